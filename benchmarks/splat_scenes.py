@@ -1,0 +1,114 @@
+"""Seeded scenes of Gaussians and cameras for tests and benchmarks; raw parameters, as they are optimised."""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from diff_gaussian_rasterization import GaussianRasterizationSettings
+from torch import Tensor
+
+PARAMETERS = ("means", "opacities", "scales", "rotations", "sh_dc", "sh_rest")
+FOV = math.radians(60)
+
+
+@dataclass
+class SplatScene:
+    """Raw parameters by name (PARAMETERS; logits, log scales, unnormalised w x y z, K = 16) and an image size."""
+
+    parameters: dict[str, Tensor]
+    width: int
+    height: int
+
+    def leaves(self, dtype: torch.dtype) -> dict[str, Tensor]:
+        """Fresh copies that require gradients. Values are float32's, whatever the dtype, so that dtypes compare."""
+        return {k: v.float().to(dtype).requires_grad_() for k, v in self.parameters.items()}
+
+    def settings(self, dtype: torch.dtype = torch.float64, **changes) -> GaussianRasterizationSettings:
+        """A camera at the origin that looks along +z with 60 degrees across."""
+        return settings(self.width, self.height, dtype, **changes)
+
+
+def settings(
+    width: int,
+    height: int,
+    dtype: torch.dtype = torch.float64,
+    *,
+    view: Tensor | None = None,
+    principal: tuple[float, float] = (0.0, 0.0),
+    **changes,
+) -> GaussianRasterizationSettings:
+    """A pinhole camera, 60 degrees across; view: (4, 4) world to view, not transposed; principal: offset in NDC.
+
+    `changes` replace fields of the settings (antialiasing=True, bg=...).
+    """
+    tan_x = math.tan(FOV / 2)
+    tan_y = tan_x * height / width
+    view = torch.eye(4, dtype=torch.float64) if view is None else view.double()
+    projection = torch.zeros(4, 4, dtype=torch.float64)
+    projection[0, 0], projection[1, 1] = 1 / tan_x, 1 / tan_y
+    projection[0, 2], projection[1, 2] = principal
+    projection[2, 2], projection[2, 3], projection[3, 2] = 100 / 99.99, -1 / 99.99, 1
+    made = GaussianRasterizationSettings(
+        image_height=height,
+        image_width=width,
+        tanfovx=tan_x,
+        tanfovy=tan_y,
+        bg=torch.tensor([0.2, 0.5, 0.9], dtype=dtype),
+        scale_modifier=1.0,
+        viewmatrix=view.T.contiguous().to(dtype),
+        projmatrix=(projection @ view).T.contiguous().to(dtype),
+        sh_degree=3,
+        campos=torch.linalg.inv(view)[:3, 3].contiguous().to(dtype),
+        prefiltered=False,
+        debug=False,
+        antialiasing=False,
+    )
+    return made._replace(**changes)
+
+
+def frustum(n: int, width: int, height: int, sigma_px: float, seed: int = 0) -> SplatScene:
+    """Splats uniform in the frustum at depths 2 to 10: median size sigma_px, log-normal (0.8), axes within a factor
+    of 5, opacity sigmoid(1.5 normal)."""
+    g = torch.Generator().manual_seed(seed)
+    focal = width / (2 * math.tan(FOV / 2))
+    z = 2 + 8 * torch.rand(n, generator=g)
+    x = (2 * torch.rand(n, generator=g) - 1) * 1.02 * (width / (2 * focal)) * z
+    y = (2 * torch.rand(n, generator=g) - 1) * 1.02 * (height / (2 * focal)) * z
+    size = torch.log(sigma_px * z / focal) + 0.8 * torch.randn(n, generator=g)
+    aspect = (torch.rand(n, 3, generator=g) - 0.5) * math.log(5.0)
+    parameters = {
+        "means": torch.stack([x, y, z], -1),
+        "opacities": 1.5 * torch.randn(n, 1, generator=g),
+        "scales": size[:, None] + aspect,
+        "rotations": torch.randn(n, 4, generator=g),
+        "sh_dc": 0.8 * torch.randn(n, 1, 3, generator=g),
+        "sh_rest": 0.1 * torch.randn(n, 15, 3, generator=g),
+    }
+    return SplatScene(parameters, width, height)
+
+
+def ordinary(n: int = 2000, width: int = 203, height: int = 117) -> SplatScene:
+    """What a trained scene is made of; the size is no multiple of the tile."""
+    return frustum(n, width, height, sigma_px=3.0, seed=1)
+
+
+def needles(n: int = 500, width: int = 203, height: int = 117) -> SplatScene:
+    """Splats a hundred to a million times longer than wide, up to several images long."""
+    scene = frustum(n, width, height, sigma_px=1.0, seed=2)
+    g = torch.Generator().manual_seed(3)
+    scales = scene.parameters["scales"]
+    scales[:, 0] += torch.log(10 ** (1.5 + torch.rand(n, generator=g)))
+    scales[:, 1:] -= torch.log(10 ** (0.5 + 3 * torch.rand(n, 2, generator=g)))
+    return scene
+
+
+def huge_and_tiny(n: int = 500, width: int = 203, height: int = 117) -> SplatScene:
+    """Half of the splats a thousandth of a pixel, half of them a thousand images wide."""
+    scene = frustum(n, width, height, sigma_px=1.0, seed=4)
+    scene.parameters["scales"][::2] += math.log(1e-3)
+    scene.parameters["scales"][1::2] += math.log(1000.0 * width)
+    scene.parameters["opacities"][1::2] -= 2.0
+    return scene
+
+
+KINDS = {"ordinary": ordinary, "needles": needles, "huge and tiny": huge_and_tiny}

@@ -1,0 +1,197 @@
+"""Builds a torch extension with a CPU backend and, once it has csrc/cuda/*.cu, a CUDA one.
+
+Each extension's setup.py calls `setup_extension`; pip does the rest. The result is <package>/_backend.so, which
+registers its operators when torch.ops.load_library loads it. setuptools' own extension builder and torch's know
+neither several instruction sets of one source nor parallel compilation without ninja, so the few commands are here.
+
+Environment: CXX (compiler), CUDA_HOME (toolkit), GS_CUDA=0|1 (never, or always, build CUDA; unset: where nvcc is
+found and torch was built with CUDA), TORCH_CUDA_ARCH_LIST ("9.0" or "8.0;9.0"; unset: all major architectures).
+"""
+
+import importlib.metadata
+import os
+import platform
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from types import ModuleType
+
+from setuptools import Extension, setup
+from setuptools.command.build_ext import build_ext
+
+VERSION = "0.1.0"
+OLDEST_TORCH = (2, 11)
+COMMON_INCLUDE = Path(__file__).resolve().parent / "include"
+# No -ffast-math: NaN, infinities and the order of sums matter. errno and traps nobody reads.
+CXX_FLAGS = ["-O3", "-std=c++17", "-fPIC", "-Wall", "-Wextra", "-fno-math-errno", "-fno-trapping-math"]
+# Symbols stay inside: the three libraries hold templates of the same names.
+CXX_FLAGS += ["-fvisibility=hidden", "-fvisibility-inlines-hidden"]
+X86_ISAS = {"baseline": [], "avx2": ["-march=x86-64-v3"], "avx512": ["-march=x86-64-v4", "-mprefer-vector-width=512"]}
+
+
+def setup_extension(name: str, package: str, root: Path) -> None:
+    """Runs setuptools for the extension in folder `root`: distribution `name`, import name `package`."""
+    setup(
+        name=name,
+        version=VERSION,
+        license="Apache-2.0",
+        python_requires=">=3.10",
+        packages=[package],
+        install_requires=[torch_requirement()],
+        # The real source list is found by the builder; setuptools only needs to know that there is a library.
+        ext_modules=[Extension(f"{package}._backend", sources=[])],
+        cmdclass={"build_ext": type("BuildBackend", (BuildBackend,), {"root": Path(root).resolve()})},
+        zip_safe=False,
+    )
+
+
+def torch_requirement() -> str:
+    """A compiled extension works with the torch minor version it was built against, and says so."""
+    try:
+        major, minor = importlib.metadata.version("torch").split(".")[:2]
+    except importlib.metadata.PackageNotFoundError:
+        return "torch>={}.{}".format(*OLDEST_TORCH)
+    return f"torch=={major}.{minor}.*"
+
+
+class BuildBackend(build_ext):
+    """Compiles csrc/ of the extension in `root` into one shared library."""
+
+    root: Path
+
+    def get_ext_filename(self, fullname: str) -> str:
+        # No interpreter tag: the library never sees Python.
+        return str(Path(*fullname.split(".")).with_suffix(".so"))
+
+    def build_extension(self, ext: Extension) -> None:
+        torch = import_torch()
+        cxx = find_compiler()
+        csrc = self.root / "csrc"
+        kernels = sorted((csrc / "cuda").glob("*.cu"))
+        nvcc = find_nvcc(torch.version.cuda) if kernels else None
+        objects_dir = Path(self.build_temp).resolve() / ext.name
+        objects_dir.mkdir(parents=True, exist_ok=True)
+        library = Path(self.get_ext_fullpath(ext.name)).resolve()
+        library.parent.mkdir(parents=True, exist_ok=True)
+
+        compile_cxx = [*cxx, *CXX_FLAGS, f"-I{csrc}", f"-I{COMMON_INCLUDE}"]
+        isas = {"baseline": []}
+        if platform.machine() in ("x86_64", "AMD64"):
+            compile_cxx.append("-DGS_X86")
+            isas = X86_ISAS
+        torch_dir = Path(torch.__file__).parent
+        # -fopenmp: at::parallel_for is a template over the OpenMP that torch itself was built with.
+        ops_flags = ["-isystem", str(torch_dir / "include")]
+        ops_flags += [f"-D_GLIBCXX_USE_CXX11_ABI={int(torch.compiled_with_cxx11_abi())}"]
+        ops_flags += ["-fopenmp"] if sys.platform == "linux" else []
+        libraries = [f"-L{torch_dir / 'lib'}", "-ltorch_cpu", "-lc10"]
+        if nvcc:
+            toolkit = toolkit_root(nvcc)
+            ops_flags += ["-DGS_CUDA", "-isystem", str(toolkit / "include")]
+            libraries += ["-ltorch_cuda", "-lc10_cuda", f"-L{toolkit / 'lib64'}", f"-L{toolkit / 'lib'}", "-lcudart"]
+
+        compilations = [([*compile_cxx, *ops_flags], csrc / "ops.cpp", "ops.o")]
+        for source in sorted((csrc / "cpu").glob("*.cpp")):
+            if source.stem.endswith("_isa"):
+                for isa, flags in isas.items():
+                    compilations.append(([*compile_cxx, *flags, f"-DGS_ISA={isa}"], source, f"{source.stem}.{isa}.o"))
+            else:
+                compilations.append((compile_cxx, source, f"{source.stem}.o"))
+        if nvcc:
+            compile_cuda = [nvcc, "-O3", "-std=c++17", "-Xcompiler", "-fPIC,-fvisibility=hidden", *architecture_flags()]
+            compile_cuda += [f"-I{csrc}", f"-I{COMMON_INCLUDE}"]
+            compilations += [(compile_cuda, source, f"{source.stem}.cu.o") for source in kernels]
+        with ThreadPoolExecutor(os.cpu_count()) as pool:
+            commands = [[*compiler, "-c", str(source), "-o", obj] for compiler, source, obj in compilations]
+            list(pool.map(lambda command: run(command, objects_dir), commands))
+        # Linked without -fopenmp: its runtime must be the one torch has loaded, not a second one.
+        shared = ["-dynamiclib", "-undefined", "dynamic_lookup"] if sys.platform == "darwin" else ["-shared"]
+        run([*cxx, *shared, *(obj for _, _, obj in compilations), *libraries, "-o", str(library)], objects_dir)
+
+
+def import_torch() -> ModuleType:
+    """torch, new enough; otherwise ends the build with one line."""
+    try:
+        import torch
+    except ImportError:
+        fail("torch is not installed: run `pip install -r requirements.txt` first")
+    if tuple(int(part) for part in torch.__version__.split(".")[:2]) < OLDEST_TORCH:
+        fail("torch {} is too old: {}.{} or newer is needed".format(torch.__version__, *OLDEST_TORCH))
+    return torch
+
+
+def find_compiler() -> list[str]:
+    """The C++ compiler's command: CXX, else c++, g++ or clang++ on PATH."""
+    wanted = shlex.split(os.environ.get("CXX", ""))
+    for command in [wanted] if wanted else [["c++"], ["g++"], ["clang++"]]:
+        if shutil.which(command[0]):
+            return command
+    what = f"the C++ compiler {wanted[0]} (CXX)" if wanted else "a C++ compiler"
+    fail(f"{what} was not found: install g++ or clang++ (C++17), or name one in CXX")
+
+
+def find_nvcc(torch_cuda: str | None) -> str | None:
+    """nvcc if the CUDA backend is to be built, else None. `torch_cuda`: torch.version.cuda."""
+    switch = os.environ.get("GS_CUDA", "")
+    if switch not in ("", "0", "1"):
+        fail(f"GS_CUDA must be 0 or 1, not {switch!r}")
+    if switch == "0":
+        return None
+    home = os.environ.get("CUDA_HOME")
+    nvcc = shutil.which("nvcc", path=str(Path(home) / "bin") if home else None)
+    if nvcc and torch_cuda:
+        release = re.search(r"release (\d+)\.", run([nvcc, "--version"]))
+        if release and release[1] != torch_cuda.split(".")[0]:
+            fail(
+                f"{nvcc} is of CUDA {release[1]} but torch was built with CUDA {torch_cuda}: "
+                "set CUDA_HOME to a toolkit of that version, or GS_CUDA=0 to build for the CPU only"
+            )
+        return nvcc
+    if switch == "1":
+        place = f"in CUDA_HOME ({home})" if home else "on PATH"
+        missing = "the torch that is installed has no CUDA" if nvcc else f"there is no nvcc {place}"
+        fail(f"GS_CUDA=1 but {missing}: install it, or unset GS_CUDA to build for the CPU only")
+    return None
+
+
+def toolkit_root(nvcc: str) -> Path:
+    """The toolkit's folder: CUDA_HOME, else what nvcc itself reports (PATH may hold only a wrapper of it)."""
+    if os.environ.get("CUDA_HOME"):
+        return Path(os.environ["CUDA_HOME"])
+    report = subprocess.run([nvcc, "--dryrun", "-x", "cu", "-c", os.devnull], capture_output=True, text=True).stderr
+    top = re.search(r"^#\$ TOP=(.+)$", report, re.MULTILINE)
+    if not top:
+        fail(f"{nvcc} does not say where its toolkit lies: set CUDA_HOME")
+    return Path(top[1]).resolve()
+
+
+def architecture_flags() -> list[str]:
+    """nvcc's flags for TORCH_CUDA_ARCH_LIST."""
+    names = os.environ.get("TORCH_CUDA_ARCH_LIST", "").replace(";", " ").split()
+    if not names:
+        return ["-arch=all-major"]
+    flags = []
+    for name in names:
+        number = name.removesuffix("+PTX").replace(".", "")
+        code = f"sm_{number},compute_{number}" if name.endswith("+PTX") else f"sm_{number}"
+        flags.append(f"-gencode=arch=compute_{number},code=[{code}]")
+    return flags
+
+
+def run(command: list[str], folder: Path | None = None) -> str:
+    """Runs a tool and gives back what it printed; ends the build with that if it fails."""
+    done = subprocess.run(command, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    if done.returncode:
+        fail(f"{shlex.join(command)}\n{done.stdout}failed with status {done.returncode}")
+    if done.stdout and folder:
+        print(done.stdout, end="", file=sys.stderr)
+    return done.stdout
+
+
+def fail(message: str) -> None:
+    """Ends the build with one line and no traceback."""
+    raise SystemExit(f"error: {message}")

@@ -1,0 +1,7 @@
+#pragma once
+// Marks what both the host compiler and nvcc compile.
+#ifdef __CUDACC__
+#define GS_HD __host__ __device__ inline
+#else
+#define GS_HD inline
+#endif

@@ -1,0 +1,53 @@
+#pragma once
+// Several instruction sets in one library. Every csrc/cpu/*_isa.cpp is compiled once for each, and all of
+// its code, math headers included, lives in a namespace of that instruction set: a symbol shared between
+// two of them could be linked from the wrong one and fault on an older machine.
+#include <cstdlib>
+#include <cstring>
+
+#ifndef GS_ISA
+#define GS_ISA baseline
+#endif
+#define GS_ISA_BEGIN \
+  namespace gs {     \
+  namespace GS_ISA {
+#define GS_ISA_END \
+  }                \
+  }
+
+namespace gs {
+
+enum class Isa { baseline, avx2, avx512 };
+
+// The widest instruction set of this machine, or a narrower one named by the environment variable GS_ISA
+// (to compare them). Internal linkage, for the reason above.
+static inline Isa best_isa() {
+  static const Isa isa = [] {
+    Isa found = Isa::baseline;
+#ifdef GS_X86
+    // x86-64-v3 and v4 by their parts: compilers before GCC 12 and Clang 16 don't know the levels' names.
+    if (__builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma") && __builtin_cpu_supports("bmi2"))
+      found = Isa::avx2;
+    if (found == Isa::avx2 && __builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512bw") &&
+        __builtin_cpu_supports("avx512dq") && __builtin_cpu_supports("avx512vl") && __builtin_cpu_supports("avx512cd"))
+      found = Isa::avx512;
+#endif
+    const char* wanted = std::getenv("GS_ISA");
+    if (wanted && !std::strcmp(wanted, "baseline")) return Isa::baseline;
+    if (wanted && !std::strcmp(wanted, "avx2") && found == Isa::avx512) return Isa::avx2;
+    return found;
+  }();
+  return isa;
+}
+
+}  // namespace gs
+
+// Calls gs::<isa>::fn(...) for the instruction set of this machine.
+#ifdef GS_X86
+#define GS_DISPATCH(fn, ...)                                         \
+  (::gs::best_isa() == ::gs::Isa::avx512 ? ::gs::avx512::fn(__VA_ARGS__) \
+   : ::gs::best_isa() == ::gs::Isa::avx2 ? ::gs::avx2::fn(__VA_ARGS__)   \
+                                         : ::gs::baseline::fn(__VA_ARGS__))
+#else
+#define GS_DISPATCH(fn, ...) ::gs::baseline::fn(__VA_ARGS__)
+#endif

@@ -1,0 +1,34 @@
+#pragma once
+// Threads come from the host framework: ops.cpp hands its pool in, a C++ test a serial one.
+#include <atomic>
+#include <cstdint>
+#include <functional>
+
+namespace gs {
+
+struct Executor {
+  int threads;  // how many bodies may run at once
+  // Calls body(begin, end) on ranges that cover [0, n). How n is cut depends on the number of threads, so a
+  // body's result must not depend on the cut.
+  void (*run)(int64_t n, int64_t grain, const std::function<void(int64_t, int64_t)>& body);
+};
+
+inline Executor serial_executor() {
+  return {1, [](int64_t n, int64_t, const std::function<void(int64_t, int64_t)>& body) {
+            if (n > 0) body(0, n);
+          }};
+}
+
+// body(begin, end) on blocks of fixed size, taken in turn by whichever thread is free: for uneven work.
+template <class Body>
+void for_dynamic(const Executor& executor, int64_t n, int64_t block, const Body& body) {
+  const int64_t blocks = (n + block - 1) / block;
+  std::atomic<int64_t> next{0};
+  const int64_t workers = blocks < executor.threads ? blocks : executor.threads;
+  executor.run(workers, 1, [&](int64_t, int64_t) {
+    for (int64_t b; (b = next.fetch_add(1, std::memory_order_relaxed)) < blocks;)
+      body(b * block, (b + 1) * block < n ? (b + 1) * block : n);
+  });
+}
+
+}  // namespace gs

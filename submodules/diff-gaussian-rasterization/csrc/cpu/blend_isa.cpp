@@ -1,0 +1,308 @@
+#include "../math/blend.h"
+
+#include <algorithm>
+#include <cstring>
+#include <limits>
+#include <memory>
+#include <vector>
+
+#include "../launch.h"
+#include "../math/exp2.h"
+#include "../math/footprint.h"
+#include "../math/tiles.h"
+#include "gs/simd.h"
+
+GS_ISA_BEGIN
+
+namespace {
+
+constexpr int kPixels = kTile * kTile;
+constexpr int64_t kChunk = 128;  // splats held local to a tile at once: some 5 KB of float
+
+// A tile's place in the image.
+struct Tile {
+  int x, y, columns, rows;  // px; columns and rows inside the image
+
+  Tile(int64_t index, Image image) {
+    const int per_row = tile_count(image.width);
+    x = int(index % per_row) * kTile, y = int(index / per_row) * kTile;
+    columns = std::min(kTile, image.width - x), rows = std::min(kTile, image.height - y);
+  }
+};
+
+// Copies between an image plane and a tile's 16x16 array; pixels outside the image stay as they are.
+template <class To, class From>
+void read_tile(const From* plane, Image image, const Tile& tile, To* pixels) {
+  for (int r = 0; r < tile.rows; ++r)
+    std::copy_n(plane + int64_t(tile.y + r) * image.width + tile.x, tile.columns, pixels + r * kTile);
+}
+template <class To, class From>
+void write_tile(const From* pixels, Image image, const Tile& tile, To* plane) {
+  for (int r = 0; r < tile.rows; ++r)
+    std::copy_n(pixels + r * kTile, tile.columns, plane + int64_t(tile.y + r) * image.width + tile.x);
+}
+
+template <class T>
+void gather(const BlendInput<T>& in, const Tile& tile, int64_t begin, int64_t end, LocalSplat<T>* local) {
+  for (int64_t k = begin; k < end; ++k) {
+    Splat<T> splat;
+    std::memcpy(&splat, in.splats + kSplatValues * int64_t(in.instances[k]), sizeof splat);
+    *local++ = localise(splat, T(tile.x), T(tile.y));
+  }
+}
+
+template <class T>
+typename Simd<T>::Vec lane_x(int first) {
+  T x[Simd<T>::kLanes];
+  for (int i = 0; i < Simd<T>::kLanes; ++i) x[i] = T(first + i);
+  return Simd<T>::load(x);
+}
+
+// What a strip of lanes (part of a row of a tile) carries from splat to splat.
+template <class T>
+struct ForwardState {
+  alignas(64) T transmittance[kPixels], color[3][kPixels], depth[kPixels];
+  alignas(64) T threshold[kPixels];  // log2 alpha that a splat must reach: infinite once the pixel has ended
+  alignas(64) typename IntOf<T>::type last[kPixels];
+};
+
+// Blends splats [0, count) of a chunk into one strip. Returns false when all its pixels have ended.
+template <class T, bool kDepth, bool kLast>
+bool blend_strip(const LocalSplat<T>* splats, int64_t count, int64_t position, int row, int first,
+                 ForwardState<T>& state) {
+  using S = Simd<T>;
+  using V = typename S::Vec;
+  using M = typename S::Mask;
+  const int at = row * kTile + first;
+  const T least = T(kLog2MinAlpha), least_left = T(kMinTransmittance);
+  const V x = lane_x<T>(first), zero = {}, never = zero + std::numeric_limits<T>::infinity();
+  V left = S::load(state.transmittance + at), threshold = S::load(state.threshold + at);
+  V red = S::load(state.color[0] + at), green = S::load(state.color[1] + at), blue = S::load(state.color[2] + at);
+  V depth = zero;
+  M last = {};
+  if (kDepth) depth = S::load(state.depth + at);
+  if (kLast) std::memcpy(&last, state.last + at, sizeof last);
+  bool open = S::any(threshold < never);
+  for (int64_t k = 0; open && k < count; ++k) {
+    const LocalSplat<T>& splat = splats[k];
+    const RowTerms<T> terms = row_terms(splat, T(row));
+    if (!(terms.top >= least)) continue;
+    const V t = row_exponent(terms, row_u(terms, x));
+    M reached = t >= threshold;
+    if (!S::any(reached)) continue;
+    const V alpha = capped<V, T>(exp2_lanes<V, M>(reached ? t : zero, T()));
+    const V after = left - alpha * left;
+    const M ends = reached & (after < least_left);
+    if (S::any(ends)) {
+      threshold = ends ? never : threshold;
+      reached &= ~ends;
+      open = S::any(threshold < never);
+    }
+    const V weight = reached ? alpha * left : zero;
+    red += weight * splat.r, green += weight * splat.g, blue += weight * splat.b;
+    if (kDepth) depth += weight * splat.inverse_depth;
+    if (kLast) last = reached ? M{} + typename S::Int(position + k + 1) : last;
+    left = reached ? after : left;
+  }
+  S::store(state.transmittance + at, left), S::store(state.threshold + at, threshold);
+  S::store(state.color[0] + at, red), S::store(state.color[1] + at, green), S::store(state.color[2] + at, blue);
+  if (kDepth) S::store(state.depth + at, depth);
+  if (kLast) std::memcpy(state.last + at, &last, sizeof last);
+  return open;
+}
+
+template <class T, bool kDepth, bool kLast>
+void blend_tile(const BlendInput<T>& in, int64_t index, const Blended<T>& out) {
+  const Tile tile(index, in.image);
+  const int64_t begin = in.ranges[index], end = in.ranges[index + 1];
+  ForwardState<T> state;
+  std::fill_n(state.transmittance, kPixels, T(1));
+  std::fill_n(state.color[0], 3 * kPixels, T(0));
+  if (kDepth) std::fill_n(state.depth, kPixels, T(0));
+  if (kLast) std::fill_n(state.last, kPixels, 0);
+  for (int p = 0; p < kPixels; ++p)
+    state.threshold[p] = p % kTile < tile.columns ? T(kLog2MinAlpha) : std::numeric_limits<T>::infinity();
+
+  LocalSplat<T> local[kChunk];
+  bool open = true;
+  for (int64_t from = begin; open && from < end; from += kChunk) {
+    const int64_t to = std::min(from + kChunk, end);
+    gather(in, tile, from, to, local);
+    open = false;
+    for (int row = 0; row < tile.rows; ++row)
+      for (int first = 0; first < kTile; first += Simd<T>::kLanes)
+        open |= blend_strip<T, kDepth, kLast>(local, to - from, from - begin, row, first, state);
+  }
+  for (int c = 0; c < 3; ++c) {
+    for (int p = 0; p < kPixels; ++p) state.color[c][p] += state.transmittance[p] * in.background[c];
+    write_tile(state.color[c], in.image, tile, out.color + int64_t(c) * in.image.width * in.image.height);
+  }
+  write_tile(state.transmittance, in.image, tile, out.transmittance);
+  if (kDepth) write_tile(state.depth, in.image, tile, out.inverse_depth);
+  if (kLast) write_tile(state.last, in.image, tile, out.last);
+}
+
+template <class T>
+struct BackwardState {
+  alignas(64) T transmittance[kPixels], behind[kPixels];
+  alignas(64) T color[3][kPixels], depth[kPixels];  // the image's gradient
+  alignas(64) typename IntOf<T>::type last[kPixels];
+};
+
+// The sums of one splat over a tile, in kGradientValues; true if any pixel was reached.
+template <class T, bool kDepth>
+bool splat_gradient(const LocalSplat<T>& splat, int64_t position, const Tile& tile, BackwardState<T>& state, T* sums) {
+  using S = Simd<T>;
+  using V = typename S::Vec;
+  using M = typename S::Mask;
+  const T least = T(kLog2MinAlpha);
+  const V zero = {};
+  // Rows where the splat can be reached at all, one to spare at either end; the exact test follows.
+  const T reach = std::sqrt(larger(splat.log2_opacity - least, T(0))) / splat.l22 + 1;
+  const int row_begin = clamped_floor(splat.y - reach, tile.rows);
+  const int row_end = clamped_floor(splat.y + reach + 1, tile.rows);
+  V q0 = zero, qu = zero, qv = zero, quu = zero, quv = zero, qvv = zero;
+  V red = zero, green = zero, blue = zero, depth = zero;
+  bool any = false;
+  for (int row = row_begin; row < row_end; ++row) {
+    const RowTerms<T> terms = row_terms(splat, T(row));
+    if (!(terms.top >= least)) continue;
+    for (int first = 0; first < kTile; first += S::kLanes) {
+      const int at = row * kTile + first;
+      M last;
+      std::memcpy(&last, state.last + at, sizeof last);
+      const V u = row_u(terms, lane_x<T>(first));
+      const V t = row_exponent(terms, u);
+      const M reached = (t >= least) & (last > typename S::Int(position));
+      if (!S::any(reached)) continue;
+      any = true;
+      const V uncapped = reached ? exp2_lanes<V, M>(reached ? t : zero, T()) : zero;
+      const V alpha = capped<V, T>(uncapped);
+      V left = S::load(state.transmittance + at), behind = S::load(state.behind + at);
+      const V gr = S::load(state.color[0] + at), gg = S::load(state.color[1] + at), gb = S::load(state.color[2] + at);
+      V gd = zero;
+      V value = splat.r * gr + splat.g * gg + splat.b * gb;
+      if (kDepth) gd = S::load(state.depth + at), value += splat.inverse_depth * gd;
+      const V q = uncapped * alpha_gradient<T, V>(alpha, value, left, behind);
+      const V weight = alpha * left;
+      S::store(state.transmittance + at, left), S::store(state.behind + at, behind);
+      const V qu_here = q * u, qv_here = q * terms.v;
+      q0 += q, qu += qu_here, qv += qv_here;
+      quu += qu_here * u, quv += qu_here * terms.v, qvv += qv_here * terms.v;
+      red += weight * gr, green += weight * gg, blue += weight * gb;
+      if (kDepth) depth += weight * gd;
+    }
+  }
+  if (!any) return false;
+  const V all[kGradientValues] = {q0, qu, qv, quu, quv, qvv, red, green, blue, depth};
+  for (int i = 0; i < kGradientValues; ++i) sums[i] = S::sum(all[i]);
+  return true;
+}
+
+// Sums of the processed instances, one row of kGradientValues each, in the order of slots: those of a splat lie side by
+// side, whatever tiles they come from. A bit per slot tells which were processed, a prefix sum over their counts where
+// the row is, so memory follows what was blended and nothing is added concurrently.
+template <class T>
+class CompactSlots {
+ public:
+  explicit CompactSlots(int64_t slots) : bits_((slots + 63) / 64, 0), before_(bits_.size() + 1, 0) {}
+
+  void mark(int32_t slot) { __atomic_fetch_or(&bits_[slot >> 6], uint64_t(1) << (slot & 63), __ATOMIC_RELAXED); }
+
+  void allocate() {
+    for (size_t w = 0; w < bits_.size(); ++w) before_[w + 1] = before_[w] + __builtin_popcountll(bits_[w]);
+    rows_.reset(new T[kGradientValues * before_.back()]);  // not zeroed: every row is written
+  }
+
+  // The row of a slot, or where it would be.
+  T* row(int64_t slot) {
+    const uint64_t lower = (uint64_t(1) << (slot & 63)) - 1;
+    const int64_t rank =
+        before_[slot >> 6] + (slot & 63 ? __builtin_popcountll(bits_[slot >> 6] & lower) : 0);
+    return rows_.get() + kGradientValues * rank;
+  }
+
+ private:
+  std::vector<uint64_t> bits_;
+  std::vector<int64_t> before_;
+  std::unique_ptr<T[]> rows_;
+};
+
+template <class T, bool kDepth>
+void blend_tile_vjp(const BlendInput<T>& in, const BlendGradient<T>& g, int64_t index, int64_t processed,
+                    CompactSlots<T>& slots) {
+  const Tile tile(index, in.image);
+  const int64_t begin = in.ranges[index], plane = int64_t(in.image.width) * in.image.height;
+  BackwardState<T> state;
+  std::fill_n(state.last, kPixels, 0);
+  std::fill_n(state.transmittance, kPixels, T(1));
+  std::fill_n(state.behind, kPixels, T(0));
+  std::fill_n(state.color[0], 3 * kPixels, T(0));
+  std::fill_n(state.depth, kPixels, T(0));
+  read_tile(g.last, in.image, tile, state.last);
+  read_tile(g.transmittance, in.image, tile, state.transmittance);
+  for (int c = 0; c < 3; ++c) read_tile(g.color + c * plane, in.image, tile, state.color[c]);
+  if (kDepth) read_tile(g.inverse_depth, in.image, tile, state.depth);
+  if (g.transmittance_gradient) read_tile(g.transmittance_gradient, in.image, tile, state.behind);
+  for (int p = 0; p < kPixels; ++p)
+    for (int c = 0; c < 3; ++c) state.behind[p] += in.background[c] * state.color[c][p];
+
+  LocalSplat<T> local[kChunk];
+  for (int64_t to = processed; to > 0; to -= std::min(kChunk, to)) {
+    const int64_t from = std::max<int64_t>(0, to - kChunk);
+    gather(in, tile, begin + from, begin + to, local);
+    for (int64_t k = to - 1; k >= from; --k) {
+      T* sums = slots.row(g.slots[begin + k]);
+      if (!splat_gradient<T, kDepth>(local[k - from], k, tile, state, sums)) std::fill_n(sums, kGradientValues, T(0));
+    }
+  }
+}
+
+}  // namespace
+
+template <class T>
+void blend(const Executor& executor, const BlendInput<T>& in, const Blended<T>& out) {
+  const auto run = out.inverse_depth ? (out.last ? blend_tile<T, true, true> : blend_tile<T, true, false>)
+                                     : (out.last ? blend_tile<T, false, true> : blend_tile<T, false, false>);
+  const int64_t tiles = int64_t(tile_count(in.image.width)) * tile_count(in.image.height);
+  for_dynamic(executor, tiles, 1, [&](int64_t tile, int64_t) { run(in, tile, out); });
+}
+
+template <class T>
+void blend_vjp(const Executor& executor, const BlendInput<T>& in, const BlendGradient<T>& g) {
+  const int64_t tiles = int64_t(tile_count(in.image.width)) * tile_count(in.image.height);
+  CompactSlots<T> slots(g.instance_count);
+  std::vector<int32_t> processed(tiles);
+  for_dynamic(executor, tiles, 4, [&](int64_t begin, int64_t end) {
+    for (int64_t index = begin; index < end; ++index) {
+      int32_t last[kPixels] = {};
+      read_tile(g.last, in.image, Tile(index, in.image), last);
+      processed[index] = *std::max_element(last, last + kPixels);
+      for (int64_t k = 0; k < processed[index]; ++k) slots.mark(g.slots[in.ranges[index] + k]);
+    }
+  });
+  slots.allocate();
+  const auto run = g.inverse_depth ? blend_tile_vjp<T, true> : blend_tile_vjp<T, false>;
+  for_dynamic(executor, tiles, 1,
+              [&](int64_t tile, int64_t) { run(in, g, tile, processed[tile], slots); });
+  for_dynamic(executor, g.count, 1024, [&](int64_t begin, int64_t end) {
+    for (int64_t i = begin; i < end; ++i) {
+      double sums[kGradientValues] = {};  // a splat may have thousands of tiles
+      if (g.tile_counts[i]) {
+        const T* row = slots.row(g.slot_offsets[i]);
+        const T* stop = slots.row(g.slot_offsets[i] + g.tile_counts[i]);
+        for (; row < stop; row += kGradientValues)
+          for (int v = 0; v < kGradientValues; ++v) sums[v] += row[v];
+      }
+      std::copy_n(sums, kGradientValues, g.moments + kGradientValues * i);
+    }
+  });
+}
+
+#define GS_INSTANTIATE(T)                                                           \
+  template void blend<T>(const Executor&, const BlendInput<T>&, const Blended<T>&); \
+  template void blend_vjp<T>(const Executor&, const BlendInput<T>&, const BlendGradient<T>&);
+GS_INSTANTIATE(float)
+GS_INSTANTIATE(double)
+
+GS_ISA_END

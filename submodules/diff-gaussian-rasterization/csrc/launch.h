@@ -1,0 +1,140 @@
+#pragma once
+// What a backend offers: plain structs of pointers and sizes, and the functions that work on them. N Gaussians, W x H
+// image, I instances (splat, tile) of which P are processed by the backward. All arrays row-major and contiguous
+// unless a stride is given; T is float or double.
+#include <cstdint>
+
+#include "gs/parallel.h"
+
+namespace gs {
+
+struct Image {
+  int width, height;
+};
+
+template <class T>
+struct Scene {
+  int64_t count;
+  const T* means;       // (N, 3)
+  const T* opacities;   // (N)
+  const T* scales;      // (N, 3), or null with cov3d
+  const T* rotations;   // (N, 4) w x y z
+  const T* cov3d;       // (N, 6) xx xy xz yy yz zz, or null
+  const T* colors;      // (N, 3), or null with sh
+  const T* sh_dc;       // (N, 3), row stride below
+  const T* sh_rest;     // (N, M, 3)
+  int64_t dc_stride, rest_stride;  // values from row to row
+  int rest_bands;       // M
+  int sh_degree;
+  bool raw;             // opacities are logits, scales logs, rotations of any length
+  bool antialiasing;
+  T scale_modifier;
+  const T* view;        // 4x4, transposed
+  const T* projection;  // 4x4, full, transposed
+  const T* center;      // 3
+  double tan_x, tan_y;
+  Image image;
+};
+
+template <class T>
+struct Projected {
+  T* splats;             // (N, 10), Splat in math/splat.h; undefined where tile_counts is 0
+  T* depths;             // (N)
+  int32_t* rects;        // (N, 4) tiles x0 y0 x1 y1
+  int32_t* tile_counts;  // (N)
+  int32_t* radii;        // (N)
+};
+
+// Gradients of Scene's inputs; null where not wanted. Every row is written.
+template <class T>
+struct SceneGradient {
+  T* means;
+  T* means2d;  // (N, 3): per NDC unit, 0
+  T* opacities;
+  T* scales;
+  T* rotations;
+  T* cov3d;
+  T* colors;
+  T* sh_dc;
+  T* sh_rest;
+};
+
+struct Binned {
+  int32_t* instances;     // (I) splat, by tile and inside by depth, ties by index
+  int32_t* slots;         // (I) place among the splat-contiguous instances, or null
+  int64_t* ranges;        // (tiles + 1) into instances
+  int64_t* slot_offsets;  // (N) first slot of a splat, or null
+};
+
+template <class T>
+struct BlendInput {
+  const T* splats;
+  const int32_t* instances;
+  const int64_t* ranges;
+  const T* background;  // 3
+  Image image;
+};
+
+template <class T>
+struct Blended {
+  T* color;          // (3, H, W)
+  T* transmittance;  // (H, W)
+  T* inverse_depth;  // (H, W), or null
+  int32_t* last;     // (H, W) 1 + position in the tile's list of the last splat blended, or null
+};
+
+template <class T>
+struct BlendGradient {
+  int64_t count, instance_count;
+  const int32_t* slots;
+  const int64_t* slot_offsets;
+  const int32_t* tile_counts;
+  const T* transmittance;
+  const int32_t* last;
+  const T* color;                 // dLoss/dcolor
+  const T* inverse_depth;         // or null
+  const T* transmittance_gradient;  // or null
+  T* moments;                     // out: (N, 10), Moments in math/footprint.h, then colour and inverse depth
+};
+
+// In-place Adam on `columns` leading values of each row.
+template <class T>
+struct AdamInput {
+  T* value;
+  const T* gradient;
+  T* mean;
+  T* square;
+  int64_t rows, row, columns;
+  double lr, beta1, beta2, eps, step;
+};
+
+#define GS_BACKEND                                                                                                   \
+  template <class T>                                                                                                 \
+  void project(const Executor&, const Scene<T>&, const Projected<T>&);                                               \
+  template <class T>                                                                                                 \
+  void project_vjp(const Executor&, const Scene<T>&, const int32_t* tile_counts, const T* moments,                   \
+                   const SceneGradient<T>&);                                                                         \
+  template <class T>                                                                                                 \
+  void mark_visible(const Executor&, int64_t count, const T* means, const T* view, bool* visible);                   \
+  template <class T>                                                                                                 \
+  void bin(const Executor&, int64_t count, const Projected<T>&, Image, int64_t instance_count, const Binned&);       \
+  template <class T>                                                                                                 \
+  void blend(const Executor&, const BlendInput<T>&, const Blended<T>&);                                              \
+  template <class T>                                                                                                 \
+  void blend_vjp(const Executor&, const BlendInput<T>&, const BlendGradient<T>&);                                    \
+  template <class T>                                                                                                 \
+  void adam(const Executor&, const AdamInput<T>&);
+
+namespace baseline {
+GS_BACKEND
+}
+#ifdef GS_X86
+namespace avx2 {
+GS_BACKEND
+}
+namespace avx512 {
+GS_BACKEND
+}
+#endif
+
+}  // namespace gs

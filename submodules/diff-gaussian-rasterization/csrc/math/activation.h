@@ -1,0 +1,47 @@
+#pragma once
+// From what is optimised (log scale, logit, free quaternion) to what is rendered, with derivatives.
+#include "vec.h"
+
+GS_ISA_BEGIN
+
+// log2 of the logistic function, good for any logit: sigmoid(x) = 1/(1+e^-x).
+template <class T>
+GS_HD T log2_sigmoid(T logit) {
+  const T log_sigmoid = logit > 0 ? -std::log1p(std::exp(-logit)) : logit - std::log1p(std::exp(logit));
+  return log_sigmoid * T(1.44269504088896340736);
+}
+
+// d ln sigmoid(x) / dx = sigmoid(-x).
+template <class T>
+GS_HD T log_sigmoid_slope(T logit) {
+  return logit > 0 ? std::exp(-logit) / (1 + std::exp(-logit)) : 1 / (1 + std::exp(logit));
+}
+
+template <class T>
+struct Quat {
+  T w, x, y, z;
+};
+
+// q / |q|; a zero quaternion counts as the identity. `norm` is what normalise_vjp needs (0 for that case).
+template <class T>
+GS_HD Quat<T> normalise(Quat<T> q, T& norm) {
+  // Scaled by the largest entry first: squares of 1e-20 and 1e20 leave the range of float.
+  const T m = larger(larger(std::abs(q.w), std::abs(q.x)), larger(std::abs(q.y), std::abs(q.z)));
+  norm = 0;
+  if (!(m > 0)) return {1, 0, 0, 0};
+  const Quat<T> s = {q.w / m, q.x / m, q.y / m, q.z / m};
+  const T r = std::sqrt(s.w * s.w + s.x * s.x + s.y * s.y + s.z * s.z);
+  norm = m * r;
+  return {s.w / r, s.x / r, s.y / r, s.z / r};
+}
+
+// dq = (g - n (n . g)) / |q|, n = q / |q|.
+template <class T>
+GS_HD Quat<T> normalise_vjp(Quat<T> n, T norm, Quat<T> g) {
+  if (!(norm > 0)) return {0, 0, 0, 0};
+  const T along = n.w * g.w + n.x * g.x + n.y * g.y + n.z * g.z;
+  return {(g.w - n.w * along) / norm, (g.x - n.x * along) / norm, (g.y - n.y * along) / norm,
+          (g.z - n.z * along) / norm};
+}
+
+GS_ISA_END

@@ -1,0 +1,37 @@
+#pragma once
+#include <cmath>
+
+#include "gs/hd.h"
+#include "gs/isa.h"
+
+GS_ISA_BEGIN
+
+// One step of Adam (Kingma and Ba 2015, algorithm 1) in torch's arrangement: eps is added to the corrected root.
+template <class T>
+struct AdamStep {
+  T keep1, take1;     // beta1, 1 - beta1; the difference taken in double (1 - 0.999f is off by 5e-5)
+  T keep2, take2;     // beta2, 1 - beta2
+  T rate;             // lr / (1 - beta1^t)
+  T root_correction;  // 1 / sqrt(1 - beta2^t)
+  T eps;
+};
+
+template <class T>
+GS_HD AdamStep<T> make_adam_step(double lr, double beta1, double beta2, double eps, double step) {
+  return {T(beta1),
+          T(1 - beta1),
+          T(beta2),
+          T(1 - beta2),
+          T(lr / (1 - std::pow(beta1, step))),
+          T(1 / std::sqrt(1 - std::pow(beta2, step))),
+          T(eps)};
+}
+
+template <class T>
+GS_HD void adam(const AdamStep<T>& a, T gradient, T& value, T& mean, T& square) {
+  mean = a.keep1 * mean + a.take1 * gradient;
+  square = a.keep2 * square + a.take2 * gradient * gradient;
+  value -= a.rate * (mean / (std::sqrt(square) * a.root_correction + a.eps));
+}
+
+GS_ISA_END

@@ -1,0 +1,62 @@
+#pragma once
+// What happens at a pixel. V is a lane type (a scalar or a vector of the compiler's), T its scalar.
+#include "constants.h"
+#include "gs/hd.h"
+#include "splat.h"
+
+GS_ISA_BEGIN
+
+// A splat in coordinates local to a tile, always: small splats lose 1.3e-3 of the exponent in image coordinates where
+// these lose 1.1e-5. Products are arranged so that a compiler has one way only to fuse them: forward and backward
+// must agree on which pixels are reached.
+template <class T>
+struct LocalSplat {
+  T y, l11, l12, l22;
+  T offset;  // -l11 x
+  T log2_opacity;
+  T r, g, b, inverse_depth;
+};
+
+template <class T>
+GS_HD LocalSplat<T> localise(const Splat<T>& s, T origin_x, T origin_y) {
+  return {s.y - origin_y, s.l11, s.l12, s.l22, s.l11 * (origin_x - s.x), s.log2_opacity, s.r, s.g, s.b, s.inverse_depth};
+}
+
+// Along a row of pixels v is constant: log2(alpha) = top - u^2, u = l11 x + u0.
+template <class T>
+struct RowTerms {
+  T top, l11, u0, v;
+};
+
+template <class T>
+GS_HD RowTerms<T> row_terms(const LocalSplat<T>& s, T y) {
+  const T dy = y - s.y, v = s.l22 * dy;
+  return {s.log2_opacity - v * v, s.l11, s.l12 * dy + s.offset, v};
+}
+
+template <class V, class T>
+GS_HD V row_u(const RowTerms<T>& row, V x) {
+  return x * row.l11 + row.u0;
+}
+template <class V, class T>
+GS_HD V row_exponent(const RowTerms<T>& row, V u) {
+  return row.top - u * u;
+}
+
+template <class V, class T>
+GS_HD V capped(V alpha, T cap = T(kMaxAlpha)) {
+  return alpha < cap ? alpha : V{} + cap;
+}
+
+// Walking back to front with one scalar for the colour: s = colour . image gradient of this splat, `behind` the
+// value of all behind it, normalised: dLoss/dalpha = T (s - behind), T the transmittance in front of the splat.
+// transmittance holds T (1 - alpha) on entry and T on return. Nothing is subtracted from a stored colour.
+template <class T, class V>
+GS_HD V alpha_gradient(V alpha, V s, V& transmittance, V& behind) {
+  transmittance = transmittance / (T(1) - alpha);
+  const V difference = s - behind;
+  behind = behind + alpha * difference;
+  return transmittance * difference;
+}
+
+GS_ISA_END

@@ -1,0 +1,55 @@
+#pragma once
+#include "constants.h"
+#include "vec.h"
+
+GS_ISA_BEGIN
+
+// Pinhole camera, x right, y down, z forward; pixel centres at integers.
+template <class T>
+struct Camera {
+  Vec3<T> row_x, row_y, row_z;  // world-to-view rotation
+  Vec3<T> translation;          // world-to-view
+  Vec3<T> center;               // in the world
+  T focal_x, focal_y;           // px, of the covariance's Jacobian
+  T mean_focal_x, mean_focal_y;  // px, of the mean: equal to the above unless the caller's matrices disagree
+  T axis_x, axis_y;             // px, where the optical axis meets the image
+  T ray_min_x, ray_max_x;       // limits of x/z in the Jacobian
+  T ray_min_y, ray_max_y;
+  int width, height;
+};
+
+// From the reference's settings: view and full projection matrix, both transposed (row vectors), row-major.
+// The projection's own entries come out of the product by dot products with the rotation's orthonormal rows.
+template <class T>
+GS_HD Camera<T> make_camera(const T* view, const T* full, const T* center, double tan_x, double tan_y, int width,
+                            int height) {
+  const auto column = [](const T* m, int c) { return Vec3<T>{m[c], m[4 + c], m[8 + c]}; };
+  Camera<T> cam;
+  cam.row_x = column(view, 0), cam.row_y = column(view, 1), cam.row_z = column(view, 2);
+  cam.translation = {view[12], view[13], view[14]};
+  cam.center = load3(center);
+  cam.width = width, cam.height = height;
+  cam.focal_x = T(width / (2 * tan_x)), cam.focal_y = T(height / (2 * tan_y));
+  const Vec3<T> clip_x = column(full, 0), clip_y = column(full, 1);
+  const T scale_x = dot(clip_x, cam.row_x), scale_y = dot(clip_y, cam.row_y);
+  const T shift_x = dot(clip_x, cam.row_z), shift_y = dot(clip_y, cam.row_z);
+  cam.mean_focal_x = T(0.5) * T(width) * scale_x, cam.mean_focal_y = T(0.5) * T(height) * scale_y;
+  cam.axis_x = T(0.5) * (T(width) * (1 + shift_x) - 1), cam.axis_y = T(0.5) * (T(height) * (1 + shift_y) - 1);
+  const T limit = T(kJacobianClamp);
+  cam.ray_min_x = (-limit - shift_x) * T(tan_x), cam.ray_max_x = (limit - shift_x) * T(tan_x);
+  cam.ray_min_y = (-limit - shift_y) * T(tan_y), cam.ray_max_y = (limit - shift_y) * T(tan_y);
+  return cam;
+}
+
+template <class T>
+GS_HD Vec3<T> to_view(const Camera<T>& cam, Vec3<T> p) {
+  return Vec3<T>{dot(cam.row_x, p), dot(cam.row_y, p), dot(cam.row_z, p)} + cam.translation;
+}
+
+// The near rule of the reference; false for NaN.
+template <class T>
+GS_HD bool in_front(T view_z) {
+  return view_z > T(kNear);
+}
+
+GS_ISA_END

@@ -1,0 +1,45 @@
+#pragma once
+// A splat's shape as three axes: its 3D covariance is the sum of axis axis^T, axis_k = scale_k * column k of R.
+#include "activation.h"
+#include "vec.h"
+
+GS_ISA_BEGIN
+
+template <class T>
+struct Axes {
+  Vec3<T> direction[3];  // columns of R; unit vectors for a unit quaternion
+  T scale[3];
+};
+
+// Columns of R(q), the quaternion taken as it is (as the reference does): for |q| != 1 no rotation.
+template <class T>
+GS_HD void rotation_columns(Quat<T> q, Vec3<T> column[3]) {
+  column[0] = {1 - 2 * (q.y * q.y + q.z * q.z), 2 * (q.x * q.y + q.w * q.z), 2 * (q.x * q.z - q.w * q.y)};
+  column[1] = {2 * (q.x * q.y - q.w * q.z), 1 - 2 * (q.x * q.x + q.z * q.z), 2 * (q.y * q.z + q.w * q.x)};
+  column[2] = {2 * (q.x * q.z + q.w * q.y), 2 * (q.y * q.z - q.w * q.x), 1 - 2 * (q.x * q.x + q.y * q.y)};
+}
+
+// From gradients of the columns to that of q, entry by entry of the above.
+template <class T>
+GS_HD Quat<T> rotation_columns_vjp(Quat<T> q, const Vec3<T> g[3]) {
+  return {2 * (q.z * (g[0].y - g[1].x) + q.y * (g[2].x - g[0].z) + q.x * (g[1].z - g[2].y)),
+          2 * (q.y * (g[0].y + g[1].x) + q.z * (g[0].z + g[2].x) + q.w * (g[1].z - g[2].y)) -
+              4 * q.x * (g[1].y + g[2].z),
+          2 * (q.x * (g[0].y + g[1].x) + q.z * (g[1].z + g[2].y) + q.w * (g[2].x - g[0].z)) -
+              4 * q.y * (g[0].x + g[2].z),
+          2 * (q.x * (g[0].z + g[2].x) + q.y * (g[1].z + g[2].y) + q.w * (g[0].y - g[1].x)) -
+              4 * q.z * (g[0].x + g[1].y)};
+}
+
+// Axes of a given covariance (xx, xy, xz, yy, yz, zz) by Cholesky; a pivot that rounding made negative is zero.
+template <class T>
+GS_HD Axes<T> axes_of_covariance(const T* c) {
+  const T a = std::sqrt(larger(c[0], T(0)));
+  const T b = a > 0 ? c[1] / a : T(0), d = a > 0 ? c[2] / a : T(0);
+  const T e = std::sqrt(larger(c[3] - b * b, T(0)));
+  const T f = e > 0 ? (c[4] - b * d) / e : T(0);
+  const T g = std::sqrt(larger(c[5] - d * d - f * f, T(0)));
+  return {{{a, b, d}, {0, e, f}, {0, 0, g}}, {1, 1, 1}};
+}
+
+GS_ISA_END

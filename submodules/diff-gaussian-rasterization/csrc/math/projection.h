@@ -1,0 +1,134 @@
+#pragma once
+// One Gaussian through one camera, and back.
+#include "camera.h"
+#include "covariance.h"
+#include "footprint.h"
+#include "sh.h"
+#include "splat.h"
+#include "tiles.h"
+
+GS_ISA_BEGIN
+
+// A Gaussian as it is rendered (activated).
+template <class T>
+struct Gaussian {
+  Vec3<T> mean;
+  Axes<T> axes;
+  T log2_opacity;
+};
+
+// Perspective at a view-space point: mean, and the rows p1, p2 of J W (J the Jacobian of Zwicker et al. 2001, eq. 29,
+// at the ray clamped to 1.3 half images). ray = (x/z, y/z).
+template <class T>
+struct Perspective {
+  T inverse_z;
+  T ray_x, ray_y, clamped_x, clamped_y;
+  Vec3<T> p1, p2;
+};
+
+template <class T>
+GS_HD Perspective<T> perspective(const Camera<T>& cam, Vec3<T> view) {
+  Perspective<T> p;
+  p.inverse_z = 1 / view.z;
+  p.ray_x = view.x * p.inverse_z, p.ray_y = view.y * p.inverse_z;
+  p.clamped_x = clamp(p.ray_x, cam.ray_min_x, cam.ray_max_x);
+  p.clamped_y = clamp(p.ray_y, cam.ray_min_y, cam.ray_max_y);
+  p.p1 = (cam.focal_x * p.inverse_z) * (cam.row_x - p.clamped_x * cam.row_z);
+  p.p2 = (cam.focal_y * p.inverse_z) * (cam.row_y - p.clamped_y * cam.row_z);
+  return p;
+}
+
+// M = J W R S and its minors. p1 x p2 = fx fy / z^2 (W^T (clamped ray, 1)) and the minor of columns i, j is that dotted
+// with axis_i x axis_j: no difference of large products, however thin the splat.
+template <class T>
+GS_HD Footprint<T> splat_footprint(const Camera<T>& cam, const Perspective<T>& p, const Axes<T>& axes) {
+  const auto& d = axes.direction;
+  const auto& s = axes.scale;
+  const Vec3<T> ray = cam.row_z + p.clamped_x * cam.row_x + p.clamped_y * cam.row_y;
+  const T fx = cam.focal_x * p.inverse_z, fy = cam.focal_y * p.inverse_z;
+  const Vec3<T> m1 = {s[0] * dot(p.p1, d[0]), s[1] * dot(p.p1, d[1]), s[2] * dot(p.p1, d[2])};
+  const Vec3<T> m2 = {s[0] * dot(p.p2, d[0]), s[1] * dot(p.p2, d[1]), s[2] * dot(p.p2, d[2])};
+  const Vec3<T> minors = {(fx * s[1]) * (fy * s[2]) * dot(ray, cross(d[1], d[2])),
+                          (fx * s[2]) * (fy * s[0]) * dot(ray, cross(d[2], d[0])),
+                          (fx * s[0]) * (fy * s[1]) * dot(ray, cross(d[0], d[1]))};
+  return make_footprint(m1, m2, minors);
+}
+
+// Everything of a splat but its colour. False: culled (behind, not finite, too faint to be seen anywhere).
+template <class T>
+GS_HD bool project_splat(const Camera<T>& cam, const Gaussian<T>& gaussian, bool antialiasing, Splat<T>& splat, T& depth,
+                         int& radius) {
+  radius = 0;
+  const Vec3<T> view = to_view(cam, gaussian.mean);
+  if (!in_front(view.z) || !finite(view)) return false;
+  const Perspective<T> p = perspective(cam, view);
+  const Footprint<T> f = splat_footprint(cam, p, gaussian.axes);
+  splat.x = cam.mean_focal_x * p.ray_x + cam.axis_x;
+  splat.y = cam.mean_focal_y * p.ray_y + cam.axis_y;
+  splat.l11 = f.l11, splat.l12 = f.l12, splat.l22 = f.l22;
+  splat.inverse_depth = p.inverse_z;
+  depth = view.z;
+  if (!finite(Vec3<T>{splat.x, splat.y, f.l12}) || !(f.l11 > 0) || !(f.l22 > 0) || !std::isfinite(f.a + f.c)) return false;
+  radius = footprint_radius(f);
+  if (!radius_on_image(splat.x, splat.y, radius, cam.width, cam.height)) radius = 0;
+  const T log2_opacity = gaussian.log2_opacity + (antialiasing ? std::log2(f.compensation) : T(0));
+  splat.log2_opacity = log2_opacity < T(kMaxLog2Opacity) ? log2_opacity : T(kMaxLog2Opacity);
+  return splat.log2_opacity >= T(kLog2MinAlpha) - T(1e-3);  // false for NaN; the margin is tile_rect's
+}
+
+// What project_splat's inputs receive; log2_opacity as d/d ln(opacity).
+template <class T>
+struct GaussianGradient {
+  Vec3<T> mean;
+  Vec3<T> direction[3];
+  T scale[3];
+  T log_opacity;
+  T covariance[6];  // only where the axes came from a given covariance
+  T pixel_x, pixel_y;
+};
+
+template <class T>
+GS_HD GaussianGradient<T> project_splat_vjp(const Camera<T>& cam, const Gaussian<T>& gaussian, bool antialiasing,
+                                            bool want_covariance, const Moments<T>& s, T g_inverse_depth) {
+  GaussianGradient<T> g;
+  const Vec3<T> view = to_view(cam, gaussian.mean);
+  const Perspective<T> p = perspective(cam, view);
+  const Footprint<T> f = splat_footprint(cam, p, gaussian.axes);
+  g.log_opacity = s.q;
+  mean_vjp(f, s, g.pixel_x, g.pixel_y);
+
+  Vec3<T> g1, g2;  // of M's rows
+  footprint_vjp(f, s, antialiasing, g1, g2);
+  const T row1[3] = {g1.x, g1.y, g1.z}, row2[3] = {g2.x, g2.y, g2.z};
+  Vec3<T> gp1 = {0, 0, 0}, gp2 = {0, 0, 0};
+  for (int k = 0; k < 3; ++k) {
+    const Vec3<T> d = gaussian.axes.direction[k];
+    const T scale = gaussian.axes.scale[k];
+    const Vec3<T> g_axis = row1[k] * p.p1 + row2[k] * p.p2;
+    g.scale[k] = dot(g_axis, d);
+    g.direction[k] = scale * g_axis;
+    gp1 = gp1 + (row1[k] * scale) * d;
+    gp2 = gp2 + (row2[k] * scale) * d;
+  }
+  if (want_covariance) {  // d cov3d = P^T G P, off-diagonal entries stand for two
+    T c[3];
+    covariance2d_vjp(f, s, antialiasing, c);
+    const Vec3<T> a = c[0] * p.p1 + c[1] * p.p2, b = c[1] * p.p1 + c[2] * p.p2;
+    g.covariance[0] = p.p1.x * a.x + p.p2.x * b.x;
+    g.covariance[1] = p.p1.x * a.y + p.p2.x * b.y + p.p1.y * a.x + p.p2.y * b.x;
+    g.covariance[2] = p.p1.x * a.z + p.p2.x * b.z + p.p1.z * a.x + p.p2.z * b.x;
+    g.covariance[3] = p.p1.y * a.y + p.p2.y * b.y;
+    g.covariance[4] = p.p1.y * a.z + p.p2.y * b.z + p.p1.z * a.y + p.p2.z * b.y;
+    g.covariance[5] = p.p1.z * a.z + p.p2.z * b.z;
+  }
+
+  // A clamped ray is a constant: its coordinate gets nothing through J, and z only through the factor 1/z.
+  T g_ray_x = cam.mean_focal_x * g.pixel_x, g_ray_y = cam.mean_focal_y * g.pixel_y;
+  if (p.clamped_x == p.ray_x) g_ray_x -= cam.focal_x * p.inverse_z * dot(cam.row_z, gp1);
+  if (p.clamped_y == p.ray_y) g_ray_y -= cam.focal_y * p.inverse_z * dot(cam.row_z, gp2);
+  const T g_z = -(dot(p.p1, gp1) + dot(p.p2, gp2) + p.ray_x * g_ray_x + p.ray_y * g_ray_y + p.inverse_z * g_inverse_depth);
+  g.mean = p.inverse_z * (g_ray_x * cam.row_x + g_ray_y * cam.row_y + g_z * cam.row_z);
+  return g;
+}
+
+GS_ISA_END

@@ -1,0 +1,428 @@
+// The only file that sees torch: checks, allocates, dispatches on the instruction set.
+#include <ATen/ops/empty.h>
+#include <torch/library.h>
+
+#include <array>
+#include <limits>
+
+#include "gs/isa.h"
+#include "gs/torch_executor.h"
+#include "launch.h"
+
+namespace {
+
+using at::Tensor;
+using MaybeTensor = std::optional<Tensor>;
+
+constexpr int64_t kSplatValues = 10, kGradientValues = 10, kTile = 16;
+
+// Everything that describes the Gaussians and the camera, in the order of the schemas.
+#define SCENE_SCHEMA                                                                                              \
+  "Tensor means, Tensor opacities, Tensor? scales, Tensor? rotations, Tensor? cov3d, Tensor? colors, "            \
+  "Tensor? sh_dc, Tensor? sh_rest, Tensor view, Tensor projection, Tensor center, float tan_x, float tan_y, "     \
+  "int height, int width, int sh_degree, float scale_modifier, bool antialiasing, bool raw"
+#define SCENE_PARAMETERS                                                                                          \
+  const Tensor &means, const Tensor &opacities, const MaybeTensor &scales, const MaybeTensor &rotations,          \
+      const MaybeTensor &cov3d, const MaybeTensor &colors, const MaybeTensor &sh_dc, const MaybeTensor &sh_rest,  \
+      const Tensor &view, const Tensor &projection, const Tensor &center, double tan_x, double tan_y,             \
+      int64_t height, int64_t width, int64_t sh_degree, double scale_modifier, bool antialiasing, bool raw
+#define SCENE_ARGUMENTS                                                                                           \
+  means, opacities, scales, rotations, cov3d, colors, sh_dc, sh_rest, view, projection, center, tan_x, tan_y,     \
+      height, width, sh_degree, scale_modifier, antialiasing, raw
+
+// Owns the contiguous tensors that a gs::Scene points into.
+class SceneTensors {
+ public:
+  explicit SceneTensors(SCENE_PARAMETERS)
+      : count_(means.size(0)),
+        dtype_(means.scalar_type()),
+        means_(take(means, {3}, "means")),
+        opacities_(take(opacities, {}, "opacities")),
+        scales_(take(scales, {3}, "scales")),
+        rotations_(take(rotations, {4}, "rotations")),
+        cov3d_(take(cov3d, {6}, "cov3d")),
+        colors_(take(colors, {3}, "colors")),
+        sh_dc_(take_bands(sh_dc, "sh_dc")),
+        sh_rest_(take_bands(sh_rest, "sh_rest")),
+        view_(matrix(view, 16, "view")),
+        projection_(matrix(projection, 16, "projection")),
+        center_(matrix(center, 3, "center")),
+        tan_x_(tan_x),
+        tan_y_(tan_y),
+        scale_modifier_(scale_modifier),
+        sh_degree_(int(sh_degree)),
+        antialiasing_(antialiasing),
+        raw_(raw),
+        image_{int(width), int(height)} {
+    TORCH_CHECK(cov3d_.defined() != (scales_.defined() && rotations_.defined()),
+                "give either scales and rotations or cov3d");
+    TORCH_CHECK(colors_.defined() != (sh_dc_.defined() && sh_rest_.defined()), "give either colors or sh_dc and sh_rest");
+    TORCH_CHECK(sh_degree >= 0 && sh_degree <= 3, "sh_degree must be 0 to 3, got ", sh_degree);
+    TORCH_CHECK(colors_.defined() || sh_rest_.size(1) >= (sh_degree + 1) * (sh_degree + 1) - 1, "sh_rest has ",
+                colors_.defined() ? 0 : sh_rest_.size(1), " bands, too few for sh_degree ", sh_degree);
+    TORCH_CHECK(height > 0 && width > 0 && height < (1 << 24) && width < (1 << 24), "image size ", width, "x", height,
+                " is out of range");
+    TORCH_CHECK(count() < std::numeric_limits<int32_t>::max(), "more than 2^31 Gaussians");
+  }
+
+  int64_t count() const { return count_; }
+  gs::Image image() const { return image_; }
+  at::ScalarType dtype() const { return dtype_; }
+  at::TensorOptions options() const { return means_.options(); }
+  int64_t rest_bands() const { return sh_rest_.defined() ? sh_rest_.size(1) : 0; }
+
+  template <class T>
+  gs::Scene<T> scene() const {
+    const auto pointer = [](const Tensor& t) { return t.defined() ? t.const_data_ptr<T>() : nullptr; };
+    return {count(),
+            pointer(means_),
+            pointer(opacities_),
+            pointer(scales_),
+            pointer(rotations_),
+            pointer(cov3d_),
+            pointer(colors_),
+            pointer(sh_dc_),
+            pointer(sh_rest_),
+            sh_dc_.defined() ? sh_dc_.stride(0) : 0,
+            sh_rest_.defined() ? sh_rest_.stride(0) : 0,
+            int(rest_bands()),
+            sh_degree_,
+            raw_,
+            antialiasing_,
+            T(scale_modifier_),
+            pointer(view_),
+            pointer(projection_),
+            pointer(center_),
+            tan_x_,
+            tan_y_,
+            image_};
+  }
+
+ private:
+  Tensor take(const MaybeTensor& given, at::IntArrayRef tail, const char* name) const {
+    if (!given.has_value() || !given->defined()) return {};
+    const Tensor& t = *given;
+    int64_t row = 1;
+    for (int64_t size : tail) row *= size;
+    TORCH_CHECK(t.device().is_cpu(), name, " must be on the CPU, got ", t.device());
+    TORCH_CHECK(t.dim() >= 1 && t.size(0) == count_ && t.numel() == count_ * row, name, " must be (", count_, ", ", row,
+                "), got ", t.sizes());
+    TORCH_CHECK(t.scalar_type() == dtype_, name, " must have the dtype of means, got ",
+                t.scalar_type());
+    return t.contiguous();
+  }
+  // (N, bands, 3); rows may lie apart, so that a slice of more bands needs no copy.
+  Tensor take_bands(const MaybeTensor& given, const char* name) const {
+    if (!given.has_value() || !given->defined()) return {};
+    const Tensor& t = *given;
+    TORCH_CHECK(t.dim() == 3 && t.size(0) == count() && t.size(2) == 3 && t.scalar_type() == dtype(), name,
+                " must be (", count(), ", bands, 3) with the dtype of means, got ", t.sizes(), " ", t.scalar_type());
+    return t.size(1) == 0 || (t.stride(2) == 1 && t.stride(1) == 3) ? t : t.contiguous();
+  }
+  Tensor matrix(const Tensor& t, int64_t values, const char* name) const {
+    TORCH_CHECK(t.numel() == values, name, " must have ", values, " values, got ", t.sizes());
+    return t.to(means_.options()).contiguous();
+  }
+
+  int64_t count_;  // first: the checks of the tensors read these two
+  at::ScalarType dtype_;
+  Tensor means_, opacities_, scales_, rotations_, cov3d_, colors_, sh_dc_, sh_rest_, view_, projection_, center_;
+  double tan_x_, tan_y_, scale_modifier_;
+  int sh_degree_;
+  bool antialiasing_, raw_;
+  gs::Image image_;
+};
+
+template <class F>
+void with_scalar(at::ScalarType type, const F& f) {
+  TORCH_CHECK(type == at::kFloat || type == at::kDouble, "means must be float32 or float64, got ", type);
+  if (type == at::kFloat)
+    f(float());
+  else
+    f(double());
+}
+
+int64_t tiles_of(gs::Image image) {
+  return ((image.width + kTile - 1) / kTile) * ((image.height + kTile - 1) / kTile);
+}
+
+struct ProjectedTensors {
+  Tensor splats, depths, rects, tile_counts, radii;
+  template <class T>
+  gs::Projected<T> pointers() {
+    return {splats.mutable_data_ptr<T>(), depths.mutable_data_ptr<T>(), rects.mutable_data_ptr<int32_t>(),
+            tile_counts.mutable_data_ptr<int32_t>(), radii.mutable_data_ptr<int32_t>()};
+  }
+};
+
+ProjectedTensors project(const SceneTensors& in) {
+  const int64_t n = in.count();
+  const auto ints = in.options().dtype(at::kInt);
+  ProjectedTensors out{at::empty({n, kSplatValues}, in.options()), at::empty({n}, in.options()), at::empty({n, 4}, ints),
+                       at::empty({n}, ints), at::empty({n}, ints)};
+  with_scalar(in.dtype(), [&](auto zero) {
+    using T = decltype(zero);
+    GS_DISPATCH(project, gs::torch_executor(), in.scene<T>(), out.pointers<T>());
+  });
+  return out;
+}
+
+struct BinnedTensors {
+  Tensor instances, slots, ranges, slot_offsets;
+};
+
+// `slots`: whether the backward will need them.
+BinnedTensors bin(ProjectedTensors& in, gs::Image image, bool slots) {
+  const int64_t n = in.depths.size(0);
+  const int32_t* counts = in.tile_counts.const_data_ptr<int32_t>();
+  int64_t total = 0;
+  for (int64_t i = 0; i < n; ++i) total += counts[i];
+  TORCH_CHECK(total <= std::numeric_limits<int32_t>::max(), n, " Gaussians cover ", total,
+              " tile instances, more than 2^31 - 1: render at a lower resolution or with fewer or smaller Gaussians");
+  const auto ints = in.depths.options().dtype(at::kInt), longs = in.depths.options().dtype(at::kLong);
+  BinnedTensors out{at::empty({total}, ints), at::empty({slots ? total : 0}, ints),
+                    at::empty({tiles_of(image) + 1}, longs), at::empty({slots ? n : 0}, longs)};
+  const gs::Binned binned{out.instances.mutable_data_ptr<int32_t>(), slots ? out.slots.mutable_data_ptr<int32_t>() : nullptr,
+                          out.ranges.mutable_data_ptr<int64_t>(),
+                          slots ? out.slot_offsets.mutable_data_ptr<int64_t>() : nullptr};
+  with_scalar(in.depths.scalar_type(), [&](auto zero) {
+    using T = decltype(zero);
+    GS_DISPATCH(bin, gs::torch_executor(), n, in.pointers<T>(), image, total, binned);
+  });
+  return out;
+}
+
+template <class T>
+gs::BlendInput<T> blend_input(const Tensor& splats, const Tensor& instances, const Tensor& ranges,
+                              const Tensor& background, gs::Image image) {
+  return {splats.const_data_ptr<T>(), instances.const_data_ptr<int32_t>(), ranges.const_data_ptr<int64_t>(),
+          background.const_data_ptr<T>(), image};
+}
+
+Tensor background_like(const Tensor& background, const Tensor& splats) {
+  TORCH_CHECK(background.numel() == 3, "background must have 3 values, got ", background.sizes());
+  return background.to(splats.options()).contiguous();
+}
+
+struct BlendedTensors {
+  Tensor color, transmittance, inverse_depth, last;
+};
+
+// `last`: whether the backward will need it.
+BlendedTensors blend(const Tensor& splats, const Tensor& instances, const Tensor& ranges, const Tensor& background,
+                     gs::Image image, bool inverse_depth, bool last) {
+  const int64_t h = image.height, w = image.width;
+  BlendedTensors out{at::empty({3, h, w}, splats.options()), at::empty({1, h, w}, splats.options()),
+                     at::empty({inverse_depth ? 1 : 0, h, w}, splats.options()),
+                     at::empty({last ? h : 0, w}, splats.options().dtype(at::kInt))};
+  const Tensor bg = background_like(background, splats);
+  with_scalar(splats.scalar_type(), [&](auto zero) {
+    using T = decltype(zero);
+    const gs::Blended<T> blended{out.color.mutable_data_ptr<T>(), out.transmittance.mutable_data_ptr<T>(),
+                                 inverse_depth ? out.inverse_depth.mutable_data_ptr<T>() : nullptr,
+                                 last ? out.last.mutable_data_ptr<int32_t>() : nullptr};
+    GS_DISPATCH(blend, gs::torch_executor(), blend_input<T>(splats, instances, ranges, bg, image), blended);
+  });
+  return out;
+}
+
+Tensor blend_vjp(const Tensor& splats, const Tensor& tile_counts, const Tensor& instances, const Tensor& slots,
+                 const Tensor& ranges, const Tensor& slot_offsets, const Tensor& background, const Tensor& last,
+                 const Tensor& transmittance, const Tensor& grad_color, const MaybeTensor& grad_transmittance,
+                 const MaybeTensor& grad_inverse_depth) {
+  const int64_t n = splats.size(0);
+  const gs::Image image{int(last.size(1)), int(last.size(0))};
+  TORCH_CHECK(grad_color.dim() == 3 && grad_color.size(0) == 3 && grad_color.size(1) == image.height &&
+                  grad_color.size(2) == image.width,
+              "the gradient of the image must be (3, ", image.height, ", ", image.width, "), got ", grad_color.sizes());
+  const auto plane = [&](const MaybeTensor& t) {
+    if (!t.has_value() || !t->defined()) return Tensor();
+    TORCH_CHECK(t->numel() == last.numel(), "gradient of an image plane must be (1, ", image.height, ", ", image.width,
+                "), got ", t->sizes());
+    return t->to(splats.options()).contiguous();
+  };
+  const Tensor bg = background_like(background, splats), color = grad_color.to(splats.options()).contiguous();
+  const Tensor depth = plane(grad_inverse_depth), alpha = plane(grad_transmittance);
+  Tensor moments = at::empty({n, kGradientValues}, splats.options());
+  with_scalar(splats.scalar_type(), [&](auto zero) {
+    using T = decltype(zero);
+    const gs::BlendGradient<T> g{n,
+                                 instances.size(0),
+                                 slots.const_data_ptr<int32_t>(),
+                                 slot_offsets.const_data_ptr<int64_t>(),
+                                 tile_counts.const_data_ptr<int32_t>(),
+                                 transmittance.const_data_ptr<T>(),
+                                 last.const_data_ptr<int32_t>(),
+                                 color.const_data_ptr<T>(),
+                                 depth.defined() ? depth.const_data_ptr<T>() : nullptr,
+                                 alpha.defined() ? alpha.const_data_ptr<T>() : nullptr,
+                                 moments.mutable_data_ptr<T>()};
+    GS_DISPATCH(blend_vjp, gs::torch_executor(), blend_input<T>(splats, instances, ranges, bg, image), g);
+  });
+  return moments;
+}
+
+// In the order of GRADIENTS in ops.py; empty where not wanted.
+using Gradients = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor>;
+
+Gradients project_vjp(const SceneTensors& in, const Tensor& tile_counts, const Tensor& moments,
+                      std::array<bool, 9> wanted) {
+  const int64_t n = in.count();
+  const auto make = [&](int which, at::IntArrayRef tail) {
+    std::vector<int64_t> sizes{wanted[which] ? n : 0};
+    sizes.insert(sizes.end(), tail.begin(), tail.end());
+    return at::empty(sizes, in.options());
+  };
+  std::array<Tensor, 9> g{make(0, {3}), make(1, {3}), make(2, {1}), make(3, {3}),   make(4, {4}),
+                          make(5, {6}), make(6, {3}), make(7, {1, 3}), make(8, {in.rest_bands(), 3})};
+  with_scalar(in.dtype(), [&](auto zero) {
+    using T = decltype(zero);
+    const auto out = [&](int which) { return wanted[which] ? g[which].mutable_data_ptr<T>() : nullptr; };
+    const gs::SceneGradient<T> gradient{out(0), out(1), out(2), out(3), out(4), out(5), out(6), out(7), out(8)};
+    GS_DISPATCH(project_vjp, gs::torch_executor(), in.scene<T>(), tile_counts.const_data_ptr<int32_t>(),
+                moments.const_data_ptr<T>(), gradient);
+  });
+  return {g[0], g[1], g[2], g[3], g[4], g[5], g[6], g[7], g[8]};
+}
+
+// ---- the ops ----
+
+using Tensors5 = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor>;
+using Tensors4 = std::tuple<Tensor, Tensor, Tensor, Tensor>;
+
+Tensors5 project_op(SCENE_PARAMETERS) {
+  const ProjectedTensors p = project(SceneTensors(SCENE_ARGUMENTS));
+  return {p.splats, p.depths, p.rects, p.tile_counts, p.radii};
+}
+
+Tensors4 bin_op(const Tensor& splats, const Tensor& depths, const Tensor& rects, const Tensor& tile_counts,
+                int64_t height, int64_t width, bool train) {
+  ProjectedTensors p{splats.contiguous(), depths.contiguous(), rects.contiguous(), tile_counts.contiguous(),
+                     tile_counts.contiguous()};
+  const BinnedTensors b = bin(p, {int(width), int(height)}, train);
+  return {b.instances, b.slots, b.ranges, b.slot_offsets};
+}
+
+Tensors4 blend_op(const Tensor& splats, const Tensor& instances, const Tensor& ranges, const Tensor& background,
+                  int64_t height, int64_t width, bool inverse_depth, bool train) {
+  const BlendedTensors b =
+      blend(splats.contiguous(), instances, ranges, background, {int(width), int(height)}, inverse_depth, train);
+  return {b.color, b.transmittance, b.inverse_depth, b.last};
+}
+
+Gradients project_vjp_op(SCENE_PARAMETERS, const Tensor& tile_counts, const Tensor& moments,
+                         std::array<bool, 9> wanted) {
+  return project_vjp(SceneTensors(SCENE_ARGUMENTS), tile_counts.contiguous(), moments.contiguous(), wanted);
+}
+
+using Rasterized = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor>;
+
+Rasterized rasterize_op(const Tensor& /*means2d: only receives a gradient*/, SCENE_PARAMETERS,
+                        const Tensor& background, bool inverse_depth, bool train) {
+  const SceneTensors scene(SCENE_ARGUMENTS);
+  ProjectedTensors p = project(scene);
+  BinnedTensors b = bin(p, scene.image(), train);
+  BlendedTensors o = blend(p.splats, b.instances, b.ranges, background, scene.image(), inverse_depth, train);
+  return {o.color,     o.transmittance, o.inverse_depth, p.radii,        p.splats, p.tile_counts,
+          b.instances, b.slots,         b.ranges,        b.slot_offsets, o.last};
+}
+
+Gradients rasterize_vjp_op(SCENE_PARAMETERS, const Tensor& background, const Tensor& splats,
+                           const Tensor& tile_counts, const Tensor& instances, const Tensor& slots,
+                           const Tensor& ranges, const Tensor& slot_offsets, const Tensor& last,
+                           const Tensor& transmittance, const Tensor& grad_color,
+                           const MaybeTensor& grad_transmittance, const MaybeTensor& grad_inverse_depth,
+                           std::array<bool, 9> wanted) {
+  const SceneTensors scene(SCENE_ARGUMENTS);
+  const Tensor moments = blend_vjp(splats, tile_counts, instances, slots, ranges, slot_offsets, background, last,
+                                   transmittance, grad_color, grad_transmittance, grad_inverse_depth);
+  return project_vjp(scene, tile_counts, moments, wanted);
+}
+
+Tensor mark_visible_op(const Tensor& means, const Tensor& view) {
+  TORCH_CHECK(means.dim() == 2 && means.size(1) == 3, "positions must be (N, 3), got ", means.sizes());
+  TORCH_CHECK(view.numel() == 16, "the view matrix must be 4x4, got ", view.sizes());
+  const Tensor rows = means.contiguous(), matrix = view.to(means.options()).contiguous();
+  Tensor visible = at::empty({rows.size(0)}, rows.options().dtype(at::kBool));
+  with_scalar(rows.scalar_type(), [&](auto zero) {
+    using T = decltype(zero);
+    GS_DISPATCH(mark_visible, gs::torch_executor(), rows.size(0), rows.const_data_ptr<T>(), matrix.const_data_ptr<T>(),
+                visible.mutable_data_ptr<bool>());
+  });
+  return visible;
+}
+
+void adam_op(Tensor& value, const Tensor& gradient, Tensor& mean, Tensor& square, double lr, double beta1,
+             double beta2, double eps, double step, int64_t columns) {
+  for (const Tensor* t : {&gradient, static_cast<const Tensor*>(&mean), static_cast<const Tensor*>(&square)})
+    TORCH_CHECK(t->sizes() == value.sizes() && t->scalar_type() == value.scalar_type(),
+                "gradient and moments must have the shape and dtype of the parameter, ", value.sizes(), ", got ",
+                t->sizes());
+  TORCH_CHECK(value.is_contiguous() && mean.is_contiguous() && square.is_contiguous(),
+              "parameter and moments must be contiguous");
+  if (value.numel() == 0) return;
+  const int64_t rows = value.dim() > 0 ? value.size(0) : 1, row = value.numel() / rows;
+  TORCH_CHECK(columns <= row, "columns must be at most ", row, ", got ", columns);
+  const Tensor g = gradient.contiguous();
+  with_scalar(value.scalar_type(), [&](auto zero) {
+    using T = decltype(zero);
+    const gs::AdamInput<T> in{value.mutable_data_ptr<T>(),
+                              g.const_data_ptr<T>(),
+                              mean.mutable_data_ptr<T>(),
+                              square.mutable_data_ptr<T>(),
+                              rows,
+                              row,
+                              columns < 0 ? row : columns,
+                              lr,
+                              beta1,
+                              beta2,
+                              eps,
+                              step};
+    GS_DISPATCH(adam, gs::torch_executor(), in);
+  });
+}
+
+}  // namespace
+
+TORCH_LIBRARY(diff_gaussian_rasterization, m) {
+  m.def("project(" SCENE_SCHEMA
+        ") -> (Tensor splats, Tensor depths, Tensor rects, Tensor tile_counts, Tensor radii)");
+  m.def(
+      "bin(Tensor splats, Tensor depths, Tensor rects, Tensor tile_counts, int height, int width, bool train) -> "
+      "(Tensor instances, Tensor slots, Tensor ranges, Tensor slot_offsets)");
+  m.def(
+      "blend(Tensor splats, Tensor instances, Tensor ranges, Tensor background, int height, int width, "
+      "bool inverse_depth, bool train) -> (Tensor color, Tensor transmittance, Tensor inverse_depth, Tensor last)");
+  m.def(
+      "blend_vjp(Tensor splats, Tensor tile_counts, Tensor instances, Tensor slots, Tensor ranges, "
+      "Tensor slot_offsets, Tensor background, Tensor last, Tensor transmittance, Tensor grad_color, "
+      "Tensor? grad_transmittance, Tensor? grad_inverse_depth) -> Tensor moments");
+  m.def("project_vjp(" SCENE_SCHEMA
+        ", Tensor tile_counts, Tensor moments, bool[9] wanted) -> (Tensor means, Tensor means2d, Tensor opacities, "
+        "Tensor scales, Tensor rotations, Tensor cov3d, Tensor colors, Tensor sh_dc, Tensor sh_rest)");
+  m.def("rasterize(Tensor means2d, " SCENE_SCHEMA
+        ", Tensor background, bool inverse_depth, bool train) -> (Tensor color, Tensor transmittance, "
+        "Tensor inverse_depth, Tensor radii, Tensor splats, Tensor tile_counts, Tensor instances, Tensor slots, "
+        "Tensor ranges, Tensor slot_offsets, Tensor last)");
+  m.def("rasterize_vjp(" SCENE_SCHEMA
+        ", Tensor background, Tensor splats, Tensor tile_counts, Tensor instances, Tensor slots, Tensor ranges, "
+        "Tensor slot_offsets, Tensor last, Tensor transmittance, Tensor grad_color, Tensor? grad_transmittance, "
+        "Tensor? grad_inverse_depth, bool[9] wanted) -> (Tensor means, Tensor means2d, Tensor opacities, Tensor "
+        "scales, Tensor rotations, Tensor cov3d, Tensor colors, Tensor sh_dc, Tensor sh_rest)");
+  m.def("mark_visible(Tensor means, Tensor view) -> Tensor");
+  m.def(
+      "adam_(Tensor(a!) value, Tensor gradient, Tensor(b!) mean, Tensor(c!) square, float lr, float beta1, "
+      "float beta2, float eps, float step, int columns=-1) -> ()");
+}
+
+TORCH_LIBRARY_IMPL(diff_gaussian_rasterization, CPU, m) {
+  m.impl("project", &project_op);
+  m.impl("bin", &bin_op);
+  m.impl("blend", &blend_op);
+  m.impl("blend_vjp", &blend_vjp);
+  m.impl("project_vjp", &project_vjp_op);
+  m.impl("rasterize", &rasterize_op);
+  m.impl("rasterize_vjp", &rasterize_vjp_op);
+  m.impl("mark_visible", &mark_visible_op);
+  m.impl("adam_", &adam_op);
+}

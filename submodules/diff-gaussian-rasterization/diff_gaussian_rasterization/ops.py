@@ -1,0 +1,272 @@
+"""The operators of csrc/ops.cpp as Python sees them: checks with readable messages, fake kernels, autograd.
+
+Letters: N Gaussians, K spherical harmonics, H x W pixels, I instances (a splat in a tile), tiles of 16 x 16.
+"""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+import torch
+from torch import Tensor
+
+if TYPE_CHECKING:
+    from diff_gaussian_rasterization import GaussianRasterizationSettings
+
+_LIBRARY = Path(__file__).with_name("_backend.so")
+if not _LIBRARY.exists():
+    raise ImportError(
+        "diff_gaussian_rasterization is not built: run `pip install ./submodules/diff-gaussian-rasterization` "
+        "in the repository's root"
+    )
+torch.ops.load_library(str(_LIBRARY))
+_ops = torch.ops.diff_gaussian_rasterization
+
+# Inputs that receive gradients, in the order of `wanted` and of the results of rasterize_vjp.
+GRADIENTS = ("means", "means2d", "opacities", "scales", "rotations", "cov3d", "colors", "sh_dc", "sh_rest")
+_SCENE = (
+    "means opacities scales rotations cov3d colors sh_dc sh_rest view projection center tan_x tan_y height width "
+    "sh_degree scale_modifier antialiasing raw"
+).split()
+_TILE = 16
+_VALUES = 10  # of a row of `splats` and of `moments`
+
+
+class Rasterized(NamedTuple):
+    """What `rasterize` returns."""
+
+    color: Tensor  # (3, H, W), background included
+    radii: Tensor  # (N,) int32, px: ceil of 3 sigma, 0 where culled
+    inverse_depth: Tensor | None  # (1, H, W): sum of alpha T / z, no background, not normalised
+    transmittance: Tensor | None  # (1, H, W): what is left for the background
+
+
+def rasterize(
+    means: Tensor,
+    means2d: Tensor,
+    opacities: Tensor,
+    settings: "GaussianRasterizationSettings",
+    *,
+    scales: Tensor | None = None,
+    rotations: Tensor | None = None,
+    cov3d: Tensor | None = None,
+    sh_dc: Tensor | None = None,
+    sh_rest: Tensor | None = None,
+    colors: Tensor | None = None,
+    raw: bool = False,
+    want_inverse_depth: bool = False,
+    want_transmittance: bool = False,
+) -> Rasterized:
+    """Renders Gaussians (Kerbl et al. 2023, section 4 and 6); differentiable in every tensor but the settings'.
+
+    means (N, 3) world; means2d (N, 3): only receives d loss / d mean per NDC unit; opacities (N, 1); scales (N, 3)
+    and rotations (N, 4) w x y z, or cov3d (N, 6) as xx xy xz yy yz zz; sh_dc (N, 1, 3) and sh_rest (N, K-1, 3), of
+    which the bands up to settings.sh_degree are read, or colors (N, 3). All float32 or all float64.
+    raw: opacities are logits, scales logarithms, rotations of any length (zero counts as the identity); otherwise all
+    are taken as given. Gaussians with a NaN or Inf are left out and receive zero gradients.
+    Raises TypeError and ValueError for wrong dtypes and shapes, RuntimeError where the image needs more than 2^31
+    tile instances.
+    """
+    tensors = {"means": means, "opacities": opacities, "scales": scales, "rotations": rotations, "cov3d": cov3d}
+    tensors |= {"colors": colors, "sh_dc": sh_dc, "sh_rest": sh_rest}
+    _check(tensors, means2d, settings.sh_degree, raw)
+    differentiable = [t for t in (*tensors.values(), means2d) if t is not None]
+    train = torch.is_grad_enabled() and any(t.requires_grad for t in differentiable)
+    out = _ops.rasterize(
+        means2d,
+        *tensors.values(),
+        settings.viewmatrix,
+        settings.projmatrix,
+        settings.campos,
+        settings.tanfovx,
+        settings.tanfovy,
+        settings.image_height,
+        settings.image_width,
+        settings.sh_degree,
+        settings.scale_modifier,
+        settings.antialiasing,
+        raw,
+        settings.bg,
+        want_inverse_depth,
+        train,
+    )
+    color, transmittance, inverse_depth, radii = out[:4]
+    if settings.debug:
+        _check_finite("the rendered image", color)
+        if train:
+            for name, t in [*tensors.items(), ("means2d", means2d)]:
+                if t is not None and t.requires_grad:
+                    t.register_hook(lambda g, name=name: _check_finite(f"the gradient of {name}", g))
+    return Rasterized(
+        color, radii, inverse_depth if want_inverse_depth else None, transmittance if want_transmittance else None
+    )
+
+
+def mark_visible(positions: Tensor, view: Tensor) -> Tensor:
+    """(N,) bool: z above 0.2 of positions (N, 3) in the view (4, 4, transposed)."""
+    return _ops.mark_visible(positions, view)
+
+
+def _check(tensors: dict[str, Tensor | None], means2d: Tensor, sh_degree: int, raw: bool) -> None:
+    means = tensors["means"]
+    if means.dtype not in (torch.float32, torch.float64):
+        raise TypeError(f"means must be float32 or float64, got {means.dtype}")
+    if means.dim() != 2 or means.shape[1] != 3:
+        raise ValueError(f"means must be (N, 3), got {tuple(means.shape)}")
+    if (tensors["cov3d"] is None) == (tensors["scales"] is None or tensors["rotations"] is None):
+        raise ValueError("give scales and rotations, or cov3d")
+    if (tensors["colors"] is None) == (tensors["sh_dc"] is None or tensors["sh_rest"] is None):
+        raise ValueError("give sh_dc and sh_rest, or colors")
+    n = len(means)
+    wanted = {"scales": (3,), "rotations": (4,), "cov3d": (6,), "colors": (3,), "sh_dc": (1, 3), "opacities": (1,)}
+    hints = {"scales": "logarithms of the scales" if raw else "activated scales, one per axis"}
+    for name, t in [*tensors.items(), ("means2d", means2d)]:
+        if t is None:
+            continue
+        if t.dtype != means.dtype or t.device != means.device:
+            raise TypeError(f"{name} must be {means.dtype} on {means.device} like means, got {t.dtype} on {t.device}")
+        shape = (n, *wanted.get(name, tuple(t.shape[1:])))
+        if tuple(t.shape) != shape and not (name == "opacities" and tuple(t.shape) == (n,)):
+            hint = f" ({hints[name]})" if name in hints else ""
+            raise ValueError(f"{name} must be {shape}{hint}, got {tuple(t.shape)}")
+    if not 0 <= sh_degree <= 3:
+        raise ValueError(f"sh_degree must be 0 to 3, got {sh_degree}")
+    rest = tensors["sh_rest"]
+    if rest is not None and (rest.dim() != 3 or rest.shape[2] != 3 or rest.shape[1] < (sh_degree + 1) ** 2 - 1):
+        needed = (sh_degree + 1) ** 2 - 1
+        raise ValueError(
+            f"sh_rest must be ({n}, {needed} or more, 3) for sh_degree {sh_degree}, got {tuple(rest.shape)}"
+        )
+
+
+def _check_finite(what: str, t: Tensor) -> None:
+    bad = ~torch.isfinite(t)
+    if bad.any():
+        raise FloatingPointError(
+            f"{what} has {int(bad.sum())} values that are not finite, the first at {bad.nonzero()[0].tolist()}"
+        )
+
+
+def _scene(args: tuple) -> dict:
+    return dict(zip(_SCENE, args, strict=True))
+
+
+def _tiles(height: int, width: int) -> int:
+    return -(-height // _TILE) * -(-width // _TILE)
+
+
+def _fake_gradients(scene: dict, wanted: list[bool]) -> tuple[Tensor, ...]:
+    means, n = scene["means"], scene["means"].shape[0]
+    bands = 0 if scene["sh_rest"] is None else scene["sh_rest"].shape[1]
+    tails = [(3,), (3,), (1,), (3,), (4,), (6,), (3,), (1, 3), (bands, 3)]
+    return tuple(means.new_empty((n if w else 0, *tail)) for w, tail in zip(wanted, tails, strict=True))
+
+
+@torch.library.register_fake("diff_gaussian_rasterization::project")
+def _(*args):
+    means = args[0]
+    n = means.shape[0]
+    ints = [means.new_empty(shape, dtype=torch.int32) for shape in ((n, 4), (n,), (n,))]
+    return means.new_empty((n, _VALUES)), means.new_empty((n,)), *ints
+
+
+def _fake_bin(like: Tensor, n: int, height: int, width: int, train: bool) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    total = torch.library.get_ctx().new_dynamic_size()
+    return (
+        like.new_empty((total,), dtype=torch.int32),
+        like.new_empty((total if train else 0,), dtype=torch.int32),
+        like.new_empty((_tiles(height, width) + 1,), dtype=torch.int64),
+        like.new_empty((n if train else 0,), dtype=torch.int64),
+    )
+
+
+@torch.library.register_fake("diff_gaussian_rasterization::bin")
+def _(splats, depths, rects, tile_counts, height, width, train):
+    return _fake_bin(splats, splats.shape[0], height, width, train)
+
+
+def _fake_blend(like: Tensor, height: int, width: int, inverse_depth: bool, train: bool) -> tuple[Tensor, ...]:
+    return (
+        like.new_empty((3, height, width)),
+        like.new_empty((1, height, width)),
+        like.new_empty((1 if inverse_depth else 0, height, width)),
+        like.new_empty((height if train else 0, width), dtype=torch.int32),
+    )
+
+
+@torch.library.register_fake("diff_gaussian_rasterization::blend")
+def _(splats, instances, ranges, background, height, width, inverse_depth, train):
+    return _fake_blend(splats, height, width, inverse_depth, train)
+
+
+@torch.library.register_fake("diff_gaussian_rasterization::blend_vjp")
+def _(splats, *args):
+    return splats.new_empty((splats.shape[0], _VALUES))
+
+
+@torch.library.register_fake("diff_gaussian_rasterization::project_vjp")
+def _(*args):
+    return _fake_gradients(_scene(args[: len(_SCENE)]), args[-1])
+
+
+@torch.library.register_fake("diff_gaussian_rasterization::rasterize_vjp")
+def _(*args):
+    return _fake_gradients(_scene(args[: len(_SCENE)]), args[-1])
+
+
+@torch.library.register_fake("diff_gaussian_rasterization::rasterize")
+def _(means2d, *args):
+    scene = _scene(args[: len(_SCENE)])
+    inverse_depth, train = args[-2:]
+    means, height, width = scene["means"], scene["height"], scene["width"]
+    n = means.shape[0]
+    color, transmittance, depth, last = _fake_blend(means, height, width, inverse_depth, train)
+    counts = [means.new_empty((n,), dtype=torch.int32) for _ in range(2)]
+    binned = _fake_bin(means, n, height, width, train)
+    return color, transmittance, depth, counts[0], means.new_empty((n, _VALUES)), counts[1], *binned, last
+
+
+@torch.library.register_fake("diff_gaussian_rasterization::mark_visible")
+def _(means, view):
+    return means.new_empty((means.shape[0],), dtype=torch.bool)
+
+
+@torch.library.register_fake("diff_gaussian_rasterization::adam_")
+def _(*args, **kwargs):
+    return None
+
+
+def _setup_context(ctx, inputs, output):
+    _, *scene, background, inverse_depth, train = inputs
+    _, transmittance, _, radii, splats, tile_counts, instances, slots, ranges, slot_offsets, last = output
+    ctx.mark_non_differentiable(radii, splats, tile_counts, instances, slots, ranges, slot_offsets, last)
+    ctx.set_materialize_grads(False)
+    tensors = [value for value in scene if isinstance(value, Tensor)]
+    ctx.scene = [None if isinstance(value, Tensor) else value for value in scene]
+    ctx.places = [i for i, value in enumerate(scene) if isinstance(value, Tensor)]
+    ctx.inverse_depth, ctx.train = inverse_depth, train
+    state = (background, splats, tile_counts, instances, slots, ranges, slot_offsets, last, transmittance)
+    ctx.save_for_backward(*tensors, *state)
+
+
+def _backward(ctx, grad_color, grad_transmittance, grad_inverse_depth, *_):
+    if not ctx.train:
+        raise RuntimeError("this image was rasterized with train=False, so it has no backward")
+    scene = list(ctx.scene)
+    saved = ctx.saved_tensors
+    for place, tensor in zip(ctx.places, saved, strict=False):
+        scene[place] = tensor
+    state = saved[len(ctx.places) :]
+    inputs = dict(zip(("means2d", *_SCENE), ctx.needs_input_grad, strict=False))
+    wanted = [inputs[name] for name in GRADIENTS]
+    if grad_color is None:
+        grad_color = state[-1].new_zeros(3, *state[-1].shape[1:])
+    if not ctx.inverse_depth:
+        grad_inverse_depth = None
+    gradients = _ops.rasterize_vjp(*scene, *state, grad_color, grad_transmittance, grad_inverse_depth, wanted)
+    named = {name: g for name, g, w in zip(GRADIENTS, gradients, wanted, strict=True) if w}
+    if "opacities" in named:  # (N, 1) or (N,), as they came
+        named["opacities"] = named["opacities"].reshape(scene[1].shape)
+    return named.get("means2d"), *(named.get(name) for name in _SCENE), None, None, None
+
+
+torch.library.register_autograd("diff_gaussian_rasterization::rasterize", _backward, setup_context=_setup_context)
