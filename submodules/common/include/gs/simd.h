@@ -5,6 +5,10 @@
 
 #include "gs/isa.h"
 
+#ifdef __SSE2__
+#include <immintrin.h>
+#endif
+
 GS_ISA_BEGIN
 
 template <class T>
@@ -42,21 +46,34 @@ struct Simd {
   static Vec all(T value) { return value - Vec{}; }
 
   static bool any(Mask m) {
-    typedef int64_t Words __attribute__((vector_size(kVectorBytes)));
-    Words w;
-    std::memcpy(&w, &m, sizeof w);
-    int64_t bits = 0;
-    for (int i = 0; i < kVectorBytes / 8; ++i) bits |= w[i];
-    return bits != 0;
+#if defined(__AVX512F__)
+    return _mm512_test_epi64_mask((__m512i)m, (__m512i)m) != 0;
+#elif defined(__AVX__)
+    return !_mm256_testz_si256((__m256i)m, (__m256i)m);
+#elif defined(__SSE2__)
+    return _mm_movemask_epi8((__m128i)m) != 0;
+#else
+    bool found = false;
+    for (int i = 0; i < kLanes; ++i) found |= m[i] != 0;
+    return found;
+#endif
   }
 
   // Sum of the lanes by halves: one fixed tree for an instruction set.
-  static T sum(Vec v) {
-    T lanes[kLanes];
-    store(lanes, v);
-    for (int half = kLanes / 2; half > 0; half /= 2)
-      for (int i = 0; i < half; ++i) lanes[i] += lanes[i + half];
-    return lanes[0];
+  static T sum(Vec v) { return halves<kLanes>(v); }
+
+ private:
+  template <int kCount, class Part>
+  static T halves(Part v) {
+    if constexpr (kCount == 1) {
+      return v[0];
+    } else {
+      typedef T Half __attribute__((vector_size(kCount / 2 * sizeof(T))));
+      Half low, high;
+      std::memcpy(&low, &v, sizeof low);
+      std::memcpy(&high, reinterpret_cast<const char*>(&v) + sizeof low, sizeof high);
+      return halves<kCount / 2>(Half(low + high));
+    }
   }
 };
 

@@ -44,21 +44,11 @@ Loaded<T> load(const Scene<T>& s, int64_t i) {
   return out;
 }
 
+// NaN or Inf in most inputs makes the footprint, the mean or the colour not finite, and those are checked; Cholesky's
+// guards could hide one.
 template <class T>
-bool finite_row(const T* row, int n) {
-  for (int k = 0; k < n; ++k)
-    if (!std::isfinite(row[k])) return false;
-  return true;
-}
-
-// What reaches neither the mean nor the footprint, and could still be NaN.
-template <class T>
-bool finite_inputs(const Scene<T>& s, int64_t i) {
-  if (!(s.cov3d ? finite_row(s.cov3d + 6 * i, 6) : finite_row(s.rotations + 4 * i, 4) && finite_row(s.scales + 3 * i, 3)))
-    return false;
-  if (s.colors) return finite_row(s.colors + 3 * i, 3);
-  return finite_row(s.sh_dc + s.dc_stride * i, 3) &&
-         finite_row(s.sh_rest + s.rest_stride * i, 3 * (sh_count(s.sh_degree) - 1));
+bool finite_covariance(const Scene<T>& s, int64_t i) {
+  return !s.cov3d || (finite(load3(s.cov3d + 6 * i)) && finite(load3(s.cov3d + 6 * i + 3)));
 }
 
 template <class T>
@@ -72,7 +62,7 @@ void project_one(const Scene<T>& s, const Camera<T>& camera, int64_t i, const Pr
   out.radii[i] = 0;
   Splat<T> splat;
   int radius;
-  if (!finite_inputs(s, i)) return;
+  if (!finite_covariance(s, i)) return;
   const Gaussian<T> gaussian = load(s, i).gaussian;
   const bool visible = project_splat(camera, gaussian, s.antialiasing, splat, out.depths[i], radius);
   out.radii[i] = radius;
@@ -83,14 +73,15 @@ void project_one(const Scene<T>& s, const Camera<T>& camera, int64_t i, const Pr
   Vec3<T> color;
   if (s.colors) {
     color = load3(s.colors + 3 * i);
+    if (!finite(color)) return;
   } else {
     T basis[sh_count(kMaxShDegree)];
     Vec3<T> direction;
     sh_direction(gaussian.mean - camera.center, direction);
     sh_basis(s.sh_degree, direction, basis);
-    const Vec3<T> c = unclamped_color(s, i, basis);
-    color = {larger(c.x, T(0)), larger(c.y, T(0)), larger(c.z, T(0))};
-    if (!finite(color)) return;
+    color = unclamped_color(s, i, basis);
+    if (!finite(color)) return;  // before the clamp, which would turn -Inf into 0
+    color = {larger(color.x, T(0)), larger(color.y, T(0)), larger(color.z, T(0))};
   }
   splat.r = color.x, splat.g = color.y, splat.b = color.z;
   out.tile_counts[i] = count;
