@@ -1,0 +1,25 @@
+"""Every option of the command lines, and what a model folder remembers of them."""
+
+from arguments.groups import ModelParams, OptimizationParams, PipelineParams
+from arguments.param_group import ParamGroup
+from arguments.stored import (
+    VERSION,
+    get_combined_args,
+    read_cfg_args,
+    read_model_json,
+    write_cfg_args,
+    write_model_json,
+)
+
+__all__ = [
+    "VERSION",
+    "ModelParams",
+    "OptimizationParams",
+    "ParamGroup",
+    "PipelineParams",
+    "get_combined_args",
+    "read_cfg_args",
+    "read_model_json",
+    "write_cfg_args",
+    "write_model_json",
+]

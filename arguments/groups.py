@@ -1,0 +1,213 @@
+"""The options of the three topics, each once: name, default, effect, origin of the default."""
+
+import argparse
+import os
+
+from arguments.param_group import Option, ParamGroup, above, at_least, one_of, within
+
+_EXPOSURE = "exposure compensation"
+_DEPTH = "depth supervision"
+
+
+def _resolution(value: int) -> str | None:
+    return None if value == -1 or value > 0 else "-1, 1, 2, 4, 8 or a width in pixels"
+
+
+class ModelParams(ParamGroup):
+    """What is trained from what: data, output folder, SH degree. The `stored` ones make up `cfg_args`."""
+
+    title = "model"
+    options = (
+        Option(
+            "sh_degree",
+            3,
+            "largest degree of the spherical harmonics that make colour depend on the view, 0 to 3; higher: more "
+            "view-dependent detail, more memory",
+            "paper",
+            check=within(0, 3),
+            stored=True,
+        ),
+        Option("source_path", "", "scene folder (COLMAP or Blender)", "none, must be given", short="s", stored=True),
+        Option(
+            "model_path",
+            "",
+            "output folder; empty: a new one under ./output, named by OAR_JOB_ID or at random",
+            short="m",
+            stored=True,
+        ),
+        Option(
+            "images", "images", "folder of the pictures under the scene folder (COLMAP only)", short="i", stored=True
+        ),
+        Option(
+            "depths",
+            "",
+            "folder of inverse depth maps under the scene folder; empty: no depth supervision",
+            short="d",
+            unbuilt=_DEPTH,
+            stored=True,
+        ),
+        Option(
+            "resolution",
+            -1,
+            "1, 2, 4, 8: divide the size of the pictures by that; -1: as they are, at most 1600 pixels wide; any other "
+            "value: width in pixels",
+            short="r",
+            check=_resolution,
+            stored=True,
+        ),
+        Option("white_background", False, "white behind the scene instead of black", short="w", stored=True),
+        Option(
+            "train_test_exp",
+            False,
+            "train on the left half of the test pictures too and score the right half, with exposure compensation",
+            unbuilt=_EXPOSURE,
+            stored=True,
+        ),
+        Option(
+            "data_device",
+            "cuda",
+            "device that keeps the pictures; without a usable GPU this means the CPU",
+            stored=True,
+        ),
+        Option("eval", False, "hold out a test set: every 8th picture by name, or Blender's test frames", stored=True),
+        Option(
+            "init_pcd_path",
+            "",
+            "PLY with x y z red green blue to start from instead of the scene's own points",
+            "ours",
+        ),
+        Option(
+            "images_to_load",
+            0,
+            "decoded pictures kept in memory at most, 0: all; every picture still trains",
+            "ours",
+            check=at_least(0),
+        ),
+    )
+
+    def extract(self, args: argparse.Namespace) -> argparse.Namespace:
+        """As ParamGroup.extract; a given source_path is made absolute."""
+        values = super().extract(args)
+        if values.source_path:
+            values.source_path = os.path.abspath(values.source_path)
+        return values
+
+
+class PipelineParams(ParamGroup):
+    """How an image is computed. Not part of `cfg_args`; antialiasing is remembered in `model.json`."""
+
+    title = "pipeline"
+    options = (
+        Option("convert_SHs_python", False, "evaluate spherical harmonics in PyTorch; slower, for experiments"),
+        Option("compute_cov3D_python", False, "compute 3D covariances in PyTorch; slower, for experiments"),
+        Option("debug", False, "check what goes into and comes out of every kernel; slower"),
+        Option("antialiasing", False, "keep a splat's weight when it is smaller than a pixel; for changing distances"),
+    )
+
+
+class OptimizationParams(ParamGroup):
+    """How long and how fast is trained, and how the number of Gaussians changes."""
+
+    title = "optimisation"
+    options = (
+        Option("iterations", 30_000, "training steps, one picture each", "paper", check=at_least(1)),
+        Option(
+            "position_lr_init",
+            0.00016,
+            "learning rate of positions at the start, times the scene extent",
+            "paper",
+            check=at_least(0),
+        ),
+        Option(
+            "position_lr_final",
+            0.0000016,
+            "learning rate of positions at position_lr_max_steps, times the scene extent",
+            "paper",
+            check=at_least(0),
+        ),
+        Option(
+            "position_lr_delay_mult", 0.01, "no effect (no delay steps exist); kept for old commands", check=at_least(0)
+        ),
+        Option(
+            "position_lr_max_steps",
+            30_000,
+            "step at which the rate of positions reaches its final value; does not follow --iterations",
+            check=at_least(1),
+        ),
+        Option(
+            "feature_lr",
+            0.0025,
+            "learning rate of the base colour; the view-dependent bands get 1/20 of it",
+            "paper",
+            check=at_least(0),
+        ),
+        Option(
+            "opacity_lr",
+            0.025,
+            "learning rate of the opacity logits; higher: bolder fading in and out",
+            "newest reference; 0.05 in the 2023 release",
+            check=at_least(0),
+        ),
+        Option("scaling_lr", 0.005, "learning rate of the logarithms of the scales", check=at_least(0)),
+        Option("rotation_lr", 0.001, "learning rate of the quaternions", check=at_least(0)),
+        Option("exposure_lr_init", 0.01, "learning rate of exposures at the start", unbuilt=_EXPOSURE),
+        Option("exposure_lr_final", 0.001, "learning rate of exposures at the end", unbuilt=_EXPOSURE),
+        Option("exposure_lr_delay_steps", 0, "steps over which the rate of exposures rises", unbuilt=_EXPOSURE),
+        Option("exposure_lr_delay_mult", 0.0, "factor of the rate of exposures at step 0", unbuilt=_EXPOSURE),
+        Option(
+            "percent_dense",
+            0.01,
+            "size, as a fraction of the scene extent, up to which a Gaussian is cloned and above which it is split",
+            check=at_least(0),
+        ),
+        Option(
+            "lambda_dssim",
+            0.2,
+            "weight of 1 - SSIM in the loss; the L1 term gets the rest",
+            "paper",
+            check=within(0, 1),
+        ),
+        Option("densification_interval", 100, "steps between densifications", "paper", check=at_least(1)),
+        Option(
+            "opacity_reset_interval",
+            3000,
+            "steps between resets of all opacities to at most 0.01",
+            "paper",
+            check=at_least(1),
+        ),
+        Option("densify_from_iter", 500, "densification starts after this step", check=at_least(0)),
+        Option("densify_until_iter", 15_000, "densification ends before this step", "paper", check=at_least(0)),
+        Option(
+            "densify_grad_threshold",
+            0.0002,
+            "screen-space gradient (per NDC unit) that makes a Gaussian clone or split; lower: more Gaussians",
+            "paper",
+            check=above(0),
+        ),
+        Option("depth_l1_weight_init", 1.0, "weight of the depth loss at the start", unbuilt=_DEPTH),
+        Option("depth_l1_weight_final", 0.01, "weight of the depth loss at the end", unbuilt=_DEPTH),
+        Option(
+            "random_background", False, "a new random background in every step, so that nothing hides in one colour"
+        ),
+        Option(
+            "optimizer_type",
+            "default",
+            "default: Adam over all Gaussians",
+            check=one_of("default", "sparse_adam"),
+            unbuilt="the sparse Adam optimiser",
+        ),
+        Option(
+            "max_num_splats",
+            0,
+            "most Gaussians there may be, 0: no limit; at the limit those with the largest gradient are taken",
+            "ours",
+            check=at_least(0),
+        ),
+        Option(
+            "seed",
+            0,
+            "seed of every random choice; same seed, same bytes",
+            "reference's fixed seed",
+            check=within(0, 2**63 - 1),
+        ),
+    )

@@ -1,0 +1,100 @@
+"""Options as records, so that parser, defaults, checks and help come from one place."""
+
+import argparse
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+from utils.system_utils import UserError
+
+Value = bool | int | float | str
+
+
+@dataclass(frozen=True)
+class Option:
+    """One command-line option.
+
+    name, short: long name (also the attribute) and one-letter form; default: its type is the option's type.
+    help: effect of the option; origin: where the default comes from.
+    check: takes a value, returns what is wanted when the value is not that, else None.
+    unbuilt: what this version lacks for any value but the default.
+    stored: belongs to `cfg_args`.
+    """
+
+    name: str
+    default: Value
+    help: str
+    origin: str = "reference"
+    short: str | None = None
+    check: Callable[[Any], str | None] | None = None
+    unbuilt: str | None = None
+    stored: bool = False
+
+    def add_to(self, group: argparse._ArgumentGroup, sentinel: bool) -> None:
+        flags = [f"--{self.name}"] + ([f"-{self.short}"] if self.short else [])
+        default = None if sentinel else self.default
+        shown = "off" if self.default is False else repr(self.default) if self.default == "" else self.default
+        text = f"{self.help} (default: {shown}; {self.origin})".replace("%", "%%")
+        if isinstance(self.default, bool):
+            group.add_argument(*flags, action="store_true", default=default, help=text)
+        else:
+            group.add_argument(*flags, type=type(self.default), default=default, metavar=self._metavar(), help=text)
+
+    def _metavar(self) -> str:
+        return {int: "N", float: "X", str: "TEXT"}[type(self.default)]
+
+    def verify(self, value: Value) -> None:
+        """UserError when the value is not finite, not sensible, or asks for what is not built yet."""
+        if isinstance(value, float) and not math.isfinite(value):
+            raise UserError(f"--{self.name} must be a finite number, got {value}")
+        wanted = self.check(value) if self.check else None
+        if wanted:
+            raise UserError(f"--{self.name} must be {wanted}, got {value!r}")
+        if self.unbuilt and value != self.default:
+            typed = f"--{self.name}" if value is True else f"--{self.name} {value}"
+            raise UserError(f"{typed} needs {self.unbuilt}, which this version does not have yet; leave the option out")
+
+
+class ParamGroup:
+    """A topic's options: puts them on a parser, takes their checked values from the parsed arguments.
+
+    sentinel: every default becomes None ("not given"), so that get_combined_args can tell what the user typed.
+    """
+
+    title: ClassVar[str]
+    options: ClassVar[tuple[Option, ...]]
+
+    def __init__(self, parser: argparse.ArgumentParser, sentinel: bool = False) -> None:
+        group = parser.add_argument_group(self.title)
+        for option in self.options:
+            option.add_to(group, sentinel)
+
+    def extract(self, args: argparse.Namespace) -> argparse.Namespace:
+        """This group's values out of `args`; absent or None means the default. UserError for absurd values."""
+        values: dict[str, Value] = {}
+        for option in self.options:
+            value = getattr(args, option.name, None)
+            values[option.name] = option.default if value is None else value
+            option.verify(values[option.name])
+        return argparse.Namespace(**values)
+
+
+def at_least(low: float) -> Callable[[float], str | None]:
+    """Check for `Option`: value >= low."""
+    return lambda value: None if value >= low else f"at least {low}"
+
+
+def above(low: float) -> Callable[[float], str | None]:
+    """Check for `Option`: value > low."""
+    return lambda value: None if value > low else f"greater than {low}"
+
+
+def within(low: float, high: float) -> Callable[[float], str | None]:
+    """Check for `Option`: low <= value <= high."""
+    return lambda value: None if low <= value <= high else f"between {low} and {high}"
+
+
+def one_of(*choices: str) -> Callable[[str], str | None]:
+    """Check for `Option`: value is one of the words."""
+    return lambda value: None if value in choices else " or ".join(choices)

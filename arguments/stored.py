@@ -1,0 +1,101 @@
+"""What a model folder remembers of its options: `cfg_args` (the reference's file) and `model.json` (ours)."""
+
+import argparse
+import ast
+import json
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from arguments.groups import ModelParams
+from arguments.param_group import Value
+from utils.system_utils import UserError, atomic_write
+
+VERSION = "0.1.0"
+
+_STORED = {option.name: option.default for option in ModelParams.options if option.stored}
+
+
+def write_cfg_args(model_path: str | os.PathLike, args: argparse.Namespace) -> None:
+    """Write `cfg_args`: one line, the repr of a Namespace of exactly the ten stored model options."""
+    line = repr(argparse.Namespace(**{name: getattr(args, name) for name in _STORED}))
+    with atomic_write(Path(model_path) / "cfg_args") as path:
+        path.write_text(line, encoding="utf-8")
+
+
+def read_cfg_args(model_path: str | os.PathLike) -> dict[str, Value]:
+    """Stored model options as far as the file has them; unknown keys are left out. Nothing in the file is executed.
+
+    UserError when there is no file, or when it is anything but `Namespace(name=literal, ...)`.
+    """
+    path = Path(model_path) / "cfg_args"
+    if not path.is_file():
+        raise UserError(f"no cfg_args in {model_path}; give -m the folder that train.py wrote")
+    broken = f"{path} is not one line Namespace(name=value, ...) of plain values; restore it or train again"
+    try:
+        call = ast.parse(path.read_text(encoding="utf-8").strip(), mode="eval").body
+    except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
+        raise UserError(broken) from error
+    if not (isinstance(call, ast.Call) and isinstance(call.func, ast.Name) and call.func.id == "Namespace"):
+        raise UserError(broken)
+    if call.args or any(keyword.arg is None or not _is_literal(keyword.value) for keyword in call.keywords):
+        raise UserError(broken)
+    values = {}
+    for keyword in call.keywords:
+        if keyword.arg in _STORED:
+            wanted = type(_STORED[keyword.arg])
+            value = ast.literal_eval(keyword.value)
+            if type(value) is not wanted:
+                raise UserError(f"{path}: {keyword.arg} must be {wanted.__name__}, got {value!r}; restore the file")
+            values[keyword.arg] = value
+    return values
+
+
+def _is_literal(node: ast.expr) -> bool:
+    # Stricter than ast.literal_eval, which lets sums through; no Namespace prints one. Forks store lists of numbers.
+    if isinstance(node, ast.List):
+        return all(_is_literal(item) for item in node.elts)
+    if isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.USub) and isinstance(node.operand, ast.Constant):
+        return type(node.operand.value) in (int, float)
+    return isinstance(node, ast.Constant)
+
+
+def write_model_json(model_path: str | os.PathLike, *, antialiasing: bool, seed: int) -> None:
+    """Write `model.json`: what cfg_args can't hold, keys sorted."""
+    record = {"antialiasing": antialiasing, "seed": seed, "version": VERSION}
+    with atomic_write(Path(model_path) / "model.json") as path:
+        path.write_text(json.dumps(record, indent=1, sort_keys=True, allow_nan=False) + "\n", encoding="utf-8")
+
+
+def read_model_json(model_path: str | os.PathLike) -> dict[str, Any]:
+    """Contents of `model.json`, or {} for a model of another program, which has none."""
+    path = Path(model_path) / "model.json"
+    if not path.is_file():
+        return {}
+    try:
+        record = json.loads(path.read_text(encoding="utf-8"))
+    except (ValueError, RecursionError) as error:
+        raise UserError(f"{path} is not JSON; restore it, or remove it and give --antialiasing yourself") from error
+    if not isinstance(record, dict) or not isinstance(record.get("antialiasing", False), bool):
+        raise UserError(f"{path} does not say antialiasing true or false; restore it, or remove it")
+    return record
+
+
+def get_combined_args(parser: argparse.ArgumentParser, argv: Sequence[str] | None = None) -> argparse.Namespace:
+    """Parse the command line and fill what it leaves open from the model folder that -m names.
+
+    Whatever was typed wins; flags can only be switched on. The parser's model options must default to None
+    (`ModelParams(parser, sentinel=True)`). UserError without -m or without a readable cfg_args.
+    """
+    args = parser.parse_args(argv)
+    if not getattr(args, "model_path", None):
+        raise UserError("no model folder given; name it with -m")
+    stored = read_cfg_args(args.model_path)
+    # Depth maps supervise training; a finished model is used without them.
+    stored.pop("depths", None)
+    typed = {name: value for name, value in vars(args).items() if value is not None}
+    combined = argparse.Namespace(**{**vars(args), **stored, **typed})
+    if hasattr(args, "antialiasing"):
+        combined.antialiasing = bool(args.antialiasing) or read_model_json(args.model_path).get("antialiasing", False)
+    return combined

@@ -1,0 +1,135 @@
+"""A scene: the views of a dataset, and the Gaussians that are trained on them or loaded for them."""
+
+import argparse
+import json
+import random
+import shutil
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+import torch
+
+from scene.cameras import Camera, camera_to_JSON, cameraList_from_camInfos
+from scene.dataset_readers import CameraInfo, SceneInfo, read_scene
+from scene.images import ImageStore
+from scene.point_cloud import write_point_cloud
+from utils.graphics_utils import BasicPointCloud
+from utils.system_utils import UserError, atomic_write, compute_device, saved_iterations, searchForMaxIteration
+
+
+class _Gaussians(Protocol):
+    def create_from_pcd(
+        self, pcd: BasicPointCloud, cam_infos: Sequence[CameraInfo], spatial_lr_scale: float
+    ) -> None: ...
+
+    def load_ply(self, path: str) -> None: ...
+
+    def save_ply(self, path: str) -> None: ...
+
+
+class Scene:
+    """Views and model of one run.
+
+    args: model options (ModelParams.extract). load_iteration: None starts from the dataset's points and writes
+    `input.ply` and `cameras.json` into the model folder; -1 loads the last saved iteration, N that one.
+    shuffle: mix the order of the views (always the same way). resolution_scales: factors by which views are made
+    smaller, one list of cameras each. cameras_extent: E in world units, from the training views.
+    """
+
+    def __init__(
+        self,
+        args: argparse.Namespace,
+        gaussians: _Gaussians,
+        load_iteration: int | None = None,
+        shuffle: bool = True,
+        resolution_scales: Sequence[float] = (1.0,),
+    ) -> None:
+        self.model_path = args.model_path
+        self.gaussians = gaussians
+        self.loaded_iter = None if load_iteration is None else self._find_iteration(load_iteration)
+
+        info = read_scene(args.source_path, args.images, args.eval, args.init_pcd_path)
+        self.cameras_extent = info.extent
+        if self.loaded_iter is None:
+            self._write_inputs(info)
+
+        device = compute_device()
+        images = ImageStore(args.images_to_load, picture_device(args.data_device, device))
+        self._train = self._cameras(info.train_cameras, args, images, device, shuffle, resolution_scales)
+        self._test = self._cameras(info.test_cameras, args, images, device, shuffle, resolution_scales)
+
+        if self.loaded_iter is None:
+            gaussians.create_from_pcd(info.point_cloud, info.train_cameras, self.cameras_extent)
+        else:
+            print(f"Loading trained model at iteration {self.loaded_iter}")
+            gaussians.load_ply(str(self._ply(self.loaded_iter)))
+
+    def getTrainCameras(self, scale: float = 1.0) -> list[Camera]:
+        """Training views at a resolution scale that the scene was made with."""
+        return self._train[scale]
+
+    def getTestCameras(self, scale: float = 1.0) -> list[Camera]:
+        """Held-out views at a resolution scale that the scene was made with."""
+        return self._test[scale]
+
+    def save(self, iteration: int) -> None:
+        """Write the Gaussians as `point_cloud/iteration_N/point_cloud.ply`."""
+        self.gaussians.save_ply(str(self._ply(iteration)))
+
+    def _ply(self, iteration: int) -> Path:
+        return Path(self.model_path) / "point_cloud" / f"iteration_{iteration}" / "point_cloud.ply"
+
+    def _find_iteration(self, iteration: int) -> int:
+        folder = Path(self.model_path) / "point_cloud"
+        last = searchForMaxIteration(folder)
+        if iteration == -1:
+            return last
+        if not self._ply(iteration).is_file():
+            saved = ", ".join(map(str, saved_iterations(folder)))
+            raise UserError(f"iteration {iteration} was never saved in {folder}; saved are {saved}")
+        return iteration
+
+    def _write_inputs(self, info: SceneInfo) -> None:
+        folder = Path(self.model_path)
+        if info.ply_path:
+            with atomic_write(folder / "input.ply") as path:
+                shutil.copyfile(info.ply_path, path)
+        else:
+            colors = np.round(info.point_cloud.colors * 255).astype(np.uint8)
+            write_point_cloud(folder / "input.ply", info.point_cloud.points, colors)
+        entries = [camera_to_JSON(i, camera) for i, camera in enumerate(info.test_cameras + info.train_cameras)]
+        with atomic_write(folder / "cameras.json") as path:
+            path.write_text(json.dumps(entries, allow_nan=False), encoding="utf-8")
+
+    @staticmethod
+    def _cameras(
+        infos: list[CameraInfo],
+        args: argparse.Namespace,
+        images: ImageStore,
+        device: torch.device,
+        shuffle: bool,
+        scales: Sequence[float],
+    ) -> dict[float, list[Camera]]:
+        order = list(range(len(infos)))
+        if shuffle:
+            # A generator of its own: the order must not depend on what else drew numbers before (resume).
+            random.Random(0).shuffle(order)
+        lists = {}
+        for scale in scales:
+            cameras = cameraList_from_camInfos(infos, scale, args, images, device)
+            lists[scale] = [cameras[index] for index in order]
+        return lists
+
+
+def picture_device(data_device: str, fallback: torch.device) -> torch.device:
+    """Device that keeps the pictures: option --data_device where it can be used, else the device that computes."""
+    try:
+        wanted = torch.device(data_device)
+    except RuntimeError:
+        print(f"--data_device {data_device} is no device; pictures are kept on {fallback}", file=sys.stderr)
+        return fallback
+    usable = wanted.type == "cpu" or (fallback.type == "cuda" and (wanted.index or 0) < torch.cuda.device_count())
+    return wanted if usable else fallback

@@ -1,0 +1,148 @@
+"""Views: matrices for the rasterizer, and the picture behind each.
+
+Matrices are handed on transposed (they multiply row vectors from the right). Camera frame: x right, y down, z forward.
+"""
+
+import argparse
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from scene.dataset_readers import CameraInfo
+from scene.images import ImageStore
+from scene.resolution import training_size
+from utils.graphics_utils import getProjectionMatrix, getWorld2View2
+
+ZNEAR = 0.01  # these two only shape the clip depth; nothing is culled by them
+ZFAR = 100.0
+
+
+class Camera:
+    """One view at training resolution.
+
+    uid: index in its list; colmap_id: intrinsics id. R (3,3) camera-to-world, T (3,) world-to-camera, NumPy float64.
+    FoVx, FoVy: radians. fx, fy, cx, cy: pixels at image_width x image_height, pixel centres at .5 (the rasterizer's
+    integer pixel coordinates are half a pixel less). world_view_transform, projection_matrix, full_proj_transform:
+    (4,4) float32, transposed; camera_center (3,) float32; all on `device`.
+    """
+
+    def __init__(
+        self,
+        info: CameraInfo,
+        uid: int,
+        size: tuple[int, int],
+        images: ImageStore,
+        device: torch.device | str = "cpu",
+    ) -> None:
+        self.uid = uid
+        self.colmap_id = info.uid
+        self.R = info.R
+        self.T = info.T
+        self.FoVx = info.FovX
+        self.FoVy = info.FovY
+        self.image_name = info.image_name
+        self.image_path = info.image_path
+        self.image_width, self.image_height = size
+        self.fx = info.fx * self.image_width / info.width
+        self.fy = info.fy * self.image_height / info.height
+        self.cx = info.cx * self.image_width / info.width
+        self.cy = info.cy * self.image_height / info.height
+        self.znear = ZNEAR
+        self.zfar = ZFAR
+        self.device = torch.device(device)
+        self._images = images
+
+        # float64 up to here: the product and the inverse are rounded once.
+        view = torch.from_numpy(getWorld2View2(info.R, info.T))
+        projection = getProjectionMatrix(
+            ZNEAR, ZFAR, self.FoVx, self.FoVy, 2 * info.cx / info.width - 1, 2 * info.cy / info.height - 1
+        )
+        self.world_view_transform = self._hand_on(view.T)
+        self.projection_matrix = self._hand_on(projection.T)
+        self.full_proj_transform = self._hand_on((projection @ view).T)
+        self.camera_center = self._hand_on(torch.from_numpy(info.center))
+
+    def _hand_on(self, matrix: Tensor) -> Tensor:
+        return matrix.to(self.device, torch.float32).contiguous()
+
+    def _pixels(self) -> Tensor:
+        pixels = self._images.get(self.image_path, (self.image_width, self.image_height))
+        return pixels.to(self.device, non_blocking=True)
+
+    def target(self, background: Tensor) -> Tensor:
+        """What a render of this view over `background` (3,) in [0,1] should be: (3,H,W).
+
+        uint8, meaning value/255, for a picture without alpha; else float32, laid over the background by its alpha.
+        """
+        pixels = self._pixels()
+        if pixels.shape[0] == 3:
+            return pixels
+        # Every step: as few passes as possible, and no fused ones (their rounding differs with the thread count).
+        scaled = pixels / 255
+        alpha = scaled[3:]
+        return scaled[:3].mul_(alpha).add_(background.to(self.device)[:, None, None] * (1 - alpha))
+
+    @property
+    def original_image(self) -> Tensor:
+        """The picture's colours (3,H,W) float32 in [0,1], straight, alpha not applied."""
+        return self._pixels()[:3].float() / 255
+
+    @property
+    def alpha_mask(self) -> Tensor | None:
+        """The picture's alpha (1,H,W) float32 in [0,1], None where it has none."""
+        pixels = self._pixels()
+        return pixels[3:].float() / 255 if pixels.shape[0] == 4 else None
+
+
+class MiniCam:
+    """A view without a picture: size in pixels, opening angles in radians, transposed (4,4) matrices."""
+
+    def __init__(
+        self,
+        width: int,
+        height: int,
+        fovy: float,
+        fovx: float,
+        znear: float,
+        zfar: float,
+        world_view_transform: Tensor,
+        full_proj_transform: Tensor,
+    ) -> None:
+        self.image_width = width
+        self.image_height = height
+        self.FoVy = fovy
+        self.FoVx = fovx
+        self.znear = znear
+        self.zfar = zfar
+        self.world_view_transform = world_view_transform
+        self.full_proj_transform = full_proj_transform
+        self.camera_center = torch.inverse(world_view_transform)[3, :3]
+
+
+def cameraList_from_camInfos(
+    cam_infos: list[CameraInfo],
+    resolution_scale: float,
+    args: argparse.Namespace,
+    images: ImageStore,
+    device: torch.device | str = "cpu",
+) -> list[Camera]:
+    """Cameras at training size (args.resolution, made smaller by resolution_scale) that share one picture store."""
+    return [
+        Camera(info, uid, training_size(*info.file_size, args.resolution, resolution_scale), images, device)
+        for uid, info in enumerate(cam_infos)
+    ]
+
+
+def camera_to_JSON(id: int, camera: CameraInfo) -> dict[str, object]:
+    """Entry of `cameras.json`, keys in the order readers know: camera-to-world pose, full-size intrinsics."""
+    return {
+        "id": id,
+        "img_name": camera.image_name,
+        "width": camera.width,
+        "height": camera.height,
+        "position": np.asarray(camera.center).tolist(),
+        "rotation": [row.tolist() for row in camera.R],
+        "fy": camera.fy,
+        "fx": camera.fx,
+    }

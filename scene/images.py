@@ -1,0 +1,104 @@
+"""Pictures from files: checked early, decoded once at training size, kept as uint8."""
+
+import os
+import warnings
+from collections import OrderedDict
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image
+from torch import Tensor
+
+from utils.system_utils import UserError
+
+# What Pillow raises on broken files, by format.
+_BROKEN = (OSError, SyntaxError, ValueError, EOFError, Image.DecompressionBombError)
+_TAIL = 4096
+
+
+def picture_size(path: Path) -> tuple[int, int]:
+    """Size (width, height) of a picture file, from its header. UserError for a file that is broken or cut short.
+
+    The end of the file is looked at too: a picture without its end mark is decoded to see whether it is whole.
+    """
+    try:
+        with _open(path) as image:
+            size = image.size
+            if not _has_end_mark(path, image.format):
+                image.load()
+    except _BROKEN as error:
+        raise _unreadable(path, error) from error
+    return size
+
+
+def decode(path: Path, size: tuple[int, int]) -> Tensor:
+    """Picture (3,H,W) uint8, or (4,H,W) with straight alpha where the file has any, resized to size (width, height).
+
+    Pillow's bicubic filter, antialiased when it shrinks; alpha weighs the colours (premultiplied) in resizing. EXIF
+    orientation is ignored, as it is by COLMAP. Grey, palette, CMYK and 16-bit pictures become 8-bit RGB.
+    """
+    try:
+        with _open(path) as image:
+            image = _to_rgb_or_rgba(image)
+    except _BROKEN as error:
+        raise _unreadable(path, error) from error
+    if image.size != size:
+        image = image.resize(size, Image.Resampling.BICUBIC)
+    pixels = np.asarray(image)
+    if pixels.shape[-1] == 4 and pixels[..., 3].min() == 255:
+        pixels = pixels[..., :3]
+    return torch.from_numpy(np.ascontiguousarray(pixels.transpose(2, 0, 1)))
+
+
+def _open(path: Path) -> Image.Image:
+    with warnings.catch_warnings():
+        # Large pictures are normal here; Pillow's own limit still refuses absurd ones.
+        warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+        return Image.open(path)
+
+
+def _unreadable(path: Path, error: Exception) -> UserError:
+    return UserError(f"cannot read the picture {path} ({error}); replace it or take it out of the scene")
+
+
+def _has_end_mark(path: Path, file_format: str | None) -> bool:
+    marks = {"PNG": b"IEND", "JPEG": b"\xff\xd9"}
+    if file_format not in marks:
+        return True
+    with open(path, "rb") as file:
+        file.seek(max(os.path.getsize(path) - _TAIL, 0))
+        return marks[file_format] in file.read()
+
+
+def _to_rgb_or_rgba(image: Image.Image) -> Image.Image:
+    if image.mode.startswith("I"):
+        # Pillow's own conversion of 16-bit grey clips at 255.
+        grey = np.clip(np.asarray(image).astype(np.int64), 0, 65535)
+        return Image.fromarray(((grey + 128) // 257).astype(np.uint8)).convert("RGB")
+    if image.mode == "F":
+        raise ValueError("floating-point pixels; save it with 8 or 16 bits")
+    has_alpha = image.has_transparency_data
+    return image.convert("RGBA" if has_alpha else "RGB")
+
+
+class ImageStore:
+    """Decoded pictures on one device, each decoded once; beyond `limit` (0: none) the longest unused one is dropped."""
+
+    def __init__(self, limit: int = 0, device: torch.device | str = "cpu") -> None:
+        self.limit = limit
+        self.device = torch.device(device)
+        self._pictures: OrderedDict[tuple[Path, tuple[int, int]], Tensor] = OrderedDict()
+
+    def get(self, path: Path, size: tuple[int, int]) -> Tensor:
+        """Picture (3 or 4,H,W) uint8 of `decode`, on the store's device."""
+        key = (path, size)
+        if key not in self._pictures:
+            if self.limit and len(self._pictures) >= self.limit:
+                self._pictures.popitem(last=False)
+            self._pictures[key] = decode(path, size).to(self.device)
+        self._pictures.move_to_end(key)
+        return self._pictures[key]
+
+    def __len__(self) -> int:
+        return len(self._pictures)

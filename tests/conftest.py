@@ -1,0 +1,43 @@
+"""Fixtures that several test files share."""
+
+import os
+import shutil
+from pathlib import Path
+
+import pytest
+from synthetic import make_blender_scene, make_colmap_scene
+
+
+@pytest.fixture(scope="session")
+def shared_dir() -> Path:
+    """Folder with real scenes and models: $GS_SHARED or `shared` beside the repository; skips where it is missing."""
+    folder = Path(os.environ.get("GS_SHARED") or Path(__file__).resolve().parents[2] / "shared")
+    if not (folder / "scenes").is_dir():
+        pytest.skip(f"no real scenes in {folder}; set GS_SHARED")
+    return folder
+
+
+@pytest.fixture(scope="session")
+def _colmap_master(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("colmap_master") / "scene"
+    make_colmap_scene(folder)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def _blender_master(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("blender_master") / "scene"
+    make_blender_scene(folder)
+    return folder
+
+
+@pytest.fixture
+def colmap_scene(_colmap_master: Path, tmp_path: Path) -> Path:
+    """A COLMAP scene of 17 pictures, 96x64, PINHOLE with an off-centre principal point; free to be changed."""
+    return Path(shutil.copytree(_colmap_master, tmp_path / "colmap_scene"))
+
+
+@pytest.fixture
+def blender_scene(_blender_master: Path, tmp_path: Path) -> Path:
+    """A Blender scene of 4 training and 2 test frames, 40x30 RGBA; free to be changed."""
+    return Path(shutil.copytree(_blender_master, tmp_path / "blender_scene"))

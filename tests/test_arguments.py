@@ -1,0 +1,273 @@
+"""Options, and what a model folder remembers of them."""
+
+import argparse
+import json
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from arguments import (
+    ModelParams,
+    OptimizationParams,
+    PipelineParams,
+    get_combined_args,
+    read_cfg_args,
+    read_model_json,
+    write_cfg_args,
+    write_model_json,
+)
+from utils.system_utils import UserError
+
+MODEL = {
+    "sh_degree": 3,
+    "source_path": "",
+    "model_path": "",
+    "images": "images",
+    "depths": "",
+    "resolution": -1,
+    "white_background": False,
+    "train_test_exp": False,
+    "data_device": "cuda",
+    "eval": False,
+}
+PIPELINE = {"convert_SHs_python": False, "compute_cov3D_python": False, "debug": False, "antialiasing": False}
+OPTIMISATION = {
+    "iterations": 30000,
+    "position_lr_init": 1.6e-4,
+    "position_lr_final": 1.6e-6,
+    "position_lr_delay_mult": 0.01,
+    "position_lr_max_steps": 30000,
+    "feature_lr": 0.0025,
+    "opacity_lr": 0.025,
+    "scaling_lr": 0.005,
+    "rotation_lr": 0.001,
+    "exposure_lr_init": 0.01,
+    "exposure_lr_final": 0.001,
+    "exposure_lr_delay_steps": 0,
+    "exposure_lr_delay_mult": 0.0,
+    "percent_dense": 0.01,
+    "lambda_dssim": 0.2,
+    "densification_interval": 100,
+    "opacity_reset_interval": 3000,
+    "densify_from_iter": 500,
+    "densify_until_iter": 15000,
+    "densify_grad_threshold": 2e-4,
+    "depth_l1_weight_init": 1.0,
+    "depth_l1_weight_final": 0.01,
+    "random_background": False,
+    "optimizer_type": "default",
+}
+OURS = {"init_pcd_path": "", "images_to_load": 0, "max_num_splats": 0, "seed": 0}
+
+
+def _parse(*argv: str) -> argparse.Namespace:
+    parser = argparse.ArgumentParser()
+    groups = ModelParams(parser), PipelineParams(parser), OptimizationParams(parser)
+    args = parser.parse_args(argv)
+    return argparse.Namespace(**{k: v for group in groups for k, v in vars(group.extract(args)).items()})
+
+
+def test_defaults_are_the_contracts():
+    assert vars(_parse()) == {**MODEL, **PIPELINE, **OPTIMISATION, **OURS}
+
+
+def test_help_names_every_option_with_effect_and_origin():
+    parser = argparse.ArgumentParser()
+    groups = ModelParams(parser), PipelineParams(parser), OptimizationParams(parser)
+    text = parser.format_help()
+    for group in groups:
+        for option in group.options:
+            assert f"--{option.name}" in text
+            assert len(option.help) > 10 and option.origin
+
+
+def test_train_help_lists_the_contracts_options(capsys):
+    import train
+
+    with pytest.raises(SystemExit) as exit_info:
+        train.main(["-h"])
+    assert exit_info.value.code == 0
+    text = capsys.readouterr().out
+    run = ["ip", "port", "debug_from", "detect_anomaly", "test_iterations", "save_iterations"]
+    run += ["checkpoint_iterations", "start_checkpoint", "quiet", "disable_viewer"]
+    missing = [name for name in [*MODEL, *PIPELINE, *OPTIMISATION, *OURS, *run] if f"--{name}" not in text]
+    assert missing == []
+
+
+def test_short_forms_and_unique_prefixes():
+    args = _parse("-s", "a", "-m", "b", "-i", "c", "-r2", "-w", "--lambda", "0.5", "--iter", "7", "--ev")
+    assert args.source_path.endswith("/a")
+    assert (args.model_path, args.images, args.resolution, args.white_background) == ("b", "c", 2, True)
+    assert (args.lambda_dssim, args.iterations, args.eval) == (0.5, 7, True)
+    assert _parse("-r", "4").resolution == 4
+
+
+@pytest.mark.parametrize(
+    ("option", "value"),
+    [
+        ("sh_degree", "4"),
+        ("sh_degree", "-1"),
+        ("resolution", "0"),
+        ("resolution", "-2"),
+        ("images_to_load", "-1"),
+        ("iterations", "-5"),
+        ("iterations", "0"),
+        ("position_lr_init", "nan"),
+        ("opacity_lr", "-0.1"),
+        ("scaling_lr", "inf"),
+        ("lambda_dssim", "1.5"),
+        ("densification_interval", "0"),
+        ("densify_grad_threshold", "0"),
+        ("max_num_splats", "-1"),
+        ("seed", "-1"),
+        ("optimizer_type", "sgd"),
+        ("depths", "depths2"),
+        ("optimizer_type", "sparse_adam"),
+        ("exposure_lr_init", "0.1"),
+        ("depth_l1_weight_init", "0.5"),
+    ],
+)
+def test_absurd_and_unbuilt_values_name_their_option(option, value):
+    with pytest.raises(UserError, match=f"^--{option} "):
+        _parse(f"--{option}={value}")
+
+
+def test_unbuilt_flag():
+    with pytest.raises(UserError, match="^--train_test_exp needs exposure compensation, which"):
+        _parse("--train_test_exp")
+
+
+def test_wrong_type_ends_with_status_2():
+    with pytest.raises(SystemExit) as exit_info:
+        _parse("--iterations", "many")
+    assert exit_info.value.code == 2
+
+
+def test_cfg_args_is_the_known_line(tmp_path):
+    args = _parse("-s", "/abs", "-m", "out", "--eval", "--antialiasing", "--seed", "3", "--init_pcd_path", "x.ply")
+    write_cfg_args(tmp_path, args)
+    assert (tmp_path / "cfg_args").read_text() == (
+        "Namespace(sh_degree=3, source_path='/abs', model_path='out', images='images', depths='', resolution=-1, "
+        "white_background=False, train_test_exp=False, data_device='cuda', eval=True)"
+    )
+
+
+@given(path=st.text(), images=st.text(), degree=st.integers(0, 3), resolution=st.integers(), flag=st.booleans())
+def test_cfg_args_round_trip(tmp_path_factory, path, images, degree, resolution, flag):
+    folder = tmp_path_factory.mktemp("model")
+    changed = {"source_path": path, "images": images, "sh_degree": degree, "resolution": resolution, "eval": flag}
+    written = {**MODEL, **changed}
+    write_cfg_args(folder, argparse.Namespace(**written))
+    assert read_cfg_args(folder) == written
+
+
+def test_cfg_args_of_others_are_read(tmp_path):
+    file = tmp_path / "cfg_args"
+    # Alphabetical order, 2023's keys only, a Windows path, a fork's own keys.
+    file.write_text(
+        "Namespace(data_device='cuda', eval=False, images='it\\'s', iterations=[7000, -1], resolution=-1, sh_degree=2, "
+        "source_path='C:\\\\data\\\\\"x\"', start_checkpoint=None, white_background=True)\n"
+    )
+    assert read_cfg_args(tmp_path) == {
+        "data_device": "cuda",
+        "eval": False,
+        "images": "it's",
+        "resolution": -1,
+        "sh_degree": 2,
+        "source_path": 'C:\\data\\"x"',
+        "white_background": True,
+    }
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "not python (",
+        "dict(sh_degree=3)",
+        "argparse.Namespace(sh_degree=3)",
+        "Namespace(3)",
+        "Namespace(**{'sh_degree': 3})",
+        "Namespace(sh_degree=1+2)",
+        "Namespace(sh_degree=-True)",
+        "Namespace(sh_degree=3.0)",
+        "Namespace(sh_degree=True)",
+        "Namespace(sh_degree=None)",
+        "Namespace(eval=1)",
+        "Namespace(source_path=b'x')",
+        "Namespace(source_path=''.join([]))",
+        "Namespace(source_path=open('PROOF', 'w').name)",
+        "Namespace(other=__import__('os').mkdir('PROOF'))",
+        "Namespace(other=[open('PROOF', 'w')])",
+        "Namespace(source_path=f'{1}')",
+        "Namespace(" + "-" * 5000 + "1)",
+        "Namespace(a=\0)",
+        "(" * 10_000,
+    ],
+)
+def test_cfg_args_is_never_executed(tmp_path, text, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "cfg_args").write_text(text)
+    with pytest.raises(UserError, match="cfg_args"):
+        read_cfg_args(tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["cfg_args"]
+
+
+def _combined(*argv: str) -> argparse.Namespace:
+    parser = argparse.ArgumentParser()
+    model, pipeline = ModelParams(parser, sentinel=True), PipelineParams(parser)
+    args = get_combined_args(parser, argv)
+    return argparse.Namespace(**vars(model.extract(args)), **vars(pipeline.extract(args)))
+
+
+def test_the_command_line_wins_over_the_file(tmp_path):
+    (tmp_path / "cfg_args").write_text(
+        "Namespace(sh_degree=1, source_path='/data', model_path='elsewhere', images='images_4', depths='d', "
+        "resolution=2, white_background=True, train_test_exp=False, data_device='cpu', eval=True)"
+    )
+    args = _combined("-m", str(tmp_path), "-r", "8", "-i", "images")
+    assert (args.resolution, args.images, args.model_path) == (8, "images", str(tmp_path))
+    assert (args.sh_degree, args.source_path, args.white_background, args.eval) == (1, "/data", True, True)
+    assert (args.data_device, args.depths, args.images_to_load) == ("cpu", "", 0)
+
+
+def test_a_2023_model_gets_defaults_for_what_it_lacks(tmp_path):
+    (tmp_path / "cfg_args").write_text("Namespace(sh_degree=3, source_path='/data', eval=True)")
+    args = _combined("-m", str(tmp_path))
+    assert {name: getattr(args, name) for name in MODEL} == {
+        **MODEL,
+        "source_path": "/data",
+        "model_path": str(tmp_path),
+        "eval": True,
+    }
+
+
+@pytest.mark.parametrize(("stored", "typed", "wanted"), [(0, 0, 0), (0, 1, 1), (1, 0, 1), (1, 1, 1), (None, 0, 0)])
+def test_antialiasing_is_remembered(tmp_path, stored, typed, wanted):
+    write_cfg_args(tmp_path, argparse.Namespace(**MODEL))
+    if stored is not None:
+        write_model_json(tmp_path, antialiasing=bool(stored), seed=7)
+    args = _combined("-m", str(tmp_path), *["--antialiasing"] * typed)
+    assert args.antialiasing is bool(wanted)
+
+
+def test_model_json_has_sorted_keys(tmp_path):
+    write_model_json(tmp_path, antialiasing=True, seed=7)
+    record = json.loads((tmp_path / "model.json").read_text())
+    assert list(record) == ["antialiasing", "seed", "version"]
+    assert read_model_json(tmp_path) == record
+
+
+@pytest.mark.parametrize("text", ["", "[1]", '{"antialiasing": 1}'])
+def test_a_broken_model_json_is_named(tmp_path, text):
+    (tmp_path / "model.json").write_text(text)
+    with pytest.raises(UserError, match="model.json"):
+        read_model_json(tmp_path)
+
+
+def test_no_model_folder(tmp_path):
+    with pytest.raises(UserError, match="-m"):
+        _combined()
+    with pytest.raises(UserError, match="no cfg_args in"):
+        _combined("-m", str(tmp_path))

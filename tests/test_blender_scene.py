@@ -1,0 +1,164 @@
+"""Blender folders: poses, angles, the start cloud, pictures with alpha, and what bad ones are told."""
+
+import argparse
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from synthetic import FakeGaussians, folder_state
+
+from arguments import ModelParams
+from scene import Scene
+from scene.dataset_readers import readNerfSyntheticInfo
+from scene.point_cloud import write_point_cloud
+from utils.system_utils import UserError
+
+
+def _options(scene: Path, out: Path, **changes) -> argparse.Namespace:
+    given = argparse.Namespace(source_path=str(scene), model_path=str(out), **changes)
+    return ModelParams(argparse.ArgumentParser()).extract(given)
+
+
+def _read(scene: Path, hold_out: bool = True, init_pcd_path: str = ""):
+    return readNerfSyntheticInfo(scene, "images", hold_out, init_pcd_path)
+
+
+def _edit(scene: Path, change, name: str = "transforms_train.json") -> None:
+    content = json.loads((scene / name).read_text())
+    change(content)
+    (scene / name).write_text(json.dumps(content))
+
+
+def test_axes_of_a_hand_made_pose(blender_scene):
+    # At (0,-4,0), looking along +y, z up: OpenGL's camera has x right, y up, z backward.
+    pose = [[1, 0, 0, 0], [0, 0, -1, -4], [0, 1, 0, 0], [0, 0, 0, 1]]
+    _edit(blender_scene, lambda content: content["frames"][0].update(transform_matrix=pose))
+    camera = _read(blender_scene).train_cameras[0]
+
+    def seen(point):
+        return camera.R.T @ point + camera.T
+
+    np.testing.assert_allclose(seen(np.array([0, 0, 0])), [0, 0, 4], atol=1e-12)  # ahead
+    np.testing.assert_allclose(seen(np.array([1, 0, 0])), [1, 0, 4], atol=1e-12)  # right
+    np.testing.assert_allclose(seen(np.array([0, 0, 1])), [0, -1, 4], atol=1e-12)  # up is -y
+    np.testing.assert_allclose(camera.center, [0, -4, 0], atol=1e-12)
+
+
+def test_angles_follow_each_pictures_size(blender_scene):
+    Image.new("RGBA", (50, 80)).save(blender_scene / "train" / "r_1.png")
+    first, second = _read(blender_scene).train_cameras[:2]
+    for camera, (width, height) in ((first, (40, 30)), (second, (50, 80))):
+        focal = width / (2 * math.tan(0.35))
+        assert camera.FovX == pytest.approx(0.7) and camera.FovY == pytest.approx(2 * math.atan(height / (2 * focal)))
+        assert (camera.width, camera.height, camera.cx, camera.cy) == (width, height, width / 2, height / 2)
+
+
+def test_order_names_and_hold_out(blender_scene):
+    _edit(blender_scene, lambda content: content["frames"].reverse())
+    info = _read(blender_scene)
+    assert [c.image_name for c in info.train_cameras] == ["r_3", "r_2", "r_1", "r_0"]
+    assert [c.image_name for c in info.test_cameras] == ["r_0", "r_1"]
+    together = _read(blender_scene, hold_out=False)
+    assert together.test_cameras == []
+    assert [c.image_path.parent.name for c in together.train_cameras] == ["train"] * 4 + ["test"] * 2
+    assert info.extent == pytest.approx(4.4)  # a circle of radius 4
+
+
+def test_suffix_is_appended_only_when_missing(blender_scene):
+    Image.new("RGB", (40, 30)).save(blender_scene / "train" / "dotted.7.jpg")
+
+    def change(content):
+        content["frames"][0]["file_path"] = "train/r_0.png"
+        content["frames"][1]["file_path"] = "train/dotted.7"
+
+    _edit(blender_scene, change)
+    names = [(c.image_path.name, c.image_name) for c in _read(blender_scene).train_cameras]
+    assert names[:3] == [("r_0.png", "r_0"), ("dotted.7.jpg", "dotted.7"), ("r_2.png", "r_2")]
+
+
+def test_random_cloud(blender_scene):
+    cloud = _read(blender_scene).point_cloud
+    assert cloud.points.shape == (100_000, 3) and cloud.points.dtype == np.float32
+    assert -1.3 <= cloud.points.min() < -1.299 and 1.299 < cloud.points.max() <= 1.3
+    # Even: the mean of 100,000 uniform values of deviation 0.75 is within 0.012, five deviations.
+    assert np.abs(cloud.points.mean(axis=0)).max() < 0.012
+    assert (cloud.colors == np.float32(127 / 255)).all()
+    np.testing.assert_array_equal(_read(blender_scene).point_cloud.points, cloud.points)
+
+
+def test_own_cloud_and_given_cloud(blender_scene, tmp_path):
+    write_point_cloud(blender_scene / "points3d.ply", np.array([[1.0, 2.0, 3.0]]), np.array([[0, 255, 0]]))
+    info = _read(blender_scene)
+    assert info.ply_path == blender_scene / "points3d.ply" and len(info.point_cloud.points) == 1
+    write_point_cloud(tmp_path / "mine.ply", np.zeros((2, 3)), np.zeros((2, 3)))
+    info = _read(blender_scene, init_pcd_path=str(tmp_path / "mine.ply"))
+    assert info.ply_path == tmp_path / "mine.ply" and len(info.point_cloud.points) == 2
+
+
+def test_scene_composites_and_leaves_the_dataset_alone(blender_scene, tmp_path):
+    before = folder_state(blender_scene)
+    scene = Scene(_options(blender_scene, tmp_path / "out", eval=True), FakeGaussians(), shuffle=False)
+    camera = scene.getTrainCameras()[1]
+    white, black = camera.target(torch.ones(3)), camera.target(torch.zeros(3))
+    assert white[:, 0, 0].tolist() == [1, 1, 1] and black[:, 0, 0].tolist() == [0, 0, 0]
+    middle = torch.tensor([200, 40, 90]) / 255
+    assert torch.equal(white[:, 15, 20], middle) and torch.equal(black[:, 15, 20], middle)
+    assert camera.alpha_mask.shape == (1, 30, 40)
+    assert folder_state(blender_scene) == before
+    entries = json.loads((tmp_path / "out" / "cameras.json").read_text())
+    assert [entry["img_name"] for entry in entries] == ["r_0", "r_1", "r_0", "r_1", "r_2", "r_3"]
+    assert (entries[0]["width"], entries[0]["height"], entries[0]["fx"]) == (40, 30, entries[0]["fy"])
+    assert (tmp_path / "out" / "input.ply").stat().st_size > 100_000 * 27
+
+
+def _test_gone(scene):
+    (scene / "transforms_test.json").unlink()
+
+
+def _picture_gone(scene):
+    (scene / "train" / "r_2.png").unlink()
+
+
+def _with(change):
+    return lambda scene: _edit(scene, change)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (_test_gone, "no transforms_test.json in"),
+        (_picture_gone, "1 of 4 pictures that .*transforms_train.json lists are missing: .*train/r_2.png"),
+        (lambda scene: (scene / "transforms_train.json").write_text("{"), "transforms_train.json is not a Blender"),
+        (lambda scene: (scene / "transforms_train.json").write_text("[1]"), "transforms_train.json is not a Blender"),
+        (lambda scene: (scene / "transforms_train.json").write_text("[" * 100_000), "is not a Blender camera file"),
+        (_with(lambda content: content.pop("camera_angle_x")), "KeyError: 'camera_angle_x'"),
+        (_with(lambda content: content.update(camera_angle_x=4.0)), "camera_angle_x in .*between 0 and pi, got 4.0"),
+        (_with(lambda content: content.update(camera_angle_x=float("nan"))), "camera_angle_x in .*got nan"),
+        (_with(lambda content: content.update(camera_angle_x=10**400)), "OverflowError"),
+        (_with(lambda content: content["frames"].clear()), "lists no frames"),
+        (_with(lambda content: content["frames"][0].update(file_path="a" * 5000)), "1 of 4 pictures"),
+        (_with(lambda content: content["frames"][0].update(file_path="a\0b\ud800")), "1 of 4 pictures"),
+        (_with(lambda content: content["frames"][0].pop("transform_matrix")), "KeyError: 'transform_matrix'"),
+        (_with(lambda content: content["frames"][0].update(transform_matrix=[[1, 2], [3, 4]])), "must be 4x4"),
+        (_with(lambda content: content["frames"][0].update(transform_matrix=[[0] * 4] * 4)), "Singular matrix"),
+        (_with(lambda content: content["frames"][0].update(transform_matrix=[[1e400] * 4] * 4)), "finite"),
+    ],
+)
+def test_bad_scenes_get_one_sentence_and_no_output(blender_scene, tmp_path, change, said):
+    change(blender_scene)
+    with pytest.raises(UserError, match=said) as error:
+        Scene(_options(blender_scene, tmp_path / "out", eval=True), FakeGaussians())
+    assert "\n" not in str(error.value)
+    assert not (tmp_path / "out").exists()
+
+
+def test_real_scene(shared_dir, tmp_path):
+    folder = shared_dir / "scenes" / "nerf_lego200_tiny"
+    scene = Scene(_options(folder, tmp_path / "out", eval=True, white_background=True), FakeGaussians())
+    assert (len(scene.getTrainCameras()), len(scene.getTestCameras())) == (100, 25)
+    target = scene.getTestCameras()[0].target(torch.ones(3))
+    assert target.shape == (3, 200, 200) and target.max() == 1 and target.mean() > 0.5

@@ -1,0 +1,158 @@
+"""Matrices of a view against the formulas and against pycolmap; its target picture."""
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from scipy.spatial.transform import Rotation
+from synthetic import FOCAL, make_colmap_scene
+
+from scene.cameras import Camera, MiniCam, camera_to_JSON
+from scene.dataset_readers import CameraInfo, readColmapSceneInfo
+from scene.images import ImageStore
+from utils import camera_utils
+from utils.graphics_utils import focal2fov, fov2focal, getProjectionMatrix, getWorld2View2
+
+
+def _info(path: Path = Path("none.png"), **changes) -> CameraInfo:
+    info = CameraInfo(
+        uid=7,
+        R=Rotation.from_euler("xyz", [20, -35, 60], degrees=True).as_matrix(),
+        T=np.array([0.3, -0.2, 4.0]),
+        fx=210.0,
+        fy=190.0,
+        cx=80.0,
+        cy=60.0,
+        width=160,
+        height=120,
+        image_path=path,
+        image_name=path.name,
+        file_size=(160, 120),
+    )
+    return replace(info, **changes)
+
+
+def _camera(info: CameraInfo, size: tuple[int, int] | None = None) -> Camera:
+    return Camera(info, 3, size or info.file_size, ImageStore())
+
+
+def _pixels(camera: Camera, points: np.ndarray) -> np.ndarray:
+    """Pixel positions, centres at integers, the way the rasterizer takes them from the matrix."""
+    rows = np.concatenate([points, np.ones((len(points), 1))], axis=1)
+    clip = rows @ camera.full_proj_transform.double().numpy()
+    ndc = clip[:, :2] / clip[:, 3:]
+    return ((ndc + 1) * [camera.image_width, camera.image_height] - 1) / 2
+
+
+def test_matrices_are_the_formulas_transposed():
+    info = _info()
+    camera = _camera(info)
+    V = np.eye(4)
+    V[:3, :3], V[:3, 3] = info.R.T, info.T
+    n, f = 0.01, 100.0
+    P = np.zeros((4, 4))
+    P[0, 0], P[1, 1] = 1 / math.tan(camera.FoVx / 2), 1 / math.tan(camera.FoVy / 2)
+    P[2, 2], P[2, 3], P[3, 2] = f / (f - n), -f * n / (f - n), 1
+    # One rounding to float32 of values up to 10.
+    for got, wanted in (
+        (camera.world_view_transform, V.T),
+        (camera.projection_matrix, P.T),
+        (camera.full_proj_transform, V.T @ P.T),
+        (camera.camera_center, np.linalg.inv(V.T)[3, :3]),
+    ):
+        assert got.dtype == torch.float32 and got.is_contiguous()
+        np.testing.assert_allclose(got.numpy(), wanted, rtol=6e-8, atol=1e-7)
+    assert (camera.uid, camera.colmap_id) == (3, 7)
+    np.testing.assert_array_equal(getWorld2View2(info.R, info.T), V)
+    np.testing.assert_allclose(getProjectionMatrix(n, f, camera.FoVx, camera.FoVy).numpy(), P, rtol=1e-15)
+
+
+def test_field_of_view_is_the_models_at_every_size():
+    info = _info()
+    small = _camera(info, (53, 40))
+    assert small.FoVx == focal2fov(210.0, 160) == 2 * math.atan(160 / 420)
+    assert small.FoVy == 2 * math.atan(120 / 380)
+    assert fov2focal(small.FoVx, 160) == pytest.approx(210.0)
+    assert (small.fx, small.fy) == (pytest.approx(210 * 53 / 160), pytest.approx(190 * 40 / 120))
+    assert (small.cx, small.cy) == (pytest.approx(26.5), pytest.approx(20))
+
+
+def test_an_off_centre_principal_point_moves_points_by_the_offset():
+    points = np.random.default_rng(0).uniform(-1, 1, (50, 3))
+    central, off = _camera(_info()), _camera(_info(cx=80.0 + 11.25, cy=60.0 - 7.5))
+    # float32 matrices over some 100 pixels
+    np.testing.assert_allclose(_pixels(off, points) - _pixels(central, points), [[11.25, -7.5]] * 50, atol=1e-4)
+    assert central.projection_matrix[2, 0] == 0 and central.projection_matrix[2, 1] == 0
+
+
+@pytest.mark.parametrize("size", [(96, 64), (48, 32), (60, 51)])
+@pytest.mark.parametrize(
+    ("model", "params"), [("PINHOLE", (FOCAL, 0.9 * FOCAL, 41.0, 37.5)), ("SIMPLE_PINHOLE", (FOCAL, 50.0, 30.0))]
+)
+def test_projection_agrees_with_pycolmap(tmp_path, size, model, params):
+    reconstruction = make_colmap_scene(tmp_path, model=model, params=params, views=3)
+    points = np.array([point.xyz for point in reconstruction.points3D.values()])
+    infos = readColmapSceneInfo(tmp_path, "images", False).train_cameras
+    assert len(infos) == 3
+    for info in infos:
+        camera = _camera(info, size)
+        image = reconstruction.find_image_with_name(info.image_name)
+        theirs = np.array([image.project_point(point) for point in points]) * np.array(size) / (96, 64)
+        # COLMAP has pixel centres at .5. The bound: float32 matrices over some 100 pixels.
+        np.testing.assert_allclose(_pixels(camera, points) + 0.5, theirs, atol=1e-4)
+        np.testing.assert_allclose(camera.camera_center.numpy(), image.projection_center(), rtol=1e-6, atol=1e-6)
+
+
+def test_target_without_alpha_stays_uint8(tmp_path):
+    pixels = np.random.default_rng(0).integers(0, 256, (6, 8, 3), dtype=np.uint8)
+    Image.fromarray(pixels).save(tmp_path / "a.png")
+    camera = _camera(_info(tmp_path / "a.png"), (8, 6))
+    target = camera.target(torch.ones(3))
+    assert target.dtype == torch.uint8 and camera.alpha_mask is None
+    np.testing.assert_array_equal(target.permute(1, 2, 0).numpy(), pixels)
+    assert torch.equal(camera.original_image, target.float() / 255)
+
+
+def test_target_with_alpha_lies_on_the_background(tmp_path):
+    pixels = np.random.default_rng(0).integers(0, 256, (6, 8, 4), dtype=np.uint8)
+    pixels[0, :, 3], pixels[1, :, 3] = 0, 255
+    Image.fromarray(pixels).save(tmp_path / "a.png")
+    camera = _camera(_info(tmp_path / "a.png"), (8, 6))
+    background = torch.tensor([0.2, 0.5, 1.0])
+    alpha = pixels[..., 3:] / 255.0
+    wanted = pixels[..., :3] / 255.0 * alpha + background.numpy() * (1 - alpha)
+    target = camera.target(background)
+    assert target.dtype == torch.float32
+    np.testing.assert_allclose(target.permute(1, 2, 0).numpy(), wanted, atol=2e-7)  # three roundings below 1
+    assert torch.equal(target[:, 0], background[:, None].expand(3, 8))
+    assert torch.equal(target[:, 1], camera.original_image[:, 1])
+    np.testing.assert_allclose(camera.alpha_mask[0].numpy(), alpha[..., 0], atol=6e-8)
+    assert torch.equal(camera.target(background), target)  # the stored picture is not touched
+
+
+def test_mini_camera_finds_its_centre():
+    camera = _camera(_info())
+    mini = MiniCam(
+        160, 120, camera.FoVy, camera.FoVx, 0.01, 100.0, camera.world_view_transform, camera.full_proj_transform
+    )
+    torch.testing.assert_close(mini.camera_center, camera.camera_center, rtol=1e-5, atol=1e-5)
+    assert (mini.image_width, mini.image_height, mini.FoVy) == (160, 120, camera.FoVy)
+
+
+def test_json_entry_has_the_known_keys_and_full_size_values():
+    info = _info()
+    entry = camera_to_JSON(4, info)
+    assert list(entry) == ["id", "img_name", "width", "height", "position", "rotation", "fy", "fx"]
+    assert (entry["id"], entry["img_name"], entry["width"], entry["height"]) == (4, "none.png", 160, 120)
+    assert (entry["fx"], entry["fy"]) == (210.0, 190.0)
+    np.testing.assert_allclose(entry["position"], -info.R @ info.T)
+    np.testing.assert_array_equal(entry["rotation"], info.R)
+
+
+def test_names_known_to_users_of_the_reference():
+    assert camera_utils.camera_to_JSON is camera_to_JSON
+    assert callable(camera_utils.cameraList_from_camInfos)

@@ -1,0 +1,51 @@
+"""Spherical harmonics against SciPy's."""
+
+import numpy as np
+import pytest
+import torch
+from scipy.special import sph_harm_y
+
+from utils.sh_utils import RGB2SH, SH2RGB, eval_sh, sh_basis
+
+
+def _directions(count: int) -> torch.Tensor:
+    d = torch.randn(count, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    return torch.nn.functional.normalize(d, dim=-1)
+
+
+def _real(l: int, m: int, theta: np.ndarray, phi: np.ndarray) -> np.ndarray:  # noqa: E741
+    if m == 0:
+        return sph_harm_y(l, 0, theta, phi).real
+    # SciPy's complex harmonics carry the Condon-Shortley sign, as the basis does.
+    value = np.sqrt(2) * sph_harm_y(l, abs(m), theta, phi)
+    return value.real if m > 0 else value.imag
+
+
+def test_basis_is_scipys():
+    d = _directions(40)
+    x, y, z = d.numpy().T
+    theta, phi = np.arccos(z), np.arctan2(y, x)
+    wanted = np.stack([_real(l, m, theta, phi) for l in range(5) for m in range(-l, l + 1)], axis=-1)  # noqa: E741
+    np.testing.assert_allclose(sh_basis(4, d).numpy(), wanted, atol=1e-13)  # arccos near the poles loses some digits
+
+
+@pytest.mark.parametrize("degree", range(5))
+def test_eval_sh_reads_only_its_bands(degree):
+    g = torch.Generator().manual_seed(1)
+    sh = torch.randn(10, 3, 25, dtype=torch.float64, generator=g)
+    d = _directions(10)
+    count = (degree + 1) ** 2
+    wanted = torch.einsum("nck,nk->nc", sh[..., :count], sh_basis(4, d)[:, :count])
+    sh[..., count:] = torch.nan
+    torch.testing.assert_close(eval_sh(degree, sh, d), wanted)
+
+
+def test_degree_0_colours():
+    rgb = torch.tensor([0.0, 0.25, 1.0])
+    torch.testing.assert_close(SH2RGB(RGB2SH(rgb)), rgb)
+    torch.testing.assert_close(eval_sh(0, RGB2SH(rgb)[:, None], torch.tensor([0.0, 0.0, 1.0])) + 0.5, rgb)
+
+
+def test_other_degrees_are_refused():
+    with pytest.raises(ValueError, match="0 to 4"):
+        sh_basis(5, _directions(1))

@@ -1,0 +1,90 @@
+"""Files, exit statuses and the choice of device."""
+
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+from utils import system_utils
+from utils.system_utils import UserError, atomic_write, mkdir_p, run_cli, saved_iterations, searchForMaxIteration
+
+
+def _raise(error: BaseException):
+    raise error
+
+
+@pytest.mark.parametrize(
+    ("error", "status", "said"),
+    [(UserError("mend it like this"), 2, "error: mend it like this\n"), (KeyboardInterrupt(), 130, "interrupted\n")],
+)
+def test_run_cli_says_one_line_and_exits(error, status, said, capsys):
+    with pytest.raises(SystemExit) as exit_info:
+        run_cli(lambda: _raise(error))
+    assert exit_info.value.code == status
+    assert capsys.readouterr() == ("", said)
+
+
+def test_run_cli_leaves_bugs_their_traceback():
+    with pytest.raises(ZeroDivisionError):
+        run_cli(lambda: 1 / 0)
+
+
+def test_atomic_write_replaces_only_when_the_block_ends_well(tmp_path):
+    target = tmp_path / "new" / "picture.png"
+    with atomic_write(target) as path:
+        assert path.parent == target.parent and path.suffix == ".png"
+        path.write_text("whole")
+        assert not target.exists()
+    assert target.read_text() == "whole"
+    with pytest.raises(RuntimeError), atomic_write(target) as path:
+        path.write_text("half")
+        raise RuntimeError
+    assert target.read_text() == "whole"
+    assert list(target.parent.iterdir()) == [target]
+
+
+def test_a_killed_writer_leaves_the_old_file(tmp_path):
+    target = tmp_path / "model.ply"
+    target.write_text("old")
+    script = (
+        "import os, signal, sys\n"
+        "from utils.system_utils import atomic_write\n"
+        "with atomic_write(sys.argv[1]) as path:\n"
+        "    path.write_text('ha')\n"
+        "    os.kill(os.getpid(), signal.SIGKILL)\n"
+    )
+    root = Path(__file__).resolve().parents[1]
+    done = subprocess.run([sys.executable, "-c", script, str(target)], cwd=root, check=False)
+    assert done.returncode == -signal.SIGKILL
+    assert target.read_text() == "old"
+
+
+def test_mkdir_p(tmp_path):
+    mkdir_p(tmp_path / "a" / "b")
+    mkdir_p(tmp_path / "a" / "b")
+    assert (tmp_path / "a" / "b").is_dir()
+    (tmp_path / "file").write_text("")
+    with pytest.raises(UserError, match="cannot make the folder .*file"):
+        mkdir_p(tmp_path / "file" / "below")
+
+
+def test_iterations_are_compared_as_numbers(tmp_path):
+    for name in ("iteration_7000", "iteration_30000", "iteration_900", "iteration_x", "other_99999"):
+        (tmp_path / name).mkdir()
+    assert saved_iterations(tmp_path) == [900, 7000, 30000]
+    assert searchForMaxIteration(tmp_path) == 30000
+    with pytest.raises(UserError, match="no saved iteration"):
+        searchForMaxIteration(tmp_path / "missing")
+
+
+def test_compute_device_needs_a_gpu_and_its_kernels(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.ops, "diff_gaussian_rasterization", type("Loaded", (), {"rasterize": None}))
+    for kernels in (False, True):
+        monkeypatch.setattr(torch._C, "_dispatch_has_kernel_for_dispatch_key", lambda op, key, has=kernels: has)
+        assert system_utils.compute_device().type == ("cuda" if kernels else "cpu")
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    assert system_utils.compute_device().type == "cpu"

@@ -1,0 +1,81 @@
+"""Files, folders, exit statuses and the choice of device: what every command line needs."""
+
+import contextlib
+import os
+import re
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import torch
+
+_ITERATION_FOLDER = re.compile(r"iteration_(\d+)")
+
+
+class UserError(Exception):
+    """Something the user can mend. Its text is one sentence that names the thing and the remedy."""
+
+
+def run_cli(main: Callable[[], object]) -> None:
+    """Run a command line: a UserError prints its sentence and exits 2, Ctrl-C exits 130, a bug keeps its traceback."""
+    try:
+        main()
+    except UserError as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(2)
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        sys.exit(130)
+
+
+@contextlib.contextmanager
+def atomic_write(path: str | os.PathLike) -> Iterator[Path]:
+    """Yield a temporary path beside `path`, with its suffix; rename it to `path` when the block ends well, else drop.
+
+    Makes the folder when it is missing. A killed process may leave the hidden temporary file, never half a `path`.
+    """
+    target = Path(path)
+    mkdir_p(target.parent)
+    temporary = target.with_name(f".{target.stem}.{os.getpid()}.tmp{target.suffix}")
+    try:
+        yield temporary
+        os.replace(temporary, target)
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise
+
+
+def mkdir_p(folder_path: str | os.PathLike) -> None:
+    """Make a folder and its parents; one that exists is fine. UserError where the system refuses."""
+    try:
+        os.makedirs(folder_path, exist_ok=True)
+    except OSError as error:
+        raise UserError(
+            f"cannot make the folder {folder_path} ({error.strerror}); choose another place, or mend the rights there"
+        ) from error
+
+
+def saved_iterations(folder: str | os.PathLike) -> list[int]:
+    """Every N of the sub-folders `iteration_N`, ascending; empty where the folder is missing."""
+    names = os.listdir(folder) if os.path.isdir(folder) else []
+    return sorted(int(match[1]) for name in names if (match := _ITERATION_FOLDER.fullmatch(name)))
+
+
+def searchForMaxIteration(folder: str | os.PathLike) -> int:
+    """Largest N of the sub-folders `iteration_N`. UserError when there is none."""
+    iterations = saved_iterations(folder)
+    if not iterations:
+        raise UserError(f"no saved iteration in {folder} (looked for folders iteration_N); train the model first")
+    return iterations[-1]
+
+
+def compute_device() -> torch.device:
+    """`cuda` when a GPU is visible and the rasterizer was built with its CUDA kernels, else `cpu`.
+
+    The rasterizer's library must be loaded by then (gaussian_renderer does it); unloaded counts as "no kernels".
+    """
+    op = "diff_gaussian_rasterization::rasterize"
+    loaded = hasattr(torch.ops.diff_gaussian_rasterization, "rasterize")
+    if torch.cuda.is_available() and loaded and torch._C._dispatch_has_kernel_for_dispatch_key(op, "CUDA"):
+        return torch.device("cuda")
+    return torch.device("cpu")
