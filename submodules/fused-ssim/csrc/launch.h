@@ -1,0 +1,50 @@
+#pragma once
+// What the backends implement: plain pointers and sizes, no torch.
+#include <cstdint>
+
+#include "gs/isa.h"
+#include "gs/parallel.h"
+
+namespace gs {
+
+// `planes` images of one channel, height x width, contiguous, row by row.
+template <class T>
+struct ImagePair {
+  const T* img1;
+  const void* img2;  // T, or uint8_t that means value / 255
+  bool img2_is_bytes;
+  int64_t planes, height, width;
+};
+
+template <class T>
+struct L1Ssim {
+  ImagePair<T> images;
+  bool valid;    // leave the rim of kRadius pixels out of the mean of SSIM
+  double* l1;    // out: mean of |img1 - img2|, over all pixels
+  double* ssim;  // out: mean of SSIM
+  T* gradient;   // out, like img1: d ssim / d img1; null: not wanted
+};
+
+template <class T>
+struct L1SsimVjp {
+  ImagePair<T> images;
+  const T* ssim_gradient;  // L1Ssim::gradient
+  double grad_l1, grad_ssim;
+  T* grad_img1;  // out
+};
+
+#define GS_DECLARE(isa)                                            \
+  namespace isa {                                                  \
+  void l1_ssim_cpu(const L1Ssim<float>&, const Executor&);         \
+  void l1_ssim_cpu(const L1Ssim<double>&, const Executor&);        \
+  void l1_ssim_vjp_cpu(const L1SsimVjp<float>&, const Executor&);  \
+  void l1_ssim_vjp_cpu(const L1SsimVjp<double>&, const Executor&); \
+  }
+GS_DECLARE(baseline)
+#ifdef GS_X86
+GS_DECLARE(avx2)
+GS_DECLARE(avx512)
+#endif
+#undef GS_DECLARE
+
+}  // namespace gs

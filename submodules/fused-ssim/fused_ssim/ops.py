@@ -1,0 +1,85 @@
+"""The operators fused_ssim::l1_ssim and fused_ssim::l1_ssim_vjp, their autograd, and the public functions.
+
+SSIM is that of Wang et al. 2004, per channel: 11 x 11 Gaussian window of sigma 1.5, C1 = 0.01², C2 = 0.03²; "same"
+takes pixels beyond the border as 0, "valid" leaves the rim of 5 pixels out of the mean. Only img1 gets a gradient.
+"""
+
+from pathlib import Path
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+_LIBRARY = Path(__file__).with_name("_backend.so")
+if not _LIBRARY.exists():
+    raise ImportError("fused_ssim is not built: run `pip install ./submodules/fused-ssim` in the repository's root")
+torch.ops.load_library(str(_LIBRARY))
+
+WINDOW = 11  # pixels
+
+
+def fused_ssim(img1: Tensor, img2: Tensor, padding: str = "same", train: bool = True) -> Tensor:
+    """Mean SSIM of two images, a scalar of img1's dtype.
+
+    img1: (..., H, W), float32 or float64, values in [0, 1]; img2: the same shape, of the same dtype or uint8 (value /
+    255). padding: "same" (any size) or "valid" (11 x 11 or more). train=False: no gradient, nothing kept for one.
+    Raises TypeError for a dtype, ValueError for anything else that does not fit.
+    """
+    return fused_l1_ssim(img1 if train else img1.detach(), img2, padding)[1]
+
+
+def fused_l1_ssim(img1: Tensor, img2: Tensor, padding: str = "same") -> tuple[Tensor, Tensor]:
+    """Mean |img1 - img2| (over all pixels, whatever the padding) and mean SSIM, as `fused_ssim` takes and gives them.
+
+    The gradient of |img1 - img2| where both are equal is 0. Nothing is kept for the gradient unless img1 needs one.
+    """
+    _check_inputs(img1, img2, padding)
+    train = torch.is_grad_enabled() and img1.requires_grad
+    l1, ssim, _ = torch.ops.fused_ssim.l1_ssim(img1, img2.detach(), padding == "valid", train)
+    return l1, ssim
+
+
+def _check_inputs(img1: Tensor, img2: Tensor, padding: str) -> None:
+    if padding not in ("same", "valid"):
+        raise ValueError(f'padding must be "same" or "valid", got {padding!r}')
+    if img1.dtype not in (torch.float32, torch.float64):
+        raise TypeError(f"img1 must be float32 or float64, got {img1.dtype}: convert with img1.float()")
+    if img2.dtype not in (img1.dtype, torch.uint8):
+        raise TypeError(f"img2 must be {img1.dtype} like img1, or uint8 (value / 255), got {img2.dtype}")
+    shapes = f"img1 {tuple(img1.shape)} and img2 {tuple(img2.shape)}"
+    if img1.shape != img2.shape:
+        raise ValueError(f"the images must have the same shape, got {shapes}")
+    if img1.dim() < 2 or img1.numel() == 0:
+        raise ValueError(f"the images must be (..., H, W) with at least one pixel, got {shapes}")
+    if padding == "valid" and min(img1.shape[-2:]) < WINDOW:
+        raise ValueError(f'padding "valid" needs at least {WINDOW} x {WINDOW} pixels, got {shapes}: use "same"')
+    if img1.device != img2.device:
+        raise ValueError(f"the images must be on the same device, got img1 on {img1.device} and img2 on {img2.device}")
+    device = img1.device.type
+    if not torch._C._dispatch_has_kernel_for_dispatch_key("fused_ssim::l1_ssim", device.upper()):
+        raise ValueError(f"this build of fused_ssim has no {device} backend: pass img1.cpu() and img2.cpu()")
+
+
+@torch.library.register_fake("fused_ssim::l1_ssim")
+def _l1_ssim_fake(img1: Tensor, img2: Tensor, valid: bool, train: bool) -> tuple[Tensor, Tensor, Tensor]:
+    return img1.new_empty(()), img1.new_empty(()), img1.new_empty(img1.shape if train else (0,))
+
+
+@torch.library.register_fake("fused_ssim::l1_ssim_vjp")
+def _l1_ssim_vjp_fake(img1: Tensor, img2: Tensor, ssim_gradient: Tensor, grad_l1: Tensor, grad_ssim: Tensor) -> Tensor:
+    return img1.new_empty(img1.shape)
+
+
+def _setup_context(ctx, inputs: tuple, output: tuple[Tensor, Tensor, Tensor]) -> None:
+    img1, img2, _, _ = inputs
+    ctx.mark_non_differentiable(output[2])
+    ctx.save_for_backward(img1, img2, output[2])
+
+
+@once_differentiable  # a second derivative would be silently wrong
+def _backward(ctx, grad_l1: Tensor, grad_ssim: Tensor, _) -> tuple[Tensor, None, None, None]:
+    img1, img2, ssim_gradient = ctx.saved_tensors
+    return torch.ops.fused_ssim.l1_ssim_vjp(img1, img2, ssim_gradient, grad_l1, grad_ssim), None, None, None
+
+
+torch.library.register_autograd("fused_ssim::l1_ssim", _backward, setup_context=_setup_context)

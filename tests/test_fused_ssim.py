@@ -1,0 +1,326 @@
+"""fused_ssim against float64 convolutions, scikit-image, finite differences and itself."""
+
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import torch
+from fused_ssim import fused_l1_ssim, fused_ssim
+from fused_ssim.reference import l1_ssim, ssim_map
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from skimage.metrics import structural_similarity
+from torch import Tensor
+
+EPS = {torch.float32: 2**-24, torch.float64: 2**-53}
+LARGEST_SLOPE = 2 / 0.03**2  # of SSIM by a covariance: what an error of the inputs or of the oracle is multiplied by
+both_dtypes = pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+both_paddings = pytest.mark.parametrize("padding", ["same", "valid"])
+
+
+@pytest.fixture(autouse=True)
+def one_thread() -> Iterator[None]:
+    """On images this small threads mostly wait for each other."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+def image_pair(name: str, shape: tuple[int, ...] = (3, 40, 47), dtype: torch.dtype = torch.float64) -> list[Tensor]:
+    """Named pairs of images, exact in float32, each hard for some way of computing SSIM."""
+    random = torch.Generator().manual_seed(7)
+    noise1, noise2 = torch.randn(shape, generator=random), torch.randn(shape, generator=random)
+    if name == "noise":
+        pair = (0.5 + 0.2 * noise1).clamp(0, 1), (0.5 + 0.2 * noise1 + 0.1 * noise2).clamp(0, 1)
+    elif name == "unrelated":
+        pair = torch.rand(shape, generator=random), torch.rand(shape, generator=random)
+    elif name == "nearly equal":
+        pair = (0.5 + 0.2 * noise1, 0.5 + 0.2 * noise1 + 1e-4 * noise2)
+    elif name == "bright sky":  # E[x²] - mu² is all rounding here
+        pair = 0.95 + 0.001 * noise1, 0.951 + 0.001 * noise2
+    elif name == "flat":
+        pair = torch.full(shape, 0.98), torch.full(shape, 1.0)
+    elif name == "black and flat":
+        pair = torch.zeros(shape), torch.full(shape, 0.3)
+    elif name == "salt on white":
+        pair = 1 - (noise1 > 2).float(), 1 - (noise2 > 2).float()
+    elif name == "overexposed":  # a render is not clamped by nature
+        pair = 3 + 2 * noise1, (0.5 + 0.2 * noise2).clamp(0, 1)
+    return [image.to(dtype) for image in pair]
+
+
+PAIRS = ["noise", "unrelated", "nearly equal", "bright sky", "flat", "black and flat", "salt on white", "overexposed"]
+SHAPES = [(1, 1, 1), (2, 3, 7, 5), (3, 2, 70), (70, 3), (11, 11), (1, 12, 1030)]
+CASES = [(name, (3, 40, 47)) for name in PAIRS] + [("unrelated", shape) for shape in SHAPES]
+
+
+def with_gradient(function, img1: Tensor, img2: Tensor, padding: str) -> tuple[Tensor, Tensor, Tensor]:
+    """L1, SSIM and the gradient of SSIM summed (not averaged), which does not depend on the number of pixels."""
+    img1 = img1.clone().requires_grad_()
+    l1, ssim = function(img1, img2, padding)
+    rim = 10 if padding == "valid" else 0
+    count = img1.numel() // (img1.shape[-1] * img1.shape[-2]) * (img1.shape[-1] - rim) * (img1.shape[-2] - rim)
+    (gradient,) = torch.autograd.grad(ssim * count, img1)
+    return l1.detach(), ssim.detach(), gradient
+
+
+@both_dtypes
+@pytest.mark.parametrize(("name", "shape"), CASES, ids=str)
+def test_agrees_with_reference(name: str, shape: tuple[int, ...], dtype: torch.dtype) -> None:
+    img1, img2 = image_pair(name, shape, dtype)
+    for padding in ["same", "valid"] if min(shape[-2:]) >= 11 else ["same"]:
+        l1, ssim, gradient = with_gradient(fused_l1_ssim, img1, img2, padding)
+        assert l1.dtype == ssim.dtype == gradient.dtype == dtype and l1.shape == ssim.shape == ()
+        wanted_l1, wanted_ssim, wanted_gradient = with_gradient(l1_ssim, img1.double(), img2.double(), padding)
+        # Each pixel's difference is rounded once, and the mean once.
+        assert abs(l1 - wanted_l1) <= 2 * EPS[dtype] * wanted_l1
+        # A few roundings of numbers near 1, measured: 4.3 eps; and of the sums in double where all pixels are alike.
+        assert abs(ssim - wanted_ssim) <= 8 * EPS[dtype] + 50 * EPS[torch.float64]
+        # Measured: 19 eps of the largest gradient for images in [0, 1]; the difference is rounded at the size of the
+        # larger image. The oracle adds up terms of about 10 in size that may cancel.
+        scale = wanted_gradient.abs().max() * max(1, img1.abs().max())
+        error = (gradient - wanted_gradient).abs().max()
+        assert error <= 40 * EPS[dtype] * scale + 100 * EPS[torch.float64]
+
+
+def test_bright_images_keep_their_precision() -> None:
+    """The textbook's E[x²] - mu², in float32, is a thousand times worse: what csrc/math/ssim.h is for."""
+    img1, img2 = image_pair("bright sky", dtype=torch.float32)
+    wanted = with_gradient(l1_ssim, img1.double(), img2.double(), "same")[2]
+    ours = with_gradient(fused_l1_ssim, img1, img2, "same")[2]
+
+    def textbook(img1: Tensor, img2: Tensor, padding: str) -> tuple[Tensor, Tensor]:
+        taps = torch.exp(-(torch.arange(-5.0, 6) ** 2) / 4.5)
+        window = (torch.outer(taps, taps) / taps.sum() ** 2)[None, None]
+        x, y = img1[:, None], img2[:, None]
+        mean = [torch.nn.functional.conv2d(z, window, padding=5) for z in (x, y, x * x, y * y, x * y)]
+        top = (2 * mean[0] * mean[1] + 0.0001) * (2 * (mean[4] - mean[0] * mean[1]) + 0.0009)
+        variances = mean[2] - mean[0] ** 2 + mean[3] - mean[1] ** 2
+        return img1.sum(), (top / ((mean[0] ** 2 + mean[1] ** 2 + 0.0001) * (variances + 0.0009))).mean()
+
+    def error(gradient: Tensor) -> float:
+        return float((gradient - wanted).abs().max() / wanted.abs().max())
+
+    assert error(ours) < 1e-6
+    assert error(with_gradient(textbook, img1, img2, "same")[2]) > 100 * error(ours)
+
+
+@pytest.mark.parametrize("name", ["noise", "unrelated", "salt on white"])
+def test_agrees_with_scikit_image(name: str) -> None:
+    img1, img2 = image_pair(name)
+    wanted, full = structural_similarity(
+        img1.numpy(),
+        img2.numpy(),
+        channel_axis=0,
+        data_range=1,
+        gaussian_weights=True,  # cut at 3.5 sigma: 11 taps
+        sigma=1.5,
+        use_sample_covariance=False,
+        full=True,
+    )
+    # scikit-image averages without the rim of 5 pixels, where its border would differ from ours. Its variances are
+    # E[x²] - mu², divided by C2 at worst.
+    tolerance = 20 * EPS[torch.float64] * LARGEST_SLOPE
+    assert abs(float(fused_ssim(img1, img2, padding="valid")) - wanted) < tolerance
+    difference = (ssim_map(img1, img2) - torch.from_numpy(full))[:, 5:-5, 5:-5].abs().max()
+    assert difference < tolerance  # the oracle has the same judge
+
+
+@both_paddings
+def test_gradcheck(padding: str) -> None:
+    img1, img2 = image_pair("unrelated", (12, 13))
+    assert (img1 - img2).abs().min() > 1e-5  # away from the kink of |x|
+    torch.autograd.gradcheck(lambda x: fused_l1_ssim(x, img2, padding), img1.requires_grad_())
+
+
+def test_l1_gradient_is_torchs() -> None:
+    img1, img2 = image_pair("noise", dtype=torch.float32)
+    img1[:, 3:9] = img2[:, 3:9]  # no gradient where both are equal
+    gradients = []
+    for l1 in (lambda x: fused_l1_ssim(x, img2)[0], lambda x: (x - img2).abs().mean()):
+        x = img1.clone().requires_grad_()
+        gradients.append(torch.autograd.grad(l1(x), x)[0])
+    # 1/n, rounded once from double by us and once in float by torch.
+    torch.testing.assert_close(gradients[0], gradients[1], rtol=2 * EPS[torch.float32], atol=0)
+    assert not gradients[0][:, 3:9].any()
+
+
+def test_gradients_of_both_add_up() -> None:
+    img1, img2 = image_pair("noise")
+    x = img1.clone().requires_grad_()
+    l1, ssim = fused_l1_ssim(x, img2)
+    both = torch.autograd.grad(0.8 * l1 + 0.2 * (1 - ssim), x, retain_graph=True)[0]
+    one, other = (torch.autograd.grad(y, x, retain_graph=True)[0] for y in (l1, ssim))
+    torch.testing.assert_close(both, 0.8 * one - 0.2 * other, rtol=0, atol=1e-15 * float(both.abs().max()))
+
+
+@both_dtypes
+@pytest.mark.parametrize("train", [False, True])
+def test_opcheck(train: bool, dtype: torch.dtype) -> None:
+    img1, img2 = image_pair("noise", (2, 12, 13), dtype)
+    torch.library.opcheck(torch.ops.fused_ssim.l1_ssim, (img1.requires_grad_(train), img2, True, train))
+    one = torch.ones((), dtype=dtype)
+    torch.library.opcheck(torch.ops.fused_ssim.l1_ssim_vjp, (img1.detach(), img2, torch.rand_like(img2), one, one))
+
+
+@both_dtypes
+@both_paddings
+def test_bytes_are_their_value_over_255(padding: str, dtype: torch.dtype) -> None:
+    img1 = image_pair("noise", (3, 16, 17), dtype)[0].requires_grad_()
+    bytes2 = (torch.arange(img1.numel()) % 256).to(torch.uint8).reshape(img1.shape)  # every value
+    results = []
+    for img2 in (bytes2, bytes2.to(dtype) / 255):
+        l1, ssim = fused_l1_ssim(img1, img2, padding)
+        results.append([l1, ssim, torch.autograd.grad(l1 + ssim, img1)[0]])
+    for one, other in zip(*results, strict=True):
+        assert torch.equal(one, other)
+
+
+@both_dtypes
+@pytest.mark.parametrize("value", [0.0, 0.5, 1.0])
+def test_equal_images(value: float, dtype: torch.dtype) -> None:
+    noise = image_pair("bright sky", dtype=dtype)[0]
+    for image in (torch.full((3, 20, 21), value, dtype=dtype), noise):
+        l1, ssim, gradient = with_gradient(fused_l1_ssim, image, image, "same")
+        assert l1 == 0 and ssim == 1 and not gradient.any()
+
+
+def test_leading_dimensions_and_strides() -> None:
+    img1, img2 = image_pair("noise", (4, 20, 21), torch.float32)
+
+    def all_bits(img1: Tensor, img2: Tensor) -> list[Tensor]:
+        img1 = img1.detach().requires_grad_()
+        l1, ssim = fused_l1_ssim(img1, img2)
+        return [l1, ssim, torch.autograd.grad(l1 + ssim, img1)[0].reshape(-1)]
+
+    wanted = all_bits(img1, img2)
+    views = {
+        "more dimensions": lambda x: x.reshape(2, 1, 2, 20, 21),
+        "channels last": lambda x: x[None].to(memory_format=torch.channels_last),
+        "transposed": lambda x: x.transpose(1, 2).contiguous().transpose(1, 2),
+        "every other column": lambda x: x.repeat_interleave(2, dim=2)[:, :, ::2],
+    }
+    for name, view in views.items():
+        for got, bits in zip(all_bits(view(img1), view(img2)), wanted, strict=True):
+            assert torch.equal(got, bits), name
+    one_plane = fused_ssim(img1[0], img2[0])
+    assert one_plane == fused_ssim(img1[:1], img2[:1])
+
+
+@both_dtypes
+def test_number_of_threads_changes_no_bit(dtype: torch.dtype) -> None:
+    img1, img2 = image_pair("noise", (3, 201, 300), dtype)
+    results = []
+    for count in (1, 2, 3, 7):
+        torch.set_num_threads(count)
+        img1 = img1.detach().requires_grad_()
+        l1, ssim = fused_l1_ssim(img1, img2)
+        results.append([l1, ssim, torch.autograd.grad(0.8 * l1 - 0.2 * ssim, img1)[0]])
+    for other in results[1:]:
+        assert all(torch.equal(one, same) for one, same in zip(results[0], other, strict=True))
+
+
+def test_instruction_sets_agree_to_rounding(tmp_path: Path) -> None:
+    """GS_ISA is read when the library loads; the widest set there is runs here, narrower ones in their own process."""
+    pairs = [image_pair(name, dtype=dtype) for name in ("noise", "bright sky") for dtype in EPS]
+    torch.save(pairs, tmp_path / "pairs")
+    script = """
+import sys, torch
+from fused_ssim import fused_l1_ssim
+results = []
+for img1, img2 in torch.load(sys.argv[1]):
+    l1, ssim = fused_l1_ssim(img1.requires_grad_(), img2)
+    results.append([l1.detach(), ssim.detach(), torch.autograd.grad(ssim * img1.numel(), img1)[0]])
+torch.save(results, sys.argv[2])
+"""
+    widest = [with_gradient(fused_l1_ssim, *pair, "same") for pair in pairs]
+    for isa in ("baseline", "avx2"):
+        command = [sys.executable, "-c", script, str(tmp_path / "pairs"), str(tmp_path / isa)]
+        subprocess.run(command, env={**os.environ, "GS_ISA": isa}, check=True)
+        results = torch.load(tmp_path / isa)
+        for (l1, ssim, gradient), (wanted_l1, wanted_ssim, wanted_gradient) in zip(results, widest, strict=True):
+            eps = EPS[gradient.dtype]  # tolerances: as against the reference
+            assert abs(l1 - wanted_l1) <= 2 * eps and abs(ssim - wanted_ssim) <= 8 * eps
+            assert (gradient - wanted_gradient).abs().max() <= 40 * eps * wanted_gradient.abs().max()
+        wide = torch.backends.cpu.get_cpu_capability() in ("AVX2", "AVX512") and "GS_ISA" not in os.environ
+        if isa == "baseline" and wide:
+            # It has no fma: equal bits would mean that GS_ISA was not heard.
+            assert not torch.equal(results[0][2], widest[0][2])
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(1, 40), st.integers(1, 40), st.integers(0, 2**31), st.sampled_from([0.0, 1e-3, 1.0]))
+def test_properties(height: int, width: int, seed: int, contrast: float) -> None:
+    """Symmetric in the images, bounded by 1, and unmoved by a mirror image or by another order of planes."""
+    random = torch.Generator().manual_seed(seed)
+    img1, img2 = (1 - contrast * torch.rand((3, height, width), generator=random) for _ in range(2))
+    ssim = fused_ssim(img1, img2)
+    assert -1 <= ssim <= 1
+    # Variances of img1 and of the difference, instead of img2 and the difference: other roundings, of some eps each.
+    assert abs(ssim - fused_ssim(img2, img1)) <= 8 * EPS[torch.float32]
+    assert abs(ssim - fused_ssim(img1.flip(1, 2), img2.flip(1, 2))) <= 8 * EPS[torch.float32]
+    assert abs(ssim - fused_ssim(img1[[2, 0, 1]], img2[[2, 0, 1]])) <= EPS[torch.float32]
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_a_pixel_that_is_not_finite_shows(value: float) -> None:
+    img1, img2 = image_pair("noise", dtype=torch.float32)
+    img1[1, 39, 46] = value
+    l1, ssim = fused_l1_ssim(img1, img2)
+    assert not l1.isfinite() and ssim.isnan()
+
+
+def test_only_img1_has_a_gradient_and_only_when_wanted() -> None:
+    img1, img2 = image_pair("noise")
+    img1.requires_grad_(), img2.requires_grad_()
+    assert not fused_ssim(img1, img2, train=False).requires_grad
+    with torch.no_grad():
+        assert not fused_ssim(img1, img2).requires_grad
+    assert not fused_ssim(img1.detach(), img2).requires_grad
+    fused_ssim(img1, img2).backward()
+    assert img1.grad is not None and img2.grad is None
+    nothing = torch.ops.fused_ssim.l1_ssim(img1.detach(), img2.detach(), False, False)[2]
+    assert nothing.numel() == 0
+
+
+def test_second_derivatives_are_refused() -> None:
+    img1, img2 = image_pair("noise")
+    img1.requires_grad_()
+    weight = torch.ones((), dtype=img1.dtype, requires_grad=True)
+    (gradient,) = torch.autograd.grad(weight * fused_ssim(img1, img2), img1, create_graph=True)
+    with pytest.raises(RuntimeError, match="once_differentiable"):
+        gradient.sum().backward()
+
+
+def test_the_value_is_the_same_with_and_without_a_gradient() -> None:
+    img1, img2 = image_pair("noise", (3, 201, 300), torch.float32)
+    for padding in ("same", "valid"):
+        plain = fused_l1_ssim(img1, img2, padding)
+        trained = fused_l1_ssim(img1.clone().requires_grad_(), img2, padding)
+        assert plain[0] == trained[0] and plain[1] == trained[1]
+
+
+IMAGE = torch.zeros(3, 20, 20)
+
+
+@pytest.mark.parametrize(
+    ("img1", "img2", "padding", "error", "words"),
+    [
+        (IMAGE, torch.zeros(3, 20, 21), "same", ValueError, r"\(3, 20, 20\) and img2 \(3, 20, 21\)"),
+        (IMAGE.byte(), IMAGE, "same", TypeError, "img1 must be float32 or float64, got torch.uint8"),
+        (IMAGE.half(), IMAGE.half(), "same", TypeError, "got torch.float16"),
+        (IMAGE, IMAGE.double(), "same", TypeError, "img2 must be torch.float32 like img1, or uint8"),
+        (IMAGE, IMAGE, "full", ValueError, '"same" or "valid", got \'full\''),
+        (IMAGE[:, :10], IMAGE[:, :10], "valid", ValueError, r"at least 11 x 11 pixels, got img1 \(3, 10, 20\)"),
+        (IMAGE[:, :0], IMAGE[:, :0], "same", ValueError, "at least one pixel"),
+        (IMAGE[0, 0], IMAGE[0, 0], "same", ValueError, r"must be \(..., H, W\)"),
+        (IMAGE, IMAGE.to("meta"), "same", ValueError, "same device, got img1 on cpu and img2 on meta"),
+    ],
+)
+def test_messages(img1: Tensor, img2: Tensor, padding: str, error: type[Exception], words: str) -> None:
+    with pytest.raises(error, match=words):
+        fused_ssim(img1, img2, padding)
