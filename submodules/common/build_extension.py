@@ -95,12 +95,13 @@ class BuildBackend(build_ext):
             libraries += ["-ltorch_cuda", "-lc10_cuda", f"-L{toolkit / 'lib64'}", f"-L{toolkit / 'lib'}", "-lcudart"]
 
         compilations = [([*compile_cxx, *ops_flags], csrc / "ops.cpp", "ops.o")]
-        for source in sorted((csrc / "cpu").glob("*.cpp")):
-            if source.stem.endswith("_isa"):
-                for isa, flags in isas.items():
-                    compilations.append(([*compile_cxx, *flags, f"-DGS_ISA={isa}"], source, f"{source.stem}.{isa}.o"))
-            else:
-                compilations.append((compile_cxx, source, f"{source.stem}.o"))
+        sources = sorted((csrc / "cpu").glob("*.cpp"))
+        compilations += [(compile_cxx, source, f"{source.stem}.o") for source in sources if not is_per_isa(source)]
+        # Baseline first: where the standard library's templates come out of line in several objects, the linker keeps
+        # the first, and that one must run on every machine.
+        for isa, flags in isas.items():
+            command = [*compile_cxx, *flags, f"-DGS_ISA={isa}"]
+            compilations += [(command, source, f"{source.stem}.{isa}.o") for source in sources if is_per_isa(source)]
         if nvcc:
             compile_cuda = [nvcc, "-O3", "-std=c++17", "-Xcompiler", "-fPIC,-fvisibility=hidden", *architecture_flags()]
             compile_cuda += [f"-I{csrc}", f"-I{COMMON_INCLUDE}"]
@@ -111,6 +112,11 @@ class BuildBackend(build_ext):
         # Linked without -fopenmp: its runtime must be the one torch has loaded, not a second one.
         shared = ["-dynamiclib", "-undefined", "dynamic_lookup"] if sys.platform == "darwin" else ["-shared"]
         run([*cxx, *shared, *(obj for _, _, obj in compilations), *libraries, "-o", str(library)], objects_dir)
+
+
+def is_per_isa(source: Path) -> bool:
+    """Whether a source is compiled once per instruction set."""
+    return source.stem.endswith("_isa")
 
 
 def import_torch() -> ModuleType:

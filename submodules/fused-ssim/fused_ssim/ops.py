@@ -11,9 +11,11 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 _LIBRARY = Path(__file__).with_name("_backend.so")
-if not _LIBRARY.exists():
-    raise ImportError("fused_ssim is not built: run `pip install ./submodules/fused-ssim` in the repository's root")
-torch.ops.load_library(str(_LIBRARY))
+try:
+    torch.ops.load_library(_LIBRARY)
+except OSError as error:
+    what = f"does not fit torch {torch.__version__}" if _LIBRARY.exists() else "is not built"
+    raise ImportError(f"fused_ssim {what}: run `pip install ./submodules/fused-ssim` in the repository") from error
 
 WINDOW = 11  # pixels
 

@@ -17,21 +17,21 @@ inline int finish_tests(const char* name) {
 
 }  // namespace gs
 
-#define CHECK(condition)                                                            \
-  do {                                                                              \
-    if (!(condition)) {                                                             \
-      ++gs::failures();                                                             \
+#define CHECK(condition)                                                               \
+  do {                                                                                 \
+    if (!(condition)) {                                                                \
+      ++gs::failures();                                                                \
       std::cerr << __FILE__ << ':' << __LINE__ << ": " << #condition << " is false\n"; \
-    }                                                                               \
+    }                                                                                  \
   } while (0)
 
 // |got - wanted| <= tolerance; NaN fails.
-#define CHECK_NEAR(got, wanted, tolerance)                                                               \
-  do {                                                                                                   \
-    const double got_ = (got), wanted_ = (wanted), tolerance_ = (tolerance);                             \
-    if (!(std::abs(got_ - wanted_) <= tolerance_)) {                                                     \
-      ++gs::failures();                                                                                  \
+#define CHECK_NEAR(got, wanted, tolerance)                                                                \
+  do {                                                                                                    \
+    const double got_ = (got), wanted_ = (wanted), tolerance_ = (tolerance);                              \
+    if (!(std::abs(got_ - wanted_) <= tolerance_)) {                                                      \
+      ++gs::failures();                                                                                   \
       std::cerr << __FILE__ << ':' << __LINE__ << ": " << #got << " = " << got_ << ", wanted " << wanted_ \
-                << " within " << tolerance_ << '\n';                                                     \
-    }                                                                                                    \
+                << " within " << tolerance_ << '\n';                                                      \
+    }                                                                                                     \
   } while (0)

@@ -44,7 +44,7 @@ static inline Isa best_isa() {
 
 // Calls gs::<isa>::fn(...) for the instruction set of this machine.
 #ifdef GS_X86
-#define GS_DISPATCH(fn, ...)                                         \
+#define GS_DISPATCH(fn, ...)                                             \
   (::gs::best_isa() == ::gs::Isa::avx512 ? ::gs::avx512::fn(__VA_ARGS__) \
    : ::gs::best_isa() == ::gs::Isa::avx2 ? ::gs::avx2::fn(__VA_ARGS__)   \
                                          : ::gs::baseline::fn(__VA_ARGS__))

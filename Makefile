@@ -1,0 +1,67 @@
+# make demo   a scene made, trained, rendered and scored
+# make test   lint, format check, C++ tests, pytest
+# make format rewrites what the format check would complain about
+# All set up .venv first: pinned requirements and the three extensions, again only when their sources have changed.
+# Variables: PYTHON (3.10 or newer); CXX, GS_CUDA, CUDA_HOME as in submodules/common/build_extension.py (after a change
+# of these `rm .venv/.built-*`).
+
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+EXTENSIONS := simple-knn fused-ssim diff-gaussian-rasterization
+CXX_TESTS := $(patsubst submodules/%.cpp,build/%,$(wildcard submodules/*/csrc/tests/*.cpp))
+CXX_TEST_FLAGS := -std=c++17 -O1 -g -Wall -Wextra -Werror -fsanitize=address,undefined -fno-sanitize-recover=all -pthread
+
+CXX_SOURCES := $(shell find submodules -name build -prune -o \( -name '*.cpp' -o -name '*.cu' -o -name '*.h' \) -print)
+# What the extension $(1) is built from.
+sources = $(shell find submodules/common submodules/$(1) \( -name build -o -name tests \) -prune -o \
+            \( -name '*.cpp' -o -name '*.cu' -o -name '*.h' -o -name '*.py' -o -name '*.toml' \) -print)
+
+.PHONY: install demo test lint format cpp-test clean
+.NOTPARALLEL:
+
+install: $(EXTENSIONS:%=$(VENV)/.built-%)
+
+$(VENV)/.requirements: requirements.txt requirements-dev.txt
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 10) and "Python 3.10 or newer is needed: make PYTHON=...")'
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/pip install --quiet --disable-pip-version-check -r requirements-dev.txt
+	@touch $@
+
+.SECONDEXPANSION:
+$(VENV)/.built-%: $(VENV)/.requirements $$(call sources,$$*)
+	$(BIN)/pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation ./submodules/$*
+	@touch $@
+
+demo: install output/demo_scene
+	$(BIN)/python train.py -s output/demo_scene -m output/demo --eval --iterations 1500 --test_iterations 1500
+	$(BIN)/python render.py -m output/demo --skip_train
+	$(BIN)/python metrics.py -m output/demo
+	$(BIN)/python -m demo.report output/demo
+
+output/demo_scene: | install
+	$(BIN)/python -m demo.make_scene $@
+
+test: install lint cpp-test
+	$(BIN)/python -m pytest
+
+lint: $(VENV)/.requirements
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/clang-format --dry-run -Werror $(CXX_SOURCES)
+
+format: $(VENV)/.requirements
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+	$(BIN)/clang-format -i $(CXX_SOURCES)
+
+cpp-test: $(CXX_TESTS)
+	@for test in $^; do $$test || exit 1; done
+
+build/%: submodules/%.cpp $$(call sources,$$(firstword $$(subst /, ,$$*)))
+	@mkdir -p $(@D)
+	$(CXX) $(CXX_TEST_FLAGS) -Isubmodules/$(firstword $(subst /, ,$*))/csrc -Isubmodules/common/include \
+	    $< $(wildcard submodules/$(firstword $(subst /, ,$*))/csrc/cpu/*.cpp) -o $@
+
+clean:
+	rm -rf $(VENV) build submodules/*/build submodules/*/*.egg-info

@@ -1,0 +1,42 @@
+#pragma once
+// Squared distances and the three smallest of them.
+#include <cstdint>
+#include <limits>
+
+#include "gs/hd.h"
+
+namespace gs {
+
+// Squared length of (x, y, z), at most the largest finite number. Rounding is monotone in |x|, |y| and |z|: the
+// distance to a box, computed here too, never exceeds that to a point inside it.
+template <class T>
+GS_HD T squared_length(T x, T y, T z) {
+  constexpr T largest = std::numeric_limits<T>::max();
+  const T sum = x * x + y * y + z * z;
+  return sum < largest ? sum : largest;
+}
+
+// The three smallest distances seen, ascending; infinite where fewer were seen.
+template <class T>
+struct Nearest3 {
+  static constexpr T kNone = std::numeric_limits<T>::infinity();
+  T d0 = kNone, d1 = kNone, d2 = kNone;
+
+  GS_HD void add(T d) {
+    if (!(d < d2)) return;
+    d2 = d < d1 ? d1 : d;
+    if (d < d1) d1 = d < d0 ? d0 : d;
+    if (d < d0) d0 = d;
+  }
+
+  // Mean of those seen, 0 for none, at most the largest finite number.
+  GS_HD T mean() const {
+    constexpr T largest = std::numeric_limits<T>::max();
+    if (d0 == kNone) return 0;
+    if (d1 == kNone) return d0;
+    const T sum = d2 == kNone ? d0 + d1 : d0 + d1 + d2;
+    return sum < largest ? sum / (d2 == kNone ? 2 : 3) : largest;
+  }
+};
+
+}  // namespace gs

@@ -1,0 +1,5 @@
+"""The name under which the reference's users import it."""
+
+from simple_knn.ops import distCUDA2
+
+__all__ = ["distCUDA2"]

@@ -1,0 +1,1 @@
+"""Mean squared distance of each point to its three nearest others: `from simple_knn._C import distCUDA2`."""

@@ -1,0 +1,36 @@
+"""The operator simple_knn::mean_distance2 and its checked Python form."""
+
+from pathlib import Path
+
+import torch
+
+_LIBRARY = Path(__file__).with_name("_backend.so")
+try:
+    torch.ops.load_library(_LIBRARY)
+except OSError as error:
+    what = f"does not fit torch {torch.__version__}" if _LIBRARY.exists() else "is not built"
+    raise ImportError(f"simple_knn {what}: run `pip install ./submodules/simple-knn` in the repository") from error
+
+
+@torch.library.register_fake("simple_knn::mean_distance2")
+def _fake(points: torch.Tensor) -> torch.Tensor:
+    return points.new_empty(points.shape[0])
+
+
+def distCUDA2(points: torch.Tensor) -> torch.Tensor:
+    """Mean of the squared distances of each point to its three nearest other points, exactly (no approximation).
+
+    points: (N, 3) float32 or float64, any unit. Returns (N,) in the same dtype and on the same device, in that unit
+    squared; no gradient. Others are other indexes: a duplicate is a neighbour at distance 0. With fewer than three
+    others it is the mean over those there are, and 0 for a single point. A point with a NaN or infinite coordinate
+    gets 0 and is nobody's neighbour. Where float overflows, the largest finite number.
+    Raises TypeError for another dtype, ValueError for another shape or a device this build has no backend for.
+    """
+    if points.dtype not in (torch.float32, torch.float64):
+        raise TypeError(f"points must be float32 or float64, got {points.dtype}: convert with points.float()")
+    if points.dim() != 2 or points.shape[1] != 3:
+        raise ValueError(f"points must be (N, 3), got {tuple(points.shape)}")
+    device = points.device.type
+    if not torch._C._dispatch_has_kernel_for_dispatch_key("simple_knn::mean_distance2", device.upper()):
+        raise ValueError(f"this build of simple_knn has no {device} backend: pass points.cpu()")
+    return torch.ops.simple_knn.mean_distance2(points.detach())

@@ -1,0 +1,232 @@
+"""What installs the project: the extensions' builder and its messages, the root's wheel."""
+
+import ctypes
+import importlib.util
+import os
+import platform
+import re
+import shutil
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
+
+import pytest
+import torch
+
+ROOT = Path(__file__).resolve().parent.parent
+COMMON = ROOT / "submodules" / "common"
+
+
+def load(name: str) -> ModuleType:
+    """A module of submodules/common, which is on no path."""
+    spec = importlib.util.spec_from_file_location(name, COMMON / f"{name}.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture
+def builder(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    for name in ("CXX", "CUDA_HOME", "GS_CUDA", "TORCH_CUDA_ARCH_LIST"):
+        monkeypatch.delenv(name, raising=False)
+    return load("build_extension")
+
+
+def fake_nvcc(folder: Path, release: str = "13.0") -> Path:
+    """A toolkit folder whose nvcc answers --version and --dryrun as the real one does."""
+    nvcc = folder / "bin" / "nvcc"
+    nvcc.parent.mkdir(parents=True)
+    nvcc.write_text(
+        f'#!/bin/sh\nif [ "$1" = --version ]; then echo "Cuda compilation tools, release {release}, V{release}.1"\n'
+        f"else echo '#$ _HERE_={folder}/bin' >&2; echo '#$ TOP={folder}/bin/..' >&2; fi\n"
+    )
+    nvcc.chmod(0o755)
+    return nvcc
+
+
+def test_missing_torch(builder: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "torch", None)
+    with pytest.raises(
+        SystemExit, match="^error: torch is not installed: run `pip install -r requirements.txt` first$"
+    ):
+        builder.import_torch()
+
+
+def test_old_torch(builder: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "torch", SimpleNamespace(__version__="2.9.1+cpu"))
+    with pytest.raises(SystemExit, match="^error: torch 2.9.1.cpu is too old: 2.11 or newer is needed$"):
+        builder.import_torch()
+
+
+def test_missing_compiler(builder: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    assert builder.find_compiler()
+    monkeypatch.setenv("CXX", "ccache no-such-g++")
+    with pytest.raises(SystemExit, match="^error: the C\\+\\+ compiler ccache \\(CXX\\) was not found: install"):
+        builder.find_compiler()
+    monkeypatch.delenv("CXX")
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with pytest.raises(SystemExit, match="^error: a C\\+\\+ compiler was not found: install g\\+\\+ or clang\\+\\+"):
+        builder.find_compiler()
+
+
+class TestCudaSwitch:
+    """GS_CUDA, CUDA_HOME, PATH and torch's own CUDA decide; whether a GPU is visible does not."""
+
+    def test_unset_follows_torch_and_nvcc(
+        self, builder: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    ) -> None:
+        monkeypatch.setenv("PATH", "/bin:/usr/bin:" + str(tmp_path / "nothing"))
+        nvcc = fake_nvcc(tmp_path / "cuda")
+        monkeypatch.setenv("CUDA_HOME", str(tmp_path / "cuda"))
+        assert builder.find_nvcc("13.0") == str(nvcc)
+        assert builder.find_nvcc(None) is None
+        monkeypatch.setenv("CUDA_HOME", str(tmp_path / "nothing"))
+        assert builder.find_nvcc("13.0") is None
+
+    def test_off(self, builder: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+        fake_nvcc(tmp_path)
+        monkeypatch.setenv("CUDA_HOME", str(tmp_path))
+        monkeypatch.setenv("GS_CUDA", "0")
+        assert builder.find_nvcc("13.0") is None
+
+    def test_on_without_nvcc(self, builder: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+        monkeypatch.setenv("GS_CUDA", "1")
+        monkeypatch.setenv("CUDA_HOME", str(tmp_path))
+        with pytest.raises(SystemExit, match="^error: GS_CUDA=1 but there is no nvcc in CUDA_HOME"):
+            builder.find_nvcc("13.0")
+        monkeypatch.delenv("CUDA_HOME")
+        monkeypatch.setenv("PATH", str(tmp_path))
+        with pytest.raises(SystemExit, match="^error: GS_CUDA=1 but there is no nvcc on PATH"):
+            builder.find_nvcc("13.0")
+
+    def test_on_with_a_cpu_torch(self, builder: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+        fake_nvcc(tmp_path)
+        monkeypatch.setenv("GS_CUDA", "1")
+        monkeypatch.setenv("CUDA_HOME", str(tmp_path))
+        with pytest.raises(SystemExit, match="^error: GS_CUDA=1 but the torch that is installed has no CUDA"):
+            builder.find_nvcc(None)
+
+    def test_other_major_version(self, builder: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+        fake_nvcc(tmp_path, "12.8")
+        monkeypatch.setenv("CUDA_HOME", str(tmp_path))
+        with pytest.raises(SystemExit, match="nvcc is of CUDA 12 but torch was built with CUDA 13.0: set CUDA_HOME"):
+            builder.find_nvcc("13.0")
+
+    def test_absurd_value(self, builder: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setenv("GS_CUDA", "yes")
+        with pytest.raises(SystemExit, match="^error: GS_CUDA must be 0 or 1, not 'yes'$"):
+            builder.find_nvcc("13.0")
+
+    def test_root_from_nvcc_behind_a_wrapper(self, builder: ModuleType, tmp_path: Path) -> None:
+        nvcc = fake_nvcc(tmp_path / "cuda")
+        wrapper = tmp_path / "nvcc"
+        wrapper.write_text(f'#!/bin/sh\nexec {nvcc} "$@"\n')
+        wrapper.chmod(0o755)
+        assert builder.toolkit_root(str(wrapper)) == (tmp_path / "cuda").resolve()
+
+    def test_architectures(self, builder: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
+        assert builder.architecture_flags() == ["-arch=all-major"]
+        monkeypatch.setenv("TORCH_CUDA_ARCH_LIST", "8.6;9.0+PTX")
+        assert builder.architecture_flags() == [
+            "-gencode=arch=compute_86,code=[sm_86]",
+            "-gencode=arch=compute_90,code=[sm_90,compute_90]",
+        ]
+
+
+def write_extension(folder: Path, kernel: str) -> None:
+    """A tiny extension; its ops.cpp sees no torch, to be quick."""
+    (folder / "toy").mkdir()
+    (folder / "toy" / "__init__.py").touch()
+    (folder / "csrc" / "cpu").mkdir(parents=True)
+    (folder / "csrc" / "cpu" / "kernel_isa.cpp").write_text(kernel)
+    (folder / "csrc" / "ops.cpp").write_text("")
+    (folder / "setup.py").write_text(
+        f"import sys\nfrom pathlib import Path\nsys.path.insert(0, {str(COMMON)!r})\n"
+        "from build_extension import setup_extension\n"
+        "setup_extension(name='toy', package='toy', root=Path(__file__).parent)\n"
+    )
+
+
+def build_extension(folder: Path) -> subprocess.CompletedProcess:
+    command = [sys.executable, "setup.py", "-q", "build_ext", "--inplace"]
+    return subprocess.run(command, cwd=folder, capture_output=True, text=True)
+
+
+def test_every_instruction_set_is_in_the_library(tmp_path: Path) -> None:
+    kernel = """
+        #define NAME_(isa) lanes_##isa
+        #define NAME(isa) NAME_(isa)
+        extern "C" __attribute__((visibility("default"))) int NAME(GS_ISA)() {
+        #if defined(__AVX512F__)
+          return 16;
+        #elif defined(__AVX2__)
+          return 8;
+        #else
+          return 4;
+        #endif
+        }"""
+    write_extension(tmp_path, kernel)
+    done = build_extension(tmp_path)
+    assert done.returncode == 0, done.stderr
+    library = ctypes.CDLL(str(tmp_path / "toy" / "_backend.so"))
+    assert library.lanes_baseline() == 4
+    if platform.machine() in ("x86_64", "AMD64"):
+        assert library.lanes_avx2() == 8
+        assert library.lanes_avx512() == 16
+
+
+def test_compile_error_ends_without_traceback(tmp_path: Path) -> None:
+    write_extension(tmp_path, "int broken() { return no_such_name; }")
+    done = build_extension(tmp_path)
+    assert done.returncode == 1
+    assert "kernel_isa.cpp:1:23: error:" in done.stderr  # the compiler's own words
+    assert "Traceback" not in done.stderr
+    assert not (tmp_path / "toy" / "_backend.so").exists()
+
+
+def test_extension_asks_for_the_torch_it_was_built_with(builder: ModuleType) -> None:
+    major, minor = torch.__version__.split(".")[:2]
+    assert builder.torch_requirement() == f"torch=={major}.{minor}.*"
+
+
+def test_build_fetches_torch_only_where_there_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    backend = load("backend")
+    monkeypatch.setattr(backend.build_meta, "get_requires_for_build_wheel", lambda settings: [])
+    assert backend.get_requires_for_build_wheel() == []
+    monkeypatch.setattr(backend, "find_spec", lambda name: None)
+    (pin,) = backend.get_requires_for_build_wheel()
+    assert pin in (ROOT / "requirements.txt").read_text().splitlines() and pin.startswith("torch==")
+
+
+def test_requirements_are_pinned() -> None:
+    for name in ("requirements.txt", "requirements-dev.txt"):
+        for line in (ROOT / name).read_text().splitlines():
+            assert "==" in line or line.startswith(("#", "-r ")), f"{name}: {line}"
+
+
+def test_root_wheel_has_requirements_and_no_packages(tmp_path: Path) -> None:
+    for name in ("setup.py", "pyproject.toml", "requirements.txt"):
+        shutil.copy(ROOT / name, tmp_path)
+    for package in ("utils", "scene"):  # setuptools would find these by itself
+        (tmp_path / package).mkdir()
+        (tmp_path / package / "__init__.py").touch()
+    (tmp_path / "train.py").touch()
+    code = "from setuptools import build_meta; print(build_meta.build_wheel('.'))"
+    env = os.environ | {"PYTHONDONTWRITEBYTECODE": "1"}
+    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, env=env)
+    assert done.returncode == 0, done.stderr
+    with zipfile.ZipFile(tmp_path / done.stdout.splitlines()[-1]) as wheel:
+        names = wheel.namelist()
+        metadata = wheel.read(next(name for name in names if name.endswith("/METADATA"))).decode()
+    assert {name.split("/")[0].rpartition(".")[2] for name in names} == {"dist-info"}
+    requires = [line.partition(": ")[2] for line in metadata.splitlines() if line.startswith("Requires-Dist: ")]
+    extensions = [requirement for requirement in requires if " @ file://" in requirement]
+    assert len(extensions) == 3
+    # pip 23 to 26 may serve a wheel from their cache where the last part of the URL looks like "name-version".
+    assert not any(re.search(r"\w-\w", url.rpartition("/")[2]) for url in extensions)
+    # The torch that is installed here stays.
+    assert "torch" in requires and "torchvision" in requires
+    assert any(requirement.startswith("numpy==") for requirement in requires)
