@@ -15,18 +15,18 @@ struct Image {
 template <class T>
 struct Scene {
   int64_t count;
-  const T* means;       // (N, 3)
-  const T* opacities;   // (N)
-  const T* scales;      // (N, 3), or null with cov3d
-  const T* rotations;   // (N, 4) w x y z
-  const T* cov3d;       // (N, 6) xx xy xz yy yz zz, or null
-  const T* colors;      // (N, 3), or null with sh
-  const T* sh_dc;       // (N, 3), row stride below
-  const T* sh_rest;     // (N, M, 3)
+  const T* means;                  // (N, 3)
+  const T* opacities;              // (N)
+  const T* scales;                 // (N, 3), or null with cov3d
+  const T* rotations;              // (N, 4) w x y z
+  const T* cov3d;                  // (N, 6) xx xy xz yy yz zz, or null
+  const T* colors;                 // (N, 3), or null with sh
+  const T* sh_dc;                  // (N, 3), row stride below
+  const T* sh_rest;                // (N, M, 3)
   int64_t dc_stride, rest_stride;  // values from row to row
-  int rest_bands;       // M
+  int rest_bands;                  // M
   int sh_degree;
-  bool raw;             // opacities are logits, scales logs, rotations of any length
+  bool raw;  // opacities are logits, scales logs, rotations of any length
   bool antialiasing;
   T scale_modifier;
   const T* view;        // 4x4, transposed
@@ -91,10 +91,10 @@ struct BlendGradient {
   const int32_t* tile_counts;
   const T* transmittance;
   const int32_t* last;
-  const T* color;                 // dLoss/dcolor
-  const T* inverse_depth;         // or null
+  const T* color;                   // dLoss/dcolor
+  const T* inverse_depth;           // or null
   const T* transmittance_gradient;  // or null
-  T* moments;                     // out: (N, 10), Moments in math/footprint.h, then colour and inverse depth
+  T* moments;                       // out: (N, 10), Moments in math/footprint.h, then colour and inverse depth
 };
 
 // In-place Adam on `columns` leading values of each row.
@@ -108,21 +108,21 @@ struct AdamInput {
   double lr, beta1, beta2, eps, step;
 };
 
-#define GS_BACKEND                                                                                                   \
-  template <class T>                                                                                                 \
-  void project(const Executor&, const Scene<T>&, const Projected<T>&);                                               \
-  template <class T>                                                                                                 \
-  void project_vjp(const Executor&, const Scene<T>&, const int32_t* tile_counts, const T* moments,                   \
-                   const SceneGradient<T>&);                                                                         \
-  template <class T>                                                                                                 \
-  void mark_visible(const Executor&, int64_t count, const T* means, const T* view, bool* visible);                   \
-  template <class T>                                                                                                 \
-  void bin(const Executor&, int64_t count, const Projected<T>&, Image, int64_t instance_count, const Binned&);       \
-  template <class T>                                                                                                 \
-  void blend(const Executor&, const BlendInput<T>&, const Blended<T>&);                                              \
-  template <class T>                                                                                                 \
-  void blend_vjp(const Executor&, const BlendInput<T>&, const BlendGradient<T>&);                                    \
-  template <class T>                                                                                                 \
+#define GS_BACKEND                                                                                             \
+  template <class T>                                                                                           \
+  void project(const Executor&, const Scene<T>&, const Projected<T>&);                                         \
+  template <class T>                                                                                           \
+  void project_vjp(const Executor&, const Scene<T>&, const int32_t* tile_counts, const T* moments,             \
+                   const SceneGradient<T>&);                                                                   \
+  template <class T>                                                                                           \
+  void mark_visible(const Executor&, int64_t count, const T* means, const T* view, bool* visible);             \
+  template <class T>                                                                                           \
+  void bin(const Executor&, int64_t count, const Projected<T>&, Image, int64_t instance_count, const Binned&); \
+  template <class T>                                                                                           \
+  void blend(const Executor&, const BlendInput<T>&, const Blended<T>&);                                        \
+  template <class T>                                                                                           \
+  void blend_vjp(const Executor&, const BlendInput<T>&, const BlendGradient<T>&);                              \
+  template <class T>                                                                                           \
   void adam(const Executor&, const AdamInput<T>&);
 
 namespace baseline {

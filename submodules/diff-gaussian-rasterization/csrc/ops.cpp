@@ -17,18 +17,18 @@ using MaybeTensor = std::optional<Tensor>;
 constexpr int64_t kSplatValues = 10, kGradientValues = 10, kTile = 16;
 
 // Everything that describes the Gaussians and the camera, in the order of the schemas.
-#define SCENE_SCHEMA                                                                                              \
-  "Tensor means, Tensor opacities, Tensor? scales, Tensor? rotations, Tensor? cov3d, Tensor? colors, "            \
-  "Tensor? sh_dc, Tensor? sh_rest, Tensor view, Tensor projection, Tensor center, float tan_x, float tan_y, "     \
+#define SCENE_SCHEMA                                                                                          \
+  "Tensor means, Tensor opacities, Tensor? scales, Tensor? rotations, Tensor? cov3d, Tensor? colors, "        \
+  "Tensor? sh_dc, Tensor? sh_rest, Tensor view, Tensor projection, Tensor center, float tan_x, float tan_y, " \
   "int height, int width, int sh_degree, float scale_modifier, bool antialiasing, bool raw"
-#define SCENE_PARAMETERS                                                                                          \
-  const Tensor &means, const Tensor &opacities, const MaybeTensor &scales, const MaybeTensor &rotations,          \
-      const MaybeTensor &cov3d, const MaybeTensor &colors, const MaybeTensor &sh_dc, const MaybeTensor &sh_rest,  \
-      const Tensor &view, const Tensor &projection, const Tensor &center, double tan_x, double tan_y,             \
-      int64_t height, int64_t width, int64_t sh_degree, double scale_modifier, bool antialiasing, bool raw
-#define SCENE_ARGUMENTS                                                                                           \
-  means, opacities, scales, rotations, cov3d, colors, sh_dc, sh_rest, view, projection, center, tan_x, tan_y,     \
-      height, width, sh_degree, scale_modifier, antialiasing, raw
+#define SCENE_PARAMETERS                                                                                              \
+  const Tensor &means, const Tensor &opacities, const MaybeTensor &scales, const MaybeTensor &rotations,              \
+      const MaybeTensor &cov3d, const MaybeTensor &colors, const MaybeTensor &sh_dc, const MaybeTensor &sh_rest,      \
+      const Tensor &view, const Tensor &projection, const Tensor &center, double tan_x, double tan_y, int64_t height, \
+      int64_t width, int64_t sh_degree, double scale_modifier, bool antialiasing, bool raw
+#define SCENE_ARGUMENTS                                                                                               \
+  means, opacities, scales, rotations, cov3d, colors, sh_dc, sh_rest, view, projection, center, tan_x, tan_y, height, \
+      width, sh_degree, scale_modifier, antialiasing, raw
 
 // Owns the contiguous tensors that a gs::Scene points into.
 class SceneTensors {
@@ -56,7 +56,8 @@ class SceneTensors {
         image_{int(width), int(height)} {
     TORCH_CHECK(cov3d_.defined() != (scales_.defined() && rotations_.defined()),
                 "give either scales and rotations or cov3d");
-    TORCH_CHECK(colors_.defined() != (sh_dc_.defined() && sh_rest_.defined()), "give either colors or sh_dc and sh_rest");
+    TORCH_CHECK(colors_.defined() != (sh_dc_.defined() && sh_rest_.defined()),
+                "give either colors or sh_dc and sh_rest");
     TORCH_CHECK(sh_degree >= 0 && sh_degree <= 3, "sh_degree must be 0 to 3, got ", sh_degree);
     TORCH_CHECK(colors_.defined() || sh_rest_.size(1) >= (sh_degree + 1) * (sh_degree + 1) - 1, "sh_rest has ",
                 colors_.defined() ? 0 : sh_rest_.size(1), " bands, too few for sh_degree ", sh_degree);
@@ -107,8 +108,7 @@ class SceneTensors {
     TORCH_CHECK(t.device().is_cpu(), name, " must be on the CPU, got ", t.device());
     TORCH_CHECK(t.dim() >= 1 && t.size(0) == count_ && t.numel() == count_ * row, name, " must be (", count_, ", ", row,
                 "), got ", t.sizes());
-    TORCH_CHECK(t.scalar_type() == dtype_, name, " must have the dtype of means, got ",
-                t.scalar_type());
+    TORCH_CHECK(t.scalar_type() == dtype_, name, " must have the dtype of means, got ", t.scalar_type());
     return t.contiguous();
   }
   // (N, bands, 3); rows may lie apart, so that a slice of more bands needs no copy.
@@ -142,9 +142,7 @@ void with_scalar(at::ScalarType type, const F& f) {
     f(double());
 }
 
-int64_t tiles_of(gs::Image image) {
-  return ((image.width + kTile - 1) / kTile) * ((image.height + kTile - 1) / kTile);
-}
+int64_t tiles_of(gs::Image image) { return ((image.width + kTile - 1) / kTile) * ((image.height + kTile - 1) / kTile); }
 
 struct ProjectedTensors {
   Tensor splats, depths, rects, tile_counts, radii;
@@ -158,8 +156,8 @@ struct ProjectedTensors {
 ProjectedTensors project(const SceneTensors& in) {
   const int64_t n = in.count();
   const auto ints = in.options().dtype(at::kInt);
-  ProjectedTensors out{at::empty({n, kSplatValues}, in.options()), at::empty({n}, in.options()), at::empty({n, 4}, ints),
-                       at::empty({n}, ints), at::empty({n}, ints)};
+  ProjectedTensors out{at::empty({n, kSplatValues}, in.options()), at::empty({n}, in.options()),
+                       at::empty({n, 4}, ints), at::empty({n}, ints), at::empty({n}, ints)};
   with_scalar(in.dtype(), [&](auto zero) {
     using T = decltype(zero);
     GS_DISPATCH(project, gs::torch_executor(), in.scene<T>(), out.pointers<T>());
@@ -182,9 +180,9 @@ BinnedTensors bin(ProjectedTensors& in, gs::Image image, bool slots) {
   const auto ints = in.depths.options().dtype(at::kInt), longs = in.depths.options().dtype(at::kLong);
   BinnedTensors out{at::empty({total}, ints), at::empty({slots ? total : 0}, ints),
                     at::empty({tiles_of(image) + 1}, longs), at::empty({slots ? n : 0}, longs)};
-  const gs::Binned binned{out.instances.mutable_data_ptr<int32_t>(), slots ? out.slots.mutable_data_ptr<int32_t>() : nullptr,
-                          out.ranges.mutable_data_ptr<int64_t>(),
-                          slots ? out.slot_offsets.mutable_data_ptr<int64_t>() : nullptr};
+  const gs::Binned binned{
+      out.instances.mutable_data_ptr<int32_t>(), slots ? out.slots.mutable_data_ptr<int32_t>() : nullptr,
+      out.ranges.mutable_data_ptr<int64_t>(), slots ? out.slot_offsets.mutable_data_ptr<int64_t>() : nullptr};
   with_scalar(in.depths.scalar_type(), [&](auto zero) {
     using T = decltype(zero);
     GS_DISPATCH(bin, gs::torch_executor(), n, in.pointers<T>(), image, total, binned);
@@ -273,8 +271,9 @@ Gradients project_vjp(const SceneTensors& in, const Tensor& tile_counts, const T
     sizes.insert(sizes.end(), tail.begin(), tail.end());
     return at::empty(sizes, in.options());
   };
-  std::array<Tensor, 9> g{make(0, {3}), make(1, {3}), make(2, {1}), make(3, {3}),   make(4, {4}),
-                          make(5, {6}), make(6, {3}), make(7, {1, 3}), make(8, {in.rest_bands(), 3})};
+  std::array<Tensor, 9> g{make(0, {3}), make(1, {3}),    make(2, {1}),
+                          make(3, {3}), make(4, {4}),    make(5, {6}),
+                          make(6, {3}), make(7, {1, 3}), make(8, {in.rest_bands(), 3})};
   with_scalar(in.dtype(), [&](auto zero) {
     using T = decltype(zero);
     const auto out = [&](int which) { return wanted[which] ? g[which].mutable_data_ptr<T>() : nullptr; };
@@ -317,8 +316,8 @@ Gradients project_vjp_op(SCENE_PARAMETERS, const Tensor& tile_counts, const Tens
 
 using Rasterized = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor>;
 
-Rasterized rasterize_op(const Tensor& /*means2d: only receives a gradient*/, SCENE_PARAMETERS,
-                        const Tensor& background, bool inverse_depth, bool train) {
+Rasterized rasterize_op(const Tensor& /*means2d: only receives a gradient*/, SCENE_PARAMETERS, const Tensor& background,
+                        bool inverse_depth, bool train) {
   const SceneTensors scene(SCENE_ARGUMENTS);
   ProjectedTensors p = project(scene);
   BinnedTensors b = bin(p, scene.image(), train);
@@ -327,12 +326,11 @@ Rasterized rasterize_op(const Tensor& /*means2d: only receives a gradient*/, SCE
           b.instances, b.slots,         b.ranges,        b.slot_offsets, o.last};
 }
 
-Gradients rasterize_vjp_op(SCENE_PARAMETERS, const Tensor& background, const Tensor& splats,
-                           const Tensor& tile_counts, const Tensor& instances, const Tensor& slots,
-                           const Tensor& ranges, const Tensor& slot_offsets, const Tensor& last,
-                           const Tensor& transmittance, const Tensor& grad_color,
-                           const MaybeTensor& grad_transmittance, const MaybeTensor& grad_inverse_depth,
-                           std::array<bool, 9> wanted) {
+Gradients rasterize_vjp_op(SCENE_PARAMETERS, const Tensor& background, const Tensor& splats, const Tensor& tile_counts,
+                           const Tensor& instances, const Tensor& slots, const Tensor& ranges,
+                           const Tensor& slot_offsets, const Tensor& last, const Tensor& transmittance,
+                           const Tensor& grad_color, const MaybeTensor& grad_transmittance,
+                           const MaybeTensor& grad_inverse_depth, std::array<bool, 9> wanted) {
   const SceneTensors scene(SCENE_ARGUMENTS);
   const Tensor moments = blend_vjp(splats, tile_counts, instances, slots, ranges, slot_offsets, background, last,
                                    transmittance, grad_color, grad_transmittance, grad_inverse_depth);
@@ -352,8 +350,8 @@ Tensor mark_visible_op(const Tensor& means, const Tensor& view) {
   return visible;
 }
 
-void adam_op(Tensor& value, const Tensor& gradient, Tensor& mean, Tensor& square, double lr, double beta1,
-             double beta2, double eps, double step, int64_t columns) {
+void adam_op(Tensor& value, const Tensor& gradient, Tensor& mean, Tensor& square, double lr, double beta1, double beta2,
+             double eps, double step, int64_t columns) {
   for (const Tensor* t : {&gradient, static_cast<const Tensor*>(&mean), static_cast<const Tensor*>(&square)})
     TORCH_CHECK(t->sizes() == value.sizes() && t->scalar_type() == value.scalar_type(),
                 "gradient and moments must have the shape and dtype of the parameter, ", value.sizes(), ", got ",
@@ -385,8 +383,7 @@ void adam_op(Tensor& value, const Tensor& gradient, Tensor& mean, Tensor& square
 }  // namespace
 
 TORCH_LIBRARY(diff_gaussian_rasterization, m) {
-  m.def("project(" SCENE_SCHEMA
-        ") -> (Tensor splats, Tensor depths, Tensor rects, Tensor tile_counts, Tensor radii)");
+  m.def("project(" SCENE_SCHEMA ") -> (Tensor splats, Tensor depths, Tensor rects, Tensor tile_counts, Tensor radii)");
   m.def(
       "bin(Tensor splats, Tensor depths, Tensor rects, Tensor tile_counts, int height, int width, bool train) -> "
       "(Tensor instances, Tensor slots, Tensor ranges, Tensor slot_offsets)");

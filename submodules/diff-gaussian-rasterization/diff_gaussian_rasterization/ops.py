@@ -13,20 +13,20 @@ if TYPE_CHECKING:
     from diff_gaussian_rasterization import GaussianRasterizationSettings
 
 _LIBRARY = Path(__file__).with_name("_backend.so")
-if not _LIBRARY.exists():
-    raise ImportError(
-        "diff_gaussian_rasterization is not built: run `pip install ./submodules/diff-gaussian-rasterization` "
-        "in the repository's root"
-    )
-torch.ops.load_library(str(_LIBRARY))
+try:
+    torch.ops.load_library(_LIBRARY)
+except OSError as error:
+    what = f"does not fit torch {torch.__version__}" if _LIBRARY.exists() else "is not built"
+    remedy = "run `pip install ./submodules/diff-gaussian-rasterization` in the repository"
+    raise ImportError(f"diff_gaussian_rasterization {what}: {remedy}") from error
+
 _ops = torch.ops.diff_gaussian_rasterization
 
 # Inputs that receive gradients, in the order of `wanted` and of the results of rasterize_vjp.
 GRADIENTS = ("means", "means2d", "opacities", "scales", "rotations", "cov3d", "colors", "sh_dc", "sh_rest")
-_SCENE = (
-    "means opacities scales rotations cov3d colors sh_dc sh_rest view projection center tan_x tan_y height width "
-    "sh_degree scale_modifier antialiasing raw"
-).split()
+_SCENE = ("means", "opacities", "scales", "rotations", "cov3d", "colors", "sh_dc", "sh_rest")
+_SCENE += ("view", "projection", "center", "tan_x", "tan_y", "height", "width")
+_SCENE += ("sh_degree", "scale_modifier", "antialiasing", "raw")
 _TILE = 16
 _VALUES = 10  # of a row of `splats` and of `moments`
 

@@ -1,6 +1,5 @@
-#include "../math/adam.h"
-
 #include "../launch.h"
+#include "../math/adam.h"
 
 GS_ISA_BEGIN
 

@@ -1,5 +1,3 @@
-#include "../math/blend.h"
-
 #include <algorithm>
 #include <cstring>
 #include <limits>
@@ -7,6 +5,7 @@
 #include <vector>
 
 #include "../launch.h"
+#include "../math/blend.h"
 #include "../math/exp2.h"
 #include "../math/footprint.h"
 #include "../math/tiles.h"
@@ -217,8 +216,7 @@ class CompactSlots {
   // The row of a slot, or where it would be.
   T* row(int64_t slot) {
     const uint64_t lower = (uint64_t(1) << (slot & 63)) - 1;
-    const int64_t rank =
-        before_[slot >> 6] + (slot & 63 ? __builtin_popcountll(bits_[slot >> 6] & lower) : 0);
+    const int64_t rank = before_[slot >> 6] + (slot & 63 ? __builtin_popcountll(bits_[slot >> 6] & lower) : 0);
     return rows_.get() + kGradientValues * rank;
   }
 
@@ -283,8 +281,7 @@ void blend_vjp(const Executor& executor, const BlendInput<T>& in, const BlendGra
   });
   slots.allocate();
   const auto run = g.inverse_depth ? blend_tile_vjp<T, true> : blend_tile_vjp<T, false>;
-  for_dynamic(executor, tiles, 1,
-              [&](int64_t tile, int64_t) { run(in, g, tile, processed[tile], slots); });
+  for_dynamic(executor, tiles, 1, [&](int64_t tile, int64_t) { run(in, g, tile, processed[tile], slots); });
   for_dynamic(executor, g.count, 1024, [&](int64_t begin, int64_t end) {
     for (int64_t i = begin; i < end; ++i) {
       double sums[kGradientValues] = {};  // a splat may have thousands of tiles

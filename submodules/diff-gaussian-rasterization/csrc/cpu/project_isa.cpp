@@ -44,11 +44,12 @@ Loaded<T> load(const Scene<T>& s, int64_t i) {
   return out;
 }
 
-// NaN or Inf in most inputs makes the footprint, the mean or the colour not finite, and those are checked; Cholesky's
-// guards could hide one.
+// Of what does not show in the mean or the colour, which are checked once computed.
 template <class T>
-bool finite_covariance(const Scene<T>& s, int64_t i) {
-  return !s.cov3d || (finite(load3(s.cov3d + 6 * i)) && finite(load3(s.cov3d + 6 * i + 3)));
+bool finite_shape(const Scene<T>& s, int64_t i) {
+  if (!std::isfinite(s.opacities[i])) return false;
+  if (s.cov3d) return finite(load3(s.cov3d + 6 * i)) && finite(load3(s.cov3d + 6 * i + 3));
+  return finite(load3(s.scales + 3 * i)) && finite(load3(s.rotations + 4 * i)) && std::isfinite(s.rotations[4 * i + 3]);
 }
 
 template <class T>
@@ -57,12 +58,17 @@ Vec3<T> unclamped_color(const Scene<T>& s, int64_t i, const T* basis) {
 }
 
 template <class T>
+bool usable_color(Vec3<T> c) {
+  return larger(larger(std::abs(c.x), std::abs(c.y)), std::abs(c.z)) < T(kMaxColor) && finite(c);
+}
+
+template <class T>
 void project_one(const Scene<T>& s, const Camera<T>& camera, int64_t i, const Projected<T>& out) {
   out.tile_counts[i] = 0;
   out.radii[i] = 0;
   Splat<T> splat;
   int radius;
-  if (!finite_covariance(s, i)) return;
+  if (!finite_shape(s, i)) return;
   const Gaussian<T> gaussian = load(s, i).gaussian;
   const bool visible = project_splat(camera, gaussian, s.antialiasing, splat, out.depths[i], radius);
   out.radii[i] = radius;
@@ -73,14 +79,14 @@ void project_one(const Scene<T>& s, const Camera<T>& camera, int64_t i, const Pr
   Vec3<T> color;
   if (s.colors) {
     color = load3(s.colors + 3 * i);
-    if (!finite(color)) return;
+    if (!usable_color(color)) return;
   } else {
     T basis[sh_count(kMaxShDegree)];
     Vec3<T> direction;
     sh_direction(gaussian.mean - camera.center, direction);
     sh_basis(s.sh_degree, direction, basis);
     color = unclamped_color(s, i, basis);
-    if (!finite(color)) return;  // before the clamp, which would turn -Inf into 0
+    if (!usable_color(color)) return;  // before the clamp, which would turn -Inf into 0
     color = {larger(color.x, T(0)), larger(color.y, T(0)), larger(color.z, T(0))};
   }
   splat.r = color.x, splat.g = color.y, splat.b = color.z;
@@ -186,10 +192,9 @@ void mark_visible(const Executor& executor, int64_t count, const T* means, const
   });
 }
 
-#define GS_INSTANTIATE(T)                                                                         \
-  template void project<T>(const Executor&, const Scene<T>&, const Projected<T>&);                \
-  template void project_vjp<T>(const Executor&, const Scene<T>&, const int32_t*, const T*,        \
-                               const SceneGradient<T>&);                                          \
+#define GS_INSTANTIATE(T)                                                                                            \
+  template void project<T>(const Executor&, const Scene<T>&, const Projected<T>&);                                   \
+  template void project_vjp<T>(const Executor&, const Scene<T>&, const int32_t*, const T*, const SceneGradient<T>&); \
   template void mark_visible<T>(const Executor&, int64_t, const T*, const T*, bool*);
 GS_INSTANTIATE(float)
 GS_INSTANTIATE(double)

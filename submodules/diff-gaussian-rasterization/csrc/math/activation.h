@@ -1,5 +1,6 @@
 #pragma once
 // From what is optimised (log scale, logit, free quaternion) to what is rendered, with derivatives.
+#include "constants.h"
 #include "vec.h"
 
 GS_ISA_BEGIN
@@ -22,13 +23,14 @@ struct Quat {
   T w, x, y, z;
 };
 
-// q / |q|; a zero quaternion counts as the identity. `norm` is what normalise_vjp needs (0 for that case).
+// q / |q|; a quaternion shorter than 1e-30 counts as the identity. `norm` is what normalise_vjp needs (0 for that
+// case).
 template <class T>
 GS_HD Quat<T> normalise(Quat<T> q, T& norm) {
   // Scaled by the largest entry first: squares of 1e-20 and 1e20 leave the range of float.
   const T m = larger(larger(std::abs(q.w), std::abs(q.x)), larger(std::abs(q.y), std::abs(q.z)));
   norm = 0;
-  if (!(m > 0)) return {1, 0, 0, 0};
+  if (m < T(kMinQuaternion)) return {1, 0, 0, 0};
   const Quat<T> s = {q.w / m, q.x / m, q.y / m, q.z / m};
   const T r = std::sqrt(s.w * s.w + s.x * s.x + s.y * s.y + s.z * s.z);
   norm = m * r;

@@ -19,7 +19,8 @@ struct LocalSplat {
 
 template <class T>
 GS_HD LocalSplat<T> localise(const Splat<T>& s, T origin_x, T origin_y) {
-  return {s.y - origin_y, s.l11, s.l12, s.l22, s.l11 * (origin_x - s.x), s.log2_opacity, s.r, s.g, s.b, s.inverse_depth};
+  return {s.y - origin_y, s.l11, s.l12, s.l22, s.l11 * (origin_x - s.x),
+          s.log2_opacity, s.r,   s.g,   s.b,   s.inverse_depth};
 }
 
 // Along a row of pixels v is constant: log2(alpha) = top - u^2, u = l11 x + u0.

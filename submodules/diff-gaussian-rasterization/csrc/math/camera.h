@@ -7,13 +7,13 @@ GS_ISA_BEGIN
 // Pinhole camera, x right, y down, z forward; pixel centres at integers.
 template <class T>
 struct Camera {
-  Vec3<T> row_x, row_y, row_z;  // world-to-view rotation
-  Vec3<T> translation;          // world-to-view
-  Vec3<T> center;               // in the world
-  T focal_x, focal_y;           // px, of the covariance's Jacobian
+  Vec3<T> row_x, row_y, row_z;   // world-to-view rotation
+  Vec3<T> translation;           // world-to-view
+  Vec3<T> center;                // in the world
+  T focal_x, focal_y;            // px, of the covariance's Jacobian
   T mean_focal_x, mean_focal_y;  // px, of the mean: equal to the above unless the caller's matrices disagree
-  T axis_x, axis_y;             // px, where the optical axis meets the image
-  T ray_min_x, ray_max_x;       // limits of x/z in the Jacobian
+  T axis_x, axis_y;              // px, where the optical axis meets the image
+  T ray_min_x, ray_max_x;        // limits of x/z in the Jacobian
   T ray_min_y, ray_max_y;
   int width, height;
 };

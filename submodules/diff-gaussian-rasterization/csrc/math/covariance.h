@@ -22,13 +22,11 @@ GS_HD void rotation_columns(Quat<T> q, Vec3<T> column[3]) {
 // From gradients of the columns to that of q, entry by entry of the above.
 template <class T>
 GS_HD Quat<T> rotation_columns_vjp(Quat<T> q, const Vec3<T> g[3]) {
-  return {2 * (q.z * (g[0].y - g[1].x) + q.y * (g[2].x - g[0].z) + q.x * (g[1].z - g[2].y)),
-          2 * (q.y * (g[0].y + g[1].x) + q.z * (g[0].z + g[2].x) + q.w * (g[1].z - g[2].y)) -
-              4 * q.x * (g[1].y + g[2].z),
-          2 * (q.x * (g[0].y + g[1].x) + q.z * (g[1].z + g[2].y) + q.w * (g[2].x - g[0].z)) -
-              4 * q.y * (g[0].x + g[2].z),
-          2 * (q.x * (g[0].z + g[2].x) + q.y * (g[1].z + g[2].y) + q.w * (g[0].y - g[1].x)) -
-              4 * q.z * (g[0].x + g[1].y)};
+  return {
+      2 * (q.z * (g[0].y - g[1].x) + q.y * (g[2].x - g[0].z) + q.x * (g[1].z - g[2].y)),
+      2 * (q.y * (g[0].y + g[1].x) + q.z * (g[0].z + g[2].x) + q.w * (g[1].z - g[2].y)) - 4 * q.x * (g[1].y + g[2].z),
+      2 * (q.x * (g[0].y + g[1].x) + q.z * (g[1].z + g[2].y) + q.w * (g[2].x - g[0].z)) - 4 * q.y * (g[0].x + g[2].z),
+      2 * (q.x * (g[0].z + g[2].x) + q.y * (g[1].z + g[2].y) + q.w * (g[0].y - g[1].x)) - 4 * q.z * (g[0].x + g[1].y)};
 }
 
 // Axes of a given covariance (xx, xy, xz, yy, yz, zz) by Cholesky; a pivot that rounding made negative is zero.

@@ -10,11 +10,13 @@ GS_ISA_BEGIN
 template <class T>
 struct Footprint {
   Vec3<T> m1, m2;
-  Vec3<T> minors;     // m1 x m2, the 2x2 minors of M
-  T a, b, c;          // dilated covariance xx, xy, yy
-  T schur;            // det / c
+  Vec3<T> minors;  // m1 x m2, the 2x2 minors of M
+  T a0, c0;        // covariance xx, yy
+  T a, b, c;       // dilated covariance xx, xy, yy
+  T schur;         // det / c
+  T excess;        // (det - det undilated) / c
   T l11, l12, l22;
-  T compensation;     // sqrt(det undilated / det), floored: the antialiasing factor
+  T compensation;  // sqrt(det undilated / det), floored: the antialiasing factor
   bool floored;
 };
 
@@ -26,12 +28,13 @@ GS_HD Footprint<T> make_footprint(Vec3<T> m1, Vec3<T> m2, Vec3<T> minors) {
   const T h = T(kDilation), k = T(kHalfLog2e);
   Footprint<T> f;
   f.m1 = m1, f.m2 = m2, f.minors = minors;
-  const T a0 = dot(m1, m1), c0 = dot(m2, m2);
-  f.a = a0 + h, f.b = dot(m1, m2), f.c = c0 + h;
+  f.a0 = dot(m1, m1), f.c0 = dot(m2, m2);
+  f.a = f.a0 + h, f.b = dot(m1, m2), f.c = f.c0 + h;
   const T root = std::sqrt(f.c);
   const Vec3<T> n = {minors.x / root, minors.y / root, minors.z / root};
   const T det0 = dot(n, n);
-  f.schur = det0 + h * ((a0 + c0 + h) / f.c);
+  f.excess = h * ((f.a0 + f.c0 + h) / f.c);
+  f.schur = det0 + f.excess;
   f.l22 = std::sqrt(k / f.c);
   f.l11 = std::sqrt(k / f.schur);
   f.l12 = -(f.b / f.c) * f.l11;
@@ -55,24 +58,31 @@ GS_HD void mean_vjp(const Footprint<T>& f, const Moments<T>& s, T& gx, T& gy) {
   gy = two_ln2 * (f.l12 * s.qu + f.l22 * s.qv);
 }
 
+// det/det0 - 1, where the compensation is not floored.
+template <class T>
+GS_HD T compensation_excess(const Footprint<T>& f) {
+  return f.excess / (f.compensation * f.compensation * f.schur);
+}
+
 // dM = 4 ln2^2 L^T W2 (L M): covariance's gradient is 2 ln2^2 L^T W2 L, and covariance = M M^T + const.
 // The first row of L M is l11 (m1 - (b/c) m2) = l11 (m2 x (m1 x m2) + h m1) / c, without the cancellation.
 // With antialiasing the opacity carries sqrt(det0/det): d ln = (ddet0/det0 - ddet/det)/2,
-// ddet0/dm1 = 2 m2 x (m1 x m2), ddet0/dm2 = 2 (m1 x m2) x m1, ddet = ddet0 + 2 h dM.
+// ddet0/dm1 = 2 m2 x (m1 x m2), ddet0/dm2 = 2 (m1 x m2) x m1, ddet = ddet0 + 2 h dM; 1/det0 - 1/det is taken as
+// excess / (det0 det), since the two are equal but for rounding where the splat is large.
 template <class T>
 GS_HD void footprint_vjp(const Footprint<T>& f, const Moments<T>& s, bool antialiasing, Vec3<T>& g1, Vec3<T>& g2) {
   const T h = T(kDilation), four_ln2_sq = T(4 * kLn2 * kLn2);
-  const Vec3<T> d1 = (1 / f.c) * cross(f.m2, f.minors);  // half of ddet0/dm1, over c
+  const T root = 1 / std::sqrt(f.c);                       // both factors by this: the product overflows
+  const Vec3<T> d1 = cross(root * f.m2, root * f.minors);  // half of ddet0/dm1, over c
   const Vec3<T> lm_u = f.l11 * (d1 + (h / f.c) * f.m1), lm_v = f.l22 * f.m2;
   const Vec3<T> wu = s.quu * lm_u + s.quv * lm_v, wv = s.quv * lm_u + s.qvv * lm_v;
   g1 = (four_ln2_sq * f.l11) * wu;
   g2 = four_ln2_sq * (f.l12 * wu + f.l22 * wv);
   if (!antialiasing || f.floored) return;
-  const Vec3<T> d2 = (1 / f.c) * cross(f.minors, f.m1);
-  const T ratio = f.compensation * f.compensation;
-  const T undilated = s.q / (f.schur * ratio), dilated = s.q / f.schur;
-  g1 = g1 + (undilated - dilated) * d1 - (dilated * h / f.c) * f.m1;
-  g2 = g2 + (undilated - dilated) * d2 - (dilated * h / f.c) * f.m2;
+  const Vec3<T> d2 = cross(root * f.minors, root * f.m1);
+  const T per_det = s.q / f.schur, difference = per_det * compensation_excess(f), dilation = per_det * h / f.c;
+  g1 = g1 + difference * d1 - dilation * f.m1;
+  g2 = g2 + difference * d2 - dilation * f.m2;
 }
 
 // Gradient of the 2D covariance (xx, xy, yy; xy once, of the symmetric matrix), for covariances that were given.
@@ -85,11 +95,10 @@ GS_HD void covariance2d_vjp(const Footprint<T>& f, const Moments<T>& s, bool ant
   g[1] = two_ln2_sq * (f.l12 * uu + f.l22 * uv);
   g[2] = two_ln2_sq * (f.l12 * vu + f.l22 * vv);
   if (!antialiasing || f.floored) return;
-  const T h = T(kDilation), ratio = f.compensation * f.compensation;
-  const T dilated = T(0.5) * s.q / f.schur / f.c, undilated = dilated / ratio;
-  g[0] += undilated * (f.c - h) - dilated * f.c;
-  g[1] -= (undilated - dilated) * f.b;
-  g[2] += undilated * (f.a - h) - dilated * f.a;
+  const T h = T(kDilation), excess = compensation_excess(f), half_per_det = T(0.5) * s.q / f.schur / f.c;
+  g[0] += half_per_det * (excess * f.c0 - h);
+  g[1] -= half_per_det * (excess * f.b);
+  g[2] += half_per_det * (excess * f.a0 - h);
 }
 
 // ceil(3 sigma) of the larger axis, the reference's rule; at most 2^30.

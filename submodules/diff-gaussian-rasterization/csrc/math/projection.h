@@ -54,10 +54,11 @@ GS_HD Footprint<T> splat_footprint(const Camera<T>& cam, const Perspective<T>& p
   return make_footprint(m1, m2, minors);
 }
 
-// Everything of a splat but its colour. False: culled (behind, not finite, too faint to be seen anywhere).
+// Everything of a splat but its colour; opacity, scales and rotation must be finite. False: culled (behind, not finite
+// on the image, too faint to be seen anywhere).
 template <class T>
-GS_HD bool project_splat(const Camera<T>& cam, const Gaussian<T>& gaussian, bool antialiasing, Splat<T>& splat, T& depth,
-                         int& radius) {
+GS_HD bool project_splat(const Camera<T>& cam, const Gaussian<T>& gaussian, bool antialiasing, Splat<T>& splat,
+                         T& depth, int& radius) {
   radius = 0;
   const Vec3<T> view = to_view(cam, gaussian.mean);
   if (!in_front(view.z) || !finite(view)) return false;
@@ -68,12 +69,13 @@ GS_HD bool project_splat(const Camera<T>& cam, const Gaussian<T>& gaussian, bool
   splat.l11 = f.l11, splat.l12 = f.l12, splat.l22 = f.l22;
   splat.inverse_depth = p.inverse_z;
   depth = view.z;
-  if (!finite(Vec3<T>{splat.x, splat.y, f.l12}) || !(f.l11 > 0) || !(f.l22 > 0) || !std::isfinite(f.a + f.c)) return false;
+  if (!finite(Vec3<T>{splat.x, splat.y, f.l12}) || !(f.l11 > 0) || !(f.l22 > 0) || !std::isfinite(f.a + f.c))
+    return false;
   radius = footprint_radius(f);
   if (!radius_on_image(splat.x, splat.y, radius, cam.width, cam.height)) radius = 0;
   const T log2_opacity = gaussian.log2_opacity + (antialiasing ? std::log2(f.compensation) : T(0));
   splat.log2_opacity = log2_opacity < T(kMaxLog2Opacity) ? log2_opacity : T(kMaxLog2Opacity);
-  return splat.log2_opacity >= T(kLog2MinAlpha) - T(1e-3);  // false for NaN; the margin is tile_rect's
+  return splat.log2_opacity >= T(kLog2MinAlpha) - T(1e-3);  // the margin is tile_rect's
 }
 
 // What project_splat's inputs receive; log2_opacity as d/d ln(opacity).
@@ -126,7 +128,8 @@ GS_HD GaussianGradient<T> project_splat_vjp(const Camera<T>& cam, const Gaussian
   T g_ray_x = cam.mean_focal_x * g.pixel_x, g_ray_y = cam.mean_focal_y * g.pixel_y;
   if (p.clamped_x == p.ray_x) g_ray_x -= cam.focal_x * p.inverse_z * dot(cam.row_z, gp1);
   if (p.clamped_y == p.ray_y) g_ray_y -= cam.focal_y * p.inverse_z * dot(cam.row_z, gp2);
-  const T g_z = -(dot(p.p1, gp1) + dot(p.p2, gp2) + p.ray_x * g_ray_x + p.ray_y * g_ray_y + p.inverse_z * g_inverse_depth);
+  const T g_z =
+      -(dot(p.p1, gp1) + dot(p.p2, gp2) + p.ray_x * g_ray_x + p.ray_y * g_ray_y + p.inverse_z * g_inverse_depth);
   g.mean = p.inverse_z * (g_ray_x * cam.row_x + g_ray_y * cam.row_y + g_z * cam.row_z);
   return g;
 }

@@ -1,0 +1,100 @@
+"""From a camera and a model to an image, and to what adaptive density control needs of it."""
+
+import argparse
+import math
+
+import torch
+from diff_gaussian_rasterization import GaussianRasterizationSettings, rasterize
+from torch import Tensor
+
+from scene.cameras import Camera, MiniCam
+from scene.gaussian_model import GaussianModel
+from utils.sh_utils import eval_sh
+from utils.system_utils import UserError
+
+
+def render(
+    viewpoint_camera: Camera | MiniCam,
+    pc: GaussianModel,
+    pipe: argparse.Namespace,
+    bg_color: Tensor,
+    scaling_modifier: float = 1.0,
+    separate_sh: bool = False,
+    override_color: Tensor | None = None,
+    use_trained_exp: bool = False,
+    *,
+    want_depth: bool = False,
+) -> dict[str, Tensor | None]:
+    """Render one view.
+
+    bg_color: (3,) in [0, 1] on the model's device. scaling_modifier multiplies all scales. override_color: (N, 3)
+    instead of SH. separate_sh: accepted for callers of the reference; the SH bands always go separately.
+    pipe: convert_SHs_python, compute_cov3D_python, debug, antialiasing.
+
+    Returns `render` (3, H, W) clamped to [0, 1], also in training, so values outside get no gradient;
+    `viewspace_points` (N, 3) whose gradient is that of the screen means, per NDC unit; `visibility_filter` (n, 1) int64
+    indices of the Gaussians with radius > 0; `radii` (N,) int32 pixels; `depth` inverse depth (1, H, W), or None
+    unless want_depth.
+    """
+    if use_trained_exp:
+        raise UserError("exposure compensation is not built yet; leave use_trained_exp off")
+    xyz = pc.get_xyz
+    viewspace_points = torch.zeros_like(xyz, requires_grad=xyz.requires_grad and torch.is_grad_enabled())
+    result = rasterize(
+        xyz,
+        viewspace_points,
+        settings=_settings(viewpoint_camera, pc.active_sh_degree, pipe, bg_color, scaling_modifier),
+        want_inverse_depth=want_depth,
+        **_geometry(pc, pipe.compute_cov3D_python, scaling_modifier),
+        **_colors(pc, pipe.convert_SHs_python, viewpoint_camera, override_color),
+    )
+    return {
+        "render": result.color.clamp(0, 1),
+        "viewspace_points": viewspace_points,
+        "visibility_filter": (result.radii > 0).nonzero(),
+        "radii": result.radii,
+        "depth": result.inverse_depth,
+    }
+
+
+def _settings(
+    camera: Camera | MiniCam, sh_degree: int, pipe: argparse.Namespace, background: Tensor, scaling_modifier: float
+) -> GaussianRasterizationSettings:
+    return GaussianRasterizationSettings(
+        image_height=int(camera.image_height),
+        image_width=int(camera.image_width),
+        tanfovx=math.tan(camera.FoVx / 2),
+        tanfovy=math.tan(camera.FoVy / 2),
+        bg=background,
+        scale_modifier=scaling_modifier,
+        viewmatrix=camera.world_view_transform,
+        projmatrix=camera.full_proj_transform,
+        sh_degree=sh_degree,
+        campos=camera.camera_center,
+        prefiltered=False,
+        debug=pipe.debug,
+        antialiasing=pipe.antialiasing,
+    )
+
+
+def _geometry(pc: GaussianModel, in_python: bool, scaling_modifier: float) -> dict[str, Tensor | bool]:
+    """Shapes and opacities: raw, with the activations inside the kernels (faster, and the same bits for any number of
+    threads), or the plain path through the model's activations."""
+    if in_python:
+        return {"opacities": pc.get_opacity, "cov3d": pc.get_covariance(scaling_modifier)}
+    return {"opacities": pc._opacity, "scales": pc._scaling, "rotations": pc._rotation, "raw": True}
+
+
+def _colors(
+    pc: GaussianModel, in_python: bool, camera: Camera | MiniCam, override_color: Tensor | None
+) -> dict[str, Tensor]:
+    if override_color is not None:
+        return {"colors": override_color}
+    if in_python:
+        direction = torch.nn.functional.normalize(pc.get_xyz - camera.camera_center)
+        color = eval_sh(pc.active_sh_degree, pc.get_features.transpose(1, 2), direction)
+        return {"colors": (color + 0.5).clamp_min(0.0)}
+    rest = pc.get_features_rest
+    if pc.active_bands == 0:
+        rest = rest.detach()[:, :0]  # no band is read, so no gradient full of zeros need be written
+    return {"sh_dc": pc.get_features_dc, "sh_rest": rest}

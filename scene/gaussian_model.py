@@ -1,0 +1,378 @@
+"""The trained model: raw tensors of N Gaussians, their optimiser, and adaptive density control."""
+
+import argparse
+import os
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from simple_knn._C import distCUDA2
+from torch import Tensor, nn
+
+from scene import densification as adc
+from scene.gaussian_optimizer import GaussianAdam
+from scene.gaussian_ply import GaussianRows, read_ply, write_ply
+from utils.general_utils import build_scaling_rotation, get_expon_lr_func, strip_symmetric
+from utils.graphics_utils import BasicPointCloud
+from utils.sh_utils import RGB2SH
+from utils.system_utils import UserError, compute_device
+
+INITIAL_OPACITY = 0.1
+MIN_DISTANCE2 = 1e-7  # floor of the squared distance to the neighbours, square world units: duplicates get a size
+LONE_POINT_SCALE = 0.01  # initial scale as a part of the extent where there are too few points to have neighbours
+
+# Optimiser group -> attribute, in the order of checkpoints and of the reference.
+GROUPS = {
+    "xyz": "_xyz",
+    "f_dc": "_features_dc",
+    "f_rest": "_features_rest",
+    "opacity": "_opacity",
+    "scaling": "_scaling",
+    "rotation": "_rotation",
+}
+
+
+class GaussianModel:
+    """N Gaussians with raw (unactivated) float32 parameters; `get_*` give the activated ones.
+
+    `_xyz` (N,3) world; `_features_dc` (N,1,3), `_features_rest` (N,K,3), K = (D+1)^2 - 1; `_scaling` (N,3) log;
+    `_rotation` (N,4) wxyz, any length; `_opacity` (N,1) logit. Statistics since the last densification:
+    `xyz_gradient_accum` (N,1), `denom` (N,1), `max_radii2D` (N).
+    """
+
+    def __init__(self, sh_degree: int, optimizer_type: str = "default") -> None:
+        if optimizer_type != "default":
+            raise UserError(f"optimizer_type {optimizer_type!r} is not built yet; leave it at 'default'")
+        self.active_sh_degree = 0
+        self.max_sh_degree = sh_degree
+        self.optimizer_type = optimizer_type
+        self.optimizer: GaussianAdam | None = None
+        self.percent_dense = 0.0
+        self.spatial_lr_scale = 0.0
+        bands = (sh_degree + 1) ** 2 - 1
+        self._set_rows(
+            GaussianRows(
+                xyz=torch.empty(0, 3),
+                features_dc=torch.empty(0, 1, 3),
+                features_rest=torch.empty(0, bands, 3),
+                opacity=torch.empty(0, 1),
+                scaling=torch.empty(0, 3),
+                rotation=torch.empty(0, 4),
+            )
+        )
+
+    def __len__(self) -> int:
+        """Number of Gaussians."""
+        return self._xyz.shape[0]
+
+    @property
+    def get_xyz(self) -> Tensor:
+        return self._xyz
+
+    @property
+    def get_features_dc(self) -> Tensor:
+        return self._features_dc
+
+    @property
+    def get_features_rest(self) -> Tensor:
+        return self._features_rest
+
+    @property
+    def get_features(self) -> Tensor:
+        """All SH coefficients, (N, (D+1)^2, 3)."""
+        return torch.cat((self._features_dc, self._features_rest), dim=1)
+
+    @property
+    def get_scaling(self) -> Tensor:
+        return torch.exp(self._scaling)
+
+    @property
+    def get_rotation(self) -> Tensor:
+        return nn.functional.normalize(self._rotation)
+
+    @property
+    def get_opacity(self) -> Tensor:
+        return torch.sigmoid(self._opacity)
+
+    def get_covariance(self, scaling_modifier: float = 1.0) -> Tensor:
+        """World covariances R S S R^T, S = modifier * scales: (N, 6), order xx xy xz yy yz zz."""
+        factor = build_scaling_rotation(scaling_modifier * self.get_scaling, self._rotation)
+        return strip_symmetric(factor @ factor.transpose(1, 2))
+
+    @property
+    def active_bands(self) -> int:
+        """Number of SH coefficients above band 0 that the active degree uses."""
+        return (self.active_sh_degree + 1) ** 2 - 1
+
+    # Where Gaussians come from
+
+    def create_from_pcd(self, pcd: BasicPointCloud, cam_infos: Sequence, spatial_lr_scale: float) -> None:
+        """Start from a point cloud: round Gaussians as wide as the distance to their neighbours, opacity 0.1.
+
+        spatial_lr_scale: extent of the scene in world units; scales position learning rates and size limits.
+        cam_infos: the training cameras (unused until exposures are trained).
+        """
+        points = np.asarray(pcd.points, dtype=np.float32)
+        count = len(points)
+        if count == 0:
+            raise UserError("the point cloud has no points to start from; give one with --init_pcd_path")
+        if not np.isfinite(points).all():
+            raise UserError(
+                "the point cloud has points that are not finite; remove them, or give another by --init_pcd_path"
+            )
+        if count < 4:
+            scale = np.full(count, LONE_POINT_SCALE * max(spatial_lr_scale, 1e-3), dtype=np.float32)
+        else:
+            scale = np.sqrt(np.maximum(distCUDA2(torch.from_numpy(points)).numpy(), np.float32(MIN_DISTANCE2)))
+        # NumPy's log: one thread, so the same bits for any number of torch's threads.
+        log_scale = torch.from_numpy(np.log(scale))
+        colors = torch.from_numpy(np.asarray(pcd.colors, dtype=np.float32))
+        self.spatial_lr_scale = float(spatial_lr_scale)
+        self.active_sh_degree = 0
+        self._set_rows(
+            GaussianRows(
+                xyz=torch.from_numpy(points.copy()),
+                features_dc=RGB2SH(colors).reshape(count, 1, 3),
+                features_rest=torch.zeros(count, (self.max_sh_degree + 1) ** 2 - 1, 3),
+                opacity=torch.full((count, 1), adc.logit(INITIAL_OPACITY)),
+                scaling=log_scale[:, None].repeat(1, 3),
+                rotation=torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1),
+            )
+        )
+        print(f"Number of points at initialisation :  {count}")
+
+    def load_ply(self, path: str | os.PathLike) -> None:
+        """Take all parameters from a PLY of this model's SH degree (else UserError); all SH bands become active."""
+        self._set_rows(read_ply(path, self.max_sh_degree))
+        self.active_sh_degree = self.max_sh_degree
+
+    def save_ply(self, path: str | os.PathLike) -> None:
+        """Write the raw parameters as a PLY in the reference's layout."""
+        rows = {name: getattr(self, f"_{name}").detach() for name in GaussianRows._fields}
+        write_ply(path, GaussianRows(**rows))
+
+    def _set_rows(self, rows: GaussianRows) -> None:
+        device = compute_device()
+        for name, value in rows._asdict().items():
+            setattr(self, f"_{name}", nn.Parameter(value.to(device)))
+        self._zero_statistics()
+
+    def _zero_statistics(self) -> None:
+        self.xyz_gradient_accum = torch.zeros(len(self), 1, device=self._xyz.device)
+        self.denom = torch.zeros(len(self), 1, device=self._xyz.device)
+        self.max_radii2D = torch.zeros(len(self), device=self._xyz.device)
+
+    # Optimiser
+
+    def training_setup(self, training_args: argparse.Namespace) -> None:
+        """Make the optimiser and the position schedule from the optimisation options; zero the statistics."""
+        self.percent_dense = training_args.percent_dense
+        self._zero_statistics()
+        rates = {
+            "xyz": training_args.position_lr_init * self.spatial_lr_scale,
+            "f_dc": training_args.feature_lr,
+            "f_rest": training_args.feature_lr / 20.0,
+            "opacity": training_args.opacity_lr,
+            "scaling": training_args.scaling_lr,
+            "rotation": training_args.rotation_lr,
+        }
+        self.optimizer = GaussianAdam(
+            [{"params": [getattr(self, GROUPS[name])], "lr": rate, "name": name} for name, rate in rates.items()]
+        )
+        self.xyz_scheduler_args = get_expon_lr_func(
+            lr_init=training_args.position_lr_init * self.spatial_lr_scale,
+            lr_final=training_args.position_lr_final * self.spatial_lr_scale,
+            lr_delay_mult=training_args.position_lr_delay_mult,
+            max_steps=training_args.position_lr_max_steps,
+        )
+        self._limit_columns()
+
+    def update_learning_rate(self, iteration: int) -> float:
+        """Set the position learning rate of this iteration and return it."""
+        rate = self.xyz_scheduler_args(iteration)
+        self.optimizer.param_groups[0]["lr"] = rate
+        return rate
+
+    def oneupSHdegree(self) -> None:
+        """Raise the active SH degree by one, up to the maximum."""
+        self.active_sh_degree = min(self.active_sh_degree + 1, self.max_sh_degree)
+        if self.optimizer is not None:
+            self._limit_columns()
+
+    def _limit_columns(self) -> None:
+        self.optimizer.set_active_columns("f_rest", 3 * self.active_bands)
+
+    def capture(self) -> tuple:
+        """Everything a resumed training needs, as tensors and numbers: 12 entries in the reference's order."""
+        return (
+            self.active_sh_degree,
+            self._xyz.detach(),
+            self._features_dc.detach(),
+            self._features_rest.detach(),
+            self._scaling.detach(),
+            self._rotation.detach(),
+            self._opacity.detach(),
+            self.max_radii2D,
+            self.xyz_gradient_accum,
+            self.denom,
+            self.optimizer.state_dict(),
+            float(self.spatial_lr_scale),
+        )
+
+    def restore(self, model_args: Sequence[Any], training_args: argparse.Namespace) -> None:
+        """Take the state of `capture()`. Learning rates and densification options come from `training_args`.
+
+        UserError when the state was made with another maximal SH degree or does not fit together.
+        """
+        (
+            active_sh_degree,
+            xyz,
+            features_dc,
+            features_rest,
+            scaling,
+            rotation,
+            opacity,
+            max_radii2D,
+            xyz_gradient_accum,
+            denom,
+            optimizer_state,
+            spatial_lr_scale,
+        ) = model_args
+        bands = (self.max_sh_degree + 1) ** 2 - 1
+        if features_rest.shape[1] != bands:
+            raise UserError(
+                f"the checkpoint has {features_rest.shape[1]} SH coefficients above band 0, where --sh_degree "
+                f"{self.max_sh_degree} needs {bands}; give the --sh_degree it was trained with"
+            )
+        self.active_sh_degree = int(active_sh_degree)
+        self.spatial_lr_scale = float(spatial_lr_scale)
+        tensors = (xyz, features_dc, features_rest, opacity, scaling, rotation)
+        self._set_rows(GaussianRows(*(tensor.detach() for tensor in tensors)))
+        self.training_setup(training_args)
+        rates = [group["lr"] for group in self.optimizer.param_groups]
+        try:
+            self.optimizer.load_state_dict(optimizer_state)
+        except (ValueError, KeyError) as error:
+            raise UserError(f"the optimiser state of the checkpoint does not fit ({error}); use another one") from error
+        for group, rate in zip(self.optimizer.param_groups, rates, strict=True):
+            group["lr"] = rate
+        device = self._xyz.device
+        self.max_radii2D = max_radii2D.to(device)
+        self.xyz_gradient_accum = xyz_gradient_accum.to(device)
+        self.denom = denom.to(device)
+
+    # Adaptive density control
+
+    def add_densification_stats(self, viewspace_point_tensor: Tensor, update_filter: Tensor) -> None:
+        """Add this view's screen-space gradient lengths and count it, for the Gaussians it saw.
+
+        viewspace_point_tensor: (N, 3) with `.grad` per NDC unit; update_filter: indices (n,) or (n, 1), or a mask (N,).
+        """
+        x, y = viewspace_point_tensor.grad[:, 0], viewspace_point_tensor.grad[:, 1]
+        length = (x * x + y * y).sqrt()[:, None]
+        if update_filter.dtype != torch.bool:
+            seen = torch.zeros(len(self), dtype=torch.bool, device=length.device)
+            update_filter = seen.index_fill_(0, update_filter.reshape(-1), True)
+        seen = update_filter[:, None]
+        self.xyz_gradient_accum += torch.where(seen, length, 0.0)
+        self.denom += seen
+
+    def densify_and_prune(
+        self,
+        max_grad: float,
+        min_opacity: float,
+        extent: float,
+        max_screen_size: int | None,
+        *,
+        seed: int = 0,
+        iteration: int = 0,
+        max_splats: int = 0,
+    ) -> None:
+        """Clone small and split large Gaussians with a mean gradient >= max_grad, then remove useless ones.
+
+        extent: of the scene, world units; max_screen_size: None, or remove wider ones (pixels) and those over a tenth
+        of the extent. seed and iteration decide the positions of split children; max_splats > 0 bounds growth.
+        """
+        gradient = adc.mean_gradient(self.xyz_gradient_accum, self.denom)
+        if max_splats > 0:
+            gradient = adc.limit_growth(gradient, max_grad, max_splats - len(self))
+        self.densify_and_clone(gradient, max_grad, extent)
+        self.densify_and_split(gradient, max_grad, extent, seed=seed, iteration=iteration)
+        remove = adc.is_useless(self._opacity, min_opacity)
+        if max_screen_size:
+            # Appending has just zeroed max_radii2D, so the first test never fires, as in the reference.
+            remove |= self.max_radii2D > max_screen_size
+            remove |= ~adc.is_small(self._scaling, adc.PRUNE_EXTENT * extent)
+        self.prune_points(remove)
+
+    def densify_and_clone(self, grads: Tensor, grad_threshold: float, scene_extent: float) -> None:
+        """Append an exact copy of each Gaussian with gradient >= threshold and scale <= percent_dense * extent."""
+        small = adc.is_small(self._scaling, self.percent_dense * scene_extent)
+        chosen = ((grads.reshape(-1) >= grad_threshold) & small).nonzero().reshape(-1)
+        self.densification_postfix(*(getattr(self, name).detach().index_select(0, chosen) for name in GROUPS.values()))
+
+    def densify_and_split(
+        self,
+        grads: Tensor,
+        grad_threshold: float,
+        scene_extent: float,
+        N: int = 2,
+        *,
+        seed: int = 0,
+        iteration: int = 0,
+    ) -> None:
+        """Replace each Gaussian with gradient >= threshold and scale > percent_dense * extent by N smaller ones.
+
+        grads: (n,) or (n, 1) for the first n Gaussians; those appended since (fresh clones) have gradient 0.
+        """
+        before = len(self)
+        large = ~adc.is_small(self._scaling, self.percent_dense * scene_extent)
+        grads = grads.reshape(-1)
+        large[len(grads) :] = False
+        large[: len(grads)] &= grads >= grad_threshold
+        parents = large.nonzero().reshape(-1)
+        rows = {name: getattr(self, name).detach().index_select(0, parents) for name in GROUPS.values()}
+        children = [
+            adc.split_children(
+                rows["_xyz"], rows["_scaling"], rows["_rotation"], parents, child, seed=seed, iteration=iteration
+            )
+            for child in range(N)
+        ]
+        copies = {name: torch.cat([value] * N) for name, value in rows.items() if name not in ("_xyz", "_scaling")}
+        copies["_xyz"], copies["_scaling"] = (torch.cat(parts) for parts in zip(*children, strict=True))
+        self.densification_postfix(*(copies[name] for name in GROUPS.values()))
+        self.prune_points(torch.cat((large, large.new_zeros(len(self) - before))))
+
+    def densification_postfix(
+        self,
+        new_xyz: Tensor,
+        new_features_dc: Tensor,
+        new_features_rest: Tensor,
+        new_opacities: Tensor,
+        new_scaling: Tensor,
+        new_rotation: Tensor,
+    ) -> None:
+        """Append Gaussians (raw parameters), also when there are none; the statistics of all are zeroed."""
+        new = (new_xyz, new_features_dc, new_features_rest, new_opacities, new_scaling, new_rotation)
+        self._take(self.optimizer.append_rows(dict(zip(GROUPS, new, strict=True))))
+        self._zero_statistics()
+
+    def prune_points(self, mask: Tensor) -> None:
+        """Remove the Gaussians of a mask (N,) bool, with their optimiser state and statistics."""
+        keep = (~mask).nonzero().reshape(-1)
+        if len(keep) == len(self):
+            return
+        self._take(self.optimizer.keep_rows(keep))
+        self.xyz_gradient_accum = self.xyz_gradient_accum.index_select(0, keep)
+        self.denom = self.denom.index_select(0, keep)
+        self.max_radii2D = self.max_radii2D.index_select(0, keep)
+
+    def reset_opacity(self) -> None:
+        """Bring every opacity down to at most 0.01; its Adam moments start again from zero."""
+        lowered = self._opacity.detach().clamp_max(adc.logit(adc.RESET_OPACITY))
+        self._opacity = self.optimizer.reset("opacity", lowered)
+
+    def _take(self, params: dict[str, nn.Parameter]) -> None:
+        for name, param in params.items():
+            setattr(self, GROUPS[name], param)

@@ -1,0 +1,100 @@
+"""Adam over the tensors of a Gaussian model, and what becomes of its state when Gaussians come and go."""
+
+from collections.abc import Callable
+
+import diff_gaussian_rasterization  # noqa: F401  (its library holds the Adam kernel)
+import torch
+from torch import Tensor, nn
+
+_ADAM = torch.ops.diff_gaussian_rasterization.adam_
+
+
+class GaussianAdam(torch.optim.Adam):
+    """torch.optim.Adam, one parameter (N, ...) per named group, by a kernel with the same bits for any thread count.
+
+    State and state dict have torch's form (step, exp_avg, exp_avg_sq), so checkpoints carry over both ways.
+    """
+
+    def __init__(self, groups: list[dict], eps: float = 1e-15) -> None:
+        """groups: dicts with `params` (a list of one Parameter), `lr` and `name`."""
+        super().__init__(groups, lr=0.0, eps=eps)
+        self._active_columns: dict[str, int] = {}
+
+    def set_active_columns(self, name: str, columns: int) -> None:
+        """Promise that only the first `columns` values of each row of this group ever had a gradient.
+
+        Adam's step for the others changes no bit (moments and gradient are zero), so it is left out.
+        """
+        self._active_columns[name] = columns
+
+    @torch.no_grad()
+    def step(self, closure: Callable[[], float] | None = None) -> float | None:
+        """One Adam step of every parameter that has a gradient; the others, counters included, stay as they are."""
+        loss = None
+        if closure is not None:
+            with torch.enable_grad():
+                loss = closure()
+        stepped = False
+        for group in self.param_groups:
+            (param,) = group["params"]
+            columns = self._active_columns.get(group["name"], -1)
+            if columns == 0:
+                # Nothing was rendered from this group, so it got no gradient; it counts along with its neighbour.
+                if stepped and param.numel():
+                    self._state_of(param)["step"] += 1
+                continue
+            stepped = param.grad is not None
+            if not stepped:
+                continue
+            state = self._state_of(param)
+            state["step"] += 1
+            moments = state["exp_avg"], state["exp_avg_sq"]
+            beta1, beta2 = group["betas"]
+            _ADAM(param, param.grad, *moments, group["lr"], beta1, beta2, group["eps"], int(state["step"]), columns)
+        return loss
+
+    def _state_of(self, param: Tensor) -> dict[str, Tensor]:
+        state = self.state[param]
+        if not state:
+            state["step"] = torch.zeros((), dtype=torch.float32)
+            state["exp_avg"] = torch.zeros_like(param)
+            state["exp_avg_sq"] = torch.zeros_like(param)
+        return state
+
+    def append_rows(self, rows: dict[str, Tensor]) -> dict[str, nn.Parameter]:
+        """Append `rows[name]` (n, ...) to each group, with zero moments. Returns the parameters, without gradient."""
+
+        def grow(moment: Tensor, name: str) -> Tensor:
+            return torch.cat((moment, torch.zeros_like(rows[name])))
+
+        return {
+            group["name"]: self._replace(group, torch.cat((group["params"][0].detach(), rows[group["name"]])), grow)
+            for group in self.param_groups
+        }
+
+    def keep_rows(self, indices: Tensor) -> dict[str, nn.Parameter]:
+        """Keep the rows of `indices` (n,) int64 in every group. Returns the new parameters, without gradient."""
+
+        def select(moment: Tensor, _: str) -> Tensor:
+            return moment.index_select(0, indices)
+
+        return {
+            group["name"]: self._replace(group, group["params"][0].detach().index_select(0, indices), select)
+            for group in self.param_groups
+        }
+
+    def reset(self, name: str, value: Tensor) -> nn.Parameter:
+        """Give one group a new value and zero moments. Returns the new parameter, without gradient."""
+        (group,) = (group for group in self.param_groups if group["name"] == name)
+        return self._replace(group, value, lambda moment, _: torch.zeros_like(moment))
+
+    def _replace(self, group: dict, value: Tensor, change: Callable[[Tensor, str], Tensor]) -> nn.Parameter:
+        """Swap a group's parameter; `change` maps its moments, the step counter stays."""
+        param = nn.Parameter(value.requires_grad_(True))
+        state = self.state.pop(group["params"][0], None)
+        if state:
+            for key in ("exp_avg", "exp_avg_sq"):
+                state[key] = change(state[key], group["name"])
+            self.state[param] = state
+        group["params"] = [param]
+        return param

@@ -1,0 +1,191 @@
+"""Adaptive density control: the reference's rules on toy sets, its windows, and what becomes of Adam's state."""
+
+import math
+
+import pytest
+import torch
+from gaussians import GROUPS, model, moments, options, parameters, take_steps
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from scene import densification as adc
+from scene.gaussian_model import GaussianModel
+from utils.general_utils import build_rotation
+
+EXTENT = 2.0
+LIMIT = 0.01 * EXTENT  # percent_dense * extent
+THRESHOLD = 2e-4
+
+
+def _toy(scales: list[float], gradients: list[float], opacity: float = 0.5) -> GaussianModel:
+    """One Gaussian per entry: a largest scale in world units and a mean gradient, seen in 4 views."""
+    gaussians = model(len(scales), extent=EXTENT)
+    with torch.no_grad():
+        gaussians._scaling.copy_(
+            torch.tensor(scales, dtype=torch.float64).log().float()[:, None] - torch.tensor([0, 1, 2])
+        )
+        gaussians._opacity.fill_(math.log(opacity / (1 - opacity)))
+    take_steps(gaussians, 2)
+    with torch.no_grad():
+        gaussians._scaling[:, 0] = torch.tensor(scales, dtype=torch.float64).log().float()
+        gaussians._scaling[:, 1:] = gaussians._scaling[:, :1] - 1
+        gaussians._opacity.fill_(math.log(opacity / (1 - opacity)))
+    gaussians.denom.fill_(4)
+    gaussians.xyz_gradient_accum = 4 * torch.tensor(gradients)[:, None]
+    gaussians.max_radii2D.fill_(100)
+    return gaussians
+
+
+def _densify(gaussians: GaussianModel, screen: int | None = None, **more: int) -> None:
+    gaussians.densify_and_prune(THRESHOLD, adc.MIN_OPACITY, EXTENT, screen, **more)
+
+
+def test_selection_at_equality():
+    """g >= threshold grows; s <= limit clones, s > limit splits."""
+    threshold = torch.tensor(THRESHOLD).item()  # what float32 makes of it, so that four views of it average to it
+    below = torch.nextafter(torch.tensor(threshold), torch.tensor(0.0)).item()
+    limit = math.exp(math.log(LIMIT))
+    above = limit * (1 + 1e-5)
+    gaussians = _toy([limit, limit, above, above, limit], [threshold, below, threshold, below, 1.0])
+    before = parameters(gaussians)
+    gaussians.densify_and_prune(threshold, adc.MIN_OPACITY, EXTENT, None)
+    # Kept in order: 0, 1, 3, 4 (2 was split), then clones of 0 and 4, then two children of 2.
+    assert len(gaussians) == 8
+    for name, value in parameters(gaussians).items():
+        assert torch.equal(value[:6], before[name][[0, 1, 3, 4, 0, 4]])
+        if name not in ("xyz", "scaling"):
+            assert torch.equal(value[6:], before[name][[2, 2]])
+    after = parameters(gaussians)
+    assert torch.equal(after["scaling"][6:], before["scaling"][[2, 2]] - math.log(1.6))
+    assert not torch.equal(after["xyz"][6], after["xyz"][7])
+
+
+def test_statistics_start_again_and_moments_follow_their_rows():
+    gaussians = _toy([LIMIT / 2, LIMIT * 3, LIMIT], [1.0, 1.0, 0.0])
+    state = moments(gaussians)
+    _densify(gaussians)
+    assert len(gaussians) == 5  # 0, 2, clone of 0, two children of 1
+    assert not gaussians.xyz_gradient_accum.any() and not gaussians.denom.any() and not gaussians.max_radii2D.any()
+    assert gaussians.denom.shape == (5, 1) and gaussians.max_radii2D.shape == (5,)
+    for name, now in moments(gaussians).items():
+        assert now["step"] == 2
+        for key in ("exp_avg", "exp_avg_sq"):
+            assert torch.equal(now[key][:2], state[name][key][[0, 2]]) and not now[key][2:].any()
+
+
+def test_optimiser_does_nothing_in_a_densification_iteration():
+    gaussians = _toy([LIMIT] * 3, [0.0] * 3)
+    for name in GROUPS.values():
+        getattr(gaussians, name).grad = torch.ones_like(getattr(gaussians, name))
+    before = parameters(gaussians)
+    _densify(gaussians)
+    gaussians.optimizer.step()
+    for name, value in parameters(gaussians).items():
+        assert torch.equal(value, before[name])
+        assert moments(gaussians)[name]["step"] == 2
+
+
+def test_reset_freezes_opacity_alone():
+    gaussians = _toy([LIMIT] * 3, [0.0] * 3)
+    with torch.no_grad():
+        gaussians._opacity[0] = -6.0
+    for name in GROUPS.values():
+        getattr(gaussians, name).grad = torch.ones_like(getattr(gaussians, name))
+    before = parameters(gaussians)
+    gaussians.reset_opacity()
+    assert not moments(gaussians)["opacity"]["exp_avg"].any()
+    gaussians.optimizer.step()
+    low = torch.tensor(adc.logit(0.01), dtype=torch.float32).item()
+    assert gaussians._opacity.reshape(-1).tolist() == [-6.0, low, low]
+    assert gaussians.get_opacity[1:].detach().numpy() == pytest.approx(0.01)
+    for name, value in parameters(gaussians).items():
+        assert name == "opacity" or not torch.equal(value, before[name])
+
+
+def test_pruning():
+    gaussians = _toy([LIMIT] * 6, [0.0] * 6)
+    low = adc.logit(adc.MIN_OPACITY)
+    with torch.no_grad():
+        gaussians._opacity[0] = low - 1e-3
+        gaussians._opacity[1] = low + 1e-3
+        gaussians._scaling[2, 1] = math.log(0.1 * EXTENT) + 1e-3
+        gaussians._scaling[3, 1] = math.log(0.1 * EXTENT) - 1e-3
+    kept = gaussians._xyz.detach().clone()
+    _densify(gaussians, screen=None)
+    assert torch.equal(gaussians._xyz, kept[1:])  # no sizes before the first opacity reset
+    _densify(gaussians, screen=20)
+    # max_radii2D was 100, yet nothing went for its screen size: the reference zeroes it just before.
+    assert torch.equal(gaussians._xyz, kept[[1, 3, 4, 5]])
+
+
+def test_children_are_drawn_from_their_parent():
+    """The whitened offsets of many children have mean 0 and covariance 1 in the parent's own frame."""
+    n = 20_000
+    scaling = torch.tensor([0.5, -1.0, -3.0]).repeat(n, 1)
+    rotation = torch.tensor([0.9, -0.4, 1.3, 0.2]).repeat(n, 1)
+    centre = torch.tensor([1.0, -2.0, 0.5]).repeat(n, 1)
+    children, scales = adc.split_children(centre, scaling, rotation, torch.arange(n), 0, seed=3, iteration=600)
+    offset = (children - centre).double() @ build_rotation(rotation[:1].double())[0] / scaling.double().exp()
+    assert offset.mean(0).abs().max() < 4 / math.sqrt(n)
+    assert (offset.T @ offset / n - torch.eye(3)).abs().max() < 4 * math.sqrt(2 / n)
+    assert torch.equal(scales, scaling - math.log(1.6))
+    again, _ = adc.split_children(centre[:5], scaling[:5], rotation[:5], torch.arange(5), 0, seed=3, iteration=600)
+    assert torch.equal(again, children[:5])
+    other, _ = adc.split_children(centre[:5], scaling[:5], rotation[:5], torch.arange(5), 1, seed=3, iteration=600)
+    assert (other != again).all()
+
+
+def test_a_zero_quaternion_splits_to_finite_places():
+    children, _ = adc.split_children(
+        torch.zeros(2, 3), torch.zeros(2, 3), torch.zeros(2, 4), torch.arange(2), 0, seed=0, iteration=1
+    )
+    assert children.isfinite().all()
+
+
+def test_windows_of_the_defaults():
+    opt = options()
+    todo = {t: adc.actions(t, opt, white_background=False) for t in range(1, 30_001)}
+    assert [t for t in todo if todo[t].densify] == list(range(600, 15_000, 100))
+    assert [t for t in todo if todo[t].reset_opacity] == [3000, 6000, 9000, 12_000]
+    assert [t for t in todo if todo[t].observe] == list(range(1, 15_000))
+    assert [t for t in todo if todo[t].densify and todo[t].limit_size] == list(range(3100, 15_000, 100))
+    white = [t for t in range(1, 30_001) if adc.actions(t, opt, white_background=True).reset_opacity]
+    assert white == [500, 3000, 6000, 9000, 12_000]
+
+
+def test_never_seen_gaussians_have_no_gradient():
+    assert adc.mean_gradient(torch.tensor([[0.0], [3.0]]), torch.tensor([[0.0], [2.0]])).tolist() == [0.0, 1.5]
+
+
+def test_statistics_take_indices_and_masks():
+    gaussians = model(4)
+    points = torch.zeros(4, 3, requires_grad=True)
+    points.grad = torch.tensor([[3.0, 4.0, 100.0], [1.0, 0.0, 0.0], [0.0, 2.0, 0.0], [0.0, 0.0, 0.0]])
+    gaussians.add_densification_stats(points, torch.tensor([[0], [3]]))
+    gaussians.add_densification_stats(points, torch.tensor([True, False, True, False]))
+    assert gaussians.xyz_gradient_accum.reshape(-1).tolist() == [10.0, 0.0, 2.0, 0.0]
+    assert gaussians.denom.reshape(-1).tolist() == [2.0, 0.0, 1.0, 1.0]
+
+
+def test_the_cap_takes_the_largest_gradients_ties_by_index():
+    gradient = torch.tensor([5.0, 1.0, 5.0, 7.0, 5.0, 0.5])
+    assert adc.limit_growth(gradient, 1.0, 3).nonzero().reshape(-1).tolist() == [0, 2, 3, 5]
+    assert adc.limit_growth(gradient, 1.0, 0).tolist() == [0, 0, 0, 0, 0, 0.5]
+    assert adc.limit_growth(gradient, 1.0, -2).tolist() == [0, 0, 0, 0, 0, 0.5]
+    assert torch.equal(adc.limit_growth(gradient, 1.0, 5), gradient)
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    count=st.integers(1, 30),
+    cap=st.integers(1, 50),
+    seed=st.integers(0, 2**16),
+)
+def test_the_cap_is_never_passed_and_reached_when_it_can(count, cap, seed):
+    generator = torch.Generator().manual_seed(seed)
+    scales = (LIMIT * (0.5 + torch.rand(count, generator=generator))).tolist()
+    gradients = (2 * THRESHOLD * torch.rand(count, generator=generator)).tolist()
+    gaussians = _toy(scales, gradients)
+    candidates = int((adc.mean_gradient(gaussians.xyz_gradient_accum, gaussians.denom) >= THRESHOLD).sum())
+    _densify(gaussians, max_splats=cap)
+    assert len(gaussians) == max(count, min(cap, count + candidates))

@@ -1,0 +1,155 @@
+"""Our Adam against torch's, and the surgery of its state."""
+
+import copy
+
+import pytest
+import torch
+from gaussians import GROUPS, model, moments, options, parameters, take_steps
+
+from scene.gaussian_optimizer import GaussianAdam
+
+
+def _groups(seed: int = 0) -> list[dict]:
+    generator = torch.Generator().manual_seed(seed)
+    shapes = {"xyz": (50, 3), "f_rest": (50, 15, 3), "opacity": (50, 1)}
+    return [
+        {"params": [torch.nn.Parameter(torch.randn(shape, generator=generator))], "lr": rate, "name": name}
+        for (name, shape), rate in zip(shapes.items(), (1e-2, 1e-3, 5e-2), strict=True)
+    ]
+
+
+def _step(optimizers: list[torch.optim.Optimizer], generator: torch.Generator) -> None:
+    for groups in zip(*(optimizer.param_groups for optimizer in optimizers), strict=True):
+        # Gradients of very different sizes, some exactly zero, as a rasterizer gives them.
+        shape = groups[0]["params"][0].shape
+        gradient = torch.randn(shape, generator=generator) * 10 ** (-8 * torch.rand(shape, generator=generator))
+        gradient[::5] = 0
+        for group in groups:
+            group["params"][0].grad = gradient.clone()
+    for optimizer in optimizers:
+        optimizer.step()
+
+
+def test_steps_follow_torch():
+    ours = GaussianAdam(_groups())
+    theirs = torch.optim.Adam(_groups(), lr=0.0, eps=1e-15)
+    generator = torch.Generator().manual_seed(1)
+    for step in range(50):
+        ours.param_groups[0]["lr"] = theirs.param_groups[0]["lr"] = 1e-2 * 0.97**step
+        _step([ours, theirs], generator)
+    for mine, other in zip(ours.param_groups, theirs.param_groups, strict=True):
+        a, b = mine["params"][0], other["params"][0]
+        # 50 steps, each a few roundings of a parameter of size 4 (2^-22) and of a step of size lr.
+        assert (a - b).abs().max() < 50 * 2**-22
+        state, expected = ours.state[a], theirs.state[b]
+        assert state.keys() == expected.keys()
+        assert torch.equal(state["step"], expected["step"]) and state["step"].dtype == expected["step"].dtype
+        # Means of gradients of size 4 may cancel; squares don't, so these agree relatively.
+        torch.testing.assert_close(state["exp_avg"], expected["exp_avg"], rtol=0, atol=2**-22)
+        torch.testing.assert_close(state["exp_avg_sq"], expected["exp_avg_sq"], rtol=1e-5, atol=0)
+
+
+@pytest.mark.parametrize("direction", ["ours to torch", "torch to ours"])
+def test_state_dicts_carry_over(direction):
+    ours, theirs = GaussianAdam(_groups()), torch.optim.Adam(_groups(), lr=0.0, eps=1e-15)
+    source, target = (ours, theirs) if direction == "ours to torch" else (theirs, ours)
+    generator = torch.Generator().manual_seed(1)
+    _step([source], generator)
+    target.load_state_dict(copy.deepcopy(source.state_dict()))
+    with torch.no_grad():
+        for mine, other in zip(source.param_groups, target.param_groups, strict=True):
+            other["params"][0].copy_(mine["params"][0])
+    _step([ours, theirs], generator)
+    for mine, other in zip(ours.param_groups, theirs.param_groups, strict=True):
+        torch.testing.assert_close(mine["params"][0], other["params"][0], rtol=0, atol=2**-22)
+        assert ours.state[mine["params"][0]]["step"] == 2
+
+
+def test_parameters_without_gradient_stay_and_do_not_count():
+    optimizer = GaussianAdam(_groups())
+    _step([optimizer], torch.Generator().manual_seed(0))
+    optimizer.zero_grad(set_to_none=True)
+    before = [group["params"][0].detach().clone() for group in optimizer.param_groups]
+    optimizer.step()
+    for group, value in zip(optimizer.param_groups, before, strict=True):
+        assert torch.equal(group["params"][0], value)
+        assert optimizer.state[group["params"][0]]["step"] == 1
+
+
+@pytest.mark.parametrize("columns", [0, 9, 24])
+def test_leaving_out_inactive_bands_changes_no_bit(columns):
+    """The dense step of columns with zero gradient and moments, against the one that skips them."""
+    dense, sparse = GaussianAdam(_groups()), GaussianAdam(_groups())
+    sparse.set_active_columns("f_rest", columns)
+    generator = torch.Generator().manual_seed(0)
+    for _ in range(5):
+        for a, b in zip(dense.param_groups, sparse.param_groups, strict=True):
+            gradient = torch.randn(a["params"][0].shape, generator=generator)
+            if a["name"] == "f_rest":
+                gradient.view(len(gradient), -1)[:, columns:] = 0
+            a["params"][0].grad, b["params"][0].grad = gradient, gradient.clone()
+            if a["name"] == "f_rest" and columns == 0:
+                b["params"][0].grad = None
+        dense.step()
+        sparse.step()
+    for a, b in zip(dense.param_groups, sparse.param_groups, strict=True):
+        assert torch.equal(a["params"][0], b["params"][0])
+        for key, value in dense.state[a["params"][0]].items():
+            assert torch.equal(value, sparse.state[b["params"][0]][key])
+
+
+def test_appended_rows_start_with_zero_moments_and_the_counter_stays():
+    gaussians = model(20)
+    take_steps(gaussians, 3)
+    values, state = parameters(gaussians), moments(gaussians)
+    new = {name: torch.full((4, *value.shape[1:]), 0.5) for name, value in values.items()}
+    taken = gaussians.optimizer.append_rows(new)
+    for name, param in taken.items():
+        assert param.grad is None and param.requires_grad
+        assert torch.equal(param.detach(), torch.cat((values[name], new[name])))
+        now = gaussians.optimizer.state[param]
+        assert now["step"] == 3
+        for key in ("exp_avg", "exp_avg_sq"):
+            assert torch.equal(now[key][:20], state[name][key]) and not now[key][20:].any()
+    assert len(gaussians.optimizer.state) == len(GROUPS)  # nothing of the old parameters is kept alive
+
+
+def test_kept_rows_keep_their_moments():
+    gaussians = model(20)
+    take_steps(gaussians, 2)
+    values, state = parameters(gaussians), moments(gaussians)
+    indices = torch.tensor([1, 5, 19])
+    for name, param in gaussians.optimizer.keep_rows(indices).items():
+        assert torch.equal(param.detach(), values[name][indices])
+        assert torch.equal(gaussians.optimizer.state[param]["exp_avg_sq"], state[name]["exp_avg_sq"][indices])
+
+
+def test_surgery_before_the_first_step():
+    gaussians = model(5)
+    gaussians.prune_points(torch.tensor([True, False, False, False, True]))
+    gaussians.reset_opacity()
+    take_steps(gaussians, 1)
+    assert len(gaussians) == 3
+
+
+def test_groups_are_the_references():
+    optimizer = model(3, extent=2.0).optimizer
+    opt = options()
+    assert [group["name"] for group in optimizer.param_groups] == [
+        "xyz",
+        "f_dc",
+        "f_rest",
+        "opacity",
+        "scaling",
+        "rotation",
+    ]
+    rates = [
+        opt.position_lr_init * 2,
+        opt.feature_lr,
+        opt.feature_lr / 20,
+        opt.opacity_lr,
+        opt.scaling_lr,
+        opt.rotation_lr,
+    ]
+    assert [group["lr"] for group in optimizer.param_groups] == rates
+    assert all(group["eps"] == 1e-15 and group["betas"] == (0.9, 0.999) for group in optimizer.param_groups)

@@ -1,0 +1,126 @@
+"""point_cloud.ply: the reference's layout byte for byte, other writers' files, clear refusals."""
+
+import numpy as np
+import pytest
+import torch
+from gaussians import model, parameters
+from plyfile import PlyData, PlyElement
+
+from scene.gaussian_model import GaussianModel
+from utils.system_utils import UserError
+
+ORDER = (
+    ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
+    + [f"f_rest_{i}" for i in range(45)]
+    + ["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
+)
+
+
+def _assert_equal(a: GaussianModel, b: GaussianModel) -> None:
+    for name, value in parameters(a).items():
+        assert torch.equal(parameters(b)[name], value), name
+
+
+def _loaded(path, degree: int = 3) -> GaussianModel:
+    gaussians = GaussianModel(degree)
+    gaussians.load_ply(path)
+    return gaussians
+
+
+def test_layout_by_plyfile(tmp_path):
+    gaussians = model(17)
+    gaussians.save_ply(tmp_path / "a" / "point_cloud.ply")
+    content = PlyData.read(tmp_path / "a" / "point_cloud.ply")
+    assert not content.text and content.byte_order == "<" and [e.name for e in content.elements] == ["vertex"]
+    vertex = content["vertex"]
+    assert [p.name for p in vertex.properties] == ORDER
+    assert {p.val_dtype for p in vertex.properties} == {"f4"}
+    rest = gaussians._features_rest.detach().numpy()
+    for channel in range(3):
+        for k in range(15):
+            np.testing.assert_array_equal(vertex[f"f_rest_{channel * 15 + k}"], rest[:, k, channel])
+    for name, tensor in {"x": gaussians._xyz[:, 0], "nz": torch.zeros(17), "f_dc_2": gaussians._features_dc[:, 0, 2],
+                         "opacity": gaussians._opacity[:, 0], "scale_1": gaussians._scaling[:, 1],
+                         "rot_3": gaussians._rotation[:, 3]}.items():  # fmt: skip
+        np.testing.assert_array_equal(vertex[name], tensor.detach().numpy())
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_round_trip(tmp_path, degree):
+    gaussians = model(9, degree)
+    gaussians.save_ply(tmp_path / "a.ply")
+    again = _loaded(tmp_path / "a.ply", degree)
+    _assert_equal(gaussians, again)
+    assert again.active_sh_degree == degree
+    again.save_ply(tmp_path / "b.ply")
+    assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
+
+
+def test_a_model_of_others_keeps_its_bytes(shared_dir, tmp_path):
+    source = shared_dir / "models" / "room7k_sh3.ply"
+    gaussians = _loaded(source)
+    assert len(gaussians) == 9080
+    gaussians.save_ply(tmp_path / "again.ply")
+    assert (tmp_path / "again.ply").read_bytes() == source.read_bytes()
+
+
+@pytest.mark.parametrize("kind", ["shuffled", "text", "big endian", "double", "extra", "no normals"])
+def test_foreign_files_load(tmp_path, kind):
+    gaussians = model(11)
+    gaussians.save_ply(tmp_path / "ours.ply")
+    data = PlyData.read(tmp_path / "ours.ply", mmap=False)["vertex"].data
+    names = list(data.dtype.names)
+    if kind == "shuffled":
+        names = list(np.random.default_rng(0).permutation(names))
+    if kind == "no normals":
+        names = [name for name in names if name[0] != "n"]
+    kinds = dict.fromkeys(names, "f8" if kind == "double" else "f4")
+    if kind == "extra":
+        kinds = {"id": "u1", **kinds, "label": "i4"}
+    foreign = np.zeros(len(data), dtype=list(kinds.items()))
+    for name in names:
+        foreign[name] = data[name]
+    PlyData(
+        [PlyElement.describe(foreign, "vertex")], text=kind == "text", byte_order=">" if kind == "big endian" else "<"
+    ).write(tmp_path / "foreign.ply")
+    _assert_equal(gaussians, _loaded(tmp_path / "foreign.ply"))
+
+
+def test_an_empty_model_round_trips(tmp_path):
+    GaussianModel(1).save_ply(tmp_path / "none.ply")
+    assert len(_loaded(tmp_path / "none.ply", 1)) == 0
+
+
+def test_refusals(tmp_path):
+    model(5, degree=2).save_ply(tmp_path / "two.ply")
+    with pytest.raises(UserError, match="SH degree 2.*SH degree 3 needs 45.*--sh_degree"):
+        _loaded(tmp_path / "two.ply")
+    points = np.zeros(4, dtype=[(name, "f4") for name in "xyz"])
+    PlyData([PlyElement.describe(points, "vertex")]).write(tmp_path / "points.ply")
+    with pytest.raises(UserError, match="f_dc_0, f_dc_1, f_dc_2, opacity, scale_0.*rot_3"):
+        _loaded(tmp_path / "points.ply")
+    PlyData([PlyElement.describe(points, "corner")]).write(tmp_path / "corner.ply")
+    with pytest.raises(UserError, match="vertex"):
+        _loaded(tmp_path / "corner.ply")
+    with pytest.raises(UserError, match="no file"):
+        _loaded(tmp_path / "absent.ply")
+    (tmp_path / "text.ply").write_text("hello")
+    with pytest.raises(UserError, match="not a whole PLY"):
+        _loaded(tmp_path / "text.ply")
+    whole = (tmp_path / "two.ply").read_bytes()
+    for length in (len(whole) - 7, len(whole) // 2, 40, 0):
+        (tmp_path / "cut.ply").write_bytes(whole[:length])
+        with pytest.raises(UserError, match="not a whole PLY"):
+            _loaded(tmp_path / "cut.ply", 2)
+
+
+def test_a_failed_write_leaves_no_file(tmp_path, monkeypatch):
+    gaussians = model(5)
+
+    def fail(*_: object, **__: object) -> None:
+        raise OSError("disk full")
+
+    monkeypatch.setattr("scene.gaussian_ply.np.zeros", fail)
+    with pytest.raises(OSError, match="disk full"):
+        gaussians.save_ply(tmp_path / "point_cloud.ply")
+    assert not list(tmp_path.iterdir())

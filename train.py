@@ -1,0 +1,324 @@
+"""Train a Gaussian model: photos with cameras and sparse points in, point_cloud.ply out.
+
+python train.py -s SCENE -m OUT --eval
+"""
+
+import argparse
+import math
+import os
+import sys
+import uuid
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+from tqdm import tqdm
+
+from arguments import ModelParams, OptimizationParams, PipelineParams, write_cfg_args, write_model_json
+from gaussian_renderer import render
+from scene import Scene
+from scene import densification as adc
+from scene.cameras import Camera
+from scene.checkpoint import load_checkpoint, save_checkpoint
+from scene.gaussian_model import GaussianModel
+from utils.counter_rng import Stream, permutation, uniform
+from utils.general_utils import safe_state
+from utils.image_utils import as_float, psnr
+from utils.interrupt import DeferredInterrupt
+from utils.loss_utils import l1_loss, photometric_loss
+from utils.system_utils import UserError, compute_device, mkdir_p, run_cli
+from utils.training_log import Stopwatch, TrainingLog
+
+try:
+    from torch.utils.tensorboard import SummaryWriter
+except ImportError:
+    SummaryWriter = None
+
+SH_INTERVAL = 1000  # iterations between raises of the active SH degree
+BAR_INTERVAL = 10  # iterations between updates of the progress bar
+EMA_NEW = 0.4  # weight of the newest loss in the one that is shown
+
+
+def training(
+    dataset: argparse.Namespace,
+    opt: argparse.Namespace,
+    pipe: argparse.Namespace,
+    testing_iterations: Sequence[int],
+    saving_iterations: Sequence[int],
+    checkpoint_iterations: Sequence[int],
+    checkpoint: str | None,
+    debug_from: int = -1,
+) -> None:
+    """Train from the options of the three groups; write model, checkpoints and log to dataset.model_path.
+
+    testing_iterations, saving_iterations, checkpoint_iterations: when to score, save the PLY, save a checkpoint.
+    checkpoint: a chkpntN.pth to go on from, or None. debug_from: switch pipe.debug on after this iteration.
+    """
+    device = compute_device()
+    capture, first_iteration = load_checkpoint(checkpoint, device) if checkpoint else (None, 0)
+    if first_iteration >= opt.iterations:
+        raise UserError(
+            f"{checkpoint} is at iteration {first_iteration}, so --iterations {opt.iterations} leaves nothing to do; "
+            "--iterations counts from the start of the first run"
+        )
+    _warn_of_late_reset(opt, dataset.white_background)
+    dataset.model_path = dataset.model_path or _new_output_folder()
+    gaussians = GaussianModel(dataset.sh_degree, opt.optimizer_type)
+    scene = Scene(dataset, gaussians, shuffle=False)
+    gaussians.training_setup(opt)
+    if capture is not None:
+        gaussians.restore(capture, opt)
+        capture = None  # so that densification can free what it replaces
+    # After all that bad input can stop, or a slip of the keyboard would overwrite the options of a finished model.
+    tb_writer = prepare_output_and_logger(dataset, antialiasing=pipe.antialiasing, seed=opt.seed)
+
+    views = _ViewOrder(scene.getTrainCameras(), opt.seed)
+    fixed_background = torch.full((3,), 1.0 if dataset.white_background else 0.0, device=device)
+    log = TrainingLog(scene.model_path, first_iteration)
+    shown_loss = 0.0
+    clock = Stopwatch()
+    bar = tqdm(initial=first_iteration, total=opt.iterations, desc="Training progress", dynamic_ncols=True)
+    with bar, DeferredInterrupt() as interrupt:
+        for iteration in range(first_iteration + 1, opt.iterations + 1):
+            started = clock.seconds
+            gaussians.update_learning_rate(iteration)
+            if iteration % SH_INTERVAL == 0:
+                gaussians.oneupSHdegree()
+            camera = views[iteration]
+            if iteration - 1 == debug_from:
+                pipe.debug = True
+            background = _random_background(opt.seed, iteration, device) if opt.random_background else fixed_background
+
+            package = render(camera, gaussians, pipe, background)
+            loss, l1 = photometric_loss(package["render"], camera.target(background), opt.lambda_dssim)
+            value = loss.item()
+            if not math.isfinite(value):
+                raise UserError(
+                    f"the loss became {value} in iteration {iteration} (view {camera.image_name}), so training stopped "
+                    "and nothing of it was saved; lower the learning rates, or check this view and the point cloud"
+                )
+            loss.backward()
+
+            shown_loss = EMA_NEW * value + (1 - EMA_NEW) * shown_loss
+            if iteration % BAR_INTERVAL == 0 or iteration == opt.iterations:
+                bar.set_postfix({"Loss": f"{shown_loss:.7f}", "Gaussians": len(gaussians)}, refresh=False)
+                bar.update(iteration - bar.n)
+            seconds = clock.seconds
+            with clock.paused():
+                scores = training_report(
+                    tb_writer, iteration, l1, loss, l1_loss, seconds - started, testing_iterations, scene, render,
+                    (pipe, fixed_background),
+                )  # fmt: skip
+                saving = iteration in saving_iterations
+                if saving:
+                    tqdm.write(f"[ITER {iteration}] Saving Gaussians", file=sys.stdout)
+                    scene.save(iteration)
+                if saving or scores:
+                    log.add(iteration, seconds, gaussians=len(gaussians), loss=shown_loss, **scores)
+
+            _control_density(gaussians, package, iteration, opt, scene.cameras_extent, dataset.white_background)
+            if iteration < opt.iterations:
+                gaussians.optimizer.step()
+                gaussians.optimizer.zero_grad(set_to_none=True)
+            stop = interrupt.requested  # once: Ctrl-C may come at any moment
+            if iteration in checkpoint_iterations or stop:
+                with clock.paused():
+                    tqdm.write(f"[ITER {iteration}] Saving Checkpoint", file=sys.stdout)
+                    path = Path(scene.model_path) / f"chkpnt{iteration}.pth"
+                    save_checkpoint(path, gaussians.capture(), iteration)
+            if stop:
+                tqdm.write(f"go on with --start_checkpoint {path}", file=sys.stderr)
+                raise KeyboardInterrupt
+    if tb_writer:
+        tb_writer.close()
+    print(f"Trained {opt.iterations - first_iteration} iterations in {clock.seconds:.1f} s, without tests and saving")
+
+
+class _ViewOrder:
+    """Training cameras by iteration (from 1): each once per epoch, in an order drawn anew from seed and epoch."""
+
+    def __init__(self, cameras: list[Camera], seed: int) -> None:
+        if not cameras:
+            raise UserError("the scene has no training views; without --eval all views train")
+        self._cameras = cameras
+        self._seed = seed
+        self._epoch = -1
+        self._order: list[int] = []
+
+    def __getitem__(self, iteration: int) -> Camera:
+        epoch, position = divmod(iteration - 1, len(self._cameras))
+        if epoch != self._epoch:
+            self._epoch = epoch
+            self._order = permutation(self._seed, Stream.VIEW_ORDER, epoch, len(self._cameras))
+        return self._cameras[self._order[position]]
+
+
+def _random_background(seed: int, iteration: int, device: torch.device) -> Tensor:
+    return uniform(seed, Stream.BACKGROUND, iteration, torch.zeros(1, dtype=torch.int64))[0, :3].to(device)
+
+
+def _control_density(
+    gaussians: GaussianModel,
+    package: dict[str, Tensor],
+    iteration: int,
+    opt: argparse.Namespace,
+    extent: float,
+    white_background: bool,
+) -> None:
+    """Statistics of this view, and in due time clones, splits, pruning and the reset of opacities."""
+    todo = adc.actions(iteration, opt, white_background)
+    if todo.observe:
+        radii = package["radii"]
+        torch.maximum(gaussians.max_radii2D, radii, out=gaussians.max_radii2D)
+        gaussians.add_densification_stats(package["viewspace_points"], radii > 0)
+    if todo.densify:
+        gaussians.densify_and_prune(
+            opt.densify_grad_threshold,
+            adc.MIN_OPACITY,
+            extent,
+            adc.MAX_SCREEN_SIZE if todo.limit_size else None,
+            seed=opt.seed,
+            iteration=iteration,
+            max_splats=opt.max_num_splats,
+        )
+        if len(gaussians) == 0:
+            raise UserError(
+                f"no Gaussian was left after the densification of iteration {iteration}: the views do not agree "
+                "with the points; check the scene, or raise --opacity_reset_interval"
+            )
+    if todo.reset_opacity:
+        gaussians.reset_opacity()
+
+
+def _warn_of_late_reset(opt: argparse.Namespace, white_background: bool) -> None:
+    last = range(max(1, opt.iterations - 999), opt.iterations)
+    late = [t for t in last if adc.actions(t, opt, white_background).reset_opacity]
+    if late:
+        print(
+            f"warning: opacities are reset in iteration {late[-1]}, and {opt.iterations - late[-1]} iterations are few "
+            "to recover from that; change --iterations or --opacity_reset_interval"
+        )
+
+
+def _new_output_folder() -> str:
+    name = os.environ.get("OAR_JOB_ID") or str(uuid.uuid4())
+    return os.path.join("./output/", name[:10])
+
+
+def prepare_output_and_logger(args: argparse.Namespace, *, antialiasing: bool, seed: int) -> Any | None:
+    """Make the output folder (a new one under ./output when args.model_path is empty) with cfg_args and model.json.
+
+    Returns a TensorBoard writer, or None where TensorBoard is not installed.
+    """
+    args.model_path = args.model_path or _new_output_folder()
+    print(f"Output folder: {args.model_path}")
+    mkdir_p(args.model_path)
+    write_cfg_args(args.model_path, args)
+    write_model_json(args.model_path, antialiasing=antialiasing, seed=seed)
+    if SummaryWriter is None:
+        print("TensorBoard is not installed: no event file")
+        return None
+    return SummaryWriter(args.model_path)
+
+
+def training_report(
+    tb_writer: Any | None,
+    iteration: int,
+    l1: Tensor,
+    loss: Tensor,
+    l1_loss: Callable[[Tensor, Tensor], Tensor],
+    elapsed: float,
+    testing_iterations: Sequence[int],
+    scene: Scene,
+    renderFunc: Callable[..., dict[str, Tensor]],
+    renderArgs: tuple,
+) -> dict[str, float]:
+    """Log this iteration to TensorBoard; in a testing iteration score test views and five training views, and print.
+
+    elapsed: seconds of this iteration; renderArgs: what follows camera and model in renderFunc, (pipe, background).
+    Returns `<set>_l1` and `<set>_psnr` (dB, mean over views and channels) of the sets scored, {} otherwise.
+    """
+    if tb_writer:
+        tb_writer.add_scalar("train_loss_patches/l1_loss", l1.item(), iteration)
+        tb_writer.add_scalar("train_loss_patches/total_loss", loss.item(), iteration)
+        tb_writer.add_scalar("iter_time", elapsed * 1000.0, iteration)
+    if iteration not in testing_iterations:
+        return {}
+    train = scene.getTrainCameras()
+    sets = {"test": scene.getTestCameras(), "train": [train[i % len(train)] for i in range(5, 30, 5)]}
+    scores = {}
+    for name, cameras in sets.items():
+        if not cameras:
+            continue
+        differences, ratios = [], []
+        for index, camera in enumerate(cameras):
+            with torch.no_grad():
+                image = renderFunc(camera, scene.gaussians, *renderArgs)["render"]
+                target = as_float(camera.target(renderArgs[1]))
+                differences.append(l1_loss(image, target).item())
+                ratios.append(psnr(image, target).mean().item())
+            if tb_writer and index < 5:
+                tag = f"{name}_view_{camera.image_name}"
+                tb_writer.add_image(f"{tag}/render", image, global_step=iteration)
+                if iteration == testing_iterations[0]:
+                    tb_writer.add_image(f"{tag}/ground_truth", target, global_step=iteration)
+        l1_mean, psnr_mean = sum(differences) / len(cameras), sum(ratios) / len(cameras)
+        tqdm.write(f"[ITER {iteration}] Evaluating {name}: L1 {l1_mean} PSNR {psnr_mean}", file=sys.stdout)
+        if tb_writer:
+            tb_writer.add_scalar(f"{name}/loss_viewpoint - l1_loss", l1_mean, iteration)
+            tb_writer.add_scalar(f"{name}/loss_viewpoint - psnr", psnr_mean, iteration)
+        scores |= {f"{name}_l1": l1_mean, f"{name}_psnr": psnr_mean}
+    if tb_writer:
+        tb_writer.add_histogram("scene/opacity_histogram", scene.gaussians.get_opacity, iteration)
+        tb_writer.add_scalar("total_points", len(scene.gaussians), iteration)
+    return scores
+
+
+def _parser() -> tuple[argparse.ArgumentParser, ModelParams, OptimizationParams, PipelineParams]:
+    parser = argparse.ArgumentParser(description="Train a Gaussian model from photos with known cameras.")
+    groups = ModelParams(parser), OptimizationParams(parser), PipelineParams(parser)
+    add = parser.add_argument
+    add("--ip", type=str, default="127.0.0.1", help="address of the viewer (no viewer in this version; no effect)")
+    add("--port", type=int, default=6009, help="port of the viewer (no effect)")
+    add("--disable_viewer", action="store_true", help="open no port for the viewer (none is opened anyway)")
+    add("--debug_from", type=int, default=-1, metavar="N", help="switch --debug on after iteration N (default: never)")
+    add("--detect_anomaly", action="store_true", help="let autograd name the operation that made a NaN; slow")
+    listed = {"type": int, "nargs": "+", "metavar": "N"}
+    add("--test_iterations", **listed, default=[7_000, 30_000],
+        help="iterations that score the test views, -1: none (default: 7000 30000, reference)")  # fmt: skip
+    add("--save_iterations", **listed, default=[7_000, 30_000],
+        help="iterations that save the model; the last one always does (default: 7000 30000, reference)")  # fmt: skip
+    add("--checkpoint_iterations", **listed, default=[], help="iterations that save a checkpoint (default: none)")
+    add("--start_checkpoint", type=str, default=None, metavar="FILE", help="chkpntN.pth to go on from (default: none)")
+    add("--quiet", action="store_true", help="print nothing but the progress bar and errors")
+    return parser, *groups
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """The command line."""
+    parser, model, optimisation, pipeline = _parser()
+    args = parser.parse_args(argv)
+    dataset, opt, pipe = model.extract(args), optimisation.extract(args), pipeline.extract(args)
+    for name in ("save_iterations", "checkpoint_iterations"):
+        if any(t < 1 for t in getattr(args, name)):
+            raise UserError(f"--{name} counts from 1, got {min(getattr(args, name))}")
+    safe_state(args.quiet, opt.seed)
+    print(f"Optimizing {dataset.model_path}")
+    torch.autograd.set_detect_anomaly(args.detect_anomaly)
+    training(
+        dataset,
+        opt,
+        pipe,
+        args.test_iterations,
+        [*args.save_iterations, opt.iterations],
+        args.checkpoint_iterations,
+        args.start_checkpoint,
+        args.debug_from,
+    )
+    print("Training complete.")
+
+
+if __name__ == "__main__":
+    run_cli(main)

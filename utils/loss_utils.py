@@ -1,0 +1,64 @@
+"""Losses between a render and its photo: plain ones for reading and comparing, the fused one for training."""
+
+import torch
+import torch.nn.functional as F
+from fused_ssim import fused_l1_ssim
+from torch import Tensor
+
+WINDOW = 11
+SIGMA = 1.5  # pixels
+C1 = 0.01**2
+C2 = 0.03**2
+
+
+def l1_loss(network_output: Tensor, gt: Tensor) -> Tensor:
+    """Mean absolute difference."""
+    return (network_output - gt).abs().mean()
+
+
+def l2_loss(network_output: Tensor, gt: Tensor) -> Tensor:
+    """Mean squared difference."""
+    return ((network_output - gt) ** 2).mean()
+
+
+def _gaussian_window(size: int, like: Tensor) -> Tensor:
+    """Normalised 1D Gaussian of `size` taps, sigma 1.5."""
+    x = torch.arange(size, dtype=torch.float64) - size // 2
+    weights = torch.exp(-0.5 * (x / SIGMA) ** 2)
+    return (weights / weights.sum()).to(like)
+
+
+def ssim(img1: Tensor, img2: Tensor, window_size: int = WINDOW, size_average: bool = True) -> Tensor:
+    """Structural similarity (Wang et al. 2004, eq. 13) per channel with a Gaussian window and zeros outside the image.
+
+    img1, img2: (C, H, W) or (B, C, H, W) in [0, 1]. Returns the mean over everything, or over each image of the batch
+    when `size_average` is off.
+    """
+    if img1.dim() == 3:
+        img1, img2 = img1[None], img2[None]
+    channels = img1.shape[1]
+    window = _gaussian_window(window_size, img1)
+    rows = window.view(1, 1, -1, 1).repeat(channels, 1, 1, 1)
+    columns = window.view(1, 1, 1, -1).repeat(channels, 1, 1, 1)
+
+    def blur(image: Tensor) -> Tensor:
+        image = F.conv2d(image, rows, padding=(window_size // 2, 0), groups=channels)
+        return F.conv2d(image, columns, padding=(0, window_size // 2), groups=channels)
+
+    mean1, mean2 = blur(img1), blur(img2)
+    variance1 = blur(img1 * img1) - mean1 * mean1
+    variance2 = blur(img2 * img2) - mean2 * mean2
+    covariance = blur(img1 * img2) - mean1 * mean2
+    luminance = (2 * mean1 * mean2 + C1) / (mean1 * mean1 + mean2 * mean2 + C1)
+    structure = (2 * covariance + C2) / (variance1 + variance2 + C2)
+    similarity = luminance * structure
+    return similarity.mean() if size_average else similarity.mean(dim=(1, 2, 3))
+
+
+def photometric_loss(image: Tensor, target: Tensor, lambda_dssim: float) -> tuple[Tensor, Tensor]:
+    """(1 - lambda) L1 + lambda (1 - SSIM) (Kerbl et al. 2023, eq. 7) and its L1 part, from one fused pass.
+
+    image: (3, H, W) float32 in [0, 1], differentiable; target: the same shape, float32, or uint8 meaning value / 255.
+    """
+    l1, similarity = fused_l1_ssim(image, target)
+    return (1.0 - lambda_dssim) * l1 + lambda_dssim * (1.0 - similarity), l1

@@ -1,0 +1,153 @@
+"""LPIPS (Zhang et al. 2018, version 0.1) through the `lpips` package, with ImageNet weights wherever they can be had.
+
+The package brings the linear heads; the backbone's weights are torchvision's. They come from a given file, from
+torch's cache, or are downloaded into it. A backbone without weights is never used.
+"""
+
+from __future__ import annotations
+
+import importlib
+import socket
+import sys
+import warnings
+from pathlib import Path
+from types import ModuleType
+
+import torch
+
+from utils.system_utils import UserError
+
+# The first convolution tells the backbones apart; the smallest side (pixels) is what their poolings leave a pixel of.
+_FIRST_LAYER = {"vgg": (64, 3, 3, 3), "alex": (64, 3, 11, 11)}
+MIN_SIDE = {"vgg": 16, "alex": 31}
+_DOWNLOAD_TIMEOUT = 10.0  # seconds without an answer before the network counts as absent
+
+
+class LpipsUnavailable(Exception):
+    """LPIPS cannot be computed here; the text says what to put where."""
+
+
+def import_lpips() -> ModuleType:
+    """The `lpips` package, also beside a CPU-only torch.
+
+    torchvision's wheel cannot load its compiled operators there, yet its Python side attaches fake kernels to two of
+    them and stops when they do not exist (0.28). LPIPS needs neither, so their schemas are declared and the import is
+    repeated. They are declared only after the failure: where the real operators exist, theirs would clash with ours.
+    """
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            importlib.import_module("torchvision")
+        except RuntimeError as error:
+            if "torchvision::" not in str(error):
+                raise
+            for name in [name for name in sys.modules if name.split(".")[0] == "torchvision"]:
+                del sys.modules[name]
+            _declare_missing_operators()
+        return importlib.import_module("lpips")
+
+
+def _declare_missing_operators() -> None:
+    global _schemas  # the schemas live as long as this object
+    _schemas = torch.library.Library("torchvision", "FRAGMENT")
+    for name in ("nms", "qnms"):
+        if not hasattr(torch.ops.torchvision, name):
+            _schemas.define(f"{name}(Tensor dets, Tensor scores, float iou_threshold) -> Tensor")
+
+
+class PerceptualDistance:
+    """LPIPS with one backbone, `vgg` or `alex`.
+
+    `weights` are state-dict files in torchvision's format (parameters `features.*`; others are ignored), of which the
+    one that fits the backbone is taken; without any, torch's cache and then the network. Raises LpipsUnavailable, or
+    UserError for a file of the wrong kind.
+    """
+
+    def __init__(self, net: str, weights: list[Path], device: torch.device) -> None:
+        state = _features_from_files(net, weights) if weights else _features_from_cache(net)
+        lpips = import_lpips()
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # torchvision's about an argument that lpips still uses
+            model = lpips.LPIPS(net=net, pnet_rand=True, verbose=False)  # random only until the next lines
+        trunk = model.net.state_dict()  # names are sliceK.N.weight, N being the layer of torchvision's `features`
+        model.net.load_state_dict({name: _pick(state, name.split(".", 1)[1], trunk[name], net) for name in trunk})
+        self._model = model.to(device).eval().requires_grad_(False)
+
+    @torch.no_grad()
+    def __call__(self, image: torch.Tensor, other: torch.Tensor, *, unit_range: bool) -> float:
+        """Distance of two images (3, H, W), float32 in [0, 1].
+
+        The network's normalisation expects [-1, 1]. `unit_range=True` hands it [0, 1] all the same, as the published
+        3DGS numbers do; False maps to [-1, 1] first, as the package documents.
+        """
+        return float(self._model(image[None], other[None], normalize=not unit_range))
+
+
+def _pick(state: dict[str, torch.Tensor], name: str, like: torch.Tensor, net: str) -> torch.Tensor:
+    value = state.get(f"features.{name}")
+    if not isinstance(value, torch.Tensor) or value.shape != like.shape:
+        found = "nothing" if value is None else str(tuple(getattr(value, "shape", ())))
+        raise UserError(
+            f"the LPIPS weights for {net} have {found} as features.{name}, wanted {tuple(like.shape)}; "
+            f"give --lpips_weights the state dict of torchvision's {_torchvision_name(net)}"
+        )
+    return value
+
+
+def _torchvision_name(net: str) -> str:
+    return {"vgg": "vgg16", "alex": "alexnet"}[net]
+
+
+def _features_from_files(net: str, files: list[Path]) -> dict[str, torch.Tensor]:
+    for file in files:
+        state = _load_state(file)
+        shape = tuple(getattr(state.get("features.0.weight"), "shape", ()))
+        if shape not in _FIRST_LAYER.values():
+            raise UserError(f"{file} holds no weights of torchvision's vgg16 or alexnet (features.0.weight ...)")
+        if shape == _FIRST_LAYER[net]:
+            return state
+    raise LpipsUnavailable(f"no file of --lpips_weights holds torchvision's {_torchvision_name(net)}; add it there")
+
+
+def _load_state(file: Path) -> dict[str, torch.Tensor]:
+    try:
+        state = torch.load(file, map_location="cpu", weights_only=True)
+    except FileNotFoundError:
+        raise UserError(f"no such file: {file} (--lpips_weights)") from None
+    except Exception as error:  # torch raises many kinds for damaged files and for pickles that are not plain tensors
+        raise UserError(f"{file} is no readable state dict of plain tensors ({type(error).__name__})") from error
+    if not isinstance(state, dict):
+        raise UserError(f"{file} holds a {type(state).__name__}, wanted a state dict in torchvision's format")
+    return state
+
+
+def _features_from_cache(net: str) -> dict[str, torch.Tensor]:
+    import_lpips()  # makes torchvision importable
+    models = importlib.import_module("torchvision.models")
+    url = {"vgg": models.VGG16_Weights, "alex": models.AlexNet_Weights}[net].IMAGENET1K_V1.url
+    cached = Path(torch.hub.get_dir()) / "checkpoints" / url.rsplit("/", 1)[1]
+    if cached.is_file():
+        return _load_state(cached)
+    state = _download(url)
+    if state is None:
+        raise LpipsUnavailable(f"put {url} at {cached}, or name the file with --lpips_weights")
+    return state
+
+
+def _download(url: str) -> dict[str, torch.Tensor] | None:
+    """Fetch a state dict into torch's cache. None when that fails, and at once when it has failed before."""
+    global _network_failed
+    if _network_failed:
+        return None
+    before = socket.getdefaulttimeout()
+    socket.setdefaulttimeout(_DOWNLOAD_TIMEOUT)
+    try:
+        return torch.hub.load_state_dict_from_url(url, map_location="cpu", check_hash=True)
+    except (OSError, RuntimeError):  # no network, refused, or a damaged download
+        _network_failed = True
+        return None
+    finally:
+        socket.setdefaulttimeout(before)
+
+
+_network_failed = False
