@@ -1,0 +1,36 @@
+"""One picture of a few test views: ground truth, render, and their difference."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont
+
+GAIN = 5  # how much the difference is amplified
+GAP = 6  # pixels between pictures
+HEADER = 26  # pixels of height of the titles
+
+
+def error_image(truth: Image.Image, render: Image.Image) -> Image.Image:
+    """Absolute difference per channel, amplified by GAIN, black where equal."""
+    difference = np.abs(np.asarray(truth.convert("RGB"), np.int16) - np.asarray(render.convert("RGB"), np.int16))
+    return Image.fromarray(np.minimum(difference * GAIN, 255).astype(np.uint8))
+
+
+def contact_sheet(views: Sequence[tuple[str, Image.Image, Image.Image]]) -> Image.Image:
+    """A row for each view (label, ground truth, render), under a row of titles. The pictures may differ in size."""
+    cell_width = max(truth.width for _, truth, _ in views)
+    cell_height = max(truth.height for _, truth, _ in views)
+    size = (3 * (cell_width + GAP) + GAP, HEADER + len(views) * (cell_height + GAP))
+    sheet = Image.new("RGB", size, "white")
+    draw = ImageDraw.Draw(sheet)
+    font = ImageFont.load_default(size=15)
+    for column, title in enumerate(("ground truth", "render", f"error x {GAIN}")):
+        draw.text((GAP + column * (cell_width + GAP), 4), title, fill="black", font=font)
+    for row, (label, truth, render) in enumerate(views):
+        y = HEADER + row * (cell_height + GAP)
+        for column, picture in enumerate((truth, render, error_image(truth, render))):
+            sheet.paste(picture.convert("RGB"), (GAP + column * (cell_width + GAP), y))
+        draw.text((GAP + 6, y + 4), label, fill="white", font=font, stroke_width=2, stroke_fill="black")
+    return sheet

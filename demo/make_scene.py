@@ -1,0 +1,97 @@
+"""Make the demo scene: ray-traced pictures of analytic shapes, and a COLMAP model of them.
+
+python -m demo.make_scene OUT [--views 60] [--size 400 300] [--points 8000] [--seed 0]
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+from argparse import ArgumentParser
+from concurrent.futures import ProcessPoolExecutor
+from functools import partial
+from multiprocessing import get_context
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+from tqdm import tqdm
+
+from demo.colmap_model import write_model
+from demo.objects import demo_scene
+from demo.surface_points import sample_points
+from demo.tracer import View, render_view
+from demo.views import ring_views
+from utils.system_utils import UserError, mkdir_p, run_cli
+
+PIXELS_PER_PROCESS = 1_000_000  # below this, starting another process (2 s) takes longer than it saves
+
+
+def _demo_picture(view: View) -> np.ndarray:
+    return render_view(demo_scene(), view)
+
+
+def _pictures(views: list[View]) -> list[np.ndarray]:
+    """What the views show, (H, W, 3) uint8 each, made on all cores if it is worth it."""
+    pixels = sum(view.width * view.height for view in views)
+    workers = min(os.cpu_count() or 1, 1 + pixels // PIXELS_PER_PROCESS)
+    bar = partial(tqdm, total=len(views), desc="Ray tracing", unit="view")
+    if workers == 1:
+        return list(bar(map(_demo_picture, views)))
+    # Processes, because numpy holds the interpreter for much of the time on blocks this small.
+    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
+        return list(bar(pool.map(_demo_picture, views)))
+
+
+def make_scene(out: Path, views: int, width: int, height: int, points: int, seed: int) -> int:
+    """Write the scene to `out` (images/, sparse/0) and return its number of points.
+
+    The same arguments give the same pictures and points. `out` appears only when it is complete; UserError if it is
+    there already and not empty.
+    """
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise UserError(f"{out} exists and is not an empty folder; choose another one or delete it first")
+    rng = np.random.default_rng(seed)
+    cameras = ring_views(views, width, height, rng)
+    names = [f"view_{k:03d}.png" for k in range(views)]
+    mkdir_p(out.parent)
+    work = out.with_name(f".{out.name}.{os.getpid()}.tmp")
+    try:
+        (work / "images").mkdir(parents=True)
+        pictures = _pictures(cameras)
+        for name, picture in zip(names, pictures, strict=True):
+            Image.fromarray(picture).save(work / "images" / name)
+        cloud = sample_points(demo_scene(), cameras, pictures, points, rng)
+        write_model(work / "sparse" / "0", names, cameras, cloud)
+        if out.exists():
+            out.rmdir()
+        work.rename(out)
+    finally:
+        shutil.rmtree(work, ignore_errors=True)
+    return len(cloud.xyz)
+
+
+def main() -> None:
+    parser = ArgumentParser(prog="python -m demo.make_scene", description="Make the ray-traced demo scene.")
+    parser.add_argument("out", type=Path, help="folder to make; it gets images/ and sparse/0")
+    parser.add_argument("--views", type=int, default=60, help="number of pictures, on three rings (60)")
+    parser.add_argument(
+        "--size", type=int, nargs=2, default=(400, 300), metavar=("W", "H"), help="pixels of a picture (400 300)"
+    )
+    parser.add_argument("--points", type=int, default=8000, help="surface points tried; a few are dropped (8000)")
+    parser.add_argument("--seed", type=int, default=0, help="of the cameras' jitter and of the points (0)")
+    args = parser.parse_args()
+    for option, value, least in (
+        ("--views", args.views, 3),
+        ("--size", min(args.size), 16),
+        ("--points", args.points, 1),
+        ("--seed", args.seed, 0),
+    ):
+        if value < least:
+            raise UserError(f"{option} must be at least {least}, got {value}")
+    count = make_scene(args.out, args.views, *args.size, args.points, args.seed)
+    print(f"{args.out}: {args.views} pictures of {args.size[0]}x{args.size[1]} pixels, {count} points")
+
+
+if __name__ == "__main__":
+    run_cli(main)

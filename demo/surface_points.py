@@ -1,0 +1,81 @@
+"""Points on the surfaces of a scene, as structure from motion would find them: noisy, coloured, with their tracks."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from demo.objects import Thing
+from demo.tracer import View, trace
+
+POSITION_NOISE = 0.004  # standard deviation of a point, as a fraction of its distance from the view that found it
+PIXEL_NOISE = 0.3  # standard deviation of an observation in pixels
+MIN_TRACK = 3  # views a point must be seen in
+
+
+@dataclass(frozen=True)
+class SurfacePoints:
+    """`xyz` (N, 3) in world units, `rgb` (N, 3) uint8, and per view the points it sees: `seen[v]` indices (K,) and
+    `keypoints[v]` (K, 2), where they were observed, in pixels with pixel centres at .5."""
+
+    xyz: np.ndarray
+    rgb: np.ndarray
+    seen: list[np.ndarray]
+    keypoints: list[np.ndarray]
+
+
+def _found_by_views(
+    things: list[Thing], views: list[View], count: int, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """Surface points (3, count) under random pixels of random views, and their distances (count,) from them."""
+    owner = np.sort(rng.integers(len(views), size=count))
+    u, v = rng.uniform(size=(2, count))
+    points = np.empty((3, count))
+    distance = np.empty(count)
+    for k, view in enumerate(views):
+        mine = np.flatnonzero(owner == k)
+        direction = view.rays(u[mine] * view.width, v[mine] * view.height)
+        origin = view.center.reshape(3, 1)
+        distance[mine], _ = trace(things, origin.astype(np.float32), direction)
+        points[:, mine] = origin + distance[mine] * direction
+    return points, distance
+
+
+def _visible(things: list[Thing], view: View, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Indices (K,) of the surface points (3, N) that a view sees unoccluded, and their image positions (K, 2)."""
+    x, y, z = view.project(points)
+    inside = np.flatnonzero((z > 0) & (x >= 0) & (x < view.width) & (y >= 0) & (y < view.height))
+    origin = view.center.reshape(3, 1)
+    offset = points[:, inside] - origin
+    distance = np.linalg.norm(offset, axis=0)
+    hit, _ = trace(things, origin.astype(np.float32), (offset / distance).astype(np.float32))
+    # A surface seen at a slant moves its hit by far more than float32's rounding; things are much thicker than this.
+    near = hit > distance - 0.02
+    return inside[near], np.stack([x, y], axis=1)[inside[near]]
+
+
+def sample_points(
+    things: list[Thing], views: list[View], pictures: list[np.ndarray], count: int, rng: np.random.Generator
+) -> SurfacePoints:
+    """About `count` surface points with true visibility: those that fewer than MIN_TRACK views see are dropped.
+
+    Colours are means over the `pictures` (H, W, 3) uint8 that see a point, so they hold no view dependence.
+    """
+    points, distance = _found_by_views(things, views, count, rng)
+    seen, exact = zip(*(_visible(things, view, points) for view in views), strict=True)
+    track = np.bincount(np.concatenate(seen), minlength=count)
+    colour = np.zeros((count, 3))
+    for index, place, picture in zip(seen, exact, pictures, strict=True):
+        column, row = place.astype(int).T
+        colour[index] += picture[row, column]
+    keep = track >= MIN_TRACK
+    renumber = np.cumsum(keep) - 1
+    xyz = points.T + rng.normal(size=(count, 3)) * (POSITION_NOISE * distance)[:, None]
+    noisy = [place + rng.normal(scale=PIXEL_NOISE, size=place.shape) for place in exact]
+    return SurfacePoints(
+        xyz=xyz[keep],
+        rgb=np.floor(colour[keep] / track[keep, None] + 0.5).astype(np.uint8),
+        seen=[renumber[index[keep[index]]] for index in seen],
+        keypoints=[place[keep[index]] for index, place in zip(seen, noisy, strict=True)],
+    )

@@ -1,0 +1,220 @@
+"""Score rendered test views against their ground truth: PSNR, SSIM and LPIPS.
+
+python metrics.py -m MODEL [MODEL ...] [--lpips_net vgg|alex|both] [--lpips_weights FILE ...]
+
+Reads MODEL/test/<method>/{renders,gt}, writes MODEL/results.json (means), per_view.json, and metrics_info.json, which
+says what convention each number follows.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from argparse import ArgumentParser
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from fused_ssim import fused_ssim
+from PIL import Image
+from tqdm import tqdm
+
+from arguments import read_cfg_args
+from utils.lpips_utils import MIN_SIDE, LpipsUnavailable, PerceptualDistance
+from utils.system_utils import UserError, atomic_write, run_cli
+
+CONVENTIONS = {
+    "PSNR": "dB, from one mean squared error over pixels and channels of the 8-bit images; null where infinite",
+    "SSIM": "11x11 Gaussian window, sigma 1.5, zero padding, C1 0.01^2, C2 0.03^2, mean over pixels and channels",
+    "LPIPS": "version 0.1, VGG-16, inputs in [0,1] without mapping, as in the published 3DGS tables",
+    "LPIPS_vgg": "version 0.1, VGG-16, inputs mapped to [-1,1]",
+    "LPIPS_alex": "version 0.1, AlexNet, inputs mapped to [-1,1]",
+}
+BACKBONES = {"LPIPS": "vgg", "LPIPS_vgg": "vgg", "LPIPS_alex": "alex"}
+
+Metric = Callable[[np.ndarray, np.ndarray], float | None]
+Scores = dict[str, dict[str, float | None]]
+
+
+@dataclass(frozen=True)
+class Pair:
+    """A render and its ground truth, of the same size; `size` is (width, height) in pixels."""
+
+    name: str
+    render: Path
+    truth: Path
+    size: tuple[int, int]
+
+
+def find_pairs(model: Path) -> dict[str, list[Pair]]:
+    """The image pairs of every method (sub-folder of `test`), both sorted by name. Reads headers only.
+
+    UserError for anything that keeps them from being scored.
+    """
+    if not model.is_dir():
+        raise UserError(f"no such model folder: {model}")
+    test = model / "test"
+    methods = sorted(folder for folder in test.iterdir() if folder.is_dir()) if test.is_dir() else []
+    if not methods:
+        without_eval = trained_with_eval(model) is False
+        cause = "; it was trained without --eval and has no test views, train it with --eval" if without_eval else ""
+        raise UserError(f"no rendered test views in {test}{cause or f'; run render.py -m {model} first'}")
+    return {folder.name: _pairs_of(folder) for folder in methods}
+
+
+def _pairs_of(method: Path) -> list[Pair]:
+    names = {}
+    for side in ("renders", "gt"):
+        folder = method / side
+        if not folder.is_dir():
+            raise UserError(f"{folder} is missing; run render.py again")
+        names[side] = {file.name for file in folder.iterdir() if not file.name.startswith(".")}
+    if lonely := sorted(names["renders"] ^ names["gt"]):
+        there, lacking = ("renders", "gt") if lonely[0] in names["renders"] else ("gt", "renders")
+        raise UserError(f"{method}: {lonely[0]} is in {there} and not in {lacking}; run render.py again")
+    if not names["gt"]:
+        raise UserError(f"{method} has no images; its model has no test views, or run render.py again")
+    pairs = []
+    for name in sorted(names["gt"]):
+        render, truth = method / "renders" / name, method / "gt" / name
+        sizes = _size(render), _size(truth)
+        if sizes[0] != sizes[1]:
+            raise UserError(f"{render} has {sizes[0]} pixels and its ground truth {sizes[1]}; run render.py again")
+        pairs.append(Pair(name, render, truth, sizes[0]))
+    return pairs
+
+
+def _size(file: Path) -> tuple[int, int]:
+    try:
+        with Image.open(file) as image:
+            return image.size
+    except OSError as error:
+        raise UserError(f"{file} is not a readable image; run render.py again") from error
+
+
+def _read(file: Path) -> np.ndarray:
+    """The first three channels of an image, (H, W, 3) uint8."""
+    try:
+        with Image.open(file) as image:
+            return np.asarray(image.convert("RGB"))
+    except OSError as error:
+        raise UserError(f"{file} is damaged ({error}); run render.py again") from error
+
+
+def trained_with_eval(model: Path) -> bool | None:
+    """Whether the model was trained with a test set held out; None when cfg_args does not say."""
+    if not (model / "cfg_args").is_file():
+        return None
+    stored = read_cfg_args(model).get("eval")
+    return stored if isinstance(stored, bool) else None
+
+
+def psnr(render: np.ndarray, truth: np.ndarray) -> float | None:
+    """PSNR in dB of two images (H, W, 3) uint8, exact up to the logarithm; None when they are equal."""
+    squares = int(((render.astype(np.int64) - truth.astype(np.int64)) ** 2).sum())
+    return 10 * math.log10(255**2 * render.size / squares) if squares else None
+
+
+def ssim(render: np.ndarray, truth: np.ndarray) -> float:
+    """Mean SSIM of two images (H, W, 3) uint8, computed in float64."""
+    channels_first = [torch.from_numpy(image.transpose(2, 0, 1) / 255.0) for image in (render, truth)]
+    return float(fused_ssim(*channels_first, train=False))
+
+
+def _lpips_metric(distance: PerceptualDistance, unit_range: bool, device: torch.device) -> Metric:
+    def metric(render: np.ndarray, truth: np.ndarray) -> float:
+        images = [torch.from_numpy(image.transpose(2, 0, 1).copy()).to(device) / 255 for image in (render, truth)]
+        return distance(*images, unit_range=unit_range)
+
+    return metric
+
+
+def make_metrics(lpips_net: str, weights: list[Path], smallest_side: int) -> dict[str, Metric]:
+    """The metrics by key, in the order of the files. A line is printed for each backbone that can't be had; its keys
+    then give None. `smallest_side`: of all the images, in pixels."""
+    keys = ["SSIM", "PSNR", "LPIPS"] + [f"LPIPS_{net}" for net in ("vgg", "alex") if lpips_net in (net, "both")]
+    metrics: dict[str, Metric] = dict.fromkeys(keys, lambda render, truth: None)
+    metrics.update(SSIM=ssim, PSNR=psnr)
+    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    for net in ("vgg", "alex"):
+        if lpips_net not in (net, "both"):
+            continue
+        mine = [key for key in keys if BACKBONES.get(key) == net]
+        try:
+            if smallest_side < MIN_SIDE[net]:
+                raise LpipsUnavailable(f"it needs images of at least {MIN_SIDE[net]} pixels a side")
+            distance = PerceptualDistance(net, weights, device)
+        except LpipsUnavailable as reason:
+            print(f"{', '.join(mine)} will be null: {reason}")
+            continue
+        metrics.update({key: _lpips_metric(distance, key == "LPIPS", device) for key in mine})
+    return metrics
+
+
+def score(pairs: list[Pair], metrics: dict[str, Metric], title: str) -> Scores:
+    """Every metric of every pair, {metric: {file name: value}}; one pair is in memory at a time."""
+    scores: Scores = {key: {} for key in metrics}
+    for pair in tqdm(pairs, desc=title, unit="view"):
+        render, truth = _read(pair.render), _read(pair.truth)
+        for key, metric in metrics.items():
+            scores[key][pair.name] = metric(render, truth)
+    return scores
+
+
+def mean(values: dict[str, float | None]) -> float | None:
+    """Mean over the views; None as soon as one of them has no number."""
+    numbers = list(values.values())
+    return None if None in numbers else math.fsum(numbers) / len(numbers)
+
+
+def write_json(path: Path, content: dict[str, Any], sort_keys: bool = False) -> None:
+    with atomic_write(path) as temporary:
+        temporary.write_text(json.dumps(content, indent=1, sort_keys=sort_keys, allow_nan=False) + "\n")
+
+
+def main() -> None:
+    parser = ArgumentParser(description="Score rendered test views: PSNR, SSIM, LPIPS.")
+    parser.add_argument("-m", "--model_paths", type=Path, nargs="+", required=True, help="model folders to score")
+    parser.add_argument(
+        "--lpips_net",
+        choices=("vgg", "alex", "both"),
+        default="vgg",
+        help="backbone: vgg gives LPIPS (as in the published tables) and LPIPS_vgg, alex gives LPIPS_alex (vgg)",
+    )
+    parser.add_argument(
+        "--lpips_weights",
+        type=Path,
+        nargs="+",
+        default=[],
+        metavar="FILE",
+        help="state dicts of torchvision's vgg16 or alexnet, instead of torch's cache and its download",
+    )
+    args = parser.parse_args()
+
+    found = {model: find_pairs(model) for model in args.model_paths}
+    sides = [side for methods in found.values() for pairs in methods.values() for pair in pairs for side in pair.size]
+    metrics = make_metrics(args.lpips_net, args.lpips_weights, min(sides))
+    for model, methods in found.items():
+        held_out = trained_with_eval(model)
+        if held_out is False:
+            print(f"warning: {model} was trained without --eval, so these scores are of views it was trained on")
+        per_view = {name: score(pairs, metrics, f"{model.name}/{name}") for name, pairs in methods.items()}
+        results = {name: {key: mean(values) for key, values in scores.items()} for name, scores in per_view.items()}
+        for name, means in results.items():
+            shown = "  ".join(f"{key} {'null' if value is None else f'{value:.4f}'}" for key, value in means.items())
+            print(f"{model} {name} ({len(methods[name])} views): {shown}")
+        info = {
+            "conventions": {key: CONVENTIONS[key] for key in metrics},
+            "trained_with_eval": held_out,
+            "views": {name: len(pairs) for name, pairs in methods.items()},
+        }
+        write_json(model / "results.json", results)
+        write_json(model / "per_view.json", per_view)
+        write_json(model / "metrics_info.json", info, sort_keys=True)
+
+
+if __name__ == "__main__":
+    run_cli(main)

@@ -1,0 +1,106 @@
+"""Render a trained model's train and test views as PNG, with the ground truth beside, and time it.
+
+python render.py -m MODEL [--iteration N] [--skip_train] [--skip_test]
+
+Writes MODEL/{train,test}/ours_N/{renders,gt}/00000.png ..., numbered by the views' sorted order.
+"""
+
+from __future__ import annotations
+
+import argparse
+import re
+import statistics
+import time
+from pathlib import Path
+
+import torch
+from PIL import Image
+from tqdm import tqdm
+
+from arguments import ModelParams, PipelineParams, get_combined_args
+from gaussian_renderer import render
+from scene import Scene
+from scene.cameras import Camera
+from scene.gaussian_model import GaussianModel
+from utils.general_utils import safe_state
+from utils.system_utils import atomic_write, compute_device, mkdir_p, run_cli
+
+
+def to_bytes(image: torch.Tensor) -> torch.Tensor:
+    """An image (3, H, W), float in [0, 1] or already uint8, as (H, W, 3) uint8, halves rounded up."""
+    if image.dtype != torch.uint8:
+        image = (image.clamp(0, 1) * 255 + 0.5).to(torch.uint8)
+    return image.permute(1, 2, 0).contiguous().cpu()
+
+
+def save_png(image: torch.Tensor, path: Path) -> None:
+    """Write an image as `to_bytes` takes it; the file is there whole or not at all."""
+    with atomic_write(path) as temporary:
+        Image.fromarray(to_bytes(image).numpy()).save(temporary)
+
+
+def remove_leftovers(folder: Path, count: int) -> None:
+    """Delete the numbered PNGs beyond the first `count` that an earlier run with more views has left."""
+    for file in folder.glob("*.png"):
+        if re.fullmatch(r"\d{5,}", file.stem) and int(file.stem) >= count:
+            file.unlink()
+
+
+def render_set(
+    folder: Path, views: list[Camera], gaussians: GaussianModel, pipe: argparse.Namespace, background: torch.Tensor
+) -> list[float]:
+    """Write the renders and the ground truth of `views` under `folder`; seconds of rendering per view (without I/O)."""
+    for side in ("renders", "gt"):
+        mkdir_p(folder / side)
+        remove_leftovers(folder / side, len(views))
+    seconds = []
+    if views:
+        render(views[0], gaussians, pipe, background)  # the first call pays for allocations and caches
+    for index, view in enumerate(tqdm(views, desc=f"Rendering {folder.parent.name}", unit="view")):
+        _wait(background.device)
+        start = time.perf_counter()
+        image = render(view, gaussians, pipe, background)["render"]
+        _wait(background.device)
+        seconds.append(time.perf_counter() - start)
+        save_png(image, folder / "renders" / f"{index:05d}.png")
+        save_png(view.target(background), folder / "gt" / f"{index:05d}.png")
+    return seconds
+
+
+def _wait(device: torch.device) -> None:
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+
+
+@torch.no_grad()
+def main() -> None:
+    parser = argparse.ArgumentParser(description="Render the train and test views of a trained model.")
+    model_params, pipeline_params = ModelParams(parser, sentinel=True), PipelineParams(parser)
+    parser.add_argument("--iteration", type=int, default=-1, help="saved iteration to render (-1: the highest)")
+    parser.add_argument("--skip_train", action="store_true", help="leave the training views out")
+    parser.add_argument("--skip_test", action="store_true", help="leave the test views out")
+    parser.add_argument("--quiet", action="store_true", help="print nothing to stdout")
+    args = get_combined_args(parser)
+    options, pipe = model_params.extract(args), pipeline_params.extract(args)
+    safe_state(args.quiet)
+
+    gaussians = GaussianModel(options.sh_degree)
+    scene = Scene(options, gaussians, load_iteration=args.iteration, shuffle=False)
+    background = torch.full((3,), 1.0 if options.white_background else 0.0, device=compute_device())
+    for name, skip, views in (
+        ("train", args.skip_train, scene.getTrainCameras),
+        ("test", args.skip_test, scene.getTestCameras),
+    ):
+        if skip:
+            continue
+        folder = Path(scene.model_path) / name / f"ours_{scene.loaded_iter}"
+        seconds = render_set(folder, views(), gaussians, pipe, background)
+        if seconds:
+            median = statistics.median(seconds)
+            print(f"{name}: {len(seconds)} views, median {1e3 * median:.2f} ms a view ({1 / median:.1f} a second)")
+        else:
+            print(f"{name}: no views" + ("; the model was trained without --eval" if name == "test" else ""))
+
+
+if __name__ == "__main__":
+    run_cli(main)

@@ -1,0 +1,257 @@
+"""The demo's ray tracer and its COLMAP model: against closed forms, NumPy's polynomial roots and pycolmap."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from demo import make_scene as maker
+from demo.contact_sheet import GAIN, GAP, HEADER, contact_sheet
+from demo.make_scene import make_scene
+from demo.objects import demo_scene
+from demo.shapes import Box, Ground, Shape, Sphere, Torus
+from demo.tracer import render_view, trace
+from demo.views import ring_views
+from utils.system_utils import UserError
+
+ROOT = Path(__file__).parents[1]
+VIEWS, WIDTH, HEIGHT, POINTS = 12, 80, 60, 600
+
+SPHERE = Sphere((0.2, -0.4, 0.3), 0.7)
+TORUS = Torus((-0.15, -0.62, 0.95), (0.35, -0.55, 0.75), 0.42, 0.16)
+BOX = Box((0.9, -0.4, 0.5), (0.3, 0.4, 0.2), 0.5)
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory) -> Path:
+    out = tmp_path_factory.mktemp("demo") / "scene"
+    make_scene(out, VIEWS, WIDTH, HEIGHT, POINTS, seed=3)
+    return out
+
+
+@pytest.fixture(scope="module")
+def model(scene):
+    import pycolmap
+
+    return pycolmap.Reconstruction(scene / "sparse" / "0")
+
+
+def rays(count: int, center: tuple[float, float, float]) -> tuple[np.ndarray, np.ndarray]:
+    """Origins (3, R) around a centre, unit directions (3, R) towards somewhere near it; float64."""
+    rng = np.random.default_rng(11)
+    origin = rng.normal(size=(3, count))
+    origin = np.asarray(center)[:, None] + 3 * origin / np.linalg.norm(origin, axis=0)
+    direction = np.asarray(center)[:, None] + rng.uniform(-0.7, 0.7, (3, count)) - origin
+    return origin, direction / np.linalg.norm(direction, axis=0)
+
+
+def inside(shape: Shape, p: np.ndarray) -> np.ndarray:
+    """How deep points (3, N) are in a solid, positive inside; float64, written apart from the tracer."""
+    offset = p - np.reshape(getattr(shape, "center", (0, 0, 0)), (3, 1))
+    if isinstance(shape, Ground):
+        return p[1]
+    if isinstance(shape, Sphere):
+        depth = shape.radius - np.linalg.norm(offset, axis=0)
+        return -depth if shape.inside else depth
+    if isinstance(shape, Torus):
+        axis = np.asarray(shape.axis) / np.linalg.norm(shape.axis)
+        height = axis @ offset
+        ring = np.linalg.norm(offset - axis[:, None] * height, axis=0)
+        return shape.tube - np.hypot(ring - shape.radius, height)
+    c, s = np.cos(shape.turn), np.sin(shape.turn)
+    local = np.array([[c, 0, -s], [0, 1, 0], [s, 0, c]]) @ offset
+    return (np.reshape(shape.half, (3, 1)) - np.abs(local)).min(axis=0)
+
+
+def torus_by_roots(origin: np.ndarray, direction: np.ndarray) -> float:
+    """Distance to TORUS along one ray: the smallest positive real root of its quartic."""
+    axis = np.asarray(TORUS.axis) / np.linalg.norm(TORUS.axis)
+    o = origin - TORUS.center
+    square = np.poly1d([1, 2 * o @ direction, o @ o])  # |o + t d|²
+    height = np.poly1d([direction @ axis, o @ axis])
+    quartic = (square + TORUS.radius**2 - TORUS.tube**2) ** 2 - 4 * TORUS.radius**2 * (square - height**2)
+    real = [root.real for root in quartic.roots if abs(root.imag) < 1e-7 and root.real > 0]
+    return min(real, default=np.inf)
+
+
+def test_torus_hits_are_the_roots_of_its_quartic():
+    origin, direction = rays(400, TORUS.center)
+    found = TORUS.intersect(origin.astype(np.float32), direction.astype(np.float32))
+    expected = np.array([torus_by_roots(o, d) for o, d in zip(origin.T, direction.T, strict=True)])
+    assert 100 < np.isfinite(expected).sum() < 390
+    # Marching stops 2e-4 before the surface, so a ray that passes nearer than that counts as a hit: one or two here.
+    differ = np.isfinite(found) != np.isfinite(expected)
+    assert differ.sum() <= 2 and np.isfinite(found[differ]).all()
+    hit = np.isfinite(found) & np.isfinite(expected)
+    # For the same reason distances are short by 2e-4 / cos of the angle to the normal: 99 % below 2e-3.
+    assert np.quantile(np.abs(found[hit] - expected[hit]), 0.99) < 2e-3
+
+
+@pytest.mark.parametrize("shape", [SPHERE, TORUS, BOX, Ground(9.0), Sphere((0, 0, 0), 9.0, inside=True)])
+def test_hits_are_the_first_points_on_the_surface_and_normals_point_out(shape):
+    center = getattr(shape, "center", (0, -0.2, 0))
+    origin, direction = rays(500, center)
+    if isinstance(shape, Ground):
+        origin[1] = -np.abs(origin[1]) - 0.1
+    t = shape.intersect(origin.astype(np.float32), direction.astype(np.float32)).astype(np.float64)
+    hit = np.isfinite(t)
+    assert hit.sum() > 100
+    o, d, t = origin[:, hit], direction[:, hit], t[hit]
+    point = o + t * d
+    assert np.abs(inside(shape, point)).max() < 5e-4  # float32 at distances of 10, and the marching's 2e-4
+    for part in np.linspace(0.02, 0.98, 49):
+        assert inside(shape, o + part * t * d).max() < 1e-3
+    # A ray that misses is never within the solid.
+    if not isinstance(shape, Ground):
+        for part in np.linspace(0, 6, 200):
+            assert inside(shape, origin[:, ~hit] + part * direction[:, ~hit]).max(initial=-1) < 3e-3
+
+    normal = shape.normal(point.astype(np.float32)).astype(np.float64)
+    assert np.allclose(np.linalg.norm(normal, axis=0), 1, atol=1e-5)
+    step = 1e-3
+    slope = inside(shape, point - step * normal) - inside(shape, point + step * normal)
+    # 2 * step along the true normal; hits within a step of a box's edge have two of them.
+    assert np.quantile(slope, 0.02) > 1.98 * step
+
+
+def test_the_nearest_thing_is_seen():
+    things = demo_scene()
+    view = ring_views(3, 32, 24, np.random.default_rng(0))[0]
+    x, y = np.meshgrid(np.arange(32) + 0.5, np.arange(24) + 0.5)
+    direction = view.rays(x.reshape(-1), y.reshape(-1))
+    origin = view.center.astype(np.float32).reshape(3, 1)
+    distance, index = trace(things, origin, direction)
+    each = np.stack([thing.shape.intersect(origin, direction) for thing in things])
+    assert np.array_equal(distance, each.min(axis=0))
+    assert np.array_equal(index, each.argmin(axis=0))
+    assert len(set(index)) >= 5  # sky, ground and objects
+
+
+def test_samples_average_what_a_pixel_covers():
+    view = ring_views(3, 24, 16, np.random.default_rng(0))[0]
+    things = demo_scene()
+    fine = render_view(things, view, samples=8).astype(float)
+    # Supersampling converges: with the true mean as limit, more samples come nearer to it.
+    errors = [np.abs(render_view(things, view, samples=n) - fine).mean() for n in (1, 3)]
+    assert errors[1] < 0.5 * errors[0]
+    assert errors[1] < 2.0  # of 255
+
+
+def test_pycolmap_reads_a_valid_model(model, scene):
+    assert model.is_valid()
+    assert model.num_reg_images() == VIEWS
+    assert 0.6 * POINTS < model.num_points3D() <= POINTS  # with so few views many points are seen by fewer than three
+    camera = model.cameras[1]
+    assert (camera.model_name, camera.width, camera.height) == ("PINHOLE", WIDTH, HEIGHT)
+    names = sorted(image.name for image in model.images.values())
+    assert names == sorted(file.name for file in (scene / "images").iterdir())
+    with Image.open(scene / "images" / names[0]) as picture:
+        assert picture.size == (WIDTH, HEIGHT)
+
+
+def test_points_project_near_their_observations(model):
+    # Expected: position noise 0.004 * 72 px (focal length) and 0.3 px of observation, per axis: mean length 0.52 px.
+    error = model.compute_mean_reprojection_error()
+    assert 0.3 < error < 0.8
+    for point in list(model.points3D.values())[::20]:
+        errors = []
+        for element in point.track.elements:
+            image = model.images[element.image_id]
+            errors.append(np.linalg.norm(image.project_point(point.xyz) - image.points2D[element.point2D_idx].xy))
+        assert np.mean(errors) == pytest.approx(point.error, rel=1e-6)
+
+
+def test_tracks_are_what_is_visible(model):
+    """Between a camera and a point it observes there is nothing; between it and one in frame that it doesn't, there
+    is something solid. The scene's points are noisy, so both hold for nearly all of them."""
+    things = demo_scene()
+    part = np.linspace(0.05, 0.97, 120)
+    blocked = {True: [], False: []}
+    for image in model.images.values():
+        center = image.projection_center()[:, None]
+        seen = {point2d.point3D_id for point2d in image.points2D}
+        for point_id, point in model.points3D.items():
+            place = image.project_point(point.xyz)
+            if place is None or not (1 < place[0] < WIDTH - 1 and 1 < place[1] < HEIGHT - 1):
+                continue
+            line = center + part * (point.xyz[:, None] - center)
+            depth = max(inside(thing.shape, line).max() for thing in things)
+            blocked[point_id in seen].append(depth > 0.03)
+    assert len(blocked[True]) > 2000 and len(blocked[False]) > 100
+    assert np.mean(blocked[True]) < 0.02
+    assert np.mean(blocked[False]) > 0.8
+
+
+def test_views_agree_on_colours_except_where_it_is_glossy(model, scene):
+    """A point has about the same colour in all views that see it, as it would not if poses and pictures disagreed."""
+    samples: dict[int, list[np.ndarray]] = {}
+    for image in model.images.values():
+        pixels = np.asarray(Image.open(scene / "images" / image.name), float)
+        for point2d in image.points2D:
+            x, y = np.clip(point2d.xy.astype(int), 0, (WIDTH - 1, HEIGHT - 1))
+            samples.setdefault(point2d.point3D_id, []).append(pixels[y, x])
+    spread = np.array([np.std(values, axis=0).mean() for values in samples.values()])
+    colours = np.concatenate([np.array(values) for values in samples.values()])
+    assert np.median(spread) < 0.4 * colours.std(axis=0).mean()
+    for point_id, values in samples.items():
+        # The model's colours come from the places without observation noise, hence not exactly these pixels.
+        assert np.abs(np.mean(values, axis=0) - model.points3D[point_id].color).max() < 70
+    colour_error = [np.abs(np.mean(v, axis=0) - model.points3D[k].color).mean() for k, v in samples.items()]
+    assert np.median(colour_error) < 6
+
+
+def test_colour_depends_on_the_view_where_it_is_glossy():
+    things = demo_scene()
+    glossy = next(thing for thing in things if thing.mirror > 0.1)
+    matt = [thing if thing is not glossy else type(thing)(thing.shape, thing.texture) for thing in things]
+    view = ring_views(3, 60, 45, np.random.default_rng(0))[0]
+    assert (render_view(things, view, 1) != render_view(matt, view, 1)).any()
+
+
+def test_same_seed_same_bytes_and_another_seed_another_scene(tmp_path):
+    folders = [tmp_path / name for name in "abc"]
+    for folder, seed in zip(folders, (5, 5, 6), strict=True):
+        make_scene(folder, 3, 24, 18, 60, seed)
+    files = sorted(file.relative_to(folders[0]) for file in folders[0].rglob("*") if file.is_file())
+    assert len(files) >= 6
+    contents = [[(folder / file).read_bytes() for file in files] for folder in folders]
+    assert contents[0] == contents[1]
+    assert contents[0] != contents[2]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a", "b", "c"]  # no temporary folder is left
+
+
+def test_other_processes_give_the_same_pictures(monkeypatch):
+    views = ring_views(4, 24, 18, np.random.default_rng(0))
+    alone = maker._pictures(views)
+    monkeypatch.setattr(maker, "PIXELS_PER_PROCESS", 24 * 18)
+    monkeypatch.setattr(maker.os, "cpu_count", lambda: 2)
+    assert np.array_equal(maker._pictures(views), alone)
+
+
+def test_a_folder_in_use_is_left_alone(tmp_path):
+    (tmp_path / "mine.txt").write_text("keep")
+    with pytest.raises(UserError, match="not an empty folder"):
+        make_scene(tmp_path, 3, 24, 18, 60, 0)
+    assert [file.name for file in tmp_path.iterdir()] == ["mine.txt"]
+
+
+def test_absurd_numbers_end_with_a_sentence_and_status_2(tmp_path):
+    command = [sys.executable, "-m", "demo.make_scene", str(tmp_path / "out"), "--views", "0"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stderr) == (2, "error: --views must be at least 3, got 0\n")
+    assert not (tmp_path / "out").exists()
+
+
+def test_contact_sheet_shows_truth_render_and_amplified_error():
+    truth = Image.new("RGB", (40, 30), (100, 100, 100))
+    render = Image.new("RGB", (40, 30), (110, 90, 100))
+    sheet = contact_sheet([("a", truth, render), ("b", truth, truth)])
+    assert sheet.size == (3 * (40 + GAP) + GAP, HEADER + 2 * (30 + GAP))
+    bottom = HEADER + 29  # below the label
+    assert sheet.getpixel((GAP + 39, bottom)) == (100, 100, 100)
+    assert sheet.getpixel((2 * GAP + 40 + 39, bottom)) == (110, 90, 100)
+    assert sheet.getpixel((3 * GAP + 80 + 39, bottom)) == (10 * GAIN, 10 * GAIN, 0)
+    assert sheet.getpixel((3 * GAP + 80 + 39, bottom + 30 + GAP)) == (0, 0, 0)

@@ -1,0 +1,76 @@
+"""render.py: what it writes for a view, and its timing; the whole command is in test_end_to_end.py."""
+
+from argparse import Namespace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+render = pytest.importorskip("render", reason="the extensions are not built: make test")
+
+
+def read(path) -> np.ndarray:
+    with Image.open(path) as image:
+        assert image.mode == "RGB"
+        return np.asarray(image)
+
+
+def view(target: torch.Tensor) -> SimpleNamespace:
+    return SimpleNamespace(target=lambda background: target)
+
+
+@pytest.fixture
+def rendered(monkeypatch) -> dict[int, torch.Tensor]:
+    """What render() gives, by view."""
+    prepared: dict[int, torch.Tensor] = {}
+    monkeypatch.setattr(render, "render", lambda view, *_: {"render": prepared[id(view)]})
+    return prepared
+
+
+def test_bytes_are_rounded_half_up_and_clamped():
+    values = torch.tensor(
+        [-0.3, 0, 0.499 / 255, 0.5 / 255, 1.5 / 255, 2.5 / 255, 254.5 / 255, 1, 7], dtype=torch.float64
+    )
+    expected = [0, 0, 0, 1, 2, 3, 255, 255, 255]
+    image = values.repeat(3, 2, 1)
+    assert render.to_bytes(image)[1, :, 2].tolist() == expected
+    assert render.to_bytes(image).shape == (2, 9, 3)
+
+
+def test_every_8_bit_value_survives_float32():
+    levels = torch.arange(256, dtype=torch.float32).repeat(3, 1, 1) / 255
+    assert torch.equal(render.to_bytes(levels)[0, :, 0], torch.arange(256, dtype=torch.uint8))
+
+
+def test_renders_and_ground_truth_side_by_side(tmp_path, rendered):
+    generator = torch.Generator().manual_seed(1)
+    plain = torch.randint(0, 256, (3, 6, 8), dtype=torch.uint8, generator=generator)
+    composited, first, second = torch.rand(3, 3, 6, 8, generator=generator)
+    views = [view(plain), view(composited)]
+    rendered.update({id(views[0]): first, id(views[1]): second})
+    folder = tmp_path / "test" / "ours_7"
+    seconds = render.render_set(folder, views, None, Namespace(), torch.zeros(3))
+    assert len(seconds) == 2 and min(seconds) > 0
+    assert sorted(file.relative_to(folder).as_posix() for file in folder.rglob("*.png")) == [
+        "gt/00000.png", "gt/00001.png", "renders/00000.png", "renders/00001.png",
+    ]  # fmt: skip
+    for side, index, image in (("renders", 0, first), ("renders", 1, second), ("gt", 1, composited)):
+        expected = np.floor(image.double().numpy() * 255 + 0.5).transpose(1, 2, 0)
+        assert np.array_equal(read(folder / side / f"{index:05d}.png"), expected)
+    assert np.array_equal(read(folder / "gt" / "00000.png"), plain.numpy().transpose(1, 2, 0))
+
+
+def test_pngs_of_an_earlier_larger_run_are_removed_and_nothing_else(tmp_path, rendered):
+    views = [view(torch.zeros(3, 4, 4, dtype=torch.uint8)) for _ in range(3)]
+    rendered.update({id(one): torch.zeros(3, 4, 4) for one in views})
+    render.render_set(tmp_path, views, None, Namespace(), torch.zeros(3))
+    (tmp_path / "gt" / "notes.png").write_text("mine")
+    render.render_set(tmp_path, views[:1], None, Namespace(), torch.zeros(3))
+    assert sorted(file.name for file in (tmp_path / "renders").iterdir()) == ["00000.png"]
+    assert sorted(file.name for file in (tmp_path / "gt").iterdir()) == ["00000.png", "notes.png"]
+
+
+def test_no_views_no_time(tmp_path):
+    assert render.render_set(tmp_path / "test" / "ours_1", [], None, Namespace(), torch.zeros(3)) == []
