@@ -1,0 +1,208 @@
+// The small functions: exp2, activations, quaternions, spherical harmonics; derivatives by central differences.
+#include <limits>
+#include <random>
+
+#include "gs/check.h"
+#include "gs/simd.h"
+#include "math/covariance.h"
+#include "math/exp2.h"
+#include "math/sh.h"
+
+using namespace gs::GS_ISA;
+
+namespace {
+
+std::mt19937 generator(1);
+double normal() { return std::normal_distribution<double>()(generator); }
+
+// Largest relative error of exp2_lanes on steps over the range that blending uses and beyond, up to |t| = 120.
+template <class T>
+double exp2_error() {
+  using S = Simd<T>;
+  double worst = 0;
+  T t[S::kLanes], got[S::kLanes];
+  for (double first = -119.9; first < 119; first += 0.0137) {
+    for (int i = 0; i < S::kLanes; ++i) t[i] = T(first + 0.001 * i);
+    S::store(got, exp2_lanes<typename S::Vec, typename S::Mask>(S::load(t), T()));
+    for (int i = 0; i < S::kLanes; ++i)
+      worst = std::max<double>(worst, std::abs(double((long double)got[i] / std::exp2((long double)t[i]) - 1)));
+  }
+  return worst;
+}
+
+void test_exp2() {
+  // Rounding of the polynomial's steps: twice the unit in the last place, 1.2e-7 and 2.2e-16, holds with room.
+  CHECK(exp2_error<float>() < 2.4e-7);
+  CHECK(exp2_error<double>() < 4.5e-16);
+}
+
+template <class T>
+void test_sigmoid() {
+  const double unit = std::numeric_limits<T>::epsilon();
+  for (double x = -80; x <= 80; x += 0.37) {
+    const long double logit = T(x), log2_e = 1.4426950408889634074L;
+    const long double wanted = -std::log1p(std::exp(-logit)) * log2_e;
+    // Relative, so that opacities near 1 keep their distance from it.
+    CHECK_NEAR(log2_sigmoid(T(x)) / double(wanted), 1, 4 * unit);
+    CHECK_NEAR(log_sigmoid_slope(T(x)) * double(1 + std::exp(logit)), 1, 4 * unit);
+  }
+  CHECK(log2_sigmoid(std::numeric_limits<T>::infinity()) == 0);
+  CHECK(log2_sigmoid(-std::numeric_limits<T>::infinity()) == -std::numeric_limits<T>::infinity());
+  CHECK(std::isnan(log2_sigmoid(std::numeric_limits<T>::quiet_NaN())));
+}
+
+double& entry(Quat<double>& q, int k) { return k == 0 ? q.w : k == 1 ? q.x : k == 2 ? q.y : q.z; }
+
+// A fixed combination of the nine entries of R(q / |q|) or R(q).
+double rotation_objective(const Quat<double>& q, const Vec3<double> weight[3], bool unit) {
+  double norm;
+  Vec3<double> column[3];
+  rotation_columns(unit ? normalise(q, norm) : q, column);
+  return dot(column[0], weight[0]) + dot(column[1], weight[1]) + dot(column[2], weight[2]);
+}
+
+void test_rotation() {
+  for (int trial = 0; trial < 20; ++trial) {
+    Quat<double> q = {normal(), normal(), normal(), normal()};
+    Vec3<double> weight[3];
+    for (Vec3<double>& w : weight) w = {normal(), normal(), normal()};
+
+    double norm;
+    const Quat<double> n = normalise(q, norm);
+    Vec3<double> c[3];
+    rotation_columns(n, c);
+    for (int i = 0; i < 3; ++i)
+      for (int j = 0; j < 3; ++j) CHECK_NEAR(dot(c[i], c[j]), i == j, 1e-14);
+    CHECK_NEAR(dot(cross(c[0], c[1]), c[2]), 1, 1e-14);
+
+    Quat<double> as_is = rotation_columns_vjp(q, weight);
+    Quat<double> unit = normalise_vjp(n, norm, rotation_columns_vjp(n, weight));
+    for (int k = 0; k < 4; ++k) {
+      Quat<double> high = q, low = q;
+      const double h = 1e-5;
+      entry(high, k) += h, entry(low, k) -= h;
+      for (bool raw : {false, true}) {
+        const double difference =
+            (rotation_objective(high, weight, raw) - rotation_objective(low, weight, raw)) / (2 * h);
+        // Truncation: h^2 times a third derivative of some 1 / |q|^3.
+        CHECK_NEAR(entry(raw ? unit : as_is, k), difference, 1e-8 * (1 + 1 / (norm * norm * norm)));
+      }
+    }
+  }
+}
+
+template <class T>
+void test_degenerate_quaternions() {
+  T norm;
+  // Zero, and what is so short that a gradient divided by it would leave the range.
+  for (T size : {T(0), std::numeric_limits<T>::denorm_min(), std::numeric_limits<T>::min()}) {
+    const Quat<T> none = normalise(Quat<T>{0, size, -size, 0}, norm);
+    CHECK(none.w == 1 && none.x == 0 && none.y == 0 && none.z == 0 && norm == 0);
+    const Quat<T> still = normalise_vjp(none, norm, Quat<T>{1, 2, 3, 4});
+    CHECK(still.w == 0 && still.x == 0 && still.y == 0 && still.z == 0);
+  }
+  // Their squares leave the range of the type.
+  for (double size : {1e-20, 1e-25, 1e20, 1e30}) {
+    const Quat<T> q = normalise(Quat<T>{T(size), T(-size), T(size), T(size)}, norm);
+    CHECK_NEAR(q.w, 0.5, 1e-6);
+    CHECK_NEAR(q.x, -0.5, 1e-6);
+    CHECK_NEAR(norm / T(size), 2, 1e-6);
+  }
+}
+
+void test_covariance_axes() {
+  for (int trial = 0; trial < 20; ++trial) {
+    double m[3][3], full[3][3] = {};
+    for (auto& row : m)
+      for (double& value : row) value = normal();
+    for (int i = 0; i < 3; ++i)
+      for (int j = 0; j < 3; ++j)
+        for (int k = 0; k < 3; ++k) full[i][j] += m[i][k] * m[j][k];
+    const double packed[6] = {full[0][0], full[0][1], full[0][2], full[1][1], full[1][2], full[2][2]};
+    const Axes<double> axes = axes_of_covariance(packed);
+    double back[3][3] = {};
+    for (int k = 0; k < 3; ++k) {
+      const double a[3] = {axes.direction[k].x, axes.direction[k].y, axes.direction[k].z};
+      for (int i = 0; i < 3; ++i)
+        for (int j = 0; j < 3; ++j) back[i][j] += axes.scale[k] * axes.scale[k] * a[i] * a[j];
+    }
+    for (int i = 0; i < 3; ++i)
+      for (int j = 0; j < 3; ++j) CHECK_NEAR(back[i][j], full[i][j], 1e-13 * (1 + std::abs(full[i][j])));
+  }
+  // Flat ones: pivots of zero, or a little below by rounding.
+  const float flat[6] = {0, 0, 0, 1, 1, 1}, negative[6] = {1, 1, 1, 1, 1, 0.9999999f};
+  for (const float* c : {flat, negative})
+    for (const Vec3<float>& d : axes_of_covariance(c).direction) CHECK(finite(d));
+}
+
+void test_harmonics() {
+  for (int trial = 0; trial < 20; ++trial) {
+    Vec3<double> d;
+    CHECK(sh_direction(Vec3<double>{normal(), normal(), normal()}, d) > 0);
+    CHECK_NEAR(dot(d, d), 1, 1e-14);
+    double basis[16], weight[16];
+    sh_basis(3, d, basis);
+    for (double& w : weight) w = normal();
+    for (int l = 0; l <= kMaxShDegree; ++l) {  // Unsoeld: the squares of a band sum to (2 l + 1) / 4 pi
+      double sum = 0;
+      for (int k = l * l; k < sh_count(l); ++k) sum += basis[k] * basis[k];
+      CHECK_NEAR(sum, (2 * l + 1) / (4 * 3.14159265358979323846), 1e-14);
+    }
+    for (int degree = 0; degree <= kMaxShDegree; ++degree) {
+      const Vec3<double> g = sh_basis_vjp(degree, d, weight);
+      const double got[3] = {g.x, g.y, g.z};
+      for (int axis = 0; axis < 3; ++axis) {
+        const double h = 1e-5;
+        double difference = 0;
+        for (double sign : {1.0, -1.0}) {
+          Vec3<double> moved = d;
+          (axis == 0 ? moved.x : axis == 1 ? moved.y : moved.z) += sign * h;
+          sh_basis(degree, moved, basis);
+          for (int k = 0; k < sh_count(degree); ++k) difference += sign * weight[k] * basis[k] / (2 * h);
+        }
+        // The basis is taken as the polynomial it is, off the sphere as well; cubic, so h^2 is the truncation.
+        CHECK_NEAR(got[axis], difference, 1e-9);
+      }
+    }
+  }
+}
+
+void test_direction() {
+  const Vec3<double> v = {0.3, -1.2, 0.7}, weight = {0.5, 2, -1};
+  Vec3<double> d;
+  const double norm = sh_direction(v, d);
+  const Vec3<double> g = sh_direction_vjp(d, norm, weight);
+  const double got[3] = {g.x, g.y, g.z}, h = 1e-6;
+  for (int axis = 0; axis < 3; ++axis) {
+    double difference = 0;
+    for (double sign : {1.0, -1.0}) {
+      Vec3<double> moved = v;
+      (axis == 0 ? moved.x : axis == 1 ? moved.y : moved.z) += sign * h;
+      sh_direction(moved, d);
+      difference += sign * dot(d, weight) / (2 * h);
+    }
+    CHECK_NEAR(got[axis], difference, 1e-9);
+  }
+  // On the camera's centre there is no direction: the bands above 0 vanish, and nothing is NaN.
+  Vec3<float> none;
+  CHECK(sh_direction(Vec3<float>{0, 0, 0}, none) == 0);
+  CHECK(none.x == 0 && none.y == 0 && none.z == 0);
+  const Vec3<float> nothing = sh_direction_vjp(none, 0.0f, Vec3<float>{1, 2, 3});
+  CHECK(nothing.x == 0 && nothing.y == 0 && nothing.z == 0);
+  CHECK_NEAR(sh_direction(Vec3<float>{3e-30f, 0, 4e-30f}, none) * 1e30, 5, 1e-5);
+  CHECK_NEAR(none.x, 0.6, 1e-6);
+  CHECK_NEAR(sh_direction(Vec3<float>{3e30f, 0, 4e30f}, none) * 1e-30, 5, 1e-5);
+}
+
+}  // namespace
+
+int main() {
+  test_exp2();
+  test_sigmoid<float>(), test_sigmoid<double>();
+  test_rotation();
+  test_degenerate_quaternions<float>(), test_degenerate_quaternions<double>();
+  test_covariance_axes();
+  test_harmonics();
+  test_direction();
+  return gs::finish_tests("rasterizer functions");
+}

@@ -1,0 +1,229 @@
+"""What the rasterizer's tests share: both renderers under one call, the error as the design defines it, scenes."""
+
+import math
+from typing import NamedTuple
+
+import torch
+from diff_gaussian_rasterization import GaussianRasterizationSettings, Rasterized, rasterize
+from torch import Tensor
+
+from benchmarks.splat_scenes import settings
+
+ops = torch.ops.diff_gaussian_rasterization
+
+
+class Error(NamedTuple):
+    """Of a tensor: largest and median difference over the largest reference value."""
+
+    largest: float
+    median: float
+
+
+def error(got: Tensor, reference: Tensor) -> Error:
+    """Infinite where `got` has a NaN; absolute where the reference is zero."""
+    difference = (got.double() - reference.double()).abs().nan_to_num(nan=math.inf)
+    scale = reference.abs().max().item() or 1.0
+    return Error(difference.max().item() / scale, difference.median().item() / scale)
+
+
+def render(
+    parameters: dict[str, Tensor],
+    camera: GaussianRasterizationSettings,
+    means2d: Tensor | None = None,
+    *,
+    function=rasterize,
+    raw: bool = True,
+    **wanted: bool,
+) -> Rasterized:
+    """`rasterize`, or the oracle's `render` as function, on parameters by name."""
+    rest = dict(parameters)
+    means, opacities = rest.pop("means"), rest.pop("opacities")
+    means2d = torch.zeros_like(means) if means2d is None else means2d
+    if function is rasterize:
+        wanted = {"want_inverse_depth": True, "want_transmittance": True} | wanted
+    return function(means, means2d, opacities, camera, **rest, raw=raw, **wanted)
+
+
+def leaves(parameters: dict[str, Tensor], dtype: torch.dtype | None = None) -> dict[str, Tensor]:
+    """Fresh copies that require gradients."""
+    return {name: t.detach().clone().to(dtype or t.dtype).requires_grad_() for name, t in parameters.items()}
+
+
+def gradients(parameters: dict[str, Tensor], camera: GaussianRasterizationSettings, **options) -> dict[str, Tensor]:
+    """Image, planes and every gradient of a fixed loss of all of them, by name."""
+    inputs = leaves(parameters)
+    means2d = torch.zeros_like(inputs["means"]).requires_grad_()
+    out = render(inputs, camera, means2d, **options)
+    loss_of(out).backward()
+    named = {f"d {name}": t.grad for name, t in [*inputs.items(), ("means2d", means2d)]}
+    return {name: t.detach() for name, t in out._asdict().items()} | named
+
+
+def loss_of(out: NamedTuple, keep: Tensor | None = None) -> Tensor:
+    """Sum of all three planes with fixed random weights; keep (H, W) bool: the other pixels do not count."""
+    generator = torch.Generator().manual_seed(5)
+    loss = 0.0
+    for plane in (out.color, out.inverse_depth, out.transmittance):
+        weights = torch.randn(plane.shape, generator=generator, dtype=torch.float64)
+        loss = loss + ((weights if keep is None else weights * keep) * plane.double()).sum()
+    return loss
+
+
+def activated(parameters: dict[str, Tensor]) -> dict[str, Tensor]:
+    """Raw parameters as the reference's API wants them."""
+    out = dict(parameters)
+    out["opacities"] = torch.sigmoid(out["opacities"])
+    out["scales"] = torch.exp(out["scales"])
+    out["rotations"] = out["rotations"] / out["rotations"].norm(dim=1, keepdim=True)
+    return out
+
+
+def rotation_matrix(q: Tensor) -> Tensor:
+    """(3, 3) of a quaternion w x y z of any length, by the product of its left and right multiplication."""
+    w, x, y, z = (q.double() / q.double().norm()).tolist()
+    left = torch.tensor([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]], dtype=torch.float64)
+    right = torch.tensor([[w, x, y, z], [-x, w, -z, y], [-y, z, w, -x], [-z, -y, x, w]], dtype=torch.float64)
+    return (left @ right)[1:, 1:]
+
+
+def rigid(q: tuple[float, ...], translation: tuple[float, ...]) -> Tensor:
+    """(4, 4) world to view, not transposed."""
+    view = torch.eye(4, dtype=torch.float64)
+    view[:3, :3] = rotation_matrix(torch.tensor(q))
+    view[:3, 3] = torch.tensor(translation, dtype=torch.float64)
+    return view
+
+
+def few(n: int = 3, width: int = 18, height: int = 7, dtype: torch.dtype = torch.float64) -> tuple[dict, dict]:
+    """Raw parameters and arguments of `settings`: few splats, no cut-off near: 1/255 < alpha < 0.99 on every pixel."""
+    g = torch.Generator().manual_seed(11)
+    depth = 2.0 + torch.arange(n) / 2
+    focal = width / (2 * math.tan(math.radians(30)))
+    across = torch.rand(n, 2, generator=g) - 0.5
+    offset = across * torch.tensor([width, height]) * 0.6 * depth[:, None] / focal
+    parameters = {
+        "means": torch.cat([offset, depth[:, None]], 1),
+        "opacities": 0.5 * torch.randn(n, 1, generator=g),
+        "scales": torch.log(9 * depth[:, None] / focal) + 0.3 * torch.randn(n, 3, generator=g),
+        "rotations": torch.randn(n, 4, generator=g),
+        "sh_dc": 0.8 + 0.3 * torch.randn(n, 1, 3, generator=g),
+        "sh_rest": 0.1 * torch.randn(n, 15, 3, generator=g),
+    }
+    return {k: v.to(dtype) for k, v in parameters.items()}, {"width": width, "height": height, "dtype": dtype}
+
+
+def one_splat(
+    x: float = 0.0,
+    y: float = 0.0,
+    z: float = 1.0,
+    *,
+    opacity: float = 0.5,
+    scale: float = 0.05,
+    color: tuple[float, float, float] = (1.0, 0.5, 0.25),
+    dtype: torch.dtype = torch.float64,
+) -> dict[str, Tensor]:
+    """An isotropic Gaussian, activated, with a colour of its own."""
+    return {
+        "means": torch.tensor([[x, y, z]], dtype=dtype),
+        "opacities": torch.tensor([[opacity]], dtype=dtype),
+        "scales": torch.full((1, 3), scale, dtype=dtype),
+        "rotations": torch.tensor([[1.0, 0, 0, 0]], dtype=dtype),
+        "colors": torch.tensor([color], dtype=dtype),
+    }
+
+
+def together(*splats: dict[str, Tensor]) -> dict[str, Tensor]:
+    """Several of the above in one scene."""
+    return {name: torch.cat([s[name] for s in splats]) for name in splats[0]}
+
+
+def pick(parameters: dict[str, Tensor], rows) -> dict[str, Tensor]:
+    """The same scene with these rows only."""
+    return {name: t[rows] for name, t in parameters.items()}
+
+
+def scene_arguments(parameters: dict[str, Tensor], camera: GaussianRasterizationSettings, raw: bool = True) -> tuple:
+    """The arguments that the ops have in common, in their order."""
+    names = ("means", "opacities", "scales", "rotations", "cov3d", "colors", "sh_dc", "sh_rest")
+    return (
+        *(parameters.get(name) for name in names),
+        camera.viewmatrix,
+        camera.projmatrix,
+        camera.campos,
+        camera.tanfovx,
+        camera.tanfovy,
+        camera.image_height,
+        camera.image_width,
+        camera.sh_degree,
+        camera.scale_modifier,
+        camera.antialiasing,
+        raw,
+    )
+
+
+def everywhere(depths: Tensor, width: int, height: int) -> tuple[Tensor, Tensor]:
+    """Instances and ranges with every splat in every tile, by depth, ties by index."""
+    order = torch.argsort(depths, stable=True).to(torch.int32)
+    tiles = -(-width // 16) * -(-height // 16)
+    return order.repeat(tiles), len(order) * torch.arange(tiles + 1)
+
+
+def assert_culling_is_exact(
+    splats: Tensor, depths: Tensor, rects: Tensor, counts: Tensor, width: int, height: int, also: Tensor | None = None
+) -> tuple[int, int]:
+    """Blending `bin`'s lists gives the bits of blending all splats everywhere; returns the instances of both.
+
+    also (K, 11): rows and depths of splats that `project` left out; they belong to the second list as well.
+    """
+    background = torch.tensor([0.3, 0.6, 0.1], dtype=splats.dtype)
+    instances, _, ranges, _ = ops.bin(splats, depths, rects, counts, height, width, False)
+    got = ops.blend(splats, instances, ranges, background, height, width, True, False)
+    seen = counts > 0
+    splats, depths = splats[seen], depths[seen]
+    if also is not None:
+        splats, depths = torch.cat([splats, also[:, :10]]), torch.cat([depths, also[:, 10]])
+    all_instances, all_ranges = everywhere(depths, width, height)
+    wanted = ops.blend(splats, all_instances, all_ranges, background, height, width, True, False)
+    for a, b in zip(got[:3], wanted[:3], strict=True):
+        assert torch.equal(a, b)
+    return len(instances), len(all_instances)
+
+
+def borderline_splats(n: int, width: int, height: int, dtype: torch.dtype) -> tuple[Tensor, ...]:
+    """`project`'s splats, depths, rects and counts, and what it left out, of splats whose opacity is tuned so that
+    they reach 1/255 at one pixel on the rim of one tile within some units in the last place."""
+    g = torch.Generator().manual_seed(6)
+    focal = width / (2 * math.tan(math.radians(30)))
+    z = 2 + torch.rand(n, 1, generator=g)
+    span = torch.tensor([width, height]) * 1.2 / focal
+    parameters = {
+        "means": torch.cat([(torch.rand(n, 2, generator=g) - 0.5) * span * z, z], 1),
+        "opacities": torch.ones(n, 1),
+        "scales": torch.exp(torch.randn(n, 3, generator=g)) * 3 * z / focal,
+        "rotations": torch.nn.functional.normalize(torch.randn(n, 4, generator=g)),
+        "colors": torch.rand(n, 3, generator=g),
+    }
+    parameters["scales"][: n // 2] = parameters["scales"][: n // 2, :1]
+    parameters = {name: t.to(dtype) for name, t in parameters.items()}
+    camera = settings(width, height, dtype)
+    splats, depths, _, counts, _ = ops.project(*scene_arguments(parameters, camera, raw=False))
+    # The corner of a tile, not far from the mean: where a tile's least distance is at a pixel centre.
+    u, v = (2 * torch.randn(2, n, generator=g)).clamp(-2.5, 2.5)
+    dy = v / splats[:, 4]
+    pixel = splats[:, :2] + torch.stack([(u - splats[:, 3] * dy) / splats[:, 2], dy], 1)
+    pixel = (pixel / 16).round() * 16
+    pixel = torch.where(pixel > splats[:, :2], pixel, pixel - 1)
+    pixel = torch.minimum(pixel.clamp(min=0), torch.tensor([width - 1, height - 1]))
+    dx, dy = (pixel.double() - splats[:, :2].double()).unbind(1)
+    u, v = splats[:, 2].double() * dx + splats[:, 3].double() * dy, splats[:, 4].double() * dy
+    step = torch.randint(-8, 9, (n,), generator=g) * torch.finfo(dtype).eps
+    tuned = torch.exp2(u * u + v * v) / 255 * (1 + step)
+    usable = (counts > 0) & (tuned < 0.9)
+    assert usable.sum() > n / 3
+    parameters["opacities"] = tuned[:, None].to(dtype)
+    parameters = pick(parameters, usable)
+    rows = splats[usable], depths[usable]
+    splats, depths, rects, counts, _ = ops.project(*scene_arguments(parameters, camera, raw=False))
+    dropped = rows[0][counts == 0].clone()
+    dropped[:, 5] = torch.log2(parameters["opacities"][counts == 0, 0])
+    return splats, depths, rects, counts, torch.cat([dropped, rows[1][counts == 0, None]], 1)

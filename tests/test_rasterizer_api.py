@@ -1,0 +1,301 @@
+"""The public interface (CONTRACT.md 6.1): arguments, results, exceptions and their messages."""
+
+import pytest
+import torch
+from diff_gaussian_rasterization import GaussianRasterizationSettings, GaussianRasterizer, rasterize
+from rasterizer_tools import activated, few, leaves, ops, render, scene_arguments
+
+from benchmarks.splat_scenes import settings
+
+
+def scene(n: int = 3, dtype: torch.dtype = torch.float32):
+    raw, size = few(n, dtype=dtype)
+    return activated(raw), settings(**size)
+
+
+def call(splats, camera, **changes):
+    """The public class's call, by keyword as users write it."""
+    arguments = {
+        "means3D": splats["means"],
+        "means2D": torch.zeros_like(splats["means"]),
+        "opacities": splats["opacities"],
+        "shs": torch.cat([splats["sh_dc"], splats["sh_rest"]], 1),
+        "scales": splats["scales"],
+        "rotations": splats["rotations"],
+    }
+    return GaussianRasterizer(raster_settings=camera)(**(arguments | changes))
+
+
+def test_settings_are_the_references_tuple():
+    names = [
+        "image_height",
+        "image_width",
+        "tanfovx",
+        "tanfovy",
+        "bg",
+        "scale_modifier",
+        "viewmatrix",
+        "projmatrix",
+        "sh_degree",
+        "campos",
+        "prefiltered",
+        "debug",
+        "antialiasing",
+    ]
+    assert GaussianRasterizationSettings._fields[:13] == tuple(names)
+    # Ours come behind and have defaults, so that the reference's 13 stay valid, by place as by name.
+    assert set(GaussianRasterizationSettings._fields[13:]) == set(GaussianRasterizationSettings._field_defaults)
+    splats, camera = scene()
+    by_place = GaussianRasterizationSettings(*camera[:13])
+    assert torch.equal(call(splats, by_place)[0], call(splats, camera)[0])
+    with pytest.raises(TypeError):
+        GaussianRasterizationSettings(*camera[:12])
+
+
+def test_three_results():
+    splats, camera = scene()
+    result = call(splats, camera)
+    assert isinstance(result, tuple) and len(result) == 3
+    color, radii, inverse_depth = result
+    assert color.shape == (3, 7, 18) and color.dtype == torch.float32
+    assert radii.shape == (3,) and radii.dtype == torch.int32 and not radii.requires_grad
+    assert inverse_depth.shape == (1, 7, 18)
+    assert call(splats, camera._replace(inverse_depth=False))[2] is None
+
+
+def test_by_place_in_the_references_order():
+    splats, camera = scene()
+    sh = torch.cat([splats["sh_dc"], splats["sh_rest"]], 1)
+    places = (splats["means"], torch.zeros(3, 3), splats["opacities"], sh, None, splats["scales"], splats["rotations"])
+    assert torch.equal(GaussianRasterizer(camera)(*places, None)[0], call(splats, camera)[0])
+
+
+def test_the_class_and_the_function_agree():
+    splats, camera = scene()
+    color, radii, inverse_depth = call(splats, camera)
+    out = render(splats, camera, raw=False)
+    assert torch.equal(color, out.color) and torch.equal(radii, out.radii)
+    assert torch.equal(inverse_depth, out.inverse_depth)
+    raw = render(few(3, dtype=torch.float32)[0], camera)
+    # Activated outside in float32, or inside.
+    torch.testing.assert_close(raw.color, out.color, rtol=0, atol=2e-6)
+
+
+def test_exactly_one_of_each_pair_of_alternatives():
+    splats, camera = scene()
+    covariance = torch.eye(3)[[0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]].repeat(3, 1)
+    for changes in (
+        {"shs": None},
+        {"colors_precomp": torch.rand(3, 3)},
+        {"scales": None},
+        {"rotations": None},
+        {"scales": None, "rotations": None},
+        {"cov3D_precomp": covariance},
+        {"cov3D_precomp": covariance, "scales": None},
+    ):
+        with pytest.raises(Exception, match="exactly one"):
+            call(splats, camera, **changes)
+    call(splats, camera, shs=None, colors_precomp=torch.rand(3, 3))
+    call(splats, camera, scales=None, rotations=None, cov3D_precomp=covariance)
+
+
+@pytest.mark.parametrize("degree", [0, 3])
+def test_no_gaussians_give_the_background(degree):
+    splats, camera = scene()
+    none = {name: t[:0] for name, t in splats.items()}
+    color, radii, inverse_depth = call(none, camera._replace(sh_degree=degree))
+    assert torch.equal(color, camera.bg.float()[:, None, None].expand(3, 7, 18))
+    assert radii.shape == (0,) and not inverse_depth.any()
+    inputs = leaves(none)
+    render(inputs, camera, raw=False).color.sum().backward()
+    for name, t in inputs.items():
+        assert t.grad.shape == none[name].shape
+
+
+def test_mark_visible():
+    camera = scene()[1]._replace(viewmatrix=torch.tensor([[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 1, 1]]))
+    positions = torch.tensor([[0.0, 0, 0], [0, 0, -0.5], [0, 0, -0.9], [99.0, 99, 0], [0, 0, float("nan")]])
+    visible = GaussianRasterizer(camera).markVisible(positions)
+    assert visible.dtype == torch.bool and visible.tolist() == [True, True, False, True, False]
+    assert GaussianRasterizer(camera).markVisible(positions[:0]).shape == (0,)
+
+
+def test_quaternions_are_not_normalised_without_raw():
+    splats, camera = scene(1)
+    double = splats | {"rotations": splats["rotations"] * 1.2}
+    assert not torch.equal(call(double, camera)[0], call(splats, camera)[0])
+    raw, _ = few(1, dtype=torch.float32)
+    # A power of two changes no bit of the normalised one.
+    assert torch.equal(render(raw | {"rotations": 4 * raw["rotations"]}, camera).color, render(raw, camera).color)
+
+
+def test_coefficients_beyond_the_degree_are_ignored():
+    splats, camera = scene()
+    for degree in (0, 1, 2):
+        active = (degree + 1) ** 2 - 1
+        inputs = leaves(splats)
+        out = render(inputs, camera._replace(sh_degree=degree), raw=False)
+        few_bands = splats | {"sh_rest": splats["sh_rest"][:, :active]}
+        assert torch.equal(out.color, render(few_bands, camera._replace(sh_degree=degree), raw=False).color)
+        spoilt = splats | {"sh_rest": splats["sh_rest"].clone()}
+        spoilt["sh_rest"][:, active:] = float("nan")
+        assert torch.equal(out.color, render(spoilt, camera._replace(sh_degree=degree), raw=False).color)
+        out.color.square().sum().backward()
+        gradient = inputs["sh_rest"].grad
+        assert gradient.shape == (3, 15, 3)
+        assert gradient[:, :active].all() and not gradient[:, active:].any()
+
+
+def test_opacities_may_be_a_column_or_a_row():
+    splats, camera = scene()
+    row = splats | {"opacities": splats["opacities"][:, 0].clone().requires_grad_()}
+    column = splats | {"opacities": splats["opacities"].clone().requires_grad_()}
+    for s in (row, column):
+        render(s, camera, raw=False).color.sum().backward()
+    assert row["opacities"].grad.shape == (3,)
+    assert torch.equal(row["opacities"].grad, column["opacities"].grad[:, 0])
+
+
+def test_strided_inputs_give_the_same_bits():
+    splats, camera = scene()
+    wanted = render(splats, camera, raw=False).color
+    for name, t in splats.items():
+        wide = torch.full((2 * t.shape[0], *t.shape[1:-1], 2 * t.shape[-1]), float("nan"))
+        wide[::2, ..., ::2] = t
+        assert torch.equal(render(splats | {name: wide[::2, ..., ::2]}, camera, raw=False).color, wanted), name
+    features = torch.cat([splats["sh_dc"], splats["sh_rest"]], 1)  # as the reference's callers have them
+    sliced = splats | {"sh_dc": features[:, :1], "sh_rest": features[:, 1:]}
+    assert torch.equal(render(sliced, camera, raw=False).color, wanted)
+    gradient = torch.ones_like(wanted).mT.contiguous().mT  # a backward may be handed any strides
+    inputs = leaves(splats)
+    render(inputs, camera, raw=False).color.backward(gradient)
+    plain = leaves(splats)
+    render(plain, camera, raw=False).color.sum().backward()
+    assert torch.equal(inputs["means"].grad, plain["means"].grad)
+
+
+def test_only_asked_gradients_are_made():
+    splats, camera = scene()
+    for name in splats:
+        inputs = dict(splats)
+        inputs[name] = splats[name].clone().requires_grad_()
+        render(inputs, camera, raw=False).color.sum().backward()
+        everything = leaves(splats)
+        render(everything, camera, raw=False).color.sum().backward()
+        assert torch.equal(inputs[name].grad, everything[name].grad)
+
+
+def _outputs(splats, camera, train: bool, inverse_depth: bool = True):
+    return ops.rasterize(
+        torch.zeros_like(splats["means"]), *scene_arguments(splats, camera, False), camera.bg, inverse_depth, train
+    )
+
+
+def test_nothing_is_kept_without_gradients():
+    splats, camera = scene()
+    names = [
+        "color",
+        "transmittance",
+        "inverse_depth",
+        "radii",
+        "splats",
+        "tile_counts",
+        "instances",
+        "slots",
+        "ranges",
+        "slot_offsets",
+        "last",
+    ]
+    rendering = dict(zip(names, _outputs(splats, camera, False, False), strict=True))
+    for name in ("slots", "slot_offsets", "last", "inverse_depth"):
+        assert rendering[name].numel() == 0, name
+    training = dict(zip(names, _outputs(splats, camera, True), strict=True))
+    assert (
+        len(training["slots"]) == len(training["instances"]) == training["ranges"][-1] == training["tile_counts"].sum()
+    )
+    assert training["last"].shape == (7, 18)
+    assert torch.equal(rendering["color"], training["color"])
+    # The public function decides by the grad mode and by its inputs.
+    with torch.no_grad():
+        assert render(leaves(splats), camera, raw=False).color.grad_fn is None
+    assert render(splats, camera, raw=False).color.grad_fn is None
+
+
+def test_the_backward_of_a_rendering_says_what_is_wrong():
+    splats, camera = scene()
+    inputs = leaves(splats)
+    color = _outputs(inputs, camera, False)[0]
+    with pytest.raises(RuntimeError, match="train=False"):
+        color.sum().backward()
+
+
+def test_a_second_backward_of_a_freed_graph_is_torchs_own_error():
+    splats, camera = scene()
+    color = render(leaves(splats), camera, raw=False).color
+    color.sum().backward(retain_graph=True)
+    color.sum().backward()
+    with pytest.raises(RuntimeError, match="second time"):
+        color.sum().backward()
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "error", "message"),
+    [
+        ("means", torch.zeros(3, 2), ValueError, r"means must be \(N, 3\), got \(3, 2\)"),
+        ("means", torch.zeros(3, 3, dtype=torch.float16), TypeError, "float32 or float64.*float16"),
+        ("means", torch.zeros(3, 3, dtype=torch.int64), TypeError, "float32 or float64.*int64"),
+        ("opacities", torch.zeros(2, 1), ValueError, r"opacities must be \(3, 1\).*got \(2, 1\)"),
+        ("scales", torch.zeros(3, 1), ValueError, r"scales must be \(3, 3\) \(activated.*\), got \(3, 1\)"),
+        ("rotations", torch.zeros(3, 3), ValueError, r"rotations must be \(3, 4\), got \(3, 3\)"),
+        ("sh_dc", torch.zeros(3, 3), ValueError, r"sh_dc must be \(3, 1, 3\), got \(3, 3\)"),
+        ("sh_rest", torch.zeros(3, 8, 3), ValueError, r"15 or more, 3\) for sh_degree 3, got \(3, 8, 3\)"),
+        ("sh_rest", torch.zeros(2, 15, 3), ValueError, r"sh_rest must be \(3"),
+        ("sh_dc", torch.zeros(3, 1, 3, dtype=torch.float64), TypeError, "sh_dc must be torch.float32.*float64"),
+        ("scales", None, ValueError, "give scales and rotations, or cov3d"),
+        ("sh_rest", None, ValueError, "give sh_dc and sh_rest, or colors"),
+        ("colors", torch.zeros(3, 3), ValueError, "give sh_dc and sh_rest, or colors"),
+        ("cov3d", torch.zeros(3, 6), ValueError, "give scales and rotations, or cov3d"),
+    ],
+)
+def test_wrong_inputs_are_named(name, value, error, message):
+    splats, camera = scene()
+    with pytest.raises(error, match=message):
+        render(splats | {name: value}, camera, torch.zeros(3, 3), raw=False)
+
+
+def test_raw_scales_are_asked_for_as_logarithms():
+    raw, size = few(dtype=torch.float32)
+    with pytest.raises(ValueError, match="logarithms"):
+        render(raw | {"scales": raw["scales"][:, :1]}, settings(**size))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"sh_degree": 4}, "sh_degree must be 0 to 3, got 4"),
+        ({"sh_degree": -1}, "sh_degree must be 0 to 3, got -1"),
+        ({"image_width": 0}, "image size 0x7 is out of range"),
+        ({"image_height": -1}, "image size 18x-1 is out of range"),
+        ({"viewmatrix": torch.eye(3)}, "view must have 16 values"),
+        ({"bg": torch.zeros(1)}, "background must have 3 values"),
+    ],
+)
+def test_wrong_settings_are_named(changes, message):
+    splats, camera = scene()
+    with pytest.raises((ValueError, RuntimeError), match=message):
+        render(splats, camera._replace(**changes), raw=False)
+
+
+def test_means2d_of_another_shape_is_named():
+    splats, camera = scene()
+    with pytest.raises(ValueError, match=r"means2d must be \(3, 3\)|means2d must be"):
+        rest = {k: v for k, v in splats.items() if k not in ("means", "opacities")}
+        rasterize(splats["means"], torch.zeros(2, 3), splats["opacities"], camera, **rest)
+
+
+def test_debug_names_a_gradient_that_is_not_finite():
+    splats, camera = scene()
+    inputs = leaves(splats)
+    out = render(inputs, camera._replace(debug=True), raw=False)
+    with pytest.raises(FloatingPointError, match="gradient of .* not finite"):
+        (out.color.sum() * float("inf")).backward()

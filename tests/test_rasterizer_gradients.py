@@ -1,0 +1,182 @@
+"""Gradients against central differences in float64, where no cut-off is near: 1/255 < alpha < 0.99 on all pixels."""
+
+import math
+
+import pytest
+import torch
+from rasterizer_tools import activated, few, ops, render, rigid, scene_arguments
+
+from benchmarks.splat_scenes import settings
+
+
+@pytest.fixture(autouse=True)
+def one_thread():
+    """Images of a hundred pixels: more threads only wait for each other."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+
+
+# Steps of 1e-6 leave a central difference some 1e-9 from truncation and rounding; a wrong term is far above 1e-6.
+CHECK = {"eps": 1e-6, "atol": 1e-7, "rtol": 1e-6}
+VIEW = rigid((0.95, 0.1, -0.15, 0.05), (0.1, -0.05, 0.2))
+
+
+def _check(parameters, camera, raw=True, **check):
+    with torch.no_grad():
+        out = render(parameters, camera, raw=raw)
+        splats = ops.project(*scene_arguments(parameters, camera, raw))[0]
+    # The scene is what this file says: every splat on every pixel, none of them opaque.
+    ys, xs = torch.meshgrid(torch.arange(7.0), torch.arange(18.0), indexing="ij")
+    for s in splats:
+        u = s[2] * (xs - s[0]) + s[3] * (ys - s[1])
+        v = s[4] * (ys - s[1])
+        alpha = torch.exp2(s[5] - u * u - v * v)
+        assert alpha.min() > 1.05 / 255 and alpha.max() < 0.98
+    assert out.transmittance.min() > 1e-3
+
+    names = list(parameters)
+    weights = torch.randn(3, 5 * 7 * 18, dtype=torch.float64, generator=torch.Generator().manual_seed(4)) / 25
+
+    def sums(*values):  # of all pixels of all planes, in three random ways
+        out = render(dict(zip(names, values, strict=True)), camera, raw=raw)
+        return weights @ torch.cat([out.color, out.inverse_depth, out.transmittance]).flatten()
+
+    inputs = [parameters[name].detach().clone().requires_grad_() for name in names]
+    assert torch.autograd.gradcheck(sums, inputs, **(CHECK | check))
+
+
+@pytest.mark.parametrize("antialiasing", [False, True], ids=["plain alpha", "antialiased"])
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_raw_parameters(degree, antialiasing):
+    parameters, size = few()
+    parameters["sh_rest"] = parameters["sh_rest"][:, : max((degree + 1) ** 2 - 1, 3)]  # degree 0: bands not read
+    _check(parameters, settings(**size, view=VIEW, sh_degree=degree, antialiasing=antialiasing))
+
+
+@pytest.mark.parametrize("antialiasing", [False, True], ids=["plain alpha", "antialiased"])
+def test_activated_parameters_colours_and_scale_modifier(antialiasing):
+    parameters, size = few()
+    parameters = activated(parameters)
+    parameters["colors"] = torch.rand(3, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(2))
+    del parameters["sh_dc"], parameters["sh_rest"]
+    camera = settings(**size, view=VIEW, principal=(0.05, -0.1), scale_modifier=0.9, antialiasing=antialiasing)
+    _check(parameters, camera, raw=False)
+
+
+def test_quaternions_are_taken_as_they_are_without_raw():
+    parameters, size = few(2)
+    parameters = activated(parameters)
+    parameters["rotations"] = parameters["rotations"] * torch.tensor([[1.1], [0.9]], dtype=torch.float64)
+    _check(parameters, settings(**size), raw=False)
+
+
+@pytest.mark.parametrize("antialiasing", [False, True], ids=["plain alpha", "antialiased"])
+def test_given_covariances(antialiasing):
+    """An off-diagonal value stands for both entries of the symmetric matrix."""
+    parameters, size = few()
+    g = torch.Generator().manual_seed(3)
+    scale = 1.3 * parameters["scales"].mean(1).exp()[:, None, None]
+    axes = scale * (torch.eye(3) + 0.2 * torch.randn(3, 3, 3, generator=g, dtype=torch.float64))
+    parameters["cov3d"] = (axes @ axes.mT)[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
+    del parameters["scales"], parameters["rotations"]
+    parameters["opacities"] = torch.sigmoid(parameters["opacities"])
+    # Adding 1e-6 to a covariance of 1e-3 bends more than to a scale.
+    _check(parameters, settings(**size, view=VIEW, antialiasing=antialiasing), raw=False, eps=1e-7, atol=1e-6)
+
+
+@pytest.mark.parametrize("antialiasing", [False, True], ids=["plain alpha", "antialiased"])
+@pytest.mark.parametrize("axis", [0, 1])
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+def test_the_clamped_ray_has_its_exact_derivative(side, axis, antialiasing):
+    """Beyond 1.3 half images J is frozen: nothing reaches x through it, and z through its factor 1/z only (DGR#75)."""
+    parameters, size = few(2)
+    camera = settings(**size, principal=(0.1, -0.1), antialiasing=antialiasing)
+    tan = (camera.tanfovx, camera.tanfovy)[axis]
+    means = parameters["means"]
+    means[0, axis] = side * 1.6 * tan * means[0, 2]
+    if axis == 1:  # seen from that far away over the short side, alpha needs a longer splat
+        means[0, 0] = 0.0
+    parameters["scales"][0] += 0.3
+    parameters["opacities"][0] = 1.5
+    _check(parameters, camera)
+
+
+def test_the_gradient_of_means2d_is_that_of_the_mean_in_ndc():
+    """Moving the principal point by h moves a splat by h W/2 pixels and changes nothing else of it."""
+    parameters, size = few(1)
+    weights = torch.randn(3, 7, 18, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+
+    def loss(x, y, means2d=None):
+        return (weights * render(parameters, settings(**size, principal=(x, y)), means2d).color).sum()
+
+    means2d = torch.zeros(1, 3, dtype=torch.float64, requires_grad=True)
+    loss(0.0, 0.0, means2d).backward()
+    h = 1e-5
+    differences = [(loss(h, 0) - loss(-h, 0)) / (2 * h), (loss(0, h) - loss(0, -h)) / (2 * h), 0.0]
+    torch.testing.assert_close(means2d.grad[0], torch.tensor(differences, dtype=torch.float64), rtol=1e-7, atol=1e-8)
+
+
+def test_each_plane_gives_its_gradient_alone():
+    """A backward from one result must not depend on the others being used or asked for."""
+    parameters, size = few()
+    camera = settings(**size)
+    names = list(parameters)
+    inputs = {name: t.clone().requires_grad_() for name, t in parameters.items()}
+
+    def grad(plane, **wanted):
+        out = getattr(render(inputs, camera, **wanted), plane)
+        weights = torch.linspace(-1, 1, out.numel(), dtype=torch.float64).reshape(out.shape)
+        grads = torch.autograd.grad((weights * out).sum(), list(inputs.values()), allow_unused=True)
+        return dict(zip(names, grads, strict=True))
+
+    alone = grad("color", want_inverse_depth=False, want_transmittance=False)
+    for name, g in grad("color").items():
+        assert torch.equal(g, alone[name])
+    assert not grad("inverse_depth")["sh_dc"].any()
+    assert not grad("transmittance")["sh_rest"].any()
+    for plane in ("inverse_depth", "transmittance"):
+        assert grad(plane)["opacities"].all()
+
+
+def test_a_clamped_colour_channel_gets_no_gradient():
+    parameters, size = few(1)
+    parameters["sh_dc"] = torch.tensor([[[-9.0, 0.5, 0.5]]], dtype=torch.float64)
+    inputs = {name: t.clone().requires_grad_() for name, t in parameters.items()}
+    out = render(inputs, settings(**size))
+    out.color[0].sum().backward(retain_graph=True)
+    assert not inputs["sh_dc"].grad[..., 0].any() and not inputs["sh_rest"].grad[..., 0].any()
+    assert inputs["opacities"].grad.all()  # it still hides the background
+    inputs["sh_dc"].grad = None
+    out.color[1].sum().backward()
+    assert inputs["sh_dc"].grad[..., 1].all() and not inputs["sh_dc"].grad[..., 0].any()
+
+
+@pytest.mark.parametrize("side", [0.9, 1.1])
+def test_the_antialiasing_factor_is_floored(side):
+    """Where det0/det comes to 2.5e-5 the factor is 0.005, whatever the scale, and gives it no gradient."""
+    parameters, size = few(1, 17, 7)  # odd: the mean is at the middle pixel's centre
+    parameters["means"][:, :2] = 0.0
+    parameters["opacities"][:] = 4.0
+    # (s^2 / (s^2 + 0.3))^2 = 2.5e-5 for a round splat of s px.
+    s = (0.3 * 0.005 / (1 - 0.005)) ** 0.5 * side
+    focal = 17 / (2 * settings(**size).tanfovx)
+    parameters["scales"][:] = math.log(s * 2 / focal)
+    inputs = {name: t.clone().requires_grad_() for name, t in parameters.items()}
+
+    def at_middle(scales):
+        out = render(inputs | {"scales": scales}, settings(**size, antialiasing=True))
+        return 1 - out.transmittance[0, 3, 8]
+
+    factor = max(0.005, s * s / (s * s + 0.3))
+    opacity = torch.sigmoid(parameters["opacities"]).item()
+    alpha = at_middle(inputs["scales"])
+    assert alpha.item() == pytest.approx(opacity * factor, rel=1e-12)
+    alpha.backward()
+    h = 1e-5
+    with torch.no_grad():
+        difference = (at_middle(inputs["scales"] + h) - at_middle(inputs["scales"] - h)) / (2 * h)
+    got = inputs["scales"].grad.sum().item()
+    assert got == pytest.approx(difference.item(), rel=1e-6, abs=1e-12)
+    assert (got == 0) == (side < 1)

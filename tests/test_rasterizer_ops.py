@@ -1,0 +1,87 @@
+"""The operators: registration under torch's own checks, and the steps one by one against the whole."""
+
+import pytest
+import torch
+from rasterizer_tools import few, leaves, ops, render, scene_arguments, together
+
+from benchmarks.splat_scenes import settings
+
+
+def _check(op, *arguments, **keywords):
+    torch.library.opcheck(op, arguments, keywords)
+
+
+@pytest.mark.parametrize("train", [False, True])
+@pytest.mark.parametrize("inverse_depth", [False, True])
+def test_opcheck_rasterize(inverse_depth, train):
+    raw, size = few(dtype=torch.float32)
+    camera = settings(**size)
+    inputs = leaves(raw) if train else raw
+    means2d = torch.zeros(3, 3, requires_grad=train)
+    _check(ops.rasterize, means2d, *scene_arguments(inputs, camera), camera.bg.float(), inverse_depth, train)
+
+
+def test_opcheck_every_other_op():
+    raw, size = few(dtype=torch.float32)
+    camera = settings(**size)
+    height, width, background = camera.image_height, camera.image_width, camera.bg.float()
+    arguments = scene_arguments(raw, camera)
+    _check(ops.project, *arguments)
+    splats, depths, rects, counts, _ = ops.project(*arguments)
+    for train in (False, True):
+        _check(ops.bin, splats, depths, rects, counts, height, width, train)
+    instances, slots, ranges, offsets = ops.bin(splats, depths, rects, counts, height, width, True)
+    for inverse_depth, train in [(False, False), (True, True)]:
+        _check(ops.blend, splats, instances, ranges, background, height, width, inverse_depth, train)
+    image, transmittance, plane, last = ops.blend(splats, instances, ranges, background, height, width, True, True)
+    state = (splats, counts, instances, slots, ranges, offsets, background, last, transmittance)
+    gradients = (torch.ones_like(image), torch.ones_like(transmittance), torch.ones_like(plane))
+    _check(ops.blend_vjp, *state, *gradients)
+    moments = ops.blend_vjp(*state, *gradients)
+    wanted = [True, True, True, True, True, False, False, True, True]
+    _check(ops.project_vjp, *arguments, counts, moments, wanted)
+    state = (background, splats, counts, instances, slots, ranges, offsets, last, transmittance)
+    _check(ops.rasterize_vjp, *arguments, *state, *gradients, wanted)
+    _check(ops.mark_visible, raw["means"], camera.viewmatrix.float())
+    moment = torch.rand(3, 3)
+    _check(ops.adam_, torch.rand(3, 3), torch.rand(3, 3), moment, moment.clone(), 0.1, 0.9, 0.99, 1e-8, 1.0, columns=2)
+
+
+def test_the_steps_one_by_one_are_the_whole():
+    """rasterize is project, bin and blend; rasterize_vjp is blend_vjp and project_vjp."""
+    raw, size = few(dtype=torch.float64)
+    raw = together(raw, raw)
+    camera = settings(**size)
+    arguments = scene_arguments(raw, camera)
+    splats, depths, rects, counts, radii = ops.project(*arguments)
+    instances, slots, ranges, offsets = ops.bin(splats, depths, rects, counts, 7, 18, True)
+    color, transmittance, inverse_depth, last = ops.blend(splats, instances, ranges, camera.bg, 7, 18, True, True)
+    inputs = leaves(raw)
+    out = render(inputs, camera)
+    assert torch.equal(out.color, color) and torch.equal(out.transmittance, transmittance)
+    assert torch.equal(out.inverse_depth, inverse_depth) and torch.equal(out.radii, radii)
+    weights = torch.linspace(-1, 1, color.numel(), dtype=torch.float64).reshape(color.shape)
+    (weights * out.color).sum().backward()
+    state = (splats, counts, instances, slots, ranges, offsets, camera.bg, last, transmittance)
+    moments = ops.blend_vjp(*state, weights, None, None)
+    wanted = [True, False, True, True, True, False, False, True, True]
+    gradients = ops.project_vjp(*arguments, counts, moments, wanted)
+    for name, g in zip(
+        ("means", "opacities", "scales", "rotations", "sh_dc", "sh_rest"),
+        [*gradients[:1], *gradients[2:5], *gradients[7:]],
+        strict=True,
+    ):
+        assert torch.equal(inputs[name].grad, g), name
+    assert gradients[1].numel() == gradients[5].numel() == 0
+
+
+@pytest.mark.parametrize("counts", [(2**31 - 1,) * 3, (2**30, 2**30, 0)])
+def test_more_instances_than_an_index_holds_are_an_error(counts):
+    """Before anything is allocated: 6.4 billion of them would be 50 GB."""
+    raw, size = few(dtype=torch.float32)
+    splats, depths, rects, _, _ = ops.project(*scene_arguments(raw, settings(**size)))
+    faked = torch.tensor(counts, dtype=torch.int32)
+    with pytest.raises(
+        RuntimeError, match=f"3 Gaussians cover {sum(counts)} tile instances, more than 2.31 - 1: render"
+    ):
+        ops.bin(splats, depths, rects, faked, 7, 18, True)

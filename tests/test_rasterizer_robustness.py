@@ -1,0 +1,155 @@
+"""Poison in one Gaussian: nothing crashes, no other is disturbed, and what is not finite gets a zero gradient."""
+
+import math
+
+import pytest
+import torch
+from rasterizer_tools import activated, gradients, pick, render
+from torch import Tensor
+
+from benchmarks.splat_scenes import ordinary, settings
+
+N, VICTIM, SIZE = 40, 17, (75, 53)
+NOT_FINITE = [math.nan, math.inf, -math.inf]
+# The thresholds' neighbourhood, what squares or cubes leave float, what vanishes in it.
+EXTREME = [3.4e38, -3.4e38, 1e20, -1e20, 1e10, -1e10, 1e-20, 1e-38, 1e-45, 0.0, 0.2, 16.0, 1e4, 30.0, -50.0, 50.0]
+
+
+@pytest.fixture(scope="module")
+def camera():
+    return settings(*SIZE, torch.float32, antialiasing=True)
+
+
+def scene(raw: bool) -> dict[str, Tensor]:
+    parameters = {name: t.float() for name, t in ordinary(N, *SIZE).parameters.items()}
+    parameters["means"][VICTIM] = torch.tensor([0.1, -0.1, 3.0])  # in the middle of things
+    if raw:
+        return parameters
+    out = activated(parameters)
+    del out["sh_dc"], out["sh_rest"], out["scales"], out["rotations"]
+    axes = torch.randn(N, 3, 3, generator=torch.Generator().manual_seed(1)) * 0.05
+    out["cov3d"] = (axes @ axes.mT)[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
+    out["colors"] = torch.rand(N, 3, generator=torch.Generator().manual_seed(2))
+    return out
+
+
+CASES = [(True, name) for name in ("means", "opacities", "scales", "rotations", "sh_dc", "sh_rest")]
+CASES += [(False, name) for name in ("opacities", "cov3d", "colors")]
+
+
+def poisoned(parameters: dict[str, Tensor], name: str, value: float, whole_row: bool) -> dict[str, Tensor]:
+    out = {k: t.clone() for k, t in parameters.items()}
+    flat = out[name][VICTIM].view(-1)
+    flat[: flat.numel() if whole_row else 1] = value
+    return out
+
+
+@pytest.mark.parametrize(("raw", "name"), CASES)
+def test_a_gaussian_that_is_not_finite_is_as_if_it_were_not_there(raw, name, camera):
+    parameters = scene(raw)
+    others = torch.arange(N) != VICTIM
+    wanted = gradients(pick(parameters, others), camera, raw=raw)
+    for value in NOT_FINITE:
+        for whole_row in (False, True):
+            bad = poisoned(parameters, name, value, whole_row)
+            got = gradients(bad, camera, raw=raw)
+            for key, t in got.items():
+                if key in ("color", "inverse_depth", "transmittance"):
+                    assert torch.equal(t, wanted[key]), (key, value)
+                else:
+                    assert torch.equal(t[others], wanted[key]), (key, value)
+                    # Colours are read only where there are tiles, so they do not decide on the radius.
+                    assert not t[VICTIM].any() or (key == "radii" and name in ("sh_dc", "sh_rest", "colors")), (
+                        key,
+                        value,
+                    )
+
+
+@pytest.mark.parametrize(("raw", "name"), CASES)
+def test_extreme_finite_values_leave_everything_finite(raw, name, camera):
+    parameters = scene(raw)
+    for value in EXTREME:
+        for whole_row in (False, True):
+            for key, t in gradients(poisoned(parameters, name, value, whole_row), camera, raw=raw).items():
+                assert t.isfinite().all(), (key, value)
+
+
+def test_a_zero_quaternion_counts_as_the_identity(camera):
+    parameters = scene(True)
+    for value in (0.0, 1e-45):
+        zero = {k: t.clone() for k, t in parameters.items()}
+        zero["rotations"][VICTIM] = torch.tensor([0.0, value, 0.0, 0.0])
+        identity = {k: t.clone() for k, t in zero.items()}
+        identity["rotations"][VICTIM] = torch.tensor([1.0, 0.0, 0.0, 0.0])
+        got, wanted = gradients(zero, camera), gradients(identity, camera)
+        assert torch.equal(got["color"], wanted["color"])
+        assert not got["d rotations"][VICTIM].any()
+        assert torch.equal(got["d scales"], wanted["d scales"])
+
+
+@pytest.mark.parametrize("length", [1e-20, 1e20])
+def test_the_length_of_a_raw_quaternion_does_not_matter(length, camera):
+    parameters = scene(True)
+    long = parameters | {"rotations": parameters["rotations"] * length}
+    got, wanted = gradients(long, camera), gradients(parameters, camera)
+    # Rounding of the product by a length that is no power of two.
+    torch.testing.assert_close(got["color"], wanted["color"], rtol=0, atol=1e-5)
+    torch.testing.assert_close(got["d rotations"] * length, wanted["d rotations"], rtol=1e-2, atol=1e-4)
+
+
+@pytest.mark.parametrize("logit", [-50.0, 50.0])
+def test_saturated_logits(logit, camera):
+    parameters = {k: t.clone() for k, t in scene(True).items()}
+    parameters["opacities"][VICTIM] = logit
+    got = gradients(parameters, camera)
+    slope = got["d opacities"][VICTIM].abs().item()
+    assert slope < 1e-15  # of the logistic function: e^-50
+    assert (slope > 0) == (logit > 0)  # the other is culled
+    assert got["radii"][VICTIM] > 0
+    center = got["transmittance"][0, 24, 39].item()
+    assert logit < 0 or center <= 0.0101
+
+
+@pytest.mark.parametrize("scale", [1e-10, 1e6])
+def test_scales_from_points_to_worlds(scale, camera):
+    parameters = {k: t.clone() for k, t in scene(True).items()}
+    parameters["scales"][VICTIM] = math.log(scale)
+    got = gradients(parameters, camera._replace(antialiasing=False))
+    assert all(t.isfinite().all() for t in got.values())
+    alone = render(pick(parameters, slice(VICTIM, VICTIM + 1)), camera._replace(antialiasing=False))
+    opacity = torch.sigmoid(parameters["opacities"][VICTIM]).item()
+    reached = 1 - alone.transmittance
+    if scale > 1:  # flat over the image
+        assert reached.min().item() == pytest.approx(opacity, rel=1e-5) == reached.max().item()
+    else:  # the dilation alone: a pixel or few
+        assert 0 < (reached > 0).sum() < 30
+
+
+def test_bright_coefficients(camera):
+    parameters = {k: t.clone() for k, t in scene(True).items()}
+    parameters["sh_dc"][VICTIM] = 1e4
+    parameters["sh_rest"][VICTIM] *= 1e4
+    got = gradients(parameters, camera)
+    assert all(t.isfinite().all() for t in got.values())
+    assert got["color"].max() > 100
+
+
+def test_a_mean_on_the_cameras_centre_is_culled(camera):
+    parameters = {k: t.clone() for k, t in scene(True).items()}
+    parameters["means"][VICTIM] = 0.0
+    got = gradients(parameters, camera)
+    assert got["radii"][VICTIM] == 0 and not got["d means"][VICTIM].any()
+    # With `campos` on a mean that is seen, the viewing direction is undefined: degree 0 alone is left of its colour.
+    parameters["means"][VICTIM] = torch.tensor([0.1, -0.1, 3.0])
+    elsewhere = camera._replace(campos=parameters["means"][VICTIM].clone())
+    got = gradients(parameters, elsewhere)
+    assert all(t.isfinite().all() for t in got.values())
+    assert got["d sh_dc"][VICTIM].any() and not got["d sh_rest"][VICTIM].any()
+
+
+def test_a_degenerate_covariance_is_finite(camera):
+    parameters = scene(False)
+    for values in ([0.0] * 6, [1, 1, 1, 1, 1, 1], [1e-3, 0, 0, -1e-3, 0, 1e-3], [1e-3, 1, 0, 1e-3, 0, 1e-3]):
+        bad = {k: t.clone() for k, t in parameters.items()}
+        bad["cov3d"][VICTIM] = torch.tensor(values, dtype=torch.float32)
+        assert all(t.isfinite().all() for t in gradients(bad, camera, raw=False).values()), values
