@@ -4,6 +4,7 @@
 // unless a stride is given; T is float or double.
 #include <cstdint>
 
+#include "gs/cuda_queue.h"
 #include "gs/parallel.h"
 
 namespace gs {
@@ -108,33 +109,39 @@ struct AdamInput {
   double lr, beta1, beta2, eps, step;
 };
 
-#define GS_BACKEND                                                                                             \
-  template <class T>                                                                                           \
-  void project(const Executor&, const Scene<T>&, const Projected<T>&);                                         \
-  template <class T>                                                                                           \
-  void project_vjp(const Executor&, const Scene<T>&, const int32_t* tile_counts, const T* moments,             \
-                   const SceneGradient<T>&);                                                                   \
-  template <class T>                                                                                           \
-  void mark_visible(const Executor&, int64_t count, const T* means, const T* view, bool* visible);             \
-  template <class T>                                                                                           \
-  void bin(const Executor&, int64_t count, const Projected<T>&, Image, int64_t instance_count, const Binned&); \
-  template <class T>                                                                                           \
-  void blend(const Executor&, const BlendInput<T>&, const Blended<T>&);                                        \
-  template <class T>                                                                                           \
-  void blend_vjp(const Executor&, const BlendInput<T>&, const BlendGradient<T>&);                              \
-  template <class T>                                                                                           \
-  void adam(const Executor&, const AdamInput<T>&);
+// Every backend's functions. `Where` says how they run: an Executor on the CPU, a Queue on a GPU.
+#define GS_BACKEND(Where)                                                                                   \
+  template <class T>                                                                                        \
+  void project(const Where&, const Scene<T>&, const Projected<T>&);                                         \
+  template <class T>                                                                                        \
+  void project_vjp(const Where&, const Scene<T>&, const int32_t* tile_counts, const T* moments,             \
+                   const SceneGradient<T>&);                                                                \
+  template <class T>                                                                                        \
+  void mark_visible(const Where&, int64_t count, const T* means, const T* view, bool* visible);             \
+  template <class T>                                                                                        \
+  void bin(const Where&, int64_t count, const Projected<T>&, Image, int64_t instance_count, const Binned&); \
+  template <class T>                                                                                        \
+  void blend(const Where&, const BlendInput<T>&, const Blended<T>&);                                        \
+  template <class T>                                                                                        \
+  void blend_vjp(const Where&, const BlendInput<T>&, const BlendGradient<T>&);                              \
+  template <class T>                                                                                        \
+  void adam(const Where&, const AdamInput<T>&);
 
 namespace baseline {
-GS_BACKEND
+GS_BACKEND(Executor)
 }
 #ifdef GS_X86
 namespace avx2 {
-GS_BACKEND
+GS_BACKEND(Executor)
 }
 namespace avx512 {
-GS_BACKEND
+GS_BACKEND(Executor)
 }
 #endif
+namespace cuda {
+GS_BACKEND(Queue)
+// The number of tile instances of a projection: waits for it.
+int64_t count_instances(const Queue&, int64_t count, const int32_t* tile_counts);
+}  // namespace cuda
 
 }  // namespace gs

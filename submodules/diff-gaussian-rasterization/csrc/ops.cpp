@@ -1,13 +1,17 @@
-// The only file that sees torch: checks, allocates, dispatches on the instruction set.
+// The only file that sees torch: checks, allocates, dispatches on device and instruction set.
 #include <ATen/ops/empty.h>
 #include <torch/library.h>
 
 #include <array>
 #include <limits>
+#include <type_traits>
 
 #include "gs/isa.h"
 #include "gs/torch_executor.h"
 #include "launch.h"
+#ifdef GS_CUDA
+#include "gs/torch_queue.h"
+#endif
 
 namespace {
 
@@ -36,6 +40,7 @@ class SceneTensors {
   explicit SceneTensors(SCENE_PARAMETERS)
       : count_(means.size(0)),
         dtype_(means.scalar_type()),
+        device_(means.device()),
         means_(take(means, {3}, "means")),
         opacities_(take(opacities, {}, "opacities")),
         scales_(take(scales, {3}, "scales")),
@@ -105,7 +110,7 @@ class SceneTensors {
     const Tensor& t = *given;
     int64_t row = 1;
     for (int64_t size : tail) row *= size;
-    TORCH_CHECK(t.device().is_cpu(), name, " must be on the CPU, got ", t.device());
+    TORCH_CHECK(t.device() == device_, name, " must be on the device of means, ", device_, ", got ", t.device());
     TORCH_CHECK(t.dim() >= 1 && t.size(0) == count_ && t.numel() == count_ * row, name, " must be (", count_, ", ", row,
                 "), got ", t.sizes());
     TORCH_CHECK(t.scalar_type() == dtype_, name, " must have the dtype of means, got ", t.scalar_type());
@@ -115,6 +120,7 @@ class SceneTensors {
   Tensor take_bands(const MaybeTensor& given, const char* name) const {
     if (!given.has_value() || !given->defined()) return {};
     const Tensor& t = *given;
+    TORCH_CHECK(t.device() == device_, name, " must be on the device of means, ", device_, ", got ", t.device());
     TORCH_CHECK(t.dim() == 3 && t.size(0) == count() && t.size(2) == 3 && t.scalar_type() == dtype(), name,
                 " must be (", count(), ", bands, 3) with the dtype of means, got ", t.sizes(), " ", t.scalar_type());
     return t.size(1) == 0 || (t.stride(2) == 1 && t.stride(1) == 3) ? t : t.contiguous();
@@ -124,8 +130,9 @@ class SceneTensors {
     return t.to(means_.options()).contiguous();
   }
 
-  int64_t count_;  // first: the checks of the tensors read these two
+  int64_t count_;  // first: the checks of the tensors read these three
   at::ScalarType dtype_;
+  at::Device device_;
   Tensor means_, opacities_, scales_, rotations_, cov3d_, colors_, sh_dc_, sh_rest_, view_, projection_, center_;
   double tan_x_, tan_y_, scale_modifier_;
   int sh_degree_;
@@ -141,6 +148,21 @@ void with_scalar(at::ScalarType type, const F& f) {
   else
     f(double());
 }
+
+// Runs a backend's function where the tensor `like` lies.
+#ifdef GS_CUDA
+#define RUN(T, like, fn, ...)                                                                               \
+  if (!(like).is_cuda()) {                                                                                  \
+    GS_DISPATCH(fn, gs::torch_executor(), __VA_ARGS__);                                                     \
+  } else if constexpr (std::is_same_v<T, float>) {                                                          \
+    gs::TorchQueue queue((like).device());                                                                  \
+    gs::cuda::fn(queue.queue(), __VA_ARGS__);                                                               \
+  } else {                                                                                                  \
+    TORCH_CHECK(false, "the CUDA backend computes in float32, got float64: pass .float(), or use the CPU"); \
+  }
+#else
+#define RUN(T, like, fn, ...) GS_DISPATCH(fn, gs::torch_executor(), __VA_ARGS__)
+#endif
 
 int64_t tiles_of(gs::Image image) { return ((image.width + kTile - 1) / kTile) * ((image.height + kTile - 1) / kTile); }
 
@@ -160,9 +182,23 @@ ProjectedTensors project(const SceneTensors& in) {
                        at::empty({n, 4}, ints), at::empty({n}, ints), at::empty({n}, ints)};
   with_scalar(in.dtype(), [&](auto zero) {
     using T = decltype(zero);
-    GS_DISPATCH(project, gs::torch_executor(), in.scene<T>(), out.pointers<T>());
+    RUN(T, out.splats, project, in.scene<T>(), out.pointers<T>());
   });
   return out;
+}
+
+int64_t count_instances(const Tensor& tile_counts) {
+  const int64_t n = tile_counts.size(0);
+  const int32_t* counts = tile_counts.const_data_ptr<int32_t>();
+#ifdef GS_CUDA
+  if (tile_counts.is_cuda()) {
+    gs::TorchQueue queue(tile_counts.device());
+    return gs::cuda::count_instances(queue.queue(), n, counts);
+  }
+#endif
+  int64_t total = 0;
+  for (int64_t i = 0; i < n; ++i) total += counts[i];
+  return total;
 }
 
 struct BinnedTensors {
@@ -172,9 +208,7 @@ struct BinnedTensors {
 // `slots`: whether the backward will need them.
 BinnedTensors bin(ProjectedTensors& in, gs::Image image, bool slots) {
   const int64_t n = in.depths.size(0);
-  const int32_t* counts = in.tile_counts.const_data_ptr<int32_t>();
-  int64_t total = 0;
-  for (int64_t i = 0; i < n; ++i) total += counts[i];
+  const int64_t total = count_instances(in.tile_counts);
   TORCH_CHECK(total <= std::numeric_limits<int32_t>::max(), n, " Gaussians cover ", total,
               " tile instances, more than 2^31 - 1: render at a lower resolution or with fewer or smaller Gaussians");
   const auto ints = in.depths.options().dtype(at::kInt), longs = in.depths.options().dtype(at::kLong);
@@ -185,7 +219,7 @@ BinnedTensors bin(ProjectedTensors& in, gs::Image image, bool slots) {
       out.ranges.mutable_data_ptr<int64_t>(), slots ? out.slot_offsets.mutable_data_ptr<int64_t>() : nullptr};
   with_scalar(in.depths.scalar_type(), [&](auto zero) {
     using T = decltype(zero);
-    GS_DISPATCH(bin, gs::torch_executor(), n, in.pointers<T>(), image, total, binned);
+    RUN(T, in.depths, bin, n, in.pointers<T>(), image, total, binned);
   });
   return out;
 }
@@ -219,7 +253,7 @@ BlendedTensors blend(const Tensor& splats, const Tensor& instances, const Tensor
     const gs::Blended<T> blended{out.color.mutable_data_ptr<T>(), out.transmittance.mutable_data_ptr<T>(),
                                  inverse_depth ? out.inverse_depth.mutable_data_ptr<T>() : nullptr,
                                  last ? out.last.mutable_data_ptr<int32_t>() : nullptr};
-    GS_DISPATCH(blend, gs::torch_executor(), blend_input<T>(splats, instances, ranges, bg, image), blended);
+    RUN(T, splats, blend, blend_input<T>(splats, instances, ranges, bg, image), blended);
   });
   return out;
 }
@@ -255,7 +289,7 @@ Tensor blend_vjp(const Tensor& splats, const Tensor& tile_counts, const Tensor& 
                                  depth.defined() ? depth.const_data_ptr<T>() : nullptr,
                                  alpha.defined() ? alpha.const_data_ptr<T>() : nullptr,
                                  moments.mutable_data_ptr<T>()};
-    GS_DISPATCH(blend_vjp, gs::torch_executor(), blend_input<T>(splats, instances, ranges, bg, image), g);
+    RUN(T, splats, blend_vjp, blend_input<T>(splats, instances, ranges, bg, image), g);
   });
   return moments;
 }
@@ -278,8 +312,8 @@ Gradients project_vjp(const SceneTensors& in, const Tensor& tile_counts, const T
     using T = decltype(zero);
     const auto out = [&](int which) { return wanted[which] ? g[which].mutable_data_ptr<T>() : nullptr; };
     const gs::SceneGradient<T> gradient{out(0), out(1), out(2), out(3), out(4), out(5), out(6), out(7), out(8)};
-    GS_DISPATCH(project_vjp, gs::torch_executor(), in.scene<T>(), tile_counts.const_data_ptr<int32_t>(),
-                moments.const_data_ptr<T>(), gradient);
+    RUN(T, moments, project_vjp, in.scene<T>(), tile_counts.const_data_ptr<int32_t>(), moments.const_data_ptr<T>(),
+        gradient);
   });
   return {g[0], g[1], g[2], g[3], g[4], g[5], g[6], g[7], g[8]};
 }
@@ -344,8 +378,8 @@ Tensor mark_visible_op(const Tensor& means, const Tensor& view) {
   Tensor visible = at::empty({rows.size(0)}, rows.options().dtype(at::kBool));
   with_scalar(rows.scalar_type(), [&](auto zero) {
     using T = decltype(zero);
-    GS_DISPATCH(mark_visible, gs::torch_executor(), rows.size(0), rows.const_data_ptr<T>(), matrix.const_data_ptr<T>(),
-                visible.mutable_data_ptr<bool>());
+    RUN(T, rows, mark_visible, rows.size(0), rows.const_data_ptr<T>(), matrix.const_data_ptr<T>(),
+        visible.mutable_data_ptr<bool>());
   });
   return visible;
 }
@@ -376,7 +410,7 @@ void adam_op(Tensor& value, const Tensor& gradient, Tensor& mean, Tensor& square
                               beta2,
                               eps,
                               step};
-    GS_DISPATCH(adam, gs::torch_executor(), in);
+    RUN(T, value, adam, in);
   });
 }
 
@@ -412,14 +446,19 @@ TORCH_LIBRARY(diff_gaussian_rasterization, m) {
       "float beta2, float eps, float step, int columns=-1) -> ()");
 }
 
-TORCH_LIBRARY_IMPL(diff_gaussian_rasterization, CPU, m) {
-  m.impl("project", &project_op);
-  m.impl("bin", &bin_op);
-  m.impl("blend", &blend_op);
-  m.impl("blend_vjp", &blend_vjp);
-  m.impl("project_vjp", &project_vjp_op);
-  m.impl("rasterize", &rasterize_op);
-  m.impl("rasterize_vjp", &rasterize_vjp_op);
-  m.impl("mark_visible", &mark_visible_op);
-  m.impl("adam_", &adam_op);
-}
+#define REGISTER(device)                                       \
+  TORCH_LIBRARY_IMPL(diff_gaussian_rasterization, device, m) { \
+    m.impl("project", &project_op);                            \
+    m.impl("bin", &bin_op);                                    \
+    m.impl("blend", &blend_op);                                \
+    m.impl("blend_vjp", &blend_vjp);                           \
+    m.impl("project_vjp", &project_vjp_op);                    \
+    m.impl("rasterize", &rasterize_op);                        \
+    m.impl("rasterize_vjp", &rasterize_vjp_op);                \
+    m.impl("mark_visible", &mark_visible_op);                  \
+    m.impl("adam_", &adam_op);                                 \
+  }
+REGISTER(CPU)
+#ifdef GS_CUDA
+REGISTER(CUDA)
+#endif

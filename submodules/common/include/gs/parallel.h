@@ -13,11 +13,10 @@ struct Executor {
   void (*run)(int64_t n, int64_t grain, const std::function<void(int64_t, int64_t)>& body);
 };
 
-inline Executor serial_executor() {
-  return {1, [](int64_t n, int64_t, const std::function<void(int64_t, int64_t)>& body) {
-            if (n > 0) body(0, n);
-          }};
+inline void run_serially(int64_t n, int64_t /*grain*/, const std::function<void(int64_t, int64_t)>& body) {
+  if (n > 0) body(0, n);
 }
+inline Executor serial_executor() { return {1, &run_serially}; }
 
 // body(begin, end) on blocks of fixed size, taken in turn by whichever thread is free: for uneven work.
 template <class Body>

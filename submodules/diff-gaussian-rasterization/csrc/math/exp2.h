@@ -1,7 +1,6 @@
 #pragma once
 #include <cstring>
 
-#include "gs/hd.h"
 #include "gs/isa.h"
 
 GS_ISA_BEGIN
@@ -10,7 +9,7 @@ GS_ISA_BEGIN
 // bits, which go onto the exponent of 2^f by integer addition. 2^f is a polynomial: float the minimax one of degree
 // 6 (relative error 1.9e-9, under rounding), double Taylor's of degree 13 (4e-18).
 template <class V, class I>
-GS_HD V exp2_lanes(V t, float) {
+inline V exp2_lanes(V t, float) {
   const float magic = 12582912.0f;
   const V shifted = t + magic;
   const V f = t - (shifted - magic);
@@ -29,7 +28,7 @@ GS_HD V exp2_lanes(V t, float) {
 }
 
 template <class V, class I>
-GS_HD V exp2_lanes(V t, double) {
+inline V exp2_lanes(V t, double) {
   const double magic = 6755399441055744.0;
   const V shifted = t + magic;
   const V f = (t - (shifted - magic)) * 0.693147180559945309417;

@@ -75,7 +75,9 @@ GS_HD Vec3<T> sh_direction_vjp(Vec3<T> d, T norm, Vec3<T> g) {
 template <class T>
 GS_HD Vec3<T> sh_color(int degree, const T* basis, const T* dc, const T* rest) {
   Vec3<T> c = Vec3<T>{T(0.5), T(0.5), T(0.5)} + basis[0] * load3(dc);
-  for (int k = 1; k < sh_count(degree); ++k) c = c + basis[k] * load3(rest + 3 * (k - 1));
+  const int active = sh_count(degree);
+  for (int k = 1; k < sh_count(kMaxShDegree); ++k)  // of constant length, so that a GPU keeps the basis in registers
+    if (k < active) c = c + basis[k] * load3(rest + 3 * (k - 1));
   return c;
 }
 

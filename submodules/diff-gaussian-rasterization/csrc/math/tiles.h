@@ -62,29 +62,27 @@ GS_HD TileTest<T> make_tile_test(const Splat<T>& s, TileRect rect, int width, in
   const T unit = sizeof(T) == 4 ? T(5.9604644775390625e-8) : T(1.1102230246251565e-16);
   const T far_x = larger(std::abs(T(rect.x0 * kTile) - s.x), std::abs(T(rect.x1 * kTile) - s.x));
   const T far_y = larger(std::abs(T(rect.y0 * kTile) - s.y), std::abs(T(rect.y1 * kTile) - s.y));
-  const T margin = 48 * unit * (std::abs(s.l11) * far_x + std::abs(s.l12) * far_y + 2);
+  const T terms = multiply_add(std::abs(s.l11), far_x, multiply_add(std::abs(s.l12), far_y, T(2)));
   return {s,
           width,
           height,
           -s.l12 / s.l11,
-          -s.l11 * s.l12 / (s.l12 * s.l12 + s.l22 * s.l22),
-          s.log2_opacity - T(kLog2MinAlpha) + margin};
+          -s.l11 * s.l12 / multiply_add(s.l12, s.l12, s.l22 * s.l22),
+          multiply_add(48 * unit, terms, s.log2_opacity - T(kLog2MinAlpha))};
 }
 
-// Compares the least u^2 + v^2 over the box of the tile's pixel centres: 0 if the mean is inside, else on an edge that
-// faces the mean, where it is a parabola in one coordinate. The box lies between the centres too, so this may keep a
-// tile that no pixel needs, never the other way round.
+// Compares the least u^2 + v^2 over the box of pixel centres x0..x1, y0..y1 (px, inclusive): 0 if the mean is inside,
+// else on an edge that faces the mean, where it is a parabola in one coordinate. The box lies between the centres too,
+// so this may keep a tile that no pixel needs, never the other way round.
 template <class T>
-GS_HD bool tile_reached(const TileTest<T>& test, int tile_x, int tile_y) {
+GS_HD bool box_reached(const TileTest<T>& test, T left, T right, T top, T bottom) {
   const Splat<T>& s = test.splat;
-  const int last_x = tile_x * kTile + kTile - 1, last_y = tile_y * kTile + kTile - 1;
-  const T x0 = T(tile_x * kTile) - s.x, x1 = T(last_x < test.width ? last_x : test.width - 1) - s.x;
-  const T y0 = T(tile_y * kTile) - s.y, y1 = T(last_y < test.height ? last_y : test.height - 1) - s.y;
+  const T x0 = left - s.x, x1 = right - s.x, y0 = top - s.y, y1 = bottom - s.y;
   const bool inside_x = x0 <= 0 && x1 >= 0, inside_y = y0 <= 0 && y1 >= 0;
   if (inside_x && inside_y) return test.level >= 0;
   const auto within = [&](T dx, T dy) {
-    const T u = s.l11 * dx + s.l12 * dy, v = s.l22 * dy;
-    return u * u + v * v <= test.level;
+    const T u = multiply_add(s.l11, dx, s.l12 * dy), v = s.l22 * dy;
+    return multiply_add(u, u, v * v) <= test.level;
   };
   if (!inside_x) {
     const T dx = x0 > 0 ? x0 : x1;
@@ -93,6 +91,13 @@ GS_HD bool tile_reached(const TileTest<T>& test, int tile_x, int tile_y) {
   if (inside_y) return false;
   const T dy = y0 > 0 ? y0 : y1;
   return within(clamp(test.slope_x * dy, x0, x1), dy);
+}
+
+template <class T>
+GS_HD bool tile_reached(const TileTest<T>& test, int tile_x, int tile_y) {
+  const int right = tile_x * kTile + kTile - 1, bottom = tile_y * kTile + kTile - 1;
+  return box_reached(test, T(tile_x * kTile), T(right < test.width ? right : test.width - 1), T(tile_y * kTile),
+                     T(bottom < test.height ? bottom : test.height - 1));
 }
 
 // Calls visit(tile) for the tiles reached, row by row: the one enumeration behind counting and emission.

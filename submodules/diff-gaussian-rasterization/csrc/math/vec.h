@@ -39,6 +39,15 @@ template <class T>
 GS_HD T clamp(T value, T low, T high) {
   return value < low ? low : value > high ? high : value;
 }
+// a b + c rounded one way wherever it is compiled: counting and emission must not differ by what a compiler fuses.
+template <class T>
+GS_HD T multiply_add(T a, T b, T c) {
+#if defined(__CUDA_ARCH__) || defined(__FMA__)
+  return std::fma(a, b, c);
+#else
+  return a * b + c;  // nothing to fuse it with
+#endif
+}
 template <class T>
 GS_HD T larger(T a, T b) {
   return a < b ? b : a;

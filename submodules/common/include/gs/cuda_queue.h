@@ -1,0 +1,19 @@
+#pragma once
+// Where a CUDA backend runs and gets its temporary memory from; the host framework fills it in.
+#include <cstddef>
+
+namespace gs {
+
+struct Queue {
+  void* stream;  // cudaStream_t
+  // Device memory that lives until the call that it was handed to has been enqueued and its stream has used it.
+  void* (*allocate)(void* context, size_t bytes);
+  void* context;
+
+  template <class T>
+  T* array(size_t count) const {
+    return static_cast<T*>(allocate(context, count * sizeof(T)));
+  }
+};
+
+}  // namespace gs

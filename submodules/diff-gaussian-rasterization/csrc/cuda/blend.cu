@@ -1,0 +1,360 @@
+// A block per tile. A warp owns a sub-tile, a lane several pixels of a row, so that a splat's loads, the loop and the
+// ballot are shared; 32 splats at a time are tested against the sub-tile, a lane each.
+#include <cuda_runtime.h>
+#include <thrust/iterator/counting_iterator.h>
+#include <thrust/iterator/transform_iterator.h>
+
+#include <cub/cub.cuh>
+
+#include "../launch.h"
+#include "../math/blend.h"
+#include "../math/footprint.h"
+#include "../math/tiles.h"
+#include "gs/cuda_check.h"
+
+namespace gs {
+namespace cuda {
+
+using namespace baseline;
+
+namespace {
+
+constexpr unsigned kWarp = 0xffffffffu;
+constexpr float kLeast = float(kLog2MinAlpha);
+
+cudaStream_t stream_of(const Queue& queue) { return static_cast<cudaStream_t>(queue.stream); }
+int64_t tiles_of(Image image) { return int64_t(tile_count(image.width)) * tile_count(image.height); }
+
+__device__ __forceinline__ float exp2_fast(float t) {
+  float y;
+  asm("ex2.approx.ftz.f32 %0, %1;" : "=f"(y) : "f"(t));
+  return y;
+}
+
+// How a tile is shared out: a lane has kRun pixels of one row, 4 (or 8, if one) columns apart.
+template <int kRun_>
+struct Layout {
+  static constexpr int kRun = kRun_;
+  static constexpr int kColumns = kRun == 1 ? 8 : 4;  // lanes side by side
+  static constexpr int kWide = kColumns * kRun, kHigh = 32 / kColumns;
+  static constexpr int kAcross = kTile / kWide, kWarps = kTile * kTile / (kWide * kHigh);
+  static constexpr int kThreads = 32 * kWarps;
+
+  int left, top;  // of the warp's sub-tile, in the tile
+  int x, y;       // of the lane's first pixel, in the tile
+  __device__ Layout() {
+    const int warp = threadIdx.x / 32, lane = threadIdx.x % 32;
+    left = warp % kAcross * kWide, top = warp / kAcross * kHigh;
+    x = left + lane % kColumns, y = top + lane / kColumns;
+  }
+  __device__ static int column(int run) { return run * kColumns; }
+};
+
+using Forward = Layout<2>;
+using Backward = Layout<4>;
+
+// A batch of splats in shared memory, local to the tile.
+template <int kCount>
+struct Batch {
+  float4 shape[kCount];  // y, l11, l12, l22
+  float4 rest[kCount];   // offset, log2 opacity, x, inverse depth
+  float4 color[kCount];  // r, g, b, level of TileTest
+
+  __device__ void put(int k, const float* splats, int32_t index, float left, float top) {
+    const float2* from = reinterpret_cast<const float2*>(splats + kSplatValues * int64_t(index));
+    const float2 a = from[0], b = from[1], c = from[2], d = from[3], e = from[4];
+    const Splat<float> splat = {a.x, a.y, b.x, b.y, c.x, c.y, d.x, d.y, e.x, e.y};
+    const LocalSplat<float> s = localise(splat, left, top);
+    shape[k] = make_float4(s.y, s.l11, s.l12, s.l22);
+    rest[k] = make_float4(s.offset, s.log2_opacity, splat.x - left, s.inverse_depth);
+    color[k] = make_float4(s.r, s.g, s.b, 0);
+  }
+
+  __device__ LocalSplat<float> local(int k) const {
+    const float4 a = shape[k], b = rest[k];
+    return {a.x, a.y, a.z, a.w, b.x, b.y, 0, 0, 0, b.w};
+  }
+
+  // Can splat k reach the box of pixels, in the tile?
+  __device__ bool reaches(int k, float x0, float x1, float y0, float y1) const {
+    const float4 a = shape[k], b = rest[k];
+    const Splat<float> splat = {b.z, a.x, a.y, a.z, a.w, b.y, 0, 0, 0, 0};
+    return box_reached(make_tile_test(splat, TileRect{0, 0, 1, 1}, 0, 0), x0, x1, y0, y1);
+  }
+};
+
+template <class L, int kCount>
+__device__ unsigned reached_by_warp(const Batch<kCount>& batch, const L& at, int from, int count) {
+  const int k = from + threadIdx.x % 32;
+  const bool hit = k < count && batch.reaches(k, at.left, at.left + L::kWide - 1, at.top, at.top + L::kHigh - 1);
+  return __ballot_sync(kWarp, hit);
+}
+
+template <bool kDepth, bool kLast>
+__global__ void __launch_bounds__(Forward::kThreads) blend_kernel(BlendInput<float> in, Blended<float> out) {
+  constexpr int kBatch = 128, kRun = Forward::kRun;
+  __shared__ Batch<kBatch> batch;
+  const Forward at;
+  const int across = tile_count(in.image.width), tile = blockIdx.x;
+  const int left = tile % across * kTile, top = tile / across * kTile;
+  float transmittance[kRun], red[kRun], green[kRun], blue[kRun], depth[kRun], threshold[kRun];
+  int last[kRun];
+  for (int p = 0; p < kRun; ++p) {
+    transmittance[p] = 1, red[p] = green[p] = blue[p] = depth[p] = 0, last[p] = 0;
+    const bool inside = left + at.x + at.column(p) < in.image.width && top + at.y < in.image.height;
+    threshold[p] = inside ? kLeast : INFINITY;
+  }
+  bool open = true;
+  const int64_t begin = in.ranges[tile], end = in.ranges[tile + 1];
+  for (int64_t first = begin; first < end; first += kBatch) {
+    if (!__syncthreads_or(open)) break;
+    const int count = int(end - first < kBatch ? end - first : kBatch);
+    for (int k = threadIdx.x; k < count; k += Forward::kThreads)
+      batch.put(k, in.splats, in.instances[first + k], float(left), float(top));
+    __syncthreads();
+    for (int from = 0; open && from < count; from += 32) {
+      for (unsigned hits = reached_by_warp(batch, at, from, count); hits; hits &= hits - 1) {
+        const int k = from + __ffs(hits) - 1;
+        const LocalSplat<float> splat = batch.local(k);
+        const RowTerms<float> row = row_terms(splat, float(at.y));
+#pragma unroll
+        for (int p = 0; p < kRun; ++p) {
+          const float t = row_exponent(row, row_u(row, float(at.x + at.column(p))));
+          if (!(t >= threshold[p])) continue;
+          const float alpha = capped<float, float>(exp2_fast(t));
+          const float after = transmittance[p] - alpha * transmittance[p];
+          if (after < float(kMinTransmittance)) {
+            threshold[p] = INFINITY;
+            continue;
+          }
+          const float weight = alpha * transmittance[p];
+          const float4 c = batch.color[k];
+          red[p] += weight * c.x, green[p] += weight * c.y, blue[p] += weight * c.z;
+          if (kDepth) depth[p] += weight * splat.inverse_depth;
+          if (kLast) last[p] = int(first - begin) + k + 1;
+          transmittance[p] = after;
+        }
+      }
+      bool any = false;
+      for (int p = 0; p < kRun; ++p) any |= threshold[p] < 0;
+      open = __any_sync(kWarp, any);
+    }
+  }
+  for (int p = 0; p < kRun; ++p) {
+    const int x = left + at.x + at.column(p), y = top + at.y;
+    if (x >= in.image.width || y >= in.image.height) continue;
+    const int64_t pixel = int64_t(y) * in.image.width + x, plane = int64_t(in.image.width) * in.image.height;
+    out.color[pixel] = red[p] + transmittance[p] * in.background[0];
+    out.color[plane + pixel] = green[p] + transmittance[p] * in.background[1];
+    out.color[2 * plane + pixel] = blue[p] + transmittance[p] * in.background[2];
+    out.transmittance[pixel] = transmittance[p];
+    if (kDepth) out.inverse_depth[pixel] = depth[p];
+    if (kLast) out.last[pixel] = last[p];
+  }
+}
+
+// A bit per slot that the backward will fill, and how many lie before each word of bits.
+struct Compact {
+  uint32_t* bits;
+  const int32_t* before;
+
+  __device__ int64_t row(int64_t slot) const {
+    const uint32_t lower = (1u << (slot & 31)) - 1;
+    return before[slot >> 5] + ((slot & 31) ? __popc(bits[slot >> 5] & lower) : 0);
+  }
+};
+
+struct CountBits {
+  const uint32_t* bits;
+  int64_t words;
+  __host__ __device__ int32_t operator()(int64_t word) const {
+#ifdef __CUDA_ARCH__
+    return word < words ? __popc(bits[word]) : 0;
+#else
+    return 0;
+#endif
+  }
+};
+
+// How far each tile's backward has to go, and the slots of the instances up to there.
+__global__ void __launch_bounds__(kTile* kTile)
+    mark_kernel(BlendInput<float> in, const int32_t* last, const int32_t* slots, int32_t* processed, uint32_t* bits) {
+  __shared__ int32_t most;
+  if (threadIdx.x == 0) most = 0;
+  __syncthreads();
+  const int across = tile_count(in.image.width), tile = blockIdx.x;
+  const int x = tile % across * kTile + threadIdx.x % kTile, y = tile / across * kTile + threadIdx.x / kTile;
+  const int mine = x < in.image.width && y < in.image.height ? last[int64_t(y) * in.image.width + x] : 0;
+  const int warp_most = __reduce_max_sync(kWarp, mine);
+  if (threadIdx.x % 32 == 0) atomicMax(&most, warp_most);
+  __syncthreads();
+  if (threadIdx.x == 0) processed[tile] = most;
+  for (int k = threadIdx.x; k < most; k += kTile * kTile) {
+    const int32_t slot = slots[in.ranges[tile] + k];
+    atomicOr(bits + (slot >> 5), 1u << (slot & 31));
+  }
+}
+
+// Ten values summed over a warp in 12 shuffles: each step halves the values a lane keeps while doubling the lanes that
+// are summed. `value` is the one whose sum this lane ends with, or -1.
+__device__ __forceinline__ float transposed_sum(const float (&v)[kGradientValues], int& value) {
+  const int lane = threadIdx.x % 32;
+  const bool b16 = lane & 16, b8 = lane & 8, b4 = lane & 4, b2 = lane & 2;
+  float a[5], b[3], c[2];
+#pragma unroll
+  for (int i = 0; i < 5; ++i) a[i] = (b16 ? v[i + 5] : v[i]) + __shfl_xor_sync(kWarp, b16 ? v[i] : v[i + 5], 16);
+#pragma unroll
+  for (int i = 0; i < 3; ++i) {
+    const float high = i < 2 ? a[i + 3] : 0;
+    b[i] = (b8 ? high : a[i]) + __shfl_xor_sync(kWarp, b8 ? a[i] : high, 8);
+  }
+#pragma unroll
+  for (int i = 0; i < 2; ++i) {
+    const float high = i < 1 ? b[2] : 0;
+    c[i] = (b4 ? high : b[i]) + __shfl_xor_sync(kWarp, b4 ? b[i] : high, 4);
+  }
+  float sum = (b2 ? c[1] : c[0]) + __shfl_xor_sync(kWarp, b2 ? c[0] : c[1], 2);
+  sum += __shfl_xor_sync(kWarp, sum, 1);
+  const int within3 = b4 ? 2 : b2, within5 = (b8 ? 3 : 0) + within3;
+  const bool exists = !(lane & 1) && !(b4 && b2) && within5 < 5;
+  value = exists ? (b16 ? 5 : 0) + within5 : -1;
+  return sum;
+}
+
+template <bool kDepth>
+__global__ void __launch_bounds__(Backward::kThreads)
+    blend_vjp_kernel(BlendInput<float> in, BlendGradient<float> g, const int32_t* processed, Compact compact,
+                     float* rows) {
+  constexpr int kBatch = 64, kRun = Backward::kRun;
+  __shared__ Batch<kBatch> batch;
+  __shared__ float sums[Backward::kWarps][kBatch * kGradientValues];
+  __shared__ int64_t row_of[kBatch];
+  const Backward at;
+  const int across = tile_count(in.image.width), tile = blockIdx.x, warp = threadIdx.x / 32;
+  const int left = tile % across * kTile, top = tile / across * kTile;
+  const int64_t plane = int64_t(in.image.width) * in.image.height;
+  float transmittance[kRun], behind[kRun], red[kRun], green[kRun], blue[kRun], depth[kRun];
+  int last[kRun], furthest = 0;
+  for (int p = 0; p < kRun; ++p) {
+    const int x = left + at.x + at.column(p), y = top + at.y;
+    const bool inside = x < in.image.width && y < in.image.height;
+    const int64_t pixel = inside ? int64_t(y) * in.image.width + x : 0;
+    transmittance[p] = inside ? g.transmittance[pixel] : 1;
+    last[p] = inside ? g.last[pixel] : 0;
+    red[p] = inside ? g.color[pixel] : 0;
+    green[p] = inside ? g.color[plane + pixel] : 0;
+    blue[p] = inside ? g.color[2 * plane + pixel] : 0;
+    depth[p] = kDepth && inside ? g.inverse_depth[pixel] : 0;
+    behind[p] = in.background[0] * red[p] + in.background[1] * green[p] + in.background[2] * blue[p];
+    if (g.transmittance_gradient && inside) behind[p] += g.transmittance_gradient[pixel];
+    furthest = last[p] > furthest ? last[p] : furthest;
+  }
+  furthest = __reduce_max_sync(kWarp, furthest);
+  const int64_t begin = in.ranges[tile];
+  for (int end = processed[tile]; end > 0; end -= kBatch) {
+    const int count = end < kBatch ? end : kBatch, first = end - count;
+    __syncthreads();
+    for (int k = threadIdx.x; k < count; k += Backward::kThreads) {
+      batch.put(k, in.splats, in.instances[begin + first + k], float(left), float(top));
+      row_of[k] = compact.row(g.slots[begin + first + k]);
+    }
+    for (int k = threadIdx.x; k < Backward::kWarps * kBatch * kGradientValues; k += Backward::kThreads) sums[0][k] = 0;
+    __syncthreads();
+    for (int from = (count - 1) / 32 * 32; from >= 0; from -= 32) {
+      if (first + from >= furthest) continue;
+      unsigned hits = reached_by_warp(batch, at, from, count);
+      while (hits) {
+        const int bit = 31 - __clz(hits), k = from + bit;
+        hits &= ~(1u << bit);
+        const LocalSplat<float> splat = batch.local(k);
+        const float4 c = batch.color[k];
+        const RowTerms<float> row = row_terms(splat, float(at.y));
+        float q0 = 0, qu = 0, quu = 0, r = 0, gr = 0, b = 0, d = 0;
+        bool any = false;
+#pragma unroll
+        for (int p = 0; p < kRun; ++p) {
+          const float u = row_u(row, float(at.x + at.column(p))), t = row_exponent(row, u);
+          if (!(t >= kLeast) || first + k >= last[p]) continue;
+          any = true;
+          const float uncapped = exp2_fast(t), alpha = capped<float, float>(uncapped);
+          float value = c.x * red[p] + c.y * green[p] + c.z * blue[p];
+          if (kDepth) value += splat.inverse_depth * depth[p];
+          const float q = uncapped * alpha_gradient<float, float>(alpha, value, transmittance[p], behind[p]);
+          const float weight = alpha * transmittance[p], qu_here = q * u;
+          q0 += q, qu += qu_here, quu += qu_here * u;
+          r += weight * red[p], gr += weight * green[p], b += weight * blue[p];
+          if (kDepth) d += weight * depth[p];
+        }
+        if (!__any_sync(kWarp, any)) continue;
+        // Along a row v is constant, so three of the moments come last.
+        const float v[kGradientValues] = {q0, qu, row.v * q0, quu, row.v * qu, row.v * row.v * q0, r, gr, b, d};
+        int value;
+        const float sum = transposed_sum(v, value);
+        if (value >= 0) sums[warp][k * kGradientValues + value] = sum;
+      }
+    }
+    __syncthreads();
+    for (int k = threadIdx.x; k < count * kGradientValues; k += Backward::kThreads) {
+      float sum = 0;
+      for (int w = 0; w < Backward::kWarps; ++w) sum += sums[w][k];
+      rows[kGradientValues * row_of[k / kGradientValues] + k % kGradientValues] = sum;
+    }
+  }
+}
+
+// A thread per splat and value adds the rows of the splat's slots in their order.
+__global__ void __launch_bounds__(256)
+    reduce_kernel(int64_t count, const int32_t* tile_counts, const int64_t* slot_offsets, Compact compact,
+                  const float* rows, float* moments) {
+  const int64_t k = int64_t(blockIdx.x) * 256 + threadIdx.x, i = k / kGradientValues, value = k % kGradientValues;
+  if (i >= count) return;
+  float sum = 0;
+  if (tile_counts[i]) {
+    const int64_t stop = compact.row(slot_offsets[i] + tile_counts[i]);
+    for (int64_t row = compact.row(slot_offsets[i]); row < stop; ++row) sum += rows[kGradientValues * row + value];
+  }
+  moments[k] = sum;
+}
+
+}  // namespace
+
+template <>
+void blend<float>(const Queue& queue, const BlendInput<float>& in, const Blended<float>& out) {
+  const auto kernel = out.inverse_depth ? (out.last ? blend_kernel<true, true> : blend_kernel<true, false>)
+                                        : (out.last ? blend_kernel<false, true> : blend_kernel<false, false>);
+  kernel<<<unsigned(tiles_of(in.image)), Forward::kThreads, 0, stream_of(queue)>>>(in, out);
+  check_launch("blend");
+}
+
+template <>
+void blend_vjp<float>(const Queue& queue, const BlendInput<float>& in, const BlendGradient<float>& g) {
+  if (!g.count) return;
+  const cudaStream_t stream = stream_of(queue);
+  const unsigned tiles = unsigned(tiles_of(in.image));
+  const int64_t words = (g.instance_count + 31) / 32;
+  uint32_t* bits = queue.array<uint32_t>(words + 1);
+  int32_t *before = queue.array<int32_t>(words + 1), *processed = queue.array<int32_t>(tiles);
+  GS_CUDA_CHECK(cudaMemsetAsync(bits, 0, (words + 1) * sizeof *bits, stream));
+  mark_kernel<<<tiles, kTile * kTile, 0, stream>>>(in, g.last, g.slots, processed, bits);
+  check_launch("mark");
+  const auto counts = thrust::make_transform_iterator(thrust::counting_iterator<int64_t>(0), CountBits{bits, words});
+  size_t bytes = 0;
+  GS_CUDA_CHECK(cub::DeviceScan::ExclusiveSum(nullptr, bytes, counts, before, words + 1, stream));
+  void* memory = queue.allocate(queue.context, bytes);
+  GS_CUDA_CHECK(cub::DeviceScan::ExclusiveSum(memory, bytes, counts, before, words + 1, stream));
+  int32_t total = 0;
+  GS_CUDA_CHECK(cudaMemcpyAsync(&total, before + words, sizeof total, cudaMemcpyDeviceToHost, stream));
+  GS_CUDA_CHECK(cudaStreamSynchronize(stream));
+  float* rows = queue.array<float>(size_t(total) * kGradientValues);
+  const Compact compact{bits, before};
+  const auto kernel = g.inverse_depth ? blend_vjp_kernel<true> : blend_vjp_kernel<false>;
+  kernel<<<tiles, Backward::kThreads, 0, stream>>>(in, g, processed, compact, rows);
+  check_launch("blend_vjp");
+  const int64_t values = g.count * kGradientValues;
+  reduce_kernel<<<unsigned((values + 255) / 256), 256, 0, stream>>>(g.count, g.tile_counts, g.slot_offsets, compact,
+                                                                    rows, g.moments);
+  check_launch("reduce");
+}
+
+}  // namespace cuda
+}  // namespace gs

@@ -1,0 +1,127 @@
+// A thread per Gaussian; rows of sh_rest pass through shared memory, since a thread's own 180 bytes are not coalesced.
+#include <cuda_runtime.h>
+
+#include "../math/scene_row.h"
+#include "gs/cuda_check.h"
+#include "tiles.cuh"
+
+namespace gs {
+namespace cuda {
+
+namespace {
+
+constexpr int kThreads = 128;
+constexpr int kRest = 3 * (sh_count(kMaxShDegree) - 1);  // 45 values: odd, so rows lie in different banks
+
+dim3 blocks_for(int64_t n) { return dim3(unsigned((n + kThreads - 1) / kThreads)); }
+
+// The warp's rows of sh_rest that are `wanted` (a bit per lane), `values` of each, into or out of shared memory.
+__device__ void read_rows(const float* global, int64_t first, int64_t stride, int values, unsigned wanted,
+                          float* rows) {
+  const int lane = threadIdx.x & 31;
+  for (; wanted; wanted &= wanted - 1) {
+    const int row = __ffs(wanted) - 1;
+    for (int v = lane; v < values; v += 32) rows[row * kRest + v] = global[(first + row) * stride + v];
+  }
+  __syncwarp();
+}
+__device__ void write_rows(const float* rows, int64_t first, int count, int values, float* global) {
+  __syncwarp();
+  const int lane = threadIdx.x & 31;
+  for (int k = lane; k < count * values; k += 32) global[first * values + k] = rows[k / values * kRest + k % values];
+}
+
+__global__ void __launch_bounds__(kThreads) project_kernel(Scene<float> s, Projected<float> out) {
+  __shared__ Camera<float> camera;
+  __shared__ float rest[kThreads * kRest];
+  if (threadIdx.x == 0) camera = camera_of(s);
+  __syncthreads();
+  const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
+  Splat<float> splat = {};
+  float depth = INFINITY;
+  int radius = 0;
+  const bool visible = i < s.count && project_shape(s, camera, i, splat, depth, radius);
+  TileRect rect = {0, 0, 0, 0};
+  if (visible) rect = tile_rect(splat, s.image.width, s.image.height);
+  int32_t count = warp_list_tiles(splat, rect, s.image, 0, 0, [](int64_t, int32_t, int32_t) {});
+
+  float* row = rest + threadIdx.x * kRest;
+  if (!s.colors) {
+    float* warp_rows = rest + (threadIdx.x & ~31) * kRest;
+    const int values = 3 * (sh_count(s.sh_degree) - 1);
+    read_rows(s.sh_rest, i - (threadIdx.x & 31), s.rest_stride, values, __ballot_sync(kWarp, count > 0), warp_rows);
+  }
+  if (count && !project_color(s, camera, i, row, splat)) count = 0;
+  if (i >= s.count) return;
+  out.radii[i] = radius;
+  out.tile_counts[i] = count;
+  out.depths[i] = count ? depth : INFINITY;
+  if (!count) return;
+  reinterpret_cast<int4*>(out.rects)[i] = make_int4(rect.x0, rect.y0, rect.x1, rect.y1);
+  float2* to = reinterpret_cast<float2*>(out.splats + kSplatValues * i);
+  to[0] = make_float2(splat.x, splat.y);
+  to[1] = make_float2(splat.l11, splat.l12);
+  to[2] = make_float2(splat.l22, splat.log2_opacity);
+  to[3] = make_float2(splat.r, splat.g);
+  to[4] = make_float2(splat.b, splat.inverse_depth);
+}
+
+__global__ void __launch_bounds__(kThreads)
+    project_vjp_kernel(Scene<float> s, const int32_t* tile_counts, const float* moments, SceneGradient<float> out) {
+  __shared__ Camera<float> camera;
+  __shared__ float rest[kThreads * kRest];
+  if (threadIdx.x == 0) camera = camera_of(s);
+  __syncthreads();
+  const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x, first = i - (threadIdx.x & 31);
+  const bool seen = i < s.count && tile_counts[i] != 0;
+  float* row = rest + threadIdx.x * kRest;
+  float* warp_rows = rest + (threadIdx.x & ~31) * kRest;
+  if (!s.colors) {
+    const int values = 3 * (sh_count(s.sh_degree) - 1);
+    read_rows(s.sh_rest, first, s.rest_stride, values, __ballot_sync(kWarp, seen), warp_rows);
+  }
+  if (seen) {
+    float m[kGradientValues];
+    for (int k = 0; k < kGradientValues; ++k) m[k] = moments[kGradientValues * i + k];
+    project_vjp_row(s, camera, i, m, row, out.sh_rest ? row : nullptr, out);
+  } else if (i < s.count) {
+    zero_gradient(i, out);
+    for (int k = 0; k < 3 * s.rest_bands; ++k) row[k] = 0;
+  }
+  if (out.sh_rest && first < s.count)
+    write_rows(warp_rows, first, int(s.count - first < 32 ? s.count - first : 32), 3 * s.rest_bands, out.sh_rest);
+}
+
+__global__ void mark_visible_kernel(int64_t count, const float* means, const float* view, bool* visible) {
+  const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
+  if (i < count) visible[i] = in_front(dot(Vec3<float>{view[2], view[6], view[10]}, load3(means + 3 * i)) + view[14]);
+}
+
+cudaStream_t stream_of(const Queue& queue) { return static_cast<cudaStream_t>(queue.stream); }
+
+}  // namespace
+
+template <>
+void project<float>(const Queue& queue, const Scene<float>& s, const Projected<float>& out) {
+  if (!s.count) return;
+  project_kernel<<<blocks_for(s.count), kThreads, 0, stream_of(queue)>>>(s, out);
+  check_launch("project");
+}
+
+template <>
+void project_vjp<float>(const Queue& queue, const Scene<float>& s, const int32_t* tile_counts, const float* moments,
+                        const SceneGradient<float>& out) {
+  if (!s.count) return;
+  project_vjp_kernel<<<blocks_for(s.count), kThreads, 0, stream_of(queue)>>>(s, tile_counts, moments, out);
+  check_launch("project_vjp");
+}
+
+template <>
+void mark_visible<float>(const Queue& queue, int64_t count, const float* means, const float* view, bool* visible) {
+  if (!count) return;
+  mark_visible_kernel<<<blocks_for(count), kThreads, 0, stream_of(queue)>>>(count, means, view, visible);
+  check_launch("mark_visible");
+}
+
+}  // namespace cuda
+}  // namespace gs

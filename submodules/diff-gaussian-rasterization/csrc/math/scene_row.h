@@ -1,0 +1,162 @@
+#pragma once
+// One Gaussian, from a Scene's rows to a Splat and from moments to gradients' rows: what every backend does for an
+// index.
+#include <cmath>
+
+#include "../launch.h"
+#include "projection.h"
+
+GS_ISA_BEGIN
+
+template <class T>
+GS_HD Camera<T> camera_of(const Scene<T>& s) {
+  return make_camera(s.view, s.projection, s.center, s.tan_x, s.tan_y, s.image.width, s.image.height);
+}
+
+// A Gaussian and what its activations' derivatives need.
+template <class T>
+struct Loaded {
+  Gaussian<T> gaussian;
+  Quat<T> rotation;  // as used: normalised if raw
+  T rotation_norm;
+};
+
+template <class T>
+GS_HD Loaded<T> load(const Scene<T>& s, int64_t i) {
+  Loaded<T> out{};
+  Gaussian<T>& g = out.gaussian;
+  g.mean = load3(s.means + 3 * i);
+  g.log2_opacity = s.raw ? log2_sigmoid(s.opacities[i]) : std::log2(s.opacities[i]);
+  if (s.cov3d) {
+    g.axes = axes_of_covariance(s.cov3d + 6 * i);
+    return out;
+  }
+  const T* q = s.rotations + 4 * i;
+  out.rotation = {q[0], q[1], q[2], q[3]};
+  if (s.raw) out.rotation = normalise(out.rotation, out.rotation_norm);
+  rotation_columns(out.rotation, g.axes.direction);
+  for (int k = 0; k < 3; ++k) {
+    const T scale = s.scales[3 * i + k];
+    g.axes.scale[k] = s.scale_modifier * (s.raw ? std::exp(scale) : scale);
+  }
+  return out;
+}
+
+// What need not show in the mean or the footprint, which are checked once computed.
+template <class T>
+GS_HD bool finite_shape(const Scene<T>& s, int64_t i) {
+  if (!std::isfinite(s.opacities[i])) return false;
+  if (s.cov3d) return finite(load3(s.cov3d + 6 * i)) && finite(load3(s.cov3d + 6 * i + 3));
+  return finite(load3(s.scales + 3 * i)) && finite(load3(s.rotations + 4 * i)) && std::isfinite(s.rotations[4 * i + 3]);
+}
+
+// Everything of a splat but its colour. False: culled; depth is infinite then, so that it sorts last.
+template <class T>
+GS_HD bool project_shape(const Scene<T>& s, const Camera<T>& camera, int64_t i, Splat<T>& splat, T& depth,
+                         int& radius) {
+  radius = 0;
+  depth = T(INFINITY);
+  if (!finite_shape(s, i)) return false;
+  T z;
+  if (!project_splat(camera, load(s, i).gaussian, s.antialiasing, splat, z, radius)) return false;
+  depth = z;
+  return true;
+}
+
+// The colour's basis at the direction from which Gaussian i is seen; returns its distance.
+template <class T>
+GS_HD T color_basis(const Scene<T>& s, const Camera<T>& camera, int64_t i, Vec3<T>& direction, T* basis) {
+  const T norm = sh_direction(load3(s.means + 3 * i) - camera.center, direction);
+  sh_basis(s.sh_degree, direction, basis);
+  return norm;
+}
+
+// Colour of a splat; `rest` is its row of sh_rest, wherever that lies. False: not finite, or beyond use.
+template <class T>
+GS_HD bool project_color(const Scene<T>& s, const Camera<T>& camera, int64_t i, const T* rest, Splat<T>& splat) {
+  Vec3<T> c;
+  if (s.colors) {
+    c = load3(s.colors + 3 * i);
+  } else {
+    T basis[sh_count(kMaxShDegree)];
+    Vec3<T> direction;
+    color_basis(s, camera, i, direction, basis);
+    c = sh_color(s.sh_degree, basis, s.sh_dc + s.dc_stride * i, rest);
+  }
+  if (!finite(c) || !(larger(larger(std::abs(c.x), std::abs(c.y)), std::abs(c.z)) < T(kMaxColor))) return false;
+  if (!s.colors) c = {larger(c.x, T(0)), larger(c.y, T(0)), larger(c.z, T(0))};  // after the test: it hides -Inf
+  splat.r = c.x, splat.g = c.y, splat.b = c.z;
+  return true;
+}
+
+template <class T>
+GS_HD void zero_row(T* rows, int64_t i, int row) {
+  if (rows)
+    for (int k = 0; k < row; ++k) rows[row * i + k] = 0;
+}
+
+// All gradients of a Gaussian that was not seen, but for sh_rest.
+template <class T>
+GS_HD void zero_gradient(int64_t i, const SceneGradient<T>& out) {
+  zero_row(out.means, i, 3), zero_row(out.means2d, i, 3), zero_row(out.opacities, i, 1);
+  zero_row(out.scales, i, 3), zero_row(out.rotations, i, 4), zero_row(out.cov3d, i, 6);
+  zero_row(out.colors, i, 3), zero_row(out.sh_dc, i, 3);
+}
+
+// Gradients of the coefficients and, returned, of the mean through the viewing direction. `rest` and g_rest are the
+// rows of sh_rest and of its gradient (or null), wherever they lie; they may be the same.
+template <class T>
+GS_HD Vec3<T> color_vjp(const Scene<T>& s, const Camera<T>& camera, int64_t i, Vec3<T> g, const T* rest, T* g_dc,
+                        T* g_rest) {
+  constexpr int kCount = sh_count(kMaxShDegree);
+  T basis[kCount], weight[kCount];
+  Vec3<T> direction;
+  const T norm = color_basis(s, camera, i, direction, basis);
+  const Vec3<T> c = sh_color(s.sh_degree, basis, s.sh_dc + s.dc_stride * i, rest);
+  g = {c.x > 0 ? g.x : T(0), c.y > 0 ? g.y : T(0), c.z > 0 ? g.z : T(0)};
+  if (g_dc) store3(g_dc + 3 * i, basis[0] * g);
+  const int active = sh_count(s.sh_degree);
+  for (int k = 1; k < kCount; ++k) {  // of constant length, so that a GPU keeps the arrays in registers
+    if (k < active) {
+      weight[k] = dot(load3(rest + 3 * (k - 1)), g);
+      if (g_rest) store3(g_rest + 3 * (k - 1), basis[k] * g);
+    } else if (g_rest && k <= s.rest_bands) {
+      store3(g_rest + 3 * (k - 1), Vec3<T>{0, 0, 0});
+    }
+  }
+  return sh_direction_vjp(direction, norm, sh_basis_vjp(s.sh_degree, direction, weight));
+}
+
+template <class T>
+GS_HD void project_vjp_row(const Scene<T>& s, const Camera<T>& camera, int64_t i, const T* m, const T* rest, T* g_rest,
+                           const SceneGradient<T>& out) {
+  const Loaded<T> in = load(s, i);
+  const GaussianGradient<T> g = project_splat_vjp(camera, in.gaussian, s.antialiasing, out.cov3d != nullptr,
+                                                  Moments<T>{m[0], m[1], m[2], m[3], m[4], m[5]}, m[9]);
+  Vec3<T> g_mean = g.mean;
+  const Vec3<T> g_color = {m[6], m[7], m[8]};
+  if (s.colors) {
+    if (out.colors) store3(out.colors + 3 * i, g_color);
+  } else {
+    g_mean = g_mean + color_vjp(s, camera, i, g_color, rest, out.sh_dc, g_rest);
+  }
+  if (out.means) store3(out.means + 3 * i, g_mean);
+  if (out.means2d)
+    store3(out.means2d + 3 * i,
+           Vec3<T>{g.pixel_x * T(0.5) * T(s.image.width), g.pixel_y * T(0.5) * T(s.image.height), T(0)});
+  if (out.opacities)
+    out.opacities[i] = g.log_opacity * (s.raw ? log_sigmoid_slope(s.opacities[i]) : 1 / s.opacities[i]);
+  if (out.scales)
+    for (int k = 0; k < 3; ++k)
+      out.scales[3 * i + k] = g.scale[k] * (s.raw ? in.gaussian.axes.scale[k] : s.scale_modifier);
+  if (out.rotations) {
+    Quat<T> q = rotation_columns_vjp(in.rotation, g.direction);
+    if (s.raw) q = normalise_vjp(in.rotation, in.rotation_norm, q);
+    T* row = out.rotations + 4 * i;
+    row[0] = q.w, row[1] = q.x, row[2] = q.y, row[3] = q.z;
+  }
+  if (out.cov3d)
+    for (int k = 0; k < 6; ++k) out.cov3d[6 * i + k] = g.covariance[k];
+}
+
+GS_ISA_END
