@@ -9,7 +9,7 @@ import torch
 
 from utils.system_utils import UserError, atomic_write
 
-_ENTRIES = 12
+_ENTRIES = 12  # of the reference; the values of further attributes may follow
 # The reference stores the scene extent as a NumPy scalar. NumPy 1 and 2 name its rebuilding function differently.
 _SCALAR = np.float64(0).__reduce__()[0]
 _ALLOWED = [
@@ -40,10 +40,11 @@ def load_checkpoint(path: str | os.PathLike, device: torch.device | str = "cpu")
         ) from error
     with _as_user_error(path):
         capture, iteration = content
-        if len(capture) != _ENTRIES or not all(torch.is_tensor(entry) for entry in capture[1:10]):
+        per_gaussian = (*capture[1:10], *capture[_ENTRIES:])
+        if len(capture) < _ENTRIES or not all(torch.is_tensor(entry) for entry in per_gaussian):
             raise ValueError
         count = len(capture[1])
-        if any(len(tensor) != count for tensor in capture[1:10]):
+        if any(len(tensor) != count for tensor in per_gaussian):
             raise ValueError
         return tuple(capture), int(iteration)
 

@@ -11,8 +11,9 @@ from simple_knn._C import distCUDA2
 from torch import Tensor, nn
 
 from scene import densification as adc
+from scene.gaussian_attributes import IN_CHECKPOINT, Rows, attributes
 from scene.gaussian_optimizer import GaussianAdam
-from scene.gaussian_ply import GaussianRows, read_ply, write_ply
+from scene.gaussian_ply import read_ply, write_ply
 from utils.general_utils import build_scaling_rotation, get_expon_lr_func, strip_symmetric
 from utils.graphics_utils import BasicPointCloud
 from utils.sh_utils import RGB2SH
@@ -21,16 +22,6 @@ from utils.system_utils import UserError, compute_device
 INITIAL_OPACITY = 0.1
 MIN_DISTANCE2 = 1e-7  # floor of the squared distance to the neighbours, square world units: duplicates get a size
 LONE_POINT_SCALE = 0.01  # initial scale as a part of the extent where there are too few points to have neighbours
-
-# Optimiser group -> attribute, in the order of checkpoints and of the reference.
-GROUPS = {
-    "xyz": "_xyz",
-    "f_dc": "_features_dc",
-    "f_rest": "_features_rest",
-    "opacity": "_opacity",
-    "scaling": "_scaling",
-    "rotation": "_rotation",
-}
 
 
 class GaussianModel:
@@ -50,17 +41,8 @@ class GaussianModel:
         self.optimizer: GaussianAdam | None = None
         self.percent_dense = 0.0
         self.spatial_lr_scale = 0.0
-        bands = (sh_degree + 1) ** 2 - 1
-        self._set_rows(
-            GaussianRows(
-                xyz=torch.empty(0, 3),
-                features_dc=torch.empty(0, 1, 3),
-                features_rest=torch.empty(0, bands, 3),
-                opacity=torch.empty(0, 1),
-                scaling=torch.empty(0, 3),
-                rotation=torch.empty(0, 4),
-            )
-        )
+        self._attributes = attributes(sh_degree)
+        self._set_rows({name: torch.empty(0, *attribute.shape) for name, attribute in self._attributes.items()})
 
     def __len__(self) -> int:
         """Number of Gaussians."""
@@ -131,14 +113,14 @@ class GaussianModel:
         self.spatial_lr_scale = float(spatial_lr_scale)
         self.active_sh_degree = 0
         self._set_rows(
-            GaussianRows(
-                xyz=torch.from_numpy(points.copy()),
-                features_dc=RGB2SH(colors).reshape(count, 1, 3),
-                features_rest=torch.zeros(count, (self.max_sh_degree + 1) ** 2 - 1, 3),
-                opacity=torch.full((count, 1), adc.logit(INITIAL_OPACITY)),
-                scaling=log_scale[:, None].repeat(1, 3),
-                rotation=torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1),
-            )
+            {
+                "xyz": torch.from_numpy(points.copy()),
+                "f_dc": RGB2SH(colors).reshape(count, 1, 3),
+                "f_rest": torch.zeros(count, *self._attributes["f_rest"].shape),
+                "opacity": torch.full((count, 1), adc.logit(INITIAL_OPACITY)),
+                "scaling": log_scale[:, None].repeat(1, 3),
+                "rotation": torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1),
+            }
         )
         print(f"Number of points at initialisation :  {count}")
 
@@ -149,14 +131,19 @@ class GaussianModel:
 
     def save_ply(self, path: str | os.PathLike) -> None:
         """Write the raw parameters as a PLY in the reference's layout."""
-        rows = {name: getattr(self, f"_{name}").detach() for name in GaussianRows._fields}
-        write_ply(path, GaussianRows(**rows))
+        write_ply(path, self._rows(), self.max_sh_degree)
 
-    def _set_rows(self, rows: GaussianRows) -> None:
+    def _rows(self) -> Rows:
+        return {name: getattr(self, attribute.field).detach() for name, attribute in self._attributes.items()}
+
+    def _set_rows(self, rows: Rows) -> None:
         device = compute_device()
-        for name, value in rows._asdict().items():
-            setattr(self, f"_{name}", nn.Parameter(value.to(device)))
+        self._take({name: nn.Parameter(rows[name].to(device)) for name in self._attributes})
         self._zero_statistics()
+
+    def _take(self, params: dict[str, nn.Parameter]) -> None:
+        for name, param in params.items():
+            setattr(self, self._attributes[name].field, param)
 
     def _zero_statistics(self) -> None:
         self.xyz_gradient_accum = torch.zeros(len(self), 1, device=self._xyz.device)
@@ -169,16 +156,11 @@ class GaussianModel:
         """Make the optimiser and the position schedule from the optimisation options; zero the statistics."""
         self.percent_dense = training_args.percent_dense
         self._zero_statistics()
-        rates = {
-            "xyz": training_args.position_lr_init * self.spatial_lr_scale,
-            "f_dc": training_args.feature_lr,
-            "f_rest": training_args.feature_lr / 20.0,
-            "opacity": training_args.opacity_lr,
-            "scaling": training_args.scaling_lr,
-            "rotation": training_args.rotation_lr,
-        }
         self.optimizer = GaussianAdam(
-            [{"params": [getattr(self, GROUPS[name])], "lr": rate, "name": name} for name, rate in rates.items()]
+            [
+                {"params": [getattr(self, a.field)], "lr": a.rate(training_args, self.spatial_lr_scale), "name": name}
+                for name, a in self._attributes.items()
+            ]
         )
         self.xyz_scheduler_args = get_expon_lr_func(
             lr_init=training_args.position_lr_init * self.spatial_lr_scale,
@@ -204,20 +186,20 @@ class GaussianModel:
         self.optimizer.set_active_columns("f_rest", 3 * self.active_bands)
 
     def capture(self) -> tuple:
-        """Everything a resumed training needs, as tensors and numbers: 12 entries in the reference's order."""
+        """Everything a resumed training needs, as tensors and numbers: 12 entries in the reference's order.
+
+        Attributes that the reference does not have follow as further entries.
+        """
+        rows = self._rows()
         return (
             self.active_sh_degree,
-            self._xyz.detach(),
-            self._features_dc.detach(),
-            self._features_rest.detach(),
-            self._scaling.detach(),
-            self._rotation.detach(),
-            self._opacity.detach(),
+            *(rows[name] for name in IN_CHECKPOINT),
             self.max_radii2D,
             self.xyz_gradient_accum,
             self.denom,
             self.optimizer.state_dict(),
             float(self.spatial_lr_scale),
+            *(values for name, values in rows.items() if name not in IN_CHECKPOINT),
         )
 
     def restore(self, model_args: Sequence[Any], training_args: argparse.Namespace) -> None:
@@ -225,30 +207,25 @@ class GaussianModel:
 
         UserError when the state was made with another maximal SH degree or does not fit together.
         """
-        (
-            active_sh_degree,
-            xyz,
-            features_dc,
-            features_rest,
-            scaling,
-            rotation,
-            opacity,
-            max_radii2D,
-            xyz_gradient_accum,
-            denom,
-            optimizer_state,
-            spatial_lr_scale,
-        ) = model_args
-        bands = (self.max_sh_degree + 1) ** 2 - 1
-        if features_rest.shape[1] != bands:
+        active_sh_degree, *tensors = model_args[:7]
+        max_radii2D, xyz_gradient_accum, denom, optimizer_state, spatial_lr_scale, *others = model_args[7:]
+        names = (*IN_CHECKPOINT, *(name for name in self._attributes if name not in IN_CHECKPOINT))
+        tensors += others
+        if len(tensors) != len(names):
             raise UserError(
-                f"the checkpoint has {features_rest.shape[1]} SH coefficients above band 0, where --sh_degree "
-                f"{self.max_sh_degree} needs {bands}; give the --sh_degree it was trained with"
+                f"the checkpoint has {len(tensors)} attributes per Gaussian, where this model has {len(names)} "
+                f"({', '.join(names)}); give a checkpoint of this model"
+            )
+        rows = {name: tensor.detach() for name, tensor in zip(names, tensors, strict=True)}
+        found, wanted = rows["f_rest"].shape[1], self._attributes["f_rest"].shape[0]
+        if found != wanted:
+            raise UserError(
+                f"the checkpoint has {found} SH coefficients above band 0, where --sh_degree "
+                f"{self.max_sh_degree} needs {wanted}; give the --sh_degree it was trained with"
             )
         self.active_sh_degree = int(active_sh_degree)
         self.spatial_lr_scale = float(spatial_lr_scale)
-        tensors = (xyz, features_dc, features_rest, opacity, scaling, rotation)
-        self._set_rows(GaussianRows(*(tensor.detach() for tensor in tensors)))
+        self._set_rows(rows)
         self.training_setup(training_args)
         rates = [group["lr"] for group in self.optimizer.param_groups]
         try:
@@ -310,7 +287,7 @@ class GaussianModel:
         """Append an exact copy of each Gaussian with gradient >= threshold and scale <= percent_dense * extent."""
         small = adc.is_small(self._scaling, self.percent_dense * scene_extent)
         chosen = ((grads.reshape(-1) >= grad_threshold) & small).nonzero().reshape(-1)
-        self.densification_postfix(*(getattr(self, name).detach().index_select(0, chosen) for name in GROUPS.values()))
+        self.densification_postfix(*(values.index_select(0, chosen) for values in self._rows().values()))
 
     def densify_and_split(
         self,
@@ -332,16 +309,16 @@ class GaussianModel:
         large[len(grads) :] = False
         large[: len(grads)] &= grads >= grad_threshold
         parents = large.nonzero().reshape(-1)
-        rows = {name: getattr(self, name).detach().index_select(0, parents) for name in GROUPS.values()}
+        rows = {name: values.index_select(0, parents) for name, values in self._rows().items()}
         children = [
             adc.split_children(
-                rows["_xyz"], rows["_scaling"], rows["_rotation"], parents, child, seed=seed, iteration=iteration
+                rows["xyz"], rows["scaling"], rows["rotation"], parents, child, seed=seed, iteration=iteration
             )
             for child in range(N)
         ]
-        copies = {name: torch.cat([value] * N) for name, value in rows.items() if name not in ("_xyz", "_scaling")}
-        copies["_xyz"], copies["_scaling"] = (torch.cat(parts) for parts in zip(*children, strict=True))
-        self.densification_postfix(*(copies[name] for name in GROUPS.values()))
+        rows = {name: torch.cat([values] * N) for name, values in rows.items()}
+        rows["xyz"], rows["scaling"] = (torch.cat(parts) for parts in zip(*children, strict=True))
+        self.densification_postfix(*rows.values())
         self.prune_points(torch.cat((large, large.new_zeros(len(self) - before))))
 
     def densification_postfix(
@@ -352,10 +329,11 @@ class GaussianModel:
         new_opacities: Tensor,
         new_scaling: Tensor,
         new_rotation: Tensor,
+        *new_others: Tensor,
     ) -> None:
         """Append Gaussians (raw parameters), also when there are none; the statistics of all are zeroed."""
-        new = (new_xyz, new_features_dc, new_features_rest, new_opacities, new_scaling, new_rotation)
-        self._take(self.optimizer.append_rows(dict(zip(GROUPS, new, strict=True))))
+        new = (new_xyz, new_features_dc, new_features_rest, new_opacities, new_scaling, new_rotation, *new_others)
+        self._take(self.optimizer.append_rows(dict(zip(self._attributes, new, strict=True))))
         self._zero_statistics()
 
     def prune_points(self, mask: Tensor) -> None:
@@ -372,7 +350,3 @@ class GaussianModel:
         """Bring every opacity down to at most 0.01; its Adam moments start again from zero."""
         lowered = self._opacity.detach().clamp_max(adc.logit(adc.RESET_OPACITY))
         self._opacity = self.optimizer.reset("opacity", lowered)
-
-    def _take(self, params: dict[str, nn.Parameter]) -> None:
-        for name, param in params.items():
-            setattr(self, GROUPS[name], param)

@@ -6,8 +6,11 @@ import numpy as np
 import torch
 
 from arguments import OptimizationParams, PipelineParams
-from scene.gaussian_model import GROUPS, GaussianModel
+from scene.gaussian_attributes import attributes
+from scene.gaussian_model import GaussianModel
 from utils.graphics_utils import BasicPointCloud
+
+GROUPS = {group: attribute.field for group, attribute in attributes(0).items()}
 
 
 def options(**changes: object) -> argparse.Namespace:

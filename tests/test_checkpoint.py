@@ -92,6 +92,7 @@ def _wrong_files(folder) -> dict[str, str]:
     torch.save({"weights": torch.zeros(3)}, folder / "dictionary")
     torch.save((capture[:11], 5), folder / "eleven")
     torch.save(((*capture[:9], capture[9][:2], *capture[10:]), 5), folder / "lengths")
+    torch.save(((*capture, torch.zeros(2, 1)), 5), folder / "further")
     torch.save((*capture, _Bomb()), folder / "bomb")
     buffer = io.BytesIO()
     pickle.dump(_Bomb(), buffer, protocol=2)
@@ -108,6 +109,7 @@ def _wrong_files(folder) -> dict[str, str]:
         "dictionary": "parts do not fit",
         "eleven": "parts do not fit",
         "lengths": "parts do not fit",
+        "further": "parts do not fit",
         "bomb": "never run",
         "pickle": "never run",
         "zip": "chkpntN.pth",

@@ -60,6 +60,23 @@ def test_selection_at_equality():
     assert not torch.equal(after["xyz"][6], after["xyz"][7])
 
 
+def test_clones_and_children_inherit_from_their_own_parent():
+    """Several of each kind, so that rows in another order show."""
+    gaussians = _toy([LIMIT / 2] * 3 + [LIMIT * 3] * 3, [1.0, 0.0, 1.0, 1.0, 0.0, 1.0])
+    before = parameters(gaussians)
+    _densify(gaussians)
+    # Kept: 0, 1, 2, 4 (3 and 5 were split); clones of 0 and 2; first children of 3 and 5, then the second ones.
+    origin = [0, 1, 2, 4, 0, 2, 3, 5, 3, 5]
+    for name, value in parameters(gaussians).items():
+        assert name in ("opacity", "scaling") or not torch.equal(value[6], value[7])
+        expected = before[name][origin]
+        if name == "scaling":
+            expected[6:] -= math.log(1.6)
+        if name == "xyz":
+            value, expected = value[:6], expected[:6]
+        assert torch.equal(value, expected), name
+
+
 def test_statistics_start_again_and_moments_follow_their_rows():
     gaussians = _toy([LIMIT / 2, LIMIT * 3, LIMIT], [1.0, 1.0, 0.0])
     state = moments(gaussians)

@@ -115,6 +115,12 @@ def test_restore_refuses_another_degree():
         GaussianModel(1).restore(model(5, degree=2).capture(), options())
 
 
+def test_restore_refuses_other_attributes():
+    capture = model(5).capture()
+    with pytest.raises(UserError, match=r"has 7 attributes per Gaussian.*has 6 \(xyz, f_dc"):
+        GaussianModel(3).restore((*capture, torch.zeros(5, 1)), options())
+
+
 def test_unknown_optimizer_is_refused():
     with pytest.raises(UserError, match="sparse_adam"):
         GaussianModel(3, "sparse_adam")

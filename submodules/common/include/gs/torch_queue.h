@@ -21,8 +21,7 @@ class TorchQueue {
  private:
   static void* allocate(void* context, size_t bytes) {
     auto* self = static_cast<TorchQueue*>(context);
-    self->memory_.push_back(
-        at::empty({int64_t(bytes)}, at::TensorOptions().dtype(at::kByte).device(self->device_)));
+    self->memory_.push_back(at::empty({int64_t(bytes)}, at::TensorOptions().dtype(at::kByte).device(self->device_)));
     return self->memory_.back().mutable_data_ptr();
   }
 

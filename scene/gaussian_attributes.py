@@ -1,0 +1,44 @@
+"""The table of what is trained of each Gaussian. Optimiser, density control, PLY and checkpoints go over it."""
+
+import argparse
+from collections.abc import Callable
+from typing import NamedTuple
+
+from torch import Tensor
+
+Rows = dict[str, Tensor]  # raw values (N, *shape), float32, by optimiser group
+
+
+class Attribute(NamedTuple):
+    """One raw (unactivated) parameter of every Gaussian."""
+
+    field: str  # where GaussianModel keeps it
+    shape: tuple[int, ...]  # of one Gaussian's values, (..., 3) with RGB last for SH
+    columns: list[str]  # in the PLY; SH band by band within a channel
+    rate: Callable[[argparse.Namespace, float], float]  # learning rate of optimisation options and scene extent
+
+
+def attributes(sh_degree: int) -> dict[str, Attribute]:
+    """Attribute by optimiser group, in the order of groups and PLY columns, for a maximal SH degree.
+
+    The six of the paper come first; docs/extending.md adds one.
+    """
+    bands = (sh_degree + 1) ** 2 - 1
+    return {
+        "xyz": Attribute("_xyz", (3,), ["x", "y", "z"], lambda opt, extent: opt.position_lr_init * extent),
+        "f_dc": Attribute("_features_dc", (1, 3), _numbered("f_dc", 3), lambda opt, _: opt.feature_lr),
+        "f_rest": Attribute(
+            "_features_rest", (bands, 3), _numbered("f_rest", 3 * bands), lambda opt, _: opt.feature_lr / 20.0
+        ),
+        "opacity": Attribute("_opacity", (1,), ["opacity"], lambda opt, _: opt.opacity_lr),
+        "scaling": Attribute("_scaling", (3,), _numbered("scale", 3), lambda opt, _: opt.scaling_lr),
+        "rotation": Attribute("_rotation", (4,), _numbered("rot", 4), lambda opt, _: opt.rotation_lr),
+    }
+
+
+# Entries 1 to 6 of a checkpoint, as the reference has them; other attributes follow after its last entry.
+IN_CHECKPOINT = ("xyz", "f_dc", "f_rest", "scaling", "rotation", "opacity")
+
+
+def _numbered(name: str, count: int) -> list[str]:
+    return [f"{name}_{i}" for i in range(count)]
