@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import utils.openmp  # noqa: F401  isort: skip  (before torch)
 import numpy as np
 import torch
 from fused_ssim import fused_ssim

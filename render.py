@@ -13,6 +13,7 @@ import statistics
 import time
 from pathlib import Path
 
+import utils.openmp  # noqa: F401  isort: skip  (before torch)
 import torch
 from PIL import Image
 from tqdm import tqdm

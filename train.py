@@ -12,6 +12,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+import utils.openmp  # noqa: F401  isort: skip  (before torch)
 import torch
 from torch import Tensor
 from tqdm import tqdm

@@ -4,6 +4,7 @@ import os
 import shutil
 from pathlib import Path
 
+import utils.openmp  # noqa: F401  isort: skip  (before torch)
 import pytest
 from synthetic import make_blender_scene, make_colmap_scene
 

@@ -40,7 +40,6 @@ def test_opcheck_every_other_op():
     moments = ops.blend_vjp(*state, *gradients)
     wanted = [True, True, True, True, True, False, False, True, True]
     _check(ops.project_vjp, *arguments, counts, moments, wanted)
-    state = (background, splats, counts, instances, slots, ranges, offsets, last, transmittance)
     _check(ops.rasterize_vjp, *arguments, *state, *gradients, wanted)
     _check(ops.mark_visible, raw["means"], camera.viewmatrix.float())
     moment = torch.rand(3, 3)

@@ -44,6 +44,7 @@ struct Projected {
   int32_t* rects;        // (N, 4) tiles x0 y0 x1 y1
   int32_t* tile_counts;  // (N)
   int32_t* radii;        // (N)
+  uint64_t* tile_masks;  // (N), or null: which tiles of a rectangle of at most 64 are reached, a bit each in its order
 };
 
 // Gradients of Scene's inputs; null where not wanted. Every row is written.
@@ -142,6 +143,9 @@ namespace cuda {
 GS_BACKEND(Queue)
 // The number of tile instances of a projection: waits for it.
 int64_t count_instances(const Queue&, int64_t count, const int32_t* tile_counts);
+// blend_vjp and project_vjp in one, without the moments in between (BlendGradient::moments is not written).
+void rasterize_vjp(const Queue&, const Scene<float>&, const BlendInput<float>&, const BlendGradient<float>&,
+                   const SceneGradient<float>&);
 }  // namespace cuda
 
 }  // namespace gs

@@ -168,18 +168,28 @@ int64_t tiles_of(gs::Image image) { return ((image.width + kTile - 1) / kTile) *
 
 struct ProjectedTensors {
   Tensor splats, depths, rects, tile_counts, radii;
+  Tensor tile_masks;  // a GPU's only
   template <class T>
   gs::Projected<T> pointers() {
-    return {splats.mutable_data_ptr<T>(), depths.mutable_data_ptr<T>(), rects.mutable_data_ptr<int32_t>(),
-            tile_counts.mutable_data_ptr<int32_t>(), radii.mutable_data_ptr<int32_t>()};
+    return {splats.mutable_data_ptr<T>(),
+            depths.mutable_data_ptr<T>(),
+            rects.mutable_data_ptr<int32_t>(),
+            tile_counts.mutable_data_ptr<int32_t>(),
+            radii.mutable_data_ptr<int32_t>(),
+            tile_masks.defined() ? static_cast<uint64_t*>(tile_masks.mutable_data_ptr()) : nullptr};
   }
 };
 
 ProjectedTensors project(const SceneTensors& in) {
   const int64_t n = in.count();
   const auto ints = in.options().dtype(at::kInt);
-  ProjectedTensors out{at::empty({n, kSplatValues}, in.options()), at::empty({n}, in.options()),
-                       at::empty({n, 4}, ints), at::empty({n}, ints), at::empty({n}, ints)};
+  ProjectedTensors out{at::empty({n, kSplatValues}, in.options()),
+                       at::empty({n}, in.options()),
+                       at::empty({n, 4}, ints),
+                       at::empty({n}, ints),
+                       at::empty({n}, ints),
+                       {}};
+  if (in.options().device().is_cuda()) out.tile_masks = at::empty({n}, in.options().dtype(at::kLong));
   with_scalar(in.dtype(), [&](auto zero) {
     using T = decltype(zero);
     RUN(T, out.splats, project, in.scene<T>(), out.pointers<T>());
@@ -258,64 +268,106 @@ BlendedTensors blend(const Tensor& splats, const Tensor& instances, const Tensor
   return out;
 }
 
-Tensor blend_vjp(const Tensor& splats, const Tensor& tile_counts, const Tensor& instances, const Tensor& slots,
-                 const Tensor& ranges, const Tensor& slot_offsets, const Tensor& background, const Tensor& last,
-                 const Tensor& transmittance, const Tensor& grad_color, const MaybeTensor& grad_transmittance,
-                 const MaybeTensor& grad_inverse_depth) {
-  const int64_t n = splats.size(0);
-  const gs::Image image{int(last.size(1)), int(last.size(0))};
-  TORCH_CHECK(grad_color.dim() == 3 && grad_color.size(0) == 3 && grad_color.size(1) == image.height &&
-                  grad_color.size(2) == image.width,
-              "the gradient of the image must be (3, ", image.height, ", ", image.width, "), got ", grad_color.sizes());
-  const auto plane = [&](const MaybeTensor& t) {
-    if (!t.has_value() || !t->defined()) return Tensor();
-    TORCH_CHECK(t->numel() == last.numel(), "gradient of an image plane must be (1, ", image.height, ", ", image.width,
-                "), got ", t->sizes());
-    return t->to(splats.options()).contiguous();
-  };
-  const Tensor bg = background_like(background, splats), color = grad_color.to(splats.options()).contiguous();
-  const Tensor depth = plane(grad_inverse_depth), alpha = plane(grad_transmittance);
-  Tensor moments = at::empty({n, kGradientValues}, splats.options());
-  with_scalar(splats.scalar_type(), [&](auto zero) {
+// What the backward of blending takes: owns the tensors that gs::BlendInput and gs::BlendGradient point into.
+class BlendBackward {
+ public:
+  BlendBackward(const Tensor& splats, const Tensor& tile_counts, const Tensor& instances, const Tensor& slots,
+                const Tensor& ranges, const Tensor& slot_offsets, const Tensor& background, const Tensor& last,
+                const Tensor& transmittance, const Tensor& grad_color, const MaybeTensor& grad_transmittance,
+                const MaybeTensor& grad_inverse_depth)
+      : splats_(splats.contiguous()),
+        tile_counts_(tile_counts.contiguous()),
+        instances_(instances),
+        slots_(slots),
+        ranges_(ranges),
+        slot_offsets_(slot_offsets),
+        background_(background_like(background, splats)),
+        last_(last),
+        transmittance_(transmittance),
+        image_{int(last.size(1)), int(last.size(0))},
+        color_(plane(grad_color, 3)),
+        alpha_(plane(grad_transmittance, 1)),
+        depth_(plane(grad_inverse_depth, 1)) {}
+
+  const Tensor& splats() const { return splats_; }
+
+  template <class T>
+  gs::BlendInput<T> input() const {
+    return blend_input<T>(splats_, instances_, ranges_, background_, image_);
+  }
+  template <class T>
+  gs::BlendGradient<T> gradient(T* moments) const {
+    return {splats_.size(0),
+            instances_.size(0),
+            slots_.const_data_ptr<int32_t>(),
+            slot_offsets_.const_data_ptr<int64_t>(),
+            tile_counts_.const_data_ptr<int32_t>(),
+            transmittance_.const_data_ptr<T>(),
+            last_.const_data_ptr<int32_t>(),
+            color_.const_data_ptr<T>(),
+            depth_.defined() ? depth_.const_data_ptr<T>() : nullptr,
+            alpha_.defined() ? alpha_.const_data_ptr<T>() : nullptr,
+            moments};
+  }
+
+ private:
+  Tensor plane(const MaybeTensor& t, int64_t channels) const {
+    if (!t.has_value() || !t->defined()) return {};
+    TORCH_CHECK(t->dim() == 3 && t->size(0) == channels && t->size(1) == image_.height && t->size(2) == image_.width,
+                "the gradient of an image must be (", channels, ", ", image_.height, ", ", image_.width, "), got ",
+                t->sizes());
+    return t->to(splats_.options()).contiguous();
+  }
+
+  Tensor splats_, tile_counts_, instances_, slots_, ranges_, slot_offsets_, background_, last_, transmittance_;
+  gs::Image image_;
+  Tensor color_, alpha_, depth_;
+};
+
+Tensor blend_vjp(const BlendBackward& in) {
+  Tensor moments = at::empty({in.splats().size(0), kGradientValues}, in.splats().options());
+  with_scalar(moments.scalar_type(), [&](auto zero) {
     using T = decltype(zero);
-    const gs::BlendGradient<T> g{n,
-                                 instances.size(0),
-                                 slots.const_data_ptr<int32_t>(),
-                                 slot_offsets.const_data_ptr<int64_t>(),
-                                 tile_counts.const_data_ptr<int32_t>(),
-                                 transmittance.const_data_ptr<T>(),
-                                 last.const_data_ptr<int32_t>(),
-                                 color.const_data_ptr<T>(),
-                                 depth.defined() ? depth.const_data_ptr<T>() : nullptr,
-                                 alpha.defined() ? alpha.const_data_ptr<T>() : nullptr,
-                                 moments.mutable_data_ptr<T>()};
-    RUN(T, splats, blend_vjp, blend_input<T>(splats, instances, ranges, bg, image), g);
+    RUN(T, moments, blend_vjp, in.input<T>(), in.gradient<T>(moments.mutable_data_ptr<T>()));
   });
   return moments;
 }
 
 // In the order of GRADIENTS in ops.py; empty where not wanted.
 using Gradients = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor>;
+using Wanted = std::array<bool, 9>;
 
-Gradients project_vjp(const SceneTensors& in, const Tensor& tile_counts, const Tensor& moments,
-                      std::array<bool, 9> wanted) {
-  const int64_t n = in.count();
-  const auto make = [&](int which, at::IntArrayRef tail) {
-    std::vector<int64_t> sizes{wanted[which] ? n : 0};
-    sizes.insert(sizes.end(), tail.begin(), tail.end());
-    return at::empty(sizes, in.options());
-  };
-  std::array<Tensor, 9> g{make(0, {3}), make(1, {3}),    make(2, {1}),
-                          make(3, {3}), make(4, {4}),    make(5, {6}),
-                          make(6, {3}), make(7, {1, 3}), make(8, {in.rest_bands(), 3})};
+class SceneGradients {
+ public:
+  SceneGradients(const SceneTensors& in, const Wanted& wanted) : wanted_(wanted) {
+    const std::array<std::vector<int64_t>, 9> rows{{{3}, {3}, {1}, {3}, {4}, {6}, {3}, {1, 3}, {in.rest_bands(), 3}}};
+    for (int i = 0; i < 9; ++i) {
+      std::vector<int64_t> sizes{wanted[i] ? in.count() : 0};
+      sizes.insert(sizes.end(), rows[i].begin(), rows[i].end());
+      tensors_[i] = at::empty(sizes, in.options());
+    }
+  }
+
+  template <class T>
+  gs::SceneGradient<T> pointers() {
+    const auto p = [&](int i) { return wanted_[i] ? tensors_[i].mutable_data_ptr<T>() : nullptr; };
+    return {p(0), p(1), p(2), p(3), p(4), p(5), p(6), p(7), p(8)};
+  }
+  Gradients all() const { return std::tuple_cat(tensors_); }
+
+ private:
+  Wanted wanted_;
+  std::array<Tensor, 9> tensors_;
+};
+
+Gradients project_vjp(const SceneTensors& in, const Tensor& tile_counts, const Tensor& moments, const Wanted& wanted) {
+  SceneGradients out(in, wanted);
   with_scalar(in.dtype(), [&](auto zero) {
     using T = decltype(zero);
-    const auto out = [&](int which) { return wanted[which] ? g[which].mutable_data_ptr<T>() : nullptr; };
-    const gs::SceneGradient<T> gradient{out(0), out(1), out(2), out(3), out(4), out(5), out(6), out(7), out(8)};
     RUN(T, moments, project_vjp, in.scene<T>(), tile_counts.const_data_ptr<int32_t>(), moments.const_data_ptr<T>(),
-        gradient);
+        out.pointers<T>());
   });
-  return {g[0], g[1], g[2], g[3], g[4], g[5], g[6], g[7], g[8]};
+  return out.all();
 }
 
 // ---- the ops ----
@@ -330,8 +382,8 @@ Tensors5 project_op(SCENE_PARAMETERS) {
 
 Tensors4 bin_op(const Tensor& splats, const Tensor& depths, const Tensor& rects, const Tensor& tile_counts,
                 int64_t height, int64_t width, bool train) {
-  ProjectedTensors p{splats.contiguous(), depths.contiguous(), rects.contiguous(), tile_counts.contiguous(),
-                     tile_counts.contiguous()};
+  ProjectedTensors p{splats.contiguous(),      depths.contiguous(),      rects.contiguous(),
+                     tile_counts.contiguous(), tile_counts.contiguous(), {}};
   const BinnedTensors b = bin(p, {int(width), int(height)}, train);
   return {b.instances, b.slots, b.ranges, b.slot_offsets};
 }
@@ -343,8 +395,24 @@ Tensors4 blend_op(const Tensor& splats, const Tensor& instances, const Tensor& r
   return {b.color, b.transmittance, b.inverse_depth, b.last};
 }
 
-Gradients project_vjp_op(SCENE_PARAMETERS, const Tensor& tile_counts, const Tensor& moments,
-                         std::array<bool, 9> wanted) {
+#define BACKWARD_SCHEMA                                                                                     \
+  "Tensor splats, Tensor tile_counts, Tensor instances, Tensor slots, Tensor ranges, Tensor slot_offsets, " \
+  "Tensor background, Tensor last, Tensor transmittance, Tensor grad_color, Tensor? grad_transmittance, "   \
+  "Tensor? grad_inverse_depth"
+#define GRADIENTS_SCHEMA                                                                             \
+  "(Tensor means, Tensor means2d, Tensor opacities, Tensor scales, Tensor rotations, Tensor cov3d, " \
+  "Tensor colors, Tensor sh_dc, Tensor sh_rest)"
+#define BACKWARD_PARAMETERS                                                                                            \
+  const Tensor &splats, const Tensor &tile_counts, const Tensor &instances, const Tensor &slots, const Tensor &ranges, \
+      const Tensor &slot_offsets, const Tensor &background, const Tensor &last, const Tensor &transmittance,           \
+      const Tensor &grad_color, const MaybeTensor &grad_transmittance, const MaybeTensor &grad_inverse_depth
+#define BACKWARD_ARGUMENTS                                                                                  \
+  splats, tile_counts, instances, slots, ranges, slot_offsets, background, last, transmittance, grad_color, \
+      grad_transmittance, grad_inverse_depth
+
+Tensor blend_vjp_op(BACKWARD_PARAMETERS) { return blend_vjp(BlendBackward(BACKWARD_ARGUMENTS)); }
+
+Gradients project_vjp_op(SCENE_PARAMETERS, const Tensor& tile_counts, const Tensor& moments, Wanted wanted) {
   return project_vjp(SceneTensors(SCENE_ARGUMENTS), tile_counts.contiguous(), moments.contiguous(), wanted);
 }
 
@@ -360,15 +428,19 @@ Rasterized rasterize_op(const Tensor& /*means2d: only receives a gradient*/, SCE
           b.instances, b.slots,         b.ranges,        b.slot_offsets, o.last};
 }
 
-Gradients rasterize_vjp_op(SCENE_PARAMETERS, const Tensor& background, const Tensor& splats, const Tensor& tile_counts,
-                           const Tensor& instances, const Tensor& slots, const Tensor& ranges,
-                           const Tensor& slot_offsets, const Tensor& last, const Tensor& transmittance,
-                           const Tensor& grad_color, const MaybeTensor& grad_transmittance,
-                           const MaybeTensor& grad_inverse_depth, std::array<bool, 9> wanted) {
+Gradients rasterize_vjp_op(SCENE_PARAMETERS, BACKWARD_PARAMETERS, Wanted wanted) {
   const SceneTensors scene(SCENE_ARGUMENTS);
-  const Tensor moments = blend_vjp(splats, tile_counts, instances, slots, ranges, slot_offsets, background, last,
-                                   transmittance, grad_color, grad_transmittance, grad_inverse_depth);
-  return project_vjp(scene, tile_counts, moments, wanted);
+  const BlendBackward in(BACKWARD_ARGUMENTS);
+#ifdef GS_CUDA
+  if (splats.is_cuda()) {
+    gs::TorchQueue queue(splats.device());
+    SceneGradients out(scene, wanted);
+    gs::cuda::rasterize_vjp(queue.queue(), scene.scene<float>(), in.input<float>(), in.gradient<float>(nullptr),
+                            out.pointers<float>());
+    return out.all();
+  }
+#endif
+  return project_vjp(scene, tile_counts, blend_vjp(in), wanted);
 }
 
 Tensor mark_visible_op(const Tensor& means, const Tensor& view) {
@@ -424,22 +496,13 @@ TORCH_LIBRARY(diff_gaussian_rasterization, m) {
   m.def(
       "blend(Tensor splats, Tensor instances, Tensor ranges, Tensor background, int height, int width, "
       "bool inverse_depth, bool train) -> (Tensor color, Tensor transmittance, Tensor inverse_depth, Tensor last)");
-  m.def(
-      "blend_vjp(Tensor splats, Tensor tile_counts, Tensor instances, Tensor slots, Tensor ranges, "
-      "Tensor slot_offsets, Tensor background, Tensor last, Tensor transmittance, Tensor grad_color, "
-      "Tensor? grad_transmittance, Tensor? grad_inverse_depth) -> Tensor moments");
-  m.def("project_vjp(" SCENE_SCHEMA
-        ", Tensor tile_counts, Tensor moments, bool[9] wanted) -> (Tensor means, Tensor means2d, Tensor opacities, "
-        "Tensor scales, Tensor rotations, Tensor cov3d, Tensor colors, Tensor sh_dc, Tensor sh_rest)");
+  m.def("blend_vjp(" BACKWARD_SCHEMA ") -> Tensor moments");
+  m.def("project_vjp(" SCENE_SCHEMA ", Tensor tile_counts, Tensor moments, bool[9] wanted) -> " GRADIENTS_SCHEMA);
   m.def("rasterize(Tensor means2d, " SCENE_SCHEMA
         ", Tensor background, bool inverse_depth, bool train) -> (Tensor color, Tensor transmittance, "
         "Tensor inverse_depth, Tensor radii, Tensor splats, Tensor tile_counts, Tensor instances, Tensor slots, "
         "Tensor ranges, Tensor slot_offsets, Tensor last)");
-  m.def("rasterize_vjp(" SCENE_SCHEMA
-        ", Tensor background, Tensor splats, Tensor tile_counts, Tensor instances, Tensor slots, Tensor ranges, "
-        "Tensor slot_offsets, Tensor last, Tensor transmittance, Tensor grad_color, Tensor? grad_transmittance, "
-        "Tensor? grad_inverse_depth, bool[9] wanted) -> (Tensor means, Tensor means2d, Tensor opacities, Tensor "
-        "scales, Tensor rotations, Tensor cov3d, Tensor colors, Tensor sh_dc, Tensor sh_rest)");
+  m.def("rasterize_vjp(" SCENE_SCHEMA ", " BACKWARD_SCHEMA ", bool[9] wanted) -> " GRADIENTS_SCHEMA);
   m.def("mark_visible(Tensor means, Tensor view) -> Tensor");
   m.def(
       "adam_(Tensor(a!) value, Tensor gradient, Tensor(b!) mean, Tensor(c!) square, float lr, float beta1, "
@@ -451,7 +514,7 @@ TORCH_LIBRARY(diff_gaussian_rasterization, m) {
     m.impl("project", &project_op);                            \
     m.impl("bin", &bin_op);                                    \
     m.impl("blend", &blend_op);                                \
-    m.impl("blend_vjp", &blend_vjp);                           \
+    m.impl("blend_vjp", &blend_vjp_op);                        \
     m.impl("project_vjp", &project_vjp_op);                    \
     m.impl("rasterize", &rasterize_op);                        \
     m.impl("rasterize_vjp", &rasterize_vjp_op);                \

@@ -244,7 +244,7 @@ def _setup_context(ctx, inputs, output):
     ctx.scene = [None if isinstance(value, Tensor) else value for value in scene]
     ctx.places = [i for i, value in enumerate(scene) if isinstance(value, Tensor)]
     ctx.inverse_depth, ctx.train = inverse_depth, train
-    state = (background, splats, tile_counts, instances, slots, ranges, slot_offsets, last, transmittance)
+    state = (splats, tile_counts, instances, slots, ranges, slot_offsets, background, last, transmittance)
     ctx.save_for_backward(*tensors, *state)
 
 

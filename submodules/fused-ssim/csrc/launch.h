@@ -2,6 +2,7 @@
 // What the backends implement: plain pointers and sizes, no torch.
 #include <cstdint>
 
+#include "gs/cuda_queue.h"
 #include "gs/isa.h"
 #include "gs/parallel.h"
 
@@ -32,6 +33,23 @@ struct L1SsimVjp {
   double grad_l1, grad_ssim;
   T* grad_img1;  // out
 };
+
+// As L1Ssim<float>, with every pointer to the device.
+struct L1SsimCuda {
+  ImagePair<float> images;
+  bool valid;
+  float *l1, *ssim, *gradient;
+};
+
+// As L1SsimVjp<float>, with every pointer to the device.
+struct L1SsimVjpCuda {
+  ImagePair<float> images;
+  const float *ssim_gradient, *grad_l1, *grad_ssim;
+  float* grad_img1;
+};
+
+void l1_ssim_cuda(const L1SsimCuda&, const Queue&);
+void l1_ssim_vjp_cuda(const L1SsimVjpCuda&, const Queue&);
 
 #define GS_DECLARE(isa)                                            \
   namespace isa {                                                  \

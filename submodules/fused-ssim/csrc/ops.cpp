@@ -7,6 +7,10 @@
 #include "gs/torch_executor.h"
 #include "launch.h"
 
+#ifdef GS_CUDA
+#include "gs/torch_queue.h"
+#endif
+
 namespace {
 
 void check_images(const at::Tensor& img1, const at::Tensor& img2, bool valid) {
@@ -50,12 +54,16 @@ std::tuple<at::Tensor, at::Tensor, at::Tensor> l1_ssim(const at::Tensor& img1_, 
   return img1.scalar_type() == at::kFloat ? run(0.0f) : run(0.0);
 }
 
+void check_ssim_gradient(const at::Tensor& ssim_gradient, const at::Tensor& img1) {
+  TORCH_CHECK(ssim_gradient.sizes() == img1.sizes() && ssim_gradient.scalar_type() == img1.scalar_type(),
+              "ssim_gradient must be like img1, got ", ssim_gradient.sizes(), " and ", img1.sizes(),
+              ": it is kept by l1_ssim with train = True only");
+}
+
 at::Tensor l1_ssim_vjp(const at::Tensor& img1_, const at::Tensor& img2_, const at::Tensor& ssim_gradient_,
                        const at::Tensor& grad_l1, const at::Tensor& grad_ssim) {
   check_images(img1_, img2_, false);
-  TORCH_CHECK(ssim_gradient_.sizes() == img1_.sizes() && ssim_gradient_.scalar_type() == img1_.scalar_type(),
-              "ssim_gradient must be like img1, got ", ssim_gradient_.sizes(), " and ", img1_.sizes(),
-              ": it is kept by l1_ssim with train = True only");
+  check_ssim_gradient(ssim_gradient_, img1_);
   const at::Tensor img1 = img1_.contiguous(), img2 = img2_.contiguous(), ssim_gradient = ssim_gradient_.contiguous();
   at::Tensor grad_img1 = at::empty(img1.sizes(), img1.options());
   const auto run = [&](auto zero) {
@@ -67,6 +75,46 @@ at::Tensor l1_ssim_vjp(const at::Tensor& img1_, const at::Tensor& img2_, const a
   img1.scalar_type() == at::kFloat ? run(0.0f) : run(0.0);
   return grad_img1;
 }
+
+#ifdef GS_CUDA
+void check_images_cuda(const at::Tensor& img1, const at::Tensor& img2, bool valid) {
+  check_images(img1, img2, valid);
+  TORCH_CHECK(img1.scalar_type() == at::kFloat, "img1 must be float32 on a GPU, got ", img1.scalar_type());
+  TORCH_CHECK(img1.device() == img2.device(), "img1 is on ", img1.device(), " and img2 on ", img2.device());
+}
+
+std::tuple<at::Tensor, at::Tensor, at::Tensor> l1_ssim_on_cuda(const at::Tensor& img1_, const at::Tensor& img2_,
+                                                               bool valid, bool train) {
+  check_images_cuda(img1_, img2_, valid);
+  gs::TorchQueue queue(img1_.device());
+  const at::Tensor img1 = img1_.contiguous(), img2 = img2_.contiguous();
+  at::Tensor l1 = at::empty({}, img1.options()), ssim = at::empty({}, img1.options());
+  at::Tensor gradient = train ? at::empty(img1.sizes(), img1.options()) : at::empty({0}, img1.options());
+  gs::l1_ssim_cuda({image_pair<float>(img1, img2), valid, l1.mutable_data_ptr<float>(), ssim.mutable_data_ptr<float>(),
+                    train ? gradient.mutable_data_ptr<float>() : nullptr},
+                   queue.queue());
+  return {l1, ssim, gradient};
+}
+
+at::Tensor l1_ssim_vjp_on_cuda(const at::Tensor& img1_, const at::Tensor& img2_, const at::Tensor& ssim_gradient_,
+                               const at::Tensor& grad_l1, const at::Tensor& grad_ssim) {
+  check_images_cuda(img1_, img2_, false);
+  check_ssim_gradient(ssim_gradient_, img1_);
+  for (const at::Tensor& other : {ssim_gradient_, grad_l1, grad_ssim})
+    TORCH_CHECK(other.device() == img1_.device() && other.scalar_type() == at::kFloat,
+                "the gradients must be float32 on ", img1_.device(), " like img1, got ", other.scalar_type(), " on ",
+                other.device());
+  TORCH_CHECK(grad_l1.numel() == 1 && grad_ssim.numel() == 1, "grad_l1 and grad_ssim must be scalars");
+  gs::TorchQueue queue(img1_.device());
+  const at::Tensor img1 = img1_.contiguous(), img2 = img2_.contiguous(), ssim_gradient = ssim_gradient_.contiguous();
+  at::Tensor grad_img1 = at::empty(img1.sizes(), img1.options());
+  gs::l1_ssim_vjp_cuda(
+      {image_pair<float>(img1, img2), ssim_gradient.const_data_ptr<float>(), grad_l1.const_data_ptr<float>(),
+       grad_ssim.const_data_ptr<float>(), grad_img1.mutable_data_ptr<float>()},
+      queue.queue());
+  return grad_img1;
+}
+#endif
 
 }  // namespace
 
@@ -81,3 +129,10 @@ TORCH_LIBRARY_IMPL(fused_ssim, CPU, m) {
   m.impl("l1_ssim", &l1_ssim);
   m.impl("l1_ssim_vjp", &l1_ssim_vjp);
 }
+
+#ifdef GS_CUDA
+TORCH_LIBRARY_IMPL(fused_ssim, CUDA, m) {
+  m.impl("l1_ssim", &l1_ssim_on_cuda);
+  m.impl("l1_ssim_vjp", &l1_ssim_vjp_on_cuda);
+}
+#endif

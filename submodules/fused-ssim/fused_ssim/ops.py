@@ -23,8 +23,9 @@ WINDOW = 11  # pixels
 def fused_ssim(img1: Tensor, img2: Tensor, padding: str = "same", train: bool = True) -> Tensor:
     """Mean SSIM of two images, a scalar of img1's dtype.
 
-    img1: (..., H, W), float32 or float64, values in [0, 1]; img2: the same shape, of the same dtype or uint8 (value /
-    255). padding: "same" (any size) or "valid" (11 x 11 or more). train=False: no gradient, nothing kept for one.
+    img1: (..., H, W), float32 or, on the CPU, float64, values in [0, 1]; img2: the same shape, of the same dtype or
+    uint8 (value / 255). padding: "same" (any size) or "valid" (11 x 11 or more). train=False: no gradient, nothing kept
+    for one. The same images on the same device give the same bits.
     Raises TypeError for a dtype, ValueError for anything else that does not fit.
     """
     return fused_l1_ssim(img1 if train else img1.detach(), img2, padding)[1]
@@ -60,6 +61,8 @@ def _check_inputs(img1: Tensor, img2: Tensor, padding: str) -> None:
     device = img1.device.type
     if not torch._C._dispatch_has_kernel_for_dispatch_key("fused_ssim::l1_ssim", device.upper()):
         raise ValueError(f"this build of fused_ssim has no {device} backend: pass img1.cpu() and img2.cpu()")
+    if device == "cuda" and img1.dtype != torch.float32:
+        raise TypeError(f"img1 on {img1.device} must be float32, got {img1.dtype}: pass img1.float() or img1.cpu()")
 
 
 @torch.library.register_fake("fused_ssim::l1_ssim")

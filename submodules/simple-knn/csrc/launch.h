@@ -1,7 +1,8 @@
 #pragma once
-// What each backend implements.
+// What the backends implement.
 #include <cstdint>
 
+#include "gs/cuda_queue.h"
 #include "gs/parallel.h"
 
 namespace gs {
@@ -11,5 +12,8 @@ namespace gs {
 // points: n x 3, contiguous. T: float or double.
 template <class T>
 void mean_distance2_cpu(const T* points, int64_t n, T* out, const Executor& executor);
+// n < 2^31; points and out on the device. Waits for the stream once.
+template <class T>
+void mean_distance2_cuda(const T* points, int64_t n, T* out, const Queue& queue);
 
 }  // namespace gs

@@ -55,18 +55,33 @@ __global__ void __launch_bounds__(kThreads)
   TileRect rect = {0, 0, 0, 0};
   int64_t offset = 0;
   if (count) {
-    const float2* from = reinterpret_cast<const float2*>(in.splats + kSplatValues * int64_t(index));
-    const float2 mean = from[0], l1 = from[1], l2 = from[2];
-    splat.x = mean.x, splat.y = mean.y, splat.l11 = l1.x, splat.l12 = l1.y, splat.l22 = l2.x, splat.log2_opacity = l2.y;
     const int4 r = reinterpret_cast<const int4*>(in.rects)[index];
     rect = {r.x, r.y, r.z, r.w};
     offset = offsets[k];
     if (slot_offsets) slot_offsets[index] = offset;
   }
-  warp_list_tiles(splat, rect, image, offset, index, [&](int64_t at, int32_t tile, int32_t owner) {
+  const auto put = [&](int64_t at, int32_t tile, int32_t owner) {
     tiles[at] = Key(tile);
     owners[at] = owner;
-  });
+  };
+  const int wide = rect.x1 - rect.x0;
+  if (in.tile_masks && wide * (rect.y1 - rect.y0) <= 64) {  // projection has found them already
+    const int columns = tile_count(image.width);
+    uint64_t mask = count ? in.tile_masks[index] : 0;
+    int first = 0, ty = rect.y0;  // of the row of tiles
+    for (int64_t at = offset; mask; mask &= mask - 1, ++at) {
+      const int bit = __ffsll(mask) - 1;
+      for (; bit >= first + wide; ++ty) first += wide;
+      put(at, ty * columns + rect.x0 + bit - first, index);
+    }
+    rect = {0, 0, 0, 0};
+  } else if (count) {
+    const float2* from = reinterpret_cast<const float2*>(in.splats + kSplatValues * int64_t(index));
+    const float2 mean = from[0], l1 = from[1], l2 = from[2];
+    splat.x = mean.x, splat.y = mean.y, splat.l11 = l1.x, splat.l12 = l1.y, splat.l22 = l2.x, splat.log2_opacity = l2.y;
+  }
+  uint64_t mask;
+  warp_list_tiles(splat, rect, image, offset, index, mask, put);
 }
 
 // Where each tile's list begins: every tile from that of the instance before to this one's starts here.

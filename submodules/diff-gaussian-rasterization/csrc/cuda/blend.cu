@@ -10,6 +10,7 @@
 #include "../math/blend.h"
 #include "../math/footprint.h"
 #include "../math/tiles.h"
+#include "backward.cuh"
 #include "gs/cuda_check.h"
 
 namespace gs {
@@ -153,17 +154,6 @@ __global__ void __launch_bounds__(Forward::kThreads) blend_kernel(BlendInput<flo
   }
 }
 
-// A bit per slot that the backward will fill, and how many lie before each word of bits.
-struct Compact {
-  uint32_t* bits;
-  const int32_t* before;
-
-  __device__ int64_t row(int64_t slot) const {
-    const uint32_t lower = (1u << (slot & 31)) - 1;
-    return before[slot >> 5] + ((slot & 31) ? __popc(bits[slot >> 5] & lower) : 0);
-  }
-};
-
 struct CountBits {
   const uint32_t* bits;
   int64_t words;
@@ -223,8 +213,7 @@ __device__ __forceinline__ float transposed_sum(const float (&v)[kGradientValues
 
 template <bool kDepth>
 __global__ void __launch_bounds__(Backward::kThreads)
-    blend_vjp_kernel(BlendInput<float> in, BlendGradient<float> g, const int32_t* processed, Compact compact,
-                     float* rows) {
+    blend_vjp_kernel(BlendInput<float> in, BlendGradient<float> g, const int32_t* processed, Compact compact) {
   constexpr int kBatch = 64, kRun = Backward::kRun;
   __shared__ Batch<kBatch> batch;
   __shared__ float sums[Backward::kWarps][kBatch * kGradientValues];
@@ -297,23 +286,17 @@ __global__ void __launch_bounds__(Backward::kThreads)
     for (int k = threadIdx.x; k < count * kGradientValues; k += Backward::kThreads) {
       float sum = 0;
       for (int w = 0; w < Backward::kWarps; ++w) sum += sums[w][k];
-      rows[kGradientValues * row_of[k / kGradientValues] + k % kGradientValues] = sum;
+      compact.rows[kGradientValues * row_of[k / kGradientValues] + k % kGradientValues] = sum;
     }
   }
 }
 
-// A thread per splat and value adds the rows of the splat's slots in their order.
-__global__ void __launch_bounds__(256)
-    reduce_kernel(int64_t count, const int32_t* tile_counts, const int64_t* slot_offsets, Compact compact,
-                  const float* rows, float* moments) {
-  const int64_t k = int64_t(blockIdx.x) * 256 + threadIdx.x, i = k / kGradientValues, value = k % kGradientValues;
+__global__ void __launch_bounds__(256) moments_kernel(int64_t count, SlotSums sums, float* moments) {
+  const int64_t i = int64_t(blockIdx.x) * 256 + threadIdx.x;
   if (i >= count) return;
-  float sum = 0;
-  if (tile_counts[i]) {
-    const int64_t stop = compact.row(slot_offsets[i] + tile_counts[i]);
-    for (int64_t row = compact.row(slot_offsets[i]); row < stop; ++row) sum += rows[kGradientValues * row + value];
-  }
-  moments[k] = sum;
+  float values[kGradientValues] = {};
+  if (sums.tile_counts[i]) sums.read(i, values);
+  for (int v = 0; v < kGradientValues; ++v) moments[kGradientValues * i + v] = values[v];
 }
 
 }  // namespace
@@ -326,9 +309,7 @@ void blend<float>(const Queue& queue, const BlendInput<float>& in, const Blended
   check_launch("blend");
 }
 
-template <>
-void blend_vjp<float>(const Queue& queue, const BlendInput<float>& in, const BlendGradient<float>& g) {
-  if (!g.count) return;
+Compact blend_rows(const Queue& queue, const BlendInput<float>& in, const BlendGradient<float>& g) {
   const cudaStream_t stream = stream_of(queue);
   const unsigned tiles = unsigned(tiles_of(in.image));
   const int64_t words = (g.instance_count + 31) / 32;
@@ -345,15 +326,19 @@ void blend_vjp<float>(const Queue& queue, const BlendInput<float>& in, const Ble
   int32_t total = 0;
   GS_CUDA_CHECK(cudaMemcpyAsync(&total, before + words, sizeof total, cudaMemcpyDeviceToHost, stream));
   GS_CUDA_CHECK(cudaStreamSynchronize(stream));
-  float* rows = queue.array<float>(size_t(total) * kGradientValues);
-  const Compact compact{bits, before};
+  const Compact compact{bits, before, queue.array<float>(size_t(total) * kGradientValues)};
   const auto kernel = g.inverse_depth ? blend_vjp_kernel<true> : blend_vjp_kernel<false>;
-  kernel<<<tiles, Backward::kThreads, 0, stream>>>(in, g, processed, compact, rows);
+  kernel<<<tiles, Backward::kThreads, 0, stream>>>(in, g, processed, compact);
   check_launch("blend_vjp");
-  const int64_t values = g.count * kGradientValues;
-  reduce_kernel<<<unsigned((values + 255) / 256), 256, 0, stream>>>(g.count, g.tile_counts, g.slot_offsets, compact,
-                                                                    rows, g.moments);
-  check_launch("reduce");
+  return compact;
+}
+
+template <>
+void blend_vjp<float>(const Queue& queue, const BlendInput<float>& in, const BlendGradient<float>& g) {
+  if (!g.count) return;
+  const SlotSums sums{blend_rows(queue, in, g), g.slot_offsets, g.tile_counts};
+  moments_kernel<<<unsigned((g.count + 255) / 256), 256, 0, stream_of(queue)>>>(g.count, sums, g.moments);
+  check_launch("moments");
 }
 
 }  // namespace cuda

@@ -1,7 +1,9 @@
 // A thread per Gaussian; rows of sh_rest pass through shared memory, since a thread's own 180 bytes are not coalesced.
+#include <cuda_pipeline.h>
 #include <cuda_runtime.h>
 
 #include "../math/scene_row.h"
+#include "backward.cuh"
 #include "gs/cuda_check.h"
 #include "tiles.cuh"
 
@@ -15,25 +17,52 @@ constexpr int kRest = 3 * (sh_count(kMaxShDegree) - 1);  // 45 values: odd, so r
 
 dim3 blocks_for(int64_t n) { return dim3(unsigned((n + kThreads - 1) / kThreads)); }
 
-// The warp's rows of sh_rest that are `wanted` (a bit per lane), `values` of each, into or out of shared memory.
-__device__ void read_rows(const float* global, int64_t first, int64_t stride, int values, unsigned wanted,
-                          float* rows) {
+// The warp's rows of sh_rest: those `wanted` (a bit per lane), `values` of each, start to flow into shared memory.
+// Nobody waits for a load: 32 rows one after the other took three times as long as all else.
+__device__ void fetch_rows(const float* global, int64_t first, int64_t stride, int values, unsigned wanted,
+                           float* rows) {
   const int lane = threadIdx.x & 31;
-  for (; wanted; wanted &= wanted - 1) {
-    const int row = __ffs(wanted) - 1;
-    for (int v = lane; v < values; v += 32) rows[row * kRest + v] = global[(first + row) * stride + v];
+  const float* from = global + first * stride;
+  if (stride == kRest && values == kRest && reinterpret_cast<uintptr_t>(from) % 16 == 0 && wanted == kWarp) {
+#pragma unroll
+    for (int k = 0; k < (kRest * 32 + 127) / 128; ++k) {
+      const int at = 4 * (32 * k + lane);
+      if (at < kRest * 32) __pipeline_memcpy_async(rows + at, from + at, 16);
+    }
+  } else {
+    for (; wanted; wanted &= wanted - 1) {
+      const int row = __ffs(wanted) - 1;
+      for (int v = lane; v < values; v += 32)
+        __pipeline_memcpy_async(rows + row * kRest + v, from + row * stride + v, sizeof(float));
+    }
   }
+  __pipeline_commit();
+}
+__device__ void wait_for_rows() {
+  __pipeline_wait_prior(0);
   __syncwarp();
 }
+
+// The warp's first `count` rows, `values` of each, to where rows of that many values lie side by side.
 __device__ void write_rows(const float* rows, int64_t first, int count, int values, float* global) {
   __syncwarp();
   const int lane = threadIdx.x & 31;
-  for (int k = lane; k < count * values; k += 32) global[first * values + k] = rows[k / values * kRest + k % values];
+  float* to = global + first * values;
+  if (values == kRest && count == 32 && reinterpret_cast<uintptr_t>(to) % 16 == 0) {
+#pragma unroll
+    for (int k = 0; k < (kRest * 32 + 127) / 128; ++k) {
+      const int at = 32 * k + lane;
+      if (4 * at < kRest * 32) reinterpret_cast<float4*>(to)[at] = reinterpret_cast<const float4*>(rows)[at];
+    }
+  } else {
+    for (int row = 0; row < count; ++row)
+      for (int v = lane; v < values; v += 32) to[row * values + v] = rows[row * kRest + v];
+  }
 }
 
 __global__ void __launch_bounds__(kThreads) project_kernel(Scene<float> s, Projected<float> out) {
   __shared__ Camera<float> camera;
-  __shared__ float rest[kThreads * kRest];
+  __shared__ __align__(16) float rest[kThreads * kRest];
   if (threadIdx.x == 0) camera = camera_of(s);
   __syncthreads();
   const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
@@ -43,20 +72,19 @@ __global__ void __launch_bounds__(kThreads) project_kernel(Scene<float> s, Proje
   const bool visible = i < s.count && project_shape(s, camera, i, splat, depth, radius);
   TileRect rect = {0, 0, 0, 0};
   if (visible) rect = tile_rect(splat, s.image.width, s.image.height);
-  int32_t count = warp_list_tiles(splat, rect, s.image, 0, 0, [](int64_t, int32_t, int32_t) {});
-
-  float* row = rest + threadIdx.x * kRest;
-  if (!s.colors) {
-    float* warp_rows = rest + (threadIdx.x & ~31) * kRest;
-    const int values = 3 * (sh_count(s.sh_degree) - 1);
-    read_rows(s.sh_rest, i - (threadIdx.x & 31), s.rest_stride, values, __ballot_sync(kWarp, count > 0), warp_rows);
-  }
-  if (count && !project_color(s, camera, i, row, splat)) count = 0;
+  if (!s.colors)
+    fetch_rows(s.sh_rest, i - (threadIdx.x & 31), s.rest_stride, 3 * (sh_count(s.sh_degree) - 1),
+               __ballot_sync(kWarp, rect.x1 > rect.x0), rest + (threadIdx.x & ~31) * kRest);
+  uint64_t mask;
+  int32_t count = warp_list_tiles(splat, rect, s.image, 0, 0, mask, [](int64_t, int32_t, int32_t) {});
+  wait_for_rows();
+  if (count && !project_color(s, camera, i, rest + threadIdx.x * kRest, splat)) count = 0;
   if (i >= s.count) return;
   out.radii[i] = radius;
   out.tile_counts[i] = count;
   out.depths[i] = count ? depth : INFINITY;
   if (!count) return;
+  if (out.tile_masks) out.tile_masks[i] = mask;
   reinterpret_cast<int4*>(out.rects)[i] = make_int4(rect.x0, rect.y0, rect.x1, rect.y1);
   float2* to = reinterpret_cast<float2*>(out.splats + kSplatValues * i);
   to[0] = make_float2(splat.x, splat.y);
@@ -66,23 +94,32 @@ __global__ void __launch_bounds__(kThreads) project_kernel(Scene<float> s, Proje
   to[4] = make_float2(splat.b, splat.inverse_depth);
 }
 
+// Where a splat's moments come from when they were summed up before.
+struct StoredMoments {
+  const float* moments;
+  const int32_t* tile_counts;
+  __device__ void read(int64_t i, float* m) const {
+    for (int v = 0; v < kGradientValues; ++v) m[v] = moments[kGradientValues * i + v];
+  }
+};
+
+template <class Source>
 __global__ void __launch_bounds__(kThreads)
-    project_vjp_kernel(Scene<float> s, const int32_t* tile_counts, const float* moments, SceneGradient<float> out) {
+    project_vjp_kernel(Scene<float> s, Source source, SceneGradient<float> out) {
   __shared__ Camera<float> camera;
-  __shared__ float rest[kThreads * kRest];
+  __shared__ __align__(16) float rest[kThreads * kRest];
   if (threadIdx.x == 0) camera = camera_of(s);
   __syncthreads();
   const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x, first = i - (threadIdx.x & 31);
-  const bool seen = i < s.count && tile_counts[i] != 0;
+  const bool seen = i < s.count && source.tile_counts[i] != 0;
   float* row = rest + threadIdx.x * kRest;
   float* warp_rows = rest + (threadIdx.x & ~31) * kRest;
-  if (!s.colors) {
-    const int values = 3 * (sh_count(s.sh_degree) - 1);
-    read_rows(s.sh_rest, first, s.rest_stride, values, __ballot_sync(kWarp, seen), warp_rows);
-  }
+  if (!s.colors)
+    fetch_rows(s.sh_rest, first, s.rest_stride, 3 * (sh_count(s.sh_degree) - 1), __ballot_sync(kWarp, seen), warp_rows);
+  float m[kGradientValues];
+  if (seen) source.read(i, m);
+  wait_for_rows();
   if (seen) {
-    float m[kGradientValues];
-    for (int k = 0; k < kGradientValues; ++k) m[k] = moments[kGradientValues * i + k];
     project_vjp_row(s, camera, i, m, row, out.sh_rest ? row : nullptr, out);
   } else if (i < s.count) {
     zero_gradient(i, out);
@@ -112,7 +149,16 @@ template <>
 void project_vjp<float>(const Queue& queue, const Scene<float>& s, const int32_t* tile_counts, const float* moments,
                         const SceneGradient<float>& out) {
   if (!s.count) return;
-  project_vjp_kernel<<<blocks_for(s.count), kThreads, 0, stream_of(queue)>>>(s, tile_counts, moments, out);
+  const StoredMoments source{moments, tile_counts};
+  project_vjp_kernel<<<blocks_for(s.count), kThreads, 0, stream_of(queue)>>>(s, source, out);
+  check_launch("project_vjp");
+}
+
+void rasterize_vjp(const Queue& queue, const Scene<float>& s, const BlendInput<float>& in,
+                   const BlendGradient<float>& g, const SceneGradient<float>& out) {
+  if (!s.count) return;
+  const SlotSums source{blend_rows(queue, in, g), g.slot_offsets, g.tile_counts};
+  project_vjp_kernel<<<blocks_for(s.count), kThreads, 0, stream_of(queue)>>>(s, source, out);
   check_launch("project_vjp");
 }
 

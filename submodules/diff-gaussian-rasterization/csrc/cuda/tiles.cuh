@@ -32,15 +32,24 @@ __device__ inline Splat<float> from_lane(Splat<float> s, int lane) {
 
 // Called by all lanes of a warp, each with a splat of its own (an empty rectangle for none): put(at, tile, index) gets
 // each of its tiles in the rectangle's order, at counting up from the splat's offset. Returns the number of this lane's
-// tiles.
+// tiles, and in `mask` a bit for each of the rectangle's first 64.
 template <class Put>
 __device__ int32_t warp_list_tiles(const Splat<float>& splat, TileRect rect, Image image, int64_t offset, int32_t index,
-                                   const Put& put) {
+                                   uint64_t& mask, const Put& put) {
   const int lane = threadIdx.x & 31, columns = tile_count(image.width);
   const int own = (rect.x1 - rect.x0) * (rect.y1 - rect.y0);
   int32_t count = 0;
-  if (own > 0 && own <= kOwnTiles)
-    for_each_tile(splat, rect, image.width, image.height, [&](int32_t tile) { put(offset + count++, tile, index); });
+  mask = 0;
+  if (own > 0 && own <= kOwnTiles) {
+    const TileTest<float> test = make_tile_test(splat, rect, image.width, image.height);
+    uint64_t bit = 1;
+    for (int ty = rect.y0; ty < rect.y1; ++ty)
+      for (int tx = rect.x0; tx < rect.x1; ++tx, bit <<= 1)
+        if (tile_reached(test, tx, ty)) {
+          mask |= bit;
+          put(offset + count++, ty * columns + tx, index);
+        }
+  }
   for (unsigned large = __ballot_sync(kWarp, own > kOwnTiles); large; large &= large - 1) {
     const int owner = __ffs(large) - 1;
     const TileRect r = {from_lane(rect.x0, owner), from_lane(rect.y0, owner), from_lane(rect.x1, owner),
@@ -56,6 +65,7 @@ __device__ int32_t warp_list_tiles(const Splat<float>& splat, TileRect rect, Ima
       const unsigned hits = __ballot_sync(kWarp, reached);
       if (reached) put(owner_offset + found + __popc(hits & ((1u << lane) - 1)), ty * columns + tx, owner_index);
       found += __popc(hits);
+      if (lane == owner && base < 64) mask |= uint64_t(hits) << base;
     }
     if (lane == owner) count = found;
   }

@@ -7,13 +7,28 @@
 
 namespace gs {
 
+template <class T>
+constexpr T kLargest = std::numeric_limits<T>::max();
+
+// a * b, rounded by itself: nvcc would fuse it with a sum, and the result would differ from the CPU's.
+template <class T>
+GS_HD T product(T a, T b) {
+#ifdef __CUDA_ARCH__
+  if constexpr (sizeof(T) == sizeof(float))
+    return __fmul_rn(a, b);
+  else
+    return __dmul_rn(a, b);
+#else
+  return a * b;
+#endif
+}
+
 // Squared length of (x, y, z), at most the largest finite number. Rounding is monotone in |x|, |y| and |z|: the
 // distance to a box, computed here too, never exceeds that to a point inside it.
 template <class T>
 GS_HD T squared_length(T x, T y, T z) {
-  constexpr T largest = std::numeric_limits<T>::max();
-  const T sum = x * x + y * y + z * z;
-  return sum < largest ? sum : largest;
+  const T sum = product(x, x) + product(y, y) + product(z, z);
+  return sum < kLargest<T> ? sum : kLargest<T>;
 }
 
 // The three smallest distances seen, ascending; infinite where fewer were seen.
@@ -31,11 +46,10 @@ struct Nearest3 {
 
   // Mean of those seen, 0 for none, at most the largest finite number.
   GS_HD T mean() const {
-    constexpr T largest = std::numeric_limits<T>::max();
     if (d0 == kNone) return 0;
     if (d1 == kNone) return d0;
     const T sum = d2 == kNone ? d0 + d1 : d0 + d1 + d2;
-    return sum < largest ? sum / (d2 == kNone ? 2 : 3) : largest;
+    return sum < kLargest<T> ? sum / (d2 == kNone ? 2 : 3) : kLargest<T>;
   }
 };
 
