@@ -25,19 +25,39 @@ def instruction_set() -> str:
     return min(capability, wanted, key=order.index) if wanted in order else capability
 
 
+def gpu_name() -> str:
+    """The current GPU's name with driver and clocks as nvidia-smi gives them."""
+    fields = "driver_version,clocks.sm,clocks.mem"
+    index = f"--id={torch.cuda.current_device()}"
+    state = _output("nvidia-smi", index, f"--query-gpu={fields}", "--format=csv,noheader")
+    return f"{torch.cuda.get_device_name()} (driver, SM and memory clock: {state or 'not known'})"
+
+
 def commit() -> str:
-    """Short hash of the checkout, with + where files differ from it."""
-    root = Path(__file__).resolve().parent
-    run = lambda *args: subprocess.run(["git", *args], cwd=root, capture_output=True, text=True).stdout.strip()  # noqa: E731
-    return run("rev-parse", "--short", "HEAD") + ("+" if run("status", "--porcelain", "--untracked-files=no") else "")
+    """GS_COMMIT where it is set (a copy without git), else the checkout's short hash, with + where files differ."""
+    if os.environ.get("GS_COMMIT"):
+        return os.environ["GS_COMMIT"]
+    short = _output("git", "rev-parse", "--short", "HEAD")
+    changed = _output("git", "status", "--porcelain", "--untracked-files=no")
+    return (short + ("+" if changed else "")) or "not known (GS_COMMIT is not set)"
 
 
-def describe() -> str:
-    """One line: processor, threads, instruction set, versions, commit."""
-    return (
-        f"{cpu_name()}, {torch.get_num_threads()} threads, {instruction_set()}, Python {platform.python_version()}, "
-        f"torch {torch.__version__}, commit {commit()}"
-    )
+def _output(*command: str) -> str:
+    """What a program prints; empty where it is missing or fails."""
+    try:
+        done = subprocess.run(command, cwd=Path(__file__).resolve().parent, capture_output=True, text=True)
+    except OSError:
+        return ""
+    return done.stdout.strip() if done.returncode == 0 else ""
+
+
+def describe(device: torch.device | str = "cpu") -> str:
+    """One line: processor or GPU, threads, instruction set, versions, commit."""
+    python = f"Python {platform.python_version()}, torch {torch.__version__}"
+    if torch.device(device).type == "cuda":
+        python += f", CUDA {torch.version.cuda}"
+        return f"{gpu_name()}, {cpu_name()}, {python}, commit {commit()}"
+    return f"{cpu_name()}, {torch.get_num_threads()} threads, {instruction_set()}, {python}, commit {commit()}"
 
 
 def print_table(header: list[str], rows: list[list[str]]) -> None:

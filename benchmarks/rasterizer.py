@@ -1,91 +1,47 @@
-"""Time of the rasterizer on seeded workloads, stage by stage, beside the work it did.
+"""Time of the rasterizer on seeded workloads beside the work it did, on a CPU or on a GPU.
 
-    python benchmarks/rasterizer.py
+    python benchmarks/rasterizer.py                  # on the GPU where there is one and the build has CUDA
+    python benchmarks/rasterizer.py --device cpu
+    python benchmarks/rasterizer.py --peers gsplat   # and another implementation in the same run
 
 Milliseconds are medians. Processed: instances (a splat in a tile) that the backward has to look at, those behind
-which no pixel of the tile is still open left out; evaluations = processed times 256 pixels. The last table has the
-oracle (reference.py) on a workload that it can bear.
+which no pixel of the tile is still open left out.
 """
 
 import argparse
-import statistics
 import sys
-import time
 from collections.abc import Callable
 from pathlib import Path
 
 import torch
-from diff_gaussian_rasterization import rasterize, reference
+from diff_gaussian_rasterization import reference
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
+from benchmarks.calls import Calls, Stages  # noqa: E402
 from benchmarks.environment import describe, print_table  # noqa: E402
-from benchmarks.splat_scenes import PARAMETERS, SplatScene, frustum  # noqa: E402
+from benchmarks.fragments import TILE, processed_per_tile  # noqa: E402
+from benchmarks.published import WORKLOADS  # noqa: E402
+from benchmarks.rasterizer_gpu import measure_on_gpu  # noqa: E402
+from benchmarks.splat_scenes import SplatScene, frustum  # noqa: E402
+from benchmarks.timing import cpu_milliseconds  # noqa: E402
+from utils.system_utils import UserError, compute_device, run_cli  # noqa: E402
 
-#            splats  width height median pixel sigma
-WORKLOADS = [(50_000, 400, 400, 2.4), (300_000, 800, 800, 1.7)]
+#                splats  width height median pixel sigma
+CPU_WORKLOADS = [(50_000, 400, 400, 2.4), (300_000, 800, 800, 1.7)]
 ORACLE_WORKLOAD = (1_000, 100, 100, 2.4)
-TILE = 16
-OPS = torch.ops.diff_gaussian_rasterization
-
-
-def milliseconds(run: Callable[[], object], repeats: int) -> float:
-    """Median wall time of a call, after one to warm up."""
-    run()
-    times = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        run()
-        times.append(time.perf_counter() - start)
-    return 1e3 * statistics.median(times)
 
 
 def measure(scene: SplatScene, repeats: int) -> dict[str, float]:
-    """Milliseconds of forward, forward + backward and of each stage, and counts."""
-    leaves, settings = scene.leaves(torch.float32), scene.settings(torch.float32)
-    means2d = torch.zeros_like(leaves["means"], requires_grad=True)
-    gradient = torch.randn(3, scene.height, scene.width, generator=torch.Generator().manual_seed(0))
-    named = {name: leaves[name] for name in ("scales", "rotations", "sh_dc", "sh_rest")}
-
-    def forward() -> torch.Tensor:
-        return rasterize(leaves["means"], means2d, leaves["opacities"], settings, raw=True, **named).color
-
-    result = {}
+    """Milliseconds of forward, forward + backward and of each stage, and counts, on the CPU."""
+    calls, stages = Calls(scene), Stages(scene)
+    runs: dict[str, Callable[[], object]] = {"forward": calls.forward, "+ backward": calls.with_backward}
+    result = {name: cpu_milliseconds(run, repeats) for name, run in runs.items()}
     with torch.no_grad():
-        result["forward"] = milliseconds(forward, repeats)
-    result["+ backward"] = milliseconds(lambda: forward().backward(gradient), repeats)
-
-    with torch.no_grad():
-        size = (scene.height, scene.width)
-        camera = (settings.viewmatrix, settings.projmatrix, settings.campos, settings.tanfovx, settings.tanfovy)
-        inputs = [leaves[name] for name in PARAMETERS]
-        arguments = (*inputs[:4], None, None, *inputs[4:], *camera, *size, settings.sh_degree, 1.0, False, True)
-        wanted = [True] * 5 + [False] * 2 + [True] * 2
-        projected = OPS.project(*arguments)
-        binned = OPS.bin(*projected[:4], *size, True)
-        instances, slots, ranges, offsets = binned
-        splats, counts = projected[0], projected[3]
-        blended = OPS.blend(splats, instances, ranges, settings.bg, *size, False, True)
-        state = (splats, counts, instances, slots, ranges, offsets, settings.bg, blended[3], blended[1])
-        moments = OPS.blend_vjp(*state, gradient, None, None)
-        stages = {
-            "project": lambda: OPS.project(*arguments),
-            "bin": lambda: OPS.bin(*projected[:4], *size, True),
-            "blend": lambda: OPS.blend(splats, instances, ranges, settings.bg, *size, False, False),
-            "blend_vjp": lambda: OPS.blend_vjp(*state, gradient, None, None),
-            "project_vjp": lambda: OPS.project_vjp(*arguments, counts, moments, wanted),
-        }
-        result |= {name: milliseconds(run, repeats) for name, run in stages.items()}
-    result["instances"] = len(instances)
-    result["processed"] = processed(blended[3])
+        result |= {name: cpu_milliseconds(run, repeats) for name, run in stages.calls.items()}
+    result["instances"] = len(stages.instances)
+    result["processed"] = int(processed_per_tile(stages.last).sum())
     return result
-
-
-def processed(last: torch.Tensor) -> int:
-    """Sum over tiles of the furthest position in the tile's list that any of its pixels blended."""
-    height, width = last.shape
-    padded = torch.nn.functional.pad(last, (0, -width % TILE, 0, -height % TILE))
-    return int(padded.unfold(0, TILE, TILE).unfold(1, TILE, TILE).amax((2, 3)).sum())
 
 
 def compare_oracle(repeats: int) -> list[str]:
@@ -100,11 +56,32 @@ def compare_oracle(repeats: int) -> list[str]:
         return reference.render(leaves["means"], means2d, leaves["opacities"], settings, raw=True, **named).color
 
     with torch.no_grad():
-        alone = milliseconds(forward, 3)
-    both = milliseconds(lambda: forward().sum().backward(), 3)
+        alone = cpu_milliseconds(forward, 3)
+    both = cpu_milliseconds(lambda: forward().sum().backward(), 3)
     row = [_name(ORACLE_WORKLOAD), f"{alone:.0f} / {both:.0f}"]
     row.append(f"{ours['forward']:.2f} / {ours['+ backward']:.2f}")
     return [*row, f"{alone / ours['forward']:.0f} / {both / ours['+ backward']:.0f}"]
+
+
+def measure_on_cpu(thread_counts: list[int], repeats: int) -> None:
+    """Print stage times and rates; evaluations are processed instances times 256 pixels. Then the oracle's times."""
+    stages = ["forward", "+ backward", "project", "bin", "blend", "blend_vjp", "project_vjp"]
+    header = ["splats, image, sigma", "threads", *stages, "instances", "processed"]
+    header += ["G evaluations/s/core forward", "backward"]
+    rows = []
+    for workload in CPU_WORKLOADS:
+        scene = frustum(*workload)
+        for threads in dict.fromkeys(thread_counts):
+            torch.set_num_threads(threads)
+            m = measure(scene, repeats)
+            evaluations = m["processed"] * TILE * TILE / threads / 1e6
+            row = [_name(workload), str(threads), *(f"{m[stage]:.1f}" for stage in stages)]
+            row += [f"{m['instances'] / 1e3:.0f} k", f"{m['processed'] / 1e3:.0f} k"]
+            rows.append([*row, f"{evaluations / m['blend']:.2f}", f"{evaluations / m['blend_vjp']:.2f}"])
+    print_table(header, rows)
+    print()
+    oracle_header = ["", "reference.py, ms forward / + backward", "ours, ms", "ratio"]
+    print_table(oracle_header, [compare_oracle(repeats)])
 
 
 def _name(workload: tuple) -> str:
@@ -114,28 +91,25 @@ def _name(workload: tuple) -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--threads", type=int, nargs="+", default=[1, torch.get_num_threads()])
-    parser.add_argument("--repeats", type=int, default=9)
+    add = parser.add_argument
+    add("--device", choices=["cpu", "cuda"], help="default: cuda where there is a GPU and the build has CUDA")
+    add("--workloads", nargs="+", choices=list(WORKLOADS), default=list(WORKLOADS), help="GPU: which (default: all)")
+    add("--peers", nargs="+", choices=["gsplat"], default=[], help="GPU: other implementations to time as well")
+    add("--threads", type=int, nargs="+", default=[1, torch.get_num_threads()], help="CPU: numbers of threads")
+    add("--repeats", type=int, default=9, help="CPU: timed calls (default: 9)")
     args = parser.parse_args()
-    print(describe())
-    stages = ["forward", "+ backward", "project", "bin", "blend", "blend_vjp", "project_vjp"]
-    header = ["splats, image, sigma", "threads", *stages, "instances", "processed"]
-    header += ["G evaluations/s/core forward", "backward"]
-    rows = []
-    for workload in WORKLOADS:
-        scene = frustum(*workload)
-        for threads in dict.fromkeys(args.threads):
-            torch.set_num_threads(threads)
-            m = measure(scene, args.repeats)
-            evaluations = m["processed"] * TILE * TILE / threads / 1e6
-            row = [_name(workload), str(threads), *(f"{m[stage]:.1f}" for stage in stages)]
-            row += [f"{m['instances'] / 1e3:.0f} k", f"{m['processed'] / 1e3:.0f} k"]
-            rows.append([*row, f"{evaluations / m['blend']:.2f}", f"{evaluations / m['blend_vjp']:.2f}"])
-    print_table(header, rows)
-    print()
-    oracle_header = ["", "reference.py, ms forward / + backward", "ours, ms", "ratio"]
-    print_table(oracle_header, [compare_oracle(args.repeats)])
+    found = compute_device().type
+    if args.device == "cuda" and found != "cuda":
+        raise UserError("--device cuda needs a visible GPU and the rasterizer built with CUDA (GS_CUDA=1)")
+    device = args.device or found
+    if args.peers and device == "cpu":
+        raise UserError("--peers needs --device cuda: the other implementations have no CPU side")
+    print(describe(device))
+    if device == "cuda":
+        measure_on_gpu(args.workloads, args.peers)
+    else:
+        measure_on_cpu(args.threads, args.repeats)
 
 
 if __name__ == "__main__":
-    main()
+    run_cli(main)

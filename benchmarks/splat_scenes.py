@@ -20,12 +20,15 @@ class SplatScene:
     height: int
 
     def leaves(self, dtype: torch.dtype) -> dict[str, Tensor]:
-        """Fresh copies that require gradients. Values are float32's, whatever the dtype, so that dtypes compare."""
-        return {k: v.float().to(dtype).requires_grad_() for k, v in self.parameters.items()}
+        """New leaves that require gradients. Values are float32's, whatever the dtype, so that dtypes compare; float32
+        leaves share the scene's memory."""
+        return {k: v.detach().float().to(dtype).requires_grad_() for k, v in self.parameters.items()}
 
     def settings(self, dtype: torch.dtype = torch.float64, **changes) -> GaussianRasterizationSettings:
-        """A camera at the origin that looks along +z with 60 degrees across."""
-        return settings(self.width, self.height, dtype, **changes)
+        """A camera at the origin that looks along +z with 60 degrees across, on the parameters' device."""
+        made = settings(self.width, self.height, dtype, **changes)
+        device = self.parameters["means"].device
+        return made._replace(**{k: v.to(device) for k, v in made._asdict().items() if isinstance(v, Tensor)})
 
 
 def settings(
@@ -66,23 +69,37 @@ def settings(
     return made._replace(**changes)
 
 
-def frustum(n: int, width: int, height: int, sigma_px: float, seed: int = 0) -> SplatScene:
+def frustum(
+    n: int, width: int, height: int, sigma_px: float, seed: int = 0, device: torch.device | str = "cpu"
+) -> SplatScene:
     """Splats uniform in the frustum at depths 2 to 10: median size sigma_px, log-normal (0.8), axes within a factor
-    of 5, opacity sigmoid(1.5 normal)."""
-    g = torch.Generator().manual_seed(seed)
+    of 5, opacity sigmoid(1.5 normal).
+
+    Drawn on `device`: a GPU draws other numbers than the CPU. With seed 0 and in this order of draws they are, on a
+    GPU, the tensors that the other implementations in published.py were measured on.
+    """
+    g = torch.Generator(device).manual_seed(seed)
+
+    def uniform(*shape: int) -> Tensor:
+        return torch.rand(*shape, generator=g, device=device)
+
+    def normal(*shape: int) -> Tensor:
+        return torch.randn(*shape, generator=g, device=device)
+
     focal = width / (2 * math.tan(FOV / 2))
-    z = 2 + 8 * torch.rand(n, generator=g)
-    x = (2 * torch.rand(n, generator=g) - 1) * 1.02 * (width / (2 * focal)) * z
-    y = (2 * torch.rand(n, generator=g) - 1) * 1.02 * (height / (2 * focal)) * z
-    size = torch.log(sigma_px * z / focal) + 0.8 * torch.randn(n, generator=g)
-    aspect = (torch.rand(n, 3, generator=g) - 0.5) * math.log(5.0)
+    z = 2 + 8 * uniform(n)
+    x = (2 * uniform(n) - 1) * 1.02 * (width / (2 * focal)) * z
+    y = (2 * uniform(n) - 1) * 1.02 * (height / (2 * focal)) * z
+    size = torch.log(sigma_px * z / focal) + 0.8 * normal(n)
+    aspect = (uniform(n, 3) - 0.5) * math.log(5.0)
+    rotations = normal(n, 4)
     parameters = {
         "means": torch.stack([x, y, z], -1),
-        "opacities": 1.5 * torch.randn(n, 1, generator=g),
+        "opacities": 1.5 * normal(n, 1),
         "scales": size[:, None] + aspect,
-        "rotations": torch.randn(n, 4, generator=g),
-        "sh_dc": 0.8 * torch.randn(n, 1, 3, generator=g),
-        "sh_rest": 0.1 * torch.randn(n, 15, 3, generator=g),
+        "rotations": rotations,
+        "sh_dc": 0.8 * normal(n, 1, 3),
+        "sh_rest": 0.1 * normal(n, 15, 3),
     }
     return SplatScene(parameters, width, height)
 

@@ -109,7 +109,9 @@ class BuildBackend(build_ext):
         with ThreadPoolExecutor(os.cpu_count()) as pool:
             commands = [[*compiler, "-c", str(source), "-o", obj] for compiler, source, obj in compilations]
             list(pool.map(lambda command: run(command, objects_dir), commands))
-        # Linked without -fopenmp: its runtime must be the one torch has loaded, not a second one.
+        # Linked without -fopenmp: its runtime must be the one torch has loaded, not a second one. So must the C++
+        # library's, named in full since some machines have only the static one to link by default.
+        libraries += ["-l:libstdc++.so.6"] if sys.platform == "linux" else []
         shared = ["-dynamiclib", "-undefined", "dynamic_lookup"] if sys.platform == "darwin" else ["-shared"]
         run([*cxx, *shared, *(obj for _, _, obj in compilations), *libraries, "-o", str(library)], objects_dir)
 

@@ -60,6 +60,14 @@ __device__ void write_rows(const float* rows, int64_t first, int count, int valu
   }
 }
 
+// In front, and no further off the image than a tenth of its size.
+__device__ bool near_view(const Camera<float>& cam, Vec3<float> view) {
+  const float x = cam.mean_focal_x * view.x + cam.axis_x * view.z, y = cam.mean_focal_y * view.y + cam.axis_y * view.z;
+  const float spare_x = 0.1f * cam.width * view.z, spare_y = 0.1f * cam.height * view.z;
+  return in_front(view.z) && x > -spare_x && x < cam.width * view.z + spare_x && y > -spare_y &&
+         y < cam.height * view.z + spare_y;
+}
+
 __global__ void __launch_bounds__(kThreads) project_kernel(Scene<float> s, Projected<float> out) {
   __shared__ Camera<float> camera;
   __shared__ __align__(16) float rest[kThreads * kRest];
@@ -69,12 +77,18 @@ __global__ void __launch_bounds__(kThreads) project_kernel(Scene<float> s, Proje
   Splat<float> splat = {};
   float depth = INFINITY;
   int radius = 0;
+  const auto fetch = [&](bool wanted) {
+    if (!s.colors)
+      fetch_rows(s.sh_rest, i - (threadIdx.x & 31), s.rest_stride, 3 * (sh_count(s.sh_degree) - 1),
+                 __ballot_sync(kWarp, wanted), rest + (threadIdx.x & ~31) * kRest);
+  };
+  // Coefficients of what is likely seen are on their way while the shape is worked out.
+  const bool likely = i < s.count && near_view(camera, to_view(camera, load3(s.means + 3 * i)));
+  fetch(likely);
   const bool visible = i < s.count && project_shape(s, camera, i, splat, depth, radius);
   TileRect rect = {0, 0, 0, 0};
   if (visible) rect = tile_rect(splat, s.image.width, s.image.height);
-  if (!s.colors)
-    fetch_rows(s.sh_rest, i - (threadIdx.x & 31), s.rest_stride, 3 * (sh_count(s.sh_degree) - 1),
-               __ballot_sync(kWarp, rect.x1 > rect.x0), rest + (threadIdx.x & ~31) * kRest);
+  fetch(!likely && rect.x1 > rect.x0);
   uint64_t mask;
   int32_t count = warp_list_tiles(splat, rect, s.image, 0, 0, mask, [](int64_t, int32_t, int32_t) {});
   wait_for_rows();

@@ -1,0 +1,166 @@
+#!/usr/bin/env bash
+# Builds, tests and measures on a bare machine that has an NVIDIA GPU, torch for it and nvcc; each call stays well under
+# ten minutes. Nothing is fetched: wheels of what the machine lacks lie in folders .whl* of the repository.
+#
+#   benchmarks/device.sh test                    GPU tests, then the rasterizer's CPU tests
+#   benchmarks/device.sh sanitize                memcheck and racecheck of the GPU tests on small scenes
+#   benchmarks/device.sh kernels [OPTION...]     benchmarks/rasterizer.py OPTION... (--peers gsplat), benchmarks/accuracy.py
+#   benchmarks/device.sh train SCENE [OPTION...] benchmarks/training.py SCENE OPTION...
+#   benchmarks/device.sh run COMMAND...          anything else, with the extensions built
+#
+# Environment: GS_COMMIT (what is measured, where git can't say), OUT (a folder for logs and the built wheels; put those
+# back as build/device/wheels and an unchanged source is not built again).
+set -euo pipefail
+cd "$(dirname "$0")/.."
+
+mode=${1:?test, sanitize, kernels, train or run}
+shift
+out=${OUT:-build/device/out}
+site=$PWD/build/device/site
+mkdir -p "$out" "$site"
+export PYTHONPATH=$site PYTHONUNBUFFERED=1 PATH=$PATH:${CUDA_HOME:-/usr/local/cuda}/bin
+# For a peer that compiles its kernels when first used.
+export MAX_JOBS=${MAX_JOBS:-$(nproc)} TORCH_EXTENSIONS_DIR=$PWD/build/device/torch_extensions
+
+say() { printf '\n== %s (%d s)\n' "$1" "$SECONDS"; }
+
+# Wheels of what is missing; a version that is there stays.
+install_missing() {
+  local wheels
+  wheels=$(python3 - .whl*/*.whl << 'PYTHON'
+import importlib.metadata
+import sys
+from pathlib import Path
+
+found = {}
+for wheel in map(Path, sys.argv[1:]):
+    name = wheel.name.split("-")[0]
+    try:
+        importlib.metadata.version(name)
+    except importlib.metadata.PackageNotFoundError:
+        if wheel.is_file():
+            found[name] = wheel
+print(*found.values(), sep="\n")
+PYTHON
+  )
+  [ -z "$wheels" ] || pip_install $wheels
+}
+
+pip_install() {
+  python3 -m pip install --quiet --no-index --no-deps --no-compile --no-cache-dir --upgrade --target "$site" "$@"
+}
+
+# The three extensions, at once, into wheels named by a hash of all that goes into them.
+build() {
+  export GS_CUDA=1
+  TORCH_CUDA_ARCH_LIST=${TORCH_CUDA_ARCH_LIST:-$(python3 -c \
+    'import torch; print("{}.{}".format(*torch.cuda.get_device_capability()))')}
+  export TORCH_CUDA_ARCH_LIST
+  local key wheels new name pids=()
+  key=$( (
+    python3 -c 'import sys, torch; print(sys.version, torch.__version__)'
+    echo "$TORCH_CUDA_ARCH_LIST"
+    find submodules -type f \( -name '*.py' -o -name '*.toml' -o -name '*.h' -o -name '*.cpp' -o -name '*.cu*' \) \
+      -not -path '*/build/*' -print0 | LC_ALL=C sort -z | xargs -0 sha256sum
+  ) | sha256sum | cut -c1-16)
+  wheels=build/device/wheels/$key
+  if [ ! -d "$wheels" ]; then
+    new=$(mktemp -d build/device/new.XXXX)
+    for name in diff-gaussian-rasterization simple-knn fused-ssim; do
+      python3 -m pip wheel --quiet --no-index --no-deps --no-build-isolation --no-cache-dir -w "$new" \
+        "./submodules/$name" &
+      pids+=($!)
+    done
+    for name in "${pids[@]}"; do wait "$name"; done
+    mkdir -p build/device/wheels
+    mv "$new" "$wheels"
+  fi
+  pip_install "$wheels"/*.whl
+  # Tests would only skip what is not there.
+  python3 - << 'PYTHON'
+import sys
+
+import diff_gaussian_rasterization
+import fused_ssim
+import simple_knn._C
+import torch
+
+ops = ("diff_gaussian_rasterization::rasterize", "fused_ssim::l1_ssim", "simple_knn::mean_distance2")
+missing = [op for op in ops if not torch._C._dispatch_has_kernel_for_dispatch_key(op, "CUDA")]
+if missing:
+    sys.exit(f"built without CUDA: {', '.join(missing)}")
+PYTHON
+  if [ -n "${OUT:-}" ]; then
+    mkdir -p "$OUT/wheels/$key"
+    cp "$wheels"/*.whl "$OUT/wheels/$key"
+  fi
+}
+
+describe() {
+  nvidia-smi --query-gpu=name,driver_version,memory.total --format=csv,noheader
+  nvcc --version | tail -n 2 | head -n 1
+  python3 - << 'PYTHON'
+import importlib.metadata
+import platform
+
+names = "torch numpy scipy pillow tqdm plyfile scikit-image lpips pycolmap pytest hypothesis setuptools ninja gsplat"
+versions = [f"Python {platform.python_version()}"]
+for name in names.split():
+    try:
+        versions.append(f"{name} {importlib.metadata.version(name)}")
+    except importlib.metadata.PackageNotFoundError:
+        versions.append(f"{name} -")
+print(", ".join(versions))
+PYTHON
+  echo "commit ${GS_COMMIT:-$(git rev-parse --short HEAD 2> /dev/null || echo 'not known (GS_COMMIT is not set)')}"
+}
+
+test_all() {
+  local gpu status=0
+  gpu=$(grep -l 'mark\.gpu' tests/test_*.py)
+  say "tests on the GPU"
+  python3 -m pytest -q -p no:cacheprovider -m gpu $gpu || status=1
+  say "tests of the rasterizer on the CPU"
+  python3 -m pytest -q -p no:cacheprovider -m 'not gpu' tests/test_rasterizer_*.py || status=1
+  return $status
+}
+
+# Without torch's pool of memory, or an access beyond an allocation would fall into a neighbour.
+sanitize() {
+  local tool gpu status=0
+  gpu=$(grep -l 'mark\.gpu' tests/test_*.py)
+  for tool in memcheck racecheck; do
+    say "$tool"
+    PYTORCH_NO_CUDA_MEMORY_CACHING=1 timeout 270 compute-sanitizer --tool "$tool" --error-exitcode 9 \
+      --print-limit 20 python3 -m pytest -q -x -p no:cacheprovider -m gpu \
+      -k 'test_sizes or small_clouds or agrees_with_the_cpu' $gpu || status=1
+  done
+  return $status
+}
+
+describe
+say "missing packages"
+install_missing
+say "build"
+build
+{
+  case $mode in
+    test) test_all ;;
+    sanitize) sanitize ;;
+    kernels)
+      say "kernels"
+      python3 benchmarks/rasterizer.py --device cuda "$@"
+      say "error"
+      python3 benchmarks/accuracy.py
+      ;;
+    train)
+      scene=${1:?a scene}
+      shift
+      say "training on $scene"
+      python3 benchmarks/training.py "$scene" "$(mktemp -d build/device/models.XXXX)/models" "$@"
+      ;;
+    run) "$@" ;;
+    *) echo "device.sh: unknown mode $mode" >&2 && exit 2 ;;
+  esac
+  say "done"
+} 2>&1 | tee "$out/$mode.log"

@@ -1,0 +1,88 @@
+"""gsplat 1.5.3 (PyPI) on our scenes. Its kernels are compiled for the GPU at hand when first used, which takes minutes.
+
+Activations and the joining of the SH bands count as part of the call, as they do for us; the step is torch's fused
+Adam over all tensors.
+"""
+
+import importlib.metadata
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from benchmarks.calls import image_gradient
+from benchmarks.splat_scenes import SplatScene
+from utils.system_utils import UserError
+
+INSTALL = "pip install gsplat==1.5.3 (with nvcc and ninja at hand; TORCH_CUDA_ARCH_LIST=9.0 makes it build for one GPU)"
+
+
+def version() -> str:
+    """gsplat's version; UserError where it is not installed."""
+    try:
+        import gsplat  # noqa: F401  compiles its kernels unless that has been done
+        from gsplat.cuda._backend import _C
+    except ImportError as error:
+        raise UserError(f"--peers gsplat: {error}; {INSTALL}") from error
+    if _C is None:
+        raise UserError(f"--peers gsplat: it found no nvcc to build its kernels with; {INSTALL}")
+    return importlib.metadata.version("gsplat")
+
+
+class GsplatCalls:
+    """As calls.Calls. packed: gsplat's other layout, its function's default but not its trainer's."""
+
+    def __init__(self, scene: SplatScene, packed: bool) -> None:
+        self.scene, self.packed = scene, packed
+        self.leaves = scene.leaves(torch.float32)
+        self.gradient = image_gradient(scene)
+        settings = scene.settings(torch.float32)
+        focal_x, focal_y = scene.width / (2 * settings.tanfovx), scene.height / (2 * settings.tanfovy)
+        rows = [[focal_x, 0, scene.width / 2], [0, focal_y, scene.height / 2], [0, 0, 1]]
+        self.camera = {
+            "viewmats": settings.viewmatrix.T[None].contiguous(),
+            "Ks": torch.tensor([rows], device=self.gradient.device),
+            "backgrounds": settings.bg[None],
+            "width": scene.width,
+            "height": scene.height,
+        }
+        self._adam: torch.optim.Adam | None = None
+
+    def render(self) -> Tensor:
+        """(3, H, W)"""
+        from gsplat import rasterization
+
+        p = self.leaves
+        image, _, _ = rasterization(
+            p["means"],
+            p["rotations"],
+            p["scales"].exp(),
+            p["opacities"].sigmoid().squeeze(1),
+            torch.cat([p["sh_dc"], p["sh_rest"]], 1),
+            sh_degree=3,
+            packed=self.packed,
+            **self.camera,
+        )
+        return image[0].permute(2, 0, 1)
+
+    @torch.no_grad()
+    def forward(self) -> Tensor:
+        return self.render()
+
+    def with_backward(self) -> None:
+        self.clear()
+        self.render().backward(self.gradient)
+
+    def step(self) -> None:
+        """The learning rate is 0: the arithmetic of a step, and the same scene after it."""
+        self.with_backward()
+        if self._adam is None:
+            self._adam = torch.optim.Adam(self.leaves.values(), lr=0.0, eps=1e-15, fused=True)
+        self._adam.step()
+
+    def clear(self) -> None:
+        for t in self.leaves.values():
+            t.grad = None
+
+    def steps(self) -> dict[str, Callable[[], object]]:
+        return {"forward": self.forward, "+ backward": self.with_backward, "step": self.step}

@@ -1,0 +1,119 @@
+"""Time and memory of a call, on the CPU and on a GPU."""
+
+import re
+import statistics
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch.autograd import DeviceType
+from torch.profiler import ProfilerActivity, profile
+
+WARM_UPS, REPEATS = 20, 50  # on a GPU
+_PROFILED = 10  # calls
+_WAITS = ("cudaStreamSynchronize", "cudaEventSynchronize", "cudaMemcpy")
+
+
+@dataclass
+class Kernel:
+    """Launches of one kernel that follow each other; copies and fills count as kernels."""
+
+    name: str
+    launches: int
+    milliseconds: float
+
+
+@dataclass
+class GpuTime:
+    """Median milliseconds of a call with the device idle before it."""
+
+    events: float  # between CUDA events around it, so with the gaps in which the device waits for the host
+    wall: float  # by the host's clock, until the device is done
+    launched: list[Kernel]  # in the order of the call
+    waits: int  # how often the host waits for the device within the call
+
+    @property
+    def kernels(self) -> float:
+        """The device's own time."""
+        return sum(kernel.milliseconds for kernel in self.launched)
+
+
+def cpu_milliseconds(run: Callable[[], object], repeats: int) -> float:
+    """Median wall time of a call, after one to warm up."""
+    run()
+    times = []
+    for _ in range(repeats):
+        start = time.perf_counter()
+        run()
+        times.append(time.perf_counter() - start)
+    return 1e3 * statistics.median(times)
+
+
+def gpu_time(run: Callable[[], object]) -> GpuTime:
+    """Medians over REPEATS calls after WARM_UPS."""
+    for _ in range(WARM_UPS):
+        run()
+    events, walls = [], []
+    begin, end = torch.cuda.Event(enable_timing=True), torch.cuda.Event(enable_timing=True)
+    for _ in range(REPEATS):
+        torch.cuda.synchronize()
+        start = time.perf_counter()
+        begin.record()
+        run()
+        end.record()
+        torch.cuda.synchronize()
+        walls.append(1e3 * (time.perf_counter() - start))
+        events.append(begin.elapsed_time(end))
+    launched, waits = _profile(run, _PROFILED) or _profile(run, 1)
+    return GpuTime(statistics.median(events), statistics.median(walls), launched, waits)
+
+
+def _profile(run: Callable[[], object], calls: int) -> tuple[list[Kernel], int] | None:
+    """Kernels (mean times) and waits of a call; None where the calls did not all launch the same."""
+    torch.cuda.synchronize()
+    with profile(activities=[ProfilerActivity.CPU, ProfilerActivity.CUDA]) as trace:
+        for _ in range(calls):
+            run()
+        torch.cuda.synchronize()
+    events = sorted(trace.events(), key=lambda e: e.time_range.start)
+    launched = [
+        (short_name(e.name), e.time_range.elapsed_us() / 1e3) for e in events if e.device_type == DeviceType.CUDA
+    ]
+    per_call = len(launched) // calls
+    names = [name for name, _ in launched[:per_call]]
+    if [name for name, _ in launched] != names * calls:
+        return None
+    result: list[Kernel] = []
+    for i, name in enumerate(names):
+        milliseconds = statistics.mean(ms for _, ms in launched[i::per_call])
+        if result and result[-1].name == name:
+            result[-1].launches += 1
+            result[-1].milliseconds += milliseconds
+        else:
+            result.append(Kernel(name, 1, milliseconds))
+    return result, sum(e.name in _WAITS for e in events) // calls
+
+
+def peak_mib(run: Callable[[], object], clear: Callable[[], None]) -> float:
+    """Most GPU memory in use during a call above what was in use before, MiB; `clear` drops gradients beforehand."""
+    run()
+    clear()
+    torch.cuda.synchronize()
+    torch.cuda.reset_peak_memory_stats()
+    before = torch.cuda.memory_allocated()
+    run()
+    torch.cuda.synchronize()
+    peak = torch.cuda.max_memory_allocated() - before
+    clear()
+    return peak / 2**20
+
+
+def short_name(name: str) -> str:
+    """A kernel's name without return type, namespaces, template arguments and parameters."""
+    if name.startswith(("Memcpy", "Memset")):
+        return name.split(" (")[0]
+    name = name.replace("(anonymous namespace)", "")
+    while (bare := re.sub(r"<[^<>]*>", "", name)) != name:
+        name = bare
+    return name.split("(")[0].split("::")[-1].split(" ")[-1]

@@ -1,0 +1,42 @@
+"""What the benchmarks count and read, held to plain loops."""
+
+import math
+
+import pytest
+
+from benchmarks.calls import Stages
+from benchmarks.fragments import TILE, fragments, processed_per_tile
+from benchmarks.splat_scenes import frustum
+from benchmarks.timing import short_name
+
+
+def test_fragments_are_those_of_a_loop_over_pixels():
+    scene = frustum(150, 40, 27, 4.0, seed=3)
+    stages = Stages(scene)
+    rows, instances, last = stages.splats.double().tolist(), stages.instances.tolist(), stages.last
+    blended, pixels, across = 0, scene.width * scene.height, -(-scene.width // TILE)
+    for y in range(scene.height):
+        for x in range(scene.width):
+            begin = int(stages.ranges[y // TILE * across + x // TILE])
+            for index in instances[begin : begin + int(last[y, x])]:
+                mean_x, mean_y, l11, l12, l22, log2_opacity = rows[index][:6]
+                u, v = l11 * (x - mean_x) + l12 * (y - mean_y), l22 * (y - mean_y)
+                blended += log2_opacity - u * u - v * v >= -math.log2(255)
+    counted = fragments(stages.splats, stages.instances, stages.ranges, last)
+    assert counted["blended"] == blended / pixels > 5
+    assert counted["blended"] < counted["8x4"] < counted["8x8"] < counted["16x8"] < counted["16x16"]
+    # Instances are exact: every one reaches its tile.
+    assert counted["16x16"] == int(processed_per_tile(last).sum()) * TILE * TILE / pixels
+
+
+@pytest.mark.parametrize(
+    ("name", "short"),
+    [
+        ("void gs::cuda::(anonymous namespace)::blend_kernel<false, true>(gs::Input<float>, int)", "blend_kernel"),
+        ("void cub::X_900::detail::SortKernel<cub::P<(int)3, float>, (cub::Y)0>(unsigned int*)", "SortKernel"),
+        ("Memcpy DtoH (Device -> Pageable)", "Memcpy DtoH"),
+        ("Memset (Device)", "Memset"),
+    ],
+)
+def test_short_names(name, short):
+    assert short_name(name) == short
