@@ -12,10 +12,11 @@ import argparse
 import sys
 from pathlib import Path
 
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+
+import utils.openmp  # noqa: E402, F401  isort: skip  (before torch)
 import torch
 from diff_gaussian_rasterization import rasterize, reference
-
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 from benchmarks.environment import describe, print_table  # noqa: E402
 from benchmarks.splat_scenes import KINDS, PARAMETERS, SplatScene  # noqa: E402
