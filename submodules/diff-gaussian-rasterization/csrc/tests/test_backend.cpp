@@ -72,8 +72,8 @@ Result<T> run(const gs::Executor& executor, Parameters<T>& p, gs::Image image, b
   std::vector<T> splats(kSplatValues * n), depths(n);
   std::vector<int32_t> rects(4 * n);
   out.tile_counts.resize(n), out.radii.resize(n);
-  const gs::Projected<T> projected = {splats.data(), depths.data(), rects.data(), out.tile_counts.data(),
-                                      out.radii.data()};
+  const gs::Projected<T> projected = {splats.data(),          depths.data(),    rects.data(),
+                                      out.tile_counts.data(), out.radii.data(), nullptr};
   gs::GS_ISA::project(executor, scene, projected);
   out.instances = 0;
   for (int32_t count : out.tile_counts) out.instances += count;
