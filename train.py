@@ -29,6 +29,7 @@ from utils.general_utils import safe_state
 from utils.image_utils import as_float, psnr
 from utils.interrupt import DeferredInterrupt
 from utils.loss_utils import l1_loss, photometric_loss
+from utils.loss_watch import LossWatch
 from utils.system_utils import UserError, compute_device, mkdir_p, run_cli
 from utils.training_log import Stopwatch, TrainingLog
 
@@ -38,8 +39,7 @@ except ImportError:
     SummaryWriter = None
 
 SH_INTERVAL = 1000  # iterations between raises of the active SH degree
-BAR_INTERVAL = 10  # iterations between updates of the progress bar
-EMA_NEW = 0.4  # weight of the newest loss in the one that is shown
+BAR_INTERVAL = 10  # iterations between looks at the losses, and updates of the progress bar
 
 
 def training(
@@ -78,7 +78,9 @@ def training(
     views = _ViewOrder(scene.getTrainCameras(), opt.seed)
     fixed_background = torch.full((3,), 1.0 if dataset.white_background else 0.0, device=device)
     log = TrainingLog(scene.model_path, first_iteration)
-    shown_loss = 0.0
+    losses = LossWatch(device)
+    # Where something is written: all losses up to there must have been looked at.
+    stops = {opt.iterations, *testing_iterations, *saving_iterations, *checkpoint_iterations}
     clock = Stopwatch()
     bar = tqdm(initial=first_iteration, total=opt.iterations, desc="Training progress", dynamic_ncols=True)
     with bar, DeferredInterrupt() as interrupt:
@@ -92,19 +94,14 @@ def training(
                 pipe.debug = True
             background = _random_background(opt.seed, iteration, device) if opt.random_background else fixed_background
 
-            package = render(camera, gaussians, pipe, background)
+            package = render(camera, gaussians, pipe, background, want_visibility=False)
             loss, l1 = photometric_loss(package["render"], camera.target(background), opt.lambda_dssim)
-            value = loss.item()
-            if not math.isfinite(value):
-                raise UserError(
-                    f"the loss became {value} in iteration {iteration} (view {camera.image_name}), so training stopped "
-                    "and nothing of it was saved; lower the learning rates, or check this view and the point cloud"
-                )
             loss.backward()
 
-            shown_loss = EMA_NEW * value + (1 - EMA_NEW) * shown_loss
-            if iteration % BAR_INTERVAL == 0 or iteration == opt.iterations:
-                bar.set_postfix({"Loss": f"{shown_loss:.7f}", "Gaussians": len(gaussians)}, refresh=False)
+            losses.add(iteration, loss)
+            if iteration % BAR_INTERVAL == 0 or iteration in stops:
+                _check_losses(losses.read(), views)
+                bar.set_postfix({"Loss": f"{losses.mean:.7f}", "Gaussians": len(gaussians)}, refresh=False)
                 bar.update(iteration - bar.n)
             seconds = clock.seconds
             with clock.paused():
@@ -117,7 +114,7 @@ def training(
                     tqdm.write(f"[ITER {iteration}] Saving Gaussians", file=sys.stdout)
                     scene.save(iteration)
                 if saving or scores:
-                    log.add(iteration, seconds, gaussians=len(gaussians), loss=shown_loss, **scores)
+                    log.add(iteration, seconds, gaussians=len(gaussians), loss=losses.mean, **scores)
 
             _control_density(gaussians, package, iteration, opt, scene.cameras_extent, dataset.white_background)
             if iteration < opt.iterations:
@@ -125,6 +122,7 @@ def training(
                 gaussians.optimizer.zero_grad(set_to_none=True)
             stop = interrupt.requested  # once: Ctrl-C may come at any moment
             if iteration in checkpoint_iterations or stop:
+                _check_losses(losses.read(), views)
                 with clock.paused():
                     tqdm.write(f"[ITER {iteration}] Saving Checkpoint", file=sys.stdout)
                     path = Path(scene.model_path) / f"chkpnt{iteration}.pth"
@@ -135,6 +133,16 @@ def training(
     if tb_writer:
         tb_writer.close()
     print(f"Trained {opt.iterations - first_iteration} iterations in {clock.seconds:.1f} s, without tests and saving")
+
+
+def _check_losses(values: dict[int, float], views: "_ViewOrder") -> None:
+    """UserError for the first loss, by iteration, that is not finite."""
+    for iteration, value in values.items():
+        if not math.isfinite(value):
+            raise UserError(
+                f"the loss became {value} in iteration {iteration} (view {views[iteration].image_name}), so training "
+                "stopped and nothing of it was saved; lower the learning rates, or check this view and the point cloud"
+            )
 
 
 class _ViewOrder:

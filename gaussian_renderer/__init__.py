@@ -24,6 +24,7 @@ def render(
     use_trained_exp: bool = False,
     *,
     want_depth: bool = False,
+    want_visibility: bool = True,
 ) -> dict[str, Tensor | None]:
     """Render one view.
 
@@ -33,8 +34,8 @@ def render(
 
     Returns `render` (3, H, W) clamped to [0, 1], also in training, so values outside get no gradient;
     `viewspace_points` (N, 3) whose gradient is that of the screen means, per NDC unit; `visibility_filter` (n, 1) int64
-    indices of the Gaussians with radius > 0; `radii` (N,) int32 pixels; `depth` inverse depth (1, H, W), or None
-    unless want_depth.
+    indices of the Gaussians with radius > 0, or None without want_visibility (a GPU has to be waited for it); `radii`
+    (N,) int32 pixels; `depth` inverse depth (1, H, W), or None unless want_depth.
     """
     if use_trained_exp:
         raise UserError("exposure compensation is not built yet; leave use_trained_exp off")
@@ -51,7 +52,7 @@ def render(
     return {
         "render": result.color.clamp(0, 1),
         "viewspace_points": viewspace_points,
-        "visibility_filter": (result.radii > 0).nonzero(),
+        "visibility_filter": (result.radii > 0).nonzero() if want_visibility else None,
         "radii": result.radii,
         "depth": result.inverse_depth,
     }
