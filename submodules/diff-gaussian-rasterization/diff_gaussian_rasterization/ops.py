@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 if TYPE_CHECKING:
     from diff_gaussian_rasterization import GaussianRasterizationSettings
@@ -71,7 +72,11 @@ def rasterize(
     _check(tensors, means2d, settings.sh_degree, raw)
     differentiable = [t for t in (*tensors.values(), means2d) if t is not None]
     train = torch.is_grad_enabled() and any(t.requires_grad for t in differentiable)
-    out = _ops.rasterize(
+    if settings.debug:
+        for name, t in tensors.items():
+            if t is not None:
+                _check_finite(name, t)
+    out = (_Rasterize.apply if train else _ops.rasterize)(
         means2d,
         *tensors.values(),
         settings.viewmatrix,
@@ -269,4 +274,21 @@ def _backward(ctx, grad_color, grad_transmittance, grad_inverse_depth, *_):
     return named.get("means2d"), *(named.get(name) for name in _SCENE), None, None, None
 
 
+# For whoever calls the op itself, or compiles it.
 torch.library.register_autograd("diff_gaussian_rasterization::rasterize", _backward, setup_context=_setup_context)
+
+
+class _Rasterize(torch.autograd.Function):
+    """The same two functions without the dispatcher's Python in between, which takes 0.4 ms a step."""
+
+    @staticmethod
+    def forward(*inputs):
+        with torch._C._AutoDispatchBelowAutograd():
+            return _ops.rasterize(*inputs)
+
+    setup_context = staticmethod(_setup_context)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, *gradients):
+        return _backward(ctx, *gradients)
