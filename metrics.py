@@ -20,10 +20,10 @@ import utils.openmp  # noqa: F401  isort: skip  (before torch)
 import numpy as np
 import torch
 from fused_ssim import fused_ssim
-from PIL import Image
 from tqdm import tqdm
 
 from arguments import read_cfg_args
+from utils.image_files import UNREADABLE, open_render
 from utils.lpips_utils import MIN_SIDE, LpipsUnavailable, PerceptualDistance
 from utils.system_utils import UserError, atomic_write, run_cli
 
@@ -90,18 +90,18 @@ def _pairs_of(method: Path) -> list[Pair]:
 
 def _size(file: Path) -> tuple[int, int]:
     try:
-        with Image.open(file) as image:
+        with open_render(file) as image:
             return image.size
-    except OSError as error:
+    except UNREADABLE as error:
         raise UserError(f"{file} is not a readable image; run render.py again") from error
 
 
 def _read(file: Path) -> np.ndarray:
     """The first three channels of an image, (H, W, 3) uint8."""
     try:
-        with Image.open(file) as image:
+        with open_render(file) as image:
             return np.asarray(image.convert("RGB"))
-    except OSError as error:
+    except UNREADABLE as error:
         raise UserError(f"{file} is damaged ({error}); run render.py again") from error
 
 

@@ -18,13 +18,13 @@ import torch
 from PIL import Image
 from tqdm import tqdm
 
-from arguments import ModelParams, PipelineParams, get_combined_args
+from arguments import ModelParams, OptionParser, PipelineParams, get_combined_args
 from gaussian_renderer import render
 from scene import Scene
 from scene.cameras import Camera
 from scene.gaussian_model import GaussianModel
 from utils.general_utils import safe_state
-from utils.system_utils import atomic_write, compute_device, mkdir_p, run_cli
+from utils.system_utils import UserError, atomic_write, compute_device, mkdir_p, run_cli
 
 
 def to_bytes(image: torch.Tensor) -> torch.Tensor:
@@ -52,11 +52,13 @@ def render_set(
 ) -> list[float]:
     """Write the renders and the ground truth of `views` under `folder`; seconds of rendering per view (without I/O)."""
     for side in ("renders", "gt"):
-        mkdir_p(folder / side)
         remove_leftovers(folder / side, len(views))
+        if views:
+            mkdir_p(folder / side)
+    if not views:
+        return []
     seconds = []
-    if views:
-        render(views[0], gaussians, pipe, background)  # the first call pays for allocations and caches
+    render(views[0], gaussians, pipe, background)  # the first call pays for allocations and caches
     for index, view in enumerate(tqdm(views, desc=f"Rendering {folder.parent.name}", unit="view")):
         _wait(background.device)
         start = time.perf_counter()
@@ -75,7 +77,7 @@ def _wait(device: torch.device) -> None:
 
 @torch.no_grad()
 def main() -> None:
-    parser = argparse.ArgumentParser(description="Render the train and test views of a trained model.")
+    parser = OptionParser(description="Render the train and test views of a trained model.")
     model_params, pipeline_params = ModelParams(parser, sentinel=True), PipelineParams(parser)
     parser.add_argument("--iteration", type=int, default=-1, help="saved iteration to render (-1: the highest)")
     parser.add_argument("--skip_train", action="store_true", help="leave the training views out")
@@ -87,6 +89,8 @@ def main() -> None:
 
     gaussians = GaussianModel(options.sh_degree)
     scene = Scene(options, gaussians, load_iteration=args.iteration, shuffle=False)
+    if len(gaussians) == 0:
+        raise UserError(f"iteration {scene.loaded_iter} of {scene.model_path} has no Gaussians; train it again")
     background = torch.full((3,), 1.0 if options.white_background else 0.0, device=compute_device())
     for name, skip, views in (
         ("train", args.skip_train, scene.getTrainCameras),

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from arguments import ModelParams, OptimizationParams, PipelineParams, write_cfg_args, write_model_json
+from arguments import ModelParams, OptimizationParams, OptionParser, PipelineParams, write_cfg_args, write_model_json
 from gaussian_renderer import render
 from scene import Scene
 from scene import densification as adc
@@ -57,6 +57,8 @@ def training(
     testing_iterations, saving_iterations, checkpoint_iterations: when to score, save the PLY, save a checkpoint.
     checkpoint: a chkpntN.pth to go on from, or None. debug_from: switch pipe.debug on after this iteration.
     """
+    dataset.model_path = dataset.model_path or _new_output_folder()
+    print(f"Optimizing {dataset.model_path}")
     device = compute_device()
     capture, first_iteration = load_checkpoint(checkpoint, device) if checkpoint else (None, 0)
     if first_iteration >= opt.iterations:
@@ -65,20 +67,21 @@ def training(
             "--iterations counts from the start of the first run"
         )
     _warn_of_late_reset(opt, dataset.white_background)
-    dataset.model_path = dataset.model_path or _new_output_folder()
     gaussians = GaussianModel(dataset.sh_degree, opt.optimizer_type)
-    scene = Scene(dataset, gaussians, shuffle=False)
+    scene = Scene(dataset, gaussians, shuffle=False, write=False)
     gaussians.training_setup(opt)
     if capture is not None:
         gaussians.restore(capture, opt)
         capture = None  # so that densification can free what it replaces
-    # After all that bad input can stop, or a slip of the keyboard would overwrite the options of a finished model.
-    tb_writer = prepare_output_and_logger(dataset, antialiasing=pipe.antialiasing, seed=opt.seed)
-
     views = _ViewOrder(scene.getTrainCameras(), opt.seed)
+    # After all that bad input can stop, or a slip of the keyboard would overwrite the files of a finished model.
+    tb_writer = prepare_output_and_logger(dataset, antialiasing=pipe.antialiasing, seed=opt.seed)
+    if not checkpoint or not (Path(scene.model_path) / "cameras.json").exists():
+        scene.write_inputs()
+
     fixed_background = torch.full((3,), 1.0 if dataset.white_background else 0.0, device=device)
     log = TrainingLog(scene.model_path, first_iteration)
-    losses = LossWatch(device)
+    losses = LossWatch(device, log.loss)
     # Where something is written: all losses up to there must have been looked at.
     stops = {opt.iterations, *testing_iterations, *saving_iterations, *checkpoint_iterations}
     clock = Stopwatch()
@@ -111,6 +114,7 @@ def training(
                 )  # fmt: skip
                 saving = iteration in saving_iterations
                 if saving:
+                    gaussians.check_finite(iteration)
                     tqdm.write(f"[ITER {iteration}] Saving Gaussians", file=sys.stdout)
                     scene.save(iteration)
                 if saving or scores:
@@ -120,16 +124,19 @@ def training(
             if iteration < opt.iterations:
                 gaussians.optimizer.step()
                 gaussians.optimizer.zero_grad(set_to_none=True)
-            stop = interrupt.requested  # once: Ctrl-C may come at any moment
+            stop = interrupt.requested  # once: a signal may come at any moment
             if iteration in checkpoint_iterations or stop:
                 _check_losses(losses.read(), views)
+                seconds = clock.seconds
                 with clock.paused():
+                    gaussians.check_finite(iteration)
                     tqdm.write(f"[ITER {iteration}] Saving Checkpoint", file=sys.stdout)
                     path = Path(scene.model_path) / f"chkpnt{iteration}.pth"
                     save_checkpoint(path, gaussians.capture(), iteration)
+                    log.add(iteration, seconds, gaussians=len(gaussians), loss=losses.mean)
             if stop:
                 tqdm.write(f"go on with --start_checkpoint {path}", file=sys.stderr)
-                raise KeyboardInterrupt
+                raise stop
     if tb_writer:
         tb_writer.close()
     print(f"Trained {opt.iterations - first_iteration} iterations in {clock.seconds:.1f} s, without tests and saving")
@@ -217,11 +224,10 @@ def _new_output_folder() -> str:
 
 
 def prepare_output_and_logger(args: argparse.Namespace, *, antialiasing: bool, seed: int) -> Any | None:
-    """Make the output folder (a new one under ./output when args.model_path is empty) with cfg_args and model.json.
+    """Make the output folder, args.model_path, with cfg_args and model.json.
 
     Returns a TensorBoard writer, or None where TensorBoard is not installed.
     """
-    args.model_path = args.model_path or _new_output_folder()
     print(f"Output folder: {args.model_path}")
     mkdir_p(args.model_path)
     write_cfg_args(args.model_path, args)
@@ -286,7 +292,7 @@ def training_report(
 
 
 def _parser() -> tuple[argparse.ArgumentParser, ModelParams, OptimizationParams, PipelineParams]:
-    parser = argparse.ArgumentParser(description="Train a Gaussian model from photos with known cameras.")
+    parser = OptionParser(description="Train a Gaussian model from photos with known cameras.")
     groups = ModelParams(parser), OptimizationParams(parser), PipelineParams(parser)
     add = parser.add_argument
     add("--ip", type=str, default="127.0.0.1", help="address of the viewer (no viewer in this version; no effect)")
@@ -298,7 +304,7 @@ def _parser() -> tuple[argparse.ArgumentParser, ModelParams, OptimizationParams,
     add("--test_iterations", **listed, default=[7_000, 30_000],
         help="iterations that score the test views, -1: none (default: 7000 30000, reference)")  # fmt: skip
     add("--save_iterations", **listed, default=[7_000, 30_000],
-        help="iterations that save the model; the last one always does (default: 7000 30000, reference)")  # fmt: skip
+        help="iterations that save the model besides the last, -1: none (default: 7000 30000, reference)")  # fmt: skip
     add("--checkpoint_iterations", **listed, default=[], help="iterations that save a checkpoint (default: none)")
     add("--start_checkpoint", type=str, default=None, metavar="FILE", help="chkpntN.pth to go on from (default: none)")
     add("--quiet", action="store_true", help="print nothing but the progress bar and errors")
@@ -310,11 +316,11 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser, model, optimisation, pipeline = _parser()
     args = parser.parse_args(argv)
     dataset, opt, pipe = model.extract(args), optimisation.extract(args), pipeline.extract(args)
-    for name in ("save_iterations", "checkpoint_iterations"):
-        if any(t < 1 for t in getattr(args, name)):
-            raise UserError(f"--{name} counts from 1, got {min(getattr(args, name))}")
+    for name in ("test_iterations", "save_iterations", "checkpoint_iterations"):
+        wrong = [t for t in getattr(args, name) if t < 1 and t != -1]
+        if wrong:
+            raise UserError(f"--{name} counts from 1, or is -1 for none, got {wrong[0]}")
     safe_state(args.quiet, opt.seed)
-    print(f"Optimizing {dataset.model_path}")
     torch.autograd.set_detect_anomaly(args.detect_anomaly)
     training(
         dataset,

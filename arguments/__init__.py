@@ -1,7 +1,7 @@
 """Every option of the command lines, and what a model folder remembers of them."""
 
 from arguments.groups import ModelParams, OptimizationParams, PipelineParams
-from arguments.param_group import ParamGroup
+from arguments.param_group import OptionParser, ParamGroup
 from arguments.stored import (
     VERSION,
     get_combined_args,
@@ -15,6 +15,7 @@ __all__ = [
     "VERSION",
     "ModelParams",
     "OptimizationParams",
+    "OptionParser",
     "ParamGroup",
     "PipelineParams",
     "get_combined_args",

@@ -110,7 +110,7 @@ class OptimizationParams(ParamGroup):
 
     title = "optimisation"
     options = (
-        Option("iterations", 30_000, "training steps, one picture each", "paper", check=at_least(1)),
+        Option("iterations", 30_000, "training steps, one picture each", "paper", check=within(1, 2**31 - 1)),
         Option(
             "position_lr_init",
             0.00016,
@@ -207,7 +207,7 @@ class OptimizationParams(ParamGroup):
             "seed",
             0,
             "seed of every random choice; same seed, same bytes",
-            "reference's fixed seed",
+            "ours, and the reference's fixed seed",
             check=within(0, 2**63 - 1),
         ),
     )

@@ -16,7 +16,7 @@ class Option:
     """One command-line option.
 
     name, short: long name (also the attribute) and one-letter form; default: its type is the option's type.
-    help: effect of the option; origin: where the default comes from.
+    help: effect of the option; origin: where the default comes from, "ours..." for options the reference does not have.
     check: takes a value, returns what is wanted when the value is not that, else None.
     unbuilt: what this version lacks for any value but the default.
     stored: belongs to `cfg_args`.
@@ -31,15 +31,22 @@ class Option:
     unbuilt: str | None = None
     stored: bool = False
 
+    @property
+    def ours(self) -> bool:
+        """The reference does not have it."""
+        return self.origin.startswith("ours")
+
     def add_to(self, group: argparse._ArgumentGroup, sentinel: bool) -> None:
         flags = [f"--{self.name}"] + ([f"-{self.short}"] if self.short else [])
         default = None if sentinel else self.default
         shown = "off" if self.default is False else repr(self.default) if self.default == "" else self.default
         text = f"{self.help} (default: {shown}; {self.origin})".replace("%", "%%")
         if isinstance(self.default, bool):
-            group.add_argument(*flags, action="store_true", default=default, help=text)
+            kind: dict[str, Any] = {"action": "store_true"}
         else:
-            group.add_argument(*flags, type=type(self.default), default=default, metavar=self._metavar(), help=text)
+            kind = {"type": type(self.default), "metavar": self._metavar()}
+        action = group.add_argument(*flags, **kind, default=default, help=text)
+        action.ours = self.ours  # type: ignore[attr-defined]  # for OptionParser
 
     def _metavar(self) -> str:
         return {int: "N", float: "X", str: "TEXT"}[type(self.default)]
@@ -54,6 +61,15 @@ class Option:
         if self.unbuilt and value != self.default:
             typed = f"--{self.name}" if value is True else f"--{self.name} {value}"
             raise UserError(f"{typed} needs {self.unbuilt}, which this version does not have yet; leave the option out")
+
+
+class OptionParser(argparse.ArgumentParser):
+    """A parser in which an abbreviation of just one of the reference's options means that one, whatever we added."""
+
+    def _get_option_tuples(self, option_string: str) -> list[Any]:
+        matches = super()._get_option_tuples(option_string)
+        others = [match for match in matches if not getattr(match[0], "ours", False)]
+        return others if len(others) == 1 else matches
 
 
 class ParamGroup:

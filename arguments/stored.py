@@ -30,6 +30,8 @@ def read_cfg_args(model_path: str | os.PathLike) -> dict[str, Value]:
     UserError when there is no file, or when it is anything but `Namespace(name=literal, ...)`.
     """
     path = Path(model_path) / "cfg_args"
+    if not Path(model_path).is_dir():
+        raise UserError(f"no such model folder: {model_path}; give -m the folder that train.py wrote")
     if not path.is_file():
         raise UserError(f"no cfg_args in {model_path}; give -m the folder that train.py wrote")
     broken = f"{path} is not one line Namespace(name=value, ...) of plain values; restore it or train again"
@@ -39,26 +41,20 @@ def read_cfg_args(model_path: str | os.PathLike) -> dict[str, Value]:
         raise UserError(broken) from error
     if not (isinstance(call, ast.Call) and isinstance(call.func, ast.Name) and call.func.id == "Namespace"):
         raise UserError(broken)
-    if call.args or any(keyword.arg is None or not _is_literal(keyword.value) for keyword in call.keywords):
+    if call.args or any(keyword.arg is None for keyword in call.keywords):
         raise UserError(broken)
     values = {}
     for keyword in call.keywords:
+        try:
+            value = ast.literal_eval(keyword.value)
+        except (ValueError, TypeError, RecursionError, MemoryError) as error:
+            raise UserError(broken) from error
         if keyword.arg in _STORED:
             wanted = type(_STORED[keyword.arg])
-            value = ast.literal_eval(keyword.value)
             if type(value) is not wanted:
                 raise UserError(f"{path}: {keyword.arg} must be {wanted.__name__}, got {value!r}; restore the file")
             values[keyword.arg] = value
     return values
-
-
-def _is_literal(node: ast.expr) -> bool:
-    # Stricter than ast.literal_eval, which lets sums through; no Namespace prints one. Forks store lists of numbers.
-    if isinstance(node, ast.List):
-        return all(_is_literal(item) for item in node.elts)
-    if isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.USub) and isinstance(node.operand, ast.Constant):
-        return type(node.operand.value) in (int, float)
-    return isinstance(node, ast.Constant)
 
 
 def write_model_json(model_path: str | os.PathLike, *, antialiasing: bool, seed: int) -> None:

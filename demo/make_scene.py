@@ -19,7 +19,7 @@ from tqdm import tqdm
 
 from demo.colmap_model import write_model
 from demo.objects import demo_scene
-from demo.surface_points import sample_points
+from demo.surface_points import MIN_TRACK, sample_points
 from demo.tracer import View, render_view
 from demo.views import ring_views
 from utils.system_utils import UserError, mkdir_p, run_cli
@@ -31,10 +31,15 @@ def _demo_picture(view: View) -> np.ndarray:
     return render_view(demo_scene(), view)
 
 
+def _cores() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 def _pictures(views: list[View]) -> list[np.ndarray]:
     """What the views show, (H, W, 3) uint8 each, made on all cores if it is worth it."""
     pixels = sum(view.width * view.height for view in views)
-    workers = min(os.cpu_count() or 1, 1 + pixels // PIXELS_PER_PROCESS)
+    workers = min(_cores(), 1 + pixels // PIXELS_PER_PROCESS)
     bar = partial(tqdm, total=len(views), desc="Ray tracing", unit="view")
     if workers == 1:
         return list(bar(map(_demo_picture, views)))
@@ -47,8 +52,11 @@ def make_scene(out: Path, views: int, width: int, height: int, points: int, seed
     """Write the scene to `out` (images/, sparse/0) and return its number of points.
 
     The same arguments give the same pictures and points. `out` appears only when it is complete; UserError if it is
-    there already and not empty.
+    there already and not empty, can't be made, or would be a scene without points.
     """
+    out = out.resolve()
+    if out == Path.cwd():
+        raise UserError("the current folder can't be replaced by the scene; name a folder to make")
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise UserError(f"{out} exists and is not an empty folder; choose another one or delete it first")
     rng = np.random.default_rng(seed)
@@ -62,10 +70,16 @@ def make_scene(out: Path, views: int, width: int, height: int, points: int, seed
         for name, picture in zip(names, pictures, strict=True):
             Image.fromarray(picture).save(work / "images" / name)
         cloud = sample_points(demo_scene(), cameras, pictures, points, rng)
+        if not len(cloud.xyz):
+            raise UserError(f"none of {points} points is seen by {MIN_TRACK} views; raise --points or --views")
         write_model(work / "sparse" / "0", names, cameras, cloud)
         if out.exists():
             out.rmdir()
         work.rename(out)
+    except OSError as error:
+        raise UserError(
+            f"cannot write {out} ({error.strerror or error}); choose another place, or mend the rights there"
+        ) from error
     finally:
         shutil.rmtree(work, ignore_errors=True)
     return len(cloud.xyz)

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from scene.cameras import Camera, camera_to_JSON, cameraList_from_camInfos
-from scene.dataset_readers import CameraInfo, SceneInfo, read_scene
+from scene.dataset_readers import CameraInfo, read_scene
 from scene.images import ImageStore
 from scene.point_cloud import write_point_cloud
 from utils.graphics_utils import BasicPointCloud
@@ -33,8 +33,8 @@ class _Gaussians(Protocol):
 class Scene:
     """Views and model of one run.
 
-    args: model options (ModelParams.extract). load_iteration: None starts from the dataset's points and writes
-    `input.ply` and `cameras.json` into the model folder; -1 loads the last saved iteration, N that one.
+    args: model options (ModelParams.extract). load_iteration: None starts from the dataset's points and, unless `write`
+    is False, calls `write_inputs` when nothing was refused; -1 loads the last saved iteration, N that one.
     shuffle: mix the order of the views (always the same way). resolution_scales: factors by which views are made
     smaller, one list of cameras each. cameras_extent: E in world units, from the training views.
     """
@@ -46,15 +46,17 @@ class Scene:
         load_iteration: int | None = None,
         shuffle: bool = True,
         resolution_scales: Sequence[float] = (1.0,),
+        write: bool = True,
     ) -> None:
         self.model_path = args.model_path
         self.gaussians = gaussians
         self.loaded_iter = None if load_iteration is None else self._find_iteration(load_iteration)
 
-        info = read_scene(args.source_path, args.images, args.eval, args.init_pcd_path)
-        self.cameras_extent = info.extent
         if self.loaded_iter is None:
-            self._write_inputs(info)
+            _refuse_dataset_folder(args)
+        info = read_scene(args.source_path, args.images, args.eval, args.init_pcd_path, self.loaded_iter is None)
+        self._info = info
+        self.cameras_extent = info.extent
 
         device = compute_device()
         images = ImageStore(args.images_to_load, picture_device(args.data_device, device))
@@ -63,6 +65,8 @@ class Scene:
 
         if self.loaded_iter is None:
             gaussians.create_from_pcd(info.point_cloud, info.train_cameras, self.cameras_extent)
+            if write:
+                self.write_inputs()
         else:
             print(f"Loading trained model at iteration {self.loaded_iter}")
             gaussians.load_ply(str(self._ply(self.loaded_iter)))
@@ -79,6 +83,19 @@ class Scene:
         """Write the Gaussians as `point_cloud/iteration_N/point_cloud.ply`."""
         self.gaussians.save_ply(str(self._ply(iteration)))
 
+    def write_inputs(self) -> None:
+        """Write the cloud and the cameras into the model folder, `input.ply` and `cameras.json`."""
+        folder, info = Path(self.model_path), self._info
+        if info.ply_path:
+            with atomic_write(folder / "input.ply") as path:
+                shutil.copyfile(info.ply_path, path)
+        else:
+            colors = np.round(info.point_cloud.colors * 255).astype(np.uint8)
+            write_point_cloud(folder / "input.ply", info.point_cloud.points, colors)
+        entries = [camera_to_JSON(i, camera) for i, camera in enumerate(info.test_cameras + info.train_cameras)]
+        with atomic_write(folder / "cameras.json") as path:
+            path.write_text(json.dumps(entries, allow_nan=False), encoding="utf-8")
+
     def _ply(self, iteration: int) -> Path:
         return Path(self.model_path) / "point_cloud" / f"iteration_{iteration}" / "point_cloud.ply"
 
@@ -91,18 +108,6 @@ class Scene:
             saved = ", ".join(map(str, saved_iterations(folder)))
             raise UserError(f"iteration {iteration} was never saved in {folder}; saved are {saved}")
         return iteration
-
-    def _write_inputs(self, info: SceneInfo) -> None:
-        folder = Path(self.model_path)
-        if info.ply_path:
-            with atomic_write(folder / "input.ply") as path:
-                shutil.copyfile(info.ply_path, path)
-        else:
-            colors = np.round(info.point_cloud.colors * 255).astype(np.uint8)
-            write_point_cloud(folder / "input.ply", info.point_cloud.points, colors)
-        entries = [camera_to_JSON(i, camera) for i, camera in enumerate(info.test_cameras + info.train_cameras)]
-        with atomic_write(folder / "cameras.json") as path:
-            path.write_text(json.dumps(entries, allow_nan=False), encoding="utf-8")
 
     @staticmethod
     def _cameras(
@@ -122,6 +127,15 @@ class Scene:
             cameras = cameraList_from_camInfos(infos, scale, args, images, device)
             lists[scale] = [cameras[index] for index in order]
         return lists
+
+
+def _refuse_dataset_folder(args: argparse.Namespace) -> None:
+    """UserError when the model would be written into the dataset, which nothing may change."""
+    if not args.source_path or not args.model_path:
+        return
+    source, model = Path(args.source_path).resolve(), Path(args.model_path).resolve()
+    if model.is_relative_to(source):
+        raise UserError(f"the output folder {args.model_path} lies in the scene folder {source}; name another with -m")
 
 
 def picture_device(data_device: str, fallback: torch.device) -> torch.device:

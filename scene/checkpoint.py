@@ -1,8 +1,9 @@
 """chkpntN.pth: (capture of the model, N), tensors and numbers only, read without running anything it holds."""
 
-import contextlib
+import math
 import os
-from collections.abc import Iterator
+from numbers import Real
+from typing import Any
 
 import numpy as np
 import torch
@@ -24,7 +25,13 @@ _ALLOWED = [
 def save_checkpoint(path: str | os.PathLike, capture: tuple, iteration: int) -> None:
     """Write (capture, iteration), whole or not at all."""
     with atomic_write(path) as temporary:
-        torch.save((capture, iteration), temporary)
+        try:
+            torch.save((capture, iteration), temporary)
+        except RuntimeError as error:
+            # torch hides why its writer of archives failed, but that is never the content.
+            if "inline_container" not in str(error) and "PytorchStreamWriter" not in str(error):
+                raise
+            raise OSError("no space is left, or files must not be so large") from error
 
 
 def load_checkpoint(path: str | os.PathLike, device: torch.device | str = "cpu") -> tuple[tuple, int]:
@@ -38,15 +45,39 @@ def load_checkpoint(path: str | os.PathLike, device: torch.device | str = "cpu")
             f"{path} is not a checkpoint of train.py: it is damaged, or holds objects other than tensors and numbers, "
             "which are never run; give a chkpntN.pth"
         ) from error
-    with _as_user_error(path):
-        capture, iteration = content
-        per_gaussian = (*capture[1:10], *capture[_ENTRIES:])
-        if len(capture) < _ENTRIES or not all(torch.is_tensor(entry) for entry in per_gaussian):
-            raise ValueError
-        count = len(capture[1])
-        if any(len(tensor) != count for tensor in per_gaussian):
-            raise ValueError
-        return tuple(capture), int(iteration)
+    try:
+        return _checked(content)
+    except ValueError as error:
+        raise UserError(
+            f"{path} is not a checkpoint of train.py: its parts do not fit ({error}); give a chkpntN.pth"
+        ) from error
+
+
+def _checked(content: Any) -> tuple[tuple, int]:
+    """Capture and iteration; ValueError saying what is wrong. Shapes of attributes are GaussianModel.restore's."""
+    if not isinstance(content, tuple | list) or len(content) != 2:
+        raise ValueError("it is no pair of a state and an iteration")
+    capture, iteration = content
+    if not isinstance(capture, tuple | list) or len(capture) < _ENTRIES:
+        raise ValueError(f"the state has not {_ENTRIES} entries")
+    if type(iteration) is not int or not 0 <= iteration < 2**31:
+        raise ValueError(f"the iteration is {iteration!r:.40}")
+    if type(capture[0]) is not int or not 0 <= capture[0] <= 3:
+        raise ValueError(f"the active SH degree is {capture[0]!r:.40}")
+    per_gaussian = (*capture[1:10], *capture[_ENTRIES:])
+    if not all(torch.is_tensor(t) and t.dim() > 0 and t.dtype == torch.float32 for t in per_gaussian):
+        raise ValueError("a value per Gaussian is not a float32 tensor")
+    count = len(capture[1])
+    if count == 0:
+        raise ValueError("it has no Gaussians")
+    if any(len(tensor) != count for tensor in per_gaussian):
+        raise ValueError("tensors differ in the number of Gaussians")
+    if [tuple(tensor.shape[1:]) for tensor in capture[7:10]] != [(), (1,), (1,)]:
+        raise ValueError("the statistics of density control have other shapes")
+    extent = capture[11]
+    if not isinstance(extent, Real) or isinstance(extent, bool) or not 0 <= extent < math.inf:
+        raise ValueError(f"the extent of the scene is {extent!r:.40}")
+    return tuple(capture), iteration
 
 
 def _refuse_other_kinds(path: str | os.PathLike) -> None:
@@ -60,11 +91,3 @@ def _refuse_other_kinds(path: str | os.PathLike) -> None:
             raise UserError(
                 f"--start_checkpoint {path} is a PLY, which has no optimiser state to go on from; give a chkpntN.pth"
             )
-
-
-@contextlib.contextmanager
-def _as_user_error(path: str | os.PathLike) -> Iterator[None]:
-    try:
-        yield
-    except (TypeError, ValueError) as error:
-        raise UserError(f"{path} is not a checkpoint of train.py: its parts do not fit; give a chkpntN.pth") from error

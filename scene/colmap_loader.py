@@ -1,6 +1,9 @@
 """COLMAP models through pycolmap, as plain records. The one module that imports pycolmap."""
 
+import signal
+import threading
 from pathlib import Path
+from types import ModuleType
 from typing import NamedTuple
 
 import numpy as np
@@ -47,9 +50,7 @@ def find_model(scene: Path) -> Path:
 
 def read_model(folder: Path) -> ColmapModel:
     """Read a model, binary or (where that is missing or broken) text. UserError when neither can be read."""
-    # Late: importing pycolmap takes time and loads libraries that a Blender scene does not need.
-    import pycolmap
-
+    pycolmap = _pycolmap()
     errors = []
     for suffix, read in (("bin", "read_binary"), ("txt", "read_text")):
         if not _has_model(folder, suffix):
@@ -64,6 +65,17 @@ def read_model(folder: Path) -> ColmapModel:
             continue
         return _records(model)
     raise UserError(f"cannot read the COLMAP model in {folder} ({'; '.join(errors)}); export it again from COLMAP")
+
+
+def _pycolmap() -> ModuleType:
+    # Late: importing pycolmap takes time and loads libraries that a Blender scene does not need.
+    import pycolmap
+
+    # It lets glog answer SIGTERM with a stack dump. Python does not see that, so its own idea brings back what was.
+    handler = signal.getsignal(signal.SIGTERM)
+    if handler is not None and threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, handler)
+    return pycolmap
 
 
 def points_file(folder: Path) -> Path:

@@ -61,20 +61,23 @@ class CameraInfo:
 
 @dataclass(frozen=True)
 class SceneInfo:
-    """A dataset: start cloud, views, extent E in world units, and the PLY that the cloud came from, if any."""
+    """A dataset: start cloud (None if not wanted), views, extent E in world units, the PLY of the cloud if any."""
 
-    point_cloud: BasicPointCloud
+    point_cloud: BasicPointCloud | None
     train_cameras: list[CameraInfo]
     test_cameras: list[CameraInfo]
     extent: float
     ply_path: Path | None
 
 
-def read_scene(source_path: str | os.PathLike, images: str, hold_out: bool, init_pcd_path: str = "") -> SceneInfo:
+def read_scene(
+    source_path: str | os.PathLike, images: str, hold_out: bool, init_pcd_path: str = "", want_cloud: bool = True
+) -> SceneInfo:
     """Read the dataset in a folder, whichever kind it is. UserError says what was looked for and what was found.
 
     images: folder of the pictures (COLMAP only). hold_out: keep a test set apart, else everything trains.
-    init_pcd_path: PLY to start from instead of the dataset's own points.
+    init_pcd_path: PLY to start from instead of the dataset's own points. want_cloud: without, points are neither read
+    nor judged, for a model that is there already.
     """
     folder = Path(source_path)
     if not str(source_path):
@@ -91,10 +94,12 @@ def read_scene(source_path: str | os.PathLike, images: str, hold_out: bool, init
             f"{folder} is not a scene: looked for the folder sparse (COLMAP) and the file transforms_train.json "
             f"(Blender), found {_some(found)}; give -s the folder that holds one of them"
         )
-    return sceneLoadTypeCallbacks[kind](folder, images, hold_out, init_pcd_path)
+    return sceneLoadTypeCallbacks[kind](folder, images, hold_out, init_pcd_path, want_cloud)
 
 
-def readColmapSceneInfo(folder: Path, images: str, hold_out: bool, init_pcd_path: str = "") -> SceneInfo:
+def readColmapSceneInfo(
+    folder: Path, images: str, hold_out: bool, init_pcd_path: str = "", want_cloud: bool = True
+) -> SceneInfo:
     """Read a COLMAP scene: `sparse/0` or `sparse`, pictures in `<folder>/<images>`, views sorted by name (bytes)."""
     model_folder = colmap_loader.find_model(folder)
     model = colmap_loader.read_model(model_folder)
@@ -111,6 +116,8 @@ def readColmapSceneInfo(folder: Path, images: str, hold_out: bool, init_pcd_path
     if not train:
         raise UserError(f"{folder} has too few pictures for --eval, which takes every {HOLD}th; leave --eval out")
 
+    if not want_cloud:
+        return SceneInfo(None, train, test, scene_extent(train), None)
     ply_path = Path(init_pcd_path) if init_pcd_path else _fresh_ply(model_folder)
     if ply_path:
         cloud = read_point_cloud(ply_path)
@@ -121,7 +128,9 @@ def readColmapSceneInfo(folder: Path, images: str, hold_out: bool, init_pcd_path
     return SceneInfo(cloud, train, test, scene_extent(train, cloud.points), ply_path)
 
 
-def readNerfSyntheticInfo(folder: Path, images: str, hold_out: bool, init_pcd_path: str = "") -> SceneInfo:
+def readNerfSyntheticInfo(
+    folder: Path, images: str, hold_out: bool, init_pcd_path: str = "", want_cloud: bool = True
+) -> SceneInfo:
     """Read a Blender scene (transforms_train.json, transforms_test.json), views in the order of the files.
 
     Without a cloud of its own it starts from grey points spread evenly over a cube.
@@ -133,19 +142,21 @@ def readNerfSyntheticInfo(folder: Path, images: str, hold_out: bool, init_pcd_pa
     if not train:
         raise UserError(f"{folder / 'transforms_train.json'} lists no frames; export the scene again")
 
+    if not want_cloud:
+        return SceneInfo(None, train, test, scene_extent(train), None)
     own = folder / "points3d.ply"
     ply_path = Path(init_pcd_path) if init_pcd_path else own if own.is_file() else None
     cloud = read_point_cloud(ply_path) if ply_path else _random_cloud()
     return SceneInfo(cloud, train, test, scene_extent(train, cloud.points), ply_path)
 
 
-sceneLoadTypeCallbacks: dict[str, Callable[[Path, str, bool, str], SceneInfo]] = {
+sceneLoadTypeCallbacks: dict[str, Callable[[Path, str, bool, str, bool], SceneInfo]] = {
     "Colmap": readColmapSceneInfo,
     "Blender": readNerfSyntheticInfo,
 }
 
 
-def scene_extent(cameras: list[CameraInfo], points: np.ndarray) -> float:
+def scene_extent(cameras: list[CameraInfo], points: np.ndarray | None = None) -> float:
     """Extent E: 1.1 times the largest distance of a camera from the cameras' mean, in world units.
 
     Cameras in one place have none; then 1.1 times the median depth of the points (N,3) in front of the first camera,
@@ -153,6 +164,7 @@ def scene_extent(cameras: list[CameraInfo], points: np.ndarray) -> float:
     """
     centers = np.array([camera.center for camera in cameras])
     extent = 1.1 * float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).max())
+    points = np.zeros((0, 3)) if points is None else points
     depths = (points @ cameras[0].R + cameras[0].T)[:, 2]
     depths = depths[depths > 0]
     fallback = 1.1 * float(np.median(depths)) if len(depths) else 1.0
@@ -176,6 +188,8 @@ def _colmap_camera(view: colmap_loader.ColmapView, path: Path) -> CameraInfo:
             f"the camera of {view.name} has no usable size or focal length ({view.width} x {view.height}, "
             f"{view.params}); export the model again from COLMAP"
         )
+    if not (np.isfinite(view.rotation).all() and np.isfinite(view.translation).all()):
+        raise UserError(f"the pose of {view.name} is not finite; remove the picture from the COLMAP model")
     return CameraInfo(
         uid=view.camera_id,
         R=view.rotation.T.copy(),

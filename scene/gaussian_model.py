@@ -217,27 +217,46 @@ class GaussianModel:
                 f"({', '.join(names)}); give a checkpoint of this model"
             )
         rows = {name: tensor.detach() for name, tensor in zip(names, tensors, strict=True)}
-        found, wanted = rows["f_rest"].shape[1], self._attributes["f_rest"].shape[0]
-        if found != wanted:
+        self._check_rows(rows)
+        if not 0 <= active_sh_degree <= self.max_sh_degree:
             raise UserError(
-                f"the checkpoint has {found} SH coefficients above band 0, where --sh_degree "
-                f"{self.max_sh_degree} needs {wanted}; give the --sh_degree it was trained with"
+                f"the active SH degree of the checkpoint is {active_sh_degree}, more than --sh_degree "
+                f"{self.max_sh_degree}; give the --sh_degree it was trained with"
             )
         self.active_sh_degree = int(active_sh_degree)
         self.spatial_lr_scale = float(spatial_lr_scale)
         self._set_rows(rows)
         self.training_setup(training_args)
-        rates = [group["lr"] for group in self.optimizer.param_groups]
         try:
-            self.optimizer.load_state_dict(optimizer_state)
-        except (ValueError, KeyError) as error:
+            self.optimizer.take_state(optimizer_state)
+        except ValueError as error:
             raise UserError(f"the optimiser state of the checkpoint does not fit ({error}); use another one") from error
-        for group, rate in zip(self.optimizer.param_groups, rates, strict=True):
-            group["lr"] = rate
         device = self._xyz.device
         self.max_radii2D = max_radii2D.to(device)
         self.xyz_gradient_accum = xyz_gradient_accum.to(device)
         self.denom = denom.to(device)
+
+    def _check_rows(self, rows: Rows) -> None:
+        """UserError for rows of a checkpoint that are not those of this model."""
+        for name, values in rows.items():
+            shape = self._attributes[name].shape
+            found = tuple(values.shape[1:])
+            if name == "f_rest" and found[1:] == shape[1:] and found != shape:
+                raise UserError(
+                    f"the checkpoint has {found[0]} SH coefficients above band 0, where --sh_degree "
+                    f"{self.max_sh_degree} needs {shape[0]}; give the --sh_degree it was trained with"
+                )
+            if found != shape or values.dtype != torch.float32:
+                raise UserError(
+                    f"{name} of the checkpoint has the shape {found} and type {values.dtype} per Gaussian, not {shape} "
+                    "and float32; give a checkpoint of this model"
+                )
+        check_finite(rows, "the checkpoint", "give another one")
+
+    def check_finite(self, iteration: int) -> None:
+        """UserError where a parameter is not finite, to be called before anything of this iteration is saved."""
+        remedy = "nothing of it was saved; lower the learning rates, or go on from an earlier checkpoint"
+        check_finite(self._rows(), f"iteration {iteration}", remedy)
 
     # Adaptive density control
 
@@ -350,3 +369,15 @@ class GaussianModel:
         """Bring every opacity down to at most 0.01; its Adam moments start again from zero."""
         lowered = self._opacity.detach().clamp_max(adc.logit(adc.RESET_OPACITY))
         self._opacity = self.optimizer.reset("opacity", lowered)
+
+
+def check_finite(rows: Rows, where: str, remedy: str) -> None:
+    """UserError naming the first attribute with values that are not finite, how many Gaussians, and the first one."""
+    for name, values in rows.items():
+        finite = values.isfinite()
+        if not finite.all():
+            bad = (~finite.reshape(len(values), -1)).any(dim=1).nonzero()
+            raise UserError(
+                f"{name} of {len(bad)} of {len(values)} Gaussians in {where} is not finite "
+                f"(the first is Gaussian {int(bad[0])}); {remedy}"
+            )

@@ -1,6 +1,8 @@
 """Adam over the tensors of a Gaussian model, and what becomes of its state when Gaussians come and go."""
 
+import math
 from collections.abc import Callable
+from typing import Any
 
 import diff_gaussian_rasterization  # noqa: F401  (its library holds the Adam kernel)
 import torch
@@ -61,6 +63,25 @@ class GaussianAdam(torch.optim.Adam):
             state["exp_avg_sq"] = torch.zeros_like(param)
         return state
 
+    def take_state(self, state_dict: Any) -> None:
+        """Take the moments and step counters of a state dict; options of the groups stay as they are.
+
+        ValueError, saying what does not fit, for anything but the state dict of such groups.
+        """
+        own = self.state_dict()["param_groups"]
+        try:
+            state, groups = dict(state_dict["state"]), list(state_dict["param_groups"])
+            names, keys = [group["name"] for group in groups], [list(group["params"]) for group in groups]
+        except (TypeError, ValueError, KeyError, IndexError) as error:
+            raise ValueError("it is no state of an optimiser") from error
+        if names != [group["name"] for group in own] or any(len(params) != 1 for params in keys):
+            raise ValueError("its groups are others")
+        taken = {}
+        for group, mine, (key,) in zip(self.param_groups, own, keys, strict=True):
+            if key in state:
+                taken[mine["params"][0]] = _fitting(state[key], group["params"][0], group["name"])
+        super().load_state_dict({"state": taken, "param_groups": own})
+
     def append_rows(self, rows: dict[str, Tensor]) -> dict[str, nn.Parameter]:
         """Append `rows[name]` (n, ...) to each group, with zero moments. Returns the parameters, without gradient."""
 
@@ -98,3 +119,24 @@ class GaussianAdam(torch.optim.Adam):
             self.state[param] = state
         group["params"] = [param]
         return param
+
+
+def _fitting(entry: Any, param: Tensor, name: str) -> dict[str, Tensor]:
+    """Adam's state of one parameter, checked against it."""
+    if not isinstance(entry, dict) or not {"step", "exp_avg", "exp_avg_sq"} <= entry.keys():
+        raise ValueError(f"step, exp_avg or exp_avg_sq of {name} is missing")
+    for key in ("exp_avg", "exp_avg_sq"):
+        moment = entry[key]
+        if not torch.is_tensor(moment) or moment.shape != param.shape or moment.dtype != param.dtype:
+            raise ValueError(f"{key} of {name} is not like {name}")
+    try:
+        step = float(entry["step"])  # a tensor; a number where an older torch wrote it
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise ValueError(f"step of {name} is no number") from error
+    if not (math.isfinite(step) and step >= 0):
+        raise ValueError(f"step of {name} is {step}")
+    return {
+        "step": torch.tensor(step, dtype=torch.float32),
+        "exp_avg": entry["exp_avg"],
+        "exp_avg_sq": entry["exp_avg_sq"],
+    }

@@ -41,10 +41,14 @@ def decode(path: Path, size: tuple[int, int]) -> Tensor:
     try:
         with _open(path) as image:
             image = _to_rgb_or_rgba(image)
+        if image.size != size:
+            image = image.resize(size, Image.Resampling.BICUBIC)
     except _BROKEN as error:
         raise _unreadable(path, error) from error
-    if image.size != size:
-        image = image.resize(size, Image.Resampling.BICUBIC)
+    except MemoryError as error:
+        raise UserError(
+            f"not enough memory for the picture {path} at {size[0]} x {size[1]} pixels; choose a smaller size with -r"
+        ) from error
     pixels = np.asarray(image)
     if pixels.shape[-1] == 4 and pixels[..., 3].min() == 255:
         pixels = pixels[..., :3]

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from arguments import (
     ModelParams,
     OptimizationParams,
+    OptionParser,
     PipelineParams,
     get_combined_args,
     read_cfg_args,
@@ -113,6 +114,7 @@ def test_short_forms_and_unique_prefixes():
         ("images_to_load", "-1"),
         ("iterations", "-5"),
         ("iterations", "0"),
+        ("iterations", str(2**31)),
         ("position_lr_init", "nan"),
         ("opacity_lr", "-0.1"),
         ("scaling_lr", "inf"),
@@ -201,6 +203,8 @@ def test_cfg_args_of_others_are_read(tmp_path):
         "Namespace(other=__import__('os').mkdir('PROOF'))",
         "Namespace(other=[open('PROOF', 'w')])",
         "Namespace(source_path=f'{1}')",
+        "Namespace(other={[]: 1})",
+        "Namespace(other=" + "-" * 900 + "1)",
         "Namespace(" + "-" * 5000 + "1)",
         "Namespace(a=\0)",
         "(" * 10_000,
@@ -271,3 +275,54 @@ def test_no_model_folder(tmp_path):
         _combined()
     with pytest.raises(UserError, match="no cfg_args in"):
         _combined("-m", str(tmp_path))
+    with pytest.raises(UserError, match="^no such model folder: .*nope;"):
+        _combined("-m", str(tmp_path / "nope"))
+
+
+def test_values_of_unknown_keys_may_be_any_literal(tmp_path):
+    (tmp_path / "cfg_args").write_text(
+        "Namespace(eval=True, size=(800, -600), rates={'xyz': 1e-4, 'rest': [None, b'x']}, tags={'a'}, sh_degree=2)"
+    )
+    assert read_cfg_args(tmp_path) == {"eval": True, "sh_degree": 2}
+
+
+def _only_reference_parser() -> argparse.ArgumentParser:
+    """The options of the reference and nothing else."""
+    parser = argparse.ArgumentParser()
+    for group in (ModelParams, PipelineParams, OptimizationParams):
+        for option in group.options:
+            if option.name not in OURS:
+                option.add_to(parser.add_argument_group(), sentinel=False)
+    return parser
+
+
+def _meaning(parser: argparse.ArgumentParser, prefix: str) -> str | None:
+    """Option that an abbreviation sets, None where it is refused."""
+    for value in ([], ["1"]):
+        try:
+            args = parser.parse_args([prefix, *value])
+        except SystemExit:
+            continue
+        return next(name for name, given in vars(args).items() if given != parser.get_default(name))
+    return None
+
+
+def test_abbreviations_of_the_reference_mean_the_same_in_spite_of_our_options(capsys):
+    reference, parser = _only_reference_parser(), OptionParser()
+    for group in (ModelParams, PipelineParams, OptimizationParams):
+        group(parser)
+    names = [name for name in [*MODEL, *PIPELINE, *OPTIMISATION] if not name.startswith(("depth_", "exposure_"))]
+    for prefix in sorted({f"--{name[:end]}" for name in names for end in range(1, len(name) + 1)}):
+        meant = _meaning(reference, prefix)
+        if meant:
+            assert (prefix, _meaning(parser, prefix)) == (prefix, meant)
+    assert _meaning(parser, "--im") == "images"
+    assert _meaning(parser, "--m") == "model_path"
+    assert _meaning(parser, "--max") == "max_num_splats"
+    assert _meaning(parser, "--images_") == "images_to_load"
+    assert _meaning(parser, "--s") is None
+
+
+def test_options_of_ours_are_marked():
+    options = [*ModelParams.options, *PipelineParams.options, *OptimizationParams.options]
+    assert {option.name for option in options if option.ours} == set(OURS)

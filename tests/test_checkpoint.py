@@ -1,17 +1,24 @@
 """chkpntN.pth: ours, the reference's, and what must not be loaded."""
 
+import copy
 import io
 import os
 import pickle
 import zipfile
+from collections.abc import Callable
 
 import numpy as np
 import pytest
 import torch
-from gaussians import model, parameters, take_steps
+from gaussians import model, options, parameters, take_steps
 
 from scene.checkpoint import load_checkpoint, save_checkpoint
 from utils.system_utils import UserError
+
+try:
+    import resource
+except ImportError:
+    resource = None
 
 
 def _plain(value: object) -> bool:
@@ -65,8 +72,6 @@ def test_the_references_checkpoint_loads(tmp_path, scalar, numpy):
         _as_numpy_1(tmp_path / "chkpnt3000.pth")
     loaded, iteration = load_checkpoint(tmp_path / "chkpnt3000.pth")
     assert iteration == 3000
-    from gaussians import options
-
     other = model(2)
     other.restore(loaded, options())
     assert other.spatial_lr_scale == 2.5 and type(other.spatial_lr_scale) is float
@@ -135,6 +140,72 @@ def test_a_failed_save_leaves_the_old_file(tmp_path, monkeypatch):
         raise OSError("disk full")
 
     monkeypatch.setattr("scene.checkpoint.torch.save", fail)
-    with pytest.raises(OSError, match="disk full"):
+    with pytest.raises(UserError, match="cannot write .*disk full"):
         save_checkpoint(path, model(3).capture(), 1)
     assert path.read_bytes() == before and [p.name for p in tmp_path.iterdir()] == ["chkpnt1.pth"]
+
+
+def _changed(capture: tuple, index: int, value: object) -> tuple:
+    return (*capture[:index], value, *capture[index + 1 :])
+
+
+def _with_state(capture: tuple, change: Callable[[dict], object]) -> tuple:
+    state = copy.deepcopy(capture[10])
+    change(state)
+    return _changed(capture, 10, state)
+
+
+def test_parts_that_do_not_fit_end_in_a_sentence(tmp_path):
+    gaussians = model(4)
+    take_steps(gaussians, 1)
+    good = gaussians.capture()
+    nan = good[1].clone()
+    nan[2, 1] = float("nan")
+    empty = tuple(t[:0] if torch.is_tensor(t) else t for t in good)
+    cases = {
+        "no pair": torch.zeros(2),
+        "entries": ([1, 2], 3),
+        "the iteration is -5": (good, -5),
+        "the iteration is 'x'": (good, "x"),
+        "the iteration is 2.5": (good, 2.5),
+        "SH degree is 7": (_changed(good, 0, 7), 1),
+        "SH degree is -3": (_changed(good, 0, -3), 1),
+        "SH degree is 'x'": (_changed(good, 0, "x"), 1),
+        "extent of the scene is 'x'": (_changed(good, 11, "x"), 1),
+        "extent of the scene is nan": (_changed(good, 11, float("nan")), 1),
+        "no Gaussians": (empty, 1),
+        "float32": (_changed(good, 1, good[1].double()), 1),
+        "statistics": (_changed(good, 8, torch.zeros(4, 2)), 1),
+        "xyz of the checkpoint": (_changed(good, 1, good[1][:, :2]), 1),
+        "f_rest of the checkpoint": (_changed(good, 3, good[3].reshape(4, -1)), 1),
+        "opacity of the checkpoint": (_changed(good, 6, good[6][:, 0]), 1),
+        r"xyz of 1 of 4 Gaussians in the checkpoint .*Gaussian 2\)": (_changed(good, 1, nan), 1),
+        "no state of an optimiser": (_changed(good, 10, 5), 1),
+        "exp_avg or exp_avg_sq of xyz is missing": (_with_state(good, lambda s: s["state"][0].pop("exp_avg")), 1),
+        "exp_avg of f_dc is not like": (_with_state(good, lambda s: s["state"][1].update(exp_avg=torch.zeros(3))), 1),
+        "step of xyz": (_with_state(good, lambda s: s["state"][0].update(step="x")), 1),
+        "step of xyz is nan": (_with_state(good, lambda s: s["state"][0].update(step=torch.tensor(torch.nan))), 1),
+        "groups are others": (_with_state(good, lambda s: s["param_groups"].pop()), 1),
+    }
+    for words, content in cases.items():
+        torch.save(content, tmp_path / "wrong.pth")
+        with pytest.raises(UserError, match=words) as caught:
+            model(2).restore(load_checkpoint(tmp_path / "wrong.pth")[0], options())
+        assert "\n" not in str(caught.value), words
+    torch.save((good, 1), tmp_path / "good.pth")
+    model(2).restore(load_checkpoint(tmp_path / "good.pth")[0], options())
+    with pytest.raises(UserError, match="active SH degree"):
+        model(2, degree=0).restore(_changed(model(4, degree=0).capture(), 0, 3), options())
+
+
+@pytest.mark.skipif(resource is None, reason="this system has no limits of file sizes")
+def test_a_full_disk_ends_in_a_sentence(tmp_path):
+    capture = model(2000).capture()
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (50_000, before[1]))
+    try:
+        with pytest.raises(UserError, match="cannot write .*chkpnt1.pth"):
+            save_checkpoint(tmp_path / "chkpnt1.pth", capture, 1)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert list(tmp_path.iterdir()) == []

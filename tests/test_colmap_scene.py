@@ -4,6 +4,7 @@ import argparse
 import json
 import os
 import shutil
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -16,7 +17,7 @@ from PIL import Image
 from synthetic import CENTER, FOCAL, FakeGaussians, folder_state, make_colmap_scene
 
 from arguments import ModelParams
-from scene import Scene, picture_device
+from scene import Scene, colmap_loader, picture_device
 from scene.dataset_readers import readColmapSceneInfo, scene_extent
 from scene.point_cloud import read_point_cloud, write_point_cloud
 from utils.system_utils import UserError
@@ -416,3 +417,47 @@ def test_real_scenes(shared_dir, tmp_path, name, views, held, points, extent):
 def test_distorted_cameras_are_refused(shared_dir, name, model):
     with pytest.raises(UserError, match=f"has the camera model {model}, .*undistort"):
         _read(shared_dir / "scenes" / name)
+
+
+@pytest.mark.parametrize("place", [".", "out", "images/deep/out", "../colmap_scene/out"])
+def test_nothing_is_written_into_the_dataset(colmap_scene, place):
+    before = folder_state(colmap_scene)
+    with pytest.raises(UserError, match="lies in the scene folder .*; name another with -m"):
+        Scene(_options(colmap_scene, colmap_scene / place), FakeGaussians())
+    assert folder_state(colmap_scene) == before
+    Scene(_options(colmap_scene, colmap_scene.parent / "colmap_scene_out"), FakeGaussians())
+
+
+def test_a_model_kept_in_the_dataset_can_be_used_without_the_cloud(colmap_scene):
+    ply = colmap_scene / "out" / "point_cloud" / "iteration_7" / "point_cloud.ply"
+    FakeGaussians().save_ply(str(ply))
+    (colmap_scene / "sparse" / "0" / "points3D.ply").write_text("no PLY")
+    options = _options(colmap_scene, colmap_scene / "out", init_pcd_path="absent.ply")
+    scene = Scene(options, FakeGaussians(), load_iteration=-1)
+    assert scene.gaussians.loaded == str(ply)
+    assert scene.cameras_extent == pytest.approx(scene_extent(_read_cameras(colmap_scene)))
+
+
+def _read_cameras(scene: Path):
+    return readColmapSceneInfo(scene, "images", False, want_cloud=False).train_cameras
+
+
+def test_poses_that_are_not_finite_are_named(colmap_scene, monkeypatch):
+    model = colmap_loader.read_model(colmap_scene / "sparse" / "0")
+    for part in ("rotation", "translation"):
+        views = list(model.views)
+        views[3] = views[3]._replace(**{part: np.full_like(getattr(views[3], part), np.nan)})
+        monkeypatch.setattr(colmap_loader, "read_model", lambda _, views=views: model._replace(views=views))
+        with pytest.raises(UserError, match=f"pose of {views[3].name} is not finite"):
+            _read(colmap_scene)
+
+
+def test_sigterm_stays_quiet_after_a_model_was_read(colmap_scene):
+    script = (
+        "import os, signal, sys\nfrom pathlib import Path\nfrom scene.colmap_loader import read_model\n"
+        "read_model(Path(sys.argv[1]))\nos.kill(os.getpid(), signal.SIGTERM)\n"
+    )
+    command = [sys.executable, "-c", script, str(colmap_scene / "sparse" / "0")]
+    done = subprocess.run(command, cwd=Path(__file__).parents[1], capture_output=True, check=False)
+    # pycolmap's import alone would have glog dump the stack (status the same).
+    assert (done.returncode, done.stderr) == (-signal.SIGTERM, b"")

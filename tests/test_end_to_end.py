@@ -133,7 +133,8 @@ def test_skipped_views_are_not_even_opened(trained, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("command", "words"), [("render.py", "no model folder given"), ("render.py -m nowhere", "cfg_args")]
+    ("command", "words"),
+    [("render.py", "no model folder given"), ("render.py -m nowhere", "no such model folder: nowhere")],
 )
 def test_no_model(command, words):
     done = call(*command.split())

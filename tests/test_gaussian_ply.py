@@ -120,7 +120,7 @@ def test_a_failed_write_leaves_no_file(tmp_path, monkeypatch):
     def fail(*_: object, **__: object) -> None:
         raise OSError("disk full")
 
-    monkeypatch.setattr("scene.gaussian_ply.np.zeros", fail)
-    with pytest.raises(OSError, match="disk full"):
+    monkeypatch.setattr("utils.system_utils.os.replace", fail)
+    with pytest.raises(UserError, match="cannot write .*disk full"):
         gaussians.save_ply(tmp_path / "point_cloud.ply")
     assert not list(tmp_path.iterdir())

@@ -35,6 +35,30 @@ def test_training_size(file, r, size):
     assert training_size(*file, r) == size
 
 
+@pytest.mark.parametrize("r", [16385, 100_000_000, 10**400], ids=["next", "huge", "beyond float"])
+def test_absurd_widths_are_refused(r):
+    with pytest.raises(UserError, match=r"-r\) 1\d+ is too wide; the most is 16384"):
+        training_size(48, 32, r)
+
+
+def test_absurd_heights_are_refused():
+    assert training_size(10, 20, 8192) == (8192, 16384)
+    with pytest.raises(UserError, match=r"10 x 30 pixels would train at 8192 x 24576 with --resolution \(-r\) 8192"):
+        training_size(10, 30, 8192)
+    with pytest.raises(UserError, match="would train at 100 x 20000"):
+        training_size(100, 20_000, -1)
+
+
+def test_too_little_memory_names_the_picture_and_its_size(tmp_path, monkeypatch):
+    def full(*_):
+        raise MemoryError
+
+    Image.fromarray(_noise((4, 6, 3))).save(tmp_path / "a.png")
+    monkeypatch.setattr(Image.Image, "resize", full)
+    with pytest.raises(UserError, match="memory for the picture .*a.png at 12 x 8 pixels"):
+        decode(tmp_path / "a.png", (12, 8))
+
+
 def test_resolution_scale_divides_further():
     assert training_size(1601, 901, 2, 2.0) == (400, 225)
     assert training_size(1000, 500, -1, 2.0) == (500, 250)

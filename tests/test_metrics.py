@@ -15,7 +15,7 @@ from PIL import Image
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 import metrics
-from utils import lpips_utils
+from utils import image_files, lpips_utils
 from utils.lpips_utils import LpipsUnavailable, PerceptualDistance, import_lpips
 from utils.system_utils import UserError, run_cli
 
@@ -315,3 +315,14 @@ def test_a_missing_model_ends_with_a_sentence_and_status_2(tmp_path):
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120)
     assert (done.returncode, done.stdout) == (2, "")
     assert done.stderr == f"error: no such model folder: {tmp_path / 'nowhere'}\n"
+
+
+def test_images_beyond_pillows_limit_are_scored_and_absurd_ones_refused(run, tmp_path, monkeypatch):
+    model = make_model(tmp_path / "model")
+    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 56 * 40 // 3)
+    status, _, err = run("-m", model, "--lpips_net", "alex")
+    assert status == 0, err
+    assert Image.MAX_IMAGE_PIXELS == 56 * 40 // 3
+    monkeypatch.setattr(image_files, "MOST_PIXELS", 56 * 40 - 1)
+    status, _, err = run("-m", model)
+    assert status == 2 and "00000.png is not a readable image" in err

@@ -8,6 +8,10 @@ import pytest
 import torch
 from PIL import Image
 
+from scene.gaussian_attributes import attributes
+from scene.gaussian_ply import write_ply
+from utils.system_utils import UserError
+
 render = pytest.importorskip("render", reason="the extensions are not built: make test")
 
 
@@ -72,5 +76,24 @@ def test_pngs_of_an_earlier_larger_run_are_removed_and_nothing_else(tmp_path, re
     assert sorted(file.name for file in (tmp_path / "gt").iterdir()) == ["00000.png", "notes.png"]
 
 
-def test_no_views_no_time(tmp_path):
-    assert render.render_set(tmp_path / "test" / "ours_1", [], None, Namespace(), torch.zeros(3)) == []
+def test_without_views_no_folders_appear_and_old_renders_go(tmp_path, rendered, capsys):
+    folder = tmp_path / "test" / "ours_1"
+    assert render.render_set(folder, [], None, Namespace(), torch.zeros(3)) == []
+    assert not (tmp_path / "test").exists()
+    one = view(torch.zeros(3, 4, 4, dtype=torch.uint8))
+    rendered[id(one)] = torch.zeros(3, 4, 4)
+    render.render_set(folder, [one], None, Namespace(), torch.zeros(3))
+    capsys.readouterr()
+    render.render_set(folder, [], None, Namespace(), torch.zeros(3))
+    assert list(folder.rglob("*.png")) == []
+    assert capsys.readouterr().err == ""  # no progress bar of nothing
+
+
+def test_a_model_without_gaussians_is_refused(tmp_path, colmap_scene, monkeypatch):
+    rows = {name: torch.zeros(0, *attribute.shape) for name, attribute in attributes(3).items()}
+    write_ply(tmp_path / "model" / "point_cloud" / "iteration_7" / "point_cloud.ply", rows, 3)
+    (tmp_path / "model" / "cfg_args").write_text(f"Namespace(sh_degree=3, source_path={str(colmap_scene)!r})")
+    monkeypatch.setattr("sys.argv", ["render.py", "-m", str(tmp_path / "model")])
+    with pytest.raises(UserError, match="iteration 7 of .* has no Gaussians"):
+        render.main()
+    assert sorted(path.name for path in (tmp_path / "model").iterdir()) == ["cfg_args", "point_cloud"]

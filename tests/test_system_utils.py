@@ -1,5 +1,7 @@
 """Files, exit statuses and the choice of device."""
 
+import errno
+import os
 import signal
 import subprocess
 import sys
@@ -9,7 +11,17 @@ import pytest
 import torch
 
 from utils import system_utils
-from utils.system_utils import UserError, atomic_write, mkdir_p, run_cli, saved_iterations, searchForMaxIteration
+from utils.system_utils import (
+    Terminated,
+    UserError,
+    atomic_write,
+    mkdir_p,
+    run_cli,
+    saved_iterations,
+    searchForMaxIteration,
+)
+
+ROOT = Path(__file__).resolve().parents[1]
 
 
 def _raise(error: BaseException):
@@ -18,7 +30,11 @@ def _raise(error: BaseException):
 
 @pytest.mark.parametrize(
     ("error", "status", "said"),
-    [(UserError("mend it like this"), 2, "error: mend it like this\n"), (KeyboardInterrupt(), 130, "interrupted\n")],
+    [
+        (UserError("mend it like this"), 2, "error: mend it like this\n"),
+        (KeyboardInterrupt(), 130, "interrupted\n"),
+        (Terminated(), 143, "terminated\n"),
+    ],
 )
 def test_run_cli_says_one_line_and_exits(error, status, said, capsys):
     with pytest.raises(SystemExit) as exit_info:
@@ -30,6 +46,31 @@ def test_run_cli_says_one_line_and_exits(error, status, said, capsys):
 def test_run_cli_leaves_bugs_their_traceback():
     with pytest.raises(ZeroDivisionError):
         run_cli(lambda: 1 / 0)
+
+
+@pytest.mark.parametrize("line", ["print('a')", "print('a', flush=True)", "print('a', flush=True, file=sys.stderr)"])
+def test_a_reader_that_went_away_is_no_traceback(line):
+    script = (
+        "import sys\nfrom utils.system_utils import run_cli\nsys.stdin.read()\n"
+        f"def main():\n    {line}\nrun_cli(main)\n"
+    )
+    broken = "stderr" if "stderr" in line else "stdout"
+    pipes = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.PIPE)
+    with subprocess.Popen([sys.executable, "-c", script], cwd=ROOT, **pipes) as run:
+        getattr(run, broken).close()
+        run.stdin.close()
+        said = (run.stdout if broken == "stderr" else run.stderr).read()
+        assert (run.wait(60), said) == (141, b"")
+
+
+def test_a_refused_write_names_the_target_and_leaves_nothing(tmp_path):
+    (tmp_path / "results.json").mkdir()
+    refused = pytest.raises(UserError, match=r"cannot write .*results.json \(Is a directory\); free space")
+    with refused, atomic_write(tmp_path / "results.json") as path:
+        path.write_text("{}")
+    with pytest.raises(UserError, match="cannot write .*new.json .No space left"), atomic_write(tmp_path / "new.json"):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    assert [path.name for path in tmp_path.iterdir()] == ["results.json"]
 
 
 def test_atomic_write_replaces_only_when_the_block_ends_well(tmp_path):
@@ -56,8 +97,7 @@ def test_a_killed_writer_leaves_the_old_file(tmp_path):
         "    path.write_text('ha')\n"
         "    os.kill(os.getpid(), signal.SIGKILL)\n"
     )
-    root = Path(__file__).resolve().parents[1]
-    done = subprocess.run([sys.executable, "-c", script, str(target)], cwd=root, check=False)
+    done = subprocess.run([sys.executable, "-c", script, str(target)], cwd=ROOT, check=False)
     assert done.returncode == -signal.SIGKILL
     assert target.read_text() == "old"
 

@@ -19,6 +19,7 @@ from scene.checkpoint import load_checkpoint
 from scene.gaussian_model import GaussianModel
 from scene.point_cloud import write_point_cloud
 from utils.system_utils import UserError
+from utils.training_log import Stopwatch, TrainingLog
 
 ROOT = Path(__file__).parents[1]
 SMALL = ["-r", "24", "--test_iterations", "-1"]
@@ -204,10 +205,15 @@ def test_interrupt_saves_a_checkpoint_that_goes_on_to_the_same_end(colmap_scene,
     )
     assert resumed.read_bytes() == whole.read_bytes()
     log = json.loads((tmp_path / "cut" / "train_log.json").read_text())
-    assert [record["iteration"] for record in log] == [9]
+    assert [record["iteration"] for record in log] == [4, 9]
+    whole_log = json.loads((tmp_path / "whole" / "train_log.json").read_text())
+    assert log[1]["seconds"] > log[0]["seconds"] > 0 and log[1]["gaussians"] == whole_log[0]["gaussians"]
+    assert log[1]["loss"] == whole_log[0]["loss"]  # the running mean goes on where it was
 
 
-@pytest.mark.parametrize(("sent", "status"), [(signal.SIGINT, 130), (signal.SIGKILL, -signal.SIGKILL)])
+@pytest.mark.parametrize(
+    ("sent", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGKILL, -signal.SIGKILL)]
+)
 def test_a_killed_run_leaves_whole_files(colmap_scene, tmp_path, sent, status):
     every = list(map(str, range(1, 3000)))
     command = [sys.executable, "train.py", "-s", colmap_scene, "-m", tmp_path / "out", "--iterations", "100000", *SMALL,
@@ -219,7 +225,9 @@ def test_a_killed_run_leaves_whole_files(colmap_scene, tmp_path, sent, status):
         run.send_signal(sent)
         _, error = run.communicate(timeout=60)
     assert run.returncode == status, error.decode()
-    assert b"Traceback" not in error
+    assert b"Traceback" not in error and b"***" not in error  # glog's stack dumps have such lines
+    if sent == signal.SIGTERM:
+        assert b"go on with --start_checkpoint" in error
     plys = list((tmp_path / "out" / "point_cloud").glob("iteration_*/point_cloud.ply"))
     assert len(plys) >= 20
     for ply in plys:
@@ -239,6 +247,8 @@ def test_refusals_before_anything_is_written(colmap_scene, tmp_path):
         "leaves nothing to do": ["--start_checkpoint", checkpoint, "--iterations", 2],
         "save_iterations": ["--save_iterations", 0],
         "checkpoint_iterations": ["--checkpoint_iterations", -5],
+        "--test_iterations counts from 1": ["--test_iterations", 0],
+        "-r) 100000 is too wide": ["-r", 100_000],
         "--iterations": ["--iterations", -1],
         "absent": ["-s", tmp_path / "absent"],
     }
@@ -246,9 +256,68 @@ def test_refusals_before_anything_is_written(colmap_scene, tmp_path):
         with pytest.raises(UserError, match=re.escape(words)):
             _train(colmap_scene, out, *options, iterations=5)
         assert not out.exists(), words
-    with pytest.raises(UserError, match="sh_degree"):
-        _train(colmap_scene, out, "--start_checkpoint", checkpoint, "--sh_degree", 1, iterations=5)
-    assert not (out / "cfg_args").exists()
+    empty = tmp_path / "empty.ply"
+    write_point_cloud(empty, np.zeros((0, 3)), np.zeros((0, 3)))
+    for words, options in {
+        "sh_degree": ["--start_checkpoint", checkpoint, "--sh_degree", 1],
+        "no points": ["--init_pcd_path", empty],
+    }.items():
+        with pytest.raises(UserError, match=words):
+            _train(colmap_scene, out, *options, iterations=5)
+        assert not out.exists(), words
+
+
+def test_a_resumed_run_keeps_the_inputs_of_its_folder(colmap_scene, tmp_path):
+    out = tmp_path / "out"
+    _train(colmap_scene, out, "--checkpoint_iterations", 2, iterations=2)
+    (out / "cameras.json").write_text("mine")
+    checkpoint = out / "chkpnt2.pth"
+    _train(colmap_scene, out, "--start_checkpoint", checkpoint, iterations=3)
+    assert (out / "cameras.json").read_text() == "mine"
+    _train(colmap_scene, tmp_path / "new", "--start_checkpoint", checkpoint, iterations=3)
+    assert (tmp_path / "new" / "cameras.json").exists() and (tmp_path / "new" / "input.ply").exists()
+
+
+@pytest.mark.parametrize("content", ["{broken", '[{"iter": 1}]', "5", '[{"iteration": 1, "seconds": "x"}]', "\xff"])
+def test_a_damaged_log_is_no_reason_to_stop(tmp_path, capsys, content):
+    path = tmp_path / "train_log.json"
+    path.write_bytes(content.encode("latin-1"))
+    log = TrainingLog(tmp_path, 5)
+    assert re.fullmatch(r"warning: .*train_log.json cannot be read .*\n", capsys.readouterr().err)
+    log.add(6, 1.5, loss=0.25)
+    log.add(6, 2.5, loss=0.5, gaussians=3)
+    assert json.loads(path.read_text()) == [{"iteration": 6, "seconds": 2.5, "loss": 0.5, "gaussians": 3}]
+    again = TrainingLog(tmp_path, 6)
+    assert again.loss == 0.5
+    again.add(7, 1.0)
+    assert again.records[-1]["seconds"] == 3.5
+
+
+def test_a_stopwatch_pauses_also_when_something_fails():
+    clock = Stopwatch()
+    with pytest.raises(ZeroDivisionError), clock.paused():
+        time.sleep(0.2)
+        _ = 1 / 0
+    assert clock.seconds < 0.1
+
+
+def test_a_diverged_model_is_not_saved(colmap_scene, tmp_path):
+    for option, name in (("--scaling_lr", "scaling"), ("--position_lr_init", "xyz")):
+        out = tmp_path / name
+        with pytest.raises(UserError, match=rf"{name} of \d+ of 300 Gaussians in iteration \d+ is not finite"):
+            _train(
+                colmap_scene, out, option, "3e38", "--position_lr_final", "3e38", "--checkpoint_iterations", 4,
+                "--save_iterations", 5, iterations=5,
+            )  # fmt: skip
+        assert not (out / "point_cloud").exists() and not list(out.glob("*.pth"))
+
+
+def test_a_new_folder_is_said_before_the_training(colmap_scene, tmp_path, monkeypatch, capfd):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("OAR_JOB_ID", "job")
+    train.main(["-s", str(colmap_scene), "--iterations", "1", *SMALL])
+    assert re.search(r"^Optimizing ./output/job ", capfd.readouterr().out, re.MULTILINE)
+    assert (tmp_path / "output" / "job" / "cfg_args").is_file()
 
 
 def test_a_late_reset_is_announced(colmap_scene, tmp_path, capfd):
@@ -307,3 +376,9 @@ def test_seconds_leave_evaluation_and_saving_out(colmap_scene, tmp_path, monkeyp
     log = json.loads((tmp_path / "train_log.json").read_text())
     # Four evaluations take 2 s, four iterations some 20 ms; the first also loads parts of torch.
     assert log[-1]["seconds"] - log[0]["seconds"] < 0.4
+
+
+def test_minus_one_saves_the_last_iteration_only(colmap_scene, tmp_path):
+    _train(colmap_scene, tmp_path, "--save_iterations", -1, "--checkpoint_iterations", -1, iterations=2)
+    assert [path.name for path in (tmp_path / "point_cloud").iterdir()] == ["iteration_2"]
+    assert not list(tmp_path.glob("*.pth"))

@@ -10,11 +10,11 @@ NEWEST = 0.4  # weight of the newest loss in the running mean, the reference's
 class LossWatch:
     """Takes a loss per iteration without waiting for it; `read` waits once for all of them.
 
-    mean: exponential running mean of all that were read.
+    mean: exponential running mean of all that were read, from the given one on (of the run before, or 0).
     """
 
-    def __init__(self, device: torch.device | str) -> None:
-        self.mean = 0.0
+    def __init__(self, device: torch.device | str, mean: float = 0.0) -> None:
+        self.mean = mean
         self._losses = torch.empty(CAPACITY, device=device)
         self._iterations: list[int] = []
 

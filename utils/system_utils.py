@@ -16,16 +16,41 @@ class UserError(Exception):
     """Something the user can mend. Its text is one sentence that names the thing and the remedy."""
 
 
+class Terminated(KeyboardInterrupt):
+    """SIGTERM, where it is treated as Ctrl-C is."""
+
+
 def run_cli(main: Callable[[], object]) -> None:
-    """Run a command line: a UserError prints its sentence and exits 2, Ctrl-C exits 130, a bug keeps its traceback."""
+    """Run a command line: a UserError prints its sentence and exits 2; a bug keeps its traceback.
+
+    As shells count signals: Ctrl-C exits 130, SIGTERM 143, and a reader of the output that went away (`| head`) 141.
+    """
+    try:
+        status = _status(main)
+        sys.stdout.flush()  # here, where a broken pipe can still be caught
+    except BrokenPipeError:
+        # Python flushes both once more on its way out, and either may be the broken pipe.
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        for stream in (sys.__stdout__, sys.__stderr__):
+            os.dup2(nowhere, stream.fileno())
+        status = 141
+    if status:
+        sys.exit(status)
+
+
+def _status(main: Callable[[], object]) -> int:
     try:
         main()
     except UserError as error:
         print(f"error: {error}", file=sys.stderr)
-        sys.exit(2)
+        return 2
+    except Terminated:
+        print("terminated", file=sys.stderr)
+        return 143
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
-        sys.exit(130)
+        return 130
+    return 0
 
 
 @contextlib.contextmanager
@@ -33,6 +58,7 @@ def atomic_write(path: str | os.PathLike) -> Iterator[Path]:
     """Yield a temporary path beside `path`, with its suffix; rename it to `path` when the block ends well, else drop.
 
     Makes the folder when it is missing. A killed process may leave the hidden temporary file, never half a `path`.
+    An OSError of the block or the renaming (disk full, `path` is a folder) becomes a UserError.
     """
     target = Path(path)
     mkdir_p(target.parent)
@@ -40,8 +66,14 @@ def atomic_write(path: str | os.PathLike) -> Iterator[Path]:
     try:
         yield temporary
         os.replace(temporary, target)
-    except BaseException:
-        temporary.unlink(missing_ok=True)
+    except BaseException as error:
+        with contextlib.suppress(OSError):
+            temporary.unlink()
+        if isinstance(error, OSError):
+            reason = error.strerror or error
+            raise UserError(
+                f"cannot write {target} ({reason}); free space, mend the rights, or choose another place"
+            ) from error
         raise
 
 

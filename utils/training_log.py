@@ -1,8 +1,9 @@
-"""train_log.json: error against run time, one record per tested or saved iteration."""
+"""train_log.json: error against run time, one record per tested or saved iteration and checkpoint."""
 
 import json
 import math
 import os
+import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -26,8 +27,10 @@ class Stopwatch:
     @contextmanager
     def paused(self) -> Iterator[None]:
         before = time.perf_counter()
-        yield
-        self._start += time.perf_counter() - before
+        try:
+            yield
+        finally:
+            self._start += time.perf_counter() - before
 
 
 class TrainingLog:
@@ -42,13 +45,37 @@ class TrainingLog:
         self._path = Path(model_path) / NAME
         self.records: list[dict] = []
         if first_iteration > 0 and self._path.is_file():
-            self.records = [r for r in json.loads(self._path.read_text()) if r["iteration"] <= first_iteration]
+            self.records = [r for r in _read(self._path) if r["iteration"] <= first_iteration]
         self._seconds_before = self.records[-1]["seconds"] if self.records else 0.0
 
+    @property
+    def loss(self) -> float:
+        """Running mean of the last record, 0 where there is none."""
+        return (self.records[-1].get("loss") if self.records else None) or 0.0
+
     def add(self, iteration: int, seconds: float, **values: float) -> None:
-        """Append a record; a value that is not finite (PSNR of equal images) becomes null."""
+        """Append a record, or add to that of the same iteration.
+
+        A value that is not finite (PSNR of equal images) becomes null.
+        """
         record = {name: value if math.isfinite(value) else None for name, value in values.items()}
         record |= {"iteration": iteration, "seconds": round(self._seconds_before + seconds, 3)}
+        if self.records and self.records[-1]["iteration"] == iteration:
+            record = self.records.pop() | record
         self.records.append(record)
         with atomic_write(self._path) as temporary:
             temporary.write_text(json.dumps(self.records, indent=1, sort_keys=True, allow_nan=False) + "\n")
+
+
+def _read(path: Path) -> list[dict]:
+    """Records of a log; none, with a warning, where the file is damaged: it is no reason to stop a training."""
+    try:
+        records = json.loads(path.read_text(encoding="utf-8"))
+        if not all(isinstance(r["iteration"], int) and math.isfinite(r["seconds"]) for r in records):
+            raise ValueError
+        if not all(math.isfinite(r.get("loss") or 0.0) for r in records):
+            raise ValueError
+    except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError):
+        print(f"warning: {path} cannot be read as a training log; a new one is started", file=sys.stderr)
+        return []
+    return records

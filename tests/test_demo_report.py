@@ -1,0 +1,83 @@
+"""The demo's report: its table and sheet, and a sentence for every part of a model that is missing or damaged."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from demo import report
+from utils.system_utils import UserError
+
+RESULTS = {"ours_30": {"SSIM": 0.5, "PSNR": 20.0, "LPIPS": None}}
+PER_VIEW = {"ours_30": {"PSNR": {"00000.png": 19.0, "00001.png": 21.0}}}
+
+
+@pytest.fixture
+def model(tmp_path: Path) -> Path:
+    """A model folder as train.py, render.py and metrics.py leave it."""
+    folder = tmp_path / "model"
+    ply = folder / "point_cloud" / "iteration_30" / "point_cloud.ply"
+    ply.parent.mkdir(parents=True)
+    ply.write_bytes(b"ply\nformat binary_little_endian 1.0\nelement vertex 123\nend_header\n")
+    for side in ("renders", "gt"):
+        (folder / "test" / "ours_30" / side).mkdir(parents=True)
+        for name in PER_VIEW["ours_30"]["PSNR"]:
+            Image.fromarray(np.zeros((20, 30, 3), np.uint8)).save(folder / "test" / "ours_30" / side / name)
+    (folder / "cfg_args").write_text("Namespace(source_path='/data/garden')")
+    (folder / "results.json").write_text(json.dumps(RESULTS))
+    (folder / "per_view.json").write_text(json.dumps(PER_VIEW))
+    (folder / "train_log.json").write_text(json.dumps([{"iteration": 30, "seconds": 12.4, "gaussians": 123}]))
+    return folder
+
+
+@pytest.fixture
+def run(model, monkeypatch):
+    def command() -> None:
+        monkeypatch.setattr("sys.argv", ["report", str(model)])
+        report.main()
+
+    return command
+
+
+@pytest.mark.filterwarnings("error::ResourceWarning")
+def test_table_and_sheet(run, model, capsys):
+    run()
+    cells = capsys.readouterr().out.splitlines()[1].split()
+    assert cells == ["garden", "30", "12", "s", "123", "2", "20.00", "dB", "0.5000"]
+    with Image.open(model / "contact_sheet.png") as sheet:
+        assert sheet.width > 90
+
+
+@pytest.mark.parametrize("text", ["{broken", '[{"iter": 1}]', "7", '[{"iteration": 30, "seconds": "x"}]', "{}"])
+def test_a_damaged_log_only_costs_the_time(run, model, capsys, text):
+    (model / "train_log.json").write_text(text)
+    run()
+    printed = capsys.readouterr()
+    assert "garden" in printed.out and "12 s" not in printed.out
+    assert ("train_log.json is damaged" in printed.err) == (text != "{}")
+
+
+@pytest.mark.parametrize("name", ["results.json", "per_view.json"])
+@pytest.mark.parametrize(
+    "text", ["[]", "{", '{"ours_30": []}', '{"ours_30": {"PSNR": {}}}', '{"ours_30": {"PSNR": "x", "SSIM": 1}}']
+)
+def test_damaged_scores_are_named(run, model, name, text):
+    (model / name).write_text(text)
+    with pytest.raises(UserError, match="no scores of ours_30; run render.py and metrics.py"):
+        run()
+
+
+def test_a_missing_model_file_is_named(run, model):
+    (model / "point_cloud" / "iteration_30" / "point_cloud.ply").unlink()
+    with pytest.raises(UserError, match="cannot read .*point_cloud.ply"):
+        run()
+    assert not (model / "contact_sheet.png").exists()
+
+
+@pytest.mark.parametrize("damage", [Path.unlink, lambda path: path.write_bytes(path.read_bytes()[:40])])
+def test_missing_and_damaged_pictures_are_named(run, model, damage):
+    damage(model / "test" / "ours_30" / "gt" / "00001.png")
+    with pytest.raises(UserError, match="gt/00001.png is missing or damaged; run render.py"):
+        run()
