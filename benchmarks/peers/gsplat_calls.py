@@ -42,7 +42,8 @@ class GsplatCalls:
         self.camera = {
             "viewmats": settings.viewmatrix.T[None].contiguous(),
             "Ks": torch.tensor([rows], device=self.gradient.device),
-            "backgrounds": settings.bg[None],
+            # gsplat 1.5.3 checks the background's shape against its packed means, which have no dimension for cameras.
+            "backgrounds": settings.bg if packed else settings.bg[None],
             "width": scene.width,
             "height": scene.height,
         }

@@ -37,14 +37,21 @@ struct Scene {
   Image image;
 };
 
+// All that a GPU's emission reads of a splat, in one sector of memory: it visits splats in the order of their depth.
+struct alignas(32) TileRecord {
+  uint64_t mask;  // which tiles of a rectangle of at most 64 are reached, a bit each in its order
+  uint16_t x0, y0, x1, y1;
+  int32_t count;
+};
+
 template <class T>
 struct Projected {
   T* splats;             // (N, 10), Splat in math/splat.h; undefined where tile_counts is 0
   T* depths;             // (N)
-  int32_t* rects;        // (N, 4) tiles x0 y0 x1 y1
+  int32_t* rects;        // (N, 4) tiles x0 y0 x1 y1; null where there are records
   int32_t* tile_counts;  // (N)
   int32_t* radii;        // (N)
-  uint64_t* tile_masks;  // (N), or null: which tiles of a rectangle of at most 64 are reached, a bit each in its order
+  TileRecord* records;   // (N), or null
 };
 
 // Gradients of Scene's inputs; null where not wanted. Every row is written.

@@ -2,6 +2,7 @@
 #include <ATen/ops/empty.h>
 #include <torch/library.h>
 
+#include <algorithm>
 #include <array>
 #include <limits>
 #include <type_traits>
@@ -168,28 +169,32 @@ int64_t tiles_of(gs::Image image) { return ((image.width + kTile - 1) / kTile) *
 
 struct ProjectedTensors {
   Tensor splats, depths, rects, tile_counts, radii;
-  Tensor tile_masks;  // a GPU's only
+  Tensor records;  // a GPU's only, instead of rects
   template <class T>
   gs::Projected<T> pointers() {
     return {splats.mutable_data_ptr<T>(),
             depths.mutable_data_ptr<T>(),
-            rects.mutable_data_ptr<int32_t>(),
+            rects.defined() ? rects.mutable_data_ptr<int32_t>() : nullptr,
             tile_counts.mutable_data_ptr<int32_t>(),
             radii.mutable_data_ptr<int32_t>(),
-            tile_masks.defined() ? static_cast<uint64_t*>(tile_masks.mutable_data_ptr()) : nullptr};
+            records.defined() ? static_cast<gs::TileRecord*>(records.mutable_data_ptr()) : nullptr};
   }
 };
 
-ProjectedTensors project(const SceneTensors& in) {
+// `rects`: whether the caller wants them to see; a GPU has no other use for them.
+ProjectedTensors project(const SceneTensors& in, bool rects) {
   const int64_t n = in.count();
   const auto ints = in.options().dtype(at::kInt);
-  ProjectedTensors out{at::empty({n, kSplatValues}, in.options()),
-                       at::empty({n}, in.options()),
-                       at::empty({n, 4}, ints),
-                       at::empty({n}, ints),
-                       at::empty({n}, ints),
-                       {}};
-  if (in.options().device().is_cuda()) out.tile_masks = at::empty({n}, in.options().dtype(at::kLong));
+  ProjectedTensors out;
+  out.splats = at::empty({n, kSplatValues}, in.options());
+  out.depths = at::empty({n}, in.options());
+  out.tile_counts = at::empty({n}, ints);
+  out.radii = at::empty({n}, ints);
+  const int64_t tiles_across = std::max(in.image().width, in.image().height) / kTile;
+  if (rects || !in.options().device().is_cuda() || tiles_across >= std::numeric_limits<uint16_t>::max())
+    out.rects = at::empty({n, 4}, ints);
+  else
+    out.records = at::empty({n, int64_t(sizeof(gs::TileRecord))}, in.options().dtype(at::kByte));
   with_scalar(in.dtype(), [&](auto zero) {
     using T = decltype(zero);
     RUN(T, out.splats, project, in.scene<T>(), out.pointers<T>());
@@ -376,14 +381,15 @@ using Tensors5 = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor>;
 using Tensors4 = std::tuple<Tensor, Tensor, Tensor, Tensor>;
 
 Tensors5 project_op(SCENE_PARAMETERS) {
-  const ProjectedTensors p = project(SceneTensors(SCENE_ARGUMENTS));
+  const ProjectedTensors p = project(SceneTensors(SCENE_ARGUMENTS), true);
   return {p.splats, p.depths, p.rects, p.tile_counts, p.radii};
 }
 
 Tensors4 bin_op(const Tensor& splats, const Tensor& depths, const Tensor& rects, const Tensor& tile_counts,
                 int64_t height, int64_t width, bool train) {
-  ProjectedTensors p{splats.contiguous(),      depths.contiguous(),      rects.contiguous(),
-                     tile_counts.contiguous(), tile_counts.contiguous(), {}};
+  ProjectedTensors p;
+  p.splats = splats.contiguous(), p.depths = depths.contiguous(), p.rects = rects.contiguous();
+  p.tile_counts = p.radii = tile_counts.contiguous();
   const BinnedTensors b = bin(p, {int(width), int(height)}, train);
   return {b.instances, b.slots, b.ranges, b.slot_offsets};
 }
@@ -421,7 +427,7 @@ using Rasterized = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Te
 Rasterized rasterize_op(const Tensor& /*means2d: only receives a gradient*/, SCENE_PARAMETERS, const Tensor& background,
                         bool inverse_depth, bool train) {
   const SceneTensors scene(SCENE_ARGUMENTS);
-  ProjectedTensors p = project(scene);
+  ProjectedTensors p = project(scene, false);
   BinnedTensors b = bin(p, scene.image(), train);
   BlendedTensors o = blend(p.splats, b.instances, b.ranges, background, scene.image(), inverse_depth, train);
   return {o.color,     o.transmittance, o.inverse_depth, p.radii,        p.splats, p.tile_counts,

@@ -68,18 +68,23 @@ __global__ void __launch_bounds__(kThreads)
   const int64_t k = int64_t(blockIdx.x) * kThreads + threadIdx.x;
   const int lane = threadIdx.x & 31, columns = tile_count(image.width);
   const int32_t index = k < n ? order[k] : 0;
-  const int32_t count = k < n ? in.tile_counts[index] : 0;
   TileRect rect = {0, 0, 0, 0};
-  int64_t offset = 0;
-  if (count) {
+  int32_t count = 0;
+  uint64_t mask = 0;
+  if (k < n && in.records) {
+    const TileRecord record = in.records[index];
+    rect = {record.x0, record.y0, record.x1, record.y1};
+    count = record.count, mask = record.mask;
+  } else if (k < n) {
     const int4 r = reinterpret_cast<const int4*>(in.rects)[index];
     rect = {r.x, r.y, r.z, r.w};
-    offset = offsets[k];
-    if (slot_offsets) slot_offsets[index] = offset;
+    count = in.tile_counts[index];
   }
+  if (!count) rect = {0, 0, 0, 0};
+  const int64_t offset = count ? offsets[k] : 0;
+  if (count && slot_offsets) slot_offsets[index] = offset;
   const int wide = rect.x1 - rect.x0;
-  const bool masked = in.tile_masks && count && wide * (rect.y1 - rect.y0) <= 64;
-  const uint64_t mask = masked ? in.tile_masks[index] : 0;
+  const bool masked = in.records && count && wide * (rect.y1 - rect.y0) <= 64;
 
   int32_t before = masked ? count : 0;  // masked instances of this lane and the ones before it
   for (int step = 1; step < 32; step *= 2) {

@@ -97,9 +97,10 @@ __global__ void __launch_bounds__(kThreads) project_kernel(Scene<float> s, Proje
   out.radii[i] = radius;
   out.tile_counts[i] = count;
   out.depths[i] = count ? depth : INFINITY;
+  if (out.records)
+    out.records[i] = {mask, uint16_t(rect.x0), uint16_t(rect.y0), uint16_t(rect.x1), uint16_t(rect.y1), count};
   if (!count) return;
-  if (out.tile_masks) out.tile_masks[i] = mask;
-  reinterpret_cast<int4*>(out.rects)[i] = make_int4(rect.x0, rect.y0, rect.x1, rect.y1);
+  if (out.rects) reinterpret_cast<int4*>(out.rects)[i] = make_int4(rect.x0, rect.y0, rect.x1, rect.y1);
   float2* to = reinterpret_cast<float2*>(out.splats + kSplatValues * i);
   to[0] = make_float2(splat.x, splat.y);
   to[1] = make_float2(splat.l11, splat.l12);
