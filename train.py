@@ -250,12 +250,12 @@ def training_report(
     renderFunc: Callable[..., dict[str, Tensor]],
     renderArgs: tuple,
 ) -> dict[str, float]:
-    """Log this iteration to TensorBoard; in a testing iteration score test views and five training views, and print.
+    """Log every tenth iteration to TensorBoard; in a testing iteration score test views and five training views, and print.
 
     elapsed: seconds of this iteration; renderArgs: what follows camera and model in renderFunc, (pipe, background).
     Returns `<set>_l1` and `<set>_psnr` (dB, mean over views and channels) of the sets scored, {} otherwise.
     """
-    if tb_writer:
+    if tb_writer and iteration % BAR_INTERVAL == 0:  # not always: reading a loss waits for the GPU
         tb_writer.add_scalar("train_loss_patches/l1_loss", l1.item(), iteration)
         tb_writer.add_scalar("train_loss_patches/total_loss", loss.item(), iteration)
         tb_writer.add_scalar("iter_time", elapsed * 1000.0, iteration)
