@@ -250,7 +250,7 @@ def training_report(
     renderFunc: Callable[..., dict[str, Tensor]],
     renderArgs: tuple,
 ) -> dict[str, float]:
-    """Log every tenth iteration to TensorBoard; in a testing iteration score test views and five training views, and print.
+    """Log every tenth iteration to TensorBoard; in a testing one score test views and five training views, and print.
 
     elapsed: seconds of this iteration; renderArgs: what follows camera and model in renderFunc, (pipe, background).
     Returns `<set>_l1` and `<set>_psnr` (dB, mean over views and channels) of the sets scored, {} otherwise.
