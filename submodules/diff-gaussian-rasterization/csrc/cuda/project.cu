@@ -18,7 +18,7 @@ constexpr int kRest = 3 * (sh_count(kMaxShDegree) - 1);  // 45 values: odd, so r
 dim3 blocks_for(int64_t n) { return dim3(unsigned((n + kThreads - 1) / kThreads)); }
 
 // The warp's rows of sh_rest: those `wanted` (a bit per lane), `values` of each, start to flow into shared memory.
-// Nobody waits for a load: 32 rows one after the other took three times as long as all else.
+// Nobody waits for one row before asking for the next.
 __device__ void fetch_rows(const float* global, int64_t first, int64_t stride, int values, unsigned wanted,
                            float* rows) {
   const int lane = threadIdx.x & 31;

@@ -49,7 +49,7 @@ GS_HD V capped(V alpha, T cap = T(kMaxAlpha)) {
   return alpha < cap ? alpha : V{} + cap;
 }
 
-// a / b; on a GPU by the hardware's reciprocal, 2 units in the last place and unbiased.
+// a / b; on a GPU by the hardware's reciprocal, good to 2 units in the last place.
 template <class V>
 GS_HD V quotient(V a, V b) {
 #ifdef __CUDA_ARCH__
