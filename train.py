@@ -25,12 +25,14 @@ from scene.cameras import Camera
 from scene.checkpoint import load_checkpoint, save_checkpoint
 from scene.gaussian_model import GaussianModel
 from utils.counter_rng import Stream, permutation, uniform
+from utils.curve_recorder import CurveRecorder, evenly_spread
+from utils.error_curve import Row, continue_curve
 from utils.general_utils import safe_state
 from utils.image_utils import as_float, psnr
 from utils.interrupt import DeferredInterrupt
 from utils.loss_utils import l1_loss, photometric_loss
 from utils.loss_watch import LossWatch
-from utils.system_utils import UserError, compute_device, mkdir_p, run_cli
+from utils.system_utils import UserError, compute_device, mkdir_p, run_cli, saved_iterations
 from utils.training_log import Stopwatch, TrainingLog
 
 try:
@@ -51,11 +53,13 @@ def training(
     checkpoint_iterations: Sequence[int],
     checkpoint: str | None,
     debug_from: int = -1,
+    record_curve: bool = True,
 ) -> None:
     """Train from the options of the three groups; write model, checkpoints and log to dataset.model_path.
 
     testing_iterations, saving_iterations, checkpoint_iterations: when to score, save the PLY, save a checkpoint.
     checkpoint: a chkpntN.pth to go on from, or None. debug_from: switch pipe.debug on after this iteration.
+    record_curve: with test views, write error_vs_time.csv as training goes, and draw it.
     """
     dataset.model_path = dataset.model_path or _new_output_folder()
     print(f"Optimizing {dataset.model_path}")
@@ -84,6 +88,10 @@ def training(
     losses = LossWatch(device, log.loss)
     # Where something is written: all losses up to there must have been looked at.
     stops = {opt.iterations, *testing_iterations, *saving_iterations, *checkpoint_iterations}
+    rows = continue_curve(scene.model_path, first_iteration)
+    curve = None
+    if record_curve and scene.getTestCameras():
+        curve = _curve(scene, rows, log, opt.iterations, testing_iterations, pipe, fixed_background)
     clock = Stopwatch()
     bar = tqdm(initial=first_iteration, total=opt.iterations, desc="Training progress", dynamic_ncols=True)
     with bar, DeferredInterrupt() as interrupt:
@@ -102,12 +110,15 @@ def training(
             loss.backward()
 
             losses.add(iteration, loss)
-            if iteration % BAR_INTERVAL == 0 or iteration in stops:
+            curve_due = curve is not None and curve.due(iteration, clock.seconds)
+            if iteration % BAR_INTERVAL == 0 or iteration in stops or curve_due:
                 _check_losses(losses.read(), views)
                 bar.set_postfix({"Loss": f"{losses.mean:.7f}", "Gaussians": len(gaussians)}, refresh=False)
                 bar.update(iteration - bar.n)
             seconds = clock.seconds
             with clock.paused():
+                if curve_due:
+                    curve.add(iteration, seconds, len(gaussians))
                 scores = training_report(
                     tb_writer, iteration, l1, loss, l1_loss, seconds - started, testing_iterations, scene, render,
                     (pipe, fixed_background),
@@ -140,6 +151,33 @@ def training(
     if tb_writer:
         tb_writer.close()
     print(f"Trained {opt.iterations - first_iteration} iterations in {clock.seconds:.1f} s, without tests and saving")
+    if curve is not None:
+        saved = {*saving_iterations} & {*saved_iterations(Path(scene.model_path) / "point_cloud")}
+        curve.finish(seconds, saved, opt.position_lr_max_steps)
+
+
+def _curve(
+    scene: Scene,
+    rows: list[Row],
+    log: TrainingLog,
+    iterations: int,
+    testing_iterations: Sequence[int],
+    pipe: argparse.Namespace,
+    background: Tensor,
+) -> CurveRecorder:
+    """Recorder of the error of all test views and as many training views."""
+    test = scene.getTestCameras()
+    return CurveRecorder(
+        scene.model_path,
+        rows,
+        log,
+        iterations,
+        testing_iterations,
+        {"test": test, "train": evenly_spread(scene.getTrainCameras(), len(test))},
+        lambda camera: render(camera, scene.gaussians, pipe, background, want_visibility=False)["render"],
+        lambda camera: camera.target(background),
+        background.device,
+    )
 
 
 def _check_losses(values: dict[int, float], views: "_ViewOrder") -> None:
@@ -307,6 +345,8 @@ def _parser() -> tuple[argparse.ArgumentParser, ModelParams, OptimizationParams,
         help="iterations that save the model besides the last, -1: none (default: 7000 30000, reference)")  # fmt: skip
     add("--checkpoint_iterations", **listed, default=[], help="iterations that save a checkpoint (default: none)")
     add("--start_checkpoint", type=str, default=None, metavar="FILE", help="chkpntN.pth to go on from (default: none)")
+    add("--no_curve", action="store_true",
+        help="no error_vs_time.csv and .png, which cost up to 5 %% of the time (default: with --eval)")  # fmt: skip
     add("--quiet", action="store_true", help="print nothing but the progress bar and errors")
     return parser, *groups
 
@@ -331,6 +371,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         args.checkpoint_iterations,
         args.start_checkpoint,
         args.debug_from,
+        not args.no_curve,
     )
     print("Training complete.")
 

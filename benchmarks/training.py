@@ -36,7 +36,7 @@ def run(script: str, *options: str) -> float:
 def train(scene: Path, model: Path, seed: int, options: list[str]) -> dict:
     """Train, render and score one model: seconds, PSNR (dB), SSIM, Gaussians, hash of the PLY."""
     arguments = ["-s", str(scene), "-m", str(model), "--eval", "--seed", str(seed)]
-    process = run("train.py", *arguments, "--test_iterations", "-1", *options)
+    process = run("train.py", *arguments, "--test_iterations", "-1", "--no_curve", *options)
     run("render.py", "-m", str(model), "--skip_train")
     run("metrics.py", "-m", str(model))
     record = json.loads((model / "train_log.json").read_text())[-1]

@@ -91,7 +91,7 @@ def test_train_help_lists_the_contracts_options(capsys):
     assert exit_info.value.code == 0
     text = capsys.readouterr().out
     run = ["ip", "port", "debug_from", "detect_anomaly", "test_iterations", "save_iterations"]
-    run += ["checkpoint_iterations", "start_checkpoint", "quiet", "disable_viewer"]
+    run += ["checkpoint_iterations", "start_checkpoint", "quiet", "disable_viewer", "no_curve"]
     missing = [name for name in [*MODEL, *PIPELINE, *OPTIMISATION, *OURS, *run] if f"--{name}" not in text]
     assert missing == []
 

@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from utils.process import wall_seconds
 from utils.system_utils import atomic_write
 
 NAME = "train_log.json"
@@ -37,16 +38,22 @@ class TrainingLog:
     """Records of one model folder, written whole after each addition.
 
     A record has `iteration`, `seconds` (of training, without evaluation and saving; a resumed run adds to the seconds
-    before), `gaussians`, `loss` (running mean), and per set tested `<set>_l1`, `<set>_psnr`.
+    before), `wall_seconds` (since the start of the process, likewise), `gaussians`, `loss` (running mean), and per set
+    tested `<set>_l1`, `<set>_psnr`; the last record also what the curve has cost (`utils.curve_recorder`).
+
+    first_iteration, seconds_before, wall_seconds_before: what the runs have done that this one goes on from.
     """
 
     def __init__(self, model_path: str | os.PathLike, first_iteration: int) -> None:
         """Keep an existing log's records up to `first_iteration`, which a resumed run goes on from."""
         self._path = Path(model_path) / NAME
+        self.first_iteration = first_iteration
         self.records: list[dict] = []
         if first_iteration > 0 and self._path.is_file():
             self.records = [r for r in _read(self._path) if r["iteration"] <= first_iteration]
-        self._seconds_before = self.records[-1]["seconds"] if self.records else 0.0
+        last = self.records[-1] if self.records else {"seconds": 0.0}
+        self.seconds_before = last["seconds"]
+        self.wall_seconds_before = last.get("wall_seconds") or last["seconds"]
 
     @property
     def loss(self) -> float:
@@ -59,7 +66,11 @@ class TrainingLog:
         A value that is not finite (PSNR of equal images) becomes null.
         """
         record = {name: value if math.isfinite(value) else None for name, value in values.items()}
-        record |= {"iteration": iteration, "seconds": round(self._seconds_before + seconds, 3)}
+        record |= {
+            "iteration": iteration,
+            "seconds": round(self.seconds_before + seconds, 3),
+            "wall_seconds": round(self.wall_seconds_before + wall_seconds(), 3),
+        }
         if self.records and self.records[-1]["iteration"] == iteration:
             record = self.records.pop() | record
         self.records.append(record)
@@ -73,7 +84,7 @@ def _read(path: Path) -> list[dict]:
         records = json.loads(path.read_text(encoding="utf-8"))
         if not all(isinstance(r["iteration"], int) and math.isfinite(r["seconds"]) for r in records):
             raise ValueError
-        if not all(math.isfinite(r.get("loss") or 0.0) for r in records):
+        if not all(math.isfinite(r.get(name) or 0.0) for r in records for name in ("loss", "wall_seconds")):
             raise ValueError
     except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError):
         print(f"warning: {path} cannot be read as a training log; a new one is started", file=sys.stderr)

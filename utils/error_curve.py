@@ -1,0 +1,91 @@
+"""error_vs_time.csv: the error of a model in training against its time, one row per scored iteration."""
+
+import contextlib
+import csv
+import math
+import os
+import sys
+from pathlib import Path
+
+from utils.system_utils import UserError, atomic_write
+
+NAME = "error_vs_time.csv"
+FIGURE = "error_vs_time.png"
+COUNTS = ("iteration", "gaussians")
+SCORES = tuple(f"{views}_{score}" for views in ("test", "train") for score in ("l1", "psnr", "ssim"))
+COLUMNS = ("iteration", "seconds", "wall_seconds", "gaussians", "peak_memory_mib", *SCORES)
+
+Row = dict[str, float | None]
+
+
+def read_curve(path: str | os.PathLike) -> list[Row]:
+    """Rows of a curve's file by iteration, ascending; each has all COLUMNS, None where the field is empty.
+
+    seconds: of training, without evaluation and saving, over all resumed parts; wall_seconds: since the start of the
+    process, those of earlier parts added; peak_memory_mib: of the process so far (memory of the GPU where it trains);
+    `<views>_l1`, `<views>_psnr` (dB), `<views>_ssim`: `utils.view_scores`. UserError for what is no such file.
+    """
+    try:
+        with open(path, encoding="utf-8", newline="") as file:
+            lines = list(csv.reader(file, strict=True))
+        if not lines or lines[0] != list(COLUMNS):
+            raise ValueError("its columns are others")
+        rows = [_row(line) for line in lines[1:]]
+        iterations = [row["iteration"] for row in rows]
+        if iterations != sorted(set(iterations)):
+            raise ValueError("its iterations do not ascend")
+    except FileNotFoundError as error:
+        raise UserError(f"no curve {path}; train.py --eval records one unless --no_curve is given") from error
+    except (OSError, ValueError, csv.Error) as error:
+        raise UserError(f"{path} cannot be read as a curve ({error}); train again to have it recorded") from error
+    return rows
+
+
+def _row(fields: list[str]) -> Row:
+    row: Row = {}
+    for name, field in zip(COLUMNS, fields, strict=True):
+        value = None if field == "" else int(field) if name in COUNTS else float(field)
+        if value is None and name in ("iteration", "seconds"):
+            raise ValueError(f"a row without {name}")
+        if value is not None and not math.isfinite(value):
+            raise ValueError(f"a value is {field}")
+        row[name] = value
+    return row
+
+
+def write_curve(path: str | os.PathLike, rows: list[Row]) -> None:
+    """Write rows that have all COLUMNS. What is None or not finite (PSNR of equal images) gives an empty field."""
+    with atomic_write(path) as temporary, temporary.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(COLUMNS)
+        for row in rows:
+            values = [row[name] for name in COLUMNS]
+            writer.writerow([value if value is not None and math.isfinite(value) else "" for value in values])
+
+
+def continue_curve(model_path: str | os.PathLike, first_iteration: int) -> list[Row]:
+    """Rows up to `first_iteration`, which a run goes on from (0: from the start), of the curve in a model folder.
+
+    What the folder has beyond them is another training's and goes: rows, or the file, and the figure. A file that can't
+    be read is no reason to stop a training: it goes too, with a warning.
+    """
+    path = Path(model_path) / NAME
+    rows = []
+    with contextlib.suppress(OSError, UserError):  # what can't be removed is warned of when it is written
+        (path.parent / FIGURE).unlink(missing_ok=True)
+        if first_iteration and path.exists():
+            try:
+                rows = [row for row in read_curve(path) if row["iteration"] <= first_iteration]
+            except UserError as error:
+                print(f"warning: {error}; a new curve is started", file=sys.stderr)
+        if rows:
+            write_curve(path, rows)
+        else:
+            path.unlink(missing_ok=True)
+    return rows
+
+
+def best_test(rows: list[Row]) -> Row | None:
+    """The row with the highest PSNR of the test views, the first of equals; None where no row has one."""
+    scored = [row for row in rows if row["test_psnr"] is not None]
+    return max(scored, key=lambda row: row["test_psnr"], default=None)

@@ -1,0 +1,33 @@
+"""What the running process has used so far: seconds and memory."""
+
+import os
+import time
+from pathlib import Path
+
+import torch
+
+_IMPORTED = time.perf_counter()
+
+
+def wall_seconds() -> float:
+    """Seconds since the process started; on systems that do not tell, since the import of this module."""
+    since_import = time.perf_counter() - _IMPORTED
+    try:
+        # The command's name, in brackets, may have spaces; field 22 of proc(5) is the start in clock ticks since boot.
+        fields = Path("/proc/self/stat").read_text().rpartition(")")[2].split()
+        started = int(fields[22 - 3]) / os.sysconf("SC_CLK_TCK")
+        return max(time.clock_gettime(time.CLOCK_BOOTTIME) - started, since_import)
+    except (OSError, ValueError, IndexError, AttributeError):
+        return since_import
+
+
+def peak_memory_mib(device: torch.device) -> float | None:
+    """Most memory held so far, MiB: torch's on a GPU, else all that was resident; None on systems that do not tell."""
+    if device.type == "cuda":
+        return torch.cuda.max_memory_allocated(device) / 2**20
+    try:
+        # Not getrusage: after exec it still has the peak of the process that started this one.
+        status = Path("/proc/self/status").read_text()
+        return int(status.partition("VmHWM:")[2].split()[0]) / 2**10  # kB
+    except (OSError, ValueError, IndexError):
+        return None
