@@ -63,5 +63,16 @@ build/%: submodules/%.cpp $$(call sources,$$(firstword $$(subst /, ,$$*)))
 	$(CXX) $(CXX_TEST_FLAGS) -Isubmodules/$(firstword $(subst /, ,$*))/csrc -Isubmodules/common/include \
 	    $< $(wildcard submodules/$(firstword $(subst /, ,$*))/csrc/cpu/*.cpp) -o $@
 
+# CUDA kernels on the CPU: the .cu files, rewritten as C++, instead of a GPU.
+EMULATION := submodules/common/emulation
+build/%/csrc/tests/test_cuda_emulated: submodules/%/csrc/tests/test_cuda_emulated.cpp $(wildcard $(EMULATION)/*) \
+                                       $$(call sources,$$*)
+	@mkdir -p $(@D)/emulated
+	for kernels in submodules/$*/csrc/cuda/*.cu; do \
+	  $(PYTHON) $(EMULATION)/translate.py $$kernels $(@D)/emulated/$$(basename $$kernels .cu).cpp || exit 1; done
+	$(CXX) $(CXX_TEST_FLAGS) -Wno-unknown-pragmas -Isubmodules/$*/csrc -Isubmodules/$*/csrc/cuda -I$(EMULATION) \
+	    -Isubmodules/common/include $< $(@D)/emulated/*.cpp $(EMULATION)/emulation.cpp \
+	    $(wildcard submodules/$*/csrc/cpu/*.cpp) -o $@
+
 clean:
 	rm -rf $(VENV) build submodules/*/build submodules/*/*.egg-info

@@ -216,7 +216,7 @@ __global__ void __launch_bounds__(Backward::kThreads)
     blend_vjp_kernel(BlendInput<float> in, BlendGradient<float> g, const int32_t* processed, Compact compact) {
   constexpr int kBatch = 64, kRun = Backward::kRun;
   __shared__ Batch<kBatch> batch;
-  __shared__ float sums[Backward::kWarps][kBatch * kGradientValues];
+  __shared__ float sums[Backward::kWarps * kBatch * kGradientValues];
   __shared__ int64_t row_of[kBatch];
   const Backward at;
   const int across = tile_count(in.image.width), tile = blockIdx.x, warp = threadIdx.x / 32;
@@ -247,7 +247,7 @@ __global__ void __launch_bounds__(Backward::kThreads)
       batch.put(k, in.splats, in.instances[begin + first + k], float(left), float(top));
       row_of[k] = compact.row(g.slots[begin + first + k]);
     }
-    for (int k = threadIdx.x; k < Backward::kWarps * kBatch * kGradientValues; k += Backward::kThreads) sums[0][k] = 0;
+    for (int k = threadIdx.x; k < Backward::kWarps * kBatch * kGradientValues; k += Backward::kThreads) sums[k] = 0;
     __syncthreads();
     for (int from = (count - 1) / 32 * 32; from >= 0; from -= 32) {
       if (first + from >= furthest) continue;
@@ -279,13 +279,13 @@ __global__ void __launch_bounds__(Backward::kThreads)
         const float v[kGradientValues] = {q0, qu, row.v * q0, quu, row.v * qu, row.v * row.v * q0, r, gr, b, d};
         int value;
         const float sum = transposed_sum(v, value);
-        if (value >= 0) sums[warp][k * kGradientValues + value] = sum;
+        if (value >= 0) sums[(warp * kBatch + k) * kGradientValues + value] = sum;
       }
     }
     __syncthreads();
     for (int k = threadIdx.x; k < count * kGradientValues; k += Backward::kThreads) {
       float sum = 0;
-      for (int w = 0; w < Backward::kWarps; ++w) sum += sums[w][k];
+      for (int w = 0; w < Backward::kWarps; ++w) sum += sums[w * kBatch * kGradientValues + k];
       compact.rows[kGradientValues * row_of[k / kGradientValues] + k % kGradientValues] = sum;
     }
   }

@@ -1,20 +1,10 @@
 // The whole CPU backend, several threads, under the sanitizers: random scenes with poison in them, and its own sums.
-#include <cmath>
 #include <limits>
-#include <random>
 #include <thread>
-#include <vector>
 
-#include "gs/check.h"
-#include "launch.h"
-#include "math/splat.h"
-
-using namespace gs::GS_ISA;
+#include "backend_run.h"
 
 namespace {
-
-std::mt19937 generator(4);
-double normal() { return std::normal_distribution<double>()(generator); }
 
 gs::Executor threads() {
   return {3, [](int64_t n, int64_t, const std::function<void(int64_t, int64_t)>& body) {
@@ -23,90 +13,6 @@ gs::Executor threads() {
               if (n * i / 3 < n * (i + 1) / 3) running.emplace_back([&, i] { body(n * i / 3, n * (i + 1) / 3); });
             for (std::thread& thread : running) thread.join();
           }};
-}
-
-template <class T>
-struct Parameters {
-  int64_t count;
-  std::vector<T> means, opacities, scales, rotations, dc, rest;
-
-  explicit Parameters(int64_t n) : count(n) {
-    for (int64_t i = 0; i < n; ++i) {
-      for (int k = 0; k < 3; ++k) means.push_back(T(normal() + (k == 2 ? 4 : 0)));
-      opacities.push_back(T(normal()));
-      for (int k = 0; k < 3; ++k) scales.push_back(T(0.7 * normal() - 3)), dc.push_back(T(normal()));
-      for (int k = 0; k < 4; ++k) rotations.push_back(T(normal()));
-      for (int k = 0; k < 45; ++k) rest.push_back(T(0.2 * normal()));
-    }
-  }
-
-  std::vector<std::vector<T>*> all() { return {&means, &opacities, &scales, &rotations, &dc, &rest}; }
-};
-
-template <class T>
-struct Result {
-  std::vector<T> color, transmittance, depth, gradient;
-  std::vector<int32_t> radii, tile_counts;
-  int64_t instances;
-};
-
-// Forward and backward of the sum of all pixels of all planes; allocations are exact, so that a sanitizer sees a step
-// outside. The gradient holds means, means2d, opacities, scales, rotations, dc, rest, one after the other.
-template <class T>
-Result<T> run(const gs::Executor& executor, Parameters<T>& p, gs::Image image, bool antialiasing) {
-  const T view[16] = {1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1};
-  const T full[16] = {T(1 / 0.6), 0, 0, 0, 0, T(1 / 0.6), 0, 0, 0, 0, 1, 1, 0, 0, T(-0.01), 0};
-  const T center[3] = {0, 0, 0}, background[3] = {T(0.1), T(0.2), T(0.3)};
-  gs::Scene<T> scene = {};
-  scene.count = p.count;
-  scene.means = p.means.data(), scene.opacities = p.opacities.data();
-  scene.scales = p.scales.data(), scene.rotations = p.rotations.data();
-  scene.sh_dc = p.dc.data(), scene.sh_rest = p.rest.data();
-  scene.dc_stride = 3, scene.rest_stride = 45, scene.rest_bands = 15, scene.sh_degree = 3;
-  scene.raw = true, scene.antialiasing = antialiasing, scene.scale_modifier = 1;
-  scene.view = view, scene.projection = full, scene.center = center;
-  scene.tan_x = scene.tan_y = 0.6, scene.image = image;
-
-  const size_t n = p.count, pixels = size_t(image.width) * image.height;
-  Result<T> out;
-  std::vector<T> splats(kSplatValues * n), depths(n);
-  std::vector<int32_t> rects(4 * n);
-  out.tile_counts.resize(n), out.radii.resize(n);
-  const gs::Projected<T> projected = {splats.data(),          depths.data(),    rects.data(),
-                                      out.tile_counts.data(), out.radii.data(), nullptr};
-  gs::GS_ISA::project(executor, scene, projected);
-  out.instances = 0;
-  for (int32_t count : out.tile_counts) out.instances += count;
-
-  const size_t tiles = size_t((image.width + 15) / 16) * ((image.height + 15) / 16);
-  std::vector<int32_t> instances(out.instances), slots(out.instances), last(pixels);
-  std::vector<int64_t> ranges(tiles + 1), slot_offsets(n);
-  gs::GS_ISA::bin(executor, p.count, projected, image, out.instances,
-                  gs::Binned{instances.data(), slots.data(), ranges.data(), slot_offsets.data()});
-  CHECK(ranges.front() == 0 && ranges.back() == out.instances);
-  for (size_t t = 0; t < tiles; ++t)
-    for (int64_t k = ranges[t] + 1; k < ranges[t + 1]; ++k) {
-      const int32_t a = instances[k - 1], b = instances[k];
-      CHECK(depths[a] < depths[b] || (depths[a] == depths[b] && a < b));
-    }
-
-  out.color.resize(3 * pixels), out.transmittance.resize(pixels), out.depth.resize(pixels);
-  const gs::BlendInput<T> input = {splats.data(), instances.data(), ranges.data(), background, image};
-  gs::GS_ISA::blend(executor, input,
-                    gs::Blended<T>{out.color.data(), out.transmittance.data(), out.depth.data(), last.data()});
-
-  const std::vector<T> ones(3 * pixels, T(1));
-  std::vector<T> moments(kGradientValues * n);
-  gs::GS_ISA::blend_vjp(executor, input,
-                        gs::BlendGradient<T>{p.count, out.instances, slots.data(), slot_offsets.data(),
-                                             out.tile_counts.data(), out.transmittance.data(), last.data(), ones.data(),
-                                             ones.data(), ones.data(), moments.data()});
-  out.gradient.assign(n * (3 + 3 + 1 + 3 + 4 + 3 + 45), T(-77));
-  T* g = out.gradient.data();
-  const gs::SceneGradient<T> gradient = {g,       g + 3 * n, g + 6 * n,  g + 7 * n, g + 10 * n,
-                                         nullptr, nullptr,   g + 14 * n, g + 17 * n};
-  gs::GS_ISA::project_vjp(executor, scene, out.tile_counts.data(), moments.data(), gradient);
-  return out;
 }
 
 template <class T>

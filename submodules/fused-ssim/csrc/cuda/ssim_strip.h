@@ -11,6 +11,7 @@
 // A thread takes kPerThread neighbours along the direction it sums in, so that 11 taps cost it 3.5 loads a pixel.
 #include <cmath>
 #include <cstdint>
+#include <initializer_list>
 
 #include "math/ssim.h"
 

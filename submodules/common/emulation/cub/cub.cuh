@@ -1,0 +1,80 @@
+#pragma once
+// Stands in for the functions of CUB that the kernels use: same results, first call for the size of the memory.
+#include <algorithm>
+#include <cstdint>
+#include <numeric>
+#include <vector>
+
+#include "../cuda_runtime.h"
+
+namespace cub {
+
+template <class T>
+struct DoubleBuffer {
+  T* buffers[2];
+  int selector = 0;
+  DoubleBuffer(T* current, T* alternate) : buffers{current, alternate} {}
+  T* Current() { return buffers[selector]; }
+  T* Alternate() { return buffers[selector ^ 1]; }
+};
+
+struct DeviceRadixSort {
+  template <class Key, class Value, class Count>
+  static cudaError_t SortPairs(void* memory, size_t& bytes, const Key* keys, Key* sorted_keys, const Value* values,
+                               Value* sorted_values, Count n, int begin_bit, int end_bit, cudaStream_t) {
+    if (!memory) return bytes = 1, cudaSuccess;
+    std::vector<int64_t> order(n);
+    std::iota(order.begin(), order.end(), int64_t(0));
+    const uint64_t mask = end_bit - begin_bit == 64 ? ~uint64_t(0) : (uint64_t(1) << (end_bit - begin_bit)) - 1;
+    const auto part = [&](int64_t i) { return uint64_t(keys[i]) >> begin_bit & mask; };
+    std::stable_sort(order.begin(), order.end(), [&](int64_t a, int64_t b) { return part(a) < part(b); });
+    for (int64_t i = 0; i < int64_t(n); ++i) sorted_keys[i] = keys[order[i]], sorted_values[i] = values[order[i]];
+    return cudaSuccess;
+  }
+  template <class Key, class Value, class Count>
+  static cudaError_t SortPairs(void* memory, size_t& bytes, DoubleBuffer<Key>& keys, DoubleBuffer<Value>& values,
+                               Count n, int begin_bit, int end_bit, cudaStream_t stream) {
+    const cudaError_t status = SortPairs(memory, bytes, keys.Current(), keys.Alternate(), values.Current(),
+                                         values.Alternate(), n, begin_bit, end_bit, stream);
+    if (memory) keys.selector ^= 1, values.selector ^= 1;
+    return status;
+  }
+};
+
+struct DeviceScan {
+  template <class In, class Out, class Count>
+  static cudaError_t ExclusiveSum(void* memory, size_t& bytes, In in, Out* out, Count n, cudaStream_t) {
+    if (!memory) return bytes = 1, cudaSuccess;
+    Out sum = 0;
+    for (Count i = 0; i < n; ++i) {
+      const Out value = Out(in[i]);
+      out[i] = sum;
+      sum += value;
+    }
+    return cudaSuccess;
+  }
+};
+
+struct DeviceReduce {
+  template <class In, class Out, class Count>
+  static cudaError_t Sum(void* memory, size_t& bytes, In in, Out* out, Count n, cudaStream_t) {
+    if (!memory) return bytes = 1, cudaSuccess;
+    *out = 0;
+    for (Count i = 0; i < n; ++i) *out += Out(in[i]);
+    return cudaSuccess;
+  }
+};
+
+struct DeviceSelect {
+  template <class In, class Out, class Number, class Count, class Predicate>
+  static cudaError_t If(void* memory, size_t& bytes, In in, Out* out, Number* selected, Count n,
+                        const Predicate& wanted, cudaStream_t) {
+    if (!memory) return bytes = 1, cudaSuccess;
+    *selected = 0;
+    for (Count i = 0; i < n; ++i)
+      if (wanted(in[i])) out[(*selected)++] = in[i];
+    return cudaSuccess;
+  }
+};
+
+}  // namespace cub

@@ -1,0 +1,34 @@
+#pragma once
+// A queue for the emulated kernels, for tests.
+#include <cstdlib>
+#include <cstring>
+#include <memory>
+#include <new>
+#include <vector>
+
+#include "emulation.h"
+#include "gs/cuda_queue.h"
+
+namespace gs::emulation {
+
+// Memory of exact sizes, so that a sanitizer sees a step outside; freed with this.
+class Memory {
+ public:
+  Queue queue() { return {nullptr, &allocate, this}; }
+
+ private:
+  static void* allocate(void* context, size_t bytes) {
+    auto& pieces = static_cast<Memory*>(context)->pieces_;
+    void* piece = nullptr;
+    if (posix_memalign(&piece, kAlignment, bytes)) throw std::bad_alloc();
+    std::memset(piece, 0x7f, bytes);  // floats of 3.4e38: nothing may rely on zeros
+    pieces.emplace_back(piece, &std::free);
+    return piece;
+  }
+  static constexpr size_t kAlignment = 512;  // that of torch's allocator
+  std::vector<std::unique_ptr<void, void (*)(void*)>> pieces_;
+};
+
+constexpr Order kOrders[] = {Order::forward, Order::backward, Order::shuffled};
+
+}  // namespace gs::emulation

@@ -1,0 +1,215 @@
+#include "emulation.h"
+
+#include <algorithm>
+#include <cstdio>
+#include <cstdlib>
+#include <memory>
+#include <random>
+#include <vector>
+
+#if defined(__SANITIZE_ADDRESS__)
+#include <sanitizer/common_interface_defs.h>
+#define GS_ASAN 1
+#endif
+
+namespace gs::emulation {
+namespace {
+
+constexpr size_t kStack = 256 << 10;
+
+[[noreturn]] void fail(const char* message, const char* what) {
+  std::fprintf(stderr, "CUDA emulation: %s (%s) in block %u, thread %u\n", message, what ? what : "-", blockIdx.x,
+               threadIdx.x);
+  std::abort();
+}
+
+struct Thread {
+  ucontext_t context;
+  std::unique_ptr<char[]> stack;
+  Meeting waits_for = Meeting::done;
+  const char* what = nullptr;
+  bool runnable = false;
+  int votes = 0;  // taken part in, of the block
+#ifdef GS_ASAN
+  void* fake_stack = nullptr;
+#endif
+};
+
+struct Warp {
+  uint64_t slots[2][32];  // two, since a lane may be one meeting ahead of the slowest reader
+  int turn[32];           // which of them each lane uses next
+};
+
+struct Grid {
+  std::vector<Thread> threads;
+  std::vector<Warp> warps;
+  std::vector<char> shared;
+  ucontext_t scheduler;
+  const std::function<void()>* body = nullptr;
+  unsigned current = 0, count = 0;
+  bool votes[3];  // of this vote, the one before (still being read) and the one after
+#ifdef GS_ASAN
+  void* fake_stack = nullptr;
+  const void* scheduler_stack = nullptr;
+  size_t scheduler_size = 0;
+#endif
+};
+Grid grid_state;
+
+void to_scheduler(Thread& self, bool for_good) {
+#ifdef GS_ASAN
+  __sanitizer_start_switch_fiber(for_good ? nullptr : &self.fake_stack, grid_state.scheduler_stack,
+                                 grid_state.scheduler_size);
+#else
+  (void)for_good;
+#endif
+  swapcontext(&self.context, &grid_state.scheduler);
+#ifdef GS_ASAN
+  __sanitizer_finish_switch_fiber(self.fake_stack, &grid_state.scheduler_stack, &grid_state.scheduler_size);
+#endif
+}
+
+void start() {
+#ifdef GS_ASAN
+  __sanitizer_finish_switch_fiber(nullptr, &grid_state.scheduler_stack, &grid_state.scheduler_size);
+#endif
+  (*grid_state.body)();
+  Thread& self = grid_state.threads[grid_state.current];
+  self.waits_for = Meeting::done;
+  self.runnable = false;
+  to_scheduler(self, true);
+}
+
+void give_turn(unsigned index) {
+  Thread& thread = grid_state.threads[index];
+  grid_state.current = index;
+  threadIdx = dim3(index, 0, 0);
+#ifdef GS_ASAN
+  __sanitizer_start_switch_fiber(&grid_state.fake_stack, thread.stack.get(), kStack);
+#endif
+  swapcontext(&grid_state.scheduler, &thread.context);
+#ifdef GS_ASAN
+  __sanitizer_finish_switch_fiber(grid_state.fake_stack, nullptr, nullptr);
+#endif
+}
+
+// Lets those go on whose meeting is complete. Threads that have ended are not waited for, as on a GPU.
+bool release() {
+  const unsigned count = grid_state.count;
+  bool any = false, whole_block = true;
+  for (unsigned i = 0; i < count; ++i) {
+    const Thread& thread = grid_state.threads[i];
+    whole_block = whole_block && (thread.waits_for == Meeting::block || thread.waits_for == Meeting::done);
+  }
+  for (unsigned first = 0; first < count; first += 32) {
+    const unsigned stop = std::min(first + 32, count);
+    const char* what = nullptr;
+    bool whole_warp = true;
+    for (unsigned i = first; i < stop; ++i) {
+      const Thread& thread = grid_state.threads[i];
+      if (thread.waits_for == Meeting::done) continue;
+      if (thread.waits_for != Meeting::warp) whole_warp = false;
+      if (thread.waits_for == Meeting::warp && what && std::strcmp(what, thread.what))
+        fail("lanes of a warp meet in different collectives", what);
+      if (thread.waits_for == Meeting::warp) what = thread.what;
+    }
+    for (unsigned i = first; i < stop; ++i) {
+      Thread& thread = grid_state.threads[i];
+      if (thread.waits_for == Meeting::done || !(whole_warp ? true : whole_block)) continue;
+      thread.runnable = true;
+      any = true;
+    }
+  }
+  return any;
+}
+
+void run_block(const std::function<void()>& body) {
+  static std::mt19937 generator(1);
+  grid_state.body = &body;
+  const unsigned count = grid_state.count;
+  for (unsigned i = 0; i < count; ++i) {
+    Thread& thread = grid_state.threads[i];
+    getcontext(&thread.context);
+    thread.context.uc_stack.ss_sp = thread.stack.get();
+    thread.context.uc_stack.ss_size = kStack;
+    thread.context.uc_link = nullptr;
+    makecontext(&thread.context, &start, 0);
+    thread.runnable = true;
+    thread.waits_for = Meeting::none;
+    thread.votes = 0;
+  }
+  std::fill(grid_state.votes, grid_state.votes + 3, false);
+  for (Warp& warp : grid_state.warps) std::fill(warp.turn, warp.turn + 32, 0);
+  std::vector<unsigned> turns(count);
+  for (unsigned i = 0; i < count; ++i) turns[i] = order == Order::backward ? count - 1 - i : i;
+  for (;;) {
+    if (order == Order::shuffled) std::shuffle(turns.begin(), turns.end(), generator);
+    for (unsigned index : turns) {
+      if (!grid_state.threads[index].runnable) continue;
+      grid_state.threads[index].runnable = false;
+      give_turn(index);
+    }
+    bool done = true;
+    for (unsigned i = 0; i < count; ++i) done = done && grid_state.threads[i].waits_for == Meeting::done;
+    if (done) return;
+    if (!release()) fail("threads wait for each other at different barriers", nullptr);
+  }
+}
+
+}  // namespace
+
+void run_grid(dim3 grid, dim3 block, size_t shared, const std::function<void()>& body) {
+  if (grid.y != 1 || grid.z != 1 || block.y != 1 || block.z != 1) fail("only one dimension is emulated", nullptr);
+  grid_state.count = block.x;
+  while (grid_state.threads.size() < block.x) {
+    grid_state.threads.emplace_back();
+    grid_state.threads.back().stack.reset(new char[kStack]);
+  }
+  grid_state.warps.resize((block.x + 31) / 32);
+  gridDim = grid;
+  blockDim = block;
+  for (unsigned b = 0; b < grid.x; ++b) {
+    blockIdx = dim3(b, 0, 0);
+    grid_state.shared.assign(shared, char(0x7f));  // shared memory starts as garbage
+    run_block(body);
+  }
+}
+
+void* dynamic_shared() { return grid_state.shared.data(); }
+
+void meet(Meeting meeting, const char* what) {
+  Thread& self = grid_state.threads[grid_state.current];
+  self.waits_for = meeting;
+  self.what = what;
+  to_scheduler(self, false);
+}
+
+int lane() { return int(grid_state.current % 32); }
+
+unsigned present() {
+  const unsigned first = grid_state.current / 32 * 32, stop = std::min(first + 32, grid_state.count);
+  unsigned lanes = 0;
+  for (unsigned i = first; i < stop; ++i)
+    if (grid_state.threads[i].waits_for != Meeting::done) lanes |= 1u << (i - first);
+  return lanes;
+}
+
+bool any_of_block(bool mine) {
+  const int vote = grid_state.threads[grid_state.current].votes++;
+  grid_state.votes[vote % 3] |= mine;
+  meet(Meeting::block, "__syncthreads_or");
+  grid_state.votes[(vote + 2) % 3] = false;
+  return grid_state.votes[vote % 3];
+}
+
+const uint64_t* exchange(uint64_t mine, const char* what, unsigned mask) {
+  if (mask != 0xffffffffu) fail("only whole warps are emulated", what);
+  if (present() != 0xffffffffu) fail("a lane of the mask has ended, or the warp is not whole", what);
+  Warp& warp = grid_state.warps[grid_state.current / 32];
+  uint64_t* slots = warp.slots[warp.turn[lane()]++ % 2];
+  slots[lane()] = mine;
+  meet(Meeting::warp, what);
+  return slots;
+}
+
+}  // namespace gs::emulation

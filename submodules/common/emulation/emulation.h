@@ -1,0 +1,75 @@
+#pragma once
+// Runs CUDA kernels on the CPU, a fiber per thread, so that they can be tested where there is no GPU: under the address
+// sanitizer (steps outside global memory, misaligned vectors), with threads taken in any order (a missing barrier
+// changes results), and with collectives checked (all lanes there, all in the same one). Blocks run one after the
+// other; shared memory is static. Says nothing about speed, rounding of PTX instructions, or races between blocks.
+//
+// translate.py rewrites the few things of a .cu that are not C++.
+#include <ucontext.h>
+
+#include <cstdint>
+#include <cstring>
+#include <functional>
+
+struct dim3 {
+  unsigned x = 1, y = 1, z = 1;
+  constexpr dim3(unsigned x_ = 1, unsigned y_ = 1, unsigned z_ = 1) : x(x_), y(y_), z(z_) {}
+};
+inline dim3 threadIdx, blockIdx, blockDim, gridDim;
+
+namespace gs::emulation {
+
+enum class Order { forward, backward, shuffled };
+// In which order the runnable threads of a block get their turns.
+inline Order order = Order::forward;
+
+// Runs body once per thread of each block.
+void run_grid(dim3 grid, dim3 block, size_t dynamic_shared, const std::function<void()>& body);
+void* dynamic_shared();
+
+// What a lane of a warp waits for; lanes that wait for different things at once are a bug of the kernel.
+enum class Meeting { none, warp, block, done };
+// Ends the thread's turn until all of its warp or block have come to the same meeting. `what` names the collective.
+void meet(Meeting meeting, const char* what);
+
+// Leaves 8 bytes for the others of the warp, meets them, and returns where theirs lie (32 of them, until the next
+// meeting but one); `present` has a bit for each lane of the warp that there is.
+const uint64_t* exchange(uint64_t mine, const char* what, unsigned mask);
+unsigned present();
+int lane();
+// Whether any thread of the block said yes.
+bool any_of_block(bool mine);
+
+// What translate.py makes of kernel<<<grid, block, shared, stream>>>(arguments...).
+template <class Kernel>
+auto launch(dim3 grid, dim3 block, size_t shared, void* /*stream*/, const Kernel& kernel) {
+  return [=](auto... arguments) { run_grid(grid, block, shared, [&] { kernel(arguments...); }); };
+}
+
+template <class T>
+T shuffle(T value, int from, const char* what, unsigned mask) {
+  static_assert(sizeof(T) <= 8);
+  uint64_t bits = 0;
+  std::memcpy(&bits, &value, sizeof value);
+  bits = exchange(bits, what, mask)[from >= 0 && from < 32 ? from : lane()];
+  std::memcpy(&value, &bits, sizeof value);
+  return value;
+}
+
+template <class T, class Combine>
+T reduce(T value, const char* what, unsigned mask, const Combine& combine) {
+  uint64_t bits = 0;
+  std::memcpy(&bits, &value, sizeof value);
+  const uint64_t* all = exchange(bits, what, mask);
+  bool first = true;
+  for (int k = 0; k < 32; ++k)
+    if (present() >> k & 1) {
+      T other;
+      std::memcpy(&other, &all[k], sizeof other);
+      value = first ? other : combine(value, other);
+      first = false;
+    }
+  return value;
+}
+
+}  // namespace gs::emulation

@@ -1,0 +1,101 @@
+#pragma once
+// A random scene, and a pass forward and backward through a backend, for tests.
+#include <cmath>
+#include <random>
+#include <vector>
+
+#include "gs/check.h"
+#include "launch.h"
+#include "math/splat.h"
+
+using namespace gs::GS_ISA;
+
+inline std::mt19937 generator(4);
+inline double normal() { return std::normal_distribution<double>()(generator); }
+
+template <class T>
+struct Parameters {
+  int64_t count;
+  std::vector<T> means, opacities, scales, rotations, dc, rest;
+
+  explicit Parameters(int64_t n) : count(n) {
+    for (int64_t i = 0; i < n; ++i) {
+      for (int k = 0; k < 3; ++k) means.push_back(T(normal() + (k == 2 ? 4 : 0)));
+      opacities.push_back(T(normal()));
+      for (int k = 0; k < 3; ++k) scales.push_back(T(0.7 * normal() - 3)), dc.push_back(T(normal()));
+      for (int k = 0; k < 4; ++k) rotations.push_back(T(normal()));
+      for (int k = 0; k < 45; ++k) rest.push_back(T(0.2 * normal()));
+    }
+  }
+
+  std::vector<std::vector<T>*> all() { return {&means, &opacities, &scales, &rotations, &dc, &rest}; }
+};
+
+template <class T>
+struct Result {
+  std::vector<T> color, transmittance, depth, gradient;
+  std::vector<int32_t> radii, tile_counts;
+  int64_t instances;
+};
+
+// Forward and backward of the sum of all pixels of all planes, on an Executor or a Queue; allocations are exact, so
+// that a sanitizer sees a step outside. The gradient holds means, means2d, opacities, scales, rotations, dc, rest, one
+// after the other. records: projection hands binning one record a splat in place of its rectangles.
+template <class T, class Where>
+Result<T> run(const Where& where, Parameters<T>& p, gs::Image image, bool antialiasing, bool records = false) {
+  using gs::cuda::bin, gs::cuda::blend, gs::cuda::blend_vjp, gs::cuda::project, gs::cuda::project_vjp;
+  using gs::GS_ISA::bin, gs::GS_ISA::blend, gs::GS_ISA::blend_vjp, gs::GS_ISA::project, gs::GS_ISA::project_vjp;
+  const T view[16] = {1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1};
+  const T full[16] = {T(1 / 0.6), 0, 0, 0, 0, T(1 / 0.6), 0, 0, 0, 0, 1, 1, 0, 0, T(-0.01), 0};
+  const T center[3] = {0, 0, 0}, background[3] = {T(0.1), T(0.2), T(0.3)};
+  gs::Scene<T> scene = {};
+  scene.count = p.count;
+  scene.means = p.means.data(), scene.opacities = p.opacities.data();
+  scene.scales = p.scales.data(), scene.rotations = p.rotations.data();
+  scene.sh_dc = p.dc.data(), scene.sh_rest = p.rest.data();
+  scene.dc_stride = 3, scene.rest_stride = 45, scene.rest_bands = 15, scene.sh_degree = 3;
+  scene.raw = true, scene.antialiasing = antialiasing, scene.scale_modifier = 1;
+  scene.view = view, scene.projection = full, scene.center = center;
+  scene.tan_x = scene.tan_y = 0.6, scene.image = image;
+
+  const size_t n = p.count, pixels = size_t(image.width) * image.height;
+  Result<T> out;
+  std::vector<T> splats(kSplatValues * n), depths(n);
+  std::vector<int32_t> rects(4 * n);
+  std::vector<gs::TileRecord> record(n);
+  out.tile_counts.resize(n), out.radii.resize(n);
+  const gs::Projected<T> projected = {splats.data(),          depths.data(),    records ? nullptr : rects.data(),
+                                      out.tile_counts.data(), out.radii.data(), records ? record.data() : nullptr};
+  project(where, scene, projected);
+  out.instances = 0;
+  for (int32_t count : out.tile_counts) out.instances += count;
+
+  const size_t tiles = size_t((image.width + 15) / 16) * ((image.height + 15) / 16);
+  std::vector<int32_t> instances(out.instances), slots(out.instances), last(pixels);
+  std::vector<int64_t> ranges(tiles + 1), slot_offsets(n);
+  bin(where, p.count, projected, image, out.instances,
+      gs::Binned{instances.data(), slots.data(), ranges.data(), slot_offsets.data()});
+  CHECK(ranges.front() == 0 && ranges.back() == out.instances);
+  for (size_t t = 0; t < tiles; ++t)
+    for (int64_t k = ranges[t] + 1; k < ranges[t + 1]; ++k) {
+      const int32_t a = instances[k - 1], b = instances[k];
+      CHECK(depths[a] < depths[b] || (depths[a] == depths[b] && a < b));
+    }
+
+  out.color.resize(3 * pixels), out.transmittance.resize(pixels), out.depth.resize(pixels);
+  const gs::BlendInput<T> input = {splats.data(), instances.data(), ranges.data(), background, image};
+  blend(where, input, gs::Blended<T>{out.color.data(), out.transmittance.data(), out.depth.data(), last.data()});
+
+  const std::vector<T> ones(3 * pixels, T(1));
+  std::vector<T> moments(kGradientValues * n);
+  blend_vjp(where, input,
+            gs::BlendGradient<T>{p.count, out.instances, slots.data(), slot_offsets.data(), out.tile_counts.data(),
+                                 out.transmittance.data(), last.data(), ones.data(), ones.data(), ones.data(),
+                                 moments.data()});
+  out.gradient.assign(n * (3 + 3 + 1 + 3 + 4 + 3 + 45), T(-77));
+  T* g = out.gradient.data();
+  const gs::SceneGradient<T> gradient = {g,       g + 3 * n, g + 6 * n,  g + 7 * n, g + 10 * n,
+                                         nullptr, nullptr,   g + 14 * n, g + 17 * n};
+  project_vjp(where, scene, out.tile_counts.data(), moments.data(), gradient);
+  return out;
+}

@@ -1,0 +1,67 @@
+// The CUDA kernels on the CPU (submodules/common/emulation), under the sanitizers, against the CPU backend, with
+// threads taken in several orders.
+#include <cmath>
+#include <random>
+#include <vector>
+
+#include "emulated_queue.h"
+#include "gs/check.h"
+#include "launch.h"
+
+namespace {
+
+struct Result {
+  float l1 = -1, ssim = -1;
+  std::vector<float> gradient, vjp;
+};
+
+template <class Source>
+void check(int64_t planes, int64_t height, int64_t width, bool valid) {
+  std::mt19937 random(unsigned(height * 1000 + width));
+  std::uniform_real_distribution<float> uniform;
+  std::vector<float> img1(planes * height * width);
+  std::vector<Source> img2(img1.size());
+  for (float& x : img1) x = uniform(random);
+  for (Source& x : img2) x = Source(sizeof(Source) == 1 ? 255 * uniform(random) : uniform(random));
+  const gs::ImagePair<float> images = {img1.data(), img2.data(), sizeof(Source) == 1, planes, height, width};
+
+  double l1, ssim;
+  std::vector<float> gradient(img1.size()), vjp(img1.size());
+  gs::GS_ISA::l1_ssim_cpu({images, valid, &l1, &ssim, gradient.data()}, gs::serial_executor());
+  const float grad_l1 = 0.7f, grad_ssim = -1.3f;
+  gs::GS_ISA::l1_ssim_vjp_cpu({images, gradient.data(), grad_l1, grad_ssim, vjp.data()}, gs::serial_executor());
+  double largest = 0;
+  for (float x : gradient) largest = std::max(largest, double(std::abs(x)));
+
+  Result first;
+  for (const auto order : gs::emulation::kOrders) {
+    gs::emulation::order = order;
+    gs::emulation::Memory memory;
+    Result got;
+    got.gradient.resize(img1.size()), got.vjp.resize(img1.size());
+    gs::l1_ssim_cuda({images, valid, &got.l1, &got.ssim, got.gradient.data()}, memory.queue());
+    gs::l1_ssim_vjp_cuda({images, gradient.data(), &grad_l1, &grad_ssim, got.vjp.data()}, memory.queue());
+    // Means of values near 1, rounded to float; a gradient is a sum of some 242 products of its own.
+    CHECK_NEAR(got.l1, l1, 1e-6);
+    CHECK_NEAR(got.ssim, ssim, 2e-6);
+    for (size_t i = 0; i < gradient.size(); ++i) {
+      CHECK_NEAR(got.gradient[i], gradient[i], 2e-5 * largest);
+      CHECK_NEAR(got.vjp[i], vjp[i], 2e-6 * (largest + 1.0 / img1.size()));
+    }
+    if (order == gs::emulation::Order::forward) first = got;
+    CHECK(got.l1 == first.l1 && got.ssim == first.ssim && got.gradient == first.gradient && got.vjp == first.vjp);
+  }
+}
+
+}  // namespace
+
+int main() {
+  for (bool valid : {false, true}) {
+    check<uint8_t>(3, 37, 70, valid);
+    check<float>(1, 12, 11, valid);
+    check<float>(2, 65, 33, valid);
+  }
+  check<float>(3, 1, 1, false);
+  check<uint8_t>(3, 5, 130, false);
+  return gs::finish_tests("CUDA SSIM, emulated");
+}
