@@ -14,7 +14,7 @@ CXX_TEST_FLAGS := -std=c++17 -O1 -g -Wall -Wextra -Werror -fsanitize=address,und
 
 CXX_SOURCES := $(shell find submodules -name build -prune -o \( -name '*.cpp' -o -name '*.cu' -o -name '*.h' \) -print)
 # What the extension $(1) is built from.
-sources = $(shell find submodules/common submodules/$(1) \( -name build -o -name tests \) -prune -o \
+sources = $(shell find submodules/common submodules/$(1) \( -name build -o -name tests -o -name emulation \) -prune -o \
             \( -name '*.cpp' -o -name '*.cu' -o -name '*.h' -o -name '*.py' -o -name '*.toml' \) -print)
 
 .PHONY: install demo test lint format cpp-test clean
