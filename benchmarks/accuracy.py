@@ -1,83 +1,163 @@
-"""Error of every output and every gradient of the rasterizer against the float64 oracle.
+"""Error of every output and every gradient of the rasterizer against the float64 oracle, and against run time.
 
-    python benchmarks/accuracy.py
+    python benchmarks/accuracy.py                                          # the errors
+    python benchmarks/accuracy.py --figure docs/accuracy.png               # and error against run time
+    python benchmarks/accuracy.py --json accuracy.json                     # the same as numbers, where there is
+    python -m benchmarks.accuracy_figure accuracy.json docs/accuracy.png   # no matplotlib; drawn elsewhere
 
 Error of a tensor = max |difference| / max |reference|, the median of |difference| / max |reference| beside it. Pixels
 within 1e-4 of a cut-off (alpha 1/255, transmittance 1e-4) or under a depth tie, where rounding alone may decide, are
-counted in their own column and left out of the loss and the comparison. The oracle gets the float32 values of every
-parameter, so both dtypes answer the same question.
+counted in their own row and left out of the loss and the comparison. The oracle gets the float32 values of every
+parameter, so all kernels answer the same question: those of the CPU, and of a GPU where there is one.
+
+With --figure or --json each kernel is timed as well, and a second build of the rasterizer with the library's
+exponential in place of the fast one is measured beside the installed one (made under build/ when first used; see
+exact_exponential.py). Errors are those of the small scenes that the oracle can bear; the time beside an error is that
+of forward and backward of an image on a larger scene of the same family (TIMED_SIZES in kernel_runs.py).
 """
 
 import argparse
+import json
+import os
+import subprocess
 import sys
+import tempfile
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 import utils.openmp  # noqa: E402, F401  isort: skip  (before torch)
 import torch
-from diff_gaussian_rasterization import rasterize, reference
+from torch import Tensor
+from tqdm import tqdm
 
+from benchmarks import exact_exponential  # noqa: E402
+from benchmarks.accuracy_figure import draw, require_matplotlib  # noqa: E402
 from benchmarks.environment import describe, print_table  # noqa: E402
-from benchmarks.splat_scenes import KINDS, PARAMETERS, SplatScene  # noqa: E402
+from benchmarks.kernel_runs import (  # noqa: E402
+    CASES,
+    CPU_DOUBLE,
+    CPU_FLOAT,
+    CUDA_FLOAT,
+    TIMED_SIZES,
+    Case,
+    Kernel,
+    Run,
+    kernels,
+    run_all,
+    run_oracle,
+)
+from utils.system_utils import atomic_write, run_cli  # noqa: E402
 
-OUTPUTS = ("image", "inverse depth", "transmittance")
+ROOT = Path(__file__).resolve().parent.parent
+Runs = dict[tuple[Case, Kernel], Run]
+
+# CUDA float against CPU double: how far above CPU float it may be.
+MOST = 3.0
+# Errors under this are a few units in the last place, where one rounding more decides a ratio.
+SMALL = 1e-6
 
 
-def errors(scene: SplatScene, dtype: torch.dtype, antialiasing: bool) -> tuple[dict[str, tuple[float, float]], int]:
-    """(largest, median) error by name of output or gradient, and the number of pixels left out."""
-    wanted, near = _run(scene, torch.float64, antialiasing, oracle=True)
-    got, _ = _run(scene, dtype, antialiasing, oracle=False, keep=~near)
-    result = {}
-    for name, reference_value in wanted.items():
-        difference = (got[name].double() - reference_value).abs()
-        scale = reference_value.abs().max().clamp_min(1e-300)
-        result[name] = (float(difference.max() / scale), float(difference.median() / scale))
-    return result, int(near.sum())
+def error(got: Tensor, wanted: Tensor) -> tuple[float, float]:
+    """Largest and median |difference| over the largest |wanted|."""
+    difference, scale = (got.double() - wanted.double()).abs(), wanted.double().abs().max().clamp_min(1e-300)
+    return float(difference.max() / scale), float(difference.median() / scale)
 
 
-def _run(
-    scene: SplatScene, dtype: torch.dtype, antialiasing: bool, oracle: bool, keep: torch.Tensor | None = None
-) -> tuple[dict[str, torch.Tensor], torch.Tensor]:
-    leaves = scene.leaves(dtype)
-    settings = scene.settings(torch.float64, antialiasing=antialiasing)
-    means2d = torch.zeros_like(leaves["means"], requires_grad=True)
-    arguments = {name: leaves[name] for name in ("scales", "rotations", "sh_dc", "sh_rest")} | {"raw": True}
-    if oracle:
-        out = reference.render(leaves["means"], means2d, leaves["opacities"], settings, **arguments)
-        keep = ~out.near_cut
-    else:
-        out = rasterize(
-            leaves["means"],
-            means2d,
-            leaves["opacities"],
-            settings,
-            **arguments,
-            want_inverse_depth=True,
-            want_transmittance=True,
-        )
-    planes = [out.color, out.inverse_depth, out.transmittance]
-    generator = torch.Generator().manual_seed(7)
-    weights = [torch.randn(plane.shape, generator=generator, dtype=torch.float64).to(plane.dtype) for plane in planes]
-    sum((plane * weight * keep).sum() for plane, weight in zip(planes, weights, strict=True)).backward()
-    tensors = {name: (plane * keep).detach() for name, plane in zip(OUTPUTS, planes, strict=True)}
-    tensors |= {f"d {name}": leaves[name].grad for name in PARAMETERS} | {"d screen mean": means2d.grad[:, :2]}
-    return tensors, ~keep
+def run_exact(masks: dict[Case, Tensor]) -> Runs:
+    """`run_all` with times in the build with the exact exponential, in a process of its own."""
+    package = exact_exponential.build()
+    path = os.pathsep.join([str(package), str(ROOT), os.environ.get("PYTHONPATH", "")]).rstrip(os.pathsep)
+    with tempfile.TemporaryDirectory() as folder:
+        given, taken = Path(folder) / "masks.pt", Path(folder) / "runs.pt"
+        torch.save({tuple(case): mask for case, mask in masks.items()}, given)
+        command = [sys.executable, "-m", "benchmarks.kernel_runs", str(given), str(taken), "--times"]
+        subprocess.run(command, cwd=ROOT, env=os.environ | {"PYTHONPATH": path}, check=True)
+        result = torch.load(taken)
+    assert Path(result["package"]).is_relative_to(package), f"{result['package']} was measured, not {package}"
+    return {(Case(*key[:2]), Kernel(*key[2:])): Run(*run) for key, run in result["runs"].items()}
+
+
+def measure(times: bool) -> tuple[list[dict], dict[Case, Runs]]:
+    """A record for each run (as --json writes them), and the installed build's runs."""
+    oracle = {case: run_oracle(case) for case in tqdm(CASES, desc="Oracle", unit="scene", leave=False)}
+    masks = {case: keep for case, (_, keep) in oracle.items()}
+    fast = run_all(masks, times)
+    builds = {"fast": fast} | ({"exact": run_exact(masks)} if times else {})
+    records = []
+    for exponential, runs in builds.items():
+        for (case, kernel), run in runs.items():
+            wanted, keep = oracle[case]
+            records.append(
+                {
+                    "scene": case.kind,
+                    "antialiasing": case.antialiasing,
+                    "kernel": str(kernel),
+                    "exponential": exponential,
+                    "errors": {name: error(run.tensors[name], value) for name, value in wanted.items()},
+                    "pixels left out": int((~keep).sum()),
+                    "milliseconds": run.milliseconds,
+                }
+            )
+    return records, fast
+
+
+def print_errors(records: list[dict]) -> None:
+    """A table of largest (median) errors for each setting of antialiasing and exponential."""
+    for exponential in dict.fromkeys(r["exponential"] for r in records):
+        for antialiasing in (False, True):
+            chosen = [r for r in records if (r["exponential"], r["antialiasing"]) == (exponential, antialiasing)]
+            chosen.sort(key=lambda r: list(TIMED_SIZES).index(r["scene"]))
+            print(
+                f"\nLargest (median) error, {exponential} exponential, antialiasing {'on' if antialiasing else 'off'}"
+            )
+            rows = [
+                [name, *("{:.1e} ({:.0e})".format(*r["errors"][name]) for r in chosen)] for name in chosen[0]["errors"]
+            ]
+            rows.append(["pixels left out", *(str(r["pixels left out"]) for r in chosen)])
+            if chosen[0]["milliseconds"] is not None:
+                rows.append(["forward + backward, ms", *(f"{r['milliseconds']:.1f}" for r in chosen)])
+            print_table(["", *(f"{r['scene']}, {r['kernel']}" for r in chosen)], rows)
+
+
+def print_ratios(runs: Runs) -> None:
+    """CUDA float beside CPU float, the largest errors of both against CPU double."""
+    rows, ratios = [], {}
+    for name in next(iter(runs.values())).tensors:
+        row = [name]
+        for case in CASES:
+            wanted = runs[case, CPU_DOUBLE].tensors[name]
+            cuda, cpu = (error(runs[case, kernel].tensors[name], wanted)[0] for kernel in (CUDA_FLOAT, CPU_FLOAT))
+            ratios[name, case] = (cuda / max(cpu, 1e-300), max(cuda, cpu))
+            row.append(f"{cuda:.1e} / {cpu:.1e} = {ratios[name, case][0]:.2f}")
+        rows.append(row)
+    print("\nLargest error against CPU double: CUDA float / CPU float = ratio")
+    print_table(["", *(f"{case.kind}{', antialiased' if case.antialiasing else ''}" for case in CASES)], rows)
+    notable = [ratio for ratio, larger in ratios.values() if larger > SMALL]
+    print(f"Largest ratio: {max(ratio for ratio, _ in ratios.values()):.2f}", end="; ")
+    print(f"where either error exceeds {SMALL:.0e}: {max(notable, default=0):.2f} (at most {MOST:g} wanted)")
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--antialiasing", action="store_true", help="measure with antialiasing")
+    parser.add_argument("--figure", type=Path, help="time the kernels too and draw error against time to this file")
+    parser.add_argument("--json", type=Path, help="time the kernels too and write all that was measured to this file")
     args = parser.parse_args()
-    print(describe())
-    columns = [(kind, dtype) for kind in KINDS for dtype in (torch.float32, torch.float64)]
-    measured = {column: errors(KINDS[column[0]](), column[1], args.antialiasing) for column in columns}
-    header = ["", *(f"{kind}, {str(dtype).removeprefix('torch.')}" for kind, dtype in columns)]
-    names = measured[columns[0]][0]
-    rows = [[name, *("{:.1e} ({:.0e})".format(*measured[column][0][name]) for column in columns)] for name in names]
-    rows.append(["pixels left out", *(str(measured[column][1]) for column in columns)])
-    print_table(header, rows)
+    if args.figure:
+        require_matplotlib()
+    machines = list(dict.fromkeys(describe(kernel.device) for kernel in kernels()))
+    print("\n".join(machines))
+    records, runs = measure(times=bool(args.figure or args.json))
+    print_errors(records)
+    if CUDA_FLOAT in kernels():
+        print_ratios(runs)
+    measured = {"machines": machines, "records": records, "timed sizes": TIMED_SIZES}
+    if args.json:
+        with atomic_write(args.json) as temporary:
+            temporary.write_text(json.dumps(measured, indent=1, sort_keys=True, allow_nan=False) + "\n")
+    if args.figure:
+        draw(measured, args.figure)
 
 
 if __name__ == "__main__":
-    main()
+    run_cli(main)

@@ -14,12 +14,12 @@ OPS = torch.ops.diff_gaussian_rasterization
 class Calls:
     """Forward alone, with backward, and with a dense Adam step; parameters raw, as they are optimised."""
 
-    def __init__(self, scene: SplatScene) -> None:
+    def __init__(self, scene: SplatScene, dtype: torch.dtype = torch.float32, antialiasing: bool = False) -> None:
         self.scene = scene
-        self.leaves = scene.leaves(torch.float32)
-        self.settings = scene.settings(torch.float32)
+        self.leaves = scene.leaves(dtype)
+        self.settings = scene.settings(dtype, antialiasing=antialiasing)
         self.means2d = torch.zeros_like(self.leaves["means"], requires_grad=True)
-        self.gradient = image_gradient(scene)
+        self.gradient = image_gradient(scene).to(dtype)
         self._moments: list[tuple[Tensor, Tensor]] = []
 
     def render(self) -> Tensor:

@@ -4,7 +4,8 @@
 #
 #   benchmarks/device.sh test                    GPU tests, then the rasterizer's CPU tests
 #   benchmarks/device.sh sanitize                memcheck and racecheck of the GPU tests on small scenes
-#   benchmarks/device.sh kernels [OPTION...]     benchmarks/rasterizer.py OPTION... (--peers gsplat), benchmarks/accuracy.py
+#   benchmarks/device.sh kernels [OPTION...]     benchmarks/rasterizer.py OPTION... (--peers gsplat)
+#   benchmarks/device.sh accuracy                benchmarks/accuracy.py; its figure is drawn elsewhere from accuracy.json
 #   benchmarks/device.sh train SCENE [OPTION...] benchmarks/training.py SCENE OPTION...
 #   benchmarks/device.sh run COMMAND...          anything else, with the extensions built
 #
@@ -13,7 +14,7 @@
 set -euo pipefail
 cd "$(dirname "$0")/.."
 
-mode=${1:?test, sanitize, kernels, train or run}
+mode=${1:?test, sanitize, kernels, accuracy, train or run}
 shift
 out=${OUT:-build/device/out}
 site=$PWD/build/device/site
@@ -150,8 +151,10 @@ build
     kernels)
       say "kernels"
       python3 benchmarks/rasterizer.py --device cuda "$@"
-      say "error"
-      python3 benchmarks/accuracy.py
+      ;;
+    accuracy)
+      say "error against run time"
+      python3 benchmarks/accuracy.py --json "$out/accuracy.json"
       ;;
     train)
       scene=${1:?a scene}

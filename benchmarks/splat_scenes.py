@@ -24,6 +24,10 @@ class SplatScene:
         leaves share the scene's memory."""
         return {k: v.detach().float().to(dtype).requires_grad_() for k, v in self.parameters.items()}
 
+    def to(self, device: torch.device | str) -> "SplatScene":
+        """The same scene on another device."""
+        return SplatScene({k: v.to(device) for k, v in self.parameters.items()}, self.width, self.height)
+
     def settings(self, dtype: torch.dtype = torch.float64, **changes) -> GaussianRasterizationSettings:
         """A camera at the origin that looks along +z with 60 degrees across, on the parameters' device."""
         made = settings(self.width, self.height, dtype, **changes)

@@ -10,13 +10,11 @@ from pathlib import Path
 # kernel<A, B><<<grid, block, shared, stream>>>(arguments)
 _LAUNCH = re.compile(r"([A-Za-z_]\w*(?:<[\w, :]*>)?)\s*<<<(.*?)>>>", re.DOTALL)
 _DYNAMIC_SHARED = re.compile(r"extern __shared__ ([\w:]+) (\w+)\[\];")
-_EXP2 = re.compile(r'asm\("ex2\.approx\.ftz\.f32 %0, %1;" : "=f"\((\w+)\) : "f"\((\w+)\)\);')
 
 
 def translate(source: str) -> str:
     """C++ for the text of a .cu file; ValueError where something of CUDA is left."""
     source = _DYNAMIC_SHARED.sub(r"\1* \2 = static_cast<\1*>(gs::emulation::dynamic_shared());", source)
-    source = _EXP2.sub(r"\1 = std::exp2(\2);", source)
     source = _LAUNCH.sub(r"gs::emulation::launch(\2, [=](auto... arguments) { \1(arguments...); })", source)
     for rest in ("<<<", "asm(", "extern __shared__"):
         if rest in source:

@@ -8,6 +8,7 @@
 
 #include "../launch.h"
 #include "../math/blend.h"
+#include "../math/exp2.h"
 #include "../math/footprint.h"
 #include "../math/tiles.h"
 #include "backward.cuh"
@@ -25,12 +26,6 @@ constexpr float kLeast = float(kLog2MinAlpha);
 
 cudaStream_t stream_of(const Queue& queue) { return static_cast<cudaStream_t>(queue.stream); }
 int64_t tiles_of(Image image) { return int64_t(tile_count(image.width)) * tile_count(image.height); }
-
-__device__ __forceinline__ float exp2_fast(float t) {
-  float y;
-  asm("ex2.approx.ftz.f32 %0, %1;" : "=f"(y) : "f"(t));
-  return y;
-}
 
 // How a tile is shared out: a lane has kRun pixels of one row, 4 (or 8, if one) columns apart.
 template <int kRun_>
@@ -122,7 +117,7 @@ __global__ void __launch_bounds__(Forward::kThreads) blend_kernel(BlendInput<flo
         for (int p = 0; p < kRun; ++p) {
           const float t = row_exponent(row, row_u(row, float(at.x + at.column(p))));
           if (!(t >= threshold[p])) continue;
-          const float alpha = capped<float, float>(exp2_fast(t));
+          const float alpha = capped<float, float>(exp2_device(t));
           const float after = transmittance[p] - alpha * transmittance[p];
           if (after < float(kMinTransmittance)) {
             threshold[p] = INFINITY;
@@ -265,7 +260,7 @@ __global__ void __launch_bounds__(Backward::kThreads)
           const float u = row_u(row, float(at.x + at.column(p))), t = row_exponent(row, u);
           if (!(t >= kLeast) || first + k >= last[p]) continue;
           any = true;
-          const float uncapped = exp2_fast(t), alpha = capped<float, float>(uncapped);
+          const float uncapped = exp2_device(t), alpha = capped<float, float>(uncapped);
           float value = c.x * red[p] + c.y * green[p] + c.z * blue[p];
           if (kDepth) value += splat.inverse_depth * depth[p];
           const float q = uncapped * alpha_gradient<float, float>(alpha, value, transmittance[p], behind[p]);
