@@ -2,14 +2,14 @@
 
 python render.py -m MODEL [--iteration N] [--skip_train] [--skip_test]
 
-Writes MODEL/{train,test}/ours_N/{renders,gt}/00000.png ..., numbered by the views' sorted order.
+Writes MODEL/{train,test}/ours_N/{renders,gt}/00000.png ..., numbered by the views' sorted order, and render_times.json
+beside these folders: the time of each view, with the device idle before it and done after it, without I/O.
 """
 
 from __future__ import annotations
 
 import argparse
 import re
-import statistics
 import time
 from pathlib import Path
 
@@ -23,6 +23,7 @@ from gaussian_renderer import render
 from scene import Scene
 from scene.cameras import Camera
 from scene.gaussian_model import GaussianModel
+from utils import render_times
 from utils.general_utils import safe_state
 from utils.system_utils import UserError, atomic_write, compute_device, mkdir_p, run_cli
 
@@ -58,16 +59,21 @@ def render_set(
     if not views:
         return []
     seconds = []
-    render(views[0], gaussians, pipe, background)  # the first call pays for allocations and caches
+    for view in {(view.image_width, view.image_height): view for view in views}.values():
+        _image(view, gaussians, pipe, background)  # the first call of a size pays for allocations and caches
     for index, view in enumerate(tqdm(views, desc=f"Rendering {folder.parent.name}", unit="view")):
         _wait(background.device)
         start = time.perf_counter()
-        image = render(view, gaussians, pipe, background)["render"]
+        image = _image(view, gaussians, pipe, background)
         _wait(background.device)
         seconds.append(time.perf_counter() - start)
         save_png(image, folder / "renders" / f"{index:05d}.png")
         save_png(view.target(background), folder / "gt" / f"{index:05d}.png")
     return seconds
+
+
+def _image(view: Camera, gaussians: GaussianModel, pipe: argparse.Namespace, background: torch.Tensor) -> torch.Tensor:
+    return render(view, gaussians, pipe, background, want_visibility=False)["render"]
 
 
 def _wait(device: torch.device) -> None:
@@ -93,16 +99,20 @@ def main() -> None:
         raise UserError(f"iteration {scene.loaded_iter} of {scene.model_path} has no Gaussians; train it again")
     background = torch.full((3,), 1.0 if options.white_background else 0.0, device=compute_device())
     for name, skip, views in (
-        ("train", args.skip_train, scene.getTrainCameras),
-        ("test", args.skip_test, scene.getTestCameras),
+        ("train", args.skip_train, scene.getTrainCameras()),
+        ("test", args.skip_test, scene.getTestCameras()),
     ):
         if skip:
             continue
         folder = Path(scene.model_path) / name / f"ours_{scene.loaded_iter}"
-        seconds = render_set(folder, views(), gaussians, pipe, background)
+        (folder / render_times.NAME).unlink(missing_ok=True)  # not of what an interrupted run has left
+        seconds = render_set(folder, views, gaussians, pipe, background)
         if seconds:
-            median = statistics.median(seconds)
-            print(f"{name}: {len(seconds)} views, median {1e3 * median:.2f} ms a view ({1 / median:.1f} a second)")
+            sizes = [(view.image_width, view.image_height) for view in views]
+            times = render_times.summarise(seconds, sizes, len(gaussians), pipe.antialiasing, background.device)
+            render_times.write(folder, times)
+            median = f"median {times['median_ms']:.2f} ms a view ({times['fps']:.1f} frames per second)"
+            print(f"{name}: {len(views)} views, {median}")
         else:
             print(f"{name}: no views" + ("; the model was trained without --eval" if name == "test" else ""))
 

@@ -7,14 +7,7 @@ from pathlib import Path
 
 import torch
 
-
-def cpu_name() -> str:
-    """The processor's name, from the kernel where it tells."""
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-    except OSError:
-        return platform.processor() or platform.machine()
-    return next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), platform.machine())
+from utils.machine import cpu_name
 
 
 def instruction_set() -> str:

@@ -79,8 +79,11 @@ def test_renders_are_numbered_and_stand_beside_their_ground_truth(trained):
                 Image.open(trained.scene / f"images/view_{view:03d}.png") as photo,
             ):
                 assert np.array_equal(np.asarray(truth), np.asarray(photo))
-        timing = rf"^{name}: {len(views)} views, median [\d.]+ ms a view \([\d.]+ a second\)"
-        assert re.search(timing, trained.rendering, re.MULTILINE)
+        timing = rf"^{name}: {len(views)} views, median ([\d.]+) ms a view \([\d.]+ frames per second\)"
+        median = re.search(timing, trained.rendering, re.MULTILINE)[1]
+        times = json.loads((folder / "render_times.json").read_text())
+        assert list(times["milliseconds"]) == numbered and f"{times['median_ms']:.2f}" == median
+        assert times["sizes"] == [[120, 90]] and times["gaussians"] > 3000
 
 
 def test_scores_of_the_held_out_views(trained, tmp_path):

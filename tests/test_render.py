@@ -1,5 +1,6 @@
 """render.py: what it writes for a view, and its timing; the whole command is in test_end_to_end.py."""
 
+import json
 from argparse import Namespace
 from types import SimpleNamespace
 
@@ -10,6 +11,7 @@ from PIL import Image
 
 from scene.gaussian_attributes import attributes
 from scene.gaussian_ply import write_ply
+from utils import render_times
 from utils.system_utils import UserError
 
 render = pytest.importorskip("render", reason="the extensions are not built: make test")
@@ -22,14 +24,14 @@ def read(path) -> np.ndarray:
 
 
 def view(target: torch.Tensor) -> SimpleNamespace:
-    return SimpleNamespace(target=lambda background: target)
+    return SimpleNamespace(target=lambda background: target, image_width=target.shape[2], image_height=target.shape[1])
 
 
 @pytest.fixture
 def rendered(monkeypatch) -> dict[int, torch.Tensor]:
     """What render() gives, by view."""
     prepared: dict[int, torch.Tensor] = {}
-    monkeypatch.setattr(render, "render", lambda view, *_: {"render": prepared[id(view)]})
+    monkeypatch.setattr(render, "render", lambda view, *_, **__: {"render": prepared[id(view)]})
     return prepared
 
 
@@ -97,3 +99,40 @@ def test_a_model_without_gaussians_is_refused(tmp_path, colmap_scene, monkeypatc
     with pytest.raises(UserError, match="iteration 7 of .* has no Gaussians"):
         render.main()
     assert sorted(path.name for path in (tmp_path / "model").iterdir()) == ["cfg_args", "point_cloud"]
+
+
+def test_times_are_in_milliseconds_by_picture():
+    cpu = torch.device("cpu")
+    times = render_times.summarise([0.02, 0.05, 0.01], [(8, 6), (4, 3), (8, 6)], 7, True, cpu)
+    assert times.pop("device") and times.pop("threads") == torch.get_num_threads()
+    assert times == {
+        "antialiasing": True,
+        "fps": 50.0,
+        "gaussians": 7,
+        "median_ms": 20.0,
+        "milliseconds": {"00000.png": 20.0, "00001.png": 50.0, "00002.png": 10.0},
+        "sizes": [(4, 3), (8, 6)],
+        "torch": torch.__version__,
+    }
+
+
+def test_times_on_disk_are_those_of_the_last_run(tmp_path, colmap_scene, monkeypatch, capsys):
+    rows = {name: torch.zeros(5, *attribute.shape) for name, attribute in attributes(3).items()}
+    write_ply(tmp_path / "model" / "point_cloud" / "iteration_7" / "point_cloud.ply", rows, 3)
+    monkeypatch.setattr("sys.argv", ["render.py", "-m", str(tmp_path / "model")])
+    files = [tmp_path / "model" / name / "ours_7" / "render_times.json" for name in ("train", "test")]
+
+    def timed_views(held_out: bool) -> list[int]:
+        options = f"Namespace(sh_degree=3, source_path={str(colmap_scene)!r}, eval={held_out})"
+        (tmp_path / "model" / "cfg_args").write_text(options)
+        render.main()
+        return [len(json.loads(file.read_text())["milliseconds"]) if file.exists() else 0 for file in files]
+
+    assert timed_views(held_out=True) == [14, 3]
+    assert "test: 3 views, median " in capsys.readouterr().out
+    text = files[1].read_text()
+    times = json.loads(text)
+    assert text == json.dumps(times, indent=1, sort_keys=True) + "\n"
+    assert times["gaussians"] == 5 and times["sizes"] == [[96, 64]] and not times["antialiasing"]
+    assert times["median_ms"] == sorted(times["milliseconds"].values())[1] > 0
+    assert timed_views(held_out=False) == [17, 0]
