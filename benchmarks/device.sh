@@ -118,7 +118,7 @@ PYTHON
 
 test_all() {
   local gpu status=0
-  gpu=$(grep -l 'mark\.gpu' tests/test_*.py)
+  gpu=$(grep -lE 'mark\.gpu|GPU_MARKS|_AND_GPU' tests/test_*.py)
   say "tests on the GPU"
   python3 -m pytest -q -p no:cacheprovider -m gpu $gpu || status=1
   say "tests of the rasterizer on the CPU"
@@ -129,7 +129,7 @@ test_all() {
 # Without torch's pool of memory, or an access beyond an allocation would fall into a neighbour.
 sanitize() {
   local tool gpu status=0
-  gpu=$(grep -l 'mark\.gpu' tests/test_*.py)
+  gpu=$(grep -lE 'mark\.gpu|GPU_MARKS|_AND_GPU' tests/test_*.py)
   for tool in memcheck racecheck; do
     say "$tool"
     PYTORCH_NO_CUDA_MEMORY_CACHING=1 timeout 270 compute-sanitizer --tool "$tool" --error-exitcode 9 \

@@ -30,9 +30,7 @@ class SplatScene:
 
     def settings(self, dtype: torch.dtype = torch.float64, **changes) -> GaussianRasterizationSettings:
         """A camera at the origin that looks along +z with 60 degrees across, on the parameters' device."""
-        made = settings(self.width, self.height, dtype, **changes)
-        device = self.parameters["means"].device
-        return made._replace(**{k: v.to(device) for k, v in made._asdict().items() if isinstance(v, Tensor)})
+        return on_device(settings(self.width, self.height, dtype, **changes), self.parameters["means"].device)
 
 
 def settings(
@@ -71,6 +69,11 @@ def settings(
         antialiasing=False,
     )
     return made._replace(**changes)
+
+
+def on_device(camera: GaussianRasterizationSettings, device: torch.device | str) -> GaussianRasterizationSettings:
+    """The same settings with their tensors on `device`."""
+    return camera._replace(**{k: v.to(device) for k, v in camera._asdict().items() if isinstance(v, Tensor)})
 
 
 def frustum(

@@ -2,10 +2,12 @@
 
 import os
 import shutil
+from collections.abc import Iterator
 from pathlib import Path
 
 import utils.openmp  # noqa: F401  isort: skip  (before torch)
 import pytest
+import torch
 from synthetic import make_blender_scene, make_colmap_scene
 
 
@@ -42,3 +44,11 @@ def colmap_scene(_colmap_master: Path, tmp_path: Path) -> Path:
 def blender_scene(_blender_master: Path, tmp_path: Path) -> Path:
     """A Blender scene of 4 training and 2 test frames, 40x30 RGBA; free to be changed."""
     return Path(shutil.copytree(_blender_master, tmp_path / "blender_scene"))
+
+
+@pytest.fixture
+def dtype(request: pytest.FixtureRequest) -> Iterator[torch.dtype]:
+    """The dtype of a parameter (device, dtype), whose device is torch's default during the test."""
+    device, made = request.param
+    with torch.device(device):
+        yield made

@@ -1,15 +1,35 @@
 """What the rasterizer's tests share: both renderers under one call, the error as the design defines it, scenes."""
 
 import math
+from collections.abc import Callable
 from typing import NamedTuple
 
+import pytest
 import torch
 from diff_gaussian_rasterization import GaussianRasterizationSettings, Rasterized, rasterize
 from torch import Tensor
 
-from benchmarks.splat_scenes import settings
+from benchmarks.splat_scenes import on_device, settings
 
 ops = torch.ops.diff_gaussian_rasterization
+
+BUILT = torch._C._dispatch_has_kernel_for_dispatch_key("diff_gaussian_rasterization::rasterize", "CUDA")
+GPU_MARKS = (
+    pytest.mark.gpu,
+    pytest.mark.skipif(not (torch.cuda.is_available() and BUILT), reason="needs a GPU and a build with CUDA"),
+)
+_PLACES = {"float64": ("cpu", torch.float64), "float32": ("cpu", torch.float32), "cuda": ("cuda", torch.float32)}
+
+
+def _param(name: str, *values: object) -> object:
+    return pytest.param(*values, id=name, marks=GPU_MARKS if name == "cuda" else ())
+
+
+# What runs on a GPU as well (benchmarks/device.sh finds the files by "_AND_GPU"). DTYPES_AND_GPU is for tests that make
+# all their tensors without naming a device: the fixture `dtype` makes it torch's default.
+CPU_AND_GPU = pytest.mark.parametrize("device", [_param(name, name) for name in ("cpu", "cuda")])
+BOTH_AND_GPU = pytest.mark.parametrize(("device", "dtype"), [_param(k, *place) for k, place in _PLACES.items()])
+DTYPES_AND_GPU = pytest.mark.parametrize("dtype", [_param(k, place) for k, place in _PLACES.items()], indirect=True)
 
 
 class Error(NamedTuple):
@@ -49,14 +69,21 @@ def leaves(parameters: dict[str, Tensor], dtype: torch.dtype | None = None) -> d
     return {name: t.detach().clone().to(dtype or t.dtype).requires_grad_() for name, t in parameters.items()}
 
 
-def gradients(parameters: dict[str, Tensor], camera: GaussianRasterizationSettings, **options) -> dict[str, Tensor]:
-    """Image, planes and every gradient of a fixed loss of all of them, by name."""
-    inputs = leaves(parameters)
+def gradients(
+    parameters: dict[str, Tensor],
+    camera: GaussianRasterizationSettings,
+    device: str = "cpu",
+    loss: Callable[[Rasterized], Tensor] | None = None,
+    **options,
+) -> dict[str, Tensor]:
+    """Image, planes and every gradient of a loss of theirs (None: `loss_of`), by name. Computed on `device`; the
+    results are on the CPU."""
+    inputs = leaves({name: t.to(device) for name, t in parameters.items()})
     means2d = torch.zeros_like(inputs["means"]).requires_grad_()
-    out = render(inputs, camera, means2d, **options)
-    loss_of(out).backward()
+    out = render(inputs, on_device(camera, device), means2d, **options)
+    (loss or loss_of)(out).backward()
     named = {f"d {name}": t.grad for name, t in [*inputs.items(), ("means2d", means2d)]}
-    return {name: t.detach() for name, t in out._asdict().items()} | named
+    return {name: t.detach().cpu() for name, t in (out._asdict() | named).items()}
 
 
 def loss_of(out: NamedTuple, keep: Tensor | None = None) -> Tensor:
@@ -65,7 +92,8 @@ def loss_of(out: NamedTuple, keep: Tensor | None = None) -> Tensor:
     loss = 0.0
     for plane in (out.color, out.inverse_depth, out.transmittance):
         weights = torch.randn(plane.shape, generator=generator, dtype=torch.float64)
-        loss = loss + ((weights if keep is None else weights * keep) * plane.double()).sum()
+        weights = weights if keep is None else weights * keep
+        loss = loss + (weights.to(plane.device) * plane.double()).sum()
     return loss
 
 
@@ -165,7 +193,7 @@ def everywhere(depths: Tensor, width: int, height: int) -> tuple[Tensor, Tensor]
     """Instances and ranges with every splat in every tile, by depth, ties by index."""
     order = torch.argsort(depths, stable=True).to(torch.int32)
     tiles = -(-width // 16) * -(-height // 16)
-    return order.repeat(tiles), len(order) * torch.arange(tiles + 1)
+    return order.repeat(tiles), len(order) * torch.arange(tiles + 1, device=depths.device)
 
 
 def assert_culling_is_exact(
@@ -175,7 +203,7 @@ def assert_culling_is_exact(
 
     also (K, 11): rows and depths of splats that `project` left out; they belong to the second list as well.
     """
-    background = torch.tensor([0.3, 0.6, 0.1], dtype=splats.dtype)
+    background = torch.tensor([0.3, 0.6, 0.1], dtype=splats.dtype, device=splats.device)
     instances, _, ranges, _ = ops.bin(splats, depths, rects, counts, height, width, False)
     got = ops.blend(splats, instances, ranges, background, height, width, True, False)
     seen = counts > 0
@@ -189,7 +217,7 @@ def assert_culling_is_exact(
     return len(instances), len(all_instances)
 
 
-def borderline_splats(n: int, width: int, height: int, dtype: torch.dtype) -> tuple[Tensor, ...]:
+def borderline_splats(n: int, width: int, height: int, dtype: torch.dtype, device: str = "cpu") -> tuple[Tensor, ...]:
     """`project`'s splats, depths, rects and counts, and what it left out, of splats whose opacity is tuned so that
     they reach 1/255 at one pixel on the rim of one tile within some units in the last place."""
     g = torch.Generator().manual_seed(6)
@@ -204,19 +232,19 @@ def borderline_splats(n: int, width: int, height: int, dtype: torch.dtype) -> tu
         "colors": torch.rand(n, 3, generator=g),
     }
     parameters["scales"][: n // 2] = parameters["scales"][: n // 2, :1]
-    parameters = {name: t.to(dtype) for name, t in parameters.items()}
-    camera = settings(width, height, dtype)
+    parameters = {name: t.to(device, dtype) for name, t in parameters.items()}
+    camera = on_device(settings(width, height, dtype), device)
     splats, depths, _, counts, _ = ops.project(*scene_arguments(parameters, camera, raw=False))
     # The corner of a tile, not far from the mean: where a tile's least distance is at a pixel centre.
-    u, v = (2 * torch.randn(2, n, generator=g)).clamp(-2.5, 2.5)
+    u, v = (2 * torch.randn(2, n, generator=g)).clamp(-2.5, 2.5).to(device)
     dy = v / splats[:, 4]
     pixel = splats[:, :2] + torch.stack([(u - splats[:, 3] * dy) / splats[:, 2], dy], 1)
     pixel = (pixel / 16).round() * 16
     pixel = torch.where(pixel > splats[:, :2], pixel, pixel - 1)
-    pixel = torch.minimum(pixel.clamp(min=0), torch.tensor([width - 1, height - 1]))
+    pixel = torch.minimum(pixel.clamp(min=0), torch.tensor([width - 1, height - 1], device=device))
     dx, dy = (pixel.double() - splats[:, :2].double()).unbind(1)
     u, v = splats[:, 2].double() * dx + splats[:, 3].double() * dy, splats[:, 4].double() * dy
-    step = torch.randint(-8, 9, (n,), generator=g) * torch.finfo(dtype).eps
+    step = torch.randint(-8, 9, (n,), generator=g).to(device) * torch.finfo(dtype).eps
     tuned = torch.exp2(u * u + v * v) / 255 * (1 + step)
     usable = (counts > 0) & (tuned < 0.9)
     assert usable.sum() > n / 3

@@ -2,46 +2,19 @@
 
 import pytest
 import torch
-from diff_gaussian_rasterization import rasterize
+from rasterizer_tools import GPU_MARKS, gradients, loss_of
 
-from benchmarks.splat_scenes import KINDS, PARAMETERS, SplatScene, frustum, settings
+from benchmarks.splat_scenes import KINDS, SplatScene, frustum, settings
 
-BUILT = torch._C._dispatch_has_kernel_for_dispatch_key("diff_gaussian_rasterization::rasterize", "CUDA")
-pytestmark = [
-    pytest.mark.gpu,
-    pytest.mark.skipif(not (torch.cuda.is_available() and BUILT), reason="needs a GPU and a build with CUDA"),
-]
+pytestmark = [*GPU_MARKS]
 OPS = torch.ops.diff_gaussian_rasterization
 PLANES = ("color", "inverse_depth", "transmittance")
 
 
 def run(scene: SplatScene, device: str, dtype: torch.dtype = torch.float32, keep=None, **changes) -> dict:
     """Every plane, radii and every gradient of a weighted sum of all planes; `keep` masks pixels."""
-    leaves = {k: v.detach().to(device).requires_grad_() for k, v in scene.leaves(dtype).items()}
-    camera = scene.settings(dtype, **changes)
-    camera = camera._replace(**{k: getattr(camera, k).to(device) for k in ("bg", "viewmatrix", "projmatrix", "campos")})
-    means2d = torch.zeros_like(leaves["means"], requires_grad=True)
-    named = {name: leaves[name] for name in ("scales", "rotations", "sh_dc", "sh_rest")}
-    out = rasterize(
-        leaves["means"],
-        means2d,
-        leaves["opacities"],
-        camera,
-        raw=True,
-        want_inverse_depth=True,
-        want_transmittance=True,
-        **named,
-    )
-    generator = torch.Generator().manual_seed(7)
-    loss = 0
-    for name in PLANES:
-        plane = getattr(out, name)
-        weight = torch.randn(plane.shape, generator=generator, dtype=torch.float64).to(plane)
-        loss = loss + (plane * weight * (1 if keep is None else keep.to(plane))).sum()
-    loss.backward()
-    result = {name: getattr(out, name).detach().cpu() for name in (*PLANES, "radii")}
-    result |= {f"d {name}": leaves[name].grad.cpu() for name in PARAMETERS}
-    return result | {"d means2d": means2d.grad.cpu()}
+    parameters = {name: t.float().to(dtype) for name, t in scene.parameters.items()}
+    return gradients(parameters, scene.settings(dtype, **changes), device, lambda out: loss_of(out, keep))
 
 
 def largest_error(got: torch.Tensor, wanted: torch.Tensor) -> float:
@@ -80,9 +53,15 @@ def test_errors_are_those_of_cpu_float(kind, antialiasing):
 def test_sizes(n, width, height):
     scene = frustum(n, width, height, 4.0, seed=3)
     got, wanted = run(scene, "cuda"), run(scene, "cpu")
-    for name in PLANES:
-        # Float against float: twice an error of 3e-6, and a few pixels at a cut-off.
-        assert ((got[name] - wanted[name]).abs() > 1e-4).float().mean() <= 0.002, name
+    # Float against float: twice an error of 3e-6, and a few pixels at a cut-off.
+    off = torch.stack([((got[name] - wanted[name]).abs() > 2e-5).any(0) for name in PLANES]).any(0)
+    assert off.float().mean() <= 0.002
+    got, wanted = (run(scene, device, keep=~off) for device in ("cuda", "cpu"))
+    for name in wanted:
+        assert got[name].shape == wanted[name].shape
+        if name.startswith("d ") and n:
+            # CPU float is off from double by up to 1.4e-6 here; CUDA may be by three times that: 6e-6 in all, doubled.
+            assert largest_error(got[name], wanted[name]) <= 1.2e-5, name
 
 
 def test_same_bits_every_time():

@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from rasterizer_tools import activated, gradients, pick, render
+from rasterizer_tools import CPU_AND_GPU, activated, gradients, pick, render
 from torch import Tensor
 
 from benchmarks.splat_scenes import ordinary, settings
@@ -44,15 +44,16 @@ def poisoned(parameters: dict[str, Tensor], name: str, value: float, whole_row: 
     return out
 
 
+@CPU_AND_GPU
 @pytest.mark.parametrize(("raw", "name"), CASES)
-def test_a_gaussian_that_is_not_finite_is_as_if_it_were_not_there(raw, name, camera):
+def test_a_gaussian_that_is_not_finite_is_as_if_it_were_not_there(raw, name, camera, device):
     parameters = scene(raw)
     others = torch.arange(N) != VICTIM
-    wanted = gradients(pick(parameters, others), camera, raw=raw)
+    wanted = gradients(pick(parameters, others), camera, device, raw=raw)
     for value in NOT_FINITE:
         for whole_row in (False, True):
             bad = poisoned(parameters, name, value, whole_row)
-            got = gradients(bad, camera, raw=raw)
+            got = gradients(bad, camera, device, raw=raw)
             for key, t in got.items():
                 if key in ("color", "inverse_depth", "transmittance"):
                     assert torch.equal(t, wanted[key]), (key, value)
@@ -65,12 +66,13 @@ def test_a_gaussian_that_is_not_finite_is_as_if_it_were_not_there(raw, name, cam
                     )
 
 
+@CPU_AND_GPU
 @pytest.mark.parametrize(("raw", "name"), CASES)
-def test_extreme_finite_values_leave_everything_finite(raw, name, camera):
+def test_extreme_finite_values_leave_everything_finite(raw, name, camera, device):
     parameters = scene(raw)
     for value in EXTREME:
         for whole_row in (False, True):
-            for key, t in gradients(poisoned(parameters, name, value, whole_row), camera, raw=raw).items():
+            for key, t in gradients(poisoned(parameters, name, value, whole_row), camera, device, raw=raw).items():
                 assert t.isfinite().all(), (key, value)
 
 
@@ -97,11 +99,12 @@ def test_the_length_of_a_raw_quaternion_does_not_matter(length, camera):
     torch.testing.assert_close(got["d rotations"] * length, wanted["d rotations"], rtol=1e-6, atol=0)
 
 
+@CPU_AND_GPU
 @pytest.mark.parametrize("logit", [-50.0, 50.0])
-def test_saturated_logits(logit, camera):
+def test_saturated_logits(logit, camera, device):
     parameters = {k: t.clone() for k, t in scene(True).items()}
     parameters["opacities"][VICTIM] = logit
-    got = gradients(parameters, camera)
+    got = gradients(parameters, camera, device)
     slope = got["d opacities"][VICTIM].abs().item()
     assert slope < 1e-15  # of the logistic function: e^-50
     assert (slope > 0) == (logit > 0)  # the other is culled
@@ -134,22 +137,24 @@ def test_bright_coefficients(camera):
     assert got["color"].max() > 100
 
 
-def test_a_mean_on_the_cameras_centre_is_culled(camera):
+@CPU_AND_GPU
+def test_a_mean_on_the_cameras_centre_is_culled(camera, device):
     parameters = {k: t.clone() for k, t in scene(True).items()}
     parameters["means"][VICTIM] = 0.0
-    got = gradients(parameters, camera)
+    got = gradients(parameters, camera, device)
     assert got["radii"][VICTIM] == 0 and not got["d means"][VICTIM].any()
     # With `campos` on a mean that is seen, the viewing direction is undefined: degree 0 alone is left of its colour.
     parameters["means"][VICTIM] = torch.tensor([0.1, -0.1, 3.0])
     elsewhere = camera._replace(campos=parameters["means"][VICTIM].clone())
-    got = gradients(parameters, elsewhere)
+    got = gradients(parameters, elsewhere, device)
     assert all(t.isfinite().all() for t in got.values())
     assert got["d sh_dc"][VICTIM].any() and not got["d sh_rest"][VICTIM].any()
 
 
-def test_a_degenerate_covariance_is_finite(camera):
+@CPU_AND_GPU
+def test_a_degenerate_covariance_is_finite(camera, device):
     parameters = scene(False)
     for values in ([0.0] * 6, [1, 1, 1, 1, 1, 1], [1e-3, 0, 0, -1e-3, 0, 1e-3], [1e-3, 1, 0, 1e-3, 0, 1e-3]):
         bad = {k: t.clone() for k, t in parameters.items()}
         bad["cov3d"][VICTIM] = torch.tensor(values, dtype=torch.float32)
-        assert all(t.isfinite().all() for t in gradients(bad, camera, raw=False).values()), values
+        assert all(t.isfinite().all() for t in gradients(bad, camera, device, raw=False).values()), values

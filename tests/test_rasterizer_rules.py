@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from rasterizer_tools import activated, few, one_splat, ops, pick, render, scene_arguments, together
+from rasterizer_tools import DTYPES_AND_GPU, activated, few, one_splat, ops, pick, render, scene_arguments, together
 
 from benchmarks.splat_scenes import ordinary, settings
 
@@ -24,7 +24,7 @@ def nextafter(value: float, towards: float, dtype: torch.dtype) -> float:
     return torch.nextafter(torch.tensor(value, dtype=dtype), torch.tensor(towards, dtype=dtype)).item()
 
 
-@BOTH
+@DTYPES_AND_GPU
 def test_the_near_plane_is_at_0_2_and_excluded(dtype):
     near = torch.tensor(0.2, dtype=dtype).item()
     for z, visible in [(near, False), (nextafter(near, 1, dtype), True), (-1.0, False), (0.0, False)]:
@@ -46,7 +46,7 @@ def test_alpha_of_1_255_is_blended_and_less_is_not(dtype):
         assert (out.transmittance == 1).sum() == 17 * 17 - blended
 
 
-@BOTH
+@DTYPES_AND_GPU
 def test_no_pixel_is_blended_under_1_255(dtype):
     """The rule holds at the edge, far out as well: no cut at 3 sigma, whose alpha is 0.011."""
     splat = one_splat(opacity=0.9, scale=0.2, dtype=dtype)
@@ -63,7 +63,7 @@ def test_no_pixel_is_blended_under_1_255(dtype):
     )
 
 
-@BOTH
+@DTYPES_AND_GPU
 def test_alpha_is_capped_at_0_99_and_the_gradient_passes(dtype):
     splat = leaf(one_splat(opacity=0.995, dtype=dtype))
     background = torch.tensor([0.25, 0.0, 0.5], dtype=dtype)
@@ -77,7 +77,7 @@ def test_alpha_is_capped_at_0_99_and_the_gradient_passes(dtype):
     assert splat["colors"].grad[0, 0].item() == pytest.approx(0.99, rel=1e-6)
 
 
-@BOTH
+@DTYPES_AND_GPU
 def test_a_saturated_splat_in_front_leaves_the_rest_a_hundredth(dtype):
     splats = leaf(together(one_splat(z=1, opacity=1.0, dtype=dtype), one_splat(z=2, opacity=0.5, dtype=dtype)))
     out = render(splats, camera(dtype), raw=False)
@@ -87,23 +87,25 @@ def test_a_saturated_splat_in_front_leaves_the_rest_a_hundredth(dtype):
     assert splats["opacities"].grad[1].item() == pytest.approx(0.01 * (1.0 - 0.2), rel=1e-4)
 
 
-@BOTH
+@DTYPES_AND_GPU
 def test_the_splat_that_would_leave_less_than_1e_4_ends_the_pixel_unblended(dtype):
     opacities = [0.95, 0.95, 0.95, 0.95, 0.01]  # the last would fit again, but the pixel has ended
     splats = [one_splat(z=1 + i, opacity=o, scale=0.05 * (1 + i), dtype=dtype) for i, o in enumerate(opacities)]
     splats = leaf(together(*splats))
     splats["colors"] = torch.eye(5, 3, dtype=dtype, requires_grad=True)
     out = render(splats, camera(dtype, bg=torch.zeros(3, dtype=dtype)), raw=False)
-    assert out.transmittance[MIDDLE].item() == pytest.approx(0.05**3, rel=1e-5)
+    # 1 - 0.95 makes 20 units in the last place of one; a GPU's exponential is good to two, and there are three factors.
+    bound = 2 * 3 * 20 * torch.finfo(dtype).eps
+    assert out.transmittance[MIDDLE].item() == pytest.approx(0.05**3, rel=bound)
     wanted = torch.tensor([0.95, 0.95 * 0.05, 0.95 * 0.05**2], dtype=dtype)
-    torch.testing.assert_close(out.color[MIDDLE], wanted, rtol=1e-5, atol=0)
+    torch.testing.assert_close(out.color[MIDDLE], wanted, rtol=bound, atol=0)
     (out.color[:, 8, 8].sum() + out.transmittance[0, 8, 8] + out.inverse_depth[0, 8, 8]).backward()
     for t in splats.values():
         assert not t.grad[3:].any()
     assert splats["colors"].grad[:3].all() and splats["opacities"].grad[:3].all()
 
 
-@BOTH
+@DTYPES_AND_GPU
 @pytest.mark.parametrize(("third", "blended"), [(0.9599, True), (0.9601, False)])
 def test_the_transmittance_limit_is_1e_4(third, blended, dtype):
     opacities = [0.95, 0.95, third]  # 0.0025 (1 - third)
@@ -117,7 +119,7 @@ def expected_radius(a: float, b: float, c: float) -> int:
     return math.ceil(3 * math.sqrt((a + c) / 2 + root))
 
 
-@BOTH
+@DTYPES_AND_GPU
 def test_radius_is_3_sigma_of_the_longer_axis(dtype):
     focal = 17 / (2 * math.tan(math.radians(30)))
     for sx, sy, angle in [(1e-6, 1e-6, 0.0), (0.05, 0.05, 0.3), (0.3, 0.02, 0.0), (0.3, 0.02, 0.7), (0.1, 0.5, -1.1)]:
@@ -172,7 +174,7 @@ def test_equal_depths_keep_the_order_of_their_index():
     assert ties > 50
 
 
-@BOTH
+@DTYPES_AND_GPU
 def test_inverse_depth_is_the_sum_of_weights_over_z_without_background(dtype):
     alphas, zs = [0.3, 0.6, 0.5], [1.0, 2.5, 7.0]
     splats = together(*(one_splat(z=z, opacity=a, dtype=dtype) for z, a in zip(zs, alphas, strict=True)))
@@ -188,7 +190,7 @@ def test_inverse_depth_is_the_sum_of_weights_over_z_without_background(dtype):
     assert corner.inverse_depth[0, 0, 0] == 0 and corner.transmittance[0, 0, 0] == 1
 
 
-@BOTH
+@DTYPES_AND_GPU
 def test_the_background_shows_through_and_its_gradient_path_is_in_the_splats(dtype):
     """What is behind the last splat is the background: d colour / d alpha = colour - background."""
     for background in ([0.0, 0.0, 0.0], [1.0, 1.0, 1.0], [0.2, 0.7, 0.4]):

@@ -1,30 +1,64 @@
-"""Tile culling changes no bit: exact instance lists against lists with every splat in every tile."""
+"""Culling changes no bit: exact instance lists against lists with every splat in every tile, pixels against sums."""
+
+import math
 
 import pytest
 import torch
-from rasterizer_tools import assert_culling_is_exact, borderline_splats, ops, scene_arguments
+from rasterizer_tools import BOTH_AND_GPU, CPU_AND_GPU, assert_culling_is_exact, borderline_splats, ops, scene_arguments
 
+from benchmarks.environment import instruction_set
 from benchmarks.splat_scenes import KINDS, settings
 
-BOTH = pytest.mark.parametrize("dtype", [torch.float64, torch.float32], ids=["float64", "float32"])
 SIZE = (75, 53)
 
 
-@BOTH
+@BOTH_AND_GPU
 @pytest.mark.parametrize("kind", KINDS)
-def test_no_pixel_differs(kind, dtype):
-    scene = KINDS[kind](400, *SIZE)
+def test_no_pixel_differs(kind, device, dtype):
+    scene = KINDS[kind](400, *SIZE).to(device)
     parameters = {name: t.to(dtype) for name, t in scene.parameters.items()}
     projected = ops.project(*scene_arguments(parameters, settings(*SIZE, dtype)))
     assert_culling_is_exact(projected[0], *projected[1:4], *SIZE)
 
 
-@BOTH
-def test_no_pixel_differs_where_opacities_are_tuned_to_the_cut(dtype):
+@BOTH_AND_GPU
+def test_no_pixel_differs_where_opacities_are_tuned_to_the_cut(device, dtype):
     """Each splat reaches 1/255 at one pixel of one tile's rim within some units in the last place, over or under."""
-    *projected, left_out = borderline_splats(600, *SIZE, dtype)
+    *projected, left_out = borderline_splats(600, *SIZE, dtype, device)
     instances, everywhere = assert_culling_is_exact(*projected, *SIZE, left_out)
     assert instances < 0.6 * everywhere
+
+
+@CPU_AND_GPU
+def test_the_pixels_reached_are_those_whose_exponent_comes_to_the_cut(device):
+    """Within a tile as well (rows of lanes, a GPU's sub-tiles): each tuned splat alone, its exponent by the kernels'
+    own operations, one by one."""
+    if device == "cpu" and instruction_set() == "baseline":
+        pytest.skip("fused operations are emulated, and this instruction set has none")
+    width, height = SIZE
+    *projected, _ = borderline_splats(600, *SIZE, torch.float32, device)
+    splats = projected[0][projected[3] > 0]
+    tiles = -(-width // 16) * -(-height // 16)
+    x, y = torch.arange(width, device=device), torch.arange(height, device=device)[:, None]
+    near = 0
+    for i, s in enumerate(splats):
+        instances = torch.full((tiles,), i, dtype=torch.int32, device=device)
+        ranges, background = torch.arange(tiles + 1, device=device), torch.zeros(3, device=device)
+        left = ops.blend(splats, instances, ranges, background, height, width, False, False)[1][0]
+        mean_x, mean_y, l11, l12, l22, log2_opacity = s[:6]
+        dy = (y % 16).float() - (mean_y - (y // 16 * 16).float())
+        v = l22 * dy
+        u = _fused(l11, (x % 16).float(), _fused(l12, dy, l11 * ((x // 16 * 16).float() - mean_x)))
+        exponent = _fused(-u, u, _fused(-v, v, log2_opacity))
+        least = torch.tensor(-math.log2(255), dtype=torch.float32, device=device)
+        assert torch.equal(left < 1, exponent >= least)
+        near += int((exponent - least).abs().min() < 1e-5)
+    assert near > 0.5 * len(splats)
+
+
+def _fused(a: torch.Tensor, b: torch.Tensor, c: torch.Tensor) -> torch.Tensor:
+    """a b + c in float32, rounded once: the product is exact in float64."""
+    return (a.double() * b.double() + c.double()).float()
 
 
 def test_lists_hold_no_tile_in_vain():
