@@ -23,6 +23,7 @@ from gaussian_renderer import render
 from scene import Scene
 from scene.cameras import Camera
 from scene.gaussian_model import GaussianModel
+from scene.memory_guard import memory_errors_explained
 from utils import render_times
 from utils.general_utils import safe_state
 from utils.system_utils import UserError, atomic_write, compute_device, mkdir_p, run_cli
@@ -93,6 +94,7 @@ def main() -> None:
     options, pipe = model_params.extract(args), pipeline_params.extract(args)
     safe_state(args.quiet)
 
+    options.images_to_load = 1  # each is looked at once
     gaussians = GaussianModel(options.sh_degree)
     scene = Scene(options, gaussians, load_iteration=args.iteration, shuffle=False)
     if len(gaussians) == 0:
@@ -106,7 +108,8 @@ def main() -> None:
             continue
         folder = Path(scene.model_path) / name / f"ours_{scene.loaded_iter}"
         (folder / render_times.NAME).unlink(missing_ok=True)  # not of what an interrupted run has left
-        seconds = render_set(folder, views, gaussians, pipe, background)
+        with memory_errors_explained(gaussians, views):
+            seconds = render_set(folder, views, gaussians, pipe, background)
         if seconds:
             sizes = [(view.image_width, view.image_height) for view in views]
             times = render_times.summarise(seconds, sizes, len(gaussians), pipe.antialiasing, background.device)

@@ -24,6 +24,8 @@ from scene import densification as adc
 from scene.cameras import Camera
 from scene.checkpoint import load_checkpoint, save_checkpoint
 from scene.gaussian_model import GaussianModel
+from scene.memory_estimate import announce_memory
+from scene.memory_guard import MemoryGuard
 from utils.counter_rng import Stream, permutation, uniform
 from utils.curve_recorder import CurveRecorder, evenly_spread
 from utils.error_curve import Row, continue_curve
@@ -83,6 +85,7 @@ def training(
     if not checkpoint or not (Path(scene.model_path) / "cameras.json").exists():
         scene.write_inputs()
 
+    announce_memory(scene, gaussians, opt.max_num_splats)
     fixed_background = torch.full((3,), 1.0 if dataset.white_background else 0.0, device=device)
     log = TrainingLog(scene.model_path, first_iteration)
     losses = LossWatch(device, log.loss)
@@ -94,15 +97,18 @@ def training(
         curve = _curve(scene, rows, log, opt.iterations, testing_iterations, pipe, fixed_background)
     clock = Stopwatch()
     bar = tqdm(initial=first_iteration, total=opt.iterations, desc="Training progress", dynamic_ncols=True)
-    with bar, DeferredInterrupt() as interrupt:
+    guard = MemoryGuard(gaussians, scene.model_path, first_iteration)
+    with bar, DeferredInterrupt() as interrupt, guard:
         for iteration in range(first_iteration + 1, opt.iterations + 1):
             started = clock.seconds
             gaussians.update_learning_rate(iteration)
             if iteration % SH_INTERVAL == 0:
                 gaussians.oneupSHdegree()
             camera = views[iteration]
+            guard.working(camera)
             if iteration - 1 == debug_from:
                 pipe.debug = True
+            scene.prefetch(views.coming(iteration, min(scene.images.ahead, opt.iterations - iteration + 1)))
             background = _random_background(opt.seed, iteration, device) if opt.random_background else fixed_background
 
             package = render(camera, gaussians, pipe, background, want_visibility=False)
@@ -131,10 +137,12 @@ def training(
                 if saving or scores:
                     log.add(iteration, seconds, gaussians=len(gaussians), loss=losses.mean, **scores)
 
+            guard.changing()
             _control_density(gaussians, package, iteration, opt, scene.cameras_extent, dataset.white_background)
             if iteration < opt.iterations:
                 gaussians.optimizer.step()
                 gaussians.optimizer.zero_grad(set_to_none=True)
+            guard.reached(iteration)
             stop = interrupt.requested  # once: a signal may come at any moment
             if iteration in checkpoint_iterations or stop:
                 _check_losses(losses.read(), views)
@@ -198,15 +206,19 @@ class _ViewOrder:
             raise UserError("the scene has no training views; without --eval all views train")
         self._cameras = cameras
         self._seed = seed
-        self._epoch = -1
-        self._order: list[int] = []
+        self._orders: dict[int, list[int]] = {}
 
     def __getitem__(self, iteration: int) -> Camera:
         epoch, position = divmod(iteration - 1, len(self._cameras))
-        if epoch != self._epoch:
-            self._epoch = epoch
-            self._order = permutation(self._seed, Stream.VIEW_ORDER, epoch, len(self._cameras))
-        return self._cameras[self._order[position]]
+        if epoch not in self._orders:
+            # At most two: looking ahead from the end of one epoch goes to and fro between it and the next.
+            order = permutation(self._seed, Stream.VIEW_ORDER, epoch, len(self._cameras))
+            self._orders = {epoch: order} | {e: o for e, o in self._orders.items() if e == epoch - 1}
+        return self._cameras[self._orders[epoch][position]]
+
+    def coming(self, iteration: int, count: int) -> list[Camera]:
+        """The cameras of `count` iterations, this one first; of an epoch's length at most."""
+        return [self[t] for t in range(iteration, iteration + min(count, len(self._cameras)))]
 
 
 def _random_background(seed: int, iteration: int, device: torch.device) -> Tensor:

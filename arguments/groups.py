@@ -66,7 +66,9 @@ class ModelParams(ParamGroup):
         Option(
             "data_device",
             "cuda",
-            "device that keeps the pictures; without a usable GPU this means the CPU",
+            "device that keeps the pictures, as 8-bit values; they are kept in pinned memory of the CPU instead, and "
+            "copied ahead of their use, where they would take more than a quarter of the GPU's free memory, and with "
+            "cpu; without a usable GPU this means the CPU",
             stored=True,
         ),
         Option("eval", False, "hold out a test set: every 8th picture by name, or Blender's test frames", stored=True),
@@ -79,7 +81,8 @@ class ModelParams(ParamGroup):
         Option(
             "images_to_load",
             0,
-            "decoded pictures kept in memory at most, 0: all; every picture still trains",
+            "decoded pictures kept in memory at most, 0: all; every picture still trains, as it would with all, and "
+            "up to 32 that come next are decoded ahead",
             "ours",
             check=at_least(0),
         ),

@@ -14,7 +14,7 @@ import torch
 
 from scene.cameras import Camera, camera_to_JSON, cameraList_from_camInfos
 from scene.dataset_readers import CameraInfo, read_scene
-from scene.images import ImageStore
+from scene.image_store import ImageStore
 from scene.point_cloud import write_point_cloud
 from utils.graphics_utils import BasicPointCloud
 from utils.system_utils import UserError, atomic_write, compute_device, saved_iterations, searchForMaxIteration
@@ -36,7 +36,8 @@ class Scene:
     args: model options (ModelParams.extract). load_iteration: None starts from the dataset's points and, unless `write`
     is False, calls `write_inputs` when nothing was refused; -1 loads the last saved iteration, N that one.
     shuffle: mix the order of the views (always the same way). resolution_scales: factors by which views are made
-    smaller, one list of cameras each. cameras_extent: E in world units, from the training views.
+    smaller, one list of cameras each. cameras_extent: E in world units, from the training views. images: the views'
+    pictures.
     """
 
     def __init__(
@@ -59,9 +60,11 @@ class Scene:
         self.cameras_extent = info.extent
 
         device = compute_device()
-        images = ImageStore(args.images_to_load, picture_device(args.data_device, device))
+        images = ImageStore(args.images_to_load, picture_device(args.data_device, device), device)
+        self.images = images
         self._train = self._cameras(info.train_cameras, args, images, device, shuffle, resolution_scales)
         self._test = self._cameras(info.test_cameras, args, images, device, shuffle, resolution_scales)
+        images.plan(_pictures(self._train), _pictures(self._test))
 
         if self.loaded_iter is None:
             gaussians.create_from_pcd(info.point_cloud, info.train_cameras, self.cameras_extent)
@@ -78,6 +81,10 @@ class Scene:
     def getTestCameras(self, scale: float = 1.0) -> list[Camera]:
         """Held-out views at a resolution scale that the scene was made with."""
         return self._test[scale]
+
+    def prefetch(self, cameras: Sequence[Camera]) -> None:
+        """Begin to make the pictures of the views ready that are used next, in that order (`images.ahead` of them)."""
+        self.images.prefetch([picture for camera in cameras for picture in camera.pictures])
 
     def save(self, iteration: int) -> None:
         """Write the Gaussians as `point_cloud/iteration_N/point_cloud.ply`."""
@@ -127,6 +134,10 @@ class Scene:
             cameras = cameraList_from_camInfos(infos, scale, args, images, device)
             lists[scale] = [cameras[index] for index in order]
         return lists
+
+
+def _pictures(lists: dict[float, list[Camera]]) -> list[tuple[Path, tuple[int, int]]]:
+    return [picture for cameras in lists.values() for camera in cameras for picture in camera.pictures]
 
 
 def _refuse_dataset_folder(args: argparse.Namespace) -> None:

@@ -4,13 +4,14 @@ Matrices are handed on transposed (they multiply row vectors from the right). Ca
 """
 
 import argparse
+from pathlib import Path
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from scene.dataset_readers import CameraInfo
-from scene.images import ImageStore
+from scene.image_store import ImageStore
 from scene.resolution import training_size
 from utils.graphics_utils import getProjectionMatrix, getWorld2View2
 
@@ -66,8 +67,13 @@ class Camera:
     def _hand_on(self, matrix: Tensor) -> Tensor:
         return matrix.to(self.device, torch.float32).contiguous()
 
+    @property
+    def pictures(self) -> list[tuple[Path, tuple[int, int]]]:
+        """Files that `target` reads, each with the size (width, height) it is decoded at."""
+        return [(self.image_path, (self.image_width, self.image_height))]
+
     def _pixels(self) -> Tensor:
-        pixels = self._images.get(self.image_path, (self.image_width, self.image_height))
+        pixels = self._images.get(*self.pictures[0])
         return pixels.to(self.device, non_blocking=True)
 
     def target(self, background: Tensor) -> Tensor:

@@ -145,10 +145,11 @@ class GaussianModel:
         for name, param in params.items():
             setattr(self, self._attributes[name].field, param)
 
-    def _zero_statistics(self) -> None:
-        self.xyz_gradient_accum = torch.zeros(len(self), 1, device=self._xyz.device)
-        self.denom = torch.zeros(len(self), 1, device=self._xyz.device)
-        self.max_radii2D = torch.zeros(len(self), device=self._xyz.device)
+    def _zero_statistics(self, device: torch.device | str | None = None) -> None:
+        device = device or self._xyz.device
+        self.xyz_gradient_accum = torch.zeros(len(self), 1, device=device)
+        self.denom = torch.zeros(len(self), 1, device=device)
+        self.max_radii2D = torch.zeros(len(self), device=device)
 
     # Optimiser
 
@@ -253,10 +254,27 @@ class GaussianModel:
                 )
         check_finite(rows, "the checkpoint", "give another one")
 
-    def check_finite(self, iteration: int) -> None:
-        """UserError where a parameter is not finite, to be called before anything of this iteration is saved."""
+    def check_finite(self, iteration: int, device: torch.device | str | None = None) -> None:
+        """UserError where a parameter is not finite, to be called before anything of this iteration is saved.
+
+        device: that looks (default: where the parameters are).
+        """
         remedy = "nothing of it was saved; lower the learning rates, or go on from an earlier checkpoint"
-        check_finite(self._rows(), f"iteration {iteration}", remedy)
+        check_finite(
+            {name: values.to(device) for name, values in self._rows().items()}, f"iteration {iteration}", remedy
+        )
+
+    def take_from_optimizer(self) -> None:
+        """After a densification that memory did not suffice for: take the rows that it got to, for saving them.
+
+        Statistics that belong to other rows start again. MemoryError where tensors have different numbers of rows.
+        """
+        self._take({group["name"]: group["params"][0] for group in self.optimizer.param_groups})
+        moments = [values for state in self.optimizer.state.values() for values in state.values() if values.dim() > 0]
+        if any(len(values) != len(self) for values in (*self._rows().values(), *moments)):
+            raise MemoryError("a densification stopped half-way")
+        if any(len(values) != len(self) for values in (self.xyz_gradient_accum, self.denom, self.max_radii2D)):
+            self._zero_statistics("cpu")
 
     # Adaptive density control
 

@@ -8,6 +8,8 @@ import diff_gaussian_rasterization  # noqa: F401  (its library holds the Adam ke
 import torch
 from torch import Tensor, nn
 
+from utils.memory import is_out_of_memory
+
 _ADAM = torch.ops.diff_gaussian_rasterization.adam_
 
 
@@ -85,24 +87,41 @@ class GaussianAdam(torch.optim.Adam):
     def append_rows(self, rows: dict[str, Tensor]) -> dict[str, nn.Parameter]:
         """Append `rows[name]` (n, ...) to each group, with zero moments. Returns the parameters, without gradient."""
 
-        def grow(moment: Tensor, name: str) -> Tensor:
-            return torch.cat((moment, torch.zeros_like(rows[name])))
+        def grow(values: Tensor, name: str, is_moment: bool) -> Tensor:
+            new = rows[name].to(values.device)
+            return torch.cat((values, torch.zeros_like(new) if is_moment else new))
 
-        return {
-            group["name"]: self._replace(group, torch.cat((group["params"][0].detach(), rows[group["name"]])), grow)
-            for group in self.param_groups
-        }
+        return self._change_rows(grow)
 
     def keep_rows(self, indices: Tensor) -> dict[str, nn.Parameter]:
         """Keep the rows of `indices` (n,) int64 in every group. Returns the new parameters, without gradient."""
+        return self._change_rows(lambda values, *_: values.index_select(0, indices.to(values.device)))
 
-        def select(moment: Tensor, _: str) -> Tensor:
-            return moment.index_select(0, indices)
+    def _change_rows(self, change: Callable[[Tensor, str, bool], Tensor]) -> dict[str, nn.Parameter]:
+        """Map every group's parameter and moments; `change` takes values, name, and whether they are a moment.
 
-        return {
-            group["name"]: self._replace(group, group["params"][0].detach().index_select(0, indices), select)
-            for group in self.param_groups
-        }
+        What a device has no room for goes to the CPU, so that all have the same rows when the error is raised after the
+        last: such a model can't train on, but be saved.
+        """
+        errors = []
+
+        def changed(values: Tensor, name: str, is_moment: bool) -> Tensor:
+            try:
+                return change(values, name, is_moment)
+            except (MemoryError, RuntimeError) as error:
+                if not is_out_of_memory(error):
+                    raise
+                errors.append(error)
+                return change(values.cpu(), name, is_moment)
+
+        params = {}
+        for group in self.param_groups:
+            name = group["name"]
+            value = changed(group["params"][0].detach(), name, False)
+            params[name] = self._replace(group, value, lambda moment, name: changed(moment, name, True))
+        if errors:
+            raise errors[0]
+        return params
 
     def reset(self, name: str, value: Tensor) -> nn.Parameter:
         """Give one group a new value and zero moments. Returns the new parameter, without gradient."""
@@ -112,11 +131,11 @@ class GaussianAdam(torch.optim.Adam):
     def _replace(self, group: dict, value: Tensor, change: Callable[[Tensor, str], Tensor]) -> nn.Parameter:
         """Swap a group's parameter; `change` maps its moments, the step counter stays."""
         param = nn.Parameter(value.requires_grad_(True))
-        state = self.state.pop(group["params"][0], None)
-        if state:
+        old = group["params"][0]
+        if self.state.get(old):
             for key in ("exp_avg", "exp_avg_sq"):
-                state[key] = change(state[key], group["name"])
-            self.state[param] = state
+                self.state[old][key] = change(self.state[old][key], group["name"])
+            self.state[param] = self.state.pop(old)
         group["params"] = [param]
         return param
 

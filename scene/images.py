@@ -1,8 +1,7 @@
-"""Pictures from files: checked early, decoded once at training size, kept as uint8."""
+"""Pictures from files: checked early, decoded at training size as uint8."""
 
 import os
 import warnings
-from collections import OrderedDict
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +14,9 @@ from utils.system_utils import UserError
 # What Pillow raises on broken files, by format.
 _BROKEN = (OSError, SyntaxError, ValueError, EOFError, Image.DecompressionBombError)
 _TAIL = 4096
+# Large pictures are normal here; Pillow's own limit still refuses absurd ones. Once and for all, as filters that are
+# set for a block only are shared by all threads.
+warnings.filterwarnings("ignore", category=Image.DecompressionBombWarning)
 
 
 def picture_size(path: Path) -> tuple[int, int]:
@@ -23,7 +25,7 @@ def picture_size(path: Path) -> tuple[int, int]:
     The end of the file is looked at too: a picture without its end mark is decoded to see whether it is whole.
     """
     try:
-        with _open(path) as image:
+        with Image.open(path) as image:
             size = image.size
             if not _has_end_mark(path, image.format):
                 image.load()
@@ -39,27 +41,20 @@ def decode(path: Path, size: tuple[int, int]) -> Tensor:
     orientation is ignored, as it is by COLMAP. Grey, palette, CMYK and 16-bit pictures become 8-bit RGB.
     """
     try:
-        with _open(path) as image:
+        with Image.open(path) as image:
             image = _to_rgb_or_rgba(image)
         if image.size != size:
             image = image.resize(size, Image.Resampling.BICUBIC)
+        pixels = np.asarray(image)
+        if pixels.shape[-1] == 4 and pixels[..., 3].min() == 255:
+            pixels = pixels[..., :3]
+        return torch.from_numpy(np.ascontiguousarray(pixels.transpose(2, 0, 1)))
     except _BROKEN as error:
         raise _unreadable(path, error) from error
     except MemoryError as error:
         raise UserError(
             f"not enough memory for the picture {path} at {size[0]} x {size[1]} pixels; choose a smaller size with -r"
         ) from error
-    pixels = np.asarray(image)
-    if pixels.shape[-1] == 4 and pixels[..., 3].min() == 255:
-        pixels = pixels[..., :3]
-    return torch.from_numpy(np.ascontiguousarray(pixels.transpose(2, 0, 1)))
-
-
-def _open(path: Path) -> Image.Image:
-    with warnings.catch_warnings():
-        # Large pictures are normal here; Pillow's own limit still refuses absurd ones.
-        warnings.simplefilter("ignore", Image.DecompressionBombWarning)
-        return Image.open(path)
 
 
 def _unreadable(path: Path, error: Exception) -> UserError:
@@ -84,25 +79,3 @@ def _to_rgb_or_rgba(image: Image.Image) -> Image.Image:
         raise ValueError("floating-point pixels; save it with 8 or 16 bits")
     has_alpha = image.has_transparency_data
     return image.convert("RGBA" if has_alpha else "RGB")
-
-
-class ImageStore:
-    """Decoded pictures on one device, each decoded once; beyond `limit` (0: none) the longest unused one is dropped."""
-
-    def __init__(self, limit: int = 0, device: torch.device | str = "cpu") -> None:
-        self.limit = limit
-        self.device = torch.device(device)
-        self._pictures: OrderedDict[tuple[Path, tuple[int, int]], Tensor] = OrderedDict()
-
-    def get(self, path: Path, size: tuple[int, int]) -> Tensor:
-        """Picture (3 or 4,H,W) uint8 of `decode`, on the store's device."""
-        key = (path, size)
-        if key not in self._pictures:
-            if self.limit and len(self._pictures) >= self.limit:
-                self._pictures.popitem(last=False)
-            self._pictures[key] = decode(path, size).to(self.device)
-        self._pictures.move_to_end(key)
-        return self._pictures[key]
-
-    def __len__(self) -> int:
-        return len(self._pictures)

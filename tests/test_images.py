@@ -7,8 +7,8 @@ import pytest
 import torch
 from PIL import Image
 
-from scene import images, resolution
-from scene.images import ImageStore, decode, picture_size
+from scene import resolution
+from scene.images import decode, picture_size
 from scene.resolution import training_size
 from utils.system_utils import UserError
 
@@ -169,22 +169,3 @@ def test_a_whole_picture_with_bytes_behind_it_is_accepted(tmp_path):
     Image.fromarray(_noise((64, 64, 3))).save(path)
     path.write_bytes(path.read_bytes() + b"\0" * 10_000)
     assert picture_size(path) == (64, 64)
-
-
-@pytest.mark.parametrize(("limit", "decoded"), [(0, 3), (2, 4), (1, 6)])
-def test_the_store_decodes_once_within_its_limit(tmp_path, monkeypatch, limit, decoded):
-    for name in "abc":
-        Image.fromarray(_noise((4, 4, 3))).save(tmp_path / f"{name}.png")
-    count = 0
-
-    def counting(path, size):
-        nonlocal count
-        count += 1
-        return decode(path, size)
-
-    monkeypatch.setattr(images, "decode", counting)
-    store = ImageStore(limit)
-    for name in "abacab":  # with room for two: c takes the place of b, as a was used after it
-        store.get(tmp_path / f"{name}.png", (4, 4))
-        assert not limit or len(store) <= limit
-    assert count == decoded

@@ -9,6 +9,8 @@ from pathlib import Path
 
 import torch
 
+from utils.memory import is_out_of_memory, shortage
+
 _ITERATION_FOLDER = re.compile(r"iteration_(\d+)")
 
 
@@ -43,6 +45,15 @@ def _status(main: Callable[[], object]) -> int:
         main()
     except UserError as error:
         print(f"error: {error}", file=sys.stderr)
+        return 2
+    except (MemoryError, RuntimeError) as error:
+        if not is_out_of_memory(error):
+            raise
+        print(
+            f"error: memory did not suffice ({shortage(error, compute_device())}); lower --resolution (-r), or free "
+            "memory that other programs use",
+            file=sys.stderr,
+        )
         return 2
     except Terminated:
         print("terminated", file=sys.stderr)

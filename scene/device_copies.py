@@ -1,0 +1,39 @@
+"""Copies of pinned pictures to a GPU, made while it works on something else."""
+
+from collections.abc import Collection, Hashable
+
+import torch
+from torch import Tensor
+
+
+class DeviceCopies:
+    """Copies on a stream of their own: they wait for no kernel, and kernels wait only for the picture they need."""
+
+    def __init__(self, device: torch.device) -> None:
+        self._device = device
+        self._stream = torch.cuda.Stream(device)
+        self._sent: dict[Hashable, tuple[Tensor, torch.cuda.Event]] = {}
+
+    def send(self, key: Hashable, picture: Tensor) -> None:
+        """Begin to copy a pinned picture, unless that was begun before."""
+        if key in self._sent:
+            return
+        with torch.cuda.stream(self._stream):
+            copy = picture.to(self._device, non_blocking=True)
+            ready = torch.cuda.Event()
+            ready.record(self._stream)
+        self._sent[key] = copy, ready
+
+    def take(self, key: Hashable, picture: Tensor) -> Tensor:
+        """The copy, for the current stream, which waits for it; the host does not."""
+        self.send(key, picture)
+        copy, ready = self._sent.pop(key)
+        current = torch.cuda.current_stream(self._device)
+        current.wait_event(ready)
+        copy.record_stream(current)  # so that its memory is not used again before that stream is done with it
+        return copy
+
+    def keep_only(self, keys: Collection[Hashable]) -> None:
+        """Drop copies that were not taken and are not among these."""
+        for key in self._sent.keys() - set(keys):
+            del self._sent[key]

@@ -1,0 +1,100 @@
+"""Where memory does not suffice the model is saved, and a sentence says what was wanted and what helps."""
+
+import contextlib
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from types import TracebackType
+
+from scene.cameras import Camera
+from scene.checkpoint import save_checkpoint
+from scene.gaussian_model import GaussianModel
+from utils.memory import is_out_of_memory, shortage
+from utils.system_utils import UserError
+
+
+class MemoryGuard:
+    """Inside `with`, where a training runs out of memory the model is saved and the error becomes a UserError.
+
+    The training says where it is: `reached` (an iteration is complete), `working` (which view), `changing` (from here
+    on the model is between two iterations). Before `changing`, what is saved is the state after the last iteration, and
+    going on from it equals a run that was never stopped. Afterwards it is a whole model, too, but that iteration's
+    densification or optimiser step may be done in part.
+    """
+
+    def __init__(self, gaussians: GaussianModel, model_path: str, first_iteration: int) -> None:
+        self._gaussians = gaussians
+        self._folder = Path(model_path)
+        self._first = first_iteration
+        self.reached(first_iteration)
+
+    def reached(self, iteration: int) -> None:
+        """The model has the state after this iteration."""
+        self._iteration = iteration
+        self._sh_degree = self._gaussians.active_sh_degree
+        self._changing = False
+        self._camera: Camera | None = None
+
+    def working(self, camera: Camera) -> None:
+        """The next iteration has begun, with this view."""
+        self._camera = camera
+
+    def changing(self) -> None:
+        """The next iteration begins to change the model."""
+        self._changing = True
+
+    def __enter__(self) -> "MemoryGuard":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if is_out_of_memory(error):
+            what = _situation(error, self._gaussians, [self._camera] if self._camera else [])
+            raise UserError(
+                f"memory did not suffice in iteration {self._iteration + 1} ({what}); {self._rescue()}"
+            ) from error
+
+    def _rescue(self) -> str:
+        """Save what there is. Says what was saved, and what to do."""
+        if self._iteration == self._first and not self._changing:
+            return "nothing was trained yet; lower --resolution (-r), --max_num_splats, --images_to_load or --sh_degree"
+        gaussians, iteration = self._gaussians, self._iteration + self._changing
+        try:
+            if self._changing:
+                gaussians.take_from_optimizer()
+                state = f"the model in iteration {iteration}, whose last changes may be done in part,"
+            else:
+                gaussians.active_sh_degree = self._sh_degree
+                state = f"the model after iteration {iteration}"
+            # On the CPU: there may be no room left for the check where the model is.
+            gaussians.check_finite(iteration, "cpu")
+            path = self._folder / f"chkpnt{iteration}.pth"
+            save_checkpoint(path, gaussians.capture(), iteration)
+        except (UserError, MemoryError, RuntimeError) as error:
+            return f"and the model could not be saved ({error}); go on from an earlier checkpoint"
+        return (
+            f"{state} is saved: go on with --start_checkpoint {path} and --max_num_splats {len(gaussians)}, "
+            "--images_to_load or a lower --resolution (-r), or start anew with a lower --sh_degree"
+        )
+
+
+@contextlib.contextmanager
+def memory_errors_explained(gaussians: GaussianModel, cameras: Sequence[Camera]) -> Iterator[None]:
+    """UserError in place of an error for want of memory while these views are rendered."""
+    try:
+        yield
+    except Exception as error:
+        if not is_out_of_memory(error):
+            raise
+        raise UserError(
+            f"memory did not suffice for rendering ({_situation(error, gaussians, cameras)}); lower --resolution (-r), "
+            "or free memory that other programs use"
+        ) from error
+
+
+def _situation(error: BaseException, gaussians: GaussianModel, cameras: Sequence[Camera]) -> str:
+    parts = [shortage(error, gaussians.get_xyz.device), f"{len(gaussians):,} Gaussians"]
+    if cameras:
+        largest = max(cameras, key=lambda camera: camera.image_width * camera.image_height)
+        parts.append(f"pictures of {largest.image_width} x {largest.image_height}")
+    return "; ".join(parts)

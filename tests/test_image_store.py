@@ -1,0 +1,241 @@
+"""The store of decoded pictures: once each, bounded, ahead of use, and the same training whatever it does."""
+
+import gc
+import threading
+import time
+import weakref
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+import train
+from scene import image_store
+from scene.image_store import ImageStore
+from scene.images import decode
+from utils.system_utils import UserError
+
+SIZE = (6, 4)
+
+
+@pytest.fixture
+def files(tmp_path) -> list[Path]:
+    """Ten pictures of 6x4, every one of another colour."""
+    paths = [tmp_path / f"{number}.png" for number in range(10)]
+    for number, path in enumerate(paths):
+        Image.new("RGB", SIZE, (20 * number, 10, 0)).save(path)
+    return paths
+
+
+class Decodings:
+    """Counts calls of `decode` by file, and how many of the pictures are in memory at once."""
+
+    def __init__(self) -> None:
+        self.names: list[str] = []
+        self.alive = self.most = 0
+        self.threads: set[str] = set()
+        self.seconds = 0.0
+        self._lock = threading.Lock()
+
+    def __call__(self, path, size):
+        with self._lock:
+            self.names.append(path.stem)
+            self.threads.add(threading.current_thread().name)
+            self.alive += 1
+            self.most = max(self.most, self.alive)
+        time.sleep(self.seconds)
+        try:
+            picture = decode(path, size)
+        except BaseException:
+            self._gone()
+            raise
+        weakref.finalize(picture, self._gone)
+        return picture
+
+    def _gone(self) -> None:
+        with self._lock:
+            self.alive -= 1
+
+
+@pytest.fixture
+def decodings(monkeypatch) -> Decodings:
+    counting = Decodings()
+    monkeypatch.setattr(image_store, "decode", counting)
+    return counting
+
+
+def _pictures(paths: list[Path]) -> list[tuple[Path, tuple[int, int]]]:
+    return [(path, SIZE) for path in paths]
+
+
+@pytest.mark.parametrize(("limit", "decoded"), [(0, 3), (2, 4), (1, 6)])
+def test_each_is_decoded_once_within_the_limit(files, decodings, limit, decoded):
+    store = ImageStore(limit)
+    for name in (0, 1, 0, 2, 0, 1):  # with room for two: 2 takes the place of 1, as 0 was used after it
+        store.get(files[name], SIZE)
+        assert not limit or len(store) <= limit
+    assert len(decodings.names) == decoded
+
+
+@pytest.mark.parametrize("workers", [1, 4])
+@pytest.mark.parametrize("limit", [0, 1, 2, 3, 9])
+def test_decoding_ahead_gives_the_right_pictures_within_the_limit(files, decodings, limit, workers):
+    store = ImageStore(limit)
+    store._workers = workers
+    decodings.seconds = 0.002
+    store.plan(_pictures(files))
+    order = np.random.default_rng(0)
+    order = [int(i) for _ in range(4) for i in order.permutation(len(files))]
+    for step, number in enumerate(order):
+        store.prefetch(_pictures([files[i] for i in order[step : step + store.ahead]]))
+        picture = store.get(files[number], SIZE)
+        assert picture[0, 0, 0] == 20 * number and picture.shape == (3, 4, 6)
+        del picture
+        if step % 7 == 0:  # scoring asks for views that nobody announced
+            assert store.get(files[step % 10], SIZE)[0, 0, 0] == 20 * (step % 10)
+        assert not limit or len(store) <= limit
+    gc.collect()
+    if limit:
+        assert decodings.most <= limit
+    else:
+        assert sorted(decodings.names) == [path.stem for path in files]
+    if limit != 1:
+        assert any(name.startswith("decode") for name in decodings.threads)
+
+
+def test_what_comes_next_is_decoded_meanwhile(files, decodings):
+    store = ImageStore(3)
+    store._workers = 2
+    store.plan(_pictures(files))
+    store.prefetch(_pictures(files[:3]))
+    deadline = time.monotonic() + 10
+    while len(decodings.names) < 3 and time.monotonic() < deadline:
+        time.sleep(0.001)
+    assert sorted(decodings.names) == ["0", "1", "2"]
+    for path in files[:3]:
+        store.get(path, SIZE)
+    assert len(decodings.names) == 3 and threading.current_thread().name not in decodings.threads
+
+
+def test_a_coming_picture_that_is_there_is_not_dropped_for_another(files, decodings):
+    store = ImageStore(3)
+    store.plan(_pictures(files))
+    for number in (0, 1, 2):
+        store.get(files[number], SIZE)
+    store.prefetch(_pictures([files[0], files[3]]))  # 0 is the longest unused, but 1 has to go
+    for number in (0, 3, 2):
+        store.get(files[number], SIZE)
+    assert decodings.names == ["0", "1", "2", "3"]
+
+
+def test_no_threads_remain_when_all_is_there(files):
+    store = ImageStore(0)
+    store.plan(_pictures(files))
+    for step, path in enumerate(files):
+        store.prefetch(_pictures(files[step : step + store.ahead]))
+        store.get(path, SIZE)
+    assert store.ahead == 0
+    deadline = time.monotonic() + 10
+    while (left := _decoders()) and time.monotonic() < deadline:
+        time.sleep(0.001)
+    assert not left
+
+
+def _decoders() -> list[threading.Thread]:
+    return [thread for thread in threading.enumerate() if thread.name.startswith("decode")]
+
+
+def test_an_error_ahead_comes_at_the_view_that_needs_it(files):
+    store = ImageStore(4)
+    files[2].write_bytes(files[2].read_bytes()[:40])
+    store.plan(_pictures(files))
+    store.prefetch(_pictures(files[:4]))
+    for number in (0, 1, 3):
+        assert store.get(files[number], SIZE)[0, 0, 0] == 20 * number
+    for _ in range(2):
+        with pytest.raises(UserError, match="cannot read the picture .*2.png"):
+            store.get(files[2], SIZE)
+    store.prefetch(_pictures(files[1:4]))
+    with pytest.raises(UserError, match="cannot read the picture .*2.png"):
+        store.get(files[2], SIZE)
+    Image.new("RGB", SIZE, (40, 0, 0)).save(files[2])
+    assert store.get(files[2], SIZE)[0, 0, 0] == 40
+
+
+def test_a_limit_that_all_fit_is_none(files):
+    store = ImageStore(10)
+    store.plan(_pictures(files[:8]), _pictures(files[8:]))
+    assert store.limit == 0
+    store = ImageStore(9)
+    store.plan(_pictures(files[:8]), _pictures(files[8:]))
+    assert store.limit == 9 and store.planned_bytes == 9 * 4 * 6 * 4
+
+
+def test_bytes_are_those_of_the_largest_that_are_kept(tmp_path):
+    store = ImageStore(2)
+    sizes = [(10, 10), (30, 20), (5, 5)]
+    store.plan([(tmp_path / f"{number}.JPG", size) for number, size in enumerate(sizes)])
+    assert store.planned_bytes == 3 * (600 + 100)
+
+
+OPTIONS = [
+    "-r", "24", "--test_iterations", "20", "--eval", "--densify_from_iter", "10", "--densification_interval", "20",
+    "--densify_grad_threshold", "5e-5", "--iterations", "60",
+]  # fmt: skip
+
+
+def test_what_is_kept_and_decoded_ahead_changes_no_bit(colmap_scene, tmp_path, monkeypatch):
+    plys = []
+    for name, options, ahead in (("all", [], True), ("plain", [], False), ("1", [1], True), ("2", [2], True),
+                                 ("5", [5], True)):  # fmt: skip
+        with monkeypatch.context() as patch:
+            if not ahead:
+                patch.setattr(ImageStore, "prefetch", lambda *_: None)
+            limit = ["--images_to_load", *map(str, options)] if options else []
+            train.main(["-s", str(colmap_scene), "-m", str(tmp_path / name), *OPTIONS, *limit])
+        plys.append((tmp_path / name / "point_cloud" / "iteration_60" / "point_cloud.ply").read_bytes())
+    assert len(set(plys)) == 1
+
+
+def test_a_gpu_keeps_what_fits_its_share(files, monkeypatch):
+    """The rule alone: which device keeps, without one."""
+    free = 4 * 10 * 4 * 6 * 4  # four times what ten RGBA pictures take
+    monkeypatch.setattr(image_store, "free_memory", lambda device: free)
+    monkeypatch.setattr(image_store, "DeviceCopies", lambda device: object())
+    for room, limit, kept in ((0, 0, "cuda"), (-1, 0, "cpu"), (-1, 9, "cuda"), (-2 * 4 * 96, 8, "cuda")):
+        free = 3840 + room
+        store = ImageStore(limit, "cuda", "cuda")
+        store.plan(_pictures(files[:7]), _pictures(files[7:]))
+        assert store.keep_on.type == kept, (room, limit)
+    assert store.planned_bytes == 8 * 96
+    store = ImageStore(0, "cpu", "cuda")
+    store.plan(_pictures(files))
+    assert store.keep_on.type == "cpu" and store.planned_bytes == 10 * 128  # pinned in powers of two
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no NVIDIA GPU")
+@pytest.mark.parametrize("limit", [0, 3])
+@pytest.mark.parametrize("keep_on", ["cuda", "cpu"])
+def test_pictures_reach_the_gpu_whole(tmp_path, limit, keep_on):
+    """Large enough that a copy takes a while, with kernels on the current stream that read at once."""
+    rng = np.random.default_rng(0)
+    size = (1024, 768)
+    paths = [tmp_path / f"{number}.bmp" for number in range(8)]
+    for path in paths:
+        Image.fromarray(rng.integers(0, 256, (*size[::-1], 3), dtype=np.uint8)).save(path)
+    truth = {path: decode(path, size).long().sum().item() for path in paths}
+    store = ImageStore(limit, keep_on, "cuda")
+    store.plan([(path, size) for path in paths])
+    order = [paths[i] for _ in range(12) for i in rng.permutation(len(paths))]
+    sums = []
+    for step, path in enumerate(order):
+        store.prefetch([(coming, size) for coming in order[step : step + store.ahead]])
+        picture = store.get(path, size)
+        assert picture.is_cuda
+        sums.append(picture.long().sum())
+        del picture
+        assert not limit or len(store) <= limit
+    assert [int(value) for value in sums] == [truth[path] for path in order]

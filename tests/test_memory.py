@@ -1,0 +1,320 @@
+"""Too little memory: what is said beforehand, what is saved when it happens, and how the sentence reads."""
+
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import torch
+from gaussians import model, options
+from PIL import Image
+
+import render
+import train
+from scene import images, memory_estimate
+from scene.checkpoint import load_checkpoint
+from scene.gaussian_optimizer import GaussianAdam
+from scene.memory_estimate import training_bytes
+from utils import memory
+from utils.memory import free_memory, gib, is_out_of_memory, shortage
+from utils.system_utils import UserError, run_cli
+
+ROOT = Path(__file__).parents[1]
+HUGE = 1 << 60
+# What torch says on a GPU that is full.
+ON_A_GPU = torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 20.00 GiB. GPU 0 has a total capacity of ...")
+
+
+@pytest.fixture(autouse=True)
+def _stdout(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Training stamps stdout: bring it back."""
+    monkeypatch.setattr(sys, "stdout", sys.stdout)
+
+
+def _raised(call) -> Exception:
+    try:
+        call()
+    except Exception as error:
+        return error
+    raise AssertionError("nothing was raised")
+
+
+def _instances_beyond_counting() -> None:
+    raise RuntimeError("5 Gaussians cover 3000000000 tile instances, more than 2^31 - 1: render at a lower resolution")
+
+
+def test_which_errors_mean_too_little_memory():
+    for call in (
+        lambda: torch.empty(HUGE, dtype=torch.uint8),
+        lambda: bytearray(HUGE),
+        _instances_beyond_counting,
+    ):
+        error = _raised(call)
+        assert is_out_of_memory(error), error
+        wrapped = UserError("too large")
+        wrapped.__cause__ = error
+        assert is_out_of_memory(wrapped)
+    assert is_out_of_memory(ON_A_GPU)
+    for error in (
+        None,
+        RuntimeError("shapes differ"),
+        ValueError("out of memory"),
+        UserError("no"),
+        KeyboardInterrupt(),
+    ):
+        assert not is_out_of_memory(error)
+
+
+def test_numbers_of_an_error():
+    free = r"[\d.]+ GiB free on the CPU"
+    refused = _raised(lambda: torch.empty(3 << 40, dtype=torch.uint8))
+    assert re.fullmatch(f"3072.0 GiB asked for, {free}", shortage(refused, "cpu"))
+    assert shortage(ON_A_GPU, "cpu").startswith("20.0 GiB asked for, ")
+    counted = shortage(_raised(_instances_beyond_counting), "cpu")
+    assert re.fullmatch(rf"5 Gaussians cover 3000000000 tile instances, more than 2\^31 - 1, {free}", counted)
+    assert re.fullmatch(f"MemoryError, {free}", shortage(MemoryError(), "cpu"))
+
+
+def test_free_memory_is_what_the_kernel_and_the_container_leave(tmp_path, monkeypatch):
+    available = memory._available()
+    if available is None:
+        pytest.skip("this system has no /proc/meminfo")
+    monkeypatch.setattr(memory, "_CGROUP", tmp_path)
+    assert free_memory("cpu") == pytest.approx(available, rel=0.1)
+    (tmp_path / "memory.max").write_text("max\n")
+    assert free_memory("cpu") == pytest.approx(available, rel=0.1)
+    (tmp_path / "memory.max").write_text("1000000\n")
+    (tmp_path / "memory.current").write_text("900000\n")
+    (tmp_path / "memory.stat").write_text("anon 5\ninactive_file 50000\n")
+    assert free_memory("cpu") == 150_000
+    for path in tmp_path.iterdir():
+        path.unlink()
+    (tmp_path / "memory").mkdir()
+    (tmp_path / "memory" / "memory.limit_in_bytes").write_text("1000\n")
+    (tmp_path / "memory" / "memory.usage_in_bytes").write_text("400\n")
+    (tmp_path / "memory" / "memory.stat").write_text("total_inactive_file 100\n")
+    assert free_memory("cpu") == 700
+
+
+# Training
+
+
+SMALL = [
+    "-r", "24", "--test_iterations", "-1", "--iterations", "9", "--densify_from_iter", "2",
+    "--densification_interval", "3", "--densify_grad_threshold", "5e-5",
+]  # fmt: skip
+
+
+def _train(scene: Path, out: Path, *more: object) -> bytes:
+    train.main(["-s", str(scene), "-m", str(out), *SMALL, *map(str, more)])
+    return (out / "point_cloud" / "iteration_9" / "point_cloud.ply").read_bytes()
+
+
+def _failing(function, call: int, error: Exception):
+    """`function`, but for one call that raises."""
+    calls = []
+
+    def fails(*args: object, **kwargs: object) -> object:
+        calls.append(1)
+        if len(calls) == call:
+            raise error
+        return function(*args, **kwargs)
+
+    return fails
+
+
+@pytest.mark.parametrize(
+    ("error", "said"),
+    [
+        (_raised(lambda: torch.empty(HUGE, dtype=torch.uint8)), "1073741824.0 GiB asked for, "),
+        (ON_A_GPU, "20.0 GiB asked for, "),
+        (_raised(_instances_beyond_counting), "5 Gaussians cover 3000000000 tile instances"),
+    ],
+    ids=["cpu", "gpu", "instances"],
+)
+def test_the_state_before_is_saved_and_goes_on_to_the_same_end(colmap_scene, tmp_path, monkeypatch, error, said):
+    monkeypatch.setattr(train, "SH_INTERVAL", 5)  # so that the failing iteration is one that raises the degree
+    with monkeypatch.context() as patch:
+        patch.setattr(train, "render", _failing(train.render, 5, error))
+        with pytest.raises(UserError, match="memory did not suffice in iteration 5") as caught:
+            _train(colmap_scene, tmp_path / "cut")
+    text = str(caught.value)
+    for part in (said, "pictures of 24 x 16", "after iteration 4 is saved", "chkpnt4.pth", "--max_num_splats", "-r",
+                 "--images_to_load", "--sh_degree"):  # fmt: skip
+        assert part in text and "\n" not in text, part
+    capture, iteration = load_checkpoint(tmp_path / "cut" / "chkpnt4.pth")
+    assert iteration == 4 and capture[0] == 0 and f"{len(capture[1])} Gaussians" in text
+    resumed = _train(colmap_scene, tmp_path / "cut", "--start_checkpoint", tmp_path / "cut" / "chkpnt4.pth")
+    assert resumed == _train(colmap_scene, tmp_path / "whole")
+
+
+def test_a_picture_that_does_not_fit_saves_too(colmap_scene, tmp_path, monkeypatch):
+    monkeypatch.setattr(images, "_to_rgb_or_rgba", _failing(images._to_rgb_or_rgba, 5, MemoryError()))
+    with pytest.raises(UserError, match=r"for the picture .*[vV]\d\d.png at 24 x 16 pixels.*chkpnt4.pth"):
+        _train(colmap_scene, tmp_path, "--images_to_load", 1)
+    assert load_checkpoint(tmp_path / "chkpnt4.pth")[1] == 4
+
+
+@pytest.mark.parametrize("call", [1, 5, 19, 30])
+def test_a_densification_cut_short_is_saved_whole(colmap_scene, tmp_path, monkeypatch, call):
+    """The first allocation of each kind fails once, as on a GPU, whose rows then go to the CPU."""
+    plain = GaussianAdam._change_rows
+    counted = []
+
+    def counting(self, change):
+        def once(values, name, is_moment):
+            counted.append(name)
+            if len(counted) == call:
+                raise ON_A_GPU
+            return change(values, name, is_moment)
+
+        return plain(self, once)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(GaussianAdam, "_change_rows", counting)
+        with pytest.raises(UserError, match="in iteration 3 .*may be done in part, is saved: .*chkpnt3.pth"):
+            _train(colmap_scene, tmp_path)
+    capture, iteration = load_checkpoint(tmp_path / "chkpnt3.pth")
+    assert iteration == 3 and len(capture[1]) > 300
+    _train(colmap_scene, tmp_path, "--start_checkpoint", tmp_path / "chkpnt3.pth")
+
+
+def test_a_densification_that_can_not_be_finished_saves_nothing(colmap_scene, tmp_path, monkeypatch):
+    def full(*_: object) -> torch.Tensor:
+        raise MemoryError
+
+    monkeypatch.setattr(torch, "cat", _failing(torch.cat, 4, MemoryError()))
+    monkeypatch.setattr(torch.Tensor, "cpu", full)
+    with pytest.raises(UserError, match="in iteration 3 .*could not be saved .*half-way"):
+        _train(colmap_scene, tmp_path)
+    assert not list(tmp_path.glob("*.pth"))
+
+
+def test_nothing_trained_saves_nothing(colmap_scene, tmp_path, monkeypatch):
+    monkeypatch.setattr(train, "render", _failing(train.render, 1, ON_A_GPU))
+    with pytest.raises(UserError, match="in iteration 1 .*nothing was trained yet"):
+        _train(colmap_scene, tmp_path)
+    assert not list(tmp_path.glob("*.pth"))
+
+
+def test_other_errors_pass(colmap_scene, tmp_path, monkeypatch):
+    monkeypatch.setattr(train, "render", _failing(train.render, 3, RuntimeError("shapes differ")))
+    with pytest.raises(RuntimeError, match="shapes differ"):
+        _train(colmap_scene, tmp_path)
+    assert not list(tmp_path.glob("*.pth"))
+
+
+def test_rendering_says_what_did_not_fit(colmap_scene, tmp_path, monkeypatch):
+    _train(colmap_scene, tmp_path)
+    monkeypatch.setattr(render, "render", _failing(render.render, 4, ON_A_GPU))
+    monkeypatch.setattr(sys, "argv", ["render.py", "-m", str(tmp_path)])
+    with pytest.raises(UserError, match=r"rendering \(20.0 GiB asked for.*Gaussians; pictures of 24 x 16\).*-r"):
+        render.main()
+
+
+def test_every_command_ends_in_a_sentence(capsys):
+    def full() -> None:
+        torch.empty(HUGE, dtype=torch.uint8)
+
+    with pytest.raises(SystemExit) as ended:
+        run_cli(full)
+    assert ended.value.code == 2
+    assert re.fullmatch(r"error: memory did not suffice \(.* asked for, .*\n", capsys.readouterr().err)
+    with pytest.raises(RuntimeError, match="shapes"):
+        run_cli(lambda: (_ for _ in ()).throw(RuntimeError("shapes differ")))
+
+
+# The estimate
+
+
+def test_the_estimate_and_its_warnings(colmap_scene, tmp_path, monkeypatch, capfd):
+    free = 1 << 40
+    monkeypatch.setattr(memory_estimate, "free_memory", lambda _: free)
+    at_start = 300 * (16 * 59 + memory_estimate.PER_GAUSSIAN) + 24 * 16 * memory_estimate.PER_PIXEL
+    pictures = 17 * 4 * 24 * 16
+
+    def said(*more: object) -> tuple[str, str]:
+        _train(colmap_scene, tmp_path, *more)
+        out, err = capfd.readouterr()
+        (line,) = re.findall("^Memory of.*$", out, re.MULTILINE)
+        return line, "\n".join(re.findall("^warning: the memory.*$", err, re.MULTILINE))
+
+    line, warning = said()
+    assert (
+        "of the CPU" in line
+        and "300 Gaussians" in line
+        and "6,000 (scenes often grow 20-fold); 1024.0 GiB free" in line
+    )
+    assert not warning
+    line, warning = said("--max_num_splats", 2_000_000_000)
+    assert f"{gib(2e9 * 1070)} with 2,000,000,000 (--max_num_splats)" in line
+    assert "too small for 2,000,000,000 Gaussians; set a lower --max_num_splats" in warning
+    free = pictures + at_start
+    assert "6,000 Gaussians" in said()[1] and not said("--max_num_splats", 300)[1]
+    free -= 1
+    assert "for 300 Gaussians; set --images_to_load" in said()[1]
+
+
+def test_the_estimate_counts_what_a_step_allocates():
+    """Held to torch's own count of the tensors: parameters, gradients and moments are exact."""
+    gaussians = model(50)
+    gaussians.training_setup(options())
+    for group in gaussians.optimizer.param_groups:
+        group["params"][0].grad = torch.ones_like(group["params"][0])
+    gaussians.optimizer.set_active_columns("f_rest", -1)
+    gaussians.optimizer.step()
+    tensors = [group["params"][0] for group in gaussians.optimizer.param_groups]
+    tensors += [parameter.grad for parameter in tensors]
+    tensors += [value for state in gaussians.optimizer.state.values() for value in state.values() if value.dim()]
+    counted = sum(tensor.untyped_storage().nbytes() for tensor in tensors)
+    assert training_bytes(gaussians, 50, 0) - 50 * memory_estimate.PER_GAUSSIAN == counted
+
+
+# Pictures and processes
+
+
+def test_render_decodes_only_what_it_renders(colmap_scene, tmp_path, monkeypatch):
+    _train(colmap_scene, tmp_path, "--eval")
+    decoded = []
+    monkeypatch.setattr(
+        "scene.image_store.decode", lambda path, size: decoded.append(path) or images.decode(path, size)
+    )
+    monkeypatch.setattr(sys, "argv", ["render.py", "-m", str(tmp_path), "--skip_train"])
+    render.main()
+    assert len(decoded) == len(set(decoded)) == 3
+
+
+def test_threads_end_with_an_interrupted_run(colmap_scene, tmp_path):
+    for path in (colmap_scene / "images").rglob("*.png"):
+        Image.open(path).resize((1200, 800)).save(path)
+    command = [
+        sys.executable, "train.py", "-s", colmap_scene, "-m", tmp_path / "out", "--iterations", 100000, "-r", 24,
+        "--test_iterations", -1, "--images_to_load", 4, "--checkpoint_iterations", 3,
+    ]  # fmt: skip
+    with subprocess.Popen(list(map(str, command)), cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE) as run:
+        deadline = time.monotonic() + 120
+        while not (tmp_path / "out" / "chkpnt3.pth").exists() and run.poll() is None and time.monotonic() < deadline:
+            time.sleep(0.01)
+        run.send_signal(signal.SIGINT)
+        _, error = run.communicate(timeout=60)
+    assert run.returncode == 130 and b"Traceback" not in error, error.decode()
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no NVIDIA GPU")
+def test_a_full_gpu_saves_the_model(colmap_scene, tmp_path, monkeypatch):
+    plain, calls = train.render, []
+
+    def greedy(*args: object, **kwargs: object) -> dict:
+        calls.append(1)
+        if len(calls) == 3:
+            torch.empty(1 << 50, dtype=torch.uint8, device="cuda")
+        return plain(*args, **kwargs)
+
+    monkeypatch.setattr(train, "render", greedy)
+    with pytest.raises(UserError, match="GiB asked for, .* GiB free on the GPU.*chkpnt2.pth"):
+        _train(colmap_scene, tmp_path)
+    assert load_checkpoint(tmp_path / "chkpnt2.pth")[1] == 2

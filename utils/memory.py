@@ -1,0 +1,75 @@
+"""How much memory is free, and errors that mean there is too little."""
+
+import contextlib
+import re
+from pathlib import Path
+
+import torch
+
+# torch's words on CPU and GPU, C++'s own, CUDA's, and the rasterizer's on more instances than it can count.
+_WORDS = ("can't allocate memory", "not enough memory", "out of memory", "bad_alloc", "more than 2^31")
+_ASKED = re.compile(r"(?:[Tt]ried|Unable) to allocate ([\d.]+) ?(bytes|[KMGT]iB)")
+_UNITS = {"bytes": 1, "KiB": 2**10, "MiB": 2**20, "GiB": 2**30, "TiB": 2**40}
+_CGROUP = Path("/sys/fs/cgroup")
+
+
+def is_out_of_memory(error: BaseException | None) -> bool:
+    """Whether an error, or what it was raised from, says that memory did not suffice or could not be counted."""
+    if error is None:
+        return False
+    if isinstance(error, RuntimeError):  # torch.OutOfMemoryError is one, too
+        return any(words in str(error) for words in _WORDS)
+    return isinstance(error, MemoryError) or is_out_of_memory(error.__cause__)
+
+
+def shortage(error: BaseException, device: torch.device | str) -> str:
+    """What such an error was about: the bytes asked for or its own words, and the bytes free where that is known."""
+    asked, free = _ASKED.search(str(error)), free_memory(device)
+    if asked:
+        parts = [f"{gib(float(asked[1]) * _UNITS[asked[2]])} asked for"]
+    else:
+        parts = [re.split("[:;\n]", str(error) or type(error).__name__)[0]]
+    if free is not None:
+        parts.append(f"{gib(free)} free on the {'GPU' if torch.device(device).type == 'cuda' else 'CPU'}")
+    return ", ".join(parts)
+
+
+def gib(count: float) -> str:
+    """Bytes as text in GiB."""
+    return f"{count / 2**30:.2f} GiB" if count < 9.995 * 2**30 else f"{count / 2**30:.1f} GiB"
+
+
+def free_memory(device: torch.device | str) -> int | None:
+    """Bytes that can still be taken on a device; None where the system does not tell.
+
+    CPU: what the kernel calls available, less where the container (control group) allows less. GPU: what the driver
+    has, and what torch holds without using it.
+    """
+    device = torch.device(device)
+    if device.type == "cuda":
+        held = torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
+        return torch.cuda.mem_get_info(device)[0] + held
+    known = [value for value in (_available(), _group_limit()) if value is not None]
+    return min(known, default=None)
+
+
+def _available() -> int | None:
+    with contextlib.suppress(OSError, ValueError):
+        for line in Path("/proc/meminfo").read_text().splitlines():
+            if line.startswith("MemAvailable:"):
+                return int(line.split()[1]) * 1024
+    return None
+
+
+def _group_limit() -> int | None:
+    """Bytes below the limit of this process's control group (version 2, or 1); None without a limit."""
+    for limit, used in (
+        ("memory.max", "memory.current"),
+        ("memory/memory.limit_in_bytes", "memory/memory.usage_in_bytes"),
+    ):
+        with contextlib.suppress(OSError, ValueError):
+            most = int((_CGROUP / limit).read_text())  # ValueError: the word "max"
+            stat = (_CGROUP / limit).with_name("memory.stat").read_text()
+            cached = re.search(r"^(?:total_)?inactive_file (\d+)$", stat, re.MULTILINE)  # given back when asked for
+            return max(most - int((_CGROUP / used).read_text()) + (int(cached[1]) if cached else 0), 0)
+    return None
