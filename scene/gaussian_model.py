@@ -145,11 +145,10 @@ class GaussianModel:
         for name, param in params.items():
             setattr(self, self._attributes[name].field, param)
 
-    def _zero_statistics(self, device: torch.device | str | None = None) -> None:
-        device = device or self._xyz.device
-        self.xyz_gradient_accum = torch.zeros(len(self), 1, device=device)
-        self.denom = torch.zeros(len(self), 1, device=device)
-        self.max_radii2D = torch.zeros(len(self), device=device)
+    def _zero_statistics(self) -> None:
+        self.xyz_gradient_accum = torch.zeros(len(self), 1, device=self._xyz.device)
+        self.denom = torch.zeros(len(self), 1, device=self._xyz.device)
+        self.max_radii2D = torch.zeros(len(self), device=self._xyz.device)
 
     # Optimiser
 
@@ -254,27 +253,16 @@ class GaussianModel:
                 )
         check_finite(rows, "the checkpoint", "give another one")
 
-    def check_finite(self, iteration: int, device: torch.device | str | None = None) -> None:
-        """UserError where a parameter is not finite, to be called before anything of this iteration is saved.
-
-        device: that looks (default: where the parameters are).
-        """
+    def check_finite(self, iteration: int) -> None:
+        """UserError where a parameter is not finite, to be called before anything of this iteration is saved."""
         remedy = "nothing of it was saved; lower the learning rates, or go on from an earlier checkpoint"
-        check_finite(
-            {name: values.to(device) for name, values in self._rows().items()}, f"iteration {iteration}", remedy
-        )
+        check_finite(self._rows(), f"iteration {iteration}", remedy)
 
     def take_from_optimizer(self) -> None:
-        """After a densification that memory did not suffice for: take the rows that it got to, for saving them.
-
-        Statistics that belong to other rows start again. MemoryError where tensors have different numbers of rows.
-        """
+        """After a densification that memory did not suffice for: take the rows that it got to, for saving them."""
         self._take({group["name"]: group["params"][0] for group in self.optimizer.param_groups})
-        moments = [values for state in self.optimizer.state.values() for values in state.values() if values.dim() > 0]
-        if any(len(values) != len(self) for values in (*self._rows().values(), *moments)):
-            raise MemoryError("a densification stopped half-way")
         if any(len(values) != len(self) for values in (self.xyz_gradient_accum, self.denom, self.max_radii2D)):
-            self._zero_statistics("cpu")
+            self._zero_statistics()
 
     # Adaptive density control
 
@@ -308,6 +296,7 @@ class GaussianModel:
         extent: of the scene, world units; max_screen_size: None, or remove wider ones (pixels) and those over a tenth
         of the extent. seed and iteration decide the positions of split children; max_splats > 0 bounds growth.
         """
+        self.optimizer.zero_grad(set_to_none=True)  # its memory is needed; new parameters have none anyway
         gradient = adc.mean_gradient(self.xyz_gradient_accum, self.denom)
         if max_splats > 0:
             gradient = adc.limit_growth(gradient, max_grad, max_splats - len(self))
@@ -392,9 +381,10 @@ class GaussianModel:
 def check_finite(rows: Rows, where: str, remedy: str) -> None:
     """UserError naming the first attribute with values that are not finite, how many Gaussians, and the first one."""
     for name, values in rows.items():
-        finite = values.isfinite()
+        # In parts, as there may be little memory left.
+        finite = torch.cat([part.isfinite().flatten(1).all(dim=1) for part in values.split(1 << 16)])
         if not finite.all():
-            bad = (~finite.reshape(len(values), -1)).any(dim=1).nonzero()
+            bad = (~finite).nonzero()
             raise UserError(
                 f"{name} of {len(bad)} of {len(values)} Gaussians in {where} is not finite "
                 f"(the first is Gaussian {int(bad[0])}); {remedy}"

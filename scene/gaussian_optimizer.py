@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from utils.memory import is_out_of_memory
 
+_CHUNK = 1 << 16  # rows that are moved at a time where there is no memory for all
 _ADAM = torch.ops.diff_gaussian_rasterization.adam_
 
 
@@ -85,42 +86,49 @@ class GaussianAdam(torch.optim.Adam):
         super().load_state_dict({"state": taken, "param_groups": own})
 
     def append_rows(self, rows: dict[str, Tensor]) -> dict[str, nn.Parameter]:
-        """Append `rows[name]` (n, ...) to each group, with zero moments. Returns the parameters, without gradient."""
+        """Append `rows[name]` (n, ...) to each group, with zero moments. Returns the parameters, without gradient.
+
+        Where memory does not suffice, nothing is appended to any.
+        """
+        count = len(self.param_groups[0]["params"][0])
 
         def grow(values: Tensor, name: str, is_moment: bool) -> Tensor:
-            new = rows[name].to(values.device)
-            return torch.cat((values, torch.zeros_like(new) if is_moment else new))
+            return torch.cat((values, torch.zeros_like(rows[name]) if is_moment else rows[name]))
 
-        return self._change_rows(grow)
+        try:
+            return self._change_rows(grow)
+        except (MemoryError, RuntimeError) as error:
+            if is_out_of_memory(error):
+                self._change_rows(lambda values, *_: values[:count])
+            raise
 
     def keep_rows(self, indices: Tensor) -> dict[str, nn.Parameter]:
-        """Keep the rows of `indices` (n,) int64 in every group. Returns the new parameters, without gradient."""
-        return self._change_rows(lambda values, *_: values.index_select(0, indices.to(values.device)))
+        """Keep the rows of `indices` (n,) int64, ascending, in every group. Returns the parameters, without gradient.
 
-    def _change_rows(self, change: Callable[[Tensor, str, bool], Tensor]) -> dict[str, nn.Parameter]:
-        """Map every group's parameter and moments; `change` takes values, name, and whether they are a moment.
-
-        What a device has no room for goes to the CPU, so that all have the same rows when the error is raised after the
-        last: such a model can't train on, but be saved.
+        Where memory does not suffice, it is done all the same, before the error is raised.
         """
         errors = []
 
-        def changed(values: Tensor, name: str, is_moment: bool) -> Tensor:
+        def select(values: Tensor, *_: object) -> Tensor:
             try:
-                return change(values, name, is_moment)
+                return values.index_select(0, indices)
             except (MemoryError, RuntimeError) as error:
                 if not is_out_of_memory(error):
                     raise
                 errors.append(error)
-                return change(values.cpu(), name, is_moment)
+                return _move_up(values, indices)
 
-        params = {}
-        for group in self.param_groups:
-            name = group["name"]
-            value = changed(group["params"][0].detach(), name, False)
-            params[name] = self._replace(group, value, lambda moment, name: changed(moment, name, True))
+        params = self._change_rows(select)
         if errors:
             raise errors[0]
+        return params
+
+    def _change_rows(self, change: Callable[[Tensor, str, bool], Tensor]) -> dict[str, nn.Parameter]:
+        """Map all parameters and their moments; `change` takes values, the group's name, and whether it is a moment."""
+        params = {}
+        for group in self.param_groups:
+            value = change(group["params"][0].detach(), group["name"], False)
+            params[group["name"]] = self._replace(group, value, lambda moment, name: change(moment, name, True))
         return params
 
     def reset(self, name: str, value: Tensor) -> nn.Parameter:
@@ -138,6 +146,14 @@ class GaussianAdam(torch.optim.Adam):
             self.state[param] = self.state.pop(old)
         group["params"] = [param]
         return param
+
+
+def _move_up(values: Tensor, indices: Tensor) -> Tensor:
+    """values[indices] for ascending indices, in the memory of `values` itself."""
+    for start in range(0, len(indices), _CHUNK):
+        part = indices[start : start + _CHUNK]
+        values[start : start + len(part)] = values.index_select(0, part)  # later parts come from rows further down
+    return values[: len(indices)]
 
 
 def _fitting(entry: Any, param: Tensor, name: str) -> dict[str, Tensor]:

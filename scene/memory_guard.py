@@ -1,6 +1,7 @@
 """Where memory does not suffice the model is saved, and a sentence says what was wanted and what helps."""
 
 import contextlib
+import traceback
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from types import TracebackType
@@ -50,6 +51,7 @@ class MemoryGuard:
     ) -> None:
         if is_out_of_memory(error):
             what = _situation(error, self._gaussians, [self._camera] if self._camera else [])
+            traceback.clear_frames(trace)  # what was being computed takes memory that saving may need
             raise UserError(
                 f"memory did not suffice in iteration {self._iteration + 1} ({what}); {self._rescue()}"
             ) from error
@@ -59,22 +61,23 @@ class MemoryGuard:
         if self._iteration == self._first and not self._changing:
             return "nothing was trained yet; lower --resolution (-r), --max_num_splats, --images_to_load or --sh_degree"
         gaussians, iteration = self._gaussians, self._iteration + self._changing
+        anew, state = "--sh_degree", f"the model after iteration {iteration}"
+        further = "a lower --resolution (-r) or --images_to_load"
         try:
             if self._changing:
                 gaussians.take_from_optimizer()
                 state = f"the model in iteration {iteration}, whose last changes may be done in part,"
+                further = f"--max_num_splats {len(gaussians)}, {further}"
             else:
                 gaussians.active_sh_degree = self._sh_degree
-                state = f"the model after iteration {iteration}"
-            # On the CPU: there may be no room left for the check where the model is.
-            gaussians.check_finite(iteration, "cpu")
+                anew = "--max_num_splats or --sh_degree"  # going on with as many would end here again
+            gaussians.check_finite(iteration)
             path = self._folder / f"chkpnt{iteration}.pth"
             save_checkpoint(path, gaussians.capture(), iteration)
         except (UserError, MemoryError, RuntimeError) as error:
             return f"and the model could not be saved ({error}); go on from an earlier checkpoint"
         return (
-            f"{state} is saved: go on with --start_checkpoint {path} and --max_num_splats {len(gaussians)}, "
-            "--images_to_load or a lower --resolution (-r), or start anew with a lower --sh_degree"
+            f"{state} is saved: go on with --start_checkpoint {path} and {further}, or start anew with a lower {anew}"
         )
 
 

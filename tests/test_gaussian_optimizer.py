@@ -6,6 +6,7 @@ import pytest
 import torch
 from gaussians import GROUPS, model, moments, options, parameters, take_steps
 
+from scene import gaussian_optimizer
 from scene.gaussian_optimizer import GaussianAdam
 
 
@@ -153,3 +154,45 @@ def test_groups_are_the_references():
     ]
     assert [group["lr"] for group in optimizer.param_groups] == rates
     assert all(group["eps"] == 1e-15 and group["betas"] == (0.9, 0.999) for group in optimizer.param_groups)
+
+
+def _failing(function, call: int):
+    calls = []
+
+    def fails(*args: object, **kwargs: object) -> torch.Tensor:
+        calls.append(1)
+        if len(calls) == call:
+            raise MemoryError
+        return function(*args, **kwargs)
+
+    return fails
+
+
+@pytest.mark.parametrize("call", [1, 2, 3, 9, 18])
+def test_where_memory_fails_rows_are_appended_to_none_and_kept_in_all(monkeypatch, call):
+    """Six groups with two moments each: 18 tensors, of which the memory for one can't be had."""
+    monkeypatch.setattr(gaussian_optimizer, "_CHUNK", 7)
+    gaussians = model(40)
+    take_steps(gaussians, 2)
+    before, state = parameters(gaussians), moments(gaussians)
+    rows = {name: values[:5] for name, values in before.items()}
+    with monkeypatch.context() as patch, pytest.raises(MemoryError):
+        patch.setattr(torch, "cat", _failing(torch.cat, call))
+        gaussians.optimizer.append_rows(rows)
+    gaussians.take_from_optimizer()
+    _assert_rows(gaussians, before, state, torch.arange(40))
+
+    kept = torch.arange(40)[torch.randperm(40, generator=torch.Generator().manual_seed(0)) < 30]
+    with monkeypatch.context() as patch, pytest.raises(MemoryError):
+        patch.setattr(torch.Tensor, "index_select", _failing(torch.Tensor.index_select, call))
+        gaussians.optimizer.keep_rows(kept)
+    gaussians.take_from_optimizer()
+    _assert_rows(gaussians, before, state, kept)
+    assert [len(values) for values in (gaussians.denom, gaussians.max_radii2D)] == [30, 30]
+
+
+def _assert_rows(gaussians, before: dict, state: dict, rows: torch.Tensor) -> None:
+    for name, values in parameters(gaussians).items():
+        assert torch.equal(values, before[name][rows]), name
+        for key in ("exp_avg", "exp_avg_sq"):
+            assert torch.equal(moments(gaussians)[name][key], state[name][key][rows]), (name, key)

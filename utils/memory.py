@@ -6,6 +6,11 @@ from pathlib import Path
 
 import torch
 
+try:
+    import resource
+except ImportError:  # Windows
+    resource = None
+
 # torch's words on CPU and GPU, C++'s own, CUDA's, and the rasterizer's on more instances than it can count.
 _WORDS = ("can't allocate memory", "not enough memory", "out of memory", "bad_alloc", "more than 2^31")
 _ASKED = re.compile(r"(?:[Tt]ried|Unable) to allocate ([\d.]+) ?(bytes|[KMGT]iB)")
@@ -42,14 +47,14 @@ def gib(count: float) -> str:
 def free_memory(device: torch.device | str) -> int | None:
     """Bytes that can still be taken on a device; None where the system does not tell.
 
-    CPU: what the kernel calls available, less where the container (control group) allows less. GPU: what the driver
-    has, and what torch holds without using it.
+    CPU: what the kernel calls available, less where the container (control group) or a limit of the process (ulimit -v)
+    allows less. GPU: what the driver has, and what torch holds without using it.
     """
     device = torch.device(device)
     if device.type == "cuda":
         held = torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
         return torch.cuda.mem_get_info(device)[0] + held
-    known = [value for value in (_available(), _group_limit()) if value is not None]
+    known = [value for value in (_available(), _group_limit(), _process_limit()) if value is not None]
     return min(known, default=None)
 
 
@@ -72,4 +77,13 @@ def _group_limit() -> int | None:
             stat = (_CGROUP / limit).with_name("memory.stat").read_text()
             cached = re.search(r"^(?:total_)?inactive_file (\d+)$", stat, re.MULTILINE)  # given back when asked for
             return max(most - int((_CGROUP / used).read_text()) + (int(cached[1]) if cached else 0), 0)
+    return None
+
+
+def _process_limit() -> int | None:
+    """Bytes of address space left to this process; None without a limit."""
+    if resource is None or (most := resource.getrlimit(resource.RLIMIT_AS)[0]) == resource.RLIM_INFINITY:
+        return None
+    with contextlib.suppress(OSError, ValueError):
+        return max(most - int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize(), 0)
     return None
