@@ -9,12 +9,12 @@ import pytest
 from PIL import Image
 
 from demo import make_scene as maker
-from demo.contact_sheet import GAIN, GAP, HEADER, contact_sheet
 from demo.make_scene import make_scene
 from demo.objects import demo_scene
 from demo.shapes import Box, Ground, Shape, Sphere, Torus
 from demo.tracer import render_view, trace
 from demo.views import ring_views
+from evaluation.contact_sheet import GAIN, GAP, HEADER, contact_sheet
 from utils.system_utils import UserError
 
 ROOT = Path(__file__).parents[1]

@@ -18,19 +18,32 @@ def error_image(truth: Image.Image, render: Image.Image) -> Image.Image:
     return Image.fromarray(np.minimum(difference * GAIN, 255).astype(np.uint8))
 
 
-def contact_sheet(views: Sequence[tuple[str, Image.Image, Image.Image]]) -> Image.Image:
-    """A row for each view (label, ground truth, render), under a row of titles. The pictures may differ in size."""
-    cell_width = max(truth.width for _, truth, _ in views)
-    cell_height = max(truth.height for _, truth, _ in views)
+def contact_sheet(views: Sequence[tuple[str, Image.Image, Image.Image]], widest: int | None = None) -> Image.Image:
+    """A row for each view (label, ground truth, render), under a row of titles. The pictures may differ in size.
+
+    widest: larger pictures are shrunk to that width in pixels, errors after they were taken.
+    """
+    cells = [
+        (label, [_shrunk(image, widest) for image in (truth, render, error_image(truth, render))])
+        for label, truth, render in views
+    ]
+    cell_width = max(images[0].width for _, images in cells)
+    cell_height = max(images[0].height for _, images in cells)
     size = (3 * (cell_width + GAP) + GAP, HEADER + len(views) * (cell_height + GAP))
     sheet = Image.new("RGB", size, "white")
     draw = ImageDraw.Draw(sheet)
     font = ImageFont.load_default(size=15)
     for column, title in enumerate(("ground truth", "render", f"error x {GAIN}")):
         draw.text((GAP + column * (cell_width + GAP), 4), title, fill="black", font=font)
-    for row, (label, truth, render) in enumerate(views):
+    for row, (label, images) in enumerate(cells):
         y = HEADER + row * (cell_height + GAP)
-        for column, picture in enumerate((truth, render, error_image(truth, render))):
+        for column, picture in enumerate(images):
             sheet.paste(picture.convert("RGB"), (GAP + column * (cell_width + GAP), y))
         draw.text((GAP + 6, y + 4), label, fill="white", font=font, stroke_width=2, stroke_fill="black")
     return sheet
+
+
+def _shrunk(image: Image.Image, widest: int | None) -> Image.Image:
+    if widest is None or image.width <= widest:
+        return image
+    return image.convert("RGB").resize((widest, max(round(image.height * widest / image.width), 1)))

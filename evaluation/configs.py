@@ -1,0 +1,52 @@
+"""--configs FILE: named option sets for train.py."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+from utils.system_utils import UserError
+
+_SHAPE = 'like {"base": [], "sh1": ["--sh_degree", "1"]}'
+
+
+def read_configs(path: Path) -> dict[str, tuple[str, ...]]:
+    """The option sets of a JSON file, {name: [word, ...]}, in its order. Numbers may stand for words."""
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"), object_pairs_hook=_no_duplicates)
+    except OSError as error:
+        raise UserError(f"cannot read {path} ({error.strerror}); --configs takes a JSON file {_SHAPE}") from error
+    except ValueError as error:
+        raise UserError(f"{path} is no JSON for --configs ({error}); write it {_SHAPE}") from error
+    if not isinstance(content, dict) or not content:
+        raise UserError(f"{path} names no option sets; write it {_SHAPE}")
+    configs = {}
+    for name, words in content.items():
+        # A folder, and not one that a seed or train.py makes.
+        if not re.fullmatch(r"[A-Za-z0-9][\w.+-]*", name) or re.fullmatch(r"seed_\d+|point_cloud|test|train", name):
+            raise UserError(f"{path}: {name!r} cannot name a folder; use letters, digits, _ . + -")
+        if not isinstance(words, list) or not all(type(word) in (str, int, float) for word in words):
+            raise UserError(f"{path}: {name} must be a list of train.py's words, {_SHAPE}")
+        configs[name] = tuple(str(word) for word in words)
+        check_options(configs[name], f"{path}, {name}")
+    return configs
+
+
+def _no_duplicates(pairs: list[tuple[str, object]]) -> dict[str, object]:
+    names = [name for name, _ in pairs]
+    if twice := [name for name in names if names.count(name) > 1]:
+        raise ValueError(f"{twice[0]} is there twice")
+    return dict(pairs)
+
+
+def check_options(words: Sequence[str], where: str) -> None:
+    """UserError for options that full_eval.py itself has to set: data, model folder, checkpoint."""
+    for word in words:
+        name = word.split("=")[0]
+        taken = name[:2] in ("-s", "-m") or any(
+            len(name) > 4 and long.startswith(name) for long in ("--source_path", "--model_path", "--start_checkpoint")
+        )
+        if taken:
+            raise UserError(f"{where}: {word} is set by full_eval.py itself; leave it out")

@@ -1,0 +1,242 @@
+"""The report's content, once, for both renderings: sections of paragraphs, tables, pictures and quoted messages."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from evaluation.machine import one_line
+from evaluation.published import COMPARED, published_tables
+
+
+@dataclass(frozen=True)
+class Table:
+    """Cells are text already; the first column reads left, the others right."""
+
+    header: list[str]
+    rows: list[list[str]]
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A PNG on disk, absolute."""
+
+    path: Path
+    caption: str
+
+
+@dataclass(frozen=True)
+class Quote:
+    """Messages as they were."""
+
+    lines: list[str]
+
+
+Block = str | Table | Picture | Quote
+
+
+@dataclass(frozen=True)
+class Section:
+    """A title and what stands under it."""
+
+    title: str
+    blocks: list[Block] = field(default_factory=list)
+
+
+_DIGITS = {"PSNR": 2, "SSIM": 4, "LPIPS": 4, "seconds": 1, "gaussians": 0, "peak_memory_mib": 0, "render_ms": 2}
+_HEADS = {
+    "PSNR": "PSNR (dB)",
+    "seconds": "training (s)",
+    "gaussians": "Gaussians",
+    "peak_memory_mib": "peak memory (MiB)",
+    "render_ms": "render (ms)",
+}
+
+
+def number(value: float | None, digits: int) -> str:
+    """A number for a cell, - for none."""
+    return "-" if value is None else f"{value:,.{digits}f}"
+
+
+def spread_cell(spread: Mapping[str, Any], digits: int) -> str:
+    """Mean and standard deviation of a `summary.spread`."""
+    deviation = "" if spread["std"] is None else f" ± {spread['std']:,.{digits}f}"
+    return number(spread["mean"], digits) + deviation
+
+
+def results_table(rows: Sequence[Mapping[str, Any]]) -> Table:
+    """`summary` of report.json as a table; times, sizes and memory that no row has are left out."""
+    configs = any(row["config"] for row in rows)
+    quantities = [
+        name for name in _DIGITS
+        if name in ("PSNR", "SSIM", "LPIPS") or any(row[name]["mean"] is not None for row in rows)
+    ]  # fmt: skip
+    header = ["scene", *(["options"] if configs else []), "iteration", "seeds"]
+    header += [_HEADS.get(name, name) for name in quantities]
+    cells = []
+    for row in rows:
+        label = [row["scene"], *([row["config"] or "-"] if configs else [])]
+        seeds = " ".join(map(str, row["seeds"])) if row["seeds"] != [None] else "-"
+        cells.append(
+            [*label, f"{row['iteration']:,}", seeds, *(spread_cell(row[name], _DIGITS[name]) for name in quantities)]
+        )
+    return Table(header, cells)
+
+
+def document(report: Mapping[str, Any], figures: Mapping[str, Sequence[Picture]]) -> list[Section]:
+    """The sections. `figures`: pictures by scene."""
+    return [
+        *_failures(report),
+        _results(report),
+        *_published(report),
+        *_cheapest(report),
+        *_scenes(report, figures),
+        _manifest(report),
+    ]
+
+
+def _failures(report: Mapping[str, Any]) -> list[Section]:
+    blocks: list[Block] = []
+    for run in report["runs"]:
+        if failure := run["failure"]:
+            blocks.append(f"{run_title(run)}: failed in {failure['stage']}")
+            blocks.append(
+                Quote([" ".join(failure["command"]), *failure["lines"]] if failure["command"] else failure["lines"])
+            )
+    return [Section("Failed", blocks)] if blocks else []
+
+
+def run_title(run: Mapping[str, Any]) -> str:
+    """Scene, option set and seed."""
+    seed = None if run["seed"] is None else f"seed {run['seed']}"
+    return ", ".join(part for part in (run["scene"], run["config"], seed) if part)
+
+
+def _results(report: Mapping[str, Any]) -> Section:
+    rows = report["summary"]
+    blocks: list[Block] = [results_table(rows) if rows else "Nothing was scored."]
+    if any(row["PSNR"]["std"] is not None for row in rows):
+        blocks.append("Mean ± standard deviation of the sample over the seeds.")
+    if rows and all(row["LPIPS"]["mean"] is None for row in rows):
+        blocks.append("LPIPS is missing: metrics.py had no weights of its network (it says what to put where).")
+    if unfinished := [run_title(run) for run in report["runs"] if not run["finished"] and not run["failure"]]:
+        blocks.append(f"Not finished: {'; '.join(unfinished)}.")
+    if means := report["dataset_means"]:
+        header = ["data set", "options", "iteration", *(_HEADS.get(name, name) for name in _DIGITS)]
+        cells = [
+            [mean["group"], mean["config"] or "-", f"{mean['iteration']:,}"]
+            + [number(mean[name], digits) for name, digits in _DIGITS.items()]
+            for mean in means
+        ]
+        blocks.append(Table(header, cells))
+    blocks += report["warnings"]
+    return Section("Results", blocks)
+
+
+def _published(report: Mapping[str, Any]) -> list[Section]:
+    if not report["published"]:
+        return []
+    header = ["scene", "options", "iteration", "table"]
+    header += [f"{_HEADS.get(name, name)}: ours, published, difference" for name in COMPARED]
+    cells = []
+    for row in report["published"]:
+        added = row["other_options"]
+        options = "not known" if added is None else " ".join(added) or "the table's"
+        line = [
+            row["scene"],
+            f"{row['config']}: {options}" if row["config"] else options,
+            f"{row['iteration']:,}",
+            row["table"],
+        ]
+        for name in COMPARED:
+            values = row["numbers"].get(name)
+            digits = _DIGITS[name]
+            if values is None:
+                line.append("-")
+                continue
+            both = f"{number(values['ours'], digits)}, {number(values['published'], digits)}"
+            line.append(f"{both}, {values['difference']:+,.{digits}f}")
+        cells.append(line)
+    named = {row["table"] for row in report["published"]}
+    notes = [f"{table['name']} ({table['hardware']}): {table['source']}; {table['note']}."
+             for table in published_tables() if table["name"] in named]  # fmt: skip
+    return [Section("Beside published numbers", [Table(header, cells), *notes])]
+
+
+def cheapest_table(rows: Sequence[Mapping[str, Any]]) -> Table:
+    """A scene's `cheapest` of report.json."""
+    cells = []
+    for row in rows:
+        line = [f"{row['psnr']:.1f}"]
+        for name, digits in (("seconds", 1), ("gaussians", 0)):
+            line += [row[name]["config"] or "-", number(row[name]["value"], digits)]
+        cells.append(line)
+    return Table(["test PSNR (dB)", "first there", "seconds", "smallest", "Gaussians"], cells)
+
+
+def _cheapest(report: Mapping[str, Any]) -> list[Section]:
+    blocks: list[Block] = []
+    for scene, rows in report["cheapest"].items():
+        blocks += [scene, cheapest_table(rows)]
+    if not blocks:
+        return []
+    blocks.append(
+        "The option set that comes to a test PSNR in the fewest seconds of training, and the one with the fewest "
+        "Gaussians at that PSNR or better, both from the curves (scores in training, on unrounded pictures; between "
+        "two points PSNR is linear in the logarithm of time). Of several seeds all must get there, and their mean "
+        "counts."
+    )
+    return [Section("Cheapest option set for a given error", blocks)]
+
+
+def _scenes(report: Mapping[str, Any], figures: Mapping[str, Sequence[Picture]]) -> list[Section]:
+    sections = []
+    for scene in dict.fromkeys(run["scene"] for run in report["runs"]):
+        blocks: list[Block] = []
+        for run in report["runs"]:
+            if run["scene"] == scene and (peak := run["peak"]):
+                blocks.append(
+                    f"{run_title(run)}: the test views were best at iteration {peak['iteration']:,} "
+                    f"({peak['test_psnr']:.2f} dB) and lost {peak['lost']:.2f} dB until the end; --iterations "
+                    f"{peak['iteration']} ends there."
+                )
+        blocks += figures.get(scene, ())
+        if blocks:
+            sections.append(Section(scene, blocks))
+    return sections
+
+
+def _manifest(report: Mapping[str, Any]) -> Section:
+    manifest = report["manifest"]
+    header = ["model", "source", "train views", "test views", "test sizes", "ground truth", "train.py options"]
+    cells = []
+    for run in report["runs"]:
+        sizes = " ".join(f"{width}x{height}" for width, height in run["test_sizes"])
+        views = [str(run["views"][name] if run["views"][name] is not None else "-") for name in ("train", "test")]
+        digest = (run["ground_truth_sha256"] or "-")[:12]
+        cells.append(
+            [
+                run["model"],
+                run["source"] or "-",
+                *views,
+                sizes or "-",
+                digest,
+                " ".join(run["options"] or ["not known"]),
+            ]
+        )
+    machines = sorted({one_line(run["machine"]) for run in report["runs"] if run["machine"]})
+    return Section(
+        "What was run",
+        [
+            f"Command: {' '.join(manifest['command'])}",
+            *(f"Trained on: {line}" for line in machines),
+            f"Split: {manifest['split']}",
+            f"Resize filter: {manifest['resize_filter']}",
+            "Scores: " + "; ".join(f"{name}: {text}" for name, text in manifest["conventions"].items()),
+            Table(header, cells),
+            "Ground truth: first digits of a digest of the test views' sizes and pixels. Scores compare only where it "
+            "is the same.",
+        ],
+    )

@@ -1,0 +1,93 @@
+"""The report's pictures: error against time of a scene, and its worst test views."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from evaluation.contact_sheet import contact_sheet
+from evaluation.model_folder import picture
+from evaluation.tradeoff import pareto_front
+from utils.error_curve import Row
+from utils.system_utils import atomic_write
+
+WIDEST = 480  # pixels of a picture on a sheet
+
+
+def _psnr(row: Row, views: str) -> float | None:
+    return row[f"{views}_psnr"]
+
+
+def _dissimilarity(row: Row, views: str) -> float | None:
+    ssim = row[f"{views}_ssim"]
+    return None if ssim is None else 1 - ssim
+
+
+def draw_curves(path: Path, scene: str, runs: Sequence[dict[str, Any]]) -> bool:
+    """Test PSNR and 1 - SSIM of a scene's runs against seconds of training; False where no run has a curve.
+
+    One colour for an option set, one line for a seed. With several option sets the Pareto front of all points is
+    marked; with one, the training views are drawn too, dashed, so that over-fitting shows.
+    """
+    from matplotlib.figure import Figure  # late: only a report needs it
+
+    runs = [run for run in runs if any(row["test_psnr"] is not None for row in run["curve"])]
+    if not runs:
+        return False
+    configs = list(dict.fromkeys(run["config"] for run in runs))
+    figure = Figure(figsize=(12, 4.8), layout="constrained")
+    figure.suptitle(f"{scene}: error against time")
+    panels = ((_psnr, "PSNR of the test views (dB)", -1), (_dissimilarity, "1 - SSIM of the test views", 1))
+    for axes, (value, label, sign) in zip(figure.subplots(1, 2), panels, strict=True):
+        every: list[tuple[float, float]] = []
+        for run in runs:
+            index = configs.index(run["config"])
+            first = run is next(other for other in runs if other["config"] == run["config"])
+            points = _points(run["curve"], value, "test")
+            every += points
+            style = {"color": f"C{index % 10}", "linestyle": ("-", "-.", ":")[index // 10 % 3], "linewidth": 1.2}
+            axes.plot(*_columns(points), marker=".", label=(run["config"] or "test") if first else None, **style)
+            if len(configs) == 1 and (train := _points(run["curve"], value, "train")):
+                style |= {"linestyle": "--", "alpha": 0.6}
+                axes.plot(*_columns(train), label="train" if first else None, **style)
+        if len(configs) > 1:
+            front = [every[i] for i in pareto_front([(seconds, sign * number) for seconds, number in every])]
+            axes.step(
+                *_columns(front), where="post", color="black", linewidth=0.6, marker="o", markerfacecolor="none",
+                markersize=8, label="Pareto front",
+            )  # fmt: skip
+        axes.set(xscale="log", xlabel="seconds of training, without scoring and saving", ylabel=label)
+        if value is _dissimilarity and all(number > 0 for _, number in every):
+            axes.set_yscale("log")
+        axes.grid(True, which="both", alpha=0.3)
+        axes.legend(fontsize="small")
+    with atomic_write(path) as temporary:
+        figure.savefig(temporary, dpi=110, metadata={"Software": None})
+    return True
+
+
+def _points(curve: Sequence[Row], value: Callable[[Row, str], float | None], views: str) -> list[tuple[float, float]]:
+    pairs = ((row["seconds"], value(row, views)) for row in curve)
+    return [(seconds, number) for seconds, number in pairs if seconds > 0 and number is not None]
+
+
+def _columns(points: Sequence[tuple[float, float]]) -> tuple[list[float], list[float]]:
+    return [x for x, _ in points], [y for _, y in points]
+
+
+def draw_worst_views(path: Path, run: dict[str, Any], output: Path) -> bool:
+    """A run's worst test views, each with ground truth, render and amplified error; False where it has none."""
+    folder = output / run["model"] / "test" / f"ours_{run['final_iteration']}"
+    if not run["worst_views"]:
+        return False
+    rows = [
+        (
+            f"{view['picture']}: {view['PSNR']:.2f} dB",
+            *(picture(folder / side / view["file"]) for side in ("gt", "renders")),
+        )
+        for view in run["worst_views"]
+    ]
+    with atomic_write(path) as temporary:
+        contact_sheet(rows, WIDEST).save(temporary)
+    return True

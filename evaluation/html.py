@@ -1,0 +1,40 @@
+"""The report as one HTML file that needs nothing else: pictures are in it, and there is no script."""
+
+from __future__ import annotations
+
+import base64
+import io
+from collections.abc import Sequence
+from pathlib import Path
+
+import jinja2
+from PIL import Image
+
+from evaluation.document import Picture, Quote, Section, Table
+
+_PHOTOGRAPHIC = 1 << 18  # bytes of a PNG above which a JPEG stands in for it
+_QUALITY = 90
+
+
+def data_uri(path: Path) -> str:
+    """A picture as a data: URI, large ones as JPEG."""
+    content, kind = path.read_bytes(), "png"
+    if len(content) > _PHOTOGRAPHIC:
+        buffer = io.BytesIO()
+        with Image.open(path) as image:
+            image.convert("RGB").save(buffer, "JPEG", quality=_QUALITY)
+        content, kind = buffer.getvalue(), "jpeg"
+    return f"data:image/{kind};base64,{base64.b64encode(content).decode()}"
+
+
+def to_html(title: str, sections: Sequence[Section]) -> str:
+    """The whole page."""
+    environment = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(Path(__file__).parent), autoescape=True, undefined=jinja2.StrictUndefined,
+        trim_blocks=True, lstrip_blocks=True,
+    )  # fmt: skip
+    environment.filters["data_uri"] = data_uri
+    environment.tests |= {
+        kind.__name__.lower(): lambda value, kind=kind: isinstance(value, kind) for kind in (Table, Picture, Quote)
+    }
+    return environment.get_template("report.html.jinja").render(title=title, sections=sections)

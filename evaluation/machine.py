@@ -1,0 +1,75 @@
+"""Where and with what a training ran. `python -m evaluation.machine` prints it as JSON."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import json
+import platform
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+_ROOT = Path(__file__).resolve().parents[1]
+_PACKAGES = ("lpips", "numpy", "pillow", "pycolmap", "torch", "torchvision")
+
+
+def machine() -> dict[str, Any]:
+    """Processor, GPU, threads, versions, commit of this machine and checkout; {} where they cannot be found out.
+
+    A process of its own asks: asking a GPU for its name takes some of its memory for as long as the asker lives.
+    """
+    command = [sys.executable, "-m", "evaluation.machine"]
+    done = subprocess.run(command, cwd=_ROOT, capture_output=True, text=True, check=False)
+    if done.returncode:
+        print(f"warning: this machine could not be described:\n{done.stderr}", file=sys.stderr)
+        return {}
+    return json.loads(done.stdout)
+
+
+def _describe() -> dict[str, Any]:
+    import torch
+
+    import gaussian_renderer  # noqa: F401  (compute_device asks for its library)
+    from arguments.stored import VERSION
+    from benchmarks import environment
+    from utils.system_utils import compute_device
+
+    device = compute_device().type
+    return {
+        "commit": environment.commit(),
+        "cpu": environment.cpu_name(),
+        "cuda": torch.version.cuda if device == "cuda" else None,
+        "device": device,
+        "gpu": environment.gpu_name() if device == "cuda" else None,
+        "instruction_set": environment.instruction_set(),
+        "packages": {name: _version(name) for name in _PACKAGES},
+        "python": platform.python_version(),
+        "system": platform.platform(),
+        "threads": torch.get_num_threads(),
+        "version": VERSION,
+    }
+
+
+def _version(package: str) -> str | None:
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return None
+
+
+def one_line(facts: dict[str, Any]) -> str:
+    """What people want to know of `machine()`'s answer."""
+    if not facts:
+        return "not known"
+    where = f"{facts['gpu']}, {facts['cpu']}" if facts["gpu"] else f"{facts['cpu']}, {facts['instruction_set']}"
+    return (
+        f"{where}, {facts['threads']} threads, Python {facts['python']}, torch {facts['packages']['torch']}, "
+        f"commit {facts['commit']}"
+    )
+
+
+if __name__ == "__main__":
+    import utils.openmp  # noqa: F401  (before torch)
+
+    print(json.dumps(_describe(), sort_keys=True, allow_nan=False))

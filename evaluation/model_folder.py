@@ -1,0 +1,97 @@
+"""What a model folder says of itself: Gaussians, times, scores, pictures."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+import sys
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from utils.image_files import UNREADABLE, open_render
+from utils.system_utils import UserError
+
+
+def ply_file(model: Path, iteration: int) -> Path:
+    """Where a saved iteration's Gaussians lie."""
+    return model / "point_cloud" / f"iteration_{iteration}" / "point_cloud.ply"
+
+
+def count_gaussians(model: Path, iteration: int) -> int:
+    """Number of Gaussians of a saved iteration, from the header of its PLY."""
+    ply = ply_file(model, iteration)
+    try:
+        with ply.open("rb") as file:
+            header = file.read(4096).split(b"end_header")[0]
+    except OSError as error:
+        raise UserError(f"cannot read {ply} ({error.strerror}); train the model again") from error
+    found = re.search(rb"element vertex (\d+)", header)
+    if not found:
+        raise UserError(f"{ply} is not a PLY of Gaussians; train the model again")
+    return int(found[1])
+
+
+def load_scores(model: Path, method: str) -> tuple[dict[str, float | None], dict[str, dict[str, float | None]]]:
+    """Mean scores, and scores by metric and view, that metrics.py has written for a method."""
+    try:
+        results = json.loads((model / "results.json").read_text())[method]
+        per_view = json.loads((model / "per_view.json").read_text())[method]
+        for numbers in ({key: results[key] for key in ("PSNR", "SSIM")}, per_view["PSNR"]):
+            if not numbers or any(type(value) not in (int, float, type(None)) for value in numbers.values()):
+                raise ValueError("no numbers")
+    except (OSError, KeyError, ValueError, TypeError, AttributeError) as error:
+        raise UserError(f"{model} has no scores of {method}; run render.py and metrics.py -m {model} first") from error
+    return results, per_view
+
+
+def training_seconds(model: Path, iteration: int) -> float | None:
+    """Seconds of training until an iteration, without tests and saving; None when train.py has not logged them."""
+    log = model / "train_log.json"
+    if not log.is_file():
+        return None
+    try:
+        seconds = {record["iteration"]: float(record["seconds"]) for record in json.loads(log.read_text())}
+    except (OSError, KeyError, ValueError, TypeError) as error:
+        print(f"{log} is damaged ({type(error).__name__}), so the training time is unknown", file=sys.stderr)
+        return None
+    return seconds.get(iteration)
+
+
+def picture(file: Path) -> Image.Image:
+    """A render or a ground truth, RGB."""
+    try:
+        with open_render(file) as image:
+            return image.convert("RGB")
+    except UNREADABLE as error:
+        raise UserError(f"{file} is missing or damaged; run render.py and metrics.py again") from error
+
+
+def picture_size(file: Path) -> tuple[int, int]:
+    """Width and height in pixels, from the file's header."""
+    try:
+        with open_render(file) as image:
+            return image.size
+    except UNREADABLE as error:
+        raise UserError(f"{file} is missing or damaged; run render.py and metrics.py again") from error
+
+
+def view_names(folder: Path) -> list[str]:
+    """Names of a folder's PNGs, sorted; none where there is no folder."""
+    return sorted(file.name for file in folder.glob("*.png") if not file.name.startswith("."))
+
+
+def ground_truth_digest(model: Path, method: str) -> str:
+    """SHA-256 of the test views' ground truth, sizes and pixels in their order.
+
+    Two scores compare only where it is the same: it changes with split, resolution, resize filter and background.
+    """
+    digest = hashlib.sha256()
+    folder = model / "test" / method / "gt"
+    for name in view_names(folder):
+        image = picture(folder / name)
+        digest.update(f"{image.width}x{image.height}".encode())
+        digest.update(np.asarray(image).tobytes())
+    return digest.hexdigest()

@@ -1,0 +1,69 @@
+"""Comparison with published tables (published.json, each with its source)."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+COMPARED = ("PSNR", "SSIM", "LPIPS", "gaussians")
+
+
+def published_tables() -> list[dict[str, Any]]:
+    """Tables with name, source, hardware, note, the `groups` and what else a run must `requires` be to compare;
+    `scenes` and `means` (of a group) hold numbers by iteration. LPIPS: VGG on [0, 1]; seconds: on that hardware."""
+    return json.loads((Path(__file__).parent / "published.json").read_text(encoding="utf-8"))["tables"]
+
+
+def compare(
+    runs: Sequence[dict[str, Any]], rows: Sequence[dict[str, Any]], means: Sequence[dict[str, Any]]
+) -> list[dict[str, Any]]:
+    """Ours beside each published number of the same scene (or mean of a data set) and iteration.
+
+    runs, rows, means: of report.json (`runs`, `summary`, `dataset_means`). `other_options`: what ours was trained with
+    beyond the table's own options (null: not known); with any, it is these that a difference shows.
+    """
+    compared = []
+    for table in published_tables():
+        for row in rows:
+            run = next(run for run in runs if (run["scene"], run["config"]) == (row["scene"], row["config"]))
+            theirs = table["scenes"].get(row["scene"], {}).get(str(row["iteration"]))
+            if theirs and row["group"] in table["groups"] and _meets(run, table.get("requires", {})):
+                ours = {name: row[name]["mean"] for name in COMPARED}
+                compared.append(_comparison(table, row, row["scene"], ours, theirs, run["added_options"]))
+        for mean in means:
+            theirs = table["means"].get(mean["group"], {}).get(str(mean["iteration"]))
+            if theirs:
+                run = next(run for run in runs if (run["group"], run["config"]) == (mean["group"], mean["config"]))
+                ours = {name: mean[name] for name in COMPARED}
+                compared.append(
+                    _comparison(table, mean, f"mean of {mean['group']}", ours, theirs, run["added_options"])
+                )
+    return compared
+
+
+def _meets(run: dict[str, Any], wanted: dict[str, Any]) -> bool:
+    return (
+        run["test_sizes"] == wanted.get("test_sizes", run["test_sizes"])
+        and run["views"]["test"] == wanted.get("test_views", run["views"]["test"])
+        and set(wanted.get("options", ())) <= set(run["options"] or ())
+    )
+
+
+def _comparison(
+    table: dict[str, Any], row: dict[str, Any], scene: str, ours: dict, theirs: dict, added: Sequence[str] | None
+) -> dict[str, Any]:
+    numbers = {
+        name: {"difference": ours[name] - theirs[name], "ours": ours[name], "published": theirs[name]}
+        for name in COMPARED
+        if name in theirs and ours[name] is not None
+    }
+    return {
+        "config": row["config"],
+        "iteration": row["iteration"],
+        "numbers": numbers,
+        "other_options": added,
+        "scene": scene,
+        "table": table["name"],
+    }

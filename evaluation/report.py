@@ -1,0 +1,131 @@
+"""report.json, report.md, report.html, the figures and timing.txt."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from evaluation.document import Picture, document, run_title
+from evaluation.figures import draw_curves, draw_worst_views
+from evaluation.html import to_html
+from evaluation.markdown import to_markdown
+from evaluation.published import compare
+from evaluation.summary import dataset_means, summarise
+from evaluation.tradeoff import cheapest
+from utils.system_utils import UserError, atomic_write
+
+TITLE = "3D Gaussian Splatting: evaluation"
+SPLIT = (
+    "COLMAP: every 8th picture by name is a test view; Blender: transforms_test.json (unless train.py's options say "
+    "otherwise)"
+)
+RESIZE_FILTER = "Pillow, bicubic, antialiased where it shrinks; 8-bit pictures"
+
+
+def make_report(command: Sequence[str], runs: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """All of report.json from what `results.read_run` says of each run; `command`: the words of the command line."""
+    rows = summarise(runs)
+    means = dataset_means(rows)
+    return {
+        "cheapest": _cheapest(runs),
+        "dataset_means": means,
+        "manifest": {
+            "command": list(command),
+            "conventions": next((run["conventions"] for run in runs if run["conventions"]), {}),
+            "resize_filter": RESIZE_FILTER,
+            "split": SPLIT,
+        },
+        "published": compare(runs, rows, means),
+        "runs": list(runs),
+        "summary": rows,
+        "warnings": _warnings(runs, rows),
+    }
+
+
+def _cheapest(runs: Sequence[dict[str, Any]]) -> dict[str, list[dict[str, Any]]]:
+    """By scene, where there are option sets to choose from."""
+    found = {}
+    for scene in dict.fromkeys(run["scene"] for run in runs):
+        curves: dict[str, list] = {}
+        for run in runs:
+            if run["scene"] == scene and run["config"] and not run["failure"]:
+                curves.setdefault(run["config"], []).append(run["curve"])
+        if len(curves) > 1 and (rows := cheapest(curves)):
+            found[scene] = rows
+    return found
+
+
+def _warnings(runs: Sequence[dict[str, Any]], rows: Sequence[dict[str, Any]]) -> list[str]:
+    """What keeps numbers of one report from being compared."""
+    lines = []
+    for scene in dict.fromkeys(run["scene"] for run in runs):
+        truths = {run["ground_truth_sha256"] for run in runs if run["scene"] == scene and run["ground_truth_sha256"]}
+        if len(truths) > 1:
+            lines.append(
+                f"{scene}: its runs were scored on different ground truth (size, split or background), so their scores "
+                "and curves do not compare."
+            )
+    for name in ("commit", "cpu", "gpu", "instruction_set", "threads"):
+        values = {str(run["machine"].get(name)) for run in runs if run["machine"]}
+        if len(values) > 1:
+            lines.append(f"Trained with different {name}: {', '.join(sorted(values))}.")
+    for row in rows:
+        if row["failed_seeds"]:
+            lines.append(f"{row['scene']} {row['config'] or ''}: without the failed seeds {row['failed_seeds']}.")
+    return lines
+
+
+def write_report(report: Mapping[str, Any], output: Path) -> None:
+    """Write all files of the report into `output`."""
+    pictures = {
+        scene: _draw(output, scene, [run for run in report["runs"] if run["scene"] == scene])
+        for scene in dict.fromkeys(run["scene"] for run in report["runs"])
+    }
+    sections = document(report, pictures)
+    texts = {
+        "report.json": json.dumps(report, indent=1, sort_keys=True, allow_nan=False) + "\n",
+        "report.md": to_markdown(TITLE, sections, output),
+        "report.html": to_html(TITLE, sections),
+        "timing.txt": _timing(report["runs"]),
+    }
+    for name, text in texts.items():
+        with atomic_write(output / name) as temporary:
+            temporary.write_text(text, encoding="utf-8")
+
+
+def _draw(output: Path, scene: str, runs: Sequence[dict[str, Any]]) -> list[Picture]:
+    """The pictures of a scene: its curves, and the worst views of each option set's first whole run."""
+    folder = output / "figures"
+    pictures = []
+    path = folder / f"{scene}_curves.png"
+    try:
+        if draw_curves(path, scene, runs):
+            pictures.append(Picture(path, f"{scene}: error of the test views against seconds of training"))
+    except ImportError as error:
+        print(f"warning: no figure of {scene}'s curves: matplotlib cannot be imported ({error})", file=sys.stderr)
+    seen = set()
+    for run in runs:
+        if run["failure"] or run["config"] in seen:
+            continue
+        path = folder / f"{scene}{'_' + run['config'] if run['config'] else ''}_worst_views.png"
+        try:
+            drawn = draw_worst_views(path, run, output)
+        except UserError as error:
+            print(f"warning: no worst views of {run_title(run)}: {error}", file=sys.stderr)
+            continue
+        if drawn:
+            seen.add(run["config"])
+            pictures.append(Picture(path, f"{run_title(run)}: the test views with the lowest PSNR"))
+    return pictures
+
+
+def _timing(runs: Sequence[dict[str, Any]]) -> str:
+    """Minutes that train.py took (wall clock) for each group of scenes."""
+    minutes: dict[str, float] = {}
+    for run in runs:
+        if run["wall_seconds"] is not None:
+            minutes[run["group"]] = minutes.get(run["group"], 0.0) + run["wall_seconds"] / 60
+    return "".join(f"{group}: {value:.2f} minutes\n" for group, value in minutes.items())

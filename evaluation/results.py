@@ -1,0 +1,160 @@
+"""One run's part of report.json, read from its model folder."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import sys
+from pathlib import Path
+from typing import Any
+
+from evaluation.model_folder import (
+    count_gaussians,
+    load_scores,
+    picture_size,
+    training_seconds,
+    view_names,
+)
+from evaluation.record import Record
+from evaluation.runs import Run
+from evaluation.stages import Failure
+from utils.curve_peak import CLEAR
+from utils.error_curve import NAME as CURVE
+from utils.error_curve import Row, best_test, read_curve
+from utils.system_utils import UserError, saved_iterations
+
+WORST = 3  # views with the lowest PSNR that are shown of each run
+
+
+def read_run(run: Run, output: Path, failure: Failure | None) -> dict[str, Any]:
+    """What is known of a run, as JSON; parts that are missing are null or empty. Paths are relative to `output`.
+
+    finished: its last iteration is scored and no stage failed. A damaged file counts as a failure. options, source,
+    added_options: null where they are not known.
+    """
+    record = Record(run.model)
+    trained = record.stage("train") or {}
+    # With --skip_training a model may be another's, or one made with other options than are asked for now.
+    known = record.key or (None if (run.model / "point_cloud").exists() else run.key)
+    curve = _curve(run.model)
+    result = {
+        "added_options": list(run.added) if known == run.key else None,
+        "config": run.config,
+        "conventions": (_json(run.model / "metrics_info.json") or {}).get("conventions", {}),
+        "curve": curve,
+        "final_iteration": None,
+        "ground_truth_sha256": (record.stage("metrics") or {}).get("ground_truth_sha256"),
+        "group": run.scene.group,
+        "iterations": {},
+        "machine": trained.get("machine") or {},
+        "model": os.path.relpath(run.model, output),
+        "options": known and known["options"],
+        "peak": _peak(curve),
+        "scene": run.scene.name,
+        "seed": run.seed,
+        "source": known and known["scene"],
+        "test_sizes": [],
+        "views": {"test": None, "train": None},
+        "wall_seconds": trained.get("wall_seconds"),
+        "worst_views": [],
+    }
+    saved = saved_iterations(run.model / "point_cloud")
+    try:
+        iterations = {str(n): _iteration(run.model, n, curve) for n in saved}
+        last = max((int(n) for n, values in iterations.items() if values["views"]), default=None)
+        result |= {"final_iteration": last, "iterations": iterations}
+        if last is not None:
+            result |= {
+                "test_sizes": _sizes(run.model, last),
+                "views": _view_counts(run.model, iterations[str(last)]["views"]),
+                "worst_views": _worst(run.model, last),
+            }
+    except UserError as error:
+        failure = failure or Failure("report", [], [str(error)])
+    result["failure"] = dataclasses.asdict(failure) if failure else None
+    result["finished"] = not failure and bool(saved) and result["final_iteration"] == saved[-1]
+    return result
+
+
+def _curve(model: Path) -> list[Row]:
+    if not (model / CURVE).is_file():
+        return []
+    try:
+        return read_curve(model / CURVE)
+    except UserError as error:
+        print(f"warning: {error}", file=sys.stderr)
+        return []
+
+
+def _iteration(model: Path, iteration: int, curve: list[Row]) -> dict[str, Any]:
+    """Scores (metrics.py), time, size and memory at a saved iteration."""
+    method = f"ours_{iteration}"
+    point = next((row for row in curve if row["iteration"] == iteration), {})
+    # The peak only grows, so that of the last point before is a lower bound; only a point right there will do.
+    values: dict[str, Any] = {
+        "PSNR": None,
+        "SSIM": None,
+        "LPIPS": None,
+        "fps": None,
+        "gaussians": count_gaussians(model, iteration),
+        "peak_memory_mib": point.get("peak_memory_mib"),
+        "render_ms": None,
+        "seconds": point.get("seconds") if (logged := training_seconds(model, iteration)) is None else logged,
+        "views": 0,
+    }
+    try:
+        means, per_view = load_scores(model, method)
+    except UserError:
+        return values
+    times = _json(model / "test" / method / "render_times.json") or {}
+    return values | {
+        **{key: means.get(key) for key in ("PSNR", "SSIM", "LPIPS")},
+        "fps": times.get("fps"),
+        "render_ms": times.get("median_ms"),
+        "views": len(per_view["PSNR"]),
+    }
+
+
+def _json(path: Path) -> Any | None:
+    """A JSON file's content; None where there is none, or no JSON."""
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError):
+        return None
+
+
+def _peak(curve: list[Row]) -> dict[str, Any] | None:
+    """Where the test views were clearly better before the end: that iteration, its PSNR and what was lost since."""
+    best = best_test(curve)
+    if best is None or curve[-1]["test_psnr"] is None or best["test_psnr"] - curve[-1]["test_psnr"] < CLEAR:
+        return None
+    lost = best["test_psnr"] - curve[-1]["test_psnr"]
+    return {"iteration": best["iteration"], "lost": lost, "test_psnr": best["test_psnr"]}
+
+
+def _sizes(model: Path, iteration: int) -> list[list[int]]:
+    """The different sizes [width, height] of the test views, in pixels, ascending."""
+    folder = model / "test" / f"ours_{iteration}" / "gt"
+    return [list(size) for size in sorted({picture_size(folder / name) for name in view_names(folder)})]
+
+
+def _view_counts(model: Path, test: int) -> dict[str, int | None]:
+    """Number of training and test views: cameras.json lists both."""
+    cameras = _json(model / "cameras.json")
+    return {"test": test, "train": len(cameras) - test if isinstance(cameras, list) else None}
+
+
+def _worst(model: Path, iteration: int) -> list[dict[str, Any]]:
+    """The test views with the lowest PSNR, worst first: file, picture's name (cameras.json lists test views first)."""
+    scores = load_scores(model, f"ours_{iteration}")[1]["PSNR"]
+    worst = sorted((value, name) for name, value in scores.items() if value is not None)[:WORST]
+    cameras = _json(model / "cameras.json")
+    return [{"PSNR": value, "file": name, "picture": _picture_name(cameras, name)} for value, name in worst]
+
+
+def _picture_name(cameras: Any, file: str) -> str:
+    try:
+        return str(cameras[int(Path(file).stem)]["img_name"])
+    except (ValueError, IndexError, KeyError, TypeError):
+        return file

@@ -1,0 +1,68 @@
+"""Mean and spread over seeds, and means over a data set."""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+from evaluation.scenes import DATASETS
+
+QUANTITIES = ("PSNR", "SSIM", "LPIPS", "seconds", "gaussians", "peak_memory_mib", "render_ms", "fps")
+
+
+def spread(values: Iterable[float | None]) -> dict[str, Any]:
+    """Mean, standard deviation of the sample (n - 1 below the sum; None for one value) and the values themselves.
+
+    The mean is None as soon as one value is: a mean over fewer seeds would not compare.
+    """
+    numbers = list(values)
+    known = bool(numbers) and None not in numbers
+    return {
+        "mean": statistics.fmean(numbers) if known else None,
+        "std": statistics.stdev(numbers) if known and len(numbers) > 1 else None,
+        "values": numbers,
+    }
+
+
+def summarise(runs: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """For each scene, option set and scored iteration the spread of QUANTITIES over the seeds.
+
+    Seeds whose run failed are left out and listed under `failed_seeds`. In the order of `runs`.
+    """
+    cells: dict[tuple, list[dict[str, Any]]] = {}
+    for run in runs:
+        cells.setdefault((run["scene"], run["config"]), []).append(run)
+    rows = []
+    for (scene, config), members in cells.items():
+        whole = [run for run in members if not run["failure"]]
+        for iteration in sorted(
+            {int(n) for run in whole for n, values in run["iterations"].items() if values["views"]}
+        ):
+            there = [run for run in whole if run["iterations"].get(str(iteration), {}).get("views")]
+            row = {name: spread(run["iterations"][str(iteration)][name] for run in there) for name in QUANTITIES}
+            row |= {
+                "config": config,
+                "failed_seeds": [run["seed"] for run in members if run["failure"]],
+                "group": members[0]["group"],
+                "iteration": iteration,
+                "one_ground_truth": len({run["ground_truth_sha256"] for run in there}) == 1,
+                "scene": scene,
+                "seeds": [run["seed"] for run in there],
+            }
+            rows.append(row)
+    return rows
+
+
+def dataset_means(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Means over the scenes of a data set, for each option set and iteration, where all its scenes are there."""
+    cells: dict[tuple, dict[str, dict[str, Any]]] = {}
+    for row in rows:
+        if row["group"] in DATASETS:
+            cells.setdefault((row["group"], row["config"], row["iteration"]), {})[row["scene"]] = row
+    means = []
+    for (group, config, iteration), scenes in cells.items():
+        if scenes.keys() == DATASETS[group].keys():
+            mean = {name: spread(row[name]["mean"] for row in scenes.values())["mean"] for name in QUANTITIES}
+            means.append({**mean, "config": config, "group": group, "iteration": iteration})
+    return means

@@ -1,0 +1,86 @@
+"""Error against time across option sets: the Pareto front, and what is cheapest for a given error."""
+
+from __future__ import annotations
+
+import math
+import statistics
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from utils.error_curve import Row
+
+DROPS = (0.0, 0.1, 0.2, 0.5, 1.0, 2.0, 3.0, 5.0, 8.0)  # dB below the best: dense where the last tenths get dear
+
+Curves = Mapping[str, Sequence[Sequence[Row]]]  # option set -> a curve for each seed
+
+
+def pareto_front(points: Sequence[tuple[float, float]]) -> list[int]:
+    """Indices of the points (cost, error) that no other beats in both, by ascending cost; of equal points the first."""
+    front: list[int] = []
+    for index in sorted(range(len(points)), key=lambda i: (*points[i], i)):
+        if not front or points[index][1] < points[front[-1]][1]:
+            front.append(index)
+    return front
+
+
+def seconds_to_reach(curve: Sequence[Row], level: float) -> float | None:
+    """Seconds of training until the test PSNR first comes to `level` (dB), None if never.
+
+    Between the scored iterations PSNR is taken as linear in the logarithm of the seconds; the first counts as it is.
+    """
+    before: Row | None = None
+    for row in curve:
+        if row["test_psnr"] is None:
+            continue
+        if row["test_psnr"] >= level:
+            if before is None or before["seconds"] <= 0:
+                return row["seconds"]
+            part = (level - before["test_psnr"]) / (row["test_psnr"] - before["test_psnr"])
+            return math.exp((1 - part) * math.log(before["seconds"]) + part * math.log(row["seconds"]))
+        before = row
+    return None
+
+
+def gaussians_to_reach(curve: Sequence[Row], level: float) -> float | None:
+    """Least number of Gaussians with which a scored iteration comes to `level` (dB) or better, None if none does."""
+    counts = [row["gaussians"] for row in curve if row["test_psnr"] is not None and row["test_psnr"] >= level]
+    return min((count for count in counts if count is not None), default=None)
+
+
+def levels(curves: Curves) -> list[float]:
+    """PSNRs (dB, descending) worth asking for: the best that all seeds of some option set reach, cut to a tenth, and
+    DROPS below it, as far as not every option set starts above."""
+    top = max((min(_best(curve) for curve in seeds) for seeds in curves.values() if seeds), default=-math.inf)
+    if not math.isfinite(top):
+        return []
+    firsts = [next((row["test_psnr"] for row in curve if row["test_psnr"] is not None), top) for curve in _all(curves)]
+    tenths = math.floor(top * 10)
+    return [level for drop in DROPS if (level := (tenths - round(10 * drop)) / 10) > min(firsts)]
+
+
+def _all(curves: Curves) -> list[Sequence[Row]]:
+    return [curve for seeds in curves.values() for curve in seeds]
+
+
+def _best(curve: Sequence[Row]) -> float:
+    return max((row["test_psnr"] for row in curve if row["test_psnr"] is not None), default=-math.inf)
+
+
+def cheapest(curves: Curves) -> list[dict[str, Any]]:
+    """For each level: the option set that comes to it in the fewest seconds, and the one with the fewest Gaussians.
+
+    Of several seeds all must come to the level, and their mean counts.
+    """
+    rows = []
+    for level in levels(curves):
+        row: dict[str, Any] = {"psnr": level}
+        for name, measure in (("seconds", seconds_to_reach), ("gaussians", gaussians_to_reach)):
+            costs = {}
+            for config, seeds in curves.items():
+                values = [measure(curve, level) for curve in seeds]
+                if values and None not in values:
+                    costs[config] = statistics.fmean(values)
+            best = min(costs, key=costs.__getitem__, default=None)
+            row[name] = {"all": costs, "config": best, "value": costs.get(best)}
+        rows.append(row)
+    return rows

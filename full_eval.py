@@ -1,0 +1,149 @@
+"""Train, render and score a table of scenes, and report on all of it.
+
+python full_eval.py -m360 DIR -tat DIR -db DIR [--output_path DIR]
+python full_eval.py --scenes FOLDER ... [--iterations N] [--seeds 0 1 2] [--configs FILE] [-- more options of train.py]
+
+Writes report.md, report.json, report.html, figures/ and timing.txt into the output folder, and a model folder for every
+run: <scene>[/<option set>][/seed_N]. Run again after an interruption, it goes on with what is not finished.
+"""
+
+from __future__ import annotations
+
+import sys
+from argparse import ArgumentParser, Namespace
+from collections.abc import Sequence
+from pathlib import Path
+
+import utils.openmp  # noqa: F401  isort: skip  (before torch)
+
+from evaluation import stages
+from evaluation.configs import check_options, read_configs
+from evaluation.document import cheapest_table, results_table
+from evaluation.machine import machine
+from evaluation.markdown import markdown_table
+from evaluation.report import make_report, write_report
+from evaluation.results import read_run
+from evaluation.runs import Run, check_folders, plan_runs
+from evaluation.scenes import SceneEntry, check_names, dataset_scenes, finished_scenes, folder_scenes
+from evaluation.stages import Failure, StageFailed
+from utils.system_utils import UserError, mkdir_p, run_cli
+
+EXPOSURE = (
+    "--exposure_lr_init", "0.001", "--exposure_lr_final", "0.0001", "--exposure_lr_delay_steps", "5000",
+    "--exposure_lr_delay_mult", "0.001", "--train_test_exp",
+)  # fmt: skip
+
+
+def _parser() -> ArgumentParser:
+    parser = ArgumentParser(
+        description="Train, render and score a table of scenes, and report on all of it.",
+        epilog="Whatever follows -- goes to train.py. Finished is what was trained from the same scene folder with the "
+        "same options of train.py, whatever the version of the code; a changed dataset is not noticed. Exit status: 1 "
+        "when a run failed, 2 when nothing could be started.",
+    )
+    add = parser.add_argument
+    flag = {"action": "store_true"}
+    add("--mipnerf360", "-m360", type=Path, metavar="DIR", help="folder of the nine scenes of Mip-NeRF 360")
+    add("--tanksandtemples", "-tat", type=Path, metavar="DIR", help="folder of truck and train of Tanks and Temples")
+    add("--deepblending", "-db", type=Path, metavar="DIR", help="folder of drjohnson and playroom of Deep Blending")
+    add("--scenes", type=Path, nargs="+", default=[], metavar="FOLDER",
+        help="any COLMAP or Blender folders; Blender scenes get train.py's -w, as in published tables")  # fmt: skip
+    add("--output_path", type=Path, default=Path("./eval"), metavar="DIR", help="models and report (default: ./eval)")
+    add("--skip_training", **flag, help="take the models that are in the output folder, whatever made them")
+    add("--skip_rendering", **flag, help="take the renders that are there")
+    add("--skip_metrics", **flag, help="take the scores that are there")
+    add("--iterations", type=int, metavar="N", help="training steps (default: train.py's, 30000)")
+    add("--seeds", type=int, nargs="+", default=[], metavar="N",
+        help="train with each of these seeds and report mean and standard deviation (default: once)")  # fmt: skip
+    add("--configs", type=Path, metavar="FILE",
+        help='train under each option set of a JSON file, {"name": ["--sh_degree", "1"], ...}, and say which is '
+        "cheapest for a given error (default: once)")  # fmt: skip
+    add("--use_depth", **flag, help="supervise with inverse depth maps: train.py -d depths2/")
+    add("--use_expcomp", **flag, help="exposure compensation: train.py --train_test_exp and its learning rates")
+    add("--fast", **flag, help="train.py --optimizer_type sparse_adam")
+    add("--aa", **flag, help="train and render with --antialiasing")
+    return parser
+
+
+def _scenes(args: Namespace) -> list[SceneEntry]:
+    groups = ("mipnerf360", "tanksandtemples", "deepblending")
+    scenes = [entry for group in groups if (root := getattr(args, group)) for entry in dataset_scenes(group, root)]
+    scenes += folder_scenes(args.scenes)
+    if not scenes and args.skip_training and args.skip_rendering:
+        scenes = finished_scenes(args.output_path)
+    if not scenes:
+        raise UserError("no scenes given; name data sets with -m360, -tat, -db, or folders with --scenes")
+    check_names(scenes)
+    return scenes
+
+
+def _plan(args: Namespace, more: Sequence[str]) -> list[Run]:
+    """The runs; UserError for options that cannot be meant, before hours are spent."""
+    if args.iterations is not None and args.iterations < 1:
+        raise UserError(f"--iterations must be at least 1, got {args.iterations}")
+    if min(args.seeds, default=0) < 0 or len(set(args.seeds)) < len(args.seeds):
+        raise UserError(f"--seeds must be different numbers from 0, got {' '.join(map(str, args.seeds))}")
+    check_options(more, "after --")
+    configs = read_configs(args.configs) if args.configs else {}
+    common = [
+        *(("-d", "depths2/") if args.use_depth else ()),
+        *(EXPOSURE if args.use_expcomp else ()),
+        *(("--optimizer_type", "sparse_adam") if args.fast else ()),
+        *(("--antialiasing",) if args.aa else ()),
+        *(() if args.iterations is None else ("--iterations", str(args.iterations))),
+        *more,
+    ]
+    if args.seeds and any(word.split("=")[0] == "--seed" for word in (*common, *sum(configs.values(), ()))):
+        raise UserError("--seed is given twice: leave it out where --seeds is given")
+    runs = plan_runs(_scenes(args), args.output_path.resolve(), common, configs, args.seeds)
+    if not args.skip_training:
+        check_folders(runs)
+    return runs
+
+
+def _carry_out(runs: Sequence[Run], args: Namespace, failures: dict[Run, Failure]) -> None:
+    """Bring every run to its end; a failure is noted and said, and the next one follows."""
+    facts = {} if args.skip_training else machine()
+    render_options = ("--antialiasing",) if args.aa else ()
+    for number, run in enumerate(runs, 1):
+        print(f"[{number}/{len(runs)}] {run.title}", flush=True)
+        try:
+            if not args.skip_training:
+                stages.train(run, facts)
+            if not args.skip_rendering:
+                stages.render(run, render_options)
+            if not args.skip_metrics:
+                stages.score(run)
+        except StageFailed as failed:
+            failures[run] = failed.failure
+            print(f"  FAILED ({failed.failure.stage}): {failed}", flush=True)
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """The command line."""
+    words = list(sys.argv[1:] if argv is None else argv)
+    end = words.index("--") if "--" in words else len(words)
+    args = _parser().parse_args(words[:end])
+    runs = _plan(args, words[end + 1 :])
+    output = args.output_path.resolve()
+    mkdir_p(output)
+    failures: dict[Run, Failure] = {}
+    try:
+        _carry_out(runs, args, failures)
+    finally:  # after Ctrl-C too: what is finished is reported
+        report = make_report(["full_eval.py", *words], [read_run(run, output, failures.get(run)) for run in runs])
+        write_report(report, output)
+        if report["summary"]:
+            print(markdown_table(results_table(report["summary"])))
+        for scene, rows in report["cheapest"].items():
+            print(f"\n{scene}: cheapest option set for a given error\n{markdown_table(cheapest_table(rows))}")
+        print(f"\nreport: {output / 'report.html'}")
+    if failures:
+        print(
+            f"{len(failures)} of {len(runs)} runs failed: {', '.join(run.title for run in failures)}", file=sys.stderr
+        )
+        sys.exit(1)
+
+
+if __name__ == "__main__":
+    run_cli(main)

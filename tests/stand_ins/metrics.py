@@ -1,0 +1,21 @@
+"""Stands in for metrics.py: the PSNR that the stand-in for train.py has left, the second view below the first."""
+
+import argparse
+import json
+import sys
+from pathlib import Path
+
+parser = argparse.ArgumentParser()
+parser.add_argument("-m", type=Path)
+args = parser.parse_args()
+
+with (args.m / "scored.txt").open("a") as calls:
+    calls.write(json.dumps(["metrics", *sys.argv[1:]]) + "\n")
+psnr = json.loads((args.m / "stand_in.json").read_text())["psnr"]
+means, per_view = {}, {}
+for folder in (args.m / "test").iterdir():
+    means[folder.name] = {"SSIM": 0.9, "PSNR": psnr, "LPIPS": None}
+    per_view[folder.name] = {"PSNR": {"00000.png": psnr + 1, "00001.png": psnr - 1}}
+(args.m / "results.json").write_text(json.dumps(means))
+(args.m / "per_view.json").write_text(json.dumps(per_view))
+(args.m / "metrics_info.json").write_text(json.dumps({"conventions": {"PSNR": "dB"}}))

@@ -1,0 +1,61 @@
+"""Stands in for train.py: writes at once what a training would, with numbers that follow from the options.
+
+A scene folder with a file `broken` makes it fail, one with a file `slow` makes it wait for a signal.
+"""
+
+import argparse
+import json
+import signal
+import sys
+import time
+from pathlib import Path
+
+parser = argparse.ArgumentParser()
+parser.add_argument("-s", type=Path)
+parser.add_argument("-m", type=Path)
+parser.add_argument("--iterations", type=int, default=30000)
+parser.add_argument("--sh_degree", type=int, default=3)
+parser.add_argument("--seed", type=int, default=0)
+parser.add_argument("--start_checkpoint")
+args = parser.parse_known_args()[0]
+
+with (args.s.parent / "calls.txt").open("a") as calls:
+    calls.write(json.dumps(["train", *sys.argv[1:]]) + "\n")
+args.m.mkdir(parents=True, exist_ok=True)
+if (args.s / "broken").exists():
+    sys.stderr.write("Training progress:  50%|#####     | 5/10\r\n")
+    sys.exit("error: <b>the scene</b> is broken; mend it")
+
+
+def stop(signum, frame):
+    signal.signal(signal.SIGINT, lambda *_: sys.exit("two signals: no checkpoint"))
+    time.sleep(0.5)
+    (args.m / "chkpnt5.pth").write_bytes(b"")
+    sys.exit(130)
+
+
+if (args.s / "slow").exists() and not args.start_checkpoint:
+    signal.signal(signal.SIGINT, stop)
+    (args.s / "started").touch()
+    time.sleep(30)
+    sys.exit("no signal came")
+
+best = 20.0 + args.sh_degree + 0.1 * args.seed  # dB at the end
+slowness = 1 + args.sh_degree  # seconds an iteration, times ten
+scores = ",".join(f"{views}_{score}" for views in ("test", "train") for score in ("l1", "psnr", "ssim"))
+rows = [f"iteration,seconds,wall_seconds,gaussians,peak_memory_mib,{scores}"]
+for t in (args.iterations // 4, args.iterations // 2, args.iterations):
+    progress = t / args.iterations
+    cost = f"{t},{t * slowness / 10},{t},{100 * t * slowness},{300 + t}"
+    rows.append(f"{cost},0.1,{best - 10 + 10 * progress},{0.7 + 0.2 * progress},0.1,30,0.95")
+(args.m / "error_vs_time.csv").write_text("\n".join(rows) + "\n")
+(args.m / "stand_in.json").write_text(json.dumps({"psnr": best}))
+(args.m / "cameras.json").write_text(json.dumps([{"img_name": f"photo_{i}.jpg"} for i in range(9)]))
+log = []
+for t in {7000, 30000, args.iterations}:
+    if t <= args.iterations:
+        ply = args.m / "point_cloud" / f"iteration_{t}" / "point_cloud.ply"
+        ply.parent.mkdir(parents=True, exist_ok=True)
+        ply.write_text(f"ply\nelement vertex {100 * t * slowness}\nend_header\n")
+        log.append({"iteration": t, "seconds": t * slowness / 10})
+(args.m / "train_log.json").write_text(json.dumps(log))

@@ -1,0 +1,127 @@
+"""The evaluation's arithmetic: spread, Pareto front, cheapest option sets, published tables."""
+
+import statistics
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from evaluation import published
+from evaluation.document import Table
+from evaluation.markdown import markdown_table
+from evaluation.readme_table import BEGIN, END, replace_results
+from evaluation.scenes import DATASETS
+from evaluation.summary import QUANTITIES, spread, summarise
+from evaluation.tradeoff import cheapest, gaussians_to_reach, levels, pareto_front, seconds_to_reach
+from utils.error_curve import COLUMNS
+from utils.system_utils import UserError
+
+
+def curve(*points: tuple[float, float | None, float]) -> list[dict]:
+    """Rows of (seconds, test PSNR, Gaussians)."""
+    return [
+        dict.fromkeys(COLUMNS) | {"iteration": i, "seconds": s, "test_psnr": p, "gaussians": n}
+        for i, (s, p, n) in enumerate(points, 1)
+    ]
+
+
+def test_pareto_front_of_known_points():
+    points = [(3, 1), (1, 5), (2, 5), (2, 4), (4, 1), (3, 1)]
+    assert pareto_front(points) == [1, 3, 0]
+    assert pareto_front([]) == []
+
+
+@given(st.lists(st.tuples(st.integers(0, 9), st.integers(0, 9)), max_size=30))
+def test_pareto_front_is_what_nothing_beats(points):
+    front = pareto_front(points)
+
+    def beaten(point):
+        return any(q != point and q[0] <= point[0] and q[1] <= point[1] for q in points)
+
+    assert {points[i] for i in front} == {point for point in points if not beaten(point)}
+    assert len({points[i] for i in front}) == len(front)
+
+
+def test_seconds_to_reach_between_points():
+    rows = curve((1, 10, 100), (4, None, 100), (100, 20, 300), (200, 19, 250), (300, 30, 400))
+    assert seconds_to_reach(rows, 9) == 1
+    assert seconds_to_reach(rows, 20) == pytest.approx(100)
+    assert seconds_to_reach(rows, 15) == pytest.approx(10)  # halfway in the logarithm from 1 to 100
+    assert seconds_to_reach(rows, 31) is None
+    assert gaussians_to_reach(rows, 20) == 300 and gaussians_to_reach(rows, 18) == 250
+    assert gaussians_to_reach(rows, 31) is None
+
+
+def test_cheapest_wants_every_seed_and_takes_the_mean():
+    curves = {
+        "slow": [curve((10, 20, 50), (100, 30.07, 60)), curve((10, 20, 50), (100, 30.07, 60))],
+        "fast": [curve((1, 20, 80), (10, 29, 90)), curve((3, 20, 70), (30, 28, 90))],
+    }
+    rows = {row["psnr"]: row for row in cheapest(curves)}
+    assert list(rows) == [30.0, 29.9, 29.8, 29.5, 29.0, 28.0, 27.0, 25.0, 22.0] == levels(curves)
+    assert rows[29.0]["seconds"]["config"] == "slow" and set(rows[29.0]["seconds"]["all"]) == {"slow"}
+    assert rows[28.0]["seconds"]["config"] == "fast" and set(rows[28.0]["seconds"]["all"]) == {"slow", "fast"}
+    assert rows[28.0]["seconds"]["value"] == pytest.approx((10 ** (8 / 9) + 30) / 2)
+    assert rows[28.0]["gaussians"] == {"all": {"slow": 60, "fast": 90}, "config": "slow", "value": 60}
+
+
+def test_cheapest_of_nothing():
+    assert cheapest({}) == [] == cheapest({"a": [[]], "b": [curve((1, None, 2))]})
+
+
+def test_spread():
+    assert spread([1.0, 2.0, 4.0]) == {
+        "mean": pytest.approx(7 / 3), "std": pytest.approx(statistics.stdev([1, 2, 4])), "values": [1.0, 2.0, 4.0],
+    }  # fmt: skip
+    assert spread([5.0])["std"] is None and spread([5.0])["mean"] == 5.0
+    assert spread([5.0, None])["mean"] is None and spread([])["mean"] is None
+
+
+def test_a_failed_seed_is_left_out_and_named():
+    def run(seed, failure):
+        values = dict.fromkeys(QUANTITIES, 1.0 + seed) | {"views": 3}
+        return {"scene": "a", "group": "scenes", "config": None, "seed": seed, "failure": failure,
+                "iterations": {"10": values}, "ground_truth_sha256": "x"}  # fmt: skip
+
+    (row,) = summarise([run(0, None), run(1, {"stage": "train"}), run(2, None)])
+    assert row["PSNR"] == {"mean": 2.0, "std": pytest.approx(2**0.5), "values": [1.0, 3.0]}
+    assert row["seeds"] == [0, 2] and row["failed_seeds"] == [1]
+
+
+def test_published_scenes_add_up_to_the_published_means():
+    """Two tables of the paper, transcribed by hand: each mean of scenes must be the printed mean."""
+    table = published.published_tables()[0]
+    assert set(table["scenes"]) == {name for scenes in DATASETS.values() for name in scenes}
+    for group, by_iteration in table["means"].items():
+        for iteration, means in by_iteration.items():
+            for metric, half in (("PSNR", 0.005), ("SSIM", 0.0005), ("LPIPS", 0.0005)):
+                mean = statistics.fmean(table["scenes"][name][iteration][metric] for name in DATASETS[group])
+                # The mean is rounded, and so are the numbers it was made of here.
+                assert abs(mean - means[metric]) <= 1.5 * half + 1e-12, (group, iteration, metric)
+
+
+def _blender_run(**change):
+    run = {"scene": "lego", "config": None, "group": "scenes", "added_options": [], "options": ["--eval", "-w"],
+           "test_sizes": [[800, 800]], "views": {"test": 200, "train": 100}}  # fmt: skip
+    row = {"scene": "lego", "config": None, "group": "scenes", "iteration": 30000}
+    row |= {name: spread([35.0 if name == "PSNR" else 0.5]) for name in QUANTITIES}
+    return published.compare([run | change], [row], [])
+
+
+def test_synthetic_scenes_compare_at_full_size_over_white_only():
+    (found,) = _blender_run()
+    assert found["numbers"] == {"PSNR": {"ours": 35.0, "published": 35.78, "difference": pytest.approx(-0.78)}}
+    assert not _blender_run(test_sizes=[[400, 400]])
+    assert not _blender_run(views={"test": 25, "train": 100})
+    assert not _blender_run(options=["--eval"])
+
+
+def test_markdown_keeps_columns_apart():
+    lines = markdown_table(Table(["a", "b"], [["x|y", "1"], ["z", "22"]])).splitlines()
+    assert lines == ["| a    |   b |", "| ---- | --: |", "| x\\|y |   1 |", "| z    |  22 |"]
+
+
+@pytest.mark.parametrize("text", ["", BEGIN, f"{END}\n{BEGIN}", f"{BEGIN}{BEGIN}{END}"])
+def test_a_readme_without_marks_is_left_alone(text):
+    with pytest.raises(UserError, match="one line <!-- results: begin"):
+        replace_results(text, [])

@@ -1,0 +1,386 @@
+"""full_eval.py: what it runs, resumes, refuses and reports; with stand-ins for what it runs, and once for real."""
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from PIL import Image
+
+import full_eval
+from evaluation import readme_table, stages
+from evaluation import report as report_module
+from evaluation.figures import draw_curves
+from evaluation.readme_table import BEGIN, END
+from evaluation.scenes import DATASETS
+from utils.system_utils import UserError
+
+ROOT = Path(__file__).parents[1]
+STAND_INS = Path(__file__).parent / "stand_ins"
+MACHINE = {
+    "commit": "abc", "cpu": "some CPU", "gpu": None, "instruction_set": "avx2", "packages": {"torch": "2"},
+    "python": "3.11", "threads": 2,
+}  # fmt: skip
+
+
+@pytest.fixture(autouse=True)
+def _stand_ins(monkeypatch):
+    monkeypatch.setattr(stages, "_ROOT", STAND_INS)
+    monkeypatch.setattr(full_eval, "machine", lambda: MACHINE)
+    monkeypatch.setattr(report_module, "draw_curves", lambda *_: False)  # half a second each; see `figures`
+
+
+@pytest.fixture
+def figures(monkeypatch):
+    """For tests that look at the curves' figures."""
+    monkeypatch.setattr(report_module, "draw_curves", draw_curves)
+
+
+@pytest.fixture
+def scenes(tmp_path) -> Path:
+    """A folder of two scenes, `attic` (COLMAP) and `brick` (Blender)."""
+    folder = tmp_path / "scenes"
+    (folder / "attic" / "sparse").mkdir(parents=True)
+    (folder / "brick").mkdir()
+    (folder / "brick" / "transforms_train.json").touch()
+    return folder
+
+
+def calls(scenes: Path) -> list[list[str]]:
+    """Command lines of the stand-ins for train.py and render.py, in their order."""
+    log = scenes / "calls.txt"
+    return [json.loads(line) for line in log.read_text().splitlines()] if log.exists() else []
+
+
+def run(*words: object) -> dict:
+    full_eval.main([str(word) for word in words])
+    return report_of(Path(words[words.index("--output_path") + 1]))
+
+
+def report_of(output: Path) -> dict:
+    return json.loads((output / "report.json").read_text())
+
+
+def test_commands_of_a_plain_scene(figures, scenes, tmp_path):
+    out = tmp_path / "out"
+    report = run("--scenes", scenes / "attic", scenes / "brick", "--output_path", out, "--iterations", 40, "--aa",
+                 "--", "-r", 2)  # fmt: skip
+    attic, attic_render, brick, _ = calls(scenes)
+    shared = ["--eval", "--test_iterations", "-1"]
+    switches = ["--antialiasing", "--iterations", "40", "-r", "2"]
+    assert attic == ["train", "-s", str(scenes / "attic"), "-m", str(out / "attic"), "--disable_viewer", "--quiet",
+                     *shared, *switches]  # fmt: skip
+    assert brick[7:] == [*shared, "-w", *switches]
+    assert attic_render == ["render", "-m", str(out / "attic"), "-s", str(scenes / "attic"), "--iteration", "40",
+                            "--skip_train", "--eval", "--quiet", "--antialiasing"]  # fmt: skip
+    first = report["runs"][0]
+    assert first["finished"] and first["failure"] is None and first["model"] == "attic"
+    assert first["iterations"]["40"] == {
+        "PSNR": 23.0, "SSIM": 0.9, "LPIPS": None, "fps": 250.0, "gaussians": 16000, "peak_memory_mib": 340.0,
+        "render_ms": 4.0, "seconds": 16.0, "views": 2,
+    }  # fmt: skip
+    assert first["views"] == {"test": 2, "train": 7} and first["test_sizes"] == [[120, 80]]
+    assert first["worst_views"][0] == {"PSNR": 22.0, "file": "00001.png", "picture": "photo_1.jpg"}
+    assert first["machine"] == MACHINE and report["published"] == [] and report["cheapest"] == {}
+    assert (out / "timing.txt").read_text().startswith("scenes: 0.0")
+    for name in ("attic_curves.png", "attic_worst_views.png"):
+        with Image.open(out / "figures" / name) as image:
+            assert image.width > 300
+
+
+def test_data_sets_get_the_options_of_the_paper(scenes, tmp_path):
+    mip, tanks = tmp_path / "mip", tmp_path / "tat"
+    for name in DATASETS["mipnerf360"]:
+        (mip / name).mkdir(parents=True)
+    (tanks / "truck").mkdir(parents=True)
+    with pytest.raises(SystemExit) as status:
+        run("-m360", mip, "-tat", tanks, "--output_path", tmp_path / "out", "--fast", "--use_depth", "--use_expcomp")
+    assert status.value.code == 1  # "train" is missing
+    trained = {Path(words[2]).name: words[10:] for words in calls(mip) if words[0] == "train"}
+    switches = ["-d", "depths2/", *full_eval.EXPOSURE, "--optimizer_type", "sparse_adam"]
+    assert trained["garden"] == ["-i", "images_4", *switches] and trained["room"] == ["-i", "images_2", *switches]
+    assert [words for words in calls(tanks) if words[0] == "train"][0][10:] == switches
+    iterations = [words[6] for words in calls(mip) if words[0] == "render"]
+    assert iterations == ["7000", "30000"] * 9
+
+    report = report_of(tmp_path / "out")
+    failed = [run for run in report["runs"] if run["failure"]]
+    assert [run["scene"] for run in failed] == ["train"]
+    assert "no such scene folder" in failed[0]["failure"]["lines"][0]
+    garden = [row for row in report["published"] if row["scene"] == "garden" and row["iteration"] == 30000]
+    assert [row["table"] for row in garden] == [
+        "Kerbl et al. 2023", "official code, re-run by the gsplat authors",
+    ]  # fmt: skip
+    assert garden[0]["numbers"]["PSNR"] == pytest.approx({"ours": 23.0, "published": 27.41, "difference": -4.41})
+    assert "LPIPS" not in garden[0]["numbers"]  # ours is null
+    assert garden[0]["other_options"] == switches
+    means = {(row["scene"], row["iteration"]) for row in report["published"] if row["scene"].startswith("mean")}
+    assert means == {("mean of mipnerf360", 7000), ("mean of mipnerf360", 30000)}  # Tanks and Temples lacks a scene
+    groups = [line.split(":")[0] for line in (tmp_path / "out" / "timing.txt").read_text().splitlines()]
+    assert groups == ["mipnerf360", "tanksandtemples"]
+
+
+def test_a_second_call_does_nothing_again(scenes, tmp_path):
+    out = tmp_path / "out"
+    command = ("--scenes", scenes / "attic", "--output_path", out, "--iterations", 40)
+    first = run(*command)
+    done = calls(scenes)
+    assert run(*command) == first
+    assert calls(scenes) == done
+    assert len((out / "attic" / "scored.txt").read_text().splitlines()) == 1
+
+    (out / "attic" / "test" / "ours_40" / "renders" / "00001.png").unlink()
+    run(*command)
+    assert [words[0] for words in calls(scenes)[len(done) :]] == ["render"]
+    (out / "attic" / "results.json").write_text("{}")
+    run(*command)
+    (out / "attic" / "point_cloud" / "iteration_40" / "point_cloud.ply").unlink()
+    run(*command)
+    assert [words[0] for words in calls(scenes)[len(done) + 1 :]] == ["train", "render"]
+    assert len((out / "attic" / "scored.txt").read_text().splitlines()) == 4
+
+
+def test_other_options_are_not_mixed_in(scenes, tmp_path):
+    out = tmp_path / "out"
+    command = ("--scenes", scenes / "attic", "--output_path", out)
+    run(*command, "--iterations", 40)
+    done = calls(scenes)
+    with pytest.raises(UserError, match="attic was trained with other options .*40; asked for .*50"):
+        run(*command, "--iterations", 50)
+    (out / "attic" / "full_eval.json").write_text("{broken")
+    with pytest.raises(UserError, match="attic holds a model that full_eval.py has not trained"):
+        run(*command, "--iterations", 40)
+    assert calls(scenes) == done
+
+    (found,) = run(*command, "--skip_training")["runs"]
+    assert found["finished"] and (found["machine"], found["options"]) == ({}, None)
+
+
+def test_finished_models_without_any_data_set(scenes, tmp_path):
+    """With --skip_training the reference dies; metrics alone need no data set at all."""
+    out = tmp_path / "out"
+    (scenes / "attic").rename(scenes / "garden")
+    run("--scenes", scenes / "garden", "--output_path", out, "--iterations", 40)
+    report = run("--skip_training", "--skip_rendering", "--output_path", out)
+    assert [(run["scene"], run["group"], run["finished"]) for run in report["runs"]] == [("garden", "mipnerf360", True)]
+
+
+def test_a_failed_scene_is_told_and_the_others_go_on(scenes, tmp_path, capsys):
+    out = tmp_path / "out"
+    (scenes / "attic" / "broken").touch()
+    with pytest.raises(SystemExit) as status:
+        run("--scenes", scenes / "attic", scenes / "brick", "--output_path", out, "--iterations", 40)
+    assert status.value.code == 1
+    report = report_of(out)
+    attic, brick = report["runs"]
+    assert attic["failure"]["stage"] == "train" and attic["failure"]["command"][1].endswith("train.py")
+    assert attic["failure"]["lines"] == ["error: <b>the scene</b> is broken; mend it"]  # no progress bar
+    assert brick["finished"] and [row["scene"] for row in report["summary"]] == ["brick"]
+    assert "    error: <b>the scene</b> is broken; mend it" in (out / "report.md").read_text()
+    assert "&lt;b&gt;the scene&lt;/b&gt; is broken" in (out / "report.html").read_text()
+    assert "1 of 2 runs failed: attic" in capsys.readouterr().err
+
+    (scenes / "attic" / "broken").unlink()
+    before = len(calls(scenes))
+    assert run("--scenes", scenes / "attic", scenes / "brick", "--output_path", out, "--iterations", 40)["runs"][0][
+        "finished"
+    ]
+    assert [words[0] for words in calls(scenes)[before:]] == ["train", "render"]  # of attic alone
+
+
+def test_ctrl_c_reaches_the_training_and_the_next_call_resumes_it(scenes, tmp_path):
+    out = tmp_path / "out"
+    (scenes / "attic" / "slow").touch()
+    program = (
+        "import pathlib, sys; from evaluation import stages; import full_eval; from utils.system_utils import run_cli;"
+        f"stages._ROOT = pathlib.Path({str(STAND_INS)!r}); full_eval.machine = dict; run_cli(full_eval.main)"
+    )
+    words = ["--scenes", str(scenes / "attic"), str(scenes / "brick"), "--output_path", str(out), "--iterations", "40"]
+    process = subprocess.Popen([sys.executable, "-c", program, *words], cwd=ROOT, stderr=subprocess.PIPE, text=True,
+                               start_new_session=True)  # fmt: skip
+    try:
+        deadline = time.monotonic() + 60
+        while not (scenes / "attic" / "started").exists() and time.monotonic() < deadline:
+            time.sleep(0.05)
+        os.killpg(process.pid, signal.SIGINT)  # to the whole group, as a terminal does
+        said = process.communicate(timeout=30)[1]
+    finally:
+        process.kill()
+    assert process.returncode == 130, said
+    report = report_of(out)
+    assert [run["finished"] for run in report["runs"]] == [False, False] and not report["runs"][0]["failure"]
+    assert "Not finished: attic; brick." in (out / "report.md").read_text()
+
+    report = run(*words)
+    assert [run["finished"] for run in report["runs"]] == [True, True]
+    resumed = next(words for words in calls(scenes)[1:] if words[0] == "train")
+    assert resumed[-2:] == ["--start_checkpoint", str(out / "attic" / "chkpnt5.pth")]
+
+
+def test_seeds_and_option_sets(figures, scenes, tmp_path, capsys, monkeypatch):
+    out, configs = tmp_path / "out", tmp_path / "configs.json"
+    configs.write_text('{"base": [], "sh1": ["--sh_degree", 1]}')
+    report = run("--scenes", scenes / "attic", "--output_path", out, "--iterations", 40, "--seeds", 0, 2, "--configs",
+                 configs)  # fmt: skip
+    assert [run["model"] for run in report["runs"]] == [
+        "attic/base/seed_0", "attic/base/seed_2", "attic/sh1/seed_0", "attic/sh1/seed_2",
+    ]  # fmt: skip
+    base, small = report["summary"]
+    assert base["PSNR"] == {"mean": pytest.approx(23.1), "std": pytest.approx(0.2 / 2**0.5), "values": [23.0, 23.2]}
+    assert base["LPIPS"] == {"mean": None, "std": None, "values": [None, None]}
+    assert (base["config"], base["seeds"], small["PSNR"]["mean"]) == ("base", [0, 2], pytest.approx(21.1))
+    assert base["one_ground_truth"] and report["warnings"] == []
+
+    levels = report["cheapest"]["attic"]
+    # Seed 0 of base ends at 23.0 and seed 2 at 23.2: both reach 23.0. sh1 is twice as fast and ends at 21.0.
+    assert levels[0]["psnr"] == 23.0 and levels[0]["seconds"]["config"] == "base"
+    assert levels[-1]["psnr"] < 21.0 and levels[-1]["seconds"]["config"] == "sh1"
+    said = capsys.readouterr().out
+    assert "attic: cheapest option set for a given error" in said and "23.10 ± 0.14" in said
+    assert (out / "figures" / "attic_sh1_worst_views.png").exists()
+
+    readme = tmp_path / "README.md"
+    readme.write_text(f"before\n\n{BEGIN}\nold\n{END}\n\nafter\n")
+    monkeypatch.setattr(sys, "argv", ["readme_table", str(out / "report.json"), "--readme", str(readme)])
+    for _ in range(2):  # the second time nothing changes
+        readme_table.main()
+        text = readme.read_text()
+        assert text.startswith(f"before\n\n{BEGIN}\n\n| scene") and text.endswith(f"\n\n{END}\n\nafter\n")
+        assert "23.10 ± 0.14" in text and "sh1: `--iterations 40 --sh_degree 1`" in text and "some CPU" in text
+        assert "old" not in text and text.count("| attic") == 2
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        ("", "no scenes given"),
+        ("--scenes SCENES/attic SCENES/attic", "two scenes are named attic"),
+        ("--scenes nowhere", "no such scene folder: nowhere"),
+        ("--scenes SCENES/attic --iterations 0", "--iterations must be at least 1"),
+        ("--scenes SCENES/attic --seeds 1 1", "--seeds must be different"),
+        ("--scenes SCENES/attic --seeds 1 -- --seed 2", "--seed is given twice"),
+        ("--scenes SCENES/attic -- -m elsewhere", "after --: -m is set by full_eval.py itself"),
+        ("--scenes SCENES/attic -- --model=elsewhere", "--model=elsewhere is set by full_eval.py"),
+        ("--scenes SCENES/attic --configs nowhere.json", "cannot read nowhere.json"),
+        ("--skip_training --skip_rendering", "no scenes given"),
+    ],
+)
+def test_refusals(scenes, tmp_path, words, sentence):
+    words = words.replace("SCENES", str(scenes)).split()
+    with pytest.raises(UserError, match=sentence):
+        full_eval.main(["--output_path", str(tmp_path / "out"), *words])
+    assert calls(scenes) == []
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        ("{", "is no JSON"),
+        ("[]", "names no option sets"),
+        ('{"a": [], "a": []}', "a is there twice"),
+        ('{"../a": []}', "cannot name a folder"),
+        ('{"seed_1": []}', "cannot name a folder"),
+        ('{"a": "--sh_degree 1"}', "a must be a list"),
+        ('{"a": ["-s", "x"]}', "a: -s is set by full_eval.py itself"),
+    ],
+)
+def test_refused_option_sets(scenes, tmp_path, text, sentence):
+    configs = tmp_path / "configs.json"
+    configs.write_text(text)
+    with pytest.raises(UserError, match=sentence):
+        run("--scenes", scenes / "attic", "--output_path", tmp_path / "out", "--configs", configs)
+
+
+def test_different_ground_truth_is_pointed_out(scenes, tmp_path):
+    out = tmp_path / "out"
+    command = ("--scenes", scenes / "attic", "--output_path", out, "--iterations", 40, "--seeds", 0, 1)
+    assert run(*command)["warnings"] == []
+    Image.new("RGB", (120, 80)).save(out / "attic" / "seed_1" / "test" / "ours_40" / "gt" / "00000.png")
+    (out / "attic" / "seed_1" / "results.json").unlink()
+    report = run(*command)
+    assert len(report["warnings"]) == 1 and "different ground truth" in report["warnings"][0]
+    assert report["warnings"][0] in (out / "report.md").read_text()
+
+
+def test_damaged_files_do_not_cost_the_report(scenes, tmp_path, capsys):
+    out = tmp_path / "out"
+    names = ("cloud", "curve", "fine", "picture", "scores")
+    for name in names:
+        (scenes / name / "sparse").mkdir(parents=True)
+    command = ["--scenes", *(scenes / name for name in names), "--output_path", out, "--iterations", 40]
+    run(*command)
+    (out / "cloud" / "point_cloud" / "iteration_40" / "point_cloud.ply").write_text("ply\n")
+    (out / "curve" / "error_vs_time.csv").write_text("x")
+    (out / "picture" / "test" / "ours_40" / "renders" / "00001.png").write_bytes(b"x")
+    (out / "scores" / "results.json").write_text("{")
+    report = run(*command, "--skip_training", "--skip_rendering", "--skip_metrics")
+    assert [run["finished"] for run in report["runs"]] == [False, True, True, True, False]
+    assert report["runs"][0]["failure"]["stage"] == "report"
+    warnings = capsys.readouterr().err
+    assert "error_vs_time.csv cannot be read" in warnings and "no worst views of picture" in warnings
+    assert (out / "report.html").exists()
+
+
+def _browser() -> str | None:
+    names = ("chromium", "chromium-browser", "google-chrome", "chrome-headless-shell")
+    return next((path for name in names if (path := shutil.which(name))), None)
+
+
+# Appended to a copy: the report itself has no script.
+PROBE = """<script>addEventListener("load", () => {
+  const images = [...document.images];
+  document.body.dataset.probe = images.length + " images, " +
+    images.filter(image => image.complete && image.naturalWidth > 0).length + " loaded";
+})</script></body>"""
+
+
+def test_html_opens_in_a_browser_and_needs_nothing_else(figures, scenes, tmp_path):
+    out = tmp_path / "out"
+    (scenes / "brick" / "broken").touch()
+    with pytest.raises(SystemExit):
+        run("--scenes", scenes / "attic", scenes / "brick", "--output_path", out, "--iterations", 40)
+    html = (out / "report.html").read_text()
+    assert "<script" not in html and "http:" not in html and "https:" not in html
+    assert all(part.startswith("data:image/") for part in html.split('src="')[1:])
+    browser = _browser()
+    if browser is None:
+        pytest.skip("no Chromium on PATH")
+    probed = tmp_path / "probed.html"
+    probed.write_text(html.replace("</body>", PROBE))
+    command = [
+        browser, "--headless=new", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage", "--no-first-run",
+        f"--user-data-dir={tmp_path / 'profile'}", "--enable-logging=stderr", "--v=0", "--dump-dom", probed.as_uri(),
+    ]  # fmt: skip
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    assert 'data-probe="2 images, 2 loaded"' in done.stdout, done.stderr
+    assert "CONSOLE" not in done.stderr
+
+
+def test_for_real(colmap_scene, tmp_path):
+    """train.py, render.py and metrics.py understand what they are given, and the report has what they leave."""
+    out = tmp_path / "out"
+    words = ["--scenes", str(colmap_scene), "--output_path", str(out), "--iterations", "20"]
+    # A proxy that refuses: LPIPS shall not fetch its weights here.
+    environment = os.environ | {"TORCH_HOME": os.devnull, "https_proxy": "http://127.0.0.1:9"}
+    done = subprocess.run([sys.executable, "full_eval.py", *words], cwd=ROOT, env=environment, capture_output=True,
+                          text=True, timeout=300)  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    report = report_of(out)
+    (run,) = report["runs"]
+    scores = json.loads((out / "colmap_scene" / "results.json").read_text())["ours_20"]
+    values = run["iterations"]["20"]
+    assert {key: values[key] for key in scores if key in values} == {
+        key: scores[key] for key in ("SSIM", "PSNR", "LPIPS")
+    }
+    assert values["gaussians"] == 300 and values["seconds"] > 0 and values["peak_memory_mib"] > 50
+    assert values["render_ms"] > 0 and values["fps"] > 0
+    assert run["views"] == {"test": 3, "train": 14} and run["test_sizes"] == [[96, 64]]
+    assert run["curve"][-1]["iteration"] == 20 and run["curve"][-1]["test_psnr"] > 5
+    assert run["machine"]["packages"]["torch"] and run["machine"]["commit"]
+    assert run["worst_views"][0]["picture"].endswith(".png") and "/" in run["worst_views"][0]["picture"]
+    assert len(run["ground_truth_sha256"]) == 64
