@@ -35,5 +35,6 @@ setup(
     python_requires=">=3.10",
     packages=[],
     py_modules=[],
+    extras_require={"video": ["imageio-ffmpeg==0.8.1"]},  # convert.py --video
     install_requires=requirements() + [f"{name} @ {extension_url(name)}" for name in EXTENSIONS],
 )

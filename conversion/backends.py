@@ -1,0 +1,174 @@
+"""The commands of the long steps: pycolmap's (worker.py), or those of a COLMAP program that the user names."""
+
+import json
+import subprocess
+import sys
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, Protocol
+
+from conversion.layout import Layout
+from utils.system_utils import UserError, atomic_write
+
+Command = list[str]
+TOLERANCE = 1e-6  # of the cost in global bundle adjustment, the reference's: much faster, hardly worse
+# COLMAP's lens models that can be undistorted to a pinhole's picture.
+LENS_MODELS = (
+    *("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "FOV"),
+    *("SIMPLE_DIVISION", "DIVISION", "SIMPLE_FISHEYE", "FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"),
+    *("OPENCV_FISHEYE", "THIN_PRISM_FISHEYE", "RAD_TAN_THIN_PRISM_FISHEYE", "EUCM"),
+)
+_WORKER = Path(__file__).with_name("worker.py")
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What the user chose. camera: COLMAP's name of the lens model that is fitted."""
+
+    camera: str
+    max_num_features: int
+    matcher: str
+    mapper: str
+    no_gpu: bool
+
+
+def _mapped(layout: Layout, settings: Settings) -> Path:
+    return layout.calibrated if settings.mapper == "global" else layout.database
+
+
+class Backend(Protocol):
+    """Commands of each step. groups: names of photos of one size each, which share a camera."""
+
+    identity: str  # of the program; results of another are not continued
+
+    def features(self, layout: Layout, settings: Settings, groups: list[list[str]], masks: bool) -> list[Command]: ...
+
+    def matching(self, layout: Layout, settings: Settings) -> list[Command]: ...
+
+    def mapping(self, layout: Layout, settings: Settings) -> list[Command]: ...
+
+
+def worker_command(layout: Layout, step: str, **job: Any) -> Command:
+    """Command that runs one step of worker.py; its job goes through a file, since names of photos can be many."""
+    path = layout.work / "jobs" / f"{step}.json"
+    with atomic_write(path) as temporary:
+        temporary.write_text(json.dumps({"step": step, **job}), encoding="utf-8")
+    return [sys.executable, str(_WORKER), str(path)]
+
+
+class Pycolmap:
+    """The pycolmap package that the project needs anyway."""
+
+    def __init__(self) -> None:
+        self.identity = f"pycolmap {version('pycolmap')}"
+
+    def features(self, layout: Layout, settings: Settings, groups: list[list[str]], masks: bool) -> list[Command]:
+        job = {
+            "groups": groups,
+            "masks": str(layout.masks) if masks else "",
+            "camera": settings.camera,
+            "max_num_features": settings.max_num_features,
+        }
+        return [self._command(layout, settings, "features", **job)]
+
+    def matching(self, layout: Layout, settings: Settings) -> list[Command]:
+        return [self._command(layout, settings, "matching", matcher=settings.matcher)]
+
+    def mapping(self, layout: Layout, settings: Settings) -> list[Command]:
+        job = {"models": str(layout.models), "mapper": settings.mapper, "tolerance": TOLERANCE}
+        job["database"] = str(_mapped(layout, settings))
+        return [self._command(layout, settings, "mapping", **job)]
+
+    @staticmethod
+    def _command(layout: Layout, settings: Settings, step: str, **job: Any) -> Command:
+        common = {"database": str(layout.database), "photos": str(layout.photos), "no_gpu": settings.no_gpu}
+        return worker_command(layout, step, **{**common, **job})
+
+
+class Program:
+    """A COLMAP program. Options that were renamed between versions are looked up in its own help, before anything runs.
+
+    UserError when it can't be run, is no COLMAP, or lacks what the settings ask for.
+    """
+
+    def __init__(self, executable: str, settings: Settings) -> None:
+        self._executable = executable
+        named = [line for line in (self._output("help") or "").splitlines() if line.startswith("COLMAP")]
+        if not named:
+            raise UserError(
+                f"{executable} does not answer `help` as COLMAP does; give --colmap_executable the path of COLMAP, or "
+                "leave it out to use pycolmap"
+            )
+        self.identity = named[0]
+        self._matcher = f"{settings.matcher}_matcher"
+        switch = "0" if settings.no_gpu else "1"
+        # Named anew in COLMAP 3.12, when other features than SIFT came.
+        names = "--FeatureExtraction.use_gpu", "--SiftExtraction.use_gpu"
+        self._gpu_for_features = [self._known("feature_extractor", *names), switch]
+        names = "--FeatureMatching.use_gpu", "--SiftMatching.use_gpu"
+        self._gpu_for_matching = [self._known(self._matcher, *names), switch]
+        if settings.mapper == "global" and not all(map(self._has, ("view_graph_calibrator", "global_mapper"))):
+            raise UserError(
+                f"{executable} ({self.identity}) has no global_mapper; use --mapper incremental, or leave "
+                "--colmap_executable out to use pycolmap's"
+            )
+
+    def features(self, layout: Layout, settings: Settings, groups: list[list[str]], masks: bool) -> list[Command]:
+        commands = []
+        for number, names in enumerate(groups):
+            listed = layout.work / "jobs" / f"photos_{number}.txt"
+            with atomic_write(listed) as temporary:
+                temporary.write_text("".join(f"{name}\n" for name in names), encoding="utf-8")
+            command = [
+                *self._start("feature_extractor", layout.database),
+                *("--image_path", str(layout.photos)),
+                *("--image_list_path", str(listed)),
+                *("--ImageReader.camera_model", settings.camera),
+                *("--ImageReader.single_camera", "1"),
+                *("--SiftExtraction.max_num_features", str(settings.max_num_features)),
+            ]
+            command += ["--ImageReader.mask_path", str(layout.masks)] if masks else []
+            commands.append(command + self._gpu_for_features)
+        return commands
+
+    def matching(self, layout: Layout, settings: Settings) -> list[Command]:
+        return [self._start(self._matcher, layout.database) + self._gpu_for_matching]
+
+    def mapping(self, layout: Layout, settings: Settings) -> list[Command]:
+        layout.models.mkdir(parents=True)
+        paths = ["--image_path", str(layout.photos), "--output_path", str(layout.models)]
+        database = _mapped(layout, settings)
+        if settings.mapper == "global":
+            calibrate = self._start("view_graph_calibrator", database)
+            return [calibrate, [*self._start("global_mapper", database), *paths]]
+        return [[*self._start("mapper", database), *paths, "--Mapper.ba_global_function_tolerance", str(TOLERANCE)]]
+
+    def _start(self, name: str, database: Path) -> Command:
+        return [self._executable, name, "--database_path", str(database)]
+
+    def _has(self, name: str) -> bool:
+        return self._output(name, "-h") is not None
+
+    def _known(self, name: str, *options: str) -> str:
+        """The first of the options that the help of a command lists."""
+        text = self._output(name, "-h") or ""
+        for option in options:
+            if option in text:
+                return option
+        raise UserError(
+            f"`{self._executable} {name} -h` lists neither {' nor '.join(options)}, so it is no COLMAP that is known "
+            "here; leave --colmap_executable out to use pycolmap"
+        )
+
+    def _output(self, *arguments: str) -> str | None:
+        """What the program prints; None where it fails."""
+        command = [self._executable, *arguments]
+        try:
+            done = subprocess.run(command, capture_output=True, text=True, errors="replace", timeout=60)
+        except (OSError, subprocess.TimeoutExpired) as error:
+            raise UserError(
+                f"cannot run --colmap_executable {self._executable} ({error}); give its full path, or leave the option "
+                "out to use pycolmap"
+            ) from error
+        return done.stdout + done.stderr if done.returncode == 0 else None

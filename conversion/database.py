@@ -1,0 +1,64 @@
+"""Looks into COLMAP's database while others write it: how far features and matches are, who matches whom."""
+
+import contextlib
+import sqlite3
+from collections import Counter
+from pathlib import Path
+
+_PAIR = 2147483647  # COLMAP: pair_id = smaller image_id * this + larger image_id
+
+
+def count_rows(database: Path, table: str) -> int:
+    """Rows of a table; 0 while there is none, or while it is locked."""
+    rows = _query(database, f"SELECT COUNT(*) FROM {table}")
+    return rows[0][0] if rows else 0
+
+
+def most_features(database: Path) -> int:
+    """Number of features of the photo that has most."""
+    rows = _query(database, "SELECT MAX(rows) FROM keypoints")
+    return (rows[0][0] or 0) if rows else 0
+
+
+def forget_matches(database: Path) -> None:
+    """Empty the tables that matching fills; the features stay."""
+    if not database.is_file():
+        return
+    # A database cut off before it had tables has nothing to forget.
+    with contextlib.suppress(sqlite3.OperationalError), contextlib.closing(sqlite3.connect(database)) as connection:
+        connection.execute("DELETE FROM matches")
+        connection.execute("DELETE FROM two_view_geometries")
+        connection.commit()
+
+
+def copy_database(database: Path, target: Path) -> None:
+    """Copy a database with what is still in its log."""
+    target.unlink(missing_ok=True)
+    with contextlib.closing(sqlite3.connect(database)) as source, contextlib.closing(sqlite3.connect(target)) as copy:
+        source.backup(copy)
+
+
+def partners(database: Path) -> dict[str, int]:
+    """For every photo, with how many others its matches passed the geometric check."""
+    names = dict(_query(database, "SELECT image_id, name FROM images"))
+    counts = Counter({name: 0 for name in names.values()})
+    for (pair,) in _query(database, "SELECT pair_id FROM two_view_geometries WHERE rows > 0"):
+        for image in divmod(pair, _PAIR):
+            if image in names:
+                counts[names[image]] += 1
+    return dict(counts)
+
+
+def _query(database: Path, statement: str) -> list[tuple]:
+    if not database.is_file():
+        return []
+    try:
+        connection = sqlite3.connect(f"{database.absolute().as_uri()}?mode=ro", uri=True, timeout=1)
+    except sqlite3.Error:
+        return []
+    try:
+        return connection.execute(statement).fetchall()
+    except sqlite3.Error:
+        return []
+    finally:
+        connection.close()

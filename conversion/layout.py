@@ -1,0 +1,163 @@
+"""Where things lie in a folder that is converted, and what is said when they don't."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from utils.system_utils import UserError
+
+PICTURES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
+# Frequent beside photos, and read neither by Pillow alone nor by COLMAP.
+_FOREIGN = (".heic", ".heif", ".avif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".gif")
+_VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mts")
+FEWEST = 3
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Paths of one conversion. `input`: the photos, left alone; `work`: what can be made again; the rest: the scene."""
+
+    scene: Path
+
+    @property
+    def input(self) -> Path:
+        return self.scene / "input"
+
+    @property
+    def work(self) -> Path:
+        return self.scene / "distorted"
+
+    @property
+    def photos(self) -> Path:
+        """The photos as COLMAP gets them: upright, in formats it reads."""
+        return self.work / "photos"
+
+    @property
+    def masks(self) -> Path:
+        return self.work / "masks"
+
+    @property
+    def database(self) -> Path:
+        return self.work / "database.db"
+
+    @property
+    def calibrated(self) -> Path:
+        """A copy of the database that global mapping writes its estimates of focal lengths into."""
+        return self.work / "calibrated.db"
+
+    @property
+    def models(self) -> Path:
+        """One folder per model of the mapper, 0, 1, ..."""
+        return self.work / "sparse"
+
+    @property
+    def undistorted(self) -> Path:
+        return self.work / "undistorted"
+
+    @property
+    def log(self) -> Path:
+        return self.work / "colmap.log"
+
+    @property
+    def stages(self) -> Path:
+        return self.work / "stages.json"
+
+    @property
+    def report(self) -> Path:
+        return self.scene / "convert_report.json"
+
+    @property
+    def images(self) -> Path:
+        return self.scene / "images"
+
+    @property
+    def sparse(self) -> Path:
+        return self.scene / "sparse"
+
+    def resized(self, factor: int) -> Path:
+        return self.scene / f"images_{factor}"
+
+
+def scene_folder(given: str) -> Path:
+    """The folder that -s names, absolute. UserError where it is none, with the usual slips named."""
+    bare = given.strip("'\"")
+    if bare != given and not Path(given).exists() and Path(bare).exists():
+        raise UserError(
+            f"the path given with -s has quotes in it: {given}; give {bare} and quote it for the shell once"
+        )
+    folder = Path(given)
+    if folder.is_file():
+        hint = "give its folder with -s and the video with --video" if folder.suffix.lower() in _VIDEOS else ""
+        raise UserError(
+            f"{given} is a file; {hint or 'give -s the folder that holds the folder input with the photos'}"
+        )
+    if not folder.is_dir():
+        raise UserError(f"no folder {given}; make it, with the photos in a folder input in it, and give it with -s")
+    return folder.absolute()
+
+
+def find_photos(layout: Layout) -> list[str]:
+    """Names of the photos below `input`, sub-folders included, sorted. UserError for too few, or some elsewhere."""
+    if not layout.input.is_dir():
+        raise UserError(_no_input(layout))
+    files = [path for path in sorted(layout.input.rglob("*")) if path.is_file()]
+    names = picture_names(layout.input)
+    foreign = [path for path in files if path.suffix.lower() in _FOREIGN]
+    if foreign:
+        raise UserError(
+            f"{len(foreign)} files in {layout.input} are of a kind that can't be read, the first is {foreign[0].name}; "
+            f"convert them to JPEG or PNG, or take them out"
+        )
+    if len(names) < FEWEST:
+        videos = [path.name for path in files if path.suffix.lower() in _VIDEOS]
+        hint = f"; move {videos[0]} elsewhere and give it with --video" if videos else ""
+        raise UserError(
+            f"{len(names)} photos ({', '.join(PICTURES)}) in {layout.input}, at least {FEWEST} are needed, and 20 to "
+            f"200 with much overlap are usual; put more there{hint}"
+        )
+    return names
+
+
+def picture_names(folder: Path) -> list[str]:
+    """Pictures below a folder, hidden ones left out, as COLMAP names them, sorted."""
+    return sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if _is_picture(path))
+
+
+def _no_input(layout: Layout) -> str:
+    scene = layout.scene
+    if scene.name == "input":
+        return f"{scene} is the folder of the photos itself; give -s the folder around it, {scene.parent}"
+    beside = sum(map(_is_picture, scene.iterdir()))
+    if beside:
+        return (
+            f"no folder input in {scene}, but {beside} pictures in it itself; make {layout.input}, move them there, "
+            f"and give -s {scene} again"
+        )
+    if (scene / "images").is_dir() and not (scene / "sparse").is_dir():
+        return f"no folder input in {scene}; rename its folder images to input"
+    return f"no folder input in {scene}; put the photos there, or give a video with --video"
+
+
+def _is_picture(path: Path) -> bool:
+    return path.suffix.lower() in PICTURES and not path.name.startswith(".") and path.is_file()
+
+
+def refuse_foreign_results(layout: Layout, scene_made: bool, work_made: bool, skip_matching: bool) -> None:
+    """UserError where writing would overwrite a scene or a COLMAP project that convert.py did not make.
+
+    scene_made, work_made: whether an earlier run here got so far as to write the scene, or into the work folder.
+    """
+    there = [] if scene_made else [path.name for path in (layout.images, layout.sparse) if path.exists()]
+    ours = (
+        work_made
+        or skip_matching
+        or not layout.work.exists()
+        or {path.name for path in layout.work.iterdir()} <= {layout.stages.name}
+    )
+    if not ours:
+        there.append(layout.work.name)
+    if there:
+        raise UserError(
+            f"{layout.scene} already has {' and '.join(there)}, which convert.py did not make and will not overwrite; "
+            "move them away, or convert in another folder"
+            + ("; --skip_matching uses the model in distorted/sparse" if layout.models.is_dir() and not ours else "")
+        )

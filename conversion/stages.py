@@ -1,0 +1,74 @@
+"""What of a conversion is done, so that a second run does only the rest."""
+
+import hashlib
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from utils.system_utils import UserError, atomic_write
+
+
+class Stage(NamedTuple):
+    """One step. made_from: what its result depends on besides the earlier stages (JSON); reset: removes its results.
+
+    resumable: work can go on where an interrupted run with the same inputs stopped, without a reset.
+    """
+
+    name: str
+    made_from: Any
+    reset: Callable[[], None]
+    work: Callable[[], None]
+    resumable: bool = False
+
+
+class StageRecord:
+    """stages.json: for each stage begun, a digest of all that it was made from, and whether it was finished."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._record: dict[str, dict[str, Any]] = {}
+        if path.is_file():
+            try:
+                self._record = json.loads(path.read_text(encoding="utf-8"))
+                done = {name: entry["done"] and entry["made_from"] for name, entry in self._record.items()}
+            except (ValueError, KeyError, TypeError, AttributeError) as error:
+                raise UserError(
+                    f"{path} is damaged; remove the folder {path.parent} to convert from the beginning"
+                ) from error
+            del done
+
+    def begun(self, name: str) -> bool:
+        """Whether this stage was ever begun here."""
+        return name in self._record
+
+    def run(self, stages: list[Stage]) -> list[str]:
+        """Do what is not done, in order; names of the stages that were done before.
+
+        The first stage whose inputs changed, or that was never finished, is done again with all that follow.
+        """
+        digest, kept = "", []
+        for number, stage in enumerate(stages):
+            text = json.dumps([digest, stage.name, stage.made_from], sort_keys=True)
+            digest = hashlib.sha256(text.encode()).hexdigest()[:16]
+            before = self._record.get(stage.name, {})
+            same = before.get("made_from") == digest
+            if same and before["done"]:
+                kept.append(stage.name)
+                continue
+            # Backwards: what was made last goes first.
+            for later in reversed(stages[number:]):
+                if later is not stage or not (same and stage.resumable):
+                    later.reset()
+                if later is not stage:
+                    self._record.pop(later.name, None)
+            self._record[stage.name] = {"made_from": digest, "done": False}
+            self._save()
+            stage.work()
+            self._record[stage.name]["done"] = True
+            self._save()
+        return kept
+
+    def _save(self) -> None:
+        with atomic_write(self._path) as path:
+            path.write_text(json.dumps(self._record, indent=1, sort_keys=True) + "\n", encoding="utf-8")

@@ -1,0 +1,195 @@
+"""The steps of a conversion, each with what it is made from and how it is undone."""
+
+import contextlib
+import re
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from conversion import report
+from conversion.backends import Backend, Settings, worker_command
+from conversion.database import copy_database, count_rows, forget_matches, most_features, partners
+from conversion.layout import Layout, picture_names
+from conversion.photos import JPEG_QUALITY, prepare_photos, resize_images, sizes
+from conversion.programs import run_programs
+from conversion.stages import Stage
+from conversion.video import PATTERN, extract_frames
+from utils.system_utils import UserError, mkdir_p
+
+FACTORS = (2, 4, 8)  # of --resize
+# How far apart by name the pairs of COLMAP's sequential matching are: 1 to 10, and powers of 2 with exponents below 10.
+_NEIGHBOURS = sorted({*range(1, 11), *(2**k for k in range(10))})
+_REGISTERED = re.compile(rb"num_reg_frames=(\d+)|Registering image #\d+ \((\d+)\)")
+
+
+def video_stage(layout: Layout, video: Path, count: int) -> Stage:
+    """Frames of a video into `input`."""
+
+    def reset() -> None:
+        for frame in layout.input.glob(PATTERN):
+            frame.unlink()
+
+    def work() -> None:
+        mkdir_p(layout.input)
+        extract_frames(video, layout.input, count)
+
+    return Stage("video", [_state(video), count], reset, work)
+
+
+def photo_stage(layout: Layout, names: list[str], masks: Path | None) -> Stage:
+    """Upright photos and masks in the work folder."""
+    made_from = [[name, _state(layout.input / name)] for name in names]
+    if masks and masks.is_dir():
+        made_from.append([[str(path), _state(path)] for path in sorted(masks.rglob("*")) if path.is_file()])
+
+    def reset() -> None:
+        _remove(layout.photos, layout.masks)
+
+    return Stage("photos", made_from, reset, lambda: prepare_photos(layout, names, masks))
+
+
+def reconstruction_stages(layout: Layout, backend: Backend, settings: Settings, masks: bool) -> list[Stage]:
+    """Features, matching and mapping."""
+    hint = "" if settings.no_gpu else "; --no_gpu may help where the GPU or the display is the reason"
+
+    def features() -> None:
+        groups = sizes(layout)
+        if len(groups) > 1:
+            listed = ", ".join(f"{w} x {h} ({len(names)})" for (w, h), names in groups.items())
+            print(f"photos of {len(groups)} sizes, each gets a camera of its own: {listed}")
+        commands = backend.features(layout, settings, list(groups.values()), masks)
+        total = sum(map(len, groups.values()))
+        run_programs(commands, layout.log, "Features", total, lambda: count_rows(layout.database, "keypoints"), hint)
+
+    def forget_features() -> None:
+        for suffix in ("", "-wal", "-shm", "-journal"):
+            layout.database.with_name(layout.database.name + suffix).unlink(missing_ok=True)
+
+    def forget_models() -> None:
+        _remove(layout.models)
+        layout.calibrated.unlink(missing_ok=True)
+
+    def matching() -> None:
+        photos = count_rows(layout.database, "images")
+        steps = range(1, photos) if settings.matcher == "exhaustive" else _NEIGHBOURS
+        pairs = sum(max(photos - step, 0) for step in steps)
+        done = lambda: count_rows(layout.database, "matches")  # noqa: E731
+        run_programs(backend.matching(layout, settings), layout.log, "Matching", pairs, done, hint)
+
+    def mapping() -> None:
+        total = count_rows(layout.database, "images")
+        done = _registered_since(layout.log)
+        if settings.mapper == "global":
+            copy_database(layout.database, layout.calibrated)
+        run_programs(backend.mapping(layout, settings), layout.log, "Mapping", total, done)
+
+    return [
+        Stage(
+            "features",
+            [backend.identity, settings.camera, settings.max_num_features, settings.no_gpu],
+            forget_features,
+            features,
+        ),
+        Stage("matching", [settings.matcher], lambda: forget_matches(layout.database), matching, resumable=True),
+        Stage("mapping", [settings.mapper], forget_models, mapping),
+    ]
+
+
+def undistortion_stage(layout: Layout, settings: Settings, made_from: Any, **made: Any) -> Stage:
+    """The largest model without distortion as `images` and `sparse/0`, and the report. made: settings to report."""
+
+    def reset() -> None:
+        _remove(layout.undistorted, layout.images, layout.sparse, *map(layout.resized, FACTORS))
+        layout.report.unlink(missing_ok=True)
+
+    def work() -> None:
+        out = layout.work / "survey.json"
+        survey = worker_command(layout, "survey", models=str(layout.models), out=str(out))
+        run_programs([survey], layout.log, "Reading models", 1, out.exists)
+        models = report.read_survey(out)
+        root = layout.photos if layout.photos.is_dir() else layout.input
+        photos = picture_names(root)
+        matches = partners(layout.database)
+        report.refuse_nothing(models, photos, matches, settings.matcher)
+        chosen = models[0]
+        command = worker_command(
+            layout,
+            "undistort",
+            model=str(layout.models / chosen.folder),
+            photos=str(root),
+            out=str(layout.undistorted),
+            jpeg_quality=JPEG_QUALITY,
+        )
+        images = layout.undistorted / "images"
+        total = len(chosen.registered)
+        run_programs([command], layout.log, "Undistorting", total, lambda: sum(p.is_file() for p in images.rglob("*")))
+        missing = [name for name in chosen.registered if not (images / name).is_file()]
+        if missing:
+            raise UserError(
+                f"{len(missing)} photos of the model in {layout.models / chosen.folder} are not in {root}, the first "
+                f"is {missing[0]}; put them there under the names that the model has"
+            )
+        mkdir_p(layout.sparse)
+        (layout.undistorted / "sparse").rename(layout.sparse / "0")
+        images.rename(layout.images)
+        _remove(layout.undistorted)
+        limit = settings.max_num_features
+        at_limit = limit if most_features(layout.database) >= limit else 0
+        lines = report.advice(models, photos, matches, settings.matcher, at_limit)
+        report.write_report(layout.report, models, photos, matches, lines, **made)
+
+    return Stage("undistortion", made_from, reset, work)
+
+
+def resize_stage(layout: Layout) -> Stage:
+    """Smaller copies of the pictures: images_2, images_4, images_8."""
+
+    def reset() -> None:
+        _remove(*map(layout.resized, FACTORS))
+
+    def work() -> None:
+        for factor in FACTORS:
+            resize_images(layout, factor)
+
+    return Stage("resize", list(FACTORS), reset, work)
+
+
+def model_state(layout: Layout) -> list[Any]:
+    """What tells whether a model made elsewhere has changed. UserError where there is none."""
+    files = sorted(layout.models.rglob("*.*")) if layout.models.is_dir() else []
+    if not files:
+        raise UserError(f"--skip_matching needs a COLMAP model in {layout.models}; leave it out to have one made")
+    return [[str(path.relative_to(layout.models)), *_state(path)] for path in files]
+
+
+def _registered_since(log: Path) -> Callable[[], int]:
+    """How many photos the mapper says to have placed, counted from the log's end as it is now."""
+    position = log.stat().st_size if log.is_file() else 0
+    most = 0
+
+    def count() -> int:
+        nonlocal position, most
+        with contextlib.suppress(OSError), open(log, "rb") as file:
+            file.seek(position)
+            text = file.read()
+            # Half a line stays for the next look.
+            whole = text[: text.rfind(b"\n") + 1]
+            position += len(whole)
+            for match in _REGISTERED.finditer(whole):
+                most = max(most, int(match[1] or match[2]) + 1)
+        return most
+
+    return count
+
+
+def _state(path: Path) -> list[Any]:
+    """What tells whether a file has changed."""
+    stat = path.stat()
+    return [path.name, stat.st_size, stat.st_mtime_ns]
+
+
+def _remove(*folders: Path) -> None:
+    for folder in folders:
+        if folder.is_dir():
+            shutil.rmtree(folder)

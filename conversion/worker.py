@@ -1,0 +1,103 @@
+"""pycolmap's long steps as a program of their own: `python worker.py JOB.json`, the job an object {"step": ..., ...}.
+
+In another process they can be stopped at once, can't take the caller with them when they crash, and log to a file.
+Imports nothing of the project, since only its own folder is on the path.
+"""
+
+import json
+import os
+import sys
+from pathlib import Path
+from typing import Any
+
+import pycolmap
+
+SEED = 0
+
+
+def features(job: dict[str, Any]) -> None:
+    """SIFT features of groups of pictures, one camera for each group, into a new database."""
+    reader = pycolmap.ImageReaderOptions()
+    reader.camera_model = job["camera"]
+    if job["masks"]:
+        reader.mask_path = job["masks"]
+    options = pycolmap.FeatureExtractionOptions()
+    options.sift.max_num_features = job["max_num_features"]
+    pycolmap.Database.open(job["database"]).close()
+    for names in job["groups"]:
+        # First in order: threads would number the pictures as they happen to get ready.
+        pycolmap.import_images(job["database"], job["photos"], pycolmap.CameraMode.SINGLE, names, reader)
+        pycolmap.extract_features(
+            job["database"], job["photos"], names, pycolmap.CameraMode.SINGLE, reader, options, _device(job)
+        )
+
+
+def matching(job: dict[str, Any]) -> None:
+    """Matches of pairs, verified; pairs that the database has are not done again."""
+    match = {"exhaustive": pycolmap.match_exhaustive, "sequential": pycolmap.match_sequential}[job["matcher"]]
+    verification = pycolmap.TwoViewGeometryOptions()
+    verification.ransac.random_seed = SEED
+    match(job["database"], verification_options=verification, device=_device(job))
+
+
+def mapping(job: dict[str, Any]) -> None:
+    """Poses and points: one or more models in sub-folders of `models`."""
+    os.makedirs(job["models"])
+    if job["mapper"] == "global":
+        # It does not refine focal lengths from nothing; this estimates them from the pairs.
+        pycolmap.calibrate_view_graph(job["database"])
+        options = pycolmap.GlobalPipelineOptions()
+        options.random_seed = SEED
+        pycolmap.global_mapping(job["database"], job["photos"], job["models"], options)
+        return
+    options = pycolmap.IncrementalPipelineOptions()
+    options.random_seed = SEED
+    options.ba_global_function_tolerance = job["tolerance"]
+    options.min_model_size = 3  # a small model is better than none; the report says how small it is
+    pycolmap.incremental_mapping(job["database"], job["photos"], job["models"], options)
+
+
+def survey(job: dict[str, Any]) -> None:
+    """What the models hold, written to the JSON file `out`."""
+    models = []
+    for folder in sorted(Path(job["models"]).iterdir()):
+        try:
+            model = pycolmap.Reconstruction(str(folder))
+        except (ValueError, RuntimeError, IndexError):
+            continue  # no model, or one that was cut off while it was written
+        models.append(
+            {
+                "folder": folder.name,
+                "registered": sorted(model.images[i].name for i in model.reg_image_ids()),
+                "points": model.num_points3D(),
+                "track_length": model.compute_mean_track_length(),
+                "error": model.compute_mean_reprojection_error(),
+                "cameras": [
+                    {
+                        "id": i,
+                        "model": c.model_name,
+                        "size": [c.width, c.height],
+                        "params": [float(p) for p in c.params],
+                    }
+                    for i, c in sorted(model.cameras.items())
+                ],
+            }
+        )
+    Path(job["out"]).write_text(json.dumps(models), encoding="utf-8")
+
+
+def undistort(job: dict[str, Any]) -> None:
+    """Pictures and model without lens distortion, in COLMAP's layout, into the folder `out`."""
+    pycolmap.undistort_images(job["out"], job["model"], job["photos"], jpeg_quality=job["jpeg_quality"])
+
+
+def _device(job: dict[str, Any]) -> pycolmap.Device:
+    return pycolmap.Device.cpu if job["no_gpu"] else pycolmap.Device.auto
+
+
+STEPS = {step.__name__: step for step in (features, matching, mapping, survey, undistort)}
+
+if __name__ == "__main__":
+    job = json.loads(Path(sys.argv[1]).read_text(encoding="utf-8"))
+    pycolmap.set_random_seed(SEED)
+    STEPS[job["step"]](job)

@@ -1,0 +1,127 @@
+"""From photos or a video to a scene that train.py takes: camera poses, points, undistorted pictures.
+
+python convert.py -s SCENE                 photos in SCENE/input
+python convert.py -s SCENE --video FILE    frames of a video, written to SCENE/input
+
+Writes SCENE/images, SCENE/sparse/0, SCENE/convert_report.json, and what it needs again into SCENE/distorted. A second
+run goes on after the last stage that was finished, and does again what other options or other photos change.
+"""
+
+import argparse
+import json
+import shlex
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from conversion.backends import LENS_MODELS, Backend, Program, Pycolmap, Settings
+from conversion.layout import FEWEST, Layout, find_photos, refuse_foreign_results, scene_folder
+from conversion.report import summary
+from conversion.stages import Stage, StageRecord
+from conversion.steps import (
+    model_state,
+    photo_stage,
+    reconstruction_stages,
+    resize_stage,
+    undistortion_stage,
+    video_stage,
+)
+from utils.system_utils import UserError, run_cli
+
+
+def convert(layout: Layout, settings: Settings, args: argparse.Namespace) -> None:
+    """Run the stages that are not done; print what was placed and what to do about the rest."""
+    names = [] if args.video else find_photos(layout)
+    record = StageRecord(layout.stages)
+    refuse_foreign_results(layout, record.begun("undistortion"), record.begun("photos"), args.skip_matching)
+    kept = []
+    if args.video:
+        kept = record.run([_video(layout, record, args)])
+        names = find_photos(layout)
+    if args.skip_matching:
+        stages = []
+        program = "--skip_matching: the model that was in distorted/sparse"
+        made_from = [names, model_state(layout)]
+    else:
+        backend = _backend(args.colmap_executable, settings)
+        program, made_from = backend.identity, None
+        masks = Path(args.mask_path) if args.mask_path else None
+        stages = [photo_stage(layout, names, masks)]
+        stages += reconstruction_stages(layout, backend, settings, masks is not None)
+    made = {"camera": settings.camera, "mapper": settings.mapper, "matcher": settings.matcher, "program": program}
+    stages.append(undistortion_stage(layout, settings, made_from, **made))
+    if args.resize:
+        stages.append(resize_stage(layout))
+    kept += record.run(stages)
+    if kept:
+        print(f"done before: {', '.join(kept)} (remove {layout.work} to begin anew)")
+    report = json.loads(layout.report.read_text(encoding="utf-8"))
+    print(summary(report))
+    for line in report["advice"]:
+        print(f"warning: {line}", file=sys.stderr)
+    print(f"train it with: python train.py -s {shlex.quote(str(layout.scene))}")
+
+
+def _video(layout: Layout, record: StageRecord, args: argparse.Namespace) -> Stage:
+    video = Path(args.video)
+    if not video.is_file():
+        raise UserError(f"no video {video}; give an existing file with --video")
+    if layout.input.is_dir() and not record.begun("video") and any(layout.input.iterdir()):
+        raise UserError(
+            f"{layout.input} has files already, and the frames would be mixed with them; leave --video out, or "
+            "convert the video in another folder"
+        )
+    return video_stage(layout, video, args.video_frames)
+
+
+def _backend(executable: str, settings: Settings) -> Backend:
+    return Program(executable, settings) if executable else Pycolmap()
+
+
+def _check_camera(name: str) -> None:
+    """UserError for a lens model that COLMAP does not have, or that can't be undistorted."""
+    if name not in LENS_MODELS:
+        raise UserError(f"--camera {name} is no lens model that can be used; choose one of {', '.join(LENS_MODELS)}")
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """The command line."""
+    parser = argparse.ArgumentParser(
+        description="Photos in SCENE/input, or a video, to a scene for train.py: poses, points, undistorted pictures."
+    )
+    add = parser.add_argument
+    add("-s", "--source_path", required=True, metavar="SCENE", help="folder with the photos in its sub-folder input")
+    add("--camera", default="OPENCV", help="lens model to fit; for a fisheye lens OPENCV_FISHEYE (default: OPENCV)")
+    add("--no_gpu", action="store_true", help="features and matching on the CPU even where COLMAP could use a GPU")
+    add("--skip_matching", action="store_true", help="only undistort: the largest model in SCENE/distorted/sparse")
+    add("--colmap_executable", default="", metavar="FILE",
+        help="COLMAP program for features, matching and mapping (default: pycolmap does them)")  # fmt: skip
+    add("--magick_executable", default="", metavar="FILE", help="no effect (Pillow resizes the pictures)")
+    add("--resize", action="store_true", help="also write images_2, images_4, images_8, sides divided by that")
+    add("--video", default="", metavar="FILE", help="take frames of this video as photos; needs imageio-ffmpeg")
+    add("--video_frames", type=int, default=150, metavar="N",
+        help="frames to take, the sharpest of each of N equal spans of time (default: 150)")  # fmt: skip
+    add("--matcher", choices=("exhaustive", "sequential"), default=None,
+        help="compare every pair, or neighbours by name (default: exhaustive; with --video sequential)")  # fmt: skip
+    add("--mapper", choices=("incremental", "global"), default="incremental",
+        help="place photo after photo, or all at once: faster for hundreds (default: incremental)")  # fmt: skip
+    add("--max_num_features", type=int, default=8192, metavar="N",
+        help="most features of a photo; more: for surfaces with little texture, slower (default: 8192)")  # fmt: skip
+    add("--mask_path", default="", metavar="FOLDER",
+        help="masks named as the photos, with .png behind; black: no features there (default: none)")  # fmt: skip
+    add("stray", nargs="*", help=argparse.SUPPRESS)
+    args = parser.parse_args(argv)
+    if args.stray:
+        whole = " ".join([args.source_path, *args.stray])
+        raise UserError(f"don't know what to do with {args.stray[0]}; quote paths with spaces: -s {shlex.quote(whole)}")
+    for option, least in (("max_num_features", 100), ("video_frames", FEWEST)):
+        if getattr(args, option) < least:
+            raise UserError(f"--{option} must be at least {least}, got {getattr(args, option)}")
+    layout = Layout(scene_folder(args.source_path))
+    _check_camera(args.camera)
+    matcher = args.matcher or ("sequential" if args.video else "exhaustive")
+    convert(layout, Settings(args.camera, args.max_num_features, matcher, args.mapper, args.no_gpu), args)
+
+
+if __name__ == "__main__":
+    run_cli(main)

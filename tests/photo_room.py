@@ -1,0 +1,58 @@
+"""Photos of a room's corner, three walls with a texture each, from known places: what features can be found on."""
+
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+from scipy.ndimage import map_coordinates, zoom
+
+SIZE = (240, 180)
+FOCAL = 220.0
+
+
+def camera_centers(count: int) -> np.ndarray:
+    """Places (count,3) on an arc that looks into the corner at the origin."""
+    angles = np.linspace(0.25, 1.3, count)
+    return np.stack([4 * np.cos(angles), 4 * np.sin(angles), 1.4 + 0.5 * np.sin(5 * angles)], axis=1)
+
+
+def make_photos(folder: Path, count: int, suffix: str = ".png", **save: object) -> None:
+    """Write photo_00, photo_01, ... of SIZE, taken with focal length FOCAL (pixels), into a folder."""
+    folder.mkdir(parents=True, exist_ok=True)
+    textures = [_texture(seed) for seed in range(3)]
+    for number, center in enumerate(camera_centers(count)):
+        picture = Image.fromarray(_photo(center, textures))
+        picture.save(folder / f"photo_{number:02d}{suffix}", **save)
+
+
+def _texture(seed: int) -> np.ndarray:
+    """Noise (256,256,3) in [0,1], coarse and fine."""
+    rng = np.random.default_rng(seed)
+    layers = [zoom(rng.random((side, side, 3)), (256 / side, 256 / side, 1), order=1) for side in (16, 64, 128)]
+    return np.clip(sum(layers) / 3 * 1.6 - 0.3, 0, 1)
+
+
+def _photo(center: np.ndarray, textures: list[np.ndarray]) -> np.ndarray:
+    width, height = SIZE
+    forward = np.array([0.0, 0.0, 0.6]) - center
+    forward /= np.linalg.norm(forward)
+    right = np.cross(forward, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    down = np.cross(forward, right)
+    # Four rays a pixel: sharp edges without aliasing.
+    y, x = (np.mgrid[: 2 * height, : 2 * width] + 0.5) / 2
+    rays = ((x - width / 2) * right[:, None, None] + (y - height / 2) * down[:, None, None]) / FOCAL
+    rays = rays + forward[:, None, None]
+    with np.errstate(divide="ignore"):
+        distances = np.where(rays < 0, -center[:, None, None] / rays, np.inf)
+    wall = distances.argmin(axis=0)
+    hit = center[:, None, None] + rays * distances.min(axis=0)
+    colors = np.zeros((2 * height, 2 * width, 3))
+    for axis in range(3):
+        u, v = (hit[other][wall == axis] * 64 for other in range(3) if other != axis)
+        for channel in range(3):
+            colors[wall == axis, channel] = map_coordinates(
+                textures[axis][..., channel], [u, v], order=1, mode="grid-wrap"
+            )
+    pixels = colors.reshape(height, 2, width, 2, 3).mean(axis=(1, 3))
+    return (pixels * 255 + 0.5).astype(np.uint8)

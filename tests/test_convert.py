@@ -1,0 +1,502 @@
+"""convert.py: photos of known places become a scene; second runs, interruptions, and what slips are told."""
+
+import json
+import os
+import re
+import shutil
+import signal
+import stat
+import sys
+import threading
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pycolmap
+import pytest
+from photo_room import FOCAL, SIZE, camera_centers, make_photos
+from PIL import Image
+from synthetic import folder_state
+
+import convert
+from conversion import report
+from conversion.backends import LENS_MODELS, Program, Pycolmap, Settings
+from conversion.database import count_rows, forget_matches, most_features, partners
+from conversion.layout import Layout
+from conversion.photos import find_masks, prepare_photos
+from conversion.programs import run_programs
+from conversion.stages import Stage, StageRecord
+from conversion.steps import reconstruction_stages
+from conversion.video import extract_frames, sharpness
+from scene.dataset_readers import read_scene
+from utils.system_utils import UserError
+
+VIEWS = 8
+SETTINGS = Settings("OPENCV", 8192, "exhaustive", "incremental", no_gpu=True)
+NAMES = ["photo_00.png", "photo_01.png", "Ünser Bild 2.png", "deep/photo_03.png"] + [
+    f"photo_0{i}.png" for i in (4, 5, 6)
+]
+NAMES.append("photo_07.jpg")
+
+
+@pytest.fixture(scope="module")
+def photos(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Photos of a room in `input`: a sub-folder, blanks and an umlaut in names, one that lies on its side by EXIF."""
+    scene = tmp_path_factory.mktemp("convert") / "my room"
+    make_photos(scene / "input", VIEWS)
+    for number, name in enumerate(NAMES):
+        plain = scene / "input" / f"photo_{number:02d}.png"
+        if name.endswith(".jpg"):
+            exif = Image.Exif()
+            exif[0x0112] = 6  # "turn by 90 degrees clockwise to see it upright"
+            exif[0x010F] = "maker"
+            Image.open(plain).transpose(Image.Transpose.ROTATE_90).save(
+                plain.with_suffix(".jpg"), quality=97, exif=exif
+            )
+            plain.unlink()
+        else:
+            (scene / "input" / name).parent.mkdir(exist_ok=True)
+            plain.rename(scene / "input" / name)
+    return scene
+
+
+@pytest.fixture(scope="module")
+def converted(photos: Path) -> Path:
+    before = folder_state(photos / "input")
+    convert.main(["-s", str(photos), "--no_gpu", "--resize"])
+    assert folder_state(photos / "input") == before
+    return photos
+
+
+@pytest.fixture
+def copy(converted: Path, tmp_path: Path) -> Path:
+    """The converted scene, free to be changed."""
+    return Path(shutil.copytree(converted, tmp_path / "copy", copy_function=shutil.copy2))
+
+
+def test_every_photo_is_placed_where_it_was_taken(converted):
+    info = read_scene(converted, "images", hold_out=False)
+    assert [camera.image_name for camera in info.train_cameras] == sorted(NAMES, key=os.fsencode)
+    assert len(info.point_cloud.points) > 1000
+    for camera in info.train_cameras:
+        assert camera.file_size == (camera.width, camera.height)
+        # Without distortion the crop is small, and the focal length is found to 2 %.
+        assert abs(camera.width - SIZE[0]) < 12 and abs(camera.height - SIZE[1]) < 12
+        assert camera.fx == pytest.approx(FOCAL, rel=0.02)
+    model = pycolmap.Reconstruction(converted / "sparse" / "0")
+    assert {camera.model_name for camera in model.cameras.values()} == {"PINHOLE"}
+    places = camera_centers(VIEWS)
+    ransac = pycolmap.RANSACOptions()
+    ransac.max_error = 0.05
+    transform = pycolmap.align_reconstruction_to_locations(model, NAMES, places, VIEWS, ransac)
+    assert transform is not None
+    model.transform(transform)
+    found = np.array([model.find_image_with_name(name).projection_center() for name in NAMES])
+    # Cameras stand some 4 away from the corner; 1 % of that.
+    assert np.abs(found - places).max() < 0.04
+
+
+def test_what_is_written(converted):
+    assert sorted(path.name for path in converted.iterdir()) == [
+        *("convert_report.json", "distorted", "images", "images_2", "images_4", "images_8", "input", "sparse"),
+    ]
+    content = json.loads((converted / "convert_report.json").read_text())
+    assert list(content) == sorted(content)
+    assert (content["registered"], content["photos"], content["left_out"], content["advice"]) == (VIEWS, VIEWS, {}, [])
+    assert content["points"] == len(read_scene(converted, "images", False).point_cloud.points)
+    for name in NAMES:
+        with Image.open(converted / "images" / name) as whole:
+            for factor in (2, 4, 8):
+                with Image.open(converted / f"images_{factor}" / name) as small:
+                    assert small.size == (round(whole.width / factor), round(whole.height / factor))
+
+
+def test_a_second_run_does_only_what_changed(copy, capsys):
+    scene = folder_state(copy)
+    convert.main(["-s", str(copy), "--no_gpu", "--resize"])
+    assert "done before: photos, features, matching, mapping, undistortion, resize" in capsys.readouterr().out
+    assert folder_state(copy) == scene
+    features = Layout(copy).database.read_bytes()
+    # Resized copies of the old pictures must not stay beside new ones.
+    convert.main(["-s", str(copy), "--no_gpu", "--mapper", "global"])
+    out = capsys.readouterr().out
+    assert "done before: photos, features, matching (" in out and f"{VIEWS} of {VIEWS} photos placed" in out
+    assert not (copy / "images_2").exists()
+    # The focal lengths that global mapping estimates are not for those who go on with the features.
+    assert Layout(copy).database.read_bytes() == features
+    assert len(read_scene(copy, "images", False).train_cameras) == VIEWS
+
+
+def test_a_model_made_elsewhere_is_undistorted(copy, capsys):
+    other = copy.parent / "other"
+    shutil.copytree(copy / "distorted" / "photos", other / "input")
+    shutil.copytree(copy / "distorted" / "sparse", other / "distorted" / "sparse")
+    with pytest.raises(UserError, match="already has distorted, which convert.py did not make.*--skip_matching"):
+        convert.main(["-s", str(other)])
+    # A model of two photos that comes first must not be taken.
+    small = other / "distorted" / "sparse" / "0"
+    small.rename(small.with_name("1"))
+    small.mkdir()
+    model = pycolmap.Reconstruction(small.with_name("1"))
+    for frame in sorted(model.reg_frame_ids())[2:]:
+        model.deregister_frame(frame)
+    model.write_binary(str(small))
+    convert.main(["-s", str(other), "--skip_matching"])
+    assert len(read_scene(other, "images", False).train_cameras) == VIEWS
+    assert json.loads((other / "convert_report.json").read_text())["model"] == "1"
+
+
+def test_a_scene_of_someone_else_is_left_alone(photos, tmp_path):
+    shutil.copytree(photos / "input", tmp_path / "input")
+    (tmp_path / "images").mkdir()
+    with pytest.raises(UserError, match="already has images, which convert.py did not make and will not overwrite"):
+        convert.main(["-s", str(tmp_path)])
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["images", "input"]
+
+
+def test_photos_that_share_nothing(tmp_path):
+    (tmp_path / "input").mkdir()
+    for number in range(3):
+        noise = np.random.default_rng(number).integers(0, 256, (60, 80, 3), dtype=np.uint8)
+        Image.fromarray(noise).resize((160, 120)).save(tmp_path / "input" / f"{number}.png")
+    with pytest.raises(UserError, match="none of 3 photos could be placed: no two of them .*overlap by 60 to 80 %"):
+        convert.main(["-s", str(tmp_path), "--no_gpu"])
+    assert not (tmp_path / "images").exists()
+
+
+def _photos_themselves(scene: Path) -> list[str]:
+    return [str(scene / "input")]
+
+
+def _photos_beside(scene: Path) -> list[str]:
+    for path in sorted((scene / "input").iterdir()):
+        path.rename(scene / path.name)
+    (scene / "input").rmdir()
+    return [str(scene)]
+
+
+def _called_images(scene: Path) -> list[str]:
+    (scene / "input").rename(scene / "images")
+    return [str(scene)]
+
+
+def _empty(scene: Path) -> list[str]:
+    (scene / "input").rename(scene / "elsewhere")
+    return [str(scene)]
+
+
+def _few(scene: Path) -> list[str]:
+    for path in sorted((scene / "input").iterdir())[1:]:
+        path.unlink()
+    (scene / "input" / "walk.mp4").touch()
+    return [str(scene)]
+
+
+def _phone(scene: Path) -> list[str]:
+    (scene / "input" / "IMG_1.HEIC").touch()
+    return [str(scene)]
+
+
+def _cut(scene: Path) -> list[str]:
+    path = scene / "input" / "photo_01.png"
+    path.write_bytes(path.read_bytes()[:-40])
+    return [str(scene)]
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (_photos_themselves, r"room/input is the folder of the photos itself; give -s the folder around it, .*room$"),
+        (_photos_beside, r"no folder input in .*room, but 3 pictures in it itself; make .*input, move them there"),
+        (_called_images, r"no folder input in .*room; rename its folder images to input"),
+        (_empty, r"no folder input in .*room; put the photos there, or give a video with --video"),
+        (_few, r"^1 photos .* in .*input, at least 3 are needed.*move walk.mp4 elsewhere and give it with --video"),
+        (_phone, r"1 files in .* kind that can't be read, the first is IMG_1.HEIC; convert them to JPEG or PNG"),
+        (_cut, r"cannot read the picture .*photo_01.png"),
+        (lambda scene: [str(scene / "nowhere")], r"no folder .*nowhere; make it, with the photos in a folder input"),
+        (lambda scene: [f"'{scene}'"], r"has quotes in it: '.*room'; give /.*room and quote it for the shell once"),
+        (lambda scene: [str(scene), "of", "mine"], r"don't know what to do with of; quote paths.*room of mine'"),
+        (
+            lambda scene: [str(scene / "input" / "photo_00.png")],
+            r"photo_00.png is a file; give -s the folder that holds",
+        ),
+        (lambda scene: [str(scene), "--camera", "PINHOLEY"], r"--camera PINHOLEY is no lens model.*OPENCV_FISHEYE"),
+        (
+            lambda scene: [str(scene), "--camera", "EQUIRECTANGULAR"],
+            r"EQUIRECTANGULAR is no lens model that can be used",
+        ),
+        (lambda scene: [str(scene), "--mask_path", "no"], r"no folder of masks no; give an existing one"),
+        (lambda scene: [str(scene), "--mask_path", str(scene)], r"none of 3 photos has a mask .*photo_00.png.png"),
+        (lambda scene: [str(scene), "--max_num_features", "0"], r"--max_num_features must be at least 100, got 0"),
+        (lambda scene: [str(scene), "--skip_matching"], r"--skip_matching needs a COLMAP model in .*distorted/sparse"),
+        (lambda scene: [str(scene), "--video", "walk.mp4"], r"no video walk.mp4; give an existing file"),
+        (lambda scene: [str(scene), "--video", __file__], r"input has files already, and the frames would be mixed"),
+        (lambda scene: [str(scene), "--colmap_executable", "/no/colmap"], r"cannot run --colmap_executable /no/colmap"),
+    ],
+)
+def test_slips_get_one_sentence(tmp_path, change, said):
+    scene = tmp_path / "room"
+    (scene / "input").mkdir(parents=True)
+    for number in range(3):
+        Image.new("RGB", (40, 30)).save(scene / "input" / f"photo_{number:02d}.png")
+    with pytest.raises(UserError, match=said) as error:
+        convert.main(["-s", *change(scene)])
+    assert "\n" not in str(error.value)
+    assert not (scene / "sparse").exists()
+
+
+def _stages(done: list[str], fail: str = "", **made_from: int) -> list[Stage]:
+    def work(name: str) -> None:
+        done.append(name)
+        if name == fail:
+            raise KeyboardInterrupt
+
+    return [
+        Stage(name, value, lambda name=name: done.append(f"-{name}"), lambda name=name: work(name), name == "b")
+        for name, value in made_from.items()
+    ]
+
+
+def test_stages_are_redone_from_the_first_that_changed(tmp_path):
+    def run(fail: str = "", **made_from: int) -> list[str]:
+        done: list[str] = []
+        try:
+            kept = StageRecord(tmp_path / "stages.json").run(_stages(done, fail, **made_from))
+            return [*(f"={name}" for name in kept), *done]
+        except KeyboardInterrupt:
+            return [*done, "stopped"]
+
+    assert run(a=1, b=1, c=1) == ["-c", "-b", "-a", "a", "-c", "-b", "b", "-c", "c"]
+    assert run(a=1, b=1, c=1) == ["=a", "=b", "=c"]
+    assert run(a=1, b=2, c=1, fail="b") == ["-c", "-b", "b", "stopped"]
+    # b can go on: it is not reset; c was never begun.
+    assert run(a=1, b=2, c=1, fail="c") == ["-c", "b", "-c", "c", "stopped"]
+    assert run(a=1, b=2, c=1) == ["=a", "=b", "-c", "c"]
+    assert run(a=2, b=2, c=1)[:4] == ["-c", "-b", "-a", "a"]
+    (tmp_path / "stages.json").write_text("[]")
+    with pytest.raises(UserError, match="stages.json is damaged; remove the folder"):
+        run(a=1)
+
+
+def test_looks_into_the_database(copy):
+    database = Layout(copy).database
+    every = count_rows(database, "matches")
+    assert every == VIEWS * (VIEWS - 1) // 2
+    matched = partners(database)
+    assert set(matched) == set(NAMES) and all(count >= 2 for count in matched.values())
+    features = count_rows(database, "keypoints")
+    forget_matches(database)
+    assert (count_rows(database, "matches"), count_rows(database, "keypoints")) == (0, features)
+    assert set(partners(database).values()) == {0}
+    assert 500 < most_features(database) < 8192
+
+
+def test_ctrl_c_ends_the_program_that_works(tmp_path):
+    script = "import os, sys, time; open(sys.argv[1], 'w').write(str(os.getpid())); time.sleep(60)"
+    threading.Timer(1.0, os.kill, (os.getpid(), signal.SIGINT)).start()
+    with pytest.raises(KeyboardInterrupt):
+        run_programs([[sys.executable, "-c", script, str(tmp_path / "pid")]], tmp_path / "log", "Waiting", 1, lambda: 0)
+    with pytest.raises(ProcessLookupError):
+        os.kill(int((tmp_path / "pid").read_text()), 0)
+
+
+def test_a_program_that_fails_is_quoted(tmp_path):
+    script = "import sys; print('first'); print('no disk left'); sys.exit(3)"
+    with pytest.raises(UserError, match=r"features failed \(status 3: no disk left\); the whole story is in .*log"):
+        run_programs([[sys.executable, "-c", script]], tmp_path / "log", "Features", 1, lambda: 0)
+    with pytest.raises(UserError, match="cannot run /no/program"):
+        run_programs([["/no/program"]], tmp_path / "log", "Features", 1, lambda: 0)
+
+
+def _fake_colmap(folder: Path, prefix: str, without: str = "") -> str:
+    """A program that answers as COLMAP does; GPU options are called <prefix>Extraction.use_gpu, <prefix>Matching..."""
+    path = folder / "colmap"
+    path.write_text(
+        f'#!/bin/sh\ncase "$1" in\n{without or "none"}) exit 1;;\nhelp) echo "COLMAP 9.9";;\n'
+        f"feature_extractor) echo '  --{prefix}Extraction.use_gpu arg (=1)';;\n"
+        f"*_matcher) echo '  --{prefix}Matching.use_gpu arg (=1)';;\nesac\n"
+    )
+    path.chmod(path.stat().st_mode | stat.S_IXUSR)
+    return str(path)
+
+
+@pytest.mark.parametrize("prefix", ["Sift", "Feature"])
+def test_gpu_options_have_the_names_of_the_colmap_that_is_there(tmp_path, prefix):
+    layout = Layout(tmp_path / "scene")
+    program = Program(_fake_colmap(tmp_path, prefix), SETTINGS)
+    assert program.identity == "COLMAP 9.9"
+    (first, second) = program.features(layout, SETTINGS, [["a b.png"], ["c.png", "d.png"]], masks=True)
+    assert first[-2:] == second[-2:] == [f"--{prefix}Extraction.use_gpu", "0"]
+    assert Path(second[second.index("--image_list_path") + 1]).read_text() == "c.png\nd.png\n"
+    assert first[first.index("--ImageReader.mask_path") + 1] == str(layout.masks)
+    (match,) = program.matching(layout, SETTINGS)
+    assert match[1:] == [
+        "exhaustive_matcher",
+        "--database_path",
+        str(layout.database),
+        f"--{prefix}Matching.use_gpu",
+        "0",
+    ]
+    (mapper,) = program.mapping(layout, SETTINGS)
+    assert mapper[1] == "mapper" and mapper[-2:] == ["--Mapper.ba_global_function_tolerance", "1e-06"]
+
+
+def test_programs_that_can_not_do_it(tmp_path):
+    with pytest.raises(UserError, match="help` as COLMAP does"):
+        Program("/bin/true", SETTINGS)
+    with pytest.raises(UserError, match="lists neither --FeatureExtraction.use_gpu nor --SiftExtraction.use_gpu"):
+        Program(_fake_colmap(tmp_path, "New"), SETTINGS)
+    old = _fake_colmap(tmp_path, "Sift", without="global_mapper")
+    Program(old, SETTINGS)
+    whole = Program(_fake_colmap(tmp_path, "Sift"), replace(SETTINGS, mapper="global"))
+    layout = Layout(tmp_path / "scene")
+    calibrate, mapper = whole.mapping(layout, replace(SETTINGS, mapper="global"))
+    assert [calibrate[1], mapper[1]] == ["view_graph_calibrator", "global_mapper"]
+    assert calibrate[3] == mapper[3] == str(layout.calibrated)
+    _fake_colmap(tmp_path, "Sift", without="global_mapper")
+    with pytest.raises(UserError, match="COLMAP 9.9.*has no global_mapper; use --mapper incremental"):
+        Program(old, replace(SETTINGS, mapper="global"))
+
+
+def test_orientation_is_baked_in_and_other_exif_kept(converted):
+    turned = converted / "input" / "photo_07.jpg"
+    with Image.open(turned) as stored, Image.open(converted / "distorted" / "photos" / "photo_07.jpg") as upright:
+        assert stored.size == SIZE[::-1] and upright.size == SIZE
+        assert upright.getexif().get(0x0112, 1) == 1 and upright.getexif()[0x010F] == "maker"
+        straight = np.asarray(stored.transpose(Image.Transpose.ROTATE_270), dtype=float)
+        # JPEG quality 95 once more: a few levels.
+        assert np.abs(np.asarray(upright, dtype=float) - straight).mean() < 4
+    plain = "distorted/photos/photo_00.png"
+    assert (converted / plain).read_bytes() == (converted / "input" / "photo_00.png").read_bytes()
+
+
+def test_webp_is_rewritten_since_colmap_does_not_read_it(tmp_path):
+    layout = Layout(tmp_path)
+    layout.input.mkdir()
+    Image.effect_noise((40, 30), 60).convert("RGB").save(layout.input / "a.webp", lossless=True)
+    prepare_photos(layout, ["a.webp"], None)
+    with Image.open(layout.input / "a.webp") as before, Image.open(layout.photos / "a.webp.png") as after:
+        np.testing.assert_array_equal(np.asarray(before), np.asarray(after))
+
+
+def test_masks_keep_features_away(photos, tmp_path):
+    layout = Layout(tmp_path / "scene")
+    masks = tmp_path / "masks"
+    for folder in (layout.input, masks / "deep"):
+        folder.mkdir(parents=True)
+    for name in (*NAMES[:2], NAMES[3]):
+        (layout.input / name).parent.mkdir(exist_ok=True)
+        shutil.copy(photos / "input" / name, layout.input / name)
+    half = Image.new("L", SIZE)
+    half.paste(255, (SIZE[0] // 2, 0, *SIZE))
+    half.save(masks / "photo_00.png.png")
+    half.convert("RGB").save(masks / "deep" / "photo_03.png")
+    prepare_photos(layout, [*NAMES[:2], NAMES[3]], masks)
+    features, *_ = reconstruction_stages(layout, Pycolmap(), SETTINGS, masks=True)
+    features.work()
+    database = pycolmap.Database.open(str(layout.database))
+    rows = {image.name: database.read_keypoints(image.image_id) for image in database.read_all_images()}
+    for name in ("photo_00.png", "deep/photo_03.png"):
+        assert len(rows[name]) > 50 and rows[name][:, 0].min() > SIZE[0] / 2 - 1
+    # Without a mask of its own it is used whole.
+    assert rows["photo_01.png"][:, 0].min() < SIZE[0] / 4
+    database.close()
+
+
+def test_every_lens_model_but_the_spherical_one_can_be_asked_for():
+    assert {*LENS_MODELS, "INVALID", "EQUIRECTANGULAR"} == set(pycolmap.CameraModelId.__members__)
+
+
+def test_masks_of_another_size(tmp_path):
+    layout = Layout(tmp_path / "scene")
+    layout.input.mkdir(parents=True)
+    Image.new("RGB", (40, 30)).save(layout.input / "a.png")
+    (tmp_path / "masks").mkdir()
+    Image.new("L", (30, 40)).save(tmp_path / "masks" / "a.png")
+    assert find_masks(["a.png", "b.png"], tmp_path / "masks") == {"a.png": tmp_path / "masks" / "a.png"}
+    with pytest.raises(UserError, match="mask .*a.png has 30 x 40 pixels, but its photo a.png has 40 x 30"):
+        prepare_photos(layout, ["a.png"], tmp_path / "masks")
+
+
+def _model(registered: int, points: int = 5000, track: float = 5.0, error: float = 0.5, first: int = 0) -> report.Model:
+    return report.Model("0", [f"{i:03d}" for i in range(first, first + registered)], points, track, error, [])
+
+
+@pytest.mark.parametrize(
+    ("models", "said"),
+    [
+        ([_model(40)], []),
+        (
+            [_model(38)],
+            [r"2 of 40 photos were left out \(038, 039\), 1 of them match no other photo; .*--matcher exhaustive"],
+        ),
+        (
+            [_model(25), _model(15, first=25)],
+            ["15 of 40", r"fall into 2 parts .*\(25 photos are used, the others have 15\)"],
+        ),
+        ([_model(40), _model(12)], []),
+        ([_model(40, points=900)], ["only 900 points, 1000 or more .*photos help, and --max_num_features 16384$"]),
+        ([_model(40, track=2.4)], ["seen by 2.4 photos on average, which means little overlap"]),
+        ([_model(40, error=2.0)], ["miss their pixels by 2.0 pixels"]),
+    ],
+)
+def test_advice(models, said):
+    photos = [f"{i:03d}" for i in range(40)]
+    matches = dict.fromkeys(photos[:39], 3)
+    lines = report.advice(models, photos, matches, "sequential", 8192)
+    assert len(lines) == len(said)
+    for line, wanted in zip(lines, said, strict=True):
+        assert re.search(wanted, line), line
+
+
+class _Decoder(SimpleNamespace):
+    """Stands for imageio_ffmpeg: frames of noise, every third one sharp."""
+
+    @staticmethod
+    def count_frames_and_secs(path: str) -> tuple[int, float]:
+        return 9, 0.3
+
+    @staticmethod
+    def read_frames(path: str):
+        yield {"size": (40, 30)}
+        for number in range(9):
+            noise = np.random.default_rng(number).integers(0, 256, (30, 40, 3), dtype=np.uint8)
+            picture = Image.fromarray(noise)
+            yield (picture if number % 3 == 1 else picture.reduce(4).resize((40, 30))).tobytes()
+
+
+def test_the_sharpest_frame_of_each_span_is_taken(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", _Decoder())
+    extract_frames(Path("any.mp4"), tmp_path, 3)
+    assert sorted(path.name for path in tmp_path.iterdir()) == [f"frame_0000{i}.jpg" for i in (1, 2, 3)]
+    for index, path in enumerate(sorted(tmp_path.iterdir())):
+        noise = np.random.default_rng(3 * index + 1).integers(0, 256, (30, 40, 3), dtype=np.uint8)
+        assert sharpness(np.asarray(Image.open(path))) == pytest.approx(sharpness(noise), rel=0.1)
+    extract_frames(Path("any.mp4"), tmp_path / "..", 100)
+    assert len(list(tmp_path.parent.glob("frame_*.jpg"))) == 9
+
+
+def test_a_video_without_decoder(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    video = tmp_path / "walk.mp4"
+    video.touch()
+    with pytest.raises(UserError, match="--video needs the package imageio-ffmpeg; `pip install imageio-ffmpeg`"):
+        convert.main(["-s", str(tmp_path), "--video", str(video)])
+
+
+def test_a_real_video(tmp_path):
+    ffmpeg = pytest.importorskip("imageio_ffmpeg", reason="the extra imageio-ffmpeg is not installed")
+    make_photos(tmp_path / "photos", 6)
+    writer = ffmpeg.write_frames(str(tmp_path / "walk.mp4"), (SIZE[0], SIZE[1]), macro_block_size=1)
+    writer.send(None)
+    for path in sorted((tmp_path / "photos").iterdir()):
+        writer.send(np.asarray(Image.open(path)).tobytes())
+    writer.close()
+    folder = tmp_path / "input"
+    folder.mkdir()
+    extract_frames(tmp_path / "walk.mp4", folder, 3)
+    assert [Image.open(path).size for path in sorted(folder.iterdir())] == [SIZE] * 3
+    (tmp_path / "no.mp4").write_bytes(b"no video")
+    with pytest.raises(UserError, match="cannot read the video .*no.mp4"):
+        extract_frames(tmp_path / "no.mp4", folder, 3)
