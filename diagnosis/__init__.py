@@ -1,0 +1,1 @@
+"""What doctor.py looks at: the environment, a dataset, a trained model. Each check gives lines; nothing is changed."""

@@ -1,0 +1,182 @@
+"""Can this dataset be trained, and what about it will show in the result? Through the project's own readers."""
+
+import contextlib
+import io
+import json
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+
+from diagnosis.lines import Line, from_error, some
+from scene.dataset_readers import CameraInfo, SceneInfo, read_scene
+from utils.system_utils import UserError
+
+# Learning rates and size limits are fractions of the extent, but depths below 0.2 are culled and float32 is used.
+EXTENT = (0.1, 100.0)
+FEWEST_VIEWS = 20
+FEWEST_POINTS = 1000
+REGISTERED = 0.9  # share of the photos
+FAR_CAMERA = 10.0  # times the median distance of cameras from their median
+FAR_POINT = 100.0  # extents from the cameras; a sky is some tens away
+FAR_SHARE = 0.01
+OPENING = (10.0, 150.0)  # degrees; outside, the focal length is doubtful
+FEWEST_IN_VIEW = 10  # points of the cloud in a picture
+_SAMPLE = 5000  # points looked at
+_WIDE = 1600
+
+
+def check_dataset(source: str, images: str) -> list[Line]:
+    """Lines about the dataset in a folder. images: as train.py's -i."""
+    said = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(said):
+            info = read_scene(source, images, hold_out=False)
+    except UserError as error:
+        return [*_warnings(said.getvalue()), from_error(error)]
+    lines = [*_warnings(said.getvalue()), *check_views(info.train_cameras)]
+    lines += check_extent(info) + check_lenses(info.train_cameras) + check_cloud(info)
+    return lines + _check_registered(Path(source))
+
+
+def check_views(cameras: list[CameraInfo]) -> list[Line]:
+    """Number and sizes of the pictures, and what they take in memory."""
+    sizes = Counter(camera.file_size for camera in cameras)
+    listed = ", ".join(f"{w} x {h} ({n})" for (w, h), n in sizes.most_common(3))
+    listed += f" and {len(sizes) - 3} more sizes" if len(sizes) > 3 else ""
+    lines = [Line(f"{len(cameras)} pictures, all there and readable: {listed}")]
+    if len(cameras) < FEWEST_VIEWS:
+        lines.append(
+            Line(f"only {len(cameras)} pictures", f"take {FEWEST_VIEWS} or more; new views will look bad with fewer")
+        )
+    wide = sum(n for (width, _), n in sizes.items() if width > _WIDE)
+    if wide:
+        lines.append(Line(f"{wide} pictures are wider than {_WIDE}, they train at that width unless -r 1 is given"))
+    return lines
+
+
+def check_extent(info: SceneInfo) -> list[Line]:
+    """Scale of the scene, and cameras far off."""
+    centers = np.array([camera.center for camera in info.train_cameras])
+    low, high = EXTENT
+    lines = []
+    spread = np.linalg.norm(centers - centers.mean(axis=0), axis=1).max()
+    if len(centers) > 1 and spread < 1e-3 * info.extent:
+        lines.append(
+            Line(
+                "all cameras stand in one place, so depth can't be found", "take pictures from places some steps apart"
+            )
+        )
+    if low <= info.extent <= high:
+        lines.append(Line(f"extent {info.extent:.3g}"))
+    else:
+        factor = 10.0 ** round(np.log10(5 / info.extent))
+        lines.append(
+            Line(
+                f"the extent is {info.extent:.3g}, outside {low:g} to {high:g}",
+                f"scale cameras and points by {factor:g}; depths below 0.2 are never drawn",
+            )
+        )
+    distances = np.linalg.norm(centers - np.median(centers, axis=0), axis=1)
+    usual = float(np.median(distances))
+    far = [c.image_name for c, d in zip(info.train_cameras, distances, strict=True) if d > FAR_CAMERA * usual > 0]
+    if far:
+        lines.append(
+            Line(
+                f"{len(far)} cameras are more than {FAR_CAMERA:g} times as far out as usual ({some(far)})",
+                "remove them from the model, their poses are likely wrong; they inflate the extent",
+            )
+        )
+    return lines
+
+
+def check_lenses(cameras: list[CameraInfo]) -> list[Line]:
+    """Opening angles that no usual lens has."""
+    low, high = np.radians(OPENING)
+    odd = [camera for camera in cameras if not low <= camera.FovX <= high]
+    if not odd:
+        return []
+    angle = np.degrees(odd[0].FovX)
+    return [
+        Line(
+            f"{len(odd)} cameras have odd opening angles ({odd[0].image_name}: {angle:.1f} degrees)",
+            "check focal length and picture size, or reconstruct the scene again",
+        )
+    ]
+
+
+def check_cloud(info: SceneInfo) -> list[Line]:
+    """Number of points, points far away, and whether the cameras look at them."""
+    points = info.point_cloud.points.astype(np.float64)
+    lines = [Line(f"{len(points)} points to start from")]
+    if len(points) < FEWEST_POINTS:
+        more = "start from more points (--init_pcd_path), or reconstruct with more pictures or features"
+        lines = [Line(f"only {len(points)} points to start from, {FEWEST_POINTS} or more are good", more)]
+    if not len(points):
+        return lines
+    centers = np.array([camera.center for camera in info.train_cameras])
+    far = np.linalg.norm(points - centers.mean(axis=0), axis=1) > FAR_POINT * info.extent
+    if far.mean() > FAR_SHARE:
+        lines.append(
+            Line(
+                f"{far.mean():.1%} of the points are more than {FAR_POINT:g} extents away",
+                "remove them from the cloud (COLMAP: filter by reprojection error and angle)",
+            )
+        )
+    seen = points_in_views(info.train_cameras, points[:: max(1, len(points) // _SAMPLE)])
+    unseen = float((~seen.any(axis=0)).mean())
+    if unseen > 0.5:
+        lines.append(
+            Line(
+                f"{unseen:.0%} of the points are in no picture",
+                "poses and points don't belong together: check the axes (x right, y down, z forward) and the scale",
+            )
+        )
+    share = len(points) / seen.shape[1]
+    away = [
+        c.image_name for c, n in zip(info.train_cameras, seen.sum(axis=1), strict=True) if n * share < FEWEST_IN_VIEW
+    ]
+    if away and unseen <= 0.5:
+        lines.append(
+            Line(
+                f"{len(away)} cameras have hardly any point in view ({some(away)})",
+                "they look away or their poses are wrong; remove them from the model",
+            )
+        )
+    return lines
+
+
+def points_in_views(cameras: list[CameraInfo], points: np.ndarray) -> np.ndarray:
+    """Which points (N,3) lie in front of a camera and inside its picture: (cameras, N) bool."""
+    seen = np.zeros((len(cameras), len(points)), dtype=bool)
+    for row, camera in zip(seen, cameras, strict=True):
+        local = points @ camera.R + camera.T
+        front = local[:, 2] > 0
+        depth = np.where(front, local[:, 2], 1.0)
+        x = camera.fx * local[:, 0] / depth + camera.cx
+        y = camera.fy * local[:, 1] / depth + camera.cy
+        row[:] = front & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
+    return seen
+
+
+def _check_registered(source: Path) -> list[Line]:
+    """What convert.py has noted, where it made the scene."""
+    path = source / "convert_report.json"
+    if not path.is_file():
+        return []
+    try:
+        report = json.loads(path.read_text(encoding="utf-8"))
+        placed, photos = int(report["registered"]), int(report["photos"])
+        advice = [str(line) for line in report["advice"]]
+    except (ValueError, KeyError, TypeError):
+        return [Line(f"{path} is damaged", "remove it, or run convert.py again")]
+    if photos and placed / photos < REGISTERED:
+        remedy = advice[0].rpartition("; ")[2] if advice else "take more photos that overlap"
+        return [Line(f"only {placed} of {photos} photos were placed by convert.py", remedy)]
+    return [Line(f"{placed} of {photos} photos were placed by convert.py")]
+
+
+def _warnings(said: str) -> list[Line]:
+    """What the readers print beside what they return; progress bars left out."""
+    texts = [text.strip() for text in said.replace("\r", "\n").splitlines() if text.strip() and "%|" not in text]
+    return [Line(text, note=True) for text in texts]

@@ -1,0 +1,183 @@
+"""Is a trained model whole, and if its pictures are black or bad, why?"""
+
+import argparse
+import contextlib
+import io
+from typing import Any
+
+import numpy as np
+import torch
+
+from arguments import ModelParams, PipelineParams, read_cfg_args, read_model_json
+from diagnosis.dataset import check_dataset
+from diagnosis.lines import Line, from_error
+from gaussian_renderer import render
+from scene import Scene
+from scene.cameras import Camera
+from scene.gaussian_model import GaussianModel
+from utils.image_utils import as_float, psnr
+from utils.system_utils import UserError, compute_device
+
+# Densification prunes below 0.005 and a reset leaves 0.01: a model whose median is there has not recovered.
+FAINT = 0.02
+BINS = (0.0, 0.01, 0.05, 0.2, 0.5, 0.9, 1.0)
+HUGE = 1.0  # extents: one standard deviation of a splat as large as the whole scene
+HUGE_SHARE = 0.01
+BLACK = 0.02  # mean of a picture in [0, 1]
+BAD_PSNR = 18.0  # dB on training views; models that converge reach 22 and more
+FEW_ITERATIONS = 3000
+RESET_INTERVAL = 3000  # the default of --opacity_reset_interval
+NEAREST = 0.2  # depth below which nothing is drawn
+FEW_GAUSSIANS = 2000
+_VIEWS = 4
+_WIDTH = 200
+
+
+def check_model(model_path: str, iteration: int) -> list[Line]:
+    """Lines about the model that train.py wrote into a folder; iteration -1: the last one saved."""
+    try:
+        stored = read_cfg_args(model_path)
+        with contextlib.redirect_stdout(io.StringIO()):  # of the readers
+            options, scene = _load(model_path, stored, iteration)
+    except UserError as error:
+        return [from_error(error)]
+    gaussians = scene.gaussians
+    name = f"iteration {scene.loaded_iter}"
+    if not len(gaussians):
+        return [Line(f"{name} has no Gaussians, so renders show the background", "train it again")]
+    lines = [Line(f"{name}, {len(gaussians)} Gaussians of SH degree {options.sh_degree}"), *check_values(gaussians)]
+    if any(line.finding for line in lines):
+        return lines
+    return lines + check_shapes(gaussians, scene.cameras_extent) + check_renders(scene, options, stored)
+
+
+def _load(model_path: str, stored: dict[str, Any], iteration: int) -> tuple[argparse.Namespace, Scene]:
+    # Small pictures: this is about black and bad, not about decimals.
+    given = {**stored, "model_path": model_path, "resolution": _WIDTH, "images_to_load": 1, "eval": False}
+    given.pop("depths", None)
+    options = ModelParams(argparse.ArgumentParser()).extract(argparse.Namespace(**given))
+    gaussians = GaussianModel(options.sh_degree)
+    return options, Scene(options, gaussians, load_iteration=iteration, shuffle=False)
+
+
+def check_values(gaussians: GaussianModel) -> list[Line]:
+    """NaN and infinities."""
+    raw = {
+        "position": gaussians.get_xyz,
+        "opacity": gaussians._opacity,
+        "scale": gaussians._scaling,
+        "rotation": gaussians._rotation,
+        "colour": gaussians.get_features,
+    }
+    lines = []
+    for name, values in raw.items():
+        bad = int((~torch.isfinite(values)).flatten(1).any(dim=1).sum())
+        if bad:
+            lines.append(
+                Line(
+                    f"{bad} of {len(values)} Gaussians have a {name} that is not finite",
+                    "go on from an earlier checkpoint, or train again, with lower learning rates",
+                )
+            )
+    return lines
+
+
+def check_shapes(gaussians: GaussianModel, extent: float) -> list[Line]:
+    """Histogram of the opacities, and sizes against the extent of the cameras."""
+    opacity = gaussians.get_opacity.detach().flatten().cpu().numpy()
+    counts, _ = np.histogram(opacity, bins=BINS)
+    shares = ", ".join(
+        f"{low:g}-{high:g} {count / len(opacity):.0%}" for low, high, count in zip(BINS, BINS[1:], counts, strict=False)
+    )
+    lines = [Line(f"opacities: {shares}; median {np.median(opacity):.2f}")]
+    largest = gaussians.get_scaling.detach().max(dim=1).values.cpu().numpy()
+    huge = float((largest > HUGE * extent).mean())
+    if huge > HUGE_SHARE:
+        lines.append(
+            Line(
+                f"{huge:.1%} of the Gaussians are larger than the extent of the cameras ({extent:.3g})",
+                "remove far points from the start cloud, and look whether the poses are right",
+            )
+        )
+    else:
+        lines.append(
+            Line(f"sizes: median {np.median(largest) / extent:.2g}, largest {largest.max() / extent:.2g} extents")
+        )
+    return lines
+
+
+def check_renders(scene: Scene, options: argparse.Namespace, stored: dict[str, Any]) -> list[Line]:
+    """A few training views, rendered small: not black, and near the pictures. Else the likeliest reasons."""
+    cameras = scene.getTrainCameras()
+    cameras = cameras[:: max(1, len(cameras) // _VIEWS)][:_VIEWS]
+    looks = [_look(camera, scene, options) for camera in cameras]
+    brightness, truth, coverage, drawn, score = (float(np.mean(values)) for values in zip(*looks, strict=True))
+    if brightness < BLACK and truth < BLACK:
+        return [Line("the pictures themselves are black", "look at them; where they are transparent, train with -w")]
+    if brightness < BLACK:
+        return [_why_black(scene, cameras, coverage, drawn)]
+    if score < BAD_PSNR:
+        return [Line(f"training views have a PSNR of only {score:.1f} dB", _why_bad(scene, stored))]
+    return [Line(f"{len(cameras)} training views rendered {_WIDTH} pixels wide: PSNR {score:.1f} dB")]
+
+
+def _look(camera: Camera, scene: Scene, options: argparse.Namespace) -> tuple[float, float, float, float, float]:
+    """Means of render and picture, share of the picture that is covered, share of Gaussians drawn, PSNR in dB."""
+    gaussians = scene.gaussians
+    pipe = PipelineParams(argparse.ArgumentParser()).extract(argparse.Namespace())
+    pipe.antialiasing = read_model_json(scene.model_path).get("antialiasing", False)
+    background = torch.full((3,), 1.0 if options.white_background else 0.0, device=compute_device())
+    with torch.no_grad():
+        package = render(camera, gaussians, pipe, background)
+        black = torch.zeros_like(gaussians.get_xyz)
+        through = render(camera, gaussians, pipe, torch.ones_like(background), override_color=black)["render"]
+        target = as_float(camera.target(background))
+        ratio = float(psnr(package["render"], target).mean())
+    drawn = float((package["radii"] > 0).float().mean())
+    return float(package["render"].mean()), float(target.mean()), 1 - float(through.mean()), drawn, min(ratio, 99.0)
+
+
+def _why_black(scene: Scene, cameras: list[Camera], coverage: float, drawn: float) -> Line:
+    gaussians = scene.gaussians
+    text = "renders of the training views are black: "
+    if drawn < 0.01:
+        depths = torch.cat([_depths(camera, gaussians.get_xyz) for camera in cameras])
+        near = float(((depths > 0) & (depths < NEAREST)).float().mean())
+        if near > 0.5:
+            return Line(
+                f"{text}most Gaussians are nearer than {NEAREST} and never drawn",
+                "scale cameras and points of the scene by 10 or more and train again",
+            )
+        return Line(
+            f"{text}no Gaussian is in view, the cameras look away",
+            "look at the poses (x right, y down, z forward) and whether the model belongs to this dataset",
+        )
+    if coverage < 0.1 or float(gaussians.get_opacity.detach().median()) < FAINT:
+        return Line(
+            f"{text}the Gaussians are almost transparent",
+            "train on, since opacities are reset every 3000 iterations; else lower --opacity_lr, and look at the poses",
+        )
+    return Line(
+        f"{text}the Gaussians themselves are black",
+        "look whether the pictures that were trained on are (transparent ones need -w), and at --feature_lr",
+    )
+
+
+def _depths(camera: Camera, points: torch.Tensor) -> torch.Tensor:
+    return points @ camera.world_view_transform[:3, 2] + camera.world_view_transform[3, 2]
+
+
+def _why_bad(scene: Scene, stored: dict[str, Any]) -> str:
+    iteration = scene.loaded_iter
+    if RESET_INTERVAL <= iteration < 15_000 and iteration % RESET_INTERVAL < 500:
+        return "this iteration is shortly after opacities were reset; look at a later one"
+    if iteration < FEW_ITERATIONS:
+        return f"train longer, {FEW_ITERATIONS} iterations at least"
+    problems = [
+        line for line in check_dataset(stored.get("source_path", ""), stored.get("images", "images")) if line.finding
+    ]
+    if problems:
+        return f"the dataset has problems ({problems[0].text}): {problems[0].remedy}"
+    if len(scene.gaussians) < FEW_GAUSSIANS:
+        return f"there are only {len(scene.gaussians)} Gaussians; lower --densify_grad_threshold, or give more points"
+    return "train with the default learning rates; if that does not help, the poses are wrong: reconstruct the scene"

@@ -1,0 +1,284 @@
+"""doctor.py: each fault gets its own line, and a healthy scene and model get none."""
+
+import argparse
+import dataclasses
+import json
+from pathlib import Path
+
+import diff_gaussian_rasterization
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+import doctor
+from arguments import ModelParams, write_cfg_args
+from diagnosis import environment
+from diagnosis.dataset import check_cloud, check_dataset, check_extent, check_lenses, points_in_views
+from diagnosis.lines import Line
+from diagnosis.model import check_model
+from scene.dataset_readers import read_scene
+from scene.gaussian_model import GaussianModel
+from utils.graphics_utils import BasicPointCloud
+from utils.system_utils import UserError
+
+
+def problems(lines: list[Line]) -> list[str]:
+    return [str(line) for line in lines if line.finding]
+
+
+@pytest.fixture
+def healthy(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An environment without problems, whatever is installed here."""
+    monkeypatch.setattr(environment, "check_packages", lambda: [Line("packages")])
+    monkeypatch.setattr(environment, "check_build", lambda: [Line("build")])
+
+
+def exit_status(*argv: str) -> int:
+    try:
+        doctor.main(argv)
+    except SystemExit as end:
+        return end.code
+    return 0
+
+
+def test_exit_statuses(healthy, colmap_scene, tmp_path, capsys):
+    assert exit_status() == 0
+    assert capsys.readouterr().out.endswith("all is well\n")
+    assert exit_status("-s", str(colmap_scene)) == 1
+    out = capsys.readouterr().out
+    assert "PROBLEM only 17 pictures -> " in out and "PROBLEM only 300 points" in out and out.endswith("2 problems\n")
+    for option in ("-s", "-m"):
+        with pytest.raises(UserError, match=f"no folder .*nowhere; give an existing one with {option}"):
+            doctor.main([option, str(tmp_path / "nowhere")])
+
+
+def test_missing_packages_end_it(monkeypatch, colmap_scene, capsys):
+    found = environment._version
+    monkeypatch.setattr(environment, "_version", lambda name: None if name == "plyfile" else found(name))
+    assert exit_status("-s", str(colmap_scene)) == 1
+    out = capsys.readouterr().out
+    assert "PROBLEM packages are missing: plyfile -> run `pip install -r requirements.txt`" in out
+    assert "pictures" not in out
+
+
+def _sources(root: Path, version: str = "0.1.0") -> Path:
+    """A repository with the installed Python side of simple-knn."""
+    common, package = root / "submodules" / "common", root / "submodules" / "simple-knn" / "simple_knn"
+    common.mkdir(parents=True)
+    package.mkdir(parents=True)
+    (common / "build_extension.py").write_text(f'VERSION = "{version}"\n')
+    import simple_knn
+
+    for path in Path(simple_knn.__file__).parent.glob("*.py"):
+        (package / path.name).write_bytes(path.read_bytes())
+    return package
+
+
+def test_extensions_that_do_not_fit(monkeypatch, tmp_path):
+    def check(torch_version: str = torch.__version__) -> list[str]:
+        return problems(environment._check_extension("simple-knn", "simple_knn", torch_version))
+
+    package = _sources(tmp_path)
+    monkeypatch.setattr(environment, "ROOT", tmp_path)
+    assert check() == []
+    assert "was built for torch==2.13.*, torch is 9.0.1" in check("9.0.1")[0]
+    (package / "ops.py").write_text("changed")
+    assert "installed from other sources than these (ops.py) -> run `pip install ./submodules/simple-knn`" in check()[0]
+    (tmp_path / "submodules" / "common" / "build_extension.py").write_text('VERSION = "0.2.0"\n')
+    assert "is version 0.1.0, this code is 0.2.0" in check()[0]
+    monkeypatch.setattr(environment, "_version", lambda name: None)
+    assert "simple-knn is not installed" in check()[0]
+
+
+def test_the_rasterizer_is_tried(monkeypatch):
+    (line,) = environment._check_rasterizer(torch)
+    assert not line.finding and "agrees with its float64 oracle" in line.text
+    right = diff_gaussian_rasterization.rasterize
+    monkeypatch.setattr(
+        diff_gaussian_rasterization, "rasterize", lambda **k: (r := right(**k))._replace(color=r.color + 1e-4)
+    )
+    (line,) = environment._check_rasterizer(torch)
+    assert line.finding and "1.0e-04 off the oracle" in line.text
+
+
+def test_a_gpu_that_is_not_used(monkeypatch):
+    monkeypatch.setattr(environment, "_nvidia_gpu", lambda: "GPU 0: H100")
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    monkeypatch.setattr(torch.version, "cuda", None)
+    assert "H100 is there, but torch" in problems(environment._check_gpu(torch))[0]
+    monkeypatch.setattr(torch.version, "cuda", "13.0")
+    assert "update the driver" in problems(environment._check_gpu(torch))[0]
+
+
+@pytest.fixture
+def info(colmap_scene):
+    """The synthetic scene: cameras around a unit cube of points that all look at it."""
+    return read_scene(colmap_scene, "images", hold_out=False)
+
+
+def test_the_synthetic_scene_is_sound(info):
+    assert problems(check_extent(info)) == problems(check_lenses(info.train_cameras)) == []
+    few = problems(check_cloud(info))
+    assert len(few) == 1 and "only 300 points" in few[0]
+    # pycolmap projects its synthetic points into the pictures that see them.
+    seen = points_in_views(info.train_cameras, info.point_cloud.points)
+    assert seen.any(axis=0).mean() > 0.9
+
+
+def test_scale(info):
+    for factor, remedy in ((1e-3, "by 1000;"), (1e3, "by 0.001;")):
+        cameras = [dataclasses.replace(camera, T=camera.T * factor) for camera in info.train_cameras]
+        scaled = dataclasses.replace(info, train_cameras=cameras, extent=info.extent * factor)
+        assert remedy in problems(check_extent(scaled))[0]
+
+
+def test_stray_cameras(info):
+    cameras = list(info.train_cameras)
+    cameras[3] = dataclasses.replace(cameras[3], T=cameras[3].T + 200)
+    (line,) = problems(check_extent(dataclasses.replace(info, train_cameras=cameras, extent=50.0)))
+    assert f"1 cameras are more than 10 times as far out as usual ({cameras[3].image_name})" in line
+    cameras = [dataclasses.replace(c, T=-c.R.T @ np.ones(3)) for c in info.train_cameras]
+    (line,) = problems(check_extent(dataclasses.replace(info, train_cameras=cameras)))
+    assert "all cameras stand in one place" in line
+
+
+def test_odd_lenses(info):
+    cameras = [dataclasses.replace(info.train_cameras[0], fx=5000.0), *info.train_cameras[1:]]
+    assert "1 cameras have odd opening angles" in problems(check_lenses(cameras))[0]
+
+
+def _with_cloud(info, points: np.ndarray):
+    return dataclasses.replace(info, point_cloud=BasicPointCloud(points, np.zeros_like(points), np.zeros_like(points)))
+
+
+def test_points_and_cameras_that_do_not_meet(info):
+    many = np.random.default_rng(0).normal(scale=0.2, size=(2000, 3)).astype(np.float32)
+    assert problems(check_cloud(_with_cloud(info, many))) == []
+    around = [dataclasses.replace(c, R=c.R @ np.diag([-1.0, 1.0, -1.0]), T=np.diag([-1.0, 1.0, -1.0]) @ c.T)
+              for c in info.train_cameras]  # fmt: skip
+    turned = dataclasses.replace(_with_cloud(info, many), train_cameras=around)
+    assert (
+        "100% of the points are in no picture -> poses and points don't belong together"
+        in problems(check_cloud(turned))[0]
+    )
+    one = dataclasses.replace(_with_cloud(info, many), train_cameras=[around[0], *info.train_cameras[1:]])
+    assert f"1 cameras have hardly any point in view ({around[0].image_name})" in problems(check_cloud(one))[0]
+    far = many.copy()
+    far[::20] = 1e5
+    assert "5.0% of the points are more than 100 extents away" in problems(check_cloud(_with_cloud(info, far)))[0]
+
+
+def test_what_readers_say_becomes_a_line(colmap_scene, tmp_path):
+    (picture, *_) = sorted((colmap_scene / "images" / "left").iterdir())
+    Image.new("RGB", (96, 70)).save(picture)
+    first = check_dataset(str(colmap_scene), "images")[0]
+    assert str(first).startswith("note    1 of 17 pictures have another aspect ratio") and not first.finding
+    picture.unlink()
+    (line,) = check_dataset(str(colmap_scene), "images")
+    assert line.finding and "are missing" in line.text and "-i" in line.remedy
+
+
+def test_what_convert_noted(colmap_scene):
+    report = {
+        "registered": 17,
+        "photos": 30,
+        "advice": ["13 of 30 photos were left out; take more photos between them"],
+    }
+    path = colmap_scene / "convert_report.json"
+    path.write_text(json.dumps(report))
+    said = problems(check_dataset(str(colmap_scene), "images"))
+    assert "PROBLEM only 17 of 30 photos were placed by convert.py -> take more photos between them" in said
+    path.write_text("{")
+    assert any(
+        "convert_report.json is damaged" in text for text in problems(check_dataset(str(colmap_scene), "images"))
+    )
+
+
+@pytest.fixture
+def model(colmap_scene, tmp_path):
+    """Function that writes a model of the synthetic scene, its Gaussians changed, and gives the folder."""
+
+    def write(change=lambda gaussians: None, iteration: int = 7, source: Path = colmap_scene) -> str:
+        folder = tmp_path / "model"
+        given = argparse.Namespace(source_path=str(source), model_path=str(folder))
+        write_cfg_args(folder, ModelParams(argparse.ArgumentParser()).extract(given))
+        gaussians = GaussianModel(3)
+        cloud = read_scene(colmap_scene, "images", hold_out=False).point_cloud
+        gaussians.create_from_pcd(cloud, [], 1.0)
+        with torch.no_grad():
+            change(gaussians)
+        gaussians.save_ply(folder / "point_cloud" / f"iteration_{iteration}" / "point_cloud.ply")
+        return str(folder)
+
+    return write
+
+
+def _nan(gaussians):
+    gaussians._scaling[5, 1] = np.nan
+
+
+def _transparent(gaussians):
+    gaussians._opacity.fill_(-7)
+
+
+def _elsewhere(gaussians):
+    gaussians._xyz += 500
+
+
+def _black(gaussians):
+    gaussians._opacity.fill_(3)
+    gaussians._features_dc.fill_(-5)
+
+
+def _huge(gaussians):
+    gaussians._scaling[:50] = 3
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (_nan, "1 of 300 Gaussians have a scale that is not finite -> go on from an earlier checkpoint"),
+        (_transparent, "renders of the training views are black: the Gaussians are almost transparent -> "),
+        (_elsewhere, "black: no Gaussian is in view, the cameras look away -> look at the poses"),
+        (_black, "black: the Gaussians themselves are black -> look whether the pictures"),
+        (_huge, "16.7% of the Gaussians are larger than the extent of the cameras"),
+    ],
+)
+def test_models_with_a_fault(model, change, said):
+    assert any(said in text for text in problems(check_model(model(change), -1)))
+
+
+def test_a_scene_too_small_to_be_drawn(model, colmap_scene):
+    import pycolmap
+
+    sparse = colmap_scene / "sparse" / "0"
+    reconstruction = pycolmap.Reconstruction(sparse)
+    reconstruction.transform(pycolmap.Sim3d(0.005, pycolmap.Rotation3d(), np.zeros(3)))
+    reconstruction.write_binary(str(sparse))
+    (line,) = problems(check_model(model(), -1))
+    assert "most Gaussians are nearer than 0.2 and never drawn -> scale cameras and points" in line
+
+
+def test_models_that_have_not_converged(model):
+    lines = check_model(model(), -1)
+    assert lines[0].text == "iteration 7, 300 Gaussians of SH degree 3"
+    assert "opacities: 0-0.01 0%, 0.01-0.05 0%, 0.05-0.2 100%" in lines[1].text
+    assert any("PSNR of only" in text and "train longer, 3000 iterations" in text for text in problems(lines))
+    assert any(
+        "shortly after opacities were reset" in text for text in problems(check_model(model(iteration=6100), 6100))
+    )
+    assert any(
+        "the dataset has problems (only 17 pictures)" in text
+        for text in problems(check_model(model(iteration=20000), -1))
+    )
+
+
+def test_folders_that_are_no_models(model, tmp_path):
+    assert "no cfg_args" in check_model(str(tmp_path), -1)[0].text
+    folder = Path(model())
+    assert "iteration 8 was never saved" in check_model(str(folder), 8)[0].text
+    ply = folder / "point_cloud" / "iteration_7" / "point_cloud.ply"
+    ply.write_bytes(ply.read_bytes()[:-100])
+    assert "is not a whole PLY file" in check_model(str(folder), -1)[0].text
+    assert "no scene folder" in check_model(model(source=tmp_path / "gone"), -1)[0].text
