@@ -231,7 +231,7 @@ def _blender_cameras(folder: Path, name: str) -> list[CameraInfo]:
             "frames, each with file_path and a 4x4 transform_matrix"
         ) from error
     if not 0 < angle < np.pi:
-        raise UserError(f"camera_angle_x in {path} must lie between 0 and pi, got {angle}")
+        raise UserError(f"camera_angle_x in {path} must lie between 0 and pi, got {angle}; give it in radians")
     paths = [_blender_picture(folder, file_path) for file_path, _ in frames]
     _check_present(paths, str(path), "put them there")
     cameras = []
