@@ -2,8 +2,8 @@
 
 python metrics.py -m MODEL [MODEL ...] [--lpips_net vgg|alex|both] [--lpips_weights FILE ...]
 
-Reads MODEL/test/<method>/{renders,gt}, writes MODEL/results.json (means), per_view.json, and metrics_info.json, which
-says what convention each number follows.
+Reads MODEL/test/<method>/{renders,gt} and masks where there are any, writes MODEL/results.json (means), per_view.json,
+and metrics_info.json, which says what convention each number follows.
 """
 
 from __future__ import annotations
@@ -36,18 +36,24 @@ CONVENTIONS = {
 }
 BACKBONES = {"LPIPS": "vgg", "LPIPS_vgg": "vgg", "LPIPS_alex": "alex"}
 
-Metric = Callable[[np.ndarray, np.ndarray], float | None]
+MASKED = {
+    "PSNR": "the mean over the pixels that count",
+    "SSIM": "other pixels are 0 in both images, as beyond the border; 1 - SSIM is divided by the share that counts",
+    "LPIPS": "other pixels of the render are the ground truth's; the mean of the map over the pixels that count",
+}
+Metric = Callable[[np.ndarray, np.ndarray, np.ndarray | None], float | None]
 Scores = dict[str, dict[str, float | None]]
 
 
 @dataclass(frozen=True)
 class Pair:
-    """A render and its ground truth, of the same size; `size` is (width, height) in pixels."""
+    """A render, its ground truth and the mask of what counts (None: all), of the same size (width, height), pixels."""
 
     name: str
     render: Path
     truth: Path
     size: tuple[int, int]
+    mask: Path | None = None
 
 
 def find_pairs(model: Path) -> dict[str, list[Pair]]:
@@ -84,7 +90,10 @@ def _pairs_of(method: Path) -> list[Pair]:
         sizes = _size(render), _size(truth)
         if sizes[0] != sizes[1]:
             raise UserError(f"{render} has {sizes[0]} pixels and its ground truth {sizes[1]}; run render.py again")
-        pairs.append(Pair(name, render, truth, sizes[0]))
+        mask = method / "masks" / name
+        if mask.is_file() and _size(mask) != sizes[0]:
+            raise UserError(f"{mask} has {_size(mask)} pixels and its render {sizes[0]}; run render.py again")
+        pairs.append(Pair(name, render, truth, sizes[0], mask if mask.is_file() else None))
     return pairs
 
 
@@ -113,22 +122,33 @@ def trained_with_eval(model: Path) -> bool | None:
     return stored if isinstance(stored, bool) else None
 
 
-def psnr(render: np.ndarray, truth: np.ndarray) -> float | None:
-    """PSNR in dB of two images (H, W, 3) uint8, exact up to the logarithm; None when they are equal."""
+def psnr(render: np.ndarray, truth: np.ndarray, mask: np.ndarray | None = None) -> float | None:
+    """PSNR in dB of two images (H, W, 3) uint8, exact up to the logarithm; None when they are equal.
+
+    mask: (H, W) bool, the pixels that count; the same for the other metrics, of which MASKED says what they do.
+    """
+    if mask is not None:
+        render, truth = render[mask], truth[mask]
     squares = int(((render.astype(np.int64) - truth.astype(np.int64)) ** 2).sum())
     return 10 * math.log10(255**2 * render.size / squares) if squares else None
 
 
-def ssim(render: np.ndarray, truth: np.ndarray) -> float:
+def ssim(render: np.ndarray, truth: np.ndarray, mask: np.ndarray | None = None) -> float:
     """Mean SSIM of two images (H, W, 3) uint8, computed in float64."""
+    if mask is not None:
+        render, truth = render * mask[..., None], truth * mask[..., None]
     channels_first = [torch.from_numpy(image.transpose(2, 0, 1) / 255.0) for image in (render, truth)]
-    return float(fused_ssim(*channels_first, train=False))
+    similarity = float(fused_ssim(*channels_first, train=False))
+    return similarity if mask is None else 1 - (1 - similarity) * mask.size / int(mask.sum())
 
 
 def _lpips_metric(distance: PerceptualDistance, unit_range: bool, device: torch.device) -> Metric:
-    def metric(render: np.ndarray, truth: np.ndarray) -> float:
+    def metric(render: np.ndarray, truth: np.ndarray, mask: np.ndarray | None = None) -> float:
+        if mask is not None:
+            render = np.where(mask[..., None], render, truth)
         images = [torch.from_numpy(image.transpose(2, 0, 1).copy()).to(device) / 255 for image in (render, truth)]
-        return distance(*images, unit_range=unit_range)
+        counts = None if mask is None else torch.from_numpy(mask).to(device)
+        return distance(*images, unit_range=unit_range, mask=counts)
 
     return metric
 
@@ -137,7 +157,7 @@ def make_metrics(lpips_net: str, weights: list[Path], smallest_side: int) -> dic
     """The metrics by key, in the order of the files. A line is printed for each backbone that can't be had; its keys
     then give None. `smallest_side`: of all the images, in pixels."""
     keys = ["SSIM", "PSNR", "LPIPS"] + [f"LPIPS_{net}" for net in ("vgg", "alex") if lpips_net in (net, "both")]
-    metrics: dict[str, Metric] = dict.fromkeys(keys, lambda render, truth: None)
+    metrics: dict[str, Metric] = dict.fromkeys(keys, lambda render, truth, mask: None)
     metrics.update(SSIM=ssim, PSNR=psnr)
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     for net in ("vgg", "alex"):
@@ -156,19 +176,25 @@ def make_metrics(lpips_net: str, weights: list[Path], smallest_side: int) -> dic
 
 
 def score(pairs: list[Pair], metrics: dict[str, Metric], title: str) -> Scores:
-    """Every metric of every pair, {metric: {file name: value}}; one pair is in memory at a time."""
+    """Every metric of every pair, {metric: {file name: value}}; one pair is in memory at a time.
+
+    A pair of which no pixel counts has no scores and is left out.
+    """
     scores: Scores = {key: {} for key in metrics}
     for pair in tqdm(pairs, desc=title, unit="view"):
         render, truth = _read(pair.render), _read(pair.truth)
+        mask = None if pair.mask is None else _read(pair.mask)[..., 0] > 0
+        if mask is not None and not mask.any():
+            continue
         for key, metric in metrics.items():
-            scores[key][pair.name] = metric(render, truth)
+            scores[key][pair.name] = metric(render, truth, mask)
     return scores
 
 
 def mean(values: dict[str, float | None]) -> float | None:
-    """Mean over the views; None as soon as one of them has no number."""
+    """Mean over the views; None as soon as one of them has no number, or when there are none."""
     numbers = list(values.values())
-    return None if None in numbers else math.fsum(numbers) / len(numbers)
+    return None if None in numbers or not numbers else math.fsum(numbers) / len(numbers)
 
 
 def write_json(path: Path, content: dict[str, Any], sort_keys: bool = False) -> None:
@@ -212,6 +238,9 @@ def main() -> None:
             "trained_with_eval": held_out,
             "views": {name: len(pairs) for name, pairs in methods.items()},
         }
+        masked = {name: sum(pair.mask is not None for pair in pairs) for name, pairs in methods.items()}
+        if any(masked.values()):
+            info |= {"masked": {key: MASKED[key.split("_")[0]] for key in metrics}, "masked_views": masked}
         write_json(model / "results.json", results)
         write_json(model / "per_view.json", per_view)
         write_json(model / "metrics_info.json", info, sort_keys=True)

@@ -2,8 +2,9 @@
 
 python render.py -m MODEL [--iteration N] [--skip_train] [--skip_test]
 
-Writes MODEL/{train,test}/ours_N/{renders,gt}/00000.png ..., numbered by the views' sorted order, and render_times.json
-beside these folders: the time of each view, with the device idle before it and done after it, without I/O.
+Writes MODEL/{train,test}/ours_N/{renders,gt}/00000.png ..., numbered by the views' sorted order, masks/ for views of
+which not every pixel counts, and render_times.json beside these folders: the time of each view, with the device idle
+before it and done after it, without I/O.
 """
 
 from __future__ import annotations
@@ -42,6 +43,12 @@ def save_png(image: torch.Tensor, path: Path) -> None:
         Image.fromarray(to_bytes(image).numpy()).save(temporary)
 
 
+def save_mask(mask: torch.Tensor, path: Path) -> None:
+    """Write a mask (1, H, W) bool as a grey PNG, white where pixels count."""
+    with atomic_write(path) as temporary:
+        Image.fromarray(mask[0].to(torch.uint8).mul(255).cpu().numpy()).save(temporary)
+
+
 def remove_leftovers(folder: Path, count: int) -> None:
     """Delete the numbered PNGs beyond the first `count` that an earlier run with more views has left."""
     for file in folder.glob("*.png"):
@@ -57,6 +64,7 @@ def render_set(
         remove_leftovers(folder / side, len(views))
         if views:
             mkdir_p(folder / side)
+    remove_leftovers(folder / "masks", 0)  # not every view need have one
     if not views:
         return []
     seconds = []
@@ -70,6 +78,8 @@ def render_set(
         seconds.append(time.perf_counter() - start)
         save_png(image, folder / "renders" / f"{index:05d}.png")
         save_png(view.target(background), folder / "gt" / f"{index:05d}.png")
+        if (mask := view.mask) is not None:
+            save_mask(mask, folder / "masks" / f"{index:05d}.png")
     return seconds
 
 

@@ -30,7 +30,7 @@ from utils.counter_rng import Stream, permutation, uniform
 from utils.curve_recorder import CurveRecorder, evenly_spread
 from utils.error_curve import Row, continue_curve
 from utils.general_utils import safe_state
-from utils.image_utils import as_float, psnr
+from utils.image_utils import as_float, pixels_that_count, psnr
 from utils.interrupt import DeferredInterrupt
 from utils.loss_utils import l1_loss, photometric_loss
 from utils.loss_watch import LossWatch
@@ -112,7 +112,7 @@ def training(
             background = _random_background(opt.seed, iteration, device) if opt.random_background else fixed_background
 
             package = render(camera, gaussians, pipe, background, want_visibility=False)
-            loss, l1 = photometric_loss(package["render"], camera.target(background), opt.lambda_dssim)
+            loss, l1 = photometric_loss(package["render"], camera.target(background), opt.lambda_dssim, camera.mask)
             loss.backward()
 
             losses.add(iteration, loss)
@@ -281,7 +281,7 @@ def prepare_output_and_logger(args: argparse.Namespace, *, antialiasing: bool, s
     print(f"Output folder: {args.model_path}")
     mkdir_p(args.model_path)
     write_cfg_args(args.model_path, args)
-    write_model_json(args.model_path, antialiasing=antialiasing, seed=seed)
+    write_model_json(args.model_path, args, antialiasing=antialiasing, seed=seed)
     if SummaryWriter is None:
         print("TensorBoard is not installed: no event file")
         return None
@@ -322,8 +322,9 @@ def training_report(
             with torch.no_grad():
                 image = renderFunc(camera, scene.gaussians, *renderArgs)["render"]
                 target = as_float(camera.target(renderArgs[1]))
-                differences.append(l1_loss(image, target).item())
-                ratios.append(psnr(image, target).mean().item())
+                counted = [pixels_that_count(x, camera.mask) for x in (image, target)]
+                differences.append(l1_loss(*counted).item())
+                ratios.append(psnr(*counted).mean().item())
             if tb_writer and index < 5:
                 tag = f"{name}_view_{camera.image_name}"
                 tb_writer.add_image(f"{tag}/render", image, global_step=iteration)

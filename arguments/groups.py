@@ -75,8 +75,35 @@ class ModelParams(ParamGroup):
         Option(
             "init_pcd_path",
             "",
-            "PLY with x y z red green blue to start from instead of the scene's own points",
+            "file of points to start from instead of the scene's own: PLY, npz (points, colors), or text with x y z, "
+            "or x y z red green blue, a line",
             "ours",
+        ),
+        Option(
+            "init_type",
+            "sfm",
+            "points to start from without --init_pcd_path. sfm: the scene's own; random: grey ones in the cameras' "
+            "frusta, in Blender scenes in the reference's cube",
+            "ours",
+            check=one_of("sfm", "random"),
+        ),
+        Option(
+            "masks",
+            "",
+            "folder of masks in the scene folder, or a whole path: by the names of the pictures, with .png appended or "
+            "another suffix, black masks; empty: those that a nerfstudio scene names",
+            "ours",
+            remembered=True,
+        ),
+        Option("invert_masks", False, "white masks instead of black", "ours", remembered=True),
+        Option(
+            "mask_meaning",
+            "auto",
+            "what is masked. ignore: left out of loss and scores; transparent: shows the background, as alpha does; "
+            "auto: ignore for mask files, transparent for the pictures' alpha",
+            "ours",
+            check=one_of("auto", "ignore", "transparent"),
+            remembered=True,
         ),
         Option(
             "images_to_load",

@@ -19,7 +19,7 @@ class Option:
     help: effect of the option; origin: where the default comes from, "ours..." for options the reference does not have.
     check: takes a value, returns what is wanted when the value is not that, else None.
     unbuilt: what this version lacks for any value but the default.
-    stored: belongs to `cfg_args`.
+    stored: belongs to `cfg_args`. remembered: belongs to `model.json`, for render.py.
     """
 
     name: str
@@ -30,6 +30,7 @@ class Option:
     check: Callable[[Any], str | None] | None = None
     unbuilt: str | None = None
     stored: bool = False
+    remembered: bool = False
 
     @property
     def ours(self) -> bool:

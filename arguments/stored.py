@@ -15,6 +15,7 @@ from utils.system_utils import UserError, atomic_write
 VERSION = "0.1.0"
 
 _STORED = {option.name: option.default for option in ModelParams.options if option.stored}
+_REMEMBERED = {option.name: option.default for option in ModelParams.options if option.remembered}
 
 
 def write_cfg_args(model_path: str | os.PathLike, args: argparse.Namespace) -> None:
@@ -57,9 +58,14 @@ def read_cfg_args(model_path: str | os.PathLike) -> dict[str, Value]:
     return values
 
 
-def write_model_json(model_path: str | os.PathLike, *, antialiasing: bool, seed: int) -> None:
-    """Write `model.json`: what cfg_args can't hold, keys sorted."""
+def write_model_json(
+    model_path: str | os.PathLike, args: argparse.Namespace | None = None, *, antialiasing: bool, seed: int
+) -> None:
+    """Write `model.json`: what cfg_args can't hold, keys sorted. args: model options, of which what differs is kept."""
     record = {"antialiasing": antialiasing, "seed": seed, "version": VERSION}
+    for name, default in _REMEMBERED.items():
+        if (value := getattr(args, name, default)) != default:
+            record[name] = value
     with atomic_write(Path(model_path) / "model.json") as path:
         path.write_text(json.dumps(record, indent=1, sort_keys=True, allow_nan=False) + "\n", encoding="utf-8")
 
@@ -75,6 +81,9 @@ def read_model_json(model_path: str | os.PathLike) -> dict[str, Any]:
         raise UserError(f"{path} is not JSON; restore it, or remove it and give --antialiasing yourself") from error
     if not isinstance(record, dict) or not isinstance(record.get("antialiasing", False), bool):
         raise UserError(f"{path} does not say antialiasing true or false; restore it, or remove it")
+    for name, default in _REMEMBERED.items():
+        if type(record.get(name, default)) is not type(default):
+            raise UserError(f"{path}: {name} must be {type(default).__name__}, got {record[name]!r}; restore the file")
     return record
 
 
@@ -91,7 +100,9 @@ def get_combined_args(parser: argparse.ArgumentParser, argv: Sequence[str] | Non
     # Depth maps supervise training; a finished model is used without them.
     stored.pop("depths", None)
     typed = {name: value for name, value in vars(args).items() if value is not None}
+    record = read_model_json(args.model_path)
+    stored |= {name: record[name] for name in _REMEMBERED if name in record}
     combined = argparse.Namespace(**{**vars(args), **stored, **typed})
     if hasattr(args, "antialiasing"):
-        combined.antialiasing = bool(args.antialiasing) or read_model_json(args.model_path).get("antialiasing", False)
+        combined.antialiasing = bool(args.antialiasing) or record.get("antialiasing", False)
     return combined

@@ -14,7 +14,8 @@ import torch
 
 from scene.cameras import Camera, camera_to_JSON, cameraList_from_camInfos
 from scene.dataset_readers import CameraInfo, read_scene
-from scene.image_store import ImageStore
+from scene.image_store import ImageStore, Source
+from scene.masks import MaskOptions
 from scene.point_cloud import write_point_cloud
 from utils.graphics_utils import BasicPointCloud
 from utils.system_utils import UserError, atomic_write, compute_device, saved_iterations, searchForMaxIteration
@@ -55,7 +56,15 @@ class Scene:
 
         if self.loaded_iter is None:
             _refuse_dataset_folder(args)
-        info = read_scene(args.source_path, args.images, args.eval, args.init_pcd_path, self.loaded_iter is None)
+        info = read_scene(
+            args.source_path,
+            args.images,
+            args.eval,
+            args.init_pcd_path,
+            want_cloud=self.loaded_iter is None,
+            init_type=args.init_type,
+            masks=MaskOptions(args.masks, args.invert_masks, args.mask_meaning),
+        )
         self._info = info
         self.cameras_extent = info.extent
 
@@ -136,7 +145,7 @@ class Scene:
         return lists
 
 
-def _pictures(lists: dict[float, list[Camera]]) -> list[tuple[Path, tuple[int, int]]]:
+def _pictures(lists: dict[float, list[Camera]]) -> list[tuple[Source, tuple[int, int]]]:
     return [picture for cameras in lists.values() for camera in cameras for picture in camera.pictures]
 
 

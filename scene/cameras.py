@@ -4,14 +4,14 @@ Matrices are handed on transposed (they multiply row vectors from the right). Ca
 """
 
 import argparse
-from pathlib import Path
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from scene.dataset_readers import CameraInfo
-from scene.image_store import ImageStore
+from scene.image_store import ImageStore, Source
+from scene.masks import TRANSPARENT, Cutout
 from scene.resolution import training_size
 from utils.graphics_utils import getProjectionMatrix, getWorld2View2
 
@@ -53,6 +53,11 @@ class Camera:
         self.zfar = ZFAR
         self.device = torch.device(device)
         self._images = images
+        self._source = info.image_path
+        self._mask = info.mask
+        self._ignore_alpha = info.ignore_alpha
+        if info.mask is not None and info.mask.meaning == TRANSPARENT:
+            self._source, self._mask = Cutout(info.image_path, info.mask), None
 
         # float64 up to here: the product and the inverse are rounded once.
         view = torch.from_numpy(getWorld2View2(info.R, info.T))
@@ -68,9 +73,10 @@ class Camera:
         return matrix.to(self.device, torch.float32).contiguous()
 
     @property
-    def pictures(self) -> list[tuple[Path, tuple[int, int]]]:
-        """Files that `target` reads, each with the size (width, height) it is decoded at."""
-        return [(self.image_path, (self.image_width, self.image_height))]
+    def pictures(self) -> list[tuple[Source, tuple[int, int]]]:
+        """What `target` and `mask` read, in this order, each with the size (width, height) it is decoded at."""
+        sources = [self._source] if self._mask is None else [self._source, self._mask]
+        return [(source, (self.image_width, self.image_height)) for source in sources]
 
     def _pixels(self) -> Tensor:
         pixels = self._images.get(*self.pictures[0])
@@ -79,15 +85,27 @@ class Camera:
     def target(self, background: Tensor) -> Tensor:
         """What a render of this view over `background` (3,) in [0,1] should be: (3,H,W).
 
-        uint8, meaning value/255, for a picture without alpha; else float32, laid over the background by its alpha.
+        uint8, meaning value/255, for a picture without alpha, or with one that is a mask; else float32, laid over the
+        background by its alpha.
         """
         pixels = self._pixels()
-        if pixels.shape[0] == 3:
-            return pixels
+        if pixels.shape[0] == 3 or self._ignore_alpha:
+            return pixels[:3]
         # Every step: as few passes as possible, and no fused ones (their rounding differs with the thread count).
         scaled = pixels / 255
         alpha = scaled[3:]
         return scaled[:3].mul_(alpha).add_(background.to(self.device)[:, None, None] * (1 - alpha))
+
+    @property
+    def mask(self) -> Tensor | None:
+        """Which pixels count in loss and scores, (1,H,W) bool; None where all do."""
+        counts = None
+        if self._mask is not None:
+            counts = self._images.get(*self.pictures[1]).to(self.device, non_blocking=True) == 255
+        if self._ignore_alpha and (pixels := self._pixels()).shape[0] == 4:
+            opaque = pixels[3:] == 255
+            counts = opaque if counts is None else counts & opaque
+        return counts
 
     @property
     def original_image(self) -> Tensor:

@@ -1,28 +1,22 @@
-"""COLMAP models through pycolmap, as plain records. The one module that imports pycolmap."""
+"""COLMAP models through pycolmap, as plain records."""
 
-import signal
-import threading
+import sys
 from pathlib import Path
-from types import ModuleType
 from typing import NamedTuple
 
 import numpy as np
 
-# Pillow's zlib must be in the process before pycolmap's, or writing a PNG aborts (pycolmap 4.2.1, Pillow 13.0).
-from PIL import Image  # noqa: F401
-
+from scene.lens import Lens
+from scene.pycolmap_import import import_pycolmap
 from utils.system_utils import UserError
 
 
 class ColmapView(NamedTuple):
-    """A registered picture: COLMAP's name, camera, intrinsics in pixels, world-to-camera rotation (3,3), shift (3,)."""
+    """A registered picture: COLMAP's name, camera id and lens, world-to-camera rotation (3,3) and translation (3,)."""
 
     name: str
     camera_id: int
-    camera_model: str
-    params: tuple[float, ...]
-    width: int
-    height: int
+    lens: Lens
     rotation: np.ndarray
     translation: np.ndarray
 
@@ -35,22 +29,42 @@ class ColmapModel(NamedTuple):
     colors: np.ndarray
 
 
-def find_model(scene: Path) -> Path:
-    """Folder of the COLMAP model, `sparse/0` or `sparse`. UserError that says what is there instead."""
-    candidates = (scene / "sparse" / "0", scene / "sparse")
-    for folder in candidates:
-        if any(_has_model(folder, suffix) for suffix in ("bin", "txt")):
-            return folder
-    found = sorted(str(path.relative_to(scene)) for path in (scene / "sparse").glob("**/*"))[:8]
-    raise UserError(
-        f"no COLMAP model in {candidates[0]} or {candidates[1]}: looked for cameras, images and points3D as .bin or "
-        f".txt, found {', '.join(found) or 'nothing'}; copy the whole model there"
-    )
+def find_model(scene: Path) -> tuple[Path, ColmapModel]:
+    """Folder and contents of the COLMAP model with the most registered pictures: in `sparse` or one of its sub-folders.
+
+    Of equal ones `sparse/0` comes first, then `sparse`. A line says which is taken where there are several. UserError
+    that says what is there where there is none, or none can be read.
+    """
+    sparse = scene / "sparse"
+    inside = sorted(path for path in sparse.iterdir() if path.is_dir())
+    folders = list(dict.fromkeys([sparse / "0", sparse, *inside]))
+    folders = [folder for folder in folders if any(_has_model(folder, suffix) for suffix in ("bin", "txt"))]
+    if not folders:
+        found = sorted(str(path.relative_to(scene)) for path in sparse.glob("**/*"))[:8]
+        raise UserError(
+            f"no COLMAP model in {sparse / '0'}, {sparse} or another folder in it: looked for cameras, images and "
+            f"points3D as .bin or .txt, found {', '.join(found) or 'nothing'}; copy the whole model there"
+        )
+    models, errors = {}, []
+    for folder in folders:
+        try:
+            models[folder] = read_model(folder)
+        except UserError as error:
+            errors.append(error)
+    if not models:
+        raise errors[0]
+    for error in errors:
+        print(f"{error}; another model is used", file=sys.stderr)
+    best = max(models, key=lambda folder: len(models[folder].views))  # the first of equal ones
+    if len(models) > 1:
+        others = ", ".join(f"{folder} {len(models[folder].views)}" for folder in models if folder != best)
+        print(f"{best} registers {len(models[best].views)} pictures and is used; {others}", file=sys.stderr)
+    return best, models[best]
 
 
 def read_model(folder: Path) -> ColmapModel:
     """Read a model, binary or (where that is missing or broken) text. UserError when neither can be read."""
-    pycolmap = _pycolmap()
+    pycolmap = import_pycolmap()
     errors = []
     for suffix, read in (("bin", "read_binary"), ("txt", "read_text")):
         if not _has_model(folder, suffix):
@@ -60,22 +74,12 @@ def read_model(folder: Path) -> ColmapModel:
             getattr(model, read)(str(folder))
             if suffix == "bin":
                 _check_cameras_whole(folder / "cameras.bin", model)
-        except (ValueError, RuntimeError, IndexError, MemoryError) as error:
+            return _records(model, {} if suffix == "bin" else _spaced_names(folder / "images.txt", model))
+        except UnicodeDecodeError:
+            errors.append(f".{suffix}: picture names that are not UTF-8, rename pictures in plain letters")
+        except (ValueError, RuntimeError, LookupError, MemoryError) as error:
             errors.append(f".{suffix}: {str(error).splitlines()[0] if str(error) else type(error).__name__}")
-            continue
-        return _records(model)
     raise UserError(f"cannot read the COLMAP model in {folder} ({'; '.join(errors)}); export it again from COLMAP")
-
-
-def _pycolmap() -> ModuleType:
-    # Late: importing pycolmap takes time and loads libraries that a Blender scene does not need.
-    import pycolmap
-
-    # It lets glog answer SIGTERM with a stack dump. Python does not see that, so its own idea brings back what was.
-    handler = signal.getsignal(signal.SIGTERM)
-    if handler is not None and threading.current_thread() is threading.main_thread():
-        signal.signal(signal.SIGTERM, handler)
-    return pycolmap
 
 
 def points_file(folder: Path) -> Path:
@@ -94,7 +98,19 @@ def _check_cameras_whole(path: Path, model) -> None:
         raise ValueError(f"cameras.bin is cut short, {path.stat().st_size} of {wanted} bytes")
 
 
-def _records(model) -> ColmapModel:
+def _spaced_names(path: Path, model) -> dict[int, str]:
+    """Names with spaces in an images.txt by image id: pycolmap 4.2.1 ends names there, the format's lines do not."""
+    names = {}
+    for line in path.read_text(encoding="utf-8").splitlines():
+        fields = line.split(maxsplit=9)  # id, quaternion, translation, camera id, name; or else 2D points
+        if len(fields) == 10 and " " in fields[9].rstrip() and fields[0].isdigit():
+            image_id = int(fields[0])
+            if image_id in model.images and model.images[image_id].name == fields[9].split()[0]:
+                names[image_id] = fields[9].rstrip()
+    return names
+
+
+def _records(model, spaced_names: dict[int, str]) -> ColmapModel:
     views = []
     for image_id in sorted(model.reg_image_ids()):
         image = model.images[image_id]
@@ -102,12 +118,14 @@ def _records(model) -> ColmapModel:
         pose = image.cam_from_world().matrix()
         views.append(
             ColmapView(
-                name=image.name,
+                name=spaced_names.get(image_id, image.name),
                 camera_id=image.camera_id,
-                camera_model=camera.model_name,
-                params=tuple(float(value) for value in camera.params),
-                width=int(camera.width),
-                height=int(camera.height),
+                lens=Lens(
+                    camera.model_name,
+                    tuple(float(value) for value in camera.params),
+                    int(camera.width),
+                    int(camera.height),
+                ),
                 rotation=pose[:, :3],
                 translation=pose[:, 3],
             )

@@ -5,6 +5,7 @@ from collections import OrderedDict
 from collections.abc import Iterable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from pathlib import Path
+from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -18,12 +19,27 @@ MOST_THREADS = 16
 COPIES_AHEAD = 2  # pictures copied to the GPU ahead of their use; a copy takes less than an iteration
 
 Size = tuple[int, int]  # width, height
-Key = tuple[str, Size]
+
+
+class Decodable(Protocol):
+    """A hashable source of pixels that are more than a picture file (scene/masks.py).
+
+    channels: of what `decode` gives at a size (width, height), (channels,H,W) uint8.
+    """
+
+    channels: int
+
+    def decode(self, size: Size) -> Tensor: ...
+
+
+Source = Path | Decodable
+Key = tuple[str | Decodable, Size]  # files by their names, which are quicker to look up
 
 
 class ImageStore:
     """Pictures of `decode`, each decoded once and kept; beyond `limit` (0: none) the longest unused one is dropped.
 
+    A source is a file, or something that decodes itself; a mask counts as a picture.
     keep_on: device that keeps them. device: that which `get` hands them out on (default: keep_on). Where it is a GPU
     and keep_on is not, they lie in pinned memory and are copied without waiting. Threads exist only while there is
     something to decode ahead. For one calling thread.
@@ -42,14 +58,14 @@ class ImageStore:
         self._threads: ThreadPoolExecutor | None = None
         self._copies: DeviceCopies | None = None
 
-    def plan(self, training: Iterable[tuple[Path, Size]], others: Iterable[tuple[Path, Size]] = ()) -> None:
+    def plan(self, training: Iterable[tuple[Source, Size]], others: Iterable[tuple[Source, Size]] = ()) -> None:
         """Say which pictures there will be, before the first is asked for.
 
         Where they do not fit GPU_SHARE of a GPU's free memory, as many as are kept at once, the CPU keeps them. A limit
         that all of them fit is none.
         """
-        self._awaited = {_key(path, size) for path, size in training}
-        self._planned = self._awaited | {_key(path, size) for path, size in others}
+        self._awaited = {_key(source, size) for source, size in training}
+        self._planned = self._awaited | {_key(source, size) for source, size in others}
         if self.limit >= len(self._planned):
             self.limit = 0
         if self.keep_on.type == "cuda" and self.planned_bytes > GPU_SHARE * free_memory(self.keep_on):
@@ -60,14 +76,14 @@ class ImageStore:
     @property
     def planned_bytes(self) -> int:
         """Memory that the pictures of `plan` take at most, as many as are kept at once."""
-        sizes = sorted((_bytes(path, size) for path, size in self._planned), reverse=True)
+        sizes = sorted((_bytes(*key) for key in self._planned), reverse=True)
         if self._copies:
             sizes = [1 << (size - 1).bit_length() for size in sizes]  # torch pins memory in powers of two
         return sum(sizes[: self.limit or None])
 
-    def get(self, path: Path, size: Size) -> Tensor:
-        """Picture (3 or 4,H,W) uint8 of `decode`, on the store's device. UserError as `decode`."""
-        key = _key(path, size)
+    def get(self, source: Source, size: Size) -> Tensor:
+        """Picture (3 or 4,H,W) uint8 of `decode`, or of the source's own, on the store's device. UserError as there."""
+        key = _key(source, size)
         picture = self._kept.get(key)
         if picture is None or isinstance(picture, Future):
             picture = self._finished(key)
@@ -82,12 +98,12 @@ class ImageStore:
             return min(self.limit, most) if self.limit else most
         return 1 + COPIES_AHEAD if self._copies else 0
 
-    def prefetch(self, coming: Sequence[tuple[Path, Size]]) -> None:
+    def prefetch(self, coming: Sequence[tuple[Source, Size]]) -> None:
         """Begin to make pictures ready, without waiting: those that `get` is asked for next, in that order.
 
         At most `limit`. A picture that can't be decoded ends in an error where it is asked for, not here.
         """
-        keys = list(dict.fromkeys(_key(path, size) for path, size in coming))[: self.limit or None]
+        keys = list(dict.fromkeys(_key(source, size) for source, size in coming))[: self.limit or None]
         for key in keys:
             if key in self._kept:
                 self._kept.move_to_end(key)
@@ -124,8 +140,8 @@ class ImageStore:
         return picture
 
     def _decode(self, key: Key) -> Tensor:
-        path, size = key
-        picture = decode(Path(path), size)
+        source, size = key
+        picture = decode(Path(source), size) if isinstance(source, str) else source.decode(size)
         # Copies to a GPU wait for nothing only from pinned memory.
         return picture.pin_memory() if "cuda" in (self.keep_on.type, self.device.type) else picture
 
@@ -136,13 +152,15 @@ class ImageStore:
                 wait([oldest])  # a thread is at it, and holds as much memory as a picture kept
 
 
-def _key(path: Path, size: Size) -> Key:
-    return os.fspath(path), size
+def _key(source: Source, size: Size) -> Key:
+    return os.fspath(source) if isinstance(source, Path) else source, size
 
 
-def _bytes(path: str, size: Size) -> int:
+def _bytes(source: str | Decodable, size: Size) -> int:
     """Bytes of a decoded picture at most: a JPEG has no alpha, of others it is not known before they are decoded."""
-    channels = 3 if path.lower().endswith((".jpg", ".jpeg")) else 4
+    if not isinstance(source, str):
+        return source.channels * size[0] * size[1]
+    channels = 3 if source.lower().endswith((".jpg", ".jpeg")) else 4
     return channels * size[0] * size[1]
 
 

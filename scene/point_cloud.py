@@ -1,5 +1,7 @@
-"""Coloured point clouds as PLY: `input.ply`, a scene's own points, `--init_pcd_path`."""
+"""Coloured point clouds from files: PLY, text and npz. `input.ply`, a scene's own points, `--init_pcd_path`."""
 
+import warnings
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -13,13 +15,41 @@ _NORMAL = ("nx", "ny", "nz")
 _COLOR = ("red", "green", "blue")
 
 
-def read_point_cloud(path: Path) -> BasicPointCloud:
-    """Points, colours (integers: fractions of their type's maximum) and normals (0 where not given) of a PLY.
+def is_ply(path: Path) -> bool:
+    """Whether the file begins as a PLY does."""
+    return _begins_with(path, b"ply")
 
-    UserError for a file that is missing, no PLY, lacks x y z red green blue, or holds points that are not finite.
+
+def read_point_cloud(path: Path) -> BasicPointCloud:
+    """Points with colours and normals (0 where not given) of a file whose content tells its kind.
+
+    PLY: x y z red green blue, integers as fractions of their type's maximum. npz: `points` or `xyz` (N,3), `colors` or
+    `rgb` (N,3). Text: three or six numbers a line, x y z and red green blue, split by spaces or commas. Colours of the
+    last two go to 1, or to 255 when any is above 1; without any the points are grey.
+    UserError for a file that is missing, none of these, or holds points that are not finite.
     """
     if not path.is_file():
-        raise UserError(f"no point cloud {path}; give the path of a PLY file")
+        raise UserError(f"no point cloud {path}; give the path of a PLY, npz or text file of points")
+    if is_ply(path) or path.suffix.lower() == ".ply":
+        cloud = _read_ply(path)
+    else:
+        table = _read_npz(path) if _begins_with(path, b"PK") else _read_text(path)
+        cloud = _from_table(table)
+    check_finite(cloud.points, path)
+    if not ((cloud.colors >= 0) & (cloud.colors <= 1)).all():
+        raise UserError(f"colours in {path} are neither integers nor between 0 and 1; save red green blue as uchar")
+    return cloud
+
+
+def _begins_with(path: Path, magic: bytes) -> bool:
+    try:
+        with open(path, "rb") as file:
+            return file.read(len(magic)) == magic
+    except OSError as error:
+        raise UserError(f"cannot read the point cloud {path} ({error.strerror}); mend its rights") from error
+
+
+def _read_ply(path: Path) -> BasicPointCloud:
     try:
         ply = PlyData.read(str(path))
     except (PlyParseError, ValueError, OSError, EOFError, MemoryError) as error:
@@ -36,10 +66,54 @@ def read_point_cloud(path: Path) -> BasicPointCloud:
         normals = _columns(vertices, _NORMAL) if has_normals else np.zeros_like(points)
     except (TypeError, ValueError) as error:
         raise UserError(f"the point cloud {path} has lists where numbers are needed; export it again") from error
-    check_finite(points, path)
-    if not ((colors >= 0) & (colors <= 1)).all():
-        raise UserError(f"colours in {path} are neither integers nor between 0 and 1; save red green blue as uchar")
     return BasicPointCloud(points, colors, normals)
+
+
+def _read_npz(path: Path) -> np.ndarray:
+    try:
+        with np.load(path, allow_pickle=False) as arrays:
+            points, colors = (
+                next((arrays[name] for name in names if name in arrays), None)
+                for names in (("points", "xyz"), ("colors", "rgb"))
+            )
+        parts = [np.asarray(part, np.float64) for part in (points, colors) if part is not None]
+        if points is None or any(part.ndim != 2 or part.shape[1] != 3 for part in parts):
+            raise ValueError("no array points (N,3), and colors (N,3) if any")
+        return np.concatenate(parts, axis=1)
+    except (ValueError, TypeError, OSError, EOFError, KeyError, MemoryError, zipfile.BadZipFile) as error:
+        raise UserError(
+            f"{path} is not a readable npz file of points ({error}); save points and colors (N,3)"
+        ) from error
+
+
+def _read_text(path: Path) -> np.ndarray:
+    try:
+        lines = path.read_text(encoding="utf-8").replace(",", " ").replace(";", " ").splitlines()
+        # A first line that begins with a letter names the columns.
+        skip = 1 if lines and lines[0].lstrip()[:1].isalpha() else 0
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # about no lines at all
+            table = np.loadtxt(lines[skip:], dtype=np.float64, ndmin=2)
+        if not table.size or table.shape[1] not in (3, 6):
+            raise ValueError(f"{table.shape[1]} columns" if table.size else "no numbers")
+    except (ValueError, OSError, MemoryError) as error:
+        raise UserError(
+            f"{path} is neither PLY nor npz, and not text with x y z or x y z red green blue a line ({error}); export "
+            "the point cloud again"
+        ) from error
+    return table
+
+
+def _from_table(table: np.ndarray) -> BasicPointCloud:
+    """A cloud of a table (N, 3 or 6) of x y z and red green blue."""
+    with np.errstate(over="ignore"):  # becomes infinite, which check_finite reports
+        points = table[:, :3].astype(np.float32)
+    colors = table[:, 3:]
+    if not colors.shape[1]:
+        colors = np.full_like(table[:, :3], 127 / 255)
+    elif colors.size and colors.max() > 1:
+        colors = colors / 255
+    return BasicPointCloud(points, colors.astype(np.float32), np.zeros_like(points))
 
 
 def check_finite(points: np.ndarray, path: Path) -> None:

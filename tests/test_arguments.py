@@ -59,7 +59,16 @@ OPTIMISATION = {
     "random_background": False,
     "optimizer_type": "default",
 }
-OURS = {"init_pcd_path": "", "images_to_load": 0, "max_num_splats": 0, "seed": 0}
+OURS = {
+    "init_pcd_path": "",
+    "init_type": "sfm",
+    "masks": "",
+    "invert_masks": False,
+    "mask_meaning": "auto",
+    "images_to_load": 0,
+    "max_num_splats": 0,
+    "seed": 0,
+}
 
 
 def _parse(*argv: str) -> argparse.Namespace:

@@ -13,7 +13,7 @@ from synthetic import FakeGaussians, folder_state
 
 from arguments import ModelParams
 from scene import Scene
-from scene.dataset_readers import readNerfSyntheticInfo
+from scene.dataset_readers import read_scene
 from scene.point_cloud import write_point_cloud
 from utils.system_utils import UserError
 
@@ -23,8 +23,8 @@ def _options(scene: Path, out: Path, **changes) -> argparse.Namespace:
     return ModelParams(argparse.ArgumentParser()).extract(given)
 
 
-def _read(scene: Path, hold_out: bool = True, init_pcd_path: str = ""):
-    return readNerfSyntheticInfo(scene, "images", hold_out, init_pcd_path)
+def _read(scene: Path, hold_out: bool = True, init_pcd_path: str = "", **options):
+    return read_scene(scene, "images", hold_out, init_pcd_path, **options)
 
 
 def _edit(scene: Path, change, name: str = "transforms_train.json") -> None:
@@ -132,10 +132,10 @@ def _with(change):
     [
         (_test_gone, "no transforms_test.json in"),
         (_picture_gone, "1 of 4 pictures that .*transforms_train.json lists are missing: .*train/r_2.png"),
-        (lambda scene: (scene / "transforms_train.json").write_text("{"), "transforms_train.json is not a Blender"),
-        (lambda scene: (scene / "transforms_train.json").write_text("[1]"), "transforms_train.json is not a Blender"),
-        (lambda scene: (scene / "transforms_train.json").write_text("[" * 100_000), "is not a Blender camera file"),
-        (_with(lambda content: content.pop("camera_angle_x")), "KeyError: 'camera_angle_x'"),
+        (lambda scene: (scene / "transforms_train.json").write_text("{"), "transforms_train.json is not a camera file"),
+        (lambda scene: (scene / "transforms_train.json").write_text("[1]"), "transforms_train.json is not a camera"),
+        (lambda scene: (scene / "transforms_train.json").write_text("[" * 100_000), "is not a camera file"),
+        (_with(lambda content: content.pop("camera_angle_x")), "has neither camera_angle_x nor fl_x"),
         (_with(lambda content: content.update(camera_angle_x=4.0)), "camera_angle_x in .*between 0 and pi, got 4.0"),
         (_with(lambda content: content.update(camera_angle_x=float("nan"))), "camera_angle_x in .*got nan"),
         (_with(lambda content: content.update(camera_angle_x=10**400)), "OverflowError"),

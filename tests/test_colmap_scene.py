@@ -18,7 +18,7 @@ from synthetic import CENTER, FOCAL, FakeGaussians, folder_state, make_colmap_sc
 
 from arguments import ModelParams
 from scene import Scene, colmap_loader, picture_device
-from scene.dataset_readers import readColmapSceneInfo, scene_extent
+from scene.dataset_readers import read_scene, scene_extent
 from scene.point_cloud import read_point_cloud, write_point_cloud
 from utils.system_utils import UserError
 
@@ -28,8 +28,8 @@ def _options(scene: Path, out: Path, **changes) -> argparse.Namespace:
     return ModelParams(argparse.ArgumentParser()).extract(given)
 
 
-def _read(scene: Path, hold_out: bool = False, init_pcd_path: str = ""):
-    return readColmapSceneInfo(scene, "images", hold_out, init_pcd_path)
+def _read(scene: Path, hold_out: bool = False, init_pcd_path: str = "", **options):
+    return read_scene(scene, "images", hold_out, init_pcd_path, **options)
 
 
 def _as_text(scene: Path) -> pycolmap.Reconstruction:
@@ -103,9 +103,10 @@ def test_empty_second_lines_in_text(colmap_scene):
     lines[1::2] = [""] * len(lines[1::2])
     (sparse / "images.txt").write_text("\n".join(lines) + "\n")
     (sparse / "points3D.txt").write_text("")
-    info = _read(colmap_scene)
+    info = _read(colmap_scene, want_cloud=False)
     assert [c.image_name for c in info.train_cameras] == [c.image_name for c in whole.train_cameras]
-    assert info.point_cloud.points.shape == (0, 3)
+    with pytest.raises(UserError, match="has no points; start from random points with --init_type random"):
+        _read(colmap_scene)
 
 
 def test_broken_binary_falls_back_to_text(colmap_scene):
@@ -310,9 +311,7 @@ def _cut_picture(scene):
 def _camera_model(scene):
     sparse = scene / "sparse" / "0"
     text = _as_text(scene) and (sparse / "cameras.txt").read_text()
-    (sparse / "cameras.txt").write_text(
-        text.replace("PINHOLE 96 64 110 110 45 34.5", "OPENCV 96 64 110 110 45 34.5 0 0 0 0")
-    )
+    (sparse / "cameras.txt").write_text(text.replace("PINHOLE 96 64 110 110 45 34.5", "EQUIRECTANGULAR 96 64 96 64"))
 
 
 def _no_views(scene):
@@ -332,7 +331,7 @@ def _no_views(scene):
         (_cut("points3D.bin"), r"cannot read the COLMAP model in "),
         (_missing_pictures, r"7 of 17 pictures that .* lists are missing: .*Right/V03.png, .* and 2 more; .*-i"),
         (_cut_picture, r"cannot read the picture .*left/v02.png"),
-        (_camera_model, r"picture Right/V03.png has the camera model OPENCV, only PINHOLE .*image_undistorter"),
+        (_camera_model, r"picture Right/V03.png has the camera model EQUIRECTANGULAR, a panorama .*; cut it"),
         (_no_views, r"has no registered picture"),
     ],
 )
@@ -413,12 +412,6 @@ def test_real_scenes(shared_dir, tmp_path, name, views, held, points, extent):
         assert camera.target(torch.zeros(3)).shape == (3, camera.image_height, camera.image_width)
 
 
-@pytest.mark.parametrize(("name", "model"), [("fox_raw", "OPENCV"), ("monstree_raw", "SIMPLE_RADIAL")])
-def test_distorted_cameras_are_refused(shared_dir, name, model):
-    with pytest.raises(UserError, match=f"has the camera model {model}, .*undistort"):
-        _read(shared_dir / "scenes" / name)
-
-
 @pytest.mark.parametrize("place", [".", "out", "images/deep/out", "../colmap_scene/out"])
 def test_nothing_is_written_into_the_dataset(colmap_scene, place):
     before = folder_state(colmap_scene)
@@ -439,7 +432,7 @@ def test_a_model_kept_in_the_dataset_can_be_used_without_the_cloud(colmap_scene)
 
 
 def _read_cameras(scene: Path):
-    return readColmapSceneInfo(scene, "images", False, want_cloud=False).train_cameras
+    return _read(scene, want_cloud=False).train_cameras
 
 
 def test_poses_that_are_not_finite_are_named(colmap_scene, monkeypatch):

@@ -135,6 +135,30 @@ def test_lpips_is_the_packages(weights, net):
             assert distance(images[0][0], images[1][0], unit_range=unit_range) == expected
 
 
+def test_lpips_under_a_mask_is_the_mean_of_the_packages_map(weights):
+    file, judge = weights["alex"]
+    truth = picture(5, 48, 64)
+    images = [torch.from_numpy(image.transpose(2, 0, 1).copy()) / 255 for image in (noisy(truth, 6), truth)]
+    mask = torch.zeros(48, 64, dtype=torch.bool)
+    mask[10:40, 5:30] = True
+    distance = PerceptualDistance("alex", [file], torch.device("cpu"))
+    judge.spatial = True
+    with torch.no_grad():
+        expected = judge(images[0][None], images[1][None])[0, 0][mask].mean().item()
+        everywhere = judge(images[0][None], images[1][None]).mean().item()
+    judge.spatial = False
+    assert distance(*images, unit_range=True, mask=mask) == expected
+    plain = distance(*images, unit_range=True)
+    assert plain != expected and plain == pytest.approx(
+        everywhere, rel=0.05
+    )  # each layer's map is stretched to the image
+
+    metric = metrics._lpips_metric(distance, True, torch.device("cpu"))
+    shown, mask = noisy(truth, 6), mask.numpy()
+    hidden = np.where(mask[..., None], shown, 255 - shown)
+    assert metric(hidden, truth, mask) == metric(shown, truth, mask) < metric(shown, truth)
+
+
 def test_lpips_takes_the_cached_weights(weights, tmp_path, monkeypatch):
     file, judge = weights["alex"]
     (tmp_path / "hub" / "checkpoints").mkdir(parents=True)

@@ -24,7 +24,8 @@ def read(path) -> np.ndarray:
 
 
 def view(target: torch.Tensor) -> SimpleNamespace:
-    return SimpleNamespace(target=lambda background: target, image_width=target.shape[2], image_height=target.shape[1])
+    size = {"image_width": target.shape[2], "image_height": target.shape[1]}
+    return SimpleNamespace(target=lambda background: target, mask=None, **size)
 
 
 @pytest.fixture

@@ -20,3 +20,13 @@ def psnr(img1: Tensor, img2: Tensor) -> Tensor:
 def as_float(image: Tensor) -> Tensor:
     """uint8 pixels as float32 in [0, 1]; float ones as they are."""
     return image.to(torch.float32) / 255.0 if image.dtype == torch.uint8 else image
+
+
+def pixels_that_count(image: Tensor, mask: Tensor | None) -> Tensor:
+    """The pixels (C, n) of an image (C, H, W) where the mask (1, H, W) is True; the image itself without a mask.
+
+    Where the mask is nowhere True this is one black pixel, so that two such images are equal.
+    """
+    if mask is None:
+        return image
+    return image[:, mask[0]] if mask.any() else image.new_zeros(image.shape[0], 1)

@@ -74,13 +74,18 @@ class PerceptualDistance:
         self._model = model.to(device).eval().requires_grad_(False)
 
     @torch.no_grad()
-    def __call__(self, image: torch.Tensor, other: torch.Tensor, *, unit_range: bool) -> float:
+    def __call__(
+        self, image: torch.Tensor, other: torch.Tensor, *, unit_range: bool, mask: torch.Tensor | None = None
+    ) -> float:
         """Distance of two images (3, H, W), float32 in [0, 1].
 
         The network's normalisation expects [-1, 1]. `unit_range=True` hands it [0, 1] all the same, as the published
-        3DGS numbers do; False maps to [-1, 1] first, as the package documents.
+        3DGS numbers do; False maps to [-1, 1] first, as the package documents. mask: (H, W) bool, the pixels over which
+        the map of distances is averaged; without one the layers' means are added, as published.
         """
-        return float(self._model(image[None], other[None], normalize=not unit_range))
+        self._model.spatial = mask is not None
+        distance = self._model(image[None], other[None], normalize=not unit_range)
+        return float(distance if mask is None else distance[0, 0][mask].mean())
 
 
 def _pick(state: dict[str, torch.Tensor], name: str, like: torch.Tensor, net: str) -> torch.Tensor:

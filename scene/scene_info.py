@@ -1,0 +1,91 @@
+"""What readers of datasets return: plain records. Nothing here decodes pictures, uses a GPU or writes a file."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from scene.masks import Mask
+from utils.graphics_utils import BasicPointCloud, focal2fov
+from utils.system_utils import UserError
+
+HOLD = 8  # every 8th picture by name is a test view (Mip-NeRF 360's split)
+
+
+@dataclass(frozen=True)
+class CameraInfo:
+    """One view.
+
+    uid: COLMAP's camera (intrinsics) id, or the frame's index. R (3,3): camera-to-world rotation; T (3,):
+    world-to-camera translation. fx, fy, cx, cy in pixels of an image of width x height (pixel centres at .5).
+    image_name: COLMAP's full name, or the file's stem. file_size: (width, height) of the file. mask: of the same size
+    as the file, None where everything counts. ignore_alpha: what is transparent in the file does not count.
+    """
+
+    uid: int
+    R: np.ndarray
+    T: np.ndarray
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    width: int
+    height: int
+    image_path: Path
+    image_name: str
+    file_size: tuple[int, int]
+    mask: Mask | None = None
+    ignore_alpha: bool = False
+
+    @property
+    def FovX(self) -> float:
+        """Horizontal opening angle in radians of a frustum of the image's width."""
+        return focal2fov(self.fx, self.width)
+
+    @property
+    def FovY(self) -> float:
+        """Vertical opening angle in radians of a frustum of the image's height."""
+        return focal2fov(self.fy, self.height)
+
+    @property
+    def center(self) -> np.ndarray:
+        """Camera centre (3,) in the world."""
+        return -self.R @ self.T
+
+
+@dataclass(frozen=True)
+class SceneInfo:
+    """A dataset: start cloud (None if not wanted), views, extent E in world units, the PLY of the cloud if any."""
+
+    point_cloud: BasicPointCloud | None
+    train_cameras: list[CameraInfo]
+    test_cameras: list[CameraInfo]
+    extent: float
+    ply_path: Path | None
+
+
+def split_by_order(
+    cameras: list[CameraInfo], hold_out: bool, folder: Path
+) -> tuple[list[CameraInfo], list[CameraInfo]]:
+    """Training and test views: with hold_out every HOLD-th, from the first on, is a test view."""
+    train = [camera for index, camera in enumerate(cameras) if not hold_out or index % HOLD]
+    test = [camera for index, camera in enumerate(cameras) if hold_out and index % HOLD == 0]
+    if not train:
+        raise UserError(f"{folder} has too few pictures for --eval, which takes every {HOLD}th; leave --eval out")
+    return train, test
+
+
+def scene_extent(cameras: list[CameraInfo], points: np.ndarray | None = None) -> float:
+    """Extent E: 1.1 times the largest distance of a camera from the cameras' mean, in world units.
+
+    Cameras in one place have none; then 1.1 times the median depth of the points (N,3) in front of the first camera,
+    or 1 without such points.
+    """
+    centers = np.array([camera.center for camera in cameras])
+    extent = 1.1 * float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).max())
+    points = np.zeros((0, 3)) if points is None else points
+    depths = (points @ cameras[0].R + cameras[0].T)[:, 2]
+    depths = depths[depths > 0]
+    fallback = 1.1 * float(np.median(depths)) if len(depths) else 1.0
+    # Rounding can leave a tiny distance between equal centres.
+    return extent if extent > 1e-6 * fallback else fallback

@@ -1,0 +1,166 @@
+"""Which COLMAP model is read, how pictures are found by their names, and that pictures of any kind load in a scene."""
+
+import shutil
+import unicodedata
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+import torch
+from PIL import Image
+from synthetic import HEIGHT, WIDTH, FakeGaussians, folder_state, make_colmap_scene
+from test_colmap_scene import _options, _read
+
+from scene import Scene
+from utils.system_utils import UserError
+
+
+def _rename(scene: Path, new_names: dict[str, str], text: bool = False) -> None:
+    """Give pictures new names in the model and on disk."""
+    sparse = scene / "sparse" / "0"
+    reconstruction = pycolmap.Reconstruction(str(sparse))
+    for image in reconstruction.images.values():
+        if image.name in new_names:
+            new = new_names[image.name]
+            (scene / "images" / new).parent.mkdir(parents=True, exist_ok=True)
+            shutil.move(scene / "images" / image.name, scene / "images" / new)
+            image.name = new
+    if text:
+        for path in sparse.iterdir():
+            path.unlink()
+    (reconstruction.write_text if text else reconstruction.write_binary)(str(sparse))
+
+
+def _model(folder: Path, views: int) -> None:
+    """A model with the first few pictures of the scene that the folder lies in."""
+    reconstruction = pycolmap.Reconstruction(str(folder.parent / "0"))
+    for image_id in sorted(reconstruction.reg_image_ids())[views:]:
+        reconstruction.deregister_frame(reconstruction.images[image_id].frame_id)
+    folder.mkdir()
+    reconstruction.write_binary(str(folder))
+
+
+@pytest.mark.parametrize("text", [False, True])
+def test_names_with_spaces_and_letters_of_all_sorts(colmap_scene, text):
+    names = ["der Wald/Föhn  7 .png", "森/写真 1.png", "a b.png", "12 34.png"]
+    olds = [camera.image_name for camera in _read(colmap_scene).train_cameras]
+    _rename(colmap_scene, dict(zip(olds, names, strict=False)), text)
+    read = [camera.image_name for camera in _read(colmap_scene).train_cameras]
+    assert set(names) < set(read) and len(read) == 17
+
+
+def test_names_that_are_not_utf8(colmap_scene):
+    path = colmap_scene / "sparse" / "0" / "images.bin"
+    path.write_bytes(path.read_bytes().replace(b"left/v02", b"left/\xe902"))
+    with pytest.raises(UserError, match="picture names that are not UTF-8, rename pictures"):
+        _read(colmap_scene)
+
+
+def test_names_that_match_but_for_case_accents_or_slashes(colmap_scene, capsys):
+    olds = [camera.image_name for camera in _read(colmap_scene).train_cameras]
+    composed = unicodedata.normalize("NFC", "é.png")
+    _rename(colmap_scene, {olds[0]: composed})
+    pictures = colmap_scene / "images"
+    (pictures / composed).rename(pictures / unicodedata.normalize("NFD", composed))
+    (pictures / "RIGHT").mkdir()
+    (pictures / olds[1]).rename(pictures / olds[1].upper())
+    capsys.readouterr()
+    cameras = {camera.image_name: camera.image_path for camera in _read(colmap_scene).train_cameras}
+    assert len(cameras) == 17 and all(path.is_file() for path in cameras.values())
+    assert cameras[olds[1]].name == Path(olds[1]).name.upper()
+    said = capsys.readouterr().err
+    assert said.startswith("2 of 17 pictures have other letters in their file names") and said.count("\n") == 1
+
+    # Two that are alike, and neither the one: not to be guessed.
+    shutil.copyfile(pictures / olds[1].upper(), pictures / olds[1].upper().replace("PNG", "Png"))
+    with pytest.raises(UserError, match="1 of 17 pictures"):
+        _read(colmap_scene)
+
+
+def test_the_largest_of_several_models(colmap_scene, capsys):
+    whole = _read(colmap_scene)
+    assert capsys.readouterr().err == ""
+    sparse = colmap_scene / "sparse"
+    _model(sparse / "1", 5)
+    shutil.copytree(sparse / "0", sparse / "2")
+    _read(colmap_scene)
+    assert (
+        capsys.readouterr().err
+        == f"{sparse / '0'} registers 17 pictures and is used; {sparse / '1'} 5, {sparse / '2'} 17\n"
+    )
+    shutil.rmtree(sparse / "2")
+    (sparse / "1").rename(sparse / "large")
+    (sparse / "0").rename(sparse / "1")
+    (sparse / "large").rename(sparse / "0")
+    assert len(_read(colmap_scene).train_cameras) == len(whole.train_cameras)
+    assert capsys.readouterr().err == f"{sparse / '1'} registers 17 pictures and is used; {sparse / '0'} 5\n"
+
+    (sparse / "1" / "images.bin").write_bytes(b"broken")
+    assert len(_read(colmap_scene).train_cameras) == 5
+    assert "cannot read the COLMAP model in" in capsys.readouterr().err
+
+
+def test_several_cameras_and_sizes(tmp_path):
+    make_colmap_scene(tmp_path, views=4)
+    sparse = tmp_path / "sparse" / "0"
+    reconstruction = pycolmap.Reconstruction(str(sparse))
+    shutil.rmtree(sparse)
+    sparse.mkdir()
+    reconstruction.write_text(str(sparse))
+    for name in ("rigs.txt", "frames.txt"):  # the classic three files allow any camera for any picture
+        (sparse / name).unlink()
+    with open(sparse / "cameras.txt", "a") as file:
+        file.write("7 SIMPLE_RADIAL 48 32 55 22.5 17.25 -0.1\n")
+    lines = (sparse / "images.txt").read_text().splitlines()
+    for index, line in enumerate(lines):
+        if line.endswith("png") and line.startswith("1 "):
+            fields = line.split()
+            lines[index] = " ".join([*fields[:8], "7", fields[9]])
+            small = tmp_path / "images" / fields[9]
+    (sparse / "images.txt").write_text("\n".join(lines) + "\n")
+    with Image.open(small) as image:
+        image.resize((48, 32)).save(small)
+    cameras = {camera.uid: camera for camera in _read(tmp_path).train_cameras}
+    assert set(cameras) == {1, 7}
+    assert (cameras[1].width, cameras[1].file_size) == (WIDTH, (WIDTH, HEIGHT))
+    assert cameras[7].fx == 55 and cameras[7].file_size == (cameras[7].width, cameras[7].height)
+    assert cameras[7].width < 55
+
+
+def _kinds(image: Image.Image) -> dict[str, tuple[Image.Image, dict]]:
+    exif = Image.Exif()
+    exif[0x0112] = 6  # orientation: to be turned by a quarter
+    grey = image.convert("L")
+    sixteen = Image.fromarray(np.asarray(grey).astype(np.uint16) * 257)
+    return {
+        "EXIF": (image, {"format": "JPEG", "quality": 100, "subsampling": 0, "exif": exif}),
+        "grey": (grey, {"format": "PNG"}),
+        "16 bit": (sixteen, {"format": "PNG"}),
+        "palette": (image.quantize(256), {"format": "PNG"}),
+        "CMYK": (image.convert("CMYK"), {"format": "TIFF"}),
+    }
+
+
+@pytest.mark.parametrize("model", ["PINHOLE", "OPENCV"])
+@pytest.mark.parametrize("kind", ["EXIF", "grey", "16 bit", "palette", "CMYK"])
+def test_pictures_of_any_kind(tmp_path, kind, model):
+    params = (110.0, 110.0, 45.0, 34.5) + ((-0.1, 0, 0, 0) if model == "OPENCV" else ())
+    folder = tmp_path / "scene"
+    make_colmap_scene(folder, model=model, params=params, views=1)
+    (path,) = (folder / "images").rglob("*.png")
+    options = _options(folder, tmp_path / "out")
+    (camera,) = Scene(options, FakeGaussians()).getTrainCameras()
+    plain = camera.target(torch.zeros(3)).float()
+    with Image.open(path) as image:
+        picture, how = _kinds(image.convert("RGB"))[kind]
+    picture.save(path, **how)
+    before = folder_state(folder)
+    (camera,) = Scene(options, FakeGaussians()).getTrainCameras()
+    target = camera.target(torch.zeros(3)).float()
+    assert target.shape == plain.shape
+    if kind in ("grey", "16 bit"):
+        plain = (plain * torch.tensor([0.299, 0.587, 0.114])[:, None, None]).sum(0).expand(3, -1, -1)  # ITU-R 601
+    # A palette of 256 colours, and JPEG, lose some levels; a turned picture would be off by 30 and more.
+    assert (target - plain).abs().mean() < (6 if kind == "palette" else 1)
+    assert folder_state(folder) == before

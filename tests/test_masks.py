@@ -1,0 +1,288 @@
+"""Masks: their files, their two meanings in loss, views, renders and scores."""
+
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from fused_ssim.reference import ssim_map
+from PIL import Image
+from synthetic import HEIGHT, WIDTH, FakeGaussians, folder_state
+from test_colmap_scene import _options, _read
+from torch import Tensor
+
+import metrics
+import render
+import train
+from scene import Scene
+from scene.images import decode
+from scene.masks import TRANSPARENT, Mask
+from utils.image_utils import pixels_that_count
+from utils.loss_utils import photometric_loss
+from utils.system_utils import UserError
+
+
+def _pair(seed: int = 0, size: tuple[int, int] = (37, 53)) -> tuple[Tensor, Tensor, Tensor]:
+    """Image, target and a mask with a large hole, a small one, and single pixels."""
+    generator = torch.Generator().manual_seed(seed)
+    image = torch.rand(3, *size, generator=generator)
+    target = (image + 0.2 * torch.randn(3, *size, generator=generator)).clamp(0, 1)
+    mask = torch.ones(1, *size, dtype=torch.bool)
+    mask[:, 10:30, 20:45] = False
+    mask[:, 3, 4:9] = False
+    mask &= torch.rand(1, *size, generator=generator) > 0.02
+    return image, target, mask
+
+
+@pytest.mark.parametrize("as_bytes", [False, True])
+@pytest.mark.parametrize("weight", [0.0, 0.2, 1.0])
+def test_loss_and_gradient_are_those_of_the_definition(weight, as_bytes):
+    image, target, mask = _pair()
+    if as_bytes:
+        target = (target * 255).round().to(torch.uint8)
+    image.requires_grad_()
+    loss, l1 = photometric_loss(image, target, weight, mask)
+    loss.backward()
+
+    exact = image.detach().double().requires_grad_()
+    truth = target.double() / 255 if as_bytes else target.double()
+    pixels = 3 * mask.sum()
+    expected_l1 = ((exact - truth).abs() * mask).sum() / pixels
+    dissimilarity = (1 - ssim_map(exact * mask, truth * mask)).sum() / pixels
+    expected = (1 - weight) * expected_l1 + weight * dissimilarity
+    expected.backward()
+    # float32's share: 1 - SSIM is a difference of numbers near 1, then multiplied by what the mask leaves out (1.4).
+    assert loss.item() == pytest.approx(expected.item(), abs=1e-5)
+    assert l1.item() == pytest.approx(expected_l1.item(), abs=1e-6)
+    assert (image.grad - exact.grad).abs().max() < 1e-5 * exact.grad.abs().max()
+    assert (image.grad[:, ~mask[0]] == 0).all()
+
+
+def test_what_is_ignored_has_no_say():
+    image, target, mask = _pair()
+    other = [torch.where(mask, x, torch.rand(x.shape)).requires_grad_() for x in (image, target)]
+    image.requires_grad_()
+    losses = [photometric_loss(x, y.detach(), 0.2, mask)[0] for x, y in ((image, target), other)]
+    assert losses[0] == losses[1]
+    torch.stack(losses).sum().backward()
+    assert torch.equal(image.grad, other[0].grad)
+
+
+def test_masks_that_leave_out_nothing_or_everything():
+    image, target, mask = _pair()
+    assert photometric_loss(image, target, 0.2, torch.ones_like(mask)) == photometric_loss(image, target, 0.2)
+    image.requires_grad_()
+    loss, l1 = photometric_loss(image, target, 0.2, torch.zeros_like(mask))
+    loss.backward()
+    assert loss == l1 == 0 and (image.grad == 0).all()
+    assert pixels_that_count(image, torch.zeros_like(mask)).tolist() == [[0], [0], [0]]
+    assert torch.equal(pixels_that_count(image, mask), image[:, mask[0]])
+    assert pixels_that_count(image, None) is image
+
+
+def _save(path: Path, grey: np.ndarray) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(grey).save(path)
+    return path
+
+
+def test_black_is_dark(tmp_path):
+    grey = np.full((8, 8), 255, np.uint8)
+    grey[0, 0], grey[5, 4], grey[7, 7] = 0, 127, 128
+    path = _save(tmp_path / "m.png", grey)
+    pixels = Mask(path).decode((8, 8))
+    assert pixels.shape == (1, 8, 8) and pixels.dtype == torch.uint8 and set(pixels.unique().tolist()) == {0, 255}
+    assert (pixels[0] == 0).nonzero().tolist() == [[0, 0], [5, 4]]
+    inverted = Mask(path, inverted=True).decode((8, 8))
+    assert torch.equal(inverted, 255 - pixels)
+
+
+@pytest.mark.parametrize("size", [(60, 45), (40, 30), (23, 17), (90, 67), (240, 180)])
+def test_at_other_sizes_what_counts_is_free_of_what_is_masked(tmp_path, size):
+    mask = np.full((90, 120), 255, np.uint8)
+    mask[30:45, 50:83] = 0
+    picture = np.random.default_rng(0).integers(0, 256, (90, 120, 3), dtype=np.uint8)
+    other = np.where(mask[..., None] == 255, picture, 255 - picture)
+    counts = Mask(_save(tmp_path / "m.png", mask)).decode(size)[0] == 255
+    one, two = (decode(_save(tmp_path / f"{i}.png", p), size) for i, p in enumerate((picture, other)))
+    same = (one == two).all(dim=0)
+    assert (counts <= same).all()
+    # No more than needed is lost: 2 and a part pixels of the coarser size around the masked 33 x 15.
+    scale = min(size[0] / 120, 1)
+    assert (~counts).sum() <= (max(size[0] / 120, 1)) ** 2 * (33 * scale + 6) * (15 * scale + 6)
+
+
+def test_soft_edges_are_kept_where_they_mean_alpha(tmp_path):
+    path = _save(tmp_path / "m.png", np.arange(0, 64, dtype=np.uint8).reshape(8, 8) * 4)
+    pixels = Mask(path, meaning=TRANSPARENT).decode((8, 8))[0].numpy()
+    np.testing.assert_array_equal(pixels, np.arange(0, 256, 4).reshape(8, 8))
+    np.testing.assert_array_equal(255 - pixels, Mask(path, True, TRANSPARENT).decode((8, 8))[0].numpy())
+
+
+def test_a_mask_may_be_the_alpha_of_a_picture(tmp_path):
+    cutout = np.zeros((6, 6, 4), np.uint8)
+    cutout[2:4, 2:4] = (10, 0, 0, 255)
+    assert (Mask(_save(tmp_path / "m.png", cutout)).decode((6, 6))[0] == 255).nonzero().tolist() == [
+        [2, 2], [2, 3], [3, 2], [3, 3],
+    ]  # fmt: skip
+
+
+@pytest.fixture
+def masked_scene(colmap_scene) -> Path:
+    """Masks for all 17 pictures, named in several ways: the left third is black."""
+    for index, camera in enumerate(_read(colmap_scene).train_cameras):
+        name = Path(camera.image_name)
+        grey = np.full((HEIGHT, WIDTH), 255, np.uint8)
+        grey[:, : WIDTH // 3] = 0
+        ways = [name, Path(f"{name}.png"), name.with_suffix(".PNG"), name.with_suffix(".jpg"), Path(str(name).upper())]
+        _save(colmap_scene / "masks" / ways[index % 5], grey)
+    return colmap_scene
+
+
+def _views(scene: Path, **options) -> list:
+    return Scene(_options(scene, scene.parent / "out", **options), FakeGaussians(), shuffle=False).getTrainCameras()
+
+
+def test_masks_are_found_by_the_names_of_the_pictures(masked_scene, capsys):
+    before = folder_state(masked_scene)
+    assert all(view.mask is None for view in _views(masked_scene))
+    capsys.readouterr()
+    views = _views(masked_scene, masks="masks")
+    for view in views:
+        assert view.mask.dtype == torch.bool and view.mask.shape == (1, HEIGHT, WIDTH)
+        assert view.mask[:, :, 32:].all() and not view.mask[:, :, :32].any()
+        assert view.target(torch.zeros(3)).dtype == torch.uint8
+    assert capsys.readouterr().err == ""
+    for view in _views(masked_scene, masks=str(masked_scene / "masks"), invert_masks=True, resolution=48):
+        assert not view.mask[:, :, 14:].any() and view.mask[:, :, :14].all()
+    assert folder_state(masked_scene) == before
+
+    next(masked_scene.rglob("masks/left/*.png.png")).unlink()
+    (lacking,) = [view.image_name for view in _views(masked_scene, masks="masks") if view.mask is None]
+    assert f"1 of 17 pictures have no mask and count whole: {lacking}" in capsys.readouterr().err
+
+
+def test_a_transparent_mask_is_alpha(masked_scene):
+    first = _views(masked_scene)[0]
+    with Image.open(first.image_path) as image:
+        pixels = np.asarray(image).copy()
+    smooth = _views(masked_scene, resolution=48)[0].target(torch.zeros(3))
+    pixels[:, : WIDTH // 3] = (255, 0, 255)
+    Image.fromarray(pixels).save(first.image_path)
+    plain = _views(masked_scene)[0].target(torch.zeros(3))
+    for view in _views(masked_scene, masks="masks", mask_meaning="transparent")[:5]:
+        assert view.mask is None and view.alpha_mask.shape == (1, HEIGHT, WIDTH)
+        target = view.target(torch.tensor([0.25, 0.5, 1.0]))
+        assert (target[:, :, :32] == torch.tensor([0.25, 0.5, 1.0])[:, None, None]).all()
+    view = _views(masked_scene, masks="masks", mask_meaning="transparent")[0]
+    assert torch.equal(view.target(torch.ones(3))[:, :, 32:], (plain / 255)[:, :, 32:])
+    # At half the size too: what is cut away does not bleed into the edge.
+    half = _views(masked_scene, masks="masks", mask_meaning="transparent", resolution=48)[0]
+    edge = half._pixels()[:, :, 16].int()
+    assert (edge[3] > 200).all() and (edge[:3] - smooth[:, :, 16].int()).abs().float().mean() < 4
+
+
+def test_alpha_is_background_unless_it_is_to_be_ignored(colmap_scene):
+    name = _read(colmap_scene).train_cameras[0].image_name
+    pixels = np.asarray(Image.open(colmap_scene / "images" / name).convert("RGBA")).copy()
+    pixels[:20, :, 3], pixels[20, :, 3] = 0, 128
+    Image.fromarray(pixels).save(colmap_scene / "images" / name)
+    for meaning in ("auto", "transparent"):
+        view = _views(colmap_scene, mask_meaning=meaning)[0]
+        assert view.mask is None and (view.target(torch.ones(3))[:, :20] == 1).all()
+    view, other = _views(colmap_scene, mask_meaning="ignore")[:2]
+    assert view.mask[:, 21:].all() and not view.mask[:, :21].any() and other.mask is None
+    assert torch.equal(view.target(torch.ones(3)), torch.from_numpy(pixels[..., :3].transpose(2, 0, 1).copy()))
+
+    _save(colmap_scene / "masks" / name, np.repeat(np.uint8([[0, 255]]), 48, 1).repeat(HEIGHT, 0))
+    view = _views(colmap_scene, masks="masks", mask_meaning="ignore")[0]
+    assert view.mask[:, 21:, 48:].all() and view.mask.sum() == 43 * 48
+    view = _views(colmap_scene, masks="masks", mask_meaning="transparent")[0]
+    assert (view.alpha_mask[:, 21:, 48:] == 1).all() and (view.alpha_mask > 0).sum() == 44 * 48
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (
+            lambda masks: masks.rename(masks.parent / "elsewhere"),
+            "no folder .*/masks for --masks; name one in the scene",
+        ),
+        (
+            lambda masks: [path.rename(path.parent / f"mask_{path.name}") for path in masks.rglob("*.*")],
+            "no mask in .*/masks .* belongs to a picture: looked for .*V03.png.png .* name masks as the pictures",
+        ),
+        (
+            lambda masks: [_save(path, np.zeros((9, 9), np.uint8)) for path in masks.rglob("*.*")],
+            "the mask .* is 9 x 9 pixels and its picture 96 x 64; make masks of the same shape",
+        ),
+        (lambda masks: [path.write_bytes(b"x") for path in masks.rglob("*.*")], "cannot read the picture .*/masks/"),
+    ],
+)
+def test_bad_masks_get_one_sentence(masked_scene, change, said):
+    change(masked_scene / "masks")
+    with pytest.raises(UserError, match=said):
+        _views(masked_scene, masks="masks")
+
+
+def _train(scene: Path, out: Path, *options: object) -> bytes:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "stdout", sys.stdout)  # which training stamps: bring it back
+        command = ["-s", scene, "-m", out, "--iterations", 40, "--test_iterations", -1, "--eval", "-r", 48, *options]
+        train.main(list(map(str, command)))
+    return (out / "point_cloud" / "iteration_40" / "point_cloud.ply").read_bytes()
+
+
+def test_training_rendering_and_scores_ignore_what_is_masked(masked_scene, tmp_path, monkeypatch):
+    masks = ("--masks", "masks", "--test_iterations", 40)
+    plain, masked = _train(masked_scene, tmp_path / "plain"), _train(masked_scene, tmp_path / "masked", *masks)
+    assert json.loads((tmp_path / "masked" / "model.json").read_text())["masks"] == "masks"
+    assert "masks" not in json.loads((tmp_path / "plain" / "model.json").read_text())
+
+    def run(module, *arguments: object) -> None:
+        monkeypatch.setattr(sys, "argv", [f"{module.__name__}.py", *map(str, arguments)])
+        monkeypatch.setattr(sys, "stdout", sys.stdout)
+        monkeypatch.setenv("TORCH_HOME", "/dev/null")
+        monkeypatch.setenv("https_proxy", "http://127.0.0.1:9")
+        module.main()
+
+    run(render, "-m", tmp_path / "masked", "--skip_train", "--quiet")
+    run(metrics, "-m", tmp_path / "masked")
+    folder = tmp_path / "masked" / "test" / "ours_40"
+    assert [path.name for path in sorted((folder / "masks").iterdir())] == ["00000.png", "00001.png", "00002.png"]
+    for name, score in json.loads((tmp_path / "masked" / "per_view.json").read_text())["ours_40"]["PSNR"].items():
+        counts, shown, truth = (np.asarray(Image.open(folder / d / name)) for d in ("masks", "renders", "gt"))
+        assert counts.shape == (32, 48) and (counts[:, 18:] == 255).all() and not counts[:, :18].any()
+        error = (shown[:, 18:].astype(float) - truth[:, 18:]) ** 2
+        assert score == pytest.approx(10 * np.log10(255**2 / error.mean()), abs=1e-9)
+    info = json.loads((tmp_path / "masked" / "metrics_info.json").read_text())
+    assert info["masked_views"] == {"ours_40": 3} and "mean over the pixels that count" in info["masked"]["PSNR"]
+
+    # Other things behind the masks: the same model to the byte.
+    for path in (masked_scene / "images").rglob("*.png"):
+        pixels = np.asarray(Image.open(path)).copy()
+        pixels[:, : WIDTH // 3] = 255 - pixels[:, : WIDTH // 3]
+        Image.fromarray(pixels).save(path)
+    assert _train(masked_scene, tmp_path / "masked_again", *masks) == masked
+    assert _train(masked_scene, tmp_path / "plain_again") != plain
+
+    # Render without masks: those of before do not stay.
+    run(render, "-m", tmp_path / "masked", "--skip_train", "--quiet", "--masks", "")
+    assert list((folder / "masks").iterdir()) == []
+
+
+def test_scores_are_those_of_the_definition():
+    rng = np.random.default_rng(0)
+    truth = rng.integers(0, 256, (40, 56, 3), dtype=np.uint8)
+    shown = np.clip(truth + rng.normal(scale=20, size=truth.shape), 0, 255).astype(np.uint8)
+    mask = np.ones((40, 56), bool)
+    mask[5:30, 10:40] = False
+    first = [torch.from_numpy((image * mask[..., None]).transpose(2, 0, 1) / 255.0) for image in (shown, truth)]
+    expected = 1 - (1 - ssim_map(*first)).sum().item() / (3 * mask.sum())
+    assert metrics.ssim(shown, truth, mask) == pytest.approx(expected, abs=1e-12)
+    assert metrics.ssim(shown, truth, np.ones_like(mask)) == pytest.approx(metrics.ssim(shown, truth), abs=1e-12)
+    hidden = np.where(mask[..., None], shown, 255 - shown)
+    for metric in (metrics.ssim, metrics.psnr):
+        assert metric(hidden, truth, mask) == metric(shown, truth, mask) != metric(shown, truth)

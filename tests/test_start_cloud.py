@@ -1,0 +1,143 @@
+"""What training starts from: files of points of all sorts, and random points where cameras look."""
+
+import numpy as np
+import pytest
+import torch
+from synthetic import FakeGaussians
+from test_colmap_scene import _options, _read
+
+from scene import Scene
+from scene.point_cloud import read_point_cloud, write_point_cloud
+from utils.system_utils import UserError
+
+POINTS = np.array([[0.25, -1.5, 3.0], [4.0, 5.5, -6.0]])
+BYTES = np.array([[255, 0, 51], [102, 255, 204]])
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "0.25 -1.5 3 255 0 51\n4 5.5 -6 102 255 204\n",
+        "x,y,z,r,g,b\n0.25,-1.5,3,255,0,51\n4,5.5,-6,102,255,204",
+        "# by hand\n0.25 -1.5 3e0   1 0 0.2\n\n4 5.5 -6 0.4 1 0.8\n",
+        "0.25;-1.5;3;255;0;51\r\n4;5.5;-6;102;255;204\r\n",
+    ],
+)
+def test_text(tmp_path, text):
+    (tmp_path / "a.xyz").write_text(text)
+    cloud = read_point_cloud(tmp_path / "a.xyz")
+    np.testing.assert_array_equal(cloud.points, np.float32(POINTS))
+    np.testing.assert_allclose(cloud.colors, BYTES / 255, atol=1e-7)
+    assert cloud.points.dtype == cloud.colors.dtype == cloud.normals.dtype == np.float32
+
+
+@pytest.mark.parametrize("keys", [("points", "colors"), ("xyz", "rgb")])
+@pytest.mark.parametrize("colors", [BYTES.astype(np.uint8), BYTES / 255])
+def test_npz(tmp_path, keys, colors):
+    np.savez(tmp_path / "a.npz", **dict(zip(keys, (POINTS, colors), strict=True)), other=np.zeros(3))
+    cloud = read_point_cloud(tmp_path / "a.npz")
+    np.testing.assert_array_equal(cloud.points, np.float32(POINTS))
+    np.testing.assert_allclose(cloud.colors, BYTES / 255, atol=1e-7)
+
+
+def test_points_without_colours_are_grey(tmp_path):
+    np.savez_compressed(tmp_path / "a.npz", points=POINTS)
+    (tmp_path / "a.txt").write_text("0.25 -1.5 3\n4 5.5 -6\n")
+    for name in ("a.npz", "a.txt"):
+        cloud = read_point_cloud(tmp_path / name)
+        np.testing.assert_array_equal(cloud.points, np.float32(POINTS))
+        assert (cloud.colors == np.float32(127 / 255)).all()
+
+
+def test_the_content_tells_the_kind(tmp_path):
+    write_point_cloud(tmp_path / "cloud.txt", POINTS, BYTES)
+    np.testing.assert_array_equal(read_point_cloud(tmp_path / "cloud.txt").points, np.float32(POINTS))
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "said"),
+    [
+        ("a.xyz", b"1 2\n3 4\n", "not text with x y z .*2 columns"),
+        ("a.xyz", b"1 2 3\n4 5 six\n", "not text with x y z"),
+        ("a.xyz", b"\xff\xfe\x00", "not text with x y z"),
+        ("a.xyz", b"only words\n", "no numbers"),
+        ("a.xyz", b"1 2 nan\n", r"1 of 1 points .* are not finite \(first: number 0\)"),
+        ("a.xyz", b"1 2 1e99\n", "are not finite"),
+        ("a.xyz", b"1 2 3 400 0 0\n", "neither integers nor between 0 and 1"),
+        ("a.npz", b"PK\x03\x04 broken", "not a readable npz"),
+    ],
+)
+def test_bad_files(tmp_path, name, content, said):
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(UserError, match=said) as error:
+        read_point_cloud(tmp_path / name)
+    assert str(tmp_path / name) in str(error.value)
+
+
+@pytest.mark.parametrize(
+    "arrays", [{"a": POINTS}, {"points": POINTS[:, :2]}, {"points": POINTS, "colors": BYTES[:1]}, {"points": [{}, {}]}]
+)
+def test_bad_arrays(tmp_path, arrays):
+    np.savez(tmp_path / "a.npz", **{name: np.array(value) for name, value in arrays.items()})
+    with pytest.raises(UserError, match="not a readable npz"):
+        read_point_cloud(tmp_path / "a.npz")
+
+
+def test_a_scene_starts_from_such_a_file(colmap_scene, tmp_path):
+    (tmp_path / "a.xyz").write_text("0.25 -1.5 3 255 0 51\n4 5.5 -6 102 255 204\n")
+    gaussians = FakeGaussians()
+    Scene(_options(colmap_scene, tmp_path / "out", init_pcd_path=str(tmp_path / "a.xyz")), gaussians)
+    np.testing.assert_array_equal(gaussians.pcd.points, np.float32(POINTS))
+    written = read_point_cloud(tmp_path / "out" / "input.ply")
+    np.testing.assert_array_equal(written.points, gaussians.pcd.points)
+    np.testing.assert_array_equal(written.colors, gaussians.pcd.colors)
+
+
+def test_random_points_lie_where_cameras_look(colmap_scene):
+    info = _read(colmap_scene, init_type="random")
+    points = info.point_cloud.points.astype(np.float64)
+    assert points.shape == (100_000, 3) and (info.point_cloud.colors == np.float32(127 / 255)).all()
+    seen = np.zeros(len(points), int)
+    for camera in info.train_cameras:
+        x, y, z = (points @ camera.R + camera.T).T
+        with np.errstate(divide="ignore", invalid="ignore"):
+            u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
+        margin = 1e-3  # pixels: the points are float32
+        seen += (z > 0) & (abs(u - 48) <= 48 + margin) & (abs(v - 32) <= 32 + margin)
+    assert seen.min() >= 1 and seen.max() > 1
+    # The cameras look at the cube of the points from all sides: that is where the random ones are densest.
+    cloud = _read(colmap_scene).point_cloud.points
+    middle, radius = cloud.mean(axis=0), np.linalg.norm(cloud - cloud.mean(axis=0), axis=1).max()
+    near = (np.linalg.norm(points - middle, axis=1) < radius).mean()
+    ball = 4 / 3 * np.pi * radius**3
+    assert near / ball > 3 / np.prod(np.ptp(points, axis=0))
+    np.testing.assert_array_equal(_read(colmap_scene, init_type="random").point_cloud.points, info.point_cloud.points)
+
+
+def test_random_points_of_cameras_side_by_side(colmap_scene):
+    from dataclasses import replace
+
+    from scene.start_cloud import random_in_frusta
+
+    camera = _read(colmap_scene).train_cameras[0]
+    row = [replace(camera, T=camera.T + (0.1 * step, 0, 0)) for step in range(5)]
+    points = random_in_frusta(row).points
+    depth = (points @ camera.R + camera.T)[:, 2]
+    # Parallel axes meet nowhere: depths are a quarter of the extent, 1.1 x 0.2, and up to 2.5 times it.
+    assert depth.min() == pytest.approx(0.25 * 0.22, rel=0.01) and depth.max() == pytest.approx(2.5 * 0.22, rel=0.01)
+
+
+def test_random_points_of_a_blender_scene_are_the_references_cube(blender_scene):
+    write_point_cloud(blender_scene / "points3d.ply", POINTS, BYTES)
+    assert len(_read(blender_scene).point_cloud.points) == 2
+    info = _read(blender_scene, init_type="random")
+    assert info.ply_path is None and np.abs(info.point_cloud.points).max() <= np.float32(1.3)
+
+
+def test_no_points_at_all(colmap_scene, tmp_path):
+    (tmp_path / "none.ply").write_bytes(b"")
+    write_point_cloud(colmap_scene / "sparse" / "0" / "points3D.ply", np.zeros((0, 3)), np.zeros((0, 3)))
+    with pytest.raises(UserError, match="has no points; start from random points with --init_type random, or from a f"):
+        Scene(_options(colmap_scene, tmp_path / "out"), FakeGaussians())
+    scene = Scene(_options(colmap_scene, tmp_path / "out", init_type="random"), FakeGaussians())
+    assert scene.getTrainCameras()[0].target(torch.zeros(3)).shape == (3, 64, 96)

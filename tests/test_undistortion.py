@@ -1,0 +1,272 @@
+"""Any camera model of pycolmap, undistorted: where things are seen, what is kept in the cache, what counts.
+
+The judge is pycolmap's own projection of each model.
+"""
+
+import numpy as np
+import pycolmap
+import pytest
+import torch
+from PIL import Image
+from synthetic import FakeGaussians, folder_state, make_colmap_scene
+from test_colmap_scene import _options, _read
+
+from scene import Scene
+from scene.lens import WIDEST, Lens, pinhole_of, undistortion
+from scene.masks import TRANSPARENT, Mask
+from scene.undistortion import Photo, undistort
+from utils.system_utils import UserError
+
+WIDTH, HEIGHT, FOCAL = 200, 150, 150.0
+CENTER = (104.0, 72.0)
+# Distortion as lenses have it, strong enough to move the corners by 10 pixels and more.
+DISTORTIONS = {
+    "SIMPLE_PINHOLE": (),
+    "PINHOLE": (),
+    "SIMPLE_RADIAL": (-0.15,),
+    "RADIAL": (-0.15, 0.02),
+    "OPENCV": (-0.15, 0.02, 0.003, -0.002),
+    "FULL_OPENCV": (-0.15, 0.02, 0.003, -0.002, 0.01, 0.02, -0.01, 0.005),
+    "OPENCV_FISHEYE": (0.05, -0.01, 0.003, -0.001),
+    "SIMPLE_RADIAL_FISHEYE": (0.05,),
+    "RADIAL_FISHEYE": (0.05, -0.01),
+    "SIMPLE_FISHEYE": (),
+    "FISHEYE": (),
+    "FOV": (0.8,),
+    "THIN_PRISM_FISHEYE": (0.02, -0.01, 0.001, -0.001, 0.003, -0.001, 0.001, -0.001),
+    "RAD_TAN_THIN_PRISM_FISHEYE": (0.02, -0.01, 0.003, -0.001, 0.001, 0, 0.001, -0.001, 0.001, -0.001, 0.001, 0),
+    "SIMPLE_DIVISION": (-0.15,),
+    "DIVISION": (-0.15,),
+    "EUCM": (0.6, 1.1),
+}
+DISTORTED = [name for name in DISTORTIONS if "PINHOLE" not in name]
+
+
+def _lens(model: str, focal: float = FOCAL) -> Lens:
+    numbers = len(pycolmap.Camera.create_from_model_name(1, model, focal, 8, 8).focal_length_idxs())
+    return Lens(model, (focal,) * numbers + CENTER + DISTORTIONS[model], WIDTH, HEIGHT)
+
+
+def _camera(lens: Lens) -> pycolmap.Camera:
+    return pycolmap.Camera(model=lens.model, width=lens.width, height=lens.height, params=list(lens.params))
+
+
+def _dot(at: np.ndarray, width: int, height: int) -> np.ndarray:
+    """A white spot, sigma 2 pixels, whose middle is at a place in pixels (centres at .5)."""
+    rows, columns = np.mgrid[:height, :width] + 0.5
+    return np.exp(-((columns - at[0]) ** 2 + (rows - at[1]) ** 2) / 8)
+
+
+def _middle(picture: np.ndarray, near: np.ndarray) -> np.ndarray:
+    rows, columns = np.mgrid[: picture.shape[0], : picture.shape[1]] + 0.5
+    weight = picture * ((columns - near[0]) ** 2 + (rows - near[1]) ** 2 < 15**2)
+    return np.array([(weight * columns).sum(), (weight * rows).sum()]) / weight.sum()
+
+
+def test_the_table_has_every_model():
+    assert {*DISTORTIONS, "EQUIRECTANGULAR", "INVALID"} == set(pycolmap.CameraModelId.__members__)
+
+
+@pytest.mark.parametrize("model", DISTORTED)
+def test_things_are_where_the_pinhole_sees_them(tmp_path, model):
+    lens = _lens(model)
+    assert pinhole_of(lens, "a.png") is None
+    plan = undistortion(lens, WIDTH, HEIGHT)
+    fx, fy, cx, cy, width, height = plan.pinhole
+    for index, (u, v) in enumerate([(0.5, 0.5), (0.2, 0.25), (0.8, 0.75), (0.85, 0.2)]):
+        place = np.array([u * width, v * height])
+        ray = np.array([(place[0] - cx) / fx, (place[1] - cy) / fy, 1.0])
+        picture = _dot(_camera(lens).img_from_cam(ray), WIDTH, HEIGHT)
+        path = tmp_path / f"{index}.png"
+        Image.fromarray(np.uint8(255 * picture.round(3))).convert("RGB").save(path)
+        (result,) = undistort([Photo(path, (WIDTH, HEIGHT), lens)])
+        with Image.open(result.path) as image:
+            assert image.size == (width, height)
+            seen = np.asarray(image, dtype=np.float64)[..., 0]
+        # A round spot becomes an oval whose middle is off by the second derivative of the distortion: 0.1 pixels here.
+        assert np.abs(_middle(seen, place) - place).max() < 0.15
+        # Without undistortion it would be elsewhere, but in the middle of the picture.
+        assert (
+            index == 0
+            or np.abs(_middle(picture, place) - place).max() > 1
+            or picture[tuple(place.astype(int)[::-1])] < 0.5
+        )
+    assert result.mask is None  # as COLMAP chooses it, every pixel lies in the photo
+
+
+@pytest.mark.parametrize("model", ["SIMPLE_PINHOLE", "PINHOLE", "OPENCV", "FULL_OPENCV", "FOV"])
+def test_lenses_without_distortion_are_pinholes(model):
+    lens = _lens(model)
+    zeros = (0.0,) * len(DISTORTIONS[model])
+    lens = lens._replace(params=lens.params[: len(lens.params) - len(zeros)] + zeros)
+    assert pinhole_of(lens, "a.png") == (FOCAL, FOCAL, *CENTER, WIDTH, HEIGHT)
+
+
+@pytest.mark.parametrize("model", ["SIMPLE_FISHEYE", "OPENCV_FISHEYE", "FOV", "EUCM", "RADIAL"])
+def test_lenses_too_wide_for_a_pinhole_show_their_middle(model):
+    """Their border has no place in any pinhole picture, and COLMAP's choice would be arbitrary (40 x 30 pixels)."""
+    lens = _lens(model, focal=50.0)
+    if model == "RADIAL":  # whose polynomial turns back far out
+        lens = lens._replace(params=(*lens.params[:-2], 0.05, -0.02))
+    plan = undistortion(lens, WIDTH, HEIGHT)
+    assert plan.widest == pytest.approx(WIDEST)
+    assert plan.pinhole.width / 2 / plan.pinhole.fx == pytest.approx(np.tan(np.radians(WIDEST)), rel=0.02)
+    rays = _camera(lens)  # the judge: what counts comes back to where it was
+    x, y = np.meshgrid(np.arange(plan.pinhole.width) + 0.5, np.arange(plan.pinhole.height) + 0.5)
+    local = np.stack([(x - plan.pinhole.cx) / plan.pinhole.fx, (y - plan.pinhole.cy) / plan.pinhole.fy], -1)
+    for row, column in np.random.default_rng(0).integers(0, local.shape[:2], (200, 2)):
+        pixel = rays.img_from_cam(np.append(local[row, column], 1.0))
+        back = rays.cam_from_img(pixel) if pixel is not None else None
+        once = back is not None and np.linalg.norm(back - local[row, column]) * plan.pinhole.fx < 0.5
+        inside = pixel is not None and (pixel > 1).all() and (pixel < (WIDTH - 1, HEIGHT - 1)).all()
+        counts = plan.valid is None or plan.valid[row, column]
+        assert counts <= once
+        assert counts or not (once and inside)
+    if model == "RADIAL":
+        assert plan.valid is not None and 0.3 < plan.valid.mean() < 1
+
+
+def _photo(path, color=(200, 100, 50), size=(WIDTH, HEIGHT), mode="RGB"):
+    pixels = np.random.default_rng(1).integers(0, 256, (size[1], size[0], 4), dtype=np.uint8)
+    pixels[..., :3] = np.asarray(color) + pixels[..., :3] // 8
+    Image.fromarray(pixels).convert(mode).save(path)
+    return path
+
+
+def test_the_cache_is_keyed_by_content(tmp_path, cache_folder, capsys):
+    lens = _lens("OPENCV")
+    path = _photo(tmp_path / "a.png")
+    photo = Photo(path, (WIDTH, HEIGHT), lens)
+    (first,) = undistort([photo])
+    said = capsys.readouterr().err
+    assert f"are kept in {cache_folder / 'undistorted'}" in said and "GS_CACHE" in said
+    assert first.path.is_relative_to(cache_folder) and sorted(p.name for p in tmp_path.iterdir()) == ["a.png"]
+    before = folder_state(cache_folder)
+
+    copy = tmp_path / "b.png"
+    copy.write_bytes(path.read_bytes())
+    again, other = undistort([photo, photo._replace(path=copy)])
+    assert again.path == other.path == first.path
+    assert folder_state(cache_folder) == before and "are kept" not in capsys.readouterr().err
+
+    first.path.write_bytes(first.path.read_bytes()[:-30])  # by a full disk, or a curious user
+    undistort([photo])
+    assert first.path.read_bytes() == before[str(first.path.relative_to(cache_folder))][1]
+
+    others = [
+        photo._replace(lens=lens._replace(params=(*lens.params[:-1], 0.001))),
+        photo._replace(mask=Mask(_photo(tmp_path / "m.png", mode="L"))),
+        photo._replace(mask=Mask(tmp_path / "m.png", inverted=True)),
+    ]
+    _photo(path, color=(10, 20, 30))
+    assert len({result.path for result in undistort([photo, *others])} | {first.path}) == 5
+
+
+def test_a_cache_that_cannot_be_written_is_named(tmp_path, monkeypatch):
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv("GS_CACHE", str(tmp_path / "file" / "cache"))
+    with pytest.raises(UserError, match="cannot make the folder .*file/cache/undistorted"):
+        undistort([Photo(_photo(tmp_path / "a.png"), (WIDTH, HEIGHT), _lens("OPENCV"))])
+
+
+def test_a_broken_picture_is_named(tmp_path):
+    path = _photo(tmp_path / "a.png")
+    path.write_bytes(path.read_bytes()[:-4000])
+    with pytest.raises(UserError, match="cannot read the picture .*a.png"):
+        undistort([Photo(path, (WIDTH, HEIGHT), _lens("OPENCV"))])
+
+
+def test_pictures_smaller_than_their_lens(tmp_path):
+    whole = undistortion(_lens("OPENCV_FISHEYE"), WIDTH, HEIGHT).pinhole
+    half = undistort([Photo(_photo(tmp_path / "a.png", size=(100, 75)), (100, 75), _lens("OPENCV_FISHEYE"))])[0].pinhole
+    np.testing.assert_allclose(half[:4], np.array(whole[:4]) / 2, atol=0.5)  # sizes are whole pixels
+    assert abs(half.width - whole.width / 2) <= 1
+
+
+def _masked(tmp_path, meaning: str, **photo):
+    grey = np.full((HEIGHT, WIDTH), 255, np.uint8)
+    grey[:, : WIDTH // 2] = 0
+    Image.fromarray(grey).save(tmp_path / "mask.png")
+    mask = Mask(tmp_path / "mask.png", meaning=meaning)
+    (result,) = undistort([Photo(_photo(tmp_path / "a.png"), (WIDTH, HEIGHT), _lens("OPENCV"), mask, **photo)])
+    with Image.open(result.path) as image:
+        return result, np.asarray(image)
+
+
+def test_a_mask_is_undistorted_with_its_picture(tmp_path):
+    result, pixels = _masked(tmp_path, "ignore")
+    assert pixels.shape[2] == 3
+    counts = result.mask.decode((result.pinhole.width, result.pinhole.height))[0].numpy()
+    camera = _camera(_lens("OPENCV"))
+    rows, columns = np.nonzero(counts == 255)
+    x = [(columns + 0.5 - result.pinhole.cx) / result.pinhole.fx, (rows + 0.5 - result.pinhole.cy) / result.pinhole.fy]
+    seen = camera.img_from_cam(np.column_stack([*x, np.ones(len(rows))]))
+    assert seen[:, 0].min() >= WIDTH / 2  # nothing that counts is mixed with what is masked
+    assert len(rows) == pytest.approx(0.5 * counts.size, rel=0.1)
+
+
+def test_a_transparent_mask_becomes_alpha(tmp_path):
+    result, pixels = _masked(tmp_path, TRANSPARENT)
+    assert result.mask is None and pixels.shape[2] == 4
+    assert (pixels[:, :60, 3] == 0).all() and (pixels[:, -60:, 3] == 255).all()
+    # Straight colours up to the edge: what is masked does not bleed in. 240 / 8 levels of noise above the base colour.
+    shown = pixels[pixels[..., 3] > 128][:, 0]
+    assert shown.min() >= 199 and shown.max() <= 232
+
+
+def test_alpha_is_undistorted_or_ignored(tmp_path):
+    pixels = np.zeros((HEIGHT, WIDTH, 4), np.uint8)
+    pixels[:, WIDTH // 2 :] = (200, 100, 50, 255)
+    Image.fromarray(pixels).save(tmp_path / "a.png")
+    photo = Photo(tmp_path / "a.png", (WIDTH, HEIGHT), _lens("OPENCV"))
+    kept, ignored = undistort([photo, photo._replace(ignore_alpha=True)])
+    with Image.open(kept.path) as image:
+        alpha = np.asarray(image)[..., 3]
+        assert np.asarray(image)[alpha > 0][:, 0].min() >= 198  # not darkened by the hidden black
+    with Image.open(ignored.path) as image:
+        assert image.mode == "RGB"
+    counts = ignored.mask.decode((ignored.pinhole.width, ignored.pinhole.height))[0].numpy()
+    assert kept.mask is None and ((counts == 255) <= (alpha == 255)).all() and (counts == 255).any()
+
+
+@pytest.mark.parametrize("model", ["OPENCV", "OPENCV_FISHEYE", "SIMPLE_RADIAL"])
+def test_a_distorted_scene_shows_its_points_where_they_are(tmp_path, model, cache_folder):
+    params = {
+        "OPENCV": (110.0, 110.0, 45.0, 34.5, -0.2, 0.03, 0.004, -0.003),
+        "OPENCV_FISHEYE": (80.0, 80.0, 45.0, 34.5, 0.05, -0.01, 0.003, -0.001),
+        "SIMPLE_RADIAL": (110.0, 45.0, 34.5, -0.2),
+    }[model]
+    folder = tmp_path / "scene"
+    reconstruction = make_colmap_scene(folder, model=model, params=params, views=5)
+    before = folder_state(folder)
+    scene = Scene(_options(folder, tmp_path / "out"), FakeGaussians(), shuffle=False)
+    hits = tried = 0
+    for camera in scene.getTrainCameras():
+        assert camera.mask is None
+        target = camera.target(torch.zeros(3)).permute(1, 2, 0).numpy()
+        from_world = reconstruction.find_image_with_name(camera.image_name).cam_from_world()
+        points = sorted(reconstruction.points3D.values(), key=lambda p, m=from_world: (m * p.xyz)[2])
+        nearer = np.zeros((0, 2))
+        for point in points[:80]:
+            local = from_world * point.xyz
+            place = np.array([camera.fx, camera.fy]) * local[:2] / local[2] + (camera.cx, camera.cy)
+            hidden = (np.linalg.norm(nearer - place, axis=1) < 5).any()  # discs have a radius of 2 to 3 pixels
+            nearer = np.vstack([nearer, place])
+            x, y = np.floor(place).astype(int)
+            if not hidden and 2 <= x < camera.image_width - 2 and 2 <= y < camera.image_height - 2:
+                tried += 1
+                hits += np.abs(target[y, x].astype(int) - point.color).max() <= 3
+    assert tried > 15 and hits == tried
+    assert folder_state(folder) == before
+
+
+def test_real_distorted_scenes(shared_dir, tmp_path):
+    for name, views, model_points in (("fox_raw", 12, 5115), ("monstree_raw", 9, 5400)):
+        folder = shared_dir / "scenes" / name
+        info = _read(folder)
+        assert len(info.train_cameras) == views and len(info.point_cloud.points) == model_points
+        for camera in info.train_cameras:
+            assert camera.mask is None and camera.file_size == (camera.width, camera.height)
+            # COLMAP keeps focal lengths; these lenses are nearly free of distortion, so sizes stay alike too.
+            with Image.open(folder / "images" / camera.image_name) as image:
+                assert abs(image.width - camera.width) < 0.05 * image.width

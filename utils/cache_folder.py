@@ -1,0 +1,15 @@
+"""Where results that can be made again are kept between runs."""
+
+import os
+from pathlib import Path
+
+NAME = "gaussian-splatting"
+
+
+def cache_folder() -> Path:
+    """The folder $GS_CACHE, else `gaussian-splatting` in $XDG_CACHE_HOME or ~/.cache. It may not exist yet."""
+    if given := os.environ.get("GS_CACHE"):
+        return Path(given)
+    base = os.environ.get("XDG_CACHE_HOME", "")
+    # The XDG base directory specification: a path that is not absolute counts as none.
+    return (Path(base) if os.path.isabs(base) else Path.home() / ".cache") / NAME
