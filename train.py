@@ -184,6 +184,7 @@ def _curve(
         {"test": test, "train": evenly_spread(scene.getTrainCameras(), len(test))},
         lambda camera: render(camera, scene.gaussians, pipe, background, want_visibility=False)["render"],
         lambda camera: camera.target(background),
+        lambda camera: camera.mask,
         background.device,
     )
 

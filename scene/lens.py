@@ -41,14 +41,13 @@ class Pinhole(NamedTuple):
 class Undistortion(NamedTuple):
     """How pictures of a lens become pinhole pictures.
 
-    camera, options: pycolmap's, for undistort_image. pinhole: of the result. valid: (height, width) bool, which of its
-    pixels the photo shows; None for all. widest: half the angle in degrees to which a wide lens was cut, else None.
+    camera, options: pycolmap's, for undistort_image. pinhole: of the result. widest: half the angle in degrees to which
+    a wide lens is cut, else None.
     """
 
     camera: Any
     options: Any
     pinhole: Pinhole
-    valid: np.ndarray | None
     widest: float | None
 
 
@@ -94,7 +93,7 @@ def _camera(lens: Lens, name: str = "") -> Any:
     return camera
 
 
-@functools.lru_cache(maxsize=8)  # few: masks are large, and pictures of one lens mostly follow each other
+@functools.cache
 def undistortion(lens: Lens, width: int, height: int) -> Undistortion:
     """How to undistort pictures of a lens that are width x height pixels large (the lens is scaled to that)."""
     pycolmap = import_pycolmap()
@@ -107,13 +106,20 @@ def undistortion(lens: Lens, width: int, height: int) -> Undistortion:
         scale = 2 * math.tan(math.radians(WIDEST)) * camera.mean_focal_length() / max(width, height)
         options.min_scale = options.max_scale = min(max(scale, options.min_scale), options.max_scale)
         widest = math.degrees(math.atan(options.max_scale * max(width, height) / 2 / camera.mean_focal_length()))
-    white = pycolmap.Bitmap.from_array(np.full((height, width), 255, np.uint8))
-    shown, result = pycolmap.undistort_image(options, white, camera)
-    valid = shown.to_array() == 255
-    if widest is not None:
-        valid &= _seen_once(camera, result)
+    result = pycolmap.undistort_camera(options, camera)
     pinhole = Pinhole(*(float(value) for value in result.params), int(result.width), int(result.height))
-    return Undistortion(camera, options, pinhole, None if valid.all() else valid, widest)
+    return Undistortion(camera, options, pinhole, widest)
+
+
+@functools.lru_cache(maxsize=4)  # few, for they are large, and pictures of one lens mostly follow each other
+def shown_pixels(lens: Lens, width: int, height: int) -> np.ndarray:
+    """Which pixels of the undistorted picture the photo, width x height pixels large, shows: (height, width) bool."""
+    pycolmap = import_pycolmap()
+    plan = undistortion(lens, width, height)
+    white = pycolmap.Bitmap.from_array(np.full((height, width), 255, np.uint8))
+    shown, result = pycolmap.undistort_image(plan.options, white, plan.camera)
+    shown = shown.to_array() == 255
+    return shown if plan.widest is None else shown & _seen_once(plan.camera, result)
 
 
 def _border_can_be_projected(camera: Any) -> bool:

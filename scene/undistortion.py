@@ -17,11 +17,11 @@ from PIL import Image
 from tqdm import tqdm
 
 from scene.images import decode, picture_size
-from scene.lens import Lens, Pinhole, Undistortion, undistortion
+from scene.lens import Lens, Pinhole, Undistortion, shown_pixels, undistortion
 from scene.masks import TRANSPARENT, Mask
 from scene.pycolmap_import import import_pycolmap
 from utils.cache_folder import cache_folder
-from utils.system_utils import UserError, atomic_write
+from utils.system_utils import UserError, atomic_write, mkdir_p
 
 _FORMAT = "1"  # of the files in the cache: to be raised when the same input shall give other files
 
@@ -54,6 +54,11 @@ def undistort(photos: Sequence[Photo]) -> list[Undistorted]:
     a cache that cannot be written.
     """
     folder = cache_folder() / "undistorted"
+    try:
+        mkdir_p(folder)
+    except UserError as error:
+        raise UserError(f"{error}; undistorted pictures are kept there, GS_CACHE names another folder") from error
+    _say_which_are_cut(photos)
     version = import_pycolmap().__version__
     keys = _in_threads(lambda photo: _key(photo, version), photos, "Looking up undistorted pictures")
     paths = [folder / key[:2] / f"{key}.png" for key in keys]
@@ -67,6 +72,17 @@ def undistort(photos: Sequence[Photo]) -> list[Undistorted]:
             file=sys.stderr,
         )
     return [_result(photo, path) for photo, path in zip(photos, paths, strict=True)]
+
+
+def _say_which_are_cut(photos: Sequence[Photo]) -> None:
+    cut = [photo for photo in photos if undistortion(photo.lens, *photo.size).widest is not None]
+    if cut:
+        plan = undistortion(cut[0].lens, *cut[0].size)
+        print(
+            f"{len(cut)} pictures, the first is {cut[0].path.name}, have a lens that sees more than a pinhole picture "
+            f"can show; of its field of view {2 * plan.widest:.0f} degrees are used",
+            file=sys.stderr,
+        )
 
 
 def _in_threads(work: Callable[[Job], Result], jobs: Sequence[Job], title: str) -> list[Result]:
@@ -129,14 +145,14 @@ def _make(photo: Photo, path: Path) -> None:
             pixels = np.dstack([pixels[..., :3], np.round(own / 255.0 * mask[..., None]).astype(np.uint8)])
         else:
             counts &= mask == 255
-    valid = np.ones((plan.pinhole.height, plan.pinhole.width), bool) if plan.valid is None else plan.valid
+    shown = shown_pixels(photo.lens, *photo.size)
     if not counts.all():
         # Interpolation mixes neighbours: a pixel counts if all that went into it does.
-        valid = valid & (_warp(np.where(counts, 255, 0).astype(np.uint8), plan) == 255)
+        shown = shown & (_warp(np.where(counts, 255, 0).astype(np.uint8), plan) == 255)
     mask_path = _mask_path(path)
-    if not valid.all():
+    if not shown.all():
         with atomic_write(mask_path) as temporary:
-            Image.fromarray(np.where(valid, 255, 0).astype(np.uint8)).save(temporary)
+            Image.fromarray(np.where(shown, 255, 0).astype(np.uint8)).save(temporary)
     # After the mask: where the picture is, its mask is too.
     with atomic_write(path) as temporary:
         Image.fromarray(_warp_picture(pixels, plan)).save(temporary, compress_level=1)

@@ -175,7 +175,7 @@ class TestScores:
         targets = [(r + 0.1 * torch.randn(r.shape, generator=generator)).clamp(0, 1) for r in renders]
         targets = [(t * 255).round().to(torch.uint8) for t in targets]
         truths = [t.double().numpy() / 255 for t in targets]
-        means = mean_scores(zip(renders, targets, strict=True))
+        means = mean_scores(zip(renders, targets, (None, None), strict=True))
         psnrs = [
             peak_signal_noise_ratio(t, r.double().numpy(), data_range=1.0) for t, r in zip(truths, renders, strict=True)
         ]
@@ -189,9 +189,21 @@ class TestScores:
 
     def test_equal_images_and_no_images(self):
         image = torch.full((3, 12, 12), 51 / 255)
-        means = mean_scores([(image, torch.full((3, 12, 12), 51, dtype=torch.uint8)), (image, image * 0)])
+        means = mean_scores([(image, torch.full((3, 12, 12), 51, dtype=torch.uint8), None), (image, image * 0, None)])
         assert means["psnr"] == math.inf and means["l1"] == pytest.approx(0.1)
         assert mean_scores([]) == {}
+
+    def test_masks(self):
+        """A mask that leaves out a rim, against the views without it; SSIM is tested with the loss."""
+        generator = torch.Generator().manual_seed(0)
+        image, target = torch.rand(2, 3, 20, 30, generator=generator)
+        mask = torch.zeros(1, 20, 30, dtype=torch.bool)
+        mask[:, 4:, :20] = True
+        means = mean_scores([(image, target, mask), (image, target, torch.zeros_like(mask))])
+        inside = mean_scores([(image[:, 4:, :20], target[:, 4:, :20], None)])
+        assert means["l1"] == pytest.approx(inside["l1"], rel=1e-5)
+        assert means["psnr"] == pytest.approx(inside["psnr"], abs=1e-4)
+        assert means["ssim"] != pytest.approx(mean_scores([(image, target, None)])["ssim"], abs=1e-3)
 
     def test_views_are_evenly_spread(self):
         assert evenly_spread(range(9), 3) == [0, 4, 8]

@@ -11,44 +11,18 @@ from PIL import Image
 from synthetic import FakeGaussians, folder_state, make_colmap_scene
 from test_colmap_scene import _options, _read
 
+from benchmarks.lenses import DISTORTED, DISTORTIONS, colmap_camera, make_lens
 from scene import Scene
-from scene.lens import WIDEST, Lens, pinhole_of, undistortion
+from scene.lens import WIDEST, Lens, pinhole_of, shown_pixels, undistortion
 from scene.masks import TRANSPARENT, Mask
 from scene.undistortion import Photo, undistort
 from utils.system_utils import UserError
 
 WIDTH, HEIGHT, FOCAL = 200, 150, 150.0
-CENTER = (104.0, 72.0)
-# Distortion as lenses have it, strong enough to move the corners by 10 pixels and more.
-DISTORTIONS = {
-    "SIMPLE_PINHOLE": (),
-    "PINHOLE": (),
-    "SIMPLE_RADIAL": (-0.15,),
-    "RADIAL": (-0.15, 0.02),
-    "OPENCV": (-0.15, 0.02, 0.003, -0.002),
-    "FULL_OPENCV": (-0.15, 0.02, 0.003, -0.002, 0.01, 0.02, -0.01, 0.005),
-    "OPENCV_FISHEYE": (0.05, -0.01, 0.003, -0.001),
-    "SIMPLE_RADIAL_FISHEYE": (0.05,),
-    "RADIAL_FISHEYE": (0.05, -0.01),
-    "SIMPLE_FISHEYE": (),
-    "FISHEYE": (),
-    "FOV": (0.8,),
-    "THIN_PRISM_FISHEYE": (0.02, -0.01, 0.001, -0.001, 0.003, -0.001, 0.001, -0.001),
-    "RAD_TAN_THIN_PRISM_FISHEYE": (0.02, -0.01, 0.003, -0.001, 0.001, 0, 0.001, -0.001, 0.001, -0.001, 0.001, 0),
-    "SIMPLE_DIVISION": (-0.15,),
-    "DIVISION": (-0.15,),
-    "EUCM": (0.6, 1.1),
-}
-DISTORTED = [name for name in DISTORTIONS if "PINHOLE" not in name]
 
 
 def _lens(model: str, focal: float = FOCAL) -> Lens:
-    numbers = len(pycolmap.Camera.create_from_model_name(1, model, focal, 8, 8).focal_length_idxs())
-    return Lens(model, (focal,) * numbers + CENTER + DISTORTIONS[model], WIDTH, HEIGHT)
-
-
-def _camera(lens: Lens) -> pycolmap.Camera:
-    return pycolmap.Camera(model=lens.model, width=lens.width, height=lens.height, params=list(lens.params))
+    return make_lens(model, focal, WIDTH, HEIGHT)
 
 
 def _dot(at: np.ndarray, width: int, height: int) -> np.ndarray:
@@ -76,7 +50,7 @@ def test_things_are_where_the_pinhole_sees_them(tmp_path, model):
     for index, (u, v) in enumerate([(0.5, 0.5), (0.2, 0.25), (0.8, 0.75), (0.85, 0.2)]):
         place = np.array([u * width, v * height])
         ray = np.array([(place[0] - cx) / fx, (place[1] - cy) / fy, 1.0])
-        picture = _dot(_camera(lens).img_from_cam(ray), WIDTH, HEIGHT)
+        picture = _dot(colmap_camera(lens).img_from_cam(ray), WIDTH, HEIGHT)
         path = tmp_path / f"{index}.png"
         Image.fromarray(np.uint8(255 * picture.round(3))).convert("RGB").save(path)
         (result,) = undistort([Photo(path, (WIDTH, HEIGHT), lens)])
@@ -99,7 +73,7 @@ def test_lenses_without_distortion_are_pinholes(model):
     lens = _lens(model)
     zeros = (0.0,) * len(DISTORTIONS[model])
     lens = lens._replace(params=lens.params[: len(lens.params) - len(zeros)] + zeros)
-    assert pinhole_of(lens, "a.png") == (FOCAL, FOCAL, *CENTER, WIDTH, HEIGHT)
+    assert pinhole_of(lens, "a.png") == (FOCAL, FOCAL, 104.0, 72.0, WIDTH, HEIGHT)
 
 
 @pytest.mark.parametrize("model", ["SIMPLE_FISHEYE", "OPENCV_FISHEYE", "FOV", "EUCM", "RADIAL"])
@@ -109,9 +83,10 @@ def test_lenses_too_wide_for_a_pinhole_show_their_middle(model):
     if model == "RADIAL":  # whose polynomial turns back far out
         lens = lens._replace(params=(*lens.params[:-2], 0.05, -0.02))
     plan = undistortion(lens, WIDTH, HEIGHT)
+    shown = shown_pixels(lens, WIDTH, HEIGHT)
     assert plan.widest == pytest.approx(WIDEST)
     assert plan.pinhole.width / 2 / plan.pinhole.fx == pytest.approx(np.tan(np.radians(WIDEST)), rel=0.02)
-    rays = _camera(lens)  # the judge: what counts comes back to where it was
+    rays = colmap_camera(lens)  # the judge: what counts comes back to where it was
     x, y = np.meshgrid(np.arange(plan.pinhole.width) + 0.5, np.arange(plan.pinhole.height) + 0.5)
     local = np.stack([(x - plan.pinhole.cx) / plan.pinhole.fx, (y - plan.pinhole.cy) / plan.pinhole.fy], -1)
     for row, column in np.random.default_rng(0).integers(0, local.shape[:2], (200, 2)):
@@ -119,11 +94,11 @@ def test_lenses_too_wide_for_a_pinhole_show_their_middle(model):
         back = rays.cam_from_img(pixel) if pixel is not None else None
         once = back is not None and np.linalg.norm(back - local[row, column]) * plan.pinhole.fx < 0.5
         inside = pixel is not None and (pixel > 1).all() and (pixel < (WIDTH - 1, HEIGHT - 1)).all()
-        counts = plan.valid is None or plan.valid[row, column]
+        counts = shown[row, column]
         assert counts <= once
         assert counts or not (once and inside)
     if model == "RADIAL":
-        assert plan.valid is not None and 0.3 < plan.valid.mean() < 1
+        assert 0.3 < shown.mean() < 1
 
 
 def _photo(path, color=(200, 100, 50), size=(WIDTH, HEIGHT), mode="RGB"):
@@ -165,7 +140,7 @@ def test_the_cache_is_keyed_by_content(tmp_path, cache_folder, capsys):
 def test_a_cache_that_cannot_be_written_is_named(tmp_path, monkeypatch):
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("GS_CACHE", str(tmp_path / "file" / "cache"))
-    with pytest.raises(UserError, match="cannot make the folder .*file/cache/undistorted"):
+    with pytest.raises(UserError, match="cannot make the folder .*file/cache/undistorted .*GS_CACHE names another"):
         undistort([Photo(_photo(tmp_path / "a.png"), (WIDTH, HEIGHT), _lens("OPENCV"))])
 
 
@@ -197,7 +172,7 @@ def test_a_mask_is_undistorted_with_its_picture(tmp_path):
     result, pixels = _masked(tmp_path, "ignore")
     assert pixels.shape[2] == 3
     counts = result.mask.decode((result.pinhole.width, result.pinhole.height))[0].numpy()
-    camera = _camera(_lens("OPENCV"))
+    camera = colmap_camera(_lens("OPENCV"))
     rows, columns = np.nonzero(counts == 255)
     x = [(columns + 0.5 - result.pinhole.cx) / result.pinhole.fx, (rows + 0.5 - result.pinhole.cy) / result.pinhole.fy]
     seen = camera.img_from_cam(np.column_stack([*x, np.ones(len(rows))]))
@@ -270,3 +245,14 @@ def test_real_distorted_scenes(shared_dir, tmp_path):
             # COLMAP keeps focal lengths; these lenses are nearly free of distortion, so sizes stay alike too.
             with Image.open(folder / "images" / camera.image_name) as image:
                 assert abs(image.width - camera.width) < 0.05 * image.width
+
+
+def test_a_wide_lens_in_a_scene(tmp_path, capsys):
+    """What the photo does not show does not count."""
+    folder = tmp_path / "scene"
+    make_colmap_scene(folder, model="RADIAL", params=(25.0, 45.0, 34.5, 0.05, -0.02), views=2)
+    for camera in _read(folder).train_cameras:
+        assert camera.mask is not None
+    assert "2 pictures, the first is v" in capsys.readouterr().err
+    for view in Scene(_options(folder, tmp_path / "out"), FakeGaussians()).getTrainCameras():
+        assert view.mask.shape == (1, view.image_height, view.image_width) and 0.3 < view.mask.float().mean() < 1

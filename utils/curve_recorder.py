@@ -32,9 +32,9 @@ class CurveRecorder:
     """Scores views in the iterations of a schedule, keeps the curve's file up to date, and draws it at the end.
 
     rows: of the runs before, which `log` has the seconds of. iterations: the last one; always: those scored at any
-    cost. views: those to score, by set, "test" and "train"; render(view) and target(view) give what `mean_scores`
-    takes. A curve that can't be written is warned of once; the next point tries again, for a training is worth more
-    than its curve.
+    cost. views: those to score, by set, "test" and "train"; render(view), target(view) and mask(view) give what
+    `mean_scores` takes. A curve that can't be written is warned of once; the next point tries again, for a training is
+    worth more than its curve.
     """
 
     def __init__(
@@ -47,6 +47,7 @@ class CurveRecorder:
         views: dict[str, Sequence[View]],
         render: Callable[[View], Tensor],
         target: Callable[[View], Tensor],
+        mask: Callable[[View], Tensor | None],
         device: torch.device,
     ) -> None:
         self.rows = rows
@@ -57,6 +58,7 @@ class CurveRecorder:
         self._views = views
         self._render = render
         self._target = target
+        self._mask = mask
         self._device = device
         self._loading = 0.0  # seconds of decoding pictures that were not needed before
         self._writing = 0.0  # seconds of writing the file
@@ -100,7 +102,7 @@ class CurveRecorder:
     def _score(self, row: Row) -> None:
         with torch.no_grad():
             for name, views in self._views.items():
-                scores = mean_scores((self._render(view), self._target(view)) for view in views)
+                scores = mean_scores((self._render(view), self._target(view), self._mask(view)) for view in views)
                 row |= {f"{name}_{score}": round(value, 6) for score, value in scores.items()}
 
     def _write(self) -> None:

@@ -58,16 +58,20 @@ def ssim(img1: Tensor, img2: Tensor, window_size: int = WINDOW, size_average: bo
 def photometric_loss(
     image: Tensor, target: Tensor, lambda_dssim: float, mask: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
-    """(1 - lambda) L1 + lambda (1 - SSIM) (Kerbl et al. 2023, eq. 7) and its L1 part, from one fused pass.
+    """(1 - lambda) L1 + lambda (1 - SSIM) (Kerbl et al. 2023, eq. 7) and its L1 part; arguments as `l1_and_ssim`."""
+    l1, similarity = l1_and_ssim(image, target, mask)
+    return (1.0 - lambda_dssim) * l1 + lambda_dssim * (1.0 - similarity), l1
+
+
+def l1_and_ssim(image: Tensor, target: Tensor, mask: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    """Mean |image - target| and mean SSIM from one fused pass.
 
     image: (3, H, W) float32 in [0, 1], differentiable; target: the same shape, float32, or uint8 meaning value / 255.
     mask: (1, H, W) bool, the pixels that count. The others are to both terms what lies beyond the border, 0 in both
     images: windows see them as such, and the sums of |difference| and of 1 - SSIM are divided by the pixels that count.
     """
     if mask is None:
-        l1, similarity = fused_l1_ssim(image, target)
-        return (1.0 - lambda_dssim) * l1 + lambda_dssim * (1.0 - similarity), l1
+        return fused_l1_ssim(image, target)
     l1, similarity = fused_l1_ssim(*(torch.where(mask, x, torch.zeros_like(x)) for x in (image, target)))
-    share = mask.numel() / mask.sum().clamp_min(1)  # no counting pixel: no loss
-    l1 = share * l1
-    return (1.0 - lambda_dssim) * l1 + lambda_dssim * share * (1.0 - similarity), l1
+    share = mask.numel() / mask.sum().clamp_min(1)  # without a counting pixel both images are equal
+    return share * l1, 1.0 - share * (1.0 - similarity)
