@@ -35,7 +35,7 @@ def readColmapSceneInfo(
     names = [view.name for view in views]
     listed_by = f"the COLMAP model in {model_folder}"
     paths = find_pictures(folder / images, names, listed_by, "put them there, or name their folder with -i")
-    found = find_masks(folder, names, masks) if masks.folder else [None] * len(views)
+    found = find_masks(folder, names, masks)
     cameras = make_cameras(
         [
             SourceView(view.name, path, view.camera_id, view.lens, view.rotation, view.translation, mask)

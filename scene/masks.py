@@ -116,8 +116,13 @@ def add_alpha(pixels: Tensor, mask: Tensor) -> Tensor:
 def find_masks(scene: Path, names: Sequence[str], options: MaskOptions) -> list[Mask | None]:
     """The mask of each picture, by name: `<name>`, `<name>.png` (COLMAP's way), or the name with another suffix.
 
-    UserError when the folder is missing or has no mask for any of them; where some lack one, a line says so.
+    None for all without a folder in the options. UserError when the folder is missing or has no mask for any of them;
+    where some lack one, a line says so.
     """
+    if not options.folder:
+        if options.invert:
+            raise UserError("--invert_masks has no masks to invert; name their folder with --masks, or leave it out")
+        return [None] * len(names)
     folder = scene / options.folder
     if not folder.is_dir():
         raise UserError(f"no folder {folder} for --masks; name one in the scene folder, or give its whole path")

@@ -30,7 +30,7 @@ def lens_of(frame: Mapping[str, Any], shared: Mapping[str, Any], size: tuple[int
     width, height = int(number("w", size[0])), int(number("h", size[1]))
     for name in ("camera_angle_x", "camera_angle_y"):
         if not 0 < number(name, 1.0) < np.pi:
-            raise UserError(f"{name} in {file} must lie between 0 and pi, got {number(name, 1.0)}")
+            raise UserError(f"{name} in {file} must lie between 0 and pi, got {number(name, 1.0)}; give it in radians")
     if fields.get("fl_x") is None and fields.get("camera_angle_x") is None:
         raise UserError(f"{file} has neither camera_angle_x nor fl_x; export the cameras with one of them")
     fx = number("fl_x", fov2focal(number("camera_angle_x", 1.0), width))

@@ -130,9 +130,9 @@ def _relative(path: Path, folder: Path) -> str:
 
 def _masks(file: _CameraFile, names: list[str], masks: MaskOptions) -> list[Mask | None]:
     folder = file.path.parent
-    if masks.folder:
-        return find_masks(folder, names, masks)
     listed = [frame.fields.get("mask_path") for frame in file.frames]
+    if masks.folder or not any(listed):
+        return find_masks(folder, names, masks)
     found = find_pictures(folder, [str(name) for name in listed if name], f"(as masks) {file.path}", "put them there")
     paths = iter(found)
     return [masks.mask(next(paths)) if name else None for name in listed]

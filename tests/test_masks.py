@@ -227,6 +227,12 @@ def test_bad_masks_get_one_sentence(masked_scene, change, said):
         _views(masked_scene, masks="masks")
 
 
+def test_masks_to_invert_must_be_named(colmap_scene, blender_scene):
+    for folder in (colmap_scene, blender_scene):
+        with pytest.raises(UserError, match="--invert_masks has no masks to invert; name their folder with --masks"):
+            _views(folder, invert_masks=True)
+
+
 def _train(scene: Path, out: Path, *options: object) -> bytes:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(sys, "stdout", sys.stdout)  # which training stamps: bring it back
