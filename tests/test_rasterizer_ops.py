@@ -84,13 +84,28 @@ def test_the_steps_one_by_one_are_the_whole(device, dtype):
     assert gradients[1].numel() == gradients[5].numel() == 0
 
 
-@pytest.mark.parametrize("counts", [(2**31 - 1,) * 3, (2**30, 2**30, 0)])
-def test_more_instances_than_an_index_holds_are_an_error(counts):
-    """Before anything is allocated: 6.4 billion of them would be 50 GB."""
+@pytest.mark.parametrize(
+    ("counts", "named"),
+    [
+        ((2**31 - 1,) * 3, r"\d \(2147483647\), \d \(2147483647\), \d \(2147483647\)"),
+        ((7, 2**31 - 1, 2**30), r"1 \(2147483647\), 2 \(1073741824\), 0 \(7\)"),
+    ],
+)
+def test_more_instances_than_an_index_holds_are_an_error(counts, named):
+    """Before anything is allocated: 6.4 billion of them would be 50 GB. The message names the giants."""
     raw, size = few(dtype=torch.float32)
     splats, depths, rects, _, _ = ops.project(*scene_arguments(raw, settings(**size)))
     faked = torch.tensor(counts, dtype=torch.int32)
     with pytest.raises(
-        RuntimeError, match=f"3 Gaussians cover {sum(counts)} tile instances, more than 2.31 - 1: render"
+        RuntimeError,
+        match=f"3 Gaussians cover {sum(counts)} tile instances, more than 2.31 - 1; most are those of Gaussian {named}",
     ):
         ops.bin(splats, depths, rects, faked, 7, 18, True)
+
+
+def test_an_image_of_more_tiles_than_an_index_holds_is_an_error():
+    """At once: counting a giant's tiles would take hours."""
+    raw, size = few(dtype=torch.float32)
+    camera = settings(**size)._replace(image_width=2**23, image_height=2**23)
+    with pytest.raises(RuntimeError, match=r"image size 8388608x8388608 has more than 2\^31 - 1 tiles"):
+        render(raw, camera)

@@ -1,13 +1,17 @@
-"""What must hold for any scene: properties over drawn scenes."""
+"""What must hold for any scene: properties over drawn scenes.
+
+GS_FUZZ=2000 in the environment draws that many scenes for each property.
+"""
 
 import math
+import os
 
 import pytest
 import torch
 from hypothesis import HealthCheck, given
 from hypothesis import settings as budget
 from hypothesis import strategies as st
-from rasterizer_tools import gradients, render, rigid, rotation_matrix
+from rasterizer_tools import gradients, ops, pick, render, rigid, rotation_matrix, scene_arguments
 from torch import Tensor
 
 from benchmarks.splat_scenes import KINDS, SplatScene, frustum, needles, settings
@@ -15,7 +19,9 @@ from benchmarks.splat_scenes import KINDS, SplatScene, frustum, needles, setting
 SEEDS = st.integers(0, 2**31 - 1)
 UNIT = st.floats(-1, 1, width=32)
 QUATERNIONS = st.tuples(UNIT, UNIT, UNIT, UNIT).filter(lambda q: sum(x * x for x in q) > 0.01)
-SHORT = budget(max_examples=15, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow])
+FUZZ = int(os.environ.get("GS_FUZZ", "0"))
+SHORT = budget(max_examples=FUZZ or 15, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow])
+MANY = budget(SHORT, max_examples=FUZZ or 150)
 WIDTH, HEIGHT = 64, 48
 
 
@@ -130,7 +136,7 @@ def test_weights_and_transmittance_sum_to_one(seed, kind, dtype):
 FINITE = st.floats(width=32, allow_nan=False, allow_infinity=False)
 
 
-@budget(max_examples=100, deadline=None, derandomize=True)
+@budget(SHORT, max_examples=FUZZ or 100)
 @given(
     means=st.lists(FINITE, min_size=6, max_size=6),
     rest=st.lists(FINITE, min_size=2 * (1 + 3 + 4), max_size=2 * (1 + 3 + 4)),
@@ -150,10 +156,87 @@ def test_everything_is_finite_on_any_finite_input(means, rest, colors, antialias
         assert t.isfinite().all(), name
 
 
+# Not finite, where float32 or its squares end, and the rules' own thresholds.
+POISON = [math.nan, math.inf, -math.inf, 3.4e38, -3.4e38, 1e20, -1e20, 1e-20, 1e-38, -1e-45, 0.0, 0.2, 1.3, 16.0, 0.99]
+POISON += [1 / 255, 1e-4, -50.0, 50.0, 88.0, -104.0, 1e4, 1e7]
+SPOILT = st.tuples(
+    st.sampled_from(["means", "opacities", "scales", "rotations", "sh_dc", "sh_rest"]),
+    st.integers(0, 19),  # Gaussian
+    st.sampled_from([0, 1, 2, None]),  # its value, None for all
+    st.sampled_from(POISON),
+)
+
+
+def spoilt_scene(seed: int, places: list[tuple]) -> tuple[dict[str, Tensor], Tensor]:
+    """Twenty Gaussians, float32, with poison at some places; and which of them are finite, (20,) bool."""
+    parameters = {name: t.float() for name, t in scene(seed, 20, 4.0).items()}
+    for name, row, column, value in places:
+        flat = parameters[name][row].view(-1)
+        flat[slice(None) if column is None else column % len(flat)] = value
+    finite = torch.ones(20, dtype=torch.bool)
+    for name, t in parameters.items():
+        ok = ~t.isnan() if name == "opacities" else t.isfinite()  # infinite logits are opacities of 0 and 1
+        finite &= ok.reshape(20, -1).all(1)
+    return parameters, finite
+
+
+@MANY
+@given(seed=SEEDS, places=st.lists(SPOILT, min_size=1, max_size=8), antialiasing=st.booleans())
+def test_poison_stays_where_it_is(seed, places, antialiasing):
+    """All is finite; Gaussians that are not might as well be absent; in another order, everything is the same."""
+    parameters, finite = spoilt_scene(seed, places)
+    camera = settings(WIDTH, HEIGHT, torch.float32, antialiasing=antialiasing)
+    got = gradients(parameters, camera)
+    clean = gradients(pick(parameters, finite), camera)
+    depths = parameters["means"][:, 2]
+    seen = depths[finite]
+    order = torch.randperm(20, generator=torch.Generator().manual_seed(seed))
+    permuted = gradients(pick(parameters, order), camera) if len(seen.unique()) == len(seen) else None
+    for name, t in got.items():
+        assert t.isfinite().all(), name
+        per_splat = name == "radii" or name.startswith("d ")
+        assert torch.equal(t[finite] if per_splat else t, clean[name]), name
+        assert not name.startswith("d ") or not t[~finite].any(), name
+        assert permuted is None or torch.equal(permuted[name], t[order] if per_splat else t), name
+
+
+@MANY
+@given(seed=SEEDS, places=st.lists(SPOILT, max_size=8), antialiasing=st.booleans())
+def test_weights_of_any_scene_sum_to_at_most_one(seed, places, antialiasing):
+    parameters, _ = spoilt_scene(seed, places)
+    colors = {"colors": torch.ones(20, 3)}
+    shape = {name: t for name, t in parameters.items() if not name.startswith("sh")}
+    camera = settings(WIDTH, HEIGHT, torch.float32, bg=torch.zeros(3), antialiasing=antialiasing)
+    out = render(shape | colors, camera)
+    assert out.color.min() >= 0
+    # 20 products and sums at most, each rounded.
+    torch.testing.assert_close(out.color + out.transmittance, torch.ones(3, HEIGHT, WIDTH), rtol=0, atol=3e-6)
+
+
+@MANY
+@given(seed=SEEDS, places=st.lists(SPOILT, max_size=8), antialiasing=st.booleans())
+def test_halves_of_an_image_are_the_whole_to_the_bit(seed, places, antialiasing):
+    """Blended from the same splats: what lies below the middle is not there for the upper half, nor the reverse."""
+    parameters, _ = spoilt_scene(seed, places)
+    height, across = 32, WIDTH // 16
+    camera = settings(WIDTH, height, torch.float32, antialiasing=antialiasing)
+    splats, depths, rects, counts, _ = ops.project(*scene_arguments(parameters, camera, raw=True))
+    instances, _, ranges, _ = ops.bin(splats, depths, rects, counts, height, WIDTH, False)
+    whole = ops.blend(splats, instances, ranges, camera.bg, height, WIDTH, True, True)
+    for top in (0, 16):
+        own = ranges[top // 16 * across : top // 16 * across + across + 1]
+        shifted = splats.clone()
+        shifted[:, 1] -= top
+        representable = (shifted[:, 1] + top == splats[:, 1]).all()
+        half = ops.blend(shifted, instances, own, camera.bg, 16, WIDTH, True, True)
+        for a, b in zip(half, whole, strict=True):
+            assert not representable or torch.equal(a, b[..., top : top + 16, :])
+
+
 LOG_SCALES = st.floats(-100, 100, width=32)
 
 
-@budget(max_examples=100, deadline=None, derandomize=True)
+@budget(SHORT, max_examples=FUZZ or 100)
 @given(
     scales=st.lists(LOG_SCALES, min_size=6, max_size=6),
     quaternions=st.lists(UNIT, min_size=8, max_size=8),

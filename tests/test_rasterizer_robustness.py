@@ -51,6 +51,8 @@ def test_a_gaussian_that_is_not_finite_is_as_if_it_were_not_there(raw, name, cam
     others = torch.arange(N) != VICTIM
     wanted = gradients(pick(parameters, others), camera, device, raw=raw)
     for value in NOT_FINITE:
+        if raw and name == "opacities" and math.isinf(value):
+            continue  # a logit like any other
         for whole_row in (False, True):
             bad = poisoned(parameters, name, value, whole_row)
             got = gradients(bad, camera, device, raw=raw)
@@ -111,6 +113,20 @@ def test_saturated_logits(logit, camera, device):
     assert got["radii"][VICTIM] > 0
     center = got["transmittance"][0, 24, 39].item()
     assert logit < 0 or center <= 0.0101
+
+
+def test_infinite_logits_are_opacities_of_one_and_zero(camera):
+    parameters = {k: t.clone() for k, t in scene(True).items()}
+    for logit, opacity in ((math.inf, 1.0), (-math.inf, 0.0)):
+        parameters["opacities"][VICTIM] = logit
+        got = gradients(parameters, camera)
+        as_given = activated(parameters)
+        assert as_given["opacities"][VICTIM] == opacity
+        wanted = render(as_given, camera, raw=False)
+        # Activated in Python, scales and rotations are rounded once more.
+        torch.testing.assert_close(got["color"], wanted.color, rtol=0, atol=1e-5)
+        assert got["radii"][VICTIM] > 0  # whatever the opacity, as for any other
+        assert all(t.isfinite().all() for t in got.values()) and not got["d opacities"][VICTIM].any()
 
 
 @pytest.mark.parametrize("scale", [1e-10, 1e6])

@@ -1,5 +1,6 @@
 // The only file that sees torch: checks, allocates, dispatches on device and instruction set.
 #include <ATen/ops/empty.h>
+#include <ATen/ops/topk.h>
 #include <torch/library.h>
 
 #include <algorithm>
@@ -69,6 +70,8 @@ class SceneTensors {
                 colors_.defined() ? 0 : sh_rest_.size(1), " bands, too few for sh_degree ", sh_degree);
     TORCH_CHECK(height > 0 && width > 0 && height < (1 << 24) && width < (1 << 24), "image size ", width, "x", height,
                 " is out of range");
+    TORCH_CHECK((width + kTile - 1) / kTile * ((height + kTile - 1) / kTile) <= std::numeric_limits<int32_t>::max(),
+                "image size ", width, "x", height, " has more than 2^31 - 1 tiles of 16x16");
     TORCH_CHECK(count() < std::numeric_limits<int32_t>::max(), "more than 2^31 Gaussians");
   }
 
@@ -216,6 +219,16 @@ int64_t count_instances(const Tensor& tile_counts) {
   return total;
 }
 
+// The Gaussians that ask for most, as words: often a few giants do for nearly all.
+std::string most_tiles(const Tensor& tile_counts) {
+  const auto [counts, rows] = at::topk(tile_counts.cpu(), std::min<int64_t>(3, tile_counts.size(0)));
+  std::string words;
+  for (int64_t k = 0; k < counts.size(0); ++k)
+    words += (k ? ", " : "") + std::to_string(rows.const_data_ptr<int64_t>()[k]) + " (" +
+             std::to_string(counts.const_data_ptr<int32_t>()[k]) + ")";
+  return words;
+}
+
 struct BinnedTensors {
   Tensor instances, slots, ranges, slot_offsets;
 };
@@ -225,7 +238,8 @@ BinnedTensors bin(ProjectedTensors& in, gs::Image image, bool slots) {
   const int64_t n = in.depths.size(0);
   const int64_t total = count_instances(in.tile_counts);
   TORCH_CHECK(total <= std::numeric_limits<int32_t>::max(), n, " Gaussians cover ", total,
-              " tile instances, more than 2^31 - 1: render at a lower resolution or with fewer or smaller Gaussians");
+              " tile instances, more than 2^31 - 1; most are those of Gaussian ", most_tiles(in.tile_counts),
+              ": remove such giants, or render at a lower resolution or with fewer Gaussians");
   const auto ints = in.depths.options().dtype(at::kInt), longs = in.depths.options().dtype(at::kLong);
   BinnedTensors out{at::empty({total}, ints), at::empty({slots ? total : 0}, ints),
                     at::empty({tiles_of(image) + 1}, longs), at::empty({slots ? n : 0}, longs)};

@@ -37,13 +37,14 @@ GS_HD Quat<T> normalise(Quat<T> q, T& norm) {
   return {s.w / r, s.x / r, s.y / r, s.z / r};
 }
 
-// dq = (g - n (n . g)) / |q|, n = q / |q|.
+// From the torque about the rotation's own axes: turned by small angles a about them, n = q / |q| becomes n (1, a/2).
 template <class T>
-GS_HD Quat<T> normalise_vjp(Quat<T> n, T norm, Quat<T> g) {
+GS_HD Quat<T> normalise_vjp(Quat<T> n, T norm, Vec3<T> torque) {
   if (!(norm > 0)) return {0, 0, 0, 0};
-  const T along = n.w * g.w + n.x * g.x + n.y * g.y + n.z * g.z;
-  return {(g.w - n.w * along) / norm, (g.x - n.x * along) / norm, (g.y - n.y * along) / norm,
-          (g.z - n.z * along) / norm};
+  const T k = 2 / norm;
+  const Vec3<T> t = torque;
+  return {k * (-n.x * t.x - n.y * t.y - n.z * t.z), k * (n.w * t.x + n.y * t.z - n.z * t.y),
+          k * (n.w * t.y + n.z * t.x - n.x * t.z), k * (n.w * t.z + n.x * t.y - n.y * t.x)};
 }
 
 GS_ISA_END

@@ -19,25 +19,28 @@ struct Camera {
 };
 
 // From the reference's settings: view and full projection matrix, both transposed (row vectors), row-major.
-// The projection's own entries come out of the product by dot products with the rotation's orthonormal rows.
+// The projection's own entries come out of the product by dot products with the rotation's rows; in double, and with
+// what rounding left of x . z taken out, because in a narrow field of view the scale is 1e5 times the shift.
 template <class T>
 GS_HD Camera<T> make_camera(const T* view, const T* full, const T* center, double tan_x, double tan_y, int width,
                             int height) {
   const auto column = [](const T* m, int c) { return Vec3<T>{m[c], m[4 + c], m[8 + c]}; };
+  const auto wide = [](Vec3<T> v) { return Vec3<double>{v.x, v.y, v.z}; };
   Camera<T> cam;
   cam.row_x = column(view, 0), cam.row_y = column(view, 1), cam.row_z = column(view, 2);
   cam.translation = {view[12], view[13], view[14]};
   cam.center = load3(center);
   cam.width = width, cam.height = height;
   cam.focal_x = T(width / (2 * tan_x)), cam.focal_y = T(height / (2 * tan_y));
-  const Vec3<T> clip_x = column(full, 0), clip_y = column(full, 1);
-  const T scale_x = dot(clip_x, cam.row_x), scale_y = dot(clip_y, cam.row_y);
-  const T shift_x = dot(clip_x, cam.row_z), shift_y = dot(clip_y, cam.row_z);
-  cam.mean_focal_x = T(0.5) * T(width) * scale_x, cam.mean_focal_y = T(0.5) * T(height) * scale_y;
-  cam.axis_x = T(0.5) * (T(width) * (1 + shift_x) - 1), cam.axis_y = T(0.5) * (T(height) * (1 + shift_y) - 1);
-  const T limit = T(kJacobianClamp);
-  cam.ray_min_x = (-limit - shift_x) * T(tan_x), cam.ray_max_x = (limit - shift_x) * T(tan_x);
-  cam.ray_min_y = (-limit - shift_y) * T(tan_y), cam.ray_max_y = (limit - shift_y) * T(tan_y);
+  const Vec3<double> x = wide(cam.row_x), y = wide(cam.row_y), z = wide(cam.row_z);
+  const Vec3<double> clip_x = wide(column(full, 0)), clip_y = wide(column(full, 1));
+  const double scale_x = dot(clip_x, x), scale_y = dot(clip_y, y);
+  const double shift_x = dot(clip_x, z) - scale_x * dot(x, z), shift_y = dot(clip_y, z) - scale_y * dot(y, z);
+  cam.mean_focal_x = T(0.5 * width * scale_x), cam.mean_focal_y = T(0.5 * height * scale_y);
+  cam.axis_x = T(0.5 * (width * (1 + shift_x) - 1)), cam.axis_y = T(0.5 * (height * (1 + shift_y) - 1));
+  const double limit = kJacobianClamp;
+  cam.ray_min_x = T((-limit - shift_x) * tan_x), cam.ray_max_x = T((limit - shift_x) * tan_x);
+  cam.ray_min_y = T((-limit - shift_y) * tan_y), cam.ray_max_y = T((limit - shift_y) * tan_y);
   return cam;
 }
 

@@ -64,25 +64,37 @@ GS_HD T compensation_excess(const Footprint<T>& f) {
   return f.excess / (f.compensation * f.compensation * f.schur);
 }
 
-// dM = 4 ln2^2 L^T W2 (L M): covariance's gradient is 2 ln2^2 L^T W2 L, and covariance = M M^T + const.
-// The first row of L M is l11 (m1 - (b/c) m2) = l11 (m2 x (m1 x m2) + h m1) / c, without the cancellation.
-// With antialiasing the opacity carries sqrt(det0/det): d ln = (ddet0/det0 - ddet/det)/2,
-// ddet0/dm1 = 2 m2 x (m1 x m2), ddet0/dm2 = 2 (m1 x m2) x m1, ddet = ddet0 + 2 h dM; 1/det0 - 1/det is taken as
-// excess / (det0 det), since the two are equal but for rounding where the splat is large.
+// What M receives: by rows, and in the splat's own frame the symmetric matrix M^T dM. Scales and rotation come from the
+// latter, so that nothing cancels between an axis' length and its direction.
 template <class T>
-GS_HD void footprint_vjp(const Footprint<T>& f, const Moments<T>& s, bool antialiasing, Vec3<T>& g1, Vec3<T>& g2) {
+struct ShapeGradient {
+  Vec3<T> m1, m2;
+  Vec3<T> diagonal, off;  // xx yy zz, yz zx xy
+};
+
+// dM = L^T W (L M): covariance's gradient is L^T W L / 2, and covariance = M M^T + const. So M^T dM = (L M)^T W (L M).
+// The first row of L M is l11 (m1 - (b/c) m2) = l11 (m2 x (m1 x m2) + h m1) / c, without the cancellation.
+// W is 4 ln2^2 W2, and with antialiasing, where the opacity carries sqrt(det0/det), also L^-T (adj0/det0 - adj/det)
+// L^-1, adj0 and adj the adjugates of the covariance before and after dilation; multiplied out with det0 = a0 c0 - b^2
+// its terms in b and c cancel on paper.
+template <class T>
+GS_HD ShapeGradient<T> footprint_vjp(const Footprint<T>& f, const Moments<T>& s, bool antialiasing) {
   const T h = T(kDilation), four_ln2_sq = T(4 * kLn2 * kLn2);
-  const T root = 1 / std::sqrt(f.c);                       // both factors by this: the product overflows
-  const Vec3<T> d1 = cross(root * f.m2, root * f.minors);  // half of ddet0/dm1, over c
-  const Vec3<T> lm_u = f.l11 * (d1 + (h / f.c) * f.m1), lm_v = f.l22 * f.m2;
-  const Vec3<T> wu = s.quu * lm_u + s.quv * lm_v, wv = s.quv * lm_u + s.qvv * lm_v;
-  g1 = (four_ln2_sq * f.l11) * wu;
-  g2 = four_ln2_sq * (f.l12 * wu + f.l22 * wv);
-  if (!antialiasing || f.floored) return;
-  const Vec3<T> d2 = cross(root * f.minors, root * f.m1);
-  const T per_det = s.q / f.schur, difference = per_det * compensation_excess(f), dilation = per_det * h / f.c;
-  g1 = g1 + difference * d1 - dilation * f.m1;
-  g2 = g2 + difference * d2 - dilation * f.m2;
+  T uu = four_ln2_sq * s.quu, uv = four_ln2_sq * s.quv, vv = four_ln2_sq * s.qvv;
+  if (antialiasing && !f.floored) {
+    const T inverse_ratio = 1 / (f.compensation * f.compensation), slope = f.b / f.c;
+    const T k = T(kDilation / kHalfLog2e) * s.q * inverse_ratio;
+    uu += k * ((slope / f.schur) * slope + f.c0 / f.c / f.schur);
+    uv -= k * (slope / std::sqrt(f.schur) / std::sqrt(f.c));
+    vv += k * ((f.compensation * f.compensation + h * (f.a0 / f.c / f.schur)) / f.c);
+  }
+  const T root = 1 / std::sqrt(f.c);  // both factors by this: the product overflows
+  const Vec3<T> lm_u = f.l11 * (cross(root * f.m2, root * f.minors) + (h / f.c) * f.m1), lm_v = f.l22 * f.m2;
+  const Vec3<T> wu = uu * lm_u + uv * lm_v, wv = uv * lm_u + vv * lm_v;
+  return {f.l11 * wu,
+          f.l12 * wu + f.l22 * wv,
+          {lm_u.x * wu.x + lm_v.x * wv.x, lm_u.y * wu.y + lm_v.y * wv.y, lm_u.z * wu.z + lm_v.z * wv.z},
+          {lm_u.y * wu.z + lm_v.y * wv.z, lm_u.z * wu.x + lm_v.z * wv.x, lm_u.x * wu.y + lm_v.x * wv.y}};
 }
 
 // Gradient of the 2D covariance (xx, xy, yy; xy once, of the symmetric matrix), for covariances that were given.

@@ -82,16 +82,26 @@ GS_HD bool project_splat(const Camera<T>& cam, const Gaussian<T>& gaussian, bool
 template <class T>
 struct GaussianGradient {
   Vec3<T> mean;
-  Vec3<T> direction[3];
-  T scale[3];
+  Vec3<T> torque;        // of turns about the axes, where they are known to be perpendicular
+  Vec3<T> direction[3];  // of the axes, where they are not
+  T log_scale[3];
   T log_opacity;
-  T covariance[6];  // only where the axes came from a given covariance
   T pixel_x, pixel_y;
 };
 
+// About an axis, from M^T dM between the other two, of scales a and b: off (a/b - b/a), exactly 0 where they are equal.
+// `off` has both as factors, so by the smaller it can be divided.
+template <class T>
+GS_HD T torque(T off, T a, T b) {
+  const T low = a < b ? a : b, high = larger(a, b);
+  return low > 0 ? off / low * (a + b) * ((a - b) / high) : T(0);
+}
+
+// perpendicular: whether the axes are. g_covariance (6, or null): of the covariance that the axes came from.
 template <class T>
 GS_HD GaussianGradient<T> project_splat_vjp(const Camera<T>& cam, const Gaussian<T>& gaussian, bool antialiasing,
-                                            bool want_covariance, const Moments<T>& s, T g_inverse_depth) {
+                                            bool perpendicular, T* g_covariance, const Moments<T>& s,
+                                            T g_inverse_depth) {
   GaussianGradient<T> g;
   const Vec3<T> view = to_view(cam, gaussian.mean);
   const Perspective<T> p = perspective(cam, view);
@@ -99,37 +109,38 @@ GS_HD GaussianGradient<T> project_splat_vjp(const Camera<T>& cam, const Gaussian
   g.log_opacity = s.q;
   mean_vjp(f, s, g.pixel_x, g.pixel_y);
 
-  Vec3<T> g1, g2;  // of M's rows
-  footprint_vjp(f, s, antialiasing, g1, g2);
-  const T row1[3] = {g1.x, g1.y, g1.z}, row2[3] = {g2.x, g2.y, g2.z};
-  Vec3<T> gp1 = {0, 0, 0}, gp2 = {0, 0, 0};
+  const ShapeGradient<T> shape = footprint_vjp(f, s, antialiasing);
+  const auto& d = gaussian.axes.direction;
+  const auto& c = gaussian.axes.scale;
+  const T row1[3] = {shape.m1.x, shape.m1.y, shape.m1.z}, row2[3] = {shape.m2.x, shape.m2.y, shape.m2.z};
+  T along1 = 0, along2 = 0;  // dP's rows on the optical axis
   for (int k = 0; k < 3; ++k) {
-    const Vec3<T> d = gaussian.axes.direction[k];
-    const T scale = gaussian.axes.scale[k];
-    const Vec3<T> g_axis = row1[k] * p.p1 + row2[k] * p.p2;
-    g.scale[k] = dot(g_axis, d);
-    g.direction[k] = scale * g_axis;
-    gp1 = gp1 + (row1[k] * scale) * d;
-    gp2 = gp2 + (row2[k] * scale) * d;
+    const T depth = c[k] * dot(cam.row_z, d[k]);
+    along1 += row1[k] * depth, along2 += row2[k] * depth;
   }
-  if (want_covariance) {  // d cov3d = P^T G P, off-diagonal entries stand for two
-    T c[3];
-    covariance2d_vjp(f, s, antialiasing, c);
-    const Vec3<T> a = c[0] * p.p1 + c[1] * p.p2, b = c[1] * p.p1 + c[2] * p.p2;
-    g.covariance[0] = p.p1.x * a.x + p.p2.x * b.x;
-    g.covariance[1] = p.p1.x * a.y + p.p2.x * b.y + p.p1.y * a.x + p.p2.y * b.x;
-    g.covariance[2] = p.p1.x * a.z + p.p2.x * b.z + p.p1.z * a.x + p.p2.z * b.x;
-    g.covariance[3] = p.p1.y * a.y + p.p2.y * b.y;
-    g.covariance[4] = p.p1.y * a.z + p.p2.y * b.z + p.p1.z * a.y + p.p2.z * b.y;
-    g.covariance[5] = p.p1.z * a.z + p.p2.z * b.z;
+  g.log_scale[0] = shape.diagonal.x, g.log_scale[1] = shape.diagonal.y, g.log_scale[2] = shape.diagonal.z;
+  if (perpendicular)
+    g.torque = {torque(shape.off.x, c[1], c[2]), torque(shape.off.y, c[2], c[0]), torque(shape.off.z, c[0], c[1])};
+  else
+    for (int k = 0; k < 3; ++k) g.direction[k] = c[k] * (row1[k] * p.p1 + row2[k] * p.p2);
+  if (g_covariance) {  // d cov3d = P^T G P, off-diagonal entries stand for two
+    T c2[3];
+    covariance2d_vjp(f, s, antialiasing, c2);
+    const Vec3<T> a = c2[0] * p.p1 + c2[1] * p.p2, b = c2[1] * p.p1 + c2[2] * p.p2;
+    g_covariance[0] = p.p1.x * a.x + p.p2.x * b.x;
+    g_covariance[1] = p.p1.x * a.y + p.p2.x * b.y + p.p1.y * a.x + p.p2.y * b.x;
+    g_covariance[2] = p.p1.x * a.z + p.p2.x * b.z + p.p1.z * a.x + p.p2.z * b.x;
+    g_covariance[3] = p.p1.y * a.y + p.p2.y * b.y;
+    g_covariance[4] = p.p1.y * a.z + p.p2.y * b.z + p.p1.z * a.y + p.p2.z * b.y;
+    g_covariance[5] = p.p1.z * a.z + p.p2.z * b.z;
   }
 
   // A clamped ray is a constant: its coordinate gets nothing through J, and z only through the factor 1/z.
   T g_ray_x = cam.mean_focal_x * g.pixel_x, g_ray_y = cam.mean_focal_y * g.pixel_y;
-  if (p.clamped_x == p.ray_x) g_ray_x -= cam.focal_x * p.inverse_z * dot(cam.row_z, gp1);
-  if (p.clamped_y == p.ray_y) g_ray_y -= cam.focal_y * p.inverse_z * dot(cam.row_z, gp2);
-  const T g_z =
-      -(dot(p.p1, gp1) + dot(p.p2, gp2) + p.ray_x * g_ray_x + p.ray_y * g_ray_y + p.inverse_z * g_inverse_depth);
+  if (p.clamped_x == p.ray_x) g_ray_x -= cam.focal_x * p.inverse_z * along1;
+  if (p.clamped_y == p.ray_y) g_ray_y -= cam.focal_y * p.inverse_z * along2;
+  const T g_z = -(shape.diagonal.x + shape.diagonal.y + shape.diagonal.z + p.ray_x * g_ray_x + p.ray_y * g_ray_y +
+                  p.inverse_z * g_inverse_depth);
   g.mean = p.inverse_z * (g_ray_x * cam.row_x + g_ray_y * cam.row_y + g_z * cam.row_z);
   return g;
 }

@@ -42,10 +42,11 @@ GS_HD Loaded<T> load(const Scene<T>& s, int64_t i) {
   return out;
 }
 
-// What need not show in the mean or the footprint, which are checked once computed.
+// What need not show in the mean or the footprint, which are checked once computed. Infinite logits are the opacities 0
+// and 1: programs that set an opacity write them.
 template <class T>
 GS_HD bool finite_shape(const Scene<T>& s, int64_t i) {
-  if (!std::isfinite(s.opacities[i])) return false;
+  if (s.raw ? std::isnan(s.opacities[i]) : !std::isfinite(s.opacities[i])) return false;
   if (s.cov3d) return finite(load3(s.cov3d + 6 * i)) && finite(load3(s.cov3d + 6 * i + 3));
   return finite(load3(s.scales + 3 * i)) && finite(load3(s.rotations + 4 * i)) && std::isfinite(s.rotations[4 * i + 3]);
 }
@@ -131,8 +132,9 @@ template <class T>
 GS_HD void project_vjp_row(const Scene<T>& s, const Camera<T>& camera, int64_t i, const T* m, const T* rest, T* g_rest,
                            const SceneGradient<T>& out) {
   const Loaded<T> in = load(s, i);
-  const GaussianGradient<T> g = project_splat_vjp(camera, in.gaussian, s.antialiasing, out.cov3d != nullptr,
-                                                  Moments<T>{m[0], m[1], m[2], m[3], m[4], m[5]}, m[9]);
+  const GaussianGradient<T> g =
+      project_splat_vjp(camera, in.gaussian, s.antialiasing, s.raw, out.cov3d ? out.cov3d + 6 * i : nullptr,
+                        Moments<T>{m[0], m[1], m[2], m[3], m[4], m[5]}, m[9]);
   Vec3<T> g_mean = g.mean;
   const Vec3<T> g_color = {m[6], m[7], m[8]};
   if (s.colors) {
@@ -147,16 +149,16 @@ GS_HD void project_vjp_row(const Scene<T>& s, const Camera<T>& camera, int64_t i
   if (out.opacities)
     out.opacities[i] = g.log_opacity * (s.raw ? log_sigmoid_slope(s.opacities[i]) : 1 / s.opacities[i]);
   if (out.scales)
-    for (int k = 0; k < 3; ++k)
-      out.scales[3 * i + k] = g.scale[k] * (s.raw ? in.gaussian.axes.scale[k] : s.scale_modifier);
+    for (int k = 0; k < 3; ++k) {
+      const T scale = s.raw ? T(1) : s.scales[3 * i + k];
+      out.scales[3 * i + k] = scale != 0 ? g.log_scale[k] / scale : T(0);  // even in the scale
+    }
   if (out.rotations) {
-    Quat<T> q = rotation_columns_vjp(in.rotation, g.direction);
-    if (s.raw) q = normalise_vjp(in.rotation, in.rotation_norm, q);
+    const Quat<T> q =
+        s.raw ? normalise_vjp(in.rotation, in.rotation_norm, g.torque) : rotation_columns_vjp(in.rotation, g.direction);
     T* row = out.rotations + 4 * i;
     row[0] = q.w, row[1] = q.x, row[2] = q.y, row[3] = q.z;
   }
-  if (out.cov3d)
-    for (int k = 0; k < 6; ++k) out.cov3d[6 * i + k] = g.covariance[k];
 }
 
 GS_ISA_END

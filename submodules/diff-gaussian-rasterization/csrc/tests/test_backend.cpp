@@ -104,7 +104,7 @@ void test_poison() {
         const Result<T> got = run(gs::serial_executor(), p, image, true);
         check_finite(got.color), check_finite(got.transmittance), check_finite(got.depth);
         check_finite(got.gradient);
-        if (std::isfinite(value)) continue;
+        if (std::isfinite(value) || (&values == &p.opacities && std::isinf(value))) continue;  // a logit like any other
         CHECK(got.tile_counts[kVictim] == 0);
         if (which < 4) CHECK(got.radii[kVictim] == 0);  // colours are read of splats with tiles only
         CHECK(got.color == wanted.color && got.gradient == wanted.gradient);

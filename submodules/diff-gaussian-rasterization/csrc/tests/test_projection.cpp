@@ -117,14 +117,16 @@ void check_gradient(double ray_x, double ray_y, bool antialiasing, bool given_co
   const double depth_weight = 0.8;
   Moments<double> moments = {};
   objective(cam, p, antialiasing, pixels, depth_weight, &moments);
-  const GaussianGradient<double> g =
-      project_splat_vjp(cam, gaussian(p), antialiasing, given_covariance, moments, depth_weight);
+  double covariance[6];
+  const GaussianGradient<double> g = project_splat_vjp(cam, gaussian(p), antialiasing, false,
+                                                       given_covariance ? covariance : nullptr, moments, depth_weight);
   Parameters got = {g.mean.x, g.mean.y, g.mean.z};
   if (given_covariance) {
-    got.insert(got.end(), g.covariance, g.covariance + 6);
+    got.insert(got.end(), covariance, covariance + 6);
   } else {
     const Quat<double> q = rotation_columns_vjp(Quat<double>{p[3], p[4], p[5], p[6]}, g.direction);
-    for (double value : {q.w, q.x, q.y, q.z, g.scale[0], g.scale[1], g.scale[2]}) got.push_back(value);
+    for (double value : {q.w, q.x, q.y, q.z}) got.push_back(value);
+    for (int k = 0; k < 3; ++k) got.push_back(g.log_scale[k] / p[7 + k]);
   }
   got.push_back(g.log_opacity / p.back());
 
@@ -148,6 +150,52 @@ void test_gradients() {
     for (bool given_covariance : {false, true})
       for (double ray_x : {-1.7, -0.4, 0.9, 1.6})
         for (double ray_y : {-1.5, 0.2, 1.8}) check_gradient(ray_x, ray_y, antialiasing, given_covariance);
+}
+
+// Turning about the axes of a unit quaternion: the torque against the gradient of the axes' directions.
+void test_torque() {
+  for (bool antialiasing : {false, true}) {
+    const Camera<double> cam = camera(0.1, -0.15);
+    Gaussian<double> g = {{0.1, 0.2, 1.5}, {}, -0.5};
+    double norm;
+    const Quat<double> q = normalise(Quat<double>{normal(), normal(), normal(), normal()}, norm);
+    rotation_columns(q, g.axes.direction);
+    for (double& s : g.axes.scale) s = uniform(0.02, 0.4);
+    const Moments<double> moments = {0.3, 0.1, -0.2, 0.4, 0.15, -0.3};
+    const auto vjp = [&](bool perpendicular) {
+      return project_splat_vjp<double>(cam, g, antialiasing, perpendicular, nullptr, moments, 0.0);
+    };
+    const GaussianGradient<double> general = vjp(false);
+    const Vec3<double>*of = general.direction, *d = g.axes.direction;
+    const Vec3<double> wanted = {dot(d[2], of[1]) - dot(d[1], of[2]), dot(d[0], of[2]) - dot(d[2], of[0]),
+                                 dot(d[1], of[0]) - dot(d[0], of[1])};
+    const Vec3<double> got = vjp(true).torque;
+    CHECK_NEAR(got.x, wanted.x, 1e-12 * (1 + length(wanted)));
+    CHECK_NEAR(got.y, wanted.y, 1e-12 * (1 + length(wanted)));
+    CHECK_NEAR(got.z, wanted.z, 1e-12 * (1 + length(wanted)));
+    CHECK(length(wanted) > 1e-3);
+    for (double& s : g.axes.scale) s = 0.1;
+    const Vec3<double> none = vjp(true).torque;
+    CHECK(none.x == 0 && none.y == 0 && none.z == 0);
+  }
+}
+
+// A field of view of 0.001 degrees: rows that rounding left a little oblique are no shift of the principal point.
+void test_narrow_camera() {
+  const double tan = 1.0 / (1 << 17);  // a power of two, so the projection is exact
+  const Camera<double> turned = camera(0, 0);
+  const Vec3<double> row[3] = {turned.row_x, turned.row_y, turned.row_z};
+  float view[16] = {}, full[16] = {};
+  for (int i = 0; i < 3; ++i) {
+    view[i] = float(row[i].x), view[4 + i] = float(row[i].y), view[8 + i] = float(row[i].z);
+    for (int k = 0; k < 3; ++k) full[4 * k + i] = i < 2 ? view[4 * k + i] / float(tan) : view[4 * k + i];
+  }
+  const float center[3] = {};
+  const Camera<float> cam = make_camera(view, full, center, tan, tan, kWidth, kHeight);
+  // Before the rows' angle was taken out, 0.1 px or so.
+  CHECK_NEAR(cam.axis_x, 0.5 * (kWidth - 1), 1e-5);
+  CHECK_NEAR(cam.axis_y, 0.5 * (kHeight - 1), 1e-5);
+  CHECK_NEAR(cam.mean_focal_x / cam.focal_x, 1, 1e-6);
 }
 
 // The exponent within 3 sigma, in log2 units, of needles of `length` px: M given, both precisions from it.
@@ -214,6 +262,8 @@ void test_footprint_identities() {
 
 int main() {
   test_gradients();
+  test_torque();
+  test_narrow_camera();
   test_needles();
   test_footprint_identities();
   return gs::finish_tests("rasterizer projection");
