@@ -27,6 +27,7 @@ from scene.gaussian_model import GaussianModel
 from scene.memory_guard import memory_errors_explained
 from utils import render_times
 from utils.general_utils import safe_state
+from utils.image_utils import right_half
 from utils.system_utils import UserError, atomic_write, compute_device, mkdir_p, run_cli
 
 
@@ -57,9 +58,17 @@ def remove_leftovers(folder: Path, count: int) -> None:
 
 
 def render_set(
-    folder: Path, views: list[Camera], gaussians: GaussianModel, pipe: argparse.Namespace, background: torch.Tensor
+    folder: Path,
+    views: list[Camera],
+    gaussians: GaussianModel,
+    pipe: argparse.Namespace,
+    background: torch.Tensor,
+    train_test_exp: bool = False,
 ) -> list[float]:
-    """Write the renders and the ground truth of `views` under `folder`; seconds of rendering per view (without I/O)."""
+    """Write the renders and the ground truth of `views` under `folder`; seconds of rendering per view (without I/O).
+
+    train_test_exp: render with exposures, and write right halves only.
+    """
     for side in ("renders", "gt"):
         remove_leftovers(folder / side, len(views))
         if views:
@@ -69,22 +78,28 @@ def render_set(
         return []
     seconds = []
     for view in {(view.image_width, view.image_height): view for view in views}.values():
-        _image(view, gaussians, pipe, background)  # the first call of a size pays for allocations and caches
+        # The first call of a size pays for allocations and caches.
+        _image(view, gaussians, pipe, background, train_test_exp)
     for index, view in enumerate(tqdm(views, desc=f"Rendering {folder.parent.name}", unit="view")):
         _wait(background.device)
         start = time.perf_counter()
-        image = _image(view, gaussians, pipe, background)
+        image = _image(view, gaussians, pipe, background, train_test_exp)
         _wait(background.device)
         seconds.append(time.perf_counter() - start)
+        target = view.target(background)
+        if train_test_exp:
+            image, target = right_half(image), right_half(target)
         save_png(image, folder / "renders" / f"{index:05d}.png")
-        save_png(view.target(background), folder / "gt" / f"{index:05d}.png")
+        save_png(target, folder / "gt" / f"{index:05d}.png")
         if (mask := view.mask) is not None:
-            save_mask(mask, folder / "masks" / f"{index:05d}.png")
+            save_mask(right_half(mask) if train_test_exp else mask, folder / "masks" / f"{index:05d}.png")
     return seconds
 
 
-def _image(view: Camera, gaussians: GaussianModel, pipe: argparse.Namespace, background: torch.Tensor) -> torch.Tensor:
-    return render(view, gaussians, pipe, background, want_visibility=False)["render"]
+def _image(
+    view: Camera, gaussians: GaussianModel, pipe: argparse.Namespace, background: torch.Tensor, exposed: bool
+) -> torch.Tensor:
+    return render(view, gaussians, pipe, background, use_trained_exp=exposed, want_visibility=False)["render"]
 
 
 def _wait(device: torch.device) -> None:
@@ -119,7 +134,7 @@ def main() -> None:
         folder = Path(scene.model_path) / name / f"ours_{scene.loaded_iter}"
         (folder / render_times.NAME).unlink(missing_ok=True)  # not of what an interrupted run has left
         with memory_errors_explained(gaussians, views):
-            seconds = render_set(folder, views, gaussians, pipe, background)
+            seconds = render_set(folder, views, gaussians, pipe, background, options.train_test_exp)
         if seconds:
             sizes = [(view.image_width, view.image_height) for view in views]
             times = render_times.summarise(seconds, sizes, len(gaussians), pipe.antialiasing, background.device)

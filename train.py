@@ -29,10 +29,10 @@ from scene.memory_guard import MemoryGuard
 from utils.counter_rng import Stream, permutation, uniform
 from utils.curve_recorder import CurveRecorder, evenly_spread
 from utils.error_curve import Row, continue_curve
-from utils.general_utils import safe_state
-from utils.image_utils import as_float, pixels_that_count, psnr
+from utils.general_utils import get_expon_lr_func, safe_state
+from utils.image_utils import as_float, pixels_that_count, psnr, right_half
 from utils.interrupt import DeferredInterrupt
-from utils.loss_utils import l1_loss, photometric_loss
+from utils.loss_utils import inverse_depth_loss, l1_loss, photometric_loss
 from utils.loss_watch import LossWatch
 from utils.system_utils import UserError, compute_device, mkdir_p, run_cli, saved_iterations
 from utils.training_log import Stopwatch, TrainingLog
@@ -78,6 +78,7 @@ def training(
     gaussians.training_setup(opt)
     if capture is not None:
         gaussians.restore(capture, opt)
+        _check_exposures(gaussians, dataset.train_test_exp, checkpoint)
         capture = None  # so that densification can free what it replaces
     views = _ViewOrder(scene.getTrainCameras(), opt.seed)
     # After all that bad input can stop, or a slip of the keyboard would overwrite the files of a finished model.
@@ -89,12 +90,16 @@ def training(
     fixed_background = torch.full((3,), 1.0 if dataset.white_background else 0.0, device=device)
     log = TrainingLog(scene.model_path, first_iteration)
     losses = LossWatch(device, log.loss)
+    depth_weight = get_expon_lr_func(opt.depth_l1_weight_init, opt.depth_l1_weight_final, max_steps=opt.iterations)
+    depth_losses = LossWatch(device)
     # Where something is written: all losses up to there must have been looked at.
     stops = {opt.iterations, *testing_iterations, *saving_iterations, *checkpoint_iterations}
     rows = continue_curve(scene.model_path, first_iteration)
     curve = None
     if record_curve and scene.getTestCameras():
-        curve = _curve(scene, rows, log, opt.iterations, testing_iterations, pipe, fixed_background)
+        curve = _curve(
+            scene, rows, log, opt.iterations, testing_iterations, pipe, fixed_background, dataset.train_test_exp
+        )
     clock = Stopwatch()
     bar = tqdm(initial=first_iteration, total=opt.iterations, desc="Training progress", dynamic_ncols=True)
     guard = MemoryGuard(gaussians, scene.model_path, first_iteration)
@@ -111,15 +116,29 @@ def training(
             scene.prefetch(views.coming(iteration, min(scene.images.ahead, opt.iterations - iteration + 1)))
             background = _random_background(opt.seed, iteration, device) if opt.random_background else fixed_background
 
-            package = render(camera, gaussians, pipe, background, want_visibility=False)
-            loss, l1 = photometric_loss(package["render"], camera.target(background), opt.lambda_dssim, camera.mask)
+            weight = depth_weight(iteration) if camera.depth_reliable else 0.0
+            package = render(
+                camera, gaussians, pipe, background,
+                use_trained_exp=dataset.train_test_exp, want_depth=weight > 0, want_visibility=False,
+            )  # fmt: skip
+            loss, l1 = photometric_loss(
+                package["render"], camera.target(background), opt.lambda_dssim, camera.mask, camera.columns
+            )
+            if weight > 0:
+                depth_loss = weight * inverse_depth_loss(package["depth"], camera.invdepthmap, camera.columns)
+                depth_losses.add(iteration, depth_loss)
+                loss = loss + depth_loss
             loss.backward()
 
             losses.add(iteration, loss)
             curve_due = curve is not None and curve.due(iteration, clock.seconds)
             if iteration % BAR_INTERVAL == 0 or iteration in stops or curve_due:
                 _check_losses(losses.read(), views)
-                bar.set_postfix({"Loss": f"{losses.mean:.7f}", "Gaussians": len(gaussians)}, refresh=False)
+                shown = {"Loss": f"{losses.mean:.7f}"}
+                if dataset.depths:
+                    depth_losses.read()
+                    shown["Depth Loss"] = f"{depth_losses.mean:.7f}"
+                bar.set_postfix(shown, Gaussians=len(gaussians), refresh=False)
                 bar.update(iteration - bar.n)
             seconds = clock.seconds
             with clock.paused():
@@ -127,7 +146,7 @@ def training(
                     curve.add(iteration, seconds, len(gaussians))
                 scores = training_report(
                     tb_writer, iteration, l1, loss, l1_loss, seconds - started, testing_iterations, scene, render,
-                    (pipe, fixed_background),
+                    (pipe, fixed_background), dataset.train_test_exp,
                 )  # fmt: skip
                 saving = iteration in saving_iterations
                 if saving:
@@ -140,8 +159,7 @@ def training(
             guard.changing()
             _control_density(gaussians, package, iteration, opt, scene.cameras_extent, dataset.white_background)
             if iteration < opt.iterations:
-                gaussians.optimizer.step()
-                gaussians.optimizer.zero_grad(set_to_none=True)
+                gaussians.step(package["radii"])
             guard.reached(iteration)
             stop = interrupt.requested  # once: a signal may come at any moment
             if iteration in checkpoint_iterations or stop:
@@ -172,19 +190,31 @@ def _curve(
     testing_iterations: Sequence[int],
     pipe: argparse.Namespace,
     background: Tensor,
+    train_test_exp: bool,
 ) -> CurveRecorder:
     """Recorder of the error of all test views and as many training views."""
     test = scene.getTestCameras()
+    trained = [camera for camera in scene.getTrainCameras() if camera.columns is None]  # in whole
+
+    def image(camera: Camera) -> Tensor:
+        package = render(
+            camera, scene.gaussians, pipe, background, use_trained_exp=train_test_exp, want_visibility=False
+        )
+        return package["render"]
+
+    def scored(image: Tensor) -> Tensor:
+        return right_half(image).contiguous() if train_test_exp else image
+
     return CurveRecorder(
         scene.model_path,
         rows,
         log,
         iterations,
         testing_iterations,
-        {"test": test, "train": evenly_spread(scene.getTrainCameras(), len(test))},
-        lambda camera: render(camera, scene.gaussians, pipe, background, want_visibility=False)["render"],
-        lambda camera: camera.target(background),
-        lambda camera: camera.mask,
+        {"test": test, "train": evenly_spread(trained, len(test))},
+        lambda camera: scored(image(camera)),
+        lambda camera: scored(camera.target(background)),
+        lambda camera: None if camera.mask is None else scored(camera.mask),
         background.device,
     )
 
@@ -197,6 +227,14 @@ def _check_losses(values: dict[int, float], views: "_ViewOrder") -> None:
                 f"the loss became {value} in iteration {iteration} (view {views[iteration].image_name}), so training "
                 "stopped and nothing of it was saved; lower the learning rates, or check this view and the point cloud"
             )
+
+
+def _check_exposures(gaussians: GaussianModel, train_test_exp: bool, checkpoint: str) -> None:
+    """UserError for a checkpoint with exposures that this run would not use; a word on the opposite."""
+    if gaussians.exposures.trained and not train_test_exp:
+        raise UserError(f"{checkpoint} was trained with --train_test_exp; give that option")
+    if train_test_exp and not gaussians.exposures.trained:
+        print(f"{checkpoint} has no exposures: all pictures start without a correction")
 
 
 class _ViewOrder:
@@ -300,10 +338,12 @@ def training_report(
     scene: Scene,
     renderFunc: Callable[..., dict[str, Tensor]],
     renderArgs: tuple,
+    train_test_exp: bool = False,
 ) -> dict[str, float]:
     """Log every tenth iteration to TensorBoard; in a testing one score test views and five training views, and print.
 
     elapsed: seconds of this iteration; renderArgs: what follows camera and model in renderFunc, (pipe, background).
+    train_test_exp: render with exposures, and score right halves only.
     Returns `<set>_l1` and `<set>_psnr` (dB, mean over views and channels) of the sets scored, {} otherwise.
     """
     if tb_writer and iteration % BAR_INTERVAL == 0:  # not always: reading a loss waits for the GPU
@@ -312,6 +352,7 @@ def training_report(
         tb_writer.add_scalar("iter_time", elapsed * 1000.0, iteration)
     if iteration not in testing_iterations:
         return {}
+    exposed = {"use_trained_exp": True} if train_test_exp else {}
     train = scene.getTrainCameras()
     sets = {"test": scene.getTestCameras(), "train": [train[i % len(train)] for i in range(5, 30, 5)]}
     scores = {}
@@ -321,9 +362,12 @@ def training_report(
         differences, ratios = [], []
         for index, camera in enumerate(cameras):
             with torch.no_grad():
-                image = renderFunc(camera, scene.gaussians, *renderArgs)["render"]
+                image = renderFunc(camera, scene.gaussians, *renderArgs, **exposed)["render"]
                 target = as_float(camera.target(renderArgs[1]))
-                counted = [pixels_that_count(x, camera.mask) for x in (image, target)]
+                mask = camera.mask
+                if train_test_exp:
+                    image, target, mask = (None if x is None else right_half(x) for x in (image, target, mask))
+                counted = [pixels_that_count(x, mask) for x in (image, target)]
                 differences.append(l1_loss(*counted).item())
                 ratios.append(psnr(*counted).mean().item())
             if tb_writer and index < 5:

@@ -5,9 +5,6 @@ import os
 
 from arguments.param_group import Option, ParamGroup, above, at_least, one_of, within
 
-_EXPOSURE = "exposure compensation"
-_DEPTH = "depth supervision"
-
 
 def _resolution(value: int) -> str | None:
     return None if value == -1 or value > 0 else "-1, 1, 2, 4, 8 or a width in pixels"
@@ -41,9 +38,9 @@ class ModelParams(ParamGroup):
         Option(
             "depths",
             "",
-            "folder of inverse depth maps under the scene folder; empty: no depth supervision",
+            "folder of inverse depth maps (PNG by the pictures' names) under the scene folder, which steady what few "
+            "pictures see; empty: no depth supervision",
             short="d",
-            unbuilt=_DEPTH,
             stored=True,
         ),
         Option(
@@ -59,8 +56,8 @@ class ModelParams(ParamGroup):
         Option(
             "train_test_exp",
             False,
-            "train on the left half of the test pictures too and score the right half, with exposure compensation",
-            unbuilt=_EXPOSURE,
+            "train a colour correction of each picture, for pictures of different exposure, also on the left halves of "
+            "the test pictures; only right halves are scored and rendered",
             stored=True,
         ),
         Option(
@@ -180,10 +177,22 @@ class OptimizationParams(ParamGroup):
         ),
         Option("scaling_lr", 0.005, "learning rate of the logarithms of the scales", check=at_least(0)),
         Option("rotation_lr", 0.001, "learning rate of the quaternions", check=at_least(0)),
-        Option("exposure_lr_init", 0.01, "learning rate of exposures at the start", unbuilt=_EXPOSURE),
-        Option("exposure_lr_final", 0.001, "learning rate of exposures at the end", unbuilt=_EXPOSURE),
-        Option("exposure_lr_delay_steps", 0, "steps over which the rate of exposures rises", unbuilt=_EXPOSURE),
-        Option("exposure_lr_delay_mult", 0.0, "factor of the rate of exposures at step 0", unbuilt=_EXPOSURE),
+        Option(
+            "exposure_lr_init", 0.01, "learning rate of exposures (--train_test_exp) at the start", check=at_least(0)
+        ),
+        Option("exposure_lr_final", 0.001, "learning rate of exposures in the last step", check=at_least(0)),
+        Option(
+            "exposure_lr_delay_steps",
+            0,
+            "steps over which the rate of exposures rises to what it would be without",
+            check=at_least(0),
+        ),
+        Option(
+            "exposure_lr_delay_mult",
+            0.0,
+            "factor of the rate of exposures at step 0 of that rise",
+            check=within(0, 1),
+        ),
         Option(
             "percent_dense",
             0.01,
@@ -214,17 +223,17 @@ class OptimizationParams(ParamGroup):
             "paper",
             check=above(0),
         ),
-        Option("depth_l1_weight_init", 1.0, "weight of the depth loss at the start", unbuilt=_DEPTH),
-        Option("depth_l1_weight_final", 0.01, "weight of the depth loss at the end", unbuilt=_DEPTH),
+        Option("depth_l1_weight_init", 1.0, "weight of the depth loss (--depths) at the start", check=at_least(0)),
+        Option("depth_l1_weight_final", 0.01, "weight of the depth loss in the last step", check=at_least(0)),
         Option(
             "random_background", False, "a new random background in every step, so that nothing hides in one colour"
         ),
         Option(
             "optimizer_type",
             "default",
-            "default: Adam over all Gaussians",
+            "default: Adam over all Gaussians; sparse_adam: steps only those that the view sees, without bias "
+            "correction; faster where views see little of the scene",
             check=one_of("default", "sparse_adam"),
-            unbuilt="the sparse Adam optimiser",
         ),
         Option(
             "max_num_splats",

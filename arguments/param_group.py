@@ -18,7 +18,6 @@ class Option:
     name, short: long name (also the attribute) and one-letter form; default: its type is the option's type.
     help: effect of the option; origin: where the default comes from, "ours..." for options the reference does not have.
     check: takes a value, returns what is wanted when the value is not that, else None.
-    unbuilt: what this version lacks for any value but the default.
     stored: belongs to `cfg_args`. remembered: belongs to `model.json`, for render.py.
     """
 
@@ -28,7 +27,6 @@ class Option:
     origin: str = "reference"
     short: str | None = None
     check: Callable[[Any], str | None] | None = None
-    unbuilt: str | None = None
     stored: bool = False
     remembered: bool = False
 
@@ -53,15 +51,12 @@ class Option:
         return {int: "N", float: "X", str: "TEXT"}[type(self.default)]
 
     def verify(self, value: Value) -> None:
-        """UserError when the value is not finite, not sensible, or asks for what is not built yet."""
+        """UserError when the value is not finite or not sensible."""
         if isinstance(value, float) and not math.isfinite(value):
             raise UserError(f"--{self.name} must be a finite number, got {value}")
         wanted = self.check(value) if self.check else None
         if wanted:
             raise UserError(f"--{self.name} must be {wanted}, got {value!r}")
-        if self.unbuilt and value != self.default:
-            typed = f"--{self.name}" if value is True else f"--{self.name} {value}"
-            raise UserError(f"{typed} needs {self.unbuilt}, which this version does not have yet; leave the option out")
 
 
 class OptionParser(argparse.ArgumentParser):

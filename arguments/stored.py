@@ -97,8 +97,6 @@ def get_combined_args(parser: argparse.ArgumentParser, argv: Sequence[str] | Non
     if not getattr(args, "model_path", None):
         raise UserError("no model folder given; name it with -m")
     stored = read_cfg_args(args.model_path)
-    # Depth maps supervise training; a finished model is used without them.
-    stored.pop("depths", None)
     typed = {name: value for name, value in vars(args).items() if value is not None}
     record = read_model_json(args.model_path)
     stored |= {name: record[name] for name in _REMEMBERED if name in record}

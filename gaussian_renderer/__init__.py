@@ -9,8 +9,8 @@ from torch import Tensor
 
 from scene.cameras import Camera, MiniCam
 from scene.gaussian_model import GaussianModel
+from utils.exposure import apply_exposure
 from utils.sh_utils import eval_sh
-from utils.system_utils import UserError
 
 
 def render(
@@ -30,15 +30,14 @@ def render(
 
     bg_color: (3,) in [0, 1] on the model's device. scaling_modifier multiplies all scales. override_color: (N, 3)
     instead of SH. separate_sh: accepted for callers of the reference; the SH bands always go separately.
-    pipe: convert_SHs_python, compute_cov3D_python, debug, antialiasing.
+    pipe: convert_SHs_python, compute_cov3D_python, debug, antialiasing. use_trained_exp: as the picture behind the view
+    was exposed, before the clamp; a view without a picture is shown without.
 
     Returns `render` (3, H, W) clamped to [0, 1], also in training, so values outside get no gradient;
     `viewspace_points` (N, 3) whose gradient is that of the screen means, per NDC unit; `visibility_filter` (n, 1) int64
     indices of the Gaussians with radius > 0, or None without want_visibility (a GPU has to be waited for it); `radii`
     (N,) int32 pixels; `depth` inverse depth (1, H, W), or None unless want_depth.
     """
-    if use_trained_exp:
-        raise UserError("exposure compensation is not built yet; leave use_trained_exp off")
     xyz = pc.get_xyz
     viewspace_points = torch.zeros_like(xyz, requires_grad=xyz.requires_grad and torch.is_grad_enabled())
     result = rasterize(
@@ -49,8 +48,11 @@ def render(
         **_geometry(pc, pipe.compute_cov3D_python, scaling_modifier),
         **_colors(pc, pipe.convert_SHs_python, viewpoint_camera, override_color),
     )
+    color = result.color
+    if use_trained_exp and (name := getattr(viewpoint_camera, "exposure_name", None)) is not None:
+        color = apply_exposure(color, pc.get_exposure_from_name(name))
     return {
-        "render": result.color.clamp(0, 1),
+        "render": color.clamp(0, 1),
         "viewspace_points": viewspace_points,
         "visibility_filter": (result.radii > 0).nonzero() if want_visibility else None,
         "radii": result.radii,

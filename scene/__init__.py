@@ -14,7 +14,9 @@ import torch
 
 from scene.cameras import Camera, camera_to_JSON, cameraList_from_camInfos
 from scene.dataset_readers import CameraInfo, read_scene
-from scene.image_store import ImageStore, Source
+from scene.depth_maps import with_depth_maps
+from scene.half_images import mark_halves, train_on_all
+from scene.image_store import ImageStore, Picture
 from scene.masks import MaskOptions
 from scene.point_cloud import write_point_cloud
 from utils.graphics_utils import BasicPointCloud
@@ -29,6 +31,10 @@ class _Gaussians(Protocol):
     def load_ply(self, path: str) -> None: ...
 
     def save_ply(self, path: str) -> None: ...
+
+    def load_exposures(self, folder: str, cam_infos: Sequence[CameraInfo]) -> None: ...
+
+    def save_exposures(self, folder: str) -> None: ...
 
 
 class Scene:
@@ -65,6 +71,11 @@ class Scene:
             init_type=args.init_type,
             masks=MaskOptions(args.masks, args.invert_masks, args.mask_meaning),
         )
+        self._halves = args.train_test_exp
+        if self._halves:
+            info = train_on_all(info)
+        if args.depths and self.loaded_iter is None:
+            info = with_depth_maps(info, Path(args.source_path), args.depths)
         self._info = info
         self.cameras_extent = info.extent
 
@@ -75,6 +86,10 @@ class Scene:
         self._test = self._cameras(info.test_cameras, args, images, device, shuffle, resolution_scales)
         images.plan(_pictures(self._train), _pictures(self._test))
 
+        if self._halves:
+            for scale in resolution_scales:
+                mark_halves(self._train[scale], self._test[scale], info.train_cameras)
+
         if self.loaded_iter is None:
             gaussians.create_from_pcd(info.point_cloud, info.train_cameras, self.cameras_extent)
             if write:
@@ -82,6 +97,8 @@ class Scene:
         else:
             print(f"Loading trained model at iteration {self.loaded_iter}")
             gaussians.load_ply(str(self._ply(self.loaded_iter)))
+            if self._halves:
+                gaussians.load_exposures(self.model_path, info.train_cameras)
 
     def getTrainCameras(self, scale: float = 1.0) -> list[Camera]:
         """Training views at a resolution scale that the scene was made with."""
@@ -96,8 +113,10 @@ class Scene:
         self.images.prefetch([picture for camera in cameras for picture in camera.pictures])
 
     def save(self, iteration: int) -> None:
-        """Write the Gaussians as `point_cloud/iteration_N/point_cloud.ply`."""
+        """Write the Gaussians as `point_cloud/iteration_N/point_cloud.ply`, and exposures where those are trained."""
         self.gaussians.save_ply(str(self._ply(iteration)))
+        if self._halves:
+            self.gaussians.save_exposures(self.model_path)
 
     def write_inputs(self) -> None:
         """Write the cloud and the cameras into the model folder, `input.ply` and `cameras.json`."""
@@ -145,7 +164,7 @@ class Scene:
         return lists
 
 
-def _pictures(lists: dict[float, list[Camera]]) -> list[tuple[Source, tuple[int, int]]]:
+def _pictures(lists: dict[float, list[Camera]]) -> list[Picture]:
     return [picture for cameras in lists.values() for camera in cameras for picture in camera.pictures]
 
 

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from scene.dataset_readers import CameraInfo
-from scene.image_store import ImageStore, Source
+from scene.image_store import ImageStore, Picture
 from scene.masks import TRANSPARENT, Cutout
 from scene.resolution import training_size
 from utils.graphics_utils import getProjectionMatrix, getWorld2View2
@@ -25,7 +25,8 @@ class Camera:
     uid: index in its list; colmap_id: intrinsics id. R (3,3) camera-to-world, T (3,) world-to-camera, NumPy float64.
     FoVx, FoVy: radians. fx, fy, cx, cy: pixels at image_width x image_height, pixel centres at .5 (the rasterizer's
     integer pixel coordinates are half a pixel less). world_view_transform, projection_matrix, full_proj_transform:
-    (4,4) float32, transposed; camera_center (3,) float32; all on `device`.
+    (4,4) float32, transposed; camera_center (3,) float32; all on `device`. columns: those that count, left out of loss
+    or scores is the rest; None: all (scene/half_images.py). exposure_name: the picture's among the trained exposures.
     """
 
     def __init__(
@@ -44,6 +45,8 @@ class Camera:
         self.FoVy = info.FovY
         self.image_name = info.image_name
         self.image_path = info.image_path
+        self.exposure_name = info.image_name
+        self.columns: slice | None = None
         self.image_width, self.image_height = size
         self.fx = info.fx * self.image_width / info.width
         self.fy = info.fy * self.image_height / info.height
@@ -58,6 +61,7 @@ class Camera:
         self._ignore_alpha = info.ignore_alpha
         if info.mask is not None and info.mask.meaning == TRANSPARENT:
             self._source, self._mask = Cutout(info.image_path, info.mask), None
+        self._depth = info.depth
 
         # float64 up to here: the product and the inverse are rounded once.
         view = torch.from_numpy(getWorld2View2(info.R, info.T))
@@ -73,10 +77,10 @@ class Camera:
         return matrix.to(self.device, torch.float32).contiguous()
 
     @property
-    def pictures(self) -> list[tuple[Source, tuple[int, int]]]:
-        """What `target` and `mask` read, in this order, each with the size (width, height) it is decoded at."""
-        sources = [self._source] if self._mask is None else [self._source, self._mask]
-        return [(source, (self.image_width, self.image_height)) for source in sources]
+    def pictures(self) -> list[Picture]:
+        """What `target`, `mask` and `invdepthmap` read, each with the size (width, height) it is decoded at."""
+        sources = (self._source, self._mask, self._depth)
+        return [(source, (self.image_width, self.image_height)) for source in sources if source is not None]
 
     def _pixels(self) -> Tensor:
         pixels = self._images.get(*self.pictures[0])
@@ -114,9 +118,35 @@ class Camera:
 
     @property
     def alpha_mask(self) -> Tensor | None:
-        """The picture's alpha (1,H,W) float32 in [0,1], None where it has none."""
+        """The picture's alpha (1,H,W) float32 in [0,1], 0 outside `columns`; None where it has none and all count."""
         pixels = self._pixels()
-        return pixels[3:].float() / 255 if pixels.shape[0] == 4 else None
+        alpha = pixels[3:].float() / 255 if pixels.shape[0] == 4 else None
+        return alpha if self.columns is None else self._within_columns(alpha)
+
+    @property
+    def depth_reliable(self) -> bool:
+        """Whether there is an inverse depth map to train on."""
+        return self._depth is not None
+
+    @property
+    def invdepthmap(self) -> Tensor | None:
+        """Inverse depth (1,H,W) float32, 1 / world units; None without a reliable map."""
+        if self._depth is None:
+            return None
+        values = self._images.get(*self.pictures[-1])
+        return values.to(self.device, non_blocking=True)
+
+    @property
+    def depth_mask(self) -> Tensor | None:
+        """(1,H,W) float32: 1 where the inverse depth counts, 0 outside `columns`; None without a reliable map."""
+        return None if self._depth is None else self._within_columns()
+
+    def _within_columns(self, values: Tensor | None = None) -> Tensor:
+        """Values (1,H,W), ones by default, in the columns that count; 0 elsewhere."""
+        mask = torch.zeros(1, self.image_height, self.image_width, device=self.device)
+        columns = slice(None) if self.columns is None else self.columns
+        mask[..., columns] = 1.0 if values is None else values[..., columns]
+        return mask
 
 
 class MiniCam:

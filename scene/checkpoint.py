@@ -10,7 +10,7 @@ import torch
 
 from utils.system_utils import UserError, atomic_write
 
-_ENTRIES = 12  # of the reference; the values of further attributes may follow
+_ENTRIES = 12  # of the reference; the values of further attributes may follow, and a dict of the exposures
 # The reference stores the scene extent as a NumPy scalar. NumPy 1 and 2 name its rebuilding function differently.
 _SCALAR = np.float64(0).__reduce__()[0]
 _ALLOWED = [
@@ -64,7 +64,7 @@ def _checked(content: Any) -> tuple[tuple, int]:
         raise ValueError(f"the iteration is {iteration!r:.40}")
     if type(capture[0]) is not int or not 0 <= capture[0] <= 3:
         raise ValueError(f"the active SH degree is {capture[0]!r:.40}")
-    per_gaussian = (*capture[1:10], *capture[_ENTRIES:])
+    per_gaussian = (*capture[1:10], *(entry for entry in capture[_ENTRIES:] if not isinstance(entry, dict)))
     if not all(torch.is_tensor(t) and t.dim() > 0 and t.dtype == torch.float32 for t in per_gaussian):
         raise ValueError("a value per Gaussian is not a float32 tensor")
     count = len(capture[1])

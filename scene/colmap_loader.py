@@ -82,6 +82,44 @@ def read_model(folder: Path) -> ColmapModel:
     raise UserError(f"cannot read the COLMAP model in {folder} ({'; '.join(errors)}); export it again from COLMAP")
 
 
+class Sightings(NamedTuple):
+    """Points a registered picture sees: their pixels (n,2) of width x height, centres at .5, and depths z (n,)."""
+
+    name: str
+    width: int
+    height: int
+    pixels: np.ndarray
+    depths: np.ndarray
+
+
+def read_sightings(folder: Path, suffix: str) -> list[Sightings]:
+    """Sightings of all registered pictures of a model in files .bin or .txt. UserError when it can't be read."""
+    if not _has_model(folder, suffix):
+        raise UserError(f"no COLMAP model in {folder} as .{suffix}; choose the other kind with --model_type")
+    model = import_pycolmap().Reconstruction()
+    try:
+        (model.read_binary if suffix == "bin" else model.read_text)(str(folder))
+    except (ValueError, RuntimeError, IndexError, MemoryError) as error:
+        raise UserError(f"cannot read the COLMAP model in {folder} ({error}); export it again from COLMAP") from error
+    sightings = []
+    for image_id in sorted(model.reg_image_ids()):
+        image = model.images[image_id]
+        camera = model.cameras[image.camera_id]
+        seen = [point for point in image.points2D if point.has_point3D()]
+        points = np.array([model.points3D[point.point3D_id].xyz for point in seen], dtype=np.float64).reshape(-1, 3)
+        pose = image.cam_from_world().matrix()
+        sightings.append(
+            Sightings(
+                name=image.name,
+                width=int(camera.width),
+                height=int(camera.height),
+                pixels=np.array([point.xy for point in seen], dtype=np.float64).reshape(-1, 2),
+                depths=points @ pose[2, :3] + pose[2, 3],
+            )
+        )
+    return sightings
+
+
 def points_file(folder: Path) -> Path:
     """The file that holds the model's points."""
     return next(path for path in (folder / "points3D.bin", folder / "points3D.txt") if path.is_file())

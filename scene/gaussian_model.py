@@ -11,9 +11,12 @@ from simple_knn._C import distCUDA2
 from torch import Tensor, nn
 
 from scene import densification as adc
+from scene.exposure import Exposures, read_exposures
 from scene.gaussian_attributes import IN_CHECKPOINT, Rows, attributes
 from scene.gaussian_optimizer import GaussianAdam
 from scene.gaussian_ply import read_ply, write_ply
+from scene.half_images import exposure_names
+from scene.sparse_adam import SparseGaussianAdam
 from utils.general_utils import build_scaling_rotation, get_expon_lr_func, strip_symmetric
 from utils.graphics_utils import BasicPointCloud
 from utils.sh_utils import RGB2SH
@@ -21,6 +24,7 @@ from utils.system_utils import UserError, compute_device
 
 INITIAL_OPACITY = 0.1
 MIN_DISTANCE2 = 1e-7  # floor of the squared distance to the neighbours, square world units: duplicates get a size
+_OPTIMIZERS = {"default": GaussianAdam, "sparse_adam": SparseGaussianAdam}
 LONE_POINT_SCALE = 0.01  # initial scale as a part of the extent where there are too few points to have neighbours
 
 
@@ -29,18 +33,20 @@ class GaussianModel:
 
     `_xyz` (N,3) world; `_features_dc` (N,1,3), `_features_rest` (N,K,3), K = (D+1)^2 - 1; `_scaling` (N,3) log;
     `_rotation` (N,4) wxyz, any length; `_opacity` (N,1) logit. Statistics since the last densification:
-    `xyz_gradient_accum` (N,1), `denom` (N,1), `max_radii2D` (N).
+    `xyz_gradient_accum` (N,1), `denom` (N,1), `max_radii2D` (N). `exposures`: of the training pictures, identities
+    unless trained. optimizer_type: "default" or "sparse_adam", whose step takes a mask of the visible Gaussians.
     """
 
     def __init__(self, sh_degree: int, optimizer_type: str = "default") -> None:
-        if optimizer_type != "default":
-            raise UserError(f"optimizer_type {optimizer_type!r} is not built yet; leave it at 'default'")
+        if optimizer_type not in _OPTIMIZERS:
+            raise UserError(f"optimizer_type must be {' or '.join(_OPTIMIZERS)}, got {optimizer_type!r}")
         self.active_sh_degree = 0
         self.max_sh_degree = sh_degree
         self.optimizer_type = optimizer_type
         self.optimizer: GaussianAdam | None = None
         self.percent_dense = 0.0
         self.spatial_lr_scale = 0.0
+        self.exposures = Exposures()
         self._attributes = attributes(sh_degree)
         self._set_rows({name: torch.empty(0, *attribute.shape) for name, attribute in self._attributes.items()})
 
@@ -83,6 +89,15 @@ class GaussianModel:
         return strip_symmetric(factor @ factor.transpose(1, 2))
 
     @property
+    def get_exposure(self) -> Tensor:
+        """Maps of colours (n, 3, 4) of the n training pictures."""
+        return self.exposures.values
+
+    def get_exposure_from_name(self, image_name: str) -> Tensor:
+        """Map of colours (3, 4) of a training picture, by its name in exposure.json."""
+        return self.exposures[image_name]
+
+    @property
     def active_bands(self) -> int:
         """Number of SH coefficients above band 0 that the active degree uses."""
         return (self.active_sh_degree + 1) ** 2 - 1
@@ -93,7 +108,7 @@ class GaussianModel:
         """Start from a point cloud: round Gaussians as wide as the distance to their neighbours, opacity 0.1.
 
         spatial_lr_scale: extent of the scene in world units; scales position learning rates and size limits.
-        cam_infos: the training cameras (unused until exposures are trained).
+        cam_infos: the training cameras, each of which gets an exposure.
         """
         points = np.asarray(pcd.points, dtype=np.float32)
         count = len(points)
@@ -122,6 +137,7 @@ class GaussianModel:
                 "rotation": torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1),
             }
         )
+        self.exposures = Exposures(exposure_names(cam_infos))
         print(f"Number of points at initialisation :  {count}")
 
     def load_ply(self, path: str | os.PathLike) -> None:
@@ -132,6 +148,14 @@ class GaussianModel:
     def save_ply(self, path: str | os.PathLike) -> None:
         """Write the raw parameters as a PLY in the reference's layout."""
         write_ply(path, self._rows(), self.max_sh_degree)
+
+    def load_exposures(self, folder: str | os.PathLike, cam_infos: Sequence) -> None:
+        """Take the exposures of the training cameras from a model folder."""
+        self.exposures = read_exposures(folder, cam_infos)
+
+    def save_exposures(self, folder: str | os.PathLike) -> None:
+        """Write the exposures into a model folder."""
+        self.exposures.write(folder)
 
     def _rows(self) -> Rows:
         return {name: getattr(self, attribute.field).detach() for name, attribute in self._attributes.items()}
@@ -156,7 +180,7 @@ class GaussianModel:
         """Make the optimiser and the position schedule from the optimisation options; zero the statistics."""
         self.percent_dense = training_args.percent_dense
         self._zero_statistics()
-        self.optimizer = GaussianAdam(
+        self.optimizer = _OPTIMIZERS[self.optimizer_type](
             [
                 {"params": [getattr(self, a.field)], "lr": a.rate(training_args, self.spatial_lr_scale), "name": name}
                 for name, a in self._attributes.items()
@@ -169,12 +193,26 @@ class GaussianModel:
             max_steps=training_args.position_lr_max_steps,
         )
         self._limit_columns()
+        self.exposures.training_setup(training_args)
 
     def update_learning_rate(self, iteration: int) -> float:
-        """Set the position learning rate of this iteration and return it."""
+        """Set the learning rates of this iteration that change with it; return the positions'."""
+        self.exposures.update_learning_rate(iteration)
         rate = self.xyz_scheduler_args(iteration)
         self.optimizer.param_groups[0]["lr"] = rate
         return rate
+
+    def step(self, radii: Tensor) -> None:
+        """One step of all optimisers, and no gradients left.
+
+        radii: (N,) pixels in the view of this iteration, 0 for those that the sparse optimiser leaves alone.
+        """
+        if self.optimizer_type == "sparse_adam":
+            self.optimizer.step(radii > 0)
+        else:
+            self.optimizer.step()
+        self.optimizer.zero_grad(set_to_none=True)
+        self.exposures.step()
 
     def oneupSHdegree(self) -> None:
         """Raise the active SH degree by one, up to the maximum."""
@@ -188,7 +226,7 @@ class GaussianModel:
     def capture(self) -> tuple:
         """Everything a resumed training needs, as tensors and numbers: 12 entries in the reference's order.
 
-        Attributes that the reference does not have follow as further entries.
+        Attributes that the reference does not have follow as further entries, then the exposures if they are trained.
         """
         rows = self._rows()
         return (
@@ -200,6 +238,7 @@ class GaussianModel:
             self.optimizer.state_dict(),
             float(self.spatial_lr_scale),
             *(values for name, values in rows.items() if name not in IN_CHECKPOINT),
+            *([self.exposures.capture()] if self.exposures.trained else []),
         )
 
     def restore(self, model_args: Sequence[Any], training_args: argparse.Namespace) -> None:
@@ -209,8 +248,9 @@ class GaussianModel:
         """
         active_sh_degree, *tensors = model_args[:7]
         max_radii2D, xyz_gradient_accum, denom, optimizer_state, spatial_lr_scale, *others = model_args[7:]
+        exposures = next((entry for entry in others if isinstance(entry, dict)), None)
         names = (*IN_CHECKPOINT, *(name for name in self._attributes if name not in IN_CHECKPOINT))
-        tensors += others
+        tensors += [entry for entry in others if not isinstance(entry, dict)]
         if len(tensors) != len(names):
             raise UserError(
                 f"the checkpoint has {len(tensors)} attributes per Gaussian, where this model has {len(names)} "
@@ -231,6 +271,8 @@ class GaussianModel:
             self.optimizer.take_state(optimizer_state)
         except ValueError as error:
             raise UserError(f"the optimiser state of the checkpoint does not fit ({error}); use another one") from error
+        if exposures is not None:
+            self.exposures.restore(exposures)
         device = self._xyz.device
         self.max_radii2D = max_radii2D.to(device)
         self.xyz_gradient_accum = xyz_gradient_accum.to(device)
@@ -257,6 +299,7 @@ class GaussianModel:
         """UserError where a parameter is not finite, to be called before anything of this iteration is saved."""
         remedy = "nothing of it was saved; lower the learning rates, or go on from an earlier checkpoint"
         check_finite(self._rows(), f"iteration {iteration}", remedy)
+        self.exposures.check_finite(f"iteration {iteration}", remedy)
 
     def take_from_optimizer(self) -> None:
         """After a densification that memory did not suffice for: take the rows that it got to, for saving them."""

@@ -22,24 +22,25 @@ Size = tuple[int, int]  # width, height
 
 
 class Decodable(Protocol):
-    """A hashable source of pixels that are more than a picture file (scene/masks.py).
+    """A hashable source of pixels that are more than a picture file (scene/masks.py, scene/depth_maps.py).
 
-    channels: of what `decode` gives at a size (width, height), (channels,H,W) uint8.
+    pixel_bytes: of what `decode` gives at a size (width, height), (channels,H,W).
     """
 
-    channels: int
+    pixel_bytes: int
 
     def decode(self, size: Size) -> Tensor: ...
 
 
 Source = Path | Decodable
+Picture = tuple[Source, Size]
 Key = tuple[str | Decodable, Size]  # files by their names, which are quicker to look up
 
 
 class ImageStore:
-    """Pictures of `decode`, each decoded once and kept; beyond `limit` (0: none) the longest unused one is dropped.
+    """Pictures of `decode`, and other sources that have one, each decoded once and kept.
 
-    A source is a file, or something that decodes itself; a mask counts as a picture.
+    Beyond `limit` (0: none) the longest unused one is dropped; a mask or a depth map counts as a picture.
     keep_on: device that keeps them. device: that which `get` hands them out on (default: keep_on). Where it is a GPU
     and keep_on is not, they lie in pinned memory and are copied without waiting. Threads exist only while there is
     something to decode ahead. For one calling thread.
@@ -58,7 +59,7 @@ class ImageStore:
         self._threads: ThreadPoolExecutor | None = None
         self._copies: DeviceCopies | None = None
 
-    def plan(self, training: Iterable[tuple[Source, Size]], others: Iterable[tuple[Source, Size]] = ()) -> None:
+    def plan(self, training: Iterable[Picture], others: Iterable[Picture] = ()) -> None:
         """Say which pictures there will be, before the first is asked for.
 
         Where they do not fit GPU_SHARE of a GPU's free memory, as many as are kept at once, the CPU keeps them. A limit
@@ -82,7 +83,10 @@ class ImageStore:
         return sum(sizes[: self.limit or None])
 
     def get(self, source: Source, size: Size) -> Tensor:
-        """Picture (3 or 4,H,W) uint8 of `decode`, or of the source's own, on the store's device. UserError as there."""
+        """Picture (3 or 4,H,W) uint8 of `decode`, or what the source decodes to, on the store's device.
+
+        UserError as `decode`.
+        """
         key = _key(source, size)
         picture = self._kept.get(key)
         if picture is None or isinstance(picture, Future):
@@ -98,7 +102,7 @@ class ImageStore:
             return min(self.limit, most) if self.limit else most
         return 1 + COPIES_AHEAD if self._copies else 0
 
-    def prefetch(self, coming: Sequence[tuple[Source, Size]]) -> None:
+    def prefetch(self, coming: Sequence[Picture]) -> None:
         """Begin to make pictures ready, without waiting: those that `get` is asked for next, in that order.
 
         At most `limit`. A picture that can't be decoded ends in an error where it is asked for, not here.
@@ -159,7 +163,7 @@ def _key(source: Source, size: Size) -> Key:
 def _bytes(source: str | Decodable, size: Size) -> int:
     """Bytes of a decoded picture at most: a JPEG has no alpha, of others it is not known before they are decoded."""
     if not isinstance(source, str):
-        return source.channels * size[0] * size[1]
+        return source.pixel_bytes * size[0] * size[1]
     channels = 3 if source.lower().endswith((".jpg", ".jpeg")) else 4
     return channels * size[0] * size[1]
 

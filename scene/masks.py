@@ -60,7 +60,7 @@ class Mask:
     path: Path
     inverted: bool = False
     meaning: str = IGNORE
-    channels: ClassVar[int] = 1
+    pixel_bytes: ClassVar[int] = 1
 
     def decode(self, size: tuple[int, int]) -> Tensor:
         """(1,H,W) uint8 at size (width, height): 255 keeps, 0 masks.
@@ -95,7 +95,7 @@ class Cutout:
 
     path: Path
     mask: Mask
-    channels: ClassVar[int] = 4
+    pixel_bytes: ClassVar[int] = 4
 
     def decode(self, size: tuple[int, int]) -> Tensor:
         """(4,H,W) uint8 as `scene.images.decode` gives it, with straight alpha."""

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
+from scene.image_store import Decodable
 from scene.masks import Mask
 from utils.graphics_utils import BasicPointCloud, focal2fov
 from utils.system_utils import UserError
@@ -19,7 +20,8 @@ class CameraInfo:
     uid: COLMAP's camera (intrinsics) id, or the frame's index. R (3,3): camera-to-world rotation; T (3,):
     world-to-camera translation. fx, fy, cx, cy in pixels of an image of width x height (pixel centres at .5).
     image_name: COLMAP's full name, or the file's stem. file_size: (width, height) of the file. mask: of the same size
-    as the file, None where everything counts. ignore_alpha: what is transparent in the file does not count.
+    as the file, None where everything counts. ignore_alpha: what is transparent in the file does not count. depth: of a
+    training view that has a map of it (scene/depth_maps.py).
     """
 
     uid: int
@@ -36,6 +38,7 @@ class CameraInfo:
     file_size: tuple[int, int]
     mask: Mask | None = None
     ignore_alpha: bool = False
+    depth: Decodable | None = None
 
     @property
     def FovX(self) -> float:

@@ -34,7 +34,7 @@ def model(
     count: int, degree: int = 3, extent: float = 1.0, seed: int = 0, active: bool = True, **changes: object
 ) -> GaussianModel:
     """A model made from a cloud, all parameters random, its optimiser set up, all SH bands active or only band 0."""
-    gaussians = GaussianModel(degree)
+    gaussians = GaussianModel(degree, str(changes.get("optimizer_type", "default")))
     gaussians.create_from_pcd(cloud(count, seed), [], extent)
     generator = torch.Generator().manual_seed(seed)
     with torch.no_grad():

@@ -122,5 +122,5 @@ def test_restore_refuses_other_attributes():
 
 
 def test_unknown_optimizer_is_refused():
-    with pytest.raises(UserError, match="sparse_adam"):
-        GaussianModel(3, "sparse_adam")
+    with pytest.raises(UserError, match="optimizer_type must be default or sparse_adam, got 'sgd'"):
+        GaussianModel(3, "sgd")

@@ -51,6 +51,8 @@ def test_opcheck_every_other_op(device):
     _check(ops.mark_visible, raw["means"], camera.viewmatrix.float())
     moment = torch.rand(3, 3, device=device)
     _check(ops.adam_, moment + 1, moment + 2, moment, moment.clone(), 0.1, 0.9, 0.99, 1e-8, 1.0, columns=2)
+    seen = torch.tensor([True, False, True], device=device)
+    _check(ops.sparse_adam_, moment + 1, moment + 2, moment, moment.clone(), seen, 0.1, 0.9, 0.99, 1e-8)
 
 
 @BOTH_AND_GPU

@@ -8,8 +8,10 @@ from gaussians import GROUPS, model, pipeline
 
 from gaussian_renderer import render
 from scene.cameras import MiniCam
+from scene.exposure import Exposures
 from scene.gaussian_model import GaussianModel
 from utils.graphics_utils import getProjectionMatrix
+from utils.loss_utils import inverse_depth_loss
 from utils.system_utils import UserError
 
 WIDTH, HEIGHT = 41, 27
@@ -120,6 +122,60 @@ def test_an_empty_model_shows_the_background(camera):
     assert torch.equal(image, background[:, None, None].expand(3, HEIGHT, WIDTH))
 
 
-def test_exposure_is_refused(camera):
-    with pytest.raises(UserError, match="exposure"):
-        render(camera, model(3), pipeline(), BLACK, use_trained_exp=True)
+def test_exposure_maps_row_vectors_before_the_clamp(camera):
+    gaussians = model(40)
+    gaussians.exposures = Exposures(["other", "this"])
+    exposure = torch.tensor([[1.5, 0.2, 0.0, 0.1], [0.0, -0.4, 0.3, 0.3], [0.1, 0.0, 2.0, -0.2]], dtype=torch.float64)
+    with torch.no_grad():
+        gaussians.exposures.values[1] = exposure
+    camera.exposure_name = "this"
+    background = torch.tensor([0.2, 0.9, 0.4])
+    colors = {"override_color": 0.1 + 0.8 * torch.rand(40, 3, generator=torch.Generator().manual_seed(1))}
+    plain = render(camera, gaussians, pipeline(), background, **colors)["render"].detach().double()
+    assert plain.min() > 0 and plain.max() < 1  # nothing was cut off, so that it can be mapped again
+    got = render(camera, gaussians, pipeline(), background, use_trained_exp=True, **colors)["render"]
+    mapped = torch.einsum("ihw,ij->jhw", plain, exposure[:, :3]) + exposure[:, 3, None, None]
+    assert (mapped < 0).any() and (mapped > 1).any()
+    torch.testing.assert_close(got.double(), mapped.clamp(0, 1), rtol=0, atol=1e-6)  # a few roundings of values of 2
+    weights = torch.randn(3, HEIGHT, WIDTH, generator=torch.Generator().manual_seed(0))
+    (got * weights).sum().backward()
+    inside = ((mapped > 0) & (mapped < 1)) * weights.double()
+    matrix = torch.einsum("ihw,jhw->ij", plain, inside)
+    expected = torch.cat([matrix, inside.sum((1, 2))[:, None]], dim=1)
+    gradient = gaussians.get_exposure.grad
+    torch.testing.assert_close(gradient[1].double(), expected, rtol=1e-4, atol=1e-4)  # float32 sums of a thousand
+    assert not gradient[0].any()
+
+
+def test_a_view_without_a_picture_has_no_exposure_and_an_unknown_one_is_named(camera):
+    gaussians = model(5)
+    plain = render(camera, gaussians, pipeline(), BLACK)["render"]
+    assert torch.equal(render(camera, gaussians, pipeline(), BLACK, use_trained_exp=True)["render"], plain)
+    camera.exposure_name = "somewhere.png"
+    with pytest.raises(UserError, match="no trained exposure of somewhere.png"):
+        render(camera, gaussians, pipeline(), BLACK, use_trained_exp=True)
+
+
+def test_the_inverse_depth_is_differentiated(camera):
+    """Gradient of the depth loss by central differences, in the opacity and the distance of a Gaussian in front."""
+    gaussians = model(1)
+    with torch.no_grad():
+        gaussians._xyz.zero_()
+        gaussians._scaling.fill_(math.log(0.5))
+        gaussians._opacity.fill_(0.5)
+    target = torch.full((1, HEIGHT, WIDTH), 0.1)
+
+    def loss() -> torch.Tensor:
+        return inverse_depth_loss(render(camera, gaussians, pipeline(), BLACK, want_depth=True)["depth"], target)
+
+    loss().backward()
+    for param, index in ((gaussians._opacity, (0, 0)), (gaussians._xyz, (0, 2))):
+        step, values = 1e-2, []
+        for sign in (1, -1):
+            with torch.no_grad():
+                param[index] += sign * step
+                values.append(loss().item())
+                param[index] -= sign * step
+        slope = (values[0] - values[1]) / (2 * step)
+        # float32 values of 0.1, and pixels that cross the target or alpha's cut-off at 1/255.
+        assert slope != 0 and param.grad[index].item() == pytest.approx(slope, rel=0.03)

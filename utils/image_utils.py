@@ -17,6 +17,11 @@ def psnr(img1: Tensor, img2: Tensor) -> Tensor:
     return -10.0 * mse(img1, img2).log10()
 
 
+def right_half(image: Tensor) -> Tensor:
+    """The columns from W // 2 on of an image (..., W): what the half-image protocol scores (scene/half_images.py)."""
+    return image[..., image.shape[-1] // 2 :]
+
+
 def as_float(image: Tensor) -> Tensor:
     """uint8 pixels as float32 in [0, 1]; float ones as they are."""
     return image.to(torch.float32) / 255.0 if image.dtype == torch.uint8 else image

@@ -56,11 +56,19 @@ def ssim(img1: Tensor, img2: Tensor, window_size: int = WINDOW, size_average: bo
 
 
 def photometric_loss(
-    image: Tensor, target: Tensor, lambda_dssim: float, mask: Tensor | None = None
+    image: Tensor, target: Tensor, lambda_dssim: float, mask: Tensor | None = None, columns: slice | None = None
 ) -> tuple[Tensor, Tensor]:
-    """(1 - lambda) L1 + lambda (1 - SSIM) (Kerbl et al. 2023, eq. 7) and its L1 part; arguments as `l1_and_ssim`."""
-    l1, similarity = l1_and_ssim(image, target, mask)
-    return (1.0 - lambda_dssim) * l1 + lambda_dssim * (1.0 - similarity), l1
+    """(1 - lambda) L1 + lambda (1 - SSIM) (Kerbl et al. 2023, eq. 7) and its L1 part; arguments as `l1_and_ssim`.
+
+    columns: those that count, None: all. The others are cut off, but a pixel weighs what it does in a whole image.
+    """
+    if columns is None:
+        l1, similarity = l1_and_ssim(image, target, mask)
+        return (1.0 - lambda_dssim) * l1 + lambda_dssim * (1.0 - similarity), l1
+    cut = [None if x is None else x[..., columns].contiguous() for x in (image, target, mask)]
+    loss, l1 = photometric_loss(cut[0], cut[1], lambda_dssim, cut[2])
+    share = len(range(image.shape[-1])[columns]) / image.shape[-1]
+    return share * loss, l1
 
 
 def l1_and_ssim(image: Tensor, target: Tensor, mask: Tensor | None = None) -> tuple[Tensor, Tensor]:
@@ -75,3 +83,11 @@ def l1_and_ssim(image: Tensor, target: Tensor, mask: Tensor | None = None) -> tu
     l1, similarity = fused_l1_ssim(*(torch.where(mask, x, torch.zeros_like(x)) for x in (image, target)))
     share = mask.numel() / mask.sum().clamp_min(1)  # without a counting pixel both images are equal
     return share * l1, 1.0 - share * (1.0 - similarity)
+
+
+def inverse_depth_loss(inverse_depth: Tensor, target: Tensor, columns: slice | None = None) -> Tensor:
+    """Mean absolute difference of inverse depths (1, H, W), 1 / world units; columns that don't count differ by 0."""
+    difference = (inverse_depth - target).abs()
+    if columns is None:
+        return difference.mean()
+    return difference[..., columns].sum() / difference.numel()

@@ -133,7 +133,10 @@ struct AdamInput {
   template <class T>                                                                                        \
   void blend_vjp(const Where&, const BlendInput<T>&, const BlendGradient<T>&);                              \
   template <class T>                                                                                        \
-  void adam(const Where&, const AdamInput<T>&);
+  void adam(const Where&, const AdamInput<T>&);                                                             \
+  /* Adam without bias correction on the rows that are visible, (rows); `step` is not read. */              \
+  template <class T>                                                                                        \
+  void sparse_adam(const Where&, const AdamInput<T>&, const bool* visible);
 
 namespace baseline {
 GS_BACKEND(Executor)

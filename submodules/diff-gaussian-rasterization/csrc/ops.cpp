@@ -476,14 +476,18 @@ Tensor mark_visible_op(const Tensor& means, const Tensor& view) {
   return visible;
 }
 
-void adam_op(Tensor& value, const Tensor& gradient, Tensor& mean, Tensor& square, double lr, double beta1, double beta2,
-             double eps, double step, int64_t columns) {
-  for (const Tensor* t : {&gradient, static_cast<const Tensor*>(&mean), static_cast<const Tensor*>(&square)})
+void check_moments(const Tensor& value, const Tensor& gradient, const Tensor& mean, const Tensor& square) {
+  for (const Tensor* t : {&gradient, &mean, &square})
     TORCH_CHECK(t->sizes() == value.sizes() && t->scalar_type() == value.scalar_type(),
                 "gradient and moments must have the shape and dtype of the parameter, ", value.sizes(), ", got ",
                 t->sizes());
   TORCH_CHECK(value.is_contiguous() && mean.is_contiguous() && square.is_contiguous(),
               "parameter and moments must be contiguous");
+}
+
+void adam_op(Tensor& value, const Tensor& gradient, Tensor& mean, Tensor& square, double lr, double beta1, double beta2,
+             double eps, double step, int64_t columns) {
+  check_moments(value, gradient, mean, square);
   if (value.numel() == 0) return;
   const int64_t rows = value.dim() > 0 ? value.size(0) : 1, row = value.numel() / rows;
   TORCH_CHECK(columns <= row, "columns must be at most ", row, ", got ", columns);
@@ -503,6 +507,29 @@ void adam_op(Tensor& value, const Tensor& gradient, Tensor& mean, Tensor& square
                               eps,
                               step};
     RUN(T, value, adam, in);
+  });
+}
+
+void sparse_adam_op(Tensor& value, const Tensor& gradient, Tensor& mean, Tensor& square, const Tensor& visible,
+                    double lr, double beta1, double beta2, double eps, int64_t columns) {
+  check_moments(value, gradient, mean, square);
+  const int64_t rows = value.dim() > 0 ? value.size(0) : 1;
+  TORCH_CHECK(visible.dim() == 1 && visible.size(0) == rows && visible.scalar_type() == at::kBool &&
+                  visible.device() == value.device(),
+              "visible must be (", rows, ") bool on ", value.device(), ", got ", visible.sizes(), " ",
+              visible.scalar_type(), " on ", visible.device());
+  if (value.numel() == 0) return;
+  const int64_t row = value.numel() / rows;
+  TORCH_CHECK(columns <= row, "columns must be at most ", row, ", got ", columns);
+  const Tensor g = gradient.contiguous(), mask = visible.contiguous();
+  with_scalar(value.scalar_type(), [&](auto zero) {
+    using T = decltype(zero);
+    gs::AdamInput<T> in{};
+    in.value = value.mutable_data_ptr<T>(), in.gradient = g.const_data_ptr<T>();
+    in.mean = mean.mutable_data_ptr<T>(), in.square = square.mutable_data_ptr<T>();
+    in.rows = rows, in.row = row, in.columns = columns < 0 ? row : columns;
+    in.lr = lr, in.beta1 = beta1, in.beta2 = beta2, in.eps = eps;
+    RUN(T, value, sparse_adam, in, mask.const_data_ptr<bool>());
   });
 }
 
@@ -527,6 +554,9 @@ TORCH_LIBRARY(diff_gaussian_rasterization, m) {
   m.def(
       "adam_(Tensor(a!) value, Tensor gradient, Tensor(b!) mean, Tensor(c!) square, float lr, float beta1, "
       "float beta2, float eps, float step, int columns=-1) -> ()");
+  m.def(
+      "sparse_adam_(Tensor(a!) value, Tensor gradient, Tensor(b!) mean, Tensor(c!) square, Tensor visible, float lr, "
+      "float beta1, float beta2, float eps, int columns=-1) -> ()");
 }
 
 #define REGISTER(device)                                       \
@@ -540,6 +570,7 @@ TORCH_LIBRARY(diff_gaussian_rasterization, m) {
     m.impl("rasterize_vjp", &rasterize_vjp_op);                \
     m.impl("mark_visible", &mark_visible_op);                  \
     m.impl("adam_", &adam_op);                                 \
+    m.impl("sparse_adam_", &sparse_adam_op);                   \
   }
 REGISTER(CPU)
 #ifdef GS_CUDA

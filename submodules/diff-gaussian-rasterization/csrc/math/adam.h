@@ -27,6 +27,13 @@ GS_HD AdamStep<T> make_adam_step(double lr, double beta1, double beta2, double e
           T(eps)};
 }
 
+// The same without the bias corrections: the step of sparse Adam (Mallick et al. 2024, Taming 3DGS), in which nobody
+// counts the steps of a row.
+template <class T>
+GS_HD AdamStep<T> make_uncorrected_adam_step(double lr, double beta1, double beta2, double eps) {
+  return {T(beta1), T(1 - beta1), T(beta2), T(1 - beta2), T(lr), T(1), T(eps)};
+}
+
 template <class T>
 GS_HD void adam(const AdamStep<T>& a, T gradient, T& value, T& mean, T& square) {
   mean = a.keep1 * mean + a.take1 * gradient;

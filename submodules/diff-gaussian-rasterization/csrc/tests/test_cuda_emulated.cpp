@@ -46,9 +46,40 @@ void test_against_cpu() {
       }
 }
 
+void test_sparse_adam() {
+  constexpr int64_t rows = 300, row = 45;
+  for (const int64_t columns : {int64_t(0), int64_t(9), row}) {
+    bool visible[rows];
+    std::vector<float> gradient(rows * row), start[3];
+    for (int64_t r = 0; r < rows; ++r) visible[r] = r % 3 != 1;
+    for (float& g : gradient) g = float(normal());
+    for (std::vector<float>& part : start)
+      for (int64_t i = 0; i < rows * row; ++i) part.push_back(float(std::abs(normal())));
+    const auto step = [&](const auto& where, std::vector<float>(&state)[3]) {
+      using gs::GS_ISA::sparse_adam, gs::cuda::sparse_adam;
+      gs::AdamInput<float> in{};
+      in.value = state[0].data(), in.gradient = gradient.data();
+      in.mean = state[1].data(), in.square = state[2].data();
+      in.rows = rows, in.row = row, in.columns = columns;
+      in.lr = 0.01, in.beta1 = 0.9, in.beta2 = 0.999, in.eps = 1e-15;
+      sparse_adam(where, in, visible);
+    };
+    std::vector<float> cpu[3] = {start[0], start[1], start[2]}, got[3] = {start[0], start[1], start[2]};
+    step(gs::serial_executor(), cpu);
+    gs::emulation::Memory memory;
+    step(memory.queue(), got);
+    for (int part = 0; part < 3; ++part) {
+      check_near(got[part], cpu[part], 1e-6);  // some units in the last place
+      for (int64_t i = 0; i < rows * row; ++i)
+        CHECK((got[part][i] != start[part][i]) == (visible[i / row] && i % row < columns));
+    }
+  }
+}
+
 }  // namespace
 
 int main() {
   test_against_cpu();
+  test_sparse_adam();
   return gs::finish_tests("CUDA kernels, emulated");
 }

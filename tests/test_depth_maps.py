@@ -1,0 +1,295 @@
+"""Depth maps: decoding, which of them are believed, and the fit that depth_params.json holds."""
+
+import json
+import struct
+import subprocess
+import sys
+import zlib
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from gaussians import pipeline
+from PIL import Image
+from scipy.ndimage import map_coordinates
+from synthetic import FakeGaussians
+
+import train
+from arguments import ModelParams, OptionParser
+from gaussian_renderer import render
+from scene import Scene
+from scene.colmap_loader import Sightings, read_sightings
+from scene.dataset_readers import read_scene
+from scene.depth_maps import DepthMap, read_values, resize, with_depth_maps
+from scene.depth_scale import fit_line, fit_picture
+from scene.gaussian_model import GaussianModel
+from utils.loss_utils import inverse_depth_loss
+from utils.system_utils import UserError
+
+ROOT = Path(__file__).parents[1]
+
+
+def _save(values: np.ndarray, path: Path) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(values).save(path)
+    return path
+
+
+def _random(shape: tuple[int, ...], dtype: type, seed: int = 0) -> np.ndarray:
+    return np.random.default_rng(seed).integers(0, np.iinfo(dtype).max, shape, dtype=dtype, endpoint=True)
+
+
+def test_values_come_as_they_are(tmp_path):
+    for dtype in (np.uint8, np.uint16):
+        grey = _random((9, 12), dtype)
+        np.testing.assert_array_equal(read_values(_save(grey, tmp_path / "grey.png")), grey)
+    equal = np.repeat(_random((9, 12, 1), np.uint8), 3, axis=2)
+    np.testing.assert_array_equal(read_values(_save(equal, tmp_path / "equal.png")), equal[..., 0])
+
+
+def test_what_is_no_depth_map_is_named(tmp_path):
+    with pytest.raises(UserError, match="colored.png is coloured"):
+        read_values(_save(_random((9, 12, 3), np.uint8), tmp_path / "colored.png"))
+
+    # A PNG of one pixel, 16-bit RGB: Pillow would give the upper halves.
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+    header = struct.pack(">IIBBBBB", 1, 1, 16, 2, 0, 0, 0)
+    pixel = zlib.compress(b"\0" + struct.pack(">HHH", 300, 300, 300))
+    content = b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", pixel) + chunk(b"IEND", b"")
+    (tmp_path / "deep.png").write_bytes(content)
+    with pytest.raises(UserError, match="deep.png has 16-bit colours"):
+        read_values(tmp_path / "deep.png")
+    (tmp_path / "text.png").write_text("hello")
+    with pytest.raises(UserError, match="cannot read the depth map .*text.png"):
+        read_values(tmp_path / "text.png")
+
+
+@pytest.mark.parametrize("size", [(12, 9), (5, 4), (31, 40), (1, 1), (24, 3)])
+def test_resampling_against_torch_and_scipy(size):
+    values = np.random.default_rng(0).random((9, 12))
+    ours = resize(values, size)
+    theirs = torch.nn.functional.interpolate(
+        torch.from_numpy(values)[None, None], size[::-1], mode="bilinear", align_corners=False
+    )[0, 0].numpy()
+    np.testing.assert_allclose(ours, theirs, atol=1e-14)
+    at = np.meshgrid(
+        (np.arange(size[1]) + 0.5) * 9 / size[1] - 0.5, (np.arange(size[0]) + 0.5) * 12 / size[0] - 0.5, indexing="ij"
+    )
+    np.testing.assert_allclose(ours, map_coordinates(values, at, order=1, mode="nearest"), atol=1e-14)
+    for lone in (values[:1], values[:, :1]):
+        assert resize(lone, size).shape == size[::-1]
+
+
+def test_scale_and_offset_in_double(tmp_path):
+    grey = _random((9, 12), np.uint16)
+    path = _save(grey, tmp_path / "a.png")
+    whole = DepthMap(path, 65536.0, 2.5, -0.3).decode((12, 9))
+    assert whole.shape == (1, 9, 12) and whole.dtype == torch.float32
+    np.testing.assert_array_equal(whole[0].numpy(), (grey / 65536 * 2.5 - 0.3).astype(np.float32))
+    assert whole.min() < 0  # negatives are cut off before the offset, as the reference does
+    smaller = DepthMap(path, 512.0).decode((6, 5))[0].numpy()
+    np.testing.assert_allclose(smaller, resize(grey / 512, (6, 5)), rtol=1e-7)
+
+
+# Which views have a map to be believed
+
+
+@pytest.fixture
+def scene(colmap_scene: Path) -> Path:
+    """The COLMAP scene with a map for each picture, all fitting alike."""
+    names = [view.name for view in read_sightings(colmap_scene / "sparse/0", "bin")]
+    for name in names:
+        _save(_random((32, 48), np.uint16), (colmap_scene / "depths" / name).with_suffix(".png"))
+    _write_params(colmap_scene, {name[: -len(".png")]: {"scale": 1.0, "offset": 0.0} for name in names})
+    return colmap_scene
+
+
+def _write_params(scene: Path, table: object) -> None:
+    (scene / "sparse/0/depth_params.json").write_text(json.dumps(table))
+
+
+def _params(scene: Path) -> dict:
+    return json.loads((scene / "sparse/0/depth_params.json").read_text())
+
+
+def _depths(scene: Path, hold_out: bool = False) -> dict[str, DepthMap | None]:
+    info = with_depth_maps(read_scene(scene, "images", hold_out), scene, "depths/")
+    assert all(camera.depth is None for camera in info.test_cameras)
+    return {camera.image_name: camera.depth for camera in info.train_cameras}
+
+
+def test_every_picture_has_its_map(scene, capsys):
+    depths = _depths(scene)
+    assert len(depths) == 17 and capsys.readouterr().err == ""
+    for name, depth in depths.items():
+        assert depth == DepthMap((scene / "depths" / name).with_suffix(".png"), 65536.0, 1.0, 0.0)
+    assert len(_depths(scene, hold_out=True)) == 14
+
+
+def test_unreliable_and_unknown_scales_give_no_loss_and_one_message(scene, capsys):
+    table = _params(scene)
+    first, second, third, fourth, fifth = sorted(table)[:5]
+    table[first]["scale"], table[second]["scale"], table[third]["scale"] = 0.19, 5.1, 0.0
+    table[fourth]["scale"] = 4.9
+    del table[fifth]
+    _write_params(scene, table)
+    depths = _depths(scene)
+    lost = {f"{name}.png" for name in (first, second, third, fifth)}
+    assert {name for name, depth in depths.items() if depth is None} == lost
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1 and f"4 of 17 training pictures have no depth loss: 1 not in {scene}" in said
+    assert f"({fifth}.png), 3 of an unreliable scale there ({first}.png, {second}.png, {third}.png)" in said
+
+
+def test_what_is_missing_or_broken_is_named(scene):
+    table = _params(scene)
+    some = sorted(table)[0]
+    cases = {
+        "not give a scale and an offset .*KeyError": {some: {"scale": 1.0}},
+        "not give a scale and an offset .*AttributeError": [1],
+        "not give a scale and an offset .*not finite": {some: {"scale": 1.0, "offset": float("nan")}},
+        "17 of 17 training pictures have no depth loss": {name: {"scale": 0.0, "offset": 0.0} for name in table},
+    }
+    for words, content in cases.items():
+        _write_params(scene, content)
+        with pytest.raises(UserError, match=f"{words}.*make_depth_scale.py"):
+            _depths(scene)
+    _write_params(scene, table)
+    (scene / "depths" / f"{some}.png").unlink()
+    with pytest.raises(UserError, match=f"1 of 17 depth maps are missing: .*{some}.png; put them there"):
+        _depths(scene)
+    (scene / "sparse/0/depth_params.json").unlink()
+    with pytest.raises(UserError, match="no .*depth_params.json, .*`python utils/make_depth_scale.py --base_dir"):
+        _depths(scene)
+    (scene / "depths").rename(scene / "elsewhere")
+    with pytest.raises(UserError, match="no folder of depth maps .*depths"):
+        _depths(scene)
+
+
+def test_pictures_that_differ_by_their_suffix_alone_do_not_share_a_map(scene):
+    info = read_scene(scene, "images", False)
+    first = info.train_cameras[0]
+    twin = replace(first, image_name=first.image_name.replace(".png", ".jpg"))
+    with pytest.raises(UserError, match="several training pictures have the same depth map"):
+        with_depth_maps(replace(info, train_cameras=[first, twin]), scene, "depths")
+
+
+def test_blender_maps_are_found_by_name_or_by_path(blender_scene):
+    for index in range(4):
+        _save(np.full((30, 40), 256 * (index + 1), np.uint16), blender_scene / f"depths/r_{index}.png")
+    depths = _depths(blender_scene, hold_out=True)
+    assert depths["r_1"].decode((4, 4)).unique().tolist() == [1.0]  # 512 / 512
+    with pytest.raises(UserError, match="the same depth map: .*r_0.png.*sub-folders"):
+        _depths(blender_scene)
+    for path in [*blender_scene.glob("train/*.png"), *blender_scene.glob("test/*.png")]:
+        _save(np.zeros((30, 40), np.uint16), blender_scene / "depths" / path.relative_to(blender_scene))
+    assert all(depth.path.parent.name in ("train", "test") for depth in _depths(blender_scene).values())
+
+
+# The fit
+
+
+def test_the_line_is_robust_and_exact_without_outliers():
+    mono = np.random.default_rng(0).random(200)
+    assert fit_line(mono, 3 * mono - 0.2) == pytest.approx((3, -0.2), abs=1e-12)
+    middle = np.median(2 * mono)
+    spread = np.abs(2 * mono + 1 - middle - 1).mean() / np.abs(mono - np.median(mono)).mean()
+    assert fit_line(mono, 2 * mono + 1) == pytest.approx((spread, middle + 1 - spread * np.median(mono)))
+    flipped = 3 * mono - 0.2
+    flipped[:5] = 100.0  # by the medians' line: the offset stays with the many
+    scale, offset = fit_line(mono, flipped)
+    assert scale * np.median(mono) + offset == pytest.approx(np.median(flipped))
+    assert fit_line(mono[:10], mono[:10]) == (0, 0)
+    assert fit_line(mono[:11], mono[:11]) != (0, 0)
+    assert fit_line(mono, 1e-3 * mono) == (0, 0)
+    assert fit_line(np.ones(20), mono[:20]) == (0, 0)
+
+
+def test_points_are_looked_up_where_colmap_sees_them():
+    """A map of twice the size, its inverse depth linear in x; points behind the camera or outside don't count."""
+    rng = np.random.default_rng(0)
+    pixels = rng.uniform(1, 39, (40, 2))
+    depths = 1 / (0.1 + 0.02 * pixels[:, 0])
+    pixels[0], pixels[1], depths[2] = (-3, 5), (5, 41), -1
+    ramp = np.repeat((np.arange(80)[None] + 0.5) / 2 / 100, 80, axis=0)
+    scale, offset = fit_picture(Sightings("a.png", 40, 40, pixels, depths), ramp)
+    assert (scale, offset) == pytest.approx((2.0, 0.1), abs=1e-9)
+
+
+def test_the_command_makes_a_file_that_training_takes(colmap_scene, tmp_path, monkeypatch):
+    """Maps made of the points themselves, a square around each, a scale and an offset to a picture."""
+    monkeypatch.setattr(sys, "stdout", sys.stdout)
+    wanted = {}
+    rng = np.random.default_rng(0)
+    for view in read_sightings(colmap_scene / "sparse/0", "bin"):
+        scale, offset = rng.uniform(0.5, 1.5), rng.uniform(-0.02, 0.02)
+        values = np.zeros((view.height * 8, view.width * 8))
+        for (x, y), z in zip(view.pixels * 8, view.depths, strict=True):
+            values[max(int(y) - 1, 0) : int(y) + 2, max(int(x) - 1, 0) : int(x) + 2] = (1 / z - offset) / scale
+        assert values.max() < 1
+        _save((values * 65535).round().astype(np.uint16), (tmp_path / "maps" / view.name).with_suffix(".png"))
+        wanted[view.name.removesuffix(".png")] = (scale, offset)
+    command = ["utils/make_depth_scale.py", "--base_dir", colmap_scene, "--depths_dir", tmp_path / "maps"]
+    done = subprocess.run([sys.executable, *map(str, command)], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "17 of 17 pictures have a depth map" in done.stdout
+    params = _params(colmap_scene)
+    assert list(params[next(iter(params))]) == ["scale", "offset"]
+    for name, (scale, offset) in wanted.items():
+        # Some squares lie over others; means of distances are what they disturb most.
+        assert (params[name]["scale"], params[name]["offset"]) == pytest.approx((scale, offset), rel=0.05, abs=0.02)
+    (tmp_path / "maps").rename(colmap_scene / "depths")
+    train.main(["-s", str(colmap_scene), "-m", str(tmp_path / "out"), "-d", "depths", "--iterations", "3", "-r", "24"])
+
+
+# Training
+
+
+def _train(scene: Path, out: Path, *more: object) -> bytes:
+    train.main(["-s", str(scene), "-m", str(out), "-r", "24", "--iterations", "60", *map(str, more)])
+    return (out / "point_cloud/iteration_60/point_cloud.ply").read_bytes()
+
+
+def test_training_follows_the_maps_or_leaves_them_alone(scene, tmp_path, monkeypatch):
+    monkeypatch.setattr(sys, "stdout", sys.stdout)
+    for path in (scene / "depths").rglob("*.png"):
+        _save(np.full((64, 96), 6554, np.uint16), path)  # 0.1: all is far behind where it seems
+    plain = _train(scene, tmp_path / "plain")
+    off = _train(scene, tmp_path / "off", "-d", "depths", "--depth_l1_weight_init", 0, "--depth_l1_weight_final", 0)
+    assert off == plain
+    weight = ("--depth_l1_weight_init", 20, "--depth_l1_weight_final", 20)  # the picture's wishes are others
+    supervised = _train(scene, tmp_path / "on", "-d", "depths", *weight, "--images_to_load", 2)
+    assert supervised != plain
+    assert supervised == _train(scene, tmp_path / "unlimited", "-d", "depths", *weight)
+    error = {name: _depth_error(scene, tmp_path / name) for name in ("plain", "on")}
+    assert error["on"] < 0.8 * error["plain"], error
+
+
+def _depth_error(scene: Path, out: Path) -> float:
+    options = ModelParams(OptionParser()).extract(OptionParser().parse_args([]))
+    options.source_path, options.model_path, options.resolution, options.depths = str(scene), str(out), 24, "depths"
+    gaussians = GaussianModel(3)
+    gaussians.load_ply(out / "point_cloud/iteration_60/point_cloud.ply")
+    cameras = Scene(options, FakeGaussians(), shuffle=False, write=False).getTrainCameras()
+    with torch.no_grad():
+        losses = [
+            inverse_depth_loss(
+                render(camera, gaussians, pipeline(), torch.zeros(3), want_depth=True)["depth"], camera.invdepthmap
+            )
+            for camera in cameras
+        ]
+    return float(torch.stack(losses).mean())
+
+
+def test_a_finished_model_needs_no_maps(scene):
+    options = ModelParams(OptionParser()).extract(OptionParser().parse_args([]))
+    options.source_path, options.model_path, options.depths = str(scene), str(scene / "model"), "nowhere"
+    (scene / "model/point_cloud/iteration_1").mkdir(parents=True)
+    (scene / "model/point_cloud/iteration_1/point_cloud.ply").write_bytes(b"ply")
+    cameras = Scene(options, FakeGaussians(), load_iteration=1).getTrainCameras()
+    assert not any(camera.depth_reliable for camera in cameras)
+    assert cameras[0].invdepthmap is None and cameras[0].depth_mask is None

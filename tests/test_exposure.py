@@ -1,0 +1,321 @@
+"""Exposures: names, schedule, files, checkpoints; and the half-image protocol that trains them."""
+
+import json
+import math
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from gaussians import cloud, model, options, take_steps
+from PIL import Image
+
+import render
+import train
+from scene.checkpoint import load_checkpoint, save_checkpoint
+from scene.dataset_readers import CameraInfo, read_scene
+from scene.exposure import Exposures, read_exposures
+from scene.gaussian_model import GaussianModel
+from scene.half_images import exposure_names, train_on_all
+from scene.point_cloud import write_point_cloud
+from utils.error_curve import read_curve
+from utils.exposure import apply_exposure
+from utils.loss_utils import inverse_depth_loss, l1_loss, photometric_loss, ssim
+from utils.system_utils import UserError
+
+NAMES = ["b.png", "a.png", "left/c.png"]
+GAIN = 0.6  # of every third picture
+
+
+def _infos(*paths: str, stems: bool = False) -> list[CameraInfo]:
+    info = CameraInfo(0, np.eye(3), np.zeros(3), 9.0, 9.0, 4.0, 3.0, 8, 6, Path(), "", (8, 6))
+    return [
+        replace(info, image_path=Path("/scene", path), image_name=Path(path).stem if stems else path) for path in paths
+    ]
+
+
+def _trained(names: list[str] = NAMES, steps: int = 3, **changes: object) -> Exposures:
+    exposures = Exposures(names)
+    exposures.training_setup(options(iterations=100, **changes))
+    generator = torch.Generator().manual_seed(0)
+    for step in range(1, steps + 1):
+        exposures.update_learning_rate(step)
+        exposures.values.grad = torch.randn(len(names), 3, 4, generator=generator)
+        exposures.step()
+    return exposures
+
+
+def test_names_clash_only_where_they_are_made_to():
+    assert exposure_names(_infos(*NAMES)) == NAMES
+    blender = _infos("train/r_0.png", "train/r_1.png", "test/r_0.png", stems=True)
+    assert exposure_names(blender) == ["train/r_0.png", "r_1", "test/r_0.png"]
+    assert exposure_names([]) == []
+
+
+def test_a_model_starts_with_identities():
+    gaussians = GaussianModel(3)
+    gaussians.create_from_pcd(cloud(5), _infos(*NAMES), 1.0)
+    assert gaussians.get_exposure.shape == (3, 3, 4)
+    for name in NAMES:
+        assert gaussians.get_exposure_from_name(name).tolist() == [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]
+
+
+@pytest.mark.parametrize(("delay", "multiple"), [(0, 0.0), (50, 0.1)])
+def test_the_schedule_is_the_formula(delay, multiple):
+    changes = {"exposure_lr_delay_steps": delay, "exposure_lr_delay_mult": multiple}
+    exposures = _trained(steps=0, **changes)
+    for t in (0, 1, 30, 50, 100):
+        exposures.update_learning_rate(t)
+        tau = min(t / 100, 1)
+        wanted = math.exp((1 - tau) * math.log(0.01) + tau * math.log(0.001))
+        if delay:
+            wanted *= multiple + (1 - multiple) * math.sin(0.5 * math.pi * min(t / delay, 1))
+        assert exposures.optimizer.param_groups[0]["lr"] == pytest.approx(wanted, rel=1e-12)
+
+
+def test_steps_are_those_of_torchs_adam_by_default():
+    ours = _trained(steps=20)
+    values = torch.nn.Parameter(torch.eye(3, 4).repeat(3, 1, 1))
+    theirs = torch.optim.Adam([values])
+    generator = torch.Generator().manual_seed(0)
+    for step in range(1, 21):
+        theirs.param_groups[0]["lr"] = ours._rate(step)
+        values.grad = torch.randn(3, 3, 4, generator=generator)
+        theirs.step()
+    # Twenty steps of 0.01, each good to some units in the last place of values about 1.
+    torch.testing.assert_close(ours.values, values, rtol=0, atol=20 * 2**-22)
+    assert (values - torch.eye(3, 4)).abs().max() > 0.05
+
+
+def test_the_gradient_has_the_same_bits_for_any_number_of_threads():
+    before = torch.get_num_threads()
+    generator = torch.Generator().manual_seed(0)
+    image, weights = torch.rand(2, 3, 301, 407, generator=generator)
+    results = []
+    try:
+        for threads in (1, 2, 3):
+            torch.set_num_threads(threads)
+            inputs = image.clone().requires_grad_(), torch.eye(3, 4).add(0.1).requires_grad_()
+            out = apply_exposure(*inputs)
+            results.append((out.detach(), *torch.autograd.grad((out * weights).sum(), inputs)))
+    finally:
+        torch.set_num_threads(before)
+    for result in results[1:]:
+        assert all(torch.equal(a, b) for a, b in zip(result, results[0], strict=True))
+
+
+# exposure.json
+
+
+def test_the_file_comes_back(tmp_path):
+    exposures = _trained()
+    exposures.write(tmp_path)
+    table = json.loads((tmp_path / "exposure.json").read_text())
+    assert list(table) == NAMES and np.shape(table["a.png"]) == (3, 4)
+    again = read_exposures(tmp_path, _infos(*NAMES[::-1]))
+    assert again.names == NAMES[::-1] and not again.trained
+    for name in NAMES:
+        assert torch.equal(again[name], exposures[name]) and exposures[name].tolist() == table[name]
+
+
+def test_names_that_others_did_not_tell_apart_are_found(tmp_path):
+    rows = [[2, 0, 0, 0], [0, 2, 0, 0], [0, 0, 2, 0.5]]
+    (tmp_path / "exposure.json").write_text(json.dumps({"r_0": rows}))
+    exposures = read_exposures(tmp_path, _infos("train/r_0.png", "test/r_0.png", stems=True))
+    assert exposures["train/r_0.png"].tolist() == exposures["test/r_0.png"].tolist() == rows
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (None, "cannot read .*exposure.json"),
+        ("{", "is not JSON"),
+        ("[1]", "is no table of exposures"),
+        ("{}", "has no exposure of a.png"),
+        ('{"a.png": [[1, 0, 0, 0]]}', "is not 3 x 4 finite numbers"),
+        ('{"a.png": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, NaN]]}', "is not 3 x 4 finite numbers"),
+        ('{"a.png": "white"}', "is no matrix of numbers"),
+        ('{"a.png": [[1, 0], [1]]}', "is no matrix of numbers"),
+    ],
+)
+def test_a_broken_file_is_named(tmp_path, text, words):
+    if text is not None:
+        (tmp_path / "exposure.json").write_text(text)
+    with pytest.raises(UserError, match=f"{words}.*; restore it, or write train_test_exp=False"):
+        read_exposures(tmp_path, _infos("a.png"))
+
+
+# Checkpoints
+
+
+def test_checkpoints_carry_them_behind_the_references_entries(tmp_path):
+    gaussians = model(6)
+    gaussians.exposures = _trained()
+    take_steps(gaussians, 1)
+    capture = gaussians.capture()
+    assert len(capture) == 13 and len(model(6).capture()) == 12
+    save_checkpoint(tmp_path / "c.pth", capture, 5)
+    loaded, _ = load_checkpoint(tmp_path / "c.pth")
+    other = model(2)
+    other.exposures = Exposures(NAMES)
+    other.restore(loaded, options(iterations=100))
+    assert other.exposures.trained
+    for exposures in (gaussians.exposures, other.exposures):
+        exposures.update_learning_rate(4)
+        exposures.values.grad = torch.ones(3, 3, 4)
+        exposures.step()
+    assert torch.equal(other.get_exposure, gaussians.get_exposure)
+
+
+def test_exposures_that_do_not_fit_are_refused():
+    state = _trained().capture()
+    cases = {
+        "exposures of other pictures": state | {"names": NAMES[:2]},
+        "3 x 4|float32": state | {"values": state["values"].double()},
+        "optimiser state in the checkpoint does not fit": state | {"optimizer": 5},
+    }
+    for words, wrong in cases.items():
+        with pytest.raises(UserError, match=words):
+            _trained(steps=0).restore(wrong)
+    with pytest.raises(UserError, match="exposures of other pictures"):
+        _trained(["x.png"], steps=0).restore(state)
+    Exposures().check_finite("iteration 7", "do this")
+    broken = _trained()
+    with torch.no_grad():
+        broken.values[1, 0, 0] = torch.nan
+    with pytest.raises(UserError, match="the exposure of a.png in iteration 7 is not finite; do this"):
+        broken.check_finite("iteration 7", "do this")
+
+
+# Loss on a part of the columns
+
+
+def test_columns_that_do_not_count_are_cut_off():
+    generator = torch.Generator().manual_seed(0)
+    image, target = torch.rand(2, 3, 20, 31, generator=generator)
+    image.requires_grad_()
+    loss, l1 = photometric_loss(image, target, 0.2, slice(0, 15))
+    (gradient,) = torch.autograd.grad(loss, image)
+    exact = image.detach().double().requires_grad_()
+    left, wanted = exact[..., :15], target.double()[..., :15]
+    plain = (0.8 * l1_loss(left, wanted) + 0.2 * (1 - ssim(left, wanted))) * 15 / 31
+    (exact_gradient,) = torch.autograd.grad(plain, exact)
+    assert abs(loss.item() - plain.item()) < 1e-5 and abs(l1.item() - l1_loss(left, wanted).item()) < 1e-6
+    assert (gradient - exact_gradient).abs().max() < 1e-4 * exact_gradient.abs().max()
+    assert not gradient[..., 15:].any() and gradient[..., :15].any()
+    depth, mono = torch.rand(2, 1, 20, 31, generator=generator)
+    mask = torch.arange(31) < 15
+    assert torch.allclose(inverse_depth_loss(depth, mono, slice(0, 15)), ((depth - mono).abs() * mask).mean())
+    assert torch.allclose(inverse_depth_loss(depth, mono), (depth - mono).abs().mean())
+
+
+# The half-image protocol
+
+
+@pytest.fixture(autouse=True)
+def _stdout(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Training stamps stdout: bring it back."""
+    monkeypatch.setattr(sys, "stdout", sys.stdout)
+
+
+OPTIONS = [
+    "-r", "32", "--eval", "--train_test_exp", "--test_iterations", "-1", "--densify_from_iter", "50",
+    "--densification_interval", "40", "--densify_grad_threshold", "1e-4", "--max_num_splats", "450",
+    "--exposure_lr_final", "0.01",
+]  # fmt: skip
+
+
+def _train(scene: Path, out: Path, *more: object, iterations: int = 200) -> Path:
+    train.main(["-s", str(scene), "-m", str(out), "--iterations", str(iterations), *OPTIONS, *map(str, more)])
+    return out / "point_cloud" / f"iteration_{iterations}" / "point_cloud.ply"
+
+
+def _pictures(scene: Path) -> list[Path]:
+    """In the order of the views."""
+    return sorted((scene / "images").rglob("*.png"), key=lambda path: path.relative_to(scene).as_posix())
+
+
+def test_all_views_train_in_the_order_of_their_names(colmap_scene, blender_scene):
+    held = read_scene(colmap_scene, "images", True)
+    info = train_on_all(held)
+    whole = read_scene(colmap_scene, "images", False)
+    names = [camera.image_name for camera in info.train_cameras]
+    assert names == [camera.image_name for camera in whole.train_cameras]
+    assert info.test_cameras == held.test_cameras and info.extent == whole.extent != held.extent
+    blender = train_on_all(read_scene(blender_scene, "images", True))
+    paths = [camera.image_path.relative_to(blender_scene).as_posix() for camera in blender.train_cameras]
+    assert paths == [f"train/r_{i}.png" for i in range(4)] + ["test/r_0.png", "test/r_1.png"]
+
+
+def test_from_pictures_of_different_exposure_to_scored_halves(colmap_scene, tmp_path, monkeypatch):
+    pictures = _pictures(colmap_scene)
+    for path in pictures[1::3]:
+        dark = np.asarray(Image.open(path)) * GAIN
+        Image.fromarray(dark.round().astype(np.uint8)).save(path)
+    whole = _train(colmap_scene, tmp_path / "a", "--checkpoint_iterations", 90, "--test_iterations", 200)
+
+    # It knows which pictures are dark.
+    table = json.loads((tmp_path / "a/exposure.json").read_text())
+    names = [path.relative_to(colmap_scene / "images").as_posix() for path in pictures]
+    assert sorted(table) == names
+    gains = np.array([np.trace(np.array(table[name])[:, :3]) for name in names])
+    dark = np.arange(len(names)) % 3 == 1
+    assert gains[dark].max() < gains[~dark].min()
+
+    # Resumed, it is the same, exposures too; without the option it is refused.
+    more = ("--start_checkpoint", tmp_path / "a/chkpnt90.pth")
+    resumed = _train(colmap_scene, tmp_path / "b", *more)
+    assert resumed.read_bytes() == whole.read_bytes()
+    assert (tmp_path / "b/exposure.json").read_bytes() == (tmp_path / "a/exposure.json").read_bytes()
+    with pytest.raises(UserError, match="chkpnt90.pth was trained with --train_test_exp; give that option"):
+        train.main(["-s", str(colmap_scene), "-m", str(tmp_path / "c"), "-r", "32", *map(str, more)])
+
+    # render.py and the curve see right halves.
+    monkeypatch.setattr(sys, "argv", ["render.py", "-m", str(tmp_path / "a"), "--quiet"])
+    render.main()
+    scored = []
+    for index, path in enumerate(pictures[::8]):
+        shown, truth = (Image.open(tmp_path / f"a/test/ours_200/{side}/{index:05d}.png") for side in ("renders", "gt"))
+        photo = np.asarray(Image.open(path).resize((32, 21), Image.Resampling.BICUBIC))
+        np.testing.assert_array_equal(np.asarray(truth), photo[:, 16:])
+        scored.append(-10 * np.log10(np.mean((np.asarray(shown) / 255 - np.asarray(truth) / 255) ** 2)))
+    assert len(list((tmp_path / "a/train/ours_200/renders").iterdir())) == 17
+    (row,) = read_curve(tmp_path / "a/error_vs_time.csv")[-1:]
+    assert row["test_psnr"] == pytest.approx(np.mean(scored), abs=0.05)  # renders are rounded to 8 bits here alone
+
+
+def test_what_is_scored_does_not_train(colmap_scene, tmp_path):
+    plain = _train(colmap_scene, tmp_path / "a", iterations=40)
+    pictures = _pictures(colmap_scene)
+    changed = {path: np.array(Image.open(path)) for path in pictures[::8]}
+    for path, pixels in changed.items():
+        pixels[:, 64:] = 255 - pixels[:, 64:]  # a third, so that resizing carries nothing into the left half
+        Image.fromarray(pixels).save(path)
+    assert _train(colmap_scene, tmp_path / "b", iterations=40).read_bytes() == plain.read_bytes()
+    for path, pixels in changed.items():
+        pixels[:, :32] = 255 - pixels[:, :32]
+        Image.fromarray(pixels).save(path)
+    assert _train(colmap_scene, tmp_path / "c", iterations=40).read_bytes() != plain.read_bytes()
+
+
+def test_blender_frames_of_one_name_have_exposures_of_their_own(blender_scene, tmp_path, monkeypatch):
+    points = cloud(200)
+    write_point_cloud(tmp_path / "cloud.ply", points.points, (255 * points.colors).astype(np.uint8))
+    _train(blender_scene, tmp_path / "a", "-r", 16, "--init_pcd_path", tmp_path / "cloud.ply", iterations=30)
+    table = json.loads((tmp_path / "a/exposure.json").read_text())
+    assert list(table) == [
+        "train/r_0.png", "train/r_1.png", "r_2", "r_3", "test/r_0.png", "test/r_1.png",
+    ]  # fmt: skip
+    assert table["train/r_0.png"] != table["test/r_0.png"]
+    monkeypatch.setattr(sys, "argv", ["render.py", "-m", str(tmp_path / "a"), "--quiet"])
+    render.main()
+    assert Image.open(tmp_path / "a/train/ours_30/renders/00005.png").size == (8, 12)
+
+
+def test_without_the_option_nothing_is_written_and_nothing_is_cut(colmap_scene, tmp_path):
+    train.main(["-s", str(colmap_scene), "-m", str(tmp_path / "a"), "--eval", "-r", "24", "--iterations", "3",
+                "--checkpoint_iterations", "2", "--exposure_lr_init", "0.5"])  # fmt: skip
+    assert not (tmp_path / "a/exposure.json").exists()
+    assert len(load_checkpoint(tmp_path / "a/chkpnt2.pth")[0]) == 12
