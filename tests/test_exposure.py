@@ -196,7 +196,7 @@ def test_columns_that_do_not_count_are_cut_off():
     generator = torch.Generator().manual_seed(0)
     image, target = torch.rand(2, 3, 20, 31, generator=generator)
     image.requires_grad_()
-    loss, l1 = photometric_loss(image, target, 0.2, slice(0, 15))
+    loss, l1 = photometric_loss(image, target, 0.2, columns=slice(0, 15))
     (gradient,) = torch.autograd.grad(loss, image)
     exact = image.detach().double().requires_grad_()
     left, wanted = exact[..., :15], target.double()[..., :15]
