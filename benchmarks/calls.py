@@ -20,7 +20,7 @@ class Calls:
         self.settings = scene.settings(dtype, antialiasing=antialiasing)
         self.means2d = torch.zeros_like(self.leaves["means"], requires_grad=True)
         self.gradient = image_gradient(scene).to(dtype)
-        self._moments: list[tuple[Tensor, Tensor]] = []
+        self._moments: list[list[Tensor]] = []
 
     def render(self) -> Tensor:
         """(3, H, W)"""
@@ -40,10 +40,12 @@ class Calls:
         """The learning rate is 0: the arithmetic of a step, and the same scene after it."""
         self.with_backward()
         if not self._moments:
-            self._moments = [(torch.zeros_like(t), torch.zeros_like(t)) for t in self.leaves.values()]
+            self._moments = [[torch.zeros_like(t) for t in self.leaves.values()] for _ in range(2)]
+        values = list(self.leaves.values())
+        counters, n = [torch.zeros(()) for _ in values], len(values)
         with torch.no_grad():
-            for t, (mean, square) in zip(self.leaves.values(), self._moments, strict=True):
-                OPS.adam_(t, t.grad, mean, square, 0.0, 0.9, 0.999, 1e-15, 1)
+            gradients = [t.grad for t in values]
+            OPS.adam_(values, gradients, *self._moments, counters, [0.0] * n, 0.9, 0.999, 1e-15, [-1] * n)
 
     def clear(self) -> None:
         """Drop the gradients, as zero_grad(set_to_none=True) does."""

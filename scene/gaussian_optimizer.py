@@ -34,28 +34,32 @@ class GaussianAdam(torch.optim.Adam):
 
     @torch.no_grad()
     def step(self, closure: Callable[[], float] | None = None) -> float | None:
-        """One Adam step of every parameter that has a gradient; the others, counters included, stay as they are."""
+        """One Adam step of every parameter that has a gradient; the others, counters included, stay as they are.
+
+        Learning rates are the groups' own, betas and eps the optimiser's.
+        """
         loss = None
         if closure is not None:
             with torch.enable_grad():
                 loss = closure()
-        stepped = False
+        stepped, rates, columns, tensors = False, [], [], []
         for group in self.param_groups:
             (param,) = group["params"]
-            columns = self._active_columns.get(group["name"], -1)
-            if columns == 0:
+            active = self._active_columns.get(group["name"], -1)
+            if active != 0:
+                stepped, gradient = param.grad is not None, param.grad
+            elif param.numel():
                 # Nothing was rendered from this group, so it got no gradient; it counts along with its neighbour.
-                if stepped and param.numel():
-                    self._state_of(param)["step"] += 1
+                gradient = param  # stands in: of no columns nothing is read
+            else:
                 continue
-            stepped = param.grad is not None
-            if not stepped:
-                continue
-            state = self._state_of(param)
-            state["step"] += 1
-            moments = state["exp_avg"], state["exp_avg_sq"]
-            beta1, beta2 = group["betas"]
-            _ADAM(param, param.grad, *moments, group["lr"], beta1, beta2, group["eps"], int(state["step"]), columns)
+            if stepped:
+                state = self._state_of(param)
+                tensors.append((param, gradient, state["exp_avg"], state["exp_avg_sq"], state["step"]))
+                rates.append(group["lr"])
+                columns.append(active)
+        if tensors:
+            _ADAM(*map(list, zip(*tensors, strict=True)), rates, *self.defaults["betas"], self.defaults["eps"], columns)
         return loss
 
     def _state_of(self, param: Tensor) -> dict[str, Tensor]:

@@ -46,6 +46,22 @@ def error(got: Tensor, reference: Tensor) -> Error:
     return Error(difference.max().item() / scale, difference.median().item() / scale)
 
 
+def adam(
+    value: Tensor,
+    gradient: Tensor,
+    mean: Tensor,
+    square: Tensor,
+    rate: float,
+    betas: tuple[float, float],
+    eps: float,
+    step: float,
+    columns: int = -1,
+) -> None:
+    """Step number `step`, from 1, of one tensor."""
+    counter = torch.tensor(step - 1.0)
+    ops.adam_([value], [gradient], [mean], [square], [counter], [rate], *betas, eps, [columns])
+
+
 def render(
     parameters: dict[str, Tensor],
     camera: GaussianRasterizationSettings,

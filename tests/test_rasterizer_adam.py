@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from rasterizer_tools import ops
+from rasterizer_tools import adam, ops
 
 BETAS = (0.9, 0.999)
 
@@ -28,7 +28,7 @@ def test_fifty_steps_are_torchs(dtype, eps):
     for step, gradient in enumerate(gradients_of(shape, 50, dtype), start=1):
         theirs.grad = gradient.clone()
         optimizer.step()
-        ops.adam_(ours, gradient, mean, square, rate, *BETAS, eps, float(step))
+        adam(ours, gradient, mean, square, rate, BETAS, eps, float(step))
     unit = torch.finfo(dtype).eps
     state = optimizer.state[theirs]
     # Each step rounds the moments anew, two or three operations of one unit each, and beta fades the old ones.
@@ -51,8 +51,8 @@ def test_columns_left_out_are_not_touched(columns):
     whole = [start.clone(), torch.zeros_like(start), torch.zeros_like(start)]
     part = [t.clone() for t in whole]
     for step in (1.0, 2.0):
-        ops.adam_(whole[0], gradient, *whole[1:], 0.1, *BETAS, 1e-15, step)
-        ops.adam_(part[0], gradient, *part[1:], 0.1, *BETAS, 1e-15, step, columns)
+        adam(whole[0], gradient, *whole[1:], 0.1, BETAS, 1e-15, step)
+        adam(part[0], gradient, *part[1:], 0.1, BETAS, 1e-15, step, columns)
     for got, wanted, before in zip(part, whole, (start, 0 * start, 0 * start), strict=True):
         got, wanted, before = (t.reshape(n, 45) for t in (got, wanted, before))
         assert torch.equal(got[:, columns:], before[:, columns:])
@@ -70,7 +70,7 @@ def test_any_number_of_threads_gives_the_same_bits(columns):
         for threads in (1, 2, 3):
             torch.set_num_threads(threads)
             state = [start.clone(), 0.1 * gradient, gradient**2]
-            ops.adam_(state[0], gradient, *state[1:], 0.1, *BETAS, 1e-15, 7.0, columns)
+            adam(state[0], gradient, *state[1:], 0.1, BETAS, 1e-15, 7.0, columns)
             results.append(state)
     finally:
         torch.set_num_threads(before)
@@ -79,15 +79,48 @@ def test_any_number_of_threads_gives_the_same_bits(columns):
             assert torch.equal(got, wanted)
 
 
+def test_many_tensors_in_one_call_are_each_by_itself():
+    """Twenty of them, more than one launch on a GPU takes, with rates, columns and counters of their own."""
+    generator = torch.Generator().manual_seed(4)
+    shapes = [(), (7,), (300, 1), (40, 15, 3), (0, 3)] * 4
+    together = [[torch.randn(shape, generator=generator) for shape in shapes] for _ in range(3)]
+    gradients = [torch.randn(shape, generator=generator) for shape in shapes]
+    together[2] = [square**2 for square in together[2]]
+    alone = [[t.clone() for t in tensors] for tensors in together]
+    counters = [torch.tensor(float(i)) for i in range(len(shapes))]
+    rates = [0.1 / (1 + i) for i in range(len(shapes))]
+    columns = [9 if shape == (40, 15, 3) else -1 for shape in shapes]
+    for i, state in enumerate(zip(*alone, strict=True)):
+        adam(state[0], gradients[i], *state[1:], rates[i], BETAS, 1e-15, i + 1.0, columns[i])
+    ops.adam_(together[0], gradients, *together[1:], counters, rates, *BETAS, 1e-15, columns)
+    for got, wanted in zip(together, alone, strict=True):
+        assert all(torch.equal(one, other) for one, other in zip(got, wanted, strict=True))
+    assert [int(counter) for counter in counters] == list(range(1, len(shapes) + 1))
+
+
+def test_no_tensor_takes_a_step_when_one_does_not_fit():
+    good, bad = torch.ones(4, 3), torch.ones(4, 3)
+    moments = [torch.ones(4, 3) for _ in range(4)]
+    counters = [torch.tensor(2.0), torch.tensor(2.0)]
+    with pytest.raises(RuntimeError, match="shape, dtype and device of the parameter"):
+        gradients = [torch.ones(4, 3), torch.ones(3, 4)]
+        ops.adam_([good, bad], gradients, moments[:2], moments[2:], counters, [0.1] * 2, *BETAS, 1e-15, [-1] * 2)
+    assert all((t == 1).all() for t in (good, bad, *moments)) and all(c == 2 for c in counters)
+
+
 def test_wrong_arguments_are_named():
     a, b = torch.zeros(4, 3), torch.zeros(4, 2)
-    with pytest.raises(RuntimeError, match="shape and dtype of the parameter"):
-        ops.adam_(a, b, a.clone(), a.clone(), 0.1, *BETAS, 1e-15, 1.0)
-    with pytest.raises(RuntimeError, match="shape and dtype of the parameter"):
-        ops.adam_(a, a.double(), a.clone(), a.clone(), 0.1, *BETAS, 1e-15, 1.0)
+    with pytest.raises(RuntimeError, match="shape, dtype and device of the parameter"):
+        adam(a, b, a.clone(), a.clone(), 0.1, BETAS, 1e-15, 1.0)
+    with pytest.raises(RuntimeError, match="shape, dtype and device of the parameter"):
+        adam(a, a.double(), a.clone(), a.clone(), 0.1, BETAS, 1e-15, 1.0)
     with pytest.raises(RuntimeError, match="must be contiguous"):
-        ops.adam_(torch.zeros(3, 4).T, a, a.clone(), a.clone(), 0.1, *BETAS, 1e-15, 1.0)
+        adam(torch.zeros(3, 4).T, a, a.clone(), a.clone(), 0.1, BETAS, 1e-15, 1.0)
     with pytest.raises(RuntimeError, match="columns must be at most 3, got 4"):
-        ops.adam_(a, a.clone(), a.clone(), a.clone(), 0.1, *BETAS, 1e-15, 1.0, 4)
+        adam(a, a.clone(), a.clone(), a.clone(), 0.1, BETAS, 1e-15, 1.0, 4)
     empty = torch.zeros(0, 45)
-    ops.adam_(empty, empty.clone(), empty.clone(), empty.clone(), 0.1, *BETAS, 1e-15, 1.0)
+    adam(empty, empty.clone(), empty.clone(), empty.clone(), 0.1, BETAS, 1e-15, 1.0)
+    with pytest.raises(RuntimeError, match="for each of the 1 parameters, got 2"):
+        ops.adam_([a], [a.clone()], [a.clone()], [a.clone()], [torch.zeros(())], [0.1, 0.1], *BETAS, 1e-15, [-1])
+    with pytest.raises(RuntimeError, match="step counter must be one float32 on the CPU"):
+        ops.adam_([a], [a.clone()], [a.clone()], [a.clone()], [torch.ones(1).int()], [0.1], *BETAS, 1e-15, [-1])

@@ -101,15 +101,24 @@ def test_culling_changes_no_bit():
 
 
 def test_adam_is_the_cpus_to_rounding():
+    """Twenty tensors at once, more than a launch takes, some with columns left out and one empty."""
     generator = torch.Generator().manual_seed(9)
-    value, mean, square = torch.randn(500, 45, generator=generator), torch.zeros(500, 45), torch.zeros(500, 45)
-    on_gpu = [t.cuda() for t in (value, mean, square)]
-    for step in range(1, 20):
-        gradient = torch.randn(500, 45, generator=generator)
-        OPS.adam_(value, gradient, mean, square, 1e-2, 0.9, 0.999, 1e-15, step, 9)
-        OPS.adam_(on_gpu[0], gradient.cuda(), *on_gpu[1:], 1e-2, 0.9, 0.999, 1e-15, step, 9)
+    shapes = [(500, 45), (1,), (700, 3), (0, 4), (33, 15, 3)] * 4
+    columns = [9 if shape == (500, 45) else -1 for shape in shapes]
+    state = [[torch.randn(shape, generator=generator) for shape in shapes]]
+    state += [[torch.zeros(shape) for shape in shapes] for _ in range(2)]
+    on_gpu = [[t.cuda() for t in tensors] for tensors in state]
+    counters = [[torch.zeros(()) for _ in shapes] for _ in range(2)]
+    rates = [1e-2 / (1 + i) for i in range(len(shapes))]
+    for _ in range(20):
+        gradients = [torch.randn(shape, generator=generator) for shape in shapes]
+        rest = (rates, 0.9, 0.999, 1e-15, columns)
+        OPS.adam_(state[0], gradients, *state[1:], counters[0], *rest)
+        OPS.adam_(on_gpu[0], [g.cuda() for g in gradients], *on_gpu[1:], counters[1], *rest)
     # Twenty steps of 1e-2, each good to some units in the last place.
-    torch.testing.assert_close(on_gpu[0].cpu(), value, rtol=1e-6, atol=1e-6)
+    for got, wanted in zip(on_gpu[0], state[0], strict=True):
+        torch.testing.assert_close(got.cpu(), wanted, rtol=1e-6, atol=1e-6)
+    assert all(counter == 20 for counter in counters[1])
 
 
 def test_sparse_adam_is_the_cpus_to_rounding():

@@ -49,9 +49,10 @@ def test_opcheck_every_other_op(device):
     _check(ops.project_vjp, *arguments, counts, moments, wanted)
     _check(ops.rasterize_vjp, *arguments, *state, *gradients, wanted)
     _check(ops.mark_visible, raw["means"], camera.viewmatrix.float())
-    moment = torch.rand(3, 3, device=device)
-    _check(ops.adam_, moment + 1, moment + 2, moment, moment.clone(), 0.1, 0.9, 0.99, 1e-8, 1.0, columns=2)
-    seen = torch.tensor([True, False, True], device=device)
+    lists = [[torch.rand(3, 3, device=device), torch.rand(2, 5, device=device)] for _ in range(4)]
+    counters = [torch.tensor(1.0), torch.tensor(7.0)]
+    _check(ops.adam_, *lists, counters, [0.1, 0.2], 0.9, 0.99, 1e-8, [2, -1])
+    moment, seen = torch.rand(3, 3, device=device), torch.tensor([True, False, True], device=device)
     _check(ops.sparse_adam_, moment + 1, moment + 2, moment, moment.clone(), seen, 0.1, 0.9, 0.99, 1e-8)
 
 

@@ -106,7 +106,7 @@ struct BlendGradient {
   T* moments;                       // out: (N, 10), Moments in math/footprint.h, then colour and inverse depth
 };
 
-// In-place Adam on `columns` leading values of each row.
+// A tensor that takes a step of Adam in place, with the `columns` leading values of each row.
 template <class T>
 struct AdamInput {
   T* value;
@@ -133,7 +133,7 @@ struct AdamInput {
   template <class T>                                                                                        \
   void blend_vjp(const Where&, const BlendInput<T>&, const BlendGradient<T>&);                              \
   template <class T>                                                                                        \
-  void adam(const Where&, const AdamInput<T>&);                                                             \
+  void adam(const Where&, const AdamInput<T>* tensors, int64_t count);                                      \
   /* Adam without bias correction on the rows that are visible, (rows); `step` is not read. */              \
   template <class T>                                                                                        \
   void sparse_adam(const Where&, const AdamInput<T>&, const bool* visible);

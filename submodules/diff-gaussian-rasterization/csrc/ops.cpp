@@ -478,36 +478,47 @@ Tensor mark_visible_op(const Tensor& means, const Tensor& view) {
 
 void check_moments(const Tensor& value, const Tensor& gradient, const Tensor& mean, const Tensor& square) {
   for (const Tensor* t : {&gradient, &mean, &square})
-    TORCH_CHECK(t->sizes() == value.sizes() && t->scalar_type() == value.scalar_type(),
-                "gradient and moments must have the shape and dtype of the parameter, ", value.sizes(), ", got ",
-                t->sizes());
+    TORCH_CHECK(t->sizes() == value.sizes() && t->scalar_type() == value.scalar_type() && t->device() == value.device(),
+                "gradient and moments must have the shape, dtype and device of the parameter, ", value.sizes(), " ",
+                value.scalar_type(), " on ", value.device(), ", got ", t->sizes(), " ", t->scalar_type(), " on ",
+                t->device());
   TORCH_CHECK(value.is_contiguous() && mean.is_contiguous() && square.is_contiguous(),
               "parameter and moments must be contiguous");
 }
 
-void adam_op(Tensor& value, const Tensor& gradient, Tensor& mean, Tensor& square, double lr, double beta1, double beta2,
-             double eps, double step, int64_t columns) {
-  check_moments(value, gradient, mean, square);
-  if (value.numel() == 0) return;
-  const int64_t rows = value.dim() > 0 ? value.size(0) : 1, row = value.numel() / rows;
-  TORCH_CHECK(columns <= row, "columns must be at most ", row, ", got ", columns);
-  const Tensor g = gradient.contiguous();
-  with_scalar(value.scalar_type(), [&](auto zero) {
+// One step of every parameter, in one launch on a GPU. Each counter is advanced first, as torch's are.
+void adam_op(at::TensorList values, at::TensorList gradients, at::TensorList means, at::TensorList squares,
+             at::TensorList steps, at::ArrayRef<double> rates, double beta1, double beta2, double eps,
+             at::IntArrayRef columns) {
+  const size_t n = values.size();
+  for (size_t size : {gradients.size(), means.size(), squares.size(), steps.size(), rates.size(), columns.size()})
+    TORCH_CHECK(size == n, "every list must have an entry for each of the ", n, " parameters, got ", size);
+  if (n == 0) return;
+  const Tensor& first = values[0];
+  with_scalar(first.scalar_type(), [&](auto zero) {
     using T = decltype(zero);
-    const gs::AdamInput<T> in{value.mutable_data_ptr<T>(),
-                              g.const_data_ptr<T>(),
-                              mean.mutable_data_ptr<T>(),
-                              square.mutable_data_ptr<T>(),
-                              rows,
-                              row,
-                              columns < 0 ? row : columns,
-                              lr,
-                              beta1,
-                              beta2,
-                              eps,
-                              step};
-    RUN(T, value, adam, in);
+    std::vector<gs::AdamInput<T>> inputs;
+    std::vector<Tensor> contiguous;  // keeps the gradients' memory until the call is over
+    for (size_t i = 0; i < n; ++i) {
+      const Tensor& value = values[i];
+      TORCH_CHECK(value.scalar_type() == first.scalar_type() && value.device() == first.device(),
+                  "all parameters must have one dtype and device");
+      check_moments(value, gradients[i], means[i], squares[i]);
+      const Tensor& step = steps[i];
+      TORCH_CHECK(step.is_cpu() && step.numel() == 1 && step.scalar_type() == at::kFloat,
+                  "a step counter must be one float32 on the CPU, got ", step.sizes(), " ", step.scalar_type(), " on ",
+                  step.device());
+      const int64_t rows = value.dim() > 0 ? value.size(0) : 1, row = rows ? value.numel() / rows : 0;
+      TORCH_CHECK(rows == 0 || columns[i] <= row, "columns must be at most ", row, ", got ", columns[i]);
+      contiguous.push_back(gradients[i].contiguous());
+      inputs.push_back({value.mutable_data_ptr<T>(), contiguous.back().template const_data_ptr<T>(),
+                        means[i].mutable_data_ptr<T>(), squares[i].mutable_data_ptr<T>(), rows, row,
+                        columns[i] < 0 ? row : columns[i], rates[i], beta1, beta2, eps,
+                        double(*step.const_data_ptr<float>()) + 1});
+    }
+    RUN(T, first, adam, inputs.data(), int64_t(n));
   });
+  for (const Tensor& step : steps) *step.mutable_data_ptr<float>() += 1;
 }
 
 void sparse_adam_op(Tensor& value, const Tensor& gradient, Tensor& mean, Tensor& square, const Tensor& visible,
@@ -552,8 +563,8 @@ TORCH_LIBRARY(diff_gaussian_rasterization, m) {
   m.def("rasterize_vjp(" SCENE_SCHEMA ", " BACKWARD_SCHEMA ", bool[9] wanted) -> " GRADIENTS_SCHEMA);
   m.def("mark_visible(Tensor means, Tensor view) -> Tensor");
   m.def(
-      "adam_(Tensor(a!) value, Tensor gradient, Tensor(b!) mean, Tensor(c!) square, float lr, float beta1, "
-      "float beta2, float eps, float step, int columns=-1) -> ()");
+      "adam_(Tensor(a!)[] values, Tensor[] gradients, Tensor(b!)[] means, Tensor(c!)[] squares, Tensor(d!)[] steps, "
+      "float[] rates, float beta1, float beta2, float eps, int[] columns) -> ()");
   m.def(
       "sparse_adam_(Tensor(a!) value, Tensor gradient, Tensor(b!) mean, Tensor(c!) square, Tensor visible, float lr, "
       "float beta1, float beta2, float eps, int columns=-1) -> ()");

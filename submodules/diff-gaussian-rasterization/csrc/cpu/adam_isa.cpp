@@ -3,8 +3,11 @@
 
 GS_ISA_BEGIN
 
+namespace {
+
 template <class T>
-void adam(const Executor& executor, const AdamInput<T>& in) {
+void adam_tensor(const Executor& executor, const AdamInput<T>& in) {
+  if (in.columns == 0) return;
   const AdamStep<T> step = make_adam_step<T>(in.lr, in.beta1, in.beta2, in.eps, in.step);
   const bool dense = in.columns == in.row;
   // Fixed blocks, not the pool's: the compiler's vector loop and its scalar tail may round differently.
@@ -22,7 +25,14 @@ void adam(const Executor& executor, const AdamInput<T>& in) {
   });
 }
 
-template void adam<float>(const Executor&, const AdamInput<float>&);
-template void adam<double>(const Executor&, const AdamInput<double>&);
+}  // namespace
+
+template <class T>
+void adam(const Executor& executor, const AdamInput<T>* tensors, int64_t count) {
+  for (int64_t i = 0; i < count; ++i) adam_tensor(executor, tensors[i]);
+}
+
+template void adam<float>(const Executor&, const AdamInput<float>*, int64_t);
+template void adam<double>(const Executor&, const AdamInput<double>*, int64_t);
 
 GS_ISA_END

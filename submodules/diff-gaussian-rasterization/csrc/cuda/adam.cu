@@ -10,26 +10,46 @@ namespace cuda {
 namespace {
 
 constexpr int kThreads = 256;
+constexpr int kTensors = 16;  // of one launch: 130 bytes each, and a kernel's parameters have 4 KiB
 
-__global__ void __launch_bounds__(kThreads) adam_kernel(AdamInput<float> in, baseline::AdamStep<float> step) {
-  const int64_t k = int64_t(blockIdx.x) * kThreads + threadIdx.x;
+struct Tensors {
+  AdamInput<float> in[kTensors];
+  baseline::AdamStep<float> step[kTensors];
+  int64_t end[kTensors];  // the first block that is not this tensor's or an earlier one's
+};
+
+__global__ void __launch_bounds__(kThreads) adam_kernel(const __grid_constant__ Tensors tensors) {
+  int which = 0;
+  while (int64_t(blockIdx.x) >= tensors.end[which]) ++which;
+  const AdamInput<float>& in = tensors.in[which];
+  const int64_t block = int64_t(blockIdx.x) - (which ? tensors.end[which - 1] : 0);
+  const int64_t k = block * kThreads + threadIdx.x;
   if (k >= in.rows * in.columns) return;
   const int64_t i = in.columns == in.row ? k : k / in.columns * in.row + k % in.columns;
   float value = in.value[i], mean = in.mean[i], square = in.square[i];
-  baseline::adam(step, in.gradient[i], value, mean, square);
+  baseline::adam(tensors.step[which], in.gradient[i], value, mean, square);
   in.value[i] = value, in.mean[i] = mean, in.square[i] = square;
 }
 
 }  // namespace
 
 template <>
-void adam<float>(const Queue& queue, const AdamInput<float>& in) {
-  const int64_t n = in.rows * in.columns;
-  if (!n) return;
-  const auto step = baseline::make_adam_step<float>(in.lr, in.beta1, in.beta2, in.eps, in.step);
-  adam_kernel<<<unsigned((n + kThreads - 1) / kThreads), kThreads, 0, static_cast<cudaStream_t>(queue.stream)>>>(in,
-                                                                                                                 step);
-  check_launch("adam");
+void adam<float>(const Queue& queue, const AdamInput<float>* tensors, int64_t count) {
+  for (int64_t first = 0; first < count; first += kTensors) {
+    const int n = int(count - first < kTensors ? count - first : kTensors);
+    Tensors some = {};
+    int64_t blocks = 0;
+    for (int i = 0; i < n; ++i) {
+      const AdamInput<float>& in = tensors[first + i];
+      some.in[i] = in;
+      some.step[i] = baseline::make_adam_step<float>(in.lr, in.beta1, in.beta2, in.eps, in.step);
+      blocks += (in.rows * in.columns + kThreads - 1) / kThreads;
+      some.end[i] = blocks;
+    }
+    if (!blocks) continue;
+    adam_kernel<<<unsigned(blocks), kThreads, 0, static_cast<cudaStream_t>(queue.stream)>>>(some);
+    check_launch("adam");
+  }
 }
 
 }  // namespace cuda
