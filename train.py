@@ -275,9 +275,7 @@ def _control_density(
     """Statistics of this view, and in due time clones, splits, pruning and the reset of opacities."""
     todo = adc.actions(iteration, opt, white_background)
     if todo.observe:
-        radii = package["radii"]
-        torch.maximum(gaussians.max_radii2D, radii, out=gaussians.max_radii2D)
-        gaussians.add_densification_stats(package["viewspace_points"], radii > 0)
+        gaussians.observe(package["viewspace_points"], package["radii"])
     if todo.densify:
         gaussians.densify_and_prune(
             opt.densify_grad_threshold,

@@ -5,6 +5,7 @@ import os
 from collections.abc import Sequence
 from typing import Any
 
+import diff_gaussian_rasterization  # noqa: F401  (its library holds the kernel of the statistics)
 import numpy as np
 import torch
 from simple_knn._C import distCUDA2
@@ -21,6 +22,8 @@ from utils.general_utils import build_scaling_rotation, get_expon_lr_func, strip
 from utils.graphics_utils import BasicPointCloud
 from utils.sh_utils import RGB2SH
 from utils.system_utils import UserError, compute_device
+
+_OBSERVE = torch.ops.diff_gaussian_rasterization.observe_
 
 INITIAL_OPACITY = 0.1
 MIN_DISTANCE2 = 1e-7  # floor of the squared distance to the neighbours, square world units: duplicates get a size
@@ -308,6 +311,14 @@ class GaussianModel:
             self._zero_statistics()
 
     # Adaptive density control
+
+    def observe(self, viewspace_points: Tensor, radii: Tensor) -> None:
+        """Add a view to the statistics: largest radius, gradient length and count of the Gaussians that it saw.
+
+        viewspace_points: (N, 3) with `.grad` per NDC unit; radii: (N,) int32 pixels, 0 where not seen. Raises
+        max_radii2D and does what add_densification_stats does for radii > 0, in one pass.
+        """
+        _OBSERVE(self.max_radii2D, self.xyz_gradient_accum, self.denom, radii, viewspace_points.grad)
 
     def add_densification_stats(self, viewspace_point_tensor: Tensor, update_filter: Tensor) -> None:
         """Add this view's screen-space gradient lengths and count it, for the Gaussians it saw.

@@ -2,6 +2,7 @@
 
 import math
 
+import numpy as np
 import pytest
 import torch
 from gaussians import GROUPS, model, moments, options, parameters, take_steps
@@ -182,6 +183,50 @@ def test_statistics_take_indices_and_masks():
     gaussians.add_densification_stats(points, torch.tensor([True, False, True, False]))
     assert gaussians.xyz_gradient_accum.reshape(-1).tolist() == [10.0, 0.0, 2.0, 0.0]
     assert gaussians.denom.reshape(-1).tolist() == [2.0, 0.0, 1.0, 1.0]
+
+
+def _views(gaussians: GaussianModel, views: int, seed: int) -> list[tuple[torch.Tensor, torch.Tensor]]:
+    """Screen points with a gradient and radii of some views, a third of the Gaussians unseen in each."""
+    generator = torch.Generator().manual_seed(seed)
+    result = []
+    for _ in range(views):
+        points = torch.zeros(len(gaussians), 3)
+        size = 10 ** (4 * torch.rand(len(gaussians), 1, generator=generator) - 6)
+        points.grad = torch.randn(points.shape, generator=generator) * size
+        radii = torch.randint(-30, 60, (len(gaussians),), generator=generator, dtype=torch.int32).clamp_min(0)
+        result.append((points, radii))
+    return result
+
+
+def test_a_view_in_one_pass_is_its_two_parts():
+    """observe against max_radii2D and add_densification_stats in torch, and to the bit against NumPy."""
+    fused, plain = model(3001), model(3001)
+    exact = np.zeros(3001, dtype=np.float32)
+    for points, radii in _views(fused, 7, seed=0):
+        fused.observe(points, radii)
+        torch.maximum(plain.max_radii2D, radii, out=plain.max_radii2D)
+        plain.add_densification_stats(points, radii > 0)
+        x, y, _ = points.grad.numpy().T
+        exact += np.where(radii > 0, np.sqrt(x * x + y * y), np.float32(0))
+    assert fused.denom.max() == 7 and fused.max_radii2D.max() > 0
+    assert torch.equal(fused.max_radii2D, plain.max_radii2D) and torch.equal(fused.denom, plain.denom)
+    assert torch.equal(fused.xyz_gradient_accum.reshape(-1), torch.from_numpy(exact))
+    # torch's square root is off by a unit in the last place here and there.
+    torch.testing.assert_close(fused.xyz_gradient_accum, plain.xyz_gradient_accum, rtol=2 * 2**-23, atol=0)
+
+
+def test_any_number_of_threads_observes_the_same():
+    before, results = torch.get_num_threads(), []
+    try:
+        for threads in (1, 2, 3):
+            torch.set_num_threads(threads)
+            gaussians = model(40_000, degree=0)
+            for points, radii in _views(gaussians, 2, seed=1):
+                gaussians.observe(points, radii)
+            results.append(gaussians.xyz_gradient_accum)
+    finally:
+        torch.set_num_threads(before)
+    assert all(torch.equal(results[0], other) for other in results[1:])
 
 
 def test_the_cap_takes_the_largest_gradients_ties_by_index():

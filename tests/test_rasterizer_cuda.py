@@ -138,6 +138,19 @@ def test_sparse_adam_is_the_cpus_to_rounding():
     assert not torch.equal(value[:400], start[:400])
 
 
+def test_density_statistics_are_the_cpus_to_the_bit():
+    generator = torch.Generator().manual_seed(10)
+    for n in (0, 1, 30_001):
+        on_cpu = [torch.zeros(n), torch.zeros(n, 1), torch.zeros(n, 1)]
+        on_gpu = [t.cuda() for t in on_cpu]
+        for _ in range(5):
+            radii = torch.randint(-30, 60, (n,), generator=generator, dtype=torch.int32).clamp_min(0)
+            gradient = torch.randn(n, 3, generator=generator)
+            OPS.observe_(*on_cpu, radii, gradient)
+            OPS.observe_(*on_gpu, radii.cuda(), gradient.cuda())
+        assert all(torch.equal(a, b.cpu()) for a, b in zip(on_cpu, on_gpu, strict=True))
+
+
 def test_float64_says_what_to_do():
     scene = frustum(10, 20, 20, 3.0)
     with pytest.raises(RuntimeError, match="float32"):

@@ -54,6 +54,9 @@ def test_opcheck_every_other_op(device):
     _check(ops.adam_, *lists, counters, [0.1, 0.2], 0.9, 0.99, 1e-8, [2, -1])
     moment, seen = torch.rand(3, 3, device=device), torch.tensor([True, False, True], device=device)
     _check(ops.sparse_adam_, moment + 1, moment + 2, moment, moment.clone(), seen, 0.1, 0.9, 0.99, 1e-8)
+    radii = torch.tensor([0, 3, 5], dtype=torch.int32, device=device)
+    statistics = [torch.rand(shape, device=device) for shape in ((3,), (3, 1), (3, 1))]
+    _check(ops.observe_, *statistics, radii, torch.rand(3, 3, device=device))
 
 
 @BOTH_AND_GPU
@@ -112,3 +115,17 @@ def test_an_image_of_more_tiles_than_an_index_holds_is_an_error():
     camera = settings(**size)._replace(image_width=2**23, image_height=2**23)
     with pytest.raises(RuntimeError, match=r"image size 8388608x8388608 has more than 2\^31 - 1 tiles"):
         render(raw, camera)
+
+
+def test_statistics_that_do_not_fit_are_named():
+    radii, gradient = torch.ones(4, dtype=torch.int32), torch.ones(4, 3)
+    three = [torch.zeros(4), torch.zeros(4, 1), torch.zeros(4, 1)]
+    with pytest.raises(RuntimeError, match="statistics must be 4 float32 on cpu, got .3"):
+        ops.observe_(torch.zeros(3), *three[1:], radii, gradient)
+    with pytest.raises(RuntimeError, match="statistics must be contiguous"):
+        ops.observe_(torch.zeros(8)[::2], *three[1:], radii, gradient)
+    with pytest.raises(RuntimeError, match="radii must be int32, got Float"):
+        ops.observe_(*three, radii.float(), gradient)
+    with pytest.raises(RuntimeError, match="the gradient must be .4, 3. float32 on cpu, got .4, 2. Float"):
+        ops.observe_(*three, radii, gradient[:, :2])
+    ops.observe_(torch.zeros(0), torch.zeros(0, 1), torch.zeros(0, 1), radii[:0], gradient[:0])

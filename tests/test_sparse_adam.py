@@ -78,7 +78,7 @@ def test_wrong_arguments_are_named():
         with pytest.raises(RuntimeError, match=r"visible must be \(4\) bool on cpu, got"):
             ops.sparse_adam_(a, a.clone(), a.clone(), a.clone(), seen, RATE, *BETAS, EPS)
     seen = torch.ones(4, dtype=torch.bool)
-    with pytest.raises(RuntimeError, match="shape and dtype of the parameter"):
+    with pytest.raises(RuntimeError, match="shape, dtype and device of the parameter"):
         ops.sparse_adam_(a, a[:, :2], a.clone(), a.clone(), seen, RATE, *BETAS, EPS)
     with pytest.raises(RuntimeError, match="columns must be at most 3, got 4"):
         ops.sparse_adam_(a, a.clone(), a.clone(), a.clone(), seen, RATE, *BETAS, EPS, 4)

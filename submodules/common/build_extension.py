@@ -96,7 +96,9 @@ class BuildBackend(build_ext):
 
         compilations = [([*compile_cxx, *ops_flags], csrc / "ops.cpp", "ops.o")]
         sources = sorted((csrc / "cpu").glob("*.cpp"))
-        compilations += [(compile_cxx, source, f"{source.stem}.o") for source in sources if not is_per_isa(source)]
+        # What is compiled once rounds alike everywhere: no fused products where the machine has them (gs/rounded.h).
+        once = [*compile_cxx, "-ffp-contract=off"]
+        compilations += [(once, source, f"{source.stem}.o") for source in sources if not is_per_isa(source)]
         # Baseline first: where the standard library's templates come out of line in several objects, the linker keeps
         # the first, and that one must run on every machine.
         for isa, flags in isas.items():

@@ -117,6 +117,14 @@ struct AdamInput {
   double lr, beta1, beta2, eps, step;
 };
 
+// Adds a view to the statistics of density control.
+struct ObserveInput {
+  int64_t count;
+  float *max_radii, *gradient_sums, *views;  // (N), updated: Observed in math/observe.h
+  const int32_t* radii;                      // (N) of this view
+  const float* gradients;  // (N, 3) of the means on the screen: x and y, and a third that counts nothing
+};
+
 // Every backend's functions. `Where` says how they run: an Executor on the CPU, a Queue on a GPU.
 #define GS_BACKEND(Where)                                                                                   \
   template <class T>                                                                                        \
@@ -138,6 +146,8 @@ struct AdamInput {
   template <class T>                                                                                        \
   void sparse_adam(const Where&, const AdamInput<T>&, const bool* visible);
 
+void observe(const Executor&, const ObserveInput&);  // compiled once: see gs/rounded.h
+
 namespace baseline {
 GS_BACKEND(Executor)
 }
@@ -151,6 +161,7 @@ GS_BACKEND(Executor)
 #endif
 namespace cuda {
 GS_BACKEND(Queue)
+void observe(const Queue&, const ObserveInput&);
 // The number of tile instances of a projection: waits for it.
 int64_t count_instances(const Queue&, int64_t count, const int32_t* tile_counts);
 // blend_vjp and project_vjp in one, without the moments in between (BlendGradient::moments is not written).

@@ -544,6 +544,35 @@ void sparse_adam_op(Tensor& value, const Tensor& gradient, Tensor& mean, Tensor&
   });
 }
 
+void observe_op(Tensor& max_radii, Tensor& gradient_sums, Tensor& views, const Tensor& radii, const Tensor& gradient) {
+  const int64_t n = radii.numel();
+  for (const Tensor* t : {&max_radii, &gradient_sums, &views}) {
+    TORCH_CHECK(t->numel() == n && t->scalar_type() == at::kFloat && t->device() == radii.device(),
+                "statistics must be ", n, " float32 on ", radii.device(), ", got ", t->sizes(), " ", t->scalar_type(),
+                " on ", t->device());
+    TORCH_CHECK(t->is_contiguous(), "statistics must be contiguous");
+  }
+  TORCH_CHECK(radii.scalar_type() == at::kInt, "radii must be int32, got ", radii.scalar_type());
+  TORCH_CHECK(gradient.dim() == 2 && gradient.size(0) == n && gradient.size(1) == 3 &&
+                  gradient.scalar_type() == at::kFloat && gradient.device() == radii.device(),
+              "the gradient must be (", n, ", 3) float32 on ", radii.device(), ", got ", gradient.sizes(), " ",
+              gradient.scalar_type(), " on ", gradient.device());
+  const Tensor pixels = radii.contiguous(), rows = gradient.contiguous();
+  const gs::ObserveInput in{n,
+                            max_radii.mutable_data_ptr<float>(),
+                            gradient_sums.mutable_data_ptr<float>(),
+                            views.mutable_data_ptr<float>(),
+                            pixels.const_data_ptr<int32_t>(),
+                            rows.const_data_ptr<float>()};
+#ifdef GS_CUDA
+  if (radii.is_cuda()) {
+    gs::TorchQueue queue(radii.device());
+    return gs::cuda::observe(queue.queue(), in);
+  }
+#endif
+  gs::observe(gs::torch_executor(), in);
+}
+
 }  // namespace
 
 TORCH_LIBRARY(diff_gaussian_rasterization, m) {
@@ -568,6 +597,9 @@ TORCH_LIBRARY(diff_gaussian_rasterization, m) {
   m.def(
       "sparse_adam_(Tensor(a!) value, Tensor gradient, Tensor(b!) mean, Tensor(c!) square, Tensor visible, float lr, "
       "float beta1, float beta2, float eps, int columns=-1) -> ()");
+  m.def(
+      "observe_(Tensor(a!) max_radii, Tensor(b!) gradient_sums, Tensor(c!) views, Tensor radii, Tensor gradient) "
+      "-> ()");
 }
 
 #define REGISTER(device)                                       \
@@ -582,6 +614,7 @@ TORCH_LIBRARY(diff_gaussian_rasterization, m) {
     m.impl("mark_visible", &mark_visible_op);                  \
     m.impl("adam_", &adam_op);                                 \
     m.impl("sparse_adam_", &sparse_adam_op);                   \
+    m.impl("observe_", &observe_op);                           \
   }
 REGISTER(CPU)
 #ifdef GS_CUDA

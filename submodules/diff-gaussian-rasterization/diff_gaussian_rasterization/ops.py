@@ -237,6 +237,7 @@ def _(means, view):
 
 @torch.library.register_fake("diff_gaussian_rasterization::adam_")
 @torch.library.register_fake("diff_gaussian_rasterization::sparse_adam_")
+@torch.library.register_fake("diff_gaussian_rasterization::observe_")
 def _(*args, **kwargs):
     return None
 

@@ -76,10 +76,71 @@ void test_sparse_adam() {
   }
 }
 
+// Twenty tensors in one call, more than a launch takes: empty ones, one value, whole rows and leading columns of them.
+void test_adam() {
+  struct Tensor {
+    int64_t rows, row, columns;
+    std::vector<float> value, gradient, mean, square;
+  };
+  std::vector<Tensor> tensors;
+  for (int i = 0; i < 20; ++i) {
+    const int64_t shapes[5][3] = {{0, 3, 3}, {1, 1, 1}, {300, 4, 4}, {37, 45, 9}, {20, 45, 0}};
+    const auto& [rows, row, columns] = shapes[i % 5];
+    Tensor t{rows, row, columns, {}, {}, {}, {}};
+    for (int64_t k = 0; k < rows * row; ++k) {
+      t.value.push_back(float(normal())), t.gradient.push_back(float(normal()));
+      t.mean.push_back(float(normal())), t.square.push_back(float(normal() * normal() + 9));
+    }
+    tensors.push_back(t);
+  }
+  const auto inputs = [](std::vector<Tensor>& of) {
+    std::vector<gs::AdamInput<float>> in;
+    for (Tensor& t : of) {
+      const double rate = 0.1 / double(in.size() + 1), step = double(in.size() + 1);
+      in.push_back({t.value.data(), t.gradient.data(), t.mean.data(), t.square.data(), t.rows, t.row, t.columns, rate,
+                    0.9, 0.999, 1e-15, step});
+    }
+    return in;
+  };
+  std::vector<Tensor> wanted = tensors, got = tensors;
+  adam(gs::serial_executor(), inputs(wanted).data(), int64_t(wanted.size()));
+  gs::emulation::Memory memory;
+  gs::cuda::adam(memory.queue(), inputs(got).data(), int64_t(got.size()));
+  for (size_t i = 0; i < tensors.size(); ++i) {
+    // The same operations, but for fused ones.
+    check_near(got[i].value, wanted[i].value, 1e-6);
+    check_near(got[i].mean, wanted[i].mean, 1e-6), check_near(got[i].square, wanted[i].square, 1e-6);
+    for (size_t k = 0; k < got[i].value.size(); ++k)
+      CHECK((got[i].mean[k] != tensors[i].mean[k]) == (int64_t(k) % got[i].row < got[i].columns));
+  }
+}
+
+void test_observe() {
+  for (const int64_t n : {0, 1, 255, 700}) {
+    std::vector<int32_t> radii;
+    std::vector<float> gradients, start;
+    for (int64_t i = 0; i < n; ++i) {
+      radii.push_back(std::max(0, int(20 * normal())));
+      for (int k = 0; k < 3; ++k) gradients.push_back(float(normal())), start.push_back(float(10 + normal()));
+    }
+    std::vector<float> wanted = start, got = start;
+    const auto input = [&](std::vector<float>& s) {
+      return gs::ObserveInput{n, s.data(), s.data() + n, s.data() + 2 * n, radii.data(), gradients.data()};
+    };
+    gs::observe(gs::serial_executor(), input(wanted));
+    gs::emulation::Memory memory;
+    gs::cuda::observe(memory.queue(), input(got));
+    CHECK(got == wanted);
+    for (int64_t i = 0; i < n; ++i) CHECK(got[2 * n + i] == start[2 * n + i] + (radii[i] > 0 ? 1 : 0));
+  }
+}
+
 }  // namespace
 
 int main() {
   test_against_cpu();
   test_sparse_adam();
+  test_adam();
+  test_observe();
   return gs::finish_tests("CUDA kernels, emulated");
 }

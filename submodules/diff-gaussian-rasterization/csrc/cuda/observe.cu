@@ -1,0 +1,32 @@
+#include <cuda_runtime.h>
+
+#include "../launch.h"
+#include "../math/observe.h"
+#include "gs/cuda_check.h"
+
+namespace gs {
+namespace cuda {
+
+namespace {
+
+constexpr int kThreads = 256;
+
+__global__ void __launch_bounds__(kThreads) observe_kernel(ObserveInput in) {
+  const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
+  if (i >= in.count) return;
+  Observed o{in.max_radii[i], in.gradient_sums[i], in.views[i]};
+  gs::observe(in.radii[i], in.gradients[3 * i], in.gradients[3 * i + 1], o);
+  in.max_radii[i] = o.max_radius, in.gradient_sums[i] = o.gradient_sum, in.views[i] = o.views;
+}
+
+}  // namespace
+
+void observe(const Queue& queue, const ObserveInput& in) {
+  if (!in.count) return;
+  const unsigned blocks = unsigned((in.count + kThreads - 1) / kThreads);
+  observe_kernel<<<blocks, kThreads, 0, static_cast<cudaStream_t>(queue.stream)>>>(in);
+  check_launch("observe");
+}
+
+}  // namespace cuda
+}  // namespace gs
