@@ -119,7 +119,7 @@ def training(
             weight = depth_weight(iteration) if camera.depth_reliable else 0.0
             package = render(
                 camera, gaussians, pipe, background,
-                use_trained_exp=dataset.train_test_exp, want_depth=weight > 0, want_visibility=False,
+                use_trained_exp=dataset.train_test_exp, want_depth=weight > 0, want_visibility=False, clamp=False,
             )  # fmt: skip
             loss, l1 = photometric_loss(
                 package["render"], camera.target(background), opt.lambda_dssim, camera.mask, camera.columns

@@ -25,6 +25,7 @@ def render(
     *,
     want_depth: bool = False,
     want_visibility: bool = True,
+    clamp: bool = True,
 ) -> dict[str, Tensor | None]:
     """Render one view.
 
@@ -33,10 +34,10 @@ def render(
     pipe: convert_SHs_python, compute_cov3D_python, debug, antialiasing. use_trained_exp: as the picture behind the view
     was exposed, before the clamp; a view without a picture is shown without.
 
-    Returns `render` (3, H, W) clamped to [0, 1], also in training, so values outside get no gradient;
-    `viewspace_points` (N, 3) whose gradient is that of the screen means, per NDC unit; `visibility_filter` (n, 1) int64
-    indices of the Gaussians with radius > 0, or None without want_visibility (a GPU has to be waited for it); `radii`
-    (N,) int32 pixels; `depth` inverse depth (1, H, W), or None unless want_depth.
+    Returns `render` (3, H, W) clamped to [0, 1], so values outside get no gradient, or as blended without clamp, for a
+    loss that clamps; `viewspace_points` (N, 3) whose gradient is that of the screen means, per NDC unit;
+    `visibility_filter` (n, 1) int64 indices of the Gaussians with radius > 0, or None without want_visibility (a GPU
+    has to be waited for it); `radii` (N,) int32 pixels; `depth` inverse depth (1, H, W), or None unless want_depth.
     """
     xyz = pc.get_xyz
     viewspace_points = torch.zeros_like(xyz, requires_grad=xyz.requires_grad and torch.is_grad_enabled())
@@ -52,7 +53,7 @@ def render(
     if use_trained_exp and (name := getattr(viewpoint_camera, "exposure_name", None)) is not None:
         color = apply_exposure(color, pc.get_exposure_from_name(name))
     return {
-        "render": color.clamp(0, 1),
+        "render": color.clamp(0, 1) if clamp else color,
         "viewspace_points": viewspace_points,
         "visibility_filter": (result.radii > 0).nonzero() if want_visibility else None,
         "radii": result.radii,

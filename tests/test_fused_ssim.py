@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from fused_ssim import fused_l1_ssim, fused_ssim
+from fused_ssim import fused_l1_ssim, fused_photometric_loss, fused_ssim
 from fused_ssim.reference import l1_ssim, ssim_map
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -165,6 +165,86 @@ def test_opcheck(train: bool, dtype: torch.dtype) -> None:
     torch.library.opcheck(torch.ops.fused_ssim.l1_ssim, (img1.requires_grad_(train), img2, True, train))
     one = torch.ones((), dtype=dtype)
     torch.library.opcheck(torch.ops.fused_ssim.l1_ssim_vjp, (img1.detach(), img2, torch.rand_like(img2), one, one))
+
+
+def loss_in_parts(image: Tensor, target: Tensor, weight: float) -> tuple[Tensor, Tensor]:
+    """What fused_photometric_loss does, by torch around fused_l1_ssim."""
+    l1, ssim = fused_l1_ssim(image.clamp(0, 1), target)
+    return (1 - weight) * l1 + weight * (1 - ssim), l1
+
+
+def loss_and_gradient(function, image: Tensor, target: Tensor, weight: float) -> list[Tensor]:
+    """Loss, L1 and the gradient of three times the loss."""
+    image = image.detach().requires_grad_()
+    loss, l1 = function(image, target, weight)
+    return [loss.detach(), l1.detach(), torch.autograd.grad(3 * loss, image)[0]]
+
+
+def out_of_range(dtype: torch.dtype, as_bytes: bool = False) -> list[Tensor]:
+    """A render with values below 0, above 1, and of exactly 0 and 1, and its photo."""
+    image = image_pair("overexposed", dtype=dtype)[0] - 2.5
+    image[:, :4], image[:, 4:8] = 0, 1
+    target = image_pair("noise", dtype=dtype)[1]
+    return [image, (255 * target).to(torch.uint8) if as_bytes else target]
+
+
+@both_dtypes
+@pytest.mark.parametrize("as_bytes", [False, True], ids=["float", "bytes"])
+@pytest.mark.parametrize("weight", [0.0, 0.2, 1.0])
+def test_photometric_loss_is_its_parts_to_the_bit(weight: float, as_bytes: bool, dtype: torch.dtype) -> None:
+    image, target = out_of_range(dtype, as_bytes)
+    assert ((image < 0) | (image > 1)).float().mean() > 0.3
+    fused = loss_and_gradient(fused_photometric_loss, image, target, weight)
+    for got, wanted in zip(fused, loss_and_gradient(loss_in_parts, image, target, weight), strict=True):
+        assert got.dtype == dtype and torch.equal(got, wanted)
+    assert not fused[2][(image < 0) | (image > 1)].any()
+
+
+def test_photometric_loss_agrees_with_reference() -> None:
+    image, target = out_of_range(torch.float32)
+    got = loss_and_gradient(fused_photometric_loss, image, target, 0.2)
+
+    def exact(image: Tensor, target: Tensor, weight: float) -> tuple[Tensor, Tensor]:
+        l1, ssim = l1_ssim(image.clamp(0, 1), target)
+        return (1 - weight) * l1 + weight * (1 - ssim), l1
+
+    wanted = loss_and_gradient(exact, image.double(), target.double(), 0.2)
+    # Tolerances of test_agrees_with_reference, and a few roundings of the sum.
+    assert abs(got[0] - wanted[0]) <= 12 * EPS[torch.float32]
+    assert (got[2] - wanted[2]).abs().max() <= 40 * EPS[torch.float32] * wanted[2].abs().max()
+
+
+def test_photometric_loss_gradcheck() -> None:
+    image, target = image_pair("unrelated", (12, 13))
+    image = 1.4 * image - 0.2
+    for kink in (image, image - 1, image - target):
+        assert kink.abs().min() > 1e-5
+    torch.autograd.gradcheck(lambda x: fused_photometric_loss(x, target, 0.2)[0], image.requires_grad_())
+
+
+@both_dtypes
+@pytest.mark.parametrize("train", [False, True])
+def test_opcheck_photometric(train: bool, dtype: torch.dtype) -> None:
+    image, target = image_pair("noise", (2, 12, 13), dtype)
+    torch.library.opcheck(torch.ops.fused_ssim.photometric, (image.requires_grad_(train), target, 0.2, train))
+    one = torch.ones((), dtype=dtype)
+    arguments = (image.detach(), target, torch.rand_like(target), 0.2, one)
+    torch.library.opcheck(torch.ops.fused_ssim.photometric_vjp, arguments)
+
+
+def test_photometric_loss_keeps_nothing_it_does_not_need() -> None:
+    image, target = out_of_range(torch.float32)
+    loss, l1 = fused_photometric_loss(image, target, 0.2)
+    assert not loss.requires_grad and torch.ops.fused_ssim.photometric(image, target, 0.2, False)[2].numel() == 0
+    trained, trained_l1 = fused_photometric_loss(image.requires_grad_(), target, 0.2)
+    assert trained.requires_grad and not trained_l1.requires_grad
+    assert trained == loss and trained_l1 == l1
+
+
+def test_a_nan_shows_in_the_photometric_loss() -> None:
+    image, target = out_of_range(torch.float32)
+    image[1, 20, 20] = float("nan")
+    assert fused_photometric_loss(image, target, 0.2)[0].isnan()
 
 
 @both_dtypes

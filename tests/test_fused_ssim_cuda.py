@@ -2,9 +2,18 @@
 
 import pytest
 import torch
-from fused_ssim import fused_l1_ssim, fused_ssim
+from fused_ssim import fused_l1_ssim, fused_photometric_loss, fused_ssim
 from fused_ssim.reference import l1_ssim
-from test_fused_ssim import CASES, EPS, PAIRS, image_pair, with_gradient
+from test_fused_ssim import (
+    CASES,
+    EPS,
+    PAIRS,
+    image_pair,
+    loss_and_gradient,
+    loss_in_parts,
+    out_of_range,
+    with_gradient,
+)
 from torch import Tensor
 
 pytestmark = [
@@ -98,6 +107,32 @@ def test_opcheck(train: bool) -> None:
     torch.library.opcheck(torch.ops.fused_ssim.l1_ssim, (img1.clone().requires_grad_(train), img2, True, train))
     one = torch.ones((), device="cuda")
     torch.library.opcheck(torch.ops.fused_ssim.l1_ssim_vjp, (img1, img2, torch.rand_like(img2), one, one))
+
+
+@pytest.mark.parametrize("as_bytes", [False, True], ids=["float", "bytes"])
+def test_photometric_loss_agrees_with_the_cpu_and_its_parts(as_bytes: bool) -> None:
+    image, target = out_of_range(torch.float32, as_bytes)
+    on_cpu = loss_and_gradient(fused_photometric_loss, image, target, 0.2)
+    image, target = image.cuda(), target.cuda()
+    fused = loss_and_gradient(fused_photometric_loss, image, target, 0.2)
+    in_parts = loss_and_gradient(loss_in_parts, image, target, 0.2)
+    assert torch.equal(fused[1], in_parts[1]) and torch.equal(fused[2], in_parts[2])
+    assert abs(fused[0] - in_parts[0]) <= 2 * eps  # the GPU fuses a product with the sum
+    assert abs(fused[0].cpu() - on_cpu[0]) <= 10 * eps
+    assert (fused[2].cpu() - on_cpu[2]).abs().max() <= 40 * eps * on_cpu[2].abs().max()
+    torch.cuda.set_sync_debug_mode("error")
+    try:
+        loss_and_gradient(fused_photometric_loss, image, target, 0.2)
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
+
+
+@pytest.mark.parametrize("train", [False, True])
+def test_opcheck_photometric(train: bool) -> None:
+    image, target = (image.cuda() for image in image_pair("noise", (2, 12, 13), torch.float32))
+    torch.library.opcheck(torch.ops.fused_ssim.photometric, (image.requires_grad_(train), target, 0.2, train))
+    arguments = (image.detach(), target, torch.rand_like(target), 0.2, torch.ones((), device="cuda"))
+    torch.library.opcheck(torch.ops.fused_ssim.photometric_vjp, arguments)
 
 
 def all_bits(img1: Tensor, img2: Tensor) -> list[Tensor]:

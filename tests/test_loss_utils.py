@@ -73,6 +73,21 @@ def test_fused_loss_follows_the_plain_formula(weight, as_bytes):
     assert (gradient - exact_gradient).abs().max() < 1e-4 * exact_gradient.abs().max()
 
 
+@pytest.mark.parametrize("masked", [False, True])
+def test_the_loss_clamps_the_image(masked):
+    image, target = _pair(20, 30)
+    image = 2 * image - 0.5
+    mask = torch.rand(1, 20, 30, generator=torch.Generator().manual_seed(3)) < 0.8 if masked else None
+    results = []
+    for prepare in (lambda x: x, lambda x: x.clamp(0, 1)):
+        leaf = image.clone().requires_grad_()
+        loss, _ = photometric_loss(prepare(leaf), target, 0.2, mask)
+        results.append((loss.detach(), *torch.autograd.grad(loss, leaf)))
+    assert all(torch.equal(*pair) for pair in zip(*results, strict=True))
+    outside = (image < 0) | (image > 1)
+    assert outside.float().mean() > 0.3 and not results[0][1][outside].any() and results[0][1].any()
+
+
 def test_scores_agree_with_scikit_image():
     a, b = _pair(30, 31)
     per_channel = [peak_signal_noise_ratio(a[c].numpy(), b[c].numpy(), data_range=1.0) for c in range(3)]

@@ -68,6 +68,8 @@ def test_values_outside_are_clamped_and_get_no_gradient(camera):
     assert image.max() == 1.0 and image[0].min() == 1.0
     image.sum().backward()
     assert color.grad[0, 0] == 0.0 and (color.grad[0, 1:] > 0).all()
+    whole = render(camera, gaussians, pipeline(), BLACK, override_color=color, clamp=False)["render"]
+    assert whole.max() > 1 and torch.equal(whole.clamp(0, 1), image)
 
 
 @pytest.mark.parametrize("antialiasing", [False, True])

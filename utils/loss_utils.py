@@ -2,7 +2,7 @@
 
 import torch
 import torch.nn.functional as F
-from fused_ssim import fused_l1_ssim
+from fused_ssim import fused_l1_ssim, fused_photometric_loss
 from torch import Tensor
 
 WINDOW = 11
@@ -58,17 +58,20 @@ def ssim(img1: Tensor, img2: Tensor, window_size: int = WINDOW, size_average: bo
 def photometric_loss(
     image: Tensor, target: Tensor, lambda_dssim: float, mask: Tensor | None = None, columns: slice | None = None
 ) -> tuple[Tensor, Tensor]:
-    """(1 - lambda) L1 + lambda (1 - SSIM) (Kerbl et al. 2023, eq. 7) and its L1 part; arguments as `l1_and_ssim`.
+    """(1 - lambda) L1 + lambda (1 - SSIM) (Kerbl et al. 2023, eq. 7) and its L1 part, which is for the log.
 
-    columns: those that count, None: all. The others are cut off, but a pixel weighs what it does in a whole image.
+    Arguments as `l1_and_ssim`, but that the image is clamped to [0, 1] here: values outside get no gradient. columns:
+    those that count, None: all. The others are cut off, but a pixel weighs what it does in a whole image.
     """
-    if columns is None:
-        l1, similarity = l1_and_ssim(image, target, mask)
-        return (1.0 - lambda_dssim) * l1 + lambda_dssim * (1.0 - similarity), l1
-    cut = [None if x is None else x[..., columns].contiguous() for x in (image, target, mask)]
-    loss, l1 = photometric_loss(cut[0], cut[1], lambda_dssim, cut[2])
-    share = len(range(image.shape[-1])[columns]) / image.shape[-1]
-    return share * loss, l1
+    if columns is not None:
+        cut = [None if x is None else x[..., columns].contiguous() for x in (image, target, mask)]
+        loss, l1 = photometric_loss(cut[0], cut[1], lambda_dssim, cut[2])
+        share = len(range(image.shape[-1])[columns]) / image.shape[-1]
+        return share * loss, l1
+    if mask is None:
+        return fused_photometric_loss(image, target, lambda_dssim)
+    l1, similarity = l1_and_ssim(image.clamp(0, 1), target, mask)
+    return (1.0 - lambda_dssim) * l1 + lambda_dssim * (1.0 - similarity), l1
 
 
 def l1_and_ssim(image: Tensor, target: Tensor, mask: Tensor | None = None) -> tuple[Tensor, Tensor]:

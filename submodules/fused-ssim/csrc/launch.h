@@ -15,6 +15,7 @@ struct ImagePair {
   const void* img2;  // T, or uint8_t that means value / 255
   bool img2_is_bytes;
   int64_t planes, height, width;
+  bool clamp = false;  // img1 counts as clamped to [0, 1], with no gradient outside
 };
 
 template <class T>
@@ -23,7 +24,7 @@ struct L1Ssim {
   bool valid;    // leave the rim of kRadius pixels out of the mean of SSIM
   double* l1;    // out: mean of |img1 - img2|, over all pixels
   double* ssim;  // out: mean of SSIM
-  T* gradient;   // out, like img1: d ssim / d img1; null: not wanted
+  T* gradient;   // out, like img1: d ssim / d img1, clamped or not; null: not wanted
 };
 
 template <class T>
@@ -38,7 +39,10 @@ struct L1SsimVjp {
 struct L1SsimCuda {
   ImagePair<float> images;
   bool valid;
-  float *l1, *ssim, *gradient;
+  float *l1, *ssim;  // ssim null: not wanted
+  float* gradient;
+  float* loss = nullptr;  // out: l1_weight l1 + dssim_weight (1 - ssim); null: not wanted
+  float l1_weight = 0, dssim_weight = 0;
 };
 
 // As L1SsimVjp<float>, with every pointer to the device.
@@ -46,6 +50,7 @@ struct L1SsimVjpCuda {
   ImagePair<float> images;
   const float *ssim_gradient, *grad_l1, *grad_ssim;
   float* grad_img1;
+  float l1_weight = 1, ssim_weight = 1;  // of grad_l1 and grad_ssim
 };
 
 void l1_ssim_cuda(const L1SsimCuda&, const Queue&);

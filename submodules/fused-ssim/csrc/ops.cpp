@@ -25,55 +25,109 @@ void check_images(const at::Tensor& img1, const at::Tensor& img2, bool valid) {
 }
 
 template <class T>
-gs::ImagePair<T> image_pair(const at::Tensor& img1, const at::Tensor& img2) {
+gs::ImagePair<T> image_pair(const at::Tensor& img1, const at::Tensor& img2, bool clamp) {
   const int64_t height = img1.size(-2), width = img1.size(-1);
   return {img1.const_data_ptr<T>(),
           img2.const_data_ptr(),
           img2.scalar_type() == at::kByte,
           img1.numel() / (height * width),
           height,
-          width};
+          width,
+          clamp};
 }
 
-std::tuple<at::Tensor, at::Tensor, at::Tensor> l1_ssim(const at::Tensor& img1_, const at::Tensor& img2_, bool valid,
-                                                       bool train) {
+// The gradient that the backward of an image will need, or nothing.
+at::Tensor kept_gradient(const at::Tensor& img1, bool train) {
+  return train ? at::empty(img1.sizes(), img1.options()) : at::empty({0}, img1.options());
+}
+
+template <class T>
+at::Tensor scalar(T value, const at::TensorOptions& options) {
+  at::Tensor out = at::empty({}, options);
+  *out.mutable_data_ptr<T>() = value;
+  return out;
+}
+
+// Calls run(T()) for the dtype of an image.
+template <class Run>
+auto with_scalar(const at::Tensor& image, const Run& run) {
+  return image.scalar_type() == at::kFloat ? run(0.0f) : run(0.0);
+}
+
+struct Means {
+  double l1, ssim;
+};
+
+template <class T>
+Means means_of(const gs::ImagePair<T>& images, bool valid, at::Tensor& gradient) {
+  Means means{};
+  const gs::L1Ssim<T> args{images, valid, &means.l1, &means.ssim,
+                           gradient.numel() ? gradient.mutable_data_ptr<T>() : nullptr};
+  GS_DISPATCH(l1_ssim_cpu, args, gs::torch_executor());
+  return means;
+}
+
+using Tensors3 = std::tuple<at::Tensor, at::Tensor, at::Tensor>;
+
+Tensors3 l1_ssim(const at::Tensor& img1_, const at::Tensor& img2_, bool valid, bool train) {
   check_images(img1_, img2_, valid);
   const at::Tensor img1 = img1_.contiguous(), img2 = img2_.contiguous();
-  at::Tensor gradient = train ? at::empty(img1.sizes(), img1.options()) : at::empty({0}, img1.options());
-  const auto run = [&](auto zero) {
+  at::Tensor gradient = kept_gradient(img1, train);
+  return with_scalar(img1, [&](auto zero) {
     using T = decltype(zero);
-    double l1 = 0, ssim = 0;
-    const gs::L1Ssim<T> args{image_pair<T>(img1, img2), valid, &l1, &ssim,
-                             train ? gradient.mutable_data_ptr<T>() : nullptr};
-    GS_DISPATCH(l1_ssim_cpu, args, gs::torch_executor());
-    at::Tensor l1_out = at::empty({}, img1.options()), ssim_out = at::empty({}, img1.options());
-    *l1_out.mutable_data_ptr<T>() = T(l1);
-    *ssim_out.mutable_data_ptr<T>() = T(ssim);
-    return std::make_tuple(l1_out, ssim_out, gradient);
-  };
-  return img1.scalar_type() == at::kFloat ? run(0.0f) : run(0.0);
+    const Means means = means_of(image_pair<T>(img1, img2, false), valid, gradient);
+    return Tensors3(scalar(T(means.l1), img1.options()), scalar(T(means.ssim), img1.options()), gradient);
+  });
+}
+
+Tensors3 photometric(const at::Tensor& img1_, const at::Tensor& img2_, double lambda, bool train) {
+  check_images(img1_, img2_, false);
+  const at::Tensor img1 = img1_.contiguous(), img2 = img2_.contiguous();
+  at::Tensor gradient = kept_gradient(img1, train);
+  return with_scalar(img1, [&](auto zero) {
+    using T = decltype(zero);
+    const Means means = means_of(image_pair<T>(img1, img2, true), false, gradient);
+    const T loss = T(1 - lambda) * T(means.l1) + T(lambda) * (1 - T(means.ssim));
+    return Tensors3(scalar(loss, img1.options()), scalar(T(means.l1), img1.options()), gradient);
+  });
 }
 
 void check_ssim_gradient(const at::Tensor& ssim_gradient, const at::Tensor& img1) {
   TORCH_CHECK(ssim_gradient.sizes() == img1.sizes() && ssim_gradient.scalar_type() == img1.scalar_type(),
               "ssim_gradient must be like img1, got ", ssim_gradient.sizes(), " and ", img1.sizes(),
-              ": it is kept by l1_ssim with train = True only");
+              ": it is kept in a forward with train = True only");
 }
 
-at::Tensor l1_ssim_vjp(const at::Tensor& img1_, const at::Tensor& img2_, const at::Tensor& ssim_gradient_,
-                       const at::Tensor& grad_l1, const at::Tensor& grad_ssim) {
-  check_images(img1_, img2_, false);
-  check_ssim_gradient(ssim_gradient_, img1_);
+template <class T>
+at::Tensor vjp(const at::Tensor& img1_, const at::Tensor& img2_, const at::Tensor& ssim_gradient_, bool clamp,
+               T grad_l1, T grad_ssim) {
   const at::Tensor img1 = img1_.contiguous(), img2 = img2_.contiguous(), ssim_gradient = ssim_gradient_.contiguous();
   at::Tensor grad_img1 = at::empty(img1.sizes(), img1.options());
-  const auto run = [&](auto zero) {
-    using T = decltype(zero);
-    const gs::L1SsimVjp<T> args{image_pair<T>(img1, img2), ssim_gradient.const_data_ptr<T>(), grad_l1.item<double>(),
-                                grad_ssim.item<double>(), grad_img1.mutable_data_ptr<T>()};
-    GS_DISPATCH(l1_ssim_vjp_cpu, args, gs::torch_executor());
-  };
-  img1.scalar_type() == at::kFloat ? run(0.0f) : run(0.0);
+  const gs::L1SsimVjp<T> args{image_pair<T>(img1, img2, clamp), ssim_gradient.const_data_ptr<T>(), double(grad_l1),
+                              double(grad_ssim), grad_img1.mutable_data_ptr<T>()};
+  GS_DISPATCH(l1_ssim_vjp_cpu, args, gs::torch_executor());
   return grad_img1;
+}
+
+at::Tensor l1_ssim_vjp(const at::Tensor& img1, const at::Tensor& img2, const at::Tensor& ssim_gradient,
+                       const at::Tensor& grad_l1, const at::Tensor& grad_ssim) {
+  check_images(img1, img2, false);
+  check_ssim_gradient(ssim_gradient, img1);
+  return with_scalar(img1, [&](auto zero) {
+    using T = decltype(zero);
+    return vjp<T>(img1, img2, ssim_gradient, false, grad_l1.item<T>(), grad_ssim.item<T>());
+  });
+}
+
+at::Tensor photometric_vjp(const at::Tensor& img1, const at::Tensor& img2, const at::Tensor& ssim_gradient,
+                           double lambda, const at::Tensor& grad_loss) {
+  check_images(img1, img2, false);
+  check_ssim_gradient(ssim_gradient, img1);
+  return with_scalar(img1, [&](auto zero) {
+    using T = decltype(zero);
+    const T grad = grad_loss.item<T>();
+    return vjp<T>(img1, img2, ssim_gradient, true, grad * T(1 - lambda), grad * -T(lambda));
+  });
 }
 
 #ifdef GS_CUDA
@@ -83,36 +137,64 @@ void check_images_cuda(const at::Tensor& img1, const at::Tensor& img2, bool vali
   TORCH_CHECK(img1.device() == img2.device(), "img1 is on ", img1.device(), " and img2 on ", img2.device());
 }
 
-std::tuple<at::Tensor, at::Tensor, at::Tensor> l1_ssim_on_cuda(const at::Tensor& img1_, const at::Tensor& img2_,
-                                                               bool valid, bool train) {
+Tensors3 l1_ssim_on_cuda(const at::Tensor& img1_, const at::Tensor& img2_, bool valid, bool train) {
   check_images_cuda(img1_, img2_, valid);
   gs::TorchQueue queue(img1_.device());
   const at::Tensor img1 = img1_.contiguous(), img2 = img2_.contiguous();
   at::Tensor l1 = at::empty({}, img1.options()), ssim = at::empty({}, img1.options());
-  at::Tensor gradient = train ? at::empty(img1.sizes(), img1.options()) : at::empty({0}, img1.options());
-  gs::l1_ssim_cuda({image_pair<float>(img1, img2), valid, l1.mutable_data_ptr<float>(), ssim.mutable_data_ptr<float>(),
-                    train ? gradient.mutable_data_ptr<float>() : nullptr},
+  at::Tensor gradient = kept_gradient(img1, train);
+  gs::l1_ssim_cuda({image_pair<float>(img1, img2, false), valid, l1.mutable_data_ptr<float>(),
+                    ssim.mutable_data_ptr<float>(), train ? gradient.mutable_data_ptr<float>() : nullptr},
                    queue.queue());
   return {l1, ssim, gradient};
 }
 
-at::Tensor l1_ssim_vjp_on_cuda(const at::Tensor& img1_, const at::Tensor& img2_, const at::Tensor& ssim_gradient_,
-                               const at::Tensor& grad_l1, const at::Tensor& grad_ssim) {
+Tensors3 photometric_on_cuda(const at::Tensor& img1_, const at::Tensor& img2_, double lambda, bool train) {
+  check_images_cuda(img1_, img2_, false);
+  gs::TorchQueue queue(img1_.device());
+  const at::Tensor img1 = img1_.contiguous(), img2 = img2_.contiguous();
+  at::Tensor loss = at::empty({}, img1.options()), l1 = at::empty({}, img1.options());
+  at::Tensor gradient = kept_gradient(img1, train);
+  gs::l1_ssim_cuda({image_pair<float>(img1, img2, true), false, l1.mutable_data_ptr<float>(), nullptr,
+                    train ? gradient.mutable_data_ptr<float>() : nullptr, loss.mutable_data_ptr<float>(),
+                    float(1 - lambda), float(lambda)},
+                   queue.queue());
+  return {loss, l1, gradient};
+}
+
+void check_on_cuda(const at::Tensor& gradient, const at::Tensor& img1) {
+  TORCH_CHECK(gradient.device() == img1.device() && gradient.scalar_type() == at::kFloat,
+              "the gradients must be float32 on ", img1.device(), " like img1, got ", gradient.scalar_type(), " on ",
+              gradient.device());
+}
+
+at::Tensor vjp_on_cuda(const at::Tensor& img1_, const at::Tensor& img2_, const at::Tensor& ssim_gradient_, bool clamp,
+                       const at::Tensor& grad_l1, float l1_weight, const at::Tensor& grad_ssim, float ssim_weight) {
   check_images_cuda(img1_, img2_, false);
   check_ssim_gradient(ssim_gradient_, img1_);
-  for (const at::Tensor& other : {ssim_gradient_, grad_l1, grad_ssim})
-    TORCH_CHECK(other.device() == img1_.device() && other.scalar_type() == at::kFloat,
-                "the gradients must be float32 on ", img1_.device(), " like img1, got ", other.scalar_type(), " on ",
-                other.device());
-  TORCH_CHECK(grad_l1.numel() == 1 && grad_ssim.numel() == 1, "grad_l1 and grad_ssim must be scalars");
+  check_on_cuda(ssim_gradient_, img1_);
+  for (const at::Tensor& grad : {grad_l1, grad_ssim}) {
+    check_on_cuda(grad, img1_);
+    TORCH_CHECK(grad.numel() == 1, "the gradient of a mean must be a scalar, got ", grad.sizes());
+  }
   gs::TorchQueue queue(img1_.device());
   const at::Tensor img1 = img1_.contiguous(), img2 = img2_.contiguous(), ssim_gradient = ssim_gradient_.contiguous();
   at::Tensor grad_img1 = at::empty(img1.sizes(), img1.options());
   gs::l1_ssim_vjp_cuda(
-      {image_pair<float>(img1, img2), ssim_gradient.const_data_ptr<float>(), grad_l1.const_data_ptr<float>(),
-       grad_ssim.const_data_ptr<float>(), grad_img1.mutable_data_ptr<float>()},
+      {image_pair<float>(img1, img2, clamp), ssim_gradient.const_data_ptr<float>(), grad_l1.const_data_ptr<float>(),
+       grad_ssim.const_data_ptr<float>(), grad_img1.mutable_data_ptr<float>(), l1_weight, ssim_weight},
       queue.queue());
   return grad_img1;
+}
+
+at::Tensor l1_ssim_vjp_on_cuda(const at::Tensor& img1, const at::Tensor& img2, const at::Tensor& ssim_gradient,
+                               const at::Tensor& grad_l1, const at::Tensor& grad_ssim) {
+  return vjp_on_cuda(img1, img2, ssim_gradient, false, grad_l1, 1, grad_ssim, 1);
+}
+
+at::Tensor photometric_vjp_on_cuda(const at::Tensor& img1, const at::Tensor& img2, const at::Tensor& ssim_gradient,
+                                   double lambda, const at::Tensor& grad_loss) {
+  return vjp_on_cuda(img1, img2, ssim_gradient, true, grad_loss, float(1 - lambda), grad_loss, -float(lambda));
 }
 #endif
 
@@ -123,16 +205,26 @@ TORCH_LIBRARY(fused_ssim, m) {
   m.def(
       "l1_ssim_vjp(Tensor img1, Tensor img2, Tensor ssim_gradient, Tensor grad_l1, Tensor grad_ssim)"
       " -> Tensor grad_img1");
+  m.def(
+      "photometric(Tensor image, Tensor target, float lambda_dssim, bool train)"
+      " -> (Tensor loss, Tensor l1, Tensor ssim_gradient)");
+  m.def(
+      "photometric_vjp(Tensor image, Tensor target, Tensor ssim_gradient, float lambda_dssim, Tensor grad_loss)"
+      " -> Tensor grad_image");
 }
 
 TORCH_LIBRARY_IMPL(fused_ssim, CPU, m) {
   m.impl("l1_ssim", &l1_ssim);
   m.impl("l1_ssim_vjp", &l1_ssim_vjp);
+  m.impl("photometric", &photometric);
+  m.impl("photometric_vjp", &photometric_vjp);
 }
 
 #ifdef GS_CUDA
 TORCH_LIBRARY_IMPL(fused_ssim, CUDA, m) {
   m.impl("l1_ssim", &l1_ssim_on_cuda);
   m.impl("l1_ssim_vjp", &l1_ssim_vjp_on_cuda);
+  m.impl("photometric", &photometric_on_cuda);
+  m.impl("photometric_vjp", &photometric_vjp_on_cuda);
 }
 #endif

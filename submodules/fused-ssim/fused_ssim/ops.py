@@ -1,4 +1,4 @@
-"""The operators fused_ssim::l1_ssim and fused_ssim::l1_ssim_vjp, their autograd, and the public functions.
+"""The operators of csrc/ops.cpp, their autograd, and the public functions.
 
 SSIM is that of Wang et al. 2004, per channel: 11 x 11 Gaussian window of sigma 1.5, C1 = 0.01², C2 = 0.03²; "same"
 takes pixels beyond the border as 0, "valid" leaves the rim of 5 pixels out of the mean. Only img1 gets a gradient.
@@ -40,6 +40,19 @@ def fused_l1_ssim(img1: Tensor, img2: Tensor, padding: str = "same") -> tuple[Te
     train = torch.is_grad_enabled() and img1.requires_grad
     l1, ssim, _ = torch.ops.fused_ssim.l1_ssim(img1, img2.detach(), padding == "valid", train)
     return l1, ssim
+
+
+def fused_photometric_loss(img1: Tensor, img2: Tensor, lambda_dssim: float) -> tuple[Tensor, Tensor]:
+    """(1 - lambda) L1 + lambda (1 - SSIM) of img1 clamped to [0, 1] and img2, and that L1, which has no gradient.
+
+    Kerbl et al. 2023, eq. 7. Images as `fused_ssim` takes them, padding "same". Clamping is torch's: where img1 lies
+    outside [0, 1] it gets no gradient. Nothing is kept for the gradient unless img1 needs one.
+    """
+    _check_inputs(img1, img2, "same")
+    train = torch.is_grad_enabled() and img1.requires_grad
+    run = _Photometric.apply if train else torch.ops.fused_ssim.photometric
+    loss, l1, _ = run(img1, img2.detach(), float(lambda_dssim), train)
+    return loss, l1
 
 
 def _check_inputs(img1: Tensor, img2: Tensor, padding: str) -> None:
@@ -88,3 +101,46 @@ def _backward(ctx, grad_l1: Tensor, grad_ssim: Tensor, _) -> tuple[Tensor, None,
 
 
 torch.library.register_autograd("fused_ssim::l1_ssim", _backward, setup_context=_setup_context)
+
+
+@torch.library.register_fake("fused_ssim::photometric")
+def _photometric_fake(img1: Tensor, img2: Tensor, lambda_dssim: float, train: bool) -> tuple[Tensor, Tensor, Tensor]:
+    return _l1_ssim_fake(img1, img2, False, train)
+
+
+@torch.library.register_fake("fused_ssim::photometric_vjp")
+def _photometric_vjp_fake(
+    img1: Tensor, img2: Tensor, ssim_gradient: Tensor, lambda_dssim: float, grad_loss: Tensor
+) -> Tensor:
+    return img1.new_empty(img1.shape)
+
+
+def _setup_photometric(ctx, inputs: tuple, output: tuple[Tensor, Tensor, Tensor]) -> None:
+    img1, img2, ctx.lambda_dssim, _ = inputs
+    ctx.mark_non_differentiable(output[1], output[2])
+    ctx.set_materialize_grads(False)
+    ctx.save_for_backward(img1, img2, output[2])
+
+
+@once_differentiable
+def _photometric_backward(ctx, grad_loss: Tensor | None, *_) -> tuple[Tensor | None, None, None, None]:
+    if grad_loss is None:
+        return None, None, None, None
+    gradient = torch.ops.fused_ssim.photometric_vjp(*ctx.saved_tensors, ctx.lambda_dssim, grad_loss)
+    return gradient, None, None, None
+
+
+# For whoever calls the op itself, or compiles it.
+torch.library.register_autograd("fused_ssim::photometric", _photometric_backward, setup_context=_setup_photometric)
+
+
+class _Photometric(torch.autograd.Function):
+    """The same two functions without the dispatcher's Python in between."""
+
+    @staticmethod
+    def forward(*inputs):
+        with torch._C._AutoDispatchBelowAutograd():
+            return torch.ops.fused_ssim.photometric(*inputs)
+
+    setup_context = staticmethod(_setup_photometric)
+    backward = staticmethod(_photometric_backward)

@@ -51,11 +51,12 @@ T to_value(uint8_t v) {
 
 // Columns [begin, begin + width) of a row of the images (null: beyond the border), zero where they have none.
 template <class T, class Source>
-void load_row(const T* img1, const Source* img2, int64_t columns, int64_t begin, int64_t width, T* x1, T* delta) {
+void load_row(const T* img1, const Source* img2, bool clamp, int64_t columns, int64_t begin, int64_t width, T* x1,
+              T* delta) {
   const int64_t first = std::min(std::max<int64_t>(-begin, 0), width);
   const int64_t last = img1 ? std::max(std::min(columns - begin, width), first) : first;
   for (int64_t i = first; i < last; ++i) {
-    x1[i] = img1[begin + i];
+    x1[i] = clamp ? clamp_to_unit(img1[begin + i]) : img1[begin + i];
     delta[i] = to_value<T>(img2[begin + i]) - x1[i];
   }
   for (T* row : {x1, delta}) {
@@ -172,8 +173,8 @@ Sums tile(const L1Ssim<T>& args, int64_t plane, Range rows, Range columns, doubl
   for (int64_t i = 0; i < rows.size() + 2 * (margin + kRadius); ++i) {
     const int64_t row = first_row + i;
     const bool inside = row >= 0 && row < height;
-    load_row(inside ? img1 + row * width : nullptr, inside ? img2 + row * width : nullptr, width, first_column,
-             input_columns, s.x1[i], s.delta[i]);
+    load_row(inside ? img1 + row * width : nullptr, inside ? img2 + row * width : nullptr, image.clamp, width,
+             first_column, input_columns, s.x1[i], s.delta[i]);
   }
 
   Sums sums;
@@ -237,9 +238,12 @@ void all_tiles(const L1Ssim<T>& args, const Executor& executor) {
 }
 
 template <class T, class Source>
-void vjp_block(const T* img1, const Source* img2, const T* ssim_gradient, T by_l1, T by_ssim, int64_t n, T* out) {
-  for (int64_t i = 0; i < n; ++i)
-    out[i] = by_ssim * ssim_gradient[i] + by_l1 * abs_difference_vjp(img1[i], to_value<T>(img2[i]));
+void vjp_block(const T* img1, const Source* img2, bool clamp, const T* ssim_gradient, T by_l1, T by_ssim, int64_t n,
+               T* out) {
+  for (int64_t i = 0; i < n; ++i) {
+    const T sum = by_ssim * ssim_gradient[i] + by_l1 * abs_difference_vjp(img1[i], to_value<T>(img2[i]));
+    out[i] = clamp && !in_unit(img1[i]) ? T(0) : sum;
+  }
 }
 
 template <class T, class Source>
@@ -250,8 +254,8 @@ void vjp(const L1SsimVjp<T>& args, const Executor& executor) {
   const Source* img2 = static_cast<const Source*>(image.img2);
   executor.run((n + kBlock - 1) / kBlock, 1, [&](int64_t begin, int64_t end) {
     for (int64_t i = begin * kBlock; i < std::min(end * kBlock, n); i += kBlock)
-      vjp_block(image.img1 + i, img2 + i, args.ssim_gradient + i, T(args.grad_l1 / double(n)), T(args.grad_ssim),
-                std::min(kBlock, n - i), args.grad_img1 + i);
+      vjp_block(image.img1 + i, img2 + i, image.clamp, args.ssim_gradient + i, T(args.grad_l1 / double(n)),
+                T(args.grad_ssim), std::min(kBlock, n - i), args.grad_img1 + i);
   });
 }
 

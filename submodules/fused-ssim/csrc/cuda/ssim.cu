@@ -41,7 +41,7 @@ __global__ void __launch_bounds__(kThreads, 3)
 
   Sums own{};
   for (int first = 0; first < kRing; first += kStep)
-    put(strip, part, load(part, img1, img2, first, thread), first, kRing, thread, own);
+    put(strip, part, load(part, img1, img2, images.clamp, first, thread), first, kRing, thread, own);
   __syncthreads();
   const int steps = step_count(part.rows);
   for (int step = 0; step < steps; ++step) {
@@ -54,7 +54,7 @@ __global__ void __launch_bounds__(kThreads, 3)
       __syncthreads();
     }
     const int next = step * kStep + kRing;
-    const Rows rows = load(part, img1, img2, next, thread);  // under way while the gradient is computed
+    const Rows rows = load(part, img1, img2, images.clamp, next, thread);  // under way while the gradient is computed
     if constexpr (kGradient) gather_across(strip, thread);
     put(strip, part, rows, next, next + kStep, thread, own);
     __syncthreads();
@@ -66,7 +66,7 @@ __global__ void __launch_bounds__(kThreads, 3)
 
 constexpr int kSumThreads = 256;
 
-__global__ void mean_kernel(const Sums* sums, int64_t n, double l1_count, double ssim_count, float* l1, float* ssim) {
+__global__ void mean_kernel(const Sums* sums, int64_t n, double l1_count, double ssim_count, L1SsimCuda out) {
   Sums own{};
   for (int64_t i = threadIdx.x; i < n; i += kSumThreads) {
     own.l1 += sums[i].l1;
@@ -74,8 +74,10 @@ __global__ void mean_kernel(const Sums* sums, int64_t n, double l1_count, double
   }
   const Sums all = block_sum<kSumThreads>(own);
   if (threadIdx.x == 0) {
-    *l1 = float(all.l1 / l1_count);
-    *ssim = float(all.ssim / ssim_count);
+    const float l1 = float(all.l1 / l1_count), ssim = float(all.ssim / ssim_count);
+    *out.l1 = l1;
+    if (out.ssim) *out.ssim = ssim;
+    if (out.loss) *out.loss = out.l1_weight * l1 + out.dssim_weight * (1 - ssim);
   }
 }
 
@@ -94,7 +96,7 @@ void l1_ssim(const L1SsimCuda& args, const Queue& queue) {
   kernel<<<unsigned(cut.parts), kThreads, sizeof(Strip), stream>>>(images, cut, args.valid, float(1 / ssim_count),
                                                                    args.gradient, sums);
   check_launch("l1_ssim_kernel");
-  mean_kernel<<<1, kSumThreads, 0, stream>>>(sums, cut.parts, l1_count, ssim_count, args.l1, args.ssim);
+  mean_kernel<<<1, kSumThreads, 0, stream>>>(sums, cut.parts, l1_count, ssim_count, args);
   check_launch("mean_kernel");
 }
 
@@ -103,15 +105,18 @@ constexpr int kVjpPixels = 4;  // of a thread, kVjpThreads apart: loads under wa
 
 template <class Source>
 __global__ void __launch_bounds__(kVjpThreads) l1_ssim_vjp_kernel(L1SsimVjpCuda args, int64_t n, double mean) {
-  const float by_l1 = float(double(*args.grad_l1) * mean), by_ssim = *args.grad_ssim;
+  const float by_l1 = float(double(*args.grad_l1 * args.l1_weight) * mean);
+  const float by_ssim = *args.grad_ssim * args.ssim_weight;
   const Source* img2 = static_cast<const Source*>(args.images.img2);
   const int64_t first = int64_t(blockIdx.x) * (kVjpThreads * kVjpPixels) + threadIdx.x;
   GS_UNROLL
   for (int i = 0; i < kVjpPixels; ++i) {
     const int64_t at = first + i * kVjpThreads;
-    if (at < n)
-      args.grad_img1[at] =
-          by_ssim * args.ssim_gradient[at] + by_l1 * abs_difference_vjp(args.images.img1[at], to_float(img2[at]));
+    if (at < n) {
+      const float x1 = args.images.img1[at];
+      const float sum = by_ssim * args.ssim_gradient[at] + by_l1 * abs_difference_vjp(x1, to_float(img2[at]));
+      args.grad_img1[at] = args.images.clamp && !in_unit(x1) ? 0 : sum;
+    }
   }
 }
 

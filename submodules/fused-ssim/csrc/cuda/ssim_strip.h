@@ -76,7 +76,7 @@ struct Rows {
 constexpr int kRowsApart = kThreads / kColumns;
 
 template <class Source>
-GS_HD Rows load(const Part& part, const float* img1, const Source* img2, int first, int thread) {
+GS_HD Rows load(const Part& part, const float* img1, const Source* img2, bool clamp, int first, int thread) {
   Rows rows;
   const int64_t column = part.column - kReach + thread % kColumns;
   GS_UNROLL
@@ -84,7 +84,8 @@ GS_HD Rows load(const Part& part, const float* img1, const Source* img2, int fir
     const int64_t row = part.row - kReach + first + thread / kColumns + i * kRowsApart;
     const bool inside = row >= 0 && row < part.height && column >= 0 && column < part.width;
     const int64_t at = inside ? row * part.width + column : 0;
-    rows.x1[i] = inside ? img1[at] : 0;
+    const float x1 = inside ? img1[at] : 0;
+    rows.x1[i] = clamp ? clamp_to_unit(x1) : x1;
     rows.delta[i] = inside ? to_float(img2[at]) - rows.x1[i] : 0;
   }
   return rows;

@@ -123,6 +123,17 @@ GS_HD Anchored<V> gather(const At& at, const Pixel<V>& anchor) {
   return sum;
 }
 
+// x clamped to [0, 1], and whether its derivative there is 1 and not 0; as torch has it, NaN stays and gets no
+// gradient.
+template <class S>
+GS_HD S clamp_to_unit(S x) {
+  return x < 0 ? S(0) : x > 1 ? S(1) : x;
+}
+template <class S>
+GS_HD bool in_unit(S x) {
+  return x >= 0 && x <= 1;
+}
+
 // Derivative of |x2 - x1| by x1; 0 where they are equal, as torch has it.
 template <class V>
 GS_HD V abs_difference_vjp(V x1, V x2) {

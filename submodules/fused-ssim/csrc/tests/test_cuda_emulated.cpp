@@ -11,19 +11,19 @@
 namespace {
 
 struct Result {
-  float l1 = -1, ssim = -1;
+  float l1 = -1, ssim = -1, loss = -1;
   std::vector<float> gradient, vjp;
 };
 
 template <class Source>
-void check(int64_t planes, int64_t height, int64_t width, bool valid) {
+void check(int64_t planes, int64_t height, int64_t width, bool valid, bool clamp = false) {
   std::mt19937 random(unsigned(height * 1000 + width));
-  std::uniform_real_distribution<float> uniform;
+  std::uniform_real_distribution<float> uniform, wide(-0.5f, 1.5f);
   std::vector<float> img1(planes * height * width);
   std::vector<Source> img2(img1.size());
-  for (float& x : img1) x = uniform(random);
+  for (float& x : img1) x = clamp ? wide(random) : uniform(random);
   for (Source& x : img2) x = Source(sizeof(Source) == 1 ? 255 * uniform(random) : uniform(random));
-  const gs::ImagePair<float> images = {img1.data(), img2.data(), sizeof(Source) == 1, planes, height, width};
+  const gs::ImagePair<float> images = {img1.data(), img2.data(), sizeof(Source) == 1, planes, height, width, clamp};
 
   double l1, ssim;
   std::vector<float> gradient(img1.size()), vjp(img1.size());
@@ -39,15 +39,23 @@ void check(int64_t planes, int64_t height, int64_t width, bool valid) {
     gs::emulation::Memory memory;
     Result got;
     got.gradient.resize(img1.size()), got.vjp.resize(img1.size());
-    gs::l1_ssim_cuda({images, valid, &got.l1, &got.ssim, got.gradient.data()}, memory.queue());
+    gs::l1_ssim_cuda({images, valid, &got.l1, &got.ssim, got.gradient.data(), &got.loss, 0.8f, 0.2f}, memory.queue());
     gs::l1_ssim_vjp_cuda({images, gradient.data(), &grad_l1, &grad_ssim, got.vjp.data()}, memory.queue());
     // Means of values near 1, rounded to float; a gradient is a sum of some 242 products of its own.
     CHECK_NEAR(got.l1, l1, 1e-6);
     CHECK_NEAR(got.ssim, ssim, 2e-6);
+    CHECK_NEAR(got.loss, 0.8 * l1 + 0.2 * (1 - ssim), 2e-6);
     for (size_t i = 0; i < gradient.size(); ++i) {
       CHECK_NEAR(got.gradient[i], gradient[i], 2e-5 * largest);
       CHECK_NEAR(got.vjp[i], vjp[i], 2e-6 * (largest + 1.0 / img1.size()));
     }
+    std::vector<float> weighted(img1.size());  // weights and gradients trade places
+    const float one = 1;
+    float no_l1 = -1;
+    gs::l1_ssim_vjp_cuda({images, gradient.data(), &one, &one, weighted.data(), grad_l1, grad_ssim}, memory.queue());
+    CHECK(weighted == got.vjp);
+    gs::l1_ssim_cuda({images, valid, &no_l1, nullptr, nullptr}, memory.queue());  // nothing but what is asked for
+    CHECK(no_l1 == got.l1);
     if (order == gs::emulation::Order::forward) first = got;
     CHECK(got.l1 == first.l1 && got.ssim == first.ssim && got.gradient == first.gradient && got.vjp == first.vjp);
   }
@@ -63,5 +71,6 @@ int main() {
   }
   check<float>(3, 1, 1, false);
   check<uint8_t>(3, 5, 130, false);
+  check<uint8_t>(3, 37, 110, false, true);
   return gs::finish_tests("CUDA SSIM, emulated");
 }

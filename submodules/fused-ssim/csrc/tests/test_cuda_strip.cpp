@@ -28,7 +28,7 @@ struct Result {
 
 template <bool kGradient, class Source>
 Result run_kernel(const Cut& cut, int64_t planes, int64_t height, int64_t width, bool valid,
-                  const std::vector<float>& img1, const std::vector<Source>& img2) {
+                  const std::vector<float>& img1, const std::vector<Source>& img2, bool clamp) {
   const double rim = valid ? kReach : 0;
   const double ssim_count = double(planes) * (height - rim) * (width - rim);
   const float nan = std::numeric_limits<float>::quiet_NaN();
@@ -44,13 +44,14 @@ Result run_kernel(const Cut& cut, int64_t planes, int64_t height, int64_t width,
     const Source* plane2 = &img2[plane];
     Sums sums{};
     for (int first = 0; first < kRing; first += kStep)
-      all_threads([&](int t) { put(*strip, part, load(part, plane1, plane2, first, t), first, kRing, t, sums); });
+      all_threads(
+          [&](int t) { put(*strip, part, load(part, plane1, plane2, clamp, first, t), first, kRing, t, sums); });
     for (int step = 0; step < step_count(part.rows); ++step) {
       all_threads([&](int t) { column_stats(*strip, step, t); });
       all_threads([&](int t) { window_row<kGradient>(*strip, part, step, t, sums); });
       if (kGradient) all_threads([&](int t) { gather_down(*strip, step, t); });
       const int next = step * kStep + kRing;
-      all_threads([&](int t) { rows[t] = load(part, plane1, plane2, next, t); });
+      all_threads([&](int t) { rows[t] = load(part, plane1, plane2, clamp, next, t); });
       if (kGradient) all_threads([&](int t) { gather_across(*strip, t); });
       all_threads([&](int t) { put(*strip, part, rows[t], next, next + kStep, t, sums); });
       if (kGradient)
@@ -65,20 +66,20 @@ Result run_kernel(const Cut& cut, int64_t planes, int64_t height, int64_t width,
 }
 
 template <class Source>
-void check(int steps, int64_t planes, int64_t height, int64_t width, bool valid) {
+void check(int steps, int64_t planes, int64_t height, int64_t width, bool valid, bool clamp = false) {
   const Cut cut = Cut::with_steps(steps, planes, height, width);
   std::mt19937 random(unsigned(height * 10000 + width));
-  std::uniform_real_distribution<float> uniform;
+  std::uniform_real_distribution<float> uniform, wide(-0.5f, 1.5f);
   std::vector<float> img1(planes * height * width), wanted(img1.size());
   std::vector<Source> img2(img1.size());
-  for (float& x : img1) x = uniform(random);
+  for (float& x : img1) x = clamp ? wide(random) : uniform(random);
   for (Source& x : img2) x = Source(sizeof(Source) == 1 ? 255 * uniform(random) : uniform(random));
 
   double l1 = 0, ssim = 0;
   gs::GS_ISA::l1_ssim_cpu(
-      {{img1.data(), img2.data(), sizeof(Source) == 1, planes, height, width}, valid, &l1, &ssim, wanted.data()},
+      {{img1.data(), img2.data(), sizeof(Source) == 1, planes, height, width, clamp}, valid, &l1, &ssim, wanted.data()},
       gs::serial_executor());
-  const Result got = run_kernel<true>(cut, planes, height, width, valid, img1, img2);
+  const Result got = run_kernel<true>(cut, planes, height, width, valid, img1, img2, clamp);
   // The same floats, but for fused multiply-adds where the compiler takes them; sums of doubles in another order.
   CHECK_NEAR(got.l1, l1, 1e-12);
   CHECK_NEAR(got.ssim, ssim, 4 * 6e-8);
@@ -87,9 +88,9 @@ void check(int steps, int64_t planes, int64_t height, int64_t width, bool valid)
   for (size_t i = 0; i < wanted.size(); ++i) CHECK_NEAR(got.gradient[i], wanted[i], 40 * 6e-8 * largest);
 
   last_thread_first = true;  // a thread that needed another's result of the same phase would show
-  CHECK(run_kernel<true>(cut, planes, height, width, valid, img1, img2).gradient == got.gradient);
+  CHECK(run_kernel<true>(cut, planes, height, width, valid, img1, img2, clamp).gradient == got.gradient);
   last_thread_first = false;
-  const Result plain = run_kernel<false>(cut, planes, height, width, valid, img1, img2);
+  const Result plain = run_kernel<false>(cut, planes, height, width, valid, img1, img2, clamp);
   CHECK(plain.l1 == got.l1 && plain.ssim == got.ssim);
 }
 
@@ -109,6 +110,7 @@ int main() {
   for (const int64_t width : {213, 216, 217, 230}) check<float>(8, 2, 13, width, true);
   for (const int64_t height : {11, 12, 22, 23, 32, 33}) check<uint8_t>(8, 2, height, 15, true);
   check<uint8_t>(8, 3, 9, 130, false);
+  check<uint8_t>(8, 1, 45, 109, false, true);
   for (const int steps : {12, 20}) check<float>(steps, 1, 150, 112, true);
   return gs::finish_tests("fused-ssim/test_cuda_strip");
 }
