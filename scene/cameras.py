@@ -7,6 +7,7 @@ import argparse
 
 import numpy as np
 import torch
+from fused_ssim import composite
 from torch import Tensor
 
 from scene.dataset_readers import CameraInfo
@@ -95,10 +96,7 @@ class Camera:
         pixels = self._pixels()
         if pixels.shape[0] == 3 or self._ignore_alpha:
             return pixels[:3]
-        # Every step: as few passes as possible, and no fused ones (their rounding differs with the thread count).
-        scaled = pixels / 255
-        alpha = scaled[3:]
-        return scaled[:3].mul_(alpha).add_(background.to(self.device)[:, None, None] * (1 - alpha))
+        return composite(pixels, background.to(self.device))
 
     @property
     def mask(self) -> Tensor | None:

@@ -11,6 +11,7 @@ from torch import Tensor
 import train
 from gaussian_renderer import render
 from scene import gaussian_optimizer
+from scene.cameras import Camera
 from scene.gaussian_model import GaussianModel
 from scene.point_cloud import write_point_cloud
 
@@ -25,6 +26,12 @@ def _loss(image: Tensor, target: Tensor, weight: float, mask: None, columns: Non
     assert image.min() >= 0 and image.max() <= 1 and mask is columns is None
     l1, ssim = fused_l1_ssim(image, target)
     return (1.0 - weight) * l1 + weight * (1.0 - ssim), l1
+
+
+def _target(camera: Camera, background: Tensor) -> Tensor:
+    scaled = camera._pixels() / 255
+    color, alpha = scaled[:3], scaled[3:]
+    return color * alpha + background[:, None, None] * (1 - alpha)
 
 
 def _observe(gaussians: GaussianModel, points: Tensor, radii: Tensor) -> None:
@@ -54,6 +61,7 @@ def test_fused_and_plain_steps_go_the_same_way(blender_scene, tmp_path, monkeypa
         if not fused:
             monkeypatch.setattr(train, "render", _render)
             monkeypatch.setattr(train, "photometric_loss", _loss)
+            monkeypatch.setattr(Camera, "target", _target)
             monkeypatch.setattr(GaussianModel, "observe", _observe)
             monkeypatch.setattr(gaussian_optimizer, "_ADAM", _adam)
         out = tmp_path / str(fused)

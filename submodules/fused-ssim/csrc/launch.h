@@ -53,6 +53,17 @@ struct L1SsimVjpCuda {
   float l1_weight = 1, ssim_weight = 1;  // of grad_l1 and grad_ssim
 };
 
+// A picture with alpha over a background.
+struct Composite {
+  const uint8_t* picture;   // (4, pixels): red, green, blue, straight alpha
+  const float* background;  // 3
+  int64_t pixels;
+  float* out;  // (3, pixels)
+};
+
+void composite_cpu(const Composite&, const Executor&);  // compiled once: see gs/rounded.h
+void composite_cuda(const Composite&, const Queue&);
+
 void l1_ssim_cuda(const L1SsimCuda&, const Queue&);
 void l1_ssim_vjp_cuda(const L1SsimVjpCuda&, const Queue&);
 

@@ -198,6 +198,28 @@ at::Tensor photometric_vjp_on_cuda(const at::Tensor& img1, const at::Tensor& img
 }
 #endif
 
+at::Tensor composite(const at::Tensor& picture_, const at::Tensor& background_) {
+  TORCH_CHECK(picture_.dim() == 3 && picture_.size(0) == 4 && picture_.scalar_type() == at::kByte,
+              "the picture must be (4, H, W) uint8, got ", picture_.sizes(), " ", picture_.scalar_type());
+  TORCH_CHECK(background_.numel() == 3 && background_.scalar_type() == at::kFloat,
+              "the background must be 3 float32, got ", background_.sizes(), " ", background_.scalar_type());
+  TORCH_CHECK(background_.device() == picture_.device(), "the picture is on ", picture_.device(),
+              " and the background on ", background_.device());
+  const at::Tensor picture = picture_.contiguous(), background = background_.contiguous();
+  at::Tensor out = at::empty({3, picture.size(1), picture.size(2)}, background.options());
+  const gs::Composite args{picture.const_data_ptr<uint8_t>(), background.const_data_ptr<float>(),
+                           picture.size(1) * picture.size(2), out.mutable_data_ptr<float>()};
+#ifdef GS_CUDA
+  if (picture.is_cuda()) {
+    gs::TorchQueue queue(picture.device());
+    gs::composite_cuda(args, queue.queue());
+    return out;
+  }
+#endif
+  gs::composite_cpu(args, gs::torch_executor());
+  return out;
+}
+
 }  // namespace
 
 TORCH_LIBRARY(fused_ssim, m) {
@@ -211,6 +233,7 @@ TORCH_LIBRARY(fused_ssim, m) {
   m.def(
       "photometric_vjp(Tensor image, Tensor target, Tensor ssim_gradient, float lambda_dssim, Tensor grad_loss)"
       " -> Tensor grad_image");
+  m.def("composite(Tensor picture, Tensor background) -> Tensor");
 }
 
 TORCH_LIBRARY_IMPL(fused_ssim, CPU, m) {
@@ -218,6 +241,7 @@ TORCH_LIBRARY_IMPL(fused_ssim, CPU, m) {
   m.impl("l1_ssim_vjp", &l1_ssim_vjp);
   m.impl("photometric", &photometric);
   m.impl("photometric_vjp", &photometric_vjp);
+  m.impl("composite", &composite);
 }
 
 #ifdef GS_CUDA
@@ -226,5 +250,6 @@ TORCH_LIBRARY_IMPL(fused_ssim, CUDA, m) {
   m.impl("l1_ssim_vjp", &l1_ssim_vjp_on_cuda);
   m.impl("photometric", &photometric_on_cuda);
   m.impl("photometric_vjp", &photometric_vjp_on_cuda);
+  m.impl("composite", &composite);
 }
 #endif

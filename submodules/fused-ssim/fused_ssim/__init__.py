@@ -1,5 +1,8 @@
-"""Structural similarity (SSIM) and mean absolute difference of two images, with their gradient, in one pass."""
+"""Structural similarity (SSIM) and mean absolute difference of two images, with their gradient, in one pass.
 
-from fused_ssim.ops import fused_l1_ssim, fused_photometric_loss, fused_ssim
+And `composite`, for photos with alpha that the loss is to compare with.
+"""
 
-__all__ = ["fused_l1_ssim", "fused_photometric_loss", "fused_ssim"]
+from fused_ssim.ops import composite, fused_l1_ssim, fused_photometric_loss, fused_ssim
+
+__all__ = ["composite", "fused_l1_ssim", "fused_photometric_loss", "fused_ssim"]

@@ -55,6 +55,15 @@ def fused_photometric_loss(img1: Tensor, img2: Tensor, lambda_dssim: float) -> t
     return loss, l1
 
 
+def composite(picture: Tensor, background: Tensor) -> Tensor:
+    """A picture (4, H, W) uint8 with straight alpha over a background (3,) float32 in [0, 1]: (3, H, W) float32.
+
+    color / 255 * alpha + background * (1 - alpha), alpha as value / 255; the same bits on every device. No gradient.
+    Raises RuntimeError for other shapes, dtypes, and tensors on two devices.
+    """
+    return torch.ops.fused_ssim.composite(picture, background)
+
+
 def _check_inputs(img1: Tensor, img2: Tensor, padding: str) -> None:
     if padding not in ("same", "valid"):
         raise ValueError(f'padding must be "same" or "valid", got {padding!r}')
@@ -113,6 +122,11 @@ def _photometric_vjp_fake(
     img1: Tensor, img2: Tensor, ssim_gradient: Tensor, lambda_dssim: float, grad_loss: Tensor
 ) -> Tensor:
     return img1.new_empty(img1.shape)
+
+
+@torch.library.register_fake("fused_ssim::composite")
+def _composite_fake(picture: Tensor, background: Tensor) -> Tensor:
+    return background.new_empty((3, *picture.shape[1:]))
 
 
 def _setup_photometric(ctx, inputs: tuple, output: tuple[Tensor, Tensor, Tensor]) -> None:

@@ -61,9 +61,23 @@ void check(int64_t planes, int64_t height, int64_t width, bool valid, bool clamp
   }
 }
 
+void check_composite(int64_t pixels) {
+  std::mt19937 random(3);
+  std::uniform_int_distribution<int> byte(0, 255);
+  std::vector<uint8_t> picture(4 * pixels);
+  for (uint8_t& x : picture) x = uint8_t(byte(random));
+  const float background[3] = {0.2f, 0, 1};
+  std::vector<float> wanted(3 * pixels), got(3 * pixels);
+  gs::composite_cpu({picture.data(), background, pixels, wanted.data()}, gs::serial_executor());
+  gs::emulation::Memory memory;
+  gs::composite_cuda({picture.data(), background, pixels, got.data()}, memory.queue());
+  CHECK(got == wanted);
+}
+
 }  // namespace
 
 int main() {
+  for (const int64_t pixels : {0, 1, 255, 257, 1000}) check_composite(pixels);
   for (bool valid : {false, true}) {
     check<uint8_t>(3, 37, 70, valid);
     check<float>(1, 12, 11, valid);

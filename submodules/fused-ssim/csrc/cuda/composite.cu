@@ -1,0 +1,31 @@
+#include <cuda_runtime.h>
+
+#include "../launch.h"
+#include "../math/composite.h"
+#include "gs/cuda_check.h"
+
+namespace gs {
+namespace {
+
+constexpr int kThreads = 256;
+
+__global__ void __launch_bounds__(kThreads) composite_kernel(Composite args) {
+  const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
+  if (i >= args.pixels) return;
+  const uint8_t alpha = args.picture[3 * args.pixels + i];
+  for (int channel = 0; channel < 3; ++channel) {
+    const int64_t at = channel * args.pixels + i;
+    args.out[at] = composite(args.picture[at], alpha, args.background[channel]);
+  }
+}
+
+}  // namespace
+
+void composite_cuda(const Composite& args, const Queue& queue) {
+  if (!args.pixels) return;
+  const int64_t blocks = (args.pixels + kThreads - 1) / kThreads;
+  composite_kernel<<<unsigned(blocks), kThreads, 0, static_cast<cudaStream_t>(queue.stream)>>>(args);
+  check_launch("composite_kernel");
+}
+
+}  // namespace gs

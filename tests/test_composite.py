@@ -1,0 +1,86 @@
+"""fused_ssim.composite: photos with alpha over a background."""
+
+import itertools
+
+import pytest
+import torch
+from fused_ssim import composite
+from PIL import Image
+from torch import Tensor
+
+GPU = pytest.param(
+    "cuda",
+    marks=[pytest.mark.gpu, pytest.mark.skipif(not torch.cuda.is_available(), reason="torch finds no NVIDIA GPU")],
+)
+BACKGROUND = torch.tensor([0.2, 0.0, 1.0])
+
+
+def every_pair() -> Tensor:
+    """All 65,536 pairs of colour and alpha, (4, 256, 256) uint8; each channel meets another background."""
+    values = torch.arange(256, dtype=torch.uint8)
+    color, alpha = torch.meshgrid(values, values, indexing="ij")
+    return torch.stack((color, color, color, alpha))
+
+
+def in_torch(picture: Tensor, background: Tensor) -> Tensor:
+    scaled = picture / 255
+    return scaled[:3] * scaled[3:] + background[:, None, None] * (1 - scaled[3:])
+
+
+@pytest.mark.parametrize("device", ["cpu", GPU])
+def test_every_value_is_torchs_to_the_bit(device: str) -> None:
+    """On both devices the bits of torch on the CPU, which rounds each operation; and close to float64."""
+    picture = every_pair()
+    got = composite(picture.to(device), BACKGROUND.to(device)).cpu()
+    assert got.dtype == torch.float32 and torch.equal(got, in_torch(picture, BACKGROUND))
+    exact = in_torch(picture.double(), BACKGROUND.double())
+    assert (got - exact).abs().max() <= 3 * 2**-24  # three roundings of numbers up to 1
+    assert torch.equal(got[:, :, 0], BACKGROUND[:, None].expand(3, 256))
+    assert torch.equal(got[:, :, 255], picture[:3, :, 255] / 255)
+
+
+def test_agrees_with_pillow() -> None:
+    picture = torch.randint(0, 256, (4, 31, 17), generator=torch.Generator().manual_seed(0), dtype=torch.uint8)
+    image = Image.fromarray(picture.permute(1, 2, 0).numpy())
+    below = Image.new("RGBA", image.size, (51, 0, 255, 255))
+    wanted = torch.tensor(list(Image.alpha_composite(below, image).convert("RGB").tobytes())).reshape(31, 17, 3)
+    got = 255 * composite(picture, BACKGROUND).permute(1, 2, 0)
+    assert (got - wanted).abs().max() <= 1  # Pillow's are bytes
+
+
+@pytest.mark.parametrize("device", ["cpu", GPU])
+def test_sizes_and_strides(device: str) -> None:
+    for height, width in itertools.product((0, 1, 7), (1, 300)):
+        picture = torch.full((4, height, width), 128, dtype=torch.uint8)
+        picture[3, :, ::2] = 255
+        wanted = in_torch(picture, BACKGROUND)
+        turned = picture.permute(1, 2, 0).contiguous().permute(2, 0, 1)  # as Pillow's rows lie in memory
+        for same in (picture, turned):
+            assert torch.equal(composite(same.to(device), BACKGROUND.to(device)).cpu(), wanted)
+
+
+def test_number_of_threads_changes_no_bit() -> None:
+    before, results = torch.get_num_threads(), []
+    picture = every_pair()
+    try:
+        for threads in (1, 2, 3):
+            torch.set_num_threads(threads)
+            results.append(composite(picture, BACKGROUND))
+    finally:
+        torch.set_num_threads(before)
+    assert torch.equal(results[0], results[1]) and torch.equal(results[0], results[2])
+
+
+@pytest.mark.parametrize("device", ["cpu", GPU])
+def test_opcheck(device: str) -> None:
+    picture = every_pair()[:, :3, :5].to(device)
+    torch.library.opcheck(torch.ops.fused_ssim.composite, (picture, BACKGROUND.to(device)))
+
+
+def test_what_does_not_fit_is_named() -> None:
+    with pytest.raises(RuntimeError, match=r"picture must be \(4, H, W\) uint8, got .3, 2, 2. Byte"):
+        composite(torch.zeros(3, 2, 2, dtype=torch.uint8), BACKGROUND)
+    with pytest.raises(RuntimeError, match=r"picture must be \(4, H, W\) uint8, got .4, 2, 2. Float"):
+        composite(torch.zeros(4, 2, 2), BACKGROUND)
+    with pytest.raises(RuntimeError, match="background must be 3 float32, got .4. Float"):
+        composite(torch.zeros(4, 2, 2, dtype=torch.uint8), torch.zeros(4))
