@@ -89,9 +89,9 @@ def training(
     announce_memory(scene, gaussians, opt.max_num_splats)
     fixed_background = torch.full((3,), 1.0 if dataset.white_background else 0.0, device=device)
     log = TrainingLog(scene.model_path, first_iteration)
-    losses = LossWatch(device, log.loss)
+    losses = LossWatch(log.loss)
     depth_weight = get_expon_lr_func(opt.depth_l1_weight_init, opt.depth_l1_weight_final, max_steps=opt.iterations)
-    depth_losses = LossWatch(device)
+    depth_losses = LossWatch()
     # Where something is written: all losses up to there must have been looked at.
     stops = {opt.iterations, *testing_iterations, *saving_iterations, *checkpoint_iterations}
     rows = continue_curve(scene.model_path, first_iteration)

@@ -2,6 +2,7 @@
 
 import argparse
 import math
+from functools import cache
 
 import torch
 from diff_gaussian_rasterization import GaussianRasterizationSettings, rasterize
@@ -40,7 +41,8 @@ def render(
     has to be waited for it); `radii` (N,) int32 pixels; `depth` inverse depth (1, H, W), or None unless want_depth.
     """
     xyz = pc.get_xyz
-    viewspace_points = torch.zeros_like(xyz, requires_grad=xyz.requires_grad and torch.is_grad_enabled())
+    viewspace_points = _zero(xyz.device, xyz.dtype).expand_as(xyz)
+    viewspace_points.requires_grad_(xyz.requires_grad and torch.is_grad_enabled())
     result = rasterize(
         xyz,
         viewspace_points,
@@ -59,6 +61,12 @@ def render(
         "radii": result.radii,
         "depth": result.inverse_depth,
     }
+
+
+@cache
+def _zero(device: torch.device, dtype: torch.dtype) -> Tensor:
+    with torch.inference_mode(False):  # so that it can serve a training after a picture
+        return torch.zeros((), device=device, dtype=dtype)
 
 
 def _settings(

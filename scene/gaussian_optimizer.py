@@ -17,7 +17,8 @@ _ADAM = torch.ops.diff_gaussian_rasterization.adam_
 class GaussianAdam(torch.optim.Adam):
     """torch.optim.Adam, one parameter (N, ...) per named group, by a kernel with the same bits for any thread count.
 
-    State and state dict have torch's form (step, exp_avg, exp_avg_sq), so checkpoints carry over both ways.
+    State and state dict have torch's form (step, exp_avg, exp_avg_sq), so checkpoints carry over both ways. There are
+    no step hooks: torch's, with its profiler's label, take as long as the step itself.
     """
 
     def __init__(self, groups: list[dict], eps: float = 1e-15) -> None:
@@ -61,6 +62,15 @@ class GaussianAdam(torch.optim.Adam):
         if tensors:
             _ADAM(*map(list, zip(*tensors, strict=True)), rates, *self.defaults["betas"], self.defaults["eps"], columns)
         return loss
+
+    step.hooked = True  # torch wraps it otherwise
+
+    def zero_grad(self, set_to_none: bool = True) -> None:
+        """Drop the gradients, or zero them."""
+        if not set_to_none:
+            return super().zero_grad(set_to_none=False)
+        for group in self.param_groups:
+            group["params"][0].grad = None
 
     def _state_of(self, param: Tensor) -> dict[str, Tensor]:
         state = self.state[param]

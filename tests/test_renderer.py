@@ -6,6 +6,7 @@ import pytest
 import torch
 from gaussians import GROUPS, model, pipeline
 
+import gaussian_renderer
 from gaussian_renderer import render
 from scene.cameras import MiniCam
 from scene.exposure import Exposures
@@ -55,6 +56,21 @@ def test_depth_on_request(camera):
     depth = render(camera, gaussians, pipeline(), BLACK, want_depth=True)["depth"]
     assert depth.shape == (1, HEIGHT, WIDTH)
     assert depth.max().item() == pytest.approx(0.5 / 3.0, rel=0.01)  # opacity / distance, at the nearest pixel centre
+
+
+def test_screen_points_are_zeros_with_a_gradient_of_their_own_in_every_render(camera):
+    gaussian_renderer._zero.cache_clear()
+    gaussians = model(20)
+    with torch.inference_mode():  # a picture first must not stand in a training's way
+        assert not render(camera, gaussians, pipeline(), BLACK)["viewspace_points"].requires_grad
+    gradients = []
+    for weight in (1.0, 2.0):
+        package = render(camera, gaussians, pipeline(), BLACK)
+        (weight * package["render"]).sum().backward()
+        points = package["viewspace_points"]
+        assert points.shape == (20, 3) and not points.any() and points.is_leaf
+        gradients.append(points.grad)
+    assert gradients[0].any() and torch.equal(2 * gradients[0], gradients[1])
 
 
 def test_values_outside_are_clamped_and_get_no_gradient(camera):

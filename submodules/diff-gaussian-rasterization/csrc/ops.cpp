@@ -36,6 +36,13 @@ constexpr int64_t kSplatValues = 10, kGradientValues = 10, kTile = 16;
   means, opacities, scales, rotations, cov3d, colors, sh_dc, sh_rest, view, projection, center, tan_x, tan_y, height, \
       width, sh_degree, scale_modifier, antialiasing, raw
 
+// `t` contiguous, with the dtype and on the device of `like`. Asking first: torch's conversion costs even when there is
+// nothing to convert, and a step makes some ten.
+Tensor converted(const Tensor& t, const Tensor& like) {
+  const bool fits = t.scalar_type() == like.scalar_type() && t.device() == like.device();
+  return fits ? t.contiguous() : t.to(like.options()).contiguous();
+}
+
 // Owns the contiguous tensors that a gs::Scene points into.
 class SceneTensors {
  public:
@@ -131,7 +138,7 @@ class SceneTensors {
   }
   Tensor matrix(const Tensor& t, int64_t values, const char* name) const {
     TORCH_CHECK(t.numel() == values, name, " must have ", values, " values, got ", t.sizes());
-    return t.to(means_.options()).contiguous();
+    return converted(t, means_);
   }
 
   int64_t count_;  // first: the checks of the tensors read these three
@@ -262,7 +269,7 @@ gs::BlendInput<T> blend_input(const Tensor& splats, const Tensor& instances, con
 
 Tensor background_like(const Tensor& background, const Tensor& splats) {
   TORCH_CHECK(background.numel() == 3, "background must have 3 values, got ", background.sizes());
-  return background.to(splats.options()).contiguous();
+  return converted(background, splats);
 }
 
 struct BlendedTensors {
@@ -335,7 +342,7 @@ class BlendBackward {
     TORCH_CHECK(t->dim() == 3 && t->size(0) == channels && t->size(1) == image_.height && t->size(2) == image_.width,
                 "the gradient of an image must be (", channels, ", ", image_.height, ", ", image_.width, "), got ",
                 t->sizes());
-    return t->to(splats_.options()).contiguous();
+    return converted(*t, splats_);
   }
 
   Tensor splats_, tile_counts_, instances_, slots_, ranges_, slot_offsets_, background_, last_, transmittance_;
@@ -466,7 +473,7 @@ Gradients rasterize_vjp_op(SCENE_PARAMETERS, BACKWARD_PARAMETERS, Wanted wanted)
 Tensor mark_visible_op(const Tensor& means, const Tensor& view) {
   TORCH_CHECK(means.dim() == 2 && means.size(1) == 3, "positions must be (N, 3), got ", means.sizes());
   TORCH_CHECK(view.numel() == 16, "the view matrix must be 4x4, got ", view.sizes());
-  const Tensor rows = means.contiguous(), matrix = view.to(means.options()).contiguous();
+  const Tensor rows = means.contiguous(), matrix = converted(view, means);
   Tensor visible = at::empty({rows.size(0)}, rows.options().dtype(at::kBool));
   with_scalar(rows.scalar_type(), [&](auto zero) {
     using T = decltype(zero);

@@ -26,8 +26,9 @@ _ops = torch.ops.diff_gaussian_rasterization
 # Inputs that receive gradients, in the order of `wanted` and of the results of rasterize_vjp.
 GRADIENTS = ("means", "means2d", "opacities", "scales", "rotations", "cov3d", "colors", "sh_dc", "sh_rest")
 _SCENE = ("means", "opacities", "scales", "rotations", "cov3d", "colors", "sh_dc", "sh_rest")
-_SCENE += ("view", "projection", "center", "tan_x", "tan_y", "height", "width")
-_SCENE += ("sh_degree", "scale_modifier", "antialiasing", "raw")
+_SCENE += ("view", "projection", "center")
+_TENSORS = len(_SCENE)  # what comes before is a tensor or None, what comes after a number
+_SCENE += ("tan_x", "tan_y", "height", "width", "sh_degree", "scale_modifier", "antialiasing", "raw")
 _TILE = 16
 _VALUES = 10  # of a row of `splats` and of `moments`
 
@@ -247,22 +248,16 @@ def _setup_context(ctx, inputs, output):
     _, transmittance, _, radii, splats, tile_counts, instances, slots, ranges, slot_offsets, last = output
     ctx.mark_non_differentiable(radii, splats, tile_counts, instances, slots, ranges, slot_offsets, last)
     ctx.set_materialize_grads(False)
-    tensors = [value for value in scene if isinstance(value, Tensor)]
-    ctx.scene = [None if isinstance(value, Tensor) else value for value in scene]
-    ctx.places = [i for i, value in enumerate(scene) if isinstance(value, Tensor)]
-    ctx.inverse_depth, ctx.train = inverse_depth, train
+    ctx.numbers, ctx.inverse_depth, ctx.train = scene[_TENSORS:], inverse_depth, train
     state = (splats, tile_counts, instances, slots, ranges, slot_offsets, background, last, transmittance)
-    ctx.save_for_backward(*tensors, *state)
+    ctx.save_for_backward(*scene[:_TENSORS], *state)
 
 
 def _backward(ctx, grad_color, grad_transmittance, grad_inverse_depth, *_):
     if not ctx.train:
         raise RuntimeError("this image was rasterized with train=False, so it has no backward")
-    scene = list(ctx.scene)
     saved = ctx.saved_tensors
-    for place, tensor in zip(ctx.places, saved, strict=False):
-        scene[place] = tensor
-    state = saved[len(ctx.places) :]
+    scene, state = (*saved[:_TENSORS], *ctx.numbers), saved[_TENSORS:]
     inputs = dict(zip(("means2d", *_SCENE), ctx.needs_input_grad, strict=False))
     wanted = [inputs[name] for name in GRADIENTS]
     if grad_color is None:

@@ -4,6 +4,7 @@ SSIM is that of Wang et al. 2004, per channel: 11 x 11 Gaussian window of sigma 
 takes pixels beyond the border as 0, "valid" leaves the rim of 5 pixels out of the mean. Only img1 gets a gradient.
 """
 
+from functools import cache
 from pathlib import Path
 
 import torch
@@ -50,9 +51,9 @@ def fused_photometric_loss(img1: Tensor, img2: Tensor, lambda_dssim: float) -> t
     """
     _check_inputs(img1, img2, "same")
     train = torch.is_grad_enabled() and img1.requires_grad
-    run = _Photometric.apply if train else torch.ops.fused_ssim.photometric
-    loss, l1, _ = run(img1, img2.detach(), float(lambda_dssim), train)
-    return loss, l1
+    if train:
+        return _Photometric.apply(img1, img2, float(lambda_dssim), True)[:2]
+    return torch.ops.fused_ssim.photometric(img1, img2.detach(), float(lambda_dssim), False)[:2]
 
 
 def composite(picture: Tensor, background: Tensor) -> Tensor:
@@ -81,10 +82,15 @@ def _check_inputs(img1: Tensor, img2: Tensor, padding: str) -> None:
     if img1.device != img2.device:
         raise ValueError(f"the images must be on the same device, got img1 on {img1.device} and img2 on {img2.device}")
     device = img1.device.type
-    if not torch._C._dispatch_has_kernel_for_dispatch_key("fused_ssim::l1_ssim", device.upper()):
+    if not _has_backend(device):
         raise ValueError(f"this build of fused_ssim has no {device} backend: pass img1.cpu() and img2.cpu()")
     if device == "cuda" and img1.dtype != torch.float32:
         raise TypeError(f"img1 on {img1.device} must be float32, got {img1.dtype}: pass img1.float() or img1.cpu()")
+
+
+@cache  # asking takes longer than all other checks together
+def _has_backend(device: str) -> bool:
+    return torch._C._dispatch_has_kernel_for_dispatch_key("fused_ssim::l1_ssim", device.upper())
 
 
 @torch.library.register_fake("fused_ssim::l1_ssim")

@@ -1,6 +1,7 @@
 #pragma once
 // Queue over torch's current stream and caching allocator. Only ops.cpp includes this, in CUDA builds.
-#include <ATen/ops/empty.h>
+#include <ATen/core/Tensor.h>
+#include <c10/cuda/CUDACachingAllocator.h>
 #include <c10/cuda/CUDAGuard.h>
 #include <c10/cuda/CUDAStream.h>
 
@@ -14,20 +15,20 @@ namespace gs {
 // hands memory on in stream order, so that is soon enough.
 class TorchQueue {
  public:
-  explicit TorchQueue(at::Device device) : guard_(device), device_(device) {}
+  explicit TorchQueue(at::Device device) : guard_(device) {}
 
   Queue queue() { return {c10::cuda::getCurrentCUDAStream().stream(), &allocate, this}; }
 
  private:
   static void* allocate(void* context, size_t bytes) {
-    auto* self = static_cast<TorchQueue*>(context);
-    self->memory_.push_back(at::empty({int64_t(bytes)}, at::TensorOptions().dtype(at::kByte).device(self->device_)));
-    return self->memory_.back().mutable_data_ptr();
+    // The allocator itself: some fifteen arrays a step, each of which would be a tensor made by the dispatcher.
+    auto& memory = static_cast<TorchQueue*>(context)->memory_;
+    memory.push_back(c10::cuda::CUDACachingAllocator::get()->allocate(bytes));
+    return memory.back().get();
   }
 
   c10::cuda::CUDAGuard guard_;
-  at::Device device_;
-  std::vector<at::Tensor> memory_;
+  std::vector<c10::DataPtr> memory_;
 };
 
 }  // namespace gs
