@@ -46,6 +46,10 @@ struct Layout {
   __device__ static int column(int run) { return run * kColumns; }
 };
 
+// Up to here every instance gets a gradient row, 40 MiB at most, so that the host need not wait for the number of those
+// that want one.
+constexpr int64_t kRowsUnasked = 1 << 20;
+
 using Forward = Layout<2>;
 using Backward = Layout<4>;
 
@@ -318,10 +322,15 @@ Compact blend_rows(const Queue& queue, const BlendInput<float>& in, const BlendG
   GS_CUDA_CHECK(cub::DeviceScan::ExclusiveSum(nullptr, bytes, counts, before, words + 1, stream));
   void* memory = queue.allocate(queue.context, bytes);
   GS_CUDA_CHECK(cub::DeviceScan::ExclusiveSum(memory, bytes, counts, before, words + 1, stream));
-  int32_t total = 0;
-  GS_CUDA_CHECK(cudaMemcpyAsync(&total, before + words, sizeof total, cudaMemcpyDeviceToHost, stream));
-  GS_CUDA_CHECK(cudaStreamSynchronize(stream));
-  const Compact compact{bits, before, queue.array<float>(size_t(total) * kGradientValues)};
+  int64_t rows = g.instance_count;  // at most: one for each
+  if (rows > kRowsUnasked) {
+    int32_t processed_count = 0;
+    GS_CUDA_CHECK(
+        cudaMemcpyAsync(&processed_count, before + words, sizeof processed_count, cudaMemcpyDeviceToHost, stream));
+    GS_CUDA_CHECK(cudaStreamSynchronize(stream));
+    rows = processed_count;
+  }
+  const Compact compact{bits, before, queue.array<float>(size_t(rows) * kGradientValues)};
   const auto kernel = g.inverse_depth ? blend_vjp_kernel<true> : blend_vjp_kernel<false>;
   kernel<<<tiles, Backward::kThreads, 0, stream>>>(in, g, processed, compact);
   check_launch("blend_vjp");
