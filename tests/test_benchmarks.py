@@ -6,6 +6,7 @@ import pytest
 
 from benchmarks.calls import Stages
 from benchmarks.fragments import TILE, fragments, processed_per_tile
+from benchmarks.host_ops import NODE, calls_per_iteration, operator_calls
 from benchmarks.splat_scenes import frustum
 from benchmarks.timing import short_name
 
@@ -40,3 +41,13 @@ def test_fragments_are_those_of_a_loop_over_pixels():
 )
 def test_short_names(name, short):
     assert short_name(name) == short
+
+
+def test_an_iteration_makes_few_calls(colmap_scene):
+    """A step bound by the host gets slower with each: whoever adds some should know."""
+    calls = calls_per_iteration("-s", str(colmap_scene), "-r", "24")
+    for op in ("rasterize", "rasterize_vjp", "adam_", "observe_"):
+        assert calls[f"diff_gaussian_rasterization::{op}"] == 1, op
+    assert calls["fused_ssim::photometric"] == calls["fused_ssim::photometric_vjp"] == 1
+    assert calls[NODE] <= 8  # two ops, five parameters with a gradient and the screen means
+    assert operator_calls(calls) <= 90  # 62, and some 20 for the order of the views, drawn once an epoch of 17
