@@ -6,8 +6,8 @@
 
 #include <cub/cub.cuh>
 
+#include "emit.cuh"
 #include "gs/cuda_check.h"
-#include "tiles.cuh"
 
 namespace gs {
 namespace cuda {
@@ -42,85 +42,6 @@ struct OrderedCount {
 __global__ void count_up_kernel(int64_t n, int32_t* values) {
   const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
   if (i < n) values[i] = int32_t(i);
-}
-
-// The place of the n-th set bit (from 0).
-__device__ int nth_bit(uint64_t mask, int n) {
-  int place = 0;
-  for (int half = 32; half; half /= 2) {
-    const int below = __popcll(mask & ((uint64_t(1) << half) - 1));
-    if (n >= below) {
-      n -= below;
-      place += half;
-      mask >>= half;
-    }
-  }
-  return place;
-}
-
-// A warp's splats, which lie side by side in depth order, fill one stretch of the instances. Its lanes share that
-// stretch evenly and write it in order; who is whose comes from a search over the lanes' counts. Splats over more tiles
-// than a mask has bits for come after, one at a time.
-template <class Key>
-__global__ void __launch_bounds__(kThreads)
-    emit_kernel(int64_t n, const int32_t* order, const int64_t* offsets, Projected<float> in, Image image, Key* tiles,
-                int32_t* owners, int64_t* slot_offsets) {
-  const int64_t k = int64_t(blockIdx.x) * kThreads + threadIdx.x;
-  const int lane = threadIdx.x & 31, columns = tile_count(image.width);
-  const int32_t index = k < n ? order[k] : 0;
-  TileRect rect = {0, 0, 0, 0};
-  int32_t count = 0;
-  uint64_t mask = 0;
-  if (k < n && in.records) {
-    const TileRecord record = in.records[index];
-    rect = {record.x0, record.y0, record.x1, record.y1};
-    count = record.count, mask = record.mask;
-  } else if (k < n) {
-    const int4 r = reinterpret_cast<const int4*>(in.rects)[index];
-    rect = {r.x, r.y, r.z, r.w};
-    count = in.tile_counts[index];
-  }
-  if (!count) rect = {0, 0, 0, 0};
-  const int64_t offset = count ? offsets[k] : 0;
-  if (count && slot_offsets) slot_offsets[index] = offset;
-  const int wide = rect.x1 - rect.x0;
-  const bool masked = in.records && count && wide * (rect.y1 - rect.y0) <= 64;
-
-  int32_t before = masked ? count : 0;  // masked instances of this lane and the ones before it
-  for (int step = 1; step < 32; step *= 2) {
-    const int32_t other = __shfl_up_sync(kWarp, before, step);
-    if (lane >= step) before += other;
-  }
-  const int32_t total = __shfl_sync(kWarp, before, 31);
-  for (int32_t base = 0; base < total; base += 32) {
-    const int32_t j = base + lane;
-    int owner = 0;  // the first lane whose sum exceeds j
-    for (int step = 16; step; step /= 2)
-      if (__shfl_sync(kWarp, before, owner + step - 1) <= j) owner += step;
-    const int32_t nth = j - (from_lane(before, owner) - from_lane(count, owner));
-    const int64_t at = from_lane(offset, owner) + nth;
-    const uint64_t owner_mask = __shfl_sync(kWarp, mask, owner);
-    const int owner_wide = from_lane(wide, owner), x0 = from_lane(rect.x0, owner), y0 = from_lane(rect.y0, owner);
-    const int32_t owner_index = from_lane(index, owner);
-    if (j < total) {
-      const int bit = nth_bit(owner_mask, nth), row = bit / owner_wide;
-      tiles[at] = Key((y0 + row) * columns + x0 + bit - row * owner_wide);
-      owners[at] = owner_index;
-    }
-  }
-
-  Splat<float> splat = {};
-  if (count && !masked) {
-    const float2* from = reinterpret_cast<const float2*>(in.splats + kSplatValues * int64_t(index));
-    const float2 mean = from[0], l1 = from[1], l2 = from[2];
-    splat.x = mean.x, splat.y = mean.y, splat.l11 = l1.x, splat.l12 = l1.y, splat.l22 = l2.x, splat.log2_opacity = l2.y;
-  }
-  uint64_t unused;
-  warp_list_tiles(splat, masked ? TileRect{0, 0, 0, 0} : rect, image, offset, index, unused,
-                  [&](int64_t at, int32_t tile, int32_t owner) {
-                    tiles[at] = Key(tile);
-                    owners[at] = owner;
-                  });
 }
 
 // Where each tile's list begins: every tile from that of the instance before to this one's starts here.
@@ -171,8 +92,9 @@ void bin_with(const Queue& queue, int64_t n, const Projected<float>& in, Image i
       return cub::DeviceScan::ExclusiveSum(memory, bytes, counts, offsets, n, stream);
     });
     int32_t* owners = queue.array<int32_t>(instances);
-    emit_kernel<Key>
-        <<<blocks_for(n), kThreads, 0, stream>>>(n, order, offsets, in, image, keys, owners, out.slot_offsets);
+    const unsigned blocks = unsigned((instances + kEmitted - 1) / kEmitted);
+    emit_kernel<Key><<<blocks, kEmitThreads, 0, stream>>>(n, instances, order, offsets, in, image, keys, owners,
+                                                          out.slot_offsets);
     check_launch("emit");
     const int end_bit = bits_for(tiles);
     if (out.slots) {

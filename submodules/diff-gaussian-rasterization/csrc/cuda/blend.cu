@@ -292,9 +292,9 @@ __global__ void __launch_bounds__(Backward::kThreads)
 
 __global__ void __launch_bounds__(256) moments_kernel(int64_t count, SlotSums sums, float* moments) {
   const int64_t i = int64_t(blockIdx.x) * 256 + threadIdx.x;
+  float values[kGradientValues];
+  sums.read(i, i < count && sums.tile_counts[i] != 0, values);
   if (i >= count) return;
-  float values[kGradientValues] = {};
-  if (sums.tile_counts[i]) sums.read(i, values);
   for (int v = 0; v < kGradientValues; ++v) moments[kGradientValues * i + v] = values[v];
 }
 

@@ -21,22 +21,45 @@ struct Compact {
   }
 };
 
-// The sums of a splat over its slots, in their order.
+// The sums of a splat over its slots, in an order that depends on their number alone. A splat near the camera has
+// thousands: those are added by the whole warp.
 struct SlotSums {
+  static constexpr int kOwnRows = 48;
   Compact compact;
   const int64_t* slot_offsets;
   const int32_t* tile_counts;
 
-  __device__ void read(int64_t splat, float* sums) const {
+  // Called by all lanes of a warp; those that want a splat's sums get them, the others nothing.
+  __device__ void read(int64_t splat, bool wanted, float* sums) const {
     constexpr int kValues = baseline::kGradientValues;
+    constexpr unsigned kAll = 0xffffffffu;
+    int64_t begin = 0, end = 0;
+    if (wanted) {
+      const int64_t slot = slot_offsets[splat];
+      begin = compact.row(slot), end = compact.row(slot + tile_counts[splat]);
+    }
+    const bool many = end - begin > kOwnRows;
     for (int v = 0; v < kValues; ++v) sums[v] = 0;
-    const int64_t slot = slot_offsets[splat], stop = compact.row(slot + tile_counts[splat]);
-    for (int64_t row = compact.row(slot); row < stop; ++row) {
-      const float2* from = reinterpret_cast<const float2*>(compact.rows + kValues * row);
-      for (int v = 0; v < kValues / 2; ++v) {
-        const float2 pair = from[v];
-        sums[2 * v] += pair.x, sums[2 * v + 1] += pair.y;
+    if (!many)
+      for (int64_t row = begin; row < end; ++row) add(row, sums);
+    for (unsigned left = __ballot_sync(kAll, many); left; left &= left - 1) {
+      const int owner = __ffs(left) - 1, lane = threadIdx.x & 31;
+      const int64_t stop = __shfl_sync(kAll, end, owner);
+      float part[kValues] = {};
+      for (int64_t row = __shfl_sync(kAll, begin, owner) + lane; row < stop; row += 32) add(row, part);
+      for (int v = 0; v < kValues; ++v) {
+        for (int step = 16; step; step /= 2) part[v] += __shfl_xor_sync(kAll, part[v], step);
+        if (lane == owner) sums[v] = part[v];
       }
+    }
+  }
+
+ private:
+  __device__ void add(int64_t row, float* sums) const {
+    const float2* from = reinterpret_cast<const float2*>(compact.rows + baseline::kGradientValues * row);
+    for (int v = 0; v < baseline::kGradientValues / 2; ++v) {
+      const float2 pair = from[v];
+      sums[2 * v] += pair.x, sums[2 * v + 1] += pair.y;
     }
   }
 };

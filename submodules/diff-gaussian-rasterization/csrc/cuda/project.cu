@@ -90,7 +90,7 @@ __global__ void __launch_bounds__(kThreads) project_kernel(Scene<float> s, Proje
   if (visible) rect = tile_rect(splat, s.image.width, s.image.height);
   fetch(!likely && rect.x1 > rect.x0);
   uint64_t mask;
-  int32_t count = warp_list_tiles(splat, rect, s.image, 0, 0, mask, [](int64_t, int32_t, int32_t) {});
+  int32_t count = warp_count_tiles(splat, rect, s.image, mask);
   wait_for_rows();
   if (count && !project_color(s, camera, i, rest + threadIdx.x * kRest, splat)) count = 0;
   if (i >= s.count) return;
@@ -113,8 +113,8 @@ __global__ void __launch_bounds__(kThreads) project_kernel(Scene<float> s, Proje
 struct StoredMoments {
   const float* moments;
   const int32_t* tile_counts;
-  __device__ void read(int64_t i, float* m) const {
-    for (int v = 0; v < kGradientValues; ++v) m[v] = moments[kGradientValues * i + v];
+  __device__ void read(int64_t i, bool wanted, float* m) const {
+    for (int v = 0; wanted && v < kGradientValues; ++v) m[v] = moments[kGradientValues * i + v];
   }
 };
 
@@ -132,7 +132,7 @@ __global__ void __launch_bounds__(kThreads)
   if (!s.colors)
     fetch_rows(s.sh_rest, first, s.rest_stride, 3 * (sh_count(s.sh_degree) - 1), __ballot_sync(kWarp, seen), warp_rows);
   float m[kGradientValues];
-  if (seen) source.read(i, m);
+  source.read(i, seen, m);
   wait_for_rows();
   if (seen) {
     project_vjp_row(s, camera, i, m, row, out.sh_rest ? row : nullptr, out);

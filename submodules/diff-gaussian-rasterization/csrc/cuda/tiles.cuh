@@ -1,5 +1,5 @@
 #pragma once
-// Listing the tiles that a splat reaches, by whole warps: a splat over a thousand tiles must not hold up 31 others.
+// Counting the tiles that a splat reaches, by whole warps: a splat over a thousand tiles must not hold up 31 others.
 #include "../launch.h"
 #include "../math/tiles.h"
 
@@ -30,13 +30,10 @@ __device__ inline Splat<float> from_lane(Splat<float> s, int lane) {
           s.inverse_depth};
 }
 
-// Called by all lanes of a warp, each with a splat of its own (an empty rectangle for none): put(at, tile, index) gets
-// each of its tiles in the rectangle's order, at counting up from the splat's offset. Returns the number of this lane's
-// tiles, and in `mask` a bit for each of the rectangle's first 64.
-template <class Put>
-__device__ int32_t warp_list_tiles(const Splat<float>& splat, TileRect rect, Image image, int64_t offset, int32_t index,
-                                   uint64_t& mask, const Put& put) {
-  const int lane = threadIdx.x & 31, columns = tile_count(image.width);
+// Called by all lanes of a warp, each with a splat of its own (an empty rectangle for none). Returns the number of tiles
+// that the splat reaches, and in `mask` a bit for each of the rectangle's first 64.
+__device__ inline int32_t warp_count_tiles(const Splat<float>& splat, TileRect rect, Image image, uint64_t& mask) {
+  const int lane = threadIdx.x & 31;
   const int own = (rect.x1 - rect.x0) * (rect.y1 - rect.y0);
   int32_t count = 0;
   mask = 0;
@@ -45,25 +42,19 @@ __device__ int32_t warp_list_tiles(const Splat<float>& splat, TileRect rect, Ima
     uint64_t bit = 1;
     for (int ty = rect.y0; ty < rect.y1; ++ty)
       for (int tx = rect.x0; tx < rect.x1; ++tx, bit <<= 1)
-        if (tile_reached(test, tx, ty)) {
-          mask |= bit;
-          put(offset + count++, ty * columns + tx, index);
-        }
+        if (tile_reached(test, tx, ty)) mask |= bit;
+    count = __popcll(mask);
   }
   for (unsigned large = __ballot_sync(kWarp, own > kOwnTiles); large; large &= large - 1) {
     const int owner = __ffs(large) - 1;
     const TileRect r = {from_lane(rect.x0, owner), from_lane(rect.y0, owner), from_lane(rect.x1, owner),
                         from_lane(rect.y1, owner)};
     const TileTest<float> test = make_tile_test(from_lane(splat, owner), r, image.width, image.height);
-    const int64_t owner_offset = from_lane(offset, owner);
-    const int32_t owner_index = from_lane(index, owner);
     const int wide = r.x1 - r.x0, total = wide * (r.y1 - r.y0);
     int32_t found = 0;
     for (int base = 0; base < total; base += 32) {
       const int k = base + lane, tx = r.x0 + k % wide, ty = r.y0 + k / wide;
-      const bool reached = k < total && tile_reached(test, tx, ty);
-      const unsigned hits = __ballot_sync(kWarp, reached);
-      if (reached) put(owner_offset + found + __popc(hits & ((1u << lane) - 1)), ty * columns + tx, owner_index);
+      const unsigned hits = __ballot_sync(kWarp, k < total && tile_reached(test, tx, ty));
       found += __popc(hits);
       if (lane == owner && base < 64) mask |= uint64_t(hits) << base;
     }

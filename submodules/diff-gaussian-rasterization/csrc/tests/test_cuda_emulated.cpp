@@ -25,7 +25,7 @@ Result<float> run_emulated(Parameters<float>& p, gs::Image image, bool antialias
 
 void test_against_cpu() {
   using gs::emulation::Order;
-  for (const gs::Image image : {gs::Image{1, 1}, gs::Image{16, 16}, gs::Image{70, 33}})
+  for (const gs::Image image : {gs::Image{1, 1}, gs::Image{16, 16}, gs::Image{70, 33}, gs::Image{330, 70}})
     for (int64_t count : {0, 1, 33, 300})
       for (bool antialiasing : {false, true}) {
         Parameters<float> p(count);
