@@ -68,9 +68,9 @@ EMULATION := submodules/common/emulation
 build/%/csrc/tests/test_cuda_emulated: submodules/%/csrc/tests/test_cuda_emulated.cpp $(wildcard $(EMULATION)/*) \
                                        $$(call sources,$$*)
 	@mkdir -p $(@D)/emulated
-	for kernels in submodules/$*/csrc/cuda/*.cu; do \
-	  $(PYTHON) $(EMULATION)/translate.py $$kernels $(@D)/emulated/$$(basename $$kernels .cu).cpp || exit 1; done
-	$(CXX) $(CXX_TEST_FLAGS) -Wno-unknown-pragmas -Isubmodules/$*/csrc -Isubmodules/$*/csrc/cuda -I$(EMULATION) \
+	rm -f $(@D)/emulated/*
+	$(PYTHON) $(EMULATION)/translate.py $(@D)/emulated $(wildcard submodules/$*/csrc/cuda/*.cu*)
+	$(CXX) $(CXX_TEST_FLAGS) -Wno-unknown-pragmas -I$(@D)/emulated -Isubmodules/$*/csrc -Isubmodules/$*/csrc/cuda -I$(EMULATION) \
 	    -Isubmodules/common/include $< $(@D)/emulated/*.cpp $(EMULATION)/emulation.cpp \
 	    $(wildcard submodules/$*/csrc/cpu/*.cpp) -o $@
 

@@ -1,6 +1,6 @@
 """Rewrite what in a .cu file is not C++, so that a C++ compiler takes it with the headers of this folder.
 
-python translate.py KERNELS.cu KERNELS.cpp
+python translate.py FOLDER FILE...    writes what becomes of X.cu and X.cuh to FOLDER/X.cpp and FOLDER/X.cuh
 """
 
 import re
@@ -23,5 +23,7 @@ def translate(source: str) -> str:
 
 
 if __name__ == "__main__":
-    path = Path(sys.argv[1])
-    Path(sys.argv[2]).write_text(f'#line 1 "{path}"\n' + translate(path.read_text()))
+    folder = Path(sys.argv[1])
+    for path in map(Path, sys.argv[2:]):
+        name = path.with_suffix(".cpp").name if path.suffix == ".cu" else path.name
+        (folder / name).write_text(f'#line 1 "{path}"\n' + translate(path.read_text()))

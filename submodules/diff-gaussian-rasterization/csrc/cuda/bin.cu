@@ -93,8 +93,8 @@ void bin_with(const Queue& queue, int64_t n, const Projected<float>& in, Image i
     });
     int32_t* owners = queue.array<int32_t>(instances);
     const unsigned blocks = unsigned((instances + kEmitted - 1) / kEmitted);
-    emit_kernel<Key><<<blocks, kEmitThreads, 0, stream>>>(n, instances, order, offsets, in, image, keys, owners,
-                                                          out.slot_offsets);
+    emit_kernel<Key>
+        <<<blocks, kEmitThreads, 0, stream>>>(n, instances, order, offsets, in, image, keys, owners, out.slot_offsets);
     check_launch("emit");
     const int end_bit = bits_for(tiles);
     if (out.slots) {

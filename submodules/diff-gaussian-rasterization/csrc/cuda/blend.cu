@@ -13,6 +13,7 @@
 #include "../math/tiles.h"
 #include "backward.cuh"
 #include "gs/cuda_check.h"
+#include "heaviest.cuh"
 
 namespace gs {
 namespace cuda {
@@ -53,6 +54,15 @@ constexpr int64_t kRowsUnasked = 1 << 20;
 using Forward = Layout<2>;
 using Backward = Layout<4>;
 
+struct ListLength {
+  const int64_t* ranges;
+  __device__ int64_t operator()(int tile) const { return ranges[tile + 1] - ranges[tile]; }
+};
+struct ProcessedLength {
+  const int32_t* processed;
+  __device__ int64_t operator()(int tile) const { return processed[tile]; }
+};
+
 // A batch of splats in shared memory, local to the tile.
 template <int kCount>
 struct Batch {
@@ -91,11 +101,12 @@ __device__ unsigned reached_by_warp(const Batch<kCount>& batch, const L& at, int
 }
 
 template <bool kDepth, bool kLast>
-__global__ void __launch_bounds__(Forward::kThreads) blend_kernel(BlendInput<float> in, Blended<float> out) {
+__global__ void __launch_bounds__(Forward::kThreads)
+    blend_kernel(BlendInput<float> in, const int32_t* order, Blended<float> out) {
   constexpr int kBatch = 128, kRun = Forward::kRun;
   __shared__ Batch<kBatch> batch;
   const Forward at;
-  const int across = tile_count(in.image.width), tile = blockIdx.x;
+  const int across = tile_count(in.image.width), tile = order[blockIdx.x];
   const int left = tile % across * kTile, top = tile / across * kTile;
   float transmittance[kRun], red[kRun], green[kRun], blue[kRun], depth[kRun], threshold[kRun];
   int last[kRun];
@@ -212,13 +223,14 @@ __device__ __forceinline__ float transposed_sum(const float (&v)[kGradientValues
 
 template <bool kDepth>
 __global__ void __launch_bounds__(Backward::kThreads)
-    blend_vjp_kernel(BlendInput<float> in, BlendGradient<float> g, const int32_t* processed, Compact compact) {
+    blend_vjp_kernel(BlendInput<float> in, BlendGradient<float> g, const int32_t* processed, const int32_t* order,
+                     Compact compact) {
   constexpr int kBatch = 64, kRun = Backward::kRun;
   __shared__ Batch<kBatch> batch;
   __shared__ float sums[Backward::kWarps * kBatch * kGradientValues];
   __shared__ int64_t row_of[kBatch];
   const Backward at;
-  const int across = tile_count(in.image.width), tile = blockIdx.x, warp = threadIdx.x / 32;
+  const int across = tile_count(in.image.width), tile = order[blockIdx.x], warp = threadIdx.x / 32;
   const int left = tile % across * kTile, top = tile / across * kTile;
   const int64_t plane = int64_t(in.image.width) * in.image.height;
   float transmittance[kRun], behind[kRun], red[kRun], green[kRun], blue[kRun], depth[kRun];
@@ -304,7 +316,9 @@ template <>
 void blend<float>(const Queue& queue, const BlendInput<float>& in, const Blended<float>& out) {
   const auto kernel = out.inverse_depth ? (out.last ? blend_kernel<true, true> : blend_kernel<true, false>)
                                         : (out.last ? blend_kernel<false, true> : blend_kernel<false, false>);
-  kernel<<<unsigned(tiles_of(in.image)), Forward::kThreads, 0, stream_of(queue)>>>(in, out);
+  const int64_t tiles = tiles_of(in.image);
+  const int32_t* order = heaviest_first(queue, tiles, ListLength{in.ranges});
+  kernel<<<unsigned(tiles), Forward::kThreads, 0, stream_of(queue)>>>(in, order, out);
   check_launch("blend");
 }
 
@@ -332,7 +346,8 @@ Compact blend_rows(const Queue& queue, const BlendInput<float>& in, const BlendG
   }
   const Compact compact{bits, before, queue.array<float>(size_t(rows) * kGradientValues)};
   const auto kernel = g.inverse_depth ? blend_vjp_kernel<true> : blend_vjp_kernel<false>;
-  kernel<<<tiles, Backward::kThreads, 0, stream>>>(in, g, processed, compact);
+  const int32_t* order = heaviest_first(queue, tiles, ProcessedLength{processed});
+  kernel<<<tiles, Backward::kThreads, 0, stream>>>(in, g, processed, order, compact);
   check_launch("blend_vjp");
   return compact;
 }

@@ -121,8 +121,8 @@ __global__ void __launch_bounds__(kEmitThreads)
     const int32_t index = splats.index[k];
     const int x0 = splats.x0[k], y0 = splats.y0[k], wide = splats.wide[k];
     const int high = (in.records ? in.records[index].y1 : in.rects[4 * int64_t(index) + 3]) - y0;
-    const TileTest<float> test = make_tile_test(load_shape(in.splats, index), TileRect{x0, y0, x0 + wide, y0 + high},
-                                                image.width, image.height);
+    const TileTest<float> test =
+        make_tile_test(load_shape(in.splats, index), TileRect{x0, y0, x0 + wide, y0 + high}, image.width, image.height);
     int at = splats.first[k];
     for (int tile = 0; tile < wide * high && at < emitted; tile += kEmitThreads, turn ^= 1) {
       const int mine = tile + threadIdx.x, tx = x0 + mine % wide, ty = y0 + mine / wide;

@@ -30,8 +30,8 @@ __device__ inline Splat<float> from_lane(Splat<float> s, int lane) {
           s.inverse_depth};
 }
 
-// Called by all lanes of a warp, each with a splat of its own (an empty rectangle for none). Returns the number of tiles
-// that the splat reaches, and in `mask` a bit for each of the rectangle's first 64.
+// Called by all lanes of a warp, each with a splat of its own (an empty rectangle for none). Returns the number of
+// tiles that the splat reaches, and in `mask` a bit for each of the rectangle's first 64.
 __device__ inline int32_t warp_count_tiles(const Splat<float>& splat, TileRect rect, Image image, uint64_t& mask) {
   const int lane = threadIdx.x & 31;
   const int own = (rect.x1 - rect.x0) * (rect.y1 - rect.y0);

@@ -1,7 +1,10 @@
 // The CUDA kernels on the CPU (submodules/common/emulation), under the sanitizers, against the CPU backend: threads
 // taken in several orders must give the same bits, and every result lies within rounding of the CPU's.
+#include <algorithm>
+
 #include "backend_run.h"
 #include "emulated_queue.h"
+#include "heaviest.cuh"
 
 namespace {
 
@@ -135,10 +138,32 @@ void test_observe() {
   }
 }
 
+struct Lengths {
+  const int64_t* lengths;
+  int64_t operator()(int tile) const { return lengths[tile]; }
+};
+
+// Every tile once; the longest first as far as one block sorts them, an eighth of a doubling apart at most.
+void test_heaviest_first() {
+  for (int64_t tiles : {1, 2500, 16384, 20000}) {
+    std::vector<int64_t> lengths(tiles);
+    for (int64_t& length : lengths) length = int64_t(std::exp(3 * normal()));
+    lengths[tiles / 2] = int64_t(1) << 31;
+    gs::emulation::Memory memory;
+    const int32_t* order = gs::cuda::heaviest_first(memory.queue(), tiles, Lengths{lengths.data()});
+    std::vector<bool> there(tiles);
+    for (int64_t i = 0; i < tiles; ++i) there[order[i]] = true;
+    CHECK(std::count(there.begin(), there.end(), true) == tiles);
+    for (int64_t i = 1; i < tiles && tiles <= 16384; ++i)
+      CHECK(8 * (lengths[order[i]] + 1) <= 9 * (lengths[order[i - 1]] + 1));
+  }
+}
+
 }  // namespace
 
 int main() {
   test_against_cpu();
+  test_heaviest_first();
   test_sparse_adam();
   test_adam();
   test_observe();
