@@ -4,6 +4,7 @@ python train.py -s SCENE -m OUT --eval
 """
 
 import argparse
+import dataclasses
 import math
 import os
 import sys
@@ -17,8 +18,17 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from arguments import ModelParams, OptimizationParams, OptionParser, PipelineParams, write_cfg_args, write_model_json
+from arguments import (
+    ModelParams,
+    OptimizationParams,
+    OptionParser,
+    PipelineParams,
+    add_to_model_json,
+    write_cfg_args,
+    write_model_json,
+)
 from gaussian_renderer import render
+from gaussian_renderer.trimming import change_on_views, trim
 from scene import Scene
 from scene import densification as adc
 from scene.cameras import Camera
@@ -32,6 +42,7 @@ from utils.error_curve import Row, continue_curve
 from utils.general_utils import get_expon_lr_func, safe_state
 from utils.image_utils import as_float, pixels_that_count, psnr, right_half
 from utils.interrupt import DeferredInterrupt
+from utils.left_out import LeftOut, lines
 from utils.loss_utils import inverse_depth_loss, l1_loss, photometric_loss
 from utils.loss_watch import LossWatch
 from utils.system_utils import UserError, compute_device, mkdir_p, run_cli, saved_iterations
@@ -100,6 +111,7 @@ def training(
         curve = _curve(
             scene, rows, log, opt.iterations, testing_iterations, pipe, fixed_background, dataset.train_test_exp
         )
+    left_out = None
     clock = Stopwatch()
     bar = tqdm(initial=first_iteration, total=opt.iterations, desc="Training progress", dynamic_ncols=True)
     guard = MemoryGuard(gaussians, scene.model_path, first_iteration)
@@ -152,7 +164,12 @@ def training(
                 if saving:
                     gaussians.check_finite(iteration)
                     tqdm.write(f"[ITER {iteration}] Saving Gaussians", file=sys.stdout)
-                    scene.save(iteration)
+                    if iteration == opt.iterations:
+                        scored = curve is not None or iteration in testing_iterations
+                        left_out = _save_last(scene, dataset, opt, pipe, fixed_background, scored)
+                        scores |= {"gaussians_left_out": left_out.unseen}
+                    else:
+                        scene.save(iteration)
                 if saving or scores:
                     log.add(iteration, seconds, gaussians=len(gaussians), loss=losses.mean, **scores)
 
@@ -180,6 +197,8 @@ def training(
     if curve is not None:
         saved = {*saving_iterations} & {*saved_iterations(Path(scene.model_path) / "point_cloud")}
         curve.finish(seconds, saved, opt.position_lr_max_steps)
+    if left_out is not None:
+        print("\n".join(lines(left_out)))
 
 
 def _curve(
@@ -195,16 +214,7 @@ def _curve(
     """Recorder of the error of all test views and as many training views."""
     test = scene.getTestCameras()
     trained = [camera for camera in scene.getTrainCameras() if camera.columns is None]  # in whole
-
-    def image(camera: Camera) -> Tensor:
-        package = render(
-            camera, scene.gaussians, pipe, background, use_trained_exp=train_test_exp, want_visibility=False
-        )
-        return package["render"]
-
-    def scored(image: Tensor) -> Tensor:
-        return right_half(image).contiguous() if train_test_exp else image
-
+    scored = _ScoredViews(pipe, background, train_test_exp)
     return CurveRecorder(
         scene.model_path,
         rows,
@@ -212,11 +222,77 @@ def _curve(
         iterations,
         testing_iterations,
         {"test": test, "train": evenly_spread(trained, len(test))},
-        lambda camera: scored(image(camera)),
-        lambda camera: scored(camera.target(background)),
-        lambda camera: None if camera.mask is None else scored(camera.mask),
+        lambda camera: scored.image(camera, scene.gaussians),
+        scored.target,
+        scored.mask,
         background.device,
     )
+
+
+class _ScoredViews:
+    """Images of views and what they should be, as they are scored: by the half-image protocol the right halves alone,
+    rendered with exposures."""
+
+    def __init__(self, pipe: argparse.Namespace, background: Tensor, train_test_exp: bool) -> None:
+        self._pipe = pipe
+        self._background = background
+        self._halves = train_test_exp
+
+    def image(self, camera: Camera, gaussians: GaussianModel) -> Tensor:
+        exposed = {"use_trained_exp": self._halves}
+        package = render(camera, gaussians, self._pipe, self._background, **exposed, want_visibility=False)
+        return self._part(package["render"])
+
+    def target(self, camera: Camera) -> Tensor:
+        return self._part(camera.target(self._background))
+
+    def mask(self, camera: Camera) -> Tensor | None:
+        return None if camera.mask is None else self._part(camera.mask)
+
+    def _part(self, image: Tensor) -> Tensor:
+        return right_half(image).contiguous() if self._halves else image
+
+
+def _save_last(
+    scene: Scene,
+    dataset: argparse.Namespace,
+    opt: argparse.Namespace,
+    pipe: argparse.Namespace,
+    background: Tensor,
+    scored: bool,
+) -> LeftOut:
+    """Save the finished model without what it does not need; what that was goes into model.json, too.
+
+    scored: the test pictures are in memory, so that the change in PSNR costs little.
+    """
+    trained = scene.gaussians
+    trained.optimizer.zero_grad(set_to_none=True)  # the last iteration takes no step: room for the trimmed copy
+    trimmed = trim(trained, scene.getTrainCameras(), pipe, opt.keep_unseen, opt.prune_sh)
+    final, test = trimmed.gaussians, scene.getTestCameras()
+    change = {}
+    if test and final is not trained:
+        views = _ScoredViews(pipe, background, dataset.train_test_exp)
+        truth = (lambda camera: (views.target(camera), views.mask(camera))) if scored else None
+        change = change_on_views(trained, final, test, views.image, truth)
+    scene.save(opt.iterations, final)
+    write_cfg_args(scene.model_path, argparse.Namespace(**vars(dataset) | {"sh_degree": final.max_sh_degree}))
+    kept_pixels, file_pixels = scene.training_pixels()
+    left_out = LeftOut(
+        gaussians=len(trained),
+        unseen=trimmed.unseen,
+        keep_unseen=opt.keep_unseen,
+        max_sh_degree=trained.max_sh_degree,
+        sh_degree=final.max_sh_degree,
+        cut_bounds=trimmed.cut_bounds,
+        ply_bytes=trained.ply_bytes,
+        ply_bytes_saved=trained.ply_bytes - final.ply_bytes,
+        seconds=round(trimmed.seconds, 3),
+        picture_bytes=3 * kept_pixels,
+        picture_bytes_in_files=3 * file_pixels,
+        test_change={name: value for name, value in change.items() if math.isfinite(value)},
+    )
+    add_to_model_json(scene.model_path, left_out=dataclasses.asdict(left_out))
+    return left_out
 
 
 def _check_losses(values: dict[int, float], views: "_ViewOrder") -> None:

@@ -4,6 +4,7 @@ from arguments.groups import ModelParams, OptimizationParams, PipelineParams
 from arguments.param_group import OptionParser, ParamGroup
 from arguments.stored import (
     VERSION,
+    add_to_model_json,
     get_combined_args,
     read_cfg_args,
     read_model_json,
@@ -18,6 +19,7 @@ __all__ = [
     "OptionParser",
     "ParamGroup",
     "PipelineParams",
+    "add_to_model_json",
     "get_combined_args",
     "read_cfg_args",
     "read_model_json",

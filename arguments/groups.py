@@ -10,6 +10,10 @@ def _resolution(value: int) -> str | None:
     return None if value == -1 or value > 0 else "-1, 1, 2, 4, 8 or a width in pixels"
 
 
+def _tolerance(value: float) -> str | None:
+    return None if value == -1 or value >= 0 else "at least 0, or -1"
+
+
 class ModelParams(ParamGroup):
     """What is trained from what: data, output folder, SH degree. The `stored` ones make up `cfg_args`."""
 
@@ -241,6 +245,21 @@ class OptimizationParams(ParamGroup):
             "most Gaussians there may be, 0: no limit; at the limit those with the largest gradient are taken",
             "ours",
             check=at_least(0),
+        ),
+        Option(
+            "keep_unseen",
+            False,
+            "save also the Gaussians that no training view depends on; otherwise the last save leaves them out, which "
+            "changes no training view and may change others",
+            "ours",
+        ),
+        Option(
+            "prune_sh",
+            -1.0,
+            "cut, in the last save, the SH bands of highest degree that move no colour (0 to 1) by more than this; 0: "
+            "those that are zero, -1: none; --sh_degree in cfg_args follows",
+            "ours",
+            check=_tolerance,
         ),
         Option(
             "seed",

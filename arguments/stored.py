@@ -66,6 +66,15 @@ def write_model_json(
     for name, default in _REMEMBERED.items():
         if (value := getattr(args, name, default)) != default:
             record[name] = value
+    _write_record(model_path, record)
+
+
+def add_to_model_json(model_path: str | os.PathLike, **entries: Any) -> None:
+    """Add entries to `model.json`, or replace those of the same names."""
+    _write_record(model_path, read_model_json(model_path) | entries)
+
+
+def _write_record(model_path: str | os.PathLike, record: dict[str, Any]) -> None:
     with atomic_write(Path(model_path) / "model.json") as path:
         path.write_text(json.dumps(record, indent=1, sort_keys=True, allow_nan=False) + "\n", encoding="utf-8")
 

@@ -53,8 +53,15 @@ def describe(device: torch.device | str = "cpu") -> str:
     return f"{cpu_name()}, {torch.get_num_threads()} threads, {instruction_set()}, {python}, commit {commit()}"
 
 
-def print_table(header: list[str], rows: list[list[str]]) -> None:
-    """A Markdown table, padded so that it reads well in a terminal too."""
+def table(header: list[str], rows: list[list[str]]) -> list[str]:
+    """The lines of a Markdown table, padded so that it reads well in a terminal too."""
     widths = [max(len(row[i]) for row in [header, *rows]) for i in range(len(header))]
-    for row in [header, ["-" * width for width in widths], *rows]:
-        print("| " + " | ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)) + " |")
+    return [
+        "| " + " | ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)) + " |"
+        for row in [header, ["-" * width for width in widths], *rows]
+    ]
+
+
+def print_table(header: list[str], rows: list[list[str]]) -> None:
+    """Print what `table` gives."""
+    print("\n".join(table(header, rows)))

@@ -5,7 +5,7 @@ import math
 from functools import cache
 
 import torch
-from diff_gaussian_rasterization import GaussianRasterizationSettings, rasterize
+from diff_gaussian_rasterization import GaussianRasterizationSettings, decisive, rasterize
 from torch import Tensor
 
 from scene.cameras import Camera, MiniCam
@@ -67,6 +67,18 @@ def render(
 def _zero(device: torch.device, dtype: torch.dtype) -> Tensor:
     with torch.inference_mode(False):  # so that it can serve a training after a picture
         return torch.zeros((), device=device, dtype=dtype)
+
+
+@torch.no_grad()
+def seen(camera: Camera | MiniCam, pc: GaussianModel, pipe: argparse.Namespace) -> Tensor:
+    """(N,) bool: the Gaussians that the image of `render`, over any background, depends on (`decisive`)."""
+    background = pc.get_xyz.new_zeros(3)
+    return decisive(
+        pc.get_xyz,
+        settings=_settings(camera, pc.active_sh_degree, pipe, background, 1.0),
+        **_geometry(pc, pipe.compute_cov3D_python, 1.0),
+        **_colors(pc, pipe.convert_SHs_python, camera, None),
+    )
 
 
 def _settings(

@@ -112,11 +112,17 @@ class Scene:
         """Begin to make the pictures of the views ready that are used next, in that order (`images.ahead` of them)."""
         self.images.prefetch([picture for camera in cameras for picture in camera.pictures])
 
-    def save(self, iteration: int) -> None:
-        """Write the Gaussians as `point_cloud/iteration_N/point_cloud.ply`, and exposures where those are trained."""
-        self.gaussians.save_ply(str(self._ply(iteration)))
+    def save(self, iteration: int, gaussians: _Gaussians | None = None) -> None:
+        """Write the Gaussians, or those given in their place, as `point_cloud/iteration_N/point_cloud.ply`; exposures
+        where those are trained."""
+        (self.gaussians if gaussians is None else gaussians).save_ply(str(self._ply(iteration)))
         if self._halves:
             self.gaussians.save_exposures(self.model_path)
+
+    def training_pixels(self) -> tuple[int, int]:
+        """Pixels of all training views: as they train, and in their files."""
+        trained = sum(camera.image_width * camera.image_height for camera in self.getTrainCameras())
+        return trained, sum(width * height for width, height in (c.file_size for c in self._info.train_cameras))
 
     def write_inputs(self) -> None:
         """Write the cloud and the cameras into the model folder, `input.ply` and `cameras.json`."""

@@ -1,6 +1,7 @@
 """The trained model: raw tensors of N Gaussians, their optimiser, and adaptive density control."""
 
 import argparse
+import copy
 import os
 from collections.abc import Sequence
 from typing import Any
@@ -15,7 +16,7 @@ from scene import densification as adc
 from scene.exposure import Exposures, read_exposures
 from scene.gaussian_attributes import IN_CHECKPOINT, Rows, attributes
 from scene.gaussian_optimizer import GaussianAdam
-from scene.gaussian_ply import read_ply, write_ply
+from scene.gaussian_ply import read_ply, row_bytes, write_ply
 from scene.half_images import exposure_names
 from scene.sparse_adam import SparseGaussianAdam
 from utils.general_utils import build_scaling_rotation, get_expon_lr_func, strip_symmetric
@@ -159,6 +160,22 @@ class GaussianModel:
     def save_exposures(self, folder: str | os.PathLike) -> None:
         """Write the exposures into a model folder."""
         self.exposures.write(folder)
+
+    @property
+    def ply_bytes(self) -> int:
+        """Size of the PLY without its header."""
+        return len(self) * row_bytes(self.max_sh_degree)
+
+    def part(self, keep: Tensor | slice, sh_degree: int) -> "GaussianModel":
+        """A copy of the Gaussians `keep`, (N,) bool or a slice, with the SH bands up to sh_degree and no optimiser."""
+        rows = {name: values[keep] for name, values in self._rows().items()}
+        rows["f_rest"] = rows["f_rest"][:, : (sh_degree + 1) ** 2 - 1].contiguous()
+        other = copy.copy(self)
+        other.optimizer = None
+        other.max_sh_degree, other.active_sh_degree = sh_degree, min(sh_degree, self.active_sh_degree)
+        other._attributes = attributes(sh_degree)
+        other._set_rows(rows)
+        return other
 
     def _rows(self) -> Rows:
         return {name: getattr(self, attribute.field).detach() for name, attribute in self._attributes.items()}

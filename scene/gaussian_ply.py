@@ -35,6 +35,11 @@ def write_ply(path: str | os.PathLike, rows: Rows, sh_degree: int) -> None:
         matrix.tofile(file)
 
 
+def row_bytes(sh_degree: int) -> int:
+    """Bytes of one Gaussian."""
+    return 4 * (len(_NORMALS) + sum(len(attribute.columns) for attribute in attributes(sh_degree).values()))
+
+
 def read_ply(path: str | os.PathLike, sh_degree: int) -> Rows:
     """Read a Gaussian PLY of exactly this SH degree, ours or another tool's: any order, scalar type and encoding.
 

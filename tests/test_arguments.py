@@ -67,6 +67,8 @@ OURS = {
     "mask_meaning": "auto",
     "images_to_load": 0,
     "max_num_splats": 0,
+    "keep_unseen": False,
+    "prune_sh": -1.0,
     "seed": 0,
 }
 

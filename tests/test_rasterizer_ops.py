@@ -41,6 +41,7 @@ def test_opcheck_every_other_op(device):
     for inverse_depth, train in [(False, False), (True, True)]:
         _check(ops.blend, splats, instances, ranges, background, height, width, inverse_depth, train)
     image, transmittance, plane, last = ops.blend(splats, instances, ranges, background, height, width, True, True)
+    _check(ops.decisive, splats, instances, ranges, last)
     state = (splats, counts, instances, slots, ranges, offsets, background, last, transmittance)
     gradients = (torch.ones_like(image), torch.ones_like(transmittance), torch.ones_like(plane))
     _check(ops.blend_vjp, *state, *gradients)

@@ -39,7 +39,8 @@ class TrainingLog:
 
     A record has `iteration`, `seconds` (of training, without evaluation and saving; a resumed run adds to the seconds
     before), `wall_seconds` (since the start of the process, likewise), `gaussians`, `loss` (running mean), and per set
-    tested `<set>_l1`, `<set>_psnr`; the last record also what the curve has cost (`utils.curve_recorder`).
+    tested `<set>_l1`, `<set>_psnr`; the last record also `gaussians_left_out`, those of `gaussians` that the last save
+    does not have, and what the curve has cost (`utils.curve_recorder`).
 
     first_iteration, seconds_before, wall_seconds_before: what the runs have done that this one goes on from.
     """

@@ -141,6 +141,8 @@ struct ObserveInput {
   template <class T>                                                                                        \
   void blend_vjp(const Where&, const BlendInput<T>&, const BlendGradient<T>&);                              \
   template <class T>                                                                                        \
+  void mark_decisive(const Where&, const BlendInput<T>&, const int32_t* last, bool* decisive);              \
+  template <class T>                                                                                        \
   void adam(const Where&, const AdamInput<T>* tensors, int64_t count);                                      \
   /* Adam without bias correction on the rows that are visible, (rows); `step` is not read. */              \
   template <class T>                                                                                        \

@@ -1,6 +1,7 @@
 // The only file that sees torch: checks, allocates, dispatches on device and instruction set.
 #include <ATen/ops/empty.h>
 #include <ATen/ops/topk.h>
+#include <ATen/ops/zeros.h>
 #include <torch/library.h>
 
 #include <algorithm>
@@ -483,6 +484,18 @@ Tensor mark_visible_op(const Tensor& means, const Tensor& view) {
   return visible;
 }
 
+Tensor decisive_op(const Tensor& splats, const Tensor& instances, const Tensor& ranges, const Tensor& last) {
+  Tensor decisive = at::zeros({splats.size(0)}, splats.options().dtype(at::kBool));
+  const Tensor rows = splats.contiguous(), no_background = at::zeros({3}, splats.options());
+  const gs::Image image{int(last.size(1)), int(last.size(0))};
+  with_scalar(rows.scalar_type(), [&](auto zero) {
+    using T = decltype(zero);
+    RUN(T, rows, mark_decisive, blend_input<T>(rows, instances, ranges, no_background, image),
+        last.const_data_ptr<int32_t>(), decisive.mutable_data_ptr<bool>());
+  });
+  return decisive;
+}
+
 void check_moments(const Tensor& value, const Tensor& gradient, const Tensor& mean, const Tensor& square) {
   for (const Tensor* t : {&gradient, &mean, &square})
     TORCH_CHECK(t->sizes() == value.sizes() && t->scalar_type() == value.scalar_type() && t->device() == value.device(),
@@ -598,6 +611,7 @@ TORCH_LIBRARY(diff_gaussian_rasterization, m) {
         "Tensor ranges, Tensor slot_offsets, Tensor last)");
   m.def("rasterize_vjp(" SCENE_SCHEMA ", " BACKWARD_SCHEMA ", bool[9] wanted) -> " GRADIENTS_SCHEMA);
   m.def("mark_visible(Tensor means, Tensor view) -> Tensor");
+  m.def("decisive(Tensor splats, Tensor instances, Tensor ranges, Tensor last) -> Tensor");
   m.def(
       "adam_(Tensor(a!)[] values, Tensor[] gradients, Tensor(b!)[] means, Tensor(c!)[] squares, Tensor(d!)[] steps, "
       "float[] rates, float beta1, float beta2, float eps, int[] columns) -> ()");
@@ -619,6 +633,7 @@ TORCH_LIBRARY(diff_gaussian_rasterization, m) {
     m.impl("rasterize", &rasterize_op);                        \
     m.impl("rasterize_vjp", &rasterize_vjp_op);                \
     m.impl("mark_visible", &mark_visible_op);                  \
+    m.impl("decisive", &decisive_op);                          \
     m.impl("adam_", &adam_op);                                 \
     m.impl("sparse_adam_", &sparse_adam_op);                   \
     m.impl("observe_", &observe_op);                           \

@@ -5,9 +5,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from diff_gaussian_rasterization.ops import Rasterized, mark_visible, rasterize
+from diff_gaussian_rasterization.ops import Rasterized, decisive, mark_visible, rasterize
 
-__all__ = ["GaussianRasterizationSettings", "GaussianRasterizer", "Rasterized", "rasterize"]
+__all__ = ["GaussianRasterizationSettings", "GaussianRasterizer", "Rasterized", "decisive", "rasterize"]
 
 
 class GaussianRasterizationSettings(NamedTuple):

@@ -77,8 +77,50 @@ def rasterize(
         for name, t in tensors.items():
             if t is not None:
                 _check_finite(name, t)
-    out = (_Rasterize.apply if train else _ops.rasterize)(
-        means2d,
+    scene = _arguments(tensors, settings, raw)
+    out = (_Rasterize.apply if train else _ops.rasterize)(means2d, *scene, settings.bg, want_inverse_depth, train)
+    color, transmittance, inverse_depth, radii = out[:4]
+    if settings.debug:
+        _check_finite("the rendered image", color)
+        if train:
+            for name, t in [*tensors.items(), ("means2d", means2d)]:
+                if t is not None and t.requires_grad:
+                    t.register_hook(lambda g, name=name: _check_finite(f"the gradient of {name}", g))
+    return Rasterized(
+        color, radii, inverse_depth if want_inverse_depth else None, transmittance if want_transmittance else None
+    )
+
+
+@torch.no_grad()
+def decisive(
+    means: Tensor,
+    opacities: Tensor,
+    settings: "GaussianRasterizationSettings",
+    *,
+    scales: Tensor | None = None,
+    rotations: Tensor | None = None,
+    cov3d: Tensor | None = None,
+    sh_dc: Tensor | None = None,
+    sh_rest: Tensor | None = None,
+    colors: Tensor | None = None,
+    raw: bool = False,
+) -> Tensor:
+    """(N,) bool: the Gaussians that the image, as `rasterize` gives it for these arguments, depends on.
+
+    They are blended in a pixel or end one: where a Gaussian would leave less than 1e-4 of the transmittance, the pixel
+    takes neither it nor any behind it. Without the others the image is the same, bit for bit.
+    """
+    tensors = {"means": means, "opacities": opacities, "scales": scales, "rotations": rotations, "cov3d": cov3d}
+    tensors |= {"colors": colors, "sh_dc": sh_dc, "sh_rest": sh_rest}
+    _check(tensors, means, settings.sh_degree, raw)
+    out = _ops.rasterize(means, *_arguments(tensors, settings, raw), settings.bg, False, True)
+    _, _, _, _, splats, _, instances, _, ranges, _, last = out
+    return _ops.decisive(splats, instances, ranges, last)
+
+
+def _arguments(tensors: dict[str, Tensor | None], settings: "GaussianRasterizationSettings", raw: bool) -> tuple:
+    """What the operators take of Gaussians and camera, in the order of _SCENE."""
+    return (
         *tensors.values(),
         settings.viewmatrix,
         settings.projmatrix,
@@ -91,19 +133,6 @@ def rasterize(
         settings.scale_modifier,
         settings.antialiasing,
         raw,
-        settings.bg,
-        want_inverse_depth,
-        train,
-    )
-    color, transmittance, inverse_depth, radii = out[:4]
-    if settings.debug:
-        _check_finite("the rendered image", color)
-        if train:
-            for name, t in [*tensors.items(), ("means2d", means2d)]:
-                if t is not None and t.requires_grad:
-                    t.register_hook(lambda g, name=name: _check_finite(f"the gradient of {name}", g))
-    return Rasterized(
-        color, radii, inverse_depth if want_inverse_depth else None, transmittance if want_transmittance else None
     )
 
 
@@ -234,6 +263,11 @@ def _(means2d, *args):
 @torch.library.register_fake("diff_gaussian_rasterization::mark_visible")
 def _(means, view):
     return means.new_empty((means.shape[0],), dtype=torch.bool)
+
+
+@torch.library.register_fake("diff_gaussian_rasterization::decisive")
+def _(splats, *args):
+    return splats.new_empty((splats.shape[0],), dtype=torch.bool)
 
 
 @torch.library.register_fake("diff_gaussian_rasterization::adam_")

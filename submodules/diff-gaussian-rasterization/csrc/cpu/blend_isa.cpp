@@ -256,7 +256,61 @@ void blend_tile_vjp(const BlendInput<T>& in, const BlendGradient<T>& g, int64_t 
   }
 }
 
+// Marks what one strip takes of splats [0, count) of a chunk: `last` is what the strip's pixels blend, and the next
+// splat that reaches a pixel ends it. Returns false when all its pixels have ended.
+template <class T>
+bool mark_strip(const LocalSplat<T>* splats, const int32_t* instances, int64_t count, int64_t position, int row,
+                int first, const typename IntOf<T>::type* last_of_tile, T* threshold_of_tile, bool* decisive) {
+  using S = Simd<T>;
+  using V = typename S::Vec;
+  using M = typename S::Mask;
+  const int at = row * kTile + first;
+  const V x = lane_x<T>(first), never = V{} + std::numeric_limits<T>::infinity();
+  V threshold = S::load(threshold_of_tile + at);
+  M last;
+  std::memcpy(&last, last_of_tile + at, sizeof last);
+  bool open = S::any(threshold < never);
+  for (int64_t k = 0; open && k < count; ++k) {
+    const RowTerms<T> terms = row_terms(splats[k], T(row));
+    if (!(terms.top >= T(kLog2MinAlpha))) continue;
+    const M reached = row_exponent(terms, row_u(terms, x)) >= threshold;
+    if (!S::any(reached)) continue;
+    __atomic_store_n(decisive + instances[k], true, __ATOMIC_RELAXED);
+    threshold = reached & (last <= typename S::Int(position + k)) ? never : threshold;
+    open = S::any(threshold < never);
+  }
+  S::store(threshold_of_tile + at, threshold);
+  return open;
+}
+
+template <class T>
+void mark_tile(const BlendInput<T>& in, const int32_t* last_plane, int64_t index, bool* decisive) {
+  const Tile tile(index, in.image);
+  const int64_t begin = in.ranges[index], end = in.ranges[index + 1];
+  alignas(64) T threshold[kPixels];
+  alignas(64) typename IntOf<T>::type last[kPixels] = {};
+  read_tile(last_plane, in.image, tile, last);
+  for (int p = 0; p < kPixels; ++p)
+    threshold[p] = p % kTile < tile.columns ? T(kLog2MinAlpha) : std::numeric_limits<T>::infinity();
+  LocalSplat<T> local[kChunk];
+  bool open = true;
+  for (int64_t from = begin; open && from < end; from += kChunk) {
+    const int64_t to = std::min(from + kChunk, end);
+    gather(in, tile, from, to, local);
+    open = false;
+    for (int row = 0; row < tile.rows; ++row)
+      for (int first = 0; first < kTile; first += Simd<T>::kLanes)
+        open |= mark_strip(local, in.instances + from, to - from, from - begin, row, first, last, threshold, decisive);
+  }
+}
+
 }  // namespace
+
+template <class T>
+void mark_decisive(const Executor& executor, const BlendInput<T>& in, const int32_t* last, bool* decisive) {
+  const int64_t tiles = int64_t(tile_count(in.image.width)) * tile_count(in.image.height);
+  for_dynamic(executor, tiles, 1, [&](int64_t tile, int64_t) { mark_tile(in, last, tile, decisive); });
+}
 
 template <class T>
 void blend(const Executor& executor, const BlendInput<T>& in, const Blended<T>& out) {
@@ -296,9 +350,10 @@ void blend_vjp(const Executor& executor, const BlendInput<T>& in, const BlendGra
   });
 }
 
-#define GS_INSTANTIATE(T)                                                           \
-  template void blend<T>(const Executor&, const BlendInput<T>&, const Blended<T>&); \
-  template void blend_vjp<T>(const Executor&, const BlendInput<T>&, const BlendGradient<T>&);
+#define GS_INSTANTIATE(T)                                                                     \
+  template void blend<T>(const Executor&, const BlendInput<T>&, const Blended<T>&);           \
+  template void blend_vjp<T>(const Executor&, const BlendInput<T>&, const BlendGradient<T>&); \
+  template void mark_decisive<T>(const Executor&, const BlendInput<T>&, const int32_t* last, bool* decisive);
 GS_INSTANTIATE(float)
 GS_INSTANTIATE(double)
 

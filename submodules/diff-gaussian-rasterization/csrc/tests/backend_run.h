@@ -35,6 +35,7 @@ template <class T>
 struct Result {
   std::vector<T> color, transmittance, depth, gradient;
   std::vector<int32_t> radii, tile_counts;
+  std::vector<uint8_t> decisive;
   int64_t instances;
 };
 
@@ -44,6 +45,7 @@ struct Result {
 template <class T, class Where>
 Result<T> run(const Where& where, Parameters<T>& p, gs::Image image, bool antialiasing, bool records = false) {
   using gs::cuda::bin, gs::cuda::blend, gs::cuda::blend_vjp, gs::cuda::project, gs::cuda::project_vjp;
+  using gs::cuda::mark_decisive, gs::GS_ISA::mark_decisive;
   using gs::GS_ISA::bin, gs::GS_ISA::blend, gs::GS_ISA::blend_vjp, gs::GS_ISA::project, gs::GS_ISA::project_vjp;
   const T view[16] = {1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1};
   const T full[16] = {T(1 / 0.6), 0, 0, 0, 0, T(1 / 0.6), 0, 0, 0, 0, 1, 1, 0, 0, T(-0.01), 0};
@@ -85,6 +87,10 @@ Result<T> run(const Where& where, Parameters<T>& p, gs::Image image, bool antial
   out.color.resize(3 * pixels), out.transmittance.resize(pixels), out.depth.resize(pixels);
   const gs::BlendInput<T> input = {splats.data(), instances.data(), ranges.data(), background, image};
   blend(where, input, gs::Blended<T>{out.color.data(), out.transmittance.data(), out.depth.data(), last.data()});
+
+  static_assert(sizeof(bool) == 1);
+  out.decisive.resize(n);
+  mark_decisive(where, input, last.data(), reinterpret_cast<bool*>(out.decisive.data()));
 
   const std::vector<T> ones(3 * pixels, T(1));
   std::vector<T> moments(kGradientValues * n);

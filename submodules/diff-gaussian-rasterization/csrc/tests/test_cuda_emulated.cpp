@@ -36,7 +36,7 @@ void test_against_cpu() {
           for (int k = 0; k < 3; ++k) p.scales[3 * 17 + k] = 1;
         const Result<float> cpu = run(gs::serial_executor(), p, image, antialiasing);
         const Result<float> got = run_emulated(p, image, antialiasing, true, Order::forward);
-        CHECK(got.radii == cpu.radii && got.tile_counts == cpu.tile_counts);
+        CHECK(got.radii == cpu.radii && got.tile_counts == cpu.tile_counts && got.decisive == cpu.decisive);
         // exp2 and the order of sums differ; a pixel's 300 blends add some 1e-7 each.
         check_near(got.color, cpu.color, 2e-5), check_near(got.transmittance, cpu.transmittance, 2e-5);
         check_near(got.depth, cpu.depth, 2e-5);
@@ -44,7 +44,7 @@ void test_against_cpu() {
         for (const Order order : {Order::backward, Order::shuffled}) {
           const Result<float> again = run_emulated(p, image, antialiasing, order == Order::backward, order);
           CHECK(again.color == got.color && again.transmittance == got.transmittance && again.depth == got.depth);
-          CHECK(again.gradient == got.gradient);
+          CHECK(again.gradient == got.gradient && again.decisive == got.decisive);
         }
       }
 }

@@ -1,0 +1,73 @@
+"""What a finished model does not need: Gaussians that no training view depends on, SH bands below a tolerance."""
+
+import argparse
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from tqdm import tqdm
+
+from gaussian_renderer import seen
+from scene.cameras import Camera
+from scene.gaussian_model import GaussianModel
+from scene.sh_bands import cut_bounds, needed_degree
+from utils.view_scores import mean_scores
+
+
+@dataclass
+class Trimmed:
+    """A model without what it does not need, and what that was."""
+
+    gaussians: GaussianModel
+    unseen: int  # Gaussians left out
+    cut_bounds: list[float]  # by degree: what cutting all SH bands above it may change in a colour, at most
+    seconds: float  # that finding it took
+
+
+def seen_by(cameras: Sequence[Camera], gaussians: GaussianModel, pipe: argparse.Namespace) -> Tensor:
+    """(N,) bool: the Gaussians that the image of any of the cameras, at its size, depends on; all where none is."""
+    found = torch.zeros(len(gaussians), dtype=torch.bool, device=gaussians.get_xyz.device)
+    for camera in tqdm(cameras, desc="Looking for unseen Gaussians", unit="view", leave=False):
+        found |= seen(camera, gaussians, pipe)
+    return found if found.any() else ~found  # a model of no Gaussians helps nobody
+
+
+def trim(
+    gaussians: GaussianModel, cameras: Sequence[Camera], pipe: argparse.Namespace, keep_unseen: bool, prune_sh: float
+) -> Trimmed:
+    """Leave out what the training views `cameras` do not need; `gaussians` itself stays as it is.
+
+    keep_unseen: leave no Gaussian out. prune_sh: how far a colour (in [0, 1]) may move when SH bands are cut, -1: cut
+    none. Without cut bands the renders of `cameras` are the same, bit for bit.
+    """
+    start = time.perf_counter()
+    keep = None if keep_unseen else seen_by(cameras, gaussians, pipe)
+    unseen = 0 if keep is None else int((~keep).sum())
+    rest = gaussians.get_features_rest.detach()
+    bounds = cut_bounds(rest[keep] if unseen else rest)
+    degree = gaussians.max_sh_degree if prune_sh < 0 else needed_degree(bounds, prune_sh)
+    if unseen or degree < gaussians.max_sh_degree:
+        gaussians = gaussians.part(keep if unseen else slice(None), degree)
+    return Trimmed(gaussians, unseen, bounds, time.perf_counter() - start)
+
+
+@torch.no_grad()
+def change_on_views(
+    before: GaussianModel,
+    after: GaussianModel,
+    cameras: Sequence[Camera],
+    image: Callable[[Camera, GaussianModel], Tensor],
+    truth: Callable[[Camera], tuple[Tensor, Tensor | None]] | None,
+) -> dict[str, float]:
+    """How the images (3, H, W) of two models differ: `largest`, of a value in [0, 1].
+
+    truth: target and mask of a view as `mean_scores` takes them; where given, also `psnr_before` and `psnr_after`, dB.
+    """
+    change = {"largest": max(float((image(c, before) - image(c, after)).abs().max()) for c in cameras)}
+    if truth is not None:
+        for name, model in (("psnr_before", before), ("psnr_after", after)):
+            scores = mean_scores((image(c, model), *truth(c)) for c in cameras)
+            change |= {name: scores["psnr"]} if scores else {}
+    return change

@@ -1,0 +1,32 @@
+"""How much of a model's colour lies in which spherical-harmonics bands."""
+
+import math
+
+import torch
+from torch import Tensor
+
+
+def cut_bounds(f_rest: Tensor) -> list[float]:
+    """By degree d = 0..D: how far a colour moves at most, in any direction, when all bands above d are cut.
+
+    f_rest: (N, (D+1)^2 - 1, 3). The largest over Gaussians and channels of
+    sum over l > d of |c_l| sqrt((2l+1) / 4 pi), c_l the coefficients of band l: Cauchy-Schwarz, and Unsoeld's theorem
+    for the length of the basis functions of a band, which is the same in every direction. It holds for images too: a
+    pixel's weights sum to at most 1, and clamping moves nothing apart.
+    """
+    degree = math.isqrt(f_rest.shape[1] + 1) - 1
+    if not len(f_rest):
+        return [0.0] * (degree + 1)
+    total = f_rest.new_zeros(len(f_rest), 3, dtype=torch.float64)
+    bounds = [0.0]
+    for band in range(degree, 0, -1):
+        coefficients = f_rest[:, band**2 - 1 : (band + 1) ** 2 - 1]
+        length = torch.linalg.vector_norm(coefficients, dim=1, dtype=torch.float64)
+        total += length * math.sqrt((2 * band + 1) / (4 * math.pi))
+        bounds.append(float(total.max()))
+    return bounds[::-1]
+
+
+def needed_degree(bounds: list[float], tolerance: float) -> int:
+    """The lowest degree that `cut_bounds` gives no more than `tolerance`."""
+    return next(degree for degree, bound in enumerate(bounds) if bound <= tolerance)

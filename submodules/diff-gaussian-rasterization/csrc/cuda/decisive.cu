@@ -1,0 +1,46 @@
+// A thread per pixel: all threads of a tile read the same splat at the same time, so it comes from the cache. Once at
+// the end of a training, so simple before fast.
+#include <cuda_runtime.h>
+
+#include "../launch.h"
+#include "../math/blend.h"
+#include "../math/tiles.h"
+#include "gs/cuda_check.h"
+
+namespace gs {
+namespace cuda {
+
+using namespace baseline;
+
+namespace {
+
+__global__ void __launch_bounds__(kTile* kTile)
+    decisive_kernel(BlendInput<float> in, const int32_t* last, bool* decisive) {
+  const int across = tile_count(in.image.width), tile = blockIdx.x;
+  const int left = tile % across * kTile, top = tile / across * kTile;
+  const int column = threadIdx.x % kTile, row = threadIdx.x / kTile;
+  if (left + column >= in.image.width || top + row >= in.image.height) return;
+  const int64_t begin = in.ranges[tile], end = in.ranges[tile + 1];
+  const int64_t blended = begin + last[int64_t(top + row) * in.image.width + left + column];
+  for (int64_t k = begin; k < end; ++k) {
+    const int32_t index = in.instances[k];
+    const float* from = in.splats + kSplatValues * int64_t(index);
+    const Splat<float> splat = {from[0], from[1], from[2], from[3], from[4], from[5], 0, 0, 0, 0};
+    const RowTerms<float> terms = row_terms(localise(splat, float(left), float(top)), float(row));
+    if (!(row_exponent(terms, row_u(terms, float(column))) >= float(kLog2MinAlpha))) continue;
+    decisive[index] = true;  // by many threads, all the same
+    if (k >= blended) return;
+  }
+}
+
+}  // namespace
+
+template <>
+void mark_decisive<float>(const Queue& queue, const BlendInput<float>& in, const int32_t* last, bool* decisive) {
+  const int64_t tiles = int64_t(tile_count(in.image.width)) * tile_count(in.image.height);
+  decisive_kernel<<<unsigned(tiles), kTile * kTile, 0, static_cast<cudaStream_t>(queue.stream)>>>(in, last, decisive);
+  check_launch("decisive");
+}
+
+}  // namespace cuda
+}  // namespace gs
