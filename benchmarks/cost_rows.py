@@ -43,6 +43,7 @@ class Workload:
 
     def __init__(self, splats: int, width: int, height: int, sigma: float, device: torch.device) -> None:
         self.device = device
+        self._zero = torch.zeros((), device=device)
         scene = frustum(splats, width, height, sigma).to(device)
         names = ("xyz", "opacity", "scaling", "rotation", "f_dc", "f_rest")
         self._rows = dict(zip(names, scene.parameters.values(), strict=True))
@@ -76,7 +77,8 @@ class Workload:
 
     def bare_image(self, model: GaussianModel) -> Tensor:
         """The same image by the rasterizer alone, without anything that `render` adds."""
-        means2d = torch.zeros_like(model._xyz, requires_grad=torch.is_grad_enabled())
+        means2d = self._zero.expand_as(model._xyz)
+        means2d.requires_grad_(torch.is_grad_enabled())
         out = rasterize(
             model._xyz,
             means2d,
