@@ -93,7 +93,9 @@ def training(
         capture = None  # so that densification can free what it replaces
     views = _ViewOrder(scene.getTrainCameras(), opt.seed)
     # After all that bad input can stop, or a slip of the keyboard would overwrite the files of a finished model.
-    tb_writer = prepare_output_and_logger(dataset, antialiasing=pipe.antialiasing, seed=opt.seed)
+    tb_writer = prepare_output_and_logger(
+        dataset, antialiasing=pipe.antialiasing, seed=opt.seed, world_offset=gaussians.world_offset
+    )
     if not checkpoint or not (Path(scene.model_path) / "cameras.json").exists():
         scene.write_inputs()
 
@@ -365,7 +367,8 @@ def _control_density(
         if len(gaussians) == 0:
             raise UserError(
                 f"no Gaussian was left after the densification of iteration {iteration}: the views do not agree "
-                "with the points; check the scene, or raise --opacity_reset_interval"
+                "with the points, or show nothing but the background; check the scene, or raise "
+                "--opacity_reset_interval"
             )
     if todo.reset_opacity:
         gaussians.reset_opacity()
@@ -386,7 +389,9 @@ def _new_output_folder() -> str:
     return os.path.join("./output/", name[:10])
 
 
-def prepare_output_and_logger(args: argparse.Namespace, *, antialiasing: bool, seed: int) -> Any | None:
+def prepare_output_and_logger(
+    args: argparse.Namespace, *, antialiasing: bool, seed: int, world_offset: Sequence[float] = (0.0, 0.0, 0.0)
+) -> Any | None:
     """Make the output folder, args.model_path, with cfg_args and model.json.
 
     Returns a TensorBoard writer, or None where TensorBoard is not installed.
@@ -394,7 +399,7 @@ def prepare_output_and_logger(args: argparse.Namespace, *, antialiasing: bool, s
     print(f"Output folder: {args.model_path}")
     mkdir_p(args.model_path)
     write_cfg_args(args.model_path, args)
-    write_model_json(args.model_path, args, antialiasing=antialiasing, seed=seed)
+    write_model_json(args.model_path, args, antialiasing=antialiasing, seed=seed, world_offset=world_offset)
     if SummaryWriter is None:
         print("TensorBoard is not installed: no event file")
         return None

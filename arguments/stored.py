@@ -4,6 +4,7 @@ import argparse
 import ast
 import json
 import os
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ from arguments.param_group import Value
 from utils.system_utils import UserError, atomic_write
 
 VERSION = "0.1.0"
+OFFSET = "world_offset"
 
 _STORED = {option.name: option.default for option in ModelParams.options if option.stored}
 _REMEMBERED = {option.name: option.default for option in ModelParams.options if option.remembered}
@@ -59,13 +61,23 @@ def read_cfg_args(model_path: str | os.PathLike) -> dict[str, Value]:
 
 
 def write_model_json(
-    model_path: str | os.PathLike, args: argparse.Namespace | None = None, *, antialiasing: bool, seed: int
+    model_path: str | os.PathLike,
+    args: argparse.Namespace | None = None,
+    *,
+    antialiasing: bool,
+    seed: int,
+    world_offset: Sequence[float] = (0.0, 0.0, 0.0),
 ) -> None:
-    """Write `model.json`: what cfg_args can't hold, keys sorted. args: model options, of which what differs is kept."""
+    """Write `model.json`: what cfg_args can't hold, keys sorted. args: model options, of which what differs is kept.
+
+    world_offset: world coordinates of the origin of the model's frame (scene/world_offset.py); kept unless zero.
+    """
     record = {"antialiasing": antialiasing, "seed": seed, "version": VERSION}
     for name, default in _REMEMBERED.items():
         if (value := getattr(args, name, default)) != default:
             record[name] = value
+    if any(world_offset):
+        record[OFFSET] = list(world_offset)
     _write_record(model_path, record)
 
 
@@ -93,7 +105,14 @@ def read_model_json(model_path: str | os.PathLike) -> dict[str, Any]:
     for name, default in _REMEMBERED.items():
         if type(record.get(name, default)) is not type(default):
             raise UserError(f"{path}: {name} must be {type(default).__name__}, got {record[name]!r}; restore the file")
+    offset = record.get(OFFSET, [0, 0, 0])
+    if not isinstance(offset, list) or len(offset) != 3 or not all(_is_finite(value) for value in offset):
+        raise UserError(f"{path}: {OFFSET} must be three numbers, got {offset!r:.40}; restore the file")
     return record
+
+
+def _is_finite(value: Any) -> bool:
+    return type(value) in (int, float) and abs(value) <= sys.float_info.max
 
 
 def get_combined_args(parser: argparse.ArgumentParser, argv: Sequence[str] | None = None) -> argparse.Namespace:

@@ -10,6 +10,7 @@ import numpy as np
 
 from diagnosis.lines import Line, from_error, some
 from scene.dataset_readers import CameraInfo, SceneInfo, read_scene
+from scene.scene_info import APART, standing_apart
 from utils.system_utils import UserError
 
 # Learning rates and size limits are fractions of the extent, but depths below 0.2 are culled and float32 is used.
@@ -17,7 +18,6 @@ EXTENT = (0.1, 100.0)
 FEWEST_VIEWS = 20
 FEWEST_POINTS = 1000
 REGISTERED = 0.9  # share of the photos
-FAR_CAMERA = 10.0  # times the median distance of cameras from their median
 FAR_POINT = 100.0  # extents from the cameras; a sky is some tens away
 FAR_SHARE = 0.01
 OPENING = (10.0, 150.0)  # degrees; outside, the focal length is doubtful
@@ -77,14 +77,12 @@ def check_extent(info: SceneInfo) -> list[Line]:
                 f"scale cameras and points by {factor:g}; depths below 0.2 are never drawn",
             )
         )
-    distances = np.linalg.norm(centers - np.median(centers, axis=0), axis=1)
-    usual = float(np.median(distances))
-    far = [c.image_name for c, d in zip(info.train_cameras, distances, strict=True) if d > FAR_CAMERA * usual > 0]
+    far = [c.image_name for c, apart in zip(info.train_cameras, standing_apart(centers), strict=True) if apart]
     if far:
         lines.append(
             Line(
-                f"{len(far)} cameras are more than {FAR_CAMERA:g} times as far out as usual ({some(far)})",
-                "remove them from the model, their poses are likely wrong; they inflate the extent",
+                f"{len(far)} cameras are more than {APART:g} times as far out as usual ({some(far)})",
+                "remove them from the model, their poses are likely wrong; the extent is without them",
             )
         )
     return lines

@@ -12,6 +12,7 @@ from typing import Protocol
 import numpy as np
 import torch
 
+from arguments.stored import OFFSET, read_model_json
 from scene.cameras import Camera, camera_to_JSON, cameraList_from_camInfos
 from scene.dataset_readers import CameraInfo, read_scene
 from scene.depth_maps import with_depth_maps
@@ -19,11 +20,14 @@ from scene.half_images import mark_halves, train_on_all
 from scene.image_store import ImageStore, Picture
 from scene.masks import MaskOptions
 from scene.point_cloud import write_point_cloud
+from scene.training_checks import check_before_training
 from utils.graphics_utils import BasicPointCloud
 from utils.system_utils import UserError, atomic_write, compute_device, saved_iterations, searchForMaxIteration
 
 
 class _Gaussians(Protocol):
+    world_offset: tuple[float, float, float]
+
     def create_from_pcd(
         self, pcd: BasicPointCloud, cam_infos: Sequence[CameraInfo], spatial_lr_scale: float
     ) -> None: ...
@@ -70,6 +74,7 @@ class Scene:
             want_cloud=self.loaded_iter is None,
             init_type=args.init_type,
             masks=MaskOptions(args.masks, args.invert_masks, args.mask_meaning),
+            offset=None if self.loaded_iter is None else read_model_json(self.model_path).get(OFFSET, (0, 0, 0)),
         )
         self._halves = args.train_test_exp
         if self._halves:
@@ -90,7 +95,9 @@ class Scene:
             for scale in resolution_scales:
                 mark_halves(self._train[scale], self._test[scale], info.train_cameras)
 
+        gaussians.world_offset = tuple(info.offset.tolist())
         if self.loaded_iter is None:
+            check_before_training(info)
             gaussians.create_from_pcd(info.point_cloud, info.train_cameras, self.cameras_extent)
             if write:
                 self.write_inputs()
@@ -127,7 +134,7 @@ class Scene:
     def write_inputs(self) -> None:
         """Write the cloud and the cameras into the model folder, `input.ply` and `cameras.json`."""
         folder, info = Path(self.model_path), self._info
-        if info.ply_path:
+        if info.ply_path and not info.offset.any():
             with atomic_write(folder / "input.ply") as path:
                 shutil.copyfile(info.ply_path, path)
         else:

@@ -38,6 +38,7 @@ def load_checkpoint(path: str | os.PathLike, device: torch.device | str = "cpu")
     """Read (capture, iteration), ours or the reference's. UserError, one sentence, for anything else."""
     _refuse_other_kinds(path)
     try:
+        _refuse_other_formats(path)
         with torch.serialization.safe_globals(_ALLOWED):
             content = torch.load(path, map_location=device, weights_only=True)
     except Exception as error:  # a damaged file can end in any exception of the unpickler
@@ -51,6 +52,13 @@ def load_checkpoint(path: str | os.PathLike, device: torch.device | str = "cpu")
         raise UserError(
             f"{path} is not a checkpoint of train.py: its parts do not fit ({error}); give a chkpntN.pth"
         ) from error
+
+
+def _refuse_other_formats(path: str | os.PathLike) -> None:
+    """ValueError for the formats before torch 1.6, whose reader believes any number of bytes that a file names."""
+    with open(path, "rb") as file:
+        if file.read(4) != b"PK\x03\x04":
+            raise ValueError("no zip archive")
 
 
 def _checked(content: Any) -> tuple[tuple, int]:

@@ -56,9 +56,9 @@ def _own_cloud(model_folder: Path, model: colmap_loader.ColmapModel) -> StartClo
     ply_path = _fresh_ply(model_folder)
     if ply_path:
         return StartCloud(read_point_cloud(ply_path), ply_path)
-    points = model.points.astype(np.float32)
-    check_finite(points, colmap_loader.points_file(model_folder))
-    return StartCloud(BasicPointCloud(points, model.colors.astype(np.float32) / 255, np.zeros_like(points)), None)
+    check_finite(model.points, colmap_loader.points_file(model_folder))
+    colors = model.colors.astype(np.float32) / 255
+    return StartCloud(BasicPointCloud(model.points, colors, np.zeros_like(colors)), None)
 
 
 def _fresh_ply(model_folder: Path) -> Path | None:

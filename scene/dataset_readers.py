@@ -1,8 +1,10 @@
 """Readers of datasets: folders to plain records, whichever kind they are."""
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
+
+import numpy as np
 
 from scene.colmap_reader import readColmapSceneInfo
 from scene.masks import NO_MASKS, MaskOptions
@@ -10,6 +12,7 @@ from scene.picture_files import some
 from scene.scene_info import HOLD, CameraInfo, SceneInfo, scene_extent
 from scene.start_cloud import SFM, StartOptions
 from scene.transforms_reader import readNerfstudioInfo, readNerfSyntheticInfo
+from scene.world_offset import local, world_offset
 from utils.system_utils import UserError
 
 __all__ = [
@@ -39,12 +42,14 @@ def read_scene(
     want_cloud: bool = True,
     init_type: str = SFM,
     masks: MaskOptions = NO_MASKS,
+    offset: Sequence[float] | None = None,
 ) -> SceneInfo:
     """Read the dataset in a folder, whichever kind it is. UserError says what was looked for and what was found.
 
     images: folder of the pictures (COLMAP only). hold_out: keep a test set apart, else everything trains.
     init_pcd_path: file of points to start from instead of the dataset's own; else init_type, "sfm" (those) or "random".
     want_cloud: without, points are not judged, for a model that is there already.
+    offset: (3,) of the frame of that model (scene/world_offset.py); None: found for this scene.
     Pictures of distorting lenses are undistorted into the user's cache folder; nothing else is written.
     """
     folder = Path(source_path)
@@ -66,4 +71,5 @@ def read_scene(
             "them"
         )
     start = StartOptions(init_pcd_path, init_type) if want_cloud else None
-    return sceneLoadTypeCallbacks[kind](folder, images, hold_out, start, masks)
+    info = sceneLoadTypeCallbacks[kind](folder, images, hold_out, start, masks)
+    return local(info, world_offset(info) if offset is None else np.asarray(offset, dtype=np.float64))

@@ -3,6 +3,7 @@
 import argparse
 import copy
 import os
+import sys
 from collections.abc import Sequence
 from typing import Any
 
@@ -30,6 +31,8 @@ INITIAL_OPACITY = 0.1
 MIN_DISTANCE2 = 1e-7  # floor of the squared distance to the neighbours, square world units: duplicates get a size
 _OPTIMIZERS = {"default": GaussianAdam, "sparse_adam": SparseGaussianAdam}
 LONE_POINT_SCALE = 0.01  # initial scale as a part of the extent where there are too few points to have neighbours
+OUTLIER_SCALE = 100.0  # extents: an initial scale above is that of a stray point; real scenes have up to 20 or so
+LARGEST_OUTLIER = 0.1  # of the extent: what such a point gets, as large as density control lets a Gaussian be
 
 
 class GaussianModel:
@@ -38,7 +41,8 @@ class GaussianModel:
     `_xyz` (N,3) world; `_features_dc` (N,1,3), `_features_rest` (N,K,3), K = (D+1)^2 - 1; `_scaling` (N,3) log;
     `_rotation` (N,4) wxyz, any length; `_opacity` (N,1) logit. Statistics since the last densification:
     `xyz_gradient_accum` (N,1), `denom` (N,1), `max_radii2D` (N). `exposures`: of the training pictures, identities
-    unless trained. optimizer_type: "default" or "sparse_adam", whose step takes a mask of the visible Gaussians.
+    unless trained. world_offset: where the scene has the origin (scene/world_offset.py), kept in the PLY.
+    optimizer_type: "default" or "sparse_adam", whose step takes a mask of the visible Gaussians.
     """
 
     def __init__(self, sh_degree: int, optimizer_type: str = "default") -> None:
@@ -50,6 +54,7 @@ class GaussianModel:
         self.optimizer: GaussianAdam | None = None
         self.percent_dense = 0.0
         self.spatial_lr_scale = 0.0
+        self.world_offset = (0.0, 0.0, 0.0)
         self.exposures = Exposures()
         self._attributes = attributes(sh_degree)
         self._set_rows({name: torch.empty(0, *attribute.shape) for name, attribute in self._attributes.items()})
@@ -126,6 +131,7 @@ class GaussianModel:
             scale = np.full(count, LONE_POINT_SCALE * max(spatial_lr_scale, 1e-3), dtype=np.float32)
         else:
             scale = np.sqrt(np.maximum(distCUDA2(torch.from_numpy(points)).numpy(), np.float32(MIN_DISTANCE2)))
+            scale = _without_outliers(scale, spatial_lr_scale)
         # NumPy's log: one thread, so the same bits for any number of torch's threads.
         log_scale = torch.from_numpy(np.log(scale))
         colors = torch.from_numpy(np.asarray(pcd.colors, dtype=np.float32))
@@ -151,7 +157,7 @@ class GaussianModel:
 
     def save_ply(self, path: str | os.PathLike) -> None:
         """Write the raw parameters as a PLY in the reference's layout."""
-        write_ply(path, self._rows(), self.max_sh_degree)
+        write_ply(path, self._rows(), self.max_sh_degree, self.world_offset)
 
     def load_exposures(self, folder: str | os.PathLike, cam_infos: Sequence) -> None:
         """Take the exposures of the training cameras from a model folder."""
@@ -447,6 +453,19 @@ class GaussianModel:
         """Bring every opacity down to at most 0.01; its Adam moments start again from zero."""
         lowered = self._opacity.detach().clamp_max(adc.logit(adc.RESET_OPACITY))
         self._opacity = self.optimizer.reset("opacity", lowered)
+
+
+def _without_outliers(scale: np.ndarray, extent: float) -> np.ndarray:
+    """Initial scales (N,), where those of points far from all others, which would cover every picture, are lowered."""
+    stray = scale > OUTLIER_SCALE * extent
+    if extent <= 0 or not stray.any():
+        return scale
+    print(
+        f"{stray.sum()} of {len(scale)} points are more than {OUTLIER_SCALE:g} times the scene's extent from their "
+        f"neighbours; their Gaussians begin with a tenth of the extent, {LARGEST_OUTLIER * extent:.3g}",
+        file=sys.stderr,
+    )
+    return np.where(stray, np.float32(LARGEST_OUTLIER * extent), scale)
 
 
 def check_finite(rows: Rows, where: str, remedy: str) -> None:

@@ -1,7 +1,7 @@
 """point_cloud.ply: the trained model as other tools read it, with the columns and order of the reference."""
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 import torch
@@ -14,8 +14,13 @@ from utils.system_utils import UserError, atomic_write
 _NORMALS = ["nx", "ny", "nz"]  # all zero, after the positions: the reference's files have them
 
 
-def write_ply(path: str | os.PathLike, rows: Rows, sh_degree: int) -> None:
-    """Write a binary little-endian PLY, float32, SH bands channel by channel; the whole file or none."""
+def write_ply(
+    path: str | os.PathLike, rows: Rows, sh_degree: int, world_offset: Sequence[float] = (0.0, 0.0, 0.0)
+) -> None:
+    """Write a binary little-endian PLY, float32, SH bands channel by channel; the whole file or none.
+
+    world_offset: world coordinates of the origin; goes into a comment unless it is zero.
+    """
     count = len(rows["xyz"])
     parts = [(attribute.columns, rows[name]) for name, attribute in attributes(sh_degree).items()]
     parts.insert(1, (_NORMALS, torch.zeros(count, 3)))
@@ -28,7 +33,7 @@ def write_ply(path: str | os.PathLike, rows: Rows, sh_degree: int) -> None:
         stop = start + len(columns)
         matrix[:, start:stop] = values.reshape(count, len(columns)).cpu().numpy()
         start = stop
-    header = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]
+    header = ["ply", "format binary_little_endian 1.0", *_comments(world_offset), f"element vertex {count}"]
     header += [f"property float {name}" for name in names]
     with atomic_write(path) as temporary, open(temporary, "wb") as file:
         file.write("\n".join([*header, "end_header\n"]).encode("ascii"))
@@ -40,12 +45,16 @@ def row_bytes(sh_degree: int) -> int:
     return 4 * (len(_NORMALS) + sum(len(attribute.columns) for attribute in attributes(sh_degree).values()))
 
 
+def _comments(world_offset: Sequence[float]) -> list[str]:
+    return [f"comment world_offset {' '.join(map(repr, world_offset))}"] if any(world_offset) else []
+
+
 def read_ply(path: str | os.PathLike, sh_degree: int) -> Rows:
     """Read a Gaussian PLY of exactly this SH degree, ours or another tool's: any order, scalar type and encoding.
 
     UserError when the file can't be had or read, lacks properties (names them), or has another degree.
     """
-    vertices = _read_vertices(path)
+    vertices = read_vertices(path)
     present = set(vertices.dtype.names or ())
     table = attributes(sh_degree)
     wanted = table["f_rest"].columns
@@ -73,7 +82,7 @@ def read_ply(path: str | os.PathLike, sh_degree: int) -> Rows:
     return rows
 
 
-def _read_vertices(path: str | os.PathLike) -> np.ndarray:
+def read_vertices(path: str | os.PathLike) -> np.ndarray:
     """The structured array of the element `vertex`."""
     if not os.path.isfile(path):
         raise UserError(f"no file {path}; give the point_cloud.ply of a trained model")

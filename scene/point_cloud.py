@@ -1,5 +1,6 @@
 """Coloured point clouds from files: PLY, text and npz. `input.ply`, a scene's own points, `--init_pcd_path`."""
 
+import os
 import warnings
 import zipfile
 from pathlib import Path
@@ -21,14 +22,14 @@ def is_ply(path: Path) -> bool:
 
 
 def read_point_cloud(path: Path) -> BasicPointCloud:
-    """Points with colours and normals (0 where not given) of a file whose content tells its kind.
+    """Points (float64) with colours and normals (0 where not given) of a file whose content tells its kind.
 
     PLY: x y z red green blue, integers as fractions of their type's maximum. npz: `points` or `xyz` (N,3), `colors` or
     `rgb` (N,3). Text: three or six numbers a line, x y z and red green blue, split by spaces or commas. Colours of the
     last two go to 1, or to 255 when any is above 1; without any the points are grey.
     UserError for a file that is missing, none of these, or holds points that are not finite.
     """
-    if not path.is_file():
+    if not os.path.isfile(path):  # not Path's, for which a name that is too long is an error
         raise UserError(f"no point cloud {path}; give the path of a PLY, npz or text file of points")
     if is_ply(path) or path.suffix.lower() == ".ply":
         cloud = _read_ply(path)
@@ -52,7 +53,7 @@ def _begins_with(path: Path, magic: bytes) -> bool:
 def _read_ply(path: Path) -> BasicPointCloud:
     try:
         ply = PlyData.read(str(path))
-    except (PlyParseError, ValueError, OSError, EOFError, MemoryError) as error:
+    except (PlyParseError, ValueError, OverflowError, OSError, EOFError, MemoryError) as error:
         raise UserError(f"{path} is not a readable PLY file ({error}); export the point cloud again") from error
     vertices = ply["vertex"].data if "vertex" in ply else np.zeros(0, dtype=[])
     names = vertices.dtype.names or ()
@@ -60,10 +61,12 @@ def _read_ply(path: Path) -> BasicPointCloud:
     if missing:
         raise UserError(f"the point cloud {path} has no {', '.join(missing)}; it needs x y z red green blue per vertex")
     try:
-        points = _columns(vertices, _POSITION)
+        points = np.stack([vertices[name] for name in _POSITION], axis=1).astype(np.float64)
         colors = np.stack([_fraction(vertices[name]) for name in _COLOR], axis=1)
         has_normals = all(name in names for name in _NORMAL)
-        normals = _columns(vertices, _NORMAL) if has_normals else np.zeros_like(points)
+        normals = np.zeros_like(points, dtype=np.float32)
+        if has_normals:
+            normals[:] = np.stack([vertices[name] for name in _NORMAL], axis=1)
     except (TypeError, ValueError) as error:
         raise UserError(f"the point cloud {path} has lists where numbers are needed; export it again") from error
     return BasicPointCloud(points, colors, normals)
@@ -106,19 +109,18 @@ def _read_text(path: Path) -> np.ndarray:
 
 def _from_table(table: np.ndarray) -> BasicPointCloud:
     """A cloud of a table (N, 3 or 6) of x y z and red green blue."""
-    with np.errstate(over="ignore"):  # becomes infinite, which check_finite reports
-        points = table[:, :3].astype(np.float32)
-    colors = table[:, 3:]
+    points, colors = table[:, :3], table[:, 3:]
     if not colors.shape[1]:
         colors = np.full_like(table[:, :3], 127 / 255)
     elif colors.size and colors.max() > 1:
         colors = colors / 255
-    return BasicPointCloud(points, colors.astype(np.float32), np.zeros_like(points))
+    return BasicPointCloud(points, colors.astype(np.float32), np.zeros_like(points, dtype=np.float32))
 
 
 def check_finite(points: np.ndarray, path: Path) -> None:
     """UserError naming the first point (N,3) of a file that is not finite in float32."""
-    bad = ~np.isfinite(points).all(axis=1)
+    with np.errstate(over="ignore"):
+        bad = ~np.isfinite(points.astype(np.float32)).all(axis=1)
     if bad.any():
         raise UserError(
             f"{bad.sum()} of {len(bad)} points in {path} are not finite (first: number {bad.argmax()}); remove them"
@@ -135,11 +137,6 @@ def write_point_cloud(path: Path, points: np.ndarray, colors: np.ndarray) -> Non
         vertices[name] = colors[:, index]
     with atomic_write(path) as temporary:
         PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<").write(str(temporary))
-
-
-def _columns(vertices: np.ndarray, names: tuple[str, ...]) -> np.ndarray:
-    with np.errstate(over="ignore"):  # becomes infinite, which check_finite reports
-        return np.stack([vertices[name] for name in names], axis=1).astype(np.float32)
 
 
 def _fraction(values: np.ndarray) -> np.ndarray:

@@ -1,6 +1,6 @@
 """What readers of datasets return: plain records. Nothing here decodes pictures, uses a GPU or writes a file."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +11,10 @@ from utils.graphics_utils import BasicPointCloud, focal2fov
 from utils.system_utils import UserError
 
 HOLD = 8  # every 8th picture by name is a test view (Mip-NeRF 360's split)
+NEAREST = 0.2  # depth from which on Gaussians are drawn (the rasterizer's rule)
+APART = 10.0
+NARROW = 1e-2  # Gaussians wider than 0.1 E are removed: where E is less than this of the depth, all above a pixel or so
+ROUNDING = 1e-9  # distances below this part of the scene mean nothing
 
 
 @dataclass(frozen=True)
@@ -58,13 +62,17 @@ class CameraInfo:
 
 @dataclass(frozen=True)
 class SceneInfo:
-    """A dataset: start cloud (None if not wanted), views, extent E in world units, the PLY of the cloud if any."""
+    """A dataset: start cloud (None if not wanted), views, extent E in world units, the PLY of the cloud if any.
+
+    offset (3,) float64: the world's coordinates of the frame's origin (scene/world_offset.py).
+    """
 
     point_cloud: BasicPointCloud | None
     train_cameras: list[CameraInfo]
     test_cameras: list[CameraInfo]
     extent: float
     ply_path: Path | None
+    offset: np.ndarray = field(default_factory=lambda: np.zeros(3))
 
 
 def split_by_order(
@@ -81,14 +89,26 @@ def split_by_order(
 def scene_extent(cameras: list[CameraInfo], points: np.ndarray | None = None) -> float:
     """Extent E: 1.1 times the largest distance of a camera from the cameras' mean, in world units.
 
-    Cameras in one place have none; then 1.1 times the median depth of the points (N,3) in front of the first camera,
-    or 1 without such points.
+    Cameras that stand apart (`standing_apart`) are left out. Cameras in one place, or nearly so (E below NARROW times
+    the depth), have no E of their own; then 1.1 times the median depth of the points (N,3) in front of the first, or 1
+    without such points.
     """
     centers = np.array([camera.center for camera in cameras])
+    counted = ~standing_apart(centers)
+    centers, first = centers[counted], cameras[counted.argmax()]
     extent = 1.1 * float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).max())
     points = np.zeros((0, 3)) if points is None else points
-    depths = (points @ cameras[0].R + cameras[0].T)[:, 2]
+    depths = (points @ first.R + first.T)[:, 2]
     depths = depths[depths > 0]
-    fallback = 1.1 * float(np.median(depths)) if len(depths) else 1.0
-    # Rounding can leave a tiny distance between equal centres.
-    return extent if extent > 1e-6 * fallback else fallback
+    if not len(depths):
+        return extent if extent > ROUNDING * (1 + np.abs(centers).max()) else 1.0
+    fallback = 1.1 * float(np.median(depths))
+    return extent if extent > NARROW * fallback else fallback
+
+
+def standing_apart(centers: np.ndarray) -> np.ndarray:
+    """Which of the camera centres (N,3) are more than APART times the median distance from their median: (N,) bool."""
+    distances = np.linalg.norm(centers - np.median(centers, axis=0), axis=1)
+    median = float(np.median(distances))
+    # Where most cameras are in one place, but for rounding, the others are no mistake.
+    return distances > (APART * median if median > ROUNDING * distances.max() else np.inf)

@@ -93,5 +93,5 @@ def _focus_distance(cameras: list[CameraInfo]) -> float:
 
 
 def _grey(points: np.ndarray) -> BasicPointCloud:
-    points = points.astype(np.float32)
-    return BasicPointCloud(points, np.full_like(points, _GREY), np.zeros_like(points))
+    grey = np.full(points.shape, _GREY, dtype=np.float32)
+    return BasicPointCloud(points, grey, np.zeros_like(grey))

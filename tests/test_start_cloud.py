@@ -28,7 +28,7 @@ def test_text(tmp_path, text):
     cloud = read_point_cloud(tmp_path / "a.xyz")
     np.testing.assert_array_equal(cloud.points, np.float32(POINTS))
     np.testing.assert_allclose(cloud.colors, BYTES / 255, atol=1e-7)
-    assert cloud.points.dtype == cloud.colors.dtype == cloud.normals.dtype == np.float32
+    assert cloud.points.dtype == np.float64 and cloud.colors.dtype == cloud.normals.dtype == np.float32
 
 
 @pytest.mark.parametrize("keys", [("points", "colors"), ("xyz", "rgb")])

@@ -1,0 +1,54 @@
+"""Write a model in the coordinates of its scene: x, y, z in double, what else there is as it was.
+
+python -m scene.export_world MODEL OUT.ply [--iteration N]
+
+For scenes whose coordinates are large against their extent, which are trained in a frame of their own
+(scene/world_offset.py). Programs that read x, y, z as float lose the decimals again; CloudCompare and plyfile do not.
+"""
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+from plyfile import PlyData, PlyElement
+
+from arguments import read_model_json
+from arguments.stored import OFFSET
+from scene.gaussian_ply import read_vertices
+from utils.system_utils import UserError, atomic_write, run_cli, searchForMaxIteration
+
+_AXES = ("x", "y", "z")
+
+
+def export_world(ply: Path, offset: np.ndarray, out: Path) -> None:
+    """Write the Gaussians of a PLY with offset (3,) added to x, y, z, which become double."""
+    vertices = read_vertices(ply)
+    kinds = [(name, "<f8" if name in _AXES else vertices.dtype[name]) for name in vertices.dtype.names]
+    moved = np.empty(len(vertices), dtype=kinds)
+    for name in vertices.dtype.names:
+        moved[name] = vertices[name]
+    for name, distance in zip(_AXES, offset, strict=True):
+        moved[name] += distance
+    with atomic_write(out) as temporary:
+        PlyData([PlyElement.describe(moved, "vertex")], byte_order="<").write(str(temporary))
+
+
+def main() -> None:
+    """The command line."""
+    parser = argparse.ArgumentParser(description="Write a model in the coordinates of its scene, x, y, z in double.")
+    parser.add_argument("model", type=Path, help="folder that train.py wrote")
+    parser.add_argument("out", type=Path, help="PLY to write")
+    parser.add_argument("--iteration", type=int, default=-1, help="saved iteration (default: -1, the highest)")
+    args = parser.parse_args()
+    folder = args.model / "point_cloud"
+    iteration = searchForMaxIteration(folder) if args.iteration == -1 else args.iteration
+    ply = folder / f"iteration_{iteration}" / "point_cloud.ply"
+    if args.out.resolve() == ply.resolve():
+        raise UserError(f"{args.out} is the model itself; name another file")
+    offset = np.array(read_model_json(args.model).get(OFFSET, [0, 0, 0]), dtype=np.float64)
+    export_world(ply, offset, args.out)
+    print(f"{args.out}: iteration {iteration}, moved by {tuple(offset.tolist())}")
+
+
+if __name__ == "__main__":
+    run_cli(main)

@@ -1,0 +1,49 @@
+"""What is looked at before a scene is trained, so that it does not train for hours to no end."""
+
+import sys
+
+import numpy as np
+
+from scene.picture_files import some
+from scene.scene_info import APART, NEAREST, SceneInfo, standing_apart
+from utils.system_utils import UserError
+
+_SAMPLE = 16  # cameras whose depths are looked at
+_FEWEST_BEYOND = 0.01  # part of the points in front of them
+
+
+def check_before_training(info: SceneInfo) -> None:
+    """UserError for a scene that nothing can be learnt from; a line about what is taken otherwise than it stands."""
+    _check_scale(info)
+    _report_cameras_apart(info)
+    if info.offset.any():
+        print(
+            f"the scene's coordinates are large against its extent: it is trained less {tuple(info.offset.tolist())}, "
+            "which model.json keeps; python -m scene.export_world writes the model in the scene's own coordinates"
+        )
+
+
+def _check_scale(info: SceneInfo) -> None:
+    """UserError where next to nothing lies beyond the nearest depth that is drawn."""
+    cameras = info.train_cameras[:: max(1, len(info.train_cameras) // _SAMPLE)]
+    depths = np.concatenate([(info.point_cloud.points @ camera.R + camera.T)[:, 2] for camera in cameras])
+    depths = depths[depths > 0]
+    if len(depths) and (depths > NEAREST).mean() < _FEWEST_BEYOND:
+        middle = float(np.median(depths))
+        raise UserError(
+            f"the points lie {middle:.2g} units from the cameras, and nothing nearer than {NEAREST} is drawn; scale "
+            f"cameras and points of the scene by {10.0 ** np.ceil(np.log10(5 / middle)):g}"
+        )
+
+
+def _report_cameras_apart(info: SceneInfo) -> None:
+    """Say which training cameras the extent is found without."""
+    apart = standing_apart(np.array([camera.center for camera in info.train_cameras]))
+    if apart.any():
+        names = [info.train_cameras[index].image_name for index in apart.nonzero()[0]]
+        print(
+            f"{len(names)} of {len(apart)} cameras stand more than {APART:g} times the median distance from the middle "
+            f"of all ({some(names)}) and are left out of the scene's extent, {info.extent:.3g}; look whether their "
+            "poses are right",
+            file=sys.stderr,
+        )
