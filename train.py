@@ -33,6 +33,7 @@ from scene import Scene
 from scene import densification as adc
 from scene.cameras import Camera
 from scene.checkpoint import load_checkpoint, save_checkpoint
+from scene.divergence import DivergenceWatch
 from scene.gaussian_model import GaussianModel
 from scene.memory_estimate import announce_memory
 from scene.memory_guard import MemoryGuard
@@ -103,6 +104,7 @@ def training(
     fixed_background = torch.full((3,), 1.0 if dataset.white_background else 0.0, device=device)
     log = TrainingLog(scene.model_path, first_iteration)
     losses = LossWatch(log.loss)
+    watch = DivergenceWatch(gaussians, losses, scene.model_path, first_iteration, lambda t: views[t].image_name)
     depth_weight = get_expon_lr_func(opt.depth_l1_weight_init, opt.depth_l1_weight_final, max_steps=opt.iterations)
     depth_losses = LossWatch()
     # Where something is written: all losses up to there must have been looked at.
@@ -144,10 +146,12 @@ def training(
                 loss = loss + depth_loss
             loss.backward()
 
-            losses.add(iteration, loss)
+            watch.note(iteration, loss)
             curve_due = curve is not None and curve.due(iteration, clock.seconds)
-            if iteration % BAR_INTERVAL == 0 or iteration in stops or curve_due:
-                _check_losses(losses.read(), views)
+            todo = adc.actions(iteration, opt, dataset.white_background)
+            changing = todo.densify or todo.reset_opacity
+            if iteration % BAR_INTERVAL == 0 or iteration in stops or curve_due or changing:
+                watch.look(iteration)
                 shown = {"Loss": f"{losses.mean:.7f}"}
                 if dataset.depths:
                     depth_losses.read()
@@ -176,13 +180,13 @@ def training(
                     log.add(iteration, seconds, gaussians=len(gaussians), loss=losses.mean, **scores)
 
             guard.changing()
-            _control_density(gaussians, package, iteration, opt, scene.cameras_extent, dataset.white_background)
+            _control_density(gaussians, package, iteration, todo, opt, scene.cameras_extent)
             if iteration < opt.iterations:
                 gaussians.step(package["radii"])
             guard.reached(iteration)
             stop = interrupt.requested  # once: a signal may come at any moment
             if iteration in checkpoint_iterations or stop:
-                _check_losses(losses.read(), views)
+                watch.look(iteration, stepped=iteration < opt.iterations)
                 seconds = clock.seconds
                 with clock.paused():
                     gaussians.check_finite(iteration)
@@ -195,6 +199,7 @@ def training(
                 raise stop
     if tb_writer:
         tb_writer.close()
+    watch.finish()
     print(f"Trained {opt.iterations - first_iteration} iterations in {clock.seconds:.1f} s, without tests and saving")
     if curve is not None:
         saved = {*saving_iterations} & {*saved_iterations(Path(scene.model_path) / "point_cloud")}
@@ -297,16 +302,6 @@ def _save_last(
     return left_out
 
 
-def _check_losses(values: dict[int, float], views: "_ViewOrder") -> None:
-    """UserError for the first loss, by iteration, that is not finite."""
-    for iteration, value in values.items():
-        if not math.isfinite(value):
-            raise UserError(
-                f"the loss became {value} in iteration {iteration} (view {views[iteration].image_name}), so training "
-                "stopped and nothing of it was saved; lower the learning rates, or check this view and the point cloud"
-            )
-
-
 def _check_exposures(gaussians: GaussianModel, train_test_exp: bool, checkpoint: str) -> None:
     """UserError for a checkpoint with exposures that this run would not use; a word on the opposite."""
     if gaussians.exposures.trained and not train_test_exp:
@@ -346,12 +341,11 @@ def _control_density(
     gaussians: GaussianModel,
     package: dict[str, Tensor],
     iteration: int,
+    todo: adc.Actions,
     opt: argparse.Namespace,
     extent: float,
-    white_background: bool,
 ) -> None:
     """Statistics of this view, and in due time clones, splits, pruning and the reset of opacities."""
-    todo = adc.actions(iteration, opt, white_background)
     if todo.observe:
         gaussians.observe(package["viewspace_points"], package["radii"])
     if todo.densify:

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from scene import densification as adc
 from scene.exposure import Exposures, read_exposures
 from scene.gaussian_attributes import IN_CHECKPOINT, Rows, attributes
-from scene.gaussian_optimizer import GaussianAdam
+from scene.gaussian_optimizer import GaussianAdam, StepGuard
 from scene.gaussian_ply import read_ply, row_bytes, write_ply
 from scene.half_images import exposure_names
 from scene.sparse_adam import SparseGaussianAdam
@@ -240,6 +240,27 @@ class GaussianModel:
         self.optimizer.zero_grad(set_to_none=True)
         self.exposures.step()
 
+    def guard_steps(self, guard: StepGuard) -> None:
+        """Let a guard hold back the steps of all optimisers there are now."""
+        self.optimizer.guard = self.exposures.optimizer.guard = guard
+
+    def check_steps(self) -> None:
+        """UserError where a guard has held steps back, so that the model is not what it is counted as."""
+        if self.optimizer.guard and (iteration := self.optimizer.guard.stopped_in()):
+            raise UserError(f"loss or step of iteration {iteration} were not finite; lower the learning rates")
+
+    def take_marks(self) -> list[tuple[str, list[int] | list[str], int]]:
+        """What a guard kept from its step: name of the tensor, rows (of exposures the pictures), number of all rows."""
+        marks = [(name, rows.tolist(), len(self)) for name, rows in self.optimizer.take_marks().items()]
+        for name, rows in self.exposures.optimizer.take_marks().items():
+            marks.append((name, [self.exposures.names[row] for row in rows.tolist()], len(self.exposures.names)))
+        return marks
+
+    def rewind(self, steps: int) -> None:
+        """Count back the steps that a guard held back."""
+        self.optimizer.rewind(steps)
+        self.exposures.optimizer.rewind(steps)
+
     def oneupSHdegree(self) -> None:
         """Raise the active SH degree by one, up to the maximum."""
         self.active_sh_degree = min(self.active_sh_degree + 1, self.max_sh_degree)
@@ -356,6 +377,12 @@ class GaussianModel:
         seen = update_filter[:, None]
         self.xyz_gradient_accum += torch.where(seen, length, 0.0)
         self.denom += seen
+
+    def drop_broken_statistics(self) -> None:
+        """Let Gaussians whose gradients' sum is not finite begin it anew."""
+        broken = ~self.xyz_gradient_accum.isfinite()
+        self.xyz_gradient_accum[broken] = 0.0
+        self.denom[broken] = 0.0
 
     def densify_and_prune(
         self,

@@ -14,12 +14,35 @@ _CHUNK = 1 << 16  # rows that are moved at a time where there is no memory for a
 _ADAM = torch.ops.diff_gaussian_rasterization.adam_
 
 
+class StepGuard:
+    """Holds all steps back from the first iteration on whose loss is not finite, or one of whose steps.
+
+    A value whose step would not be finite (its gradient, or what becomes of it) stays as it is, and its first moment
+    becomes NaN as a mark, which GaussianAdam.take_marks takes away; all other values take their step in that iteration,
+    and none in later ones. The flag stays on the device: nobody waits for it but stopped_in.
+    """
+
+    def __init__(self, device: torch.device | str) -> None:
+        self._stopped = torch.zeros(1, dtype=torch.int64, device=device)
+        self.arguments: tuple = ()  # of the operators
+
+    def watch(self, iteration: int, loss: Tensor) -> None:
+        """Before the step of an iteration (from 1): its scalar loss."""
+        self.arguments = (loss, self._stopped, iteration)
+
+    def stopped_in(self) -> int:
+        """The iteration it was, 0 while there is none."""
+        return int(self._stopped)
+
+
 class GaussianAdam(torch.optim.Adam):
     """torch.optim.Adam, one parameter (N, ...) per named group, by a kernel with the same bits for any thread count.
 
     State and state dict have torch's form (step, exp_avg, exp_avg_sq), so checkpoints carry over both ways. There are
-    no step hooks: torch's, with its profiler's label, take as long as the step itself.
+    no step hooks: torch's, with its profiler's label, take as long as the step itself. guard: may hold steps back.
     """
+
+    guard: StepGuard | None = None
 
     def __init__(self, groups: list[dict], eps: float = 1e-15) -> None:
         """groups: dicts with `params` (a list of one Parameter), `lr` and `name`."""
@@ -60,7 +83,8 @@ class GaussianAdam(torch.optim.Adam):
                 rates.append(group["lr"])
                 columns.append(active)
         if tensors:
-            _ADAM(*map(list, zip(*tensors, strict=True)), rates, *self.defaults["betas"], self.defaults["eps"], columns)
+            lists, guard = map(list, zip(*tensors, strict=True)), self.guard.arguments if self.guard else ()
+            _ADAM(*lists, rates, *self.defaults["betas"], self.defaults["eps"], columns, *guard)
         return loss
 
     step.hooked = True  # torch wraps it otherwise
@@ -71,6 +95,25 @@ class GaussianAdam(torch.optim.Adam):
             return super().zero_grad(set_to_none=False)
         for group in self.param_groups:
             group["params"][0].grad = None
+
+    def take_marks(self) -> dict[str, Tensor]:
+        """Rows (n,) by group, of those with values that a guard kept from their step; these begin with zero moments."""
+        rows = {}
+        for group in self.param_groups:
+            state = self.state.get(group["params"][0])
+            if not state:
+                continue
+            marked = state["exp_avg"].isnan()
+            if marked.any():
+                rows[group["name"]] = marked.reshape(len(marked), -1).any(dim=1).nonzero().reshape(-1)
+                for moment in ("exp_avg", "exp_avg_sq"):
+                    state[moment].masked_fill_(marked, 0.0)
+        return rows
+
+    def rewind(self, steps: int) -> None:
+        """Count back steps that a guard held back."""
+        for state in self.state.values():
+            state["step"] = (state["step"] - steps).clamp_min(0)
 
     def _state_of(self, param: Tensor) -> dict[str, Tensor]:
         state = self.state[param]

@@ -72,6 +72,7 @@ class MemoryGuard:
                 gaussians.active_sh_degree = self._sh_degree
                 anew = "--max_num_splats or --sh_degree"  # going on with as many would end here again
             gaussians.check_finite(iteration)
+            gaussians.check_steps()
             path = self._folder / f"chkpnt{iteration}.pth"
             save_checkpoint(path, gaussians.capture(), iteration)
         except (UserError, MemoryError, RuntimeError) as error:

@@ -27,4 +27,5 @@ class SparseGaussianAdam(GaussianAdam):
             moments = state["exp_avg"], state["exp_avg_sq"]
             beta1, beta2 = group["betas"]
             columns = self._active_columns.get(group["name"], -1)
-            _SPARSE_ADAM(param, param.grad, *moments, visible, group["lr"], beta1, beta2, group["eps"], columns)
+            guard = self.guard.arguments if self.guard else ()
+            _SPARSE_ADAM(param, param.grad, *moments, visible, group["lr"], beta1, beta2, group["eps"], columns, *guard)

@@ -42,7 +42,7 @@ def _observe(gaussians: GaussianModel, points: Tensor, radii: Tensor) -> None:
     gaussians.denom += (radii > 0)[:, None]
 
 
-def _adam(values, gradients, means, squares, steps, rates, beta1, beta2, eps, columns) -> None:
+def _adam(values, gradients, means, squares, steps, rates, beta1, beta2, eps, columns, *guard) -> None:
     for one in zip(values, gradients, means, squares, steps, rates, columns, strict=True):
         *tensors, rate, count = ([item] for item in one)
         torch.ops.diff_gaussian_rasterization.adam_(*tensors, rate, beta1, beta2, eps, count)

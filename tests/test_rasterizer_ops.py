@@ -52,9 +52,12 @@ def test_opcheck_every_other_op(device):
     _check(ops.mark_visible, raw["means"], camera.viewmatrix.float())
     lists = [[torch.rand(3, 3, device=device), torch.rand(2, 5, device=device)] for _ in range(4)]
     counters = [torch.tensor(1.0), torch.tensor(7.0)]
-    _check(ops.adam_, *lists, counters, [0.1, 0.2], 0.9, 0.99, 1e-8, [2, -1])
+    guard = torch.rand((), device=device), torch.zeros(1, dtype=torch.int64, device=device), 3
+    for more in ((), guard):
+        _check(ops.adam_, *lists, counters, [0.1, 0.2], 0.9, 0.99, 1e-8, [2, -1], *more)
     moment, seen = torch.rand(3, 3, device=device), torch.tensor([True, False, True], device=device)
-    _check(ops.sparse_adam_, moment + 1, moment + 2, moment, moment.clone(), seen, 0.1, 0.9, 0.99, 1e-8)
+    for more in ((), (-1, *guard)):
+        _check(ops.sparse_adam_, moment + 1, moment + 2, moment, moment.clone(), seen, 0.1, 0.9, 0.99, 1e-8, *more)
     radii = torch.tensor([0, 3, 5], dtype=torch.int32, device=device)
     statistics = [torch.rand(shape, device=device) for shape in ((3,), (3, 1), (3, 1))]
     _check(ops.observe_, *statistics, radii, torch.rand(3, 3, device=device))

@@ -117,6 +117,14 @@ struct AdamInput {
   double lr, beta1, beta2, eps, step;
 };
 
+// Ends the steps of a training for good at the first one that is not finite. With `stopped` null it never does.
+template <class T>
+struct StepGuard {
+  const T* loss;     // scalar; if it is not finite, there is no step
+  int64_t* stopped;  // the first iteration whose loss or step was not finite, 0 while there is none; after it, no step
+  int64_t iteration;
+};
+
 // Adds a view to the statistics of density control.
 struct ObserveInput {
   int64_t count;
@@ -143,10 +151,10 @@ struct ObserveInput {
   template <class T>                                                                                        \
   void mark_decisive(const Where&, const BlendInput<T>&, const int32_t* last, bool* decisive);              \
   template <class T>                                                                                        \
-  void adam(const Where&, const AdamInput<T>* tensors, int64_t count);                                      \
+  void adam(const Where&, const AdamInput<T>* tensors, int64_t count, const StepGuard<T>&);                 \
   /* Adam without bias correction on the rows that are visible, (rows); `step` is not read. */              \
   template <class T>                                                                                        \
-  void sparse_adam(const Where&, const AdamInput<T>&, const bool* visible);
+  void sparse_adam(const Where&, const AdamInput<T>&, const bool* visible, const StepGuard<T>&);
 
 void observe(const Executor&, const ObserveInput&);  // compiled once: see gs/rounded.h
 

@@ -506,10 +506,26 @@ void check_moments(const Tensor& value, const Tensor& gradient, const Tensor& me
               "parameter and moments must be contiguous");
 }
 
-// One step of every parameter, in one launch on a GPU. Each counter is advanced first, as torch's are.
+// The guard of a step (launch.h). `stopped` (1) int64 needs a loss of the parameters' dtype.
+template <class T>
+gs::StepGuard<T> step_guard(const Tensor& value, const MaybeTensor& loss, const MaybeTensor& stopped,
+                            int64_t iteration) {
+  if (!stopped) return {};
+  TORCH_CHECK(
+      loss && loss->numel() == 1 && loss->scalar_type() == value.scalar_type() && loss->device() == value.device(),
+      "a guarded step needs the loss, one ", value.scalar_type(), " on ", value.device());
+  TORCH_CHECK(stopped->numel() == 1 && stopped->scalar_type() == at::kLong && stopped->device() == value.device(),
+              "stopped must be one int64 on ", value.device(), ", got ", stopped->sizes(), " ", stopped->scalar_type(),
+              " on ", stopped->device());
+  TORCH_CHECK(iteration > 0, "iterations of guarded steps count from 1, got ", iteration);
+  return {loss->const_data_ptr<T>(), stopped->mutable_data_ptr<int64_t>(), iteration};
+}
+
+// One step of every parameter, in one launch on a GPU. Each counter is advanced first, as torch's are, also where the
+// guard holds the step back.
 void adam_op(at::TensorList values, at::TensorList gradients, at::TensorList means, at::TensorList squares,
              at::TensorList steps, at::ArrayRef<double> rates, double beta1, double beta2, double eps,
-             at::IntArrayRef columns) {
+             at::IntArrayRef columns, const MaybeTensor& loss, const MaybeTensor& stopped, int64_t iteration) {
   const size_t n = values.size();
   for (size_t size : {gradients.size(), means.size(), squares.size(), steps.size(), rates.size(), columns.size()})
     TORCH_CHECK(size == n, "every list must have an entry for each of the ", n, " parameters, got ", size);
@@ -536,13 +552,14 @@ void adam_op(at::TensorList values, at::TensorList gradients, at::TensorList mea
                         columns[i] < 0 ? row : columns[i], rates[i], beta1, beta2, eps,
                         double(*step.const_data_ptr<float>()) + 1});
     }
-    RUN(T, first, adam, inputs.data(), int64_t(n));
+    RUN(T, first, adam, inputs.data(), int64_t(n), step_guard<T>(first, loss, stopped, iteration));
   });
   for (const Tensor& step : steps) *step.mutable_data_ptr<float>() += 1;
 }
 
 void sparse_adam_op(Tensor& value, const Tensor& gradient, Tensor& mean, Tensor& square, const Tensor& visible,
-                    double lr, double beta1, double beta2, double eps, int64_t columns) {
+                    double lr, double beta1, double beta2, double eps, int64_t columns, const MaybeTensor& loss,
+                    const MaybeTensor& stopped, int64_t iteration) {
   check_moments(value, gradient, mean, square);
   const int64_t rows = value.dim() > 0 ? value.size(0) : 1;
   TORCH_CHECK(visible.dim() == 1 && visible.size(0) == rows && visible.scalar_type() == at::kBool &&
@@ -560,7 +577,7 @@ void sparse_adam_op(Tensor& value, const Tensor& gradient, Tensor& mean, Tensor&
     in.mean = mean.mutable_data_ptr<T>(), in.square = square.mutable_data_ptr<T>();
     in.rows = rows, in.row = row, in.columns = columns < 0 ? row : columns;
     in.lr = lr, in.beta1 = beta1, in.beta2 = beta2, in.eps = eps;
-    RUN(T, value, sparse_adam, in, mask.const_data_ptr<bool>());
+    RUN(T, value, sparse_adam, in, mask.const_data_ptr<bool>(), step_guard<T>(value, loss, stopped, iteration));
   });
 }
 
@@ -614,10 +631,12 @@ TORCH_LIBRARY(diff_gaussian_rasterization, m) {
   m.def("decisive(Tensor splats, Tensor instances, Tensor ranges, Tensor last) -> Tensor");
   m.def(
       "adam_(Tensor(a!)[] values, Tensor[] gradients, Tensor(b!)[] means, Tensor(c!)[] squares, Tensor(d!)[] steps, "
-      "float[] rates, float beta1, float beta2, float eps, int[] columns) -> ()");
+      "float[] rates, float beta1, float beta2, float eps, int[] columns, Tensor? loss=None, Tensor(e!)? stopped=None, "
+      "int iteration=0) -> ()");
   m.def(
       "sparse_adam_(Tensor(a!) value, Tensor gradient, Tensor(b!) mean, Tensor(c!) square, Tensor visible, float lr, "
-      "float beta1, float beta2, float eps, int columns=-1) -> ()");
+      "float beta1, float beta2, float eps, int columns=-1, Tensor? loss=None, Tensor(d!)? stopped=None, "
+      "int iteration=0) -> ()");
   m.def(
       "observe_(Tensor(a!) max_radii, Tensor(b!) gradient_sums, Tensor(c!) views, Tensor radii, Tensor gradient) "
       "-> ()");

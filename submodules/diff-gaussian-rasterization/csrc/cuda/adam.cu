@@ -3,6 +3,7 @@
 #include "../launch.h"
 #include "../math/adam.h"
 #include "gs/cuda_check.h"
+#include "guarded_adam.cuh"
 
 namespace gs {
 namespace cuda {
@@ -16,9 +17,11 @@ struct Tensors {
   AdamInput<float> in[kTensors];
   baseline::AdamStep<float> step[kTensors];
   int64_t end[kTensors];  // the first block that is not this tensor's or an earlier one's
+  StepGuard<float> guard;
 };
 
 __global__ void __launch_bounds__(kThreads) adam_kernel(const __grid_constant__ Tensors tensors) {
+  if (!begin_step(tensors.guard)) return;
   int which = 0;
   while (int64_t(blockIdx.x) >= tensors.end[which]) ++which;
   const AdamInput<float>& in = tensors.in[which];
@@ -26,18 +29,17 @@ __global__ void __launch_bounds__(kThreads) adam_kernel(const __grid_constant__ 
   const int64_t k = block * kThreads + threadIdx.x;
   if (k >= in.rows * in.columns) return;
   const int64_t i = in.columns == in.row ? k : k / in.columns * in.row + k % in.columns;
-  float value = in.value[i], mean = in.mean[i], square = in.square[i];
-  baseline::adam(tensors.step[which], in.gradient[i], value, mean, square);
-  in.value[i] = value, in.mean[i] = mean, in.square[i] = square;
+  step_value(tensors.guard, tensors.step[which], in, i);
 }
 
 }  // namespace
 
 template <>
-void adam<float>(const Queue& queue, const AdamInput<float>* tensors, int64_t count) {
+void adam<float>(const Queue& queue, const AdamInput<float>* tensors, int64_t count, const StepGuard<float>& guard) {
   for (int64_t first = 0; first < count; first += kTensors) {
     const int n = int(count - first < kTensors ? count - first : kTensors);
     Tensors some = {};
+    some.guard = guard;
     int64_t blocks = 0;
     for (int i = 0; i < n; ++i) {
       const AdamInput<float>& in = tensors[first + i];

@@ -3,6 +3,7 @@
 #include "../launch.h"
 #include "../math/adam.h"
 #include "gs/cuda_check.h"
+#include "guarded_adam.cuh"
 
 namespace gs {
 namespace cuda {
@@ -11,27 +12,27 @@ namespace {
 
 constexpr int kThreads = 256;
 
-__global__ void __launch_bounds__(kThreads)
-    sparse_adam_kernel(AdamInput<float> in, const bool* visible, baseline::AdamStep<float> step) {
+__global__ void __launch_bounds__(kThreads) sparse_adam_kernel(AdamInput<float> in, const bool* visible,
+                                                               baseline::AdamStep<float> step, StepGuard<float> guard) {
+  if (!begin_step(guard)) return;
   const int64_t k = int64_t(blockIdx.x) * kThreads + threadIdx.x;
   if (k >= in.rows * in.columns) return;
   const int64_t r = k / in.columns;
   if (!visible[r]) return;
   const int64_t i = r * in.row + k % in.columns;
-  float value = in.value[i], mean = in.mean[i], square = in.square[i];
-  baseline::adam(step, in.gradient[i], value, mean, square);
-  in.value[i] = value, in.mean[i] = mean, in.square[i] = square;
+  step_value(guard, step, in, i);
 }
 
 }  // namespace
 
 template <>
-void sparse_adam<float>(const Queue& queue, const AdamInput<float>& in, const bool* visible) {
+void sparse_adam<float>(const Queue& queue, const AdamInput<float>& in, const bool* visible,
+                        const StepGuard<float>& guard) {
   const int64_t n = in.rows * in.columns;
   if (!n) return;
   const auto step = baseline::make_uncorrected_adam_step<float>(in.lr, in.beta1, in.beta2, in.eps);
   const auto stream = static_cast<cudaStream_t>(queue.stream);
-  sparse_adam_kernel<<<unsigned((n + kThreads - 1) / kThreads), kThreads, 0, stream>>>(in, visible, step);
+  sparse_adam_kernel<<<unsigned((n + kThreads - 1) / kThreads), kThreads, 0, stream>>>(in, visible, step, guard);
   check_launch("sparse_adam");
 }
 

@@ -1,6 +1,8 @@
 #pragma once
 #include <cmath>
+#include <cstdint>
 
+#include "../launch.h"
 #include "gs/hd.h"
 #include "gs/isa.h"
 
@@ -39,6 +41,31 @@ GS_HD void adam(const AdamStep<T>& a, T gradient, T& value, T& mean, T& square) 
   mean = a.keep1 * mean + a.take1 * gradient;
   square = a.keep2 * square + a.take2 * gradient * gradient;
   value -= a.rate * (mean / (std::sqrt(square) * a.root_correction + a.eps));
+}
+
+template <class T>
+GS_HD bool is_finite(T x) {
+  return x - x == T(0);  // inf - inf is not a number
+}
+
+// Whether the tensors of this iteration take their step.
+template <class T>
+GS_HD bool may_step(const StepGuard<T>& guard) {
+  if (!guard.stopped) return true;
+  const int64_t stopped = *static_cast<const volatile int64_t*>(guard.stopped);  // others may set it to this iteration
+  return (stopped == 0 || stopped == guard.iteration) && is_finite(*guard.loss);
+}
+
+// The step where all it makes is finite, else none: then the value stays, and its mean becomes NaN as a mark.
+template <class T>
+GS_HD bool adam_if_finite(const AdamStep<T>& a, T gradient, T& value, T& mean, T& square) {
+  T v = value, m = mean, s = square;
+  adam(a, gradient, v, m, s);
+  const bool finite = is_finite(v) & is_finite(m) & is_finite(s);
+  value = finite ? v : value;
+  mean = finite ? m : T(NAN);
+  square = finite ? s : square;
+  return finite;
 }
 
 GS_ISA_END

@@ -65,7 +65,7 @@ void test_sparse_adam() {
       in.mean = state[1].data(), in.square = state[2].data();
       in.rows = rows, in.row = row, in.columns = columns;
       in.lr = 0.01, in.beta1 = 0.9, in.beta2 = 0.999, in.eps = 1e-15;
-      sparse_adam(where, in, visible);
+      sparse_adam(where, in, visible, {});
     };
     std::vector<float> cpu[3] = {start[0], start[1], start[2]}, got[3] = {start[0], start[1], start[2]};
     step(gs::serial_executor(), cpu);
@@ -106,15 +106,69 @@ void test_adam() {
     return in;
   };
   std::vector<Tensor> wanted = tensors, got = tensors;
-  adam(gs::serial_executor(), inputs(wanted).data(), int64_t(wanted.size()));
+  adam(gs::serial_executor(), inputs(wanted).data(), int64_t(wanted.size()), gs::StepGuard<float>{});
   gs::emulation::Memory memory;
-  gs::cuda::adam(memory.queue(), inputs(got).data(), int64_t(got.size()));
+  gs::cuda::adam(memory.queue(), inputs(got).data(), int64_t(got.size()), gs::StepGuard<float>{});
   for (size_t i = 0; i < tensors.size(); ++i) {
     // The same operations, but for fused ones.
     check_near(got[i].value, wanted[i].value, 1e-6);
     check_near(got[i].mean, wanted[i].mean, 1e-6), check_near(got[i].square, wanted[i].square, 1e-6);
     for (size_t k = 0; k < got[i].value.size(); ++k)
       CHECK((got[i].mean[k] != tensors[i].mean[k]) == (int64_t(k) % got[i].row < got[i].columns));
+  }
+}
+
+// Under a guard, dense and sparse: what is not finite is marked, the rest goes on, and later steps change nothing.
+void test_step_guard() {
+  constexpr int64_t rows = 700, row = 4;
+  for (const bool sparse : {false, true}) {
+    bool visible[rows];
+    std::vector<float> gradient(rows * row), start[3];
+    for (int64_t r = 0; r < rows; ++r) visible[r] = !sparse || r % 3 != 1;
+    for (float& g : gradient) g = float(normal());
+    for (std::vector<float>& part : start)
+      for (int64_t i = 0; i < rows * row; ++i) part.push_back(float(std::abs(normal())));
+    float loss = 0.5f;
+    int64_t stopped[2] = {0, 0};
+    std::vector<float> state[2][3] = {{start[0], start[1], start[2]}, {start[0], start[1], start[2]}};
+    gs::emulation::Memory memory;
+    const auto step = [&](int64_t iteration) {
+      for (int on_gpu = 0; on_gpu < 2; ++on_gpu) {
+        std::vector<float>(&s)[3] = state[on_gpu];
+        const gs::AdamInput<float> in{
+            s[0].data(), gradient.data(), s[1].data(), s[2].data(), rows, row, row, 0.01, 0.9, 0.999, 1e-15, 1};
+        const gs::StepGuard<float> guard{&loss, &stopped[on_gpu], iteration};
+        if (on_gpu && sparse)
+          gs::cuda::sparse_adam(memory.queue(), in, visible, guard);
+        else if (on_gpu)
+          gs::cuda::adam(memory.queue(), &in, 1, guard);
+        else if (sparse)
+          gs::GS_ISA::sparse_adam(gs::serial_executor(), in, visible, guard);
+        else
+          gs::GS_ISA::adam(gs::serial_executor(), &in, 1, guard);
+      }
+      CHECK(stopped[0] == stopped[1]);
+    };
+    step(1);
+    CHECK(stopped[1] == 0);
+    gradient[5 * row + 1] = NAN, gradient[(rows - 1) * row] = INFINITY, gradient[77 * row] = 1e25f;
+    std::vector<float> before[3] = {state[1][0], state[1][1], state[1][2]};
+    step(2);
+    CHECK(stopped[1] == 2);
+    for (int64_t i = 0; i < rows * row; ++i) {
+      const bool bad = !(std::abs(gradient[i]) < 1e20f), stays = bad || !visible[i / row];
+      CHECK(std::isnan(state[1][1][i]) == (bad && visible[i / row]));
+      CHECK((state[1][0][i] == before[0][i]) == stays && (state[1][2][i] == before[2][i]) == stays);
+      for (int part : {0, 2}) CHECK(std::abs(state[1][part][i] - state[0][part][i]) <= 1e-6 * (1 + state[0][part][i]));
+      before[0][i] = state[1][0][i], gradient[i] = 1;
+    }
+    step(3);
+    loss = NAN;
+    step(4);
+    CHECK(stopped[1] == 2 && state[1][0] == before[0]);
+    stopped[0] = stopped[1] = 0;
+    step(5);
+    CHECK(stopped[1] == 5 && state[1][0] == before[0]);
   }
 }
 
@@ -166,6 +220,7 @@ int main() {
   test_heaviest_first();
   test_sparse_adam();
   test_adam();
+  test_step_guard();
   test_observe();
   return gs::finish_tests("CUDA kernels, emulated");
 }

@@ -1,0 +1,306 @@
+"""NaN and infinities in a training: the step that is held back, the model that is saved, and what is said."""
+
+import json
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+from gaussians import model, parameters
+from rasterizer_tools import ops
+
+import train
+from scene import gaussian_model
+from scene.checkpoint import load_checkpoint
+from scene.gaussian_model import GaussianModel
+from utils.system_utils import UserError
+
+BETAS, EPS, RATE = (0.9, 0.999), 1e-15, 0.01
+SMALL = ["-r", "24", "--test_iterations", "-1", "--no_curve"]
+INF, NAN = float("inf"), float("nan")
+
+
+@pytest.fixture(autouse=True)
+def _stdout(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Training stamps and may silence stdout: bring it back."""
+    monkeypatch.setattr(sys, "stdout", sys.stdout)
+
+
+# The operators
+
+State = list[torch.Tensor]  # value, first moment, second moment
+
+
+def _state(dtype: torch.dtype, rows: int = 100_000) -> tuple[State, torch.Tensor]:
+    """More than one block of values (N, 3), and a gradient."""
+    generator = torch.Generator().manual_seed(0)
+    value, gradient = (torch.randn(rows, 3, generator=generator, dtype=dtype) for _ in range(2))
+    return [value, 0.1 * gradient, gradient**2], gradient
+
+
+def _dense(state: State, gradient: torch.Tensor, *guard: object) -> None:
+    lists = [[t] for t in (state[0], gradient, *state[1:], torch.tensor(4.0))]
+    ops.adam_(*lists, [RATE], *BETAS, EPS, [2], *guard)
+
+
+def _sparse(state: State, gradient: torch.Tensor, *guard: object) -> None:
+    seen = torch.arange(len(gradient)) % 3 != 1
+    ops.sparse_adam_(state[0], gradient, *state[1:], seen, RATE, *BETAS, EPS, 2, *guard)
+
+
+@pytest.fixture(params=[_dense, _sparse], ids=["adam", "sparse adam"])
+def step(request) -> Callable[..., None]:
+    return request.param
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=["float32", "float64"])
+def test_values_without_a_finite_step_are_marked_and_the_rest_goes_on(step, dtype):
+    huge = 1e25 if dtype == torch.float32 else 1e200  # finite, but not its square
+    stopped, loss = torch.zeros(1, dtype=torch.int64), torch.tensor(0.5, dtype=dtype)
+    (plain, gradient), (guarded, _) = _state(dtype), _state(dtype)
+    step(plain, gradient)
+    step(guarded, gradient, loss, stopped, 1)
+    assert all(torch.equal(a, b) for a, b in zip(plain, guarded, strict=True)) and stopped == 0
+
+    bad = gradient.clone()
+    poison = {(5, 0): NAN, (60_000, 1): INF, (99_999, 0): -INF, (3, 1): huge, (9, 2): NAN, (7, 0): NAN}
+    for place, value in poison.items():
+        bad[place] = value
+    # Column 2 is not active, and 7 is a row that the sparse step does not see.
+    unseen = {(9, 2)} | ({(7, 0)} if step is _sparse else set())
+    before = [t.clone() for t in guarded]
+    step(guarded, bad, loss, stopped, 2)
+    step(plain, gradient)
+    assert stopped == 2
+    marked = torch.zeros_like(guarded[1], dtype=torch.bool)
+    for place in poison.keys() - unseen:
+        marked[place] = True
+    assert torch.equal(guarded[1].isnan(), marked)
+    for part, (got, old, wanted) in enumerate(zip(guarded, before, plain, strict=True)):
+        assert part == 1 or torch.equal(got[marked], old[marked])
+        rest = ~(marked | (bad != gradient))
+        assert torch.equal(got[rest], wanted[rest])
+
+    last = [t.clone() for t in guarded]
+    step(guarded, gradient, loss, stopped, 3)
+    assert stopped == 2 and all(torch.equal(a.nan_to_num(), b.nan_to_num()) for a, b in zip(guarded, last, strict=True))
+
+
+@pytest.mark.parametrize("loss", [NAN, INF, -INF])
+def test_there_is_no_step_under_a_loss_that_is_not_finite(step, loss):
+    stopped = torch.zeros(1, dtype=torch.int64)
+    (state, gradient), (before, _) = _state(torch.float32), _state(torch.float32)
+    step(state, gradient, torch.tensor(loss), stopped, 7)
+    step(state, gradient, torch.tensor(0.5), stopped, 8)
+    assert stopped == 7 and all(torch.equal(a, b) for a, b in zip(state, before, strict=True))
+
+
+def test_any_number_of_threads_marks_the_same(step):
+    before, results = torch.get_num_threads(), []
+    try:
+        for threads in (1, 2, 3):
+            torch.set_num_threads(threads)
+            state, gradient = _state(torch.float32)
+            gradient[::1001] = NAN
+            stopped = torch.zeros(1, dtype=torch.int64)
+            step(state, gradient, torch.tensor(0.5), stopped, 3)
+            results.append([t.nan_to_num(nan=77.0) for t in (*state, stopped)])
+    finally:
+        torch.set_num_threads(before)
+    assert all(torch.equal(a, b) for other in results[1:] for a, b in zip(results[0], other, strict=True))
+    assert (results[0][1] == 77).any()
+
+
+def test_guards_that_do_not_fit_are_named(step):
+    state, gradient = _state(torch.float32, rows=4)
+    stopped = torch.zeros(1, dtype=torch.int64)
+    with pytest.raises(RuntimeError, match="a guarded step needs the loss, one Float on cpu"):
+        step(state, gradient, torch.tensor(0.5).double(), stopped, 1)
+    with pytest.raises(RuntimeError, match="a guarded step needs the loss"):
+        step(state, gradient, None, stopped, 1)
+    with pytest.raises(RuntimeError, match="stopped must be one int64 on cpu, got"):
+        step(state, gradient, torch.tensor(0.5), torch.zeros(1), 1)
+    with pytest.raises(RuntimeError, match="count from 1, got 0"):
+        step(state, gradient, torch.tensor(0.5), stopped, 0)
+
+
+def test_float32_steps_are_doubles_from_1e_minus_30_to_1e10():
+    """Squares below 1e-38 vanish in float32, where eps of 1e-15 outweighs their roots anyway."""
+    size = 10 ** torch.linspace(-30, 10, 41, dtype=torch.float64)[:, None]
+    generator = torch.Generator().manual_seed(0)
+    theirs = torch.nn.Parameter(torch.zeros(41, 3, dtype=torch.float64))
+    optimizer = torch.optim.Adam([theirs], lr=RATE, betas=BETAS, eps=EPS)
+    ours, stopped = [torch.zeros(41, 3) for _ in range(3)], torch.zeros(1, dtype=torch.int64)
+    counter = torch.zeros(())
+    for iteration in range(1, 51):
+        gradient = (torch.randn(41, 3, generator=generator, dtype=torch.float64) * size).float()
+        theirs.grad = gradient.double()
+        optimizer.step()
+        lists = [[t] for t in (ours[0], gradient, *ours[1:], counter)]
+        ops.adam_(*lists, [RATE], *BETAS, EPS, [-1], torch.tensor(0.5), stopped, iteration)
+    assert stopped == 0 and theirs.abs().max() > 5 * RATE
+    # Fifty steps of 0.01 at most, each good to some units of float32. The bound is on steps, so that 1e-30 counts, too.
+    unit = torch.finfo(torch.float32).eps
+    assert ((ours[0] - theirs.detach()).abs() <= 50 * 8 * unit * RATE).all()
+    tiny = size[:, 0] < 1e-16  # steps of 1e-17 and less, for which one needs a bound of their own
+    ratio = ours[0].double()[tiny] / theirs.detach()[tiny]
+    assert ((ratio - 1).abs() < 1e-4).all()
+
+
+# The model
+
+
+def test_marks_are_taken_and_counters_go_back():
+    gaussians = model(6)
+    guard = gaussian_model.StepGuard("cpu")
+    gaussians.guard_steps(guard)
+    for iteration in range(1, 5):
+        for values in gaussians._rows().values():
+            values.grad = None
+        for name, attribute in gaussians._attributes.items():
+            param = getattr(gaussians, attribute.field)
+            param.grad = torch.full_like(param, 0.1)
+            if iteration == 2 and name in ("scaling", "f_dc"):
+                param.grad[4] = NAN
+                param.grad[1] = INF
+        guard.watch(iteration, torch.tensor(0.5))
+        gaussians.step(torch.ones(6, dtype=torch.int32))
+        if iteration == 2:
+            good = {name: values.clone() for name, values in parameters(gaussians).items()}
+    assert guard.stopped_in() == 2
+    assert gaussians.take_marks() == [("f_dc", [1, 4], 6), ("scaling", [1, 4], 6)]
+    gaussians.rewind(2)
+    assert all(torch.equal(values, good[name]) for name, values in parameters(gaussians).items())
+    assert all(state["step"] == 2 for state in gaussians.optimizer.state.values())
+    assert not any(t.isnan().any() for state in gaussians.optimizer.state.values() for t in state.values())
+    assert gaussians.take_marks() == []
+
+
+# The training
+
+
+def _train(scene: Path, out: Path, *more: object, iterations: int) -> Path:
+    train.main(["-s", str(scene), "-m", str(out), "--iterations", str(iterations), *SMALL, *map(str, more)])
+    return out / "point_cloud" / f"iteration_{iterations}" / "point_cloud.ply"
+
+
+def _nan_loss_in(monkeypatch: pytest.MonkeyPatch, iteration: int) -> None:
+    plain, calls = train.photometric_loss, []
+
+    def broken(*args: object) -> tuple[torch.Tensor, torch.Tensor]:
+        calls.append(1)
+        loss, l1 = plain(*args)
+        return (loss * NAN if len(calls) == iteration else loss), l1
+
+    monkeypatch.setattr(train, "photometric_loss", broken)
+
+
+def _same(a: object, b: object) -> bool:
+    if isinstance(a, dict):
+        return a.keys() == b.keys() and all(_same(a[key], b[key]) for key in a)
+    if isinstance(a, list | tuple):
+        return len(a) == len(b) and all(map(_same, a, b))
+    return torch.equal(a, b) if torch.is_tensor(a) else a == b
+
+
+@pytest.mark.parametrize("optimizer", ["default", "sparse_adam"])
+@pytest.mark.parametrize(("broken", "seen"), [(3, 3), (13, 13), (26, 26), (12, 20)])
+def test_the_model_before_a_loss_of_nan_is_saved(colmap_scene, tmp_path, monkeypatch, broken, seen, optimizer):
+    """Whether it is seen at once, as something is saved (3) or changed (13, 26), or later: nothing moved since."""
+    options = ["--densify_from_iter", 10, "--densification_interval", 13, "--densify_grad_threshold", 1e-4]
+    options += ["--opacity_reset_interval", 26, "--optimizer_type", optimizer]
+    monkeypatch.setattr(train, "SH_INTERVAL", 10)
+    _train(colmap_scene, tmp_path / "whole", *options, "--checkpoint_iterations", broken - 1, iterations=broken)
+    _nan_loss_in(monkeypatch, broken)
+    out = tmp_path / "broken"
+    last = rf"is saved: go on with --start_checkpoint .*chkpnt{broken - 1}.pth and lower learning rates"
+    with pytest.raises(UserError, match=rf"loss became nan in iteration {broken} \(view (left|Right)/.*{last}"):
+        _train(colmap_scene, out, *options, "--save_iterations", 3, "--checkpoint_iterations", 3, iterations=30)
+    saved, wanted = (load_checkpoint(tmp_path / name / f"chkpnt{broken - 1}.pth") for name in ("broken", "whole"))
+    statistics = slice(7, 10)  # these go on until somebody looks
+    for capture in (saved[0], wanted[0]):
+        assert all(t.isfinite().all() for t in capture[statistics])
+    # The learning rates in there are those of the next iteration, and nobody reads them.
+    kept = [[*capture[:7], capture[10]["state"], capture[11]] for capture in (saved[0], wanted[0])]
+    assert saved[1] == wanted[1] and _same(*kept)
+    assert (out / "point_cloud").exists() == (broken > 3)
+    monkeypatch.undo()
+    _train(colmap_scene, out, *options, "--start_checkpoint", out / f"chkpnt{broken - 1}.pth", iterations=30)
+
+
+def test_a_first_loss_of_nan_leaves_nothing_to_save(colmap_scene, tmp_path, monkeypatch):
+    _nan_loss_in(monkeypatch, 1)
+    with pytest.raises(UserError, match="nothing was trained before; lower the learning rates"):
+        _train(colmap_scene, tmp_path, iterations=5)
+    assert not (tmp_path / "point_cloud").exists() and not list(tmp_path.glob("*.pth"))
+
+
+@pytest.mark.parametrize("optimizer", ["default", "sparse_adam"])
+def test_gaussians_without_a_finite_step_are_named(colmap_scene, tmp_path, monkeypatch, optimizer):
+    plain, calls = GaussianModel.step, []
+
+    def poisoned(self: GaussianModel, radii: torch.Tensor) -> None:
+        calls.append(1)
+        if len(calls) == 4:
+            radii[[5, 17]] = 9  # the sparse optimiser must see them
+            self._xyz.grad[5, 1] = INF
+            self._opacity.grad[17] = NAN
+        plain(self, radii)
+
+    monkeypatch.setattr(GaussianModel, "step", poisoned)
+    said = (
+        r"xyz of 1 of 300 \(5\) and opacity of 1 of 300 \(17\) could take no finite step in iteration 4 \(view .*4.pth"
+    )
+    with pytest.raises(UserError, match=said):
+        _train(colmap_scene, tmp_path, "--optimizer_type", optimizer, iterations=30)
+    capture, iteration = load_checkpoint(tmp_path / "chkpnt4.pth")
+    assert iteration == 4 and not (tmp_path / "point_cloud").exists()
+    assert all(state["step"] == 4 for state in capture[10]["state"].values())
+    state = capture[10]["state"][0]
+    assert state["exp_avg"][5, 1] == 0 == state["exp_avg_sq"][5, 1] and state["exp_avg"].isfinite().all()
+    monkeypatch.undo()
+    again = ["--start_checkpoint", tmp_path / "chkpnt4.pth", "--optimizer_type", optimizer]
+    _train(colmap_scene, tmp_path, *again, iterations=12)
+
+
+def test_exposures_without_a_finite_step_are_named(colmap_scene, tmp_path, monkeypatch):
+    plain, calls = GaussianModel.step, []
+
+    def poisoned(self: GaussianModel, radii: torch.Tensor) -> None:
+        calls.append(1)
+        if len(calls) == 4:
+            self.exposures.values.grad[2, 0, 0] = NAN
+        plain(self, radii)
+
+    monkeypatch.setattr(GaussianModel, "step", poisoned)
+    with pytest.raises(
+        UserError, match=r"exposure of 1 of 17 \(Right/V15.png\) could take no finite step in iteration 4"
+    ):
+        _train(colmap_scene, tmp_path, "--eval", "--train_test_exp", iterations=30)
+    load_checkpoint(tmp_path / "chkpnt4.pth")
+
+
+@pytest.mark.parametrize(("option", "name"), [("--scaling_lr", "scaling"), ("--position_lr_init", "xyz")])
+def test_rates_that_overflow_stop_before_anything_is_saved(colmap_scene, tmp_path, option, name):
+    with pytest.raises(
+        UserError, match=rf"{name} of \d+ of 300 \(0, 1, .*\) could take no finite step in iteration 1 "
+    ):
+        _train(colmap_scene, tmp_path, option, "3e38", "--position_lr_final", "3e38", iterations=5)
+    assert not (tmp_path / "point_cloud").exists()
+    assert all(t.isfinite().all() for t in load_checkpoint(tmp_path / "chkpnt1.pth")[0][1:7])
+
+
+def test_rates_a_hundred_times_too_high_end_in_a_warning(colmap_scene, tmp_path, capfd):
+    rates = {"position_lr_init": 0.016, "position_lr_final": 0.016, "feature_lr": 0.25, "opacity_lr": 2.5}
+    rates |= {"scaling_lr": 0.5, "rotation_lr": 0.1}
+    high = [word for name, rate in rates.items() for word in (f"--{name}", rate)]
+    options = ["--densify_from_iter", 50, "--densification_interval", 50, "--opacity_reset_interval", 300]
+    ply = _train(colmap_scene, tmp_path / "high", *options, *high, iterations=600)
+    gaussians = GaussianModel(3)
+    gaussians.load_ply(ply)
+    gaussians.check_finite(600)
+    assert "the model is worse than the points it began with; lower the learning rates" in capfd.readouterr().err
+    _train(colmap_scene, tmp_path / "usual", *options, iterations=150)
+    assert "the model is worse" not in capfd.readouterr().err
+    assert json.loads((tmp_path / "high" / "train_log.json").read_text())[-1]["loss"] > 0
