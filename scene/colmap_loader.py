@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from scene.colmap_faults import NAMES, describe
 from scene.lens import Lens
 from scene.pycolmap_import import import_pycolmap
 from utils.system_utils import UserError
@@ -78,8 +79,15 @@ def read_model(folder: Path) -> ColmapModel:
         except UnicodeDecodeError:
             errors.append(f".{suffix}: picture names that are not UTF-8, rename pictures in plain letters")
         except (ValueError, RuntimeError, LookupError, MemoryError) as error:
-            errors.append(f".{suffix}: {str(error).splitlines()[0] if str(error) else type(error).__name__}")
-    raise UserError(f"cannot read the COLMAP model in {folder} ({'; '.join(errors)}); export it again from COLMAP")
+            errors.append(describe(folder, suffix, error))
+    raise _unreadable(folder, errors)
+
+
+def _unreadable(folder: Path, faults: list[str]) -> UserError:
+    return UserError(
+        f"cannot read the COLMAP model in {folder} ({'; '.join(faults)}); mend that, or copy all three files again "
+        "from where they were made"
+    )
 
 
 class Sightings(NamedTuple):
@@ -100,7 +108,7 @@ def read_sightings(folder: Path, suffix: str) -> list[Sightings]:
     try:
         (model.read_binary if suffix == "bin" else model.read_text)(str(folder))
     except (ValueError, RuntimeError, IndexError, MemoryError) as error:
-        raise UserError(f"cannot read the COLMAP model in {folder} ({error}); export it again from COLMAP") from error
+        raise _unreadable(folder, [describe(folder, suffix, error)]) from error
     sightings = []
     for image_id in sorted(model.reg_image_ids()):
         image = model.images[image_id]
@@ -126,7 +134,7 @@ def points_file(folder: Path) -> Path:
 
 
 def _has_model(folder: Path, suffix: str) -> bool:
-    return all((folder / f"{name}.{suffix}").is_file() for name in ("cameras", "images", "points3D"))
+    return all((folder / f"{name}.{suffix}").is_file() for name in NAMES)
 
 
 def _check_cameras_whole(path: Path, model) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 
 from scene.colmap_reader import readColmapSceneInfo
 from scene.masks import NO_MASKS, MaskOptions
-from scene.picture_files import some
+from scene.scene_folder import BLENDER, COLMAP, NERFSTUDIO, kind_of
 from scene.scene_info import HOLD, CameraInfo, SceneInfo, scene_extent
 from scene.start_cloud import SFM, StartOptions
 from scene.transforms_reader import readNerfstudioInfo, readNerfSyntheticInfo
@@ -28,9 +28,9 @@ __all__ = [
 ]
 
 sceneLoadTypeCallbacks: dict[str, Callable[[Path, str, bool, StartOptions | None, MaskOptions], SceneInfo]] = {
-    "Colmap": readColmapSceneInfo,
-    "Blender": readNerfSyntheticInfo,
-    "Nerfstudio": readNerfstudioInfo,
+    COLMAP: readColmapSceneInfo,
+    BLENDER: readNerfSyntheticInfo,
+    NERFSTUDIO: readNerfstudioInfo,
 }
 
 
@@ -55,21 +55,7 @@ def read_scene(
     folder = Path(source_path)
     if not str(source_path):
         raise UserError("no scene folder given; name it with -s")
-    if not folder.is_dir():
-        raise UserError(f"no scene folder {folder}; name an existing one with -s")
-    if (folder / "sparse").is_dir():
-        kind = "Colmap"
-    elif (folder / "transforms_train.json").is_file():
-        kind = "Blender"
-    elif (folder / "transforms.json").is_file():
-        kind = "Nerfstudio"
-    else:
-        found = sorted(path.name for path in folder.iterdir())
-        raise UserError(
-            f"{folder} is not a scene: looked for the folder sparse (COLMAP) and the files transforms_train.json "
-            f"(Blender) and transforms.json (nerfstudio), found {some(found)}; give -s the folder that holds one of "
-            "them"
-        )
+    kind = kind_of(folder)
     start = StartOptions(init_pcd_path, init_type) if want_cloud else None
     info = sceneLoadTypeCallbacks[kind](folder, images, hold_out, start, masks)
     return local(info, world_offset(info) if offset is None else np.asarray(offset, dtype=np.float64))

@@ -9,6 +9,7 @@ import torch
 from PIL import Image
 from torch import Tensor
 
+from utils.file_kinds import not_the_file
 from utils.system_utils import UserError
 
 # What Pillow raises on broken files, by format.
@@ -27,6 +28,7 @@ def picture_size(path: Path) -> tuple[int, int]:
     try:
         with Image.open(path) as image:
             size = image.size
+            _refuse_float(image)
             if not _has_end_mark(path, image.format):
                 image.load()
     except _BROKEN as error:
@@ -58,6 +60,8 @@ def decode(path: Path, size: tuple[int, int]) -> Tensor:
 
 
 def _unreadable(path: Path, error: Exception) -> UserError:
+    if other := not_the_file(path):
+        return UserError(f"the picture {path} is {other}; fetch it again or take it out of the scene")
     return UserError(f"cannot read the picture {path} ({error}); replace it or take it out of the scene")
 
 
@@ -70,12 +74,16 @@ def _has_end_mark(path: Path, file_format: str | None) -> bool:
         return marks[file_format] in file.read()
 
 
+def _refuse_float(image: Image.Image) -> None:
+    if image.mode == "F":
+        raise ValueError("floating-point pixels; save it with 8 or 16 bits")
+
+
 def _to_rgb_or_rgba(image: Image.Image) -> Image.Image:
     if image.mode.startswith("I"):
         # Pillow's own conversion of 16-bit grey clips at 255.
         grey = np.clip(np.asarray(image).astype(np.int64), 0, 65535)
         return Image.fromarray(((grey + 128) // 257).astype(np.uint8)).convert("RGB")
-    if image.mode == "F":
-        raise ValueError("floating-point pixels; save it with 8 or 16 bits")
+    _refuse_float(image)
     has_alpha = image.has_transparency_data
     return image.convert("RGBA" if has_alpha else "RGB")

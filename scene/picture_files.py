@@ -39,6 +39,14 @@ class FileIndex:
                 return alike[0]
         return None
 
+    def with_another_suffix(self, name: str) -> Path | None:
+        """A file of this name but for what follows its last dot, after a miss: the same picture in another format."""
+        stem = os.path.splitext(_folded(name))[0]
+        alike = (
+            paths[0] for folded, paths in (self._folded_paths or {}).items() if os.path.splitext(folded)[0] == stem
+        )
+        return next(alike, None)
+
 
 def _folded(name: str) -> str:
     name = unicodedata.normalize("NFC", os.path.normpath(name.replace("\\", "/"))).casefold()
@@ -52,15 +60,19 @@ def find_pictures(
 
     suffixes: may be missing in the names. UserError with the missing files; listed_by and remedy are parts of it.
     """
+    if names and not folder.is_dir():
+        raise UserError(f"there is no folder {folder}, where {listed_by} has its pictures; {remedy}")
     index = FileIndex(folder)
     paths = [index.find(name, *(name + suffix for suffix in suffixes)) for name in names]
     missing = [name for name, path in zip(names, paths, strict=True) if path is None]
     if missing:
         if suffixes:
             missing = [name if name.lower().endswith(tuple(suffixes)) else name + suffixes[0] for name in missing]
+        other = index.with_another_suffix(missing[0])
+        instead = f" ({other.relative_to(folder)} is there instead)" if other else ""
         raise UserError(
             f"{len(missing)} of {len(paths)} pictures that {listed_by} lists are missing: "
-            f"{some([str(folder / name) for name in missing])}; {remedy}"
+            f"{some([str(folder / name) for name in missing])}{instead}; {remedy}"
         )
     if index.merely_alike:
         name, path = next(iter(index.merely_alike.items()))

@@ -90,13 +90,25 @@ def readNerfstudioInfo(
 def _read(path: Path) -> _CameraFile:
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
-        frames = [
-            _Frame(str(frame["file_path"]), _world_to_camera(frame["transform_matrix"]), dict(frame))
-            for frame in content["frames"]
-        ]
-    except (ValueError, KeyError, TypeError, OverflowError, RecursionError, np.linalg.LinAlgError) as error:
+        listed = list(content["frames"])
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise _no_camera_file(path, error) from error
-    return _CameraFile(path, content, frames)
+    return _CameraFile(path, content, [_frame(path, number, frame) for number, frame in enumerate(listed, start=1)])
+
+
+def _frame(path: Path, number: int, frame: Any) -> _Frame:
+    name = f" ({frame['file_path']})" if isinstance(frame, dict) and "file_path" in frame else ""
+    where = f"frame {number}{name:.80} of {path}"
+    try:
+        lacking = [key for key in ("file_path", "transform_matrix") if key not in frame]
+        if lacking:
+            raise UserError(f"{where} has no {' and no '.join(lacking)}; mend it, or take it out")
+        return _Frame(str(frame["file_path"]), _world_to_camera(frame["transform_matrix"]), dict(frame))
+    except (ValueError, TypeError, OverflowError, np.linalg.LinAlgError) as error:
+        raise UserError(
+            f"{where} has no usable pose ({type(error).__name__}: {error}); it needs a transform_matrix of 4x4 finite "
+            "numbers that can be inverted"
+        ) from error
 
 
 def _no_camera_file(path: Path, error: Exception) -> UserError:

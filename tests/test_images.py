@@ -149,6 +149,13 @@ def test_exif_orientation_is_ignored(tmp_path):
     assert torch.equal(decode(tmp_path / "a.png", (20, 10)), _chw(image))
 
 
+def test_floating_point_pixels_are_refused_before_they_are_decoded(tmp_path):
+    Image.new("F", (4, 3), 0.5).save(tmp_path / "f.tiff")
+    for read in (picture_size, lambda path: decode(path, (4, 3))):
+        with pytest.raises(UserError, match="f.tiff .floating-point pixels; save it with 8 or 16 bits"):
+            read(tmp_path / "f.tiff")
+
+
 @pytest.mark.parametrize("suffix", ["png", "jpg"])
 @pytest.mark.parametrize("kept", [0.0, 0.3, 0.9])
 def test_a_truncated_picture_is_found_before_it_is_needed(tmp_path, suffix, kept):
@@ -160,7 +167,7 @@ def test_a_truncated_picture_is_found_before_it_is_needed(tmp_path, suffix, kept
     assert picture_size(path) == (64, 64)
     path.write_bytes(whole[: int(len(whole) * kept)])
     for use in (picture_size, lambda path: decode(path, (64, 64))):
-        with pytest.raises(UserError, match=f"cannot read the picture .*cut.{suffix}"):
+        with pytest.raises(UserError, match=f"the picture .*cut.{suffix}"):
             use(path)
 
 

@@ -82,7 +82,7 @@ def test_one_picture(tmp_path):
     assert _loss(tmp_path / "out") < 0.25  # from 0.4, of an untrained model
 
 
-@pytest.mark.parametrize("count", [1, 2, 3, 4])
+@pytest.mark.parametrize("count", [1, 2, 4])
 def test_a_handful_of_points(colmap_scene, tmp_path, count):
     def keep(model: pycolmap.Reconstruction) -> None:
         for point_id in sorted(model.points3D)[count:]:
