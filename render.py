@@ -21,10 +21,10 @@ from tqdm import tqdm
 
 from arguments import ModelParams, OptionParser, PipelineParams, get_combined_args
 from gaussian_renderer import render
-from scene import Scene
 from scene.cameras import Camera
 from scene.gaussian_model import GaussianModel
 from scene.memory_guard import memory_errors_explained
+from scene.saved_model import load_saved
 from utils import render_times
 from utils.general_utils import safe_state
 from utils.image_utils import right_half
@@ -110,7 +110,9 @@ def _wait(device: torch.device) -> None:
 @torch.no_grad()
 def main() -> None:
     parser = OptionParser(description="Render the train and test views of a trained model.")
-    model_params, pipeline_params = ModelParams(parser, sentinel=True), PipelineParams(parser)
+    # Each picture is looked at once, so one is kept.
+    model_params = ModelParams(parser, sentinel=True, without=("images_to_load",))
+    pipeline_params = PipelineParams(parser)
     parser.add_argument("--iteration", type=int, default=-1, help="saved iteration to render (-1: the highest)")
     parser.add_argument("--skip_train", action="store_true", help="leave the training views out")
     parser.add_argument("--skip_test", action="store_true", help="leave the test views out")
@@ -119,9 +121,9 @@ def main() -> None:
     options, pipe = model_params.extract(args), pipeline_params.extract(args)
     safe_state(args.quiet)
 
-    options.images_to_load = 1  # each is looked at once
-    gaussians = GaussianModel(options.sh_degree)
-    scene = Scene(options, gaussians, load_iteration=args.iteration, shuffle=False)
+    options.images_to_load = 1
+    scene = load_saved(options, args.iteration, args.typed_sh_degree)
+    gaussians = scene.gaussians
     if len(gaussians) == 0:
         raise UserError(f"iteration {scene.loaded_iter} of {scene.model_path} has no Gaussians; train it again")
     background = torch.full((3,), 1.0 if options.white_background else 0.0, device=compute_device())

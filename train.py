@@ -28,6 +28,7 @@ from arguments import (
     write_model_json,
 )
 from gaussian_renderer import render
+from gaussian_renderer.scored_views import ScoredViews
 from gaussian_renderer.trimming import change_on_views, trim
 from scene import Scene
 from scene import densification as adc
@@ -137,11 +138,10 @@ def training(
                 camera, gaussians, pipe, background,
                 use_trained_exp=dataset.train_test_exp, want_depth=weight > 0, want_visibility=False, clamp=False,
             )  # fmt: skip
-            loss, l1 = photometric_loss(
-                package["render"], camera.target(background), opt.lambda_dssim, camera.mask, camera.columns
-            )
+            target, mask = camera.ground_truth(background)
+            loss, l1 = photometric_loss(package["render"], target, opt.lambda_dssim, mask, camera.columns)
             if weight > 0:
-                depth_loss = weight * inverse_depth_loss(package["depth"], camera.invdepthmap, camera.columns)
+                depth_loss = weight * inverse_depth_loss(package["depth"], camera.invdepthmap, camera.columns, mask)
                 depth_losses.add(iteration, depth_loss)
                 loss = loss + depth_loss
             loss.backward()
@@ -221,7 +221,7 @@ def _curve(
     """Recorder of the error of all test views and as many training views."""
     test = scene.getTestCameras()
     trained = [camera for camera in scene.getTrainCameras() if camera.columns is None]  # in whole
-    scored = _ScoredViews(pipe, background, train_test_exp)
+    scored = ScoredViews(pipe, background, train_test_exp)
     return CurveRecorder(
         scene.model_path,
         rows,
@@ -234,30 +234,6 @@ def _curve(
         scored.mask,
         background.device,
     )
-
-
-class _ScoredViews:
-    """Images of views and what they should be, as they are scored: by the half-image protocol the right halves alone,
-    rendered with exposures."""
-
-    def __init__(self, pipe: argparse.Namespace, background: Tensor, train_test_exp: bool) -> None:
-        self._pipe = pipe
-        self._background = background
-        self._halves = train_test_exp
-
-    def image(self, camera: Camera, gaussians: GaussianModel) -> Tensor:
-        exposed = {"use_trained_exp": self._halves}
-        package = render(camera, gaussians, self._pipe, self._background, **exposed, want_visibility=False)
-        return self._part(package["render"])
-
-    def target(self, camera: Camera) -> Tensor:
-        return self._part(camera.target(self._background))
-
-    def mask(self, camera: Camera) -> Tensor | None:
-        return None if camera.mask is None else self._part(camera.mask)
-
-    def _part(self, image: Tensor) -> Tensor:
-        return right_half(image).contiguous() if self._halves else image
 
 
 def _save_last(
@@ -278,7 +254,7 @@ def _save_last(
     final, test = trimmed.gaussians, scene.getTestCameras()
     change = {}
     if test and final is not trained:
-        views = _ScoredViews(pipe, background, dataset.train_test_exp)
+        views = ScoredViews(pipe, background, dataset.train_test_exp)
         truth = (lambda camera: (views.target(camera), views.mask(camera))) if scored else None
         change = change_on_views(trained, final, test, views.image, truth)
     scene.save(opt.iterations, final)
@@ -440,6 +416,8 @@ def training_report(
                 mask = camera.mask
                 if train_test_exp:
                     image, target, mask = (None if x is None else right_half(x) for x in (image, target, mask))
+                if mask is not None and not mask.any():
+                    continue
                 counted = [pixels_that_count(x, mask) for x in (image, target)]
                 differences.append(l1_loss(*counted).item())
                 ratios.append(psnr(*counted).mean().item())
@@ -448,7 +426,9 @@ def training_report(
                 tb_writer.add_image(f"{tag}/render", image, global_step=iteration)
                 if iteration == testing_iterations[0]:
                     tb_writer.add_image(f"{tag}/ground_truth", target, global_step=iteration)
-        l1_mean, psnr_mean = sum(differences) / len(cameras), sum(ratios) / len(cameras)
+        if not ratios:
+            continue
+        l1_mean, psnr_mean = sum(differences) / len(differences), sum(ratios) / len(ratios)
         tqdm.write(f"[ITER {iteration}] Evaluating {name}: L1 {l1_mean} PSNR {psnr_mean}", file=sys.stdout)
         if tb_writer:
             tb_writer.add_scalar(f"{name}/loss_viewpoint - l1_loss", l1_mean, iteration)

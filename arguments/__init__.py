@@ -8,6 +8,7 @@ from arguments.stored import (
     get_combined_args,
     read_cfg_args,
     read_model_json,
+    read_stored_options,
     write_cfg_args,
     write_model_json,
 )
@@ -23,6 +24,7 @@ __all__ = [
     "get_combined_args",
     "read_cfg_args",
     "read_model_json",
+    "read_stored_options",
     "write_cfg_args",
     "write_model_json",
 ]

@@ -250,7 +250,7 @@ class OptimizationParams(ParamGroup):
             "keep_unseen",
             False,
             "save also the Gaussians that no training view depends on; otherwise the last save leaves them out, which "
-            "changes no training view and may change others",
+            "changes no training view at the size it was trained at, and may change other views and sizes",
             "ours",
         ),
         Option(

@@ -2,7 +2,7 @@
 
 import argparse
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -72,15 +72,17 @@ class ParamGroup:
     """A topic's options: puts them on a parser, takes their checked values from the parsed arguments.
 
     sentinel: every default becomes None ("not given"), so that get_combined_args can tell what the user typed.
+    without: options that the command line does not have, since they would have no effect.
     """
 
     title: ClassVar[str]
     options: ClassVar[tuple[Option, ...]]
 
-    def __init__(self, parser: argparse.ArgumentParser, sentinel: bool = False) -> None:
+    def __init__(self, parser: argparse.ArgumentParser, sentinel: bool = False, without: Collection[str] = ()) -> None:
         group = parser.add_argument_group(self.title)
         for option in self.options:
-            option.add_to(group, sentinel)
+            if option.name not in without:
+                option.add_to(group, sentinel)
 
     def extract(self, args: argparse.Namespace) -> argparse.Namespace:
         """This group's values out of `args`; absent or None means the default. UserError for absurd values."""

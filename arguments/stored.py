@@ -115,20 +115,26 @@ def _is_finite(value: Any) -> bool:
     return type(value) in (int, float) and abs(value) <= sys.float_info.max
 
 
+def read_stored_options(model_path: str | os.PathLike) -> dict[str, Value]:
+    """Model options as far as a model folder has them, in cfg_args and model.json. UserError as both readers."""
+    stored, record = read_cfg_args(model_path), read_model_json(model_path)
+    return stored | {name: record[name] for name in _REMEMBERED if name in record}
+
+
 def get_combined_args(parser: argparse.ArgumentParser, argv: Sequence[str] | None = None) -> argparse.Namespace:
     """Parse the command line and fill what it leaves open from the model folder that -m names.
 
     Whatever was typed wins; flags can only be switched on. The parser's model options must default to None
-    (`ModelParams(parser, sentinel=True)`). UserError without -m or without a readable cfg_args.
+    (`ModelParams(parser, sentinel=True)`). `typed_sh_degree` is the degree that was typed, or None: a saved PLY may be
+    of another than cfg_args. UserError without -m or without a readable cfg_args.
     """
     args = parser.parse_args(argv)
     if not getattr(args, "model_path", None):
         raise UserError("no model folder given; name it with -m")
-    stored = read_cfg_args(args.model_path)
     typed = {name: value for name, value in vars(args).items() if value is not None}
-    record = read_model_json(args.model_path)
-    stored |= {name: record[name] for name in _REMEMBERED if name in record}
-    combined = argparse.Namespace(**{**vars(args), **stored, **typed})
+    combined = argparse.Namespace(**{**vars(args), **read_stored_options(args.model_path), **typed})
+    combined.typed_sh_degree = typed.get("sh_degree")
     if hasattr(args, "antialiasing"):
-        combined.antialiasing = bool(args.antialiasing) or record.get("antialiasing", False)
+        remembered = read_model_json(args.model_path).get("antialiasing", False)
+        combined.antialiasing = bool(args.antialiasing) or remembered
     return combined

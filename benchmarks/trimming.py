@@ -6,7 +6,6 @@ A model that train.py saved without --keep_unseen has no unseen Gaussians left. 
 a colour moves at most. PSNR is the mean over the views, from unrounded renders.
 """
 
-import argparse
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -19,11 +18,11 @@ import torch
 from arguments import ModelParams, OptionParser, PipelineParams, get_combined_args  # noqa: E402
 from benchmarks.environment import describe, print_table  # noqa: E402
 from benchmarks.timing import cpu_milliseconds, gpu_time  # noqa: E402
-from gaussian_renderer import render  # noqa: E402
+from gaussian_renderer.scored_views import ScoredViews  # noqa: E402
 from gaussian_renderer.trimming import seen_by  # noqa: E402
-from scene import Scene  # noqa: E402
 from scene.cameras import Camera  # noqa: E402
 from scene.gaussian_model import GaussianModel  # noqa: E402
+from scene.saved_model import load_saved  # noqa: E402
 from scene.sh_bands import cut_bounds  # noqa: E402
 from utils.system_utils import compute_device, run_cli  # noqa: E402
 from utils.view_scores import mean_scores  # noqa: E402
@@ -43,32 +42,29 @@ def main() -> None:
     options, pipe = model_params.extract(args), pipeline_params.extract(args)
     device = compute_device()
     print(describe(device))
-    gaussians = GaussianModel(options.sh_degree)
-    scene = Scene(options, gaussians, load_iteration=args.iteration, shuffle=False)
+    scene = load_saved(options, args.iteration, args.typed_sh_degree)
+    gaussians = scene.gaussians
     background = torch.full((3,), 1.0 if options.white_background else 0.0, device=device)
     views = {"train": scene.getTrainCameras(), "test": scene.getTestCameras()}
 
     keep = seen_by(views["train"], gaussians, pipe)
+    views["train"] = [camera for camera in views["train"] if camera.columns is None]  # in whole, not the test views
     bounds = cut_bounds(gaussians.get_features_rest[keep])
     models = [("all", "", gaussians), ("without unseen", "0", gaussians.part(keep, gaussians.max_sh_degree))]
     for degree in reversed(range(gaussians.max_sh_degree)):
         models.append((f"and SH bands above {degree}", f"{bounds[degree]:.3g}", gaussians.part(keep, degree)))
-    rows = [[name, bound, *_row(model, views, pipe, background)] for name, bound, model in models]
+    scored = ScoredViews(pipe, background, options.train_test_exp)
+    rows = [[name, bound, *_row(model, views, scored, device)] for name, bound, model in models]
     header = ["saved", "bound", "Gaussians", "MB", "train PSNR", "test PSNR", "ms a view"]
     print_table(header, rows)
 
 
-def _row(
-    model: GaussianModel, views: dict[str, list[Camera]], pipe: argparse.Namespace, background: torch.Tensor
-) -> list[str]:
-    def image(camera: Camera) -> torch.Tensor:
-        return render(camera, model, pipe, background, want_visibility=False)["render"]
-
+def _row(model: GaussianModel, views: dict[str, list[Camera]], scored: ScoredViews, device: torch.device) -> list[str]:
     psnr = []
     for cameras in views.values():
-        scores = mean_scores((image(camera), camera.target(background), camera.mask) for camera in cameras)
-        psnr.append(f"{scores['psnr']:.3f}" if cameras else "")
-    median = milliseconds(lambda: image(views["train"][0]), background.device)
+        scores = mean_scores((scored.image(c, model), scored.target(c), scored.mask(c)) for c in cameras)
+        psnr.append(f"{scores['psnr']:.3f}" if scores else "")
+    median = milliseconds(lambda: scored.image(views["train"][0], model), device)
     return [str(len(model)), f"{model.ply_bytes / 1e6:.2f}", *psnr, f"{median:.2f}"]
 
 

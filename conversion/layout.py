@@ -3,9 +3,9 @@
 from dataclasses import dataclass
 from pathlib import Path
 
+from utils.image_files import SUFFIXES
 from utils.system_utils import UserError
 
-PICTURES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
 # Frequent beside photos, and read neither by Pillow alone nor by COLMAP.
 _FOREIGN = (".heic", ".heif", ".avif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".gif")
 _VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mts")
@@ -111,7 +111,7 @@ def find_photos(layout: Layout) -> list[str]:
         videos = [path.name for path in files if path.suffix.lower() in _VIDEOS]
         hint = f"; move {videos[0]} elsewhere and give it with --video" if videos else ""
         raise UserError(
-            f"{len(names)} photos ({', '.join(PICTURES)}) in {layout.input}, at least {FEWEST} are needed, and 20 to "
+            f"{len(names)} photos ({', '.join(SUFFIXES)}) in {layout.input}, at least {FEWEST} are needed, and 20 to "
             f"200 with much overlap are usual; put more there{hint}"
         )
     return names
@@ -138,7 +138,7 @@ def _no_input(layout: Layout) -> str:
 
 
 def _is_picture(path: Path) -> bool:
-    return path.suffix.lower() in PICTURES and not path.name.startswith(".") and path.is_file()
+    return path.suffix.lower() in SUFFIXES and not path.name.startswith(".") and path.is_file()
 
 
 def refuse_foreign_results(layout: Layout, scene_made: bool, work_made: bool, skip_matching: bool) -> None:

@@ -11,11 +11,12 @@ from tqdm import tqdm
 
 from conversion.layout import Layout, picture_names
 from scene.images import picture_size
+from utils.image_files import UNREADABLE
 from utils.system_utils import UserError
+from utils.threads import threads
 
 JPEG_QUALITY = 95
 _ORIENTATION = 0x0112  # EXIF tag; 1 or absent: upright
-_BROKEN = (OSError, SyntaxError, ValueError, Image.DecompressionBombError)
 
 
 def prepare_photos(layout: Layout, names: Sequence[str], masks: Path | None) -> None:
@@ -87,7 +88,7 @@ def _prepare_photo(source: Path, target: Path) -> Path:
             target = target.with_name(f"{target.name}.png") if webp else target
             _save(upright, target, image, exif=upright.getexif())
             return target
-    except _BROKEN as error:
+    except UNREADABLE as error:
         raise UserError(f"cannot turn the photo {source} upright ({error}); replace it or take it out") from error
 
 
@@ -103,7 +104,7 @@ def _prepare_mask(source: Path | None, target: Path, photo: Path, original: Path
     try:
         with Image.open(source) as image:
             mask = image.convert("L")
-    except _BROKEN as error:
+    except UNREADABLE as error:
         raise UserError(f"cannot read the mask {source} ({error}); replace it or take it out") from error
     size = picture_size(photo)
     if mask.size != size:
@@ -133,7 +134,7 @@ def _link(source: Path, target: Path) -> None:
 
 
 def _in_threads(work: Callable[[str], None], names: Sequence[str], title: str) -> None:
-    with ThreadPoolExecutor(os.cpu_count()) as pool, tqdm(total=len(names), desc=title, dynamic_ncols=True) as bar:
+    with ThreadPoolExecutor(threads()) as pool, tqdm(total=len(names), desc=title, dynamic_ncols=True) as bar:
         try:
             for _ in pool.map(work, names):
                 bar.update()

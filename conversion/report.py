@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from utils.listing import some
 from utils.system_utils import UserError, atomic_write
 
 FEWEST_POINTS = 1000  # fewer make a poor start: density control has to find the scene by itself
@@ -56,7 +57,7 @@ def advice(
     lines = []
     if out:
         lonely = sum(partners.get(name, 0) == 0 for name in out)
-        text = f"{len(out)} of {len(photos)} photos were left out ({_some(out)})"
+        text = f"{len(out)} of {len(photos)} photos were left out ({some(out)})"
         if lonely:
             text += f", {lonely} of them match no other photo"
         remedy = "take more photos between them and their neighbours, or remove them if they are blurred"
@@ -116,7 +117,3 @@ def write_report(
     with atomic_write(path) as temporary:
         text = json.dumps(content, indent=1, sort_keys=True, allow_nan=False, ensure_ascii=False)
         temporary.write_text(text + "\n", encoding="utf-8")
-
-
-def _some(names: list[str], most: int = 5) -> str:
-    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")

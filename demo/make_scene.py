@@ -23,6 +23,7 @@ from demo.surface_points import MIN_TRACK, sample_points
 from demo.tracer import View, render_view
 from demo.views import ring_views
 from utils.system_utils import UserError, mkdir_p, run_cli
+from utils.threads import cores
 
 PIXELS_PER_PROCESS = 1_000_000  # below this, starting another process (2 s) takes longer than it saves
 
@@ -31,15 +32,10 @@ def _demo_picture(view: View) -> np.ndarray:
     return render_view(demo_scene(), view)
 
 
-def _cores() -> int:
-    """Cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
 def _pictures(views: list[View]) -> list[np.ndarray]:
     """What the views show, (H, W, 3) uint8 each, made on all cores if it is worth it."""
     pixels = sum(view.width * view.height for view in views)
-    workers = min(_cores(), 1 + pixels // PIXELS_PER_PROCESS)
+    workers = min(cores(), 1 + pixels // PIXELS_PER_PROCESS)
     bar = partial(tqdm, total=len(views), desc="Ray tracing", unit="view")
     if workers == 1:
         return list(bar(map(_demo_picture, views)))

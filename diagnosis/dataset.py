@@ -8,9 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
-from diagnosis.lines import Line, from_error, some
+from diagnosis.lines import Line, from_error
 from scene.dataset_readers import CameraInfo, SceneInfo, read_scene
 from scene.scene_info import APART, standing_apart
+from utils.listing import some
 from utils.system_utils import UserError
 
 # Learning rates and size limits are fractions of the extent, but depths below 0.2 are culled and float32 is used.

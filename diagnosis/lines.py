@@ -24,8 +24,3 @@ def from_error(error: Exception) -> Line:
     """A UserError's sentence: what is wrong; what to do."""
     text, semicolon, remedy = str(error).rpartition("; ")
     return Line(text, remedy) if semicolon else Line(remedy, "mend that and look again")
-
-
-def some(names: list[str], most: int = 3) -> str:
-    """The first names, and how many more there are."""
-    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")

@@ -8,14 +8,16 @@ from typing import Any
 import numpy as np
 import torch
 
-from arguments import ModelParams, PipelineParams, read_cfg_args, read_model_json
+from arguments import ModelParams, PipelineParams, read_model_json, read_stored_options
 from diagnosis.dataset import check_dataset
 from diagnosis.lines import Line, from_error
 from gaussian_renderer import render
+from gaussian_renderer.scored_views import ScoredViews
 from scene import Scene
 from scene.cameras import Camera
 from scene.gaussian_model import GaussianModel
-from utils.image_utils import as_float, psnr
+from scene.saved_model import load_saved
+from utils.image_utils import as_float, pixels_that_count, psnr
 from utils.system_utils import UserError, compute_device
 
 # Densification prunes below 0.005 and a reset leaves 0.01: a model whose median is there has not recovered.
@@ -36,7 +38,7 @@ _WIDTH = 200
 def check_model(model_path: str, iteration: int) -> list[Line]:
     """Lines about the model that train.py wrote into a folder; iteration -1: the last one saved."""
     try:
-        stored = read_cfg_args(model_path)
+        stored = read_stored_options(model_path)
         with contextlib.redirect_stdout(io.StringIO()):  # of the readers
             options, scene = _load(model_path, stored, iteration)
     except UserError as error:
@@ -45,7 +47,8 @@ def check_model(model_path: str, iteration: int) -> list[Line]:
     name = f"iteration {scene.loaded_iter}"
     if not len(gaussians):
         return [Line(f"{name} has no Gaussians, so renders show the background", "train it again")]
-    lines = [Line(f"{name}, {len(gaussians)} Gaussians of SH degree {options.sh_degree}"), *check_values(gaussians)]
+    degree = gaussians.max_sh_degree
+    lines = [Line(f"{name}, {len(gaussians)} Gaussians of SH degree {degree}"), *check_values(gaussians)]
     if any(line.finding for line in lines):
         return lines
     return lines + check_shapes(gaussians, scene.cameras_extent) + check_renders(scene, options, stored)
@@ -53,11 +56,10 @@ def check_model(model_path: str, iteration: int) -> list[Line]:
 
 def _load(model_path: str, stored: dict[str, Any], iteration: int) -> tuple[argparse.Namespace, Scene]:
     # Small pictures: this is about black and bad, not about decimals.
-    given = {**stored, "model_path": model_path, "resolution": _WIDTH, "images_to_load": 1, "eval": False}
+    given = {**stored, "model_path": model_path, "resolution": _WIDTH, "images_to_load": 1}
     given.pop("depths", None)
     options = ModelParams(argparse.ArgumentParser()).extract(argparse.Namespace(**given))
-    gaussians = GaussianModel(options.sh_degree)
-    return options, Scene(options, gaussians, load_iteration=iteration, shuffle=False)
+    return options, load_saved(options, iteration)
 
 
 def check_values(gaussians: GaussianModel) -> list[Line]:
@@ -108,9 +110,11 @@ def check_shapes(gaussians: GaussianModel, extent: float) -> list[Line]:
 
 def check_renders(scene: Scene, options: argparse.Namespace, stored: dict[str, Any]) -> list[Line]:
     """A few training views, rendered small: not black, and near the pictures. Else the likeliest reasons."""
-    cameras = scene.getTrainCameras()
+    cameras = [camera for camera in scene.getTrainCameras() if camera.columns is None]  # in whole
     cameras = cameras[:: max(1, len(cameras) // _VIEWS)][:_VIEWS]
-    looks = [_look(camera, scene, options) for camera in cameras]
+    looks = [look for camera in cameras if (look := _look(camera, scene, options))]
+    if not looks:
+        return [Line("no pixel of the training views that were looked at counts", "look at --masks and --invert_masks")]
     brightness, truth, coverage, drawn, score = (float(np.mean(values)) for values in zip(*looks, strict=True))
     if brightness < BLACK and truth < BLACK:
         return [Line("the pictures themselves are black", "look at them; where they are transparent, train with -w")]
@@ -118,23 +122,31 @@ def check_renders(scene: Scene, options: argparse.Namespace, stored: dict[str, A
         return [_why_black(scene, cameras, coverage, drawn)]
     if score < BAD_PSNR:
         return [Line(f"training views have a PSNR of only {score:.1f} dB", _why_bad(scene, stored))]
-    return [Line(f"{len(cameras)} training views rendered {_WIDTH} pixels wide: PSNR {score:.1f} dB")]
+    return [Line(f"{len(looks)} training views rendered {_WIDTH} pixels wide: PSNR {score:.1f} dB")]
 
 
-def _look(camera: Camera, scene: Scene, options: argparse.Namespace) -> tuple[float, float, float, float, float]:
-    """Means of render and picture, share of the picture that is covered, share of Gaussians drawn, PSNR in dB."""
+def _look(camera: Camera, scene: Scene, options: argparse.Namespace) -> tuple[float, float, float, float, float] | None:
+    """Means of render and picture, share of the picture that is covered, share of Gaussians drawn, PSNR in dB.
+
+    Means and PSNR are of what is scored (masks, half images); None where that is no pixel.
+    """
     gaussians = scene.gaussians
     pipe = PipelineParams(argparse.ArgumentParser()).extract(argparse.Namespace())
     pipe.antialiasing = read_model_json(scene.model_path).get("antialiasing", False)
     background = torch.full((3,), 1.0 if options.white_background else 0.0, device=compute_device())
+    views = ScoredViews(pipe, background, options.train_test_exp)
+    mask = views.mask(camera)
+    if mask is not None and not mask.any():
+        return None
     with torch.no_grad():
-        package = render(camera, gaussians, pipe, background)
+        image, target = (
+            pixels_that_count(x, mask) for x in (views.image(camera, gaussians), as_float(views.target(camera)))
+        )
         black = torch.zeros_like(gaussians.get_xyz)
-        through = render(camera, gaussians, pipe, torch.ones_like(background), override_color=black)["render"]
-        target = as_float(camera.target(background))
-        ratio = float(psnr(package["render"], target).mean())
-    drawn = float((package["radii"] > 0).float().mean())
-    return float(package["render"].mean()), float(target.mean()), 1 - float(through.mean()), drawn, min(ratio, 99.0)
+        silhouette = render(camera, gaussians, pipe, torch.ones_like(background), override_color=black)
+    ratio = min(float(psnr(image, target).mean()), 99.0)
+    drawn = float((silhouette["radii"] > 0).float().mean())
+    return float(image.mean()), float(target.mean()), 1 - float(silhouette["render"].mean()), drawn, ratio
 
 
 def _why_black(scene: Scene, cameras: list[Camera], coverage: float, drawn: float) -> Line:

@@ -2,6 +2,7 @@
 
 import argparse
 import json
+import os
 import random
 import shutil
 import sys
@@ -62,7 +63,7 @@ class Scene:
     ) -> None:
         self.model_path = args.model_path
         self.gaussians = gaussians
-        self.loaded_iter = None if load_iteration is None else self._find_iteration(load_iteration)
+        self.loaded_iter = None if load_iteration is None else find_iteration(self.model_path, load_iteration)
 
         if self.loaded_iter is None:
             _refuse_dataset_folder(args)
@@ -103,7 +104,7 @@ class Scene:
                 self.write_inputs()
         else:
             print(f"Loading trained model at iteration {self.loaded_iter}")
-            gaussians.load_ply(str(self._ply(self.loaded_iter)))
+            gaussians.load_ply(str(saved_ply(self.model_path, self.loaded_iter)))
             if self._halves:
                 gaussians.load_exposures(self.model_path, info.train_cameras)
 
@@ -122,7 +123,7 @@ class Scene:
     def save(self, iteration: int, gaussians: _Gaussians | None = None) -> None:
         """Write the Gaussians, or those given in their place, as `point_cloud/iteration_N/point_cloud.ply`; exposures
         where those are trained."""
-        (self.gaussians if gaussians is None else gaussians).save_ply(str(self._ply(iteration)))
+        (self.gaussians if gaussians is None else gaussians).save_ply(str(saved_ply(self.model_path, iteration)))
         if self._halves:
             self.gaussians.save_exposures(self.model_path)
 
@@ -144,19 +145,6 @@ class Scene:
         with atomic_write(folder / "cameras.json") as path:
             path.write_text(json.dumps(entries, allow_nan=False), encoding="utf-8")
 
-    def _ply(self, iteration: int) -> Path:
-        return Path(self.model_path) / "point_cloud" / f"iteration_{iteration}" / "point_cloud.ply"
-
-    def _find_iteration(self, iteration: int) -> int:
-        folder = Path(self.model_path) / "point_cloud"
-        last = searchForMaxIteration(folder)
-        if iteration == -1:
-            return last
-        if not self._ply(iteration).is_file():
-            saved = ", ".join(map(str, saved_iterations(folder)))
-            raise UserError(f"iteration {iteration} was never saved in {folder}; saved are {saved}")
-        return iteration
-
     @staticmethod
     def _cameras(
         infos: list[CameraInfo],
@@ -177,6 +165,23 @@ class Scene:
         return lists
 
 
+def saved_ply(model_path: str | os.PathLike, iteration: int) -> Path:
+    """The PLY of an iteration in a model folder."""
+    return Path(model_path) / "point_cloud" / f"iteration_{iteration}" / "point_cloud.ply"
+
+
+def find_iteration(model_path: str | os.PathLike, iteration: int) -> int:
+    """The iteration, which must be saved in a model folder; -1: the last one saved. UserError where it is not there."""
+    folder = Path(model_path) / "point_cloud"
+    last = searchForMaxIteration(folder)
+    if iteration == -1:
+        return last
+    if not saved_ply(model_path, iteration).is_file():
+        saved = ", ".join(map(str, saved_iterations(folder)))
+        raise UserError(f"iteration {iteration} was never saved in {folder}; saved are {saved}")
+    return iteration
+
+
 def _pictures(lists: dict[float, list[Camera]]) -> list[Picture]:
     return [picture for cameras in lists.values() for camera in cameras for picture in camera.pictures]
 
@@ -191,11 +196,21 @@ def _refuse_dataset_folder(args: argparse.Namespace) -> None:
 
 
 def picture_device(data_device: str, fallback: torch.device) -> torch.device:
-    """Device that keeps the pictures: option --data_device where it can be used, else the device that computes."""
+    """Device that keeps the pictures: option --data_device where it can be used, else the device that computes.
+
+    A line says so where that is another than the option names, but for plain cuda where no GPU computes.
+    """
     try:
         wanted = torch.device(data_device)
     except RuntimeError:
-        print(f"--data_device {data_device} is no device; pictures are kept on {fallback}", file=sys.stderr)
+        wanted = None
+    if wanted is None or wanted.type not in ("cpu", "cuda"):
+        reason = "is neither cpu nor cuda"
+    elif wanted.type == "cpu" or (fallback.type == "cuda" and (wanted.index or 0) < torch.cuda.device_count()):
+        return wanted
+    elif wanted.index is None:
         return fallback
-    usable = wanted.type == "cpu" or (fallback.type == "cuda" and (wanted.index or 0) < torch.cuda.device_count())
-    return wanted if usable else fallback
+    else:
+        reason = "is not there, or not used"
+    print(f"warning: --data_device {data_device} {reason}; pictures are kept on {fallback}", file=sys.stderr)
+    return fallback

@@ -11,7 +11,7 @@ from fused_ssim import composite
 from torch import Tensor
 
 from scene.dataset_readers import CameraInfo
-from scene.image_store import ImageStore, Picture
+from scene.image_store import ImageStore, Picture, Source
 from scene.masks import TRANSPARENT, Cutout
 from scene.resolution import training_size
 from utils.graphics_utils import getProjectionMatrix, getWorld2View2
@@ -83,9 +83,16 @@ class Camera:
         sources = (self._source, self._mask, self._depth)
         return [(source, (self.image_width, self.image_height)) for source in sources if source is not None]
 
+    def _decoded(self, source: Source) -> Tensor:
+        return self._images.get(source, (self.image_width, self.image_height)).to(self.device, non_blocking=True)
+
     def _pixels(self) -> Tensor:
-        pixels = self._images.get(*self.pictures[0])
-        return pixels.to(self.device, non_blocking=True)
+        return self._decoded(self._source)
+
+    def ground_truth(self, background: Tensor) -> tuple[Tensor, Tensor | None]:
+        """`target` and `mask`; a picture that has to be copied to the device first is so once for both."""
+        pixels = self._pixels()
+        return self._target(pixels, background), self._counting(pixels)
 
     def target(self, background: Tensor) -> Tensor:
         """What a render of this view over `background` (3,) in [0,1] should be: (3,H,W).
@@ -93,7 +100,9 @@ class Camera:
         uint8, meaning value/255, for a picture without alpha, or with one that is a mask; else float32, laid over the
         background by its alpha.
         """
-        pixels = self._pixels()
+        return self._target(self._pixels(), background)
+
+    def _target(self, pixels: Tensor, background: Tensor) -> Tensor:
         if pixels.shape[0] == 3 or self._ignore_alpha:
             return pixels[:3]
         return composite(pixels, background.to(self.device))
@@ -101,10 +110,11 @@ class Camera:
     @property
     def mask(self) -> Tensor | None:
         """Which pixels count in loss and scores, (1,H,W) bool; None where all do."""
-        counts = None
-        if self._mask is not None:
-            counts = self._images.get(*self.pictures[1]).to(self.device, non_blocking=True) == 255
-        if self._ignore_alpha and (pixels := self._pixels()).shape[0] == 4:
+        return self._counting(self._pixels() if self._ignore_alpha else None)
+
+    def _counting(self, pixels: Tensor | None) -> Tensor | None:
+        counts = None if self._mask is None else self._decoded(self._mask) == 255
+        if self._ignore_alpha and pixels.shape[0] == 4:
             opaque = pixels[3:] == 255
             counts = opaque if counts is None else counts & opaque
         return counts
@@ -131,8 +141,7 @@ class Camera:
         """Inverse depth (1,H,W) float32, 1 / world units; None without a reliable map."""
         if self._depth is None:
             return None
-        values = self._images.get(*self.pictures[-1])
-        return values.to(self.device, non_blocking=True)
+        return self._decoded(self._depth)
 
     @property
     def depth_mask(self) -> Tensor | None:

@@ -17,6 +17,8 @@ from scene import colmap_loader
 from scene.dataset_readers import CameraInfo, SceneInfo
 from scene.images import picture_size
 from utils.cache_folder import cache_folder
+from utils.image_files import UNREADABLE
+from utils.listing import some
 from utils.system_utils import UserError
 
 PARAMS = "depth_params.json"
@@ -54,7 +56,7 @@ def with_depth_maps(info: SceneInfo, scene: Path, depths: str) -> SceneInfo:
     if undistorted:
         raise UserError(
             f"-d needs pictures without distortion, and {len(undistorted)} are undistorted on load "
-            f"({_some(undistorted)}), their depth maps not; undistort the scene with `colmap image_undistorter`, and "
+            f"({some(undistorted)}), their depth maps not; undistort the scene with `colmap image_undistorter`, and "
             "make the maps of its pictures"
         )
     if (scene / "sparse").is_dir():
@@ -76,7 +78,7 @@ def read_values(path: Path) -> np.ndarray:
                     raise UserError(f"the depth map {path} has 16-bit colours, which are not read whole; make it grey")
                 image = image.convert("RGB")
             values = np.asarray(image).astype(np.float64)
-    except (OSError, SyntaxError, ValueError, EOFError, Image.DecompressionBombError) as error:
+    except UNREADABLE as error:
         raise UserError(f"cannot read the depth map {path} ({error}); make it again") from error
     if values.ndim == 3:
         # Some tools write grey as three equal channels.
@@ -137,7 +139,7 @@ def _colmap_maps(cameras: Sequence[CameraInfo], scene: Path, folder: Path) -> li
             (unreliable if name in params else unknown).append(camera.image_name)
         maps.append(DepthMap(folder / f"{name}.png", COLMAP_UNIT, scale, offset) if believed else None)
     reasons = [
-        f"{len(names)} {what} ({_some(names)})"
+        f"{len(names)} {what} ({some(names)})"
         for names, what in ((unknown, f"not in {path}"), (unreliable, "of an unreliable scale there"))
         if names
     ]
@@ -178,18 +180,13 @@ def _check_files(paths: Sequence[Path]) -> None:
     missing = [str(path) for path in paths if not path.is_file()]
     if missing:
         raise UserError(
-            f"{len(missing)} of {len(paths)} depth maps are missing: {_some(missing)}; put them there, or leave -d out"
+            f"{len(missing)} of {len(paths)} depth maps are missing: {some(missing)}; put them there, or leave -d out"
         )
     shared = [str(path) for path, count in Counter(paths).items() if count > 1]
     if shared:
         raise UserError(
-            f"several training pictures have the same depth map: {_some(shared)}; put a map for each into the folder, "
+            f"several training pictures have the same depth map: {some(shared)}; put a map for each into the folder, "
             "in sub-folders as the pictures are (with COLMAP, give pictures names that differ by more than the suffix)"
         )
     for path in paths:
         picture_size(path)
-
-
-def _some(names: Sequence[str], most: int = 3) -> str:
-    rest = len(names) - most
-    return ", ".join(names[:most]) + (f" and {rest} more" if rest > 0 else "")

@@ -80,6 +80,7 @@ class Exposures:
             raise UserError(f"the checkpoint's exposures are not {tuple(self.values.shape)} float32; use another one")
         with torch.no_grad():
             self.values.copy_(values)
+        self.check_finite("the checkpoint", "use another one")
         try:
             self.optimizer.take_state(state.get("optimizer"))
         except ValueError as error:

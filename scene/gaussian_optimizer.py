@@ -52,7 +52,8 @@ class GaussianAdam(torch.optim.Adam):
     def set_active_columns(self, name: str, columns: int) -> None:
         """Promise that only the first `columns` values of each row of this group ever had a gradient.
 
-        Adam's step for the others changes no bit (moments and gradient are zero), so it is left out.
+        Adam's step for the others changes no bit (moments and gradient are zero), so it is left out. A group without
+        any, which gets no gradient, counts its steps along with f_dc.
         """
         self._active_columns[name] = columns
 
@@ -66,17 +67,16 @@ class GaussianAdam(torch.optim.Adam):
         if closure is not None:
             with torch.enable_grad():
                 loss = closure()
-        stepped, rates, columns, tensors = False, [], [], []
+        rates, columns, tensors = [], [], []
+        params = {group["name"]: group["params"][0] for group in self.param_groups}
         for group in self.param_groups:
             (param,) = group["params"]
             active = self._active_columns.get(group["name"], -1)
             if active != 0:
                 stepped, gradient = param.grad is not None, param.grad
-            elif param.numel():
-                # Nothing was rendered from this group, so it got no gradient; it counts along with its neighbour.
-                gradient = param  # stands in: of no columns nothing is read
             else:
-                continue
+                # Nothing was rendered from this group; the parameter stands in, as of no columns nothing is read.
+                stepped, gradient = params["f_dc"].grad is not None and param.numel() > 0, param
             if stepped:
                 state = self._state_of(param)
                 tensors.append((param, gradient, state["exp_avg"], state["exp_avg_sq"], state["step"]))

@@ -1,7 +1,7 @@
 """point_cloud.ply: the trained model as other tools read it, with the columns and order of the reference."""
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 import torch
@@ -49,6 +49,19 @@ def _comments(world_offset: Sequence[float]) -> list[str]:
     return [f"comment world_offset {' '.join(map(repr, world_offset))}"] if any(world_offset) else []
 
 
+def stored_sh_degree(path: str | os.PathLike) -> int | None:
+    """SH degree by the header of a Gaussian PLY, None where its f_rest properties are of no degree that is known.
+
+    UserError when the file can't be had or read.
+    """
+    return _degree(read_vertices(path).dtype.names or ())
+
+
+def _degree(names: Iterable[str]) -> int | None:
+    rest = sum(name.startswith("f_rest_") for name in names)
+    return next((degree for degree in range(4) if 3 * ((degree + 1) ** 2 - 1) == rest), None)
+
+
 def read_ply(path: str | os.PathLike, sh_degree: int) -> Rows:
     """Read a Gaussian PLY of exactly this SH degree, ours or another tool's: any order, scalar type and encoding.
 
@@ -65,7 +78,7 @@ def read_ply(path: str | os.PathLike, sh_degree: int) -> Rows:
             f"{path} is no Gaussian model, it lacks the properties {', '.join(missing)}; give a trained one"
         )
     if rest != len(wanted) or not present.issuperset(wanted):
-        degree = next((d for d in range(4) if 3 * ((d + 1) ** 2 - 1) == rest), None)
+        degree = _degree(present)
         found = "no SH degree that is known" if degree is None else f"SH degree {degree}"
         raise UserError(
             f"{path} has {rest} f_rest properties, that is {found}, where SH degree {sh_degree} needs {len(wanted)}; "

@@ -13,9 +13,9 @@ from torch import Tensor
 from scene.device_copies import DeviceCopies
 from scene.images import decode
 from utils.memory import free_memory
+from utils.threads import threads
 
 GPU_SHARE = 0.25  # of the memory free at the start: what pictures may take of a GPU; the model needs the rest
-MOST_THREADS = 16
 COPIES_AHEAD = 2  # pictures copied to the GPU ahead of their use; a copy takes less than an iteration
 
 Size = tuple[int, int]  # width, height
@@ -55,7 +55,7 @@ class ImageStore:
         self._kept: OrderedDict[Key, Tensor | Future[Tensor]] = OrderedDict()  # in order of use
         self._planned: set[Key] = set()
         self._awaited: set[Key] = set()  # planned for training, and not decoded yet
-        self._workers = min(_cores(), MOST_THREADS)
+        self._workers = threads()
         self._threads: ThreadPoolExecutor | None = None
         self._copies: DeviceCopies | None = None
 
@@ -166,8 +166,3 @@ def _bytes(source: str | Decodable, size: Size) -> int:
         return source.pixel_bytes * size[0] * size[1]
     channels = 3 if source.lower().endswith((".jpg", ".jpeg")) else 4
     return channels * size[0] * size[1]
-
-
-def _cores() -> int:
-    """Processors that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

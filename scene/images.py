@@ -10,10 +10,9 @@ from PIL import Image
 from torch import Tensor
 
 from utils.file_kinds import not_the_file
+from utils.image_files import UNREADABLE
 from utils.system_utils import UserError
 
-# What Pillow raises on broken files, by format.
-_BROKEN = (OSError, SyntaxError, ValueError, EOFError, Image.DecompressionBombError)
 _TAIL = 4096
 # Large pictures are normal here; Pillow's own limit still refuses absurd ones. Once and for all, as filters that are
 # set for a block only are shared by all threads.
@@ -31,7 +30,7 @@ def picture_size(path: Path) -> tuple[int, int]:
             _refuse_float(image)
             if not _has_end_mark(path, image.format):
                 image.load()
-    except _BROKEN as error:
+    except UNREADABLE as error:
         raise _unreadable(path, error) from error
     return size
 
@@ -51,7 +50,7 @@ def decode(path: Path, size: tuple[int, int]) -> Tensor:
         if pixels.shape[-1] == 4 and pixels[..., 3].min() == 255:
             pixels = pixels[..., :3]
         return torch.from_numpy(np.ascontiguousarray(pixels.transpose(2, 0, 1)))
-    except _BROKEN as error:
+    except UNREADABLE as error:
         raise _unreadable(path, error) from error
     except MemoryError as error:
         raise UserError(

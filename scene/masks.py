@@ -18,14 +18,15 @@ from PIL import Image, ImageFilter
 from torch import Tensor
 
 from scene.images import decode, picture_size
-from scene.picture_files import FileIndex, some
+from scene.picture_files import FileIndex
+from utils.image_files import SUFFIXES
+from utils.listing import some
 from utils.system_utils import UserError
 
 AUTO = "auto"
 IGNORE = "ignore"
 TRANSPARENT = "transparent"
 _REACH = ImageFilter.MinFilter(5)  # as far as bicubic resizing mixes: 2 pixels of the coarser size
-_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp")
 
 
 @dataclass(frozen=True)
@@ -141,4 +142,4 @@ def find_masks(scene: Path, names: Sequence[str], options: MaskOptions) -> list[
 
 def _find(index: FileIndex, name: str) -> Path | None:
     stem = os.path.splitext(name)[0]
-    return index.find(name, f"{name}.png", *(stem + suffix for suffix in _SUFFIXES))
+    return index.find(name, f"{name}.png", *(stem + suffix for suffix in SUFFIXES))

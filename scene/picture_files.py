@@ -6,6 +6,7 @@ import unicodedata
 from collections.abc import Sequence
 from pathlib import Path
 
+from utils.listing import some
 from utils.system_utils import UserError
 
 
@@ -82,11 +83,3 @@ def find_pictures(
             file=sys.stderr,
         )
     return paths
-
-
-def some(names: Sequence[str], most: int = 5) -> str:
-    """The first names of a list, for a message."""
-    if not names:
-        return "nothing"
-    rest = len(names) - most
-    return ", ".join(names[:most]) + (f" and {rest} more" if rest > 0 else "")

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from scene.picture_files import some
+from utils.listing import some
 from utils.system_utils import UserError
 
 COLMAP, BLENDER, NERFSTUDIO = "Colmap", "Blender", "Nerfstudio"

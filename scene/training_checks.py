@@ -4,8 +4,8 @@ import sys
 
 import numpy as np
 
-from scene.picture_files import some
 from scene.scene_info import APART, NEAREST, SceneInfo, standing_apart
+from utils.listing import some
 from utils.system_utils import UserError
 
 _SAMPLE = 16  # cameras whose depths are looked at

@@ -15,10 +15,10 @@ from scene.scene_info import CameraInfo, SceneInfo, scene_extent, split_by_order
 from scene.source_views import SourceView, make_cameras
 from scene.start_cloud import OWN_POINTS, StartCloud, StartOptions, choose_start, random_in_cube, random_in_frusta
 from scene.transforms_lens import lens_of
+from utils.image_files import SUFFIXES
 from utils.system_utils import UserError
 
 SPLITS = ("train_filenames", "val_filenames", "test_filenames")
-_SUFFIXES = (".png", ".jpg", ".jpeg")
 
 
 class _Frame(NamedTuple):
@@ -122,7 +122,7 @@ def _cameras(file: _CameraFile, masks: MaskOptions, by_stem: bool) -> list[Camer
     """The views in the order of the frames, named by the stems or by the whole relative paths of their files."""
     folder = file.path.parent
     listed = [frame.file_path for frame in file.frames]
-    paths = find_pictures(folder, listed, str(file.path), "put them there", _SUFFIXES)
+    paths = find_pictures(folder, listed, str(file.path), "put them there", SUFFIXES)
     names = [_relative(path, folder) for path in paths]
     views = []
     for index, (frame, path, mask) in enumerate(zip(file.frames, paths, _masks(file, names, masks), strict=True)):

@@ -5,7 +5,6 @@ pycolmap. So an edited photo is undistorted anew, and a copied or moved scene is
 """
 
 import hashlib
-import os
 import sys
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -14,6 +13,7 @@ from typing import NamedTuple, TypeVar
 
 import numpy as np
 from PIL import Image
+from PIL.PngImagePlugin import PngInfo
 from tqdm import tqdm
 
 from scene.images import decode, picture_size
@@ -22,8 +22,11 @@ from scene.masks import TRANSPARENT, Mask
 from scene.pycolmap_import import import_pycolmap
 from utils.cache_folder import cache_folder
 from utils.system_utils import UserError, atomic_write, mkdir_p
+from utils.threads import threads
 
-_FORMAT = "1"  # of the files in the cache: to be raised when the same input shall give other files
+_FORMAT = "2"  # of the files in the cache: to be raised when the same input shall give other files
+
+_HAS_MASK = "mask"  # text of a picture's file, yes or no, so that a mask that was deleted is missed
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")
@@ -87,7 +90,7 @@ def _say_which_are_cut(photos: Sequence[Photo]) -> None:
 
 def _in_threads(work: Callable[[Job], Result], jobs: Sequence[Job], title: str) -> list[Result]:
     # pycolmap, Pillow and hashlib let other threads run while they work.
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
+    with ThreadPoolExecutor(threads()) as pool:
         futures = [pool.submit(work, job) for job in jobs]
         try:
             return [future.result() for future in tqdm(futures, desc=title, unit="picture", leave=False)]
@@ -111,14 +114,18 @@ def _key(photo: Photo, version: str) -> str:
 
 
 def _kept(path: Path) -> bool:
-    """Whether the picture is in the cache and whole."""
+    """Whether the picture is in the cache and whole, and its mask too if it was made with one."""
     if not path.is_file():
         return False
     try:
         picture_size(path)
+        with Image.open(path) as image:
+            has_mask = image.info.get(_HAS_MASK)
+        if has_mask == "yes":
+            picture_size(_mask_path(path))
     except UserError:
         return False
-    return True
+    return has_mask in ("yes", "no")
 
 
 def _mask_path(path: Path) -> Path:
@@ -150,12 +157,15 @@ def _make(photo: Photo, path: Path) -> None:
         # Interpolation mixes neighbours: a pixel counts if all that went into it does.
         shown = shown & (_warp(np.where(counts, 255, 0).astype(np.uint8), plan) == 255)
     mask_path = _mask_path(path)
-    if not shown.all():
+    has_mask = not shown.all()
+    if has_mask:
         with atomic_write(mask_path) as temporary:
             Image.fromarray(np.where(shown, 255, 0).astype(np.uint8)).save(temporary)
+    text = PngInfo()
+    text.add_text(_HAS_MASK, "yes" if has_mask else "no")
     # After the mask: where the picture is, its mask is too.
     with atomic_write(path) as temporary:
-        Image.fromarray(_warp_picture(pixels, plan)).save(temporary, compress_level=1)
+        Image.fromarray(_warp_picture(pixels, plan)).save(temporary, compress_level=1, pnginfo=text)
 
 
 def _warp_picture(pixels: np.ndarray, plan: Undistortion) -> np.ndarray:

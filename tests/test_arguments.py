@@ -231,6 +231,22 @@ def _combined(*argv: str) -> argparse.Namespace:
     return argparse.Namespace(**vars(model.extract(args)), **vars(pipeline.extract(args)))
 
 
+def test_options_that_would_have_no_effect_are_left_out():
+    parser = argparse.ArgumentParser()
+    model = ModelParams(parser, sentinel=True, without=("images_to_load",))
+    assert "--images_to_load" not in parser.format_help() and "--masks" in parser.format_help()
+    assert model.extract(parser.parse_args([])).images_to_load == 0
+
+
+def test_a_degree_that_was_typed_is_told_from_one_that_is_stored(tmp_path):
+    (tmp_path / "cfg_args").write_text("Namespace(sh_degree=1)")
+    parser = argparse.ArgumentParser()
+    ModelParams(parser, sentinel=True)
+    for typed, known in (([], None), (["--sh_degree", "1"], 1)):
+        args = get_combined_args(parser, ["-m", str(tmp_path), *typed])
+        assert args.sh_degree == 1 and args.typed_sh_degree == known
+
+
 def test_the_command_line_wins_over_the_file(tmp_path):
     (tmp_path / "cfg_args").write_text(
         "Namespace(sh_degree=1, source_path='/data', model_path='elsewhere', images='images_4', depths='d', "

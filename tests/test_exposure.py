@@ -175,6 +175,8 @@ def test_exposures_that_do_not_fit_are_refused():
         "exposures of other pictures": state | {"names": NAMES[:2]},
         "3 x 4|float32": state | {"values": state["values"].double()},
         "optimiser state in the checkpoint does not fit": state | {"optimizer": 5},
+        "the exposure of .* in the checkpoint is not finite; use another": state
+        | {"values": torch.full_like(state["values"], torch.inf)},
     }
     for words, wrong in cases.items():
         with pytest.raises(UserError, match=words):
@@ -209,6 +211,14 @@ def test_columns_that_do_not_count_are_cut_off():
     mask = torch.arange(31) < 15
     assert torch.allclose(inverse_depth_loss(depth, mono, slice(0, 15)), ((depth - mono).abs() * mask).mean())
     assert torch.allclose(inverse_depth_loss(depth, mono), (depth - mono).abs().mean())
+    counts = torch.rand(1, 20, 31, generator=generator) < 0.3
+    broken = torch.where(counts, mono, torch.nan)
+    expected = (depth - mono).abs()[counts].mean()
+    assert torch.allclose(inverse_depth_loss(depth, broken, None, counts), expected)
+    # A view whose left half trains weighs half, whatever part of it counts.
+    left = (depth - mono).abs()[counts & mask].mean() * 15 / 31
+    assert torch.allclose(inverse_depth_loss(depth, broken, slice(0, 15), counts), left)
+    assert inverse_depth_loss(depth, mono, slice(0, 15), torch.zeros_like(counts)) == 0
 
 
 # The half-image protocol

@@ -43,8 +43,10 @@ OPTIONS = [
 
 # What runs in the copy: training, resuming, a PLY read and written again, rendering, and two refusals.
 SCRIPT = """
-import sys
+import argparse, sys
 import render, train
+from arguments import ModelParams
+from scene import Scene
 from scene.gaussian_model import GaussianModel
 from utils.system_utils import UserError
 
@@ -58,6 +60,9 @@ gaussians.save_ply(whole + "/again.ply")
 for iteration in ("1", "600"):
     sys.argv = ["render.py", "-m", whole, "--iteration", iteration, "--quiet"]
     render.main()
+loaded = ModelParams(argparse.ArgumentParser()).extract(argparse.Namespace(source_path=scene, model_path=whole))
+for view in Scene(loaded, gaussians, load_iteration=-1).getTrainCameras():
+    assert [source.parent.parent.name for source, _ in view.pictures] == ["images", "thermal"]
 for refused in (
     lambda: gaussians.load_ply(plain + last),
     lambda: train.main(["-s", scene, "-m", resumed, "--start_checkpoint", plain + "/chkpnt300.pth", *options]),

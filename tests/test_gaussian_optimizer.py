@@ -12,10 +12,10 @@ from scene.gaussian_optimizer import GaussianAdam
 
 def _groups(seed: int = 0) -> list[dict]:
     generator = torch.Generator().manual_seed(seed)
-    shapes = {"xyz": (50, 3), "f_rest": (50, 15, 3), "opacity": (50, 1)}
+    shapes = {"xyz": (50, 3), "f_dc": (50, 1, 3), "opacity": (50, 1), "f_rest": (50, 15, 3)}
     return [
         {"params": [torch.nn.Parameter(torch.randn(shape, generator=generator))], "lr": rate, "name": name}
-        for (name, shape), rate in zip(shapes.items(), (1e-2, 1e-3, 5e-2), strict=True)
+        for (name, shape), rate in zip(shapes.items(), (1e-2, 2e-2, 5e-2, 1e-3), strict=True)
     ]
 
 
@@ -107,6 +107,17 @@ def test_leaving_out_inactive_bands_changes_no_bit(columns):
         assert torch.equal(a["params"][0], b["params"][0])
         for key, value in dense.state[a["params"][0]].items():
             assert torch.equal(value, sparse.state[b["params"][0]][key])
+
+
+@pytest.mark.parametrize("with_gradient", ["f_dc", "opacity"])
+def test_inactive_bands_count_along_with_the_base_colour(with_gradient):
+    optimizer = GaussianAdam(_groups())
+    optimizer.set_active_columns("f_rest", 0)
+    param = {group["name"]: group["params"][0] for group in optimizer.param_groups}
+    param[with_gradient].grad = torch.ones_like(param[with_gradient])
+    optimizer.step()
+    counted = {name for name, value in param.items() if optimizer.state.get(value)}
+    assert counted == ({"f_dc", "f_rest"} if with_gradient == "f_dc" else {"opacity"})
 
 
 def test_appended_rows_start_with_zero_moments_and_the_counter_stays():

@@ -279,6 +279,30 @@ def test_training_rendering_and_scores_ignore_what_is_masked(masked_scene, tmp_p
     assert list((folder / "masks").iterdir()) == []
 
 
+def test_a_view_that_is_masked_whole_has_no_score(masked_scene, tmp_path):
+    cameras = _read(masked_scene).train_cameras
+    _save(next((masked_scene / "masks").glob(f"{cameras[0].image_name}*")), np.zeros((HEIGHT, WIDTH), np.uint8))
+    _train(masked_scene, tmp_path / "out", "--masks", "masks", "--test_iterations", 40)
+    scores = json.loads((tmp_path / "out" / "train_log.json").read_text())[-1]
+    assert 5 < scores["test_psnr"] < 40 and scores["test_l1"] > 0.01
+
+
+@pytest.mark.parametrize("meaning", ["ignore", "auto"])
+def test_a_view_fetches_each_picture_once(masked_scene, meaning, monkeypatch):
+    for path in (masked_scene / "images").rglob("*.png"):
+        pixels = np.asarray(Image.open(path).convert("RGBA")).copy()
+        pixels[:9, :, 3] = 0
+        Image.fromarray(pixels).save(path)
+    view = _views(masked_scene, masks="masks", mask_meaning=meaning)[0]
+    target, mask = view.target(torch.ones(3)), view.mask
+    fetched = []
+    get = view._images.get
+    monkeypatch.setattr(view._images, "get", lambda *picture: fetched.append(picture) or get(*picture))
+    both = view.ground_truth(torch.ones(3))
+    assert torch.equal(both[0], target) and torch.equal(both[1], mask)
+    assert fetched == view.pictures and len(fetched) == 2
+
+
 def test_scores_are_those_of_the_definition():
     rng = np.random.default_rng(0)
     truth = rng.integers(0, 256, (40, 56, 3), dtype=np.uint8)

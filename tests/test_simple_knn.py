@@ -130,13 +130,14 @@ def test_not_contiguous() -> None:
 
 
 def test_large_cloud_is_not_quadratic() -> None:
-    # All pairs of 200 k points are 4e10 distances, a minute and more; the tree takes 0.3 s on two cores. The second
-    # cloud puts all but a few points into one cell of any uniform grid.
+    # All pairs of 200 k points are 4e10 distances, a minute and more; the tree takes 0.3 s on two cores. Time of the
+    # process, which other programs on the machine do not add to. The second cloud puts all but a few points into one
+    # cell of any uniform grid.
     near = torch.rand(200_000, 3, generator=torch.Generator().manual_seed(1))
     for points in (near, torch.cat([near, near[:10] * 1e6])):
-        start = time.perf_counter()
+        start = time.process_time()
         distCUDA2(points)
-        assert time.perf_counter() - start < 5  # room for a busy machine
+        assert time.process_time() - start < 10
 
 
 def test_opcheck() -> None:

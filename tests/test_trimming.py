@@ -13,8 +13,10 @@ import torch
 from gaussians import model, parameters, pipeline
 from plyfile import PlyData
 
+import render as render_script
 import train
 from arguments import ModelParams, read_cfg_args
+from diagnosis.model import check_model
 from gaussian_renderer import render
 from gaussian_renderer.trimming import change_on_views, seen_by, trim
 from scene import Scene
@@ -64,7 +66,7 @@ def runs(_colmap_master, tmp_path_factory) -> SimpleNamespace:
         scene, often = _colmap_master, ("--save_iterations", 5, "--checkpoint_iterations", ITERATIONS)
         _train(scene, folder / "trimmed", cloud, *often, "--test_iterations", ITERATIONS)
         _train(scene, folder / "whole", cloud, *often, "--test_iterations", -1, "--keep_unseen")
-        _train(scene, folder / "cut", cloud, "--test_iterations", -1, "--prune_sh", 0)
+        _train(scene, folder / "cut", cloud, "--save_iterations", 5, "--test_iterations", -1, "--prune_sh", 0)
         _train(scene, folder / "halves", cloud, "--test_iterations", ITERATIONS, "--train_test_exp")
     finally:
         sys.stdout = stdout  # training stamps it
@@ -126,6 +128,22 @@ def test_bands_that_are_zero_are_cut_and_the_model_is_read_again(runs):
     assert record["sh_degree"] == 0
     # No test picture was in use, so none is decoded for a score.
     assert set(record["test_change"]) == {"largest"}
+
+
+def test_saves_before_the_cut_are_read_with_the_bands_they_have(runs, monkeypatch):
+    monkeypatch.setattr(sys, "stdout", sys.stdout)
+
+    def render_iteration(*options: object) -> None:
+        command = ["render.py", "-m", runs.cut, "--skip_train", "--quiet", "--iteration", *options]
+        monkeypatch.setattr(sys, "argv", list(map(str, command)))
+        render_script.main()
+
+    for iteration, degree in ((5, 3), (ITERATIONS, 0)):
+        render_iteration(iteration)
+        assert len(list((runs.cut / "test" / f"ours_{iteration}" / "renders").glob("*.png"))) == 3
+        assert check_model(str(runs.cut), iteration)[0].text.endswith(f"of SH degree {degree}")
+    with pytest.raises(UserError, match="SH degree 3, where SH degree 1 needs 9"):
+        render_iteration(5, "--sh_degree", 1)
 
 
 def test_test_views_that_train_in_half_stay_the_same_in_whole(runs):

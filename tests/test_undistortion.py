@@ -180,6 +180,21 @@ def test_a_mask_is_undistorted_with_its_picture(tmp_path):
     assert len(rows) == pytest.approx(0.5 * counts.size, rel=0.1)
 
 
+def test_a_mask_that_is_gone_from_the_cache_is_made_anew(tmp_path, cache_folder):
+    result, _ = _masked(tmp_path, "ignore")
+    before = result.mask.path.read_bytes()
+    for damage in (b"", before[: len(before) // 2]):
+        result.mask.path.write_bytes(damage)
+        again, _ = _masked(tmp_path, "ignore")
+        assert again.mask.path.read_bytes() == before
+    result.mask.path.unlink()
+    again, _ = _masked(tmp_path, "ignore")
+    assert again.mask.path.read_bytes() == before
+    kept = folder_state(cache_folder)
+    _masked(tmp_path, "ignore")
+    assert folder_state(cache_folder) == kept
+
+
 def test_a_transparent_mask_becomes_alpha(tmp_path):
     result, pixels = _masked(tmp_path, TRANSPARENT)
     assert result.mask is None and pixels.shape[2] == 4

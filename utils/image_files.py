@@ -1,4 +1,4 @@
-"""Rendered pictures from files, of any size that can be rendered."""
+"""Picture files: their suffixes, what reading them raises, and renders of any size that can be rendered."""
 
 import warnings
 from pathlib import Path
@@ -6,7 +6,8 @@ from pathlib import Path
 from PIL import Image
 
 MOST_PIXELS = 1 << 28  # 16384 a side, the largest training size; Pillow's own limit is lower
-UNREADABLE = (OSError, SyntaxError, ValueError, Image.DecompressionBombError)
+UNREADABLE = (OSError, SyntaxError, ValueError, EOFError, Image.DecompressionBombError)  # by format, on broken files
+SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp")
 
 
 def open_render(path: Path) -> Image.Image:

@@ -88,9 +88,18 @@ def l1_and_ssim(image: Tensor, target: Tensor, mask: Tensor | None = None) -> tu
     return share * l1, 1.0 - share * (1.0 - similarity)
 
 
-def inverse_depth_loss(inverse_depth: Tensor, target: Tensor, columns: slice | None = None) -> Tensor:
-    """Mean absolute difference of inverse depths (1, H, W), 1 / world units; columns that don't count differ by 0."""
+def inverse_depth_loss(
+    inverse_depth: Tensor, target: Tensor, columns: slice | None = None, mask: Tensor | None = None
+) -> Tensor:
+    """Mean absolute difference of inverse depths (1, H, W), 1 / world units; columns that don't count differ by 0.
+
+    mask: (1, H, W) bool, the pixels that count: of these the mean is taken, within the columns, as in photometric_loss.
+    """
     difference = (inverse_depth - target).abs()
-    if columns is None:
-        return difference.mean()
-    return difference[..., columns].sum() / difference.numel()
+    pixels = difference.numel()
+    if columns is not None:
+        difference, mask = difference[..., columns], None if mask is None else mask[..., columns]
+    if mask is None:
+        return difference.mean() if columns is None else difference.sum() / pixels
+    share = difference.numel() / pixels
+    return share * torch.where(mask, difference, 0.0).sum() / mask.sum().clamp_min(1)

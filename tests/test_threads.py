@@ -1,0 +1,53 @@
+"""How many threads work on pictures: no more than the process has processors for."""
+
+import os
+
+import pytest
+
+from utils import threads
+
+
+@pytest.fixture
+def machine(monkeypatch, tmp_path):
+    """Function that makes a machine of 64 processors of which the process may use some; limits by cgroup."""
+    monkeypatch.setattr(os, "cpu_count", lambda: 64)
+    monkeypatch.setattr(threads, "_CGROUPS", tmp_path)
+    monkeypatch.setattr(threads, "_OWN_CGROUPS", tmp_path / "own")
+
+    def make(affinity: int, own: str = "/", **limits: str) -> None:
+        monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(affinity)), raising=False)
+        (tmp_path / "own").write_text(f"1:cpu:/old\n0::{own}\n")
+        for group, limit in limits.items():
+            (tmp_path / group.replace("_", "/")).mkdir(parents=True, exist_ok=True)
+            (tmp_path / group.replace("_", "/") / "cpu.max").write_text(limit)
+
+    return make
+
+
+def test_affinity(machine):
+    machine(2)
+    assert threads.cores() == threads.threads() == 2
+    machine(64)
+    assert threads.cores() == 64 and threads.threads() == threads.MOST_THREADS and threads.threads(5) == 5
+
+
+@pytest.mark.parametrize(
+    ("outer", "inner", "count"),
+    [
+        ("max 100000", "max 100000", 8),
+        ("max 100000", "250000 100000", 3),
+        ("100000 100000", "400000 100000", 1),
+        ("x", "5000 100000", 1),
+    ],
+)
+def test_quota_of_the_group_and_those_around_it(machine, outer, inner, count):
+    machine(8, "/outer/inner", outer=outer, outer_inner=inner)
+    assert threads.cores() == count
+
+
+def test_without_cgroups_or_affinity(machine, monkeypatch, tmp_path):
+    machine(8)
+    (tmp_path / "own").unlink()
+    assert threads.cores() == 8
+    monkeypatch.delattr(os, "sched_getaffinity")
+    assert threads.cores() == 64
