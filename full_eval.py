@@ -18,14 +18,15 @@ import utils.openmp  # noqa: F401  isort: skip  (before torch)
 
 from evaluation import stages
 from evaluation.configs import check_options, read_configs
-from evaluation.document import cheapest_table, results_table
+from evaluation.document import Table, cheapest_table, results_table
+from evaluation.lock import locked
 from evaluation.machine import machine
-from evaluation.markdown import markdown_table
 from evaluation.report import make_report, write_report
 from evaluation.results import read_run
 from evaluation.runs import Run, check_folders, plan_runs
 from evaluation.scenes import SceneEntry, check_names, dataset_scenes, finished_scenes, folder_scenes
 from evaluation.stages import Failure, StageFailed
+from utils.markdown_table import markdown_table
 from utils.system_utils import UserError, mkdir_p, run_cli
 
 EXPOSURE = (
@@ -119,6 +120,10 @@ def _carry_out(runs: Sequence[Run], args: Namespace, failures: dict[Run, Failure
             print(f"  FAILED ({failed.failure.stage}): {failed}", flush=True)
 
 
+def _text(table: Table) -> str:
+    return markdown_table(table.header, table.rows)
+
+
 def main(argv: Sequence[str] | None = None) -> None:
     """The command line."""
     words = list(sys.argv[1:] if argv is None else argv)
@@ -128,16 +133,17 @@ def main(argv: Sequence[str] | None = None) -> None:
     output = args.output_path.resolve()
     mkdir_p(output)
     failures: dict[Run, Failure] = {}
-    try:
-        _carry_out(runs, args, failures)
-    finally:  # after Ctrl-C too: what is finished is reported
-        report = make_report(["full_eval.py", *words], [read_run(run, output, failures.get(run)) for run in runs])
-        write_report(report, output)
-        if report["summary"]:
-            print(markdown_table(results_table(report["summary"])))
-        for scene, rows in report["cheapest"].items():
-            print(f"\n{scene}: cheapest option set for a given error\n{markdown_table(cheapest_table(rows))}")
-        print(f"\nreport: {output / 'report.html'}")
+    with locked(output):
+        try:
+            _carry_out(runs, args, failures)
+        finally:  # after Ctrl-C too: what is finished is reported
+            report = make_report(["full_eval.py", *words], [read_run(run, output, failures.get(run)) for run in runs])
+            write_report(report, output)
+            if report["summary"]:
+                print(_text(results_table(report["summary"])))
+            for scene, rows in report["cheapest"].items():
+                print(f"\n{scene}: cheapest option set for a given error\n{_text(cheapest_table(rows))}")
+            print(f"\nreport: {output / 'report.html'}")
     if failures:
         print(
             f"{len(failures)} of {len(runs)} runs failed: {', '.join(run.title for run in failures)}", file=sys.stderr

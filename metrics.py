@@ -8,13 +8,11 @@ and metrics_info.json, which says what convention each number follows.
 
 from __future__ import annotations
 
-import json
 import math
 from argparse import ArgumentParser
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import utils.openmp  # noqa: F401  isort: skip  (before torch)
 import numpy as np
@@ -24,8 +22,9 @@ from tqdm import tqdm
 
 from arguments import read_cfg_args
 from utils.image_files import UNREADABLE, open_render
+from utils.json_files import write_json
 from utils.lpips_utils import MIN_SIDE, LpipsUnavailable, PerceptualDistance
-from utils.system_utils import UserError, atomic_write, run_cli
+from utils.system_utils import UserError, run_cli
 
 CONVENTIONS = {
     "PSNR": "dB, from one mean squared error over pixels and channels of the 8-bit images; null where infinite",
@@ -197,11 +196,6 @@ def mean(values: dict[str, float | None]) -> float | None:
     return None if None in numbers or not numbers else math.fsum(numbers) / len(numbers)
 
 
-def write_json(path: Path, content: dict[str, Any], sort_keys: bool = False) -> None:
-    with atomic_write(path) as temporary:
-        temporary.write_text(json.dumps(content, indent=1, sort_keys=sort_keys, allow_nan=False) + "\n")
-
-
 def main() -> None:
     parser = ArgumentParser(description="Score rendered test views: PSNR, SSIM, LPIPS.")
     parser.add_argument("-m", "--model_paths", type=Path, nargs="+", required=True, help="model folders to score")
@@ -241,9 +235,9 @@ def main() -> None:
         masked = {name: sum(pair.mask is not None for pair in pairs) for name, pairs in methods.items()}
         if any(masked.values()):
             info |= {"masked": {key: MASKED[key.split("_")[0]] for key in metrics}, "masked_views": masked}
-        write_json(model / "results.json", results)
-        write_json(model / "per_view.json", per_view)
-        write_json(model / "metrics_info.json", info, sort_keys=True)
+        write_json(model / "results.json", results, sort_keys=False)
+        write_json(model / "per_view.json", per_view, sort_keys=False)
+        write_json(model / "metrics_info.json", info)
 
 
 if __name__ == "__main__":

@@ -39,6 +39,7 @@ from scene.gaussian_model import GaussianModel
 from scene.memory_estimate import announce_memory
 from scene.memory_guard import MemoryGuard
 from utils.counter_rng import Stream, permutation, uniform
+from utils.curve_peak import schedules_follow_length
 from utils.curve_recorder import CurveRecorder, evenly_spread
 from utils.error_curve import Row, continue_curve
 from utils.general_utils import get_expon_lr_func, safe_state
@@ -203,7 +204,8 @@ def training(
     print(f"Trained {opt.iterations - first_iteration} iterations in {clock.seconds:.1f} s, without tests and saving")
     if curve is not None:
         saved = {*saving_iterations} & {*saved_iterations(Path(scene.model_path) / "point_cloud")}
-        curve.finish(seconds, saved, opt.position_lr_max_steps)
+        follows_length = schedules_follow_length(bool(dataset.depths), dataset.train_test_exp)
+        curve.finish(seconds, saved, opt.position_lr_max_steps, follows_length)
     if left_out is not None:
         print("\n".join(lines(left_out)))
 

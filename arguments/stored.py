@@ -2,7 +2,6 @@
 
 import argparse
 import ast
-import json
 import os
 import sys
 from collections.abc import Sequence
@@ -11,6 +10,7 @@ from typing import Any
 
 from arguments.groups import ModelParams
 from arguments.param_group import Value
+from utils.json_files import read_json, write_json
 from utils.system_utils import UserError, atomic_write
 
 VERSION = "0.1.0"
@@ -87,8 +87,7 @@ def add_to_model_json(model_path: str | os.PathLike, **entries: Any) -> None:
 
 
 def _write_record(model_path: str | os.PathLike, record: dict[str, Any]) -> None:
-    with atomic_write(Path(model_path) / "model.json") as path:
-        path.write_text(json.dumps(record, indent=1, sort_keys=True, allow_nan=False) + "\n", encoding="utf-8")
+    write_json(Path(model_path) / "model.json", record)
 
 
 def read_model_json(model_path: str | os.PathLike) -> dict[str, Any]:
@@ -97,7 +96,7 @@ def read_model_json(model_path: str | os.PathLike) -> dict[str, Any]:
     if not path.is_file():
         return {}
     try:
-        record = json.loads(path.read_text(encoding="utf-8"))
+        record = read_json(path)
     except (ValueError, RecursionError) as error:
         raise UserError(f"{path} is not JSON; restore it, or remove it and give --antialiasing yourself") from error
     if not isinstance(record, dict) or not isinstance(record.get("antialiasing", False), bool):

@@ -17,7 +17,6 @@ of forward and backward of an image on a larger scene of the same family (TIMED_
 """
 
 import argparse
-import json
 import os
 import subprocess
 import sys
@@ -47,7 +46,8 @@ from benchmarks.kernel_runs import (  # noqa: E402
     run_all,
     run_oracle,
 )
-from utils.system_utils import atomic_write, run_cli  # noqa: E402
+from utils.json_files import write_json  # noqa: E402
+from utils.system_utils import run_cli  # noqa: E402
 
 ROOT = Path(__file__).resolve().parent.parent
 Runs = dict[tuple[Case, Kernel], Run]
@@ -153,8 +153,7 @@ def main() -> None:
         print_ratios(runs)
     measured = {"machines": machines, "records": records, "timed sizes": TIMED_SIZES}
     if args.json:
-        with atomic_write(args.json) as temporary:
-            temporary.write_text(json.dumps(measured, indent=1, sort_keys=True, allow_nan=False) + "\n")
+        write_json(args.json, measured)
     if args.figure:
         draw(measured, args.figure)
 

@@ -13,7 +13,6 @@ what no float32 arithmetic can promise to stay under.
 """
 
 import argparse
-import json
 import math
 import sys
 import time
@@ -34,7 +33,7 @@ from benchmarks import textbook
 from benchmarks.environment import describe, print_table
 from benchmarks.stability_cases import CASES, Case, Problem
 from benchmarks.stability_needles import LENGTHS, NeedleError, needle_error
-from utils.system_utils import atomic_write
+from utils.json_files import write_json
 
 PLANES = ("color", "inverse_depth", "transmittance")
 PARTS = ("ordinary", "stiff")
@@ -307,8 +306,7 @@ def main() -> None:
             "needles": [{k: _plain(v) for k, v in e._asdict().items()} for e in needles],
         }
         report |= {name: {case: _as_json(r) for case, r in by_case.items()} for name, by_case in results.items()}
-        with atomic_write(args.json) as temporary:
-            temporary.write_text(json.dumps(report, indent=1, sort_keys=True, allow_nan=False) + "\n")
+        write_json(args.json, report)
 
 
 if __name__ == "__main__":

@@ -1,12 +1,12 @@
 """What was registered, and what to do when that is too little."""
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from utils.json_files import read_json, write_json
 from utils.listing import some
-from utils.system_utils import UserError, atomic_write
+from utils.system_utils import UserError
 
 FEWEST_POINTS = 1000  # fewer make a poor start: density control has to find the scene by itself
 SHORT_TRACKS = 3.0  # views a point; below, most points hang on a single pair
@@ -26,7 +26,7 @@ class Model(NamedTuple):
 
 def read_survey(path: Path) -> list[Model]:
     """The models that worker.py's survey found, the largest (photos, then points) first."""
-    models = [Model(**entry) for entry in json.loads(path.read_text(encoding="utf-8"))]
+    models = [Model(**entry) for entry in read_json(path)]
     return sorted(models, key=lambda model: (-len(model.registered), -model.points, model.folder))
 
 
@@ -114,6 +114,4 @@ def write_report(
         "points": chosen.points,
         "registered": len(chosen.registered),
     }
-    with atomic_write(path) as temporary:
-        text = json.dumps(content, indent=1, sort_keys=True, allow_nan=False, ensure_ascii=False)
-        temporary.write_text(text + "\n", encoding="utf-8")
+    write_json(path, content)

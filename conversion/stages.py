@@ -6,7 +6,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from utils.system_utils import UserError, atomic_write
+from utils.json_files import read_json, write_json
+from utils.system_utils import UserError
 
 
 class Stage(NamedTuple):
@@ -30,7 +31,7 @@ class StageRecord:
         self._record: dict[str, dict[str, Any]] = {}
         if path.is_file():
             try:
-                self._record = json.loads(path.read_text(encoding="utf-8"))
+                self._record = read_json(path)
                 done = {name: entry["done"] and entry["made_from"] for name, entry in self._record.items()}
             except (ValueError, KeyError, TypeError, AttributeError) as error:
                 raise UserError(
@@ -70,5 +71,4 @@ class StageRecord:
         return kept
 
     def _save(self) -> None:
-        with atomic_write(self._path) as path:
-            path.write_text(json.dumps(self._record, indent=1, sort_keys=True) + "\n", encoding="utf-8")
+        write_json(self._path, self._record)

@@ -2,7 +2,6 @@
 
 import contextlib
 import io
-import json
 from collections import Counter
 from pathlib import Path
 
@@ -11,6 +10,7 @@ import numpy as np
 from diagnosis.lines import Line, from_error
 from scene.dataset_readers import CameraInfo, SceneInfo, read_scene
 from scene.scene_info import APART, standing_apart
+from utils.json_files import read_json
 from utils.listing import some
 from utils.system_utils import UserError
 
@@ -164,7 +164,7 @@ def _check_registered(source: Path) -> list[Line]:
     if not path.is_file():
         return []
     try:
-        report = json.loads(path.read_text(encoding="utf-8"))
+        report = read_json(path)
         placed, photos = int(report["registered"]), int(report["photos"])
         advice = [str(line) for line in report["advice"]]
     except (ValueError, KeyError, TypeError):

@@ -40,14 +40,15 @@ class Finished:
 def run_child(command: Sequence[str]) -> Finished:
     """Run a command (no shell), copying its stderr to ours.
 
-    Ctrl-C or SIGTERM to us is handed on once, and what the child then does (train.py saves a checkpoint) is waited
-    for; `interrupt` says so. A second one kills it and raises.
+    Ctrl-C or SIGTERM to us is handed on once, SIGHUP (a closed terminal) as SIGTERM, and what the child then does
+    (train.py saves a checkpoint) is waited for; `interrupt` says so. A second one kills it and raises.
     """
     start = time.perf_counter()
     tail = _Tail()
     # A session of its own: else the terminal's Ctrl-C would reach it beside ours, and train.py takes two as "at once".
     with DeferredInterrupt() as interrupt:
-        child = subprocess.Popen(command, stderr=subprocess.PIPE, start_new_session=True)
+        # Inherits only what is inheritable: the folder's lock, so that it is kept as long as this child lives.
+        child = subprocess.Popen(command, stderr=subprocess.PIPE, start_new_session=True, close_fds=False)
         try:
             handed_on = False
             with selectors.DefaultSelector() as selector:

@@ -119,6 +119,11 @@ def _results(report: Mapping[str, Any]) -> Section:
     blocks: list[Block] = [results_table(rows) if rows else "Nothing was scored."]
     if any(row["PSNR"]["std"] is not None for row in rows):
         blocks.append("Mean ± standard deviation of the sample over the seeds.")
+    if any(row["gaussians"]["mean"] != row["gaussians_saved"]["mean"] for row in rows):
+        blocks.append(
+            "Gaussians: those trained, as published tables count them. The models as saved lack those that no training "
+            "view depends on (gaussians_saved in report.json)."
+        )
     if rows and all(row["LPIPS"]["mean"] is None for row in rows):
         blocks.append("LPIPS is missing: metrics.py had no weights of its network (it says what to put where).")
     if unfinished := [run_title(run) for run in report["runs"] if not run["finished"] and not run["failure"]]:
@@ -197,10 +202,10 @@ def _scenes(report: Mapping[str, Any], figures: Mapping[str, Sequence[Picture]])
         blocks: list[Block] = []
         for run in report["runs"]:
             if run["scene"] == scene and (peak := run["peak"]):
+                advice = f"; --iterations {peak['iteration']} ends there" if peak["shorter_ends_there"] else ""
                 blocks.append(
                     f"{run_title(run)}: the test views were best at iteration {peak['iteration']:,} "
-                    f"({peak['test_psnr']:.2f} dB) and lost {peak['lost']:.2f} dB until the end; --iterations "
-                    f"{peak['iteration']} ends there."
+                    f"({peak['test_psnr']:.2f} dB) and lost {peak['lost']:.2f} dB until the end{advice}."
                 )
         blocks += figures.get(scene, ())
         if blocks:
@@ -210,7 +215,7 @@ def _scenes(report: Mapping[str, Any], figures: Mapping[str, Sequence[Picture]])
 
 def _manifest(report: Mapping[str, Any]) -> Section:
     manifest = report["manifest"]
-    header = ["model", "source", "train views", "test views", "test sizes", "ground truth", "train.py options"]
+    header = ["model", "source", "train views", "test views", "split", "test sizes", "ground truth", "train.py options"]
     cells = []
     for run in report["runs"]:
         sizes = " ".join(f"{width}x{height}" for width, height in run["test_sizes"])
@@ -221,6 +226,7 @@ def _manifest(report: Mapping[str, Any]) -> Section:
                 run["model"],
                 run["source"] or "-",
                 *views,
+                run["split"] or "not known",
                 sizes or "-",
                 digest,
                 " ".join(run["options"] or ["not known"]),
@@ -232,11 +238,10 @@ def _manifest(report: Mapping[str, Any]) -> Section:
         [
             f"Command: {' '.join(manifest['command'])}",
             *(f"Trained on: {line}" for line in machines),
-            f"Split: {manifest['split']}",
             f"Resize filter: {manifest['resize_filter']}",
             "Scores: " + "; ".join(f"{name}: {text}" for name, text in manifest["conventions"].items()),
             Table(header, cells),
-            "Ground truth: first digits of a digest of the test views' sizes and pixels. Scores compare only where it "
-            "is the same.",
+            "Ground truth: first digits of a digest of the test views' sizes, pixels and masks. Scores compare only "
+            "where it is the same.",
         ],
     )

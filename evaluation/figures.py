@@ -6,8 +6,11 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from PIL import Image
+
 from evaluation.contact_sheet import contact_sheet
-from evaluation.model_folder import picture
+from evaluation.model_folder import mask_of, picture
 from evaluation.tradeoff import pareto_front
 from utils.error_curve import Row
 from utils.system_utils import atomic_write
@@ -76,15 +79,25 @@ def _columns(points: Sequence[tuple[float, float]]) -> tuple[list[float], list[f
     return [x for x, _ in points], [y for _, y in points]
 
 
+def _what_counts(method: Path, side: str, name: str) -> Image.Image:
+    image, mask = picture(method / side / name), mask_of(method, name)
+    if mask is None:
+        return image
+    return Image.fromarray(np.where(mask[..., None], np.asarray(image), np.uint8(255)))
+
+
 def draw_worst_views(path: Path, run: dict[str, Any], output: Path) -> bool:
-    """A run's worst test views, each with ground truth, render and amplified error; False where it has none."""
+    """A run's worst test views, each with ground truth, render and amplified error; False where it has none.
+
+    Pixels that do not count are white, and black in the error.
+    """
     folder = output / run["model"] / "test" / f"ours_{run['final_iteration']}"
     if not run["worst_views"]:
         return False
     rows = [
         (
             f"{view['picture']}: {view['PSNR']:.2f} dB",
-            *(picture(folder / side / view["file"]) for side in ("gt", "renders")),
+            *(_what_counts(folder, side, view["file"]) for side in ("gt", "renders")),
         )
         for view in run["worst_views"]
     ]

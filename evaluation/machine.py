@@ -32,17 +32,17 @@ def _describe() -> dict[str, Any]:
 
     import gaussian_renderer  # noqa: F401  (compute_device asks for its library)
     from arguments.stored import VERSION
-    from benchmarks import environment
+    from utils.machine import commit, cpu_name, gpu_name, instruction_set
     from utils.system_utils import compute_device
 
     device = compute_device().type
     return {
-        "commit": environment.commit(),
-        "cpu": environment.cpu_name(),
+        "commit": commit(),
+        "cpu": cpu_name(),
         "cuda": torch.version.cuda if device == "cuda" else None,
         "device": device,
-        "gpu": environment.gpu_name() if device == "cuda" else None,
-        "instruction_set": environment.instruction_set(),
+        "gpu": gpu_name() if device == "cuda" else None,
+        "instruction_set": instruction_set(),
         "packages": {name: _version(name) for name in _PACKAGES},
         "python": platform.python_version(),
         "system": platform.platform(),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import re
 import sys
 from pathlib import Path
@@ -11,8 +10,11 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
+from arguments.stored import read_cfg_args, read_model_json
+from utils.curve_peak import schedules_follow_length
 from utils.image_files import UNREADABLE, open_render
-from utils.system_utils import UserError
+from utils.json_files import read_json
+from utils.system_utils import UserError, saved_iterations
 
 
 def ply_file(model: Path, iteration: int) -> Path:
@@ -34,11 +36,31 @@ def count_gaussians(model: Path, iteration: int) -> int:
     return int(found[1])
 
 
+def trained_gaussians(model: Path, iteration: int) -> int:
+    """Number of Gaussians that were trained: those of the PLY and those that the last save left out as unseen."""
+    saved = count_gaussians(model, iteration)
+    try:
+        left_out = read_model_json(model).get("left_out") or {}
+        trained, unseen = int(left_out["gaussians"]), int(left_out["unseen"])
+    except (UserError, KeyError, TypeError, ValueError):
+        return saved  # a model of another program, which leaves nothing out
+    return trained if iteration == saved_iterations(model / "point_cloud")[-1] and trained - unseen == saved else saved
+
+
+def shorter_ends_there(model: Path) -> bool:
+    """Whether fewer --iterations end with the very model that a longer training had on its way; False: not known."""
+    try:
+        options = read_cfg_args(model)
+    except UserError:
+        return False
+    return not schedules_follow_length(bool(options.get("depths")), bool(options.get("train_test_exp")))
+
+
 def load_scores(model: Path, method: str) -> tuple[dict[str, float | None], dict[str, dict[str, float | None]]]:
     """Mean scores, and scores by metric and view, that metrics.py has written for a method."""
     try:
-        results = json.loads((model / "results.json").read_text())[method]
-        per_view = json.loads((model / "per_view.json").read_text())[method]
+        results = read_json(model / "results.json")[method]
+        per_view = read_json(model / "per_view.json")[method]
         for numbers in ({key: results[key] for key in ("PSNR", "SSIM")}, per_view["PSNR"]):
             if not numbers or any(type(value) not in (int, float, type(None)) for value in numbers.values()):
                 raise ValueError("no numbers")
@@ -53,7 +75,7 @@ def training_seconds(model: Path, iteration: int) -> float | None:
     if not log.is_file():
         return None
     try:
-        seconds = {record["iteration"]: float(record["seconds"]) for record in json.loads(log.read_text())}
+        seconds = {record["iteration"]: float(record["seconds"]) for record in read_json(log)}
     except (OSError, KeyError, ValueError, TypeError) as error:
         print(f"{log} is damaged ({type(error).__name__}), so the training time is unknown", file=sys.stderr)
         return None
@@ -83,15 +105,24 @@ def view_names(folder: Path) -> list[str]:
     return sorted(file.name for file in folder.glob("*.png") if not file.name.startswith("."))
 
 
-def ground_truth_digest(model: Path, method: str) -> str:
-    """SHA-256 of the test views' ground truth, sizes and pixels in their order.
+def mask_of(method: Path, name: str) -> np.ndarray | None:
+    """Which pixels of a view count, (H, W) bool, as metrics.py takes it; None where all do. method: folder `ours_N`."""
+    file = method / "masks" / name
+    return np.asarray(picture(file))[..., 0] > 0 if file.is_file() else None
 
-    Two scores compare only where it is the same: it changes with split, resolution, resize filter and background.
+
+def ground_truth_digest(model: Path, method: str) -> str:
+    """SHA-256 of the test views' ground truth in their order: sizes, pixels, and which of these count.
+
+    Two scores compare only where it is the same: it changes with split, resolution, resize filter, background, masks.
     """
     digest = hashlib.sha256()
-    folder = model / "test" / method / "gt"
-    for name in view_names(folder):
-        image = picture(folder / name)
+    folder = model / "test" / method
+    for name in view_names(folder / "gt"):
+        image = picture(folder / "gt" / name)
         digest.update(f"{image.width}x{image.height}".encode())
         digest.update(np.asarray(image).tobytes())
+        if (mask := mask_of(folder, name)) is not None:
+            digest.update(b"mask")
+            digest.update(mask.tobytes())
     return digest.hexdigest()

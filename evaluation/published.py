@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
+
+from utils.json_files import read_json
 
 COMPARED = ("PSNR", "SSIM", "LPIPS", "gaussians")
 
@@ -13,7 +14,7 @@ COMPARED = ("PSNR", "SSIM", "LPIPS", "gaussians")
 def published_tables() -> list[dict[str, Any]]:
     """Tables with name, source, hardware, note, the `groups` and what else a run must `requires` be to compare;
     `scenes` and `means` (of a group) hold numbers by iteration. LPIPS: VGG on [0, 1]; seconds: on that hardware."""
-    return json.loads((Path(__file__).parent / "published.json").read_text(encoding="utf-8"))["tables"]
+    return read_json(Path(__file__).parent / "published.json")["tables"]
 
 
 def compare(

@@ -7,7 +7,6 @@ Replaces what stands between the two marker lines of the README by a table for e
 
 from __future__ import annotations
 
-import json
 from argparse import ArgumentParser
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -15,7 +14,8 @@ from typing import Any
 
 from evaluation.document import results_table
 from evaluation.machine import one_line
-from evaluation.markdown import markdown_table
+from utils.json_files import read_json
+from utils.markdown_table import markdown_table
 from utils.system_utils import UserError, atomic_write, run_cli
 
 BEGIN = "<!-- results: begin (python -m evaluation.readme_table) -->"
@@ -24,7 +24,8 @@ END = "<!-- results: end -->"
 
 def results_text(report: Mapping[str, Any]) -> str:
     """The table of a report, the options of its option sets, and where it was trained."""
-    lines = [markdown_table(results_table(report["summary"]))]
+    table = results_table(report["summary"])
+    lines = [markdown_table(table.header, table.rows)]
     options = {run["config"] or "options": " ".join(run["added_options"] or ()) for run in report["runs"]}
     if any(options.values()):
         lines.append(
@@ -48,7 +49,7 @@ def replace_results(readme: str, reports: Sequence[Mapping[str, Any]]) -> str:
 
 def _read(path: Path) -> dict[str, Any]:
     try:
-        report = json.loads(path.read_text(encoding="utf-8"))
+        report = read_json(path)
         if not report["summary"] or not report["runs"]:
             raise ValueError("nothing was scored")
     except (OSError, ValueError, KeyError, TypeError) as error:

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from pathlib import Path
 from typing import Any
 
-from utils.system_utils import atomic_write
+from utils.json_files import read_json, write_json
 
 NAME = "full_eval.json"
 
@@ -20,7 +19,7 @@ class Record:
         self._content: dict[str, Any] = {}
         if self._path.is_file():
             try:
-                content = json.loads(self._path.read_text(encoding="utf-8"))
+                content = read_json(self._path)
                 if not isinstance(content["stages"], dict) or not isinstance(content["key"], dict | None):
                     raise ValueError
                 self._content = content
@@ -42,11 +41,10 @@ class Record:
             self._write()
 
     def note(self, name: str, **values: Any) -> None:
-        """A stage has ended well (or, for training, was interrupted): remember it."""
+        """A stage has ended well (or, for training, was interrupted or failed): remember it."""
         self._content.setdefault("key", None)
         self._content.setdefault("stages", {})[name] = values
         self._write()
 
     def _write(self) -> None:
-        with atomic_write(self._path) as temporary:
-            temporary.write_text(json.dumps(self._content, indent=1, sort_keys=True, allow_nan=False) + "\n")
+        write_json(self._path, self._content)

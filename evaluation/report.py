@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -15,13 +14,10 @@ from evaluation.markdown import to_markdown
 from evaluation.published import compare
 from evaluation.summary import dataset_means, summarise
 from evaluation.tradeoff import cheapest
+from utils.json_files import write_json
 from utils.system_utils import UserError, atomic_write
 
 TITLE = "3D Gaussian Splatting: evaluation"
-SPLIT = (
-    "COLMAP: every 8th picture by name is a test view; Blender: transforms_test.json (unless train.py's options say "
-    "otherwise)"
-)
 RESIZE_FILTER = "Pillow, bicubic, antialiased where it shrinks; 8-bit pictures"
 
 
@@ -36,7 +32,6 @@ def make_report(command: Sequence[str], runs: Sequence[dict[str, Any]]) -> dict[
             "command": list(command),
             "conventions": next((run["conventions"] for run in runs if run["conventions"]), {}),
             "resize_filter": RESIZE_FILTER,
-            "split": SPLIT,
         },
         "published": compare(runs, rows, means),
         "runs": list(runs),
@@ -65,8 +60,8 @@ def _warnings(runs: Sequence[dict[str, Any]], rows: Sequence[dict[str, Any]]) ->
         truths = {run["ground_truth_sha256"] for run in runs if run["scene"] == scene and run["ground_truth_sha256"]}
         if len(truths) > 1:
             lines.append(
-                f"{scene}: its runs were scored on different ground truth (size, split or background), so their scores "
-                "and curves do not compare."
+                f"{scene}: its runs were scored on different ground truth (size, split, background or masks), so their "
+                "scores and curves do not compare."
             )
     for name in ("commit", "cpu", "gpu", "instruction_set", "threads"):
         values = {str(run["machine"].get(name)) for run in runs if run["machine"]}
@@ -86,11 +81,11 @@ def write_report(report: Mapping[str, Any], output: Path) -> None:
     }
     sections = document(report, pictures)
     texts = {
-        "report.json": json.dumps(report, indent=1, sort_keys=True, allow_nan=False) + "\n",
         "report.md": to_markdown(TITLE, sections, output),
         "report.html": to_html(TITLE, sections),
         "timing.txt": _timing(report["runs"]),
     }
+    write_json(output / "report.json", report)
     for name, text in texts.items():
         with atomic_write(output / name) as temporary:
             temporary.write_text(text, encoding="utf-8")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import os
 import sys
 from pathlib import Path
@@ -13,15 +12,19 @@ from evaluation.model_folder import (
     count_gaussians,
     load_scores,
     picture_size,
+    shorter_ends_there,
+    trained_gaussians,
     training_seconds,
     view_names,
 )
 from evaluation.record import Record
 from evaluation.runs import Run
 from evaluation.stages import Failure
+from scene.scene_info import HOLD
 from utils.curve_peak import CLEAR
 from utils.error_curve import NAME as CURVE
 from utils.error_curve import Row, best_test, read_curve
+from utils.json_files import read_json
 from utils.system_utils import UserError, saved_iterations
 
 WORST = 3  # views with the lowest PSNR that are shown of each run
@@ -50,10 +53,11 @@ def read_run(run: Run, output: Path, failure: Failure | None) -> dict[str, Any]:
         "machine": trained.get("machine") or {},
         "model": os.path.relpath(run.model, output),
         "options": known and known["options"],
-        "peak": _peak(curve),
+        "peak": _peak(curve, run.model),
         "scene": run.scene.name,
         "seed": run.seed,
         "source": known and known["scene"],
+        "split": None,
         "test_sizes": [],
         "views": {"test": None, "train": None},
         "wall_seconds": trained.get("wall_seconds"),
@@ -66,8 +70,9 @@ def read_run(run: Run, output: Path, failure: Failure | None) -> dict[str, Any]:
         result |= {"final_iteration": last, "iterations": iterations}
         if last is not None:
             result |= {
+                "split": _split(run.model, last),
                 "test_sizes": _sizes(run.model, last),
-                "views": _view_counts(run.model, iterations[str(last)]["views"]),
+                "views": _view_counts(run.model, last, iterations[str(last)]["views"]),
                 "worst_views": _worst(run.model, last),
             }
     except UserError as error:
@@ -88,7 +93,10 @@ def _curve(model: Path) -> list[Row]:
 
 
 def _iteration(model: Path, iteration: int, curve: list[Row]) -> dict[str, Any]:
-    """Scores (metrics.py), time, size and memory at a saved iteration."""
+    """Scores (metrics.py), time, size and memory at a saved iteration.
+
+    gaussians: as trained, which is what published tables count; gaussians_saved: without those left out as unseen.
+    """
     method = f"ours_{iteration}"
     point = next((row for row in curve if row["iteration"] == iteration), {})
     # The peak only grows, so that of the last point before is a lower bound; only a point right there will do.
@@ -97,7 +105,8 @@ def _iteration(model: Path, iteration: int, curve: list[Row]) -> dict[str, Any]:
         "SSIM": None,
         "LPIPS": None,
         "fps": None,
-        "gaussians": count_gaussians(model, iteration),
+        "gaussians": trained_gaussians(model, iteration),
+        "gaussians_saved": count_gaussians(model, iteration),
         "peak_memory_mib": point.get("peak_memory_mib"),
         "render_ms": None,
         "seconds": point.get("seconds") if (logged := training_seconds(model, iteration)) is None else logged,
@@ -119,18 +128,26 @@ def _iteration(model: Path, iteration: int, curve: list[Row]) -> dict[str, Any]:
 def _json(path: Path) -> Any | None:
     """A JSON file's content; None where there is none, or no JSON."""
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
+        return read_json(path)
     except (OSError, ValueError, RecursionError):
         return None
 
 
-def _peak(curve: list[Row]) -> dict[str, Any] | None:
-    """Where the test views were clearly better before the end: that iteration, its PSNR and what was lost since."""
+def _peak(curve: list[Row], model: Path) -> dict[str, Any] | None:
+    """Where the test views were clearly better before the end: that iteration, its PSNR and what was lost since.
+
+    shorter_ends_there: whether --iterations with that number gives that very model.
+    """
     best = best_test(curve)
     if best is None or curve[-1]["test_psnr"] is None or best["test_psnr"] - curve[-1]["test_psnr"] < CLEAR:
         return None
     lost = best["test_psnr"] - curve[-1]["test_psnr"]
-    return {"iteration": best["iteration"], "lost": lost, "test_psnr": best["test_psnr"]}
+    return {
+        "iteration": best["iteration"],
+        "lost": lost,
+        "shorter_ends_there": shorter_ends_there(model),
+        "test_psnr": best["test_psnr"],
+    }
 
 
 def _sizes(model: Path, iteration: int) -> list[list[int]]:
@@ -139,10 +156,23 @@ def _sizes(model: Path, iteration: int) -> list[list[int]]:
     return [list(size) for size in sorted({picture_size(folder / name) for name in view_names(folder)})]
 
 
-def _view_counts(model: Path, test: int) -> dict[str, int | None]:
-    """Number of training and test views: cameras.json lists both."""
+def _view_counts(model: Path, iteration: int, scored: int) -> dict[str, int | None]:
+    """Number of training views, and of test views with a score: cameras.json lists both, and those wholly masked."""
     cameras = _json(model / "cameras.json")
-    return {"test": test, "train": len(cameras) - test if isinstance(cameras, list) else None}
+    held_out = len(view_names(model / "test" / f"ours_{iteration}" / "gt"))
+    return {"test": scored, "train": len(cameras) - held_out if isinstance(cameras, list) else None}
+
+
+def _split(model: Path, iteration: int) -> str | None:
+    """Which views were held out, judged by the names in cameras.json, test views first; None where it cannot tell."""
+    cameras = _json(model / "cameras.json")
+    try:
+        names = [str(camera["img_name"]) for camera in cameras]
+    except (KeyError, TypeError):
+        return None
+    held_out = len(view_names(model / "test" / f"ours_{iteration}" / "gt"))
+    by_name = sorted(set(names), key=os.fsencode)
+    return f"every {HOLD}th by name" if names[:held_out] == by_name[::HOLD] else "the data set's own"
 
 
 def _worst(model: Path, iteration: int) -> list[dict[str, Any]]:

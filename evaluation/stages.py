@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import signal
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,6 +14,7 @@ from evaluation.child import Finished, run_child
 from evaluation.model_folder import ground_truth_digest, load_scores, ply_file, view_names
 from evaluation.record import Record
 from evaluation.runs import Run
+from utils import render_times
 from utils.system_utils import UserError, saved_iterations
 
 _ROOT = Path(__file__).resolve().parents[1]
@@ -36,9 +38,11 @@ class StageFailed(Exception):
 
 
 def train(run: Run, machine: dict[str, Any]) -> None:
-    """Train, unless that is finished; go on from a checkpoint where an interrupted run has left one.
+    """Train, unless that is finished; go on from the checkpoint that an interrupt has left, and from no other.
 
-    `runs.check_folders` has seen to it that nothing in the model folder was made with other options.
+    One of a training that failed may hold half a densification, and with the same options it would fail again: then
+    training begins anew. `runs.check_folders` has seen to it that nothing in the model folder was made with other
+    options.
     """
     if run.scene.source is None:
         raise StageFailed(Failure("train", [], [f"no folder was given for {run.scene.name}"]))
@@ -48,16 +52,20 @@ def train(run: Run, machine: dict[str, Any]) -> None:
     if _trained(run, record):
         return
     record.start(run.key)
-    checkpoint = _last_checkpoint(run)
-    before = (record.stage("train_interrupted") or {}).get("wall_seconds", 0.0) if checkpoint else 0.0
+    interrupted = _interrupted(run, record)
+    checkpoint = interrupted and run.model / interrupted["checkpoint"]
+    before = interrupted["wall_seconds"] if interrupted else 0.0
     resume = ("--start_checkpoint", str(checkpoint)) if checkpoint else ()
     command = _script("train.py", "-s", str(run.scene.source), "-m", str(run.model), "--disable_viewer", "--quiet")
     command += [*run.options, *resume]
-    _say("training" + (f" from {checkpoint.name}" if checkpoint else ""))
+    _say("training" + _from_where(checkpoint, record))
+    there = _checkpoints(run)
     done = run_child(command)
     wall = round(before + done.seconds, 3)
-    if done.status and done.interrupt:
-        record.note("train_interrupted", wall_seconds=wall)
+    if done.status:
+        left = [path for path, stamp in _checkpoints(run).items() if stamp != there.get(path)]
+        if left:
+            _note_stop(record, done, max(left, key=_iteration_of), wall)
     _expect_success("train", command, done)
     iterations = saved_iterations(run.model / "point_cloud")
     if run.iterations not in iterations:
@@ -73,10 +81,37 @@ def _trained(run: Run, record: Record) -> bool:
     return all(ply_file(run.model, iteration).is_file() for iteration in done["iterations"])
 
 
-def _last_checkpoint(run: Run) -> Path | None:
-    found = {int(path.stem[6:]): path for path in run.model.glob("chkpnt*.pth") if re.fullmatch(r"\d+", path.stem[6:])}
-    usable = [iteration for iteration in found if iteration < (run.iterations or 0)]
-    return found[max(usable)] if usable else None
+def _checkpoints(run: Run) -> dict[Path, list[int]]:
+    """The checkpoints in the model folder that leave something to do, each with its `_stamp`."""
+    found = [path for path in run.model.glob("chkpnt*.pth") if re.fullmatch(r"\d+", path.stem[6:])]
+    return {path: _stamp(path) for path in found if _iteration_of(path) < (run.iterations or 0)}
+
+
+def _iteration_of(checkpoint: Path) -> int:
+    return int(checkpoint.stem[6:])
+
+
+def _note_stop(record: Record, done: Finished, checkpoint: Path, wall: float) -> None:
+    """Remember what a training has left that was stopped or failed, and in how many seconds with the parts before."""
+    stopped = done.interrupt and done.status in (128 + signal.SIGINT, 128 + signal.SIGTERM)
+    record.note("train_interrupted" if stopped else "train_failed", checkpoint=checkpoint.name, wall_seconds=wall)
+
+
+def _interrupted(run: Run, record: Record) -> dict[str, Any] | None:
+    """What was noted of an interrupt, where its checkpoint is still there."""
+    noted = record.stage("train_interrupted") or {}
+    return noted if noted.get("checkpoint") in [path.name for path in _checkpoints(run)] else None
+
+
+def _from_where(checkpoint: Path | None, record: Record) -> str:
+    if checkpoint:
+        return f" from {checkpoint.name}"
+    if failed := record.stage("train_failed"):
+        return (
+            f" from the start ({failed['checkpoint']} was left by a training that failed after "
+            f"{failed['wall_seconds']:.0f} s)"
+        )
+    return ""
 
 
 def render(run: Run, options: Sequence[str]) -> None:
@@ -125,7 +160,7 @@ def score(run: Run) -> None:
     methods = [f"ours_{iteration}" for iteration in iterations if _rendered(run.model, iteration)]
     if not methods:
         raise StageFailed(Failure("metrics", [], [f"{run.model} has no rendered test views; render them first"]))
-    renders = {method: record.stage(f"render_{method[5:]}") for method in methods}
+    renders = {method: _times_stamp(run.model, method) for method in methods}
     done = record.stage("metrics")
     if done and done["renders"] == renders and None not in renders.values() and _scored(run.model, methods):
         return
@@ -136,6 +171,12 @@ def score(run: Run) -> None:
     truth = ground_truth_digest(run.model, methods[-1])
     record.note("metrics", ground_truth_sha256=truth, renders=renders, wall_seconds=round(finished.seconds, 3))
     _stop_if_asked(finished)
+
+
+def _times_stamp(model: Path, method: str) -> list[int] | None:
+    """Tells whether the renders are still the same: render.py times each set, last of all. None: not render.py's."""
+    times = model / "test" / method / render_times.NAME
+    return _stamp(times) if times.is_file() else None
 
 
 def _scored(model: Path, methods: Sequence[str]) -> bool:

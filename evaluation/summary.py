@@ -8,7 +8,7 @@ from typing import Any
 
 from evaluation.scenes import DATASETS
 
-QUANTITIES = ("PSNR", "SSIM", "LPIPS", "seconds", "gaussians", "peak_memory_mib", "render_ms", "fps")
+QUANTITIES = ("PSNR", "SSIM", "LPIPS", "seconds", "gaussians", "gaussians_saved", "peak_memory_mib", "render_ms", "fps")
 
 
 def spread(values: Iterable[float | None]) -> dict[str, Any]:

@@ -23,12 +23,13 @@ import render
 import train
 from utils import process
 from utils.curve_figure import draw_curve
-from utils.curve_peak import peak_advice
-from utils.curve_recorder import evenly_spread
+from utils.curve_peak import peak_advice, schedules_follow_length
+from utils.curve_recorder import CurveRecorder, evenly_spread
 from utils.curve_schedule import CurveSchedule
 from utils.error_curve import COLUMNS, Row, best_test, continue_curve, read_curve, write_curve
 from utils.loss_utils import ssim
 from utils.system_utils import UserError
+from utils.training_log import TrainingLog
 from utils.view_scores import mean_scores
 
 ROOT = Path(__file__).parents[1]
@@ -205,6 +206,18 @@ class TestScores:
         assert means["psnr"] == pytest.approx(inside["psnr"], abs=1e-4)
         assert means["ssim"] != pytest.approx(mean_scores([(image, target, None)])["ssim"], abs=1e-3)
 
+    def test_pictures_and_masks_are_loaded_before_a_scoring_is_timed(self, tmp_path):
+        seen, image = [], torch.zeros(3, 12, 12)
+
+        def giving(what: str, value: torch.Tensor | None):
+            return lambda view: (seen.append((what, view)), value)[1]
+
+        parts = giving("render", image), giving("target", image), giving("mask", None)
+        views, log = {"test": ["a"], "train": ["b"]}, TrainingLog(tmp_path, 0)
+        CurveRecorder(tmp_path, [], log, 1, [], views, *parts, torch.device("cpu")).add(1, 1.0, 5)
+        assert set(seen[:4]) == {(what, view) for what in ("target", "mask") for view in "ab"}
+        assert len(seen) == 10
+
     def test_views_are_evenly_spread(self):
         assert evenly_spread(range(9), 3) == [0, 4, 8]
         assert evenly_spread(range(9), 1) == [0]
@@ -229,6 +242,14 @@ class TestPeak:
         assert "that model is saved, use it with render.py --iteration 2000" in peak_advice(
             list(self.ROWS), {2000}, 2000
         )
+
+    def test_no_advice_that_a_schedule_of_the_length_makes_untrue(self):
+        assert not schedules_follow_length(depths=False, train_test_exp=False)
+        assert schedules_follow_length(depths=True, train_test_exp=False)
+        assert schedules_follow_length(depths=False, train_test_exp=True)
+        line = peak_advice(list(self.ROWS), {7000}, 30_000, follows_length=True)
+        assert "ends with that model" not in line
+        assert "; --save_iterations 2000 keeps that model on the way; --iterations 2000 --position_lr" in line
 
     def test_no_peak_no_advice(self):
         assert peak_advice(list(self.ROWS[:2]), (), 30_000) is None
@@ -338,6 +359,22 @@ class TestTraining:
             old = [row for row in before if row["iteration"] == new["iteration"]]
             for name in ("test_psnr", "train_ssim", "gaussians") if old else ():
                 assert new[name] == old[0][name]
+
+    def test_peak_memory_is_that_of_all_parts(self, colmap_scene, tmp_path):
+        """Of a part before that took more, by its last row or its log, whichever knows more."""
+        out = tmp_path / "out"
+        _train(colmap_scene, out, "--test_iterations", 5, "--checkpoint_iterations", 5, iterations=6)
+        log = json.loads((out / "train_log.json").read_text())
+        rows = read_curve(out / "error_vs_time.csv")
+        own = rows[-1]["peak_memory_mib"]
+        assert log[-1]["peak_memory_mib"] >= own > 0
+        for of_log, of_row in ((own + 5e4, own), (own, own + 6e4)):
+            log[0]["peak_memory_mib"], rows[0]["peak_memory_mib"] = of_log, of_row
+            (out / "train_log.json").write_text(json.dumps(log))
+            write_curve(out / "error_vs_time.csv", rows)
+            _train(colmap_scene, out, "--start_checkpoint", out / "chkpnt5.pth", iterations=6)
+            assert read_curve(out / "error_vs_time.csv")[-1]["peak_memory_mib"] == max(of_log, of_row)
+        assert json.loads((out / "train_log.json").read_text())[-1]["peak_memory_mib"] < own + 5e4
 
     def test_interrupted_and_gone_on(self, colmap_scene, tmp_path, monkeypatch):
         out = tmp_path / "out"

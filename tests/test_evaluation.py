@@ -1,19 +1,20 @@
 """The evaluation's arithmetic: spread, Pareto front, cheapest option sets, published tables."""
 
+import ast
 import statistics
+from pathlib import Path
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from evaluation import published
-from evaluation.document import Table
-from evaluation.markdown import markdown_table
 from evaluation.readme_table import BEGIN, END, replace_results
 from evaluation.scenes import DATASETS
 from evaluation.summary import QUANTITIES, spread, summarise
 from evaluation.tradeoff import cheapest, gaussians_to_reach, levels, pareto_front, seconds_to_reach
 from utils.error_curve import COLUMNS
+from utils.markdown_table import markdown_table
 from utils.system_utils import UserError
 
 
@@ -117,8 +118,25 @@ def test_synthetic_scenes_compare_at_full_size_over_white_only():
 
 
 def test_markdown_keeps_columns_apart():
-    lines = markdown_table(Table(["a", "b"], [["x|y", "1"], ["z", "22"]])).splitlines()
-    assert lines == ["| a    |   b |", "| ---- | --: |", "| x\\|y |   1 |", "| z    |  22 |"]
+    table = ["a", "b"], [["x|y", "1"], ["z", "22"]]
+    assert markdown_table(*table).splitlines() == [
+        "| a    |   b |", "| ---- | --: |", "| x\\|y |   1 |", "| z    |  22 |",
+    ]  # fmt: skip
+    assert markdown_table(*table, right=False).splitlines() == [
+        "| a    | b   |", "| ---- | --- |", "| x\\|y | 1   |", "| z    | 22  |",
+    ]  # fmt: skip
+
+
+def test_nothing_imports_the_benchmarks():
+    """They measure the project: it runs without them."""
+    root = Path(__file__).parents[1]
+    ours = [path for path in root.glob("**/*.py") if path.relative_to(root).parts[0] not in ("benchmarks", "tests")]
+    assert len(ours) > 100
+    for path in ours:
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            names = [node.module or ""] if isinstance(node, ast.ImportFrom) else []
+            names += [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+            assert not [name for name in names if name.split(".")[0] == "benchmarks"], path
 
 
 @pytest.mark.parametrize("text", ["", BEGIN, f"{END}\n{BEGIN}", f"{BEGIN}{BEGIN}{END}"])

@@ -1,5 +1,7 @@
 """full_eval.py: what it runs, resumes, refuses and reports; with stand-ins for what it runs, and once for real."""
 
+import contextlib
+import dataclasses
 import json
 import os
 import shutil
@@ -15,7 +17,8 @@ from PIL import Image
 import full_eval
 from evaluation import readme_table, stages
 from evaluation import report as report_module
-from evaluation.figures import draw_curves
+from evaluation.contact_sheet import GAP, HEADER
+from evaluation.figures import draw_curves, draw_worst_views
 from evaluation.readme_table import BEGIN, END
 from evaluation.scenes import DATASETS
 from utils.system_utils import UserError
@@ -81,8 +84,8 @@ def test_commands_of_a_plain_scene(figures, scenes, tmp_path):
     first = report["runs"][0]
     assert first["finished"] and first["failure"] is None and first["model"] == "attic"
     assert first["iterations"]["40"] == {
-        "PSNR": 23.0, "SSIM": 0.9, "LPIPS": None, "fps": 250.0, "gaussians": 16000, "peak_memory_mib": 340.0,
-        "render_ms": 4.0, "seconds": 16.0, "views": 2,
+        "PSNR": 23.0, "SSIM": 0.9, "LPIPS": None, "fps": 250.0, "gaussians": 16000, "gaussians_saved": 16000,
+        "peak_memory_mib": 340.0, "render_ms": 4.0, "seconds": 16.0, "views": 2,
     }  # fmt: skip
     assert first["views"] == {"test": 2, "train": 7} and first["test_sizes"] == [[120, 80]]
     assert first["worst_views"][0] == {"PSNR": 22.0, "file": "00001.png", "picture": "photo_1.jpg"}
@@ -125,6 +128,15 @@ def test_data_sets_get_the_options_of_the_paper(scenes, tmp_path):
     assert groups == ["mipnerf360", "tanksandtemples"]
 
 
+@pytest.fixture(params=[None, 1.0])
+def _seconds(request, monkeypatch):
+    """Stages take as long as they take, or all the same time, as a render of an unchanged model may."""
+    plain = stages.run_child
+    if request.param:
+        monkeypatch.setattr(stages, "run_child", lambda c: dataclasses.replace(plain(c), seconds=request.param))
+
+
+@pytest.mark.usefixtures("_seconds")
 def test_a_second_call_does_nothing_again(scenes, tmp_path):
     out = tmp_path / "out"
     command = ("--scenes", scenes / "attic", "--output_path", out, "--iterations", 40)
@@ -193,25 +205,32 @@ def test_a_failed_scene_is_told_and_the_others_go_on(scenes, tmp_path, capsys):
     assert [words[0] for words in calls(scenes)[before:]] == ["train", "render"]  # of attic alone
 
 
-def test_ctrl_c_reaches_the_training_and_the_next_call_resumes_it(scenes, tmp_path):
-    out = tmp_path / "out"
+def _start(scenes: Path, words: list[str]) -> subprocess.Popen:
+    """full_eval.py in a process group of its own, once it trains attic, which waits for a signal."""
     (scenes / "attic" / "slow").touch()
     program = (
         "import pathlib, sys; from evaluation import stages; import full_eval; from utils.system_utils import run_cli;"
         f"stages._ROOT = pathlib.Path({str(STAND_INS)!r}); full_eval.machine = dict; run_cli(full_eval.main)"
     )
-    words = ["--scenes", str(scenes / "attic"), str(scenes / "brick"), "--output_path", str(out), "--iterations", "40"]
     process = subprocess.Popen([sys.executable, "-c", program, *words], cwd=ROOT, stderr=subprocess.PIPE, text=True,
                                start_new_session=True)  # fmt: skip
+    deadline = time.monotonic() + 60
+    while not (scenes / "attic" / "started").exists() and process.poll() is None and time.monotonic() < deadline:
+        time.sleep(0.05)
+    return process
+
+
+@pytest.mark.parametrize(("sent", "status"), [(signal.SIGINT, 130), (signal.SIGHUP, 143)])
+def test_a_signal_reaches_the_training_and_the_next_call_resumes_it(scenes, tmp_path, sent, status):
+    out = tmp_path / "out"
+    words = ["--scenes", str(scenes / "attic"), str(scenes / "brick"), "--output_path", str(out), "--iterations", "40"]
+    process = _start(scenes, words)
     try:
-        deadline = time.monotonic() + 60
-        while not (scenes / "attic" / "started").exists() and time.monotonic() < deadline:
-            time.sleep(0.05)
-        os.killpg(process.pid, signal.SIGINT)  # to the whole group, as a terminal does
+        os.killpg(process.pid, sent)  # to the whole group, as a terminal does with Ctrl-C and when it is closed
         said = process.communicate(timeout=30)[1]
     finally:
         process.kill()
-    assert process.returncode == 130, said
+    assert process.returncode == status, said
     report = report_of(out)
     assert [run["finished"] for run in report["runs"]] == [False, False] and not report["runs"][0]["failure"]
     assert "Not finished: attic; brick." in (out / "report.md").read_text()
@@ -220,6 +239,112 @@ def test_ctrl_c_reaches_the_training_and_the_next_call_resumes_it(scenes, tmp_pa
     assert [run["finished"] for run in report["runs"]] == [True, True]
     resumed = next(words for words in calls(scenes)[1:] if words[0] == "train")
     assert resumed[-2:] == ["--start_checkpoint", str(out / "attic" / "chkpnt5.pth")]
+
+
+def test_a_second_one_is_refused_while_the_first_or_its_training_lives(scenes, tmp_path):
+    out = tmp_path / "out"
+    words = ["--scenes", str(scenes / "attic"), "--output_path", str(out), "--iterations", "40"]
+    process = _start(scenes, words)
+    trainer = int((out / "attic" / "pid").read_text())
+    try:
+        with pytest.raises(UserError, match=rf"\(process {process.pid}\).* is at work in .*out; wait"):
+            run(*words)
+        process.kill()
+        process.communicate(timeout=30)
+        with pytest.raises(UserError, match="is at work in"):
+            run(*words)  # the training has outlived it
+    finally:
+        process.kill()
+        os.kill(trainer, signal.SIGKILL)
+    (scenes / "attic" / "slow").unlink()
+    deadline, report = time.monotonic() + 30, None
+    while report is None and time.monotonic() < deadline:
+        with contextlib.suppress(UserError):  # the system may take a moment to bury it
+            report = run(*words)
+    assert report["runs"][0]["finished"]  # what is left of the first is no obstacle
+
+
+def test_a_checkpoint_of_a_failure_is_not_gone_on_from(scenes, tmp_path, capsys):
+    out = tmp_path / "out"
+    words = ["--scenes", str(scenes / "attic"), "--output_path", str(out), "--iterations", "40"]
+    (scenes / "attic" / "full").touch()
+    with pytest.raises(SystemExit):
+        run(*words)
+    noted = json.loads((out / "attic" / "full_eval.json").read_text())["stages"]["train_failed"]
+    assert noted["checkpoint"] == "chkpnt9.pth" and noted["wall_seconds"] > 0
+    (scenes / "attic" / "full").unlink()
+    assert run(*words)["runs"][0]["finished"]
+    assert "--start_checkpoint" not in calls(scenes)[1]
+    assert "training from the start (chkpnt9.pth was left by a training that failed after" in capsys.readouterr().out
+
+
+def test_an_interrupts_checkpoint_stays_the_one_to_go_on_from(scenes, tmp_path):
+    """After an interrupt at 5 a failure leaves one at 9, in the same folder and later."""
+    out = tmp_path / "out"
+    words = ["--scenes", str(scenes / "attic"), "--output_path", str(out), "--iterations", "40"]
+    process = _start(scenes, words)
+    try:
+        process.send_signal(signal.SIGINT)
+        process.communicate(timeout=30)
+    finally:
+        process.kill()
+    before = json.loads((out / "attic" / "full_eval.json").read_text())["stages"]["train_interrupted"]["wall_seconds"]
+    (scenes / "attic" / "full").touch()
+    with pytest.raises(SystemExit):
+        run(*words)
+    (scenes / "attic" / "full").unlink()
+    report = run(*words)
+    assert calls(scenes)[-2][-2:] == ["--start_checkpoint", str(out / "attic" / "chkpnt5.pth")]
+    assert before > 0.5 and report["runs"][0]["wall_seconds"] > before
+
+
+def test_trained_gaussians_are_reported_and_those_saved_beside(scenes, tmp_path):
+    out = tmp_path / "out"
+    words = ["--scenes", scenes / "attic", "--output_path", out, "--iterations", 40]
+    run(*words)
+    left_out = {"antialiasing": False, "left_out": {"gaussians": 17000, "unseen": 1000}}
+    (out / "attic" / "model.json").write_text(json.dumps(left_out))
+    report = run(*words)
+    values = report["runs"][0]["iterations"]["40"]
+    assert (values["gaussians"], values["gaussians_saved"]) == (17000, 16000)
+    text = (out / "report.md").read_text()
+    assert "17,000" in text and "16,000" not in text and "Gaussians: those trained" in text
+    left_out["left_out"]["unseen"] = 999  # of another model: the PLY's rows and these do not add up
+    (out / "attic" / "model.json").write_text(json.dumps(left_out))
+    assert run(*words)["runs"][0]["iterations"]["40"]["gaussians"] == 16000
+
+
+def test_the_split_is_what_the_views_say(scenes, tmp_path):
+    out = tmp_path / "out"
+    words = ["--scenes", scenes / "attic", "--output_path", out, "--iterations", 40]
+    assert run(*words)["runs"][0]["split"] == "the data set's own"  # photo_0 and photo_1 of nine
+    names = ["photo_0", "photo_8", *(f"photo_{i}" for i in range(1, 8))]
+    (out / "attic" / "cameras.json").write_text(json.dumps([{"img_name": name} for name in names]))
+    assert run(*words)["runs"][0]["split"] == "every 8th by name"
+    assert "every 8th by name" in (out / "report.md").read_text()
+    (out / "attic" / "cameras.json").unlink()
+    assert run(*words)["runs"][0]["split"] is None
+
+
+def test_masks_are_part_of_the_ground_truth_and_blank_on_the_sheet(scenes, tmp_path):
+    out = tmp_path / "out"
+    words = ["--scenes", scenes / "attic", "--output_path", out, "--iterations", 40, "--seeds", 0, 1]
+    assert run(*words)["warnings"] == []
+    method = out / "attic" / "seed_1" / "test" / "ours_40"
+    (method / "masks").mkdir()
+    mask = Image.new("L", (120, 80), 255)
+    mask.paste(0, (0, 0, 120, 20))  # all that differs
+    mask.save(method / "masks" / "00001.png")
+    (out / "attic" / "seed_1" / "results.json").unlink()
+    report = run(*words)
+    assert "different ground truth" in report["warnings"][0] and "masks" in report["warnings"][0]
+    view = report["runs"][1]
+    assert view["worst_views"][0]["file"] == "00001.png"
+    assert draw_worst_views(tmp_path / "sheet.png", view, out)
+    with Image.open(tmp_path / "sheet.png") as sheet:
+        # In the middle of each picture: above the label, which is masked, and in the lower half, which is not.
+        masked, plain = ([sheet.getpixel((GAP + 60 + i * (120 + GAP), HEADER + y)) for i in range(3)] for y in (1, 60))
+    assert masked == [(255,) * 3, (255,) * 3, (0,) * 3] and plain == [(90,) * 3, (90,) * 3, (0,) * 3]
 
 
 def test_seeds_and_option_sets(figures, scenes, tmp_path, capsys, monkeypatch):

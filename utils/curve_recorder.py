@@ -14,7 +14,7 @@ from utils.curve_figure import draw_curve
 from utils.curve_peak import peak_advice
 from utils.curve_schedule import CurveSchedule
 from utils.error_curve import COLUMNS, FIGURE, NAME, Row, write_curve
-from utils.process import peak_memory_mib, wall_seconds
+from utils.process import wall_seconds
 from utils.system_utils import UserError
 from utils.training_log import TrainingLog
 from utils.view_scores import mean_scores
@@ -73,13 +73,14 @@ class CurveRecorder:
 
     def add(self, iteration: int, seconds: float, gaussians: int) -> None:
         """Score after `seconds` of training in this run, and write the curve with the new point."""
-        memory = peak_memory_mib(self._device)
+        # Both, as a rescued training has rows after its log's last record.
+        peaks = [self._log.peak_memory_mib(), *(row["peak_memory_mib"] for row in self.rows[-1:])]
         row = dict.fromkeys(COLUMNS) | {
             "iteration": iteration,
             "seconds": round(self._log.seconds_before + seconds, 3),
             "wall_seconds": round(self._log.wall_seconds_before + wall_seconds(), 3),
             "gaussians": gaussians,
-            "peak_memory_mib": None if memory is None else round(memory, 1),
+            "peak_memory_mib": max((peak for peak in peaks if peak is not None), default=None),
         }
         if not self._schedule.scorings:
             # Once, and most of it for pictures that training needs soon: no measure of what the next scoring costs.
@@ -98,6 +99,7 @@ class CurveRecorder:
         for views in self._views.values():
             for view in views:
                 self._target(view)
+                self._mask(view)
 
     def _score(self, row: Row) -> None:
         with torch.no_grad():
@@ -113,7 +115,7 @@ class CurveRecorder:
                 tqdm.write(f"warning: {error}; training goes on without its curve", file=sys.stderr)
             self._warned = True
 
-    def finish(self, seconds: float, saved: Container[int], position_lr_max_steps: int) -> None:
+    def finish(self, seconds: float, saved: Container[int], position_lr_max_steps: int, follows_length: bool) -> None:
         """Draw the curve; say what it has cost beside `seconds` of training in this run, and advise (`peak_advice`).
 
         The log's last record gets the costs: `curve_scoring_seconds`, `curve_writing_seconds` (of the file),
@@ -126,7 +128,7 @@ class CurveRecorder:
             f"({100 * scoring / seconds:.1f} % of the training), wrote {NAME} in {writing:.3f} s "
             f"({100 * writing / seconds:.2f} %), drew it in {drawing:.1f} s"
         )
-        if advice := peak_advice(self.rows, saved, position_lr_max_steps):
+        if advice := peak_advice(self.rows, saved, position_lr_max_steps, follows_length):
             print(advice)
         self._log.add(
             self.rows[-1]["iteration"],

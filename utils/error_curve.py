@@ -22,7 +22,7 @@ def read_curve(path: str | os.PathLike) -> list[Row]:
     """Rows of a curve's file by iteration, ascending; each has all COLUMNS, None where the field is empty.
 
     seconds: of training, without evaluation and saving, over all resumed parts; wall_seconds: since the start of the
-    process, those of earlier parts added; peak_memory_mib: of the process so far (memory of the GPU where it trains);
+    process, those of earlier parts added; peak_memory_mib: the most of all parts so far (of the GPU where it trains);
     `<views>_l1`, `<views>_psnr` (dB), `<views>_ssim`: `utils.view_scores`. UserError for what is no such file.
     """
     try:

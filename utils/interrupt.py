@@ -1,19 +1,26 @@
-"""Ctrl-C and SIGTERM that wait for a good moment."""
+"""Ctrl-C, SIGTERM and SIGHUP that wait for a good moment."""
 
+import contextlib
+import os
 import signal
 import threading
 from types import FrameType, TracebackType
 
 from utils.system_utils import Terminated
 
+_HANGUP = getattr(signal, "SIGHUP", None)  # Windows has none
 _ERRORS = {signal.SIGINT: KeyboardInterrupt, signal.SIGTERM: Terminated}
+if _HANGUP is not None:
+    _ERRORS[_HANGUP] = Terminated
 
 
 class DeferredInterrupt:
-    """Inside `with`, a first Ctrl-C or SIGTERM only sets `requested`, so that no half-done step gets saved.
+    """Inside `with`, a first Ctrl-C, SIGTERM or SIGHUP only sets `requested`, so that no half-done step gets saved.
 
-    requested: the exception to raise in a good moment, KeyboardInterrupt or Terminated, or None. A second signal raises
-    its own at once. Outside the main thread, where Python delivers no signals, it does nothing.
+    requested: the exception to raise in a good moment, KeyboardInterrupt or Terminated (SIGTERM; SIGHUP, when the
+    terminal is closed), or None. A second signal raises its own at once, but SIGHUP, which may come once from the
+    terminal and once from the shell. Under nohup SIGHUP stays ignored. Outside the main thread, where Python delivers
+    no signals, it does nothing.
     """
 
     def __init__(self) -> None:
@@ -22,7 +29,9 @@ class DeferredInterrupt:
 
     def __enter__(self) -> "DeferredInterrupt":
         if threading.current_thread() is threading.main_thread():
-            self._previous = {signum: signal.signal(signum, self._note) for signum in _ERRORS}
+            for signum in _ERRORS:
+                if signum != _HANGUP or signal.getsignal(signum) != signal.SIG_IGN:
+                    self._previous[signum] = signal.signal(signum, self._note)
         return self
 
     def __exit__(
@@ -33,6 +42,20 @@ class DeferredInterrupt:
                 signal.signal(signum, handler)
 
     def _note(self, signum: int, frame: FrameType | None) -> None:
-        if self.requested:
+        if signum == _HANGUP:
+            _leave_closed_terminal()
+        elif self.requested:
             raise _ERRORS[signum]
-        self.requested = _ERRORS[signum]
+        self.requested = self.requested or _ERRORS[signum]
+
+
+def _leave_closed_terminal() -> None:
+    """Send to nowhere what can no longer be written, or the next message would end the program before it has saved."""
+    for descriptor in (1, 2):
+        try:
+            os.write(descriptor, b"")
+        except OSError:
+            with contextlib.suppress(OSError):
+                nowhere = os.open(os.devnull, os.O_WRONLY)
+                os.dup2(nowhere, descriptor)
+                os.close(nowhere)

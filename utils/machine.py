@@ -1,6 +1,8 @@
-"""What a measurement was made on."""
+"""What a measurement was made on: processor, GPU, instruction set, commit."""
 
+import os
 import platform
+import subprocess
 from pathlib import Path
 
 import torch
@@ -18,3 +20,37 @@ def cpu_name() -> str:
 def device_name(device: torch.device) -> str:
     """The name of the GPU or of the processor that `device` stands for."""
     return torch.cuda.get_device_name(device) if device.type == "cuda" else cpu_name()
+
+
+def instruction_set() -> str:
+    """The instruction set that the CPU backends use here (environment variable GS_ISA narrows it)."""
+    capability = {"AVX512": "avx512", "AVX2": "avx2"}.get(torch.backends.cpu.get_cpu_capability(), "baseline")
+    order = ["baseline", "avx2", "avx512"]
+    wanted = os.environ.get("GS_ISA", capability)
+    return min(capability, wanted, key=order.index) if wanted in order else capability
+
+
+def gpu_name() -> str:
+    """The current GPU's name with driver and clocks as nvidia-smi gives them."""
+    fields = "driver_version,clocks.sm,clocks.mem"
+    index = f"--id={torch.cuda.current_device()}"
+    state = _output("nvidia-smi", index, f"--query-gpu={fields}", "--format=csv,noheader")
+    return f"{torch.cuda.get_device_name()} (driver, SM and memory clock: {state or 'not known'})"
+
+
+def commit() -> str:
+    """GS_COMMIT where it is set (a copy without git), else the checkout's short hash, with + where files differ."""
+    if os.environ.get("GS_COMMIT"):
+        return os.environ["GS_COMMIT"]
+    short = _output("git", "rev-parse", "--short", "HEAD")
+    changed = _output("git", "status", "--porcelain", "--untracked-files=no")
+    return (short + ("+" if changed else "")) or "not known (GS_COMMIT is not set)"
+
+
+def _output(*command: str) -> str:
+    """What a program prints; empty where it is missing or fails."""
+    try:
+        done = subprocess.run(command, cwd=Path(__file__).resolve().parent, capture_output=True, text=True)
+    except OSError:
+        return ""
+    return done.stdout.strip() if done.returncode == 0 else ""

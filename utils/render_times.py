@@ -1,6 +1,5 @@
 """render_times.json: how long each view of a rendered set took, and what one has to know to compare it."""
 
-import json
 import statistics
 from collections.abc import Sequence
 from pathlib import Path
@@ -8,8 +7,8 @@ from typing import Any
 
 import torch
 
+from utils.json_files import write_json
 from utils.machine import device_name
-from utils.system_utils import atomic_write
 
 NAME = "render_times.json"
 
@@ -37,5 +36,4 @@ def summarise(
 
 def write(folder: Path, summary: dict[str, Any]) -> None:
     """Write what `summarise` gives into `folder`."""
-    with atomic_write(folder / NAME) as temporary:
-        temporary.write_text(json.dumps(summary, indent=1, sort_keys=True, allow_nan=False) + "\n")
+    write_json(folder / NAME, summary)

@@ -19,7 +19,7 @@ class UserError(Exception):
 
 
 class Terminated(KeyboardInterrupt):
-    """SIGTERM, where it is treated as Ctrl-C is."""
+    """SIGTERM or SIGHUP, where it is treated as Ctrl-C is."""
 
 
 def run_cli(main: Callable[[], object]) -> None:

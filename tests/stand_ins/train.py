@@ -1,10 +1,12 @@
 """Stands in for train.py: writes at once what a training would, with numbers that follow from the options.
 
-A scene folder with a file `broken` makes it fail, one with a file `slow` makes it wait for a signal.
+A scene folder with a file `broken` makes it fail, one with a file `full` makes it fail and leave a checkpoint, one with
+a file `slow` makes it wait for a signal.
 """
 
 import argparse
 import json
+import os
 import signal
 import sys
 import time
@@ -27,15 +29,24 @@ if (args.s / "broken").exists():
     sys.exit("error: <b>the scene</b> is broken; mend it")
 
 
+if (args.s / "full").exists():
+    (args.m / "chkpnt9.pth").write_bytes(b"")
+    sys.stderr.write("error: memory did not suffice\n")
+    sys.exit(2)
+
+
 def stop(signum, frame):
-    signal.signal(signal.SIGINT, lambda *_: sys.exit("two signals: no checkpoint"))
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: sys.exit("two signals: no checkpoint"))
     time.sleep(0.5)
     (args.m / "chkpnt5.pth").write_bytes(b"")
-    sys.exit(130)
+    sys.exit(128 + signum)
 
 
 if (args.s / "slow").exists() and not args.start_checkpoint:
+    (args.m / "pid").write_text(str(os.getpid()))
     signal.signal(signal.SIGINT, stop)
+    signal.signal(signal.SIGTERM, stop)
     (args.s / "started").touch()
     time.sleep(30)
     sys.exit("no signal came")
