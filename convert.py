@@ -16,6 +16,7 @@ from pathlib import Path
 
 from conversion.backends import LENS_MODELS, Backend, Program, Pycolmap, Settings
 from conversion.layout import FEWEST, Layout, find_photos, refuse_foreign_results, scene_folder
+from conversion.programs import refuse_while_working
 from conversion.report import summary
 from conversion.stages import Stage, StageRecord
 from conversion.steps import (
@@ -31,7 +32,9 @@ from utils.system_utils import UserError, run_cli
 
 def convert(layout: Layout, settings: Settings, args: argparse.Namespace) -> None:
     """Run the stages that are not done; print what was placed and what to do about the rest."""
+    masks = _masks(args.mask_path)
     names = [] if args.video else find_photos(layout)
+    refuse_while_working(layout.log)
     record = StageRecord(layout.stages)
     refuse_foreign_results(layout, record.begun("undistortion"), record.begun("photos"), args.skip_matching)
     kept = []
@@ -45,7 +48,6 @@ def convert(layout: Layout, settings: Settings, args: argparse.Namespace) -> Non
     else:
         backend = _backend(args.colmap_executable, settings)
         program, made_from = backend.identity, None
-        masks = Path(args.mask_path) if args.mask_path else None
         stages = [photo_stage(layout, names, masks)]
         stages += reconstruction_stages(layout, backend, settings, masks is not None)
     made = {"camera": settings.camera, "mapper": settings.mapper, "matcher": settings.matcher, "program": program}
@@ -60,6 +62,15 @@ def convert(layout: Layout, settings: Settings, args: argparse.Namespace) -> Non
     for line in report["advice"]:
         print(f"warning: {line}", file=sys.stderr)
     print(f"train it with: python train.py -s {shlex.quote(str(layout.scene))}")
+
+
+def _masks(given: str | None) -> Path | None:
+    """The folder of --mask_path. UserError where it is none, as it would pass for a folder without masks later on."""
+    if given is None:
+        return None
+    if not given or not Path(given).is_dir():
+        raise UserError(f"no folder of masks {given!r}; give an existing one with --mask_path, or leave it out")
+    return Path(given)
 
 
 def _video(layout: Layout, record: StageRecord, args: argparse.Namespace) -> Stage:
@@ -107,7 +118,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         help="place photo after photo, or all at once: faster for hundreds (default: incremental)")  # fmt: skip
     add("--max_num_features", type=int, default=8192, metavar="N",
         help="most features of a photo; more: for surfaces with little texture, slower (default: 8192)")  # fmt: skip
-    add("--mask_path", default="", metavar="FOLDER",
+    add("--mask_path", default=None, metavar="FOLDER",
         help="masks named as the photos, with .png behind; black: no features there (default: none)")  # fmt: skip
     add("stray", nargs="*", help=argparse.SUPPRESS)
     args = parser.parse_args(argv)

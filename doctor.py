@@ -14,8 +14,8 @@ from diagnosis import environment
 from diagnosis.lines import Line
 
 
-def diagnose(source: str, images: str, model: str, iteration: int) -> int:
-    """Print the lines of all checks that were asked for; number of problems. source, model: "" for none."""
+def diagnose(source: str | None, images: str, model: str | None, iteration: int) -> int:
+    """Print the lines of all checks that were asked for; number of problems. source, model: None for none."""
     lines = environment.check_packages()
     complete = not any(line.finding for line in lines)
     if complete:
@@ -30,13 +30,13 @@ def diagnose(source: str, images: str, model: str, iteration: int) -> int:
     from utils.system_utils import UserError
 
     for option, folder in (("-s", source), ("-m", model)):
-        if folder and not Path(folder).is_dir():
-            raise UserError(f"no folder {folder}; give an existing one with {option}")
-    if source:
+        if folder is not None and not (folder and Path(folder).is_dir()):
+            raise UserError(f"no folder {folder or repr(folder)}; give an existing one with {option}")
+    if source is not None:
         from diagnosis.dataset import check_dataset
 
         problems += _show(f"dataset {source}", check_dataset(source, images))
-    if model:
+    if model is not None:
         from diagnosis.model import check_model
 
         problems += _show(f"model {model}", check_model(model, iteration))
@@ -56,8 +56,8 @@ def main(argv: Sequence[str] | None = None) -> None:
         description="Say what is wrong with environment, dataset and model, and what to do."
     )
     add = parser.add_argument
-    add("-s", "--source_path", default="", metavar="SCENE", help="scene folder to look at (default: none)")
-    add("-m", "--model_path", default="", metavar="MODEL", help="model folder to look at (default: none)")
+    add("-s", "--source_path", default=None, metavar="SCENE", help="scene folder to look at (default: none)")
+    add("-m", "--model_path", default=None, metavar="MODEL", help="model folder to look at (default: none)")
     add("-i", "--images", default="images", help="folder of the pictures under the scene folder (default: images)")
     add("--iteration", type=int, default=-1, help="saved iteration of the model (default: the last)")
     args = parser.parse_args(argv)

@@ -36,6 +36,7 @@ from scene.cameras import Camera
 from scene.checkpoint import load_checkpoint, save_checkpoint
 from scene.divergence import DivergenceWatch
 from scene.gaussian_model import GaussianModel
+from scene.mask_watch import MaskWatch
 from scene.memory_estimate import announce_memory
 from scene.memory_guard import MemoryGuard
 from utils.counter_rng import Stream, permutation, uniform
@@ -95,6 +96,7 @@ def training(
         _check_exposures(gaussians, dataset.train_test_exp, checkpoint)
         capture = None  # so that densification can free what it replaces
     views = _ViewOrder(scene.getTrainCameras(), opt.seed)
+    masks = MaskWatch(scene.getTrainCameras())
     # After all that bad input can stop, or a slip of the keyboard would overwrite the files of a finished model.
     tb_writer = prepare_output_and_logger(
         dataset, antialiasing=pipe.antialiasing, seed=opt.seed, world_offset=gaussians.world_offset
@@ -140,6 +142,7 @@ def training(
                 use_trained_exp=dataset.train_test_exp, want_depth=weight > 0, want_visibility=False, clamp=False,
             )  # fmt: skip
             target, mask = camera.ground_truth(background)
+            masks.add(camera, mask)
             loss, l1 = photometric_loss(package["render"], target, opt.lambda_dssim, mask, camera.columns)
             if weight > 0:
                 depth_loss = weight * inverse_depth_loss(package["depth"], camera.invdepthmap, camera.columns, mask)
@@ -159,6 +162,7 @@ def training(
                     shown["Depth Loss"] = f"{depth_losses.mean:.7f}"
                 bar.set_postfix(shown, Gaussians=len(gaussians), refresh=False)
                 bar.update(iteration - bar.n)
+                masks.look(last=iteration == opt.iterations)
             seconds = clock.seconds
             with clock.paused():
                 if curve_due:

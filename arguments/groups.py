@@ -4,6 +4,7 @@ import argparse
 import os
 
 from arguments.param_group import Option, ParamGroup, above, at_least, one_of, within
+from utils.system_utils import UserError
 
 
 def _resolution(value: int) -> str | None:
@@ -100,8 +101,8 @@ class ModelParams(ParamGroup):
         Option(
             "mask_meaning",
             "auto",
-            "what is masked. ignore: left out of loss and scores; transparent: shows the background, as alpha does; "
-            "auto: ignore for mask files, transparent for the pictures' alpha",
+            "what is masked by mask files or the pictures' alpha. ignore: left out of loss and scores; transparent: "
+            "shows the background; auto: ignore for mask files, transparent for alpha",
             "ours",
             check=one_of("auto", "ignore", "transparent"),
             remembered=True,
@@ -117,8 +118,13 @@ class ModelParams(ParamGroup):
     )
 
     def extract(self, args: argparse.Namespace) -> argparse.Namespace:
-        """As ParamGroup.extract; a given source_path is made absolute."""
+        """As ParamGroup.extract; a given source_path is made absolute. UserError for options at odds."""
         values = super().extract(args)
+        if values.init_pcd_path and values.init_type == "random":
+            raise UserError(
+                f"--init_type random and --init_pcd_path {values.init_pcd_path} both name the points to start from; "
+                "leave one out"
+            )
         if values.source_path:
             values.source_path = os.path.abspath(values.source_path)
         return values

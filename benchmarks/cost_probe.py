@@ -5,6 +5,7 @@
 makes a small Blender scene in FOLDER, trains on it for 3 iterations and renders it, and prints what it saw as JSON.
 """
 
+import argparse
 import json
 import math
 import sys
@@ -85,4 +86,7 @@ def probe(folder: Path) -> dict:
 
 
 if __name__ == "__main__":
-    print(json.dumps(probe(Path(sys.argv[1]))), file=sys.__stdout__)  # --quiet has silenced sys.stdout
+    parser = argparse.ArgumentParser(description="Train and render a small scene; what that loads and writes, as JSON.")
+    parser.add_argument("folder", type=Path, help="folder for the scene and the model; it is made")
+    folder = parser.parse_args().folder
+    print(json.dumps(probe(folder)), file=sys.__stdout__)  # --quiet has silenced sys.stdout

@@ -17,6 +17,8 @@ from utils.threads import threads
 
 JPEG_QUALITY = 95
 _ORIENTATION = 0x0112  # EXIF tag; 1 or absent: upright
+_LYING = (5, 6, 7, 8)  # of its values: width and height change places
+_MOST_NAMED = 20
 
 
 def prepare_photos(layout: Layout, names: Sequence[str], masks: Path | None) -> None:
@@ -24,7 +26,7 @@ def prepare_photos(layout: Layout, names: Sequence[str], masks: Path | None) -> 
 
     A photo is linked (copied where links can't be made), unless its EXIF orientation turns it or COLMAP can't read its
     format: then it is written anew, the orientation baked into the pixels and the other EXIF data kept. Masks: see
-    `_prepare_mask`. UserError names the first photo or mask that is unusable.
+    `_prepare_mask`. They were checked (`check_photos`); UserError for those whose pixels turn out to be broken.
     """
     with_mask = find_masks(names, masks) if masks else {}
 
@@ -32,15 +34,25 @@ def prepare_photos(layout: Layout, names: Sequence[str], masks: Path | None) -> 
         prepared = _prepare_photo(layout.input / name, layout.photos / name)
         if masks:
             mask = layout.masks / prepared.relative_to(layout.photos)
-            _prepare_mask(with_mask.get(name), mask.with_name(f"{mask.name}.png"), prepared, layout.input / name)
+            _prepare_mask(with_mask.get(name), mask.with_name(f"{mask.name}.png"), prepared)
 
     _in_threads(prepare, names, "Preparing photos")
 
 
+def check_photos(layout: Layout, names: Sequence[str], masks: Path | None) -> None:
+    """UserError that names all photos and masks that are broken or do not fit; decodes none that is whole."""
+    with_mask = find_masks(names, masks) if masks else {}
+
+    def check(name: str) -> None:
+        size = _upright_size(layout.input / name)
+        if name in with_mask:
+            _check_mask(with_mask[name], name, size)
+
+    _in_threads(check, names, "Checking photos")
+
+
 def find_masks(names: Sequence[str], folder: Path) -> dict[str, Path]:
     """Masks by name of photo: `<name>.png` as COLMAP has them, or the same name, or with the suffix .png."""
-    if not folder.is_dir():
-        raise UserError(f"no folder of masks {folder}; give an existing one with --mask_path")
     found = {}
     for name in names:
         candidates = (folder / f"{name}.png", folder / name, (folder / name).with_suffix(".png"))
@@ -76,7 +88,6 @@ def resize_images(layout: Layout, factor: int) -> None:
 
 def _prepare_photo(source: Path, target: Path) -> Path:
     """Path of the prepared photo: `target`, with .png behind it where the format had to change."""
-    picture_size(source)  # a UserError for what is cut short or no picture
     target.parent.mkdir(parents=True, exist_ok=True)
     try:
         with Image.open(source) as image:
@@ -92,8 +103,27 @@ def _prepare_photo(source: Path, target: Path) -> Path:
         raise UserError(f"cannot turn the photo {source} upright ({error}); replace it or take it out") from error
 
 
-def _prepare_mask(source: Path | None, target: Path, photo: Path, original: Path) -> None:
-    """Write a mask as 8-bit grey PNG; black (0) is ignored. Its size must be the photo's, as that is displayed.
+def _upright_size(photo: Path) -> tuple[int, int]:
+    width, height = picture_size(photo)  # a UserError for what is cut short or no picture
+    try:
+        with Image.open(photo) as image:
+            lies = image.getexif().get(_ORIENTATION, 1) in _LYING
+    except UNREADABLE as error:
+        raise UserError(f"cannot read the EXIF data of {photo} ({error}); replace it or take it out") from error
+    return (height, width) if lies else (width, height)
+
+
+def _check_mask(mask: Path, name: str, size: tuple[int, int]) -> None:
+    found = picture_size(mask)
+    if found != size:
+        raise UserError(
+            f"the mask {mask} has {found[0]} x {found[1]} pixels, but its photo {name} has {size[0]} x {size[1]} when "
+            "it is upright; make masks from the photos as they are displayed"
+        )
+
+
+def _prepare_mask(source: Path | None, target: Path, photo: Path) -> None:
+    """Write a mask as 8-bit grey PNG; black (0) is ignored.
 
     Without a source it is white: COLMAP leaves photos out that have none while others have.
     """
@@ -106,12 +136,6 @@ def _prepare_mask(source: Path | None, target: Path, photo: Path, original: Path
             mask = image.convert("L")
     except UNREADABLE as error:
         raise UserError(f"cannot read the mask {source} ({error}); replace it or take it out") from error
-    size = picture_size(photo)
-    if mask.size != size:
-        raise UserError(
-            f"the mask {source} has {mask.size[0]} x {mask.size[1]} pixels, but its photo {original.name} has "
-            f"{size[0]} x {size[1]} when it is upright; make masks from the photos as they are displayed"
-        )
     mask.save(target)
 
 
@@ -134,10 +158,31 @@ def _link(source: Path, target: Path) -> None:
 
 
 def _in_threads(work: Callable[[str], None], names: Sequence[str], title: str) -> None:
+    """Do the work for all names. UserError where it ended in any, with all of them."""
+
+    def attempt(name: str) -> UserError | None:
+        try:
+            work(name)
+        except UserError as error:
+            return error
+        return None
+
     with ThreadPoolExecutor(threads()) as pool, tqdm(total=len(names), desc=title, dynamic_ncols=True) as bar:
         try:
-            for _ in pool.map(work, names):
+            faults = []
+            for fault in pool.map(attempt, names):
                 bar.update()
+                if fault:
+                    faults.append(fault)
         except BaseException:
             pool.shutdown(cancel_futures=True)
             raise
+    if len(faults) == 1:
+        raise faults[0]
+    if faults:
+        # Of each what is wrong, without the remedy, which is the same for all.
+        listed = "; ".join(str(fault).partition("; ")[0] for fault in faults[:_MOST_NAMED])
+        more = f"; and {len(faults) - _MOST_NAMED} more" if len(faults) > _MOST_NAMED else ""
+        raise UserError(
+            f"{len(faults)} of {len(names)} pictures can't be used: {listed}{more}; replace them or take them out"
+        )

@@ -11,9 +11,11 @@ from utils.system_utils import UserError
 
 
 class Stage(NamedTuple):
-    """One step. made_from: what its result depends on besides the earlier stages (JSON); reset: removes its results.
+    """One step. made_from: what its result depends on besides the earlier stages (JSON).
 
-    resumable: work can go on where an interrupted run with the same inputs stopped, without a reset.
+    reset: removes its results as far as they are of no use once an earlier stage is done again. check: UserError for
+    inputs that can't be worked on, before anything is removed. resumable: work can go on where an interrupted run with
+    the same inputs stopped, without a reset.
     """
 
     name: str
@@ -21,6 +23,7 @@ class Stage(NamedTuple):
     reset: Callable[[], None]
     work: Callable[[], None]
     resumable: bool = False
+    check: Callable[[], None] = lambda: None
 
 
 class StageRecord:
@@ -57,12 +60,15 @@ class StageRecord:
             if same and before["done"]:
                 kept.append(stage.name)
                 continue
+            stage.check()
+            for later in stages[number:]:
+                if later.name in self._record:
+                    self._record[later.name]["done"] = False  # still begun: what is left of it is ours
+            self._save()
             # Backwards: what was made last goes first.
             for later in reversed(stages[number:]):
                 if later is not stage or not (same and stage.resumable):
                     later.reset()
-                if later is not stage:
-                    self._record.pop(later.name, None)
             self._record[stage.name] = {"made_from": digest, "done": False}
             self._save()
             stage.work()

@@ -11,7 +11,7 @@ from conversion import report
 from conversion.backends import Backend, Settings, worker_command
 from conversion.database import copy_database, count_rows, forget_matches, most_features, partners
 from conversion.layout import Layout, picture_names
-from conversion.photos import JPEG_QUALITY, prepare_photos, resize_images, sizes
+from conversion.photos import JPEG_QUALITY, check_photos, prepare_photos, resize_images, sizes
 from conversion.programs import run_programs
 from conversion.stages import Stage
 from conversion.video import PATTERN, extract_frames
@@ -40,13 +40,19 @@ def video_stage(layout: Layout, video: Path, count: int) -> Stage:
 def photo_stage(layout: Layout, names: list[str], masks: Path | None) -> Stage:
     """Upright photos and masks in the work folder."""
     made_from = [[name, _state(layout.input / name)] for name in names]
-    if masks and masks.is_dir():
+    if masks:
         made_from.append([[str(path), _state(path)] for path in sorted(masks.rglob("*")) if path.is_file()])
 
     def reset() -> None:
         _remove(layout.photos, layout.masks)
 
-    return Stage("photos", made_from, reset, lambda: prepare_photos(layout, names, masks))
+    return Stage(
+        "photos",
+        made_from,
+        reset,
+        lambda: prepare_photos(layout, names, masks),
+        check=lambda: check_photos(layout, names, masks),
+    )
 
 
 def reconstruction_stages(layout: Layout, backend: Backend, settings: Settings, masks: bool) -> list[Stage]:
@@ -97,11 +103,13 @@ def reconstruction_stages(layout: Layout, backend: Backend, settings: Settings, 
 
 
 def undistortion_stage(layout: Layout, settings: Settings, made_from: Any, **made: Any) -> Stage:
-    """The largest model without distortion as `images` and `sparse/0`, and the report. made: settings to report."""
+    """The largest model without distortion as `images` and `sparse/0`, and the report. made: settings to report.
+
+    The scene of an earlier run stays until the new one is there.
+    """
 
     def reset() -> None:
-        _remove(layout.undistorted, layout.images, layout.sparse, *map(layout.resized, FACTORS))
-        layout.report.unlink(missing_ok=True)
+        _remove(layout.undistorted)
 
     def work() -> None:
         out = layout.work / "survey.json"
@@ -130,6 +138,8 @@ def undistortion_stage(layout: Layout, settings: Settings, made_from: Any, **mad
                 f"{len(missing)} photos of the model in {layout.models / chosen.folder} are not in {root}, the first "
                 f"is {missing[0]}; put them there under the names that the model has"
             )
+        _remove(layout.images, layout.sparse, *map(layout.resized, FACTORS))
+        layout.report.unlink(missing_ok=True)
         mkdir_p(layout.sparse)
         (layout.undistorted / "sparse").rename(layout.sparse / "0")
         images.rename(layout.images)
@@ -145,14 +155,13 @@ def undistortion_stage(layout: Layout, settings: Settings, made_from: Any, **mad
 def resize_stage(layout: Layout) -> Stage:
     """Smaller copies of the pictures: images_2, images_4, images_8."""
 
-    def reset() -> None:
-        _remove(*map(layout.resized, FACTORS))
-
     def work() -> None:
         for factor in FACTORS:
+            _remove(layout.resized(factor))
             resize_images(layout, factor)
 
-    return Stage("resize", list(FACTORS), reset, work)
+    # No reset: they go with the pictures that they were made of, as undistortion puts others there.
+    return Stage("resize", list(FACTORS), lambda: None, work)
 
 
 def model_state(layout: Layout) -> list[Any]:

@@ -1,12 +1,14 @@
 """pycolmap's long steps as a program of their own: `python worker.py JOB.json`, the job an object {"step": ..., ...}.
 
 In another process they can be stopped at once, can't take the caller with them when they crash, and log to a file.
+It ends when its standard input does, which the caller holds open: a caller that was killed leaves nobody at work.
 Imports nothing of the project, since only its own folder is on the path.
 """
 
 import json
 import os
 import sys
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -95,9 +97,23 @@ def _device(job: dict[str, Any]) -> pycolmap.Device:
     return pycolmap.Device.cpu if job["no_gpu"] else pycolmap.Device.auto
 
 
+def _end_with_input() -> None:
+    # Not sys.stdin: its lock would be held when the interpreter shuts down.
+    while os.read(0, 1024):
+        pass
+    os._exit(1)
+
+
 STEPS = {step.__name__: step for step in (features, matching, mapping, survey, undistort)}
 
-if __name__ == "__main__":
-    job = json.loads(Path(sys.argv[1]).read_text(encoding="utf-8"))
+
+def main(path: str) -> None:
+    """Do the job in a file."""
+    job = json.loads(Path(path).read_text(encoding="utf-8"))
+    threading.Thread(target=_end_with_input, daemon=True).start()
     pycolmap.set_random_seed(SEED)
     STEPS[job["step"]](job)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1])

@@ -19,7 +19,7 @@ from scene.dataset_readers import CameraInfo, read_scene
 from scene.depth_maps import with_depth_maps
 from scene.half_images import mark_halves, train_on_all
 from scene.image_store import ImageStore, Picture
-from scene.masks import MaskOptions
+from scene.masks import MaskOptions, refuse_nothing_to_ignore
 from scene.point_cloud import write_point_cloud
 from scene.training_checks import check_before_training
 from utils.graphics_utils import BasicPointCloud
@@ -67,6 +67,7 @@ class Scene:
 
         if self.loaded_iter is None:
             _refuse_dataset_folder(args)
+        masks = MaskOptions(args.masks, args.invert_masks, args.mask_meaning)
         info = read_scene(
             args.source_path,
             args.images,
@@ -74,9 +75,12 @@ class Scene:
             args.init_pcd_path,
             want_cloud=self.loaded_iter is None,
             init_type=args.init_type,
-            masks=MaskOptions(args.masks, args.invert_masks, args.mask_meaning),
+            masks=masks,
             offset=None if self.loaded_iter is None else read_model_json(self.model_path).get(OFFSET, (0, 0, 0)),
         )
+        if self.loaded_iter is None:
+            views = info.train_cameras + info.test_cameras
+            refuse_nothing_to_ignore([(view.image_path, view.mask) for view in views], masks)
         self._halves = args.train_test_exp
         if self._halves:
             info = train_on_all(info)

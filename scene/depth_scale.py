@@ -19,8 +19,14 @@ def make_depth_params(scene: Path, depths: Path, model_type: str) -> tuple[dict[
     """Fit every registered picture that has a map in `depths`, and write depth_params.json into the model's folder.
 
     model_type: bin or txt. Returns the table (by picture name without extension `scale` and `offset`, both 0 where the
-    points do not suffice) and the number of registered pictures. UserError when no picture has a map.
+    points do not suffice) and the number of registered pictures. UserError when no picture has a map, or the scene no
+    COLMAP model.
     """
+    if not (scene / "sparse").is_dir():
+        raise UserError(
+            f"no folder sparse in {scene}: maps are fitted to the points of a COLMAP model; name a COLMAP scene "
+            "(--base_dir), or train without a fit where the scene is Blender's (transforms_train.json)"
+        )
     model, _ = find_model(scene)
     table, pictures = {}, read_sightings(model, model_type)
     for sightings in tqdm(pictures, desc="Fitting depth maps", unit="map"):

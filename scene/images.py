@@ -35,6 +35,12 @@ def picture_size(path: Path) -> tuple[int, int]:
     return size
 
 
+def may_be_transparent(path: Path) -> bool:
+    """Whether a picture file that can be read has an alpha channel or a transparent colour, from its header."""
+    with Image.open(path) as image:
+        return image.has_transparency_data
+
+
 def decode(path: Path, size: tuple[int, int]) -> Tensor:
     """Picture (3,H,W) uint8, or (4,H,W) with straight alpha where the file has any, resized to size (width, height).
 

@@ -17,7 +17,7 @@ import torch
 from PIL import Image, ImageFilter
 from torch import Tensor
 
-from scene.images import decode, picture_size
+from scene.images import decode, may_be_transparent, picture_size
 from scene.picture_files import FileIndex
 from utils.image_files import SUFFIXES
 from utils.listing import some
@@ -66,12 +66,15 @@ class Mask:
     def decode(self, size: tuple[int, int]) -> Tensor:
         """(1,H,W) uint8 at size (width, height): 255 keeps, 0 masks.
 
-        The file's alpha where it has any, else its brightness. IGNORE knows no other values: brightness 128 or more
-        keeps. At another size than the file's only what no masked pixel has a say in is kept, when pictures are resized
-        as `scene.images.decode` does it.
+        The file's alpha where it has any, else its brightness; where its values are 0 and 1 (of 255), as of True and
+        False saved as bytes, 1 means white. IGNORE knows no other values: brightness 128 or more keeps. At another size
+        than the file's only what no masked pixel has a say in is kept, when pictures are resized as
+        `scene.images.decode` does it.
         """
         pixels = decode(self.path, picture_size(self.path)).numpy()
         grey = pixels[3] if len(pixels) == 4 else pixels.max(axis=0)
+        if grey.max() == 1:
+            grey = grey * np.uint8(255)
         if self.inverted:
             grey = 255 - grey
         if self.meaning == TRANSPARENT:
@@ -138,6 +141,15 @@ def find_masks(scene: Path, names: Sequence[str], options: MaskOptions) -> list[
     if lacking:
         print(f"{len(lacking)} of {len(names)} pictures have no mask and count whole: {some(lacking)}", file=sys.stderr)
     return [None if path is None else options.mask(path) for path in found]
+
+
+def refuse_nothing_to_ignore(pictures: Sequence[tuple[Path, Mask | None]], options: MaskOptions) -> None:
+    """UserError for --mask_meaning ignore where no picture (its file, its mask) has a mask or an alpha channel."""
+    if options.meaning == IGNORE and not any(mask or may_be_transparent(path) for path, mask in pictures):
+        raise UserError(
+            "--mask_meaning ignore has nothing to ignore: no masks are named, and no picture has an alpha channel; "
+            "name the folder of masks with --masks, or leave it out"
+        )
 
 
 def _find(index: FileIndex, name: str) -> Path | None:

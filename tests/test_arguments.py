@@ -146,6 +146,15 @@ def test_absurd_values_name_their_option(option, value):
         _parse(f"--{option}={value}")
 
 
+def test_points_to_start_from_are_named_once():
+    parser = argparse.ArgumentParser()
+    group = ModelParams(parser)
+    for argv in (["--init_type", "random"], ["--init_pcd_path", "a.ply"]):
+        group.extract(parser.parse_args(argv))
+    with pytest.raises(UserError, match="^--init_type random and --init_pcd_path a.ply both name the points to start"):
+        group.extract(parser.parse_args(["--init_type", "random", "--init_pcd_path", "a.ply"]))
+
+
 def test_wrong_type_ends_with_status_2():
     with pytest.raises(SystemExit) as exit_info:
         _parse("--iterations", "many")

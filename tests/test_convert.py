@@ -6,8 +6,11 @@ import re
 import shutil
 import signal
 import stat
+import subprocess
 import sys
 import threading
+import time
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -20,18 +23,19 @@ from PIL import Image
 from synthetic import folder_state
 
 import convert
-from conversion import report
+from conversion import programs, report
 from conversion.backends import LENS_MODELS, Program, Pycolmap, Settings
 from conversion.database import count_rows, forget_matches, most_features, partners
 from conversion.layout import Layout
-from conversion.photos import find_masks, prepare_photos
-from conversion.programs import run_programs
+from conversion.photos import check_photos, find_masks, prepare_photos
+from conversion.programs import refuse_while_working, run_programs
 from conversion.stages import Stage, StageRecord
 from conversion.steps import reconstruction_stages
 from conversion.video import extract_frames, sharpness
 from scene.dataset_readers import read_scene
 from utils.system_utils import UserError
 
+ROOT = Path(__file__).resolve().parent.parent
 VIEWS = 8
 SETTINGS = Settings("OPENCV", 8192, "exhaustive", "incremental", no_gpu=True)
 NAMES = ["photo_00.png", "photo_01.png", "Ünser Bild 2.png", "deep/photo_03.png"] + [
@@ -226,7 +230,8 @@ def _cut(scene: Path) -> list[str]:
             lambda scene: [str(scene), "--camera", "EQUIRECTANGULAR"],
             r"EQUIRECTANGULAR is no lens model that can be used",
         ),
-        (lambda scene: [str(scene), "--mask_path", "no"], r"no folder of masks no; give an existing one"),
+        (lambda scene: [str(scene), "--mask_path", "no"], r"no folder of masks 'no'; give an existing one"),
+        (lambda scene: [str(scene), "--mask_path", ""], r"no folder of masks ''; give an existing one"),
         (lambda scene: [str(scene), "--mask_path", str(scene)], r"none of 3 photos has a mask .*photo_00.png.png"),
         (lambda scene: [str(scene), "--max_num_features", "0"], r"--max_num_features must be at least 100, got 0"),
         (lambda scene: [str(scene), "--skip_matching"], r"--skip_matching needs a COLMAP model in .*distorted/sparse"),
@@ -279,6 +284,43 @@ def test_stages_are_redone_from_the_first_that_changed(tmp_path):
         run(a=1)
 
 
+def test_a_finished_scene_stays_until_the_next_one_is_there(copy, monkeypatch):
+    def scene() -> dict:
+        return {
+            name: state
+            for name, state in folder_state(copy).items()
+            if Path(name).parts[0] not in ("input", "distorted")
+        }
+
+    def refused(said: str, *options: str) -> None:
+        with pytest.raises(UserError, match=said):
+            convert.main(["-s", str(copy), "--no_gpu", *options])
+        assert scene() == before
+
+    before, work = scene(), folder_state(copy / "distorted")
+    assert {"images", "images_2", "sparse"} <= {Path(name).parts[0] for name in before}
+    (copy / "input" / "new.png").write_bytes(b"no picture")
+    refused("cannot read the picture .*new.png")
+    (copy / "input" / "new.png").unlink()
+    (copy / "masks").mkdir()
+    refused("none of 8 photos has a mask", "--mask_path", str(copy / "masks"))
+    refused("no folder of masks '.*/maks'", "--mask_path", str(copy / "maks"))
+    (copy / "masks").rmdir()
+    assert folder_state(copy / "distorted") == work
+    # What fails later, too; and that the scene is still ours is not forgotten.
+
+    def fail(*_: object) -> None:
+        raise UserError("no model")
+
+    for owner, name in ((Pycolmap, "mapping"), (report, "refuse_nothing")):
+        with monkeypatch.context() as patch:
+            patch.setattr(owner, name, fail)
+            refused("no model", "--mapper", "global")
+    convert.main(["-s", str(copy), "--no_gpu"])
+    after = scene()
+    assert after and not any(Path(name).parts[0].startswith("images_") for name in after)
+
+
 def test_looks_into_the_database(copy):
     database = Layout(copy).database
     every = count_rows(database, "matches")
@@ -299,6 +341,59 @@ def test_ctrl_c_ends_the_program_that_works(tmp_path):
         run_programs([[sys.executable, "-c", script, str(tmp_path / "pid")]], tmp_path / "log", "Waiting", 1, lambda: 0)
     with pytest.raises(ProcessLookupError):
         os.kill(int((tmp_path / "pid").read_text()), 0)
+
+
+def _killed_while(tmp_path: Path, command: list[str]) -> None:
+    """run_programs with this command in a process that is killed as soon as the command has written to the log."""
+    code = (
+        "import sys; from pathlib import Path; from conversion.programs import run_programs; "
+        "run_programs([sys.argv[2:]], Path(sys.argv[1]), 'Waiting', 1, lambda: 0)"
+    )
+    log = tmp_path / "log"
+    caller = subprocess.Popen([sys.executable, "-c", code, str(log), *command], cwd=ROOT, stderr=subprocess.DEVNULL)
+    _wait_for(lambda: log.is_file() and log.read_text().endswith("\n"))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(programs, "_ORPHAN_PATIENCE", 0.0)
+        with pytest.raises(
+            UserError, match="another convert.py, or a program that a killed one had started, still wor"
+        ):
+            refuse_while_working(log)
+    caller.kill()
+    caller.wait()
+
+
+def _wait_for(condition: Callable[[], bool]) -> None:
+    deadline = time.monotonic() + 20  # generous for a busy machine; usually under one second
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+
+
+def test_a_killed_caller_leaves_no_worker(tmp_path):
+    (tmp_path / "job.json").write_text('{"step": "wait"}')
+    code = (
+        "import sys, time; sys.path.insert(0, 'conversion'); import worker; "
+        "worker.STEPS['wait'] = lambda job: (print('at work', flush=True), time.sleep(60)); "
+        "worker.main(sys.argv[1])"
+    )
+    _killed_while(tmp_path, [sys.executable, "-c", code, str(tmp_path / "job.json")])
+    # The worker had the lock; its process id would not tell, as nobody may be there to reap it.
+    refuse_while_working(tmp_path / "log")
+
+
+def test_programs_that_outlive_a_killed_caller_are_waited_for(tmp_path, monkeypatch):
+    script = "import os, time; print(os.getpid(), flush=True); time.sleep(60)"
+    _killed_while(tmp_path, [sys.executable, "-c", script])
+    log = tmp_path / "log"
+    pid = int(log.read_text())
+    monkeypatch.setattr(programs, "_ORPHAN_PATIENCE", 0.5)
+    try:
+        for run in (refuse_while_working, lambda log: run_programs([["true"]], log, "Next", 1, lambda: 0)):
+            with pytest.raises(UserError, match="still works in .*; wait for it or end it"):
+                run(log)
+    finally:
+        os.kill(pid, signal.SIGKILL)
+    refuse_while_working(log)
 
 
 def test_a_program_that_fails_is_quoted(tmp_path):
@@ -416,7 +511,28 @@ def test_masks_of_another_size(tmp_path):
     Image.new("L", (30, 40)).save(tmp_path / "masks" / "a.png")
     assert find_masks(["a.png", "b.png"], tmp_path / "masks") == {"a.png": tmp_path / "masks" / "a.png"}
     with pytest.raises(UserError, match="mask .*a.png has 30 x 40 pixels, but its photo a.png has 40 x 30"):
-        prepare_photos(layout, ["a.png"], tmp_path / "masks")
+        check_photos(layout, ["a.png"], tmp_path / "masks")
+
+
+def test_photos_and_masks_that_can_not_be_used_are_named_at_once(tmp_path):
+    layout, names = Layout(tmp_path / "scene"), [f"{letter}.jpg" for letter in "abcde"]
+    layout.input.mkdir(parents=True)
+    (tmp_path / "masks").mkdir()
+    for name in names:
+        exif = Image.Exif()
+        exif[0x0112] = 6
+        Image.new("RGB", (40, 30)).save(layout.input / name, exif=exif)
+        Image.new("L", (30, 40)).save(tmp_path / "masks" / f"{name}.png")
+    check_photos(layout, names, tmp_path / "masks")
+    whole = (layout.input / "b.jpg").read_bytes()
+    (layout.input / "b.jpg").write_bytes(whole[:-60])
+    (layout.input / "c.jpg").write_bytes(b"<html>")
+    Image.new("L", (40, 30)).save(tmp_path / "masks" / "e.jpg.png")
+    with pytest.raises(
+        UserError, match="^3 of 5 pictures can't be used: .*b.jpg.*c.jpg.*mask .*e.jpg.png has 40"
+    ) as error:
+        check_photos(layout, names, tmp_path / "masks")
+    assert "\n" not in str(error.value) and "a.jpg" not in str(error.value) and "d.jpg" not in str(error.value)
 
 
 def _model(registered: int, points: int = 5000, track: float = 5.0, error: float = 0.5, first: int = 0) -> report.Model:

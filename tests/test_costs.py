@@ -76,6 +76,12 @@ def probed(tmp_path_factory) -> dict:
     return json.loads(done.stdout)
 
 
+def test_the_probe_makes_nothing_when_it_is_asked_for_help(tmp_path):
+    command = [sys.executable, ROOT / "benchmarks" / "cost_probe.py", "--help"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True)
+    assert done.stdout.startswith("usage: cost_probe.py") and list(tmp_path.iterdir()) == []
+
+
 def test_training_and_rendering_load_nothing_they_do_not_use(probed):
     installed = {"torch.utils.tensorboard", "tensorboard"}  # train.py looks whether it is there
     assert set(probed["modules"]) <= installed

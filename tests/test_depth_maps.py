@@ -23,7 +23,7 @@ from scene import Scene
 from scene.colmap_loader import Sightings, read_sightings
 from scene.dataset_readers import read_scene
 from scene.depth_maps import DepthMap, read_values, resize, with_depth_maps
-from scene.depth_scale import fit_line, fit_picture
+from scene.depth_scale import fit_line, fit_picture, make_depth_params
 from scene.gaussian_model import GaussianModel
 from utils.loss_utils import inverse_depth_loss
 from utils.system_utils import UserError
@@ -244,6 +244,11 @@ def test_the_command_makes_a_file_that_training_takes(colmap_scene, tmp_path, mo
         assert (params[name]["scale"], params[name]["offset"]) == pytest.approx((scale, offset), rel=0.05, abs=0.02)
     (tmp_path / "maps").rename(colmap_scene / "depths")
     train.main(["-s", str(colmap_scene), "-m", str(tmp_path / "out"), "-d", "depths", "--iterations", "3", "-r", "24"])
+
+
+def test_scenes_without_points_to_fit_to(blender_scene, tmp_path):
+    with pytest.raises(UserError, match="no folder sparse in .*; name a COLMAP scene .*, or train without a fit"):
+        make_depth_params(blender_scene, tmp_path, "bin")
 
 
 # Training

@@ -57,6 +57,8 @@ def test_exit_statuses(healthy, colmap_scene, tmp_path, capsys):
     for option in ("-s", "-m"):
         with pytest.raises(UserError, match=f"no folder .*nowhere; give an existing one with {option}"):
             doctor.main([option, str(tmp_path / "nowhere")])
+        with pytest.raises(UserError, match=f"no folder ''; give an existing one with {option}"):
+            doctor.main([option, ""])
 
 
 def test_missing_packages_end_it(monkeypatch, colmap_scene, capsys):

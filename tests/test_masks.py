@@ -3,6 +3,7 @@
 import json
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -18,7 +19,8 @@ import render
 import train
 from scene import Scene
 from scene.images import decode
-from scene.masks import TRANSPARENT, Mask
+from scene.mask_watch import MaskWatch
+from scene.masks import IGNORE, TRANSPARENT, Mask
 from utils.image_utils import pixels_that_count
 from utils.loss_utils import photometric_loss
 from utils.system_utils import UserError
@@ -97,6 +99,15 @@ def test_black_is_dark(tmp_path):
     assert (pixels[0] == 0).nonzero().tolist() == [[0, 0], [5, 4]]
     inverted = Mask(path, inverted=True).decode((8, 8))
     assert torch.equal(inverted, 255 - pixels)
+
+
+@pytest.mark.parametrize("meaning", [IGNORE, TRANSPARENT])
+def test_true_and_false_saved_as_bytes(tmp_path, meaning):
+    grey = np.random.default_rng(0).integers(0, 2, (8, 8), dtype=np.uint8)
+    for inverted in (False, True):
+        written = Mask(_save(tmp_path / "m.png", grey), inverted, meaning).decode((8, 8))
+        plain = Mask(_save(tmp_path / "p.png", grey * 255), inverted, meaning).decode((8, 8))
+        assert torch.equal(written, plain) and set(plain.unique().tolist()) == {0, 255}
 
 
 @pytest.mark.parametrize("size", [(60, 45), (40, 30), (23, 17), (90, 67), (240, 180)])
@@ -233,6 +244,15 @@ def test_masks_to_invert_must_be_named(colmap_scene, blender_scene):
             _views(folder, invert_masks=True)
 
 
+def test_what_is_to_be_ignored_must_be_there(colmap_scene, masked_scene):
+    with pytest.raises(UserError, match="--mask_meaning ignore has nothing to ignore: no masks are named, and no pict"):
+        _views(colmap_scene, mask_meaning="ignore")
+    assert _views(masked_scene, mask_meaning="ignore", masks="masks")
+    path = next(path for path in (colmap_scene / "images").rglob("*.png"))
+    Image.open(path).convert("RGBA").save(path)
+    assert _views(colmap_scene, mask_meaning="ignore")
+
+
 def _train(scene: Path, out: Path, *options: object) -> bytes:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(sys, "stdout", sys.stdout)  # which training stamps: bring it back
@@ -301,6 +321,54 @@ def test_a_view_fetches_each_picture_once(masked_scene, meaning, monkeypatch):
     both = view.ground_truth(torch.ones(3))
     assert torch.equal(both[0], target) and torch.equal(both[1], mask)
     assert fetched == view.pictures and len(fetched) == 2
+
+
+def test_masks_that_leave_nothing_do_not_train_silently(masked_scene, tmp_path, capsys):
+    paths = [path for path in sorted(masked_scene.rglob("masks/**/*")) if path.is_file()]
+    for path in paths:
+        _save(path, np.zeros((HEIGHT, WIDTH), np.uint8))
+    said = r"the masks of all 14 views seen so far leave no pixel to train on; are they white masks \(--invert_masks\)"
+    with pytest.raises(UserError, match=said):
+        _train(masked_scene, tmp_path / "out", "--masks", "masks")
+    assert not (tmp_path / "out" / "point_cloud").exists()
+    assert _train(masked_scene, tmp_path / "out", "--masks", "masks", "--invert_masks")
+    assert "warning: the masks" not in capsys.readouterr().err
+    # One view that trains is enough, with a word on the others.
+    _save(paths[1], np.full((HEIGHT, WIDTH), 255, np.uint8))
+    assert _train(masked_scene, tmp_path / "out", "--masks", "masks")
+    assert capsys.readouterr().err.count("warning: the masks of 13 of 14 views leave none or almost none") == 1
+
+
+def test_views_that_count_are_looked_at_once(capsys):
+    def view(uid: int, counting: int | None, columns: slice | None = None) -> SimpleNamespace:
+        mask = None
+        if counting is not None:
+            mask = torch.zeros(1, 100, 100, dtype=torch.bool)
+            mask.view(-1)[:counting] = True
+        return SimpleNamespace(uid=uid, image_name=f"v{uid}", mask=mask, columns=columns)
+
+    # 9 of 10000 pixels are almost nothing, and the first 50 of a row are not in its right half.
+    views = [view(0, 9), view(1, 10), view(2, None), view(3, 50, slice(50, 100))]
+    watch = MaskWatch(views)
+    for one in (*views[:3], views[0]):
+        watch.add(one, one.mask)
+        watch.look(last=False)
+    assert capsys.readouterr().err == ""
+    watch.add(views[3], views[3].mask)
+    watch.look(last=False)
+    watch.look(last=True)
+    said = capsys.readouterr().err
+    assert said.count("warning") == 1 and "2 of 4 views" in said and "(v0, v3)" in said
+
+    # Of thousands of views some may have nothing; a hundred without a pixel are no accident.
+    views = [view(uid, 0) for uid in range(150)]
+    watch = MaskWatch(views)
+    for one in views[:99]:
+        watch.add(one, one.mask)
+    watch.look(last=False)
+    watch.add(views[99], views[99].mask)
+    with pytest.raises(UserError, match="all 100 views"):
+        watch.look(last=False)
 
 
 def test_scores_are_those_of_the_definition():
