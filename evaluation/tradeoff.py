@@ -10,6 +10,7 @@ from typing import Any
 from utils.error_curve import Row
 
 DROPS = (0.0, 0.1, 0.2, 0.5, 1.0, 2.0, 3.0, 5.0, 8.0)  # dB below the best: dense where the last tenths get dear
+WIDEST_STEP = 2.0  # of the seconds between two points that are interpolated; across more a line tells nothing
 
 Curves = Mapping[str, Sequence[Sequence[Row]]]  # option set -> a curve for each seed
 
@@ -26,14 +27,15 @@ def pareto_front(points: Sequence[tuple[float, float]]) -> list[int]:
 def seconds_to_reach(curve: Sequence[Row], level: float) -> float | None:
     """Seconds of training until the test PSNR first comes to `level` (dB), None if never.
 
-    Between the scored iterations PSNR is taken as linear in the logarithm of the seconds; the first counts as it is.
+    Between scored iterations PSNR is taken as linear in the logarithm of the seconds, but not where more than a
+    doubling lies between them: then, as for the first, the time of the one that is there counts.
     """
     before: Row | None = None
     for row in curve:
         if row["test_psnr"] is None:
             continue
         if row["test_psnr"] >= level:
-            if before is None or before["seconds"] <= 0:
+            if before is None or before["seconds"] <= 0 or row["seconds"] > WIDEST_STEP * before["seconds"]:
                 return row["seconds"]
             part = (level - before["test_psnr"]) / (row["test_psnr"] - before["test_psnr"])
             return math.exp((1 - part) * math.log(before["seconds"]) + part * math.log(row["seconds"]))

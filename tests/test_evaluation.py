@@ -46,8 +46,9 @@ def test_pareto_front_is_what_nothing_beats(points):
 def test_seconds_to_reach_between_points():
     rows = curve((1, 10, 100), (4, None, 100), (100, 20, 300), (200, 19, 250), (300, 30, 400))
     assert seconds_to_reach(rows, 9) == 1
-    assert seconds_to_reach(rows, 20) == pytest.approx(100)
-    assert seconds_to_reach(rows, 15) == pytest.approx(10)  # halfway in the logarithm from 1 to 100
+    assert seconds_to_reach(rows, 20) == 100
+    assert seconds_to_reach(rows, 15) == 100  # too far from the point before to say more
+    assert seconds_to_reach(rows, 24.5) == pytest.approx((200 * 300) ** 0.5)  # halfway in the logarithm
     assert seconds_to_reach(rows, 31) is None
     assert gaussians_to_reach(rows, 20) == 300 and gaussians_to_reach(rows, 18) == 250
     assert gaussians_to_reach(rows, 31) is None
@@ -56,13 +57,13 @@ def test_seconds_to_reach_between_points():
 def test_cheapest_wants_every_seed_and_takes_the_mean():
     curves = {
         "slow": [curve((10, 20, 50), (100, 30.07, 60)), curve((10, 20, 50), (100, 30.07, 60))],
-        "fast": [curve((1, 20, 80), (10, 29, 90)), curve((3, 20, 70), (30, 28, 90))],
+        "fast": [curve((1, 20, 80), (2, 29, 90)), curve((3, 20, 70), (30, 28, 90))],
     }
     rows = {row["psnr"]: row for row in cheapest(curves)}
     assert list(rows) == [30.0, 29.9, 29.8, 29.5, 29.0, 28.0, 27.0, 25.0, 22.0] == levels(curves)
     assert rows[29.0]["seconds"]["config"] == "slow" and set(rows[29.0]["seconds"]["all"]) == {"slow"}
     assert rows[28.0]["seconds"]["config"] == "fast" and set(rows[28.0]["seconds"]["all"]) == {"slow", "fast"}
-    assert rows[28.0]["seconds"]["value"] == pytest.approx((10 ** (8 / 9) + 30) / 2)
+    assert rows[28.0]["seconds"]["value"] == pytest.approx((2 ** (8 / 9) + 30) / 2)
     assert rows[28.0]["gaussians"] == {"all": {"slow": 60, "fast": 90}, "config": "slow", "value": 60}
 
 
