@@ -21,9 +21,9 @@ from tqdm import tqdm
 
 from arguments import ModelParams, OptionParser, PipelineParams, get_combined_args
 from gaussian_renderer import render
+from gaussian_renderer.memory_errors import memory_errors_explained
 from scene.cameras import Camera
 from scene.gaussian_model import GaussianModel
-from scene.memory_guard import memory_errors_explained
 from scene.saved_model import load_saved
 from utils import render_times
 from utils.general_utils import safe_state

@@ -4,12 +4,10 @@ python train.py -s SCENE -m OUT --eval
 """
 
 import argparse
-import dataclasses
-import math
 import os
 import sys
 import uuid
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,35 +16,27 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from arguments import (
-    ModelParams,
-    OptimizationParams,
-    OptionParser,
-    PipelineParams,
-    add_to_model_json,
-    write_cfg_args,
-    write_model_json,
-)
+from arguments import ModelParams, OptimizationParams, OptionParser, PipelineParams, write_cfg_args, write_model_json
 from gaussian_renderer import render
-from gaussian_renderer.scored_views import ScoredViews
-from gaussian_renderer.trimming import change_on_views, trim
 from scene import Scene
 from scene import densification as adc
-from scene.cameras import Camera
 from scene.checkpoint import load_checkpoint, save_checkpoint
-from scene.divergence import DivergenceWatch
 from scene.gaussian_model import GaussianModel
-from scene.mask_watch import MaskWatch
-from scene.memory_estimate import announce_memory
-from scene.memory_guard import MemoryGuard
-from utils.counter_rng import Stream, permutation, uniform
+from training.checks import check_exposures, check_scene, warn_of_late_reset
+from training.curve import scene_curve
+from training.divergence import DivergenceWatch
+from training.last_save import save_last
+from training.mask_watch import MaskWatch
+from training.memory_estimate import announce_memory
+from training.memory_guard import MemoryGuard
+from training.report import training_report
+from training.view_order import ViewOrder
+from utils.counter_rng import Stream, uniform
 from utils.curve_peak import schedules_follow_length
-from utils.curve_recorder import CurveRecorder, evenly_spread
-from utils.error_curve import Row, continue_curve
+from utils.error_curve import continue_curve
 from utils.general_utils import get_expon_lr_func, safe_state
-from utils.image_utils import as_float, pixels_that_count, psnr, right_half
 from utils.interrupt import DeferredInterrupt
-from utils.left_out import LeftOut, lines
+from utils.left_out import lines
 from utils.loss_utils import inverse_depth_loss, l1_loss, photometric_loss
 from utils.loss_watch import LossWatch
 from utils.system_utils import UserError, compute_device, mkdir_p, run_cli, saved_iterations
@@ -87,15 +77,19 @@ def training(
             f"{checkpoint} is at iteration {first_iteration}, so --iterations {opt.iterations} leaves nothing to do; "
             "--iterations counts from the start of the first run"
         )
-    _warn_of_late_reset(opt, dataset.white_background)
+    warn_of_late_reset(opt, dataset.white_background)
     gaussians = GaussianModel(dataset.sh_degree, opt.optimizer_type)
-    scene = Scene(dataset, gaussians, shuffle=False, write=False)
-    gaussians.training_setup(opt)
-    if capture is not None:
+    scene = Scene(dataset, gaussians, shuffle=False, start=False)
+    check_scene(scene.info)
+    if capture is None:
+        scene.create_gaussians()
+        gaussians.training_setup(opt)
+    else:
+        gaussians.start_exposures(scene.info.train_cameras)
         gaussians.restore(capture, opt)
-        _check_exposures(gaussians, dataset.train_test_exp, checkpoint)
+        check_exposures(gaussians, dataset.train_test_exp, checkpoint)
         capture = None  # so that densification can free what it replaces
-    views = _ViewOrder(scene.getTrainCameras(), opt.seed)
+    views = ViewOrder(scene.getTrainCameras(), opt.seed)
     masks = MaskWatch(scene.getTrainCameras())
     # After all that bad input can stop, or a slip of the keyboard would overwrite the files of a finished model.
     tb_writer = prepare_output_and_logger(
@@ -107,19 +101,19 @@ def training(
     announce_memory(scene, gaussians, opt.max_num_splats)
     fixed_background = torch.full((3,), 1.0 if dataset.white_background else 0.0, device=device)
     log = TrainingLog(scene.model_path, first_iteration)
+    rows = continue_curve(scene.model_path, first_iteration)
     losses = LossWatch(log.loss)
     watch = DivergenceWatch(gaussians, losses, scene.model_path, first_iteration, lambda t: views[t].image_name)
     depth_weight = get_expon_lr_func(opt.depth_l1_weight_init, opt.depth_l1_weight_final, max_steps=opt.iterations)
     depth_losses = LossWatch()
+    shown = {"Loss": losses} | ({"Depth Loss": depth_losses} if dataset.depths else {})
     # Where something is written: all losses up to there must have been looked at.
     stops = {opt.iterations, *testing_iterations, *saving_iterations, *checkpoint_iterations}
-    rows = continue_curve(scene.model_path, first_iteration)
-    curve = None
-    if record_curve and scene.getTestCameras():
-        curve = _curve(
+    curve = left_out = None
+    if record_curve:
+        curve = scene_curve(
             scene, rows, log, opt.iterations, testing_iterations, pipe, fixed_background, dataset.train_test_exp
         )
-    left_out = None
     clock = Stopwatch()
     bar = tqdm(initial=first_iteration, total=opt.iterations, desc="Training progress", dynamic_ncols=True)
     guard = MemoryGuard(gaussians, scene.model_path, first_iteration)
@@ -156,12 +150,7 @@ def training(
             changing = todo.densify or todo.reset_opacity
             if iteration % BAR_INTERVAL == 0 or iteration in stops or curve_due or changing:
                 watch.look(iteration)
-                shown = {"Loss": f"{losses.mean:.7f}"}
-                if dataset.depths:
-                    depth_losses.read()
-                    shown["Depth Loss"] = f"{depth_losses.mean:.7f}"
-                bar.set_postfix(shown, Gaussians=len(gaussians), refresh=False)
-                bar.update(iteration - bar.n)
+                _show(bar, iteration, shown, len(gaussians))
                 masks.look(last=iteration == opt.iterations)
             seconds = clock.seconds
             with clock.paused():
@@ -177,7 +166,7 @@ def training(
                     tqdm.write(f"[ITER {iteration}] Saving Gaussians", file=sys.stdout)
                     if iteration == opt.iterations:
                         scored = curve is not None or iteration in testing_iterations
-                        left_out = _save_last(scene, dataset, opt, pipe, fixed_background, scored)
+                        left_out = save_last(scene, dataset, opt, pipe, fixed_background, scored)
                         scores |= {"gaussians_left_out": left_out.unseen}
                     else:
                         scene.save(iteration)
@@ -194,10 +183,7 @@ def training(
                 watch.look(iteration, stepped=iteration < opt.iterations)
                 seconds = clock.seconds
                 with clock.paused():
-                    gaussians.check_finite(iteration)
-                    tqdm.write(f"[ITER {iteration}] Saving Checkpoint", file=sys.stdout)
-                    path = Path(scene.model_path) / f"chkpnt{iteration}.pth"
-                    save_checkpoint(path, gaussians.capture(), iteration)
+                    path = _save_checkpoint(gaussians, scene.model_path, iteration)
                     log.add(iteration, seconds, gaussians=len(gaussians), loss=losses.mean)
             if stop:
                 tqdm.write(f"go on with --start_checkpoint {path}", file=sys.stderr)
@@ -214,109 +200,24 @@ def training(
         print("\n".join(lines(left_out)))
 
 
-def _curve(
-    scene: Scene,
-    rows: list[Row],
-    log: TrainingLog,
-    iterations: int,
-    testing_iterations: Sequence[int],
-    pipe: argparse.Namespace,
-    background: Tensor,
-    train_test_exp: bool,
-) -> CurveRecorder:
-    """Recorder of the error of all test views and as many training views."""
-    test = scene.getTestCameras()
-    trained = [camera for camera in scene.getTrainCameras() if camera.columns is None]  # in whole
-    scored = ScoredViews(pipe, background, train_test_exp)
-    return CurveRecorder(
-        scene.model_path,
-        rows,
-        log,
-        iterations,
-        testing_iterations,
-        {"test": test, "train": evenly_spread(trained, len(test))},
-        lambda camera: scored.image(camera, scene.gaussians),
-        scored.target,
-        scored.mask,
-        background.device,
-    )
-
-
-def _save_last(
-    scene: Scene,
-    dataset: argparse.Namespace,
-    opt: argparse.Namespace,
-    pipe: argparse.Namespace,
-    background: Tensor,
-    scored: bool,
-) -> LeftOut:
-    """Save the finished model without what it does not need; what that was goes into model.json, too.
-
-    scored: the test pictures are in memory, so that the change in PSNR costs little.
-    """
-    trained = scene.gaussians
-    trained.optimizer.zero_grad(set_to_none=True)  # the last iteration takes no step: room for the trimmed copy
-    trimmed = trim(trained, scene.getTrainCameras(), pipe, opt.keep_unseen, opt.prune_sh)
-    final, test = trimmed.gaussians, scene.getTestCameras()
-    change = {}
-    if test and final is not trained:
-        views = ScoredViews(pipe, background, dataset.train_test_exp)
-        truth = (lambda camera: (views.target(camera), views.mask(camera))) if scored else None
-        change = change_on_views(trained, final, test, views.image, truth)
-    scene.save(opt.iterations, final)
-    write_cfg_args(scene.model_path, argparse.Namespace(**vars(dataset) | {"sh_degree": final.max_sh_degree}))
-    kept_pixels, file_pixels = scene.training_pixels()
-    left_out = LeftOut(
-        gaussians=len(trained),
-        unseen=trimmed.unseen,
-        keep_unseen=opt.keep_unseen,
-        max_sh_degree=trained.max_sh_degree,
-        sh_degree=final.max_sh_degree,
-        cut_bounds=trimmed.cut_bounds,
-        ply_bytes=trained.ply_bytes,
-        ply_bytes_saved=trained.ply_bytes - final.ply_bytes,
-        seconds=round(trimmed.seconds, 3),
-        picture_bytes=3 * kept_pixels,
-        picture_bytes_in_files=3 * file_pixels,
-        test_change={name: value for name, value in change.items() if math.isfinite(value)},
-    )
-    add_to_model_json(scene.model_path, left_out=dataclasses.asdict(left_out))
-    return left_out
-
-
-def _check_exposures(gaussians: GaussianModel, train_test_exp: bool, checkpoint: str) -> None:
-    """UserError for a checkpoint with exposures that this run would not use; a word on the opposite."""
-    if gaussians.exposures.trained and not train_test_exp:
-        raise UserError(f"{checkpoint} was trained with --train_test_exp; give that option")
-    if train_test_exp and not gaussians.exposures.trained:
-        print(f"{checkpoint} has no exposures: all pictures start without a correction")
-
-
-class _ViewOrder:
-    """Training cameras by iteration (from 1): each once per epoch, in an order drawn anew from seed and epoch."""
-
-    def __init__(self, cameras: list[Camera], seed: int) -> None:
-        if not cameras:
-            raise UserError("the scene has no training views; without --eval all views train")
-        self._cameras = cameras
-        self._seed = seed
-        self._orders: dict[int, list[int]] = {}
-
-    def __getitem__(self, iteration: int) -> Camera:
-        epoch, position = divmod(iteration - 1, len(self._cameras))
-        if epoch not in self._orders:
-            # At most two: looking ahead from the end of one epoch goes to and fro between it and the next.
-            order = permutation(self._seed, Stream.VIEW_ORDER, epoch, len(self._cameras))
-            self._orders = {epoch: order} | {e: o for e, o in self._orders.items() if e == epoch - 1}
-        return self._cameras[self._orders[epoch][position]]
-
-    def coming(self, iteration: int, count: int) -> list[Camera]:
-        """The cameras of `count` iterations, this one first; of an epoch's length at most."""
-        return [self[t] for t in range(iteration, iteration + min(count, len(self._cameras)))]
-
-
 def _random_background(seed: int, iteration: int, device: torch.device) -> Tensor:
     return uniform(seed, Stream.BACKGROUND, iteration, torch.zeros(1, dtype=torch.int64))[0, :3].to(device)
+
+
+def _show(bar: tqdm, iteration: int, losses: dict[str, LossWatch], count: int) -> None:
+    for loss in losses.values():
+        loss.read()
+    means = {name: f"{loss.mean:.7f}" for name, loss in losses.items()}
+    bar.set_postfix(means, Gaussians=count, refresh=False)
+    bar.update(iteration - bar.n)
+
+
+def _save_checkpoint(gaussians: GaussianModel, model_path: str, iteration: int) -> Path:
+    gaussians.check_finite(iteration)
+    tqdm.write(f"[ITER {iteration}] Saving Checkpoint", file=sys.stdout)
+    path = Path(model_path) / f"chkpnt{iteration}.pth"
+    save_checkpoint(path, gaussians.capture(), iteration)
+    return path
 
 
 def _control_density(
@@ -350,100 +251,24 @@ def _control_density(
         gaussians.reset_opacity()
 
 
-def _warn_of_late_reset(opt: argparse.Namespace, white_background: bool) -> None:
-    last = range(max(1, opt.iterations - 999), opt.iterations)
-    late = [t for t in last if adc.actions(t, opt, white_background).reset_opacity]
-    if late:
-        print(
-            f"warning: opacities are reset in iteration {late[-1]}, and {opt.iterations - late[-1]} iterations are few "
-            "to recover from that; change --iterations or --opacity_reset_interval"
-        )
-
-
 def _new_output_folder() -> str:
     name = os.environ.get("OAR_JOB_ID") or str(uuid.uuid4())
     return os.path.join("./output/", name[:10])
 
 
-def prepare_output_and_logger(
-    args: argparse.Namespace, *, antialiasing: bool, seed: int, world_offset: Sequence[float] = (0.0, 0.0, 0.0)
-) -> Any | None:
-    """Make the output folder, args.model_path, with cfg_args and model.json.
+def prepare_output_and_logger(args: argparse.Namespace, **kept: Any) -> Any | None:
+    """Make the output folder, args.model_path, with cfg_args and model.json (kept: as write_model_json takes it).
 
     Returns a TensorBoard writer, or None where TensorBoard is not installed.
     """
     print(f"Output folder: {args.model_path}")
     mkdir_p(args.model_path)
     write_cfg_args(args.model_path, args)
-    write_model_json(args.model_path, args, antialiasing=antialiasing, seed=seed, world_offset=world_offset)
+    write_model_json(args.model_path, args, **kept)
     if SummaryWriter is None:
         print("TensorBoard is not installed: no event file")
         return None
     return SummaryWriter(args.model_path)
-
-
-def training_report(
-    tb_writer: Any | None,
-    iteration: int,
-    l1: Tensor,
-    loss: Tensor,
-    l1_loss: Callable[[Tensor, Tensor], Tensor],
-    elapsed: float,
-    testing_iterations: Sequence[int],
-    scene: Scene,
-    renderFunc: Callable[..., dict[str, Tensor]],
-    renderArgs: tuple,
-    train_test_exp: bool = False,
-) -> dict[str, float]:
-    """Log every tenth iteration to TensorBoard; in a testing one score test views and five training views, and print.
-
-    elapsed: seconds of this iteration; renderArgs: what follows camera and model in renderFunc, (pipe, background).
-    train_test_exp: render with exposures, and score right halves only.
-    Returns `<set>_l1` and `<set>_psnr` (dB, mean over views and channels) of the sets scored, {} otherwise.
-    """
-    if tb_writer and iteration % BAR_INTERVAL == 0:  # not always: reading a loss waits for the GPU
-        tb_writer.add_scalar("train_loss_patches/l1_loss", l1.item(), iteration)
-        tb_writer.add_scalar("train_loss_patches/total_loss", loss.item(), iteration)
-        tb_writer.add_scalar("iter_time", elapsed * 1000.0, iteration)
-    if iteration not in testing_iterations:
-        return {}
-    exposed = {"use_trained_exp": True} if train_test_exp else {}
-    train = scene.getTrainCameras()
-    sets = {"test": scene.getTestCameras(), "train": [train[i % len(train)] for i in range(5, 30, 5)]}
-    scores = {}
-    for name, cameras in sets.items():
-        if not cameras:
-            continue
-        differences, ratios = [], []
-        for index, camera in enumerate(cameras):
-            with torch.no_grad():
-                image = renderFunc(camera, scene.gaussians, *renderArgs, **exposed)["render"]
-                target = as_float(camera.target(renderArgs[1]))
-                mask = camera.mask
-                if train_test_exp:
-                    image, target, mask = (None if x is None else right_half(x) for x in (image, target, mask))
-                if mask is not None and not mask.any():
-                    continue
-                counted = [pixels_that_count(x, mask) for x in (image, target)]
-                differences.append(l1_loss(*counted).item())
-                ratios.append(psnr(*counted).mean().item())
-            if tb_writer and index < 5:
-                tag = f"{name}_view_{camera.image_name}"
-                tb_writer.add_image(f"{tag}/render", image, global_step=iteration)
-                if iteration == testing_iterations[0]:
-                    tb_writer.add_image(f"{tag}/ground_truth", target, global_step=iteration)
-        if not ratios:
-            continue
-        l1_mean, psnr_mean = sum(differences) / len(differences), sum(ratios) / len(ratios)
-        tqdm.write(f"[ITER {iteration}] Evaluating {name}: L1 {l1_mean} PSNR {psnr_mean}", file=sys.stdout)
-        if tb_writer:
-            tb_writer.add_scalar(f"{name}/loss_viewpoint - l1_loss", l1_mean, iteration)
-            tb_writer.add_scalar(f"{name}/loss_viewpoint - psnr", psnr_mean, iteration)
-        scores |= {f"{name}_l1": l1_mean, f"{name}_psnr": psnr_mean}
-    if tb_writer:
-        tb_writer.add_histogram("scene/opacity_histogram", scene.gaussians.get_opacity, iteration)
-        tb_writer.add_scalar("total_points", len(scene.gaussians), iteration)
-    return scores
 
 
 def _parser() -> tuple[argparse.ArgumentParser, ModelParams, OptimizationParams, PipelineParams]:
@@ -463,20 +288,30 @@ def _parser() -> tuple[argparse.ArgumentParser, ModelParams, OptimizationParams,
     add("--checkpoint_iterations", **listed, default=[], help="iterations that save a checkpoint (default: none)")
     add("--start_checkpoint", type=str, default=None, metavar="FILE", help="chkpntN.pth to go on from (default: none)")
     add("--no_curve", action="store_true",
-        help="no error_vs_time.csv and .png, which cost up to 5 %% of the time (default: with --eval)")  # fmt: skip
+        help="no error_vs_time.csv and .png, which cost up to 5 %% of the time, more in short runs (default: with "
+        "--eval)")  # fmt: skip
     add("--quiet", action="store_true", help="print nothing but the progress bar and errors")
     return parser, *groups
 
 
-def main(argv: Sequence[str] | None = None) -> None:
-    """The command line."""
-    parser, model, optimisation, pipeline = _parser()
+def parse(argv: Sequence[str] | None = None) -> tuple[argparse.Namespace, ...]:
+    """The command line as a whole, and its model, optimisation and pipeline options.
+
+    UserError for a value that cannot be meant; argparse ends the program at words that it does not know.
+    """
+    parser, *groups = _parser()
     args = parser.parse_args(argv)
-    dataset, opt, pipe = model.extract(args), optimisation.extract(args), pipeline.extract(args)
+    options = [group.extract(args) for group in groups]
     for name in ("test_iterations", "save_iterations", "checkpoint_iterations"):
         wrong = [t for t in getattr(args, name) if t < 1 and t != -1]
         if wrong:
             raise UserError(f"--{name} counts from 1, or is -1 for none, got {wrong[0]}")
+    return args, *options
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Train as the command line says."""
+    args, dataset, opt, pipe = parse(argv)
     safe_state(args.quiet, opt.seed)
     torch.autograd.set_detect_anomaly(args.detect_anomaly)
     training(

@@ -21,7 +21,6 @@ from scene.half_images import mark_halves, train_on_all
 from scene.image_store import ImageStore, Picture
 from scene.masks import MaskOptions, refuse_nothing_to_ignore
 from scene.point_cloud import write_point_cloud
-from scene.training_checks import check_before_training
 from utils.graphics_utils import BasicPointCloud
 from utils.system_utils import UserError, atomic_write, compute_device, saved_iterations, searchForMaxIteration
 
@@ -45,11 +44,11 @@ class _Gaussians(Protocol):
 class Scene:
     """Views and model of one run.
 
-    args: model options (ModelParams.extract). load_iteration: None starts from the dataset's points and, unless `write`
-    is False, calls `write_inputs` when nothing was refused; -1 loads the last saved iteration, N that one.
+    args: model options (ModelParams.extract). load_iteration: None calls `create_gaussians` and `write_inputs`, unless
+    `start` is False, which leaves them to the caller; -1 loads the last saved iteration, N that one.
     shuffle: mix the order of the views (always the same way). resolution_scales: factors by which views are made
-    smaller, one list of cameras each. cameras_extent: E in world units, from the training views. images: the views'
-    pictures.
+    smaller, one list of cameras each. info: what was read. cameras_extent: E in world units, from the training views.
+    images: the views' pictures.
     """
 
     def __init__(
@@ -59,7 +58,7 @@ class Scene:
         load_iteration: int | None = None,
         shuffle: bool = True,
         resolution_scales: Sequence[float] = (1.0,),
-        write: bool = True,
+        start: bool = True,
     ) -> None:
         self.model_path = args.model_path
         self.gaussians = gaussians
@@ -86,7 +85,7 @@ class Scene:
             info = train_on_all(info)
         if args.depths and self.loaded_iter is None:
             info = with_depth_maps(info, Path(args.source_path), args.depths)
-        self._info = info
+        self.info = info
         self.cameras_extent = info.extent
 
         device = compute_device()
@@ -101,16 +100,14 @@ class Scene:
                 mark_halves(self._train[scale], self._test[scale], info.train_cameras)
 
         gaussians.world_offset = tuple(info.offset.tolist())
-        if self.loaded_iter is None:
-            check_before_training(info)
-            gaussians.create_from_pcd(info.point_cloud, info.train_cameras, self.cameras_extent)
-            if write:
-                self.write_inputs()
-        else:
+        if self.loaded_iter is not None:
             print(f"Loading trained model at iteration {self.loaded_iter}")
             gaussians.load_ply(str(saved_ply(self.model_path, self.loaded_iter)))
             if self._halves:
                 gaussians.load_exposures(self.model_path, info.train_cameras)
+        elif start:
+            self.create_gaussians()
+            self.write_inputs()
 
     def getTrainCameras(self, scale: float = 1.0) -> list[Camera]:
         """Training views at a resolution scale that the scene was made with."""
@@ -134,11 +131,15 @@ class Scene:
     def training_pixels(self) -> tuple[int, int]:
         """Pixels of all training views: as they train, and in their files."""
         trained = sum(camera.image_width * camera.image_height for camera in self.getTrainCameras())
-        return trained, sum(width * height for width, height in (c.file_size for c in self._info.train_cameras))
+        return trained, sum(width * height for width, height in (c.file_size for c in self.info.train_cameras))
+
+    def create_gaussians(self) -> None:
+        """Start from the dataset's points."""
+        self.gaussians.create_from_pcd(self.info.point_cloud, self.info.train_cameras, self.cameras_extent)
 
     def write_inputs(self) -> None:
         """Write the cloud and the cameras into the model folder, `input.ply` and `cameras.json`."""
-        folder, info = Path(self.model_path), self._info
+        folder, info = Path(self.model_path), self.info
         if info.ply_path and not info.offset.any():
             with atomic_write(folder / "input.ply") as path:
                 shutil.copyfile(info.ply_path, path)

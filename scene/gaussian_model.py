@@ -147,8 +147,12 @@ class GaussianModel:
                 "rotation": torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1),
             }
         )
-        self.exposures = Exposures(exposure_names(cam_infos))
+        self.start_exposures(cam_infos)
         print(f"Number of points at initialisation :  {count}")
+
+    def start_exposures(self, cam_infos: Sequence) -> None:
+        """Give each training camera an exposure that changes nothing."""
+        self.exposures = Exposures(exposure_names(cam_infos))
 
     def load_ply(self, path: str | os.PathLike) -> None:
         """Take all parameters from a PLY of this model's SH degree (else UserError); all SH bands become active."""

@@ -29,7 +29,7 @@ from scene.gaussian_model import GaussianModel
 
 ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs" / "extending.md"
-CODE = ("arguments", "gaussian_renderer", "scene", "utils", "train.py", "render.py", "pyproject.toml")
+CODE = ("arguments", "gaussian_renderer", "scene", "training", "utils", "train.py", "render.py", "pyproject.toml")
 TESTS = ("conftest.py", "gaussians.py", "synthetic.py", "test_densification.py")
 HOT, COLD, START = 0.9, 0.2, 0.5
 WIDTH = 24

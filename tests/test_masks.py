@@ -19,8 +19,8 @@ import render
 import train
 from scene import Scene
 from scene.images import decode
-from scene.mask_watch import MaskWatch
 from scene.masks import IGNORE, TRANSPARENT, Mask
+from training.mask_watch import MaskWatch
 from utils.image_utils import pixels_that_count
 from utils.loss_utils import photometric_loss
 from utils.system_utils import UserError

@@ -14,10 +14,11 @@ from PIL import Image
 
 import render
 import train
-from scene import images, memory_estimate
+from scene import images
 from scene.checkpoint import load_checkpoint
 from scene.gaussian_model import GaussianModel
-from scene.memory_estimate import training_bytes
+from training import memory_estimate
+from training.memory_estimate import training_bytes
 from utils import memory
 from utils.memory import free_memory, gib, is_out_of_memory, shortage
 from utils.system_utils import UserError, run_cli

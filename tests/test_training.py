@@ -18,6 +18,8 @@ import train
 from scene.checkpoint import load_checkpoint
 from scene.gaussian_model import GaussianModel
 from scene.point_cloud import write_point_cloud
+from training import report
+from training.view_order import ViewOrder
 from utils.system_utils import UserError
 from utils.training_log import Stopwatch, TrainingLog
 
@@ -96,12 +98,12 @@ def _cloud(out: Path) -> torch.Tensor:
 
 def test_every_view_once_an_epoch():
     cameras = [f"view {i}" for i in range(7)]
-    order = train._ViewOrder(cameras, seed=3)
+    order = ViewOrder(cameras, seed=3)
     seen = [order[t] for t in range(1, 22)]
     for epoch in range(3):
         assert sorted(seen[7 * epoch : 7 * epoch + 7]) == cameras
     assert seen[:7] != seen[7:14]
-    late = train._ViewOrder(cameras, seed=3)
+    late = ViewOrder(cameras, seed=3)
     assert [late[t] for t in (18, 3, 21)] == [seen[17], seen[2], seen[20]]
 
 
@@ -330,7 +332,7 @@ class _Writer:
 
 def test_tensorboard_gets_the_references_tags(colmap_scene, tmp_path, monkeypatch):
     monkeypatch.setattr(train, "SummaryWriter", _Writer)
-    monkeypatch.setattr(train, "BAR_INTERVAL", 2)
+    monkeypatch.setattr(report, "LOG_INTERVAL", 2)
     _train(colmap_scene, tmp_path, "--eval", "--test_iterations", "2", "3", iterations=3)
     tags = _Writer.last.tags
     for tag in ("train_loss_patches/l1_loss", "train_loss_patches/total_loss", "iter_time"):

@@ -1,15 +1,14 @@
 """Where memory does not suffice the model is saved, and a sentence says what was wanted and what helps."""
 
-import contextlib
 import traceback
-from collections.abc import Iterator, Sequence
 from pathlib import Path
 from types import TracebackType
 
+from gaussian_renderer.memory_errors import situation
 from scene.cameras import Camera
 from scene.checkpoint import save_checkpoint
 from scene.gaussian_model import GaussianModel
-from utils.memory import is_out_of_memory, shortage
+from utils.memory import is_out_of_memory
 from utils.system_utils import UserError
 
 
@@ -50,7 +49,7 @@ class MemoryGuard:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         if is_out_of_memory(error):
-            what = _situation(error, self._gaussians, [self._camera] if self._camera else [])
+            what = situation(error, self._gaussians, [self._camera] if self._camera else [])
             traceback.clear_frames(trace)  # what was being computed takes memory that saving may need
             raise UserError(
                 f"memory did not suffice in iteration {self._iteration + 1} ({what}); {self._rescue()}"
@@ -80,25 +79,3 @@ class MemoryGuard:
         return (
             f"{state} is saved: go on with --start_checkpoint {path} and {further}, or start anew with a lower {anew}"
         )
-
-
-@contextlib.contextmanager
-def memory_errors_explained(gaussians: GaussianModel, cameras: Sequence[Camera]) -> Iterator[None]:
-    """UserError in place of an error for want of memory while these views are rendered."""
-    try:
-        yield
-    except Exception as error:
-        if not is_out_of_memory(error):
-            raise
-        raise UserError(
-            f"memory did not suffice for rendering ({_situation(error, gaussians, cameras)}); lower --resolution (-r), "
-            "or free memory that other programs use"
-        ) from error
-
-
-def _situation(error: BaseException, gaussians: GaussianModel, cameras: Sequence[Camera]) -> str:
-    parts = [shortage(error, gaussians.get_xyz.device), f"{len(gaussians):,} Gaussians"]
-    if cameras:
-        largest = max(cameras, key=lambda camera: camera.image_width * camera.image_height)
-        parts.append(f"pictures of {largest.image_width} x {largest.image_height}")
-    return "; ".join(parts)

@@ -1,18 +1,22 @@
 """What is looked at before a scene is trained, so that it does not train for hours to no end."""
 
+import argparse
 import sys
 
 import numpy as np
 
+from scene import densification as adc
+from scene.gaussian_model import GaussianModel
 from scene.scene_info import APART, NEAREST, SceneInfo, standing_apart
 from utils.listing import some
 from utils.system_utils import UserError
 
 _SAMPLE = 16  # cameras whose depths are looked at
 _FEWEST_BEYOND = 0.01  # part of the points in front of them
+_RECOVERY = 1000  # iterations that a model is given to get over a reset of its opacities
 
 
-def check_before_training(info: SceneInfo) -> None:
+def check_scene(info: SceneInfo) -> None:
     """UserError for a scene that nothing can be learnt from; a line about what is taken otherwise than it stands."""
     _check_scale(info)
     _report_cameras_apart(info)
@@ -46,4 +50,23 @@ def _report_cameras_apart(info: SceneInfo) -> None:
             f"of all ({some(names)}) and are left out of the scene's extent, {info.extent:.3g}; look whether their "
             "poses are right",
             file=sys.stderr,
+        )
+
+
+def check_exposures(gaussians: GaussianModel, train_test_exp: bool, checkpoint: str) -> None:
+    """UserError for a checkpoint with exposures that this run would not use; a word on the opposite."""
+    if gaussians.exposures.trained and not train_test_exp:
+        raise UserError(f"{checkpoint} was trained with --train_test_exp; give that option")
+    if train_test_exp and not gaussians.exposures.trained:
+        print(f"{checkpoint} has no exposures: all pictures start without a correction")
+
+
+def warn_of_late_reset(opt: argparse.Namespace, white_background: bool) -> None:
+    """A line where opacities are reset so late that the model cannot recover."""
+    last = range(max(1, opt.iterations - _RECOVERY + 1), opt.iterations)
+    late = [t for t in last if adc.actions(t, opt, white_background).reset_opacity]
+    if late:
+        print(
+            f"warning: opacities are reset in iteration {late[-1]}, and {opt.iterations - late[-1]} iterations are few "
+            "to recover from that; change --iterations or --opacity_reset_interval"
         )
