@@ -23,7 +23,7 @@ from evaluation.lock import locked
 from evaluation.machine import machine
 from evaluation.report import make_report, write_report
 from evaluation.results import read_run
-from evaluation.runs import Run, check_folders, plan_runs
+from evaluation.runs import Run, check_folders, check_outside_scenes, plan_runs
 from evaluation.scenes import SceneEntry, check_names, dataset_scenes, finished_scenes, folder_scenes
 from evaluation.stages import Failure, StageFailed
 from utils.markdown_table import markdown_table
@@ -84,8 +84,9 @@ def _plan(args: Namespace, more: Sequence[str]) -> list[Run]:
         raise UserError(f"--iterations must be at least 1, got {args.iterations}")
     if min(args.seeds, default=0) < 0 or len(set(args.seeds)) < len(args.seeds):
         raise UserError(f"--seeds must be different numbers from 0, got {' '.join(map(str, args.seeds))}")
-    check_options(more, "after --")
-    configs = read_configs(args.configs) if args.configs else {}
+    parse = None if args.skip_training else _parse_for_training
+    check_options(more, "after --", parse)
+    configs = read_configs(args.configs, parse) if args.configs else {}
     common = [
         *(("-d", "depths2/") if args.use_depth else ()),
         *(EXPOSURE if args.use_expcomp else ()),
@@ -97,9 +98,16 @@ def _plan(args: Namespace, more: Sequence[str]) -> list[Run]:
     if args.seeds and any(word.split("=")[0] == "--seed" for word in (*common, *sum(configs.values(), ()))):
         raise UserError("--seed is given twice: leave it out where --seeds is given")
     runs = plan_runs(_scenes(args), args.output_path.resolve(), common, configs, args.seeds)
+    check_outside_scenes(runs)
     if not args.skip_training:
         check_folders(runs)
     return runs
+
+
+def _parse_for_training(words: Sequence[str]) -> None:
+    import train  # not needed for models that are there, whose machine may lack the extensions
+
+    train.parse(words)
 
 
 def _carry_out(runs: Sequence[Run], args: Namespace, failures: dict[Run, Failure]) -> None:

@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import json
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from utils.system_utils import UserError
 
+Parse = Callable[[Sequence[str]], object]
 _SHAPE = 'like {"base": [], "sh1": ["--sh_degree", "1"]}'
 
 
-def read_configs(path: Path) -> dict[str, tuple[str, ...]]:
-    """The option sets of a JSON file, {name: [word, ...]}, in its order. Numbers may stand for words."""
+def read_configs(path: Path, parse: Parse | None) -> dict[str, tuple[str, ...]]:
+    """The option sets of a JSON file, {name: [word, ...]}, in its order. Numbers may stand for words.
+
+    parse: as `check_options`. UserError for another file, or for words that train.py does not take.
+    """
     try:
         content = json.loads(path.read_text(encoding="utf-8"), object_pairs_hook=_no_duplicates)
     except OSError as error:
@@ -30,7 +36,7 @@ def read_configs(path: Path) -> dict[str, tuple[str, ...]]:
         if not isinstance(words, list) or not all(type(word) in (str, int, float) for word in words):
             raise UserError(f"{path}: {name} must be a list of train.py's words, {_SHAPE}")
         configs[name] = tuple(str(word) for word in words)
-        check_options(configs[name], f"{path}, {name}")
+        check_options(configs[name], f"{path}, {name}", parse)
     return configs
 
 
@@ -41,8 +47,9 @@ def _no_duplicates(pairs: list[tuple[str, object]]) -> dict[str, object]:
     return dict(pairs)
 
 
-def check_options(words: Sequence[str], where: str) -> None:
-    """UserError for options that full_eval.py itself has to set: data, model folder, checkpoint."""
+def check_options(words: Sequence[str], where: str, parse: Parse | None) -> None:
+    """UserError for options that full_eval.py itself has to set (data, model folder, checkpoint), and for what train.py
+    would refuse: before other trainings have taken hours. parse: train.py's, None where nothing is trained."""
     for word in words:
         name = word.split("=")[0]
         taken = name[:2] in ("-s", "-m") or any(
@@ -50,3 +57,17 @@ def check_options(words: Sequence[str], where: str) -> None:
         )
         if taken:
             raise UserError(f"{where}: {word} is set by full_eval.py itself; leave it out")
+    if words and parse:
+        _try(parse, words, where)
+
+
+def _try(parse: Parse, words: Sequence[str], where: str) -> None:
+    said = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(said), contextlib.redirect_stdout(io.StringIO()):
+            parse(words)
+    except SystemExit as error:  # argparse's way; without a message where it was asked for help
+        reason = said.getvalue().strip().rpartition("error: ")[2] or f"{' '.join(words)} trains nothing"
+        raise UserError(f"{where}: {reason}; train.py -h lists what there is") from error
+    except UserError as error:
+        raise UserError(f"{where}: {error}") from error

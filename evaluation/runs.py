@@ -73,6 +73,17 @@ def plan_runs(
     return runs
 
 
+def check_outside_scenes(runs: Sequence[Run]) -> None:
+    """UserError where a model folder, and so perhaps the report, would lie in a scene's: nothing is written there."""
+    sources = {run.scene.source.resolve() for run in runs if run.scene.source}
+    for run in runs:
+        for source in sources:
+            if run.model.is_relative_to(source):
+                raise UserError(
+                    f"the model folder {run.model} would lie in the scene folder {source}; choose another --output_path"
+                )
+
+
 def check_folders(runs: Sequence[Run]) -> None:
     """UserError where a model folder holds another training: nothing is overwritten, and nothing is mixed."""
     for run in runs:

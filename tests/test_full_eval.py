@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 from PIL import Image
+from synthetic import folder_state
 
 import full_eval
 from evaluation import readme_table, stages
@@ -392,14 +393,21 @@ def test_seeds_and_option_sets(figures, scenes, tmp_path, capsys, monkeypatch):
         ("--scenes SCENES/attic -- -m elsewhere", "after --: -m is set by full_eval.py itself"),
         ("--scenes SCENES/attic -- --model=elsewhere", "--model=elsewhere is set by full_eval.py"),
         ("--scenes SCENES/attic --configs nowhere.json", "cannot read nowhere.json"),
+        ("--scenes SCENES/attic -- --sh_degree 1 --sh_degreee 2", "after --: unrecognized arguments: --sh_degreee 2;"),
+        ("--scenes SCENES/attic -- --sh_degree 4", "after --: --sh_degree must be between 0 and 3"),
+        ("--scenes SCENES/attic -- -h", "after --: -h trains nothing"),
+        ("--scenes SCENES/attic SCENES/brick --output_path SCENES/brick/eval", "attic would lie in the scene folder"),
+        ("--scenes SCENES/attic --output_path SCENES", "attic would lie in the scene folder"),
+        ("--scenes SCENES/attic --output_path SCENES/attic --skip_training", "would lie in the scene folder"),
         ("--skip_training --skip_rendering", "no scenes given"),
     ],
 )
 def test_refusals(scenes, tmp_path, words, sentence):
     words = words.replace("SCENES", str(scenes)).split()
+    before = folder_state(scenes)
     with pytest.raises(UserError, match=sentence):
         full_eval.main(["--output_path", str(tmp_path / "out"), *words])
-    assert calls(scenes) == []
+    assert calls(scenes) == [] and folder_state(scenes) == before and not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize(
@@ -412,6 +420,10 @@ def test_refusals(scenes, tmp_path, words, sentence):
         ('{"seed_1": []}', "cannot name a folder"),
         ('{"a": "--sh_degree 1"}', "a must be a list"),
         ('{"a": ["-s", "x"]}', "a: -s is set by full_eval.py itself"),
+        ('{"a": [], "b": ["--sh_degreee", 1]}', "configs.json, b: unrecognized arguments: --sh_degreee 1;"),
+        ('{"a": ["--sh_degree"]}', "a: argument --sh_degree: expected one argument"),
+        ('{"a": ["--iterations", "many"]}', "a: argument --iterations: invalid int value"),
+        ('{"a": ["--opacity_lr", -1]}', "a: --opacity_lr must be at least 0"),
     ],
 )
 def test_refused_option_sets(scenes, tmp_path, text, sentence):
