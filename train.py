@@ -25,6 +25,7 @@ from scene.gaussian_model import GaussianModel
 from training.checks import check_exposures, check_scene, warn_of_late_reset
 from training.curve import scene_curve
 from training.divergence import DivergenceWatch
+from training.history import check_folder, continue_records, report_changes
 from training.last_save import save_last
 from training.mask_watch import MaskWatch
 from training.memory_estimate import announce_memory
@@ -33,14 +34,13 @@ from training.report import training_report
 from training.view_order import ViewOrder
 from utils.counter_rng import Stream, uniform
 from utils.curve_peak import schedules_follow_length
-from utils.error_curve import continue_curve
 from utils.general_utils import get_expon_lr_func, safe_state
 from utils.interrupt import DeferredInterrupt
 from utils.left_out import lines
 from utils.loss_utils import inverse_depth_loss, l1_loss, photometric_loss
 from utils.loss_watch import LossWatch
 from utils.system_utils import UserError, compute_device, mkdir_p, run_cli, saved_iterations
-from utils.training_log import Stopwatch, TrainingLog
+from utils.training_log import Stopwatch
 
 try:
     from torch.utils.tensorboard import SummaryWriter
@@ -91,17 +91,19 @@ def training(
         capture = None  # so that densification can free what it replaces
     views = ViewOrder(scene.getTrainCameras(), opt.seed)
     masks = MaskWatch(scene.getTrainCameras())
+    saves = [iteration for iteration in saving_iterations if iteration <= opt.iterations]
+    check_folder(dataset.model_path, dataset.source_path, saves, checkpoint, first_iteration)
+    kept = {"antialiasing": pipe.antialiasing, "optimizer_type": opt.optimizer_type, "seed": opt.seed}
+    if checkpoint:
+        report_changes(checkpoint, argparse.Namespace(**vars(dataset), **kept))
     # After all that bad input can stop, or a slip of the keyboard would overwrite the files of a finished model.
-    tb_writer = prepare_output_and_logger(
-        dataset, antialiasing=pipe.antialiasing, seed=opt.seed, world_offset=gaussians.world_offset
-    )
+    tb_writer = prepare_output_and_logger(dataset, **kept, world_offset=gaussians.world_offset)
     if not checkpoint or not (Path(scene.model_path) / "cameras.json").exists():
         scene.write_inputs()
 
     announce_memory(scene, gaussians, opt.max_num_splats)
     fixed_background = torch.full((3,), 1.0 if dataset.white_background else 0.0, device=device)
-    log = TrainingLog(scene.model_path, first_iteration)
-    rows = continue_curve(scene.model_path, first_iteration)
+    log, rows = continue_records(scene.model_path, checkpoint, first_iteration)
     losses = LossWatch(log.loss)
     watch = DivergenceWatch(gaussians, losses, scene.model_path, first_iteration, lambda t: views[t].image_name)
     depth_weight = get_expon_lr_func(opt.depth_l1_weight_init, opt.depth_l1_weight_final, max_steps=opt.iterations)

@@ -9,6 +9,7 @@ from arguments.stored import (
     read_cfg_args,
     read_model_json,
     read_stored_options,
+    read_training_options,
     write_cfg_args,
     write_model_json,
 )
@@ -25,6 +26,7 @@ __all__ = [
     "read_cfg_args",
     "read_model_json",
     "read_stored_options",
+    "read_training_options",
     "write_cfg_args",
     "write_model_json",
 ]

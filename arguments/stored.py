@@ -18,6 +18,7 @@ OFFSET = "world_offset"
 
 _STORED = {option.name: option.default for option in ModelParams.options if option.stored}
 _REMEMBERED = {option.name: option.default for option in ModelParams.options if option.remembered}
+_OF_TRAINING = ("antialiasing", "optimizer_type", "seed")
 
 
 def write_cfg_args(model_path: str | os.PathLike, args: argparse.Namespace) -> None:
@@ -66,16 +67,20 @@ def write_model_json(
     *,
     antialiasing: bool,
     seed: int,
+    optimizer_type: str | None = None,
     world_offset: Sequence[float] = (0.0, 0.0, 0.0),
 ) -> None:
     """Write `model.json`: what cfg_args can't hold, keys sorted. args: model options, of which what differs is kept.
 
-    world_offset: world coordinates of the origin of the model's frame (scene/world_offset.py); kept unless zero.
+    optimizer_type: of the training, None: not told. world_offset: world coordinates of the origin of the model's frame
+    (scene/world_offset.py); kept unless zero.
     """
     record = {"antialiasing": antialiasing, "seed": seed, "version": VERSION}
     for name, default in _REMEMBERED.items():
         if (value := getattr(args, name, default)) != default:
             record[name] = value
+    if optimizer_type is not None:
+        record["optimizer_type"] = optimizer_type
     if any(world_offset):
         record[OFFSET] = list(world_offset)
     _write_record(model_path, record)
@@ -118,6 +123,16 @@ def read_stored_options(model_path: str | os.PathLike) -> dict[str, Value]:
     """Model options as far as a model folder has them, in cfg_args and model.json. UserError as both readers."""
     stored, record = read_cfg_args(model_path), read_model_json(model_path)
     return stored | {name: record[name] for name in _REMEMBERED if name in record}
+
+
+def read_training_options(model_path: str | os.PathLike) -> dict[str, Any]:
+    """All options that a model folder tells of its training: those of cfg_args, and where model.json is there, masks,
+    antialiasing, seed and optimizer_type. UserError as both readers."""
+    stored, record = read_cfg_args(model_path), read_model_json(model_path)
+    if record:
+        stored |= {name: record.get(name, default) for name, default in _REMEMBERED.items()}
+        stored |= {name: record[name] for name in _OF_TRAINING if name in record}
+    return stored
 
 
 def get_combined_args(parser: argparse.ArgumentParser, argv: Sequence[str] | None = None) -> argparse.Namespace:

@@ -1,6 +1,6 @@
 """What train.py is made of besides its loop.
 
-checks                     before: may this be trained
+checks, history            before: may this be trained, and what have earlier runs left
 memory_estimate            what it will want
 view_order                 which camera in which iteration
 report, curve              scores on the way

@@ -63,19 +63,23 @@ def write_curve(path: str | os.PathLike, rows: list[Row]) -> None:
             writer.writerow([value if value is not None and math.isfinite(value) else "" for value in values])
 
 
-def continue_curve(model_path: str | os.PathLike, first_iteration: int) -> list[Row]:
+def continue_curve(
+    model_path: str | os.PathLike, first_iteration: int, before: str | os.PathLike | None = None
+) -> list[Row]:
     """Rows up to `first_iteration`, which a run goes on from (0: from the start), of the curve in a model folder.
 
     What the folder has beyond them is another training's and goes: rows, or the file, and the figure. A file that can't
-    be read is no reason to stop a training: it goes too, with a warning.
+    be read is no reason to stop a training: it goes too, with a warning. before: the folder of the run that is gone on
+    from, where it is another; nothing changes there.
     """
     path = Path(model_path) / NAME
+    source = path if before is None else Path(before) / NAME
     rows = []
     with contextlib.suppress(OSError, UserError):  # what can't be removed is warned of when it is written
         (path.parent / FIGURE).unlink(missing_ok=True)
-        if first_iteration and path.exists():
+        if first_iteration and source.exists():
             try:
-                rows = [row for row in read_curve(path) if row["iteration"] <= first_iteration]
+                rows = [row for row in read_curve(source) if row["iteration"] <= first_iteration]
             except UserError as error:
                 print(f"warning: {error}; a new curve is started", file=sys.stderr)
         if rows:

@@ -47,17 +47,28 @@ class TrainingLog:
     first_iteration, seconds_before, wall_seconds_before: what the runs have done that this one goes on from.
     """
 
-    def __init__(self, model_path: str | os.PathLike, first_iteration: int) -> None:
-        """Keep an existing log's records up to `first_iteration`, which a resumed run goes on from."""
+    def __init__(
+        self, model_path: str | os.PathLike, first_iteration: int, before: str | os.PathLike | None = None
+    ) -> None:
+        """Keep an existing log's records up to `first_iteration`, which a resumed run goes on from.
+
+        before: the folder of that log, where it is another than model_path.
+        """
         self._path = Path(model_path) / NAME
+        source = self._path if before is None else Path(before) / NAME
         self.first_iteration = first_iteration
         self.records: list[dict] = []
-        if first_iteration > 0 and self._path.is_file():
-            self.records = [r for r in _read(self._path) if r["iteration"] <= first_iteration]
+        if first_iteration > 0 and source.is_file():
+            self.records = [r for r in _read(source) if r["iteration"] <= first_iteration]
         last = self.records[-1] if self.records else {"seconds": 0.0}
         self.seconds_before = last["seconds"]
         self.wall_seconds_before = last.get("wall_seconds") or last["seconds"]
         self._peak_before: float | None = last.get("peak_memory_mib")
+
+    def not_before(self, row: dict[str, float | None]) -> None:
+        """Count on from a row (`seconds`, `wall_seconds`) of the runs before, where that is later than their log."""
+        self.seconds_before = max(self.seconds_before, row["seconds"])
+        self.wall_seconds_before = max(self.wall_seconds_before, row["wall_seconds"] or 0.0)
 
     @property
     def loss(self) -> float:

@@ -1,0 +1,211 @@
+"""Trainings after others: into a folder that holds a model, from a checkpoint elsewhere, with other options."""
+
+import argparse
+import json
+import re
+import shutil
+import sys
+from pathlib import Path
+
+import pytest
+from synthetic import folder_state
+
+import train
+from arguments import read_model_json, read_training_options, write_cfg_args, write_model_json
+from training.history import check_folder, continue_records
+from utils.error_curve import COLUMNS, read_curve, write_curve
+from utils.system_utils import UserError
+
+CURVE, LOG = "error_vs_time.csv", "train_log.json"
+MODEL_OPTIONS = {
+    "sh_degree": 3, "source_path": "/scene", "model_path": "out", "images": "images", "depths": "", "resolution": -1,
+    "white_background": False, "train_test_exp": False, "data_device": "cuda", "eval": False,
+}  # fmt: skip
+
+
+@pytest.fixture(autouse=True)
+def _stdout(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Training stamps and may silence stdout: bring it back."""
+    monkeypatch.setattr(sys, "stdout", sys.stdout)
+
+
+def _train(scene: Path, out: Path, *more: object, iterations: int) -> bytes:
+    words = ["-s", scene, "-m", out, "-r", 24, "--iterations", iterations, "--test_iterations", -1, *more]
+    train.main(list(map(str, words)))
+    return (out / "point_cloud" / f"iteration_{iterations}" / "point_cloud.ply").read_bytes()
+
+
+def _warnings(text: str) -> list[str]:
+    return re.findall("^warning: .*$", text, re.MULTILINE)
+
+
+# Into a folder that holds a model
+
+
+def test_a_model_of_another_scene_is_refused_and_nothing_of_it_changes(colmap_scene, blender_scene, tmp_path):
+    out = tmp_path / "out"
+    _train(colmap_scene, out, "--checkpoint_iterations", 2, iterations=3)
+    before = folder_state(out)
+    for options in ([], ["--start_checkpoint", _elsewhere(out / "chkpnt2.pth", tmp_path)]):
+        with pytest.raises(UserError, match=rf"out holds a model of another scene, {colmap_scene}; name another"):
+            _train(blender_scene, out, *options, iterations=4)
+        assert folder_state(out) == before
+
+
+def _elsewhere(checkpoint: Path, folder: Path) -> Path:
+    """A copy of the checkpoint without anything beside it."""
+    (folder / "moved").mkdir(exist_ok=True)
+    return Path(shutil.copy(checkpoint, folder / "moved"))
+
+
+def test_the_same_command_overwrites_in_silence(colmap_scene, tmp_path, capfd):
+    out = tmp_path / "out"
+    first = _train(colmap_scene, out, "--save_iterations", 2, iterations=3)
+    (tmp_path / "link").symlink_to(colmap_scene)
+    assert _train(tmp_path / "link", out, "--save_iterations", 2, iterations=3) == first
+    said = capfd.readouterr().err
+    assert _warnings(said) == [] and "train_log" not in said
+
+
+def test_iterations_that_stay_are_warned_of(colmap_scene, tmp_path, capfd):
+    out = tmp_path / "out"
+    _train(colmap_scene, out, "--save_iterations", 1, 3, iterations=5)
+    # 30000, a default of --save_iterations, is not reached and so not overwritten.
+    (out / "point_cloud" / "iteration_30000").mkdir()
+    capfd.readouterr()
+    _train(colmap_scene, out, "--save_iterations", 1, 30000, "--checkpoint_iterations", 3, iterations=4)
+    (warning,) = _warnings(capfd.readouterr().err)
+    assert "point_cloud keeps iteration 3, 5, 30000 of an earlier training, and render.py takes the highest" in warning
+    # Of a run that is gone on from, what it has saved before is no other training's.
+    _train(colmap_scene, out, "--start_checkpoint", out / "chkpnt3.pth", iterations=6)
+    (warning,) = _warnings(capfd.readouterr().err)
+    assert "keeps iteration 4, 5, 30000 of" in warning
+
+
+@pytest.mark.parametrize("trained", ["chkpnt5.pth", "point_cloud/iteration_5"])
+def test_what_a_folder_must_hold_to_be_refused(tmp_path, trained):
+    """Something that was trained, and cfg_args that names another scene."""
+    write_cfg_args(tmp_path, argparse.Namespace(**MODEL_OPTIONS))
+    check_folder(str(tmp_path), "/other", [5], None, 0)
+    (tmp_path / trained).mkdir(parents=True)
+    with pytest.raises(UserError, match="holds a model of another scene, /scene"):
+        check_folder(str(tmp_path), "/other", [5], None, 0)
+    check_folder(str(tmp_path), "/scene/../scene/", [5], None, 0)
+    # Going on in its own folder with a scene that was moved is only told (report_changes).
+    check_folder(str(tmp_path), "/other", [5], str(tmp_path / "chkpnt5.pth"), 5)
+    (tmp_path / "cfg_args").write_text("of another program")
+    check_folder(str(tmp_path), "/other", [5], None, 0)
+
+
+# From a checkpoint elsewhere
+
+
+@pytest.fixture
+def whole(colmap_scene, tmp_path) -> Path:
+    """A model folder with a curve, and a checkpoint at 20 of 40."""
+    out = tmp_path / "whole"
+    _train(colmap_scene, out, "--eval", "--test_iterations", 10, 30, "--checkpoint_iterations", 20, iterations=40)
+    return out
+
+
+def test_log_and_curve_go_on_in_another_folder(whole, colmap_scene, tmp_path, capfd):
+    new, before = tmp_path / "new", folder_state(whole)
+    new.mkdir()
+    (new / CURVE).write_text("of an earlier attempt")
+    (new / LOG).write_text("[]")
+    capfd.readouterr()
+    same = _train(
+        colmap_scene, new, "--eval", "--test_iterations", 10, 30, "--start_checkpoint", whole / "chkpnt20.pth",
+        iterations=40,
+    )  # fmt: skip
+    assert same == (whole / "point_cloud/iteration_40/point_cloud.ply").read_bytes()
+    assert folder_state(whole) == before and _warnings(capfd.readouterr().err) == []
+    rows, old = read_curve(new / CURVE), read_curve(whole / CURVE)
+    kept = [row for row in old if row["iteration"] <= 20]
+    assert kept and rows[: len(kept)] == kept and rows[-1]["iteration"] == 40
+    log, old_log = (json.loads((folder / LOG).read_text()) for folder in (new, whole))
+    assert log[:2] == [record for record in old_log if record["iteration"] <= 20]
+    assert [record["iteration"] for record in log] == [10, 20, 30, 40]
+    seconds = [row["seconds"] for row in rows]
+    assert seconds == sorted(seconds) and seconds[len(kept)] > log[1]["seconds"]
+
+
+def test_a_checkpoint_alone_counts_from_zero_and_says_so(whole, colmap_scene, tmp_path, capfd):
+    alone = _elsewhere(whole / "chkpnt20.pth", tmp_path)
+    _train(colmap_scene, tmp_path / "new", "--eval", "--start_checkpoint", alone, iterations=40)
+    said = capfd.readouterr().err
+    assert f"there is no train_log.json beside {alone}: seconds count from iteration 20, in the curve too" in said
+    assert all(row["iteration"] > 20 for row in read_curve(tmp_path / "new" / CURVE))
+    # In the folder that it was taken out of, the log is there.
+    _train(colmap_scene, whole, "--eval", "--start_checkpoint", alone, iterations=40)
+    assert "there is no train_log" not in capfd.readouterr().err
+    assert read_curve(whole / CURVE)[0]["iteration"] < 20
+
+
+def test_seconds_go_on_from_whichever_is_later_log_or_curve(tmp_path, capsys):
+    """A rescued training has rows after its log's last record, and a log may be lost."""
+    row = dict.fromkeys(COLUMNS) | {"iteration": 8, "seconds": 80.0, "wall_seconds": None}
+    write_curve(tmp_path / CURVE, [row])
+    for records, seconds, wall in (
+        ([{"iteration": 7, "seconds": 70.0, "wall_seconds": 71.0}], 80.0, 71.0),
+        ([{"iteration": 7, "seconds": 90.0, "wall_seconds": 91.0}], 90.0, 91.0),
+        (None, 80.0, 0.0),
+    ):
+        (tmp_path / LOG).unlink(missing_ok=True)
+        if records:
+            (tmp_path / LOG).write_text(json.dumps(records))
+        log, rows = continue_records(str(tmp_path), str(tmp_path / "chkpnt9.pth"), 9)
+        assert (log.seconds_before, log.wall_seconds_before, rows) == (seconds, wall, [row])
+    assert capsys.readouterr().err == ""
+    log, rows = continue_records(str(tmp_path), None, 0)
+    assert (log.seconds_before, rows) == (0.0, [])
+
+
+# With other options
+
+
+def test_changed_options_are_told_in_one_line(colmap_scene, tmp_path, capfd):
+    out = tmp_path / "out"
+    (colmap_scene / "masks").mkdir()
+    _train(colmap_scene, out, "--checkpoint_iterations", 2, "--seed", 3, iterations=3)
+    assert read_model_json(out)["optimizer_type"] == "default"
+    options = ["--start_checkpoint", out / "chkpnt2.pth", "--seed", 3]
+    _train(colmap_scene, tmp_path / "same", *options, iterations=3)
+    assert _warnings(capfd.readouterr().err) == []
+    changed = ["-r", 32, "-w", "--eval", "--antialiasing", "--optimizer_type", "sparse_adam", "--mask_meaning",
+               "transparent", "--seed", 4]  # fmt: skip
+    _train(colmap_scene, tmp_path / "changed", *options, *changed, iterations=3)
+    (warning,) = _warnings(capfd.readouterr().err)
+    assert warning == (
+        f"warning: {out} was trained with --resolution 24 no --white_background no --eval --mask_meaning auto "
+        "no --antialiasing --optimizer_type default --seed 3, this run has --resolution 32 --white_background --eval "
+        "--mask_meaning transparent --antialiasing --optimizer_type sparse_adam --seed 4"
+    )
+    # In the same folder cfg_args is overwritten, so the line must come before.
+    _train(colmap_scene, out, *options, "-w", iterations=3)
+    assert len(_warnings(capfd.readouterr().err)) == 1
+
+
+def test_another_scene_is_told(whole, colmap_scene, tmp_path, capfd):
+    moved = colmap_scene.rename(tmp_path / "moved_scene")
+    capfd.readouterr()
+    _train(moved, whole, "--eval", "--start_checkpoint", whole / "chkpnt20.pth", iterations=40)
+    (warning,) = _warnings(capfd.readouterr().err)
+    assert f"trained with --source_path {colmap_scene}, this run has --source_path {moved}" in warning
+
+
+def test_what_a_folder_does_not_tell_is_not_missed(tmp_path):
+    write_cfg_args(tmp_path, argparse.Namespace(**MODEL_OPTIONS))
+    assert read_training_options(tmp_path) == MODEL_OPTIONS  # of the reference, which has no model.json
+    write_model_json(tmp_path, argparse.Namespace(masks="m"), antialiasing=True, seed=2)
+    told = {"masks": "m", "invert_masks": False, "mask_meaning": "auto", "antialiasing": True, "seed": 2}
+    assert read_training_options(tmp_path) == MODEL_OPTIONS | told
+
+
+def test_points_to_start_from_are_not_counted_when_a_checkpoint_has_others(colmap_scene, tmp_path, capfd):
+    out = tmp_path / "out"
+    _train(colmap_scene, out, "--checkpoint_iterations", 2, iterations=3)
+    assert "Number of points at initialisation :  300" in capfd.readouterr().out
+    _train(colmap_scene, out, "--start_checkpoint", out / "chkpnt2.pth", "--init_type", "random", iterations=3)
+    said = capfd.readouterr().out
+    assert "Number of points" not in said and "with 300 Gaussians" in said

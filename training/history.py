@@ -1,0 +1,103 @@
+"""What earlier runs have left: in the folder that is trained into, and beside the checkpoint that is gone on from."""
+
+import argparse
+import contextlib
+import os
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from arguments import read_training_options
+from utils import training_log
+from utils.error_curve import Row, continue_curve
+from utils.system_utils import UserError, saved_iterations
+from utils.training_log import TrainingLog
+
+# Options that change what is learnt. Others are spoken of elsewhere (train_test_exp, sh_degree), or change nothing.
+_TOLD = (
+    "source_path", "images", "depths", "resolution", "white_background", "eval", "masks", "invert_masks",
+    "mask_meaning", "antialiasing", "optimizer_type", "seed",
+)  # fmt: skip
+
+
+def check_folder(
+    model_path: str, source_path: str, saving_iterations: Sequence[int], checkpoint: str | None, first_iteration: int
+) -> None:
+    """UserError where a model folder holds a model of another scene, which this training would mix with its own.
+
+    A warning of iterations that an earlier training of this scene has saved and this one does not overwrite.
+    """
+    folder = Path(model_path)
+    saved = saved_iterations(folder / "point_cloud")
+    goes_on = checkpoint is not None and _same_place(Path(checkpoint).parent, folder)
+    if not goes_on and (saved or any(folder.glob("chkpnt*.pth"))):
+        trained_on = _options_of(folder).get("source_path")
+        if trained_on and not _same_place(trained_on, source_path):
+            raise UserError(
+                f"{model_path} holds a model of another scene, {trained_on}; name another folder with -m, or remove "
+                "that one"
+            )
+    stay = [iteration for iteration in saved if iteration > first_iteration and iteration not in saving_iterations]
+    if stay:
+        print(
+            f"warning: {folder / 'point_cloud'} keeps iteration {', '.join(map(str, stay))} of an earlier training, "
+            "and render.py takes the highest unless --iteration says which; remove what is old, or name another folder "
+            "with -m",
+            file=sys.stderr,
+        )
+
+
+def report_changes(checkpoint: str, now: argparse.Namespace) -> None:
+    """A line where the run that a checkpoint lies beside had other options than `now`, those of this run.
+
+    now: model options, antialiasing, optimizer_type and seed. What the checkpoint's folder does not tell is not missed.
+    """
+    folder = Path(checkpoint).parent
+    then = _options_of(folder)
+    changed = [name for name in _TOLD if name in then and not _equal(name, then[name], getattr(now, name))]
+    if changed:
+        before, after = (" ".join(_typed(n, of[n]) for n in changed) for of in (then, vars(now)))
+        print(f"warning: {folder} was trained with {before}, this run has {after}", file=sys.stderr)
+
+
+def continue_records(model_path: str, checkpoint: str | None, first_iteration: int) -> tuple[TrainingLog, list[Row]]:
+    """The log of a training and its curve's rows so far: those up to `first_iteration` where it goes on from there.
+
+    They are read where the checkpoint lies, as that is where its training was recorded, else in model_path; they are
+    kept in model_path.
+    """
+    before = Path(model_path)
+    if checkpoint and (Path(checkpoint).parent / training_log.NAME).is_file():
+        before = Path(checkpoint).parent
+    log, rows = TrainingLog(model_path, first_iteration, before), continue_curve(model_path, first_iteration, before)
+    if rows:  # a rescued training has rows after its log's last record
+        log.not_before(rows[-1])
+    elif checkpoint and not log.records:
+        print(
+            f"there is no {training_log.NAME} beside {checkpoint}: seconds count from iteration {first_iteration}, "
+            "in the curve too",
+            file=sys.stderr,
+        )
+    return log, rows
+
+
+def _options_of(folder: Path) -> dict[str, object]:
+    """What a folder tells of its training; nothing where it can't be read: it may be no model folder at all."""
+    with contextlib.suppress(UserError, OSError):
+        return read_training_options(folder)
+    return {}
+
+
+def _equal(name: str, then: object, now: object) -> bool:
+    return _same_place(then, now) if name == "source_path" else then == now
+
+
+def _same_place(one: str | os.PathLike, other: str | os.PathLike) -> bool:
+    return os.path.realpath(one) == os.path.realpath(other)
+
+
+def _typed(name: str, value: object) -> str:
+    """An option as it would be typed."""
+    if isinstance(value, bool):
+        return f"--{name}" if value else f"no --{name}"
+    return f"--{name} {value if value != '' else repr(value)}"
