@@ -21,6 +21,7 @@ from synthetic import make_blender_scene, make_colmap_scene
 from arguments import ModelParams
 from scene import Scene
 from scene.gaussian_model import GaussianModel
+from training.checks import check_scene
 from utils.system_utils import UserError
 
 Options = dict[str, Any]
@@ -58,8 +59,10 @@ def message(fault: Fault, masters: dict[str, Path], work: Path) -> str:
     quiet = io.StringIO()
     with contextlib.redirect_stdout(quiet), contextlib.redirect_stderr(quiet):
         try:
-            cameras = Scene(extracted, GaussianModel(3), write=False).getTrainCameras()
-            for camera in cameras:
+            taken = Scene(extracted, GaussianModel(3), start=False)
+            check_scene(taken.info)
+            taken.create_gaussians()
+            for camera in taken.getTrainCameras():
                 camera.target(torch.zeros(3))
         except UserError as error:
             return str(error).replace(str(scene), "SCENE").replace(str(work / "out"), "OUT")

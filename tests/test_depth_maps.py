@@ -297,7 +297,7 @@ def _depth_error(scene: Path, out: Path) -> float:
     options.source_path, options.model_path, options.resolution, options.depths = str(scene), str(out), 24, "depths"
     gaussians = GaussianModel(3)
     gaussians.load_ply(out / "point_cloud/iteration_60/point_cloud.ply")
-    cameras = Scene(options, FakeGaussians(), shuffle=False, write=False).getTrainCameras()
+    cameras = Scene(options, FakeGaussians(), shuffle=False, start=False).getTrainCameras()
     with torch.no_grad():
         losses = [
             inverse_depth_loss(
