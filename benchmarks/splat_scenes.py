@@ -40,14 +40,17 @@ def settings(
     *,
     view: Tensor | None = None,
     principal: tuple[float, float] = (0.0, 0.0),
+    fov: float = FOV,
+    tan_ratio: float | None = None,
     **changes,
 ) -> GaussianRasterizationSettings:
-    """A pinhole camera, 60 degrees across; view: (4, 4) world to view, not transposed; principal: offset in NDC.
+    """A pinhole camera, `fov` radians across; view: (4, 4) world to view, not transposed; principal: offset in NDC.
 
-    `changes` replace fields of the settings (antialiasing=True, bg=...).
+    tan_ratio: of the half height's tangent to the half width's, that of the image if not given. `changes`
+    replace fields of the settings (antialiasing=True, bg=...).
     """
-    tan_x = math.tan(FOV / 2)
-    tan_y = tan_x * height / width
+    tan_x = math.tan(fov / 2)
+    tan_y = tan_x * height / width if tan_ratio is None else tan_x * tan_ratio
     view = torch.eye(4, dtype=torch.float64) if view is None else view.double()
     projection = torch.zeros(4, 4, dtype=torch.float64)
     projection[0, 0], projection[1, 1] = 1 / tan_x, 1 / tan_y

@@ -13,11 +13,10 @@ import torch
 from diff_gaussian_rasterization import GaussianRasterizationSettings
 from torch import Generator, Tensor
 
-from benchmarks.splat_scenes import PARAMETERS, frustum
+from benchmarks.splat_scenes import PARAMETERS, frustum, settings
 
 WIDTH, HEIGHT = 75, 53  # no multiple of the tile
 ORDINARY = 40  # Gaussians
-FOV = math.radians(60)
 Parameters = dict[str, Tensor]
 
 
@@ -58,41 +57,9 @@ class Case:
 # ---- scenes ----
 
 
-def camera(
-    width: int = WIDTH,
-    height: int = HEIGHT,
-    *,
-    fov: float = FOV,
-    tan_ratio: float | None = None,
-    principal: tuple[float, float] = (0.0, 0.0),
-    view: Tensor | None = None,
-    **changes,
-) -> GaussianRasterizationSettings:
-    """A pinhole camera with `fov` (radians) across; tan_ratio: of the half heights's tangent to the half width's, that
-    of the image if not given; principal: offset in NDC; view: (4, 4) world to view, not transposed."""
-    tan_x = math.tan(fov / 2)
-    tan_y = tan_x * (height / width if tan_ratio is None else tan_ratio)
-    view = torch.eye(4, dtype=torch.float64) if view is None else view
-    projection = torch.zeros(4, 4, dtype=torch.float64)
-    projection[0, 0], projection[1, 1] = 1 / tan_x, 1 / tan_y
-    projection[0, 2], projection[1, 2] = principal
-    projection[2, 2], projection[2, 3], projection[3, 2] = 100 / 99.99, -1 / 99.99, 1
-    made = GaussianRasterizationSettings(
-        image_height=height,
-        image_width=width,
-        tanfovx=tan_x,
-        tanfovy=tan_y,
-        bg=torch.tensor([0.2, 0.5, 0.9], dtype=torch.float64),
-        scale_modifier=1.0,
-        viewmatrix=view.T.contiguous(),
-        projmatrix=(projection @ view).T.contiguous(),
-        sh_degree=3,
-        campos=torch.linalg.inv(view)[:3, 3].contiguous(),
-        prefiltered=False,
-        debug=False,
-        antialiasing=False,
-    )
-    return made._replace(**changes)
+def camera(width: int = WIDTH, height: int = HEIGHT, **changes) -> GaussianRasterizationSettings:
+    """A pinhole camera in float64; `changes` as those of `settings`."""
+    return settings(width, height, **changes)
 
 
 def normal(g: Generator, *shape: int) -> Tensor:

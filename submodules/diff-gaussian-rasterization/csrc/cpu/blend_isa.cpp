@@ -110,19 +110,14 @@ bool blend_strip(const LocalSplat<T>* splats, int64_t count, int64_t position, i
   return open;
 }
 
-template <class T, bool kDepth, bool kLast>
-void blend_tile(const BlendInput<T>& in, int64_t index, const Blended<T>& out) {
-  const Tile tile(index, in.image);
-  const int64_t begin = in.ranges[index], end = in.ranges[index + 1];
-  ForwardState<T> state;
-  std::fill_n(state.transmittance, kPixels, T(1));
-  std::fill_n(state.color[0], 3 * kPixels, T(0));
-  if (kDepth) std::fill_n(state.depth, kPixels, T(0));
-  if (kLast) std::fill_n(state.last, kPixels, 0);
+// Splats of a tile's list from front to back, kChunk at a time, for each strip of its pixels: strip(splats, how many,
+// place of the first in the list, row, first column) says whether a pixel is open. Pixels beyond the image never are.
+template <class T, class Strip>
+void through_tile(const BlendInput<T>& in, const Tile& tile, int64_t index, T* threshold, const Strip& strip) {
   for (int p = 0; p < kPixels; ++p)
-    state.threshold[p] = p % kTile < tile.columns ? T(kLog2MinAlpha) : std::numeric_limits<T>::infinity();
-
+    threshold[p] = p % kTile < tile.columns ? T(kLog2MinAlpha) : std::numeric_limits<T>::infinity();
   LocalSplat<T> local[kChunk];
+  const int64_t begin = in.ranges[index], end = in.ranges[index + 1];
   bool open = true;
   for (int64_t from = begin; open && from < end; from += kChunk) {
     const int64_t to = std::min(from + kChunk, end);
@@ -130,8 +125,22 @@ void blend_tile(const BlendInput<T>& in, int64_t index, const Blended<T>& out) {
     open = false;
     for (int row = 0; row < tile.rows; ++row)
       for (int first = 0; first < kTile; first += Simd<T>::kLanes)
-        open |= blend_strip<T, kDepth, kLast>(local, to - from, from - begin, row, first, state);
+        open |= strip(local, to - from, from - begin, row, first);
   }
+}
+
+template <class T, bool kDepth, bool kLast>
+void blend_tile(const BlendInput<T>& in, int64_t index, const Blended<T>& out) {
+  const Tile tile(index, in.image);
+  ForwardState<T> state;
+  std::fill_n(state.transmittance, kPixels, T(1));
+  std::fill_n(state.color[0], 3 * kPixels, T(0));
+  if (kDepth) std::fill_n(state.depth, kPixels, T(0));
+  if (kLast) std::fill_n(state.last, kPixels, 0);
+  through_tile(in, tile, index, state.threshold,
+               [&](const LocalSplat<T>* local, int64_t count, int64_t position, int row, int first) {
+                 return blend_strip<T, kDepth, kLast>(local, count, position, row, first, state);
+               });
   for (int c = 0; c < 3; ++c) {
     for (int p = 0; p < kPixels; ++p) state.color[c][p] += state.transmittance[p] * in.background[c];
     write_tile(state.color[c], in.image, tile, out.color + int64_t(c) * in.image.width * in.image.height);
@@ -286,22 +295,14 @@ bool mark_strip(const LocalSplat<T>* splats, const int32_t* instances, int64_t c
 template <class T>
 void mark_tile(const BlendInput<T>& in, const int32_t* last_plane, int64_t index, bool* decisive) {
   const Tile tile(index, in.image);
-  const int64_t begin = in.ranges[index], end = in.ranges[index + 1];
   alignas(64) T threshold[kPixels];
   alignas(64) typename IntOf<T>::type last[kPixels] = {};
   read_tile(last_plane, in.image, tile, last);
-  for (int p = 0; p < kPixels; ++p)
-    threshold[p] = p % kTile < tile.columns ? T(kLog2MinAlpha) : std::numeric_limits<T>::infinity();
-  LocalSplat<T> local[kChunk];
-  bool open = true;
-  for (int64_t from = begin; open && from < end; from += kChunk) {
-    const int64_t to = std::min(from + kChunk, end);
-    gather(in, tile, from, to, local);
-    open = false;
-    for (int row = 0; row < tile.rows; ++row)
-      for (int first = 0; first < kTile; first += Simd<T>::kLanes)
-        open |= mark_strip(local, in.instances + from, to - from, from - begin, row, first, last, threshold, decisive);
-  }
+  const int32_t* instances = in.instances + in.ranges[index];
+  through_tile(in, tile, index, threshold,
+               [&](const LocalSplat<T>* local, int64_t count, int64_t position, int row, int first) {
+                 return mark_strip(local, instances + position, count, position, row, first, last, threshold, decisive);
+               });
 }
 
 }  // namespace
