@@ -40,18 +40,20 @@ def test_the_pixels_reached_are_those_whose_exponent_comes_to_the_cut(device):
     splats = projected[0][projected[3] > 0]
     tiles = -(-width // 16) * -(-height // 16)
     x, y = torch.arange(width, device=device), torch.arange(height, device=device)[:, None]
+    left, top = x // 16 * 16, y // 16 * 16
+    x, y = (x - left).float(), (y - top).float()
     near = 0
     for i, s in enumerate(splats):
         instances = torch.full((tiles,), i, dtype=torch.int32, device=device)
         ranges, background = torch.arange(tiles + 1, device=device), torch.zeros(3, device=device)
-        left = ops.blend(splats, instances, ranges, background, height, width, False, False)[1][0]
+        rest = ops.blend(splats, instances, ranges, background, height, width, False, False)[1][0]
         mean_x, mean_y, l11, l12, l22, log2_opacity = s[:6]
-        dy = (y % 16).float() - (mean_y - (y // 16 * 16).float())
-        v = l22 * dy
-        u = _fused(l11, (x % 16).float(), _fused(l12, dy, l11 * ((x // 16 * 16).float() - mean_x)))
+        v = l22 * (y - (mean_y - top))
+        u = l12.double() * (top.double() + 7.5 - mean_y) + l11.double() * (left.double() + 7.5 - mean_x)
+        u = _fused(l11, x - 7.5, _fused(l12, y - 7.5, u.float()))
         exponent = _fused(-u, u, _fused(-v, v, log2_opacity))
         least = torch.tensor(-math.log2(255), dtype=torch.float32, device=device)
-        assert torch.equal(left < 1, exponent >= least)
+        assert torch.equal(rest < 1, exponent >= least)
         near += int((exponent - least).abs().min() < 1e-5)
     assert near > 0.5 * len(splats)
 

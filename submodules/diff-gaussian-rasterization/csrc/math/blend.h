@@ -3,6 +3,7 @@
 #include "constants.h"
 #include "gs/hd.h"
 #include "splat.h"
+#include "vec.h"
 
 GS_ISA_BEGIN
 
@@ -12,18 +13,22 @@ GS_ISA_BEGIN
 template <class T>
 struct LocalSplat {
   T y, l11, l12, l22;
-  T offset;  // -l11 x
+  T u;  // at the tile's centre
   T log2_opacity;
   T r, g, b, inverse_depth;
 };
 
+constexpr double kTileCentre = (kTile - 1) / 2.0;
+
+// u in double: far along a needle it is the small difference of two products of thousands.
 template <class T>
 GS_HD LocalSplat<T> localise(const Splat<T>& s, T origin_x, T origin_y) {
-  return {s.y - origin_y, s.l11, s.l12, s.l22, s.l11 * (origin_x - s.x),
-          s.log2_opacity, s.r,   s.g,   s.b,   s.inverse_depth};
+  const double dx = origin_x + kTileCentre - s.x, dy = origin_y + kTileCentre - s.y;
+  const T u = T(multiply_add(double(s.l12), dy, s.l11 * dx));
+  return {s.y - origin_y, s.l11, s.l12, s.l22, u, s.log2_opacity, s.r, s.g, s.b, s.inverse_depth};
 }
 
-// Along a row of pixels v is constant: log2(alpha) = top - u^2, u = l11 x + u0.
+// Along a row of pixels v is constant: log2(alpha) = top - u^2, u = u0 + l11 (x - centre).
 template <class T>
 struct RowTerms {
   T top, l11, u0, v;
@@ -31,13 +36,13 @@ struct RowTerms {
 
 template <class T>
 GS_HD RowTerms<T> row_terms(const LocalSplat<T>& s, T y) {
-  const T dy = y - s.y, v = s.l22 * dy;
-  return {s.log2_opacity - v * v, s.l11, s.l12 * dy + s.offset, v};
+  const T v = s.l22 * (y - s.y);
+  return {s.log2_opacity - v * v, s.l11, s.l12 * (y - T(kTileCentre)) + s.u, v};
 }
 
 template <class V, class T>
 GS_HD V row_u(const RowTerms<T>& row, V x) {
-  return x * row.l11 + row.u0;
+  return (x - T(kTileCentre)) * row.l11 + row.u0;
 }
 template <class V, class T>
 GS_HD V row_exponent(const RowTerms<T>& row, V u) {
