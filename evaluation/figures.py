@@ -13,6 +13,7 @@ from evaluation.contact_sheet import contact_sheet
 from evaluation.model_folder import mask_of, picture
 from evaluation.tradeoff import pareto_front
 from utils.error_curve import Row
+from utils.plain_log_axis import plain_log_axis
 from utils.system_utils import atomic_write
 
 WIDEST = 480  # pixels of a picture on a sheet
@@ -61,8 +62,10 @@ def draw_curves(path: Path, scene: str, runs: Sequence[dict[str, Any]]) -> bool:
                 markersize=8, label="Pareto front",
             )  # fmt: skip
         axes.set(xscale="log", xlabel="seconds of training, without scoring and saving", ylabel=label)
+        plain_log_axis(axes.xaxis)
         if value is _dissimilarity and all(number > 0 for _, number in every):
             axes.set_yscale("log")
+            plain_log_axis(axes.yaxis)
         axes.grid(True, which="both", alpha=0.3)
         axes.legend(fontsize="small")
     with atomic_write(path) as temporary:

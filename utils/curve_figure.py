@@ -7,6 +7,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from utils.error_curve import Row, best_test
+from utils.plain_log_axis import plain_log_axis
 from utils.system_utils import atomic_write
 
 if TYPE_CHECKING:
@@ -29,9 +30,11 @@ def draw_curve(path: str | os.PathLike, rows: list[Row], title: str) -> None:
     _compare(lower, rows, _dissimilarity, "")
     _mark_best(upper, rows)
     upper.set(title=title, ylabel="PSNR, dB", xscale="log")
+    plain_log_axis(lower.xaxis)
     lower.set(ylabel="1 - SSIM", xlabel="seconds of training, without evaluation and saving")
     if lower.lines:
         lower.set_yscale("log")
+        plain_log_axis(lower.yaxis)
     for axes in (upper, lower):
         axes.grid(alpha=0.3, which="both", linewidth=0.5)
         if axes.lines:
