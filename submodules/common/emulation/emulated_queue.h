@@ -14,7 +14,7 @@ namespace gs::emulation {
 // Memory of exact sizes, so that a sanitizer sees a step outside; freed with this.
 class Memory {
  public:
-  Queue queue() { return {nullptr, &allocate, this}; }
+  Queue queue() { return {nullptr, &allocate, &pinned, this}; }
 
  private:
   static void* allocate(void* context, size_t bytes) {
@@ -25,6 +25,7 @@ class Memory {
     pieces.emplace_back(piece, &std::free);
     return piece;
   }
+  static int64_t* pinned(void* context) { return static_cast<int64_t*>(allocate(context, sizeof(int64_t))); }
   static constexpr size_t kAlignment = 512;  // that of torch's allocator
   std::vector<std::unique_ptr<void, void (*)(void*)>> pieces_;
 };

@@ -75,6 +75,12 @@ struct Binned {
   int64_t* slot_offsets;  // (N) first slot of a splat, or null
 };
 
+// Where binning gets the memory of its lists once it has counted; it may throw.
+struct BinMemory {
+  Binned (*take)(void* context, int64_t instances);
+  void* context;
+};
+
 template <class T>
 struct BlendInput {
   const T* splats;
@@ -143,7 +149,7 @@ struct ObserveInput {
   template <class T>                                                                                        \
   void mark_visible(const Where&, int64_t count, const T* means, const T* view, bool* visible);             \
   template <class T>                                                                                        \
-  void bin(const Where&, int64_t count, const Projected<T>&, Image, int64_t instance_count, const Binned&); \
+  void bin(const Where&, int64_t count, const Projected<T>&, Image, const BinMemory&); \
   template <class T>                                                                                        \
   void blend(const Where&, const BlendInput<T>&, const Blended<T>&);                                        \
   template <class T>                                                                                        \
@@ -172,8 +178,6 @@ GS_BACKEND(Executor)
 namespace cuda {
 GS_BACKEND(Queue)
 void observe(const Queue&, const ObserveInput&);
-// The number of tile instances of a projection: waits for it.
-int64_t count_instances(const Queue&, int64_t count, const int32_t* tile_counts);
 // blend_vjp and project_vjp in one, without the moments in between (BlendGradient::moments is not written).
 void rasterize_vjp(const Queue&, const Scene<float>&, const BlendInput<float>&, const BlendGradient<float>&,
                    const SceneGradient<float>&);

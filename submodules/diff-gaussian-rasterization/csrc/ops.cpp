@@ -213,20 +213,6 @@ ProjectedTensors project(const SceneTensors& in, bool rects) {
   return out;
 }
 
-int64_t count_instances(const Tensor& tile_counts) {
-  const int64_t n = tile_counts.size(0);
-  const int32_t* counts = tile_counts.const_data_ptr<int32_t>();
-#ifdef GS_CUDA
-  if (tile_counts.is_cuda()) {
-    gs::TorchQueue queue(tile_counts.device());
-    return gs::cuda::count_instances(queue.queue(), n, counts);
-  }
-#endif
-  int64_t total = 0;
-  for (int64_t i = 0; i < n; ++i) total += counts[i];
-  return total;
-}
-
 // The Gaussians that ask for most, as words: often a few giants do for nearly all.
 std::string most_tiles(const Tensor& tile_counts) {
   const auto [counts, rows] = at::topk(tile_counts.cpu(), std::min<int64_t>(3, tile_counts.size(0)));
@@ -243,20 +229,25 @@ struct BinnedTensors {
 
 // `slots`: whether the backward will need them.
 BinnedTensors bin(ProjectedTensors& in, gs::Image image, bool slots) {
-  const int64_t n = in.depths.size(0);
-  const int64_t total = count_instances(in.tile_counts);
-  TORCH_CHECK(total <= std::numeric_limits<int32_t>::max(), n, " Gaussians cover ", total,
-              " tile instances, more than 2^31 - 1; most are those of Gaussian ", most_tiles(in.tile_counts),
-              ": remove such giants, or render at a lower resolution or with fewer Gaussians");
-  const auto ints = in.depths.options().dtype(at::kInt), longs = in.depths.options().dtype(at::kLong);
-  BinnedTensors out{at::empty({total}, ints), at::empty({slots ? total : 0}, ints),
-                    at::empty({tiles_of(image) + 1}, longs), at::empty({slots ? n : 0}, longs)};
-  const gs::Binned binned{
-      out.instances.mutable_data_ptr<int32_t>(), slots ? out.slots.mutable_data_ptr<int32_t>() : nullptr,
-      out.ranges.mutable_data_ptr<int64_t>(), slots ? out.slot_offsets.mutable_data_ptr<int64_t>() : nullptr};
+  BinnedTensors out;
+  auto allocate = [&](int64_t total) {
+    const int64_t n = in.depths.size(0);
+    TORCH_CHECK(total <= std::numeric_limits<int32_t>::max(), n, " Gaussians cover ", total,
+                " tile instances, more than 2^31 - 1; most are those of Gaussian ", most_tiles(in.tile_counts),
+                ": remove such giants, or render at a lower resolution or with fewer Gaussians");
+    const auto ints = in.depths.options().dtype(at::kInt), longs = in.depths.options().dtype(at::kLong);
+    out = {at::empty({total}, ints), at::empty({slots ? total : 0}, ints), at::empty({tiles_of(image) + 1}, longs),
+           at::empty({slots ? n : 0}, longs)};
+    return gs::Binned{out.instances.mutable_data_ptr<int32_t>(),
+                      slots ? out.slots.mutable_data_ptr<int32_t>() : nullptr, out.ranges.mutable_data_ptr<int64_t>(),
+                      slots ? out.slot_offsets.mutable_data_ptr<int64_t>() : nullptr};
+  };
+  using Allocate = decltype(allocate);
+  const gs::BinMemory memory{[](void* context, int64_t total) { return (*static_cast<Allocate*>(context))(total); },
+                             &allocate};
   with_scalar(in.depths.scalar_type(), [&](auto zero) {
     using T = decltype(zero);
-    RUN(T, in.depths, bin, n, in.pointers<T>(), image, total, binned);
+    RUN(T, in.depths, bin, in.depths.size(0), in.pointers<T>(), image, memory);
   });
   return out;
 }

@@ -1,6 +1,7 @@
 #pragma once
 // Where a CUDA backend runs and gets its temporary memory from; the host framework fills it in.
 #include <cstddef>
+#include <cstdint>
 
 namespace gs {
 
@@ -8,6 +9,8 @@ struct Queue {
   void* stream;  // cudaStream_t
   // Device memory that lives until the call that it was handed to has been enqueued and its stream has used it.
   void* (*allocate)(void* context, size_t bytes);
+  // Page-locked host memory for a number, for as long: a copy to it does not hold up the host.
+  int64_t* (*pinned)(void* context);
   void* context;
 
   template <class T>

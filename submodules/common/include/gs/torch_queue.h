@@ -1,6 +1,7 @@
 #pragma once
 // Queue over torch's current stream and caching allocator. Only ops.cpp includes this, in CUDA builds.
 #include <ATen/core/Tensor.h>
+#include <ATen/ops/empty.h>
 #include <c10/cuda/CUDACachingAllocator.h>
 #include <c10/cuda/CUDAGuard.h>
 #include <c10/cuda/CUDAStream.h>
@@ -17,7 +18,7 @@ class TorchQueue {
  public:
   explicit TorchQueue(at::Device device) : guard_(device) {}
 
-  Queue queue() { return {c10::cuda::getCurrentCUDAStream().stream(), &allocate, this}; }
+  Queue queue() { return {c10::cuda::getCurrentCUDAStream().stream(), &allocate, &pinned, this}; }
 
  private:
   static void* allocate(void* context, size_t bytes) {
@@ -27,8 +28,15 @@ class TorchQueue {
     return memory.back().get();
   }
 
+  static int64_t* pinned(void* context) {
+    auto& numbers = static_cast<TorchQueue*>(context)->numbers_;
+    numbers.push_back(at::empty({1}, at::TensorOptions(at::kLong).pinned_memory(true)));
+    return numbers.back().mutable_data_ptr<int64_t>();
+  }
+
   c10::cuda::CUDAGuard guard_;
   std::vector<c10::DataPtr> memory_;
+  std::vector<at::Tensor> numbers_;
 };
 
 }  // namespace gs

@@ -80,8 +80,7 @@ void sort_by_depth(const Executor& executor, const T* depths, std::vector<int32_
 }  // namespace
 
 template <class T>
-void bin(const Executor& executor, int64_t count, const Projected<T>& projected, Image image, int64_t instance_count,
-         const Binned& out) {
+void bin(const Executor& executor, int64_t count, const Projected<T>& projected, Image image, const BinMemory& memory) {
   std::vector<int32_t> order;
   for (int64_t i = 0; i < count; ++i)
     if (projected.tile_counts[i]) order.push_back(int32_t(i));
@@ -89,10 +88,10 @@ void bin(const Executor& executor, int64_t count, const Projected<T>& projected,
   const int64_t visible = int64_t(order.size());
 
   std::vector<int64_t> offsets(visible + 1, 0);
-  for (int64_t i = 0; i < visible; ++i) {
-    offsets[i + 1] = offsets[i] + projected.tile_counts[order[i]];
-    if (out.slot_offsets) out.slot_offsets[order[i]] = offsets[i];
-  }
+  for (int64_t i = 0; i < visible; ++i) offsets[i + 1] = offsets[i] + projected.tile_counts[order[i]];
+  const int64_t instance_count = offsets[visible];
+  const Binned out = memory.take(memory.context, instance_count);
+  for (int64_t i = 0; out.slot_offsets && i < visible; ++i) out.slot_offsets[order[i]] = offsets[i];
   std::vector<int32_t> tiles(instance_count), splats(instance_count);
   for_dynamic(executor, visible, 1024, [&](int64_t begin, int64_t end) {
     for (int64_t i = begin; i < end; ++i) {
@@ -112,7 +111,7 @@ void bin(const Executor& executor, int64_t count, const Projected<T>& projected,
       });
 }
 
-template void bin<float>(const Executor&, int64_t, const Projected<float>&, Image, int64_t, const Binned&);
-template void bin<double>(const Executor&, int64_t, const Projected<double>&, Image, int64_t, const Binned&);
+template void bin<float>(const Executor&, int64_t, const Projected<float>&, Image, const BinMemory&);
+template void bin<double>(const Executor&, int64_t, const Projected<double>&, Image, const BinMemory&);
 
 GS_ISA_END

@@ -32,6 +32,33 @@ struct Widen {
   __host__ __device__ int64_t operator()(int32_t count) const { return count; }
 };
 
+// The number of instances, on its way to the host.
+class InstanceCount {
+ public:
+  InstanceCount(const Queue& queue, int64_t count, const int32_t* tile_counts) : host_(queue.pinned(queue.context)) {
+    int64_t* total = queue.array<int64_t>(1);
+    const auto counts = thrust::make_transform_iterator(tile_counts, Widen{});
+    with_memory(queue, [&](void* memory, size_t& bytes) {
+      return cub::DeviceReduce::Sum(memory, bytes, counts, total, count, stream_of(queue));
+    });
+    GS_CUDA_CHECK(cudaMemcpyAsync(host_, total, sizeof *host_, cudaMemcpyDeviceToHost, stream_of(queue)));
+    GS_CUDA_CHECK(cudaEventCreateWithFlags(&arrived_, cudaEventDisableTiming));
+    GS_CUDA_CHECK(cudaEventRecord(arrived_, stream_of(queue)));
+  }
+  InstanceCount(const InstanceCount&) = delete;
+  ~InstanceCount() { cudaEventDestroy(arrived_); }
+
+  // Waits for it, and for nothing that was queued since.
+  int64_t value() const {
+    GS_CUDA_CHECK(cudaEventSynchronize(arrived_));
+    return *host_;
+  }
+
+ private:
+  int64_t* host_;
+  cudaEvent_t arrived_;
+};
+
 // The number of tiles of the k-th splat in depth order.
 struct OrderedCount {
   const int32_t* order;
@@ -77,14 +104,14 @@ const int32_t* sort_by_depth(const Queue& queue, int64_t n, const float* depths)
   return order;
 }
 
+// order: splats by depth.
 template <class Key>
-void bin_with(const Queue& queue, int64_t n, const Projected<float>& in, Image image, int64_t instances,
-              const Binned& out) {
+void bin_with(const Queue& queue, int64_t n, const Projected<float>& in, const int32_t* order, Image image,
+              int64_t instances, const Binned& out) {
   const int64_t tiles = int64_t(tile_count(image.width)) * tile_count(image.height);
   const cudaStream_t stream = stream_of(queue);
   Key *keys = queue.array<Key>(instances), *sorted_keys = queue.array<Key>(instances);
   if (instances) {
-    const int32_t* order = sort_by_depth(queue, n, in.depths);
     int64_t* offsets = queue.array<int64_t>(n);
     const auto counts =
         thrust::make_transform_iterator(thrust::counting_iterator<int32_t>(0), OrderedCount{order, in.tile_counts});
@@ -118,27 +145,19 @@ void bin_with(const Queue& queue, int64_t n, const Projected<float>& in, Image i
 
 }  // namespace
 
-int64_t count_instances(const Queue& queue, int64_t count, const int32_t* tile_counts) {
-  if (!count) return 0;
-  int64_t* total = queue.array<int64_t>(1);
-  const auto counts = thrust::make_transform_iterator(tile_counts, Widen{});
-  with_memory(queue, [&](void* memory, size_t& bytes) {
-    return cub::DeviceReduce::Sum(memory, bytes, counts, total, count, stream_of(queue));
-  });
-  int64_t result = 0;
-  GS_CUDA_CHECK(cudaMemcpyAsync(&result, total, sizeof result, cudaMemcpyDeviceToHost, stream_of(queue)));
-  GS_CUDA_CHECK(cudaStreamSynchronize(stream_of(queue)));
-  return result;
-}
-
 template <>
-void bin<float>(const Queue& queue, int64_t count, const Projected<float>& in, Image image, int64_t instances,
-                const Binned& out) {
+void bin<float>(const Queue& queue, int64_t count, const Projected<float>& in, Image image, const BinMemory& memory) {
+  int64_t instances = 0;
+  const int32_t* order = nullptr;
+  if (count) {
+    const InstanceCount counted(queue, count, in.tile_counts);
+    order = sort_by_depth(queue, count, in.depths);  // the GPU is busy while the host waits for the number
+    instances = counted.value();
+  }
+  const Binned out = memory.take(memory.context, instances);
   const int64_t tiles = int64_t(tile_count(image.width)) * tile_count(image.height);
-  if (tiles <= 1 << 16)
-    bin_with<uint16_t>(queue, count, in, image, instances, out);
-  else
-    bin_with<uint32_t>(queue, count, in, image, instances, out);
+  const auto run = tiles <= 1 << 16 ? bin_with<uint16_t> : bin_with<uint32_t>;
+  run(queue, count, in, order, image, instances, out);
 }
 
 }  // namespace cuda

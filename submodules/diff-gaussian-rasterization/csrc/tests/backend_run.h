@@ -1,6 +1,7 @@
 #pragma once
 // A random scene, and a pass forward and backward through a backend, for tests.
 #include <cmath>
+#include <numeric>
 #include <random>
 #include <vector>
 
@@ -69,14 +70,22 @@ Result<T> run(const Where& where, Parameters<T>& p, gs::Image image, bool antial
   const gs::Projected<T> projected = {splats.data(),          depths.data(),    records ? nullptr : rects.data(),
                                       out.tile_counts.data(), out.radii.data(), records ? record.data() : nullptr};
   project(where, scene, projected);
-  out.instances = 0;
-  for (int32_t count : out.tile_counts) out.instances += count;
 
   const size_t tiles = size_t((image.width + 15) / 16) * ((image.height + 15) / 16);
-  std::vector<int32_t> instances(out.instances), slots(out.instances), last(pixels);
-  std::vector<int64_t> ranges(tiles + 1), slot_offsets(n);
-  bin(where, p.count, projected, image, out.instances,
-      gs::Binned{instances.data(), slots.data(), ranges.data(), slot_offsets.data()});
+  struct Lists {
+    std::vector<int32_t> instances, slots;
+    std::vector<int64_t> ranges, slot_offsets;
+  } lists{{}, {}, std::vector<int64_t>(tiles + 1), std::vector<int64_t>(n)};
+  const auto take = [](void* context, int64_t count) {
+    Lists& l = *static_cast<Lists*>(context);
+    l.instances.resize(count), l.slots.resize(count);
+    return gs::Binned{l.instances.data(), l.slots.data(), l.ranges.data(), l.slot_offsets.data()};
+  };
+  bin(where, p.count, projected, image, gs::BinMemory{take, &lists});
+  auto& [instances, slots, ranges, slot_offsets] = lists;
+  std::vector<int32_t> last(pixels);
+  out.instances = int64_t(instances.size());
+  CHECK(out.instances == std::accumulate(out.tile_counts.begin(), out.tile_counts.end(), int64_t(0)));
   CHECK(ranges.front() == 0 && ranges.back() == out.instances);
   for (size_t t = 0; t < tiles; ++t)
     for (int64_t k = ranges[t] + 1; k < ranges[t + 1]; ++k) {
