@@ -131,10 +131,10 @@ class TestSchedule:
         np.testing.assert_allclose(np.divide(points[1:], points[:-1]), 2**0.25, rtol=1 / 117)
 
     @pytest.mark.parametrize("views", [2, 14, 50, 400])
-    @pytest.mark.parametrize("growth", [0.0, 1.0, 30.0])
+    @pytest.mark.parametrize("growth", [-0.75, 0.0, 1.0, 30.0])
     @pytest.mark.parametrize("iterations", [2000, 30_000])
     def test_scoring_stays_under_five_percent(self, views, growth, iterations):
-        def pace(t: int) -> float:  # models grow, most of it in the first half
+        def pace(t: int) -> float:  # models grow, most of it in the first half; from random points they shrink
             return 0.01 * (1 + growth * min(1.0, 2 * t / iterations))
 
         def cost(t: int) -> float:  # of a view 0.46 iterations, as measured on a CPU
@@ -150,7 +150,7 @@ class TestSchedule:
 
     def test_a_dear_first_scoring_does_not_end_the_curve(self):
         schedule = CurveSchedule(0, 2000, [], 14)
-        points, spent, seconds = _simulate(schedule, 0, 2000, lambda t: 0.01, lambda t: 0.4 if t < 10 else 0.06)
+        points, spent, seconds = _simulate(schedule, 0, 2000, lambda t: 0.01, lambda t: 0.4 if t < 20 else 0.06)
         assert len(points) > 5
         assert spent < 0.05 * seconds
 

@@ -13,8 +13,10 @@ class CurveSchedule:
 
     The points are a fixed grid that ends with the last iteration, so that runs of one length share theirs. Where
     scoring all is too dear, every second, fourth, ... is taken. Chosen anew at each from seconds measured so far: cost
-    of the last scoring, and length of the training at the pace since the point before. The iterations in `always` and
-    the last one are scored at any cost, and what they will cost is set aside.
+    of the last scoring, and length of the training at the pace since the point before. A pace may be misleading (one
+    that begins with 100,000 random Gaussians soon has a third of them), so up to a part of the grid no more than that
+    part may have been spent. The iterations in `always` and the last one are scored at any cost, and what they will
+    cost is set aside.
     """
 
     def __init__(self, first_iteration: int, iterations: int, always: Iterable[int], views: int) -> None:
@@ -41,8 +43,10 @@ class CurveSchedule:
         place = self._places[iteration]
         # Not measured by the first scoring, which also warms up: a dear one would end the curve.
         cost = self._costs[-1] if len(self._costs) > 1 else VIEW_COST * self._views * pace
-        budget = SHARE * (seconds + pace * (self._iterations - iteration)) - self.spent
-        affordable = budget / max(cost, 1e-9) - sum(t > iteration for t in self._always)
+        budget = SHARE * (seconds + pace * (self._iterations - iteration))
+        if self.spent + cost > budget * (1 - place / (PER_OCTAVE * OCTAVES + 1)):
+            return False
+        affordable = (budget - self.spent) / max(cost, 1e-9) - sum(t > iteration for t in self._always)
         stride = 1
         while stride <= place and place // stride > affordable:  # place 0 is the last iteration, set aside above
             stride *= 2
