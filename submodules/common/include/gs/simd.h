@@ -59,6 +59,21 @@ struct Simd {
 #endif
   }
 
+  // A bit for each lane.
+  static uint32_t bits(Mask m) {
+#if defined(__AVX512DQ__)
+    if constexpr (sizeof(T) == 4) return _mm512_movepi32_mask((__m512i)m);
+    return _mm512_movepi64_mask((__m512i)m);
+#elif defined(__AVX__)
+    if constexpr (sizeof(T) == 4) return uint32_t(_mm256_movemask_ps((__m256)m));
+    return uint32_t(_mm256_movemask_pd((__m256d)m));
+#else
+    uint32_t found = 0;
+    for (int i = 0; i < kLanes; ++i) found |= uint32_t(m[i] != 0) << i;
+    return found;
+#endif
+  }
+
   // Sum of the lanes by halves: one fixed tree for an instruction set.
   static T sum(Vec v) { return halves<kLanes>(v); }
 

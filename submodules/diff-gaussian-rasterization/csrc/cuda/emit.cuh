@@ -126,7 +126,7 @@ __global__ void __launch_bounds__(kEmitThreads)
     int at = splats.first[k];
     for (int tile = 0; tile < wide * high && at < emitted; tile += kEmitThreads, turn ^= 1) {
       const int mine = tile + threadIdx.x, tx = x0 + mine % wide, ty = y0 + mine / wide;
-      const bool reached = mine < wide * high && tile_reached(test, tx, ty);
+      const bool reached = mine < wide * high && tile_reached(test, float(tx), float(ty));
       const unsigned hits = __ballot_sync(kWarp, reached);
       if (lane == 0) warp_hits[turn][warp] = __popc(hits);
       __syncthreads();  // one is enough: the next turn writes the other row

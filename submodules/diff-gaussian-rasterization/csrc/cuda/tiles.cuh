@@ -42,7 +42,7 @@ __device__ inline int32_t warp_count_tiles(const Splat<float>& splat, TileRect r
     uint64_t bit = 1;
     for (int ty = rect.y0; ty < rect.y1; ++ty)
       for (int tx = rect.x0; tx < rect.x1; ++tx, bit <<= 1)
-        if (tile_reached(test, tx, ty)) mask |= bit;
+        if (tile_reached(test, float(tx), float(ty))) mask |= bit;
     count = __popcll(mask);
   }
   for (unsigned large = __ballot_sync(kWarp, own > kOwnTiles); large; large &= large - 1) {
@@ -54,7 +54,7 @@ __device__ inline int32_t warp_count_tiles(const Splat<float>& splat, TileRect r
     int32_t found = 0;
     for (int base = 0; base < total; base += 32) {
       const int k = base + lane, tx = r.x0 + k % wide, ty = r.y0 + k / wide;
-      const unsigned hits = __ballot_sync(kWarp, k < total && tile_reached(test, tx, ty));
+      const unsigned hits = __ballot_sync(kWarp, k < total && tile_reached(test, float(tx), float(ty)));
       found += __popc(hits);
       if (lane == owner && base < 64) mask |= uint64_t(hits) << base;
     }

@@ -48,10 +48,10 @@ GS_HD TileRect tile_rect(const Splat<T>& s, int width, int height) {
 template <class T>
 struct TileTest {
   Splat<T> splat;
-  int width, height;
-  T slope_x;  // dx at which u^2 is least for a given dy, per dy
-  T slope_y;  // dy at which u^2 + v^2 is least for a given dx, per dx
-  T level;    // u^2 + v^2 up to which a pixel is reached, rounding margin included
+  T last_x, last_y;  // of the image's pixels
+  T slope_x;         // dx at which u^2 is least for a given dy, per dy
+  T slope_y;         // dy at which u^2 + v^2 is least for a given dx, per dx
+  T level;           // u^2 + v^2 up to which a pixel is reached, rounding margin included
 };
 
 // The margin, log2 units: u and v are sums of products with a relative error of some units in the last place of their
@@ -65,8 +65,8 @@ GS_HD TileTest<T> make_tile_test(const Splat<T>& s, TileRect rect, int width, in
   const T far_y = larger(std::abs(T(rect.y0 * kTile) - s.y), std::abs(T(rect.y1 * kTile) - s.y));
   const T terms = multiply_add(std::abs(s.l11), far_x, multiply_add(std::abs(s.l12), far_y, T(2)));
   return {s,
-          width,
-          height,
+          T(width - 1),
+          T(height - 1),
           -s.l12 / s.l11,
           -s.l11 * s.l12 / multiply_add(s.l12, s.l12, s.l22 * s.l22),
           multiply_add(48 * unit, terms, s.log2_opacity - T(kLog2MinAlpha))};
@@ -74,41 +74,30 @@ GS_HD TileTest<T> make_tile_test(const Splat<T>& s, TileRect rect, int width, in
 
 // Compares the least u^2 + v^2 over the box of pixel centres x0..x1, y0..y1 (px, inclusive): 0 if the mean is inside,
 // else on an edge that faces the mean, where it is a parabola in one coordinate. The box lies between the centres too,
-// so this may keep a tile that no pixel needs, never the other way round.
-template <class T>
-GS_HD bool box_reached(const TileTest<T>& test, T left, T right, T top, T bottom) {
+// so this may keep a tile that no pixel needs, never the other way round. V is T or a vector of boxes; products are
+// arranged so that a compiler has one way only to fuse them, for counting must agree with emission.
+template <class T, class V>
+GS_HD auto box_reached(const TileTest<T>& test, V left, V right, V top, V bottom) {
   const Splat<T>& s = test.splat;
-  const T x0 = left - s.x, x1 = right - s.x, y0 = top - s.y, y1 = bottom - s.y;
-  const bool inside_x = x0 <= 0 && x1 >= 0, inside_y = y0 <= 0 && y1 >= 0;
-  if (inside_x && inside_y) return test.level >= 0;
-  const auto within = [&](T dx, T dy) {
-    const T u = multiply_add(s.l11, dx, s.l12 * dy), v = s.l22 * dy;
-    return multiply_add(u, u, v * v) <= test.level;
+  const V x0 = left - s.x, x1 = right - s.x, y0 = top - s.y, y1 = bottom - s.y;
+  const auto within = [&](V dx, V dy) {
+    const V u = s.l11 * (dx - test.slope_x * dy), v = s.l22 * dy;
+    return u * u <= test.level - v * v;
   };
-  if (!inside_x) {
-    const T dx = x0 > 0 ? x0 : x1;
-    if (within(dx, clamp(test.slope_y * dx, y0, y1))) return true;
-  }
-  if (inside_y) return false;
-  const T dy = y0 > 0 ? y0 : y1;
-  return within(clamp(test.slope_x * dy, x0, x1), dy);
+  const auto beside = (x0 > T(0)) | (x1 < T(0)), above = (y0 > T(0)) | (y1 < T(0));
+  const V dx = x0 > T(0) ? x0 : x1, dy = y0 > T(0) ? y0 : y1;
+  const auto side = within(dx, clamp(V(test.slope_y * dx), y0, y1));
+  const auto edge = within(clamp(V(test.slope_x * dy), x0, x1), dy);
+  const auto outside = beside | above;
+  return (beside & side) | (above & edge) | ((!outside) & (V{} + test.level >= T(0)));
 }
 
-template <class T>
-GS_HD bool tile_reached(const TileTest<T>& test, int tile_x, int tile_y) {
-  const int right = tile_x * kTile + kTile - 1, bottom = tile_y * kTile + kTile - 1;
-  return box_reached(test, T(tile_x * kTile), T(right < test.width ? right : test.width - 1), T(tile_y * kTile),
-                     T(bottom < test.height ? bottom : test.height - 1));
-}
-
-// Calls visit(tile) for the tiles reached, row by row: the one enumeration behind counting and emission.
-template <class T, class Visit>
-GS_HD void for_each_tile(const Splat<T>& s, TileRect rect, int width, int height, const Visit& visit) {
-  const TileTest<T> test = make_tile_test(s, rect, width, height);
-  const int columns = tile_count(width);
-  for (int ty = rect.y0; ty < rect.y1; ++ty)
-    for (int tx = rect.x0; tx < rect.x1; ++tx)
-      if (tile_reached(test, tx, ty)) visit(ty * columns + tx);
+// Tiles by column and row, V as above.
+template <class T, class V>
+GS_HD auto tile_reached(const TileTest<T>& test, V tile_x, V tile_y) {
+  const V left = tile_x * T(kTile), right = left + T(kTile - 1), top = tile_y * T(kTile), bottom = top + T(kTile - 1);
+  const V last_x = V{} + test.last_x, last_y = V{} + test.last_y;
+  return box_reached(test, left, right < last_x ? right : last_x, top, bottom < last_y ? bottom : last_y);
 }
 
 GS_ISA_END

@@ -2,10 +2,10 @@
 #include <random>
 #include <vector>
 
+#include "cpu/list_tiles.h"
 #include "gs/check.h"
 #include "math/blend.h"
 #include "math/footprint.h"
-#include "math/tiles.h"
 
 using namespace gs::GS_ISA;
 
@@ -51,12 +51,18 @@ template <class T>
 std::vector<bool> listed(const Splat<T>& splat) {
   std::vector<bool> out(tile_count(kWidth) * tile_count(kHeight), false);
   int previous = -1;
-  for_each_tile(splat, tile_rect(splat, kWidth, kHeight), kWidth, kHeight, [&](int tile) {
+  std::vector<int32_t> tiles(out.size());
+  const TileRect rect = tile_rect(splat, kWidth, kHeight);
+  tiles.resize(list_tiles(splat, rect, gs::Image{kWidth, kHeight}, tiles.data()));
+  CHECK(list_tiles(splat, rect, gs::Image{kWidth, kHeight}, nullptr) == int(tiles.size()));
+  const TileTest<T> test = make_tile_test(splat, rect, kWidth, kHeight);
+  for (int tile : tiles) {
     CHECK(tile > previous);  // row by row, each once
     CHECK(tile < int(out.size()));
+    CHECK(tile_reached(test, T(tile % tile_count(kWidth)), T(tile / tile_count(kWidth))));  // alone as among others
     previous = tile;
     out[tile] = true;
-  });
+  }
   return out;
 }
 
