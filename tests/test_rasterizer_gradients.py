@@ -4,9 +4,10 @@ import math
 
 import pytest
 import torch
-from rasterizer_tools import activated, few, ops, render, rigid, scene_arguments
+from rasterizer_tools import BOTH_AND_GPU, activated, few, on_device, ops, render, rigid, scene_arguments
 
 from benchmarks.splat_scenes import settings
+from utils.sh_utils import RGB2SH
 
 
 @pytest.fixture(autouse=True)
@@ -151,6 +152,18 @@ def test_a_clamped_colour_channel_gets_no_gradient():
     inputs["sh_dc"].grad = None
     out.color[1].sum().backward()
     assert inputs["sh_dc"].grad[..., 1].all() and not inputs["sh_dc"].grad[..., 0].any()
+
+
+@BOTH_AND_GPU
+@pytest.mark.parametrize("degree", [0, 3])
+def test_a_black_point_of_a_cloud_can_become_brighter(degree, device, dtype):
+    """Its colour is 0 but for rounding, on whatever side, and clamped for good it would stay black."""
+    parameters, size = few(1, dtype=dtype)
+    parameters["sh_dc"] = RGB2SH(torch.zeros(1, 1, 3, dtype=dtype))
+    parameters["sh_rest"] = torch.zeros_like(parameters["sh_rest"])
+    inputs = {name: t.to(device).requires_grad_() for name, t in parameters.items()}
+    render(inputs, on_device(settings(**size, sh_degree=degree), device)).color.sum().backward()
+    assert (inputs["sh_dc"].grad > 0).all()
 
 
 @pytest.mark.parametrize("side", [0.9, 1.1])

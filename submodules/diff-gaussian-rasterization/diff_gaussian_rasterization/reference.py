@@ -88,7 +88,9 @@ def render(
         k = (s.sh_degree + 1) ** 2
         basis = _sh_basis(means - center)[:, :k]
         sh = torch.cat([sh_dc, sh_rest], 1).double()[:, :k]
-        colors = torch.clamp(0.5 + (basis[:, :, None] * sh).sum(1), min=0)
+        colors = 0.5 + (basis[:, :, None] * sh).sum(1)
+        colors = torch.where(colors >= -1e-6, colors, 0.0)  # with a gradient at 0, where black points of a cloud start
+        colors = colors + (torch.clamp(colors, min=0) - colors).detach()
     colors = colors.double()
 
     order = torch.argsort(torch.where(front, t[:, 2], torch.inf), stable=True)[: int(front.sum())]

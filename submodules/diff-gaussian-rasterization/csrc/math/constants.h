@@ -16,8 +16,9 @@ constexpr double kMinAntialias = 2.5e-5;    // floor of det/det dilated: compens
 constexpr double kRadiusSigmas = 3;         // `radii` and visibility, not which pixels are reached
 constexpr double kMinRadiusRoot = 0.1;      // px^4, under the root of the larger eigenvalue
 constexpr double kMaxLog2Opacity = 64;      // opacities are at most 1; this only keeps exp2 finite for others
-constexpr double kMaxColor = 1e15;          // a larger magnitude is culled like Inf: its gradients overflow
-constexpr double kMinQuaternion = 1e-30;    // shorter counts as zero: its gradient, 1/|q|, overflows
+constexpr double kBlack = -1e-6;    // a colour from here on has a gradient: black points start at 0 but for rounding
+constexpr double kMaxColor = 1e15;  // a larger magnitude is culled like Inf: its gradients overflow
+constexpr double kMinQuaternion = 1e-30;  // shorter counts as zero: its gradient, 1/|q|, overflows
 constexpr double kLn2 = 0.693147180559945309417;
 constexpr double kHalfLog2e = 0.5 / kLn2;  // exp(-q/2) = exp2(-kHalfLog2e q)
 

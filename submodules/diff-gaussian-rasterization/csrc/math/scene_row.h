@@ -114,7 +114,8 @@ GS_HD Vec3<T> color_vjp(const Scene<T>& s, const Camera<T>& camera, int64_t i, V
   Vec3<T> direction;
   const T norm = color_basis(s, camera, i, direction, basis);
   const Vec3<T> c = sh_color(s.sh_degree, basis, s.sh_dc + s.dc_stride * i, rest);
-  g = {c.x > 0 ? g.x : T(0), c.y > 0 ? g.y : T(0), c.z > 0 ? g.z : T(0)};
+  const T black = T(kBlack);
+  g = {c.x >= black ? g.x : T(0), c.y >= black ? g.y : T(0), c.z >= black ? g.z : T(0)};
   if (g_dc) store3(g_dc + 3 * i, basis[0] * g);
   const int active = sh_count(s.sh_degree);
   for (int k = 1; k < kCount; ++k) {  // of constant length, so that a GPU keeps the arrays in registers
