@@ -41,12 +41,13 @@ class InstanceCount {
     with_memory(queue, [&](void* memory, size_t& bytes) {
       return cub::DeviceReduce::Sum(memory, bytes, counts, total, count, stream_of(queue));
     });
-    GS_CUDA_CHECK(cudaMemcpyAsync(host_, total, sizeof *host_, cudaMemcpyDeviceToHost, stream_of(queue)));
     GS_CUDA_CHECK(cudaEventCreateWithFlags(&arrived_, cudaEventDisableTiming));
+    GS_CUDA_CHECK(cudaMemcpyAsync(host_, total, sizeof *host_, cudaMemcpyDeviceToHost, stream_of(queue)));
     GS_CUDA_CHECK(cudaEventRecord(arrived_, stream_of(queue)));
   }
   InstanceCount(const InstanceCount&) = delete;
-  ~InstanceCount() { cudaEventDestroy(arrived_); }
+  // Waits, too: after an error in between the number must not come into memory that is another's by then.
+  ~InstanceCount() { cudaEventSynchronize(arrived_), cudaEventDestroy(arrived_); }
 
   // Waits for it, and for nothing that was queued since.
   int64_t value() const {

@@ -54,11 +54,13 @@ GS_HD V capped(V alpha, T cap = T(kMaxAlpha)) {
   return alpha < cap ? alpha : V{} + cap;
 }
 
-// a / b; on a GPU by the hardware's reciprocal, good to 2 units in the last place.
+// a / b; on a GPU by the hardware's reciprocal and a step of correction, without which a division is 2e-8 off on
+// average and 2,000 of them in a row 4e-5.
 template <class V>
 GS_HD V quotient(V a, V b) {
 #ifdef __CUDA_ARCH__
-  return __fdividef(a, b);
+  const V inverse = __fdividef(V(1), b), first = a * inverse;
+  return std::fma(std::fma(-first, b, a), inverse, first);
 #else
   return a / b;
 #endif
