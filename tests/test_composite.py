@@ -6,7 +6,7 @@ import pytest
 import torch
 from fused_ssim import composite
 from PIL import Image
-from torch import Tensor
+from torch import Tensor, library
 
 GPU = pytest.param(
     "cuda",
@@ -74,7 +74,7 @@ def test_number_of_threads_changes_no_bit() -> None:
 @pytest.mark.parametrize("device", ["cpu", GPU])
 def test_opcheck(device: str) -> None:
     picture = every_pair()[:, :3, :5].to(device)
-    torch.library.opcheck(torch.ops.fused_ssim.composite, (picture, BACKGROUND.to(device)))
+    library.opcheck(torch.ops.fused_ssim.composite, (picture, BACKGROUND.to(device)))
 
 
 def test_what_does_not_fit_is_named() -> None:

@@ -13,7 +13,7 @@ from fused_ssim.reference import l1_ssim, ssim_map
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from skimage.metrics import structural_similarity
-from torch import Tensor
+from torch import Tensor, library
 
 EPS = {torch.float32: 2**-24, torch.float64: 2**-53}
 LARGEST_SLOPE = 2 / 0.03**2  # of SSIM by a covariance: what an error of the inputs or of the oracle is multiplied by
@@ -162,9 +162,9 @@ def test_gradients_of_both_add_up() -> None:
 @pytest.mark.parametrize("train", [False, True])
 def test_opcheck(train: bool, dtype: torch.dtype) -> None:
     img1, img2 = image_pair("noise", (2, 12, 13), dtype)
-    torch.library.opcheck(torch.ops.fused_ssim.l1_ssim, (img1.requires_grad_(train), img2, True, train))
+    library.opcheck(torch.ops.fused_ssim.l1_ssim, (img1.requires_grad_(train), img2, True, train))
     one = torch.ones((), dtype=dtype)
-    torch.library.opcheck(torch.ops.fused_ssim.l1_ssim_vjp, (img1.detach(), img2, torch.rand_like(img2), one, one))
+    library.opcheck(torch.ops.fused_ssim.l1_ssim_vjp, (img1.detach(), img2, torch.rand_like(img2), one, one))
 
 
 def loss_in_parts(image: Tensor, target: Tensor, weight: float) -> tuple[Tensor, Tensor]:
@@ -226,10 +226,10 @@ def test_photometric_loss_gradcheck() -> None:
 @pytest.mark.parametrize("train", [False, True])
 def test_opcheck_photometric(train: bool, dtype: torch.dtype) -> None:
     image, target = image_pair("noise", (2, 12, 13), dtype)
-    torch.library.opcheck(torch.ops.fused_ssim.photometric, (image.requires_grad_(train), target, 0.2, train))
+    library.opcheck(torch.ops.fused_ssim.photometric, (image.requires_grad_(train), target, 0.2, train))
     one = torch.ones((), dtype=dtype)
     arguments = (image.detach(), target, torch.rand_like(target), 0.2, one)
-    torch.library.opcheck(torch.ops.fused_ssim.photometric_vjp, arguments)
+    library.opcheck(torch.ops.fused_ssim.photometric_vjp, arguments)
 
 
 def test_photometric_loss_keeps_nothing_it_does_not_need() -> None:

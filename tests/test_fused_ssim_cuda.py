@@ -14,7 +14,7 @@ from test_fused_ssim import (
     out_of_range,
     with_gradient,
 )
-from torch import Tensor
+from torch import Tensor, library
 
 pytestmark = [
     pytest.mark.gpu,
@@ -104,9 +104,9 @@ def test_the_value_is_the_same_with_and_without_a_gradient() -> None:
 @pytest.mark.parametrize("train", [False, True])
 def test_opcheck(train: bool) -> None:
     img1, img2 = (image.cuda() for image in image_pair("noise", (2, 12, 13), torch.float32))
-    torch.library.opcheck(torch.ops.fused_ssim.l1_ssim, (img1.clone().requires_grad_(train), img2, True, train))
+    library.opcheck(torch.ops.fused_ssim.l1_ssim, (img1.clone().requires_grad_(train), img2, True, train))
     one = torch.ones((), device="cuda")
-    torch.library.opcheck(torch.ops.fused_ssim.l1_ssim_vjp, (img1, img2, torch.rand_like(img2), one, one))
+    library.opcheck(torch.ops.fused_ssim.l1_ssim_vjp, (img1, img2, torch.rand_like(img2), one, one))
 
 
 @pytest.mark.parametrize("as_bytes", [False, True], ids=["float", "bytes"])
@@ -130,9 +130,9 @@ def test_photometric_loss_agrees_with_the_cpu_and_its_parts(as_bytes: bool) -> N
 @pytest.mark.parametrize("train", [False, True])
 def test_opcheck_photometric(train: bool) -> None:
     image, target = (image.cuda() for image in image_pair("noise", (2, 12, 13), torch.float32))
-    torch.library.opcheck(torch.ops.fused_ssim.photometric, (image.requires_grad_(train), target, 0.2, train))
+    library.opcheck(torch.ops.fused_ssim.photometric, (image.requires_grad_(train), target, 0.2, train))
     arguments = (image.detach(), target, torch.rand_like(target), 0.2, torch.ones((), device="cuda"))
-    torch.library.opcheck(torch.ops.fused_ssim.photometric_vjp, arguments)
+    library.opcheck(torch.ops.fused_ssim.photometric_vjp, arguments)
 
 
 def all_bits(img1: Tensor, img2: Tensor) -> list[Tensor]:

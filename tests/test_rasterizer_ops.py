@@ -4,6 +4,7 @@ import pytest
 import torch
 from diff_gaussian_rasterization import GaussianRasterizationSettings
 from rasterizer_tools import BOTH_AND_GPU, CPU_AND_GPU, few, leaves, ops, render, scene_arguments, together
+from torch import library
 
 from benchmarks.splat_scenes import on_device, settings
 
@@ -15,7 +16,7 @@ def _few(device: str, dtype: torch.dtype = torch.float32) -> tuple[dict, Gaussia
 
 
 def _check(op, *arguments, **keywords):
-    torch.library.opcheck(op, arguments, keywords)
+    library.opcheck(op, arguments, keywords)
 
 
 @CPU_AND_GPU

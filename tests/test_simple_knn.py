@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 from simple_knn._C import distCUDA2
 from simple_knn.reference import mean_distance2
+from torch import library
 
 # Some eight rounded operations on each side; differences of coordinates are taken before squaring.
 RTOL = {torch.float32: 8 * 2**-24, torch.float64: 8 * 2**-53}
@@ -142,7 +143,7 @@ def test_large_cloud_is_not_quadratic() -> None:
 
 def test_opcheck() -> None:
     for points in (cloud("normal")[:20], cloud("normal")[:0].double()):
-        torch.library.opcheck(torch.ops.simple_knn.mean_distance2, (points,))
+        library.opcheck(torch.ops.simple_knn.mean_distance2, (points,))
 
 
 def test_has_no_gradient() -> None:

@@ -8,6 +8,7 @@ import torch
 from simple_knn._C import distCUDA2
 from simple_knn.reference import mean_distance2
 from test_simple_knn import CLOUDS, RTOL, both_dtypes, by_scipy, cloud
+from torch import library
 
 pytestmark = [
     pytest.mark.gpu,
@@ -116,7 +117,7 @@ def test_runs_on_the_current_stream() -> None:
 
 def test_opcheck() -> None:
     for points in (cloud("normal")[:20].cuda(), cloud("normal")[:0].double().cuda()):
-        torch.library.opcheck(torch.ops.simple_knn.mean_distance2, (points,))
+        library.opcheck(torch.ops.simple_knn.mean_distance2, (points,))
 
 
 def test_messages() -> None:

@@ -14,6 +14,7 @@ from pathlib import Path
 from types import ModuleType
 
 import torch
+from torch import library
 
 from utils.system_utils import UserError
 
@@ -49,7 +50,7 @@ def import_lpips() -> ModuleType:
 
 def _declare_missing_operators() -> None:
     global _schemas  # the schemas live as long as this object
-    _schemas = torch.library.Library("torchvision", "FRAGMENT")
+    _schemas = library.Library("torchvision", "FRAGMENT")
     for name in ("nms", "qnms"):
         if not hasattr(torch.ops.torchvision, name):
             _schemas.define(f"{name}(Tensor dets, Tensor scores, float iou_threshold) -> Tensor")

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import torch
-from torch import Tensor
+from torch import Tensor, library
 from torch.autograd.function import once_differentiable
 
 if TYPE_CHECKING:
@@ -196,7 +196,7 @@ def _fake_gradients(scene: dict, wanted: list[bool]) -> tuple[Tensor, ...]:
     return tuple(means.new_empty((n if w else 0, *tail)) for w, tail in zip(wanted, tails, strict=True))
 
 
-@torch.library.register_fake("diff_gaussian_rasterization::project")
+@library.register_fake("diff_gaussian_rasterization::project")
 def _(*args):
     means = args[0]
     n = means.shape[0]
@@ -205,7 +205,7 @@ def _(*args):
 
 
 def _fake_bin(like: Tensor, n: int, height: int, width: int, train: bool) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    total = torch.library.get_ctx().new_dynamic_size()
+    total = library.get_ctx().new_dynamic_size()
     return (
         like.new_empty((total,), dtype=torch.int32),
         like.new_empty((total if train else 0,), dtype=torch.int32),
@@ -214,7 +214,7 @@ def _fake_bin(like: Tensor, n: int, height: int, width: int, train: bool) -> tup
     )
 
 
-@torch.library.register_fake("diff_gaussian_rasterization::bin")
+@library.register_fake("diff_gaussian_rasterization::bin")
 def _(splats, depths, rects, tile_counts, height, width, train):
     return _fake_bin(splats, splats.shape[0], height, width, train)
 
@@ -228,27 +228,27 @@ def _fake_blend(like: Tensor, height: int, width: int, inverse_depth: bool, trai
     )
 
 
-@torch.library.register_fake("diff_gaussian_rasterization::blend")
+@library.register_fake("diff_gaussian_rasterization::blend")
 def _(splats, instances, ranges, background, height, width, inverse_depth, train):
     return _fake_blend(splats, height, width, inverse_depth, train)
 
 
-@torch.library.register_fake("diff_gaussian_rasterization::blend_vjp")
+@library.register_fake("diff_gaussian_rasterization::blend_vjp")
 def _(splats, *args):
     return splats.new_empty((splats.shape[0], _VALUES))
 
 
-@torch.library.register_fake("diff_gaussian_rasterization::project_vjp")
+@library.register_fake("diff_gaussian_rasterization::project_vjp")
 def _(*args):
     return _fake_gradients(_scene(args[: len(_SCENE)]), args[-1])
 
 
-@torch.library.register_fake("diff_gaussian_rasterization::rasterize_vjp")
+@library.register_fake("diff_gaussian_rasterization::rasterize_vjp")
 def _(*args):
     return _fake_gradients(_scene(args[: len(_SCENE)]), args[-1])
 
 
-@torch.library.register_fake("diff_gaussian_rasterization::rasterize")
+@library.register_fake("diff_gaussian_rasterization::rasterize")
 def _(means2d, *args):
     scene = _scene(args[: len(_SCENE)])
     inverse_depth, train = args[-2:]
@@ -260,19 +260,19 @@ def _(means2d, *args):
     return color, transmittance, depth, counts[0], means.new_empty((n, _VALUES)), counts[1], *binned, last
 
 
-@torch.library.register_fake("diff_gaussian_rasterization::mark_visible")
+@library.register_fake("diff_gaussian_rasterization::mark_visible")
 def _(means, view):
     return means.new_empty((means.shape[0],), dtype=torch.bool)
 
 
-@torch.library.register_fake("diff_gaussian_rasterization::decisive")
+@library.register_fake("diff_gaussian_rasterization::decisive")
 def _(splats, *args):
     return splats.new_empty((splats.shape[0],), dtype=torch.bool)
 
 
-@torch.library.register_fake("diff_gaussian_rasterization::adam_")
-@torch.library.register_fake("diff_gaussian_rasterization::sparse_adam_")
-@torch.library.register_fake("diff_gaussian_rasterization::observe_")
+@library.register_fake("diff_gaussian_rasterization::adam_")
+@library.register_fake("diff_gaussian_rasterization::sparse_adam_")
+@library.register_fake("diff_gaussian_rasterization::observe_")
 def _(*args, **kwargs):
     return None
 
@@ -306,7 +306,7 @@ def _backward(ctx, grad_color, grad_transmittance, grad_inverse_depth, *_):
 
 
 # For whoever calls the op itself, or compiles it.
-torch.library.register_autograd("diff_gaussian_rasterization::rasterize", _backward, setup_context=_setup_context)
+library.register_autograd("diff_gaussian_rasterization::rasterize", _backward, setup_context=_setup_context)
 
 
 class _Rasterize(torch.autograd.Function):

@@ -8,7 +8,7 @@ from functools import cache
 from pathlib import Path
 
 import torch
-from torch import Tensor
+from torch import Tensor, library
 from torch.autograd.function import once_differentiable
 
 _LIBRARY = Path(__file__).with_name("_backend.so")
@@ -93,12 +93,12 @@ def _has_backend(device: str) -> bool:
     return torch._C._dispatch_has_kernel_for_dispatch_key("fused_ssim::l1_ssim", device.upper())
 
 
-@torch.library.register_fake("fused_ssim::l1_ssim")
+@library.register_fake("fused_ssim::l1_ssim")
 def _l1_ssim_fake(img1: Tensor, img2: Tensor, valid: bool, train: bool) -> tuple[Tensor, Tensor, Tensor]:
     return img1.new_empty(()), img1.new_empty(()), img1.new_empty(img1.shape if train else (0,))
 
 
-@torch.library.register_fake("fused_ssim::l1_ssim_vjp")
+@library.register_fake("fused_ssim::l1_ssim_vjp")
 def _l1_ssim_vjp_fake(img1: Tensor, img2: Tensor, ssim_gradient: Tensor, grad_l1: Tensor, grad_ssim: Tensor) -> Tensor:
     return img1.new_empty(img1.shape)
 
@@ -115,22 +115,22 @@ def _backward(ctx, grad_l1: Tensor, grad_ssim: Tensor, _) -> tuple[Tensor, None,
     return torch.ops.fused_ssim.l1_ssim_vjp(img1, img2, ssim_gradient, grad_l1, grad_ssim), None, None, None
 
 
-torch.library.register_autograd("fused_ssim::l1_ssim", _backward, setup_context=_setup_context)
+library.register_autograd("fused_ssim::l1_ssim", _backward, setup_context=_setup_context)
 
 
-@torch.library.register_fake("fused_ssim::photometric")
+@library.register_fake("fused_ssim::photometric")
 def _photometric_fake(img1: Tensor, img2: Tensor, lambda_dssim: float, train: bool) -> tuple[Tensor, Tensor, Tensor]:
     return _l1_ssim_fake(img1, img2, False, train)
 
 
-@torch.library.register_fake("fused_ssim::photometric_vjp")
+@library.register_fake("fused_ssim::photometric_vjp")
 def _photometric_vjp_fake(
     img1: Tensor, img2: Tensor, ssim_gradient: Tensor, lambda_dssim: float, grad_loss: Tensor
 ) -> Tensor:
     return img1.new_empty(img1.shape)
 
 
-@torch.library.register_fake("fused_ssim::composite")
+@library.register_fake("fused_ssim::composite")
 def _composite_fake(picture: Tensor, background: Tensor) -> Tensor:
     return background.new_empty((3, *picture.shape[1:]))
 
@@ -151,7 +151,7 @@ def _photometric_backward(ctx, grad_loss: Tensor | None, *_) -> tuple[Tensor | N
 
 
 # For whoever calls the op itself, or compiles it.
-torch.library.register_autograd("fused_ssim::photometric", _photometric_backward, setup_context=_setup_photometric)
+library.register_autograd("fused_ssim::photometric", _photometric_backward, setup_context=_setup_photometric)
 
 
 class _Photometric(torch.autograd.Function):

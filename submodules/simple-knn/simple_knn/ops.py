@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import torch
+from torch import library
 
 _LIBRARY = Path(__file__).with_name("_backend.so")
 try:
@@ -12,7 +13,7 @@ except OSError as error:
     raise ImportError(f"simple_knn {what}: run `pip install ./submodules/simple-knn` in the repository") from error
 
 
-@torch.library.register_fake("simple_knn::mean_distance2")
+@library.register_fake("simple_knn::mean_distance2")
 def _fake(points: torch.Tensor) -> torch.Tensor:
     return points.new_empty(points.shape[0])
 
