@@ -68,10 +68,10 @@ class Stages:
         wanted = [True] * 5 + [False] * 2 + [True] * 2
         projected = OPS.project(*arguments)
         self.splats, counts = projected[0], projected[3]
-        self.instances, slots, self.ranges, offsets = OPS.bin(*projected[:4], *size, True)
+        self.instances, self.ranges, *slots = OPS.bin(*projected[:4], *size, True)
         blend = (self.splats, self.instances, self.ranges, settings.bg, *size, False)
         _, transmittance, _, self.last = OPS.blend(*blend, True)
-        state = (self.splats, counts, self.instances, slots, self.ranges, offsets, settings.bg, self.last)
+        state = (self.splats, projected[2], self.instances, self.ranges, *slots, settings.bg, self.last)
         state += (transmittance, image_gradient(scene), None, None)
         moments = OPS.blend_vjp(*state)
         self.calls: dict[str, Callable[[], object]] = {

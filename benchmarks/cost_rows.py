@@ -126,12 +126,12 @@ def depth(work: Workload) -> Row:
 
 def gradient_buffers(work: Workload) -> Row:
     """By hand: per splat 10 values, depth, 4 + 2 integers; an index per instance, a range per tile, color and
-    transmittance per pixel. On a GPU projection hands on a record of 32 bytes in place of 4 integers."""
+    transmittance per pixel. (On a GPU, projection hands on a record in place of 4 integers, of as many bytes.)"""
     model = work.model()
     with torch.no_grad():
         out = _operator(work, model, train=False)
-    instances, tiles = out[6].numel(), out[8].numel()
-    a_splat = 40 + 4 + (32 if work.device.type == "cuda" else 16) + 8
+    instances, tiles = out[7].numel(), out[8].numel()
+    a_splat = 40 + 4 + 16 + 8
     pixels = work.camera.image_width * work.camera.image_height
     needed = a_splat * len(model) + 4 * instances + 8 * tiles + 16 * pixels
     off = torch.no_grad()

@@ -220,7 +220,7 @@ def assert_culling_is_exact(
     also (K, 11): rows and depths of splats that `project` left out; they belong to the second list as well.
     """
     background = torch.tensor([0.3, 0.6, 0.1], dtype=splats.dtype, device=splats.device)
-    instances, _, ranges, _ = ops.bin(splats, depths, rects, counts, height, width, False)
+    instances, ranges, _, _ = ops.bin(splats, depths, rects, counts, height, width, False)
     got = ops.blend(splats, instances, ranges, background, height, width, True, False)
     seen = counts > 0
     splats, depths = splats[seen], depths[seen]

@@ -199,20 +199,24 @@ def test_nothing_is_kept_without_gradients():
         "inverse_depth",
         "radii",
         "splats",
+        "rects",
         "tile_counts",
         "instances",
-        "slots",
         "ranges",
         "slot_offsets",
+        "slots",
         "last",
     ]
     rendering = dict(zip(names, _outputs(splats, camera, False, False), strict=True))
-    for name in ("slots", "slot_offsets", "last", "inverse_depth"):
+    for name in ("rects", "slot_offsets", "last", "inverse_depth"):
         assert rendering[name].numel() == 0, name
+    assert len(rendering["slots"]) == 0
     training = dict(zip(names, _outputs(splats, camera, True), strict=True))
-    assert (
-        len(training["slots"]) == len(training["instances"]) == training["ranges"][-1] == training["tile_counts"].sum()
-    )
+    assert len(training["instances"]) == training["ranges"][-1] == training["tile_counts"].sum()
+    x0, y0, x1, y1 = training["rects"].T
+    areas = torch.where(training["tile_counts"] > 0, (x1 - x0) * (y1 - y0), 0)
+    assert torch.equal(training["slot_offsets"].diff(), areas.long())
+    assert len(training["slots"]) == training["slot_offsets"][-1] == areas.sum()
     assert training["last"].shape == (7, 18)
     assert torch.equal(rendering["color"], training["color"])
     # The public function decides by the grad mode and by its inputs.

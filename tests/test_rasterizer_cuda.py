@@ -107,7 +107,7 @@ def test_culling_changes_no_bit():
     arguments = (p["means"], p["opacities"], p["scales"], p["rotations"], None, None, p["sh_dc"], p["sh_rest"])
     arguments += (*matrices, camera.tanfovx, camera.tanfovy, 117, 203, 3, 1.0, False, True)
     splats, depths, rects, counts, _ = OPS.project(*arguments)
-    instances, _, ranges, _ = OPS.bin(splats, depths, rects, counts, 117, 203, False)
+    instances, ranges, _, _ = OPS.bin(splats, depths, rects, counts, 117, 203, False)
     seen = counts.nonzero().flatten()
     every = seen[torch.argsort(depths[seen], stable=True)].int()
     tiles = len(ranges) - 1

@@ -39,7 +39,7 @@ def test_they_are_those_of_a_loop_over_pixels():
     parameters = {name: t.double() for name, t in scene.parameters.items()}
     camera = settings(*SIZE)
     splats, depths, rects, counts, _ = ops.project(*scene_arguments(parameters, camera))
-    instances, _, ranges, _ = ops.bin(splats, depths, rects, counts, SIZE[1], SIZE[0], False)
+    instances, ranges, _, _ = ops.bin(splats, depths, rects, counts, SIZE[1], SIZE[0], False)
     rows, expected, ended_only = splats.tolist(), set(), set()
     for y in range(SIZE[1]):
         for x in range(SIZE[0]):

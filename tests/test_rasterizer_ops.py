@@ -38,18 +38,18 @@ def test_opcheck_every_other_op(device):
     splats, depths, rects, counts, _ = ops.project(*arguments)
     for train in (False, True):
         _check(ops.bin, splats, depths, rects, counts, height, width, train)
-    instances, slots, ranges, offsets = ops.bin(splats, depths, rects, counts, height, width, True)
+    instances, ranges, *slots = ops.bin(splats, depths, rects, counts, height, width, True)
     for inverse_depth, train in [(False, False), (True, True)]:
         _check(ops.blend, splats, instances, ranges, background, height, width, inverse_depth, train)
     image, transmittance, plane, last = ops.blend(splats, instances, ranges, background, height, width, True, True)
     _check(ops.decisive, splats, instances, ranges, last)
-    state = (splats, counts, instances, slots, ranges, offsets, background, last, transmittance)
+    state = (splats, rects, instances, ranges, *slots, background, last, transmittance)
     gradients = (torch.ones_like(image), torch.ones_like(transmittance), torch.ones_like(plane))
     _check(ops.blend_vjp, *state, *gradients)
     moments = ops.blend_vjp(*state, *gradients)
     wanted = [True, True, True, True, True, False, False, True, True]
     _check(ops.project_vjp, *arguments, counts, moments, wanted)
-    _check(ops.rasterize_vjp, *arguments, *state, *gradients, wanted)
+    _check(ops.rasterize_vjp, *arguments, *state, *gradients, counts, wanted)
     _check(ops.mark_visible, raw["means"], camera.viewmatrix.float())
     lists = [[torch.rand(3, 3, device=device), torch.rand(2, 5, device=device)] for _ in range(4)]
     counters = [torch.tensor(1.0), torch.tensor(7.0)]
@@ -71,7 +71,7 @@ def test_the_steps_one_by_one_are_the_whole(device, dtype):
     raw = together(raw, raw)
     arguments = scene_arguments(raw, camera)
     splats, depths, rects, counts, radii = ops.project(*arguments)
-    instances, slots, ranges, offsets = ops.bin(splats, depths, rects, counts, 7, 18, True)
+    instances, ranges, *slots = ops.bin(splats, depths, rects, counts, 7, 18, True)
     color, transmittance, inverse_depth, last = ops.blend(splats, instances, ranges, camera.bg, 7, 18, True, True)
     inputs = leaves(raw)
     out = render(inputs, camera)
@@ -79,7 +79,7 @@ def test_the_steps_one_by_one_are_the_whole(device, dtype):
     assert torch.equal(out.inverse_depth, inverse_depth) and torch.equal(out.radii, radii)
     weights = torch.linspace(-1, 1, color.numel()).reshape(color.shape).to(color)
     (weights * out.color).sum().backward()
-    state = (splats, counts, instances, slots, ranges, offsets, camera.bg, last, transmittance)
+    state = (splats, rects, instances, ranges, *slots, camera.bg, last, transmittance)
     moments = ops.blend_vjp(*state, weights, None, None)
     wanted = [True, False, True, True, True, False, False, True, True]
     gradients = ops.project_vjp(*arguments, counts, moments, wanted)

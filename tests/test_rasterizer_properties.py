@@ -221,7 +221,7 @@ def test_halves_of_an_image_are_the_whole_to_the_bit(seed, places, antialiasing)
     height, across = 32, WIDTH // 16
     camera = settings(WIDTH, height, torch.float32, antialiasing=antialiasing)
     splats, depths, rects, counts, _ = ops.project(*scene_arguments(parameters, camera, raw=True))
-    instances, _, ranges, _ = ops.bin(splats, depths, rects, counts, height, WIDTH, False)
+    instances, ranges, _, _ = ops.bin(splats, depths, rects, counts, height, WIDTH, False)
     whole = ops.blend(splats, instances, ranges, camera.bg, height, WIDTH, True, True)
     for top in (0, 16):
         own = ranges[top // 16 * across : top // 16 * across + across + 1]

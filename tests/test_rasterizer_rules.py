@@ -164,7 +164,7 @@ def test_equal_depths_keep_the_order_of_their_index():
     parameters["means"][::3, 2] = 4.0
     arguments = scene_arguments(parameters, settings(75, 53, torch.float32))
     splats, depths, rects, counts, _ = ops.project(*arguments)
-    instances, _, ranges, _ = ops.bin(splats, depths, rects, counts, 53, 75, False)
+    instances, ranges, _, _ = ops.bin(splats, depths, rects, counts, 53, 75, False)
     ties = 0
     for begin, end in zip(ranges[:-1].tolist(), ranges[1:].tolist(), strict=True):
         tile = instances[begin:end].tolist()

@@ -68,7 +68,7 @@ def test_lists_hold_no_tile_in_vain():
     scene = KINDS["ordinary"](400, *SIZE)
     parameters = {name: t.double() for name, t in scene.parameters.items()}
     splats, depths, rects, counts, _ = ops.project(*scene_arguments(parameters, settings(*SIZE)))
-    instances, _, ranges, _ = ops.bin(splats, depths, rects, counts, 53, 75, False)
+    instances, ranges, _, _ = ops.bin(splats, depths, rects, counts, 53, 75, False)
     x, y = torch.arange(75.0), torch.arange(53.0)
     vain = 0
     for tile in range(len(ranges) - 1):

@@ -25,7 +25,9 @@ class Memory {
     pieces.emplace_back(piece, &std::free);
     return piece;
   }
-  static int64_t* pinned(void* context) { return static_cast<int64_t*>(allocate(context, sizeof(int64_t))); }
+  static int64_t* pinned(void* context, int64_t count) {
+    return static_cast<int64_t*>(allocate(context, count * sizeof(int64_t)));
+  }
   static constexpr size_t kAlignment = 512;  // that of torch's allocator
   std::vector<std::unique_ptr<void, void (*)(void*)>> pieces_;
 };

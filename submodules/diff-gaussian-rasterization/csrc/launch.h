@@ -38,17 +38,16 @@ struct Scene {
 };
 
 // All that a GPU's emission reads of a splat, in one sector of memory: it visits splats in the order of their depth.
-struct alignas(32) TileRecord {
+struct alignas(16) TileRecord {
   uint64_t mask;  // which tiles of a rectangle of at most 64 are reached, a bit each in its order
   uint16_t x0, y0, x1, y1;
-  int32_t count;
 };
 
 template <class T>
 struct Projected {
   T* splats;             // (N, 10), Splat in math/splat.h; undefined where tile_counts is 0
   T* depths;             // (N)
-  int32_t* rects;        // (N, 4) tiles x0 y0 x1 y1; null where there are records
+  int32_t* rects;        // (N, 4) tiles x0 y0 x1 y1, undefined where tile_counts is 0; or null where there are records
   int32_t* tile_counts;  // (N)
   int32_t* radii;        // (N)
   TileRecord* records;   // (N), or null
@@ -69,16 +68,15 @@ struct SceneGradient {
 };
 
 struct Binned {
-  int32_t* instances;     // (I) splat, by tile and inside by depth, ties by index
-  int32_t* slots;         // (I) place among the splat-contiguous instances, or null
-  int64_t* ranges;        // (tiles + 1) into instances
-  int64_t* slot_offsets;  // (N) first slot of a splat, or null
+  int32_t* instances;  // (I) splat, by tile and inside by depth, ties by index
+  int64_t* ranges;     // (tiles + 1) into instances
 };
 
-// Where binning gets the memory of its lists once it has counted; it may throw.
+// Where binning gets the memory of its lists once it has counted; it may throw. Slots: SplatSlots in math/tiles.h.
 struct BinMemory {
-  Binned (*take)(void* context, int64_t instances);
+  Binned (*take)(void* context, int64_t instances, int64_t slots);
   void* context;
+  int64_t* slot_offsets;  // (N + 1), filled by binning; or null: no slots
 };
 
 template <class T>
@@ -100,10 +98,9 @@ struct Blended {
 
 template <class T>
 struct BlendGradient {
-  int64_t count, instance_count;
-  const int32_t* slots;
+  int64_t count, instance_count, slot_count;
+  const int32_t* rects;
   const int64_t* slot_offsets;
-  const int32_t* tile_counts;
   const T* transmittance;
   const int32_t* last;
   const T* color;                   // dLoss/dcolor

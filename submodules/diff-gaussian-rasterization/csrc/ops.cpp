@@ -192,7 +192,7 @@ struct ProjectedTensors {
   }
 };
 
-// `rects`: whether the caller wants them to see; a GPU has no other use for them.
+// `rects`: whether the caller or the backward wants them; a GPU has no other use for them.
 ProjectedTensors project(const SceneTensors& in, bool rects) {
   const int64_t n = in.count();
   const auto ints = in.options().dtype(at::kInt);
@@ -202,10 +202,9 @@ ProjectedTensors project(const SceneTensors& in, bool rects) {
   out.tile_counts = at::empty({n}, ints);
   out.radii = at::empty({n}, ints);
   const int64_t tiles_across = std::max(in.image().width, in.image().height) / kTile;
-  if (rects || !in.options().device().is_cuda() || tiles_across >= std::numeric_limits<uint16_t>::max())
-    out.rects = at::empty({n, 4}, ints);
-  else
-    out.records = at::empty({n, int64_t(sizeof(gs::TileRecord))}, in.options().dtype(at::kByte));
+  const bool records = in.options().device().is_cuda() && tiles_across < std::numeric_limits<uint16_t>::max();
+  if (rects || !records) out.rects = at::empty({n, 4}, ints);
+  if (records) out.records = at::empty({n, int64_t(sizeof(gs::TileRecord))}, in.options().dtype(at::kByte));
   with_scalar(in.dtype(), [&](auto zero) {
     using T = decltype(zero);
     RUN(T, out.splats, project, in.scene<T>(), out.pointers<T>());
@@ -224,27 +223,28 @@ std::string most_tiles(const Tensor& tile_counts) {
 }
 
 struct BinnedTensors {
-  Tensor instances, slots, ranges, slot_offsets;
+  Tensor instances, ranges, slot_offsets;
+  Tensor slots;  // (S, 0): nothing but their number, which the backward's memory is sized by
 };
 
 // `slots`: whether the backward will need them.
 BinnedTensors bin(ProjectedTensors& in, gs::Image image, bool slots) {
+  const auto ints = in.depths.options().dtype(at::kInt), longs = in.depths.options().dtype(at::kLong);
   BinnedTensors out;
-  auto allocate = [&](int64_t total) {
+  out.slot_offsets = at::empty({slots ? in.depths.size(0) + 1 : 0}, longs);
+  auto allocate = [&](int64_t total, int64_t slot_count) {
     const int64_t n = in.depths.size(0);
     TORCH_CHECK(total <= std::numeric_limits<int32_t>::max(), n, " Gaussians cover ", total,
                 " tile instances, more than 2^31 - 1; most are those of Gaussian ", most_tiles(in.tile_counts),
                 ": remove such giants, or render at a lower resolution or with fewer Gaussians");
-    const auto ints = in.depths.options().dtype(at::kInt), longs = in.depths.options().dtype(at::kLong);
-    out = {at::empty({total}, ints), at::empty({slots ? total : 0}, ints), at::empty({tiles_of(image) + 1}, longs),
-           at::empty({slots ? n : 0}, longs)};
-    return gs::Binned{out.instances.mutable_data_ptr<int32_t>(),
-                      slots ? out.slots.mutable_data_ptr<int32_t>() : nullptr, out.ranges.mutable_data_ptr<int64_t>(),
-                      slots ? out.slot_offsets.mutable_data_ptr<int64_t>() : nullptr};
+    out.instances = at::empty({total}, ints), out.ranges = at::empty({tiles_of(image) + 1}, longs);
+    out.slots = at::empty({slot_count, 0}, ints);
+    return gs::Binned{out.instances.mutable_data_ptr<int32_t>(), out.ranges.mutable_data_ptr<int64_t>()};
   };
   using Allocate = decltype(allocate);
-  const gs::BinMemory memory{[](void* context, int64_t total) { return (*static_cast<Allocate*>(context))(total); },
-                             &allocate};
+  const gs::BinMemory memory{
+      [](void* context, int64_t total, int64_t slots) { return (*static_cast<Allocate*>(context))(total, slots); },
+      &allocate, slots ? out.slot_offsets.mutable_data_ptr<int64_t>() : nullptr};
   with_scalar(in.depths.scalar_type(), [&](auto zero) {
     using T = decltype(zero);
     RUN(T, in.depths, bin, in.depths.size(0), in.pointers<T>(), image, memory);
@@ -289,16 +289,16 @@ BlendedTensors blend(const Tensor& splats, const Tensor& instances, const Tensor
 // What the backward of blending takes: owns the tensors that gs::BlendInput and gs::BlendGradient point into.
 class BlendBackward {
  public:
-  BlendBackward(const Tensor& splats, const Tensor& tile_counts, const Tensor& instances, const Tensor& slots,
-                const Tensor& ranges, const Tensor& slot_offsets, const Tensor& background, const Tensor& last,
+  BlendBackward(const Tensor& splats, const Tensor& rects, const Tensor& instances, const Tensor& ranges,
+                const Tensor& slot_offsets, const Tensor& slots, const Tensor& background, const Tensor& last,
                 const Tensor& transmittance, const Tensor& grad_color, const MaybeTensor& grad_transmittance,
                 const MaybeTensor& grad_inverse_depth)
       : splats_(splats.contiguous()),
-        tile_counts_(tile_counts.contiguous()),
+        rects_(rects.contiguous()),
         instances_(instances),
-        slots_(slots),
         ranges_(ranges),
         slot_offsets_(slot_offsets),
+        slot_count_(slots.size(0)),
         background_(background_like(background, splats)),
         last_(last),
         transmittance_(transmittance),
@@ -317,9 +317,9 @@ class BlendBackward {
   gs::BlendGradient<T> gradient(T* moments) const {
     return {splats_.size(0),
             instances_.size(0),
-            slots_.const_data_ptr<int32_t>(),
+            slot_count_,
+            rects_.const_data_ptr<int32_t>(),
             slot_offsets_.const_data_ptr<int64_t>(),
-            tile_counts_.const_data_ptr<int32_t>(),
             transmittance_.const_data_ptr<T>(),
             last_.const_data_ptr<int32_t>(),
             color_.const_data_ptr<T>(),
@@ -337,7 +337,9 @@ class BlendBackward {
     return converted(*t, splats_);
   }
 
-  Tensor splats_, tile_counts_, instances_, slots_, ranges_, slot_offsets_, background_, last_, transmittance_;
+  Tensor splats_, rects_, instances_, ranges_, slot_offsets_;
+  int64_t slot_count_;
+  Tensor background_, last_, transmittance_;
   gs::Image image_;
   Tensor color_, alpha_, depth_;
 };
@@ -404,7 +406,7 @@ Tensors4 bin_op(const Tensor& splats, const Tensor& depths, const Tensor& rects,
   p.splats = splats.contiguous(), p.depths = depths.contiguous(), p.rects = rects.contiguous();
   p.tile_counts = p.radii = tile_counts.contiguous();
   const BinnedTensors b = bin(p, {int(width), int(height)}, train);
-  return {b.instances, b.slots, b.ranges, b.slot_offsets};
+  return {b.instances, b.ranges, b.slot_offsets, b.slots};
 }
 
 Tensors4 blend_op(const Tensor& splats, const Tensor& instances, const Tensor& ranges, const Tensor& background,
@@ -414,19 +416,20 @@ Tensors4 blend_op(const Tensor& splats, const Tensor& instances, const Tensor& r
   return {b.color, b.transmittance, b.inverse_depth, b.last};
 }
 
-#define BACKWARD_SCHEMA                                                                                     \
-  "Tensor splats, Tensor tile_counts, Tensor instances, Tensor slots, Tensor ranges, Tensor slot_offsets, " \
-  "Tensor background, Tensor last, Tensor transmittance, Tensor grad_color, Tensor? grad_transmittance, "   \
+#define BACKWARD_SCHEMA                                                                                   \
+  "Tensor splats, Tensor rects, Tensor instances, Tensor ranges, Tensor slot_offsets, Tensor slots, "     \
+  "Tensor background, Tensor last, Tensor transmittance, Tensor grad_color, Tensor? grad_transmittance, " \
   "Tensor? grad_inverse_depth"
 #define GRADIENTS_SCHEMA                                                                             \
   "(Tensor means, Tensor means2d, Tensor opacities, Tensor scales, Tensor rotations, Tensor cov3d, " \
   "Tensor colors, Tensor sh_dc, Tensor sh_rest)"
-#define BACKWARD_PARAMETERS                                                                                            \
-  const Tensor &splats, const Tensor &tile_counts, const Tensor &instances, const Tensor &slots, const Tensor &ranges, \
-      const Tensor &slot_offsets, const Tensor &background, const Tensor &last, const Tensor &transmittance,           \
-      const Tensor &grad_color, const MaybeTensor &grad_transmittance, const MaybeTensor &grad_inverse_depth
-#define BACKWARD_ARGUMENTS                                                                                  \
-  splats, tile_counts, instances, slots, ranges, slot_offsets, background, last, transmittance, grad_color, \
+#define BACKWARD_PARAMETERS                                                                          \
+  const Tensor &splats, const Tensor &rects, const Tensor &instances, const Tensor &ranges,          \
+      const Tensor &slot_offsets, const Tensor &slots, const Tensor &background, const Tensor &last, \
+      const Tensor &transmittance, const Tensor &grad_color, const MaybeTensor &grad_transmittance,  \
+      const MaybeTensor &grad_inverse_depth
+#define BACKWARD_ARGUMENTS                                                                            \
+  splats, rects, instances, ranges, slot_offsets, slots, background, last, transmittance, grad_color, \
       grad_transmittance, grad_inverse_depth
 
 Tensor blend_vjp_op(BACKWARD_PARAMETERS) { return blend_vjp(BlendBackward(BACKWARD_ARGUMENTS)); }
@@ -435,19 +438,21 @@ Gradients project_vjp_op(SCENE_PARAMETERS, const Tensor& tile_counts, const Tens
   return project_vjp(SceneTensors(SCENE_ARGUMENTS), tile_counts.contiguous(), moments.contiguous(), wanted);
 }
 
-using Rasterized = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor>;
+using Rasterized =
+    std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor>;
 
 Rasterized rasterize_op(const Tensor& /*means2d: only receives a gradient*/, SCENE_PARAMETERS, const Tensor& background,
                         bool inverse_depth, bool train) {
   const SceneTensors scene(SCENE_ARGUMENTS);
-  ProjectedTensors p = project(scene, false);
+  ProjectedTensors p = project(scene, train);
   BinnedTensors b = bin(p, scene.image(), train);
   BlendedTensors o = blend(p.splats, b.instances, b.ranges, background, scene.image(), inverse_depth, train);
-  return {o.color,     o.transmittance, o.inverse_depth, p.radii,        p.splats, p.tile_counts,
-          b.instances, b.slots,         b.ranges,        b.slot_offsets, o.last};
+  if (!train) p.rects = at::empty({0, 4}, p.radii.options());
+  return {o.color,       o.transmittance, o.inverse_depth, p.radii,        p.splats, p.rects,
+          p.tile_counts, b.instances,     b.ranges,        b.slot_offsets, b.slots,  o.last};
 }
 
-Gradients rasterize_vjp_op(SCENE_PARAMETERS, BACKWARD_PARAMETERS, Wanted wanted) {
+Gradients rasterize_vjp_op(SCENE_PARAMETERS, BACKWARD_PARAMETERS, const Tensor& tile_counts, Wanted wanted) {
   const SceneTensors scene(SCENE_ARGUMENTS);
   const BlendBackward in(BACKWARD_ARGUMENTS);
 #ifdef GS_CUDA
@@ -607,7 +612,7 @@ TORCH_LIBRARY(diff_gaussian_rasterization, m) {
   m.def("project(" SCENE_SCHEMA ") -> (Tensor splats, Tensor depths, Tensor rects, Tensor tile_counts, Tensor radii)");
   m.def(
       "bin(Tensor splats, Tensor depths, Tensor rects, Tensor tile_counts, int height, int width, bool train) -> "
-      "(Tensor instances, Tensor slots, Tensor ranges, Tensor slot_offsets)");
+      "(Tensor instances, Tensor ranges, Tensor slot_offsets, Tensor slots)");
   m.def(
       "blend(Tensor splats, Tensor instances, Tensor ranges, Tensor background, int height, int width, "
       "bool inverse_depth, bool train) -> (Tensor color, Tensor transmittance, Tensor inverse_depth, Tensor last)");
@@ -615,9 +620,10 @@ TORCH_LIBRARY(diff_gaussian_rasterization, m) {
   m.def("project_vjp(" SCENE_SCHEMA ", Tensor tile_counts, Tensor moments, bool[9] wanted) -> " GRADIENTS_SCHEMA);
   m.def("rasterize(Tensor means2d, " SCENE_SCHEMA
         ", Tensor background, bool inverse_depth, bool train) -> (Tensor color, Tensor transmittance, "
-        "Tensor inverse_depth, Tensor radii, Tensor splats, Tensor tile_counts, Tensor instances, Tensor slots, "
-        "Tensor ranges, Tensor slot_offsets, Tensor last)");
-  m.def("rasterize_vjp(" SCENE_SCHEMA ", " BACKWARD_SCHEMA ", bool[9] wanted) -> " GRADIENTS_SCHEMA);
+        "Tensor inverse_depth, Tensor radii, Tensor splats, Tensor rects, Tensor tile_counts, Tensor instances, "
+        "Tensor ranges, Tensor slot_offsets, Tensor slots, Tensor last)");
+  m.def("rasterize_vjp(" SCENE_SCHEMA ", " BACKWARD_SCHEMA
+        ", Tensor tile_counts, bool[9] wanted) -> " GRADIENTS_SCHEMA);
   m.def("mark_visible(Tensor means, Tensor view) -> Tensor");
   m.def("decisive(Tensor splats, Tensor instances, Tensor ranges, Tensor last) -> Tensor");
   m.def(

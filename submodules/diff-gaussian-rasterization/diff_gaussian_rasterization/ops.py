@@ -114,7 +114,7 @@ def decisive(
     tensors |= {"colors": colors, "sh_dc": sh_dc, "sh_rest": sh_rest}
     _check(tensors, means, settings.sh_degree, raw)
     out = _ops.rasterize(means, *_arguments(tensors, settings, raw), settings.bg, False, True)
-    _, _, _, _, splats, _, instances, _, ranges, _, last = out
+    _, _, _, _, splats, _, _, instances, ranges, _, _, last = out
     return _ops.decisive(splats, instances, ranges, last)
 
 
@@ -206,11 +206,12 @@ def _(*args):
 
 def _fake_bin(like: Tensor, n: int, height: int, width: int, train: bool) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     total = library.get_ctx().new_dynamic_size()
+    slots = library.get_ctx().new_dynamic_size() if train else 0
     return (
         like.new_empty((total,), dtype=torch.int32),
-        like.new_empty((total if train else 0,), dtype=torch.int32),
         like.new_empty((_tiles(height, width) + 1,), dtype=torch.int64),
-        like.new_empty((n if train else 0,), dtype=torch.int64),
+        like.new_empty((n + 1 if train else 0,), dtype=torch.int64),
+        like.new_empty((slots, 0), dtype=torch.int32),
     )
 
 
@@ -255,9 +256,10 @@ def _(means2d, *args):
     means, height, width = scene["means"], scene["height"], scene["width"]
     n = means.shape[0]
     color, transmittance, depth, last = _fake_blend(means, height, width, inverse_depth, train)
-    counts = [means.new_empty((n,), dtype=torch.int32) for _ in range(2)]
-    binned = _fake_bin(means, n, height, width, train)
-    return color, transmittance, depth, counts[0], means.new_empty((n, _VALUES)), counts[1], *binned, last
+    radii, tile_counts = (means.new_empty((n,), dtype=torch.int32) for _ in range(2))
+    rects = means.new_empty((n if train else 0, 4), dtype=torch.int32)
+    projected = radii, means.new_empty((n, _VALUES)), rects, tile_counts
+    return color, transmittance, depth, *projected, *_fake_bin(means, n, height, width, train), last
 
 
 @library.register_fake("diff_gaussian_rasterization::mark_visible")
@@ -279,26 +281,27 @@ def _(*args, **kwargs):
 
 def _setup_context(ctx, inputs, output):
     _, *scene, background, inverse_depth, train = inputs
-    _, transmittance, _, radii, splats, tile_counts, instances, slots, ranges, slot_offsets, last = output
-    ctx.mark_non_differentiable(radii, splats, tile_counts, instances, slots, ranges, slot_offsets, last)
+    _, transmittance, _, _, splats, rects, tile_counts, instances, ranges, slot_offsets, slots, last = output
+    ctx.mark_non_differentiable(*output[3:])
     ctx.set_materialize_grads(False)
     ctx.numbers, ctx.inverse_depth, ctx.train = scene[_TENSORS:], inverse_depth, train
-    state = (splats, tile_counts, instances, slots, ranges, slot_offsets, background, last, transmittance)
-    ctx.save_for_backward(*scene[:_TENSORS], *state)
+    state = (splats, rects, instances, ranges, slot_offsets, slots, background, last, transmittance)
+    ctx.save_for_backward(*scene[:_TENSORS], *state, tile_counts)
 
 
 def _backward(ctx, grad_color, grad_transmittance, grad_inverse_depth, *_):
     if not ctx.train:
         raise RuntimeError("this image was rasterized with train=False, so it has no backward")
     saved = ctx.saved_tensors
-    scene, state = (*saved[:_TENSORS], *ctx.numbers), saved[_TENSORS:]
+    scene, state, tile_counts = (*saved[:_TENSORS], *ctx.numbers), saved[_TENSORS:-1], saved[-1]
     inputs = dict(zip(("means2d", *_SCENE), ctx.needs_input_grad, strict=False))
     wanted = [inputs[name] for name in GRADIENTS]
     if grad_color is None:
         grad_color = state[-1].new_zeros(3, *state[-1].shape[1:])
     if not ctx.inverse_depth:
         grad_inverse_depth = None
-    gradients = _ops.rasterize_vjp(*scene, *state, grad_color, grad_transmittance, grad_inverse_depth, wanted)
+    image = grad_color, grad_transmittance, grad_inverse_depth
+    gradients = _ops.rasterize_vjp(*scene, *state, *image, tile_counts, wanted)
     named = {name: g for name, g, w in zip(GRADIENTS, gradients, wanted, strict=True) if w}
     if "opacities" in named:  # (N, 1) or (N,), as they came
         named["opacities"] = named["opacities"].reshape(scene[1].shape)

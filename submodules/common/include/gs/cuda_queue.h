@@ -9,8 +9,8 @@ struct Queue {
   void* stream;  // cudaStream_t
   // Device memory that lives until the call that it was handed to has been enqueued and its stream has used it.
   void* (*allocate)(void* context, size_t bytes);
-  // Page-locked host memory for a number, for as long: a copy to it does not hold up the host.
-  int64_t* (*pinned)(void* context);
+  // Page-locked host memory for numbers, for as long: a copy to it does not hold up the host.
+  int64_t* (*pinned)(void* context, int64_t count);
   void* context;
 
   template <class T>

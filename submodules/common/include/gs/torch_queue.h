@@ -28,9 +28,9 @@ class TorchQueue {
     return memory.back().get();
   }
 
-  static int64_t* pinned(void* context) {
+  static int64_t* pinned(void* context, int64_t count) {
     auto& numbers = static_cast<TorchQueue*>(context)->numbers_;
-    numbers.push_back(at::empty({1}, at::TensorOptions(at::kLong).pinned_memory(true)));
+    numbers.push_back(at::empty({count}, at::TensorOptions(at::kLong).pinned_memory(true)));
     return numbers.back().mutable_data_ptr<int64_t>();
   }
 

@@ -112,8 +112,15 @@ void bin(const Executor& executor, int64_t count, const Projected<T>& projected,
   std::vector<int64_t> offsets(visible + 1, 0);
   for (int64_t i = 0; i < visible; ++i) offsets[i + 1] = offsets[i] + projected.tile_counts[order[i]];
   const int64_t instance_count = offsets[visible];
-  const Binned out = memory.take(memory.context, instance_count);
-  for (int64_t i = 0; out.slot_offsets && i < visible; ++i) out.slot_offsets[order[i]] = offsets[i];
+  int64_t slots = 0;
+  if (memory.slot_offsets) {
+    for (int64_t i = 0; i < count; ++i) {
+      memory.slot_offsets[i] = slots;
+      slots += slot_count(projected.rects, projected.tile_counts, i);
+    }
+    memory.slot_offsets[count] = slots;
+  }
+  const Binned out = memory.take(memory.context, instance_count, slots);
   std::vector<int32_t> tiles(instance_count), splats(instance_count);
   for_dynamic(executor, visible, 1024, [&](int64_t begin, int64_t end) {
     for (int64_t i = begin; i < end; ++i) {
@@ -127,10 +134,7 @@ void bin(const Executor& executor, int64_t count, const Projected<T>& projected,
   const int64_t tile_total = int64_t(tile_count(image.width)) * tile_count(image.height);
   counting_sort(
       executor, instance_count, tile_total, out.ranges, [&](int64_t i) { return int64_t(tiles[i]); },
-      [&](int64_t i, int64_t place) {
-        out.instances[place] = splats[i];
-        if (out.slots) out.slots[place] = int32_t(i);
-      });
+      [&](int64_t i, int64_t place) { out.instances[place] = splats[i]; });
 }
 
 template void bin<float>(const Executor&, int64_t, const Projected<float>&, Image, const BinMemory&);

@@ -211,11 +211,11 @@ bool splat_gradient(const LocalSplat<T>& splat, int64_t position, const Tile& ti
 // side, whatever tiles they come from. A bit per slot tells which were processed, a prefix sum over their counts where
 // the row is, so memory follows what was blended and nothing is added concurrently.
 template <class T>
-class CompactSlots {
+class CompactRows {
  public:
-  explicit CompactSlots(int64_t slots) : bits_((slots + 63) / 64, 0), before_(bits_.size() + 1, 0) {}
+  explicit CompactRows(int64_t slots) : bits_((slots + 63) / 64, 0), before_(bits_.size() + 1, 0) {}
 
-  void mark(int32_t slot) { __atomic_fetch_or(&bits_[slot >> 6], uint64_t(1) << (slot & 63), __ATOMIC_RELAXED); }
+  void mark(int64_t slot) { __atomic_fetch_or(&bits_[slot >> 6], uint64_t(1) << (slot & 63), __ATOMIC_RELAXED); }
 
   void allocate() {
     for (size_t w = 0; w < bits_.size(); ++w) before_[w + 1] = before_[w] + __builtin_popcountll(bits_[w]);
@@ -237,7 +237,7 @@ class CompactSlots {
 
 template <class T, bool kDepth>
 void blend_tile_vjp(const BlendInput<T>& in, const BlendGradient<T>& g, int64_t index, int64_t processed,
-                    CompactSlots<T>& slots) {
+                    CompactRows<T>& rows) {
   const Tile tile(index, in.image);
   const int64_t begin = in.ranges[index], plane = int64_t(in.image.width) * in.image.height;
   BackwardState<T> state;
@@ -254,12 +254,13 @@ void blend_tile_vjp(const BlendInput<T>& in, const BlendGradient<T>& g, int64_t 
   for (int p = 0; p < kPixels; ++p)
     for (int c = 0; c < 3; ++c) state.behind[p] += in.background[c] * state.color[c][p];
 
+  const SplatSlots slots{g.rects, g.slot_offsets};
   LocalSplat<T> local[kChunk];
   for (int64_t to = processed; to > 0; to -= std::min(kChunk, to)) {
     const int64_t from = std::max<int64_t>(0, to - kChunk);
     gather(in, tile, begin + from, begin + to, local);
     for (int64_t k = to - 1; k >= from; --k) {
-      T* sums = slots.row(g.slots[begin + k]);
+      T* sums = rows.row(slots.slot(in.instances[begin + k], tile.x / kTile, tile.y / kTile));
       if (!splat_gradient<T, kDepth>(local[k - from], k, tile, state, sums)) std::fill_n(sums, kGradientValues, T(0));
     }
   }
@@ -324,28 +325,28 @@ void blend(const Executor& executor, const BlendInput<T>& in, const Blended<T>& 
 template <class T>
 void blend_vjp(const Executor& executor, const BlendInput<T>& in, const BlendGradient<T>& g) {
   const int64_t tiles = int64_t(tile_count(in.image.width)) * tile_count(in.image.height);
-  CompactSlots<T> slots(g.instance_count);
+  const SplatSlots slots{g.rects, g.slot_offsets};
+  CompactRows<T> rows(g.slot_count);
   std::vector<int32_t> processed(tiles);
   for_dynamic(executor, tiles, 4, [&](int64_t begin, int64_t end) {
     for (int64_t index = begin; index < end; ++index) {
+      const Tile tile(index, in.image);
       int32_t last[kPixels] = {};
-      read_tile(g.last, in.image, Tile(index, in.image), last);
+      read_tile(g.last, in.image, tile, last);
       processed[index] = *std::max_element(last, last + kPixels);
-      for (int64_t k = 0; k < processed[index]; ++k) slots.mark(g.slots[in.ranges[index] + k]);
+      for (int64_t k = 0; k < processed[index]; ++k)
+        rows.mark(slots.slot(in.instances[in.ranges[index] + k], tile.x / kTile, tile.y / kTile));
     }
   });
-  slots.allocate();
+  rows.allocate();
   const auto run = g.inverse_depth ? blend_tile_vjp<T, true> : blend_tile_vjp<T, false>;
-  for_dynamic(executor, tiles, 1, [&](int64_t tile, int64_t) { run(in, g, tile, processed[tile], slots); });
+  for_dynamic(executor, tiles, 1, [&](int64_t tile, int64_t) { run(in, g, tile, processed[tile], rows); });
   for_dynamic(executor, g.count, 1024, [&](int64_t begin, int64_t end) {
     for (int64_t i = begin; i < end; ++i) {
       double sums[kGradientValues] = {};  // a splat may have thousands of tiles
-      if (g.tile_counts[i]) {
-        const T* row = slots.row(g.slot_offsets[i]);
-        const T* stop = slots.row(g.slot_offsets[i] + g.tile_counts[i]);
-        for (; row < stop; row += kGradientValues)
-          for (int v = 0; v < kGradientValues; ++v) sums[v] += row[v];
-      }
+      const T* stop = rows.row(g.slot_offsets[i + 1]);
+      for (const T* row = rows.row(g.slot_offsets[i]); row < stop; row += kGradientValues)
+        for (int v = 0; v < kGradientValues; ++v) sums[v] += row[v];
       std::copy_n(sums, kGradientValues, g.moments + kGradientValues * i);
     }
   });

@@ -32,28 +32,48 @@ struct Widen {
   __host__ __device__ int64_t operator()(int32_t count) const { return count; }
 };
 
-// The number of instances, on its way to the host.
-class InstanceCount {
- public:
-  InstanceCount(const Queue& queue, int64_t count, const int32_t* tile_counts) : host_(queue.pinned(queue.context)) {
-    int64_t* total = queue.array<int64_t>(1);
-    const auto counts = thrust::make_transform_iterator(tile_counts, Widen{});
-    with_memory(queue, [&](void* memory, size_t& bytes) {
-      return cub::DeviceReduce::Sum(memory, bytes, counts, total, count, stream_of(queue));
-    });
-    GS_CUDA_CHECK(cudaEventCreateWithFlags(&arrived_, cudaEventDisableTiming));
-    GS_CUDA_CHECK(cudaMemcpyAsync(host_, total, sizeof *host_, cudaMemcpyDeviceToHost, stream_of(queue)));
-    GS_CUDA_CHECK(cudaEventRecord(arrived_, stream_of(queue)));
+struct SlotCount {
+  const int32_t* rects;
+  const int32_t* tile_counts;
+  int64_t splats;
+  __host__ __device__ int64_t operator()(int64_t splat) const {
+    return splat < splats ? slot_count(rects, tile_counts, splat) : 0;
   }
-  InstanceCount(const InstanceCount&) = delete;
-  // Waits, too: after an error in between the number must not come into memory that is another's by then.
-  ~InstanceCount() { cudaEventSynchronize(arrived_), cudaEventDestroy(arrived_); }
+};
 
-  // Waits for it, and for nothing that was queued since.
-  int64_t value() const {
-    GS_CUDA_CHECK(cudaEventSynchronize(arrived_));
-    return *host_;
+// The numbers of instances and slots, on their way to the host. Fills slot_offsets.
+class Totals {
+ public:
+  Totals(const Queue& queue, int64_t count, const Projected<float>& in, int64_t* slot_offsets)
+      : host_(queue.pinned(queue.context, 2)) {
+    const cudaStream_t stream = stream_of(queue);
+    int64_t* instances = queue.array<int64_t>(1);
+    const auto counts = thrust::make_transform_iterator(in.tile_counts, Widen{});
+    with_memory(queue, [&](void* memory, size_t& bytes) {
+      return cub::DeviceReduce::Sum(memory, bytes, counts, instances, count, stream);
+    });
+    if (slot_offsets) {
+      const SlotCount of{in.rects, in.tile_counts, count};
+      const auto slots = thrust::make_transform_iterator(thrust::counting_iterator<int64_t>(0), of);
+      with_memory(queue, [&](void* memory, size_t& bytes) {
+        return cub::DeviceScan::ExclusiveSum(memory, bytes, slots, slot_offsets, count + 1, stream);
+      });
+    }
+    host_[1] = 0;
+    GS_CUDA_CHECK(cudaEventCreateWithFlags(&arrived_, cudaEventDisableTiming));
+    GS_CUDA_CHECK(cudaMemcpyAsync(host_, instances, sizeof *host_, cudaMemcpyDeviceToHost, stream));
+    if (slot_offsets)
+      GS_CUDA_CHECK(cudaMemcpyAsync(host_ + 1, slot_offsets + count, sizeof *host_, cudaMemcpyDeviceToHost, stream));
+    GS_CUDA_CHECK(cudaEventRecord(arrived_, stream));
   }
+  Totals(const Totals&) = delete;
+  // Waits, too: after an error in between the numbers must not come into memory that is another's by then.
+  ~Totals() { cudaEventSynchronize(arrived_), cudaEventDestroy(arrived_); }
+
+  // Waits for them, and for nothing that was queued since.
+  void wait() const { GS_CUDA_CHECK(cudaEventSynchronize(arrived_)); }
+  int64_t instances() const { return host_[0]; }
+  int64_t slots() const { return host_[1]; }
 
  private:
   int64_t* host_;
@@ -64,7 +84,8 @@ class InstanceCount {
 struct OrderedCount {
   const int32_t* order;
   const int32_t* counts;
-  __host__ __device__ int64_t operator()(int32_t k) const { return counts[order[k]]; }
+  int64_t splats;
+  __host__ __device__ int32_t operator()(int64_t k) const { return k < splats ? counts[order[k]] : 0; }
 };
 
 __global__ void count_up_kernel(int64_t n, int32_t* values) {
@@ -72,18 +93,28 @@ __global__ void count_up_kernel(int64_t n, int32_t* values) {
   if (i < n) values[i] = int32_t(i);
 }
 
-// Where each tile's list begins: every tile from that of the instance before to this one's starts here.
+// Of one load from memory.
+template <class Key>
+struct alignas(16) Keys {
+  static constexpr int kCount = 16 / sizeof(Key);
+  Key of[kCount];
+};
+
+// Where each tile's list begins: every tile from that of the instance before to this one's starts here. The memory of
+// `sorted` ends with a whole load.
 template <class Key>
 __global__ void ranges_kernel(int64_t instances, int64_t tiles, const Key* sorted, int64_t* ranges) {
-  const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
-  if (i > instances) return;
-  const int64_t from = i == 0 ? 0 : int64_t(sorted[i - 1]) + 1, to = i == instances ? tiles : int64_t(sorted[i]);
-  for (int64_t tile = from; tile <= to; ++tile) ranges[tile] = i;
-}
-
-__global__ void gather_kernel(int64_t n, const int32_t* from, const int32_t* at, int32_t* to) {
-  const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
-  if (i < n) to[i] = from[at[i]];
+  constexpr int kCount = Keys<Key>::kCount;
+  const int64_t first = (int64_t(blockIdx.x) * kThreads + threadIdx.x) * kCount;
+  if (first > instances) return;
+  int64_t tile = first == 0 ? 0 : int64_t(sorted[first - 1]) + 1;
+  const Keys<Key> keys = first < instances ? *reinterpret_cast<const Keys<Key>*>(sorted + first) : Keys<Key>{};
+#pragma unroll
+  for (int r = 0; r < kCount; ++r) {
+    const int64_t i = first + r;
+    const int64_t to = i < instances ? int64_t(keys.of[r]) : i == instances ? tiles : -1;
+    for (; tile <= to; ++tile) ranges[tile] = i;
+  }
 }
 
 int bits_for(int64_t values) {
@@ -111,36 +142,28 @@ void bin_with(const Queue& queue, int64_t n, const Projected<float>& in, const i
               int64_t instances, const Binned& out) {
   const int64_t tiles = int64_t(tile_count(image.width)) * tile_count(image.height);
   const cudaStream_t stream = stream_of(queue);
-  Key *keys = queue.array<Key>(instances), *sorted_keys = queue.array<Key>(instances);
+  const int64_t blocks = (instances + kEmitted - 1) / kEmitted;
+  Key *keys = queue.array<Key>(blocks * kEmitted), *sorted_keys = queue.array<Key>(blocks * kEmitted);
   if (instances) {
-    int64_t* offsets = queue.array<int64_t>(n);
+    int32_t *offsets = queue.array<int32_t>(n + 1), *first = queue.array<int32_t>(blocks + 1);
     const auto counts =
-        thrust::make_transform_iterator(thrust::counting_iterator<int32_t>(0), OrderedCount{order, in.tile_counts});
+        thrust::make_transform_iterator(thrust::counting_iterator<int64_t>(0), OrderedCount{order, in.tile_counts, n});
     with_memory(queue, [&](void* memory, size_t& bytes) {
-      return cub::DeviceScan::ExclusiveSum(memory, bytes, counts, offsets, n, stream);
+      return cub::DeviceScan::ExclusiveSum(memory, bytes, counts, offsets, n + 1, stream);
     });
-    int32_t* owners = queue.array<int32_t>(instances);
-    const unsigned blocks = unsigned((instances + kEmitted - 1) / kEmitted);
+    share_kernel<<<unsigned((n + kEmitThreads - 1) / kEmitThreads), kEmitThreads, 0, stream>>>(n, offsets, first);
+    check_launch("share");
+    int32_t* owners = queue.array<int32_t>(blocks * kEmitted);
     emit_kernel<Key>
-        <<<blocks, kEmitThreads, 0, stream>>>(n, instances, order, offsets, in, image, keys, owners, out.slot_offsets);
+        <<<unsigned(blocks), kEmitThreads, 0, stream>>>(instances, order, offsets, first, in, image, keys, owners);
     check_launch("emit");
-    const int end_bit = bits_for(tiles);
-    if (out.slots) {
-      int32_t* index = queue.array<int32_t>(instances);
-      count_up_kernel<<<blocks_for(instances), kThreads, 0, stream>>>(instances, index);
-      with_memory(queue, [&](void* memory, size_t& bytes) {
-        return cub::DeviceRadixSort::SortPairs(memory, bytes, keys, sorted_keys, index, out.slots, instances, 0,
-                                               end_bit, stream);
-      });
-      gather_kernel<<<blocks_for(instances), kThreads, 0, stream>>>(instances, owners, out.slots, out.instances);
-    } else {
-      with_memory(queue, [&](void* memory, size_t& bytes) {
-        return cub::DeviceRadixSort::SortPairs(memory, bytes, keys, sorted_keys, owners, out.instances, instances, 0,
-                                               end_bit, stream);
-      });
-    }
+    with_memory(queue, [&](void* memory, size_t& bytes) {
+      return cub::DeviceRadixSort::SortPairs(memory, bytes, keys, sorted_keys, owners, out.instances, instances, 0,
+                                             bits_for(tiles), stream);
+    });
   }
-  ranges_kernel<Key><<<blocks_for(instances + 1), kThreads, 0, stream>>>(instances, tiles, sorted_keys, out.ranges);
+  const int64_t loads = instances / Keys<Key>::kCount + 1;
+  ranges_kernel<Key><<<blocks_for(loads), kThreads, 0, stream>>>(instances, tiles, sorted_keys, out.ranges);
   check_launch("bin");
 }
 
@@ -148,14 +171,17 @@ void bin_with(const Queue& queue, int64_t n, const Projected<float>& in, const i
 
 template <>
 void bin<float>(const Queue& queue, int64_t count, const Projected<float>& in, Image image, const BinMemory& memory) {
-  int64_t instances = 0;
+  int64_t instances = 0, slots = 0;
   const int32_t* order = nullptr;
   if (count) {
-    const InstanceCount counted(queue, count, in.tile_counts);
-    order = sort_by_depth(queue, count, in.depths);  // the GPU is busy while the host waits for the number
-    instances = counted.value();
+    const Totals totals(queue, count, in, memory.slot_offsets);
+    order = sort_by_depth(queue, count, in.depths);  // the GPU is busy while the host waits for the numbers
+    totals.wait();
+    instances = totals.instances(), slots = totals.slots();
+  } else if (memory.slot_offsets) {
+    GS_CUDA_CHECK(cudaMemsetAsync(memory.slot_offsets, 0, sizeof *memory.slot_offsets, stream_of(queue)));
   }
-  const Binned out = memory.take(memory.context, instances);
+  const Binned out = memory.take(memory.context, instances, slots);
   const int64_t tiles = int64_t(tile_count(image.width)) * tile_count(image.height);
   const auto run = tiles <= 1 << 16 ? bin_with<uint16_t> : bin_with<uint32_t>;
   run(queue, count, in, order, image, instances, out);

@@ -179,7 +179,7 @@ struct CountBits {
 
 // How far each tile's backward has to go, and the slots of the instances up to there.
 __global__ void __launch_bounds__(kTile* kTile)
-    mark_kernel(BlendInput<float> in, const int32_t* last, const int32_t* slots, int32_t* processed, uint32_t* bits) {
+    mark_kernel(BlendInput<float> in, const int32_t* last, SplatSlots slots, int32_t* processed, uint32_t* bits) {
   __shared__ int32_t most;
   if (threadIdx.x == 0) most = 0;
   __syncthreads();
@@ -191,7 +191,7 @@ __global__ void __launch_bounds__(kTile* kTile)
   __syncthreads();
   if (threadIdx.x == 0) processed[tile] = most;
   for (int k = threadIdx.x; k < most; k += kTile * kTile) {
-    const int32_t slot = slots[in.ranges[tile] + k];
+    const int64_t slot = slots.slot(in.instances[in.ranges[tile] + k], tile % across, tile / across);
     atomicOr(bits + (slot >> 5), 1u << (slot & 31));
   }
 }
@@ -252,12 +252,14 @@ __global__ void __launch_bounds__(Backward::kThreads)
   }
   furthest = __reduce_max_sync(kWarp, furthest);
   const int64_t begin = in.ranges[tile];
+  const SplatSlots slots{g.rects, g.slot_offsets};
   for (int end = processed[tile]; end > 0; end -= kBatch) {
     const int count = end < kBatch ? end : kBatch, first = end - count;
     __syncthreads();
     for (int k = threadIdx.x; k < count; k += Backward::kThreads) {
-      batch.put(k, in.splats, in.instances[begin + first + k], float(left), float(top));
-      row_of[k] = compact.row(g.slots[begin + first + k]);
+      const int32_t splat = in.instances[begin + first + k];
+      batch.put(k, in.splats, splat, float(left), float(top));
+      row_of[k] = compact.row(slots.slot(splat, tile % across, tile / across));
     }
     for (int k = threadIdx.x; k < Backward::kWarps * kBatch * kGradientValues; k += Backward::kThreads) sums[k] = 0;
     __syncthreads();
@@ -306,7 +308,7 @@ __global__ void __launch_bounds__(Backward::kThreads)
 __global__ void __launch_bounds__(256) moments_kernel(int64_t count, SlotSums sums, float* moments) {
   const int64_t i = int64_t(blockIdx.x) * 256 + threadIdx.x;
   float values[kGradientValues];
-  sums.read(i, i < count && sums.tile_counts[i] != 0, values);
+  sums.read(i, i < count && sums.seen(i), values);
   if (i >= count) return;
   for (int v = 0; v < kGradientValues; ++v) moments[kGradientValues * i + v] = values[v];
 }
@@ -326,11 +328,11 @@ void blend<float>(const Queue& queue, const BlendInput<float>& in, const Blended
 Compact blend_rows(const Queue& queue, const BlendInput<float>& in, const BlendGradient<float>& g) {
   const cudaStream_t stream = stream_of(queue);
   const unsigned tiles = unsigned(tiles_of(in.image));
-  const int64_t words = (g.instance_count + 31) / 32;
+  const int64_t words = (g.slot_count + 31) / 32;
   uint32_t* bits = queue.array<uint32_t>(words + 1);
   int32_t *before = queue.array<int32_t>(words + 1), *processed = queue.array<int32_t>(tiles);
   GS_CUDA_CHECK(cudaMemsetAsync(bits, 0, (words + 1) * sizeof *bits, stream));
-  mark_kernel<<<tiles, kTile * kTile, 0, stream>>>(in, g.last, g.slots, processed, bits);
+  mark_kernel<<<tiles, kTile * kTile, 0, stream>>>(in, g.last, SplatSlots{g.rects, g.slot_offsets}, processed, bits);
   check_launch("mark");
   const auto counts = thrust::make_transform_iterator(thrust::counting_iterator<int64_t>(0), CountBits{bits, words});
   size_t bytes = 0;
@@ -356,7 +358,7 @@ Compact blend_rows(const Queue& queue, const BlendInput<float>& in, const BlendG
 template <>
 void blend_vjp<float>(const Queue& queue, const BlendInput<float>& in, const BlendGradient<float>& g) {
   if (!g.count) return;
-  const SlotSums sums{blend_rows(queue, in, g), g.slot_offsets, g.tile_counts};
+  const SlotSums sums{blend_rows(queue, in, g), g.slot_offsets};
   moments_kernel<<<unsigned((g.count + 255) / 256), 256, 0, stream_of(queue)>>>(g.count, sums, g.moments);
   check_launch("moments");
 }

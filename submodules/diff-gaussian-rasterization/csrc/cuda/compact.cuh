@@ -27,17 +27,15 @@ struct SlotSums {
   static constexpr int kOwnRows = 48;
   Compact compact;
   const int64_t* slot_offsets;
-  const int32_t* tile_counts;
+
+  __device__ bool seen(int64_t splat) const { return slot_offsets[splat + 1] > slot_offsets[splat]; }
 
   // Called by all lanes of a warp; those that want a splat's sums get them, the others nothing.
   __device__ void read(int64_t splat, bool wanted, float* sums) const {
     constexpr int kValues = baseline::kGradientValues;
     constexpr unsigned kAll = 0xffffffffu;
     int64_t begin = 0, end = 0;
-    if (wanted) {
-      const int64_t slot = slot_offsets[splat];
-      begin = compact.row(slot), end = compact.row(slot + tile_counts[splat]);
-    }
+    if (wanted) begin = compact.row(slot_offsets[splat]), end = compact.row(slot_offsets[splat + 1]);
     const bool many = end - begin > kOwnRows;
     for (int v = 0; v < kValues; ++v) sums[v] = 0;
     if (!many)

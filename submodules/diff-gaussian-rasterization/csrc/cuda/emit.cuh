@@ -7,7 +7,8 @@ namespace gs {
 namespace cuda {
 
 constexpr int kEmitThreads = 256;
-constexpr int kEmitted = 1024;  // instances of a block
+constexpr int kRun = 4;  // instances of a thread, side by side, stored at once
+constexpr int kEmitted = kRun * kEmitThreads;
 
 // The place of the n-th set bit (from 0).
 __device__ inline int nth_bit(uint64_t mask, int n) {
@@ -23,53 +24,52 @@ __device__ inline int nth_bit(uint64_t mask, int n) {
   return place;
 }
 
-// The last k with offsets[k] <= value, found by a warp; offsets ascend from 0.
-__device__ inline int64_t last_at_most(const int64_t* offsets, int64_t n, int64_t value) {
-  int64_t low = 0, high = n;
-  while (high - low > 1) {
-    const int64_t step = (high - low + 31) / 32, probe = low + (threadIdx.x & 31) * step;
-    const int hits = __popc(__ballot_sync(kWarp, probe < high && offsets[probe] <= value));
-    low += (hits - 1) * step;
-    high = low + step < high ? low + step : high;
+// For each block the splat, in depth order, that its first instance belongs to, and after the last block the last splat
+// that has an instance. offsets: (n + 1) the first instance of each splat in that order.
+__global__ void __launch_bounds__(kEmitThreads) share_kernel(int64_t n, const int32_t* offsets, int32_t* first) {
+  const int64_t k = int64_t(blockIdx.x) * kEmitThreads + threadIdx.x;
+  if (k >= n) return;
+  const int64_t begin = offsets[k], end = offsets[k + 1], instances = offsets[n];
+  if (begin == end) return;
+  for (int64_t block = (begin + kEmitted - 1) / kEmitted; block * kEmitted < end; ++block) first[block] = int32_t(k);
+  if (end == instances) first[(instances + kEmitted - 1) / kEmitted] = int32_t(k);
+}
+
+__device__ inline TileRect rect_of(const Projected<float>& in, int32_t splat) {
+  if (in.records) {
+    const TileRecord r = in.records[splat];
+    return {r.x0, r.y0, r.x1, r.y1};
   }
-  return low;
+  const int4 r = reinterpret_cast<const int4*>(in.rects)[splat];
+  return {r.x, r.y, r.z, r.w};
 }
 
 // The splats that a block's instances belong to, in shared memory.
 struct EmittedSplats {
+  uint64_t mask[kEmitted];  // of reached tiles; 0 where the rectangle has more than 64
   int32_t first[kEmitted];  // the splat's first instance, counted from the block's
   int32_t index[kEmitted];
-  int32_t x0[kEmitted], y0[kEmitted], wide[kEmitted];  // of its rectangle
-  uint64_t mask[kEmitted];                             // of reached tiles; 0 where the rectangle has more than 64
-  int32_t unmasked[kEmitted];                          // the places of those, in any order
+  int32_t corner[kEmitted];           // its rectangle's first tile
+  int32_t skip[kEmitted];             // from the end of one of the rectangle's rows to the start of the next, tiles
+  uint32_t per_wide[kEmitted];        // 2^16 / width, rounded up: places below 64 are divided by it exactly
+  int32_t starting[kEmitted];         // by instance: the splat that begins there, or 0
+  int32_t unmasked[kEmitted];         // splats without a mask, in any order
+  int32_t latest[kEmitThreads / 32];  // the last splat that begins in a warp's instances
   int32_t unmasked_count;
 
-  __device__ void put(int at, int32_t splat, int64_t first_instance, const Projected<float>& in) {
-    TileRect rect;
-    uint64_t reached = 0;
-    if (in.records) {
-      const TileRecord record = in.records[splat];
-      rect = {record.x0, record.y0, record.x1, record.y1};
-      reached = record.mask;
-    } else {
-      const int4 r = reinterpret_cast<const int4*>(in.rects)[splat];
-      rect = {r.x, r.y, r.z, r.w};
-    }
-    const bool masked = in.records && (rect.x1 - rect.x0) * (rect.y1 - rect.y0) <= 64;
-    first[at] = int32_t(first_instance), index[at] = splat;
-    x0[at] = rect.x0, y0[at] = rect.y0, wide[at] = rect.x1 - rect.x0;
-    mask[at] = masked ? reached : 0;
+  __device__ void put(int at, int32_t splat, int32_t first_instance, const Projected<float>& in, int columns) {
+    const TileRect rect = rect_of(in, splat);
+    const int wide = rect.x1 - rect.x0;
+    const bool masked = in.records && wide * (rect.y1 - rect.y0) <= 64;
+    mask[at] = masked ? in.records[splat].mask : 0;
+    first[at] = first_instance, index[at] = splat;
+    corner[at] = rect.y0 * columns + rect.x0, skip[at] = columns - wide, per_wide[at] = 65536 / wide + 1;
+    if (first_instance > 0) starting[first_instance] = at;
     if (!masked) unmasked[atomicAdd(&unmasked_count, 1)] = at;
   }
 
-  // The splat of instance j.
-  __device__ int owner(int j, int count) const {
-    int low = 0;
-    for (int high = count; high - low > 1;) {
-      const int middle = (low + high) / 2;
-      (first[middle] <= j ? low : high) = middle;
-    }
-    return low;
+  __device__ int tile(int k, int place) const {
+    return corner[k] + place + int(uint32_t(place) * per_wide[k] >> 16) * skip[k];
   }
 };
 
@@ -79,54 +79,71 @@ __device__ inline Splat<float> load_shape(const float* splats, int32_t index) {
   return {mean.x, mean.y, l1.x, l1.y, l2.x, l2.y, 0, 0, 0, 0};
 }
 
-// order: splats by depth; offsets: the first instance of each in that order. A splat over more tiles than a mask has
-// bits for is tested again, by the whole block, as far as the block's instances go.
+template <class T>
+struct alignas(kRun * sizeof(T)) Run {
+  T of[kRun];
+};
+
+// order: splats by depth; tiles and owners have room for whole blocks. A splat over more tiles than a mask has bits for
+// is tested again, by the whole block, as far as the block's instances go.
 template <class Key>
 __global__ void __launch_bounds__(kEmitThreads)
-    emit_kernel(int64_t n, int64_t instances, const int32_t* order, const int64_t* offsets, Projected<float> in,
-                Image image, Key* tiles, int32_t* owners, int64_t* slot_offsets) {
+    emit_kernel(int64_t instances, const int32_t* order, const int32_t* offsets, const int32_t* first_splat,
+                Projected<float> in, Image image, Key* tiles, int32_t* owners) {
   __shared__ EmittedSplats splats;
-  __shared__ int64_t ends[2];
   __shared__ int32_t warp_hits[2][kEmitThreads / 32];
   const int columns = tile_count(image.width), warp = threadIdx.x / 32, lane = threadIdx.x & 31;
   const int64_t base = int64_t(blockIdx.x) * kEmitted;
   const int emitted = int(instances - base < kEmitted ? instances - base : kEmitted);
-  if (warp < 2) {
-    const int64_t k = last_at_most(offsets, n, warp ? base + emitted - 1 : base);
-    if (lane == 0) ends[warp] = k;
-  }
+  const int32_t first = first_splat[blockIdx.x], last = first_splat[blockIdx.x + 1];
+  for (int j = threadIdx.x; j < kEmitted; j += kEmitThreads) splats.starting[j] = 0;
   if (threadIdx.x == 0) splats.unmasked_count = 0;
   __syncthreads();
-  const int64_t first = ends[0];
-  const int count = int(ends[1] - first) + 1;
-  for (int k = threadIdx.x; k < count; k += kEmitThreads) {
-    const int32_t index = order[first + k];
-    const int64_t offset = offsets[first + k];
-    splats.put(k, index, offset - base, in);
-    if (slot_offsets && offset >= base) slot_offsets[index] = offset;
+  for (int k = threadIdx.x; k <= last - first; k += kEmitThreads) {
+    const int64_t begin = offsets[first + k] - base;
+    if (begin < emitted) splats.put(k, order[first + k], int32_t(begin), in, columns);
   }
   __syncthreads();
 
-  for (int j = threadIdx.x; j < emitted; j += kEmitThreads) {
-    const int k = splats.owner(j, count);
-    const uint64_t mask = splats.mask[k];
-    if (!mask) continue;
-    const int wide = splats.wide[k], bit = nth_bit(mask, j - splats.first[k]), row = bit / wide;
-    tiles[base + j] = Key((splats.y0[k] + row) * columns + splats.x0[k] + bit - row * wide);
-    owners[base + j] = splats.index[k];
+  // Splats begin in the order of their numbers, so the largest so far is the owner.
+  const Run<int32_t> starting = reinterpret_cast<const Run<int32_t>*>(splats.starting)[threadIdx.x];
+  int k = 0;
+  for (int r = 0; r < kRun; ++r) k = starting.of[r] > k ? starting.of[r] : k;
+  for (int step = 1; step < 32; step *= 2) {
+    const int before = __shfl_up_sync(kWarp, k, step);
+    if (lane >= step && before > k) k = before;
   }
+  if (lane == 31) splats.latest[warp] = k;
+  k = __shfl_up_sync(kWarp, k, 1);
+  if (lane == 0) k = 0;
+  __syncthreads();
+  for (int w = 0; w < warp; ++w) k = splats.latest[w] > k ? splats.latest[w] : k;
 
+  const int at = kRun * threadIdx.x;
+  uint64_t left = splats.mask[k];
+  if (!starting.of[0]) left &= ~uint64_t(0) << nth_bit(left, at - splats.first[k]);
+  Run<Key> run_tiles;
+  Run<int32_t> run_owners;
+#pragma unroll
+  for (int r = 0; r < kRun; ++r) {
+    if (starting.of[r]) k = starting.of[r], left = splats.mask[k];
+    run_tiles.of[r] = Key(splats.tile(k, (__ffsll(left) - 1) & 63));  // some tile where there is no mask
+    run_owners.of[r] = splats.index[k];
+    left &= left - 1;
+  }
+  reinterpret_cast<Run<Key>*>(tiles + base)[threadIdx.x] = run_tiles;
+  reinterpret_cast<Run<int32_t>*>(owners + base)[threadIdx.x] = run_owners;
+
+  if (splats.unmasked_count) __syncthreads();  // what follows writes over what these instances got
   for (int u = 0, turn = 0; u < splats.unmasked_count; ++u) {
-    const int k = splats.unmasked[u];
-    const int32_t index = splats.index[k];
-    const int x0 = splats.x0[k], y0 = splats.y0[k], wide = splats.wide[k];
-    const int high = (in.records ? in.records[index].y1 : in.rects[4 * int64_t(index) + 3]) - y0;
-    const TileTest<float> test =
-        make_tile_test(load_shape(in.splats, index), TileRect{x0, y0, x0 + wide, y0 + high}, image.width, image.height);
+    const int32_t k = splats.unmasked[u], index = splats.index[k];
+    const TileRect rect = rect_of(in, index);
+    const TileTest<float> test = make_tile_test(load_shape(in.splats, index), rect, image.width, image.height);
+    const int wide = rect.x1 - rect.x0, area = wide * (rect.y1 - rect.y0);
     int at = splats.first[k];
-    for (int tile = 0; tile < wide * high && at < emitted; tile += kEmitThreads, turn ^= 1) {
-      const int mine = tile + threadIdx.x, tx = x0 + mine % wide, ty = y0 + mine / wide;
-      const bool reached = mine < wide * high && tile_reached(test, float(tx), float(ty));
+    for (int tile = 0; tile < area && at < emitted; tile += kEmitThreads, turn ^= 1) {
+      const int mine = tile + threadIdx.x, tx = rect.x0 + mine % wide, ty = rect.y0 + mine / wide;
+      const bool reached = mine < area && tile_reached(test, float(tx), float(ty));
       const unsigned hits = __ballot_sync(kWarp, reached);
       if (lane == 0) warp_hits[turn][warp] = __popc(hits);
       __syncthreads();  // one is enough: the next turn writes the other row

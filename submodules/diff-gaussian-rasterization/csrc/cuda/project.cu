@@ -97,8 +97,7 @@ __global__ void __launch_bounds__(kThreads) project_kernel(Scene<float> s, Proje
   out.radii[i] = radius;
   out.tile_counts[i] = count;
   out.depths[i] = count ? depth : INFINITY;
-  if (out.records)
-    out.records[i] = {mask, uint16_t(rect.x0), uint16_t(rect.y0), uint16_t(rect.x1), uint16_t(rect.y1), count};
+  if (out.records) out.records[i] = {mask, uint16_t(rect.x0), uint16_t(rect.y0), uint16_t(rect.x1), uint16_t(rect.y1)};
   if (!count) return;
   if (out.rects) reinterpret_cast<int4*>(out.rects)[i] = make_int4(rect.x0, rect.y0, rect.x1, rect.y1);
   float2* to = reinterpret_cast<float2*>(out.splats + kSplatValues * i);
@@ -113,6 +112,7 @@ __global__ void __launch_bounds__(kThreads) project_kernel(Scene<float> s, Proje
 struct StoredMoments {
   const float* moments;
   const int32_t* tile_counts;
+  __device__ bool seen(int64_t i) const { return tile_counts[i] != 0; }
   __device__ void read(int64_t i, bool wanted, float* m) const {
     for (int v = 0; wanted && v < kGradientValues; ++v) m[v] = moments[kGradientValues * i + v];
   }
@@ -126,7 +126,7 @@ __global__ void __launch_bounds__(kThreads)
   if (threadIdx.x == 0) camera = camera_of(s);
   __syncthreads();
   const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x, first = i - (threadIdx.x & 31);
-  const bool seen = i < s.count && source.tile_counts[i] != 0;
+  const bool seen = i < s.count && source.seen(i);
   float* row = rest + threadIdx.x * kRest;
   float* warp_rows = rest + (threadIdx.x & ~31) * kRest;
   if (!s.colors)
@@ -172,7 +172,7 @@ void project_vjp<float>(const Queue& queue, const Scene<float>& s, const int32_t
 void rasterize_vjp(const Queue& queue, const Scene<float>& s, const BlendInput<float>& in,
                    const BlendGradient<float>& g, const SceneGradient<float>& out) {
   if (!s.count) return;
-  const SlotSums source{blend_rows(queue, in, g), g.slot_offsets, g.tile_counts};
+  const SlotSums source{blend_rows(queue, in, g), g.slot_offsets};
   project_vjp_kernel<<<blocks_for(s.count), kThreads, 0, stream_of(queue)>>>(s, source, out);
   check_launch("project_vjp");
 }

@@ -42,7 +42,7 @@ struct Result {
 
 // Forward and backward of the sum of all pixels of all planes, on an Executor or a Queue; allocations are exact, so
 // that a sanitizer sees a step outside. The gradient holds means, means2d, opacities, scales, rotations, dc, rest, one
-// after the other. records: projection hands binning one record a splat in place of its rectangles.
+// after the other. records: projection hands binning one record a splat besides its rectangles.
 template <class T, class Where>
 Result<T> run(const Where& where, Parameters<T>& p, gs::Image image, bool antialiasing, bool records = false) {
   using gs::cuda::bin, gs::cuda::blend, gs::cuda::blend_vjp, gs::cuda::project, gs::cuda::project_vjp;
@@ -67,22 +67,25 @@ Result<T> run(const Where& where, Parameters<T>& p, gs::Image image, bool antial
   std::vector<int32_t> rects(4 * n);
   std::vector<gs::TileRecord> record(n);
   out.tile_counts.resize(n), out.radii.resize(n);
-  const gs::Projected<T> projected = {splats.data(),          depths.data(),    records ? nullptr : rects.data(),
+  const gs::Projected<T> projected = {splats.data(),          depths.data(),    rects.data(),
                                       out.tile_counts.data(), out.radii.data(), records ? record.data() : nullptr};
   project(where, scene, projected);
 
   const size_t tiles = size_t((image.width + 15) / 16) * ((image.height + 15) / 16);
   struct Lists {
-    std::vector<int32_t> instances, slots;
-    std::vector<int64_t> ranges, slot_offsets;
-  } lists{{}, {}, std::vector<int64_t>(tiles + 1), std::vector<int64_t>(n)};
-  const auto take = [](void* context, int64_t count) {
+    std::vector<int32_t> instances;
+    std::vector<int64_t> ranges;
+    int64_t slot_count;
+  } lists{{}, std::vector<int64_t>(tiles + 1), 0};
+  std::vector<int64_t> slot_offsets(n + 1);
+  const auto take = [](void* context, int64_t count, int64_t slots) {
     Lists& l = *static_cast<Lists*>(context);
-    l.instances.resize(count), l.slots.resize(count);
-    return gs::Binned{l.instances.data(), l.slots.data(), l.ranges.data(), l.slot_offsets.data()};
+    l.instances.resize(count), l.slot_count = slots;
+    return gs::Binned{l.instances.data(), l.ranges.data()};
   };
-  bin(where, p.count, projected, image, gs::BinMemory{take, &lists});
-  auto& [instances, slots, ranges, slot_offsets] = lists;
+  bin(where, p.count, projected, image, gs::BinMemory{take, &lists, slot_offsets.data()});
+  auto& [instances, ranges, slot_count] = lists;
+  CHECK(slot_count == slot_offsets.back() && slot_count >= int64_t(instances.size()));
   std::vector<int32_t> last(pixels);
   out.instances = int64_t(instances.size());
   CHECK(out.instances == std::accumulate(out.tile_counts.begin(), out.tile_counts.end(), int64_t(0)));
@@ -104,7 +107,7 @@ Result<T> run(const Where& where, Parameters<T>& p, gs::Image image, bool antial
   const std::vector<T> ones(3 * pixels, T(1));
   std::vector<T> moments(kGradientValues * n);
   blend_vjp(where, input,
-            gs::BlendGradient<T>{p.count, out.instances, slots.data(), slot_offsets.data(), out.tile_counts.data(),
+            gs::BlendGradient<T>{p.count, out.instances, slot_count, rects.data(), slot_offsets.data(),
                                  out.transmittance.data(), last.data(), ones.data(), ones.data(), ones.data(),
                                  moments.data()});
   out.gradient.assign(n * (3 + 3 + 1 + 3 + 4 + 3 + 45), T(-77));
