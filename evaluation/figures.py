@@ -57,9 +57,9 @@ def draw_curves(path: Path, scene: str, runs: Sequence[dict[str, Any]]) -> bool:
                 axes.plot(*_columns(train), label="train" if first else None, **style)
         if len(configs) > 1:
             front = [every[i] for i in pareto_front([(seconds, sign * number) for seconds, number in every])]
-            axes.step(
-                *_columns(front), where="post", color="black", linewidth=0.6, marker="o", markerfacecolor="none",
-                markersize=8, label="Pareto front",
+            axes.plot(
+                *_columns(_stairs(front)), color="black", linewidth=0.6, marker="o", markevery=2,
+                markerfacecolor="none", markersize=8, label="Pareto front",
             )  # fmt: skip
         axes.set(xscale="log", xlabel="seconds of training, without scoring and saving", ylabel=label)
         plain_log_axis(axes.xaxis)
@@ -80,6 +80,13 @@ def _points(curve: Sequence[Row], value: Callable[[Row, str], float | None], vie
 
 def _columns(points: Sequence[tuple[float, float]]) -> tuple[list[float], list[float]]:
     return [x for x, _ in points], [y for _, y in points]
+
+
+def _stairs(points: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
+    """The points with a corner between each two: every second one is a point. Matplotlib keeps its legend clear of
+    these, but not of what it draws with drawstyle "steps"."""
+    corners = [(after[0], before[1]) for before, after in zip(points, points[1:], strict=False)]
+    return [point for pair in zip(points, corners, strict=False) for point in pair] + list(points[-1:])
 
 
 def _what_counts(method: Path, side: str, name: str) -> Image.Image:

@@ -12,6 +12,7 @@ import time
 from pathlib import Path
 
 import pytest
+from matplotlib.figure import Figure
 from PIL import Image
 from synthetic import folder_state
 
@@ -346,6 +347,28 @@ def test_masks_are_part_of_the_ground_truth_and_blank_on_the_sheet(scenes, tmp_p
         # In the middle of each picture: above the label, which is masked, and in the lower half, which is not.
         masked, plain = ([sheet.getpixel((GAP + 60 + i * (120 + GAP), HEADER + y)) for i in range(3)] for y in (1, 60))
     assert masked == [(255,) * 3, (255,) * 3, (0,) * 3] and plain == [(90,) * 3, (90,) * 3, (0,) * 3]
+
+
+def test_the_legend_leaves_the_pareto_front_free(tmp_path, monkeypatch):
+    figures, plain = [], Figure.savefig
+    monkeypatch.setattr(Figure, "savefig", lambda self, *a, **k: (figures.append(self), plain(self, *a, **k)))
+    names = ("seconds", "test_psnr", "test_ssim")
+    curves = {
+        "base": [(0.3, 15.0, 0.7), (2.8, 29.0, 0.945)],
+        "fast start": [(0.3, 21.0, 0.8), (3.3, 29.5, 0.95)],
+    } | {f"set {i}": [(0.31, 15.0, 0.7), (2.9, 28.5, 0.94)] for i in range(6)}  # fmt: skip
+    runs = [
+        {"config": config, "curve": [dict(zip(names, row, strict=True)) for row in curve]}
+        for config, curve in curves.items()
+    ]
+    assert draw_curves(tmp_path / "curves.png", "attic", runs)
+    left, right = figures[0].axes
+    fronts = [next(line for line in axes.lines if line.get_label() == "Pareto front") for axes in (left, right)]
+    assert fronts[0].get_xydata().tolist() == [[0.3, 21.0], [2.8, 21.0], [2.8, 29.0], [3.3, 29.0], [3.3, 29.5]]
+    assert fronts[0].get_markevery() == 2  # corners are not marked
+    for axes, front in zip((left, right), fronts, strict=True):
+        drawn = front.get_path().transformed(front.get_transform())
+        assert not drawn.intersects_bbox(axes.get_legend().get_window_extent(), filled=False)
 
 
 def test_seeds_and_option_sets(figures, scenes, tmp_path, capsys, monkeypatch):
