@@ -17,26 +17,33 @@ constexpr int kRest = 3 * (sh_count(kMaxShDegree) - 1);  // 45 values: odd, so r
 
 dim3 blocks_for(int64_t n) { return dim3(unsigned((n + kThreads - 1) / kThreads)); }
 
-// The warp's rows of sh_rest: those `wanted` (a bit per lane), `values` of each, start to flow into shared memory.
-// Nobody waits for one row before asking for the next.
-__device__ void fetch_rows(const float* global, int64_t first, int64_t stride, int values, unsigned wanted,
-                           float* rows) {
+// Copying all 32 rows costs 12 copies a lane, one row 2: with this many wanted, reading the others too is cheaper.
+constexpr int kManyRows = 20;
+
+// The warp's rows of sh_rest, of `count` in all: those `wanted` (a bit per lane), `values` of each, start to flow into
+// shared memory. Nobody waits for one row before asking for the next. Returns which rows do, maybe more than wanted.
+__device__ unsigned fetch_rows(const float* global, int64_t first, int64_t count, int64_t stride, int values,
+                               unsigned wanted, float* rows) {
+  if (!wanted) return 0;
   const int lane = threadIdx.x & 31;
   const float* from = global + first * stride;
-  if (stride == kRest && values == kRest && reinterpret_cast<uintptr_t>(from) % 16 == 0 && wanted == kWarp) {
+  if (__popc(wanted) >= kManyRows && first + 32 <= count && stride == kRest && values == kRest &&
+      reinterpret_cast<uintptr_t>(from) % 16 == 0) {
 #pragma unroll
     for (int k = 0; k < (kRest * 32 + 127) / 128; ++k) {
       const int at = 4 * (32 * k + lane);
       if (at < kRest * 32) __pipeline_memcpy_async(rows + at, from + at, 16);
     }
+    wanted = kWarp;
   } else {
-    for (; wanted; wanted &= wanted - 1) {
-      const int row = __ffs(wanted) - 1;
+    for (unsigned left = wanted; left; left &= left - 1) {
+      const int row = __ffs(left) - 1;
       for (int v = lane; v < values; v += 32)
         __pipeline_memcpy_async(rows + row * kRest + v, from + row * stride + v, sizeof(float));
     }
   }
   __pipeline_commit();
+  return wanted;
 }
 __device__ void wait_for_rows() {
   __pipeline_wait_prior(0);
@@ -77,10 +84,11 @@ __global__ void __launch_bounds__(kThreads) project_kernel(Scene<float> s, Proje
   Splat<float> splat = {};
   float depth = INFINITY;
   int radius = 0;
+  unsigned fetched = 0;
   const auto fetch = [&](bool wanted) {
     if (!s.colors)
-      fetch_rows(s.sh_rest, i - (threadIdx.x & 31), s.rest_stride, 3 * (sh_count(s.sh_degree) - 1),
-                 __ballot_sync(kWarp, wanted), rest + (threadIdx.x & ~31) * kRest);
+      fetched |= fetch_rows(s.sh_rest, i - (threadIdx.x & 31), s.count, s.rest_stride, 3 * (sh_count(s.sh_degree) - 1),
+                            __ballot_sync(kWarp, wanted) & ~fetched, rest + (threadIdx.x & ~31) * kRest);
   };
   // Coefficients of what is likely seen are on their way while the shape is worked out.
   const bool likely = i < s.count && near_view(camera, to_view(camera, load3(s.means + 3 * i)));
@@ -88,7 +96,7 @@ __global__ void __launch_bounds__(kThreads) project_kernel(Scene<float> s, Proje
   const bool visible = i < s.count && project_shape(s, camera, i, splat, depth, radius);
   TileRect rect = {0, 0, 0, 0};
   if (visible) rect = tile_rect(splat, s.image.width, s.image.height);
-  fetch(!likely && rect.x1 > rect.x0);
+  fetch(rect.x1 > rect.x0);
   uint64_t mask;
   int32_t count = warp_count_tiles(splat, rect, s.image, mask);
   wait_for_rows();
@@ -130,7 +138,8 @@ __global__ void __launch_bounds__(kThreads)
   float* row = rest + threadIdx.x * kRest;
   float* warp_rows = rest + (threadIdx.x & ~31) * kRest;
   if (!s.colors)
-    fetch_rows(s.sh_rest, first, s.rest_stride, 3 * (sh_count(s.sh_degree) - 1), __ballot_sync(kWarp, seen), warp_rows);
+    fetch_rows(s.sh_rest, first, s.count, s.rest_stride, 3 * (sh_count(s.sh_degree) - 1), __ballot_sync(kWarp, seen),
+               warp_rows);
   float m[kGradientValues];
   source.read(i, seen, m);
   wait_for_rows();
