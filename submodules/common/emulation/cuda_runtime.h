@@ -99,6 +99,9 @@ template <class T>
 T __reduce_max_sync(unsigned mask, T mine) {
   return gs::emulation::reduce(mine, "__reduce_max_sync", mask, [](T a, T b) { return a > b ? a : b; });
 }
+inline unsigned __reduce_or_sync(unsigned mask, unsigned mine) {
+  return gs::emulation::reduce(mine, "__reduce_or_sync", mask, [](unsigned a, unsigned b) { return a | b; });
+}
 template <class T>
 T __shfl_sync(unsigned mask, T value, int from) {
   return gs::emulation::shuffle(value, from & 31, "__shfl_sync", mask);

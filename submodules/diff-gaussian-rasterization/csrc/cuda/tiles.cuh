@@ -9,52 +9,73 @@ namespace cuda {
 using namespace baseline;  // the math headers' namespace in a build without instruction sets
 
 constexpr unsigned kWarp = 0xffffffffu;
-constexpr int kOwnTiles = 24;  // rectangles up to this size are a lane's own business
+constexpr int kShared = 32;  // tiles of a rectangle up to which it is tested along with those of other lanes
 
 template <class V>
 __device__ V from_lane(V value, int lane) {
   return __shfl_sync(kWarp, value, lane);
 }
 
+// Of what tile_reached reads, all that differs between lanes.
 template <>
-__device__ inline Splat<float> from_lane(Splat<float> s, int lane) {
-  return {from_lane(s.x, lane),
-          from_lane(s.y, lane),
-          from_lane(s.l11, lane),
-          from_lane(s.l12, lane),
-          from_lane(s.l22, lane),
-          from_lane(s.log2_opacity, lane),
-          s.r,
-          s.g,
-          s.b,
-          s.inverse_depth};
+__device__ inline TileTest<float> from_lane(TileTest<float> test, int lane) {
+  Splat<float>& s = test.splat;
+  s.x = from_lane(s.x, lane), s.y = from_lane(s.y, lane);
+  s.l11 = from_lane(s.l11, lane), s.l22 = from_lane(s.l22, lane);
+  test.slope_x = from_lane(test.slope_x, lane), test.slope_y = from_lane(test.slope_y, lane);
+  test.level = from_lane(test.level, lane);
+  return test;
+}
+
+// Called by all lanes of a warp, with tests of `tiles` tiles each, 1 to 32; in rows of `wide` from (x0, y0). Returns a
+// bit for each tile that is reached. The tests of all lanes, one lane's after the other's, are shared out evenly.
+__device__ inline uint32_t warp_tiles_reached(const TileTest<float>& test, int x0, int y0, int wide, int tiles) {
+  constexpr int kOne = 1024;
+  const int lane = threadIdx.x & 31, inverse = kOne / wide + 1;  // k * inverse / kOne = k / wide for all k < 32
+  int end = tiles;
+  for (int step = 1; step < 32; step *= 2) {
+    const int before = __shfl_up_sync(kWarp, end, step);
+    if (lane >= step) end += before;
+  }
+  const int start = end - tiles, total = from_lane(end, 31);
+  unsigned kept = 0;  // lane k keeps round k's hits
+  for (int base = 0, begun = 0; base < total; base += 32) {
+    const unsigned in_round = unsigned(start - base);
+    const unsigned starts = __reduce_or_sync(kWarp, in_round < 32 ? 1u << in_round : 0u);
+    const int owner = begun + __popc(starts & ((2u << lane) - 1)) - 1;
+    begun += __popc(starts);
+    const int k = base + lane - from_lane(start, owner), row = k * from_lane(inverse, owner) / kOne;
+    const int tx = from_lane(x0, owner) + k - row * from_lane(wide, owner), ty = from_lane(y0, owner) + row;
+    const unsigned hits = __ballot_sync(kWarp, tile_reached(from_lane(test, owner), float(tx), float(ty)));
+    if (base == 32 * lane) kept = hits;
+  }
+  const uint64_t low = from_lane(kept, start / 32), high = from_lane(kept, start / 32 + 1);
+  return uint32_t((high << 32 | low) >> start % 32) & uint32_t((uint64_t(1) << tiles) - 1);
 }
 
 // Called by all lanes of a warp, each with a splat of its own (an empty rectangle for none). Returns the number of
 // tiles that the splat reaches, and in `mask` a bit for each of the rectangle's first 64.
 __device__ inline int32_t warp_count_tiles(const Splat<float>& splat, TileRect rect, Image image, uint64_t& mask) {
   const int lane = threadIdx.x & 31;
-  const int own = (rect.x1 - rect.x0) * (rect.y1 - rect.y0);
+  const int wide = rect.x1 - rect.x0, tiles = wide * (rect.y1 - rect.y0);
+  TileTest<float> test = {splat, float(image.width - 1), float(image.height - 1), 0, 0, 0};
+  if (tiles > 0) test = make_tile_test(splat, rect, image.width, image.height);
   int32_t count = 0;
   mask = 0;
-  if (own > 0 && own <= kOwnTiles) {
-    const TileTest<float> test = make_tile_test(splat, rect, image.width, image.height);
-    uint64_t bit = 1;
-    for (int ty = rect.y0; ty < rect.y1; ++ty)
-      for (int tx = rect.x0; tx < rect.x1; ++tx, bit <<= 1)
-        if (tile_reached(test, float(tx), float(ty))) mask |= bit;
-    count = __popcll(mask);
+  const bool shared = tiles > 0 && tiles <= kShared;
+  if (__any_sync(kWarp, shared)) {  // those without take part with one tile, for nothing
+    const uint32_t reached = warp_tiles_reached(test, rect.x0, rect.y0, shared ? wide : 1, shared ? tiles : 1);
+    if (shared) mask = reached, count = __popc(reached);
   }
-  for (unsigned large = __ballot_sync(kWarp, own > kOwnTiles); large; large &= large - 1) {
+  for (unsigned large = __ballot_sync(kWarp, tiles > kShared); large; large &= large - 1) {
     const int owner = __ffs(large) - 1;
-    const TileRect r = {from_lane(rect.x0, owner), from_lane(rect.y0, owner), from_lane(rect.x1, owner),
-                        from_lane(rect.y1, owner)};
-    const TileTest<float> test = make_tile_test(from_lane(splat, owner), r, image.width, image.height);
-    const int wide = r.x1 - r.x0, total = wide * (r.y1 - r.y0);
+    const TileTest<float> its = from_lane(test, owner);
+    const int x0 = from_lane(rect.x0, owner), y0 = from_lane(rect.y0, owner);
+    const int across = from_lane(wide, owner), total = from_lane(tiles, owner);
     int32_t found = 0;
     for (int base = 0; base < total; base += 32) {
-      const int k = base + lane, tx = r.x0 + k % wide, ty = r.y0 + k / wide;
-      const unsigned hits = __ballot_sync(kWarp, k < total && tile_reached(test, float(tx), float(ty)));
+      const int k = base + lane, tx = x0 + k % across, ty = y0 + k / across;
+      const unsigned hits = __ballot_sync(kWarp, k < total && tile_reached(its, float(tx), float(ty)));
       found += __popc(hits);
       if (lane == owner && base < 64) mask |= uint64_t(hits) << base;
     }
