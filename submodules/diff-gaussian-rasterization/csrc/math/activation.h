@@ -8,14 +8,15 @@ GS_ISA_BEGIN
 // log2 of the logistic function, good for any logit: sigmoid(x) = 1/(1+e^-x).
 template <class T>
 GS_HD T log2_sigmoid(T logit) {
-  const T log_sigmoid = logit > 0 ? -std::log1p(std::exp(-logit)) : logit - std::log1p(std::exp(logit));
-  return log_sigmoid * T(1.44269504088896340736);
+  const T away = std::log1p(std::exp(-std::abs(logit)));
+  return (logit > 0 ? -away : logit - away) * T(1.44269504088896340736);
 }
 
 // d ln sigmoid(x) / dx = sigmoid(-x).
 template <class T>
 GS_HD T log_sigmoid_slope(T logit) {
-  return logit > 0 ? std::exp(-logit) / (1 + std::exp(-logit)) : 1 / (1 + std::exp(logit));
+  const T e = std::exp(-std::abs(logit));
+  return (logit > 0 ? e : T(1)) / (1 + e);
 }
 
 template <class T>

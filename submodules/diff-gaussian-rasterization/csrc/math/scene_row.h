@@ -46,9 +46,11 @@ GS_HD Loaded<T> load(const Scene<T>& s, int64_t i) {
 // and 1: programs that set an opacity write them.
 template <class T>
 GS_HD bool finite_shape(const Scene<T>& s, int64_t i) {
-  if (s.raw ? std::isnan(s.opacities[i]) : !std::isfinite(s.opacities[i])) return false;
-  if (s.cov3d) return finite(load3(s.cov3d + 6 * i)) && finite(load3(s.cov3d + 6 * i + 3));
-  return finite(load3(s.scales + 3 * i)) && finite(load3(s.rotations + 4 * i)) && std::isfinite(s.rotations[4 * i + 3]);
+  const T opacity = s.opacities[i];
+  const bool good = s.raw ? !std::isnan(opacity) : std::isfinite(opacity);
+  if (s.cov3d) return good & finite(load3(s.cov3d + 6 * i)) & finite(load3(s.cov3d + 6 * i + 3));
+  return good & finite(load3(s.scales + 3 * i)) & finite(load3(s.rotations + 4 * i)) &
+         std::isfinite(s.rotations[4 * i + 3]);
 }
 
 // Everything of a splat but its colour. False: culled; depth is infinite then, so that it sorts last.

@@ -33,7 +33,7 @@ GS_HD Vec3<T> cross(Vec3<T> a, Vec3<T> b) {
 }
 template <class T>
 GS_HD bool finite(Vec3<T> a) {
-  return std::isfinite(a.x) && std::isfinite(a.y) && std::isfinite(a.z);
+  return std::isfinite(a.x) & std::isfinite(a.y) & std::isfinite(a.z);  // without waiting for one to load the next
 }
 template <class T>
 GS_HD T clamp(T value, T low, T high) {
@@ -71,7 +71,10 @@ GS_HD T length(Vec3<T> a) {
 }
 template <class T>
 GS_HD T length(T x, T y) {
-  return length(Vec3<T>{x, y, T(0)});
+  const T m = larger(std::abs(x), std::abs(y));
+  if (!(m > 0)) return m;
+  const T a = x / m, b = y / m;
+  return m * std::sqrt(a * a + b * b);
 }
 
 GS_ISA_END
