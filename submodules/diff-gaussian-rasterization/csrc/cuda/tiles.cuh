@@ -30,24 +30,24 @@ __device__ inline TileTest<float> from_lane(TileTest<float> test, int lane) {
 // Called by all lanes of a warp, with tests of `tiles` tiles each, 1 to 32; in rows of `wide` from (x0, y0). Returns a
 // bit for each tile that is reached. The tests of all lanes, one lane's after the other's, are shared out evenly.
 __device__ inline uint32_t warp_tiles_reached(const TileTest<float>& test, int x0, int y0, int wide, int tiles) {
-  constexpr int kOne = 1024;
-  const int lane = threadIdx.x & 31, inverse = kOne / wide + 1;  // k * inverse / kOne = k / wide for all k < 32
+  const int lane = threadIdx.x & 31;
+  const int inverse = int(__fdividef(1024, float(wide))) + 1;  // k * inverse >> 10 is k / wide for all k < 32
   int end = tiles;
   for (int step = 1; step < 32; step *= 2) {
     const int before = __shfl_up_sync(kWarp, end, step);
     if (lane >= step) end += before;
   }
-  const int start = end - tiles, total = from_lane(end, 31);
+  const unsigned start = end - tiles, total = from_lane(end, 31);
   unsigned kept = 0;  // lane k keeps round k's hits
-  for (int base = 0, begun = 0; base < total; base += 32) {
-    const unsigned in_round = unsigned(start - base);
+  for (unsigned base = 0, begun = 0; base < total; base += 32) {
+    const unsigned in_round = start - base;
     const unsigned starts = __reduce_or_sync(kWarp, in_round < 32 ? 1u << in_round : 0u);
     const int owner = begun + __popc(starts & ((2u << lane) - 1)) - 1;
     begun += __popc(starts);
-    const int k = base + lane - from_lane(start, owner), row = k * from_lane(inverse, owner) / kOne;
+    const int k = int(base + lane - from_lane(start, owner)), row = k * from_lane(inverse, owner) >> 10;
     const int tx = from_lane(x0, owner) + k - row * from_lane(wide, owner), ty = from_lane(y0, owner) + row;
     const unsigned hits = __ballot_sync(kWarp, tile_reached(from_lane(test, owner), float(tx), float(ty)));
-    if (base == 32 * lane) kept = hits;
+    if (lane == int(base / 32)) kept = hits;
   }
   const uint64_t low = from_lane(kept, start / 32), high = from_lane(kept, start / 32 + 1);
   return uint32_t((high << 32 | low) >> start % 32) & uint32_t((uint64_t(1) << tiles) - 1);

@@ -120,14 +120,16 @@ GS_HD Vec3<T> color_vjp(const Scene<T>& s, const Camera<T>& camera, int64_t i, V
   g = {c.x >= black ? g.x : T(0), c.y >= black ? g.y : T(0), c.z >= black ? g.z : T(0)};
   if (g_dc) store3(g_dc + 3 * i, basis[0] * g);
   const int active = sh_count(s.sh_degree);
-  for (int k = 1; k < kCount; ++k) {  // of constant length, so that a GPU keeps the arrays in registers
-    if (k < active) {
-      weight[k] = dot(load3(rest + 3 * (k - 1)), g);
-      if (g_rest) store3(g_rest + 3 * (k - 1), basis[k] * g);
-    } else if (g_rest && k <= s.rest_bands) {
-      store3(g_rest + 3 * (k - 1), Vec3<T>{0, 0, 0});
+  // Of constant length, so that a GPU keeps the arrays in registers; all is read before the same row is written.
+  for (int k = 1; k < kCount; ++k)
+    if (k < active) weight[k] = dot(load3(rest + 3 * (k - 1)), g);
+  if (g_rest)
+    for (int k = 1; k < kCount; ++k) {
+      if (k < active)
+        store3(g_rest + 3 * (k - 1), basis[k] * g);
+      else if (k <= s.rest_bands)
+        store3(g_rest + 3 * (k - 1), Vec3<T>{0, 0, 0});
     }
-  }
   return sh_direction_vjp(direction, norm, sh_basis_vjp(s.sh_degree, direction, weight));
 }
 
