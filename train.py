@@ -119,7 +119,9 @@ def training(
     clock = Stopwatch()
     bar = tqdm(initial=first_iteration, total=opt.iterations, desc="Training progress", dynamic_ncols=True)
     guard = MemoryGuard(gaussians, scene.model_path, first_iteration)
-    with bar, DeferredInterrupt() as interrupt, guard:
+    # A thread for each device's backward would have to be woken in every iteration.
+    one_thread = torch.autograd.set_multithreading_enabled(False)
+    with bar, DeferredInterrupt() as interrupt, guard, one_thread:
         for iteration in range(first_iteration + 1, opt.iterations + 1):
             started = clock.seconds
             gaussians.update_learning_rate(iteration)

@@ -99,6 +99,9 @@ template <class T>
 T __reduce_max_sync(unsigned mask, T mine) {
   return gs::emulation::reduce(mine, "__reduce_max_sync", mask, [](T a, T b) { return a > b ? a : b; });
 }
+inline unsigned __reduce_min_sync(unsigned mask, unsigned mine) {
+  return gs::emulation::reduce(mine, "__reduce_min_sync", mask, [](unsigned a, unsigned b) { return a < b ? a : b; });
+}
 inline unsigned __reduce_or_sync(unsigned mask, unsigned mine) {
   return gs::emulation::reduce(mine, "__reduce_or_sync", mask, [](unsigned a, unsigned b) { return a | b; });
 }

@@ -313,14 +313,14 @@ library.register_autograd("diff_gaussian_rasterization::rasterize", _backward, s
 
 
 class _Rasterize(torch.autograd.Function):
-    """The same two functions without the dispatcher's Python in between."""
+    """The same two functions without the dispatcher's Python in between, nor the one that a setup_context brings."""
 
     @staticmethod
-    def forward(*inputs):
+    def forward(ctx, *inputs):
         with torch._C._AutoDispatchBelowAutograd():
-            return _ops.rasterize(*inputs)
-
-    setup_context = staticmethod(_setup_context)
+            output = _ops.rasterize(*inputs)
+        _setup_context(ctx, inputs, output)
+        return output
 
     @staticmethod
     @once_differentiable

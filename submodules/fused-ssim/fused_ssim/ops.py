@@ -155,12 +155,13 @@ library.register_autograd("fused_ssim::photometric", _photometric_backward, setu
 
 
 class _Photometric(torch.autograd.Function):
-    """The same two functions without the dispatcher's Python in between."""
+    """The same two functions without the dispatcher's Python in between, nor the one that a setup_context brings."""
 
     @staticmethod
-    def forward(*inputs):
+    def forward(ctx, *inputs):
         with torch._C._AutoDispatchBelowAutograd():
-            return torch.ops.fused_ssim.photometric(*inputs)
+            output = torch.ops.fused_ssim.photometric(*inputs)
+        _setup_photometric(ctx, inputs, output)
+        return output
 
-    setup_context = staticmethod(_setup_photometric)
     backward = staticmethod(_photometric_backward)

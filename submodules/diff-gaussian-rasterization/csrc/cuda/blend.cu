@@ -307,8 +307,9 @@ __global__ void __launch_bounds__(Backward::kThreads)
 
 __global__ void __launch_bounds__(256) moments_kernel(int64_t count, SlotSums sums, float* moments) {
   const int64_t i = int64_t(blockIdx.x) * 256 + threadIdx.x;
+  __shared__ __align__(8) float stage[256 / 32 * SlotSums::kStage];
   float values[kGradientValues];
-  sums.read(i, i < count && sums.seen(i), values);
+  sums.read(i, i < count && sums.seen(i), values, stage + threadIdx.x / 32 * SlotSums::kStage);
   if (i >= count) return;
   for (int v = 0; v < kGradientValues; ++v) moments[kGradientValues * i + v] = values[v];
 }

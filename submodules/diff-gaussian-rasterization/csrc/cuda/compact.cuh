@@ -21,30 +21,49 @@ struct Compact {
   }
 };
 
-// The sums of a splat over its slots, in an order that depends on their number alone. A splat near the camera has
-// thousands: those are added by the whole warp.
+// The sums of a splat over its slots, in an order that depends on their number alone. The rows of a warp's splats lie
+// side by side, so they come by whole lines through shared memory. A splat near the camera has thousands: those are
+// added by the whole warp.
 struct SlotSums {
   static constexpr int kOwnRows = 48;
+  static constexpr int kStaged = 32;                                  // rows at a time
+  static constexpr int kStage = kStaged * baseline::kGradientValues;  // floats of shared memory for each warp
   Compact compact;
   const int64_t* slot_offsets;
 
   __device__ bool seen(int64_t splat) const { return slot_offsets[splat + 1] > slot_offsets[splat]; }
 
   // Called by all lanes of a warp; those that want a splat's sums get them, the others nothing.
-  __device__ void read(int64_t splat, bool wanted, float* sums) const {
+  __device__ void read(int64_t splat, bool wanted, float* sums, float* stage) const {
     constexpr int kValues = baseline::kGradientValues;
     constexpr unsigned kAll = 0xffffffffu;
-    int64_t begin = 0, end = 0;
-    if (wanted) begin = compact.row(slot_offsets[splat]), end = compact.row(slot_offsets[splat + 1]);
+    const int lane = threadIdx.x & 31;
+    unsigned begin = 0, end = 0;  // instances are fewer than 2^31
+    if (wanted)
+      begin = unsigned(compact.row(slot_offsets[splat])), end = unsigned(compact.row(slot_offsets[splat + 1]));
     const bool many = end - begin > kOwnRows;
     for (int v = 0; v < kValues; ++v) sums[v] = 0;
-    if (!many)
-      for (int64_t row = begin; row < end; ++row) add(row, sums);
+
+    const unsigned last = __reduce_max_sync(kAll, end);
+    for (unsigned next = begin;;) {
+      const bool open = !many && next < end;
+      const unsigned first = __reduce_min_sync(kAll, open ? next : ~0u);
+      if (first == ~0u) break;
+      const float2* from = reinterpret_cast<const float2*>(compact.rows + int64_t(kValues) * first);
+      const int pairs = kValues / 2 * int(last - first < kStaged ? last - first : kStaged);
+      __syncwarp();  // the rows before have been added
+      for (int k = lane; k < pairs; k += 32) reinterpret_cast<float2*>(stage)[k] = from[k];
+      __syncwarp();
+      if (open)
+        for (; next < end && next - first < kStaged; ++next) add(stage + kValues * (next - first), sums);
+    }
+
     for (unsigned left = __ballot_sync(kAll, many); left; left &= left - 1) {
-      const int owner = __ffs(left) - 1, lane = threadIdx.x & 31;
-      const int64_t stop = __shfl_sync(kAll, end, owner);
+      const int owner = __ffs(left) - 1;
+      const unsigned stop = __shfl_sync(kAll, end, owner);
       float part[kValues] = {};
-      for (int64_t row = __shfl_sync(kAll, begin, owner) + lane; row < stop; row += 32) add(row, part);
+      for (unsigned row = __shfl_sync(kAll, begin, owner) + lane; row < stop; row += 32)
+        add(compact.rows + int64_t(kValues) * row, part);
       for (int v = 0; v < kValues; ++v) {
         for (int step = 16; step; step /= 2) part[v] += __shfl_xor_sync(kAll, part[v], step);
         if (lane == owner) sums[v] = part[v];
@@ -53,10 +72,9 @@ struct SlotSums {
   }
 
  private:
-  __device__ void add(int64_t row, float* sums) const {
-    const float2* from = reinterpret_cast<const float2*>(compact.rows + baseline::kGradientValues * row);
+  __device__ static void add(const float* row, float* sums) {
     for (int v = 0; v < baseline::kGradientValues / 2; ++v) {
-      const float2 pair = from[v];
+      const float2 pair = reinterpret_cast<const float2*>(row)[v];
       sums[2 * v] += pair.x, sums[2 * v + 1] += pair.y;
     }
   }

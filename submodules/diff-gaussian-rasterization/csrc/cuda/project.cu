@@ -121,7 +121,7 @@ struct StoredMoments {
   const float* moments;
   const int32_t* tile_counts;
   __device__ bool seen(int64_t i) const { return tile_counts[i] != 0; }
-  __device__ void read(int64_t i, bool wanted, float* m) const {
+  __device__ void read(int64_t i, bool wanted, float* m, float* /*stage*/) const {
     for (int v = 0; wanted && v < kGradientValues; ++v) m[v] = moments[kGradientValues * i + v];
   }
 };
@@ -131,6 +131,7 @@ __global__ void __launch_bounds__(kThreads)
     project_vjp_kernel(Scene<float> s, Source source, SceneGradient<float> out) {
   __shared__ Camera<float> camera;
   __shared__ __align__(16) float rest[kThreads * kRest];
+  __shared__ __align__(8) float stage[kThreads / 32 * SlotSums::kStage];
   if (threadIdx.x == 0) camera = camera_of(s);
   __syncthreads();
   const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x, first = i - (threadIdx.x & 31);
@@ -141,7 +142,7 @@ __global__ void __launch_bounds__(kThreads)
     fetch_rows(s.sh_rest, first, s.count, s.rest_stride, 3 * (sh_count(s.sh_degree) - 1), __ballot_sync(kWarp, seen),
                warp_rows);
   float m[kGradientValues];
-  source.read(i, seen, m);
+  source.read(i, seen, m, stage + threadIdx.x / 32 * SlotSums::kStage);
   wait_for_rows();
   if (seen) {
     project_vjp_row(s, camera, i, m, row, row, out);  // writes the row unasked: a null would be tested for every band

@@ -64,7 +64,8 @@ GS_HD TileRect tile_rect(const Splat<T>& s, int width, int height) {
           clamped_floor((s.x + dx) / tile, nx - 1) + 1, clamped_floor((s.y + dy) / tile, ny - 1) + 1};
 }
 
-// Decides tile by tile for one splat; what does not depend on the tile is worked out once.
+// Decides tile by tile for one splat; what does not depend on the tile is worked out once. l11 and l22 are above 0:
+// projection leaves out the rest.
 template <class T>
 struct TileTest {
   Splat<T> splat;
