@@ -37,10 +37,10 @@ struct Scene {
   Image image;
 };
 
-// All that a GPU's emission reads of a splat, in one sector of memory: it visits splats in the order of their depth.
+// All that a GPU's binning reads of a splat, in one sector of memory: it visits splats in the order of their depth.
 struct alignas(16) TileRecord {
-  uint64_t mask;  // which tiles of a rectangle of at most 64 are reached, a bit each in its order
-  uint16_t x0, y0, x1, y1;
+  uint64_t reached;         // a bit for each tile of a rectangle of at most 64, in its order; of a larger one, how many
+  uint16_t x0, y0, x1, y1;  // empty where the splat reaches none
 };
 
 template <class T>

@@ -80,14 +80,6 @@ class Totals {
   cudaEvent_t arrived_;
 };
 
-// The number of tiles of the k-th splat in depth order.
-struct OrderedCount {
-  const int32_t* order;
-  const int32_t* counts;
-  int64_t splats;
-  __host__ __device__ int32_t operator()(int64_t k) const { return k < splats ? counts[order[k]] : 0; }
-};
-
 __global__ void count_up_kernel(int64_t n, int32_t* values) {
   const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
   if (i < n) values[i] = int32_t(i);
@@ -145,17 +137,20 @@ void bin_with(const Queue& queue, int64_t n, const Projected<float>& in, const i
   const int64_t blocks = (instances + kEmitted - 1) / kEmitted;
   Key *keys = queue.array<Key>(blocks * kEmitted), *sorted_keys = queue.array<Key>(blocks * kEmitted);
   if (instances) {
-    int32_t *offsets = queue.array<int32_t>(n + 1), *first = queue.array<int32_t>(blocks + 1);
-    const auto counts =
-        thrust::make_transform_iterator(thrust::counting_iterator<int64_t>(0), OrderedCount{order, in.tile_counts, n});
+    Lined* lined = queue.array<Lined>(n);
+    int32_t *counts = queue.array<int32_t>(n + 1), *offsets = queue.array<int32_t>(n + 1);
+    int32_t* first = queue.array<int32_t>(blocks + 1);
+    const unsigned splat_blocks = unsigned(n / kEmitThreads + 1);
+    line_up_kernel<<<splat_blocks, kEmitThreads, 0, stream>>>(n, order, in, tile_count(image.width), lined, counts);
+    check_launch("line_up");
     with_memory(queue, [&](void* memory, size_t& bytes) {
       return cub::DeviceScan::ExclusiveSum(memory, bytes, counts, offsets, n + 1, stream);
     });
-    share_kernel<<<unsigned((n + kEmitThreads - 1) / kEmitThreads), kEmitThreads, 0, stream>>>(n, offsets, first);
+    share_kernel<<<splat_blocks, kEmitThreads, 0, stream>>>(n, offsets, first);
     check_launch("share");
     int32_t* owners = queue.array<int32_t>(blocks * kEmitted);
-    emit_kernel<Key>
-        <<<unsigned(blocks), kEmitThreads, 0, stream>>>(instances, order, offsets, first, in, image, keys, owners);
+    emit_kernel<Key><<<unsigned(blocks), kEmitThreads, 0, stream>>>(instances, order, lined, offsets, first, in, image,
+                                                                    keys, owners);
     check_launch("emit");
     with_memory(queue, [&](void* memory, size_t& bytes) {
       return cub::DeviceRadixSort::SortPairs(memory, bytes, keys, sorted_keys, owners, out.instances, instances, 0,

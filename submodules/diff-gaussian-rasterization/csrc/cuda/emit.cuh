@@ -24,6 +24,44 @@ __device__ inline int nth_bit(uint64_t mask, int n) {
   return place;
 }
 
+__device__ inline TileRect rect_of(const Projected<float>& in, int32_t splat) {
+  if (in.records) {
+    const TileRecord r = in.records[splat];
+    return {r.x0, r.y0, r.x1, r.y1};
+  }
+  const int4 r = reinterpret_cast<const int4*>(in.rects)[splat];
+  return {r.x, r.y, r.z, r.w};
+}
+
+// What emission needs of a splat with a mask.
+struct alignas(16) Lined {
+  uint64_t mask;   // of reached tiles, 0 where emission has to test them
+  int32_t corner;  // the first tile of the rectangle
+  int32_t wide;
+};
+
+// Splats and their numbers of tiles side by side in depth order, so that they are looked up all over memory but once.
+// counts: (n + 1), the last 0.
+__global__ void __launch_bounds__(kEmitThreads)
+    line_up_kernel(int64_t n, const int32_t* order, Projected<float> in, int columns, Lined* lined, int32_t* counts) {
+  const int64_t k = int64_t(blockIdx.x) * kEmitThreads + threadIdx.x;
+  if (k == n) counts[n] = 0;
+  if (k >= n) return;
+  const int32_t splat = order[k];
+  const TileRect rect = rect_of(in, splat);
+  const int wide = rect.x1 - rect.x0;
+  Lined line = {0, rect.y0 * columns + rect.x0, wide};
+  if (in.records) {
+    const uint64_t reached = in.records[splat].reached;
+    const bool masked = wide * (rect.y1 - rect.y0) <= 64;
+    if (masked) line.mask = reached;
+    counts[k] = masked ? __popcll(reached) : int32_t(reached);
+  } else {
+    counts[k] = in.tile_counts[splat];
+  }
+  lined[k] = line;
+}
+
 // For each block the splat, in depth order, that its first instance belongs to, and after the last block the last splat
 // that has an instance. offsets: (n + 1) the first instance of each splat in that order.
 __global__ void __launch_bounds__(kEmitThreads) share_kernel(int64_t n, const int32_t* offsets, int32_t* first) {
@@ -35,43 +73,28 @@ __global__ void __launch_bounds__(kEmitThreads) share_kernel(int64_t n, const in
   if (end == instances) first[(instances + kEmitted - 1) / kEmitted] = int32_t(k);
 }
 
-__device__ inline TileRect rect_of(const Projected<float>& in, int32_t splat) {
-  if (in.records) {
-    const TileRecord r = in.records[splat];
-    return {r.x0, r.y0, r.x1, r.y1};
-  }
-  const int4 r = reinterpret_cast<const int4*>(in.rects)[splat];
-  return {r.x, r.y, r.z, r.w};
-}
-
 // The splats that a block's instances belong to, in shared memory.
 struct EmittedSplats {
-  uint64_t mask[kEmitted];  // of reached tiles; 0 where the rectangle has more than 64
+  Lined line[kEmitted];
   int32_t first[kEmitted];  // the splat's first instance, counted from the block's
   int32_t index[kEmitted];
-  int32_t corner[kEmitted];           // its rectangle's first tile
-  int32_t skip[kEmitted];             // from the end of one of the rectangle's rows to the start of the next, tiles
-  uint32_t per_wide[kEmitted];        // 2^16 / width, rounded up: places below 64 are divided by it exactly
   int32_t starting[kEmitted];         // by instance: the splat that begins there, or 0
-  int32_t unmasked[kEmitted];         // splats without a mask, in any order
+  uint16_t unmasked[kEmitted];        // splats without a mask, in any order
   int32_t latest[kEmitThreads / 32];  // the last splat that begins in a warp's instances
   int32_t unmasked_count;
 
-  __device__ void put(int at, int32_t splat, int32_t first_instance, const Projected<float>& in, int columns) {
-    const TileRect rect = rect_of(in, splat);
-    const int wide = rect.x1 - rect.x0;
-    const bool masked = in.records && wide * (rect.y1 - rect.y0) <= 64;
-    mask[at] = masked ? in.records[splat].mask : 0;
-    first[at] = first_instance, index[at] = splat;
-    corner[at] = rect.y0 * columns + rect.x0, skip[at] = columns - wide, per_wide[at] = 65536 / wide + 1;
+  __device__ void put(int at, int32_t splat, int32_t first_instance, const Lined& lined) {
+    line[at] = lined, first[at] = first_instance, index[at] = splat;
     if (first_instance > 0) starting[first_instance] = at;
-    if (!masked) unmasked[atomicAdd(&unmasked_count, 1)] = at;
-  }
-
-  __device__ int tile(int k, int place) const {
-    return corner[k] + place + int(uint32_t(place) * per_wide[k] >> 16) * skip[k];
+    if (!lined.mask) unmasked[atomicAdd(&unmasked_count, 1)] = uint16_t(at);
   }
 };
+
+// The tile at a place below 64 of a rectangle. A half keeps the quotient off whole numbers, so rounding can't matter.
+__device__ inline int tile_at(const Lined& line, int place, int columns) {
+  const int row = int((float(place) + 0.5f) / float(line.wide));
+  return line.corner + place + row * (columns - line.wide);
+}
 
 __device__ inline Splat<float> load_shape(const float* splats, int32_t index) {
   const float2* from = reinterpret_cast<const float2*>(splats + kSplatValues * int64_t(index));
@@ -88,8 +111,8 @@ struct alignas(kRun * sizeof(T)) Run {
 // is tested again, by the whole block, as far as the block's instances go.
 template <class Key>
 __global__ void __launch_bounds__(kEmitThreads)
-    emit_kernel(int64_t instances, const int32_t* order, const int32_t* offsets, const int32_t* first_splat,
-                Projected<float> in, Image image, Key* tiles, int32_t* owners) {
+    emit_kernel(int64_t instances, const int32_t* order, const Lined* lined, const int32_t* offsets,
+                const int32_t* first_splat, Projected<float> in, Image image, Key* tiles, int32_t* owners) {
   __shared__ EmittedSplats splats;
   __shared__ int32_t warp_hits[2][kEmitThreads / 32];
   const int columns = tile_count(image.width), warp = threadIdx.x / 32, lane = threadIdx.x & 31;
@@ -101,7 +124,9 @@ __global__ void __launch_bounds__(kEmitThreads)
   __syncthreads();
   for (int k = threadIdx.x; k <= last - first; k += kEmitThreads) {
     const int64_t begin = offsets[first + k] - base;
-    if (begin < emitted) splats.put(k, order[first + k], int32_t(begin), in, columns);
+    const Lined line = lined[first + k];
+    const int32_t index = order[first + k];
+    if (begin < emitted) splats.put(k, index, int32_t(begin), line);
   }
   __syncthreads();
 
@@ -120,16 +145,16 @@ __global__ void __launch_bounds__(kEmitThreads)
   for (int w = 0; w < warp; ++w) k = splats.latest[w] > k ? splats.latest[w] : k;
 
   const int at = kRun * threadIdx.x;
-  uint64_t left = splats.mask[k];
-  if (!starting.of[0]) left &= ~uint64_t(0) << nth_bit(left, at - splats.first[k]);
+  Lined line = splats.line[k];
+  if (!starting.of[0]) line.mask &= ~uint64_t(0) << nth_bit(line.mask, at - splats.first[k]);
   Run<Key> run_tiles;
   Run<int32_t> run_owners;
 #pragma unroll
   for (int r = 0; r < kRun; ++r) {
-    if (starting.of[r]) k = starting.of[r], left = splats.mask[k];
-    run_tiles.of[r] = Key(splats.tile(k, (__ffsll(left) - 1) & 63));  // some tile where there is no mask
+    if (starting.of[r]) k = starting.of[r], line = splats.line[k];
+    run_tiles.of[r] = Key(tile_at(line, (__ffsll(line.mask) - 1) & 63, columns));  // any tile where there is no mask
     run_owners.of[r] = splats.index[k];
-    left &= left - 1;
+    line.mask &= line.mask - 1;
   }
   reinterpret_cast<Run<Key>*>(tiles + base)[threadIdx.x] = run_tiles;
   reinterpret_cast<Run<int32_t>*>(owners + base)[threadIdx.x] = run_owners;

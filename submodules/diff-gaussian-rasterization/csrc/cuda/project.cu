@@ -105,7 +105,11 @@ __global__ void __launch_bounds__(kThreads) project_kernel(Scene<float> s, Proje
   out.radii[i] = radius;
   out.tile_counts[i] = count;
   out.depths[i] = count ? depth : INFINITY;
-  if (out.records) out.records[i] = {mask, uint16_t(rect.x0), uint16_t(rect.y0), uint16_t(rect.x1), uint16_t(rect.y1)};
+  if (out.records) {
+    if (!count) rect = {0, 0, 0, 0};
+    const uint64_t reached = (rect.x1 - rect.x0) * (rect.y1 - rect.y0) <= 64 ? mask : uint64_t(count);
+    out.records[i] = {reached, uint16_t(rect.x0), uint16_t(rect.y0), uint16_t(rect.x1), uint16_t(rect.y1)};
+  }
   if (!count) return;
   if (out.rects) reinterpret_cast<int4*>(out.rects)[i] = make_int4(rect.x0, rect.y0, rect.x1, rect.y1);
   float2* to = reinterpret_cast<float2*>(out.splats + kSplatValues * i);
