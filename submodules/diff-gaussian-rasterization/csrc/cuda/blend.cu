@@ -28,6 +28,10 @@ constexpr float kLeast = float(kLog2MinAlpha);
 cudaStream_t stream_of(const Queue& queue) { return static_cast<cudaStream_t>(queue.stream); }
 int64_t tiles_of(Image image) { return int64_t(tile_count(image.width)) * tile_count(image.height); }
 
+// Images of up to so many tiles do not fill a GPU with blocks, and wait for their longest lists: more warps share a
+// tile.
+constexpr int64_t kFewTiles = 4096;
+
 // How a tile is shared out: a lane has kRun pixels of one row, 4 (or 8, if one) columns apart.
 template <int kRun_>
 struct Layout {
@@ -51,7 +55,6 @@ struct Layout {
 // that want one.
 constexpr int64_t kRowsUnasked = 1 << 20;
 
-using Forward = Layout<2>;
 using Backward = Layout<4>;
 
 struct ListLength {
@@ -100,13 +103,42 @@ __device__ unsigned reached_by_warp(const Batch<kCount>& batch, const L& at, int
   return __ballot_sync(kWarp, hit);
 }
 
-// 9 blocks a processor keep it to 56 registers, without spills on sm_90.
-template <bool kDepth, bool kLast>
-__global__ void __launch_bounds__(Forward::kThreads, 9)
+// Splats whose exponents a warp works out at once, going front to back: with one pixel a lane it would mostly wait.
+template <class L>
+constexpr int kTogether = L::kRun == 1 ? 2 : 1;
+
+// Front to back through the splats that reach the warp, of 32 from `from`: step(k, p, exponent) for each and each pixel
+// of the lane.
+template <class L, int kCount, class Step>
+__device__ __forceinline__ void front_to_back(const Batch<kCount>& batch, const L& at, int from, int count,
+                                              const Step& step) {
+  for (unsigned hits = reached_by_warp(batch, at, from, count); hits;) {
+    int k[kTogether<L>];
+    float t[kTogether<L>][L::kRun];
+#pragma unroll
+    for (int i = 0; i < kTogether<L>; ++i) {
+      const bool exists = i == 0 || hits;
+      k[i] = exists ? from + __ffs(hits) - 1 : k[0];
+      hits &= hits - 1;
+      const RowTerms<float> row = row_terms(batch.local(k[i]), float(at.y));
+#pragma unroll
+      for (int p = 0; p < L::kRun; ++p)
+        t[i][p] = exists ? row_exponent(row, row_u(row, float(at.x + at.column(p)))) : -INFINITY;
+    }
+#pragma unroll
+    for (int i = 0; i < kTogether<L>; ++i)
+#pragma unroll
+      for (int p = 0; p < L::kRun; ++p) step(k[i], p, t[i][p]);
+  }
+}
+
+// Blocks a processor, which keep it to 56 (48 with one pixel a lane) registers, without spills on sm_90.
+template <class L, bool kDepth, bool kLast>
+__global__ void __launch_bounds__(L::kThreads, L::kRun == 1 ? 5 : 9)
     blend_kernel(BlendInput<float> in, const int32_t* order, Blended<float> out) {
-  constexpr int kBatch = 128, kRun = Forward::kRun;
+  constexpr int kBatch = L::kThreads, kRun = L::kRun;
   __shared__ Batch<kBatch> batch;
-  const Forward at;
+  const L at;
   const int across = tile_count(in.image.width), tile = order[blockIdx.x];
   const int left = tile % across * kTile, top = tile / across * kTile;
   float transmittance[kRun], red[kRun], green[kRun], blue[kRun], depth[kRun], threshold[kRun];
@@ -121,32 +153,24 @@ __global__ void __launch_bounds__(Forward::kThreads, 9)
   for (int64_t first = begin; first < end; first += kBatch) {
     if (!__syncthreads_or(open)) break;
     const int count = int(end - first < kBatch ? end - first : kBatch);
-    for (int k = threadIdx.x; k < count; k += Forward::kThreads)
-      batch.put(k, in.splats, in.instances[first + k], float(left), float(top));
+    const int mine = threadIdx.x;
+    if (mine < count) batch.put(mine, in.splats, in.instances[first + mine], float(left), float(top));
     __syncthreads();
     for (int from = 0; open && from < count; from += 32) {
-      for (unsigned hits = reached_by_warp(batch, at, from, count); hits; hits &= hits - 1) {
-        const int k = from + __ffs(hits) - 1;
-        const LocalSplat<float> splat = batch.local(k);
-        const RowTerms<float> row = row_terms(splat, float(at.y));
-#pragma unroll
-        for (int p = 0; p < kRun; ++p) {
-          const float t = row_exponent(row, row_u(row, float(at.x + at.column(p))));
-          if (!(t >= threshold[p])) continue;
-          const float alpha = capped<float, float>(exp2_device(t));
-          const float after = transmittance[p] - alpha * transmittance[p];
-          if (after < float(kMinTransmittance)) {
-            threshold[p] = INFINITY;
-            continue;
-          }
-          const float weight = alpha * transmittance[p];
-          const float4 c = batch.color[k];
-          red[p] += weight * c.x, green[p] += weight * c.y, blue[p] += weight * c.z;
-          if (kDepth) depth[p] += weight * splat.inverse_depth;
-          if (kLast) last[p] = int(first - begin) + k + 1;
-          transmittance[p] = after;
-        }
-      }
+      front_to_back(batch, at, from, count, [&](int k, int p, float t) {
+        const bool reached = t >= threshold[p];
+        if (kTogether<L> == 1 && !reached) return;  // where splats are taken together, no branch keeps them apart
+        const float alpha = capped<float, float>(exp2_device(t));
+        const float after = transmittance[p] - alpha * transmittance[p];
+        const bool ends = reached && after < float(kMinTransmittance), blended = reached && !ends;
+        const float weight = blended ? alpha * transmittance[p] : 0;
+        const float4 c = batch.color[k];
+        red[p] += weight * c.x, green[p] += weight * c.y, blue[p] += weight * c.z;
+        if (kDepth) depth[p] += weight * batch.rest[k].w;
+        if (kLast && blended) last[p] = int(first - begin) + k + 1;
+        if (blended) transmittance[p] = after;
+        if (ends) threshold[p] = INFINITY;
+      });
       bool any = false;
       for (int p = 0; p < kRun; ++p) any |= threshold[p] < 0;
       open = __any_sync(kWarp, any);
@@ -314,16 +338,21 @@ __global__ void __launch_bounds__(256) moments_kernel(int64_t count, SlotSums su
   for (int v = 0; v < kGradientValues; ++v) moments[kGradientValues * i + v] = values[v];
 }
 
+template <class L>
+void blend_as(const Queue& queue, const BlendInput<float>& in, const Blended<float>& out) {
+  const auto kernel = out.inverse_depth ? (out.last ? blend_kernel<L, true, true> : blend_kernel<L, true, false>)
+                                        : (out.last ? blend_kernel<L, false, true> : blend_kernel<L, false, false>);
+  const int64_t tiles = tiles_of(in.image);
+  const int32_t* order = heaviest_first(queue, tiles, ListLength{in.ranges});
+  kernel<<<unsigned(tiles), L::kThreads, 0, stream_of(queue)>>>(in, order, out);
+  check_launch("blend");
+}
+
 }  // namespace
 
 template <>
 void blend<float>(const Queue& queue, const BlendInput<float>& in, const Blended<float>& out) {
-  const auto kernel = out.inverse_depth ? (out.last ? blend_kernel<true, true> : blend_kernel<true, false>)
-                                        : (out.last ? blend_kernel<false, true> : blend_kernel<false, false>);
-  const int64_t tiles = tiles_of(in.image);
-  const int32_t* order = heaviest_first(queue, tiles, ListLength{in.ranges});
-  kernel<<<unsigned(tiles), Forward::kThreads, 0, stream_of(queue)>>>(in, order, out);
-  check_launch("blend");
+  (tiles_of(in.image) <= kFewTiles ? blend_as<Layout<1>> : blend_as<Layout<2>>)(queue, in, out);
 }
 
 Compact blend_rows(const Queue& queue, const BlendInput<float>& in, const BlendGradient<float>& g) {

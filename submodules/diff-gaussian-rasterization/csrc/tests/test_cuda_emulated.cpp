@@ -26,27 +26,43 @@ Result<float> run_emulated(Parameters<float>& p, gs::Image image, bool antialias
   return run(memory.queue(), p, image, antialiasing, records);
 }
 
-void test_against_cpu() {
+void check_results(const Result<float>& got, const Result<float>& cpu) {
+  CHECK(got.radii == cpu.radii && got.tile_counts == cpu.tile_counts && got.decisive == cpu.decisive);
+  // exp2 and the order of sums differ; a pixel's 300 blends add some 1e-7 each.
+  check_near(got.color, cpu.color, 2e-5), check_near(got.transmittance, cpu.transmittance, 2e-5);
+  check_near(got.depth, cpu.depth, 2e-5);
+  check_near(got.gradient, cpu.gradient, 2e-5);
+}
+
+// Near the CPU, and the same bits in every order; with either form of what binning reads.
+void check_scene(Parameters<float>& p, gs::Image image, bool antialiasing) {
   using gs::emulation::Order;
+  const Result<float> got = run_emulated(p, image, antialiasing, true, Order::forward);
+  check_results(got, run(gs::serial_executor(), p, image, antialiasing));
+  for (const Order order : {Order::backward, Order::shuffled}) {
+    const Result<float> again = run_emulated(p, image, antialiasing, order == Order::backward, order);
+    CHECK(again.color == got.color && again.transmittance == got.transmittance && again.depth == got.depth);
+    CHECK(again.gradient == got.gradient && again.decisive == got.decisive);
+  }
+}
+
+void test_against_cpu() {
   for (const gs::Image image : {gs::Image{1, 1}, gs::Image{16, 16}, gs::Image{70, 33}, gs::Image{330, 70}})
     for (int64_t count : {0, 1, 33, 300})
       for (bool antialiasing : {false, true}) {
         Parameters<float> p(count);
         if (count == 300)  // one over all tiles, which whole warps list
           for (int k = 0; k < 3; ++k) p.scales[3 * 17 + k] = 1;
-        const Result<float> cpu = run(gs::serial_executor(), p, image, antialiasing);
-        const Result<float> got = run_emulated(p, image, antialiasing, true, Order::forward);
-        CHECK(got.radii == cpu.radii && got.tile_counts == cpu.tile_counts && got.decisive == cpu.decisive);
-        // exp2 and the order of sums differ; a pixel's 300 blends add some 1e-7 each.
-        check_near(got.color, cpu.color, 2e-5), check_near(got.transmittance, cpu.transmittance, 2e-5);
-        check_near(got.depth, cpu.depth, 2e-5);
-        check_near(got.gradient, cpu.gradient, 2e-5);
-        for (const Order order : {Order::backward, Order::shuffled}) {
-          const Result<float> again = run_emulated(p, image, antialiasing, order == Order::backward, order);
-          CHECK(again.color == got.color && again.transmittance == got.transmittance && again.depth == got.depth);
-          CHECK(again.gradient == got.gradient && again.decisive == got.decisive);
-        }
+        check_scene(p, image, antialiasing);
       }
+}
+
+// More than 4,096 tiles, which blending shares out among fewer warps. Slow, so in one order.
+void test_many_tiles() {
+  constexpr gs::Image image{1040, 1024};
+  Parameters<float> p(100);
+  check_results(run_emulated(p, image, false, true, gs::emulation::Order::shuffled),
+                run(gs::serial_executor(), p, image, false));
 }
 
 void test_sparse_adam() {
@@ -217,6 +233,7 @@ void test_heaviest_first() {
 
 int main() {
   test_against_cpu();
+  test_many_tiles();
   test_heaviest_first();
   test_sparse_adam();
   test_adam();
