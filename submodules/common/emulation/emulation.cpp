@@ -123,6 +123,15 @@ bool release() {
   return any;
 }
 
+// A bit for each lane of the warp that has not ended.
+unsigned present() {
+  const unsigned first = grid_state.current / 32 * 32, stop = std::min(first + 32, grid_state.count);
+  unsigned lanes = 0;
+  for (unsigned i = first; i < stop; ++i)
+    if (grid_state.threads[i].waits_for != Meeting::done) lanes |= 1u << (i - first);
+  return lanes;
+}
+
 void run_block(const std::function<void()>& body) {
   static std::mt19937 generator(1);
   grid_state.body = &body;
@@ -185,14 +194,6 @@ void meet(Meeting meeting, const char* what) {
 }
 
 int lane() { return int(grid_state.current % 32); }
-
-unsigned present() {
-  const unsigned first = grid_state.current / 32 * 32, stop = std::min(first + 32, grid_state.count);
-  unsigned lanes = 0;
-  for (unsigned i = first; i < stop; ++i)
-    if (grid_state.threads[i].waits_for != Meeting::done) lanes |= 1u << (i - first);
-  return lanes;
-}
 
 bool any_of_block(bool mine) {
   const int vote = grid_state.threads[grid_state.current].votes++;

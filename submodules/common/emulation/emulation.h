@@ -33,9 +33,8 @@ enum class Meeting { none, warp, block, done };
 void meet(Meeting meeting, const char* what);
 
 // Leaves 8 bytes for the others of the warp, meets them, and returns where theirs lie (32 of them, until the next
-// meeting but one); `present` has a bit for each lane of the warp that there is.
+// meeting but one).
 const uint64_t* exchange(uint64_t mine, const char* what, unsigned mask);
-unsigned present();
 int lane();
 // Whether any thread of the block said yes.
 bool any_of_block(bool mine);
@@ -61,14 +60,12 @@ T reduce(T value, const char* what, unsigned mask, const Combine& combine) {
   uint64_t bits = 0;
   std::memcpy(&bits, &value, sizeof value);
   const uint64_t* all = exchange(bits, what, mask);
-  bool first = true;
-  for (int k = 0; k < 32; ++k)
-    if (present() >> k & 1) {
-      T other;
-      std::memcpy(&other, &all[k], sizeof other);
-      value = first ? other : combine(value, other);
-      first = false;
-    }
+  std::memcpy(&value, &all[0], sizeof value);
+  for (int k = 1; k < 32; ++k) {  // also those that have ended since
+    T other;
+    std::memcpy(&other, &all[k], sizeof other);
+    value = combine(value, other);
+  }
   return value;
 }
 
