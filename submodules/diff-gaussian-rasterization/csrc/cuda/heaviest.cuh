@@ -1,6 +1,8 @@
 #pragma once
-// Tiles in the order in which blocks should take them: a long list that is started last keeps one processor busy while
-// the others are done.
+// Which lists, or chunks of lists, blocks should take in which order: a long one that is started last keeps one
+// processor busy while the others are done.
+#include <cuda_runtime.h>
+
 #include <cstdint>
 
 #include "gs/cuda_check.h"
@@ -10,7 +12,22 @@ namespace gs {
 namespace cuda {
 
 constexpr int kOrderThreads = 1024;
-constexpr int kLengthClasses = 256;  // eight to a doubling
+constexpr int kLengthClasses = 256;            // eight to a doubling
+constexpr int64_t kMostOrdered = 16384;        // tiles; more would take one block too long
+constexpr int32_t kWhole = int32_t(~0u >> 1);  // the size of chunks where lists are not cut
+
+// A part of a tile's list for one block. A tile's chunks but the first one have places side by side.
+struct alignas(16) Chunk {
+  int32_t tile;        // -1 where there is none
+  int32_t first, end;  // positions in the list
+  int32_t behind;      // the place of the chunk behind this one, whether there is one or not
+};
+
+struct Work {
+  const Chunk* chunks;
+  unsigned blocks;  // one for each chunk, and perhaps some for none
+  unsigned places;  // at most
+};
 
 // Longer lists have smaller classes.
 __device__ inline int length_class(int64_t length) {
@@ -18,44 +35,68 @@ __device__ inline int length_class(int64_t length) {
   return kLengthClasses - 1 - int((bits - 0x3f800000u) >> 20);  // exponent and three bits of the mantissa
 }
 
-// One block sorts tiles by class. Within a class they lie in any order, which no result depends on.
+// How many chunks a list has besides the last one, which has the rest.
+__device__ inline int32_t full_chunks(int32_t length, int32_t size) { return length ? (length - 1) / size : 0; }
+
+// One block sorts chunks by class. Within a class they lie in any order and places are given in any, which no result
+// depends on.
 template <class Length>
-__global__ void __launch_bounds__(kOrderThreads) order_tiles_kernel(int tiles, Length length, int32_t* order) {
-  __shared__ int32_t places[kLengthClasses];
-  for (int c = threadIdx.x; c < kLengthClasses; c += kOrderThreads) places[c] = 0;
+__global__ void __launch_bounds__(kOrderThreads)
+    order_chunks_kernel(int tiles, Length length, int32_t size, int blocks, Chunk* chunks) {
+  __shared__ int32_t next[kLengthClasses], total, places;
+  for (int c = threadIdx.x; c < kLengthClasses; c += kOrderThreads) next[c] = 0;
+  if (threadIdx.x == 0) places = 0;
   __syncthreads();
-  for (int t = threadIdx.x; t < tiles; t += kOrderThreads) atomicAdd(&places[length_class(length(t))], 1);
+  for (int t = threadIdx.x; t < tiles; t += kOrderThreads) {
+    const int32_t whole = int32_t(length(t)), full = full_chunks(whole, size);
+    if (full) atomicAdd(&next[length_class(size)], full);
+    atomicAdd(&next[length_class(whole - full * size)], 1);
+  }
   __syncthreads();
   if (threadIdx.x == 0) {
     int32_t before = 0;
     for (int c = 0; c < kLengthClasses; ++c) {
-      const int32_t count = places[c];
-      places[c] = before;
+      const int32_t count = next[c];
+      next[c] = before;
       before += count;
     }
+    total = before;
   }
   __syncthreads();
-  for (int t = threadIdx.x; t < tiles; t += kOrderThreads) order[atomicAdd(&places[length_class(length(t))], 1)] = t;
+  for (int t = threadIdx.x; t < tiles; t += kOrderThreads) {
+    const int32_t whole = int32_t(length(t)), full = full_chunks(whole, size);
+    int32_t behind = 0;
+    if (full) {
+      behind = atomicAdd(&places, full);
+      const int32_t to = atomicAdd(&next[length_class(size)], full);
+      for (int c = 0; c < full; ++c) chunks[to + c] = {t, c * size, (c + 1) * size, behind + c};
+    }
+    chunks[atomicAdd(&next[length_class(whole - full * size)], 1)] = {t, full * size, whole, behind + full};
+  }
+  for (int k = total + int(threadIdx.x); k < blocks; k += kOrderThreads) chunks[k] = {-1, 0, 0, 0};
 }
 
-static __global__ void __launch_bounds__(kOrderThreads) keep_tiles_kernel(int tiles, int32_t* order) {
-  const int t = blockIdx.x * kOrderThreads + threadIdx.x;
-  if (t < tiles) order[t] = t;
-}
-
-// Tiles with the longest lists first; in the usual order where one block would take too long to sort them.
 template <class Length>
-const int32_t* heaviest_first(const Queue& queue, int64_t tiles, const Length& length) {
-  constexpr int64_t kMost = 16384;
+__global__ void __launch_bounds__(kOrderThreads) keep_tiles_kernel(int tiles, Length length, Chunk* chunks) {
+  const int t = blockIdx.x * kOrderThreads + threadIdx.x;
+  if (t < tiles) chunks[t] = {t, 0, int32_t(length(t)), 0};
+}
+
+// Chunks of `size` of the tiles' lists, the longest first; of many tiles whole lists in the usual order. total: of all
+// lengths, or more.
+template <class Length>
+Work heaviest_first(const Queue& queue, int64_t tiles, const Length& length, int32_t size = kWhole, int64_t total = 0) {
   const auto stream = static_cast<cudaStream_t>(queue.stream);
-  int32_t* order = queue.array<int32_t>(tiles);
-  if (tiles <= kMost)
-    order_tiles_kernel<<<1, kOrderThreads, 0, stream>>>(int(tiles), length, order);
+  const bool ordered = tiles <= kMostOrdered;
+  const int64_t places = ordered ? total / size : 0;
+  Chunk* chunks = queue.array<Chunk>(tiles + places);
+  if (ordered)
+    order_chunks_kernel<<<1, kOrderThreads, 0, stream>>>(int(tiles), length, size, int(tiles + places), chunks);
   else
-    keep_tiles_kernel<<<unsigned((tiles + kOrderThreads - 1) / kOrderThreads), kOrderThreads, 0, stream>>>(int(tiles),
-                                                                                                           order);
-  check_launch("order_tiles");
-  return order;
+    keep_tiles_kernel<<<unsigned((tiles + kOrderThreads - 1) / kOrderThreads), kOrderThreads, 0, stream>>>(
+        int(tiles), length, chunks);
+  check_launch("order_chunks");
+  return {chunks, unsigned(tiles + places), unsigned(places)};
 }
 
 }  // namespace cuda

@@ -57,12 +57,33 @@ void test_against_cpu() {
       }
 }
 
-// More than 4,096 tiles, which blending shares out among fewer warps. Slow, so in one order.
+// More than 4,096 tiles, which blending shares out among fewer warps; one list of two chunks. Slow, so in one order.
 void test_many_tiles() {
   constexpr gs::Image image{1040, 1024};
-  Parameters<float> p(100);
+  Parameters<float> p(700);
+  for (int64_t i = 100; i < p.count; ++i) {
+    p.means[3 * i] = p.means[3 * i + 1] = 0.1f, p.means[3 * i + 2] = 4 + 0.001f * float(i);
+    p.opacities[i] = -4.8f;
+  }
   check_results(run_emulated(p, image, false, true, gs::emulation::Order::shuffled),
                 run(gs::serial_executor(), p, image, false));
+}
+
+// Two tiles whose lists the backward cuts into several chunks: wide splats, of which some pixels close in the middle of
+// the list, behind the opaque ones, and the others stay open to its end.
+void test_long_lists() {
+  constexpr int64_t count = 2100;
+  Parameters<float> p(count);
+  for (int64_t i = 0; i < count; ++i) {
+    const float depth = 2 + 2 * float(i) / count;
+    const bool closing = i % 100 == 50 && i < count / 2;
+    for (int k = 0; k < 2; ++k) p.means[3 * i + k] *= 0.2f * depth;
+    p.means[3 * i + 2] = depth;
+    p.opacities[i] = closing ? 0.0f : -5.2f + 0.2f * float(normal());
+    for (int k = 0; k < 3; ++k) p.scales[3 * i + k] = std::log((closing ? 0.1f : 0.6f) * depth);
+    if (closing) p.means[3 * i] = -0.3f * depth;
+  }
+  check_scene(p, gs::Image{25, 16}, false);
 }
 
 void test_sparse_adam() {
@@ -213,31 +234,52 @@ struct Lengths {
   int64_t operator()(int tile) const { return lengths[tile]; }
 };
 
-// Every tile once; the longest first as far as one block sorts them, an eighth of a doubling apart at most.
+// Chunks make up every list; the longest first as far as one block sorts them, an eighth of a doubling apart at most;
+// each has a place of its own, behind that of the chunk in front.
 void test_heaviest_first() {
-  for (int64_t tiles : {1, 2500, 16384, 20000}) {
-    std::vector<int64_t> lengths(tiles);
-    for (int64_t& length : lengths) length = int64_t(std::exp(3 * normal()));
-    lengths[tiles / 2] = int64_t(1) << 31;
-    gs::emulation::Memory memory;
-    const int32_t* order = gs::cuda::heaviest_first(memory.queue(), tiles, Lengths{lengths.data()});
-    std::vector<bool> there(tiles);
-    for (int64_t i = 0; i < tiles; ++i) there[order[i]] = true;
-    CHECK(std::count(there.begin(), there.end(), true) == tiles);
-    for (int64_t i = 1; i < tiles && tiles <= 16384; ++i)
-      CHECK(8 * (lengths[order[i]] + 1) <= 9 * (lengths[order[i - 1]] + 1));
-  }
+  for (const int64_t tiles : {1, 2500, 16384, 20000})
+    for (const int32_t size : {gs::cuda::kWhole, 64}) {
+      std::vector<int64_t> lengths(tiles);
+      for (int64_t& length : lengths) length = int64_t(std::exp(3 * normal()));
+      lengths[tiles / 2] = size == 64 ? 7 * 64 : gs::cuda::kWhole;
+      gs::emulation::Memory memory;
+      const int64_t total = std::accumulate(lengths.begin(), lengths.end(), int64_t(0));
+      const gs::cuda::Work work = gs::cuda::heaviest_first(memory.queue(), tiles, Lengths{lengths.data()}, size, total);
+      const bool ordered = tiles <= 16384;
+      std::vector<std::vector<gs::cuda::Chunk>> of_tile(tiles);
+      int64_t before = int64_t(1) << 32;
+      for (unsigned i = 0; i < work.blocks; ++i) {
+        const gs::cuda::Chunk& chunk = work.chunks[i];
+        if (chunk.tile < 0) continue;
+        of_tile[chunk.tile].push_back(chunk);
+        CHECK(!ordered || 8 * (int64_t(chunk.end) - chunk.first + 1) <= 9 * (before + 1));
+        before = chunk.end - chunk.first;
+      }
+      std::vector<bool> taken(work.places);
+      for (int64_t t = 0; t < tiles; ++t) {
+        std::vector<gs::cuda::Chunk>& chunks = of_tile[t];
+        std::sort(chunks.begin(), chunks.end(), [](const auto& a, const auto& b) { return a.first < b.first; });
+        CHECK(!chunks.empty() && chunks.front().first == 0 && chunks.back().end == lengths[t]);
+        for (size_t c = 1; c < chunks.size(); ++c) {
+          CHECK(chunks[c].first == chunks[c - 1].end && chunks[c].first % size == 0);
+          CHECK(chunks[c].behind == chunks[c - 1].behind + 1 && !taken.at(chunks[c - 1].behind));
+          taken[chunks[c - 1].behind] = true;
+        }
+        CHECK(!ordered || int64_t(chunks.size()) == std::max<int64_t>(1, (lengths[t] + size - 1) / size));
+      }
+    }
 }
 
 }  // namespace
 
 int main() {
   test_against_cpu();
-  test_many_tiles();
-  test_heaviest_first();
   test_sparse_adam();
   test_adam();
   test_step_guard();
   test_observe();
+  test_many_tiles();
+  test_long_lists();
+  test_heaviest_first();
   return gs::finish_tests("CUDA kernels, emulated");
 }

@@ -1,0 +1,303 @@
+// The backward of blending. A tile's list is cut into chunks, a block each, since one long list would outlast all
+// others together: first every chunk becomes a layer, which tells the chunks in front of it what lies behind them.
+#include <thrust/iterator/counting_iterator.h>
+#include <thrust/iterator/transform_iterator.h>
+
+#include <cub/cub.cuh>
+
+#include "backward.cuh"
+#include "blend_layout.cuh"
+#include "gs/cuda_check.h"
+#include "heaviest.cuh"
+
+namespace gs {
+namespace cuda {
+
+namespace {
+
+// Splats of a chunk. Shorter ones fill a GPU better, and cost a layer for each but the first of a tile.
+constexpr int kChunk = 512;
+
+// Up to here every instance gets a gradient row, 40 MiB at most, so that the host need not wait for the number of those
+// that want one.
+constexpr int64_t kRowsUnasked = 1 << 20;
+
+struct ProcessedLength {
+  const int32_t* processed;
+  __device__ int64_t operator()(int tile) const { return processed[tile]; }
+};
+
+struct CountBits {
+  const uint32_t* bits;
+  int64_t words;
+  __host__ __device__ int32_t operator()(int64_t word) const {
+#ifdef __CUDA_ARCH__
+    return word < words ? __popc(bits[word]) : 0;
+#else
+    return 0;
+#endif
+  }
+};
+
+// How far each tile's backward has to go, and the slots of the instances up to there.
+__global__ void __launch_bounds__(kTile* kTile)
+    mark_kernel(BlendInput<float> in, const int32_t* last, SplatSlots slots, int32_t* processed, uint32_t* bits) {
+  __shared__ int32_t most;
+  if (threadIdx.x == 0) most = 0;
+  __syncthreads();
+  const int across = tile_count(in.image.width), tile = blockIdx.x;
+  const int x = tile % across * kTile + threadIdx.x % kTile, y = tile / across * kTile + threadIdx.x / kTile;
+  const int mine = x < in.image.width && y < in.image.height ? last[int64_t(y) * in.image.width + x] : 0;
+  const int warp_most = __reduce_max_sync(kWarp, mine);
+  if (threadIdx.x % 32 == 0) atomicMax(&most, warp_most);
+  __syncthreads();
+  if (threadIdx.x == 0) processed[tile] = most;
+  for (int k = threadIdx.x; k < most; k += kTile * kTile) {
+    const int64_t slot = slots.slot(in.instances[in.ranges[tile] + k], tile % across, tile / across);
+    atomicOr(bits + (slot >> 5), 1u << (slot & 31));
+  }
+}
+
+// Ten values summed over a warp in 12 shuffles: each step halves the values a lane keeps while doubling the lanes that
+// are summed. `value` is the one whose sum this lane ends with, or -1.
+__device__ __forceinline__ float transposed_sum(const float (&v)[kGradientValues], int& value) {
+  const int lane = threadIdx.x % 32;
+  const bool b16 = lane & 16, b8 = lane & 8, b4 = lane & 4, b2 = lane & 2;
+  float a[5], b[3], c[2];
+#pragma unroll
+  for (int i = 0; i < 5; ++i) a[i] = (b16 ? v[i + 5] : v[i]) + __shfl_xor_sync(kWarp, b16 ? v[i] : v[i + 5], 16);
+#pragma unroll
+  for (int i = 0; i < 3; ++i) {
+    const float high = i < 2 ? a[i + 3] : 0;
+    b[i] = (b8 ? high : a[i]) + __shfl_xor_sync(kWarp, b8 ? a[i] : high, 8);
+  }
+#pragma unroll
+  for (int i = 0; i < 2; ++i) {
+    const float high = i < 1 ? b[2] : 0;
+    c[i] = (b4 ? high : b[i]) + __shfl_xor_sync(kWarp, b4 ? b[i] : high, 4);
+  }
+  float sum = (b2 ? c[1] : c[0]) + __shfl_xor_sync(kWarp, b2 ? c[0] : c[1], 2);
+  sum += __shfl_xor_sync(kWarp, sum, 1);
+  const int within3 = b4 ? 2 : b2, within5 = (b8 ? 3 : 0) + within3;
+  const bool exists = !(lane & 1) && !(b4 && b2) && within5 < 5;
+  value = exists ? (b16 ? 5 : 0) + within5 : -1;
+  return sum;
+}
+
+// A chunk as its pixel sees it: with `behind` behind it the pixel has value + transmittance * behind.
+struct alignas(8) Layer {
+  float value, transmittance;
+};
+
+// What the backward knows of a lane's pixels. Positions count from the chunk's first, which needs no register then.
+template <class L, bool kDepth>
+struct Pixels {
+  float red[L::kRun], green[L::kRun], blue[L::kRun], depth[L::kRun];  // image gradients
+  float background[L::kRun], transmittance[L::kRun];                  // what is behind all, and how it is seen
+  int last[L::kRun], furthest;                                        // the latter of the warp
+
+  __device__ Pixels(const BlendInput<float>& in, const BlendGradient<float>& g, const L& at, int left, int top,
+                    int first) {
+    const int64_t plane = int64_t(in.image.width) * in.image.height;
+    furthest = 0;
+    for (int p = 0; p < L::kRun; ++p) {
+      const int x = left + at.x + at.column(p), y = top + at.y;
+      const bool inside = x < in.image.width && y < in.image.height;
+      const int64_t pixel = inside ? int64_t(y) * in.image.width + x : 0;
+      transmittance[p] = inside ? g.transmittance[pixel] : 1;
+      last[p] = inside ? g.last[pixel] - first : 0;
+      red[p] = inside ? g.color[pixel] : 0;
+      green[p] = inside ? g.color[plane + pixel] : 0;
+      blue[p] = inside ? g.color[2 * plane + pixel] : 0;
+      depth[p] = kDepth && inside ? g.inverse_depth[pixel] : 0;
+      background[p] = in.background[0] * red[p] + in.background[1] * green[p] + in.background[2] * blue[p];
+      if (g.transmittance_gradient && inside) background[p] += g.transmittance_gradient[pixel];
+      furthest = last[p] > furthest ? last[p] : furthest;
+    }
+    furthest = __reduce_max_sync(kWarp, furthest);
+  }
+
+  __device__ float value(int p, const float4& color, float inverse_depth) const {
+    const float sum = color.x * red[p] + color.y * green[p] + color.z * blue[p];
+    return kDepth ? sum + inverse_depth * depth[p] : sum;
+  }
+};
+
+// The layers of all chunks but the first of each tile, a block each.
+template <class L, bool kDepth>
+__global__ void __launch_bounds__(L::kThreads)
+    layers_kernel(BlendInput<float> in, BlendGradient<float> g, const Chunk* chunks, Layer* layers) {
+  constexpr int kBatch = L::kThreads, kRun = L::kRun;
+  __shared__ Batch<kBatch> batch;
+  const Chunk chunk = chunks[blockIdx.x];
+  if (chunk.tile < 0 || chunk.first == 0) return;
+  const L at;
+  const int across = tile_count(in.image.width);
+  const int left = chunk.tile % across * kTile, top = chunk.tile / across * kTile;
+  const Pixels<L, kDepth> pixels(in, g, at, left, top, chunk.first);
+  float value[kRun], transmittance[kRun];
+  for (int p = 0; p < kRun; ++p) value[p] = 0, transmittance[p] = 1;
+  const int64_t begin = in.ranges[chunk.tile] + chunk.first;
+  const int length = chunk.end - chunk.first, mine = threadIdx.x;
+  for (int first = 0; first < length; first += kBatch) {
+    const int count = length - first < kBatch ? length - first : kBatch;
+    __syncthreads();
+    if (mine < count) batch.put(mine, in.splats, in.instances[begin + first + mine], float(left), float(top));
+    __syncthreads();
+    for (int from = 0; from < count && first + from < pixels.furthest; from += 32)
+      front_to_back(batch, at, from, count, [&](int k, int p, float t) {
+        const bool blended = t >= kLeast && first + k < pixels.last[p];
+        if (kTogether<L> == 1 && !blended) return;
+        const float weight = blended ? capped<float, float>(exp2_device(t)) * transmittance[p] : 0;
+        value[p] += weight * pixels.value(p, batch.color[k], batch.rest[k].w);
+        transmittance[p] -= weight;
+      });
+  }
+  Layer* to = layers + int64_t(kTile * kTile) * (chunk.behind - 1) + at.y * kTile + at.x;
+  for (int p = 0; p < kRun; ++p) to[at.column(p)] = {value[p], transmittance[p]};
+}
+
+// Going back to front. Within these limits the loop over splats does without spills on sm_90; ptxas makes it a tenth
+// longer where it is asked for a number of blocks a processor instead.
+template <class L, bool kDepth>
+__global__ void __maxnreg__(L::kRun == 4 && kDepth ? 96 : 80)
+    blend_vjp_kernel(BlendInput<float> in, BlendGradient<float> g, const int32_t* processed, const Chunk* chunks,
+                     const Layer* layers, Compact compact) {
+  constexpr int kBatch = 64, kRun = L::kRun;
+  __shared__ Batch<kBatch> batch;
+  __shared__ float sums[L::kWarps * kBatch * kGradientValues];
+  __shared__ int64_t row_of[kBatch];
+  const Chunk chunk = chunks[blockIdx.x];
+  if (chunk.tile < 0) return;
+  const L at;
+  const int across = tile_count(in.image.width), warp = threadIdx.x / 32;
+  const int left = chunk.tile % across * kTile, top = chunk.tile / across * kTile;
+  const Pixels<L, kDepth> pixels(in, g, at, left, top, chunk.first);
+  float transmittance[kRun], behind[kRun], through[kRun];  // through: all layers behind the chunk
+  for (int p = 0; p < kRun; ++p) behind[p] = pixels.background[p], through[p] = 1;
+  const int layers_behind = (processed[chunk.tile] - chunk.end + kChunk - 1) / kChunk;
+  for (int c = layers_behind - 1; c >= 0; --c)
+    for (int p = 0; p < kRun; ++p) {
+      const int pixel = at.y * kTile + at.x + at.column(p);
+      const Layer layer = layers[int64_t(kTile * kTile) * (chunk.behind + c) + pixel];
+      behind[p] = layer.value + layer.transmittance * behind[p];
+      through[p] *= layer.transmittance;
+    }
+  for (int p = 0; p < kRun; ++p) transmittance[p] = pixels.transmittance[p] / through[p];
+  const int64_t begin = in.ranges[chunk.tile] + chunk.first;
+  const SplatSlots slots{g.rects, g.slot_offsets};
+  for (int end = chunk.end - chunk.first; end > 0; end -= kBatch) {
+    const int count = end < kBatch ? end : kBatch, first = end - count;
+    __syncthreads();
+    for (int k = threadIdx.x; k < count; k += L::kThreads) {
+      const int32_t splat = in.instances[begin + first + k];
+      batch.put(k, in.splats, splat, float(left), float(top));
+      row_of[k] = compact.row(slots.slot(splat, chunk.tile % across, chunk.tile / across));
+    }
+    for (int k = threadIdx.x; k < L::kWarps * kBatch * kGradientValues; k += L::kThreads) sums[k] = 0;
+    __syncthreads();
+    for (int from = (count - 1) / 32 * 32; from >= 0; from -= 32) {
+      if (first + from >= pixels.furthest) continue;
+      unsigned hits = reached_by_warp(batch, at, from, count);
+      while (hits) {
+        const int bit = 31 - __clz(hits), k = from + bit;
+        hits &= ~(1u << bit);
+        const LocalSplat<float> splat = batch.local(k);
+        const float4 c = batch.color[k];
+        const RowTerms<float> row = row_terms(splat, float(at.y));
+        float q0 = 0, qu = 0, quu = 0, r = 0, gr = 0, b = 0, d = 0;
+        bool any = false;
+#pragma unroll
+        for (int p = 0; p < kRun; ++p) {
+          const float u = row_u(row, float(at.x + at.column(p))), t = row_exponent(row, u);
+          if (!(t >= kLeast) || first + k >= pixels.last[p]) continue;
+          any = true;
+          const float uncapped = exp2_device(t), alpha = capped<float, float>(uncapped);
+          const float value = pixels.value(p, c, splat.inverse_depth);
+          const float q = uncapped * alpha_gradient<float, float>(alpha, value, transmittance[p], behind[p]);
+          const float weight = alpha * transmittance[p], qu_here = q * u;
+          q0 += q, qu += qu_here, quu += qu_here * u;
+          r += weight * pixels.red[p], gr += weight * pixels.green[p], b += weight * pixels.blue[p];
+          if (kDepth) d += weight * pixels.depth[p];
+        }
+        if (!__any_sync(kWarp, any)) continue;
+        // Along a row v is constant, so three of the moments come last.
+        const float v[kGradientValues] = {q0, qu, row.v * q0, quu, row.v * qu, row.v * row.v * q0, r, gr, b, d};
+        int value;
+        const float sum = transposed_sum(v, value);
+        if (value >= 0) sums[(warp * kBatch + k) * kGradientValues + value] = sum;
+      }
+    }
+    __syncthreads();
+    for (int k = threadIdx.x; k < count * kGradientValues; k += L::kThreads) {
+      float sum = 0;
+      for (int w = 0; w < L::kWarps; ++w) sum += sums[w * kBatch * kGradientValues + k];
+      compact.rows[kGradientValues * row_of[k / kGradientValues] + k % kGradientValues] = sum;
+    }
+  }
+}
+
+__global__ void __launch_bounds__(256) moments_kernel(int64_t count, SlotSums sums, float* moments) {
+  const int64_t i = int64_t(blockIdx.x) * 256 + threadIdx.x;
+  __shared__ __align__(8) float stage[256 / 32 * SlotSums::kStage];
+  float values[kGradientValues];
+  sums.read(i, i < count && sums.seen(i), values, stage + threadIdx.x / 32 * SlotSums::kStage);
+  if (i >= count) return;
+  for (int v = 0; v < kGradientValues; ++v) moments[kGradientValues * i + v] = values[v];
+}
+
+template <class Front, class Back>
+void walk_chunks(const Queue& queue, const BlendInput<float>& in, const BlendGradient<float>& g,
+                 const int32_t* processed, const Work& work, const Compact& compact) {
+  Layer* layers = queue.array<Layer>(size_t(work.places) * kTile * kTile);
+  if (work.places) {
+    const auto kernel = g.inverse_depth ? layers_kernel<Front, true> : layers_kernel<Front, false>;
+    kernel<<<work.blocks, Front::kThreads, 0, stream_of(queue)>>>(in, g, work.chunks, layers);
+    check_launch("layers");
+  }
+  const auto kernel = g.inverse_depth ? blend_vjp_kernel<Back, true> : blend_vjp_kernel<Back, false>;
+  kernel<<<work.blocks, Back::kThreads, 0, stream_of(queue)>>>(in, g, processed, work.chunks, layers, compact);
+  check_launch("blend_vjp");
+}
+
+}  // namespace
+
+Compact blend_rows(const Queue& queue, const BlendInput<float>& in, const BlendGradient<float>& g) {
+  const cudaStream_t stream = stream_of(queue);
+  const unsigned tiles = unsigned(tiles_of(in.image));
+  const int64_t words = (g.slot_count + 31) / 32;
+  uint32_t* bits = queue.array<uint32_t>(words + 1);
+  int32_t *before = queue.array<int32_t>(words + 1), *processed = queue.array<int32_t>(tiles);
+  GS_CUDA_CHECK(cudaMemsetAsync(bits, 0, (words + 1) * sizeof *bits, stream));
+  mark_kernel<<<tiles, kTile * kTile, 0, stream>>>(in, g.last, SplatSlots{g.rects, g.slot_offsets}, processed, bits);
+  check_launch("mark");
+  const auto counts = thrust::make_transform_iterator(thrust::counting_iterator<int64_t>(0), CountBits{bits, words});
+  size_t bytes = 0;
+  GS_CUDA_CHECK(cub::DeviceScan::ExclusiveSum(nullptr, bytes, counts, before, words + 1, stream));
+  void* memory = queue.allocate(queue.context, bytes);
+  GS_CUDA_CHECK(cub::DeviceScan::ExclusiveSum(memory, bytes, counts, before, words + 1, stream));
+  int64_t rows = g.instance_count;  // at most: one for each
+  if (rows > kRowsUnasked) {
+    int32_t processed_count = 0;
+    GS_CUDA_CHECK(
+        cudaMemcpyAsync(&processed_count, before + words, sizeof processed_count, cudaMemcpyDeviceToHost, stream));
+    GS_CUDA_CHECK(cudaStreamSynchronize(stream));
+    rows = processed_count;
+  }
+  const Compact compact{bits, before, queue.array<float>(size_t(rows) * kGradientValues)};
+  const Work work = heaviest_first(queue, tiles, ProcessedLength{processed}, kChunk, rows);
+  const auto walk = tiles <= kFewTiles ? walk_chunks<Layout<1>, Layout<2>> : walk_chunks<Layout<2>, Layout<4>>;
+  walk(queue, in, g, processed, work, compact);
+  return compact;
+}
+
+template <>
+void blend_vjp<float>(const Queue& queue, const BlendInput<float>& in, const BlendGradient<float>& g) {
+  if (!g.count) return;
+  const SlotSums sums{blend_rows(queue, in, g), g.slot_offsets};
+  moments_kernel<<<unsigned((g.count + 255) / 256), 256, 0, stream_of(queue)>>>(g.count, sums, g.moments);
+  check_launch("moments");
+}
+
+}  // namespace cuda
+}  // namespace gs

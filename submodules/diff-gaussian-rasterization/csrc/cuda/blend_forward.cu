@@ -1,0 +1,91 @@
+// Blending a tile's list front to back, a block per tile.
+#include "blend_layout.cuh"
+#include "gs/cuda_check.h"
+#include "heaviest.cuh"
+
+namespace gs {
+namespace cuda {
+
+namespace {
+
+struct ListLength {
+  const int64_t* ranges;
+  __device__ int64_t operator()(int tile) const { return ranges[tile + 1] - ranges[tile]; }
+};
+
+// Blocks a processor, which keep it to 56 (48 with one pixel a lane) registers, without spills on sm_90.
+template <class L, bool kDepth, bool kLast>
+__global__ void __launch_bounds__(L::kThreads, L::kRun == 1 ? 5 : 9)
+    blend_kernel(BlendInput<float> in, const Chunk* lists, Blended<float> out) {
+  constexpr int kBatch = L::kThreads, kRun = L::kRun;
+  __shared__ Batch<kBatch> batch;
+  const L at;
+  const int across = tile_count(in.image.width), tile = lists[blockIdx.x].tile;
+  const int left = tile % across * kTile, top = tile / across * kTile;
+  float transmittance[kRun], red[kRun], green[kRun], blue[kRun], depth[kRun], threshold[kRun];
+  int last[kRun];
+  for (int p = 0; p < kRun; ++p) {
+    transmittance[p] = 1, red[p] = green[p] = blue[p] = depth[p] = 0, last[p] = 0;
+    const bool inside = left + at.x + at.column(p) < in.image.width && top + at.y < in.image.height;
+    threshold[p] = inside ? kLeast : INFINITY;
+  }
+  bool open = true;
+  const int64_t begin = in.ranges[tile], end = in.ranges[tile + 1];
+  for (int64_t first = begin; first < end; first += kBatch) {
+    if (!__syncthreads_or(open)) break;
+    const int count = int(end - first < kBatch ? end - first : kBatch);
+    const int mine = threadIdx.x;
+    if (mine < count) batch.put(mine, in.splats, in.instances[first + mine], float(left), float(top));
+    __syncthreads();
+    for (int from = 0; open && from < count; from += 32) {
+      front_to_back(batch, at, from, count, [&](int k, int p, float t) {
+        const bool reached = t >= threshold[p];
+        if (kTogether<L> == 1 && !reached) return;  // where splats are taken together, no branch keeps them apart
+        const float alpha = capped<float, float>(exp2_device(t));
+        const float after = transmittance[p] - alpha * transmittance[p];
+        const bool ends = reached && after < float(kMinTransmittance), blended = reached && !ends;
+        const float weight = blended ? alpha * transmittance[p] : 0;
+        const float4 c = batch.color[k];
+        red[p] += weight * c.x, green[p] += weight * c.y, blue[p] += weight * c.z;
+        if (kDepth) depth[p] += weight * batch.rest[k].w;
+        if (kLast && blended) last[p] = int(first - begin) + k + 1;
+        if (blended) transmittance[p] = after;
+        if (ends) threshold[p] = INFINITY;
+      });
+      bool any = false;
+      for (int p = 0; p < kRun; ++p) any |= threshold[p] < 0;
+      open = __any_sync(kWarp, any);
+    }
+  }
+  for (int p = 0; p < kRun; ++p) {
+    const int x = left + at.x + at.column(p), y = top + at.y;
+    if (x >= in.image.width || y >= in.image.height) continue;
+    const int64_t pixel = int64_t(y) * in.image.width + x, plane = int64_t(in.image.width) * in.image.height;
+    out.color[pixel] = red[p] + transmittance[p] * in.background[0];
+    out.color[plane + pixel] = green[p] + transmittance[p] * in.background[1];
+    out.color[2 * plane + pixel] = blue[p] + transmittance[p] * in.background[2];
+    out.transmittance[pixel] = transmittance[p];
+    if (kDepth) out.inverse_depth[pixel] = depth[p];
+    if (kLast) out.last[pixel] = last[p];
+  }
+}
+
+template <class L>
+void blend_as(const Queue& queue, const BlendInput<float>& in, const Blended<float>& out) {
+  const auto kernel = out.inverse_depth ? (out.last ? blend_kernel<L, true, true> : blend_kernel<L, true, false>)
+                                        : (out.last ? blend_kernel<L, false, true> : blend_kernel<L, false, false>);
+  const int64_t tiles = tiles_of(in.image);
+  const Work work = heaviest_first(queue, tiles, ListLength{in.ranges});
+  kernel<<<work.blocks, L::kThreads, 0, stream_of(queue)>>>(in, work.chunks, out);
+  check_launch("blend");
+}
+
+}  // namespace
+
+template <>
+void blend<float>(const Queue& queue, const BlendInput<float>& in, const Blended<float>& out) {
+  (tiles_of(in.image) <= kFewTiles ? blend_as<Layout<1>> : blend_as<Layout<2>>)(queue, in, out);
+}
+
+}  // namespace cuda
+}  // namespace gs

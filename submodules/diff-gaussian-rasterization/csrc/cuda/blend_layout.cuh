@@ -1,0 +1,113 @@
+#pragma once
+// How a block blends a tile. A warp owns a sub-tile, a lane several pixels of a row, so that a splat's loads, the loop
+// and the ballot are shared; 32 splats at a time are tested against the sub-tile, a lane each.
+#include <cuda_runtime.h>
+
+#include "../launch.h"
+#include "../math/blend.h"
+#include "../math/exp2.h"
+#include "../math/footprint.h"
+#include "../math/tiles.h"
+
+namespace gs {
+namespace cuda {
+
+using namespace baseline;
+
+constexpr unsigned kWarp = 0xffffffffu;
+constexpr float kLeast = float(kLog2MinAlpha);
+
+// Images of up to so many tiles do not fill a GPU with blocks, and wait for their longest lists: more warps share a
+// tile.
+constexpr int64_t kFewTiles = 4096;
+
+// How a tile is shared out: a lane has kRun pixels of one row, 4 (or 8, if one) columns apart.
+template <int kRun_>
+struct Layout {
+  static constexpr int kRun = kRun_;
+  static constexpr int kColumns = kRun == 1 ? 8 : 4;  // lanes side by side
+  static constexpr int kWide = kColumns * kRun, kHigh = 32 / kColumns;
+  static constexpr int kAcross = kTile / kWide, kWarps = kTile * kTile / (kWide * kHigh);
+  static constexpr int kThreads = 32 * kWarps;
+
+  int left, top;  // of the warp's sub-tile, in the tile
+  int x, y;       // of the lane's first pixel, in the tile
+  __device__ Layout() {
+    const int warp = threadIdx.x / 32, lane = threadIdx.x % 32;
+    left = warp % kAcross * kWide, top = warp / kAcross * kHigh;
+    x = left + lane % kColumns, y = top + lane / kColumns;
+  }
+  __device__ static int column(int run) { return run * kColumns; }
+};
+
+// A batch of splats in shared memory, local to the tile.
+template <int kCount>
+struct Batch {
+  float4 shape[kCount];  // y, l11, l12, l22
+  float4 rest[kCount];   // u, log2 opacity, x, inverse depth
+  float4 color[kCount];  // r, g, b
+
+  __device__ void put(int k, const float* splats, int32_t index, float left, float top) {
+    const float2* from = reinterpret_cast<const float2*>(splats + kSplatValues * int64_t(index));
+    const float2 a = from[0], b = from[1], c = from[2], d = from[3], e = from[4];
+    const Splat<float> splat = {a.x, a.y, b.x, b.y, c.x, c.y, d.x, d.y, e.x, e.y};
+    const LocalSplat<float> s = localise(splat, left, top);
+    shape[k] = make_float4(s.y, s.l11, s.l12, s.l22);
+    rest[k] = make_float4(s.u, s.log2_opacity, splat.x - left, s.inverse_depth);
+    color[k] = make_float4(s.r, s.g, s.b, 0);
+  }
+
+  __device__ LocalSplat<float> local(int k) const {
+    const float4 a = shape[k], b = rest[k];
+    return {a.x, a.y, a.z, a.w, b.x, b.y, 0, 0, 0, b.w};
+  }
+
+  // Can splat k reach the box of pixels, in the tile?
+  __device__ bool reaches(int k, float x0, float x1, float y0, float y1) const {
+    const float4 a = shape[k], b = rest[k];
+    const Splat<float> splat = {b.z, a.x, a.y, a.z, a.w, b.y, 0, 0, 0, 0};
+    return box_reached(make_tile_test(splat, TileRect{0, 0, 1, 1}, 0, 0), x0, x1, y0, y1);
+  }
+};
+
+template <class L, int kCount>
+__device__ inline unsigned reached_by_warp(const Batch<kCount>& batch, const L& at, int from, int count) {
+  const int k = from + threadIdx.x % 32;
+  const bool hit = k < count && batch.reaches(k, at.left, at.left + L::kWide - 1, at.top, at.top + L::kHigh - 1);
+  return __ballot_sync(kWarp, hit);
+}
+
+// Splats whose exponents a warp works out at once, going front to back: with one pixel a lane it would mostly wait.
+template <class L>
+constexpr int kTogether = L::kRun == 1 ? 2 : 1;
+
+// Front to back through the splats that reach the warp, of 32 from `from`: step(k, p, exponent) for each and each pixel
+// of the lane.
+template <class L, int kCount, class Step>
+__device__ __forceinline__ void front_to_back(const Batch<kCount>& batch, const L& at, int from, int count,
+                                              const Step& step) {
+  for (unsigned hits = reached_by_warp(batch, at, from, count); hits;) {
+    int k[kTogether<L>];
+    float t[kTogether<L>][L::kRun];
+#pragma unroll
+    for (int i = 0; i < kTogether<L>; ++i) {
+      const bool exists = i == 0 || hits;
+      k[i] = exists ? from + __ffs(hits) - 1 : k[0];
+      hits &= hits - 1;
+      const RowTerms<float> row = row_terms(batch.local(k[i]), float(at.y));
+#pragma unroll
+      for (int p = 0; p < L::kRun; ++p)
+        t[i][p] = exists ? row_exponent(row, row_u(row, float(at.x + at.column(p)))) : -INFINITY;
+    }
+#pragma unroll
+    for (int i = 0; i < kTogether<L>; ++i)
+#pragma unroll
+      for (int p = 0; p < L::kRun; ++p) step(k[i], p, t[i][p]);
+  }
+}
+
+inline cudaStream_t stream_of(const Queue& queue) { return static_cast<cudaStream_t>(queue.stream); }
+inline int64_t tiles_of(Image image) { return int64_t(tile_count(image.width)) * tile_count(image.height); }
+
+}  // namespace cuda
+}  // namespace gs
