@@ -15,8 +15,12 @@ namespace cuda {
 
 namespace {
 
-// Splats of a chunk. Shorter ones fill a GPU better, and cost a layer for each but the first of a tile.
-constexpr int kChunk = 512;
+// Splats of a chunk, in an image of few tiles and of many. Shorter ones fill a GPU better, and cost a layer for each
+// but the first of a tile.
+constexpr int kChunkOfFew = 256, kChunkOfMany = 512;
+
+// Going back to front a splat costs a warp as much as several pixels do, even where few warps are at work.
+using Backward = Layout<4>;
 
 // Up to here every instance gets a gradient row, 40 MiB at most, so that the host need not wait for the number of those
 // that want one.
@@ -159,10 +163,11 @@ __global__ void __launch_bounds__(L::kThreads)
 
 // Going back to front. Within these limits the loop over splats does without spills on sm_90; ptxas makes it a tenth
 // longer where it is asked for a number of blocks a processor instead.
-template <class L, bool kDepth>
-__global__ void __maxnreg__(L::kRun == 4 && kDepth ? 96 : 80)
+template <bool kDepth>
+__global__ void __maxnreg__(kDepth ? 96 : 80)
     blend_vjp_kernel(BlendInput<float> in, BlendGradient<float> g, const int32_t* processed, const Chunk* chunks,
-                     const Layer* layers, Compact compact) {
+                     int chunk_size, const Layer* layers, Compact compact) {
+  using L = Backward;
   constexpr int kBatch = 64, kRun = L::kRun;
   __shared__ Batch<kBatch> batch;
   __shared__ float sums[L::kWarps * kBatch * kGradientValues];
@@ -175,7 +180,7 @@ __global__ void __maxnreg__(L::kRun == 4 && kDepth ? 96 : 80)
   const Pixels<L, kDepth> pixels(in, g, at, left, top, chunk.first);
   float transmittance[kRun], behind[kRun], through[kRun];  // through: all layers behind the chunk
   for (int p = 0; p < kRun; ++p) behind[p] = pixels.background[p], through[p] = 1;
-  const int layers_behind = (processed[chunk.tile] - chunk.end + kChunk - 1) / kChunk;
+  const int layers_behind = (processed[chunk.tile] - chunk.end + chunk_size - 1) / chunk_size;
   for (int c = layers_behind - 1; c >= 0; --c)
     for (int p = 0; p < kRun; ++p) {
       const int pixel = at.y * kTile + at.x + at.column(p);
@@ -246,18 +251,12 @@ __global__ void __launch_bounds__(256) moments_kernel(int64_t count, SlotSums su
   for (int v = 0; v < kGradientValues; ++v) moments[kGradientValues * i + v] = values[v];
 }
 
-template <class Front, class Back>
-void walk_chunks(const Queue& queue, const BlendInput<float>& in, const BlendGradient<float>& g,
-                 const int32_t* processed, const Work& work, const Compact& compact) {
-  Layer* layers = queue.array<Layer>(size_t(work.places) * kTile * kTile);
-  if (work.places) {
-    const auto kernel = g.inverse_depth ? layers_kernel<Front, true> : layers_kernel<Front, false>;
-    kernel<<<work.blocks, Front::kThreads, 0, stream_of(queue)>>>(in, g, work.chunks, layers);
-    check_launch("layers");
-  }
-  const auto kernel = g.inverse_depth ? blend_vjp_kernel<Back, true> : blend_vjp_kernel<Back, false>;
-  kernel<<<work.blocks, Back::kThreads, 0, stream_of(queue)>>>(in, g, processed, work.chunks, layers, compact);
-  check_launch("blend_vjp");
+template <class L>
+void find_layers(const Queue& queue, const BlendInput<float>& in, const BlendGradient<float>& g, const Work& work,
+                 Layer* layers) {
+  const auto kernel = g.inverse_depth ? layers_kernel<L, true> : layers_kernel<L, false>;
+  kernel<<<work.blocks, L::kThreads, 0, stream_of(queue)>>>(in, g, work.chunks, layers);
+  check_launch("layers");
 }
 
 }  // namespace
@@ -285,9 +284,13 @@ Compact blend_rows(const Queue& queue, const BlendInput<float>& in, const BlendG
     rows = processed_count;
   }
   const Compact compact{bits, before, queue.array<float>(size_t(rows) * kGradientValues)};
-  const Work work = heaviest_first(queue, tiles, ProcessedLength{processed}, kChunk, rows);
-  const auto walk = tiles <= kFewTiles ? walk_chunks<Layout<1>, Layout<2>> : walk_chunks<Layout<2>, Layout<4>>;
-  walk(queue, in, g, processed, work, compact);
+  const int chunk_size = tiles <= kFewTiles ? kChunkOfFew : kChunkOfMany;
+  const Work work = heaviest_first(queue, tiles, ProcessedLength{processed}, chunk_size, rows);
+  Layer* layers = queue.array<Layer>(size_t(work.places) * kTile * kTile);
+  if (work.places) (tiles <= kFewTiles ? find_layers<Layout<1>> : find_layers<Layout<2>>)(queue, in, g, work, layers);
+  const auto kernel = g.inverse_depth ? blend_vjp_kernel<true> : blend_vjp_kernel<false>;
+  kernel<<<work.blocks, Backward::kThreads, 0, stream>>>(in, g, processed, work.chunks, chunk_size, layers, compact);
+  check_launch("blend_vjp");
   return compact;
 }
 

@@ -16,11 +16,11 @@ struct ListLength {
 // Blocks a processor, which keep it to 56 (48 with one pixel a lane) registers, without spills on sm_90.
 template <class L, bool kDepth, bool kLast>
 __global__ void __launch_bounds__(L::kThreads, L::kRun == 1 ? 5 : 9)
-    blend_kernel(BlendInput<float> in, const Chunk* lists, Blended<float> out) {
+    blend_kernel(BlendInput<float> in, const Chunk* order, Blended<float> out) {
   constexpr int kBatch = L::kThreads, kRun = L::kRun;
   __shared__ Batch<kBatch> batch;
   const L at;
-  const int across = tile_count(in.image.width), tile = lists[blockIdx.x].tile;
+  const int across = tile_count(in.image.width), tile = order ? order[blockIdx.x].tile : int(blockIdx.x);
   const int left = tile % across * kTile, top = tile / across * kTile;
   float transmittance[kRun], red[kRun], green[kRun], blue[kRun], depth[kRun], threshold[kRun];
   int last[kRun];
@@ -75,8 +75,9 @@ void blend_as(const Queue& queue, const BlendInput<float>& in, const Blended<flo
   const auto kernel = out.inverse_depth ? (out.last ? blend_kernel<L, true, true> : blend_kernel<L, true, false>)
                                         : (out.last ? blend_kernel<L, false, true> : blend_kernel<L, false, false>);
   const int64_t tiles = tiles_of(in.image);
-  const Work work = heaviest_first(queue, tiles, ListLength{in.ranges});
-  kernel<<<work.blocks, L::kThreads, 0, stream_of(queue)>>>(in, work.chunks, out);
+  // Many tiles even out by themselves.
+  const Chunk* order = tiles <= kFewTiles ? heaviest_first(queue, tiles, ListLength{in.ranges}).chunks : nullptr;
+  kernel<<<unsigned(tiles), L::kThreads, 0, stream_of(queue)>>>(in, order, out);
   check_launch("blend");
 }
 
