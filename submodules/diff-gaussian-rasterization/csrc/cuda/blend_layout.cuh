@@ -19,7 +19,7 @@ constexpr float kLeast = float(kLog2MinAlpha);
 
 // Images of up to so many tiles do not fill a GPU with blocks, and wait for their longest lists: more warps share a
 // tile.
-constexpr int64_t kFewTiles = 4096;
+constexpr int64_t kFewTiles = 3000;
 
 // How a tile is shared out: a lane has kRun pixels of one row, 4 (or 8, if one) columns apart.
 template <int kRun_>
