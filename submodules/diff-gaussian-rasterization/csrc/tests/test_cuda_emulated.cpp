@@ -57,7 +57,7 @@ void test_against_cpu() {
       }
 }
 
-// More than 4,096 tiles, which blending shares out among fewer warps; one list of two chunks. Slow, so in one order.
+// More tiles than kFewTiles, so that fewer warps share one; a list of two chunks. Slow, so in one order.
 void test_many_tiles() {
   constexpr gs::Image image{1040, 1024};
   Parameters<float> p(700);
