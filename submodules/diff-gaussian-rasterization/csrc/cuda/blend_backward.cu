@@ -152,9 +152,9 @@ __global__ void __launch_bounds__(L::kThreads)
       front_to_back(batch, at, from, count, [&](int k, int p, float t) {
         const bool blended = t >= kLeast && first + k < pixels.last[p];
         if (kTogether<L> == 1 && !blended) return;
-        const float weight = blended ? capped<float, float>(exp2_device(t)) * transmittance[p] : 0;
-        value[p] += weight * pixels.value(p, batch.color[k], batch.rest[k].w);
-        transmittance[p] -= weight;
+        const float weight = capped<float, float>(exp2_device(t)) * transmittance[p];
+        const float seen = weight * pixels.value(p, batch.color[k], batch.rest[k].w);
+        if (blended) value[p] += seen, transmittance[p] -= weight;
       });
   }
   Layer* to = layers + int64_t(kTile * kTile) * (chunk.behind - 1) + at.y * kTile + at.x;

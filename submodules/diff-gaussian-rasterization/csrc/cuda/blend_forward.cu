@@ -44,12 +44,14 @@ __global__ void __launch_bounds__(L::kThreads, L::kRun == 1 ? 5 : 9)
         const float alpha = capped<float, float>(exp2_device(t));
         const float after = transmittance[p] - alpha * transmittance[p];
         const bool ends = reached && after < float(kMinTransmittance), blended = reached && !ends;
-        const float weight = blended ? alpha * transmittance[p] : 0;
         const float4 c = batch.color[k];
-        red[p] += weight * c.x, green[p] += weight * c.y, blue[p] += weight * c.z;
-        if (kDepth) depth[p] += weight * batch.rest[k].w;
-        if (kLast && blended) last[p] = int(first - begin) + k + 1;
-        if (blended) transmittance[p] = after;
+        if (blended) {
+          const float weight = alpha * transmittance[p];
+          red[p] += weight * c.x, green[p] += weight * c.y, blue[p] += weight * c.z;
+          if (kDepth) depth[p] += weight * batch.rest[k].w;
+          if (kLast) last[p] = int(first - begin) + k + 1;
+          transmittance[p] = after;
+        }
         if (ends) threshold[p] = INFINITY;
       });
       bool any = false;
