@@ -175,9 +175,14 @@ GS_BACKEND(Executor)
 namespace cuda {
 GS_BACKEND(Queue)
 void observe(const Queue&, const ObserveInput&);
+// Where the gradients go: asked for when the GPU has work to do meanwhile.
+struct GradientMemory {
+  SceneGradient<float> (*take)(void* context);
+  void* context;
+};
 // blend_vjp and project_vjp in one, without the moments in between (BlendGradient::moments is not written).
 void rasterize_vjp(const Queue&, const Scene<float>&, const BlendInput<float>&, const BlendGradient<float>&,
-                   const SceneGradient<float>&);
+                   const GradientMemory&);
 }  // namespace cuda
 
 }  // namespace gs

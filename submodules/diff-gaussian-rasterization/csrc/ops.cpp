@@ -458,10 +458,15 @@ Gradients rasterize_vjp_op(SCENE_PARAMETERS, BACKWARD_PARAMETERS, const Tensor& 
 #ifdef GS_CUDA
   if (splats.is_cuda()) {
     gs::TorchQueue queue(splats.device());
-    SceneGradients out(scene, wanted);
+    std::optional<SceneGradients> out;
+    auto allocate = [&] { return out.emplace(scene, wanted).pointers<float>(); };
+    using Allocate = decltype(allocate);
+    const gs::cuda::GradientMemory memory{[](void* context) { return (*static_cast<Allocate*>(context))(); },
+                                          &allocate};
     gs::cuda::rasterize_vjp(queue.queue(), scene.scene<float>(), in.input<float>(), in.gradient<float>(nullptr),
-                            out.pointers<float>());
-    return out.all();
+                            memory);
+    if (!out) allocate();  // no Gaussians
+    return out->all();
   }
 #endif
   return project_vjp(scene, tile_counts, blend_vjp(in), wanted);

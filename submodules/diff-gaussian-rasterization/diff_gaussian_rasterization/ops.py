@@ -29,6 +29,9 @@ _SCENE = ("means", "opacities", "scales", "rotations", "cov3d", "colors", "sh_dc
 _SCENE += ("view", "projection", "center")
 _TENSORS = len(_SCENE)  # what comes before is a tensor or None, what comes after a number
 _SCENE += ("tan_x", "tan_y", "height", "width", "sh_degree", "scale_modifier", "antialiasing", "raw")
+_INPUTS = ("means2d", *_SCENE)
+_PLACES = tuple(_INPUTS.index(name) for name in GRADIENTS)  # the first nine, means2d and means swapped
+_OTHER_INPUTS = (None,) * (len(_INPUTS) - len(GRADIENTS) + 3)  # background, inverse_depth and train come last
 _TILE = 16
 _VALUES = 10  # of a row of `splats` and of `moments`
 
@@ -294,18 +297,17 @@ def _backward(ctx, grad_color, grad_transmittance, grad_inverse_depth, *_):
         raise RuntimeError("this image was rasterized with train=False, so it has no backward")
     saved = ctx.saved_tensors
     scene, state, tile_counts = (*saved[:_TENSORS], *ctx.numbers), saved[_TENSORS:-1], saved[-1]
-    inputs = dict(zip(("means2d", *_SCENE), ctx.needs_input_grad, strict=False))
-    wanted = [inputs[name] for name in GRADIENTS]
+    wanted = [ctx.needs_input_grad[place] for place in _PLACES]
     if grad_color is None:
         grad_color = state[-1].new_zeros(3, *state[-1].shape[1:])
     if not ctx.inverse_depth:
         grad_inverse_depth = None
     image = grad_color, grad_transmittance, grad_inverse_depth
     gradients = _ops.rasterize_vjp(*scene, *state, *image, tile_counts, wanted)
-    named = {name: g for name, g, w in zip(GRADIENTS, gradients, wanted, strict=True) if w}
-    if "opacities" in named:  # (N, 1) or (N,), as they came
-        named["opacities"] = named["opacities"].reshape(scene[1].shape)
-    return named.get("means2d"), *(named.get(name) for name in _SCENE), None, None, None
+    means, means2d, opacities, *others = (g if w else None for g, w in zip(gradients, wanted, strict=True))
+    if opacities is not None and scene[1].dim() == 1:
+        opacities = opacities[:, 0]
+    return means2d, means, opacities, *others, *_OTHER_INPUTS
 
 
 # For whoever calls the op itself, or compiles it.
