@@ -21,13 +21,15 @@ dim3 blocks_for(int64_t n) { return dim3(unsigned((n + kThreads - 1) / kThreads)
 constexpr int kManyRows = 20;
 
 // The warp's rows of sh_rest, of `count` in all: those `wanted` (a bit per lane), `values` of each, start to flow into
-// shared memory. Nobody waits for one row before asking for the next. Returns which rows do, maybe more than wanted.
+// shared memory, but for those that do already. Nobody waits for one row before asking for the next. Returns which rows
+// flow then, maybe more than wanted.
 __device__ unsigned fetch_rows(const float* global, int64_t first, int64_t count, int64_t stride, int values,
-                               unsigned wanted, float* rows) {
-  if (!wanted) return 0;
+                               unsigned wanted, unsigned flowing, float* rows) {
+  wanted &= ~flowing;
+  if (!wanted) return flowing;
   const int lane = threadIdx.x & 31;
   const float* from = global + first * stride;
-  if (__popc(wanted) >= kManyRows && first + 32 <= count && stride == kRest && values == kRest &&
+  if (!flowing && __popc(wanted) >= kManyRows && first + 32 <= count && stride == kRest && values == kRest &&
       reinterpret_cast<uintptr_t>(from) % 16 == 0) {
 #pragma unroll
     for (int k = 0; k < (kRest * 32 + 127) / 128; ++k) {
@@ -43,7 +45,7 @@ __device__ unsigned fetch_rows(const float* global, int64_t first, int64_t count
     }
   }
   __pipeline_commit();
-  return wanted;
+  return flowing | wanted;
 }
 __device__ void wait_for_rows() {
   __pipeline_wait_prior(0);
@@ -84,11 +86,11 @@ __global__ void __launch_bounds__(kThreads) project_kernel(Scene<float> s, Proje
   Splat<float> splat = {};
   float depth = INFINITY;
   int radius = 0;
-  unsigned fetched = 0;
+  unsigned flowing = 0;
   const auto fetch = [&](bool wanted) {
     if (!s.colors)
-      fetched |= fetch_rows(s.sh_rest, i - (threadIdx.x & 31), s.count, s.rest_stride, 3 * (sh_count(s.sh_degree) - 1),
-                            __ballot_sync(kWarp, wanted) & ~fetched, rest + (threadIdx.x & ~31) * kRest);
+      flowing = fetch_rows(s.sh_rest, i - (threadIdx.x & 31), s.count, s.rest_stride, 3 * (sh_count(s.sh_degree) - 1),
+                           __ballot_sync(kWarp, wanted), flowing, rest + (threadIdx.x & ~31) * kRest);
   };
   // Coefficients of what is likely seen are on their way while the shape is worked out.
   const bool likely = i < s.count && near_view(camera, to_view(camera, load3(s.means + 3 * i)));
@@ -143,7 +145,7 @@ __global__ void __launch_bounds__(kThreads)
   float* row = rest + threadIdx.x * kRest;
   float* warp_rows = rest + (threadIdx.x & ~31) * kRest;
   if (!s.colors)
-    fetch_rows(s.sh_rest, first, s.count, s.rest_stride, 3 * (sh_count(s.sh_degree) - 1), __ballot_sync(kWarp, seen),
+    fetch_rows(s.sh_rest, first, s.count, s.rest_stride, 3 * (sh_count(s.sh_degree) - 1), __ballot_sync(kWarp, seen), 0,
                warp_rows);
   float m[kGradientValues];
   source.read(i, seen, m, stage + threadIdx.x / 32 * SlotSums::kStage);
