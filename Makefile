@@ -12,10 +12,10 @@ EXTENSIONS := simple-knn fused-ssim diff-gaussian-rasterization
 CXX_TESTS := $(patsubst submodules/%.cpp,build/%,$(wildcard submodules/*/csrc/tests/*.cpp))
 CXX_TEST_FLAGS := -std=c++17 -O1 -g -Wall -Wextra -Werror -fsanitize=address,undefined -fno-sanitize-recover=all -pthread
 
-CXX_SOURCES := $(shell find submodules benchmarks -name build -prune -o \( -name '*.cpp' -o -name '*.cu' -o -name '*.h' \) -print)
+CXX_SOURCES := $(shell find submodules benchmarks -name build -prune -o \( -name '*.cpp' -o -name '*.cu*' -o -name '*.h' \) -print)
 # What the extension $(1) is built from.
 sources = $(shell find submodules/common submodules/$(1) \( -name build -o -name tests -o -name emulation \) -prune -o \
-            \( -name '*.cpp' -o -name '*.cu' -o -name '*.h' -o -name '*.py' -o -name '*.toml' \) -print)
+            \( -name '*.cpp' -o -name '*.cu*' -o -name '*.h' -o -name '*.py' -o -name '*.toml' \) -print)
 
 .PHONY: install demo test lint format cpp-test clean
 .NOTPARALLEL:
@@ -58,7 +58,7 @@ format: $(VENV)/.requirements
 cpp-test: $(CXX_TESTS)
 	@for test in $^; do $$test || exit 1; done
 
-build/%: submodules/%.cpp $$(call sources,$$(firstword $$(subst /, ,$$*)))
+build/%: submodules/%.cpp $$(call sources,$$(firstword $$(subst /, ,$$*))) $$(wildcard submodules/$$(dir $$*)*.h)
 	@mkdir -p $(@D)
 	$(CXX) $(CXX_TEST_FLAGS) -Isubmodules/$(firstword $(subst /, ,$*))/csrc -Isubmodules/common/include \
 	    $< $(wildcard submodules/$(firstword $(subst /, ,$*))/csrc/cpu/*.cpp) -o $@
@@ -66,7 +66,7 @@ build/%: submodules/%.cpp $$(call sources,$$(firstword $$(subst /, ,$$*)))
 # CUDA kernels on the CPU: the .cu files, rewritten as C++, instead of a GPU.
 EMULATION := submodules/common/emulation
 build/%/csrc/tests/test_cuda_emulated: submodules/%/csrc/tests/test_cuda_emulated.cpp $(wildcard $(EMULATION)/*) \
-                                       $$(call sources,$$*)
+                                       $$(call sources,$$*) $$(wildcard submodules/$$*/csrc/tests/*.h)
 	@mkdir -p $(@D)/emulated
 	rm -f $(@D)/emulated/*
 	$(PYTHON) $(EMULATION)/translate.py $(@D)/emulated $(wildcard submodules/$*/csrc/cuda/*.cu*)
