@@ -35,11 +35,12 @@ def builder(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
 
 
 def fake_nvcc(folder: Path, release: str = "13.0") -> Path:
-    """A toolkit folder whose nvcc answers --version and --dryrun as the real one does."""
+    """A toolkit folder whose nvcc answers --version, --list-gpu-arch and --dryrun as the real one does."""
     nvcc = folder / "bin" / "nvcc"
     nvcc.parent.mkdir(parents=True)
     nvcc.write_text(
         f'#!/bin/sh\nif [ "$1" = --version ]; then echo "Cuda compilation tools, release {release}, V{release}.1"\n'
+        'elif [ "$1" = --list-gpu-arch ]; then printf "compute_%s\\n" 75 80 86 90 100 103 120\n'
         f"else echo '#$ _HERE_={folder}/bin' >&2; echo '#$ TOP={folder}/bin/..' >&2; fi\n"
     )
     nvcc.chmod(0o755)
@@ -126,12 +127,23 @@ class TestCudaSwitch:
         wrapper.chmod(0o755)
         assert builder.toolkit_root(str(wrapper)) == (tmp_path / "cuda").resolve()
 
-    def test_architectures(self, builder: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
-        assert builder.architecture_flags() == ["-arch=all-major"]
-        monkeypatch.setenv("TORCH_CUDA_ARCH_LIST", "8.6;9.0+PTX")
-        assert builder.architecture_flags() == [
-            "-gencode=arch=compute_86,code=[sm_86]",
-            "-gencode=arch=compute_90,code=[sm_90,compute_90]",
+    def test_architectures(self, builder: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+        nvcc = str(fake_nvcc(tmp_path))
+
+        def flags(*names: str) -> list[str]:
+            return [f"-gencode=arch=compute_{n},code=[sm_{n}]" for n in names]
+
+        assert builder.architecture_flags(nvcc, []) == [
+            *flags("80", "90", "100"),
+            "-gencode=arch=compute_120,code=[sm_120,compute_120]",
+        ]
+        assert builder.architecture_flags(nvcc, [(9, 0), (8, 6), (9, 0)]) == flags("86", "90")
+        with pytest.raises(SystemExit, match="^error: the CUDA backend needs compute capability 8.0 or newer, not 7.5"):
+            builder.architecture_flags(nvcc, [(7, 5)])
+        monkeypatch.setenv("TORCH_CUDA_ARCH_LIST", "8.6;9.0a+PTX")
+        assert builder.architecture_flags(nvcc, [(12, 0)]) == [
+            *flags("86"),
+            "-gencode=arch=compute_90a,code=[sm_90a,compute_90a]",
         ]
 
 

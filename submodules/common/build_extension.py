@@ -5,7 +5,8 @@ registers its operators when torch.ops.load_library loads it. setuptools' own ex
 neither several instruction sets of one source nor parallel compilation without ninja, so the few commands are here.
 
 Environment: CXX (compiler), CUDA_HOME (toolkit), GS_CUDA=0|1 (never, or always, build CUDA; unset: where nvcc is
-found and torch was built with CUDA), TORCH_CUDA_ARCH_LIST ("9.0" or "8.0;9.0"; unset: all major architectures).
+found and torch was built with CUDA), TORCH_CUDA_ARCH_LIST ("9.0" or "8.0;9.0+PTX"; unset: those of the GPUs that are
+visible, or with none all major ones from 8.0).
 """
 
 import importlib.metadata
@@ -25,6 +26,7 @@ from setuptools.command.build_ext import build_ext
 
 VERSION = "0.1.0"
 OLDEST_TORCH = (2, 11)
+OLDEST_ARCHITECTURE = 80  # reductions over a warp in one instruction
 COMMON_INCLUDE = Path(__file__).resolve().parent / "include"
 # No -ffast-math: NaN, infinities and the order of sums matter. errno and traps nobody reads.
 CXX_FLAGS = ["-O3", "-std=c++17", "-fPIC", "-Wall", "-Wextra", "-fno-math-errno", "-fno-trapping-math"]
@@ -105,7 +107,9 @@ class BuildBackend(build_ext):
             command = [*compile_cxx, *flags, f"-DGS_ISA={isa}"]
             compilations += [(command, source, f"{source.stem}.{isa}.o") for source in sources if is_per_isa(source)]
         if nvcc:
-            compile_cuda = [nvcc, "-O3", "-std=c++17", "-Xcompiler", "-fPIC,-fvisibility=hidden", *architecture_flags()]
+            compile_cuda = [nvcc, "-O3", "-std=c++17", "-Xcompiler", "-fPIC,-fvisibility=hidden"]
+            at_hand = [torch.cuda.get_device_capability(k) for k in range(torch.cuda.device_count())]
+            compile_cuda += architecture_flags(nvcc, at_hand)
             compile_cuda += [f"-I{csrc}", f"-I{COMMON_INCLUDE}"]
             compilations += [(compile_cuda, source, f"{source.stem}.cu.o") for source in kernels]
         with ThreadPoolExecutor(os.cpu_count()) as pool:
@@ -179,14 +183,22 @@ def toolkit_root(nvcc: str) -> Path:
     return Path(top[1]).resolve()
 
 
-def architecture_flags() -> list[str]:
-    """nvcc's flags for TORCH_CUDA_ARCH_LIST."""
+def architecture_flags(nvcc: str, at_hand: list[tuple[int, int]]) -> list[str]:
+    """nvcc's flags for TORCH_CUDA_ARCH_LIST, else for the compute capabilities at hand, else for what nvcc knows."""
     names = os.environ.get("TORCH_CUDA_ARCH_LIST", "").replace(";", " ").split()
+    names = names or sorted({f"{major}.{minor}" for major, minor in at_hand})
     if not names:
-        return ["-arch=all-major"]
+        known = sorted(int(n) for n in re.findall(r"^compute_(\d+0)$", run([nvcc, "--list-gpu-arch"]), re.MULTILINE))
+        names = [f"{n // 10}.0" for n in known if n >= OLDEST_ARCHITECTURE]
+        names[-1] += "+PTX"
     flags = []
     for name in names:
         number = name.removesuffix("+PTX").replace(".", "")
+        if int(re.sub(r"\D", "", number) or 0) < OLDEST_ARCHITECTURE:
+            fail(
+                f"the CUDA backend needs compute capability 8.0 or newer, not {name}: set TORCH_CUDA_ARCH_LIST to what "
+                "it is to run on, or GS_CUDA=0 to build for the CPU only"
+            )
         code = f"sm_{number},compute_{number}" if name.endswith("+PTX") else f"sm_{number}"
         flags.append(f"-gencode=arch=compute_{number},code=[{code}]")
     return flags
