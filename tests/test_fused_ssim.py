@@ -214,6 +214,13 @@ def test_photometric_loss_agrees_with_reference() -> None:
     assert (got[2] - wanted[2]).abs().max() <= 40 * EPS[torch.float32] * wanted[2].abs().max()
 
 
+def test_torch_func_differentiates_the_photometric_loss() -> None:
+    image, target = image_pair("noise")
+    inside = image.clone().requires_grad_()
+    fused_photometric_loss(inside, target, 0.2)[0].backward()
+    assert torch.equal(torch.func.grad(lambda x: fused_photometric_loss(x, target, 0.2)[0])(image), inside.grad)
+
+
 def test_photometric_loss_gradcheck() -> None:
     image, target = image_pair("unrelated", (12, 13))
     image = 1.4 * image - 0.2

@@ -185,6 +185,14 @@ def test_only_asked_gradients_are_made():
         assert torch.equal(inputs[name].grad, everything[name].grad)
 
 
+def test_torch_func_differentiates():
+    splats, camera = scene()
+    inputs = leaves(splats)
+    render(inputs, camera, raw=False).color.sum().backward()
+    grad = torch.func.grad(lambda t: render(splats | {"means": t}, camera, raw=False).color.sum())(splats["means"])
+    assert torch.equal(grad, inputs["means"].grad)
+
+
 def _outputs(splats, camera, train: bool, inverse_depth: bool = True):
     return ops.rasterize(
         torch.zeros_like(splats["means"]), *scene_arguments(splats, camera, False), camera.bg, inverse_depth, train

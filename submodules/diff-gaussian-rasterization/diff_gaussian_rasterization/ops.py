@@ -305,8 +305,8 @@ def _backward(ctx, grad_color, grad_transmittance, grad_inverse_depth, *_):
     image = grad_color, grad_transmittance, grad_inverse_depth
     gradients = _ops.rasterize_vjp(*scene, *state, *image, tile_counts, wanted)
     means, means2d, opacities, *others = (g if w else None for g, w in zip(gradients, wanted, strict=True))
-    if opacities is not None and scene[1].dim() == 1:
-        opacities = opacities[:, 0]
+    if opacities is not None and opacities.shape != scene[1].shape:
+        opacities = opacities.reshape(scene[1].shape)
     return means2d, means, opacities, *others, *_OTHER_INPUTS
 
 
@@ -315,14 +315,20 @@ library.register_autograd("diff_gaussian_rasterization::rasterize", _backward, s
 
 
 class _Rasterize(torch.autograd.Function):
-    """The same two functions without the dispatcher's Python in between, nor the one that a setup_context brings."""
+    """The same two functions without the dispatcher's Python in between."""
+
+    @classmethod
+    def apply(cls, *inputs):
+        if torch._C._are_functorch_transforms_active():
+            return super().apply(*inputs)
+        return super(torch.autograd.Function, cls).apply(*inputs)  # torch's own looks at the signature in every call
 
     @staticmethod
-    def forward(ctx, *inputs):
+    def forward(*inputs):
         with torch._C._AutoDispatchBelowAutograd():
-            output = _ops.rasterize(*inputs)
-        _setup_context(ctx, inputs, output)
-        return output
+            return _ops.rasterize(*inputs)
+
+    setup_context = staticmethod(_setup_context)
 
     @staticmethod
     @once_differentiable

@@ -155,13 +155,18 @@ library.register_autograd("fused_ssim::photometric", _photometric_backward, setu
 
 
 class _Photometric(torch.autograd.Function):
-    """The same two functions without the dispatcher's Python in between, nor the one that a setup_context brings."""
+    """The same two functions without the dispatcher's Python in between."""
+
+    @classmethod
+    def apply(cls, *inputs):
+        if torch._C._are_functorch_transforms_active():
+            return super().apply(*inputs)
+        return super(torch.autograd.Function, cls).apply(*inputs)  # torch's own looks at the signature in every call
 
     @staticmethod
-    def forward(ctx, *inputs):
+    def forward(*inputs):
         with torch._C._AutoDispatchBelowAutograd():
-            output = torch.ops.fused_ssim.photometric(*inputs)
-        _setup_photometric(ctx, inputs, output)
-        return output
+            return torch.ops.fused_ssim.photometric(*inputs)
 
+    setup_context = staticmethod(_setup_photometric)
     backward = staticmethod(_photometric_backward)
