@@ -1,7 +1,6 @@
 #pragma once
 // What a backend offers: plain structs of pointers and sizes, and the functions that work on them. N Gaussians, W x H
-// image, I instances (splat, tile) of which P are processed by the backward. All arrays row-major and contiguous
-// unless a stride is given; T is float or double.
+// image, I instances (splat, tile). All arrays row-major and contiguous unless a stride is given; T is float or double.
 #include <cstdint>
 
 #include "gs/cuda_queue.h"
@@ -37,7 +36,7 @@ struct Scene {
   Image image;
 };
 
-// All that a GPU's binning reads of a splat, in one sector of memory: it visits splats in the order of their depth.
+// What a GPU's binning reads of a splat as it visits them in the order of their depth, in one sector of memory.
 struct alignas(16) TileRecord {
   uint64_t reached;         // a bit for each tile of a rectangle of at most 64, in its order; of a larger one, how many
   uint16_t x0, y0, x1, y1;  // empty where the splat reaches none
@@ -45,9 +44,9 @@ struct alignas(16) TileRecord {
 
 template <class T>
 struct Projected {
-  T* splats;             // (N, 10), Splat in math/splat.h; undefined where tile_counts is 0
-  T* depths;             // (N)
-  int32_t* rects;        // (N, 4) tiles x0 y0 x1 y1, undefined where tile_counts is 0; or null where there are records
+  T* splats;       // (N, 10), Splat in math/splat.h; undefined where tile_counts is 0
+  T* depths;       // (N) infinite where tile_counts is 0: binning takes those last
+  int32_t* rects;  // (N, 4) tiles x0 y0 x1 y1, undefined where tile_counts is 0; a GPU with records may do without
   int32_t* tile_counts;  // (N)
   int32_t* radii;        // (N)
   TileRecord* records;   // (N), or null

@@ -76,6 +76,7 @@ class SceneTensors {
     TORCH_CHECK(sh_degree >= 0 && sh_degree <= 3, "sh_degree must be 0 to 3, got ", sh_degree);
     TORCH_CHECK(colors_.defined() || sh_rest_.size(1) >= (sh_degree + 1) * (sh_degree + 1) - 1, "sh_rest has ",
                 colors_.defined() ? 0 : sh_rest_.size(1), " bands, too few for sh_degree ", sh_degree);
+    TORCH_CHECK(rest_bands() <= 15, "sh_rest has ", rest_bands(), " bands, more than the 15 of degree 3");
     TORCH_CHECK(height > 0 && width > 0 && height < (1 << 24) && width < (1 << 24), "image size ", width, "x", height,
                 " is out of range");
     TORCH_CHECK((width + kTile - 1) / kTile * ((height + kTile - 1) / kTile) <= std::numeric_limits<int32_t>::max(),
@@ -180,7 +181,7 @@ int64_t tiles_of(gs::Image image) { return ((image.width + kTile - 1) / kTile) *
 
 struct ProjectedTensors {
   Tensor splats, depths, rects, tile_counts, radii;
-  Tensor records;  // a GPU's only, instead of rects
+  Tensor records;  // a GPU's only
   template <class T>
   gs::Projected<T> pointers() {
     return {splats.mutable_data_ptr<T>(),

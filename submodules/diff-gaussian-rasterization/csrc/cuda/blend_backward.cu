@@ -161,10 +161,17 @@ __global__ void __launch_bounds__(L::kThreads)
   for (int p = 0; p < kRun; ++p) to[at.column(p)] = {value[p], transmittance[p]};
 }
 
+// CUDA has it from 12.4 on; without it the kernel is the same, with more registers.
+#if __CUDACC_VER_MAJOR__ > 12 || (__CUDACC_VER_MAJOR__ == 12 && __CUDACC_VER_MINOR__ >= 4)
+#define GS_MAX_REGISTERS(count) __maxnreg__(count)
+#else
+#define GS_MAX_REGISTERS(count)
+#endif
+
 // Going back to front. Within these limits the loop over splats does without spills on sm_90; ptxas makes it a tenth
 // longer where it is asked for a number of blocks a processor instead.
 template <bool kDepth>
-__global__ void __maxnreg__(kDepth ? 96 : 80)
+__global__ void GS_MAX_REGISTERS(kDepth ? 96 : 80)
     blend_vjp_kernel(BlendInput<float> in, BlendGradient<float> g, const int32_t* processed, const Chunk* chunks,
                      int chunk_size, const Layer* layers, Compact compact) {
   using L = Backward;

@@ -7,8 +7,8 @@ namespace gs {
 namespace cuda {
 
 constexpr int kEmitThreads = 256;
-constexpr int kRun = 4;  // instances of a thread, side by side, stored at once
-constexpr int kEmitted = kRun * kEmitThreads;
+constexpr int kEmitRun = 4;  // instances of a thread, side by side, stored at once
+constexpr int kEmitted = kEmitRun * kEmitThreads;
 
 // The place of the n-th set bit (from 0).
 __device__ inline int nth_bit(uint64_t mask, int n) {
@@ -33,7 +33,7 @@ __device__ inline TileRect rect_of(const Projected<float>& in, int32_t splat) {
   return {r.x, r.y, r.z, r.w};
 }
 
-// What emission needs of a splat with a mask.
+// What emission needs of a splat.
 struct alignas(16) Lined {
   uint64_t mask;   // of reached tiles, 0 where emission has to test them
   int32_t corner;  // the first tile of the rectangle
@@ -48,17 +48,17 @@ __global__ void __launch_bounds__(kEmitThreads)
   if (k == n) counts[n] = 0;
   if (k >= n) return;
   const int32_t splat = order[k];
-  const TileRect rect = rect_of(in, splat);
-  const int wide = rect.x1 - rect.x0;
-  Lined line = {0, rect.y0 * columns + rect.x0, wide};
-  if (in.records) {
-    const uint64_t reached = in.records[splat].reached;
-    const bool masked = wide * (rect.y1 - rect.y0) <= 64;
-    if (masked) line.mask = reached;
-    counts[k] = masked ? __popcll(reached) : int32_t(reached);
-  } else {
-    counts[k] = in.tile_counts[splat];
+  const uint64_t reached = in.records ? in.records[splat].reached : 0;
+  int32_t count = in.records ? 0 : in.tile_counts[splat];
+  Lined line = {};
+  if (in.records || count) {  // the rectangle of a culled splat is undefined
+    const TileRect rect = rect_of(in, splat);
+    const int wide = rect.x1 - rect.x0;
+    const bool masked = in.records && wide * (rect.y1 - rect.y0) <= 64;
+    line = {masked ? reached : 0, rect.y0 * columns + rect.x0, wide};
+    if (in.records) count = masked ? __popcll(reached) : int32_t(reached);
   }
+  counts[k] = count;
   lined[k] = line;
 }
 
@@ -103,8 +103,8 @@ __device__ inline Splat<float> load_shape(const float* splats, int32_t index) {
 }
 
 template <class T>
-struct alignas(kRun * sizeof(T)) Run {
-  T of[kRun];
+struct alignas(kEmitRun * sizeof(T)) EmitRun {
+  T of[kEmitRun];
 };
 
 // order: splats by depth; tiles and owners have room for whole blocks. A splat over more tiles than a mask has bits for
@@ -131,9 +131,9 @@ __global__ void __launch_bounds__(kEmitThreads)
   __syncthreads();
 
   // Splats begin in the order of their numbers, so the largest so far is the owner.
-  const Run<int32_t> starting = reinterpret_cast<const Run<int32_t>*>(splats.starting)[threadIdx.x];
+  const EmitRun<int32_t> starting = reinterpret_cast<const EmitRun<int32_t>*>(splats.starting)[threadIdx.x];
   int k = 0;
-  for (int r = 0; r < kRun; ++r) k = starting.of[r] > k ? starting.of[r] : k;
+  for (int r = 0; r < kEmitRun; ++r) k = starting.of[r] > k ? starting.of[r] : k;
   for (int step = 1; step < 32; step *= 2) {
     const int before = __shfl_up_sync(kWarp, k, step);
     if (lane >= step && before > k) k = before;
@@ -144,20 +144,20 @@ __global__ void __launch_bounds__(kEmitThreads)
   __syncthreads();
   for (int w = 0; w < warp; ++w) k = splats.latest[w] > k ? splats.latest[w] : k;
 
-  const int at = kRun * threadIdx.x;
+  const int at = kEmitRun * threadIdx.x;
   Lined line = splats.line[k];
   if (!starting.of[0]) line.mask &= ~uint64_t(0) << nth_bit(line.mask, at - splats.first[k]);
-  Run<Key> run_tiles;
-  Run<int32_t> run_owners;
+  EmitRun<Key> run_tiles;
+  EmitRun<int32_t> run_owners;
 #pragma unroll
-  for (int r = 0; r < kRun; ++r) {
+  for (int r = 0; r < kEmitRun; ++r) {
     if (starting.of[r]) k = starting.of[r], line = splats.line[k];
     run_tiles.of[r] = Key(tile_at(line, (__ffsll(line.mask) - 1) & 63, columns));  // any tile where there is no mask
     run_owners.of[r] = splats.index[k];
     line.mask &= line.mask - 1;
   }
-  reinterpret_cast<Run<Key>*>(tiles + base)[threadIdx.x] = run_tiles;
-  reinterpret_cast<Run<int32_t>*>(owners + base)[threadIdx.x] = run_owners;
+  reinterpret_cast<EmitRun<Key>*>(tiles + base)[threadIdx.x] = run_tiles;
+  reinterpret_cast<EmitRun<int32_t>*>(owners + base)[threadIdx.x] = run_owners;
 
   if (splats.unmasked_count) __syncthreads();  // what follows writes over what these instances got
   for (int u = 0, turn = 0; u < splats.unmasked_count; ++u) {

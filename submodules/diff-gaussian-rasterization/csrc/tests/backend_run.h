@@ -40,17 +40,12 @@ struct Result {
   int64_t instances;
 };
 
-// Forward and backward of the sum of all pixels of all planes, on an Executor or a Queue; allocations are exact, so
-// that a sanitizer sees a step outside. The gradient holds means, means2d, opacities, scales, rotations, dc, rest, one
-// after the other. records: projection hands binning one record a splat besides its rectangles.
-template <class T, class Where>
-Result<T> run(const Where& where, Parameters<T>& p, gs::Image image, bool antialiasing, bool records = false) {
-  using gs::cuda::bin, gs::cuda::blend, gs::cuda::blend_vjp, gs::cuda::project, gs::cuda::project_vjp;
-  using gs::cuda::mark_decisive, gs::GS_ISA::mark_decisive;
-  using gs::GS_ISA::bin, gs::GS_ISA::blend, gs::GS_ISA::blend_vjp, gs::GS_ISA::project, gs::GS_ISA::project_vjp;
-  const T view[16] = {1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1};
-  const T full[16] = {T(1 / 0.6), 0, 0, 0, 0, T(1 / 0.6), 0, 0, 0, 0, 1, 1, 0, 0, T(-0.01), 0};
-  const T center[3] = {0, 0, 0}, background[3] = {T(0.1), T(0.2), T(0.3)};
+// The parameters as a camera at the origin sees them, 62 degrees across.
+template <class T>
+gs::Scene<T> scene_of(Parameters<T>& p, gs::Image image, bool antialiasing) {
+  static const T view[16] = {1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1};
+  static const T full[16] = {T(1 / 0.6), 0, 0, 0, 0, T(1 / 0.6), 0, 0, 0, 0, 1, 1, 0, 0, T(-0.01), 0};
+  static const T center[3] = {0, 0, 0};
   gs::Scene<T> scene = {};
   scene.count = p.count;
   scene.means = p.means.data(), scene.opacities = p.opacities.data();
@@ -60,11 +55,54 @@ Result<T> run(const Where& where, Parameters<T>& p, gs::Image image, bool antial
   scene.raw = true, scene.antialiasing = antialiasing, scene.scale_modifier = 1;
   scene.view = view, scene.projection = full, scene.center = center;
   scene.tan_x = scene.tan_y = 0.6, scene.image = image;
+  return scene;
+}
 
+// What binning gives for a scene, on an Executor or a Queue. rects, records: what projection hands on (a GPU needs one
+// of them, the CPU rects); slots: whether they are asked for.
+template <class T>
+struct Bins {
+  std::vector<int32_t> instances;
+  std::vector<int64_t> ranges, slot_offsets;
+  int64_t slot_count = 0;
+};
+template <class T, class Where>
+Bins<T> bin_scene(const Where& where, const gs::Scene<T>& scene, bool rects, bool records, bool slots) {
+  using gs::cuda::bin, gs::cuda::project, gs::GS_ISA::bin, gs::GS_ISA::project;
+  const size_t n = scene.count;
+  std::vector<T> splats(kSplatValues * n), depths(n);
+  std::vector<int32_t> rect(4 * n, 0x7fffffff), tile_counts(n), radii(n);  // where undefined, nobody may use it
+  std::vector<gs::TileRecord> record(n);
+  const gs::Projected<T> projected = {splats.data(),      depths.data(), rects ? rect.data() : nullptr,
+                                      tile_counts.data(), radii.data(),  records ? record.data() : nullptr};
+  project(where, scene, projected);
+  Bins<T> out;
+  const gs::Image image = scene.image;
+  out.ranges.resize(size_t((image.width + 15) / 16) * ((image.height + 15) / 16) + 1);
+  out.slot_offsets.resize(slots ? n + 1 : 0);
+  const auto take = [](void* context, int64_t count, int64_t slot_count) {
+    Bins<T>& b = *static_cast<Bins<T>*>(context);
+    b.instances.resize(count), b.slot_count = slot_count;
+    return gs::Binned{b.instances.data(), b.ranges.data()};
+  };
+  bin(where, scene.count, projected, image, gs::BinMemory{take, &out, slots ? out.slot_offsets.data() : nullptr});
+  return out;
+}
+
+// Forward and backward of the sum of all pixels of all planes, on an Executor or a Queue; allocations are exact, so
+// that a sanitizer sees a step outside. The gradient holds means, means2d, opacities, scales, rotations, dc, rest, one
+// after the other. records: projection hands binning one record a splat besides its rectangles.
+template <class T, class Where>
+Result<T> run(const Where& where, Parameters<T>& p, gs::Image image, bool antialiasing, bool records = false) {
+  using gs::cuda::bin, gs::cuda::blend, gs::cuda::blend_vjp, gs::cuda::project, gs::cuda::project_vjp;
+  using gs::cuda::mark_decisive, gs::GS_ISA::mark_decisive;
+  using gs::GS_ISA::bin, gs::GS_ISA::blend, gs::GS_ISA::blend_vjp, gs::GS_ISA::project, gs::GS_ISA::project_vjp;
+  const T background[3] = {T(0.1), T(0.2), T(0.3)};
+  const gs::Scene<T> scene = scene_of(p, image, antialiasing);
   const size_t n = p.count, pixels = size_t(image.width) * image.height;
   Result<T> out;
   std::vector<T> splats(kSplatValues * n), depths(n);
-  std::vector<int32_t> rects(4 * n);
+  std::vector<int32_t> rects(4 * n, 0x7fffffff);
   std::vector<gs::TileRecord> record(n);
   out.tile_counts.resize(n), out.radii.resize(n);
   const gs::Projected<T> projected = {splats.data(),          depths.data(),    rects.data(),

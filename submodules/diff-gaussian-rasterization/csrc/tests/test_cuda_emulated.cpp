@@ -86,6 +86,30 @@ void test_long_lists() {
   check_scene(p, gs::Image{25, 16}, false);
 }
 
+// Lists alone, of splats over a thousand tiles among small ones: more tiles than 16 bits count, from records or from
+// rectangles, with slots or without.
+void test_lists() {
+  using gs::emulation::Order;
+  for (const gs::Image image : {gs::Image{330, 70}, gs::Image{1040, 1024}, gs::Image{4112, 4096}})
+    for (const int64_t count : {0, 1, 150}) {
+      Parameters<float> p(count);
+      for (int64_t i = 20; i < count; i += 40)
+        for (int k = 0; k < 3; ++k) p.scales[3 * i + k] = image.width > 4000 ? -1.5f : 0;
+      const gs::Scene<float> scene = scene_of(p, image, false);
+      const Bins<float> cpu = bin_scene(gs::serial_executor(), scene, true, false, true);
+      for (const Order order : {Order::forward, Order::backward, Order::shuffled})
+        for (const bool slots : {false, true})
+          for (const auto& [rects, records] : {std::pair{true, true}, std::pair{true, false}, std::pair{false, true}}) {
+            if (slots && !rects) continue;  // slots are those of rectangles
+            gs::emulation::order = order;
+            gs::emulation::Memory memory;
+            const Bins<float> got = bin_scene(memory.queue(), scene, rects, records, slots);
+            CHECK(got.instances == cpu.instances && got.ranges == cpu.ranges);
+            CHECK(!slots || (got.slot_offsets == cpu.slot_offsets && got.slot_count == cpu.slot_count));
+          }
+    }
+}
+
 void test_sparse_adam() {
   constexpr int64_t rows = 300, row = 45;
   for (const int64_t columns : {int64_t(0), int64_t(9), row}) {
@@ -280,6 +304,7 @@ int main() {
   test_observe();
   test_many_tiles();
   test_long_lists();
+  test_lists();
   test_heaviest_first();
   return gs::finish_tests("CUDA kernels, emulated");
 }
