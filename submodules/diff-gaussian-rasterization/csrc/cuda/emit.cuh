@@ -48,15 +48,17 @@ __global__ void __launch_bounds__(kEmitThreads)
   if (k == n) counts[n] = 0;
   if (k >= n) return;
   const int32_t splat = order[k];
-  const uint64_t reached = in.records ? in.records[splat].reached : 0;
-  int32_t count = in.records ? 0 : in.tile_counts[splat];
+  int32_t count = 0;
   Lined line = {};
-  if (in.records || count) {  // the rectangle of a culled splat is undefined
+  if (in.records) {
+    const TileRecord r = in.records[splat];
+    const int wide = r.x1 - r.x0;
+    const bool masked = wide * (r.y1 - r.y0) <= 64;
+    line = {masked ? r.reached : 0, r.y0 * columns + r.x0, wide};
+    count = masked ? __popcll(r.reached) : int32_t(r.reached);
+  } else if ((count = in.tile_counts[splat])) {  // the rectangle of a culled splat is undefined
     const TileRect rect = rect_of(in, splat);
-    const int wide = rect.x1 - rect.x0;
-    const bool masked = in.records && wide * (rect.y1 - rect.y0) <= 64;
-    line = {masked ? reached : 0, rect.y0 * columns + rect.x0, wide};
-    if (in.records) count = masked ? __popcll(reached) : int32_t(reached);
+    line = {0, rect.y0 * columns + rect.x0, rect.x1 - rect.x0};
   }
   counts[k] = count;
   lined[k] = line;
