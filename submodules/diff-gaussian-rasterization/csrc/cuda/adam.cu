@@ -2,8 +2,8 @@
 
 #include "../launch.h"
 #include "../math/adam.h"
-#include "gs/cuda_check.h"
 #include "guarded_adam.cuh"
+#include "queue.cuh"
 
 namespace gs {
 namespace cuda {
@@ -49,7 +49,7 @@ void adam<float>(const Queue& queue, const AdamInput<float>* tensors, int64_t co
       some.end[i] = blocks;
     }
     if (!blocks) continue;
-    adam_kernel<<<unsigned(blocks), kThreads, 0, static_cast<cudaStream_t>(queue.stream)>>>(some);
+    adam_kernel<<<unsigned(blocks), kThreads, 0, stream_of(queue)>>>(some);
     check_launch("adam");
   }
 }

@@ -7,7 +7,6 @@
 #include <cub/cub.cuh>
 
 #include "emit.cuh"
-#include "gs/cuda_check.h"
 
 namespace gs {
 namespace cuda {
@@ -16,17 +15,7 @@ namespace {
 
 constexpr int kThreads = 256;
 
-cudaStream_t stream_of(const Queue& queue) { return static_cast<cudaStream_t>(queue.stream); }
 dim3 blocks_for(int64_t n) { return dim3(unsigned((n + kThreads - 1) / kThreads)); }
-
-// CUB's functions want to be called twice: for the size of their memory, and with it.
-template <class Run>
-void with_memory(const Queue& queue, const Run& run) {
-  size_t bytes = 0;
-  GS_CUDA_CHECK(run(nullptr, bytes));
-  void* memory = queue.allocate(queue.context, bytes);
-  GS_CUDA_CHECK(run(memory, bytes));
-}
 
 struct Widen {
   __host__ __device__ int64_t operator()(int32_t count) const { return count; }

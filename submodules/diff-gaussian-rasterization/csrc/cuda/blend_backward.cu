@@ -7,7 +7,6 @@
 
 #include "backward.cuh"
 #include "blend_layout.cuh"
-#include "gs/cuda_check.h"
 #include "heaviest.cuh"
 
 namespace gs {
@@ -278,10 +277,9 @@ Compact blend_rows(const Queue& queue, const BlendInput<float>& in, const BlendG
   mark_kernel<<<tiles, kTile * kTile, 0, stream>>>(in, g.last, SplatSlots{g.rects, g.slot_offsets}, processed, bits);
   check_launch("mark");
   const auto counts = thrust::make_transform_iterator(thrust::counting_iterator<int64_t>(0), CountBits{bits, words});
-  size_t bytes = 0;
-  GS_CUDA_CHECK(cub::DeviceScan::ExclusiveSum(nullptr, bytes, counts, before, words + 1, stream));
-  void* memory = queue.allocate(queue.context, bytes);
-  GS_CUDA_CHECK(cub::DeviceScan::ExclusiveSum(memory, bytes, counts, before, words + 1, stream));
+  with_memory(queue, [&](void* memory, size_t& bytes) {
+    return cub::DeviceScan::ExclusiveSum(memory, bytes, counts, before, words + 1, stream);
+  });
   int64_t rows = g.instance_count;  // at most: one for each
   if (rows > kRowsUnasked) {
     int32_t processed_count = 0;

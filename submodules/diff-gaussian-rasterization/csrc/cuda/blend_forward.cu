@@ -1,6 +1,5 @@
 // Blending a tile's list front to back, a block per tile.
 #include "blend_layout.cuh"
-#include "gs/cuda_check.h"
 #include "heaviest.cuh"
 
 namespace gs {

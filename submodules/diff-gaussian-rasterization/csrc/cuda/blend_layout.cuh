@@ -8,13 +8,13 @@
 #include "../math/exp2.h"
 #include "../math/footprint.h"
 #include "../math/tiles.h"
+#include "queue.cuh"
 
 namespace gs {
 namespace cuda {
 
 using namespace baseline;
 
-constexpr unsigned kWarp = 0xffffffffu;
 constexpr float kLeast = float(kLog2MinAlpha);
 
 // Images of up to so many tiles do not fill a GPU with blocks, and wait for their longest lists: more warps share a
@@ -106,7 +106,6 @@ __device__ __forceinline__ void front_to_back(const Batch<kCount>& batch, const 
   }
 }
 
-inline cudaStream_t stream_of(const Queue& queue) { return static_cast<cudaStream_t>(queue.stream); }
 inline int64_t tiles_of(Image image) { return int64_t(tile_count(image.width)) * tile_count(image.height); }
 
 }  // namespace cuda

@@ -5,6 +5,7 @@
 #include <cstdint>
 
 #include "../math/splat.h"
+#include "queue.cuh"
 
 namespace gs {
 namespace cuda {
@@ -36,7 +37,6 @@ struct SlotSums {
   // Called by all lanes of a warp; those that want a splat's sums get them, the others nothing.
   __device__ void read(int64_t splat, bool wanted, float* sums, float* stage) const {
     constexpr int kValues = baseline::kGradientValues;
-    constexpr unsigned kAll = 0xffffffffu;
     const int lane = threadIdx.x & 31;
     unsigned begin = 0, end = 0;  // instances are fewer than 2^31
     if (wanted)
@@ -44,10 +44,10 @@ struct SlotSums {
     const bool many = end - begin > kOwnRows;
     for (int v = 0; v < kValues; ++v) sums[v] = 0;
 
-    const unsigned last = __reduce_max_sync(kAll, end);
+    const unsigned last = __reduce_max_sync(kWarp, end);
     for (unsigned next = begin;;) {
       const bool open = !many && next < end;
-      const unsigned first = __reduce_min_sync(kAll, open ? next : ~0u);
+      const unsigned first = __reduce_min_sync(kWarp, open ? next : ~0u);
       if (first == ~0u) break;
       const float2* from = reinterpret_cast<const float2*>(compact.rows + int64_t(kValues) * first);
       const int pairs = kValues / 2 * int(last - first < kStaged ? last - first : kStaged);
@@ -58,14 +58,14 @@ struct SlotSums {
         for (; next < end && next - first < kStaged; ++next) add(stage + kValues * (next - first), sums);
     }
 
-    for (unsigned left = __ballot_sync(kAll, many); left; left &= left - 1) {
+    for (unsigned left = __ballot_sync(kWarp, many); left; left &= left - 1) {
       const int owner = __ffs(left) - 1;
-      const unsigned stop = __shfl_sync(kAll, end, owner);
+      const unsigned stop = __shfl_sync(kWarp, end, owner);
       float part[kValues] = {};
-      for (unsigned row = __shfl_sync(kAll, begin, owner) + lane; row < stop; row += 32)
+      for (unsigned row = __shfl_sync(kWarp, begin, owner) + lane; row < stop; row += 32)
         add(compact.rows + int64_t(kValues) * row, part);
       for (int v = 0; v < kValues; ++v) {
-        for (int step = 16; step; step /= 2) part[v] += __shfl_xor_sync(kAll, part[v], step);
+        for (int step = 16; step; step /= 2) part[v] += __shfl_xor_sync(kWarp, part[v], step);
         if (lane == owner) sums[v] = part[v];
       }
     }

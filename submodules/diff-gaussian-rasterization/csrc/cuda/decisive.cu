@@ -5,7 +5,7 @@
 #include "../launch.h"
 #include "../math/blend.h"
 #include "../math/tiles.h"
-#include "gs/cuda_check.h"
+#include "queue.cuh"
 
 namespace gs {
 namespace cuda {
@@ -38,7 +38,7 @@ __global__ void __launch_bounds__(kTile* kTile)
 template <>
 void mark_decisive<float>(const Queue& queue, const BlendInput<float>& in, const int32_t* last, bool* decisive) {
   const int64_t tiles = int64_t(tile_count(in.image.width)) * tile_count(in.image.height);
-  decisive_kernel<<<unsigned(tiles), kTile * kTile, 0, static_cast<cudaStream_t>(queue.stream)>>>(in, last, decisive);
+  decisive_kernel<<<unsigned(tiles), kTile * kTile, 0, stream_of(queue)>>>(in, last, decisive);
   check_launch("decisive");
 }
 

@@ -1,12 +1,9 @@
 #pragma once
 // Which lists, or chunks of lists, blocks should take in which order: a long one that is started last keeps one
 // processor busy while the others are done.
-#include <cuda_runtime.h>
-
 #include <cstdint>
 
-#include "gs/cuda_check.h"
-#include "gs/cuda_queue.h"
+#include "queue.cuh"
 
 namespace gs {
 namespace cuda {
@@ -86,7 +83,7 @@ __global__ void __launch_bounds__(kOrderThreads) keep_tiles_kernel(int tiles, Le
 // lengths, or more.
 template <class Length>
 Work heaviest_first(const Queue& queue, int64_t tiles, const Length& length, int32_t size = kWhole, int64_t total = 0) {
-  const auto stream = static_cast<cudaStream_t>(queue.stream);
+  const cudaStream_t stream = stream_of(queue);
   const bool ordered = tiles <= kMostOrdered;
   const int64_t places = ordered ? total / size : 0;
   Chunk* chunks = queue.array<Chunk>(tiles + places);

@@ -2,7 +2,7 @@
 
 #include "../launch.h"
 #include "../math/observe.h"
-#include "gs/cuda_check.h"
+#include "queue.cuh"
 
 namespace gs {
 namespace cuda {
@@ -24,7 +24,7 @@ __global__ void __launch_bounds__(kThreads) observe_kernel(ObserveInput in) {
 void observe(const Queue& queue, const ObserveInput& in) {
   if (!in.count) return;
   const unsigned blocks = unsigned((in.count + kThreads - 1) / kThreads);
-  observe_kernel<<<blocks, kThreads, 0, static_cast<cudaStream_t>(queue.stream)>>>(in);
+  observe_kernel<<<blocks, kThreads, 0, stream_of(queue)>>>(in);
   check_launch("observe");
 }
 

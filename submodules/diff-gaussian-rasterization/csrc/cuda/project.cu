@@ -4,7 +4,6 @@
 
 #include "../math/scene_row.h"
 #include "backward.cuh"
-#include "gs/cuda_check.h"
 #include "tiles.cuh"
 
 namespace gs {
@@ -164,8 +163,6 @@ __global__ void mark_visible_kernel(int64_t count, const float* means, const flo
   const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
   if (i < count) visible[i] = in_front(dot(Vec3<float>{view[2], view[6], view[10]}, load3(means + 3 * i)) + view[14]);
 }
-
-cudaStream_t stream_of(const Queue& queue) { return static_cast<cudaStream_t>(queue.stream); }
 
 }  // namespace
 

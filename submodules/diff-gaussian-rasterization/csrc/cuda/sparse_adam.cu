@@ -2,8 +2,8 @@
 
 #include "../launch.h"
 #include "../math/adam.h"
-#include "gs/cuda_check.h"
 #include "guarded_adam.cuh"
+#include "queue.cuh"
 
 namespace gs {
 namespace cuda {
@@ -31,7 +31,7 @@ void sparse_adam<float>(const Queue& queue, const AdamInput<float>& in, const bo
   const int64_t n = in.rows * in.columns;
   if (!n) return;
   const auto step = baseline::make_uncorrected_adam_step<float>(in.lr, in.beta1, in.beta2, in.eps);
-  const auto stream = static_cast<cudaStream_t>(queue.stream);
+  const cudaStream_t stream = stream_of(queue);
   sparse_adam_kernel<<<unsigned((n + kThreads - 1) / kThreads), kThreads, 0, stream>>>(in, visible, step, guard);
   check_launch("sparse_adam");
 }

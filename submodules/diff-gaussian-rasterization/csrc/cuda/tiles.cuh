@@ -2,13 +2,13 @@
 // Counting the tiles that a splat reaches, by whole warps: a splat over a thousand tiles must not hold up 31 others.
 #include "../launch.h"
 #include "../math/tiles.h"
+#include "queue.cuh"
 
 namespace gs {
 namespace cuda {
 
 using namespace baseline;  // the math headers' namespace in a build without instruction sets
 
-constexpr unsigned kWarp = 0xffffffffu;
 constexpr int kShared = 32;  // tiles of a rectangle up to which it is tested along with those of other lanes
 
 template <class V>

@@ -1,0 +1,25 @@
+#pragma once
+// What every kernel's host side does with its Queue, and the mask of a whole warp.
+#include <cuda_runtime.h>
+
+#include "gs/cuda_check.h"
+#include "gs/cuda_queue.h"
+
+namespace gs {
+namespace cuda {
+
+constexpr unsigned kWarp = 0xffffffffu;
+
+inline cudaStream_t stream_of(const Queue& queue) { return static_cast<cudaStream_t>(queue.stream); }
+
+// CUB's functions want to be called twice: for the size of their memory, and with it.
+template <class Call>
+void with_memory(const Queue& queue, const Call& call) {
+  size_t bytes = 0;
+  GS_CUDA_CHECK(call(nullptr, bytes));
+  void* memory = queue.allocate(queue.context, bytes);
+  GS_CUDA_CHECK(call(memory, bytes));
+}
+
+}  // namespace cuda
+}  // namespace gs
