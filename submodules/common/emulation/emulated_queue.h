@@ -1,5 +1,6 @@
 #pragma once
 // A queue for the emulated kernels, for tests.
+#include <algorithm>
 #include <cstdlib>
 #include <cstring>
 #include <memory>
@@ -11,10 +12,10 @@
 
 namespace gs::emulation {
 
-// Memory of exact sizes, so that a sanitizer sees a step outside; freed with this.
+// Memory of exact sizes, so that a sanitizer sees a step outside; freed with this or when released.
 class Memory {
  public:
-  Queue queue() { return {nullptr, &allocate, &pinned, this}; }
+  Queue queue() { return {nullptr, &allocate, &release, &pinned, this}; }
 
  private:
   static void* allocate(void* context, size_t bytes) {
@@ -24,6 +25,10 @@ class Memory {
     std::memset(piece, 0x7f, bytes);  // floats of 3.4e38: nothing may rely on zeros
     pieces.emplace_back(piece, &std::free);
     return piece;
+  }
+  static void release(void* context, const void* memory) {
+    auto& pieces = static_cast<Memory*>(context)->pieces_;
+    pieces.erase(std::find_if(pieces.begin(), pieces.end(), [=](const auto& one) { return one.get() == memory; }));
   }
   static int64_t* pinned(void* context, int64_t count) {
     return static_cast<int64_t*>(allocate(context, count * sizeof(int64_t)));

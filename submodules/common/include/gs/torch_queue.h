@@ -6,6 +6,7 @@
 #include <c10/cuda/CUDAGuard.h>
 #include <c10/cuda/CUDAStream.h>
 
+#include <algorithm>
 #include <vector>
 
 #include "gs/cuda_queue.h"
@@ -18,7 +19,7 @@ class TorchQueue {
  public:
   explicit TorchQueue(at::Device device) : guard_(device) {}
 
-  Queue queue() { return {c10::cuda::getCurrentCUDAStream().stream(), &allocate, &pinned, this}; }
+  Queue queue() { return {c10::cuda::getCurrentCUDAStream().stream(), &allocate, &release, &pinned, this}; }
 
  private:
   static void* allocate(void* context, size_t bytes) {
@@ -26,6 +27,12 @@ class TorchQueue {
     auto& memory = static_cast<TorchQueue*>(context)->memory_;
     memory.push_back(c10::cuda::CUDACachingAllocator::get()->allocate(bytes));
     return memory.back().get();
+  }
+
+  static void release(void* context, const void* memory) {
+    auto& all = static_cast<TorchQueue*>(context)->memory_;
+    const auto is_it = [=](const c10::DataPtr& one) { return one.get() == memory; };
+    all.erase(std::find_if(all.begin(), all.end(), is_it));
   }
 
   static int64_t* pinned(void* context, int64_t count) {

@@ -116,7 +116,8 @@ void bin(const Executor& executor, int64_t count, const Projected<T>& projected,
   if (memory.slot_offsets) {
     for (int64_t i = 0; i < count; ++i) {
       memory.slot_offsets[i] = slots;
-      slots += slot_count(projected.rects, projected.tile_counts, i);
+      const int32_t* r = projected.rects + 4 * i;
+      if (projected.tile_counts[i]) slots += slot_count(TileRect{r[0], r[1], r[2], r[3]});
     }
     memory.slot_offsets[count] = slots;
   }

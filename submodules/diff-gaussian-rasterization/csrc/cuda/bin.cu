@@ -17,42 +17,45 @@ constexpr int kThreads = 256;
 
 dim3 blocks_for(int64_t n) { return dim3(unsigned((n + kThreads - 1) / kThreads)); }
 
-struct Widen {
-  __host__ __device__ int64_t operator()(int32_t count) const { return count; }
-};
+constexpr int kCounted = 4;  // splats of a thread, whose loads need not wait for each other
 
-struct SlotCount {
-  const int32_t* rects;
-  const int32_t* tile_counts;
-  int64_t splats;
-  __host__ __device__ int64_t operator()(int64_t splat) const {
-    return splat < splats ? slot_count(rects, tile_counts, splat) : 0;
+// Adds all splats' instances and slots to `totals`, and numbers the splats for the depth sort.
+__global__ void __launch_bounds__(kThreads)
+    count_kernel(int64_t n, Projected<float> in, int32_t* index, unsigned long long* totals) {
+  __shared__ unsigned long long of_block[2];
+  if (threadIdx.x < 2) of_block[threadIdx.x] = 0;
+  __syncthreads();
+  const int64_t first = int64_t(blockIdx.x) * kCounted * kThreads + threadIdx.x;
+  unsigned long long instances = 0, slots = 0;
+#pragma unroll
+  for (int r = 0; r < kCounted; ++r) {
+    const int64_t i = first + r * kThreads;
+    const Reached reached = i < n ? reached_by(in, int32_t(i)) : Reached{};
+    instances += reached.count, slots += slot_count(reached.rect);
+    if (i < n) index[i] = int32_t(i);
   }
-};
+  for (int step = 16; step; step /= 2) {
+    instances += __shfl_xor_sync(kWarp, instances, step);
+    slots += __shfl_xor_sync(kWarp, slots, step);
+  }
+  if (threadIdx.x % 32 == 0) atomicAdd(of_block, instances), atomicAdd(of_block + 1, slots);
+  __syncthreads();
+  if (threadIdx.x < 2) atomicAdd(totals + threadIdx.x, of_block[threadIdx.x]);
+}
 
-// The numbers of instances and slots, on their way to the host. Fills slot_offsets.
+// The numbers of instances and slots, on their way to the host. Fills `index` with the splats' numbers.
 class Totals {
  public:
-  Totals(const Queue& queue, int64_t count, const Projected<float>& in, int64_t* slot_offsets)
+  Totals(const Queue& queue, int64_t count, const Projected<float>& in, int32_t* index)
       : host_(queue.pinned(queue.context, 2)) {
     const cudaStream_t stream = stream_of(queue);
-    int64_t* instances = queue.array<int64_t>(1);
-    const auto counts = thrust::make_transform_iterator(in.tile_counts, Widen{});
-    with_memory(queue, [&](void* memory, size_t& bytes) {
-      return cub::DeviceReduce::Sum(memory, bytes, counts, instances, count, stream);
-    });
-    if (slot_offsets) {
-      const SlotCount of{in.rects, in.tile_counts, count};
-      const auto slots = thrust::make_transform_iterator(thrust::counting_iterator<int64_t>(0), of);
-      with_memory(queue, [&](void* memory, size_t& bytes) {
-        return cub::DeviceScan::ExclusiveSum(memory, bytes, slots, slot_offsets, count + 1, stream);
-      });
-    }
-    host_[1] = 0;
+    auto* totals = queue.array<unsigned long long>(2);
+    GS_CUDA_CHECK(cudaMemsetAsync(totals, 0, 2 * sizeof *totals, stream));
+    const unsigned blocks = unsigned((count + kCounted * kThreads - 1) / (kCounted * kThreads));
+    count_kernel<<<blocks, kThreads, 0, stream>>>(count, in, index, totals);
+    check_launch("count");
     GS_CUDA_CHECK(cudaEventCreateWithFlags(&arrived_, cudaEventDisableTiming));
-    GS_CUDA_CHECK(cudaMemcpyAsync(host_, instances, sizeof *host_, cudaMemcpyDeviceToHost, stream));
-    if (slot_offsets)
-      GS_CUDA_CHECK(cudaMemcpyAsync(host_ + 1, slot_offsets + count, sizeof *host_, cudaMemcpyDeviceToHost, stream));
+    GS_CUDA_CHECK(cudaMemcpyAsync(host_, totals, 2 * sizeof *totals, cudaMemcpyDeviceToHost, stream));
     GS_CUDA_CHECK(cudaEventRecord(arrived_, stream));
   }
   Totals(const Totals&) = delete;
@@ -69,10 +72,17 @@ class Totals {
   cudaEvent_t arrived_;
 };
 
-__global__ void count_up_kernel(int64_t n, int32_t* values) {
-  const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
-  if (i < n) values[i] = int32_t(i);
-}
+struct SlotCount {
+  Projected<float> in;
+  int64_t splats;
+  __host__ __device__ int64_t operator()(int64_t splat) const {
+#ifdef __CUDA_ARCH__
+    return splat < splats ? slot_count(reached_by(in, int32_t(splat)).rect) : 0;
+#else
+    return 0;
+#endif
+  }
+};
 
 // Of one load from memory.
 template <class Key>
@@ -105,16 +115,22 @@ int bits_for(int64_t values) {
 }
 
 // Splats by depth, ties by index (the sort is stable and starts from that order); culled ones, infinitely far, last.
-const int32_t* sort_by_depth(const Queue& queue, int64_t n, const float* depths) {
+const int32_t* sort_by_depth(const Queue& queue, int64_t n, const float* depths, const int32_t* index) {
   uint32_t* sorted_keys = queue.array<uint32_t>(n);
-  int32_t *index = queue.array<int32_t>(n), *order = queue.array<int32_t>(n);
-  count_up_kernel<<<blocks_for(n), kThreads, 0, stream_of(queue)>>>(n, index);
+  int32_t* order = queue.array<int32_t>(n);
   // Positive floats sort like their bits.
   const uint32_t* keys = reinterpret_cast<const uint32_t*>(depths);
   with_memory(queue, [&](void* memory, size_t& bytes) {
     return cub::DeviceRadixSort::SortPairs(memory, bytes, keys, sorted_keys, index, order, n, 0, 32, stream_of(queue));
   });
   return order;
+}
+
+void offset_slots(const Queue& queue, int64_t n, const Projected<float>& in, int64_t* offsets) {
+  const auto slots = thrust::make_transform_iterator(thrust::counting_iterator<int64_t>(0), SlotCount{in, n});
+  with_memory(queue, [&](void* memory, size_t& bytes) {
+    return cub::DeviceScan::ExclusiveSum(memory, bytes, slots, offsets, n + 1, stream_of(queue));
+  });
 }
 
 // order: splats by depth.
@@ -158,10 +174,14 @@ void bin<float>(const Queue& queue, int64_t count, const Projected<float>& in, I
   int64_t instances = 0, slots = 0;
   const int32_t* order = nullptr;
   if (count) {
-    const Totals totals(queue, count, in, memory.slot_offsets);
-    order = sort_by_depth(queue, count, in.depths);  // the GPU is busy while the host waits for the numbers
+    int32_t* index = queue.array<int32_t>(count);
+    const Totals totals(queue, count, in, index);
+    // The GPU is busy with what needs no list while the host waits for the numbers.
+    order = sort_by_depth(queue, count, in.depths, index);
+    if (memory.slot_offsets) offset_slots(queue, count, in, memory.slot_offsets);
     totals.wait();
-    instances = totals.instances(), slots = totals.slots();
+    instances = totals.instances();
+    if (memory.slot_offsets) slots = totals.slots();
   } else if (memory.slot_offsets) {
     GS_CUDA_CHECK(cudaMemsetAsync(memory.slot_offsets, 0, sizeof *memory.slot_offsets, stream_of(queue)));
   }

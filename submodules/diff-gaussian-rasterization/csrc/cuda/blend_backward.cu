@@ -296,6 +296,8 @@ Compact blend_rows(const Queue& queue, const BlendInput<float>& in, const BlendG
   const auto kernel = g.inverse_depth ? blend_vjp_kernel<true> : blend_vjp_kernel<false>;
   kernel<<<work.blocks, Backward::kThreads, 0, stream>>>(in, g, processed, work.chunks, chunk_size, layers, compact);
   check_launch("blend_vjp");
+  for (const void* done : {static_cast<const void*>(layers), static_cast<const void*>(work.chunks)})
+    queue.release(queue.context, done);  // the gradients come next, and are most of what a step takes
   return compact;
 }
 

@@ -1,6 +1,7 @@
 #pragma once
 // Writing the instances (tile, splat) in depth order. Blocks share the instances evenly, not the splats: the nearest
 // splats lie side by side in that order and reach a thousand tiles each.
+#include "reached.cuh"
 #include "tiles.cuh"
 
 namespace gs {
@@ -24,15 +25,6 @@ __device__ inline int nth_bit(uint64_t mask, int n) {
   return place;
 }
 
-__device__ inline TileRect rect_of(const Projected<float>& in, int32_t splat) {
-  if (in.records) {
-    const TileRecord r = in.records[splat];
-    return {r.x0, r.y0, r.x1, r.y1};
-  }
-  const int4 r = reinterpret_cast<const int4*>(in.rects)[splat];
-  return {r.x, r.y, r.z, r.w};
-}
-
 // What emission needs of a splat.
 struct alignas(16) Lined {
   uint64_t mask;   // of reached tiles, 0 where emission has to test them
@@ -47,21 +39,10 @@ __global__ void __launch_bounds__(kEmitThreads)
   const int64_t k = int64_t(blockIdx.x) * kEmitThreads + threadIdx.x;
   if (k == n) counts[n] = 0;
   if (k >= n) return;
-  const int32_t splat = order[k];
-  int32_t count = 0;
-  Lined line = {};
-  if (in.records) {
-    const TileRecord r = in.records[splat];
-    const int wide = r.x1 - r.x0;
-    const bool masked = wide * (r.y1 - r.y0) <= 64;
-    line = {masked ? r.reached : 0, r.y0 * columns + r.x0, wide};
-    count = masked ? __popcll(r.reached) : int32_t(r.reached);
-  } else if ((count = in.tile_counts[splat])) {  // the rectangle of a culled splat is undefined
-    const TileRect rect = rect_of(in, splat);
-    line = {0, rect.y0 * columns + rect.x0, rect.x1 - rect.x0};
-  }
-  counts[k] = count;
-  lined[k] = line;
+  const Reached reached = reached_by(in, order[k]);
+  const TileRect rect = reached.rect;
+  counts[k] = reached.count;
+  lined[k] = {reached.mask, rect.y0 * columns + rect.x0, rect.x1 - rect.x0};
 }
 
 // For each block the splat, in depth order, that its first instance belongs to, and after the last block the last splat
@@ -164,7 +145,7 @@ __global__ void __launch_bounds__(kEmitThreads)
   if (splats.unmasked_count) __syncthreads();  // what follows writes over what these instances got
   for (int u = 0, turn = 0; u < splats.unmasked_count; ++u) {
     const int32_t k = splats.unmasked[u], index = splats.index[k];
-    const TileRect rect = rect_of(in, index);
+    const TileRect rect = reached_by(in, index).rect;
     const TileTest<float> test = make_tile_test(load_shape(in.splats, index), rect, image.width, image.height);
     const int wide = rect.x1 - rect.x0, area = wide * (rect.y1 - rect.y0);
     int at = splats.first[k];

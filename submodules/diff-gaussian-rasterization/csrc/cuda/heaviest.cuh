@@ -50,14 +50,23 @@ __global__ void __launch_bounds__(kOrderThreads)
     atomicAdd(&next[length_class(whole - full * size)], 1);
   }
   __syncthreads();
-  if (threadIdx.x == 0) {
-    int32_t before = 0;
-    for (int c = 0; c < kLengthClasses; ++c) {
-      const int32_t count = next[c];
-      next[c] = before;
-      before += count;
+  if (threadIdx.x < 32) {  // where each class begins
+    constexpr int kOwn = kLengthClasses / 32;
+    const int lane = threadIdx.x, own = kOwn * lane;
+    int32_t end = 0;
+    for (int c = 0; c < kOwn; ++c) end += next[own + c];
+    const int32_t sum = end;
+    for (int step = 1; step < 32; step *= 2) {
+      const int32_t before = __shfl_up_sync(kWarp, end, step);
+      if (lane >= step) end += before;
     }
-    total = before;
+    if (lane == 31) total = end;
+    int32_t begin = end - sum;
+    for (int c = 0; c < kOwn; ++c) {
+      const int32_t count = next[own + c];
+      next[own + c] = begin;
+      begin += count;
+    }
   }
   __syncthreads();
   for (int t = threadIdx.x; t < tiles; t += kOrderThreads) {

@@ -107,7 +107,7 @@ __global__ void __launch_bounds__(kThreads) project_kernel(Scene<float> s, Proje
   out.tile_counts[i] = count;
   out.depths[i] = count ? depth : INFINITY;
   if (out.records) {
-    if (!count) rect = {0, 0, 0, 0};
+    if (!count) rect = {0, 0, 0, 0}, mask = 0;  // also where the shape has tiles and the colour is not finite
     const uint64_t reached = (rect.x1 - rect.x0) * (rect.y1 - rect.y0) <= 64 ? mask : uint64_t(count);
     out.records[i] = {reached, uint16_t(rect.x0), uint16_t(rect.y0), uint16_t(rect.x1), uint16_t(rect.y1)};
   }

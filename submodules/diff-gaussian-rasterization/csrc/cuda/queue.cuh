@@ -19,6 +19,7 @@ void with_memory(const Queue& queue, const Call& call) {
   GS_CUDA_CHECK(call(nullptr, bytes));
   void* memory = queue.allocate(queue.context, bytes);
   GS_CUDA_CHECK(call(memory, bytes));
+  queue.release(queue.context, memory);
 }
 
 }  // namespace cuda

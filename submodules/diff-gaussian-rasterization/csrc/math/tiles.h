@@ -27,11 +27,7 @@ struct SplatSlots {
   }
 };
 
-// The slots of one splat.
-GS_HD int64_t slot_count(const int32_t* rects, const int32_t* tile_counts, int64_t splat) {
-  const int32_t* r = rects + 4 * splat;
-  return tile_counts[splat] ? int64_t(r[2] - r[0]) * (r[3] - r[1]) : 0;
-}
+GS_HD int64_t slot_count(TileRect rect) { return int64_t(rect.x1 - rect.x0) * (rect.y1 - rect.y0); }
 
 GS_HD int tile_count(int pixels) { return (pixels + kTile - 1) / kTile; }
 

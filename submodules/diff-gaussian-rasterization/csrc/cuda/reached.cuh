@@ -1,0 +1,32 @@
+#pragma once
+// What projection hands on of the tiles that splats reach, from records or, without them, from rectangles.
+#include <cstring>
+
+#include "../launch.h"
+#include "../math/tiles.h"
+
+namespace gs {
+namespace cuda {
+
+struct Reached {
+  baseline::TileRect rect;  // empty where the splat reaches none
+  int32_t count;
+  uint64_t mask;  // a bit for each tile of the rectangle; 0 where there are too many, or no record
+};
+
+__device__ inline Reached reached_by(const Projected<float>& in, int32_t splat) {
+  if (in.records) {
+    const uint4 bits = reinterpret_cast<const uint4*>(in.records)[splat];  // one load, where the struct takes two
+    TileRecord r;
+    std::memcpy(&r, &bits, sizeof r);
+    const bool masked = (r.x1 - r.x0) * (r.y1 - r.y0) <= 64;
+    return {{r.x0, r.y0, r.x1, r.y1}, masked ? __popcll(r.reached) : int32_t(r.reached), masked ? r.reached : 0};
+  }
+  const int32_t count = in.tile_counts[splat];
+  if (!count) return {};  // its rectangle is undefined
+  const int4 r = reinterpret_cast<const int4*>(in.rects)[splat];
+  return {{r.x, r.y, r.z, r.w}, count, 0};
+}
+
+}  // namespace cuda
+}  // namespace gs
