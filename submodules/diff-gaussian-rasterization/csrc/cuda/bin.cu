@@ -7,6 +7,7 @@
 #include <cub/cub.cuh>
 
 #include "emit.cuh"
+#include "to_host.cuh"
 
 namespace gs {
 namespace cuda {
@@ -43,34 +44,15 @@ __global__ void __launch_bounds__(kThreads)
   if (threadIdx.x < 2) atomicAdd(totals + threadIdx.x, of_block[threadIdx.x]);
 }
 
-// The numbers of instances and slots, on their way to the host. Fills `index` with the splats' numbers.
-class Totals {
- public:
-  Totals(const Queue& queue, int64_t count, const Projected<float>& in, int32_t* index)
-      : host_(queue.pinned(queue.context, 2)) {
-    const cudaStream_t stream = stream_of(queue);
-    auto* totals = queue.array<unsigned long long>(2);
-    GS_CUDA_CHECK(cudaMemsetAsync(totals, 0, 2 * sizeof *totals, stream));
-    const unsigned blocks = unsigned((count + kCounted * kThreads - 1) / (kCounted * kThreads));
-    count_kernel<<<blocks, kThreads, 0, stream>>>(count, in, index, totals);
-    check_launch("count");
-    GS_CUDA_CHECK(cudaEventCreateWithFlags(&arrived_, cudaEventDisableTiming));
-    GS_CUDA_CHECK(cudaMemcpyAsync(host_, totals, 2 * sizeof *totals, cudaMemcpyDeviceToHost, stream));
-    GS_CUDA_CHECK(cudaEventRecord(arrived_, stream));
-  }
-  Totals(const Totals&) = delete;
-  // Waits, too: after an error in between the numbers must not come into memory that is another's by then.
-  ~Totals() { cudaEventSynchronize(arrived_), cudaEventDestroy(arrived_); }
-
-  // Waits for them, and for nothing that was queued since.
-  void wait() const { GS_CUDA_CHECK(cudaEventSynchronize(arrived_)); }
-  int64_t instances() const { return host_[0]; }
-  int64_t slots() const { return host_[1]; }
-
- private:
-  int64_t* host_;
-  cudaEvent_t arrived_;
-};
+// The numbers of instances and slots. Fills `index` with the splats' numbers.
+const int64_t* count_all(const Queue& queue, int64_t n, const Projected<float>& in, int32_t* index) {
+  auto* totals = queue.array<unsigned long long>(2);
+  GS_CUDA_CHECK(cudaMemsetAsync(totals, 0, 2 * sizeof *totals, stream_of(queue)));
+  const unsigned blocks = unsigned((n + kCounted * kThreads - 1) / (kCounted * kThreads));
+  count_kernel<<<blocks, kThreads, 0, stream_of(queue)>>>(n, in, index, totals);
+  check_launch("count");
+  return reinterpret_cast<const int64_t*>(totals);
+}
 
 struct SlotCount {
   Projected<float> in;
@@ -175,13 +157,12 @@ void bin<float>(const Queue& queue, int64_t count, const Projected<float>& in, I
   const int32_t* order = nullptr;
   if (count) {
     int32_t* index = queue.array<int32_t>(count);
-    const Totals totals(queue, count, in, index);
+    const ToHost<int64_t> totals(queue, count_all(queue, count, in, index), 2);
     // The GPU is busy with what needs no list while the host waits for the numbers.
     order = sort_by_depth(queue, count, in.depths, index);
     if (memory.slot_offsets) offset_slots(queue, count, in, memory.slot_offsets);
-    totals.wait();
-    instances = totals.instances();
-    if (memory.slot_offsets) slots = totals.slots();
+    instances = totals.wait()[0];
+    if (memory.slot_offsets) slots = totals.wait()[1];
   } else if (memory.slot_offsets) {
     GS_CUDA_CHECK(cudaMemsetAsync(memory.slot_offsets, 0, sizeof *memory.slot_offsets, stream_of(queue)));
   }

@@ -4,10 +4,12 @@
 #include <thrust/iterator/transform_iterator.h>
 
 #include <cub/cub.cuh>
+#include <optional>
 
 #include "backward.cuh"
 #include "blend_layout.cuh"
 #include "heaviest.cuh"
+#include "to_host.cuh"
 
 namespace gs {
 namespace cuda {
@@ -280,17 +282,13 @@ Compact blend_rows(const Queue& queue, const BlendInput<float>& in, const BlendG
   with_memory(queue, [&](void* memory, size_t& bytes) {
     return cub::DeviceScan::ExclusiveSum(memory, bytes, counts, before, words + 1, stream);
   });
-  int64_t rows = g.instance_count;  // at most: one for each
-  if (rows > kRowsUnasked) {
-    int32_t processed_count = 0;
-    GS_CUDA_CHECK(
-        cudaMemcpyAsync(&processed_count, before + words, sizeof processed_count, cudaMemcpyDeviceToHost, stream));
-    GS_CUDA_CHECK(cudaStreamSynchronize(stream));
-    rows = processed_count;
-  }
-  const Compact compact{bits, before, queue.array<float>(size_t(rows) * kGradientValues)};
   const int chunk_size = tiles <= kFewTiles ? kChunkOfFew : kChunkOfMany;
-  const Work work = heaviest_first(queue, tiles, ProcessedLength{processed}, chunk_size, rows);
+  int64_t rows = g.instance_count;  // at most
+  std::optional<ToHost<int32_t>> processed_count;
+  if (rows > kRowsUnasked) processed_count.emplace(queue, before + words, 1);
+  Work work = heaviest_first(queue, tiles, ProcessedLength{processed}, chunk_size, rows);
+  if (processed_count) rows = *processed_count->wait(), work = work.shortened(rows);
+  const Compact compact{bits, before, queue.array<float>(size_t(rows) * kGradientValues)};
   Layer* layers = queue.array<Layer>(size_t(work.places) * kTile * kTile);
   if (work.places) (tiles <= kFewTiles ? find_layers<Layout<1>> : find_layers<Layout<2>>)(queue, in, g, work, layers);
   const auto kernel = g.inverse_depth ? blend_vjp_kernel<true> : blend_vjp_kernel<false>;

@@ -1,6 +1,7 @@
 #pragma once
 // Which lists, or chunks of lists, blocks should take in which order: a long one that is started last keeps one
 // processor busy while the others are done.
+#include <algorithm>
 #include <cstdint>
 
 #include "queue.cuh"
@@ -24,6 +25,13 @@ struct Work {
   const Chunk* chunks;
   unsigned blocks;  // one for each chunk, and perhaps some for none
   unsigned places;  // at most
+  int32_t size;     // of a chunk
+
+  // The same where all lengths come to no more than `total`.
+  Work shortened(int64_t total) const {
+    const unsigned fewer = unsigned(std::min<int64_t>(places, total / size));
+    return {chunks, blocks - places + fewer, fewer, size};
+  }
 };
 
 // Longer lists have smaller classes.
@@ -102,7 +110,7 @@ Work heaviest_first(const Queue& queue, int64_t tiles, const Length& length, int
     keep_tiles_kernel<<<unsigned((tiles + kOrderThreads - 1) / kOrderThreads), kOrderThreads, 0, stream>>>(
         int(tiles), length, chunks);
   check_launch("order_chunks");
-  return {chunks, unsigned(tiles + places), unsigned(places)};
+  return {chunks, unsigned(tiles + places), unsigned(places), size};
 }
 
 }  // namespace cuda

@@ -270,7 +270,9 @@ void test_heaviest_first() {
       lengths[tiles / 2] = size == 64 ? 7 * 64 : gs::cuda::kWhole;
       gs::emulation::Memory memory;
       const int64_t total = std::accumulate(lengths.begin(), lengths.end(), int64_t(0));
-      const gs::cuda::Work work = gs::cuda::heaviest_first(memory.queue(), tiles, Lengths{lengths.data()}, size, total);
+      const gs::cuda::Work work =
+          gs::cuda::heaviest_first(memory.queue(), tiles, Lengths{lengths.data()}, size, 3 * total).shortened(total);
+      CHECK(work.places == (tiles <= 16384 ? total / size : 0) && work.blocks == tiles + work.places);
       const bool ordered = tiles <= 16384;
       std::vector<std::vector<gs::cuda::Chunk>> of_tile(tiles);
       int64_t before = int64_t(1) << 32;
