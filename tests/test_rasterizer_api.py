@@ -207,24 +207,27 @@ def test_nothing_is_kept_without_gradients():
         "inverse_depth",
         "radii",
         "splats",
-        "rects",
         "tile_counts",
         "instances",
         "ranges",
-        "slot_offsets",
+        "splat_slots",
         "slots",
         "last",
     ]
     rendering = dict(zip(names, _outputs(splats, camera, False, False), strict=True))
-    for name in ("rects", "slot_offsets", "last", "inverse_depth"):
+    for name in ("splat_slots", "last", "inverse_depth"):
         assert rendering[name].numel() == 0, name
     assert len(rendering["slots"]) == 0
     training = dict(zip(names, _outputs(splats, camera, True), strict=True))
     assert len(training["instances"]) == training["ranges"][-1] == training["tile_counts"].sum()
-    x0, y0, x1, y1 = training["rects"].T
-    areas = torch.where(training["tile_counts"] > 0, (x1 - x0) * (y1 - y0), 0)
-    assert torch.equal(training["slot_offsets"].diff(), areas.long())
-    assert len(training["slots"]) == training["slot_offsets"][-1] == areas.sum()
+    _, _, rects, counts, _ = ops.project(*scene_arguments(splats, camera, False))
+    x0, y0, x1, y1 = torch.where(counts[:, None] > 0, rects, 0).T
+    areas, first = (x1 - x0) * (y1 - y0), training["splat_slots"][:, 0]
+    assert torch.equal(first.diff(), areas.long())
+    assert len(training["slots"]) == first[-1] == areas.sum()
+    skipped, wide = training["splat_slots"][:-1, 1:].contiguous().view(torch.int32).T
+    assert torch.equal(wide, x1 - x0)
+    assert torch.equal(skipped, y0 * wide + x0)
     assert training["last"].shape == (7, 18)
     assert torch.equal(rendering["color"], training["color"])
     # The public function decides by the grad mode and by its inputs.

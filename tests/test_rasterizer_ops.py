@@ -43,7 +43,7 @@ def test_opcheck_every_other_op(device):
         _check(ops.blend, splats, instances, ranges, background, height, width, inverse_depth, train)
     image, transmittance, plane, last = ops.blend(splats, instances, ranges, background, height, width, True, True)
     _check(ops.decisive, splats, instances, ranges, last)
-    state = (splats, rects, instances, ranges, *slots, background, last, transmittance)
+    state = (splats, instances, ranges, *slots, background, last, transmittance)
     gradients = (torch.ones_like(image), torch.ones_like(transmittance), torch.ones_like(plane))
     _check(ops.blend_vjp, *state, *gradients)
     moments = ops.blend_vjp(*state, *gradients)
@@ -79,7 +79,7 @@ def test_the_steps_one_by_one_are_the_whole(device, dtype):
     assert torch.equal(out.inverse_depth, inverse_depth) and torch.equal(out.radii, radii)
     weights = torch.linspace(-1, 1, color.numel()).reshape(color.shape).to(color)
     (weights * out.color).sum().backward()
-    state = (splats, rects, instances, ranges, *slots, camera.bg, last, transmittance)
+    state = (splats, instances, ranges, *slots, camera.bg, last, transmittance)
     moments = ops.blend_vjp(*state, weights, None, None)
     wanted = [True, False, True, True, True, False, False, True, True]
     gradients = ops.project_vjp(*arguments, counts, moments, wanted)

@@ -66,16 +66,22 @@ struct SceneGradient {
   T* sh_rest;
 };
 
+// The slots (math/slots.h) of a splat: a tile of its rectangle each, row by row; none where it is culled.
+struct alignas(16) SplatSlots {
+  int64_t first;          // the slots of all splats before
+  int32_t skipped, wide;  // tiles in front of the rectangle, were all rows as wide as it; its width
+};
+
 struct Binned {
   int32_t* instances;  // (I) splat, by tile and inside by depth, ties by index
   int64_t* ranges;     // (tiles + 1) into instances
 };
 
-// Where binning gets the memory of its lists once it has counted; it may throw. Slots: SplatSlots in math/tiles.h.
+// Where binning gets the memory of its lists once it has counted; it may throw.
 struct BinMemory {
   Binned (*take)(void* context, int64_t instances, int64_t slots);
   void* context;
-  int64_t* slot_offsets;  // (N + 1), filled by binning; or null: no slots
+  SplatSlots* slots;  // (N + 1), filled by binning; or null: none
 };
 
 template <class T>
@@ -98,8 +104,7 @@ struct Blended {
 template <class T>
 struct BlendGradient {
   int64_t count, instance_count, slot_count;
-  const int32_t* rects;
-  const int64_t* slot_offsets;
+  const SplatSlots* slots;
   const T* transmittance;
   const int32_t* last;
   const T* color;                   // dLoss/dcolor

@@ -193,7 +193,7 @@ struct ProjectedTensors {
   }
 };
 
-// `rects`: whether the caller or the backward wants them; a GPU has no other use for them.
+// `rects`: whether the caller wants them; a GPU has no other use for them.
 ProjectedTensors project(const SceneTensors& in, bool rects) {
   const int64_t n = in.count();
   const auto ints = in.options().dtype(at::kInt);
@@ -224,15 +224,16 @@ std::string most_tiles(const Tensor& tile_counts) {
 }
 
 struct BinnedTensors {
-  Tensor instances, ranges, slot_offsets;
-  Tensor slots;  // (S, 0): nothing but their number, which the backward's memory is sized by
+  Tensor instances, ranges;
+  Tensor splat_slots;  // (N + 1, 2): gs::SplatSlots, the second value two of 32 bits
+  Tensor slots;        // (S, 0): nothing but their number, which the backward's memory is sized by
 };
 
 // `slots`: whether the backward will need them.
 BinnedTensors bin(ProjectedTensors& in, gs::Image image, bool slots) {
   const auto ints = in.depths.options().dtype(at::kInt), longs = in.depths.options().dtype(at::kLong);
   BinnedTensors out;
-  out.slot_offsets = at::empty({slots ? in.depths.size(0) + 1 : 0}, longs);
+  out.splat_slots = at::empty({slots ? in.depths.size(0) + 1 : 0, 2}, longs);
   auto allocate = [&](int64_t total, int64_t slot_count) {
     const int64_t n = in.depths.size(0);
     TORCH_CHECK(total <= std::numeric_limits<int32_t>::max(), n, " Gaussians cover ", total,
@@ -245,7 +246,7 @@ BinnedTensors bin(ProjectedTensors& in, gs::Image image, bool slots) {
   using Allocate = decltype(allocate);
   const gs::BinMemory memory{
       [](void* context, int64_t total, int64_t slots) { return (*static_cast<Allocate*>(context))(total, slots); },
-      &allocate, slots ? out.slot_offsets.mutable_data_ptr<int64_t>() : nullptr};
+      &allocate, slots ? static_cast<gs::SplatSlots*>(out.splat_slots.mutable_data_ptr()) : nullptr};
   with_scalar(in.depths.scalar_type(), [&](auto zero) {
     using T = decltype(zero);
     RUN(T, in.depths, bin, in.depths.size(0), in.pointers<T>(), image, memory);
@@ -290,15 +291,13 @@ BlendedTensors blend(const Tensor& splats, const Tensor& instances, const Tensor
 // What the backward of blending takes: owns the tensors that gs::BlendInput and gs::BlendGradient point into.
 class BlendBackward {
  public:
-  BlendBackward(const Tensor& splats, const Tensor& rects, const Tensor& instances, const Tensor& ranges,
-                const Tensor& slot_offsets, const Tensor& slots, const Tensor& background, const Tensor& last,
-                const Tensor& transmittance, const Tensor& grad_color, const MaybeTensor& grad_transmittance,
-                const MaybeTensor& grad_inverse_depth)
+  BlendBackward(const Tensor& splats, const Tensor& instances, const Tensor& ranges, const Tensor& splat_slots,
+                const Tensor& slots, const Tensor& background, const Tensor& last, const Tensor& transmittance,
+                const Tensor& grad_color, const MaybeTensor& grad_transmittance, const MaybeTensor& grad_inverse_depth)
       : splats_(splats.contiguous()),
-        rects_(rects.contiguous()),
         instances_(instances),
         ranges_(ranges),
-        slot_offsets_(slot_offsets),
+        splat_slots_(splat_slots),
         slot_count_(slots.size(0)),
         background_(background_like(background, splats)),
         last_(last),
@@ -319,8 +318,7 @@ class BlendBackward {
     return {splats_.size(0),
             instances_.size(0),
             slot_count_,
-            rects_.const_data_ptr<int32_t>(),
-            slot_offsets_.const_data_ptr<int64_t>(),
+            static_cast<const gs::SplatSlots*>(splat_slots_.const_data_ptr()),
             transmittance_.const_data_ptr<T>(),
             last_.const_data_ptr<int32_t>(),
             color_.const_data_ptr<T>(),
@@ -338,7 +336,7 @@ class BlendBackward {
     return converted(*t, splats_);
   }
 
-  Tensor splats_, rects_, instances_, ranges_, slot_offsets_;
+  Tensor splats_, instances_, ranges_, splat_slots_;
   int64_t slot_count_;
   Tensor background_, last_, transmittance_;
   gs::Image image_;
@@ -407,7 +405,7 @@ Tensors4 bin_op(const Tensor& splats, const Tensor& depths, const Tensor& rects,
   p.splats = splats.contiguous(), p.depths = depths.contiguous(), p.rects = rects.contiguous();
   p.tile_counts = p.radii = tile_counts.contiguous();
   const BinnedTensors b = bin(p, {int(width), int(height)}, train);
-  return {b.instances, b.ranges, b.slot_offsets, b.slots};
+  return {b.instances, b.ranges, b.splat_slots, b.slots};
 }
 
 Tensors4 blend_op(const Tensor& splats, const Tensor& instances, const Tensor& ranges, const Tensor& background,
@@ -418,20 +416,19 @@ Tensors4 blend_op(const Tensor& splats, const Tensor& instances, const Tensor& r
 }
 
 #define BACKWARD_SCHEMA                                                                                   \
-  "Tensor splats, Tensor rects, Tensor instances, Tensor ranges, Tensor slot_offsets, Tensor slots, "     \
+  "Tensor splats, Tensor instances, Tensor ranges, Tensor splat_slots, Tensor slots, "                    \
   "Tensor background, Tensor last, Tensor transmittance, Tensor grad_color, Tensor? grad_transmittance, " \
   "Tensor? grad_inverse_depth"
 #define GRADIENTS_SCHEMA                                                                             \
   "(Tensor means, Tensor means2d, Tensor opacities, Tensor scales, Tensor rotations, Tensor cov3d, " \
   "Tensor colors, Tensor sh_dc, Tensor sh_rest)"
-#define BACKWARD_PARAMETERS                                                                          \
-  const Tensor &splats, const Tensor &rects, const Tensor &instances, const Tensor &ranges,          \
-      const Tensor &slot_offsets, const Tensor &slots, const Tensor &background, const Tensor &last, \
-      const Tensor &transmittance, const Tensor &grad_color, const MaybeTensor &grad_transmittance,  \
-      const MaybeTensor &grad_inverse_depth
-#define BACKWARD_ARGUMENTS                                                                            \
-  splats, rects, instances, ranges, slot_offsets, slots, background, last, transmittance, grad_color, \
-      grad_transmittance, grad_inverse_depth
+#define BACKWARD_PARAMETERS                                                                                            \
+  const Tensor &splats, const Tensor &instances, const Tensor &ranges, const Tensor &splat_slots, const Tensor &slots, \
+      const Tensor &background, const Tensor &last, const Tensor &transmittance, const Tensor &grad_color,             \
+      const MaybeTensor &grad_transmittance, const MaybeTensor &grad_inverse_depth
+#define BACKWARD_ARGUMENTS                                                                                        \
+  splats, instances, ranges, splat_slots, slots, background, last, transmittance, grad_color, grad_transmittance, \
+      grad_inverse_depth
 
 Tensor blend_vjp_op(BACKWARD_PARAMETERS) { return blend_vjp(BlendBackward(BACKWARD_ARGUMENTS)); }
 
@@ -439,18 +436,16 @@ Gradients project_vjp_op(SCENE_PARAMETERS, const Tensor& tile_counts, const Tens
   return project_vjp(SceneTensors(SCENE_ARGUMENTS), tile_counts.contiguous(), moments.contiguous(), wanted);
 }
 
-using Rasterized =
-    std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor>;
+using Rasterized = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor>;
 
 Rasterized rasterize_op(const Tensor& /*means2d: only receives a gradient*/, SCENE_PARAMETERS, const Tensor& background,
                         bool inverse_depth, bool train) {
   const SceneTensors scene(SCENE_ARGUMENTS);
-  ProjectedTensors p = project(scene, train);
+  ProjectedTensors p = project(scene, false);
   BinnedTensors b = bin(p, scene.image(), train);
   BlendedTensors o = blend(p.splats, b.instances, b.ranges, background, scene.image(), inverse_depth, train);
-  if (!train) p.rects = at::empty({0, 4}, p.radii.options());
-  return {o.color,       o.transmittance, o.inverse_depth, p.radii,        p.splats, p.rects,
-          p.tile_counts, b.instances,     b.ranges,        b.slot_offsets, b.slots,  o.last};
+  return {o.color,     o.transmittance, o.inverse_depth, p.radii, p.splats, p.tile_counts,
+          b.instances, b.ranges,        b.splat_slots,   b.slots, o.last};
 }
 
 Gradients rasterize_vjp_op(SCENE_PARAMETERS, BACKWARD_PARAMETERS, const Tensor& tile_counts, Wanted wanted) {
@@ -618,7 +613,7 @@ TORCH_LIBRARY(diff_gaussian_rasterization, m) {
   m.def("project(" SCENE_SCHEMA ") -> (Tensor splats, Tensor depths, Tensor rects, Tensor tile_counts, Tensor radii)");
   m.def(
       "bin(Tensor splats, Tensor depths, Tensor rects, Tensor tile_counts, int height, int width, bool train) -> "
-      "(Tensor instances, Tensor ranges, Tensor slot_offsets, Tensor slots)");
+      "(Tensor instances, Tensor ranges, Tensor splat_slots, Tensor slots)");
   m.def(
       "blend(Tensor splats, Tensor instances, Tensor ranges, Tensor background, int height, int width, "
       "bool inverse_depth, bool train) -> (Tensor color, Tensor transmittance, Tensor inverse_depth, Tensor last)");
@@ -626,8 +621,8 @@ TORCH_LIBRARY(diff_gaussian_rasterization, m) {
   m.def("project_vjp(" SCENE_SCHEMA ", Tensor tile_counts, Tensor moments, bool[9] wanted) -> " GRADIENTS_SCHEMA);
   m.def("rasterize(Tensor means2d, " SCENE_SCHEMA
         ", Tensor background, bool inverse_depth, bool train) -> (Tensor color, Tensor transmittance, "
-        "Tensor inverse_depth, Tensor radii, Tensor splats, Tensor rects, Tensor tile_counts, Tensor instances, "
-        "Tensor ranges, Tensor slot_offsets, Tensor slots, Tensor last)");
+        "Tensor inverse_depth, Tensor radii, Tensor splats, Tensor tile_counts, Tensor instances, "
+        "Tensor ranges, Tensor splat_slots, Tensor slots, Tensor last)");
   m.def("rasterize_vjp(" SCENE_SCHEMA ", " BACKWARD_SCHEMA
         ", Tensor tile_counts, bool[9] wanted) -> " GRADIENTS_SCHEMA);
   m.def("mark_visible(Tensor means, Tensor view) -> Tensor");

@@ -32,6 +32,8 @@ _SCENE += ("tan_x", "tan_y", "height", "width", "sh_degree", "scale_modifier", "
 _INPUTS = ("means2d", *_SCENE)
 _PLACES = tuple(_INPUTS.index(name) for name in GRADIENTS)  # the first nine, means2d and means swapped
 _OTHER_INPUTS = (None,) * (len(_INPUTS) - len(GRADIENTS) + 3)  # background, inverse_depth and train come last
+_ROWS = {"means": (3,), "means2d": (3,), "opacities": (1,), "scales": (3,), "rotations": (4,), "cov3d": (6,)}
+_ROWS |= {"colors": (3,), "sh_dc": (1, 3)}
 _TILE = 16
 _VALUES = 10  # of a row of `splats` and of `moments`
 
@@ -117,7 +119,7 @@ def decisive(
     tensors |= {"colors": colors, "sh_dc": sh_dc, "sh_rest": sh_rest}
     _check(tensors, means, settings.sh_degree, raw)
     out = _ops.rasterize(means, *_arguments(tensors, settings, raw), settings.bg, False, True)
-    _, _, _, _, splats, _, _, instances, ranges, _, _, last = out
+    _, _, _, _, splats, _, instances, ranges, _, _, last = out
     return _ops.decisive(splats, instances, ranges, last)
 
 
@@ -154,18 +156,18 @@ def _check(tensors: dict[str, Tensor | None], means2d: Tensor, sh_degree: int, r
         raise ValueError("give scales and rotations, or cov3d")
     if (tensors["colors"] is None) == (tensors["sh_dc"] is None or tensors["sh_rest"] is None):
         raise ValueError("give sh_dc and sh_rest, or colors")
-    n = len(means)
-    wanted = {"scales": (3,), "rotations": (4,), "cov3d": (6,), "colors": (3,), "sh_dc": (1, 3), "opacities": (1,)}
-    hints = {"scales": "logarithms of the scales" if raw else "activated scales, one per axis"}
-    for name, t in [*tensors.items(), ("means2d", means2d)]:
+    dtype, device, n = means.dtype, means.device, means.shape[0]
+    for name, t in (*tensors.items(), ("means2d", means2d)):
         if t is None:
             continue
-        if t.dtype != means.dtype or t.device != means.device:
-            raise TypeError(f"{name} must be {means.dtype} on {means.device} like means, got {t.dtype} on {t.device}")
-        shape = (n, *wanted.get(name, tuple(t.shape[1:])))
-        if tuple(t.shape) != shape and not (name == "opacities" and tuple(t.shape) == (n,)):
+        if t.dtype is not dtype or t.device != device:
+            raise TypeError(f"{name} must be {dtype} on {device} like means, got {t.dtype} on {t.device}")
+        shape = t.shape
+        row = _ROWS.get(name) or tuple(shape[1:])
+        if shape != (n, *row) and not (name == "opacities" and shape == (n,)):
+            hints = {"scales": "logarithms of the scales" if raw else "activated scales, one per axis"}
             hint = f" ({hints[name]})" if name in hints else ""
-            raise ValueError(f"{name} must be {shape}{hint}, got {tuple(t.shape)}")
+            raise ValueError(f"{name} must be {(n, *row)}{hint}, got {tuple(shape)}")
     if not 0 <= sh_degree <= 3:
         raise ValueError(f"sh_degree must be 0 to 3, got {sh_degree}")
     rest = tensors["sh_rest"]
@@ -213,7 +215,7 @@ def _fake_bin(like: Tensor, n: int, height: int, width: int, train: bool) -> tup
     return (
         like.new_empty((total,), dtype=torch.int32),
         like.new_empty((_tiles(height, width) + 1,), dtype=torch.int64),
-        like.new_empty((n + 1 if train else 0,), dtype=torch.int64),
+        like.new_empty((n + 1 if train else 0, 2), dtype=torch.int64),
         like.new_empty((slots, 0), dtype=torch.int32),
     )
 
@@ -260,8 +262,7 @@ def _(means2d, *args):
     n = means.shape[0]
     color, transmittance, depth, last = _fake_blend(means, height, width, inverse_depth, train)
     radii, tile_counts = (means.new_empty((n,), dtype=torch.int32) for _ in range(2))
-    rects = means.new_empty((n if train else 0, 4), dtype=torch.int32)
-    projected = radii, means.new_empty((n, _VALUES)), rects, tile_counts
+    projected = radii, means.new_empty((n, _VALUES)), tile_counts
     return color, transmittance, depth, *projected, *_fake_bin(means, n, height, width, train), last
 
 
@@ -284,11 +285,11 @@ def _(*args, **kwargs):
 
 def _setup_context(ctx, inputs, output):
     _, *scene, background, inverse_depth, train = inputs
-    _, transmittance, _, _, splats, rects, tile_counts, instances, ranges, slot_offsets, slots, last = output
+    _, transmittance, _, _, splats, tile_counts, instances, ranges, splat_slots, slots, last = output
     ctx.mark_non_differentiable(*output[3:])
     ctx.set_materialize_grads(False)
     ctx.numbers, ctx.inverse_depth, ctx.train = scene[_TENSORS:], inverse_depth, train
-    state = (splats, rects, instances, ranges, slot_offsets, slots, background, last, transmittance)
+    state = (splats, instances, ranges, splat_slots, slots, background, last, transmittance)
     ctx.save_for_backward(*scene[:_TENSORS], *state, tile_counts)
 
 

@@ -3,6 +3,7 @@
 #include <type_traits>
 #include <vector>
 
+#include "../math/slots.h"
 #include "gs/simd.h"
 #include "list_tiles.h"
 
@@ -113,13 +114,14 @@ void bin(const Executor& executor, int64_t count, const Projected<T>& projected,
   for (int64_t i = 0; i < visible; ++i) offsets[i + 1] = offsets[i] + projected.tile_counts[order[i]];
   const int64_t instance_count = offsets[visible];
   int64_t slots = 0;
-  if (memory.slot_offsets) {
+  if (memory.slots) {
     for (int64_t i = 0; i < count; ++i) {
-      memory.slot_offsets[i] = slots;
       const int32_t* r = projected.rects + 4 * i;
-      if (projected.tile_counts[i]) slots += slot_count(TileRect{r[0], r[1], r[2], r[3]});
+      const TileRect rect = projected.tile_counts[i] ? TileRect{r[0], r[1], r[2], r[3]} : TileRect{};
+      memory.slots[i] = splat_slots(slots, rect);
+      slots += slot_count(rect);
     }
-    memory.slot_offsets[count] = slots;
+    memory.slots[count] = splat_slots(slots, {});
   }
   const Binned out = memory.take(memory.context, instance_count, slots);
   std::vector<int32_t> tiles(instance_count), splats(instance_count);

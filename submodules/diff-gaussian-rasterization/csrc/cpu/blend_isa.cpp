@@ -8,6 +8,7 @@
 #include "../math/blend.h"
 #include "../math/exp2.h"
 #include "../math/footprint.h"
+#include "../math/slots.h"
 #include "../math/tiles.h"
 #include "gs/simd.h"
 
@@ -254,13 +255,12 @@ void blend_tile_vjp(const BlendInput<T>& in, const BlendGradient<T>& g, int64_t 
   for (int p = 0; p < kPixels; ++p)
     for (int c = 0; c < 3; ++c) state.behind[p] += in.background[c] * state.color[c][p];
 
-  const SplatSlots slots{g.rects, g.slot_offsets};
   LocalSplat<T> local[kChunk];
   for (int64_t to = processed; to > 0; to -= std::min(kChunk, to)) {
     const int64_t from = std::max<int64_t>(0, to - kChunk);
     gather(in, tile, begin + from, begin + to, local);
     for (int64_t k = to - 1; k >= from; --k) {
-      T* sums = rows.row(slots.slot(in.instances[begin + k], tile.x / kTile, tile.y / kTile));
+      T* sums = rows.row(slot_of(g.slots, in.instances[begin + k], tile.x / kTile, tile.y / kTile));
       if (!splat_gradient<T, kDepth>(local[k - from], k, tile, state, sums)) std::fill_n(sums, kGradientValues, T(0));
     }
   }
@@ -325,7 +325,6 @@ void blend(const Executor& executor, const BlendInput<T>& in, const Blended<T>& 
 template <class T>
 void blend_vjp(const Executor& executor, const BlendInput<T>& in, const BlendGradient<T>& g) {
   const int64_t tiles = int64_t(tile_count(in.image.width)) * tile_count(in.image.height);
-  const SplatSlots slots{g.rects, g.slot_offsets};
   CompactRows<T> rows(g.slot_count);
   std::vector<int32_t> processed(tiles);
   for_dynamic(executor, tiles, 4, [&](int64_t begin, int64_t end) {
@@ -335,7 +334,7 @@ void blend_vjp(const Executor& executor, const BlendInput<T>& in, const BlendGra
       read_tile(g.last, in.image, tile, last);
       processed[index] = *std::max_element(last, last + kPixels);
       for (int64_t k = 0; k < processed[index]; ++k)
-        rows.mark(slots.slot(in.instances[in.ranges[index] + k], tile.x / kTile, tile.y / kTile));
+        rows.mark(slot_of(g.slots, in.instances[in.ranges[index] + k], tile.x / kTile, tile.y / kTile));
     }
   });
   rows.allocate();
@@ -344,8 +343,8 @@ void blend_vjp(const Executor& executor, const BlendInput<T>& in, const BlendGra
   for_dynamic(executor, g.count, 1024, [&](int64_t begin, int64_t end) {
     for (int64_t i = begin; i < end; ++i) {
       double sums[kGradientValues] = {};  // a splat may have thousands of tiles
-      const T* stop = rows.row(g.slot_offsets[i + 1]);
-      for (const T* row = rows.row(g.slot_offsets[i]); row < stop; row += kGradientValues)
+      const T* stop = rows.row(g.slots[i + 1].first);
+      for (const T* row = rows.row(g.slots[i].first); row < stop; row += kGradientValues)
         for (int v = 0; v < kGradientValues; ++v) sums[v] += row[v];
       std::copy_n(sums, kGradientValues, g.moments + kGradientValues * i);
     }

@@ -6,6 +6,7 @@
 
 #include <cub/cub.cuh>
 
+#include "../math/slots.h"
 #include "emit.cuh"
 #include "to_host.cuh"
 
@@ -20,39 +21,49 @@ dim3 blocks_for(int64_t n) { return dim3(unsigned((n + kThreads - 1) / kThreads)
 
 constexpr int kCounted = 4;  // splats of a thread, whose loads need not wait for each other
 
-// Adds all splats' instances and slots to `totals`, and numbers the splats for the depth sort.
+// Adds all splats' instances and slots to `totals`, numbers the splats for the depth sort, and fills `slots` (or null)
+// but for where each splat's begin.
 __global__ void __launch_bounds__(kThreads)
-    count_kernel(int64_t n, Projected<float> in, int32_t* index, unsigned long long* totals) {
+    count_kernel(int64_t n, Projected<float> in, int32_t* index, SplatSlots* slots, unsigned long long* totals) {
   __shared__ unsigned long long of_block[2];
   if (threadIdx.x < 2) of_block[threadIdx.x] = 0;
   __syncthreads();
   const int64_t first = int64_t(blockIdx.x) * kCounted * kThreads + threadIdx.x;
-  unsigned long long instances = 0, slots = 0;
+  unsigned long long instances = 0, all_slots = 0;
 #pragma unroll
   for (int r = 0; r < kCounted; ++r) {
     const int64_t i = first + r * kThreads;
     const Reached reached = i < n ? reached_by(in, int32_t(i)) : Reached{};
-    instances += reached.count, slots += slot_count(reached.rect);
+    instances += reached.count, all_slots += slot_count(reached.rect);
     if (i < n) index[i] = int32_t(i);
+    if (slots && i <= n) {
+      const SplatSlots s = splat_slots(0, reached.rect);
+      *reinterpret_cast<int2*>(&slots[i].skipped) = make_int2(s.skipped, s.wide);
+    }
   }
   for (int step = 16; step; step /= 2) {
     instances += __shfl_xor_sync(kWarp, instances, step);
-    slots += __shfl_xor_sync(kWarp, slots, step);
+    all_slots += __shfl_xor_sync(kWarp, all_slots, step);
   }
-  if (threadIdx.x % 32 == 0) atomicAdd(of_block, instances), atomicAdd(of_block + 1, slots);
+  if (threadIdx.x % 32 == 0) atomicAdd(of_block, instances), atomicAdd(of_block + 1, all_slots);
   __syncthreads();
   if (threadIdx.x < 2) atomicAdd(totals + threadIdx.x, of_block[threadIdx.x]);
 }
 
-// The numbers of instances and slots. Fills `index` with the splats' numbers.
-const int64_t* count_all(const Queue& queue, int64_t n, const Projected<float>& in, int32_t* index) {
+// The numbers of instances and slots.
+const int64_t* count_all(const Queue& queue, int64_t n, const Projected<float>& in, int32_t* index, SplatSlots* slots) {
   auto* totals = queue.array<unsigned long long>(2);
   GS_CUDA_CHECK(cudaMemsetAsync(totals, 0, 2 * sizeof *totals, stream_of(queue)));
-  const unsigned blocks = unsigned((n + kCounted * kThreads - 1) / (kCounted * kThreads));
-  count_kernel<<<blocks, kThreads, 0, stream_of(queue)>>>(n, in, index, totals);
+  const unsigned blocks = unsigned(n / (kCounted * kThreads) + 1);  // with n, the end of the slots
+  count_kernel<<<blocks, kThreads, 0, stream_of(queue)>>>(n, in, index, slots, totals);
   check_launch("count");
   return reinterpret_cast<const int64_t*>(totals);
 }
+
+struct FirstSlot {
+  SplatSlots* slots;
+  __host__ __device__ int64_t& operator()(int64_t splat) const { return slots[splat].first; }
+};
 
 struct SlotCount {
   Projected<float> in;
@@ -108,10 +119,12 @@ const int32_t* sort_by_depth(const Queue& queue, int64_t n, const float* depths,
   return order;
 }
 
-void offset_slots(const Queue& queue, int64_t n, const Projected<float>& in, int64_t* offsets) {
-  const auto slots = thrust::make_transform_iterator(thrust::counting_iterator<int64_t>(0), SlotCount{in, n});
+void find_first_slots(const Queue& queue, int64_t n, const Projected<float>& in, SplatSlots* slots) {
+  const thrust::counting_iterator<int64_t> splats(0);
+  const auto counts = thrust::make_transform_iterator(splats, SlotCount{in, n});
+  const auto first = thrust::make_transform_iterator(splats, FirstSlot{slots});
   with_memory(queue, [&](void* memory, size_t& bytes) {
-    return cub::DeviceScan::ExclusiveSum(memory, bytes, slots, offsets, n + 1, stream_of(queue));
+    return cub::DeviceScan::ExclusiveSum(memory, bytes, counts, first, n + 1, stream_of(queue));
   });
 }
 
@@ -157,14 +170,14 @@ void bin<float>(const Queue& queue, int64_t count, const Projected<float>& in, I
   const int32_t* order = nullptr;
   if (count) {
     int32_t* index = queue.array<int32_t>(count);
-    const ToHost<int64_t> totals(queue, count_all(queue, count, in, index), 2);
+    const ToHost<int64_t> totals(queue, count_all(queue, count, in, index, memory.slots), 2);
     // The GPU is busy with what needs no list while the host waits for the numbers.
     order = sort_by_depth(queue, count, in.depths, index);
-    if (memory.slot_offsets) offset_slots(queue, count, in, memory.slot_offsets);
+    if (memory.slots) find_first_slots(queue, count, in, memory.slots);
     instances = totals.wait()[0];
-    if (memory.slot_offsets) slots = totals.wait()[1];
-  } else if (memory.slot_offsets) {
-    GS_CUDA_CHECK(cudaMemsetAsync(memory.slot_offsets, 0, sizeof *memory.slot_offsets, stream_of(queue)));
+    if (memory.slots) slots = totals.wait()[1];
+  } else if (memory.slots) {
+    GS_CUDA_CHECK(cudaMemsetAsync(memory.slots, 0, sizeof *memory.slots, stream_of(queue)));
   }
   const Binned out = memory.take(memory.context, instances, slots);
   const int64_t tiles = int64_t(tile_count(image.width)) * tile_count(image.height);

@@ -6,6 +6,7 @@
 #include <cub/cub.cuh>
 #include <optional>
 
+#include "../math/slots.h"
 #include "backward.cuh"
 #include "blend_layout.cuh"
 #include "heaviest.cuh"
@@ -46,7 +47,8 @@ struct CountBits {
 
 // How far each tile's backward has to go, and the slots of the instances up to there.
 __global__ void __launch_bounds__(kTile* kTile)
-    mark_kernel(BlendInput<float> in, const int32_t* last, SplatSlots slots, int32_t* processed, uint32_t* bits) {
+    mark_kernel(BlendInput<float> in, const int32_t* last, const SplatSlots* slots, int32_t* processed,
+                uint32_t* bits) {
   __shared__ int32_t most;
   if (threadIdx.x == 0) most = 0;
   __syncthreads();
@@ -58,7 +60,7 @@ __global__ void __launch_bounds__(kTile* kTile)
   __syncthreads();
   if (threadIdx.x == 0) processed[tile] = most;
   for (int k = threadIdx.x; k < most; k += kTile * kTile) {
-    const int64_t slot = slots.slot(in.instances[in.ranges[tile] + k], tile % across, tile / across);
+    const int64_t slot = slot_of(slots, in.instances[in.ranges[tile] + k], tile % across, tile / across);
     atomicOr(bits + (slot >> 5), 1u << (slot & 31));
   }
 }
@@ -198,14 +200,13 @@ __global__ void GS_MAX_REGISTERS(kDepth ? 96 : 80)
     }
   for (int p = 0; p < kRun; ++p) transmittance[p] = pixels.transmittance[p] / through[p];
   const int64_t begin = in.ranges[chunk.tile] + chunk.first;
-  const SplatSlots slots{g.rects, g.slot_offsets};
   for (int end = chunk.end - chunk.first; end > 0; end -= kBatch) {
     const int count = end < kBatch ? end : kBatch, first = end - count;
     __syncthreads();
     for (int k = threadIdx.x; k < count; k += L::kThreads) {
       const int32_t splat = in.instances[begin + first + k];
       batch.put(k, in.splats, splat, float(left), float(top));
-      row_of[k] = compact.row(slots.slot(splat, chunk.tile % across, chunk.tile / across));
+      row_of[k] = compact.row(slot_of(g.slots, splat, chunk.tile % across, chunk.tile / across));
     }
     for (int k = threadIdx.x; k < L::kWarps * kBatch * kGradientValues; k += L::kThreads) sums[k] = 0;
     __syncthreads();
@@ -276,7 +277,7 @@ Compact blend_rows(const Queue& queue, const BlendInput<float>& in, const BlendG
   uint32_t* bits = queue.array<uint32_t>(words + 1);
   int32_t *before = queue.array<int32_t>(words + 1), *processed = queue.array<int32_t>(tiles);
   GS_CUDA_CHECK(cudaMemsetAsync(bits, 0, (words + 1) * sizeof *bits, stream));
-  mark_kernel<<<tiles, kTile * kTile, 0, stream>>>(in, g.last, SplatSlots{g.rects, g.slot_offsets}, processed, bits);
+  mark_kernel<<<tiles, kTile * kTile, 0, stream>>>(in, g.last, g.slots, processed, bits);
   check_launch("mark");
   const auto counts = thrust::make_transform_iterator(thrust::counting_iterator<int64_t>(0), CountBits{bits, words});
   with_memory(queue, [&](void* memory, size_t& bytes) {
@@ -302,7 +303,7 @@ Compact blend_rows(const Queue& queue, const BlendInput<float>& in, const BlendG
 template <>
 void blend_vjp<float>(const Queue& queue, const BlendInput<float>& in, const BlendGradient<float>& g) {
   if (!g.count) return;
-  const SlotSums sums{blend_rows(queue, in, g), g.slot_offsets};
+  const SlotSums sums{blend_rows(queue, in, g), g.slots};
   moments_kernel<<<unsigned((g.count + 255) / 256), 256, 0, stream_of(queue)>>>(g.count, sums, g.moments);
   check_launch("moments");
 }

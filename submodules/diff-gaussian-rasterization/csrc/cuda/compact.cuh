@@ -4,6 +4,7 @@
 // added concurrently.
 #include <cstdint>
 
+#include "../launch.h"
 #include "../math/splat.h"
 #include "queue.cuh"
 
@@ -30,17 +31,16 @@ struct SlotSums {
   static constexpr int kStaged = 32;                                  // rows at a time
   static constexpr int kStage = kStaged * baseline::kGradientValues;  // floats of shared memory for each warp
   Compact compact;
-  const int64_t* slot_offsets;
+  const SplatSlots* slots;
 
-  __device__ bool seen(int64_t splat) const { return slot_offsets[splat + 1] > slot_offsets[splat]; }
+  __device__ bool seen(int64_t splat) const { return slots[splat + 1].first > slots[splat].first; }
 
   // Called by all lanes of a warp; those that want a splat's sums get them, the others nothing.
   __device__ void read(int64_t splat, bool wanted, float* sums, float* stage) const {
     constexpr int kValues = baseline::kGradientValues;
     const int lane = threadIdx.x & 31;
     unsigned begin = 0, end = 0;  // instances are fewer than 2^31
-    if (wanted)
-      begin = unsigned(compact.row(slot_offsets[splat])), end = unsigned(compact.row(slot_offsets[splat + 1]));
+    if (wanted) begin = unsigned(compact.row(slots[splat].first)), end = unsigned(compact.row(slots[splat + 1].first));
     const bool many = end - begin > kOwnRows;
     for (int v = 0; v < kValues; ++v) sums[v] = 0;
 

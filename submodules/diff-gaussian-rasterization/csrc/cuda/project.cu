@@ -185,7 +185,7 @@ void project_vjp<float>(const Queue& queue, const Scene<float>& s, const int32_t
 void rasterize_vjp(const Queue& queue, const Scene<float>& s, const BlendInput<float>& in,
                    const BlendGradient<float>& g, const GradientMemory& memory) {
   if (!s.count) return;
-  const SlotSums source{blend_rows(queue, in, g), g.slot_offsets};
+  const SlotSums source{blend_rows(queue, in, g), g.slots};
   const SceneGradient<float> out = memory.take(memory.context);
   project_vjp_kernel<<<blocks_for(s.count), kThreads, 0, stream_of(queue)>>>(s, source, out);
   check_launch("project_vjp");

@@ -1,7 +1,6 @@
 #pragma once
 // Which tiles a splat reaches: those where its alpha comes to 1/255 at a pixel centre.
 #include <cstdint>
-#include <cstring>
 
 #include "constants.h"
 #include "splat.h"
@@ -13,21 +12,6 @@ GS_ISA_BEGIN
 struct TileRect {
   int32_t x0, y0, x1, y1;
 };
-
-// A slot is a tile of a splat's rectangle, reached or not: row by row, one splat after the other, none where a splat is
-// culled. So an instance finds its slot, and a splat the slots of its instances, without a list of either.
-struct SplatSlots {
-  const int32_t* rects;    // (N, 4)
-  const int64_t* offsets;  // (N + 1): splat i has slots offsets[i] to offsets[i + 1]
-
-  GS_HD int64_t slot(int32_t splat, int tile_x, int tile_y) const {
-    TileRect rect;
-    std::memcpy(&rect, __builtin_assume_aligned(rects + 4 * int64_t(splat), sizeof rect), sizeof rect);
-    return offsets[splat] + int64_t(tile_y - rect.y0) * (rect.x1 - rect.x0) + (tile_x - rect.x0);
-  }
-};
-
-GS_HD int64_t slot_count(TileRect rect) { return int64_t(rect.x1 - rect.x0) * (rect.y1 - rect.y0); }
 
 GS_HD int tile_count(int pixels) { return (pixels + kTile - 1) / kTile; }
 

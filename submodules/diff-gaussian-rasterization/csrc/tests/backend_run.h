@@ -63,7 +63,8 @@ gs::Scene<T> scene_of(Parameters<T>& p, gs::Image image, bool antialiasing) {
 template <class T>
 struct Bins {
   std::vector<int32_t> instances;
-  std::vector<int64_t> ranges, slot_offsets;
+  std::vector<int64_t> ranges;
+  std::vector<gs::SplatSlots> slots;
   int64_t slot_count = 0;
 };
 template <class T, class Where>
@@ -79,13 +80,13 @@ Bins<T> bin_scene(const Where& where, const gs::Scene<T>& scene, bool rects, boo
   Bins<T> out;
   const gs::Image image = scene.image;
   out.ranges.resize(size_t((image.width + 15) / 16) * ((image.height + 15) / 16) + 1);
-  out.slot_offsets.resize(slots ? n + 1 : 0);
+  out.slots.resize(slots ? n + 1 : 0);
   const auto take = [](void* context, int64_t count, int64_t slot_count) {
     Bins<T>& b = *static_cast<Bins<T>*>(context);
     b.instances.resize(count), b.slot_count = slot_count;
     return gs::Binned{b.instances.data(), b.ranges.data()};
   };
-  bin(where, scene.count, projected, image, gs::BinMemory{take, &out, slots ? out.slot_offsets.data() : nullptr});
+  bin(where, scene.count, projected, image, gs::BinMemory{take, &out, slots ? out.slots.data() : nullptr});
   return out;
 }
 
@@ -115,15 +116,15 @@ Result<T> run(const Where& where, Parameters<T>& p, gs::Image image, bool antial
     std::vector<int64_t> ranges;
     int64_t slot_count;
   } lists{{}, std::vector<int64_t>(tiles + 1), 0};
-  std::vector<int64_t> slot_offsets(n + 1);
+  std::vector<gs::SplatSlots> slots(n + 1);
   const auto take = [](void* context, int64_t count, int64_t slots) {
     Lists& l = *static_cast<Lists*>(context);
     l.instances.resize(count), l.slot_count = slots;
     return gs::Binned{l.instances.data(), l.ranges.data()};
   };
-  bin(where, p.count, projected, image, gs::BinMemory{take, &lists, slot_offsets.data()});
+  bin(where, p.count, projected, image, gs::BinMemory{take, &lists, slots.data()});
   auto& [instances, ranges, slot_count] = lists;
-  CHECK(slot_count == slot_offsets.back() && slot_count >= int64_t(instances.size()));
+  CHECK(slot_count == slots.back().first && slot_count >= int64_t(instances.size()));
   std::vector<int32_t> last(pixels);
   out.instances = int64_t(instances.size());
   CHECK(out.instances == std::accumulate(out.tile_counts.begin(), out.tile_counts.end(), int64_t(0)));
@@ -145,9 +146,8 @@ Result<T> run(const Where& where, Parameters<T>& p, gs::Image image, bool antial
   const std::vector<T> ones(3 * pixels, T(1));
   std::vector<T> moments(kGradientValues * n);
   blend_vjp(where, input,
-            gs::BlendGradient<T>{p.count, out.instances, slot_count, rects.data(), slot_offsets.data(),
-                                 out.transmittance.data(), last.data(), ones.data(), ones.data(), ones.data(),
-                                 moments.data()});
+            gs::BlendGradient<T>{p.count, out.instances, slot_count, slots.data(), out.transmittance.data(),
+                                 last.data(), ones.data(), ones.data(), ones.data(), moments.data()});
   out.gradient.assign(n * (3 + 3 + 1 + 3 + 4 + 3 + 45), T(-77));
   T* g = out.gradient.data();
   const gs::SceneGradient<T> gradient = {g,       g + 3 * n, g + 6 * n,  g + 7 * n, g + 10 * n,

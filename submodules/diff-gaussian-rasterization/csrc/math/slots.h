@@ -1,0 +1,32 @@
+#pragma once
+// Where the backward keeps what an instance adds to a splat's gradient: by splat, not by tile as the instances lie. A
+// slot is a tile of a splat's rectangle, reached or not, so an instance finds its slot, and a splat the slots of its
+// instances, without a list of either.
+#include <cstdint>
+#include <cstring>
+
+#include "../launch.h"
+#include "tiles.h"
+
+GS_ISA_BEGIN
+
+GS_HD int64_t slot_count(TileRect rect) { return int64_t(rect.x1 - rect.x0) * (rect.y1 - rect.y0); }
+
+// first: the slots of all splats before.
+GS_HD SplatSlots splat_slots(int64_t first, TileRect rect) {
+  const int32_t wide = rect.x1 - rect.x0;
+  return {first, rect.y0 * wide + rect.x0, wide};
+}
+
+GS_HD int64_t slot_of(const SplatSlots* slots, int32_t splat, int tile_x, int tile_y) {
+#ifdef __CUDA_ARCH__
+  const int4 bits = reinterpret_cast<const int4*>(slots)[splat];  // one load, where the struct takes two
+  SplatSlots s;
+  std::memcpy(&s, &bits, sizeof s);
+#else
+  const SplatSlots s = slots[splat];
+#endif
+  return s.first + int64_t(tile_y) * s.wide + tile_x - s.skipped;
+}
+
+GS_ISA_END
