@@ -45,7 +45,7 @@ struct DeviceScan {
   template <class In, class Out, class Count>
   static cudaError_t ExclusiveSum(void* memory, size_t& bytes, In in, Out out, Count n, cudaStream_t) {
     if (!memory) return bytes = 1, cudaSuccess;
-    std::decay_t<decltype(out[0])> sum = 0;
+    std::decay_t<decltype(in[0])> sum = 0;
     for (Count i = 0; i < n; ++i) {
       const auto value = in[i];
       out[i] = sum;

@@ -21,60 +21,69 @@ dim3 blocks_for(int64_t n) { return dim3(unsigned((n + kThreads - 1) / kThreads)
 
 constexpr int kCounted = 4;  // splats of a thread, whose loads need not wait for each other
 
-// Adds all splats' instances and slots to `totals`, numbers the splats for the depth sort, and fills `slots` (or null)
-// but for where each splat's begin.
+// Adds all splats' instances and slots to `totals`, and numbers the splats for the depth sort.
 __global__ void __launch_bounds__(kThreads)
-    count_kernel(int64_t n, Projected<float> in, int32_t* index, SplatSlots* slots, unsigned long long* totals) {
+    count_kernel(int64_t n, Projected<float> in, int32_t* index, unsigned long long* totals) {
   __shared__ unsigned long long of_block[2];
   if (threadIdx.x < 2) of_block[threadIdx.x] = 0;
   __syncthreads();
   const int64_t first = int64_t(blockIdx.x) * kCounted * kThreads + threadIdx.x;
-  unsigned long long instances = 0, all_slots = 0;
+  unsigned long long instances = 0, slots = 0;
 #pragma unroll
   for (int r = 0; r < kCounted; ++r) {
     const int64_t i = first + r * kThreads;
     const Reached reached = i < n ? reached_by(in, int32_t(i)) : Reached{};
-    instances += reached.count, all_slots += slot_count(reached.rect);
+    instances += reached.count, slots += slot_count(reached.rect);
     if (i < n) index[i] = int32_t(i);
-    if (slots && i <= n) {
-      const SplatSlots s = splat_slots(0, reached.rect);
-      *reinterpret_cast<int2*>(&slots[i].skipped) = make_int2(s.skipped, s.wide);
-    }
   }
   for (int step = 16; step; step /= 2) {
     instances += __shfl_xor_sync(kWarp, instances, step);
-    all_slots += __shfl_xor_sync(kWarp, all_slots, step);
+    slots += __shfl_xor_sync(kWarp, slots, step);
   }
-  if (threadIdx.x % 32 == 0) atomicAdd(of_block, instances), atomicAdd(of_block + 1, all_slots);
+  if (threadIdx.x % 32 == 0) atomicAdd(of_block, instances), atomicAdd(of_block + 1, slots);
   __syncthreads();
   if (threadIdx.x < 2) atomicAdd(totals + threadIdx.x, of_block[threadIdx.x]);
 }
 
-// The numbers of instances and slots.
-const int64_t* count_all(const Queue& queue, int64_t n, const Projected<float>& in, int32_t* index, SplatSlots* slots) {
+// The numbers of instances and slots. Fills `index` with the splats' numbers.
+const int64_t* count_all(const Queue& queue, int64_t n, const Projected<float>& in, int32_t* index) {
   auto* totals = queue.array<unsigned long long>(2);
   GS_CUDA_CHECK(cudaMemsetAsync(totals, 0, 2 * sizeof *totals, stream_of(queue)));
-  const unsigned blocks = unsigned(n / (kCounted * kThreads) + 1);  // with n, the end of the slots
-  count_kernel<<<blocks, kThreads, 0, stream_of(queue)>>>(n, in, index, slots, totals);
+  const unsigned blocks = unsigned((n + kCounted * kThreads - 1) / (kCounted * kThreads));
+  count_kernel<<<blocks, kThreads, 0, stream_of(queue)>>>(n, in, index, totals);
   check_launch("count");
   return reinterpret_cast<const int64_t*>(totals);
 }
 
-struct FirstSlot {
-  SplatSlots* slots;
-  __host__ __device__ int64_t& operator()(int64_t splat) const { return slots[splat].first; }
-};
-
-struct SlotCount {
+// The rectangle of a splat, empty behind the last one.
+struct Rects {
   Projected<float> in;
   int64_t splats;
-  __host__ __device__ int64_t operator()(int64_t splat) const {
+  __host__ __device__ TileRect operator()(int64_t splat) const {
 #ifdef __CUDA_ARCH__
-    return splat < splats ? slot_count(reached_by(in, int32_t(splat)).rect) : 0;
-#else
-    return 0;
+    if (splat < splats) return reached_by(in, int32_t(splat)).rect;
 #endif
+    return {};
   }
+};
+
+struct SlotCounts {
+  Rects rects;
+  __host__ __device__ int64_t operator()(int64_t splat) const { return slot_count(rects(splat)); }
+};
+
+// Takes the sum of all counts before a splat's, and stores it with the rest of the splat's slots: whole sectors.
+struct SlotsAt {
+  Rects rects;
+  SplatSlots* slots;
+  int64_t splat;
+  __host__ __device__ void operator=(int64_t first) const { slots[splat] = splat_slots(first, rects(splat)); }
+};
+
+struct Slots {
+  Rects rects;
+  SplatSlots* slots;
+  __host__ __device__ SlotsAt operator()(int64_t splat) const { return {rects, slots, splat}; }
 };
 
 // Of one load from memory.
@@ -119,10 +128,11 @@ const int32_t* sort_by_depth(const Queue& queue, int64_t n, const float* depths,
   return order;
 }
 
-void find_first_slots(const Queue& queue, int64_t n, const Projected<float>& in, SplatSlots* slots) {
+void find_slots(const Queue& queue, int64_t n, const Projected<float>& in, SplatSlots* slots) {
   const thrust::counting_iterator<int64_t> splats(0);
-  const auto counts = thrust::make_transform_iterator(splats, SlotCount{in, n});
-  const auto first = thrust::make_transform_iterator(splats, FirstSlot{slots});
+  const Rects rects{in, n};
+  const auto counts = thrust::make_transform_iterator(splats, SlotCounts{rects});
+  const auto first = thrust::make_transform_iterator(splats, Slots{rects, slots});
   with_memory(queue, [&](void* memory, size_t& bytes) {
     return cub::DeviceScan::ExclusiveSum(memory, bytes, counts, first, n + 1, stream_of(queue));
   });
@@ -170,10 +180,10 @@ void bin<float>(const Queue& queue, int64_t count, const Projected<float>& in, I
   const int32_t* order = nullptr;
   if (count) {
     int32_t* index = queue.array<int32_t>(count);
-    const ToHost<int64_t> totals(queue, count_all(queue, count, in, index, memory.slots), 2);
+    const ToHost<int64_t> totals(queue, count_all(queue, count, in, index), 2);
     // The GPU is busy with what needs no list while the host waits for the numbers.
     order = sort_by_depth(queue, count, in.depths, index);
-    if (memory.slots) find_first_slots(queue, count, in, memory.slots);
+    if (memory.slots) find_slots(queue, count, in, memory.slots);
     instances = totals.wait()[0];
     if (memory.slots) slots = totals.wait()[1];
   } else if (memory.slots) {
