@@ -38,7 +38,7 @@ def counts(camera: Camera, model: GaussianModel) -> dict[str, int]:
     background = model.get_xyz.new_zeros(3)
     arguments = (*shapes, *colors, *view, *tangents, *size, *options, background, False, True)
     out = torch.ops.diff_gaussian_rasterization.rasterize(model.get_xyz, *arguments)
-    tile_counts, instances, ranges, last = out[6], out[7], out[8], out[11]
+    _, _, _, _, _, tile_counts, instances, ranges, _, _, last = out
     processed = processed_per_tile(last)
     tile = torch.repeat_interleave(torch.arange(len(processed), device=ranges.device), ranges.diff())
     behind = torch.arange(len(instances), device=ranges.device) - ranges[tile] >= processed[tile]
