@@ -42,8 +42,8 @@ def test_off_allocates_what_a_call_without_the_feature_does(rows, name):
 def test_nothing_is_allocated_for_gradients_at_inference(rows):
     row = rows["gradient_buffers"]
     assert _bytes(row, "off") == row.base_bytes
-    # In training: the first slot of each splat and beyond, the last splat of each pixel.
-    assert _bytes(row, "on") - _bytes(row, "off") == 8 * (SPLATS + 1) + 4 * WIDTH * HEIGHT
+    # In training: the slots of each splat and their end, the last splat of each pixel.
+    assert _bytes(row, "on") - _bytes(row, "off") == 16 * (SPLATS + 1) + 4 * WIDTH * HEIGHT
 
 
 def test_depth_is_allocated_on_request_only(rows):

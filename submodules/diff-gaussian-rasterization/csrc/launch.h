@@ -36,7 +36,7 @@ struct Scene {
   Image image;
 };
 
-// What a GPU's binning reads of a splat as it visits them in the order of their depth, in one sector of memory.
+// What a GPU's binning reads of a splat, in one sector of memory: it visits them in the order of their depth.
 struct alignas(16) TileRecord {
   uint64_t reached;         // a bit for each tile of a rectangle of at most 64, in its order; of a larger one, how many
   uint16_t x0, y0, x1, y1;  // empty where the splat reaches none

@@ -193,7 +193,7 @@ struct ProjectedTensors {
   }
 };
 
-// `rects`: whether the caller wants them; a GPU has no other use for them.
+// `rects`: whether the caller wants them; a GPU with records has no other use for them.
 ProjectedTensors project(const SceneTensors& in, bool rects) {
   const int64_t n = in.count();
   const auto ints = in.options().dtype(at::kInt);
@@ -297,7 +297,7 @@ class BlendBackward {
       : splats_(splats.contiguous()),
         instances_(instances),
         ranges_(ranges),
-        splat_slots_(splat_slots),
+        splat_slots_(splat_slots.contiguous()),
         slot_count_(slots.size(0)),
         background_(background_like(background, splats)),
         last_(last),
