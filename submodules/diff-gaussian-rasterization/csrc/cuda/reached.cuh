@@ -1,8 +1,7 @@
 #pragma once
 // What projection hands on of the tiles that splats reach, from records or, without them, from rectangles.
-#include <cstring>
-
 #include "../launch.h"
+#include "../math/load.h"
 #include "../math/tiles.h"
 
 namespace gs {
@@ -16,9 +15,7 @@ struct Reached {
 
 __device__ inline Reached reached_by(const Projected<float>& in, int32_t splat) {
   if (in.records) {
-    const uint4 bits = reinterpret_cast<const uint4*>(in.records)[splat];  // one load, where the struct takes two
-    TileRecord r;
-    std::memcpy(&r, &bits, sizeof r);
+    const TileRecord r = baseline::load_whole(in.records + splat);
     const bool masked = (r.x1 - r.x0) * (r.y1 - r.y0) <= 64;
     return {{r.x0, r.y0, r.x1, r.y1}, masked ? __popcll(r.reached) : int32_t(r.reached), masked ? r.reached : 0};
   }

@@ -3,9 +3,9 @@
 // slot is a tile of a splat's rectangle, reached or not, so an instance finds its slot, and a splat the slots of its
 // instances, without a list of either.
 #include <cstdint>
-#include <cstring>
 
 #include "../launch.h"
+#include "load.h"
 #include "tiles.h"
 
 GS_ISA_BEGIN
@@ -19,13 +19,7 @@ GS_HD SplatSlots splat_slots(int64_t first, TileRect rect) {
 }
 
 GS_HD int64_t slot_of(const SplatSlots* slots, int32_t splat, int tile_x, int tile_y) {
-#ifdef __CUDA_ARCH__
-  const int4 bits = reinterpret_cast<const int4*>(slots)[splat];  // one load, where the struct takes two
-  SplatSlots s;
-  std::memcpy(&s, &bits, sizeof s);
-#else
-  const SplatSlots s = slots[splat];
-#endif
+  const SplatSlots s = load_whole(slots + splat);
   return s.first + int64_t(tile_y) * s.wide + tile_x - s.skipped;
 }
 
