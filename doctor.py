@@ -19,7 +19,7 @@ def diagnose(source: str | None, images: str, model: str | None, iteration: int)
     lines = environment.check_packages()
     complete = not any(line.finding for line in lines)
     if complete:
-        import utils.openmp  # noqa: F401  isort: skip  (before torch)
+        import utils.host.openmp  # noqa: F401  isort: skip  (before torch)
 
         lines += environment.check_build()
         complete = environment.extensions_load()

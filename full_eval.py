@@ -14,7 +14,7 @@ from argparse import ArgumentParser, Namespace
 from collections.abc import Sequence
 from pathlib import Path
 
-import utils.openmp  # noqa: F401  isort: skip  (before torch)
+import utils.host.openmp  # noqa: F401  isort: skip  (before torch)
 
 from evaluation import stages
 from evaluation.configs import check_options, read_configs
@@ -26,7 +26,7 @@ from evaluation.results import read_run
 from evaluation.runs import Run, check_folders, check_outside_scenes, plan_runs
 from evaluation.scenes import SceneEntry, check_names, dataset_scenes, finished_scenes, folder_scenes
 from evaluation.stages import Failure, StageFailed
-from utils.markdown_table import markdown_table
+from utils.files.markdown_table import markdown_table
 from utils.system_utils import UserError, mkdir_p, run_cli
 
 EXPOSURE = (

@@ -14,15 +14,15 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-import utils.openmp  # noqa: F401  isort: skip  (before torch)
+import utils.host.openmp  # noqa: F401  isort: skip  (before torch)
 import numpy as np
 import torch
 from fused_ssim import fused_ssim
 from tqdm import tqdm
 
 from arguments import read_cfg_args
-from utils.image_files import UNREADABLE, open_render
-from utils.json_files import write_json
+from utils.files.image_files import UNREADABLE, open_render
+from utils.files.json_files import write_json
 from utils.lpips_utils import MIN_SIDE, LpipsUnavailable, PerceptualDistance
 from utils.system_utils import UserError, run_cli
 

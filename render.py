@@ -14,7 +14,7 @@ import re
 import time
 from pathlib import Path
 
-import utils.openmp  # noqa: F401  isort: skip  (before torch)
+import utils.host.openmp  # noqa: F401  isort: skip  (before torch)
 import torch
 from PIL import Image
 from tqdm import tqdm
@@ -22,10 +22,10 @@ from tqdm import tqdm
 from arguments import ModelParams, OptionParser, PipelineParams, get_combined_args
 from gaussian_renderer import render
 from gaussian_renderer.memory_errors import memory_errors_explained
+from records import render_times
 from scene.cameras import Camera
 from scene.gaussian_model import GaussianModel
 from scene.saved_model import load_saved
-from utils import render_times
 from utils.general_utils import safe_state
 from utils.image_utils import right_half
 from utils.system_utils import UserError, atomic_write, compute_device, mkdir_p, run_cli

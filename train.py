@@ -11,36 +11,36 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import utils.openmp  # noqa: F401  isort: skip  (before torch)
+import utils.host.openmp  # noqa: F401  isort: skip  (before torch)
 import torch
 from torch import Tensor
 from tqdm import tqdm
 
 from arguments import ModelParams, OptimizationParams, OptionParser, PipelineParams, write_cfg_args, write_model_json
 from gaussian_renderer import render
+from records.curve_peak import schedules_follow_length
+from records.training_log import Stopwatch
 from scene import Scene
-from scene import densification as adc
-from scene.checkpoint import load_checkpoint, save_checkpoint
 from scene.gaussian_model import GaussianModel
+from scene.gaussians import density as adc
+from scene.gaussians.checkpoint import load_checkpoint, save_checkpoint
 from training.checks import check_exposures, check_scene, warn_of_late_reset
-from training.curve import scene_curve
-from training.divergence import DivergenceWatch
 from training.history import check_folder, continue_records, report_changes
-from training.last_save import save_last
-from training.mask_watch import MaskWatch
+from training.left_out import lines
 from training.memory_estimate import announce_memory
-from training.memory_guard import MemoryGuard
-from training.report import training_report
+from training.observers.curve import scene_curve
+from training.observers.divergence import DivergenceWatch
+from training.observers.last_save import save_last
+from training.observers.losses import LossWatch
+from training.observers.masks import MaskWatch
+from training.observers.memory import MemoryGuard
+from training.observers.report import training_report
 from training.view_order import ViewOrder
-from utils.counter_rng import Stream, uniform
-from utils.curve_peak import schedules_follow_length
+from utils.exact.counter_rng import Stream, uniform
 from utils.general_utils import get_expon_lr_func, safe_state
-from utils.interrupt import DeferredInterrupt
-from utils.left_out import lines
+from utils.host.interrupt import DeferredInterrupt
 from utils.loss_utils import inverse_depth_loss, l1_loss, photometric_loss
-from utils.loss_watch import LossWatch
 from utils.system_utils import UserError, compute_device, mkdir_p, run_cli, saved_iterations
-from utils.training_log import Stopwatch
 
 try:
     from torch.utils.tensorboard import SummaryWriter

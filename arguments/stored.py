@@ -10,7 +10,7 @@ from typing import Any
 
 from arguments.groups import ModelParams
 from arguments.param_group import Value
-from utils.json_files import read_json, write_json
+from utils.files.json_files import read_json, write_json
 from utils.system_utils import UserError, atomic_write
 
 VERSION = "0.1.0"
@@ -73,7 +73,7 @@ def write_model_json(
     """Write `model.json`: what cfg_args can't hold, keys sorted. args: model options, of which what differs is kept.
 
     optimizer_type: of the training, None: not told. world_offset: world coordinates of the origin of the model's frame
-    (scene/world_offset.py); kept unless zero.
+    (scene/readers/world_offset.py); kept unless zero.
     """
     record = {"antialiasing": antialiasing, "seed": seed, "version": VERSION}
     for name, default in _REMEMBERED.items():

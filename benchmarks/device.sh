@@ -4,9 +4,9 @@
 #
 #   benchmarks/device.sh test                    GPU tests, then the rasterizer's CPU tests
 #   benchmarks/device.sh sanitize                memcheck and racecheck of the GPU tests on small scenes
-#   benchmarks/device.sh kernels [OPTION...]     benchmarks/rasterizer.py OPTION... (--peers gsplat)
-#   benchmarks/device.sh accuracy                benchmarks/accuracy.py; its figure is drawn elsewhere from accuracy.json
-#   benchmarks/device.sh train SCENE [OPTION...] benchmarks/training.py SCENE OPTION...
+#   benchmarks/device.sh kernels [OPTION...]     python -m benchmarks.kernels.cpu OPTION... (--peers gsplat)
+#   benchmarks/device.sh accuracy                python -m benchmarks.accuracy.oracle; its figure is drawn elsewhere from accuracy.json
+#   benchmarks/device.sh train SCENE [OPTION...] python -m benchmarks.scenes.training SCENE OPTION...
 #   benchmarks/device.sh run COMMAND...          anything else, with the extensions built
 #
 # Environment: GS_COMMIT (what is measured, where git can't say), OUT (a folder for logs and the built wheels; put those
@@ -150,17 +150,17 @@ build
     sanitize) sanitize ;;
     kernels)
       say "kernels"
-      python3 benchmarks/rasterizer.py --device cuda "$@"
+      python3 -m benchmarks.kernels.cpu --device cuda "$@"
       ;;
     accuracy)
       say "error against run time"
-      python3 benchmarks/accuracy.py --json "$out/accuracy.json"
+      python3 -m benchmarks.accuracy.oracle --json "$out/accuracy.json"
       ;;
     train)
       scene=${1:?a scene}
       shift
       say "training on $scene"
-      python3 benchmarks/training.py "$scene" "$(mktemp -d build/device/models.XXXX)/models" "$@"
+      python3 -m benchmarks.scenes.training "$scene" "$(mktemp -d build/device/models.XXXX)/models" "$@"
       ;;
     run) "$@" ;;
     *) echo "device.sh: unknown mode $mode" >&2 && exit 2 ;;

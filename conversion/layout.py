@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from utils.image_files import SUFFIXES
+from utils.files.image_files import SUFFIXES
 from utils.system_utils import UserError
 
 # Frequent beside photos, and read neither by Pillow alone nor by COLMAP.

@@ -10,10 +10,10 @@ from PIL import Image, ImageOps
 from tqdm import tqdm
 
 from conversion.layout import Layout, picture_names
-from scene.images import picture_size
-from utils.image_files import UNREADABLE
+from scene.pictures.decode import picture_size
+from utils.files.image_files import UNREADABLE
+from utils.host.threads import threads
 from utils.system_utils import UserError
-from utils.threads import threads
 
 JPEG_QUALITY = 95
 _ORIENTATION = 0x0112  # EXIF tag; 1 or absent: upright

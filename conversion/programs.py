@@ -12,7 +12,7 @@ from typing import BinaryIO
 
 from tqdm import tqdm
 
-from utils.interrupt import DeferredInterrupt
+from utils.host.interrupt import DeferredInterrupt
 from utils.system_utils import UserError
 
 try:

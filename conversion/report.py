@@ -4,8 +4,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from utils.json_files import read_json, write_json
-from utils.listing import some
+from utils.files.json_files import read_json, write_json
+from utils.files.listing import some
 from utils.system_utils import UserError
 
 FEWEST_POINTS = 1000  # fewer make a poor start: density control has to find the scene by itself

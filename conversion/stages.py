@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from utils.json_files import read_json, write_json
+from utils.files.json_files import read_json, write_json
 from utils.system_utils import UserError
 
 

@@ -22,8 +22,8 @@ from demo.objects import demo_scene
 from demo.surface_points import MIN_TRACK, sample_points
 from demo.tracer import View, render_view
 from demo.views import ring_views
+from utils.host.threads import cores
 from utils.system_utils import UserError, mkdir_p, run_cli
-from utils.threads import cores
 
 PIXELS_PER_PROCESS = 1_000_000  # below this, starting another process (2 s) takes longer than it saves
 

@@ -9,9 +9,9 @@ import numpy as np
 
 from diagnosis.lines import Line, from_error
 from scene.dataset_readers import CameraInfo, SceneInfo, read_scene
-from scene.scene_info import APART, standing_apart
-from utils.json_files import read_json
-from utils.listing import some
+from scene.readers.records import APART, standing_apart
+from utils.files.json_files import read_json
+from utils.files.listing import some
 from utils.system_utils import UserError
 
 # Learning rates and size limits are fractions of the extent, but depths below 0.2 are culled and float32 is used.

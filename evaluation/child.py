@@ -13,7 +13,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from utils.interrupt import DeferredInterrupt
+from utils.host.interrupt import DeferredInterrupt
 from utils.system_utils import Terminated
 
 LINES = 20  # of its stderr that are kept

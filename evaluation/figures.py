@@ -12,8 +12,8 @@ from PIL import Image
 from evaluation.contact_sheet import contact_sheet
 from evaluation.model_folder import mask_of, picture
 from evaluation.tradeoff import pareto_front
-from utils.error_curve import Row
-from utils.plain_log_axis import plain_log_axis
+from records.error_curve import Row
+from records.plain_log_axis import plain_log_axis
 from utils.system_utils import atomic_write
 
 WIDEST = 480  # pixels of a picture on a sheet

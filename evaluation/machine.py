@@ -32,7 +32,7 @@ def _describe() -> dict[str, Any]:
 
     import gaussian_renderer  # noqa: F401  (compute_device asks for its library)
     from arguments.stored import VERSION
-    from utils.machine import commit, cpu_name, gpu_name, instruction_set
+    from utils.host.machine import commit, cpu_name, gpu_name, instruction_set
     from utils.system_utils import compute_device
 
     device = compute_device().type
@@ -70,6 +70,6 @@ def one_line(facts: dict[str, Any]) -> str:
 
 
 if __name__ == "__main__":
-    import utils.openmp  # noqa: F401  (before torch)
+    import utils.host.openmp  # noqa: F401  (before torch)
 
     print(json.dumps(_describe(), sort_keys=True, allow_nan=False))

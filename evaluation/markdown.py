@@ -8,7 +8,7 @@ from pathlib import Path
 from urllib.parse import quote
 
 from evaluation.document import Block, Picture, Quote, Section, Table
-from utils.markdown_table import markdown_table
+from utils.files.markdown_table import markdown_table
 
 
 def _block(block: Block, folder: Path) -> str:

@@ -11,9 +11,9 @@ import numpy as np
 from PIL import Image
 
 from arguments.stored import read_cfg_args, read_model_json
-from utils.curve_peak import schedules_follow_length
-from utils.image_files import UNREADABLE, open_render
-from utils.json_files import read_json
+from records.curve_peak import schedules_follow_length
+from utils.files.image_files import UNREADABLE, open_render
+from utils.files.json_files import read_json
 from utils.system_utils import UserError, saved_iterations
 
 

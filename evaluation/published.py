@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from utils.json_files import read_json
+from utils.files.json_files import read_json
 
 COMPARED = ("PSNR", "SSIM", "LPIPS", "gaussians")
 

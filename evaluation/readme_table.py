@@ -14,8 +14,8 @@ from typing import Any
 
 from evaluation.document import results_table
 from evaluation.machine import one_line
-from utils.json_files import read_json
-from utils.markdown_table import markdown_table
+from utils.files.json_files import read_json
+from utils.files.markdown_table import markdown_table
 from utils.system_utils import UserError, atomic_write, run_cli
 
 BEGIN = "<!-- results: begin (python -m evaluation.readme_table) -->"

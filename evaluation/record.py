@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from utils.json_files import read_json, write_json
+from utils.files.json_files import read_json, write_json
 
 NAME = "full_eval.json"
 

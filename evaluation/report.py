@@ -14,7 +14,7 @@ from evaluation.markdown import to_markdown
 from evaluation.published import compare
 from evaluation.summary import dataset_means, summarise
 from evaluation.tradeoff import cheapest
-from utils.json_files import write_json
+from utils.files.json_files import write_json
 from utils.system_utils import UserError, atomic_write
 
 TITLE = "3D Gaussian Splatting: evaluation"

@@ -20,11 +20,11 @@ from evaluation.model_folder import (
 from evaluation.record import Record
 from evaluation.runs import Run
 from evaluation.stages import Failure
-from scene.scene_info import HOLD
-from utils.curve_peak import CLEAR
-from utils.error_curve import NAME as CURVE
-from utils.error_curve import Row, best_test, read_curve
-from utils.json_files import read_json
+from records.curve_peak import CLEAR
+from records.error_curve import NAME as CURVE
+from records.error_curve import Row, best_test, read_curve
+from scene.readers.records import HOLD
+from utils.files.json_files import read_json
 from utils.system_utils import UserError, saved_iterations
 
 WORST = 3  # views with the lowest PSNR that are shown of each run

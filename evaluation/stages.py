@@ -14,7 +14,7 @@ from evaluation.child import Finished, run_child
 from evaluation.model_folder import ground_truth_digest, load_scores, ply_file, view_names
 from evaluation.record import Record
 from evaluation.runs import Run
-from utils import render_times
+from records import render_times
 from utils.system_utils import UserError, saved_iterations
 
 _ROOT = Path(__file__).resolve().parents[1]

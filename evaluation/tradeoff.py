@@ -7,7 +7,7 @@ import statistics
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from utils.error_curve import Row
+from records.error_curve import Row
 
 DROPS = (0.0, 0.1, 0.2, 0.5, 1.0, 2.0, 3.0, 5.0, 8.0)  # dB below the best: dense where the last tenths get dear
 WIDEST_STEP = 2.0  # of the seconds between two points that are interpolated; across more a line tells nothing

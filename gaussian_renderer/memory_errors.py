@@ -5,7 +5,7 @@ from collections.abc import Iterator, Sequence
 
 from scene.cameras import Camera
 from scene.gaussian_model import GaussianModel
-from utils.memory import is_out_of_memory, shortage
+from utils.host.memory import is_out_of_memory, shortage
 from utils.system_utils import UserError
 
 

@@ -12,7 +12,7 @@ from tqdm import tqdm
 from gaussian_renderer import seen
 from scene.cameras import Camera
 from scene.gaussian_model import GaussianModel
-from scene.sh_bands import cut_bounds, needed_degree
+from scene.gaussians.sh_bands import cut_bounds, needed_degree
 from utils.view_scores import mean_scores
 
 

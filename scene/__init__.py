@@ -16,11 +16,11 @@ import torch
 from arguments.stored import OFFSET, read_model_json
 from scene.cameras import Camera, camera_to_JSON, cameraList_from_camInfos
 from scene.dataset_readers import CameraInfo, read_scene
-from scene.depth_maps import with_depth_maps
 from scene.half_images import mark_halves, train_on_all
-from scene.image_store import ImageStore, Picture
-from scene.masks import MaskOptions, refuse_nothing_to_ignore
-from scene.point_cloud import write_point_cloud
+from scene.pictures.masks import MaskOptions, refuse_nothing_to_ignore
+from scene.pictures.store import ImageStore, Picture
+from scene.readers.depth_maps import with_depth_maps
+from scene.readers.point_cloud import write_point_cloud
 from utils.graphics_utils import BasicPointCloud
 from utils.system_utils import UserError, atomic_write, compute_device, saved_iterations, searchForMaxIteration
 

@@ -11,9 +11,9 @@ from fused_ssim import composite
 from torch import Tensor
 
 from scene.dataset_readers import CameraInfo
-from scene.image_store import ImageStore, Picture, Source
-from scene.masks import TRANSPARENT, Cutout
-from scene.resolution import training_size
+from scene.pictures.masks import TRANSPARENT, Cutout
+from scene.pictures.resolution import training_size
+from scene.pictures.store import ImageStore, Picture, Source
 from utils.graphics_utils import getProjectionMatrix, getWorld2View2
 
 ZNEAR = 0.01  # these two only shape the clip depth; nothing is culled by them

@@ -6,13 +6,13 @@ from pathlib import Path
 
 import numpy as np
 
-from scene.colmap_reader import readColmapSceneInfo
-from scene.masks import NO_MASKS, MaskOptions
-from scene.scene_folder import BLENDER, COLMAP, NERFSTUDIO, kind_of
-from scene.scene_info import HOLD, CameraInfo, SceneInfo, scene_extent
-from scene.start_cloud import SFM, StartOptions
-from scene.transforms_reader import readNerfstudioInfo, readNerfSyntheticInfo
-from scene.world_offset import local, world_offset
+from scene.pictures.masks import NO_MASKS, MaskOptions
+from scene.readers.colmap import readColmapSceneInfo
+from scene.readers.records import HOLD, CameraInfo, SceneInfo, scene_extent
+from scene.readers.scene_folder import BLENDER, COLMAP, NERFSTUDIO, kind_of
+from scene.readers.start_cloud import SFM, StartOptions
+from scene.readers.transforms import readNerfstudioInfo, readNerfSyntheticInfo
+from scene.readers.world_offset import local, world_offset
 from utils.system_utils import UserError
 
 __all__ = [
@@ -49,7 +49,7 @@ def read_scene(
     images: folder of the pictures (COLMAP only). hold_out: keep a test set apart, else everything trains.
     init_pcd_path: file of points to start from instead of the dataset's own; else init_type, "sfm" (those) or "random".
     want_cloud: without, points are not judged, for a model that is there already.
-    offset: (3,) of the frame of that model (scene/world_offset.py); None: found for this scene.
+    offset: (3,) of the frame of that model (scene/readers/world_offset.py); None: found for this scene.
     Pictures of distorting lenses are undistorted into the user's cache folder; nothing else is written.
     """
     folder = Path(source_path)

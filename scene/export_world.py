@@ -3,7 +3,8 @@
 python -m scene.export_world MODEL OUT.ply [--iteration N]
 
 For scenes whose coordinates are large against their extent, which are trained in a frame of their own
-(scene/world_offset.py). Programs that read x, y, z as float lose the decimals again; CloudCompare and plyfile do not.
+(scene/readers/world_offset.py). Programs that read x, y, z as float lose the decimals again; CloudCompare and
+plyfile do not.
 """
 
 import argparse
@@ -14,7 +15,7 @@ from plyfile import PlyData, PlyElement
 
 from arguments import read_model_json
 from arguments.stored import OFFSET
-from scene.gaussian_ply import read_vertices
+from scene.gaussians.ply import read_vertices
 from utils.system_utils import UserError, atomic_write, run_cli, searchForMaxIteration
 
 _AXES = ("x", "y", "z")

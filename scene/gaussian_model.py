@@ -13,13 +13,13 @@ import torch
 from simple_knn._C import distCUDA2
 from torch import Tensor, nn
 
-from scene import densification as adc
-from scene.exposure import Exposures, read_exposures
-from scene.gaussian_attributes import IN_CHECKPOINT, Rows, attributes
-from scene.gaussian_optimizer import GaussianAdam, StepGuard
-from scene.gaussian_ply import read_ply, row_bytes, write_ply
+from scene.gaussians import density as adc
+from scene.gaussians.adam import GaussianAdam, StepGuard
+from scene.gaussians.attributes import IN_CHECKPOINT, Rows, attributes
+from scene.gaussians.exposure import Exposures, read_exposures
+from scene.gaussians.ply import read_ply, row_bytes, write_ply
+from scene.gaussians.sparse_adam import SparseGaussianAdam
 from scene.half_images import exposure_names
-from scene.sparse_adam import SparseGaussianAdam
 from utils.general_utils import build_scaling_rotation, get_expon_lr_func, strip_symmetric
 from utils.graphics_utils import BasicPointCloud
 from utils.sh_utils import RGB2SH
@@ -41,7 +41,7 @@ class GaussianModel:
     `_xyz` (N,3) world; `_features_dc` (N,1,3), `_features_rest` (N,K,3), K = (D+1)^2 - 1; `_scaling` (N,3) log;
     `_rotation` (N,4) wxyz, any length; `_opacity` (N,1) logit. Statistics since the last densification:
     `xyz_gradient_accum` (N,1), `denom` (N,1), `max_radii2D` (N). `exposures`: of the training pictures, identities
-    unless trained. world_offset: where the scene has the origin (scene/world_offset.py), kept in the PLY.
+    unless trained. world_offset: where the scene has the origin (scene/readers/world_offset.py), kept in the PLY.
     optimizer_type: "default" or "sparse_adam", whose step takes a mask of the visible Gaussians.
     """
 

@@ -7,7 +7,7 @@ import argparse
 
 from scene import Scene, find_iteration, saved_ply
 from scene.gaussian_model import GaussianModel
-from scene.gaussian_ply import stored_sh_degree
+from scene.gaussians.ply import stored_sh_degree
 
 
 def load_saved(options: argparse.Namespace, iteration: int, sh_degree: int | None = None) -> Scene:

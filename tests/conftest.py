@@ -5,7 +5,7 @@ import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
-import utils.openmp  # noqa: F401  isort: skip  (before torch)
+import utils.host.openmp  # noqa: F401  isort: skip  (before torch)
 import pytest
 import torch
 from synthetic import make_blender_scene, make_colmap_scene

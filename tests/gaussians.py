@@ -6,8 +6,8 @@ import numpy as np
 import torch
 
 from arguments import OptimizationParams, PipelineParams
-from scene.gaussian_attributes import attributes
 from scene.gaussian_model import GaussianModel
+from scene.gaussians.attributes import attributes
 from utils.graphics_utils import BasicPointCloud
 
 GROUPS = {group: attribute.field for group, attribute in attributes(0).items()}

@@ -9,7 +9,7 @@ import torch
 from diff_gaussian_rasterization import GaussianRasterizationSettings, Rasterized, rasterize
 from torch import Tensor
 
-from benchmarks.splat_scenes import on_device, settings
+from benchmarks.workloads.splat_scenes import on_device, settings
 
 ops = torch.ops.diff_gaussian_rasterization
 

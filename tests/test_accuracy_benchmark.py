@@ -1,4 +1,4 @@
-"""benchmarks/accuracy.py: the error, the exact exponential, the figure; the kernels' runs on small scenes."""
+"""benchmarks/accuracy/oracle.py: the error, the exact exponential, the figure; the kernels' runs on small scenes."""
 
 import re
 import shutil
@@ -9,9 +9,9 @@ import pytest
 import torch
 from PIL import Image
 
-from benchmarks import accuracy_figure, exact_exponential, kernel_runs
-from benchmarks.accuracy import error, measure, print_errors, print_ratios
-from benchmarks.kernel_runs import CPU_DOUBLE, CPU_FLOAT, CUDA_FLOAT
+from benchmarks.accuracy import exact_exponential, figure, kernel_runs
+from benchmarks.accuracy.kernel_runs import CPU_DOUBLE, CPU_FLOAT, CUDA_FLOAT
+from benchmarks.accuracy.oracle import error, measure, print_errors, print_ratios
 
 COMMON = exact_exponential.ROOT / "submodules" / "common" / "include"
 SHIPPED = exact_exponential.ROOT / "submodules" / exact_exponential.EXTENSION / "csrc" / "math" / "exp2.h"
@@ -112,7 +112,7 @@ def test_the_exact_build_differs_in_that_header_alone(tmp_path):
 
 def test_the_figure_takes_what_was_measured(tmp_path):
     pytest.importorskip("matplotlib")
-    errors = {name: (1e-6, 0.0 if name == "image" else 1e-8) for name in accuracy_figure.MARKERS}
+    errors = {name: (1e-6, 0.0 if name == "image" else 1e-8) for name in figure.MARKERS}
     records = [
         {"scene": case.kind, "antialiasing": case.antialiasing, "kernel": str(kernel), "exponential": exponential}
         | {"errors": errors, "milliseconds": milliseconds}
@@ -121,11 +121,11 @@ def test_the_figure_takes_what_was_measured(tmp_path):
         for kernel, milliseconds in ((CPU_FLOAT, 70.0), (CPU_DOUBLE, 130.0), (CUDA_FLOAT, 0.7))
     ]
     measured = {"records": records, "machines": ["a machine"], "timed sizes": kernel_runs.TIMED_SIZES}
-    accuracy_figure.draw(measured, tmp_path / "accuracy.png")
+    figure.draw(measured, tmp_path / "accuracy.png")
     with Image.open(tmp_path / "accuracy.png") as image:
         assert image.size == (1650, 1100)
 
 
 def test_every_kernel_and_scene_is_provided_for():
-    assert {str(kernel) for kernel in (CPU_FLOAT, CPU_DOUBLE, CUDA_FLOAT)} == accuracy_figure.COLORS.keys()
+    assert {str(kernel) for kernel in (CPU_FLOAT, CPU_DOUBLE, CUDA_FLOAT)} == figure.COLORS.keys()
     assert kernel_runs.TIMED_SIZES.keys() == kernel_runs.KINDS.keys()

@@ -4,11 +4,11 @@ import math
 
 import pytest
 
-from benchmarks.calls import Stages
-from benchmarks.fragments import TILE, fragments, processed_per_tile
-from benchmarks.host_ops import NODE, calls_per_iteration, operator_calls
-from benchmarks.splat_scenes import frustum
-from benchmarks.timing import short_name
+from benchmarks.harness.calls import Stages
+from benchmarks.harness.timing import short_name
+from benchmarks.kernels.fragments import TILE, fragments, processed_per_tile
+from benchmarks.kernels.host_ops import NODE, calls_per_iteration, operator_calls
+from benchmarks.workloads.splat_scenes import frustum
 
 
 def test_fragments_are_those_of_a_loop_over_pixels():

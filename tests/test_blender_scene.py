@@ -14,7 +14,7 @@ from synthetic import FakeGaussians, folder_state
 from arguments import ModelParams
 from scene import Scene
 from scene.dataset_readers import read_scene
-from scene.point_cloud import write_point_cloud
+from scene.readers.point_cloud import write_point_cloud
 from utils.system_utils import UserError
 
 

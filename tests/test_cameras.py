@@ -13,7 +13,7 @@ from synthetic import FOCAL, make_colmap_scene
 
 from scene.cameras import Camera, MiniCam, camera_to_JSON
 from scene.dataset_readers import CameraInfo, readColmapSceneInfo
-from scene.image_store import ImageStore
+from scene.pictures.store import ImageStore
 from utils import camera_utils
 from utils.graphics_utils import focal2fov, fov2focal, getProjectionMatrix, getWorld2View2
 

@@ -12,7 +12,7 @@ import pytest
 import torch
 from gaussians import model, options, parameters, take_steps
 
-from scene.checkpoint import load_checkpoint, save_checkpoint
+from scene.gaussians.checkpoint import load_checkpoint, save_checkpoint
 from utils.system_utils import UserError
 
 try:
@@ -139,7 +139,7 @@ def test_a_failed_save_leaves_the_old_file(tmp_path, monkeypatch):
         target.write_bytes(b"half")
         raise OSError("disk full")
 
-    monkeypatch.setattr("scene.checkpoint.torch.save", fail)
+    monkeypatch.setattr("scene.gaussians.checkpoint.torch.save", fail)
     with pytest.raises(UserError, match="cannot write .*disk full"):
         save_checkpoint(path, model(3).capture(), 1)
     assert path.read_bytes() == before and [p.name for p in tmp_path.iterdir()] == ["chkpnt1.pth"]

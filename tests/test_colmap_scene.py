@@ -17,9 +17,10 @@ from PIL import Image
 from synthetic import CENTER, FOCAL, FakeGaussians, folder_state, make_colmap_scene
 
 from arguments import ModelParams
-from scene import Scene, colmap_loader, picture_device
+from scene import Scene, picture_device
 from scene.dataset_readers import read_scene, scene_extent
-from scene.point_cloud import read_point_cloud, write_point_cloud
+from scene.readers import colmap_model
+from scene.readers.point_cloud import read_point_cloud, write_point_cloud
 from utils.system_utils import UserError
 
 
@@ -278,7 +279,7 @@ def test_png_can_be_written_after_a_scene_was_read(colmap_scene, tmp_path):
     script = (
         "import sys\n"
         "from pathlib import Path\n"
-        "from scene.colmap_loader import read_model\n"
+        "from scene.readers.colmap_model import read_model\n"
         "read_model(Path(sys.argv[1]))\n"
         "assert 'pycolmap' in sys.modules\n"
         "from PIL import Image\n"
@@ -448,18 +449,18 @@ def _read_cameras(scene: Path):
 
 
 def test_poses_that_are_not_finite_are_named(colmap_scene, monkeypatch):
-    model = colmap_loader.read_model(colmap_scene / "sparse" / "0")
+    model = colmap_model.read_model(colmap_scene / "sparse" / "0")
     for part in ("rotation", "translation"):
         views = list(model.views)
         views[3] = views[3]._replace(**{part: np.full_like(getattr(views[3], part), np.nan)})
-        monkeypatch.setattr(colmap_loader, "read_model", lambda _, views=views: model._replace(views=views))
+        monkeypatch.setattr(colmap_model, "read_model", lambda _, views=views: model._replace(views=views))
         with pytest.raises(UserError, match=f"pose of {views[3].name} is not finite"):
             _read(colmap_scene)
 
 
 def test_sigterm_stays_quiet_after_a_model_was_read(colmap_scene):
     script = (
-        "import os, signal, sys\nfrom pathlib import Path\nfrom scene.colmap_loader import read_model\n"
+        "import os, signal, sys\nfrom pathlib import Path\nfrom scene.readers.colmap_model import read_model\n"
         "read_model(Path(sys.argv[1]))\nos.kill(os.getpid(), signal.SIGTERM)\n"
     )
     command = [sys.executable, "-c", script, str(colmap_scene / "sparse" / "0")]

@@ -10,10 +10,10 @@ import pytest
 import torch
 from rasterizer_tools import CPU_AND_GPU, ops
 
-from benchmarks.allocations import allocated_bytes
-from benchmarks.cost_rows import ROWS, Row, Workload
-from benchmarks.costs import BEGIN, END, replace_tables
-from benchmarks.paired import difference, interleaved, median_interval
+from benchmarks.costs.allocations import allocated_bytes
+from benchmarks.costs.measure import BEGIN, END, replace_tables
+from benchmarks.costs.paired import difference, interleaved, median_interval
+from benchmarks.costs.rows import ROWS, Row, Workload
 
 ROOT = Path(__file__).parents[1]
 CPU = torch.device("cpu")
@@ -69,7 +69,7 @@ def test_what_is_compared_gives_the_same(work):
 @pytest.fixture(scope="module")
 def probed(tmp_path_factory) -> dict:
     folder = tmp_path_factory.mktemp("probe")
-    command = [sys.executable, "benchmarks/cost_probe.py", str(folder)]
+    command = [sys.executable, "-m", "benchmarks.costs.probe", str(folder)]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout)

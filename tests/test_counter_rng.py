@@ -5,8 +5,8 @@ import pytest
 import torch
 from scipy import stats
 
-from utils import portable_math
-from utils.counter_rng import Stream, normal, permutation, philox, random_bits, uniform
+from utils.exact import portable_math
+from utils.exact.counter_rng import Stream, normal, permutation, philox, random_bits, uniform
 
 F = 0xFFFFFFFF
 

@@ -9,8 +9,8 @@ from gaussians import GROUPS, model, moments, options, parameters, take_steps
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from scene import densification as adc
 from scene.gaussian_model import GaussianModel
+from scene.gaussians import density as adc
 from utils.general_utils import build_rotation
 
 EXTENT = 2.0

@@ -20,11 +20,11 @@ import train
 from arguments import ModelParams, OptionParser
 from gaussian_renderer import render
 from scene import Scene
-from scene.colmap_loader import Sightings, read_sightings
 from scene.dataset_readers import read_scene
-from scene.depth_maps import DepthMap, read_values, resize, with_depth_maps
-from scene.depth_scale import fit_line, fit_picture, make_depth_params
 from scene.gaussian_model import GaussianModel
+from scene.readers.colmap_model import Sightings, read_sightings
+from scene.readers.depth_maps import DepthMap, read_values, resize, with_depth_maps
+from scene.readers.depth_scale import fit_line, fit_picture, make_depth_params
 from utils.loss_utils import inverse_depth_loss
 from utils.system_utils import UserError
 

@@ -12,8 +12,8 @@ from rasterizer_tools import ops
 
 import train
 from scene import gaussian_model
-from scene.checkpoint import load_checkpoint
 from scene.gaussian_model import GaussianModel
+from scene.gaussians.checkpoint import load_checkpoint
 from utils.system_utils import UserError
 
 BETAS, EPS, RATE = (0.9, 0.999), 1e-15, 0.01

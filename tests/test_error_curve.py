@@ -21,15 +21,15 @@ from skimage.metrics import peak_signal_noise_ratio
 
 import render
 import train
-from utils import process
-from utils.curve_figure import draw_curve
-from utils.curve_peak import peak_advice, schedules_follow_length
-from utils.curve_recorder import CurveRecorder, evenly_spread
-from utils.curve_schedule import CurveSchedule
-from utils.error_curve import COLUMNS, Row, best_test, continue_curve, read_curve, write_curve
+from records.curve_figure import draw_curve
+from records.curve_peak import peak_advice, schedules_follow_length
+from records.curve_recorder import CurveRecorder, evenly_spread
+from records.curve_schedule import CurveSchedule
+from records.error_curve import COLUMNS, Row, best_test, continue_curve, read_curve, write_curve
+from records.training_log import TrainingLog
+from utils.host import process
 from utils.loss_utils import ssim
 from utils.system_utils import UserError
-from utils.training_log import TrainingLog
 from utils.view_scores import mean_scores
 
 ROOT = Path(__file__).parents[1]
@@ -434,7 +434,7 @@ import sys, time
 time.sleep(0.5)
 import torch
 import train
-from utils import process
+from utils.host import process
 before = process.peak_memory_mib(torch.device("cpu"))
 torch.ones(300 * 2**20, dtype=torch.uint8)
 print(process.wall_seconds(), "matplotlib" in sys.modules, process.peak_memory_mib(torch.device("cpu")) - before)

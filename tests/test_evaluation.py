@@ -13,8 +13,8 @@ from evaluation.readme_table import BEGIN, END, replace_results
 from evaluation.scenes import DATASETS
 from evaluation.summary import QUANTITIES, spread, summarise
 from evaluation.tradeoff import cheapest, gaussians_to_reach, levels, pareto_front, seconds_to_reach
-from utils.error_curve import COLUMNS
-from utils.markdown_table import markdown_table
+from records.error_curve import COLUMNS
+from utils.files.markdown_table import markdown_table
 from utils.system_utils import UserError
 
 

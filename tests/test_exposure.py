@@ -14,13 +14,13 @@ from PIL import Image
 
 import render
 import train
-from scene.checkpoint import load_checkpoint, save_checkpoint
+from records.error_curve import read_curve
 from scene.dataset_readers import CameraInfo, read_scene
-from scene.exposure import Exposures, read_exposures
 from scene.gaussian_model import GaussianModel
+from scene.gaussians.checkpoint import load_checkpoint, save_checkpoint
+from scene.gaussians.exposure import Exposures, read_exposures
 from scene.half_images import exposure_names, train_on_all
-from scene.point_cloud import write_point_cloud
-from utils.error_curve import read_curve
+from scene.readers.point_cloud import write_point_cloud
 from utils.exposure import apply_exposure
 from utils.loss_utils import inverse_depth_loss, l1_loss, photometric_loss, ssim
 from utils.system_utils import UserError

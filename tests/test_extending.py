@@ -24,8 +24,8 @@ import train
 from arguments import ModelParams
 from gaussian_renderer import render
 from scene import Scene
-from scene.checkpoint import load_checkpoint
 from scene.gaussian_model import GaussianModel
+from scene.gaussians.checkpoint import load_checkpoint
 
 ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs" / "extending.md"

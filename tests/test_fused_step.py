@@ -10,10 +10,10 @@ from torch import Tensor
 
 import train
 from gaussian_renderer import render
-from scene import gaussian_optimizer
 from scene.cameras import Camera
 from scene.gaussian_model import GaussianModel
-from scene.point_cloud import write_point_cloud
+from scene.gaussians import adam
+from scene.readers.point_cloud import write_point_cloud
 
 ITERATIONS = 90
 
@@ -63,7 +63,7 @@ def test_fused_and_plain_steps_go_the_same_way(blender_scene, tmp_path, monkeypa
             monkeypatch.setattr(train, "photometric_loss", _loss)
             monkeypatch.setattr(Camera, "target", _target)
             monkeypatch.setattr(GaussianModel, "observe", _observe)
-            monkeypatch.setattr(gaussian_optimizer, "_ADAM", _adam)
+            monkeypatch.setattr(adam, "_ADAM", _adam)
         out = tmp_path / str(fused)
         train.main(["-s", str(blender_scene), "-m", str(out), "--iterations", str(ITERATIONS), *options])
         models.append((out / f"point_cloud/iteration_{ITERATIONS}/point_cloud.ply").read_bytes())

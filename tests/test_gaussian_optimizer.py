@@ -6,8 +6,8 @@ import pytest
 import torch
 from gaussians import GROUPS, model, moments, options, parameters, take_steps
 
-from scene import gaussian_optimizer
-from scene.gaussian_optimizer import GaussianAdam
+from scene.gaussians import adam
+from scene.gaussians.adam import GaussianAdam
 
 
 def _groups(seed: int = 0) -> list[dict]:
@@ -192,7 +192,7 @@ def _failing(function, call: int):
 @pytest.mark.parametrize("call", [1, 2, 3, 9, 18])
 def test_where_memory_fails_rows_are_appended_to_none_and_kept_in_all(monkeypatch, call):
     """Six groups with two moments each: 18 tensors, of which the memory for one can't be had."""
-    monkeypatch.setattr(gaussian_optimizer, "_CHUNK", 7)
+    monkeypatch.setattr(adam, "_CHUNK", 7)
     gaussians = model(40)
     take_steps(gaussians, 2)
     before, state = parameters(gaussians), moments(gaussians)

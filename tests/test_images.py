@@ -7,9 +7,9 @@ import pytest
 import torch
 from PIL import Image
 
-from scene import resolution
-from scene.images import decode, picture_size
-from scene.resolution import training_size
+from scene.pictures import resolution
+from scene.pictures.decode import decode, picture_size
+from scene.pictures.resolution import training_size
 from utils.system_utils import UserError
 
 

@@ -18,9 +18,9 @@ import metrics
 import render
 import train
 from scene import Scene
-from scene.images import decode
-from scene.masks import IGNORE, TRANSPARENT, Mask
-from training.mask_watch import MaskWatch
+from scene.pictures.decode import decode
+from scene.pictures.masks import IGNORE, TRANSPARENT, Mask
+from training.observers.masks import MaskWatch
 from utils.image_utils import pixels_that_count
 from utils.loss_utils import photometric_loss
 from utils.system_utils import UserError

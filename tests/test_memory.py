@@ -14,13 +14,13 @@ from PIL import Image
 
 import render
 import train
-from scene import images
-from scene.checkpoint import load_checkpoint
 from scene.gaussian_model import GaussianModel
+from scene.gaussians.checkpoint import load_checkpoint
+from scene.pictures import decode
 from training import memory_estimate
 from training.memory_estimate import training_bytes
-from utils import memory
-from utils.memory import free_memory, gib, is_out_of_memory, shortage
+from utils.host import memory
+from utils.host.memory import free_memory, gib, is_out_of_memory, shortage
 from utils.system_utils import UserError, run_cli
 
 ROOT = Path(__file__).parents[1]
@@ -153,7 +153,7 @@ def test_the_state_before_is_saved_and_goes_on_to_the_same_end(colmap_scene, tmp
 
 
 def test_a_picture_that_does_not_fit_saves_too(colmap_scene, tmp_path, monkeypatch):
-    monkeypatch.setattr(images, "_to_rgb_or_rgba", _failing(images._to_rgb_or_rgba, 5, MemoryError()))
+    monkeypatch.setattr(decode, "_to_rgb_or_rgba", _failing(decode._to_rgb_or_rgba, 5, MemoryError()))
     with pytest.raises(UserError, match=r"for the picture .*[vV]\d\d.png at 24 x 16 pixels.*chkpnt4.pth"):
         _train(colmap_scene, tmp_path, "--images_to_load", 1)
     assert load_checkpoint(tmp_path / "chkpnt4.pth")[1] == 4
@@ -269,7 +269,7 @@ def test_render_decodes_only_what_it_renders(colmap_scene, tmp_path, monkeypatch
     _train(colmap_scene, tmp_path, "--eval")
     decoded = []
     monkeypatch.setattr(
-        "scene.image_store.decode", lambda path, size: decoded.append(path) or images.decode(path, size)
+        "scene.pictures.store.decode", lambda path, size: decoded.append(path) or decode.decode(path, size)
     )
     monkeypatch.setattr(sys, "argv", ["render.py", "-m", str(tmp_path), "--skip_train"])
     render.main()

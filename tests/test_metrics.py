@@ -15,7 +15,8 @@ from PIL import Image
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 import metrics
-from utils import image_files, lpips_utils
+from utils import lpips_utils
+from utils.files import image_files
 from utils.lpips_utils import LpipsUnavailable, PerceptualDistance, import_lpips
 from utils.system_utils import UserError, run_cli
 

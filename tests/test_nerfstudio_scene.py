@@ -14,9 +14,9 @@ from synthetic import FakeGaussians, folder_state, make_colmap_scene
 from test_colmap_scene import _options, _read
 
 from scene import Scene
-from scene.lens import Lens
-from scene.point_cloud import write_point_cloud
-from scene.transforms_lens import lens_of
+from scene.pictures.lens import Lens
+from scene.readers.point_cloud import write_point_cloud
+from scene.readers.transforms_lens import lens_of
 from utils.system_utils import UserError
 
 BROWN = (110.0, 110.0, 45.0, 34.5, -0.2, 0.03, 0.004, -0.003)

@@ -5,7 +5,7 @@ import torch
 from diff_gaussian_rasterization import GaussianRasterizationSettings, GaussianRasterizer, rasterize
 from rasterizer_tools import activated, few, leaves, ops, render, scene_arguments
 
-from benchmarks.splat_scenes import settings
+from benchmarks.workloads.splat_scenes import settings
 
 
 def scene(n: int = 3, dtype: torch.dtype = torch.float32):

@@ -6,7 +6,7 @@ import pytest
 import torch
 from rasterizer_tools import GPU_MARKS, gradients, loss_of
 
-from benchmarks.splat_scenes import KINDS, SplatScene, frustum, settings
+from benchmarks.workloads.splat_scenes import KINDS, SplatScene, frustum, settings
 
 pytestmark = [*GPU_MARKS]
 OPS = torch.ops.diff_gaussian_rasterization

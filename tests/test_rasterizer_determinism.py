@@ -11,7 +11,7 @@ import torch
 from rasterizer_tools import error, gradients
 from torch import Tensor
 
-from benchmarks.splat_scenes import KINDS, ordinary
+from benchmarks.workloads.splat_scenes import KINDS, ordinary
 
 ROOT = Path(__file__).resolve().parents[1]
 

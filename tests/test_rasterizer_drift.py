@@ -8,7 +8,7 @@ import torch
 from rasterizer_tools import CPU_AND_GPU, gradients
 from torch import Tensor
 
-from benchmarks.splat_scenes import settings
+from benchmarks.workloads.splat_scenes import settings
 
 SIZE = 48
 # The largest error of dLoss/dalpha that exact division leaves in float32 after 1,862 blends (measured beforehand on

@@ -6,7 +6,7 @@ import pytest
 import torch
 from rasterizer_tools import BOTH_AND_GPU, activated, few, on_device, ops, render, rigid, scene_arguments
 
-from benchmarks.splat_scenes import settings
+from benchmarks.workloads.splat_scenes import settings
 from utils.sh_utils import RGB2SH
 
 

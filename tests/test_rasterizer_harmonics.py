@@ -7,7 +7,7 @@ from diff_gaussian_rasterization import reference
 from rasterizer_tools import ops, scene_arguments
 from scipy.special import sph_harm_y
 
-from benchmarks.splat_scenes import settings
+from benchmarks.workloads.splat_scenes import settings
 
 
 def real_harmonics(directions: np.ndarray) -> np.ndarray:

@@ -6,7 +6,7 @@ from diff_gaussian_rasterization import GaussianRasterizationSettings
 from rasterizer_tools import BOTH_AND_GPU, CPU_AND_GPU, few, leaves, ops, render, scene_arguments, together
 from torch import library
 
-from benchmarks.splat_scenes import on_device, settings
+from benchmarks.workloads.splat_scenes import on_device, settings
 
 
 def _few(device: str, dtype: torch.dtype = torch.float32) -> tuple[dict, GaussianRasterizationSettings]:

@@ -12,7 +12,7 @@ from diff_gaussian_rasterization import GaussianRasterizationSettings, reference
 from rasterizer_tools import activated, error, leaves, loss_of, render, rigid
 from torch import Tensor
 
-from benchmarks.splat_scenes import KINDS, settings
+from benchmarks.workloads.splat_scenes import KINDS, settings
 
 SIZE = (45, 35)  # no multiple of the tile
 VIEW = rigid((0.9, 0.3, -0.4, 0.2), (0.7, -0.4, 1.1))

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from rasterizer_tools import gradients, ops, pick, render, rigid, rotation_matrix, scene_arguments
 from torch import Tensor
 
-from benchmarks.splat_scenes import KINDS, SplatScene, frustum, needles, settings
+from benchmarks.workloads.splat_scenes import KINDS, SplatScene, frustum, needles, settings
 
 SEEDS = st.integers(0, 2**31 - 1)
 UNIT = st.floats(-1, 1, width=32)

@@ -7,7 +7,7 @@ import torch
 from rasterizer_tools import CPU_AND_GPU, activated, gradients, pick, render
 from torch import Tensor
 
-from benchmarks.splat_scenes import ordinary, settings
+from benchmarks.workloads.splat_scenes import ordinary, settings
 
 N, VICTIM, SIZE = 40, 17, (75, 53)
 NOT_FINITE = [math.nan, math.inf, -math.inf]

@@ -6,7 +6,7 @@ import pytest
 import torch
 from rasterizer_tools import DTYPES_AND_GPU, activated, few, one_splat, ops, pick, render, scene_arguments, together
 
-from benchmarks.splat_scenes import ordinary, settings
+from benchmarks.workloads.splat_scenes import ordinary, settings
 
 BOTH = pytest.mark.parametrize("dtype", [torch.float64, torch.float32], ids=["float64", "float32"])
 MIDDLE = (..., 8, 8)  # of 17 x 17: what lies on the optical axis is exactly at this pixel's centre

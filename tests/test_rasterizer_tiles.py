@@ -6,8 +6,8 @@ import pytest
 import torch
 from rasterizer_tools import BOTH_AND_GPU, CPU_AND_GPU, assert_culling_is_exact, borderline_splats, ops, scene_arguments
 
-from benchmarks.splat_scenes import KINDS, settings
-from utils.machine import instruction_set
+from benchmarks.workloads.splat_scenes import KINDS, settings
+from utils.host.machine import instruction_set
 
 SIZE = (75, 53)
 

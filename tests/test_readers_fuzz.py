@@ -20,10 +20,10 @@ from hypothesis import strategies as st
 from synthetic import make_blender_scene
 
 from arguments import ModelParams, read_cfg_args, read_model_json, write_cfg_args, write_model_json
-from scene.checkpoint import load_checkpoint, save_checkpoint
 from scene.dataset_readers import read_scene
 from scene.gaussian_model import GaussianModel
-from scene.point_cloud import read_point_cloud, write_point_cloud
+from scene.gaussians.checkpoint import load_checkpoint, save_checkpoint
+from scene.readers.point_cloud import read_point_cloud, write_point_cloud
 from utils.system_utils import UserError
 
 EXAMPLES = int(os.environ.get("GS_FUZZ", 40))

@@ -9,9 +9,9 @@ import pytest
 import torch
 from PIL import Image
 
-from scene.gaussian_attributes import attributes
-from scene.gaussian_ply import write_ply
-from utils import render_times
+from records import render_times
+from scene.gaussians.attributes import attributes
+from scene.gaussians.ply import write_ply
 from utils.system_utils import UserError
 
 render = pytest.importorskip("render", reason="the extensions are not built: make test")

@@ -9,8 +9,8 @@ from gaussians import GROUPS, model, pipeline
 import gaussian_renderer
 from gaussian_renderer import render
 from scene.cameras import MiniCam
-from scene.exposure import Exposures
 from scene.gaussian_model import GaussianModel
+from scene.gaussians.exposure import Exposures
 from utils.graphics_utils import getProjectionMatrix
 from utils.loss_utils import inverse_depth_loss
 from utils.system_utils import UserError

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from scene.sh_bands import cut_bounds, needed_degree
+from scene.gaussians.sh_bands import cut_bounds, needed_degree
 from utils.sh_utils import eval_sh
 
 

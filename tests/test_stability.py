@@ -1,4 +1,4 @@
-"""Stiff and extreme cases, each held to its own bound (benchmarks/stability_cases.py has bounds and reasons)."""
+"""Stiff and extreme cases, each held to its own bound (benchmarks/workloads/stability_cases.py has the reasons)."""
 
 import functools
 import json
@@ -11,10 +11,10 @@ import torch
 from diff_gaussian_rasterization import reference
 from rasterizer_tools import gradients, leaves, render
 
-from benchmarks import stability
-from benchmarks.stability import CPU_DOUBLE, CPU_FLOAT, CUDA_FLOAT, TEXTBOOK, Judged
-from benchmarks.stability_cases import CASES, PLAIN, Case, long_needles
-from benchmarks.stability_needles import needle_error
+from benchmarks.accuracy import stability
+from benchmarks.accuracy.stability import CPU_DOUBLE, CPU_FLOAT, CUDA_FLOAT, TEXTBOOK, Judged
+from benchmarks.accuracy.stability_needles import needle_error
+from benchmarks.workloads.stability_cases import CASES, PLAIN, Case, long_needles
 
 BY_NAME = {case.name: case for case in CASES}
 

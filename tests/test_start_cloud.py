@@ -7,7 +7,7 @@ from synthetic import FakeGaussians
 from test_colmap_scene import _options, _read
 
 from scene import Scene
-from scene.point_cloud import read_point_cloud, write_point_cloud
+from scene.readers.point_cloud import read_point_cloud, write_point_cloud
 from utils.system_utils import UserError
 
 POINTS = np.array([[0.25, -1.5, 3.0], [4.0, 5.5, -6.0]])
@@ -117,7 +117,7 @@ def test_random_points_lie_where_cameras_look(colmap_scene):
 def test_random_points_of_cameras_side_by_side(colmap_scene):
     from dataclasses import replace
 
-    from scene.start_cloud import random_in_frusta
+    from scene.readers.start_cloud import random_in_frusta
 
     camera = _read(colmap_scene).train_cameras[0]
     row = [replace(camera, T=camera.T + (0.1 * step, 0, 0)) for step in range(5)]

@@ -4,7 +4,7 @@ import os
 
 import pytest
 
-from utils import threads
+from utils.host import threads
 
 
 @pytest.fixture

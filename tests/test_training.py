@@ -15,13 +15,13 @@ import torch
 from plyfile import PlyData
 
 import train
-from scene.checkpoint import load_checkpoint
+from records.training_log import Stopwatch, TrainingLog
 from scene.gaussian_model import GaussianModel
-from scene.point_cloud import write_point_cloud
-from training import report
+from scene.gaussians.checkpoint import load_checkpoint
+from scene.readers.point_cloud import write_point_cloud
+from training.observers import report
 from training.view_order import ViewOrder
 from utils.system_utils import UserError
-from utils.training_log import Stopwatch, TrainingLog
 
 ROOT = Path(__file__).parents[1]
 SMALL = ["-r", "24", "--test_iterations", "-1"]

@@ -20,10 +20,10 @@ from diagnosis.model import check_model
 from gaussian_renderer import render
 from gaussian_renderer.trimming import change_on_views, seen_by, trim
 from scene import Scene
-from scene.checkpoint import load_checkpoint
 from scene.gaussian_model import GaussianModel
-from scene.point_cloud import write_point_cloud
-from utils.left_out import LeftOut, lines
+from scene.gaussians.checkpoint import load_checkpoint
+from scene.readers.point_cloud import write_point_cloud
+from training.left_out import LeftOut, lines
 from utils.system_utils import UserError
 
 ITERATIONS = 12

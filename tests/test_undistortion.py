@@ -11,11 +11,11 @@ from PIL import Image
 from synthetic import FakeGaussians, folder_state, make_colmap_scene
 from test_colmap_scene import _options, _read
 
-from benchmarks.lenses import DISTORTED, DISTORTIONS, colmap_camera, make_lens
+from benchmarks.workloads.lenses import DISTORTED, DISTORTIONS, colmap_camera, make_lens
 from scene import Scene
-from scene.lens import WIDEST, Lens, pinhole_of, shown_pixels, undistortion
-from scene.masks import TRANSPARENT, Mask
-from scene.undistortion import Photo, undistort
+from scene.pictures.lens import WIDEST, Lens, pinhole_of, shown_pixels, undistortion
+from scene.pictures.masks import TRANSPARENT, Mask
+from scene.pictures.undistortion import Photo, undistort
 from utils.system_utils import UserError
 
 WIDTH, HEIGHT, FOCAL = 200, 150, 150.0

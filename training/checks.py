@@ -5,10 +5,10 @@ import sys
 
 import numpy as np
 
-from scene import densification as adc
 from scene.gaussian_model import GaussianModel
-from scene.scene_info import APART, NEAREST, SceneInfo, standing_apart
-from utils.listing import some
+from scene.gaussians import density as adc
+from scene.readers.records import APART, NEAREST, SceneInfo, standing_apart
+from utils.files.listing import some
 from utils.system_utils import UserError
 
 _SAMPLE = 16  # cameras whose depths are looked at

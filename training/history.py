@@ -8,10 +8,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from arguments import read_training_options
-from utils import training_log
-from utils.error_curve import Row, continue_curve
+from records import training_log
+from records.error_curve import Row, continue_curve
+from records.training_log import TrainingLog
 from utils.system_utils import UserError, saved_iterations
-from utils.training_log import TrainingLog
 
 # Options that change what is learnt. Others are spoken of elsewhere (train_test_exp, sh_degree), or change nothing.
 _TOLD = (

@@ -7,7 +7,7 @@ import torch
 
 from scene import Scene
 from scene.gaussian_model import GaussianModel
-from utils.memory import free_memory, gib
+from utils.host.memory import free_memory, gib
 
 # Bytes beside the parameters, their gradients and two moments. Fitted to the peak memory of forward and backward in
 # docs/performance.md (100 thousand to 6 million Gaussians, within 4 %: 106 and 57); the rest is density control's

@@ -1,7 +1,7 @@
 """Which training camera is shown in which iteration."""
 
 from scene.cameras import Camera
-from utils.counter_rng import Stream, permutation
+from utils.exact.counter_rng import Stream, permutation
 from utils.system_utils import UserError
 
 

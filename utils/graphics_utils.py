@@ -11,7 +11,7 @@ from torch import Tensor
 class BasicPointCloud(NamedTuple):
     """Coloured points: points (N,3), world units; colors (N,3) float32 in [0,1]; normals (N,3) float32.
 
-    Points are float64 as readers find them, float32 in the frame that is trained in (scene/world_offset.py).
+    Points are float64 as readers find them, float32 in the frame that is trained in (scene/readers/world_offset.py).
     """
 
     points: np.ndarray

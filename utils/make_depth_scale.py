@@ -12,7 +12,7 @@ from pathlib import Path
 if not __package__:  # run as a file: Python looks beside it, and what is imported lies one folder up
     sys.path[0] = str(Path(__file__).resolve().parents[1])
 
-from scene.depth_scale import make_depth_params  # noqa: E402
+from scene.readers.depth_scale import make_depth_params  # noqa: E402
 from utils.system_utils import run_cli  # noqa: E402
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import torch
 
-from utils.memory import is_out_of_memory, shortage
+from utils.host.memory import is_out_of_memory, shortage
 
 _ITERATION_FOLDER = re.compile(r"iteration_(\d+)")
 

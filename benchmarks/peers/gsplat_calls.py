@@ -10,8 +10,8 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from benchmarks.calls import image_gradient
-from benchmarks.splat_scenes import SplatScene
+from benchmarks.harness.calls import image_gradient
+from benchmarks.workloads.splat_scenes import SplatScene
 from utils.system_utils import UserError
 
 INSTALL = "pip install gsplat==1.5.3 (with nvcc and ninja at hand; TORCH_CUDA_ARCH_LIST=9.0 makes it build for one GPU)"

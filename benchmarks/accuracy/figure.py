@@ -1,0 +1,97 @@
+"""Draws error against run time from what accuracy.py measured.
+
+python -m benchmarks.accuracy.figure accuracy.json docs/accuracy.png
+"""
+
+import argparse
+import importlib.util
+import json
+from pathlib import Path
+
+from utils.system_utils import UserError, atomic_write, run_cli
+
+COLORS = {"CPU float32": "tab:blue", "CPU float64": "tab:green", "CUDA float32": "tab:red"}
+MARKERS = {
+    "image": "o",
+    "d means": "s",
+    "d opacities": "D",
+    "d scales": "^",
+    "d rotations": "v",
+    "d sh_dc": "<",
+    "d sh_rest": ">",
+    "d screen mean": "h",
+}
+
+
+def require_matplotlib() -> None:
+    """UserError where it is missing."""
+    if importlib.util.find_spec("matplotlib") is None:
+        raise UserError(
+            "drawing needs matplotlib: `pip install matplotlib`, or give --json and draw on another machine"
+        )
+
+
+def draw(measured: dict, path: Path) -> None:
+    """A panel for each scene and setting of antialiasing: a column of marks for each kernel at its time."""
+    require_matplotlib()
+    from matplotlib.figure import Figure
+    from matplotlib.lines import Line2D
+    from matplotlib.ticker import LogFormatter
+
+    records = measured["records"]
+    sizes = {scene: measured["timed sizes"][scene] for scene in dict.fromkeys(r["scene"] for r in records)}
+    figure = Figure(figsize=(15, 10), layout="constrained")
+    panels = figure.subplots(2, len(sizes), sharex="col", sharey=True)
+    for row, antialiasing in enumerate((False, True)):
+        for panel, scene in zip(panels[row], sizes, strict=True):
+            times = [r["milliseconds"] for r in records if r["scene"] == scene]  # of both rows: they share the axis
+            for record in records:
+                if (record["scene"], record["antialiasing"]) == (scene, antialiasing):
+                    _draw_record(panel, record, (max(times) / min(times)) ** 0.01)
+            panel.set(xscale="log", yscale="log")
+            panel.xaxis.set_major_formatter(LogFormatter())
+            panel.xaxis.set_minor_formatter(LogFormatter(minor_thresholds=(1, 0.4)))
+            panel.set_title(f"{scene}, antialiasing {'on' if antialiasing else 'off'}")
+            panel.grid(alpha=0.3)
+        panels[row][0].set_ylabel("error against the float64 oracle, on a small scene")
+    for panel, (splats, width, height) in zip(panels[1], sizes.values(), strict=True):
+        panel.set_xlabel(f"ms, forward + backward, {splats:,} splats at {width}x{height}")
+    kernels = dict.fromkeys(r["kernel"] for r in records)
+    handles = [Line2D([], [], color=COLORS[kernel], linewidth=4, label=kernel) for kernel in kernels]
+    handles += [
+        Line2D([], [], color="gray", marker="o", linestyle="", label="fast exponential"),
+        Line2D([], [], color="gray", marker="o", markerfacecolor="white", linestyle="", label="exact exponential"),
+        Line2D([], [], color="gray", marker="_", linestyle="", label="median, unless 0 (above it: largest)"),
+    ]
+    handles += [
+        Line2D([], [], color="black", marker=marker, linestyle="", label=name) for name, marker in MARKERS.items()
+    ]
+    figure.legend(handles=handles, loc="outside lower center", ncols=7)
+    figure.suptitle("Error against run time of the rasterizer\n" + "\n".join(measured["machines"]), fontsize=10)
+    with atomic_write(path) as temporary:
+        figure.savefig(temporary, dpi=110)
+
+
+def _draw_record(panel, record: dict, apart: float) -> None:
+    """The quantities side by side (times `apart`) around the run's time, each from its median to its largest error."""
+    color = COLORS[record["kernel"]]
+    face = color if record["exponential"] == "fast" else "white"
+    for i, (name, marker) in enumerate(MARKERS.items()):
+        x = record["milliseconds"] * apart ** (i - (len(MARKERS) - 1) / 2)
+        largest, median = record["errors"][name]
+        if median > 0:
+            panel.plot([x, x], [median, largest], color=color, linewidth=0.6, alpha=0.5)
+            panel.plot(x, median, marker="_", color=color, markersize=5)
+        panel.plot(x, largest, marker=marker, color=color, markerfacecolor=face, markersize=5, linestyle="")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("measured", type=Path, help="what accuracy.py --json wrote")
+    parser.add_argument("figure", type=Path, help="the picture to write")
+    args = parser.parse_args()
+    draw(json.loads(args.measured.read_text()), args.figure)
+
+
+if __name__ == "__main__":
+    run_cli(main)

@@ -1,0 +1,115 @@
+"""Along needles, by length: error of the exponent, and of the 2D covariance's gradient with the splats taken as exact.
+
+The exponent, log2 of alpha, is read off the rendered transmittance of one needle at a time, so what a user sees; judge
+is the oracle. Of the gradient this leaves out what rounding of the inputs has done before: the float32 splats that
+`project` made are the truth, judge is autograd in float64 on the definition, with those means and covariances.
+"""
+
+import math
+from typing import NamedTuple
+
+import torch
+from diff_gaussian_rasterization import rasterize, reference
+from torch import Tensor
+
+from benchmarks.workloads import textbook
+from benchmarks.workloads.stability_cases import long_needles
+
+_OPS = torch.ops.diff_gaussian_rasterization
+_HALF_LOG2E = 0.5 / math.log(2)
+
+
+class NeedleError(NamedTuple):
+    """Ours and the textbook's in float32, needles of sigma low to high px."""
+
+    low: float
+    high: float
+    exponent: float  # largest, log2 units
+    textbook_exponent: float
+    gradient: float  # median over needles of |difference| / |reference| of (xx, xy, yy)
+    textbook_gradient: float
+
+
+def needle_error(low: float, high: float, count: int = 20) -> NeedleError:
+    make, camera = long_needles(count, low, high)
+    parameters = make(torch.Generator().manual_seed(int(low)))
+    exponents = [_exponents(parameters, camera, f) for f in (reference.render, rasterize, textbook.render)]
+    wanted, ours, theirs = exponents
+    # Where alpha is neither near a cut nor so near 1 that 1 - T has lost it; what 1 - T rounds is 1e-5 at 0.01.
+    seen = (wanted > math.log2(0.01)) & (wanted < math.log2(0.97))
+    largest = [float((e - wanted)[seen].abs().nan_to_num(nan=math.inf, posinf=math.inf).max()) for e in (ours, theirs)]
+    return NeedleError(low, high, *largest, *_gradient_errors(parameters, camera))
+
+
+def _exponents(parameters: dict[str, Tensor], camera, render) -> Tensor:
+    """(n, H, W) float64 log2 alpha of each needle alone; -inf where it is not blended."""
+    rows = []
+    for i in range(len(parameters["means"])):
+        one = {name: t[i : i + 1] for name, t in parameters.items()}
+        means, opacities = one.pop("means"), one.pop("opacities")
+        wanted = {"want_transmittance": True} if render is rasterize else {}
+        out = render(means, torch.zeros_like(means), opacities, camera, raw=True, **one, **wanted)
+        rows.append(torch.log2(1 - out.transmittance[0].double()))
+    return torch.stack(rows)
+
+
+def _gradient_errors(parameters: dict[str, Tensor], camera) -> tuple[float, float]:
+    height, width = camera.image_height, camera.image_width
+    names = ("means", "opacities", "scales", "rotations", "cov3d", "colors", "sh_dc", "sh_rest")
+    settings = (camera.viewmatrix, camera.projmatrix, camera.campos, camera.tanfovx, camera.tanfovy, height, width)
+    splats, depths, rects, counts, _ = _OPS.project(*(parameters.get(n) for n in names), *settings, 3, 1.0, False, True)
+    order = torch.argsort(torch.where(counts > 0, depths, math.inf), stable=True)[: int((counts > 0).sum())]
+    l11, l12, l22 = splats[order, 2:5].double().unbind(1)
+    xx, xy, yy = 1 / l11**2 + (l12 / (l11 * l22)) ** 2, -l12 / (l11 * l22**2), 1 / l22**2
+    covariance = _HALF_LOG2E * torch.stack([xx, xy, yy], 1)
+    wanted, weights = _definition(splats[order].double(), covariance, height, width)
+
+    instances, ranges, *slots = _OPS.bin(splats, depths, rects, counts, height, width, True)
+    background = torch.zeros(3)
+    _, transmittance, _, last = _OPS.blend(splats, instances, ranges, background, height, width, False, True)
+    state = (splats, instances, ranges, *slots, background, last, transmittance)
+    quu, quv, qvv = _OPS.blend_vjp(*state, weights.float(), None, None)[order, 3:6].double().unbind(1)
+    uu, uv = quu * l11, quv * l11  # the gradient of a symmetric matrix, 2 ln2^2 L^T W2 L, xy standing for two entries
+    vu, vv = quu * l12 + quv * l22, quv * l12 + qvv * l22
+    ours = 2 * math.log(2) ** 2 * torch.stack([l11 * uu, 2 * (l12 * uu + l22 * uv), l12 * vu + l22 * vv], 1)
+
+    rounded = covariance.float()
+    reference_of_theirs, _ = _definition(splats[order].double(), rounded.double(), height, width, weights)
+    theirs, _ = _definition(splats[order], rounded, height, width, weights)
+    return _median_error(ours, wanted), _median_error(theirs, reference_of_theirs)
+
+
+def _definition(
+    rows: Tensor, covariance: Tensor, height: int, width: int, weights: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
+    """The gradient of covariances (n, 3) xx xy yy for a weighted sum of the image of splats in depth order, with the
+    conic by the textbook, in their dtype; and the weights (3, H, W), random but 0 near a cut-off."""
+    leaf = covariance.clone().requires_grad_()
+    a, b, c = leaf.unbind(1)
+    det = a * c - b * b
+    dx = torch.arange(width).to(rows) - rows[:, 0, None, None]
+    dy = torch.arange(height).to(rows)[:, None] - rows[:, 1, None, None]
+    conic = [(v / det)[:, None, None] for v in (c, -b, a)]
+    power = -0.5 * (conic[0] * dx * dx + conic[2] * dy * dy) - conic[1] * dx * dy
+    alpha = torch.exp2(rows[:, 5, None, None]) * torch.exp(power)
+    reached = (alpha >= 1 / 255) & (power <= 0)
+    after = torch.cumprod(1 - torch.where(reached, alpha.clamp(max=0.99), 0.0), 0)
+    before = torch.cat([torch.ones_like(after[:1]), after[:-1]])
+    image = torch.einsum("nhw,nc->chw", torch.where(reached, alpha.clamp(max=0.99), 0.0) * before, rows[:, 6:9])
+    if weights is None:
+        near = ((alpha * 255 - 1).abs() < 1e-2) | (alpha > 0.98) | (after < 2e-4)
+        generator = torch.Generator().manual_seed(9)
+        weights = torch.randn(3, height, width, generator=generator, dtype=torch.float64) * ~near.any(0)
+    (image * weights.to(image)).sum().backward()
+    return leaf.grad, weights
+
+
+def _median_error(got: Tensor, wanted: Tensor) -> float:
+    wanted = wanted.double()
+    size = wanted.norm(dim=1)
+    counted = size > 1e-6 * size.max()
+    errors = (got.double() - wanted).norm(dim=1)[counted] / size[counted]
+    return float(errors.nan_to_num(nan=math.inf, posinf=math.inf).median())
+
+
+LENGTHS = ((30.0, 100.0), (100.0, 300.0), (300.0, 1000.0), (1000.0, 2000.0))

@@ -1,0 +1,89 @@
+"""What a training and a rendering leave alone when they do not need it: modules, sockets, files, test pictures.
+
+    python -m benchmarks.costs.probe FOLDER
+
+makes a small Blender scene in FOLDER, trains on it for 3 iterations and renders it, and prints what it saw as JSON.
+"""
+
+import argparse
+import json
+import math
+import sys
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image, ImageFile
+
+MODULES = ("pycolmap", "matplotlib", "tensorboard", "torch.utils.tensorboard", "socketserver", "lpips", "skimage")
+SIZE = 32
+
+
+def make_scene(folder: Path) -> None:
+    """Write 4 training and 2 test frames, RGBA and opaque, with cameras on a circle of radius 4."""
+    rng = np.random.default_rng(0)
+    for split, count in (("train", 4), ("test", 2)):
+        (folder / split).mkdir(parents=True)
+        frames = []
+        for index in range(count):
+            pixels = rng.integers(0, 256, (SIZE, SIZE, 4), dtype=np.uint8)
+            pixels[..., 3] = 255
+            Image.fromarray(pixels).save(folder / split / f"r_{index}.png")
+            angle = 2 * math.pi * index / count
+            right, up, back = (math.cos(angle), math.sin(angle), 0), (0, 0, 1), (math.sin(angle), -math.cos(angle), 0)
+            pose = np.eye(4)
+            pose[:3] = np.column_stack([right, up, back, 4 * np.array(back)])
+            frames.append({"file_path": f"./{split}/r_{index}", "transform_matrix": pose.tolist()})
+        content = {"camera_angle_x": 0.7, "frames": frames}
+        (folder / f"transforms_{split}.json").write_text(json.dumps(content))
+
+
+def probe(folder: Path) -> dict:
+    """`modules` loaded of MODULES, `binds`: sockets bound, `files` written, `decoded` pictures by their path, and
+    `picture_bytes`: the memory behind each training picture, of `values` colour values."""
+    scene, model = folder / "scene", folder / "model"
+    make_scene(scene)
+    binds, decoded = [], []
+    sys.addaudithook(lambda event, args: binds.append(str(args[1])) if event == "socket.bind" else None)
+    load = ImageFile.ImageFile.load
+
+    def counting(image: ImageFile.ImageFile) -> object:
+        if image.tile:  # not decoded yet
+            decoded.append(str(Path(image.filename).relative_to(scene)))
+        return load(image)
+
+    ImageFile.ImageFile.load = counting
+    import train
+    from scene import Scene
+
+    made: list[Scene] = []
+    plain = Scene.__init__
+
+    def keeping(self: Scene, *args: object, **options: object) -> None:
+        made.append(self)
+        plain(self, *args, **options)
+
+    Scene.__init__ = keeping
+    arguments = ["-s", str(scene), "-m", str(model), "--eval", "-r", "2", "--iterations", "3"]
+    train.main([*arguments, "--test_iterations", "-1", "--no_curve", "--disable_viewer", "--quiet"])
+    import render
+
+    decoded_in_training = sorted(set(decoded))
+    sys.argv = ["render.py", "-m", str(model), "--skip_train", "--skip_test", "--quiet"]
+    render.main()
+    pictures = [camera.target(torch.zeros(3)) for camera in made[0].getTrainCameras()]
+    return {
+        "modules": [name for name in MODULES if name in sys.modules],
+        "binds": binds,
+        "files": sorted(str(file.relative_to(model)) for file in model.rglob("*") if file.is_file()),
+        "decoded": decoded_in_training,
+        "picture_bytes": [picture.untyped_storage().nbytes() for picture in pictures],
+        "values": 3 * (SIZE // 2) ** 2,
+    }
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description="Train and render a small scene; what that loads and writes, as JSON.")
+    parser.add_argument("folder", type=Path, help="folder for the scene and the model; it is made")
+    folder = parser.parse_args().folder
+    print(json.dumps(probe(folder)), file=sys.__stdout__)  # --quiet has silenced sys.stdout

@@ -1,0 +1,89 @@
+"""The rasterizer's calls on one scene, as training makes them, ready to be timed."""
+
+from collections.abc import Callable
+
+import torch
+from diff_gaussian_rasterization import rasterize
+from torch import Tensor
+
+from benchmarks.workloads.splat_scenes import PARAMETERS, SplatScene
+
+OPS = torch.ops.diff_gaussian_rasterization
+
+
+class Calls:
+    """Forward alone, with backward, and with a dense Adam step; parameters raw, as they are optimised."""
+
+    def __init__(self, scene: SplatScene, dtype: torch.dtype = torch.float32, antialiasing: bool = False) -> None:
+        self.scene = scene
+        self.leaves = scene.leaves(dtype)
+        self.settings = scene.settings(dtype, antialiasing=antialiasing)
+        self.means2d = torch.zeros_like(self.leaves["means"], requires_grad=True)
+        self.gradient = image_gradient(scene).to(dtype)
+        self._moments: list[list[Tensor]] = []
+
+    def render(self) -> Tensor:
+        """(3, H, W)"""
+        named = {name: self.leaves[name] for name in ("scales", "rotations", "sh_dc", "sh_rest")}
+        means, opacities = self.leaves["means"], self.leaves["opacities"]
+        return rasterize(means, self.means2d, opacities, self.settings, raw=True, **named).color
+
+    @torch.no_grad()
+    def forward(self) -> Tensor:
+        return self.render()
+
+    def with_backward(self) -> None:
+        self.clear()
+        self.render().backward(self.gradient)
+
+    def step(self) -> None:
+        """The learning rate is 0: the arithmetic of a step, and the same scene after it."""
+        self.with_backward()
+        if not self._moments:
+            self._moments = [[torch.zeros_like(t) for t in self.leaves.values()] for _ in range(2)]
+        values = list(self.leaves.values())
+        counters, n = [torch.zeros(()) for _ in values], len(values)
+        with torch.no_grad():
+            gradients = [t.grad for t in values]
+            OPS.adam_(values, gradients, *self._moments, counters, [0.0] * n, 0.9, 0.999, 1e-15, [-1] * n)
+
+    def clear(self) -> None:
+        """Drop the gradients, as zero_grad(set_to_none=True) does."""
+        for t in (self.means2d, *self.leaves.values()):
+            t.grad = None
+
+    def steps(self) -> dict[str, Callable[[], object]]:
+        return {"forward": self.forward, "+ backward": self.with_backward, "step": self.step}
+
+
+class Stages:
+    """The ops of one forward and backward, each by itself."""
+
+    @torch.no_grad()
+    def __init__(self, scene: SplatScene) -> None:
+        settings, size = scene.settings(torch.float32), (scene.height, scene.width)
+        camera = (settings.viewmatrix, settings.projmatrix, settings.campos, settings.tanfovx, settings.tanfovy)
+        inputs = [scene.parameters[name] for name in PARAMETERS]
+        arguments = (*inputs[:4], None, None, *inputs[4:], *camera, *size, settings.sh_degree, 1.0, False, True)
+        wanted = [True] * 5 + [False] * 2 + [True] * 2
+        projected = OPS.project(*arguments)
+        self.splats, counts = projected[0], projected[3]
+        self.instances, self.ranges, *slots = OPS.bin(*projected[:4], *size, True)
+        blend = (self.splats, self.instances, self.ranges, settings.bg, *size, False)
+        _, transmittance, _, self.last = OPS.blend(*blend, True)
+        state = (self.splats, self.instances, self.ranges, *slots, settings.bg, self.last)
+        state += (transmittance, image_gradient(scene), None, None)
+        moments = OPS.blend_vjp(*state)
+        self.calls: dict[str, Callable[[], object]] = {
+            "project": lambda: OPS.project(*arguments),
+            "bin": lambda: OPS.bin(*projected[:4], *size, True),
+            "blend": lambda: OPS.blend(*blend, False),
+            "blend_vjp": lambda: OPS.blend_vjp(*state),
+            "project_vjp": lambda: OPS.project_vjp(*arguments, counts, moments, wanted),
+        }
+
+
+def image_gradient(scene: SplatScene) -> Tensor:
+    """(3, H, W), normal numbers: what a loss would send back."""
+    g = torch.Generator().manual_seed(0)
+    return torch.randn(3, scene.height, scene.width, generator=g).to(scene.parameters["means"].device)

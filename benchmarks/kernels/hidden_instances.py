@@ -1,0 +1,66 @@
+"""How much of what a model's views bin is hidden: instances (a splat in a tile) behind where the tile is opaque.
+
+    python -m benchmarks.kernels.hidden_instances -m MODEL [--iteration N]
+
+Of each training view: the instances, those that the backward looks at ("processed": up to the last that a pixel of the
+tile blends), and the splats that have one of these. What is left is what a depth cut-off per tile could save at most.
+Medians over the views.
+"""
+
+import math
+from statistics import median
+
+import torch
+from tqdm import tqdm
+
+from arguments import ModelParams, OptionParser, get_combined_args
+from benchmarks.harness.environment import describe, print_table
+from benchmarks.kernels.fragments import processed_per_tile
+from scene.cameras import Camera
+from scene.gaussian_model import GaussianModel
+from scene.saved_model import load_saved
+from utils.system_utils import compute_device, run_cli
+
+
+def counts(camera: Camera, model: GaussianModel) -> dict[str, int]:
+    """Of one view: splats and instances listed, and those of them that are processed."""
+    size = camera.image_height, camera.image_width
+    shapes = model.get_xyz, model._opacity, model._scaling, model._rotation, None
+    colors = None, model.get_features_dc, model.get_features_rest
+    view = camera.world_view_transform, camera.full_proj_transform, camera.camera_center
+    tangents = math.tan(camera.FoVx / 2), math.tan(camera.FoVy / 2)
+    options = model.active_sh_degree, 1.0, False, True
+    background = model.get_xyz.new_zeros(3)
+    arguments = (*shapes, *colors, *view, *tangents, *size, *options, background, False, True)
+    out = torch.ops.diff_gaussian_rasterization.rasterize(model.get_xyz, *arguments)
+    _, _, _, _, _, tile_counts, instances, ranges, _, _, last = out
+    processed = processed_per_tile(last)
+    tile = torch.repeat_interleave(torch.arange(len(processed), device=ranges.device), ranges.diff())
+    behind = torch.arange(len(instances), device=ranges.device) - ranges[tile] >= processed[tile]
+    return {
+        "splats": int((tile_counts > 0).sum()),
+        "splats processed": len(instances[~behind].unique()),
+        "instances": len(instances),
+        "instances processed": int(processed.sum()),
+    }
+
+
+@torch.no_grad()
+def main() -> None:
+    parser = OptionParser(description=__doc__.splitlines()[0])
+    model_params = ModelParams(parser, sentinel=True)
+    parser.add_argument("--iteration", type=int, default=-1, help="saved iteration to look at (-1: the highest)")
+    args = get_combined_args(parser)
+    print(describe(compute_device()))
+    scene = load_saved(model_params.extract(args), args.iteration, args.typed_sh_degree)
+    views = [counts(camera, scene.gaussians) for camera in tqdm(scene.getTrainCameras(), unit="view")]
+    totals = {name: median(view[name] for view in views) for name in views[0]}
+    rows = [
+        [what, f"{totals[what]:,.0f}", f"{median(v[f'{what} processed'] / max(v[what], 1) for v in views):.3f}"]
+        for what in ("splats", "instances")
+    ]
+    print_table([f"{scene.model_path}, {len(scene.gaussians):,} Gaussians", "a view lists", "processed"], rows)
+
+
+if __name__ == "__main__":
+    run_cli(main)

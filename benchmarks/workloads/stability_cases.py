@@ -1,0 +1,554 @@
+"""Every stiff and extreme case that the rasterizer is held to: scene, camera, the largest error allowed and why.
+
+Each scene is an ordinary one with some Gaussians of the case's kind in it, the stiff part; where the camera is what is
+extreme, all of it is. benchmarks/accuracy/stability.py measures the cases, tests/test_stability.py holds them to their
+bounds.
+"""
+
+import math
+import zlib
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from diff_gaussian_rasterization import GaussianRasterizationSettings
+from torch import Generator, Tensor
+
+from benchmarks.workloads.splat_scenes import PARAMETERS, frustum, settings
+
+WIDTH, HEIGHT = 75, 53  # no multiple of the tile
+ORDINARY = 40  # Gaussians
+Parameters = dict[str, Tensor]
+
+
+@dataclass(frozen=True)
+class Problem:
+    """One case, made."""
+
+    parameters: Parameters  # raw, float32 (cov3d and the like: see `raw`)
+    camera: GaussianRasterizationSettings  # float64
+    stiff: Tensor  # (N,) bool
+    absent: Tensor  # (N,) bool: not finite, so everything must be as if they were not there
+    raw: bool = True
+
+
+@dataclass(frozen=True)
+class Bound:
+    """Largest errors allowed of CPU float32, as stability.py defines them, and the reason in a sentence."""
+
+    image: float
+    gradient: float
+    reason: str
+    median: float | None = None  # of the gradients of single Gaussians, where those differ in size
+
+
+@dataclass(frozen=True)
+class Case:
+    group: str
+    name: str
+    make: Callable[[Generator], Problem]
+    bound: Bound
+    double: float = 1e-12  # largest error allowed of CPU float64, of anything
+    cut: float = 1e-4  # pixels this near to a cut-off (relative) don't count
+
+    def problem(self) -> Problem:
+        return self.make(Generator().manual_seed(zlib.crc32(self.name.encode())))
+
+
+# ---- scenes ----
+
+
+def camera(width: int = WIDTH, height: int = HEIGHT, **changes) -> GaussianRasterizationSettings:
+    """A pinhole camera in float64; `changes` as those of `settings`."""
+    return settings(width, height, **changes)
+
+
+def normal(g: Generator, *shape: int) -> Tensor:
+    return torch.randn(*shape, generator=g, dtype=torch.float64)
+
+
+def uniform(g: Generator, low: float, high: float, *shape: int) -> Tensor:
+    return low + (high - low) * torch.rand(*shape, generator=g, dtype=torch.float64)
+
+
+def placed(pixel: Tensor, depth: Tensor, cam: GaussianRasterizationSettings) -> Tensor:
+    """Means (n, 3) in the view's frame that show at pixels (n, 2) at depths (n,)."""
+    size = torch.tensor([cam.image_width, cam.image_height], dtype=torch.float64)
+    ndc = (2 * pixel + 1) / size - 1
+    ray = ndc * torch.tensor([cam.tanfovx, cam.tanfovy])
+    return torch.cat([ray, torch.ones_like(ray[:, :1])], 1) * depth[:, None]
+
+
+def splats(
+    g: Generator,
+    n: int,
+    *,
+    sigma: Tensor | float = 3.0,
+    scales: Tensor | None = None,
+    means: Tensor | None = None,
+    rotations: Tensor | None = None,
+    logits: Tensor | None = None,
+    cam: GaussianRasterizationSettings | None = None,
+) -> Parameters:
+    """n Gaussians over the image at depths 2 to 6: sigma in px, (n, 3) or the middle of random ones, or scales in
+    world units; what is not given is random."""
+    cam = cam or camera()
+    if means is None:
+        size = torch.tensor([cam.image_width, cam.image_height])
+        means = placed(uniform(g, 0, 1, n, 2) * size, uniform(g, 2, 6, n), cam)
+    if scales is None:
+        if not isinstance(sigma, Tensor):
+            sigma = sigma * normal(g, n, 3).mul(0.4).exp()
+        scales = sigma * means[:, 2:].abs() * (2 * cam.tanfovx / cam.image_width)
+    logits = normal(g, n, 1) if logits is None else logits.reshape(n, 1)
+    made = {
+        "means": means,
+        "opacities": logits,
+        "scales": torch.log(scales.double()).expand(n, 3),
+        "rotations": normal(g, n, 4) if rotations is None else rotations,
+        "sh_dc": 0.8 * normal(g, n, 1, 3),
+        "sh_rest": 0.1 * normal(g, n, 15, 3),
+    }
+    return {name: t.float().contiguous() for name, t in made.items()}
+
+
+def among_ordinary(
+    stiff: Parameters, cam: GaussianRasterizationSettings | None = None, absent: Tensor | None = None
+) -> Problem:
+    """The stiff Gaussians after ordinary ones."""
+    ordinary = frustum(ORDINARY, WIDTH, HEIGHT, 3.0, seed=1).parameters
+    n = len(stiff["means"])
+    is_stiff = torch.cat([torch.zeros(ORDINARY, dtype=torch.bool), torch.ones(n, dtype=torch.bool)])
+    is_absent = torch.zeros(ORDINARY + n, dtype=torch.bool)
+    if absent is not None:
+        is_absent[ORDINARY:] = absent
+    parameters = {name: torch.cat([ordinary[name], stiff[name]]) for name in PARAMETERS}
+    return Problem(parameters, cam or camera(), is_stiff, is_absent)
+
+
+def all_stiff(parameters: Parameters, cam: GaussianRasterizationSettings, raw: bool = True) -> Problem:
+    n = len(parameters["means"])
+    return Problem(parameters, cam, torch.ones(n, dtype=torch.bool), torch.zeros(n, dtype=torch.bool), raw)
+
+
+ANTIALIASED = camera(antialiasing=True)
+
+
+def axes(n: int, *sigma: float) -> Tensor:
+    return torch.tensor(sigma, dtype=torch.float64).expand(n, 3)
+
+
+# ---- bounds that many cases share ----
+
+PLAIN = Bound(5e-6, 1e-5, "sums of some 50 terms, each rounded a few times; nothing about the case adds to it")
+STEEP = Bound(
+    5e-6, 3e-5, "flanks of half a pixel: one rounding of the mean, 4e-6 px, is as much of u; times few pixels' signs"
+)
+LONG = Bound(
+    3e-4, 3e-3, "a needle turned by one rounding of its quaternion moves its end by 1e-4 px: conditioning", median=2e-4
+)
+NOTHING = Bound(1e-7, 0, "the background, rounded to float32")
+ABSENT = Bound(5e-6, 0, "as if the Gaussian were not there")
+
+# ---- shape ----
+
+
+def needles(ratio: float, cam: GaussianRasterizationSettings | None = None) -> Callable[[Generator], Problem]:
+    return lambda g: among_ordinary(splats(g, 30, sigma=axes(30, 30, 30 / ratio, 30 / ratio)), cam)
+
+
+def pancakes(ratio: float, cam: GaussianRasterizationSettings | None = None) -> Callable[[Generator], Problem]:
+    return lambda g: among_ordinary(splats(g, 30, sigma=axes(30, 30, 30, 30 / ratio)), cam)
+
+
+def turn_x_to(direction: Tensor) -> Tensor:
+    """Quaternions (n, 4) that turn the first axis to unit directions (n, 3)."""
+    x = torch.tensor([1.0, 0, 0], dtype=torch.float64).expand_as(direction)
+    return torch.cat([1 + direction[:, :1], torch.linalg.cross(x, direction)], 1)
+
+
+def long_needles(
+    n: int, low: float, high: float, width_px: tuple[float, float] = (1e-3, 3)
+) -> tuple[Callable[[Generator], Parameters], GaussianRasterizationSettings]:
+    """Needles of sigma low to high px, parallel to the image but for a hundredth; the image sees any part of them
+    within 2.5 sigma."""
+    cam = camera(128, 96)
+
+    def make(g: Generator) -> Parameters:
+        length = low * (high / low) ** uniform(g, 0, 1, n)
+        thin = width_px[0] * (width_px[1] / width_px[0]) ** uniform(g, 0, 1, n, 2)
+        angle = uniform(g, 0, 2 * math.pi, n)
+        across = torch.stack([angle.cos(), angle.sin()], 1)
+        pixel = uniform(g, 0.1, 0.9, n, 2) * torch.tensor([cam.image_width, cam.image_height])
+        pixel = pixel - (uniform(g, -2.5, 2.5, n) * length)[:, None] * across
+        direction = torch.nn.functional.normalize(torch.cat([across, 0.01 * normal(g, n, 1)], 1))
+        means = placed(pixel, uniform(g, 2, 6, n), cam)
+        sigma = torch.cat([length[:, None], thin], 1)
+        return splats(g, n, sigma=sigma, means=means, rotations=turn_x_to(direction), cam=cam)
+
+    return make, cam
+
+
+def needles_of(low: float, high: float) -> Callable[[Generator], Problem]:
+    make, cam = long_needles(30, low, high)
+    return lambda g: all_stiff(make(g), cam)
+
+
+def needles_as_covariances(g: Generator) -> Problem:
+    make, cam = long_needles(30, 100, 1000)
+    raw = make(g)
+    w, x, y, z = torch.nn.functional.normalize(raw["rotations"].double()).unbind(1)
+    rows = [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)]
+    rows += [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)]
+    rows += [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]
+    m = torch.stack(rows, -1).reshape(-1, 3, 3) * raw["scales"].double().exp()[:, None, :]
+    full = (m @ m.mT)[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
+    given = {"means": raw["means"], "opacities": raw["opacities"].sigmoid(), "cov3d": full.float()}
+    return all_stiff(given | {"colors": uniform(g, 0, 1, 30, 3).float()}, cam, raw=False)
+
+
+def edge_on(cam: GaussianRasterizationSettings) -> Callable[[Generator], Problem]:
+    """Pancakes whose plane goes through the camera: their undilated determinant is that of a line."""
+
+    def make(g: Generator) -> Problem:
+        n = 30
+        means = placed(uniform(g, 0, 1, n, 2) * torch.tensor([WIDTH, HEIGHT]), uniform(g, 2, 6, n), camera())
+        thin = torch.nn.functional.normalize(torch.linalg.cross(means, normal(g, n, 3)))
+        return among_ordinary(
+            splats(g, n, sigma=axes(n, 1e-3, 20, 20), means=means, rotations=turn_x_to(thin), cam=cam), cam
+        )
+
+    return make
+
+
+def sized(sigma: float = 1.0, world: float | None = None, faint: float = 0.0) -> Callable[[Generator], Problem]:
+    def make(g: Generator) -> Problem:
+        scales = None if world is None else world * normal(g, 30, 3).mul(0.4).exp()
+        return among_ordinary(splats(g, 30, sigma=sigma, scales=scales, logits=normal(g, 30) - faint))
+
+    return make
+
+
+def round_ones(g: Generator) -> Problem:
+    return among_ordinary(splats(g, 30, sigma=axes(30, 4, 4, 4)))
+
+
+SHAPE = [
+    *(Case("shape", f"needles, axes 1 : {ratio:.0e}", needles(ratio), STEEP) for ratio in (1e2, 1e4, 1e7)),
+    *(Case("shape", f"pancakes, axes 1 : {ratio:.0e}", pancakes(ratio), PLAIN) for ratio in (1e2, 1e4, 1e7)),
+    Case("shape", "needles 1 : 1e+07, antialiased", needles(1e7, ANTIALIASED), STEEP),
+    Case("shape", "pancakes 1 : 1e+04, antialiased", pancakes(1e4, ANTIALIASED), PLAIN),
+    Case("shape", "pancakes edge-on, antialiased", edge_on(ANTIALIASED), STEEP),
+    Case("shape", "scales of 1e-10", sized(world=1e-10), STEEP),
+    Case("shape", "scales of 1e6", sized(world=1e6, faint=2), PLAIN),
+    Case("shape", "three equal scales", round_ones, PLAIN),
+    Case("shape", "a thousandth of a pixel", sized(sigma=1e-3), STEEP),
+    Case("shape", "a thousand images wide", sized(sigma=1e3 * WIDTH, faint=2), PLAIN),
+    Case("shape", "needles of 300 to 2,000 px", needles_of(300, 2000), LONG, double=1e-11, cut=2e-3),
+    Case("shape", "conics of condition 1e7", needles_of(1700, 1760), LONG, double=1e-11, cut=2e-3),
+    Case(
+        "shape",
+        "needles of 1e4 to 1e6 px",
+        needles_of(1e4, 1e6),
+        Bound(1e-2, 6e-2, "as above, a hundred times longer; what is thinner than its end's rounding is mostly cut"),
+        double=1e-10,
+        cut=0.1,
+    ),
+    Case(
+        "shape",
+        "needles of 100 to 1,000 px as covariances",
+        needles_as_covariances,
+        Bound(
+            2e-2,
+            4e-2,
+            "a float32 covariance does not hold a needle: rounding moved short axes by 0.06 px^2; those that became "
+            "negative are taken as 0 (in float64 too); one more rounding of the input does as much",
+        ),
+        double=2e-2,
+        cut=2e-3,
+    ),
+]
+
+# ---- place ----
+
+
+def at_depths(*depths: float) -> Callable[[Generator], Problem]:
+    def make(g: Generator) -> Problem:
+        z = torch.tensor(depths).double().repeat_interleave(4)
+        n = len(z)
+        means = placed(uniform(g, 0, 1, n, 2) * torch.tensor([WIDTH, HEIGHT]), z, camera())
+        return among_ordinary(splats(g, n, means=means))
+
+    return make
+
+
+def at_rays(low: float, high: float, depth: tuple[float, float], size: float) -> Callable[[Generator], Problem]:
+    """Means at low to high half images from the axis, in a random direction; scales are `size` times their distance
+    from the axis."""
+
+    def make(g: Generator) -> Problem:
+        n = 24
+        off = low * (high / low) ** uniform(g, 0, 1, n)
+        angle = uniform(g, 0, 2 * math.pi, n)
+        cam = camera()
+        z = uniform(g, *depth, n)
+        ray = torch.stack([off * angle.cos() * cam.tanfovx, off * angle.sin() * cam.tanfovy], 1)
+        means = torch.cat([ray * z[:, None], z[:, None]], 1)
+        scales = size * ray.norm(dim=1, keepdim=True) * z[:, None] * normal(g, n, 3).mul(0.3).exp()
+        return among_ordinary(splats(g, n, means=means, scales=scales))
+
+    return make
+
+
+def at_the_clamp(g: Generator) -> Problem:
+    """Rays at 1.3 half images, as near as a float and either side by 1e-5 and 1e-2."""
+    cam = camera()
+    by = torch.tensor([1 - 1e-2, 1 - 1e-5, 1 + 1e-5, 1 + 1e-2]).double().repeat_interleave(8)
+    n = len(by)
+    z = uniform(g, 2, 6, n)
+    sign = torch.where(torch.rand(n, generator=g) < 0.5, -1.0, 1.0)
+    clamped, free = 1.3 * by * sign, uniform(g, -1.2, 1.2, n)
+    horizontal = torch.arange(n) % 2 == 0
+    ray_x = torch.where(horizontal, clamped, free) * cam.tanfovx
+    ray_y = torch.where(horizontal, free, clamped) * cam.tanfovy
+    means = torch.stack([ray_x * z, ray_y * z, z], 1)
+    return among_ordinary(splats(g, n, sigma=12.0, means=means))
+
+
+def far_from_the_origin(g: Generator) -> Problem:
+    """World and camera moved to coordinates of a map projection, unshifted."""
+    made = splats(g, 40)
+    offset = torch.tensor([5e5, 4e6, 300.0], dtype=torch.float64)
+    view = torch.eye(4, dtype=torch.float64)
+    view[:3, 3] = -offset
+    return all_stiff(made | {"means": (made["means"].double() + offset).float()}, camera(view=view))
+
+
+def in_the_dark(g: Generator) -> Problem:
+    """Behind the camera, in its plane, on it, and a thousandth of a unit around it: all culled."""
+    means = torch.cat([normal(g, 8, 3) * 1e-3, normal(g, 8, 3), torch.zeros(2, 3, dtype=torch.float64)])
+    means[8:16, 2] = -means[8:16, 2].abs()
+    means[12:16, 2] = 0
+    return among_ordinary(splats(g, len(means), means=means, scales=torch.full((len(means), 3), 0.1)))
+
+
+def nextafter(value: float, steps: int) -> float:
+    t = torch.tensor(value)
+    for _ in range(abs(steps)):
+        t = torch.nextafter(t, torch.tensor(math.copysign(math.inf, steps)))
+    return float(t)
+
+
+PLACE = [
+    Case(
+        "place",
+        "at the near plane",
+        at_depths(0.19999, nextafter(0.2, -1), nextafter(0.2, 1), nextafter(0.2, 2), 0.20001, 0.201, 0.25),
+        PLAIN,
+    ),
+    Case("place", "behind, on and around the camera", in_the_dark, ABSENT),
+    Case("place", "1e7 units away", at_depths(1e5, 1e6, 1e7), PLAIN),
+    Case(
+        "place",
+        "1e6 units from the origin",
+        far_from_the_origin,
+        Bound(
+            5e-6, 1e-5, "differences of coordinates are exact while the camera is not turned; one rounding is the image"
+        ),
+        double=1e-8,
+    ),
+    Case("place", "at the limit of the Jacobian's ray", at_the_clamp, PLAIN),
+    Case("place", "3 to 1,000 half images aside", at_rays(3, 1e3, (1, 4), 0.5), PLAIN),
+    Case("place", "beside and above the camera", at_rays(20, 200, (0.2001, 0.22), 0.5), PLAIN),
+]
+
+# ---- opacity and blending ----
+
+
+def with_logits(logits: Tensor) -> Callable[[Generator], Problem]:
+    return lambda g: among_ordinary(splats(g, len(logits), sigma=4.0, logits=logits.double()))
+
+
+def at_alpha(alpha: float) -> Callable[[Generator], Problem]:
+    """The alpha at a pixel's centre is `alpha` within ulps: opacities are given as they are."""
+
+    def make(g: Generator) -> Problem:
+        problem = among_ordinary(splats(g, 17, sigma=4.0))
+        p = dict(problem.parameters)
+        pixel = torch.stack([4 + 4 * torch.arange(17), 3 + 3 * torch.arange(17) % 50], 1).double()
+        p["means"][ORDINARY:] = placed(pixel, uniform(g, 2, 6, 17), problem.camera).float()
+        p["opacities"] = p["opacities"].sigmoid()
+        p["opacities"][ORDINARY:, 0] = torch.tensor([nextafter(alpha, k) for k in range(-8, 9)])
+        p["scales"] = p["scales"].exp()
+        p["rotations"] = torch.nn.functional.normalize(p["rotations"])
+        return Problem(p, problem.camera, problem.stiff, problem.absent, raw=False)
+
+    return make
+
+
+def one_pixel_stack(g: Generator) -> Problem:
+    """50,000 wide splats over one pixel, each a little over 1/255: some 2,300 of them blend."""
+    n = 50_000
+    cam = camera(1, 1)
+    alpha = uniform(g, 1.005, 1.05, n) / 255
+    depth = torch.linspace(2, 6, n, dtype=torch.float64)[torch.randperm(n, generator=g)]
+    means = placed(uniform(g, -0.1, 0.1, n, 2), depth, cam)
+    return all_stiff(splats(g, n, sigma=30.0, means=means, logits=torch.log(alpha / (1 - alpha)), cam=cam), cam)
+
+
+def many_opaque(g: Generator) -> Problem:
+    """Every pixel ends: 200 wide splats of alpha 0.05 to 0.99."""
+    alpha = uniform(g, 0.05, 0.99, 200)
+    return among_ordinary(splats(g, 200, sigma=25.0, logits=torch.log(alpha / (1 - alpha))))
+
+
+def tied(g: Generator, equal: bool) -> Problem:
+    """Thirty Gaussians at one depth, three times over if equal."""
+    means = placed(uniform(g, 0, 1, 10, 2) * torch.tensor([WIDTH, HEIGHT]), torch.full((10,), 3.0), camera())
+    if not equal:
+        return among_ordinary(splats(g, 30, sigma=8.0, means=torch.cat([means, means + 0.0, means]).roll(1, 0)))
+    made = splats(g, 10, sigma=8.0, means=means)
+    return among_ordinary({name: t.repeat(3, *[1] * (t.dim() - 1)) for name, t in made.items()})
+
+
+OPACITY = [
+    Case("opacity", "logits from -50 to 50", with_logits(torch.linspace(-50, 50, 41)), PLAIN),
+    Case(
+        "opacity",
+        "infinite logits",
+        with_logits(torch.tensor([math.inf, -math.inf, math.inf, -math.inf])),
+        PLAIN,
+    ),
+    Case("opacity", "alpha 0.99 within ulps", at_alpha(0.99), PLAIN),
+    Case("opacity", "alpha 1/255 within ulps", at_alpha(1 / 255), PLAIN),
+    Case(
+        "opacity",
+        "50,000 splats on one pixel",
+        one_pixel_stack,
+        Bound(5e-6, 5e-6, "some 2,300 blends, each rounding T once; back to front nothing is subtracted"),
+    ),
+    Case("opacity", "transmittance down to the stop", many_opaque, PLAIN),
+    Case("opacity", "depth ties", lambda g: tied(g, False), PLAIN, cut=0.0),
+    Case("opacity", "equal splats", lambda g: tied(g, True), PLAIN, cut=0.0),
+]
+
+# ---- rotation and colour ----
+
+
+def with_quaternions(length: float) -> Callable[[Generator], Problem]:
+    return lambda g: among_ordinary(splats(g, 20, sigma=axes(20, 2, 6, 12), rotations=length * normal(g, 20, 4)))
+
+
+def bright(g: Generator) -> Problem:
+    made = splats(g, 20, sigma=4.0)
+    return among_ordinary(made | {name: 1e4 * made[name] for name in ("sh_dc", "sh_rest")})
+
+
+def on_the_centre(g: Generator) -> Problem:
+    """`campos` on the mean of a Gaussian that is seen: its viewing direction has no length."""
+    made = splats(g, 1, sigma=4.0)
+    cam = camera(campos=made["means"][0].double())
+    return among_ordinary(made, cam)
+
+
+COLOR = [
+    Case("rotation and colour", "zero quaternions", with_quaternions(0.0), PLAIN),
+    Case("rotation and colour", "denormal quaternions", with_quaternions(1e-42), PLAIN),
+    Case("rotation and colour", "quaternions of length 1e-20", with_quaternions(1e-20), PLAIN),
+    Case("rotation and colour", "quaternions of length 1e20", with_quaternions(1e20), PLAIN),
+    Case("rotation and colour", "SH coefficients of 1e4", bright, PLAIN),
+    Case("rotation and colour", "viewing direction of no length", on_the_centre, PLAIN),
+]
+
+# ---- camera ----
+
+TURNED = torch.eye(4, dtype=torch.float64)
+TURNED[:3, :3] = torch.linalg.qr(torch.tensor([[0.9, 0.3, -0.2], [-0.1, 1.0, 0.5], [0.4, -0.6, 0.8]]).double()).Q
+TURNED[:3, 3] = torch.tensor([0.7, -0.4, 1.1])
+
+
+def seen_by(n: int, cam: GaussianRasterizationSettings, sigma: float = 3.0) -> Callable[[Generator], Problem]:
+    """Ordinary Gaussians in front of an extreme camera."""
+
+    def make(g: Generator) -> Problem:
+        made = splats(g, n, sigma=sigma, cam=cam)
+        shift = torch.linalg.inv(cam.viewmatrix) @ cam.projmatrix
+        offset = shift[2, :2] * torch.tensor([cam.tanfovx, cam.tanfovy])  # of the rays of the image
+        view = cam.viewmatrix.T
+        local = made["means"].double()
+        local[:, :2] -= offset * local[:, 2:]
+        return all_stiff(made | {"means": ((local - view[:3, 3]) @ view[:3, :3]).float()}, cam)
+
+    return make
+
+
+NARROW, WIDE = math.radians(1e-3), math.radians(179)
+CAMERA = [
+    Case("camera", "one pixel", seen_by(40, camera(1, 1)), PLAIN),
+    Case(
+        "camera",
+        "16,384 x 5 px",
+        seen_by(20, camera(16384, 5), sigma=20),
+        Bound(6e-5, 1e-4, "pixel coordinates of 16,384 have steps of 1e-3"),
+    ),
+    Case("camera", "17 x 31 px", seen_by(60, camera(17, 31)), PLAIN),
+    Case("camera", "field of view 0.001 degrees", seen_by(60, camera(fov=NARROW)), PLAIN),
+    Case(
+        "camera",
+        "field of view 0.001 degrees, turned",
+        seen_by(60, camera(fov=NARROW, view=TURNED)),
+        Bound(1e-1, 2e-1, "a focal length of 4e6 px: one rounding of a rotation or a mean is 0.3 px"),
+        double=1e-9,
+    ),
+    Case("camera", "field of view 179 degrees", seen_by(60, camera(fov=WIDE)), PLAIN),
+    Case(
+        "camera",
+        "field of view 179 degrees, turned",
+        seen_by(60, camera(fov=WIDE, view=TURNED)),
+        Bound(1e-5, 3e-5, "rays of 100 to the axis: a rounding of z counts a hundredfold"),
+    ),
+    Case("camera", "principal point outside", seen_by(60, camera(principal=(3.0, -2.0))), PLAIN),
+    Case("camera", "focal lengths 100 : 1", seen_by(60, camera(tan_ratio=100)), PLAIN),
+    Case("camera", "focal lengths 1 : 100", seen_by(60, camera(tan_ratio=0.01)), PLAIN),
+]
+
+# ---- counts ----
+
+
+def all_culled(g: Generator) -> Problem:
+    made = splats(g, 20)
+    return all_stiff(made | {"means": -made["means"]}, camera())
+
+
+COUNTS = [
+    Case("counts", "none", lambda g: all_stiff(splats(g, 0), camera()), NOTHING),
+    Case("counts", "one", lambda g: all_stiff(splats(g, 1), camera()), PLAIN),
+    Case("counts", "all culled", all_culled, NOTHING),
+]
+
+# ---- NaN and Inf ----
+
+
+def poisoned(name: str, value: float) -> Callable[[Generator], Problem]:
+    def make(g: Generator) -> Problem:
+        made = splats(g, 6, sigma=6.0)
+        made[name].view(6, -1)[:, 0] = value
+        made[name][3:] = value
+        return among_ordinary(made, absent=torch.ones(6, dtype=torch.bool))
+
+    return make
+
+
+NOT_FINITE = [
+    Case(
+        "not finite",
+        f"{value} in {name}",
+        poisoned(name, value),
+        ABSENT,
+    )
+    for name in PARAMETERS
+    for value in (math.nan, math.inf)
+    if (name, value) != ("opacities", math.inf)
+]
+
+CASES = [*SHAPE, *PLACE, *OPACITY, *COLOR, *CAMERA, *COUNTS, *NOT_FINITE]

@@ -1,0 +1,49 @@
+"""Whether the test views were better before the end of a training, and what to do then."""
+
+from collections.abc import Container
+
+from records.error_curve import Row, best_test
+
+CLEAR = 0.1  # dB between best and last; points of a training that has settled were seen to differ by up to 0.07
+
+
+def schedules_follow_length(depths: bool, train_test_exp: bool) -> bool:
+    """Whether --iterations sets how fast something falls: the depth loss's weight, or the exposures' learning rate."""
+    return depths or train_test_exp
+
+
+def peak_advice(
+    rows: list[Row], saved: Container[int], position_lr_max_steps: int, follows_length: bool = False
+) -> str | None:
+    """A line that names the iteration with the lowest test error, None unless it was clearly before the last row.
+
+    saved: iterations whose PLY this training has written. follows_length: `schedules_follow_length`.
+
+    A PLY is written before its iteration's step, so a saved one is the very model that was scored (with exposures
+    those of the last save). A training of fewer --iterations ends with it, too, unless a schedule follows its length.
+    """
+    best = best_test(rows)
+    if best is None or rows[-1]["test_psnr"] is None:
+        return None
+    lost = best["test_psnr"] - rows[-1]["test_psnr"]
+    if lost < CLEAR:
+        return None
+    iteration = best["iteration"]
+    line = (
+        f"Test views were best at iteration {iteration}: PSNR {best['test_psnr']:.2f} dB, {lost:.2f} dB above the end"
+    )
+    if None not in (best["train_psnr"], rows[-1]["train_psnr"]):
+        line += f" (train views {best['train_psnr']:.2f} there, {rows[-1]['train_psnr']:.2f} at the end)"
+    if iteration in saved:
+        line += f"; that model is saved, use it with render.py --iteration {iteration}"
+    elif follows_length:
+        line += f"; --save_iterations {iteration} keeps that model on the way"
+    else:
+        line += f"; --iterations {iteration} ends with that model, --save_iterations {iteration} keeps it on the way"
+    if iteration < position_lr_max_steps:
+        length = f"--iterations {iteration} " if follows_length else ""
+        line += (
+            f"; {length}--position_lr_max_steps {iteration} {'' if follows_length else 'beside that '}is another "
+            f"training, whose learning rate of positions falls by then instead of by {position_lr_max_steps}"
+        )
+    return line

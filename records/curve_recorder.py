@@ -1,0 +1,146 @@
+"""Records the error of a model in training against its time, without changing a bit of it."""
+
+import sys
+import time
+from collections.abc import Callable, Container, Sequence
+from pathlib import Path
+from typing import TypeVar
+
+import torch
+from torch import Tensor
+from tqdm import tqdm
+
+from records.curve_figure import draw_curve
+from records.curve_peak import peak_advice
+from records.curve_schedule import CurveSchedule
+from records.error_curve import COLUMNS, FIGURE, NAME, Row, write_curve
+from records.training_log import TrainingLog
+from utils.host.process import wall_seconds
+from utils.system_utils import UserError
+from utils.view_scores import mean_scores
+
+View = TypeVar("View")
+
+
+def evenly_spread(views: Sequence[View], count: int) -> list[View]:
+    """`count` of the views, or all where there are no more, first and last among them from two on."""
+    count = min(count, len(views))
+    return [views[round(index * (len(views) - 1) / max(count - 1, 1))] for index in range(count)]
+
+
+class CurveRecorder:
+    """Scores views in the iterations of a schedule, keeps the curve's file up to date, and draws it at the end.
+
+    rows: of the runs before, which `log` has the seconds of. iterations: the last one; always: those scored at any
+    cost. views: those to score, by set, "test" and "train"; render(view), target(view) and mask(view) give what
+    `mean_scores` takes. A curve that can't be written is warned of once; the next point tries again, for a training is
+    worth more than its curve.
+    """
+
+    def __init__(
+        self,
+        model_path: str,
+        rows: list[Row],
+        log: TrainingLog,
+        iterations: int,
+        always: Sequence[int],
+        views: dict[str, Sequence[View]],
+        render: Callable[[View], Tensor],
+        target: Callable[[View], Tensor],
+        mask: Callable[[View], Tensor | None],
+        device: torch.device,
+    ) -> None:
+        self.rows = rows
+        self._folder = Path(model_path)
+        self._log = log
+        self._count = sum(map(len, views.values()))
+        self._schedule = CurveSchedule(log.first_iteration, iterations, always, self._count)
+        self._views = views
+        self._render = render
+        self._target = target
+        self._mask = mask
+        self._device = device
+        self._loading = 0.0  # seconds of decoding pictures that were not needed before
+        self._writing = 0.0  # seconds of writing the file
+        self._warned = False
+
+    def due(self, iteration: int, seconds: float) -> bool:
+        """Whether to `add` a point after `seconds` of training in this run; if so, waits for the GPU."""
+        due = self._schedule.due(iteration, seconds)
+        if due and self._device.type == "cuda":
+            torch.cuda.synchronize(self._device)
+        return due
+
+    def add(self, iteration: int, seconds: float, gaussians: int) -> None:
+        """Score after `seconds` of training in this run, and write the curve with the new point."""
+        # Both, as a rescued training has rows after its log's last record.
+        peaks = [self._log.peak_memory_mib(), *(row["peak_memory_mib"] for row in self.rows[-1:])]
+        row = dict.fromkeys(COLUMNS) | {
+            "iteration": iteration,
+            "seconds": round(self._log.seconds_before + seconds, 3),
+            "wall_seconds": round(self._log.wall_seconds_before + wall_seconds(), 3),
+            "gaussians": gaussians,
+            "peak_memory_mib": max((peak for peak in peaks if peak is not None), default=None),
+        }
+        if not self._schedule.scorings:
+            # Once, and most of it for pictures that training needs soon: no measure of what the next scoring costs.
+            self._loading = self._seconds(self._load)
+        self._schedule.scored(self._seconds(lambda: self._score(row)))
+        self.rows.append(row)
+        self._writing += self._seconds(self._write)
+
+    @staticmethod
+    def _seconds(call: Callable[[], object]) -> float:
+        start = time.perf_counter()
+        call()
+        return time.perf_counter() - start
+
+    def _load(self) -> None:
+        for views in self._views.values():
+            for view in views:
+                self._target(view)
+                self._mask(view)
+
+    def _score(self, row: Row) -> None:
+        with torch.no_grad():
+            for name, views in self._views.items():
+                scores = mean_scores((self._render(view), self._target(view), self._mask(view)) for view in views)
+                row |= {f"{name}_{score}": round(value, 6) for score, value in scores.items()}
+
+    def _write(self) -> None:
+        try:
+            write_curve(self._folder / NAME, self.rows)
+        except UserError as error:
+            if not self._warned:
+                tqdm.write(f"warning: {error}; training goes on without its curve", file=sys.stderr)
+            self._warned = True
+
+    def finish(self, seconds: float, saved: Container[int], position_lr_max_steps: int, follows_length: bool) -> None:
+        """Draw the curve; say what it has cost beside `seconds` of training in this run, and advise (`peak_advice`).
+
+        The log's last record gets the costs: `curve_scoring_seconds`, `curve_writing_seconds` (of the file),
+        `curve_drawing_seconds`, and `curve_loading_seconds` (of pictures, before the first scoring).
+        """
+        drawing = self._seconds(self._draw)
+        scoring, writing = self._schedule.spent, self._writing
+        print(
+            f"Scored {self._count} views at {self._schedule.scorings} iterations in {scoring:.2f} s "
+            f"({100 * scoring / seconds:.1f} % of the training), wrote {NAME} in {writing:.3f} s "
+            f"({100 * writing / seconds:.2f} %), drew it in {drawing:.1f} s"
+        )
+        if advice := peak_advice(self.rows, saved, position_lr_max_steps, follows_length):
+            print(advice)
+        self._log.add(
+            self.rows[-1]["iteration"],
+            seconds,
+            curve_scoring_seconds=round(scoring, 3),
+            curve_writing_seconds=round(writing, 4),
+            curve_drawing_seconds=round(drawing, 3),
+            curve_loading_seconds=round(self._loading, 3),
+        )
+
+    def _draw(self) -> None:
+        try:
+            draw_curve(self._folder / FIGURE, self.rows, self._folder.resolve().name)
+        except Exception as error:  # a broken matplotlib may raise anything, and the model is trained
+            print(f"warning: no {FIGURE}: {type(error).__name__}: {error}", file=sys.stderr)

@@ -1,0 +1,39 @@
+"""render_times.json: how long each view of a rendered set took, and what one has to know to compare it."""
+
+import statistics
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from utils.files.json_files import write_json
+from utils.host.machine import device_name
+
+NAME = "render_times.json"
+
+
+def summarise(
+    seconds: Sequence[float], sizes: Sequence[tuple[int, int]], gaussians: int, antialiasing: bool, device: torch.device
+) -> dict[str, Any]:
+    """The file's content, of `seconds` and `sizes` (width, height; px) of one view or more, in the order of their PNGs.
+
+    fps: frames per second at the median. sizes: the different ones. threads: the CPU's, whatever the device.
+    """
+    median = statistics.median(seconds)
+    return {
+        "antialiasing": antialiasing,
+        "device": device_name(device),
+        "fps": round(1 / median, 3),
+        "gaussians": gaussians,
+        "median_ms": round(1e3 * median, 4),
+        "milliseconds": {f"{index:05d}.png": round(1e3 * value, 4) for index, value in enumerate(seconds)},
+        "sizes": sorted(set(sizes)),
+        "threads": torch.get_num_threads(),
+        "torch": torch.__version__,
+    }
+
+
+def write(folder: Path, summary: dict[str, Any]) -> None:
+    """Write what `summarise` gives into `folder`."""
+    write_json(folder / NAME, summary)

@@ -1,0 +1,112 @@
+"""train_log.json: error against run time, one record per tested or saved iteration and checkpoint."""
+
+import math
+import os
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from utils.files.json_files import read_json, write_json
+from utils.host.process import peak_memory_mib, wall_seconds
+from utils.system_utils import compute_device
+
+NAME = "train_log.json"
+_FINITE = ("loss", "peak_memory_mib", "wall_seconds")  # where they are there
+
+
+class Stopwatch:
+    """Seconds since it was made, without what happens inside `paused()`."""
+
+    def __init__(self) -> None:
+        self._start = time.perf_counter()
+
+    @property
+    def seconds(self) -> float:
+        return time.perf_counter() - self._start
+
+    @contextmanager
+    def paused(self) -> Iterator[None]:
+        before = time.perf_counter()
+        try:
+            yield
+        finally:
+            self._start += time.perf_counter() - before
+
+
+class TrainingLog:
+    """Records of one model folder, written whole after each addition.
+
+    A record has `iteration`, `seconds` (of training, without evaluation and saving; a resumed run adds to the seconds
+    before), `wall_seconds` (since the start of the process, likewise), `peak_memory_mib` (the most so far, of the runs
+    before as well), `gaussians`, `loss` (running mean), and per set tested `<set>_l1`, `<set>_psnr`; the last record
+    also `gaussians_left_out`, those of `gaussians` that the last save does not have, and what the curve has cost
+    (`records.curve_recorder`).
+
+    first_iteration, seconds_before, wall_seconds_before: what the runs have done that this one goes on from.
+    """
+
+    def __init__(
+        self, model_path: str | os.PathLike, first_iteration: int, before: str | os.PathLike | None = None
+    ) -> None:
+        """Keep an existing log's records up to `first_iteration`, which a resumed run goes on from.
+
+        before: the folder of that log, where it is another than model_path.
+        """
+        self._path = Path(model_path) / NAME
+        source = self._path if before is None else Path(before) / NAME
+        self.first_iteration = first_iteration
+        self.records: list[dict] = []
+        if first_iteration > 0 and source.is_file():
+            self.records = [r for r in _read(source) if r["iteration"] <= first_iteration]
+        last = self.records[-1] if self.records else {"seconds": 0.0}
+        self.seconds_before = last["seconds"]
+        self.wall_seconds_before = last.get("wall_seconds") or last["seconds"]
+        self._peak_before: float | None = last.get("peak_memory_mib")
+
+    def not_before(self, row: dict[str, float | None]) -> None:
+        """Count on from a row (`seconds`, `wall_seconds`) of the runs before, where that is later than their log."""
+        self.seconds_before = max(self.seconds_before, row["seconds"])
+        self.wall_seconds_before = max(self.wall_seconds_before, row["wall_seconds"] or 0.0)
+
+    @property
+    def loss(self) -> float:
+        """Running mean of the last record, 0 where there is none."""
+        return (self.records[-1].get("loss") if self.records else None) or 0.0
+
+    def peak_memory_mib(self) -> float | None:
+        """Most memory held so far, in this run or one that it resumes (`utils.host.process`); None if not known."""
+        peaks = [peak for peak in (self._peak_before, peak_memory_mib(compute_device())) if peak is not None]
+        return round(max(peaks), 1) if peaks else None
+
+    def add(self, iteration: int, seconds: float, **values: float) -> None:
+        """Append a record, or add to that of the same iteration.
+
+        A value that is not finite (PSNR of equal images) becomes null.
+        """
+        record = {name: value if math.isfinite(value) else None for name, value in values.items()}
+        record |= {
+            "iteration": iteration,
+            "peak_memory_mib": self.peak_memory_mib(),
+            "seconds": round(self.seconds_before + seconds, 3),
+            "wall_seconds": round(self.wall_seconds_before + wall_seconds(), 3),
+        }
+        if self.records and self.records[-1]["iteration"] == iteration:
+            record = self.records.pop() | record
+        self.records.append(record)
+        write_json(self._path, self.records)
+
+
+def _read(path: Path) -> list[dict]:
+    """Records of a log; none, with a warning, where the file is damaged: it is no reason to stop a training."""
+    try:
+        records = read_json(path)
+        if not all(isinstance(r["iteration"], int) and math.isfinite(r["seconds"]) for r in records):
+            raise ValueError
+        if not all(math.isfinite(r.get(name) or 0.0) for r in records for name in _FINITE):
+            raise ValueError
+    except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError):
+        print(f"warning: {path} cannot be read as a training log; a new one is started", file=sys.stderr)
+        return []
+    return records

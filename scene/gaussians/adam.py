@@ -1,0 +1,234 @@
+"""Adam over the tensors of a Gaussian model, and what becomes of its state when Gaussians come and go."""
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import diff_gaussian_rasterization  # noqa: F401  (its library holds the Adam kernel)
+import torch
+from torch import Tensor, nn
+
+from utils.host.memory import is_out_of_memory
+
+_CHUNK = 1 << 16  # rows that are moved at a time where there is no memory for all
+_ADAM = torch.ops.diff_gaussian_rasterization.adam_
+
+
+class StepGuard:
+    """Holds all steps back from the first iteration on whose loss is not finite, or one of whose steps.
+
+    A value whose step would not be finite (its gradient, or what becomes of it) stays as it is, and its first moment
+    becomes NaN as a mark, which GaussianAdam.take_marks takes away; all other values take their step in that iteration,
+    and none in later ones. The flag stays on the device: nobody waits for it but stopped_in.
+    """
+
+    def __init__(self, device: torch.device | str) -> None:
+        self._stopped = torch.zeros(1, dtype=torch.int64, device=device)
+        self.arguments: tuple = ()  # of the operators
+
+    def watch(self, iteration: int, loss: Tensor) -> None:
+        """Before the step of an iteration (from 1): its scalar loss."""
+        self.arguments = (loss, self._stopped, iteration)
+
+    def stopped_in(self) -> int:
+        """The iteration it was, 0 while there is none."""
+        return int(self._stopped)
+
+
+class GaussianAdam(torch.optim.Adam):
+    """torch.optim.Adam, one parameter (N, ...) per named group, by a kernel with the same bits for any thread count.
+
+    State and state dict have torch's form (step, exp_avg, exp_avg_sq), so checkpoints carry over both ways. There are
+    no step hooks: torch's, with its profiler's label, take as long as the step itself. guard: may hold steps back.
+    """
+
+    guard: StepGuard | None = None
+
+    def __init__(self, groups: list[dict], eps: float = 1e-15) -> None:
+        """groups: dicts with `params` (a list of one Parameter), `lr` and `name`."""
+        super().__init__(groups, lr=0.0, eps=eps)
+        self._active_columns: dict[str, int] = {}
+
+    def set_active_columns(self, name: str, columns: int) -> None:
+        """Promise that only the first `columns` values of each row of this group ever had a gradient.
+
+        Adam's step for the others changes no bit (moments and gradient are zero), so it is left out. A group without
+        any, which gets no gradient, counts its steps along with f_dc.
+        """
+        self._active_columns[name] = columns
+
+    @torch.no_grad()
+    def step(self, closure: Callable[[], float] | None = None) -> float | None:
+        """One Adam step of every parameter that has a gradient; the others, counters included, stay as they are.
+
+        Learning rates are the groups' own, betas and eps the optimiser's.
+        """
+        loss = None
+        if closure is not None:
+            with torch.enable_grad():
+                loss = closure()
+        rates, columns, tensors = [], [], []
+        params = {group["name"]: group["params"][0] for group in self.param_groups}
+        for group in self.param_groups:
+            (param,) = group["params"]
+            active = self._active_columns.get(group["name"], -1)
+            if active != 0:
+                stepped, gradient = param.grad is not None, param.grad
+            else:
+                # Nothing was rendered from this group; the parameter stands in, as of no columns nothing is read.
+                stepped, gradient = params["f_dc"].grad is not None and param.numel() > 0, param
+            if stepped:
+                state = self._state_of(param)
+                tensors.append((param, gradient, state["exp_avg"], state["exp_avg_sq"], state["step"]))
+                rates.append(group["lr"])
+                columns.append(active)
+        if tensors:
+            lists, guard = map(list, zip(*tensors, strict=True)), self.guard.arguments if self.guard else ()
+            _ADAM(*lists, rates, *self.defaults["betas"], self.defaults["eps"], columns, *guard)
+        return loss
+
+    step.hooked = True  # torch wraps it otherwise
+
+    def zero_grad(self, set_to_none: bool = True) -> None:
+        """Drop the gradients, or zero them."""
+        if not set_to_none:
+            return super().zero_grad(set_to_none=False)
+        for group in self.param_groups:
+            group["params"][0].grad = None
+
+    def take_marks(self) -> dict[str, Tensor]:
+        """Rows (n,) by group, of those with values that a guard kept from their step; these begin with zero moments."""
+        rows = {}
+        for group in self.param_groups:
+            state = self.state.get(group["params"][0])
+            if not state:
+                continue
+            marked = state["exp_avg"].isnan()
+            if marked.any():
+                rows[group["name"]] = marked.reshape(len(marked), -1).any(dim=1).nonzero().reshape(-1)
+                for moment in ("exp_avg", "exp_avg_sq"):
+                    state[moment].masked_fill_(marked, 0.0)
+        return rows
+
+    def rewind(self, steps: int) -> None:
+        """Count back steps that a guard held back."""
+        for state in self.state.values():
+            state["step"] = (state["step"] - steps).clamp_min(0)
+
+    def _state_of(self, param: Tensor) -> dict[str, Tensor]:
+        state = self.state[param]
+        if not state:
+            state["step"] = torch.zeros((), dtype=torch.float32)
+            state["exp_avg"] = torch.zeros_like(param)
+            state["exp_avg_sq"] = torch.zeros_like(param)
+        return state
+
+    def take_state(self, state_dict: Any) -> None:
+        """Take the moments and step counters of a state dict; options of the groups stay as they are.
+
+        ValueError, saying what does not fit, for anything but the state dict of such groups.
+        """
+        own = self.state_dict()["param_groups"]
+        try:
+            state, groups = dict(state_dict["state"]), list(state_dict["param_groups"])
+            names, keys = [group["name"] for group in groups], [list(group["params"]) for group in groups]
+        except (TypeError, ValueError, KeyError, IndexError) as error:
+            raise ValueError("it is no state of an optimiser") from error
+        if names != [group["name"] for group in own] or any(len(params) != 1 for params in keys):
+            raise ValueError("its groups are others")
+        taken = {}
+        for group, mine, (key,) in zip(self.param_groups, own, keys, strict=True):
+            if key in state:
+                taken[mine["params"][0]] = _fitting(state[key], group["params"][0], group["name"])
+        super().load_state_dict({"state": taken, "param_groups": own})
+
+    def append_rows(self, rows: dict[str, Tensor]) -> dict[str, nn.Parameter]:
+        """Append `rows[name]` (n, ...) to each group, with zero moments. Returns the parameters, without gradient.
+
+        Where memory does not suffice, nothing is appended to any.
+        """
+        count = len(self.param_groups[0]["params"][0])
+
+        def grow(values: Tensor, name: str, is_moment: bool) -> Tensor:
+            return torch.cat((values, torch.zeros_like(rows[name]) if is_moment else rows[name]))
+
+        try:
+            return self._change_rows(grow)
+        except (MemoryError, RuntimeError) as error:
+            if is_out_of_memory(error):
+                self._change_rows(lambda values, *_: values[:count])
+            raise
+
+    def keep_rows(self, indices: Tensor) -> dict[str, nn.Parameter]:
+        """Keep the rows of `indices` (n,) int64, ascending, in every group. Returns the parameters, without gradient.
+
+        Where memory does not suffice, it is done all the same, before the error is raised.
+        """
+        errors = []
+
+        def select(values: Tensor, *_: object) -> Tensor:
+            try:
+                return values.index_select(0, indices)
+            except (MemoryError, RuntimeError) as error:
+                if not is_out_of_memory(error):
+                    raise
+                errors.append(error)
+                return _move_up(values, indices)
+
+        params = self._change_rows(select)
+        if errors:
+            raise errors[0]
+        return params
+
+    def _change_rows(self, change: Callable[[Tensor, str, bool], Tensor]) -> dict[str, nn.Parameter]:
+        """Map all parameters and their moments; `change` takes values, the group's name, and whether it is a moment."""
+        params = {}
+        for group in self.param_groups:
+            value = change(group["params"][0].detach(), group["name"], False)
+            params[group["name"]] = self._replace(group, value, lambda moment, name: change(moment, name, True))
+        return params
+
+    def reset(self, name: str, value: Tensor) -> nn.Parameter:
+        """Give one group a new value and zero moments. Returns the new parameter, without gradient."""
+        (group,) = (group for group in self.param_groups if group["name"] == name)
+        return self._replace(group, value, lambda moment, _: torch.zeros_like(moment))
+
+    def _replace(self, group: dict, value: Tensor, change: Callable[[Tensor, str], Tensor]) -> nn.Parameter:
+        """Swap a group's parameter; `change` maps its moments, the step counter stays."""
+        param = nn.Parameter(value.requires_grad_(True))
+        old = group["params"][0]
+        if self.state.get(old):
+            for key in ("exp_avg", "exp_avg_sq"):
+                self.state[old][key] = change(self.state[old][key], group["name"])
+            self.state[param] = self.state.pop(old)
+        group["params"] = [param]
+        return param
+
+
+def _move_up(values: Tensor, indices: Tensor) -> Tensor:
+    """values[indices] for ascending indices, in the memory of `values` itself."""
+    for start in range(0, len(indices), _CHUNK):
+        part = indices[start : start + _CHUNK]
+        values[start : start + len(part)] = values.index_select(0, part)  # later parts come from rows further down
+    return values[: len(indices)]
+
+
+def _fitting(entry: Any, param: Tensor, name: str) -> dict[str, Tensor]:
+    """Adam's state of one parameter, checked against it."""
+    if not isinstance(entry, dict) or not {"step", "exp_avg", "exp_avg_sq"} <= entry.keys():
+        raise ValueError(f"step, exp_avg or exp_avg_sq of {name} is missing")
+    for key in ("exp_avg", "exp_avg_sq"):
+        moment = entry[key]
+        if not torch.is_tensor(moment) or moment.shape != param.shape or moment.dtype != param.dtype:
+            raise ValueError(f"{key} of {name} is not like {name}")
+    try:
+        step = float(entry["step"])  # a tensor; a number where an older torch wrote it
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise ValueError(f"step of {name} is no number") from error
+    if not (math.isfinite(step) and step >= 0):
+        raise ValueError(f"step of {name} is {step}")
+    return {
+        "step": torch.tensor(step, dtype=torch.float32),
+        "exp_avg": entry["exp_avg"],
+        "exp_avg_sq": entry["exp_avg_sq"],
+    }

@@ -1,0 +1,104 @@
+"""Rules of adaptive density control (Kerbl et al. 2023, section 5.2) on raw parameters, without any state.
+
+Sizes and opacities are compared as logarithms and logits: no exp or sigmoid, whose last bits could turn a decision.
+"""
+
+import argparse
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from utils.exact import portable_math
+from utils.exact.counter_rng import Stream, normal
+
+SHRINK = 1.6  # children of a split have 1 / 1.6 of the parent's scale (paper, section 5.2)
+PRUNE_EXTENT = 0.1  # a Gaussian wider than this part of the scene's extent is removed, once sizes are looked at
+RESET_OPACITY = 0.01
+MIN_OPACITY = 0.005  # a Gaussian below it is removed
+MAX_SCREEN_SIZE = 20  # pixels
+
+
+class Actions(NamedTuple):
+    """What density control does in one iteration, in this order."""
+
+    observe: bool  # add this view to the statistics
+    densify: bool
+    limit_size: bool  # densification also removes Gaussians that are too wide
+    reset_opacity: bool
+
+
+def actions(iteration: int, opt: argparse.Namespace, white_background: bool) -> Actions:
+    """The schedule (paper, section 5.2, with the reference's windows): all ends before densify_until_iter."""
+    active = iteration < opt.densify_until_iter
+    return Actions(
+        observe=active,
+        densify=active and iteration > opt.densify_from_iter and iteration % opt.densification_interval == 0,
+        limit_size=iteration > opt.opacity_reset_interval,
+        reset_opacity=active
+        and (iteration % opt.opacity_reset_interval == 0 or (white_background and iteration == opt.densify_from_iter)),
+    )
+
+
+def logit(p: float) -> float:
+    """Inverse of the sigmoid, for 0 < p < 1."""
+    return math.log(p / (1.0 - p))
+
+
+def _log(x: float) -> float:
+    return math.log(x) if x > 0 else -math.inf
+
+
+def mean_gradient(accumulated: Tensor, count: Tensor) -> Tensor:
+    """Average length of the screen-space gradient over the views that saw each Gaussian; 0 where none did. (N,)."""
+    mean = (accumulated / count).reshape(-1)
+    return torch.where(mean.isnan(), 0.0, mean)
+
+
+def limit_growth(gradient: Tensor, threshold: float, room: int) -> Tensor:
+    """Zero the gradient of candidates (>= threshold) but for the `room` largest, ties by index. (N,)."""
+    candidates = (gradient >= threshold).nonzero().reshape(-1)
+    if len(candidates) <= room:
+        return gradient
+    order = torch.argsort(gradient[candidates], descending=True, stable=True)
+    limited = gradient.clone()
+    limited[candidates[order[max(room, 0) :]]] = 0.0
+    return limited
+
+
+def is_small(scaling: Tensor, limit: float) -> Tensor:
+    """Largest scale <= limit (world units), from log scales (N, 3). (N,) bool."""
+    return scaling.amax(dim=1) <= _log(limit)
+
+
+def is_useless(opacity: Tensor, min_opacity: float) -> Tensor:
+    """Opacity below `min_opacity`, from logits (N, 1). (N,) bool."""
+    return opacity.reshape(-1) < logit(min_opacity)
+
+
+def split_children(
+    xyz: Tensor, scaling: Tensor, rotation: Tensor, items: Tensor, child: int, *, seed: int, iteration: int
+) -> tuple[Tensor, Tensor]:
+    """Positions (n, 3) and log scales (n, 3) of one child per parent: mu + R(q) e, e normal with the parent's scales.
+
+    Parents are given raw: xyz (n, 3), log scales (n, 3), quaternions (n, 4) wxyz; `items` (n,) are their indices, which
+    with seed, iteration and child decide the numbers drawn.
+    """
+    noise = normal(seed, Stream.SPLIT, iteration, items, child)[:, :3] * portable_math.exp(scaling)
+    return (xyz.double() + _rotate(rotation.double(), noise)).float(), scaling - math.log(SHRINK)
+
+
+def _rotate(quaternion: Tensor, vector: Tensor) -> Tensor:
+    """v + 2 w (u x v) + 2 u x (u x v), unit quaternion (w, u); elementwise, so that no kernel may reorder sums."""
+    square = quaternion * quaternion
+    length = (((square[:, 0] + square[:, 1]) + square[:, 2]) + square[:, 3]).sqrt().clamp_min(1e-12)
+    unit = quaternion / length[:, None]
+    w, u = unit[:, :1], unit[:, 1:]
+    twice = _cross(u, vector) * 2.0
+    return (vector + w * twice) + _cross(u, twice)
+
+
+def _cross(a: Tensor, b: Tensor) -> Tensor:
+    (ax, ay, az), (bx, by, bz) = a.unbind(1), b.unbind(1)
+    return torch.stack((ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx), dim=1)

@@ -1,0 +1,129 @@
+"""A colour correction for each training picture, trained along (--train_test_exp), and exposure.json."""
+
+import argparse
+import json
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from scene.dataset_readers import CameraInfo
+from scene.gaussians.adam import GaussianAdam
+from scene.half_images import exposure_names
+from utils.general_utils import get_expon_lr_func
+from utils.system_utils import UserError, atomic_write, compute_device
+
+NAME = "exposure.json"
+_ADAM_EPS = 1e-8  # torch's default, which the reference leaves for exposures
+
+
+class Exposures:
+    """Affine maps of colours, one a training picture: `values` (N, 3, 4) float32, [I | 0] at first.
+
+    A pixel c, a row vector, becomes c A[:, :3] + A[:, 3] (`utils.exposure`). names: of the pictures, in order.
+    """
+
+    def __init__(self, names: Sequence[str] = ()) -> None:
+        self.names = list(names)
+        self._index = {name: index for index, name in enumerate(self.names)}
+        self.values = nn.Parameter(torch.eye(3, 4, device=compute_device()).repeat(len(self.names), 1, 1))
+        self.optimizer: GaussianAdam | None = None
+
+    def __getitem__(self, name: str) -> Tensor:
+        """Map (3, 4) of a picture, differentiable. UserError for a picture that was not trained on."""
+        if name not in self._index:
+            raise UserError(f"there is no trained exposure of {name}; render pictures that the model was trained on")
+        return self.values[self._index[name]]
+
+    @property
+    def trained(self) -> bool:
+        """Whether they took a step of training, in this run or one that it goes on from."""
+        return self.optimizer is not None and bool(self.optimizer.state)
+
+    def training_setup(self, opt: argparse.Namespace) -> None:
+        """Make optimiser and schedule from the optimisation options."""
+        self.optimizer = GaussianAdam([{"params": [self.values], "lr": 0.0, "name": "exposure"}], eps=_ADAM_EPS)
+        self._rate = get_expon_lr_func(
+            opt.exposure_lr_init,
+            opt.exposure_lr_final,
+            opt.exposure_lr_delay_steps,
+            opt.exposure_lr_delay_mult,
+            opt.iterations,
+        )
+
+    def update_learning_rate(self, iteration: int) -> None:
+        """Set the learning rate of this iteration."""
+        self.optimizer.param_groups[0]["lr"] = self._rate(iteration)
+
+    def step(self) -> None:
+        """One step if there is a gradient, which is dropped."""
+        if self.values.grad is not None:
+            self.optimizer.step()
+            self.optimizer.zero_grad(set_to_none=True)
+
+    def capture(self) -> dict[str, Any]:
+        """What a resumed training needs, as plain values."""
+        return {"names": self.names, "values": self.values.detach(), "optimizer": self.optimizer.state_dict()}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Take the state of `capture()`, after training_setup. UserError for what does not fit."""
+        if state.get("names") != self.names:
+            raise UserError(
+                "the checkpoint has exposures of other pictures than this run trains on; give the scene and "
+                "options --eval and --train_test_exp as it was trained"
+            )
+        values = state.get("values")
+        if not torch.is_tensor(values) or values.shape != self.values.shape or values.dtype != torch.float32:
+            raise UserError(f"the checkpoint's exposures are not {tuple(self.values.shape)} float32; use another one")
+        with torch.no_grad():
+            self.values.copy_(values)
+        self.check_finite("the checkpoint", "use another one")
+        try:
+            self.optimizer.take_state(state.get("optimizer"))
+        except ValueError as error:
+            raise UserError(f"the exposures' optimiser state in the checkpoint does not fit ({error})") from error
+
+    def check_finite(self, where: str, remedy: str) -> None:
+        """UserError naming the first picture whose map is not finite."""
+        finite = self.values.detach().isfinite().flatten(1).all(dim=1)
+        if not finite.all():
+            name = self.names[int((~finite).nonzero()[0])]
+            raise UserError(f"the exposure of {name} in {where} is not finite; {remedy}")
+
+    def write(self, folder: str | os.PathLike) -> None:
+        """Write exposure.json: by name the three rows of each map."""
+        table = dict(zip(self.names, self.values.detach().tolist(), strict=True))
+        with atomic_write(Path(folder) / NAME) as path:
+            path.write_text(json.dumps(table, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+
+
+def read_exposures(folder: str | os.PathLike, cameras: Sequence[CameraInfo]) -> Exposures:
+    """Exposures of these views from a model folder's exposure.json. UserError where one is missing or broken."""
+    path = Path(folder) / NAME
+    remedy = "restore it, or write train_test_exp=False into cfg_args to render without exposures"
+    try:
+        table = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise UserError(f"cannot read {path} ({error.strerror}); {remedy}") from error
+    except (ValueError, RecursionError) as error:
+        raise UserError(f"{path} is not JSON; {remedy}") from error
+    if not isinstance(table, dict):
+        raise UserError(f"{path} is no table of exposures by picture; {remedy}")
+    exposures = Exposures(exposure_names(cameras))
+    for index, (name, camera) in enumerate(zip(exposures.names, cameras, strict=True)):
+        # The reference's files have the image name alone, also where several pictures have it.
+        rows = table.get(name, table.get(camera.image_name))
+        if rows is None:
+            raise UserError(f"{path} has no exposure of {name}; {remedy}")
+        try:
+            value = torch.tensor(rows, dtype=torch.float32)
+        except (TypeError, ValueError, RuntimeError, OverflowError) as error:
+            raise UserError(f"the exposure of {name} in {path} is no matrix of numbers; {remedy}") from error
+        if value.shape != (3, 4) or not value.isfinite().all():
+            raise UserError(f"the exposure of {name} in {path} is not 3 x 4 finite numbers; {remedy}")
+        with torch.no_grad():
+            exposures.values[index] = value
+    return exposures

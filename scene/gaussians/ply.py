@@ -1,0 +1,124 @@
+"""point_cloud.ply: the trained model as other tools read it, with the columns and order of the reference."""
+
+import os
+from collections.abc import Iterable, Iterator, Sequence
+
+import numpy as np
+import torch
+from plyfile import PlyData, PlyParseError
+from torch import Tensor
+
+from scene.gaussians.attributes import Rows, attributes
+from utils.system_utils import UserError, atomic_write
+
+_NORMALS = ["nx", "ny", "nz"]  # all zero, after the positions: the reference's files have them
+
+
+def write_ply(
+    path: str | os.PathLike, rows: Rows, sh_degree: int, world_offset: Sequence[float] = (0.0, 0.0, 0.0)
+) -> None:
+    """Write a binary little-endian PLY, float32, SH bands channel by channel; the whole file or none.
+
+    world_offset: world coordinates of the origin; goes into a comment unless it is zero.
+    """
+    count = len(rows["xyz"])
+    parts = [(attribute.columns, rows[name]) for name, attribute in attributes(sh_degree).items()]
+    parts.insert(1, (_NORMALS, torch.zeros(count, 3)))
+    names = [name for columns, _ in parts for name in columns]
+    matrix = np.zeros((count, len(names)), dtype="<f4")
+    start = 0
+    for columns, values in parts:
+        if values.dim() == 3:
+            values = values.transpose(1, 2)
+        stop = start + len(columns)
+        matrix[:, start:stop] = values.reshape(count, len(columns)).cpu().numpy()
+        start = stop
+    header = ["ply", "format binary_little_endian 1.0", *_comments(world_offset), f"element vertex {count}"]
+    header += [f"property float {name}" for name in names]
+    with atomic_write(path) as temporary, open(temporary, "wb") as file:
+        file.write("\n".join([*header, "end_header\n"]).encode("ascii"))
+        matrix.tofile(file)
+
+
+def row_bytes(sh_degree: int) -> int:
+    """Bytes of one Gaussian."""
+    return 4 * (len(_NORMALS) + sum(len(attribute.columns) for attribute in attributes(sh_degree).values()))
+
+
+def _comments(world_offset: Sequence[float]) -> list[str]:
+    return [f"comment world_offset {' '.join(map(repr, world_offset))}"] if any(world_offset) else []
+
+
+def stored_sh_degree(path: str | os.PathLike) -> int | None:
+    """SH degree by the header of a Gaussian PLY, None where its f_rest properties are of no degree that is known.
+
+    UserError when the file can't be had or read.
+    """
+    return _degree(read_vertices(path).dtype.names or ())
+
+
+def _degree(names: Iterable[str]) -> int | None:
+    rest = sum(name.startswith("f_rest_") for name in names)
+    return next((degree for degree in range(4) if 3 * ((degree + 1) ** 2 - 1) == rest), None)
+
+
+def read_ply(path: str | os.PathLike, sh_degree: int) -> Rows:
+    """Read a Gaussian PLY of exactly this SH degree, ours or another tool's: any order, scalar type and encoding.
+
+    UserError when the file can't be had or read, lacks properties (names them), or has another degree.
+    """
+    vertices = read_vertices(path)
+    present = set(vertices.dtype.names or ())
+    table = attributes(sh_degree)
+    wanted = table["f_rest"].columns
+    rest = sum(name.startswith("f_rest_") for name in present)
+    missing = [name for part, a in table.items() if part != "f_rest" for name in a.columns if name not in present]
+    if missing:
+        raise UserError(
+            f"{path} is no Gaussian model, it lacks the properties {', '.join(missing)}; give a trained one"
+        )
+    if rest != len(wanted) or not present.issuperset(wanted):
+        degree = _degree(present)
+        found = "no SH degree that is known" if degree is None else f"SH degree {degree}"
+        raise UserError(
+            f"{path} has {rest} f_rest properties, that is {found}, where SH degree {sh_degree} needs {len(wanted)}; "
+            "give the --sh_degree of the file"
+        )
+    rows = {}
+    for (name, attribute), values in zip(
+        table.items(), _columns(vertices, [a.columns for a in table.values()]), strict=True
+    ):
+        if len(attribute.shape) == 2:
+            bands, channels = attribute.shape
+            values = values.reshape(len(vertices), channels, bands).transpose(1, 2).contiguous()
+        rows[name] = values
+    return rows
+
+
+def read_vertices(path: str | os.PathLike) -> np.ndarray:
+    """The structured array of the element `vertex`."""
+    if not os.path.isfile(path):
+        raise UserError(f"no file {path}; give the point_cloud.ply of a trained model")
+    try:
+        return PlyData.read(os.fspath(path))["vertex"].data
+    except (PlyParseError, ValueError, UnicodeDecodeError) as error:
+        raise UserError(f"{path} is not a whole PLY file ({error}); make or fetch it again") from error
+    except KeyError as error:
+        raise UserError(f"{path} has no element 'vertex', so it is no Gaussian model; give a trained one") from error
+
+
+def _columns(vertices: np.ndarray, parts: list[list[str]]) -> Iterator[Tensor]:
+    """(N, len(part)) float32 for each list of names."""
+    kinds = {vertices.dtype[name] for name in vertices.dtype.names}
+    if kinds == {np.dtype("<f4")} and vertices.dtype.itemsize == 4 * len(vertices.dtype.names):
+        # One float table: picking columns of it is many times faster than field by field.
+        table = np.asarray(vertices).view("<f4").reshape(len(vertices), len(vertices.dtype.names))
+        position = {name: i for i, name in enumerate(vertices.dtype.names)}
+        for part in parts:
+            yield torch.from_numpy(table[:, [position[name] for name in part]])
+        return
+    for part in parts:
+        matrix = np.empty((len(vertices), len(part)), dtype=np.float32)
+        for i, name in enumerate(part):
+            matrix[:, i] = vertices[name]
+        yield torch.from_numpy(matrix)

@@ -1,0 +1,31 @@
+"""Adam that steps only the Gaussians that the view of this iteration has seen."""
+
+import torch
+from torch import Tensor
+
+from scene.gaussians.adam import GaussianAdam
+
+_SPARSE_ADAM = torch.ops.diff_gaussian_rasterization.sparse_adam_
+
+
+class SparseGaussianAdam(GaussianAdam):
+    """Sparse Adam (Mallick et al. 2024, Taming 3DGS): as GaussianAdam, for visible rows and without bias correction.
+
+    Rows that were not seen keep value and moments to the bit. State and state dict keep their form; `step` counts the
+    steps of the tensor and enters nothing.
+    """
+
+    @torch.no_grad()
+    def step(self, visible: Tensor) -> None:
+        """One step of the rows of `visible` (N,) bool, in every parameter that has a gradient."""
+        for group in self.param_groups:
+            (param,) = group["params"]
+            if param.grad is None:
+                continue
+            state = self._state_of(param)
+            state["step"] += 1
+            moments = state["exp_avg"], state["exp_avg_sq"]
+            beta1, beta2 = group["betas"]
+            columns = self._active_columns.get(group["name"], -1)
+            guard = self.guard.arguments if self.guard else ()
+            _SPARSE_ADAM(param, param.grad, *moments, visible, group["lr"], beta1, beta2, group["eps"], columns, *guard)

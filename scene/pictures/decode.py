@@ -1,0 +1,94 @@
+"""Pictures from files: checked early, decoded at training size as uint8."""
+
+import os
+import warnings
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image
+from torch import Tensor
+
+from utils.files.file_kinds import not_the_file
+from utils.files.image_files import UNREADABLE
+from utils.system_utils import UserError
+
+_TAIL = 4096
+# Large pictures are normal here; Pillow's own limit still refuses absurd ones. Once and for all, as filters that are
+# set for a block only are shared by all threads.
+warnings.filterwarnings("ignore", category=Image.DecompressionBombWarning)
+
+
+def picture_size(path: Path) -> tuple[int, int]:
+    """Size (width, height) of a picture file, from its header. UserError for a file that is broken or cut short.
+
+    The end of the file is looked at too: a picture without its end mark is decoded to see whether it is whole.
+    """
+    try:
+        with Image.open(path) as image:
+            size = image.size
+            _refuse_float(image)
+            if not _has_end_mark(path, image.format):
+                image.load()
+    except UNREADABLE as error:
+        raise _unreadable(path, error) from error
+    return size
+
+
+def may_be_transparent(path: Path) -> bool:
+    """Whether a picture file that can be read has an alpha channel or a transparent colour, from its header."""
+    with Image.open(path) as image:
+        return image.has_transparency_data
+
+
+def decode(path: Path, size: tuple[int, int]) -> Tensor:
+    """Picture (3,H,W) uint8, or (4,H,W) with straight alpha where the file has any, resized to size (width, height).
+
+    Pillow's bicubic filter, antialiased when it shrinks; alpha weighs the colours (premultiplied) in resizing. EXIF
+    orientation is ignored, as it is by COLMAP. Grey, palette, CMYK and 16-bit pictures become 8-bit RGB.
+    """
+    try:
+        with Image.open(path) as image:
+            image = _to_rgb_or_rgba(image)
+        if image.size != size:
+            image = image.resize(size, Image.Resampling.BICUBIC)
+        pixels = np.asarray(image)
+        if pixels.shape[-1] == 4 and pixels[..., 3].min() == 255:
+            pixels = pixels[..., :3]
+        return torch.from_numpy(np.ascontiguousarray(pixels.transpose(2, 0, 1)))
+    except UNREADABLE as error:
+        raise _unreadable(path, error) from error
+    except MemoryError as error:
+        raise UserError(
+            f"not enough memory for the picture {path} at {size[0]} x {size[1]} pixels; choose a smaller size with -r"
+        ) from error
+
+
+def _unreadable(path: Path, error: Exception) -> UserError:
+    if other := not_the_file(path):
+        return UserError(f"the picture {path} is {other}; fetch it again or take it out of the scene")
+    return UserError(f"cannot read the picture {path} ({error}); replace it or take it out of the scene")
+
+
+def _has_end_mark(path: Path, file_format: str | None) -> bool:
+    marks = {"PNG": b"IEND", "JPEG": b"\xff\xd9"}
+    if file_format not in marks:
+        return True
+    with open(path, "rb") as file:
+        file.seek(max(os.path.getsize(path) - _TAIL, 0))
+        return marks[file_format] in file.read()
+
+
+def _refuse_float(image: Image.Image) -> None:
+    if image.mode == "F":
+        raise ValueError("floating-point pixels; save it with 8 or 16 bits")
+
+
+def _to_rgb_or_rgba(image: Image.Image) -> Image.Image:
+    if image.mode.startswith("I"):
+        # Pillow's own conversion of 16-bit grey clips at 255.
+        grey = np.clip(np.asarray(image).astype(np.int64), 0, 65535)
+        return Image.fromarray(((grey + 128) // 257).astype(np.uint8)).convert("RGB")
+    _refuse_float(image)
+    has_alpha = image.has_transparency_data
+    return image.convert("RGBA" if has_alpha else "RGB")

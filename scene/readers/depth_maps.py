@@ -1,0 +1,192 @@
+"""Inverse depth maps that supervise training (--depths): which view has one, what its values mean, how to decode it."""
+
+import json
+import sys
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+import torch
+from PIL import Image
+from torch import Tensor
+
+from scene.dataset_readers import CameraInfo, SceneInfo
+from scene.pictures.decode import picture_size
+from scene.readers import colmap_model
+from utils.files.image_files import UNREADABLE
+from utils.files.listing import some
+from utils.host.cache_folder import cache_folder
+from utils.system_utils import UserError
+
+PARAMS = "depth_params.json"
+COLMAP_UNIT = 65536.0  # of a map's values, before scale and offset; depth_scale.py has 65535, as the reference has both
+BLENDER_UNIT = 512.0
+RELIABLE = 5.0  # a scale further than this factor from the scene's median is not believed
+_MAKE = "python utils/make_depth_scale.py --base_dir {scene} --depths_dir {depths}"
+
+
+@dataclass(frozen=True)
+class DepthMap:
+    """A view's inverse depth, 1 / world units: values of the file / unit * scale + offset."""
+
+    path: Path
+    unit: float
+    scale: float = 1.0
+    offset: float = 0.0
+    pixel_bytes: ClassVar[int] = 4
+
+    def decode(self, size: tuple[int, int]) -> Tensor:
+        """Inverse depth (1, H, W) float32 at a size (width, height). UserError for a file that can't be read."""
+        values = np.maximum(resize(read_values(self.path) / self.unit, size), 0.0)
+        return torch.from_numpy((values * self.scale + self.offset).astype(np.float32))[None]
+
+
+def with_depth_maps(info: SceneInfo, scene: Path, depths: str) -> SceneInfo:
+    """The scene with a DepthMap for each training view that has one to be believed; a message about the others.
+
+    depths: folder of the maps under the scene folder. UserError where that, or a map or depth_params.json is missing.
+    """
+    folder = scene / depths
+    if not folder.is_dir():
+        raise UserError(f"no folder of depth maps {folder}; -d names it relative to the scene folder; or leave -d out")
+    undistorted = [c.image_name for c in info.train_cameras if c.image_path.is_relative_to(cache_folder())]
+    if undistorted:
+        raise UserError(
+            f"-d needs pictures without distortion, and {len(undistorted)} are undistorted on load "
+            f"({some(undistorted)}), their depth maps not; undistort the scene with `colmap image_undistorter`, and "
+            "make the maps of its pictures"
+        )
+    if (scene / "sparse").is_dir():
+        maps = _colmap_maps(info.train_cameras, scene, folder)
+    else:
+        maps = [DepthMap(_blender_file(camera, scene, folder), BLENDER_UNIT) for camera in info.train_cameras]
+    _check_files([depth.path for depth in maps if depth])
+    return replace(
+        info, train_cameras=[replace(c, depth=depth) for c, depth in zip(info.train_cameras, maps, strict=True)]
+    )
+
+
+def read_values(path: Path) -> np.ndarray:
+    """Values (H, W) float64 of a grey picture of 8 or 16 bits, as they are. UserError for one that is not grey."""
+    try:
+        with Image.open(path) as image:
+            if image.mode not in ("L", "I;16", "I;16B", "I"):
+                if _is_16_bit_color(path):
+                    raise UserError(f"the depth map {path} has 16-bit colours, which are not read whole; make it grey")
+                image = image.convert("RGB")
+            values = np.asarray(image).astype(np.float64)
+    except UNREADABLE as error:
+        raise UserError(f"cannot read the depth map {path} ({error}); make it again") from error
+    if values.ndim == 3:
+        # Some tools write grey as three equal channels.
+        if (values != values[..., :1]).any():
+            raise UserError(f"the depth map {path} is coloured; save inverse depth as grey, best with 16 bits")
+        values = values[..., 0]
+    return values
+
+
+def _is_16_bit_color(path: Path) -> bool:
+    # Pillow drops their lower half and tells nobody; the header of a PNG has the depth at 24 and the kind at 25.
+    with open(path, "rb") as file:
+        header = file.read(26)
+    return header.startswith(b"\x89PNG") and len(header) == 26 and header[24] == 16 and header[25] in (2, 6)
+
+
+def resize(values: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """(h, w) resampled to size (width, height): bilinear between four pixel centres, not antialiased."""
+    rows, columns = (_centers(count, new) for count, new in zip(values.shape, size[::-1], strict=True))
+    return sample(values, columns[None, :], rows[:, None])
+
+
+def _centers(count: int, new: int) -> np.ndarray:
+    """Where `new` pixel centres of an axis lie among `count` old ones, which are 0, 1, ..."""
+    return (np.arange(new) + 0.5) * count / new - 0.5
+
+
+def sample(values: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Bilinear values of (h, w) at columns x and rows y, pixel centres at integers; outside, those of the border."""
+
+    def split(at: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        at = np.clip(at, 0, count - 1)
+        low = np.minimum(at.astype(np.int64), max(count - 2, 0))
+        return low, np.minimum(low + 1, count - 1), at - low
+
+    left, right, u = split(x, values.shape[1])
+    top, bottom, v = split(y, values.shape[0])
+    upper = values[top, left] * (1 - u) + values[top, right] * u
+    lower = values[bottom, left] * (1 - u) + values[bottom, right] * u
+    return upper * (1 - v) + lower * v
+
+
+def _colmap_maps(cameras: Sequence[CameraInfo], scene: Path, folder: Path) -> list[DepthMap | None]:
+    path = colmap_model.find_model(scene)[0] / PARAMS
+    make = _MAKE.format(scene=scene, depths=folder)
+    if not path.is_file():
+        raise UserError(f"no {path}, which depth maps need; make it with `{make}`")
+    params = _read_params(path, make)
+    scales = [scale for scale, _ in params.values() if scale > 0]
+    median = float(np.median(scales)) if scales else 0.0
+    maps: list[DepthMap | None] = []
+    unknown, unreliable = [], []
+    for camera in cameras:
+        name = Path(camera.image_name).with_suffix("").as_posix()
+        scale, offset = params.get(name, (0.0, 0.0))
+        believed = scale > 0 and median / RELIABLE <= scale <= median * RELIABLE
+        if not believed:
+            (unreliable if name in params else unknown).append(camera.image_name)
+        maps.append(DepthMap(folder / f"{name}.png", COLMAP_UNIT, scale, offset) if believed else None)
+    reasons = [
+        f"{len(names)} {what} ({some(names)})"
+        for names, what in ((unknown, f"not in {path}"), (unreliable, "of an unreliable scale there"))
+        if names
+    ]
+    left_out = f"{len(unknown) + len(unreliable)} of {len(cameras)} training pictures have no depth loss: "
+    left_out += ", ".join(reasons)
+    if not any(maps):
+        raise UserError(f"{left_out}; make the file again with `{make}`, or leave -d out")
+    if reasons:
+        print(left_out, file=sys.stderr)
+    return maps
+
+
+def _read_params(path: Path, make: str) -> dict[str, tuple[float, float]]:
+    """Scale and offset by picture name without extension."""
+    try:
+        table = json.loads(path.read_text(encoding="utf-8"))
+        params = {name: (float(entry["scale"]), float(entry["offset"])) for name, entry in table.items()}
+        if not np.isfinite(list(params.values())).all():
+            raise ValueError("a number is not finite")
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+        raise UserError(
+            f"{path} does not give a scale and an offset for every picture ({type(error).__name__}: {error}); make it "
+            f"again with `{make}`"
+        ) from error
+    return params
+
+
+def _blender_file(camera: CameraInfo, scene: Path, folder: Path) -> Path:
+    """By the picture's path, which no other has, else by its name."""
+    if camera.image_path.is_relative_to(scene):
+        by_path = folder / camera.image_path.relative_to(scene).with_suffix(".png")
+        if by_path.is_file():
+            return by_path
+    return folder / f"{camera.image_name}.png"
+
+
+def _check_files(paths: Sequence[Path]) -> None:
+    missing = [str(path) for path in paths if not path.is_file()]
+    if missing:
+        raise UserError(
+            f"{len(missing)} of {len(paths)} depth maps are missing: {some(missing)}; put them there, or leave -d out"
+        )
+    shared = [str(path) for path, count in Counter(paths).items() if count > 1]
+    if shared:
+        raise UserError(
+            f"several training pictures have the same depth map: {some(shared)}; put a map for each into the folder, "
+            "in sub-folders as the pictures are (with COLMAP, give pictures names that differ by more than the suffix)"
+        )
+    for path in paths:
+        picture_size(path)

@@ -1,0 +1,114 @@
+"""What readers of datasets return: plain records. Nothing here decodes pictures, uses a GPU or writes a file."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from scene.pictures.masks import Mask
+from scene.pictures.store import Decodable
+from utils.graphics_utils import BasicPointCloud, focal2fov
+from utils.system_utils import UserError
+
+HOLD = 8  # every 8th picture by name is a test view (Mip-NeRF 360's split)
+NEAREST = 0.2  # depth from which on Gaussians are drawn (the rasterizer's rule)
+APART = 10.0
+NARROW = 1e-2  # Gaussians wider than 0.1 E are removed: where E is less than this of the depth, all above a pixel or so
+ROUNDING = 1e-9  # distances below this part of the scene mean nothing
+
+
+@dataclass(frozen=True)
+class CameraInfo:
+    """One view.
+
+    uid: COLMAP's camera (intrinsics) id, or the frame's index. R (3,3): camera-to-world rotation; T (3,):
+    world-to-camera translation. fx, fy, cx, cy in pixels of an image of width x height (pixel centres at .5).
+    image_name: COLMAP's full name, or the file's stem. file_size: (width, height) of the file. mask: of the same size
+    as the file, None where everything counts. ignore_alpha: what is transparent in the file does not count. depth: of a
+    training view that has a map of it (scene/readers/depth_maps.py).
+    """
+
+    uid: int
+    R: np.ndarray
+    T: np.ndarray
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    width: int
+    height: int
+    image_path: Path
+    image_name: str
+    file_size: tuple[int, int]
+    mask: Mask | None = None
+    ignore_alpha: bool = False
+    depth: Decodable | None = None
+
+    @property
+    def FovX(self) -> float:
+        """Horizontal opening angle in radians of a frustum of the image's width."""
+        return focal2fov(self.fx, self.width)
+
+    @property
+    def FovY(self) -> float:
+        """Vertical opening angle in radians of a frustum of the image's height."""
+        return focal2fov(self.fy, self.height)
+
+    @property
+    def center(self) -> np.ndarray:
+        """Camera centre (3,) in the world."""
+        return -self.R @ self.T
+
+
+@dataclass(frozen=True)
+class SceneInfo:
+    """A dataset: start cloud (None if not wanted), views, extent E in world units, the PLY of the cloud if any.
+
+    offset (3,) float64: the world's coordinates of the frame's origin (scene/readers/world_offset.py).
+    """
+
+    point_cloud: BasicPointCloud | None
+    train_cameras: list[CameraInfo]
+    test_cameras: list[CameraInfo]
+    extent: float
+    ply_path: Path | None
+    offset: np.ndarray = field(default_factory=lambda: np.zeros(3))
+
+
+def split_by_order(
+    cameras: list[CameraInfo], hold_out: bool, folder: Path
+) -> tuple[list[CameraInfo], list[CameraInfo]]:
+    """Training and test views: with hold_out every HOLD-th, from the first on, is a test view."""
+    train = [camera for index, camera in enumerate(cameras) if not hold_out or index % HOLD]
+    test = [camera for index, camera in enumerate(cameras) if hold_out and index % HOLD == 0]
+    if not train:
+        raise UserError(f"{folder} has too few pictures for --eval, which takes every {HOLD}th; leave --eval out")
+    return train, test
+
+
+def scene_extent(cameras: list[CameraInfo], points: np.ndarray | None = None) -> float:
+    """Extent E: 1.1 times the largest distance of a camera from the cameras' mean, in world units.
+
+    Cameras that stand apart (`standing_apart`) are left out. Cameras in one place, or nearly so (E below NARROW times
+    the depth), have no E of their own; then 1.1 times the median depth of the points (N,3) in front of the first, or 1
+    without such points.
+    """
+    centers = np.array([camera.center for camera in cameras])
+    counted = ~standing_apart(centers)
+    centers, first = centers[counted], cameras[counted.argmax()]
+    extent = 1.1 * float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).max())
+    points = np.zeros((0, 3)) if points is None else points
+    depths = (points @ first.R + first.T)[:, 2]
+    depths = depths[depths > 0]
+    if not len(depths):
+        return extent if extent > ROUNDING * (1 + np.abs(centers).max()) else 1.0
+    fallback = 1.1 * float(np.median(depths))
+    return extent if extent > NARROW * fallback else fallback
+
+
+def standing_apart(centers: np.ndarray) -> np.ndarray:
+    """Which of the camera centres (N,3) are more than APART times the median distance from their median: (N,) bool."""
+    distances = np.linalg.norm(centers - np.median(centers, axis=0), axis=1)
+    median = float(np.median(distances))
+    # Where most cameras are in one place, but for rounding, the others are no mistake.
+    return distances > (APART * median if median > ROUNDING * distances.max() else np.inf)

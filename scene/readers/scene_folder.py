@@ -1,0 +1,67 @@
+"""Which kind of dataset a folder holds, and where the user's scene may be if it holds none."""
+
+from pathlib import Path
+
+from utils.files.listing import some
+from utils.system_utils import UserError
+
+COLMAP, BLENDER, NERFSTUDIO = "Colmap", "Blender", "Nerfstudio"
+_PICTURES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp")
+_MODEL = ("cameras.bin", "cameras.txt")
+
+
+def kind_of(folder: Path) -> str:
+    """COLMAP, BLENDER or NERFSTUDIO. UserError that says what was looked for and found, and where the scene may be."""
+    if not folder.exists():
+        raise UserError(f"no scene folder {folder}; name an existing one with -s")
+    if not folder.is_dir():
+        raise UserError(f"{folder} is a file; give -s the folder of the scene{_or_rather(_above(folder.parent))}")
+    kind = _kind(folder)
+    if kind is None:
+        found = sorted(path.name for path in folder.iterdir())
+        raise UserError(
+            f"{folder} is not a scene: looked for the folder sparse (COLMAP) and the files transforms_train.json "
+            f"(Blender) and transforms.json (nerfstudio), found {some(found)}; {_remedy(folder)}"
+        )
+    return kind
+
+
+def _kind(folder: Path) -> str | None:
+    if (folder / "sparse").is_dir():
+        return COLMAP
+    if (folder / "transforms_train.json").is_file():
+        return BLENDER
+    return NERFSTUDIO if (folder / "transforms.json").is_file() else None
+
+
+def _remedy(folder: Path) -> str:
+    below = sorted(path for path in folder.iterdir() if path.is_dir() and _kind(path))
+    if below:
+        return f"give -s a scene in it: {some(list(map(str, below)))}"
+    if above := _above(folder):
+        return f"give -s {above}, which is one"
+    if any((folder / name).is_file() for name in _MODEL):
+        return "the files of a COLMAP model belong in a folder sparse/0 of the scene, beside the folder images"
+    inner = [path for path in (folder / "input", folder / "images", folder) if path.is_dir() and _has_pictures(path)]
+    if inner and inner[0].name == "input":
+        return f"for photos without camera poses, run python convert.py -s {folder} first"
+    if inner:
+        return (
+            f"for photos without camera poses, put them into a folder input of the scene and run python convert.py -s "
+            f"{folder if inner[0] != folder else folder.parent} first"
+        )
+    return "give -s the folder that holds one of them"
+
+
+def _above(folder: Path) -> Path | None:
+    """The scene that this folder lies in, at most two levels up: images/left, sparse/0."""
+    return next((path for path in (folder, *folder.absolute().parents[:2]) if _kind(path)), None)
+
+
+def _or_rather(scene: Path | None) -> str:
+    return f", {scene}" if scene else ""
+
+
+def _has_pictures(folder: Path) -> bool:
+    # Not deeper: it may be any folder of the disk.
+    return any(path.suffix.lower() in _PICTURES for pattern in ("*", "*/*") for path in folder.glob(pattern))

@@ -1,0 +1,100 @@
+"""From views as a dataset lists them, with any lens, to pinhole views."""
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from scene.pictures.decode import picture_size
+from scene.pictures.lens import Lens, Pinhole, pinhole_of
+from scene.pictures.masks import Mask
+from scene.pictures.undistortion import Photo, undistort
+from scene.readers.records import CameraInfo
+from utils.system_utils import UserError
+
+
+class SourceView(NamedTuple):
+    """A picture as a dataset lists it: file, lens, world-to-camera rotation (3,3) and translation (3,), mask."""
+
+    name: str
+    path: Path
+    uid: int
+    lens: Lens
+    rotation: np.ndarray
+    translation: np.ndarray
+    mask: Mask | None = None
+
+
+def make_cameras(views: Sequence[SourceView], ignore_alpha: bool) -> list[CameraInfo]:
+    """The views as pinholes: pictures of other lenses are undistorted first (scene/pictures/undistortion.py).
+
+    ignore_alpha: what is transparent in a picture does not count. UserError names the view that cannot be used.
+    """
+    pinholes = [pinhole_of(view.lens, view.name) for view in views]
+    for view in views:
+        if not (np.isfinite(view.rotation).all() and np.isfinite(view.translation).all()):
+            raise UserError(f"the pose of {view.name} is not finite; take the picture out of the scene")
+    sizes = [picture_size(view.path) for view in views]
+    _warn_of_other_shapes(views, sizes)
+    for view, size in zip(views, sizes, strict=True):
+        if view.mask is not None:
+            _check_mask(view, size)
+
+    distorted = [index for index, pinhole in enumerate(pinholes) if pinhole is None]
+    photos = [
+        Photo(views[index].path, sizes[index], views[index].lens, views[index].mask, ignore_alpha)
+        for index in distorted
+    ]
+    undistorted = dict(zip(distorted, undistort(photos) if photos else [], strict=True))
+    cameras = []
+    for index, view in enumerate(views):
+        if index in undistorted:
+            path, pinhole, mask = undistorted[index]
+            size, ignore = (pinhole.width, pinhole.height), False
+        else:
+            path, pinhole, mask, size, ignore = view.path, pinholes[index], view.mask, sizes[index], ignore_alpha
+        cameras.append(_camera(view, pinhole, path, size, mask, ignore))
+    return cameras
+
+
+def _camera(
+    view: SourceView, pinhole: Pinhole, path: Path, size: tuple[int, int], mask: Mask | None, ignore_alpha: bool
+) -> CameraInfo:
+    return CameraInfo(
+        uid=view.uid,
+        R=view.rotation.T.copy(),
+        T=view.translation.copy(),
+        **pinhole._asdict(),
+        image_path=path,
+        image_name=view.name,
+        file_size=size,
+        mask=mask,
+        ignore_alpha=ignore_alpha,
+    )
+
+
+def _check_mask(view: SourceView, size: tuple[int, int]) -> None:
+    mask_size = picture_size(view.mask.path)
+    if abs(size[0] * mask_size[1] / mask_size[0] - size[1]) > 1:
+        raise UserError(
+            f"the mask {view.mask.path} is {mask_size[0]} x {mask_size[1]} pixels and its picture {size[0]} x "
+            f"{size[1]}; make masks of the same shape as the pictures"
+        )
+
+
+def _warn_of_other_shapes(views: Sequence[SourceView], sizes: Sequence[tuple[int, int]]) -> None:
+    others = [
+        (view, size)
+        for view, size in zip(views, sizes, strict=True)
+        if abs(size[0] * view.lens.height / view.lens.width - size[1]) > 1
+    ]
+    if others:
+        view, size = others[0]
+        print(
+            f"{len(others)} of {len(views)} pictures have another aspect ratio than their camera, the first is "
+            f"{view.name} ({size[0]} x {size[1]}, camera {view.lens.width} x {view.lens.height}); they will be "
+            "stretched",
+            file=sys.stderr,
+        )

@@ -1,0 +1,97 @@
+"""The points that training starts from: the scene's own, a file's, or random ones."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from scene.readers.point_cloud import is_ply, read_point_cloud
+from scene.readers.records import CameraInfo, scene_extent
+from utils.graphics_utils import BasicPointCloud
+from utils.system_utils import UserError
+
+SFM = "sfm"
+RANDOM = "random"
+RANDOM_POINTS = 100_000
+RANDOM_HALF_SIZE = 1.3  # the NeRF-synthetic objects lie within this cube
+_NEAREST, _FARTHEST = 0.25, 2.5  # depths of random points, in distances of the cameras from what they look at
+_GREY = 127 / 255
+
+
+class StartOptions(NamedTuple):
+    """What the user wants: a file of points (empty: none), else SFM (the scene's points) or RANDOM ones."""
+
+    path: str = ""
+    kind: str = SFM
+
+
+OWN_POINTS = StartOptions()
+
+
+class StartCloud(NamedTuple):
+    """Points, and the PLY they come from, if it is one."""
+
+    cloud: BasicPointCloud
+    ply_path: Path | None
+
+
+def choose_start(
+    options: StartOptions, own: Callable[[], StartCloud | None], random: Callable[[], BasicPointCloud], lacking: str
+) -> StartCloud:
+    """The start cloud. own: reads the scene's points, or None; lacking: says in a message that there are none."""
+    if options.path:
+        path = Path(options.path)
+        return StartCloud(read_point_cloud(path), path if is_ply(path) else None)
+    if options.kind == RANDOM:
+        return StartCloud(random(), None)
+    start = own()
+    if start is None or not len(start.cloud.points):
+        raise UserError(
+            f"{lacking}; start from random points with --init_type {RANDOM}, or from a file with --init_pcd_path"
+        )
+    return start
+
+
+def random_in_cube() -> BasicPointCloud:
+    """Grey points spread evenly over a cube around the origin, as the reference has them for Blender scenes."""
+    random = np.random.default_rng(0)
+    return _grey(random.uniform(-RANDOM_HALF_SIZE, RANDOM_HALF_SIZE, (RANDOM_POINTS, 3)))
+
+
+def random_in_frusta(cameras: list[CameraInfo]) -> BasicPointCloud:
+    """Grey points in the cameras' frusta: each in a random pixel of a random view, at an even random depth.
+
+    Depths lie around that of the point which the optical axes come nearest to, in the median camera; where the axes
+    are parallel or part, around the extent of the cameras.
+    """
+    random = np.random.default_rng(0)
+    chosen = random.integers(len(cameras), size=RANDOM_POINTS)
+    x, y = random.uniform(size=(2, RANDOM_POINTS))
+    depth = _focus_distance(cameras) * random.uniform(_NEAREST, _FARTHEST, RANDOM_POINTS)
+    points = np.empty((RANDOM_POINTS, 3))
+    for index, camera in enumerate(cameras):
+        mine = chosen == index
+        local = [(x[mine] * camera.width - camera.cx) / camera.fx, (y[mine] * camera.height - camera.cy) / camera.fy]
+        local = np.stack([*local, np.ones(mine.sum())], axis=1) * depth[mine, None]
+        points[mine] = local @ camera.R.T + camera.center
+    return _grey(points)
+
+
+def _focus_distance(cameras: list[CameraInfo]) -> float:
+    extent = scene_extent(cameras)
+    axes = np.array([camera.R[:, 2] for camera in cameras])
+    centers = np.array([camera.center for camera in cameras])
+    # Least squares: the sum of I - a aᵀ over the axes a, times the point, is the sum of (I - a aᵀ) center.
+    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
+    normal = across.sum(axis=0)
+    if np.linalg.eigvalsh(normal)[0] < 1e-3 * len(cameras):  # axes within about 2 degrees of each other
+        return extent
+    focus = np.linalg.solve(normal, (across @ centers[:, :, None]).sum(axis=0)[:, 0])
+    distance = float(np.median(((focus - centers) * axes).sum(axis=1)))
+    return distance if distance > 0.1 * extent else extent
+
+
+def _grey(points: np.ndarray) -> BasicPointCloud:
+    grey = np.full(points.shape, _GREY, dtype=np.float32)
+    return BasicPointCloud(points, grey, np.zeros_like(grey))

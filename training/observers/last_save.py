@@ -1,0 +1,55 @@
+"""The last save of a training: the finished model without what it does not need."""
+
+import argparse
+import dataclasses
+import math
+
+from torch import Tensor
+
+from arguments import add_to_model_json, write_cfg_args
+from gaussian_renderer.scored_views import ScoredViews
+from gaussian_renderer.trimming import change_on_views, trim
+from scene import Scene
+from training.left_out import LeftOut
+
+
+def save_last(
+    scene: Scene,
+    dataset: argparse.Namespace,
+    opt: argparse.Namespace,
+    pipe: argparse.Namespace,
+    background: Tensor,
+    scored: bool,
+) -> LeftOut:
+    """Save the finished model without what it does not need; what that was goes into model.json, too.
+
+    scored: the test pictures are in memory, so that the change in PSNR costs little.
+    """
+    trained = scene.gaussians
+    trained.optimizer.zero_grad(set_to_none=True)  # the last iteration takes no step: room for the trimmed copy
+    trimmed = trim(trained, scene.getTrainCameras(), pipe, opt.keep_unseen, opt.prune_sh)
+    final, test = trimmed.gaussians, scene.getTestCameras()
+    change = {}
+    if test and final is not trained:
+        views = ScoredViews(pipe, background, dataset.train_test_exp)
+        truth = (lambda camera: (views.target(camera), views.mask(camera))) if scored else None
+        change = change_on_views(trained, final, test, views.image, truth)
+    scene.save(opt.iterations, final)
+    write_cfg_args(scene.model_path, argparse.Namespace(**vars(dataset) | {"sh_degree": final.max_sh_degree}))
+    kept_pixels, file_pixels = scene.training_pixels()
+    left_out = LeftOut(
+        gaussians=len(trained),
+        unseen=trimmed.unseen,
+        keep_unseen=opt.keep_unseen,
+        max_sh_degree=trained.max_sh_degree,
+        sh_degree=final.max_sh_degree,
+        cut_bounds=trimmed.cut_bounds,
+        ply_bytes=trained.ply_bytes,
+        ply_bytes_saved=trained.ply_bytes - final.ply_bytes,
+        seconds=round(trimmed.seconds, 3),
+        picture_bytes=3 * kept_pixels,
+        picture_bytes_in_files=3 * file_pixels,
+        test_change={name: value for name, value in change.items() if math.isfinite(value)},
+    )
+    add_to_model_json(scene.model_path, left_out=dataclasses.asdict(left_out))
+    return left_out

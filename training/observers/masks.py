@@ -1,0 +1,64 @@
+"""Whether masks leave anything to train on, looked at while the views train for the first time."""
+
+import sys
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+from tqdm import tqdm
+
+from scene.cameras import Camera
+from utils.files.listing import some
+from utils.system_utils import UserError
+
+_ENOUGH = 100  # views without a pixel that counts, and none with: masks that are right do not look like that
+_ALMOST_NOTHING = 1e-3  # part of the pixels
+_HINT = "are they white masks (--invert_masks), or those of another scene?"
+
+
+class MaskWatch:
+    """Takes the views as they train, without waiting for a GPU; `look` waits, until all were seen once.
+
+    views: those that train. Before training no mask is decoded for this: thousands of pictures start in seconds.
+    """
+
+    def __init__(self, views: Sequence[Camera]) -> None:
+        self._left = {view.uid for view in views}
+        self._views = len(views)
+        self._new: list[tuple[str, Tensor]] = []  # name, and part of its pixels that counts
+        self._nothing = 0
+        self._scanty: list[str] = []
+        self._seen = 0
+
+    def add(self, view: Camera, mask: Tensor | None) -> None:
+        """Note how much of a view counts by its mask, if it is seen for the first time."""
+        if view.uid not in self._left:
+            return
+        self._left.remove(view.uid)
+        if mask is None:
+            self._seen += 1
+        else:
+            part = mask if view.columns is None else mask[..., view.columns]
+            self._new.append((view.image_name, part.float().mean()))
+
+    def look(self, last: bool) -> None:
+        """Once all views were seen, or at the last iteration, say which ones have (almost) nothing that counts.
+
+        UserError when nothing counts in any of them, or of the first hundred.
+        """
+        if self._new:
+            for (name, _), part in zip(self._new, torch.stack([part for _, part in self._new]).tolist(), strict=True):
+                self._seen += 1
+                self._nothing += part == 0
+                if part < _ALMOST_NOTHING:
+                    self._scanty.append(name)
+            self._new.clear()
+        if self._nothing == self._seen >= min(self._views, _ENOUGH):
+            raise UserError(f"the masks of all {self._seen} views seen so far leave no pixel to train on; {_HINT}")
+        if self._scanty and (last or not self._left):
+            tqdm.write(
+                f"warning: the masks of {len(self._scanty)} of {self._seen} views leave none or almost none of their "
+                f"pixels ({some(self._scanty)}), so they teach nothing; {_HINT}",
+                file=sys.stderr,
+            )
+            self._scanty.clear()
