@@ -20,14 +20,13 @@ from PIL import Image
 from tqdm import tqdm
 
 from arguments import ModelParams, OptionParser, PipelineParams, get_combined_args
-from gaussian_renderer import render
 from gaussian_renderer.memory_errors import memory_errors_explained
+from gaussian_renderer.scored_views import ScoredViews
 from records import render_times
 from scene.cameras import Camera
 from scene.gaussian_model import GaussianModel
 from scene.saved_model import load_saved
 from utils.general_utils import safe_state
-from utils.image_utils import right_half
 from utils.system_utils import UserError, atomic_write, compute_device, mkdir_p, run_cli
 
 
@@ -65,10 +64,11 @@ def render_set(
     background: torch.Tensor,
     train_test_exp: bool = False,
 ) -> list[float]:
-    """Write the renders and the ground truth of `views` under `folder`; seconds of rendering per view (without I/O).
+    """Write renders, ground truth and masks of `views` under `folder`; seconds of rendering per view (without I/O).
 
     train_test_exp: render with exposures, and write right halves only.
     """
+    scored = ScoredViews(pipe, background, train_test_exp)
     for side in ("renders", "gt"):
         remove_leftovers(folder / side, len(views))
         if views:
@@ -79,27 +79,18 @@ def render_set(
     seconds = []
     for view in {(view.image_width, view.image_height): view for view in views}.values():
         # The first call of a size pays for allocations and caches.
-        _image(view, gaussians, pipe, background, train_test_exp)
+        scored.whole(view, gaussians)
     for index, view in enumerate(tqdm(views, desc=f"Rendering {folder.parent.name}", unit="view")):
         _wait(background.device)
         start = time.perf_counter()
-        image = _image(view, gaussians, pipe, background, train_test_exp)
+        image = scored.whole(view, gaussians)
         _wait(background.device)
         seconds.append(time.perf_counter() - start)
-        target = view.target(background)
-        if train_test_exp:
-            image, target = right_half(image), right_half(target)
-        save_png(image, folder / "renders" / f"{index:05d}.png")
-        save_png(target, folder / "gt" / f"{index:05d}.png")
-        if (mask := view.mask) is not None:
-            save_mask(right_half(mask) if train_test_exp else mask, folder / "masks" / f"{index:05d}.png")
+        save_png(scored.part(image), folder / "renders" / f"{index:05d}.png")
+        save_png(scored.target(view), folder / "gt" / f"{index:05d}.png")
+        if (mask := scored.mask(view)) is not None:
+            save_mask(mask, folder / "masks" / f"{index:05d}.png")
     return seconds
-
-
-def _image(
-    view: Camera, gaussians: GaussianModel, pipe: argparse.Namespace, background: torch.Tensor, exposed: bool
-) -> torch.Tensor:
-    return render(view, gaussians, pipe, background, use_trained_exp=exposed, want_visibility=False)["render"]
 
 
 def _wait(device: torch.device) -> None:

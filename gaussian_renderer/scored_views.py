@@ -1,38 +1,92 @@
-"""Renders of views and their ground truth, as scores compare them."""
+"""Scores of views against their photos: the one place that knows half images, exposures, masks and targets."""
 
 import argparse
+from collections.abc import Callable, Iterable
 
+import torch
 from torch import Tensor
 
 from gaussian_renderer import render
 from scene.cameras import Camera
 from scene.gaussian_model import GaussianModel
-from utils.image_utils import right_half
+from utils.image_utils import as_float, pixels_that_count, right_half
+from utils.loss_utils import l1_and_ssim
 
 
 class ScoredViews:
-    """Images of views and what they should be, as they are scored: by the half-image protocol (train_test_exp) the
-    right halves alone, rendered with exposures."""
+    """Renders of views beside what they should be, as they are scored.
 
-    def __init__(self, pipe: argparse.Namespace, background: Tensor, train_test_exp: bool) -> None:
+    By the half-image protocol (train_test_exp) the right halves alone count, rendered with exposures.
+    draw: gives the whole render (3, H, W) in [0, 1] of camera and model; None: by `render`.
+    """
+
+    def __init__(
+        self,
+        pipe: argparse.Namespace,
+        background: Tensor,
+        train_test_exp: bool,
+        draw: Callable[[Camera, GaussianModel], Tensor] | None = None,
+    ) -> None:
         self._pipe = pipe
         self._background = background
         self._halves = train_test_exp
+        self._draw = draw or self._render
+
+    def _render(self, camera: Camera, gaussians: GaussianModel) -> Tensor:
+        exposed = {"use_trained_exp": self._halves}
+        return render(camera, gaussians, self._pipe, self._background, **exposed, want_visibility=False)["render"]
+
+    def whole(self, camera: Camera, gaussians: GaussianModel) -> Tensor:
+        """Render (3, H, W) float32 in [0, 1] before it is cut to what counts (`part`)."""
+        return self._draw(camera, gaussians)
+
+    def part(self, image: Tensor) -> Tensor:
+        """What is scored of an image (C, H, W): all of it, or its right half."""
+        return right_half(image).contiguous() if self._halves else image
 
     def image(self, camera: Camera, gaussians: GaussianModel) -> Tensor:
-        """Render (3, H, W) float32 in [0, 1]."""
-        exposed = {"use_trained_exp": self._halves}
-        package = render(camera, gaussians, self._pipe, self._background, **exposed, want_visibility=False)
-        return self._part(package["render"])
+        """What is scored of the render, (3, H, W) float32 in [0, 1]."""
+        return self.part(self.whole(camera, gaussians))
 
     def target(self, camera: Camera) -> Tensor:
         """What the render should be, as `Camera.target`."""
-        return self._part(camera.target(self._background))
+        return self.part(camera.target(self._background))
 
     def mask(self, camera: Camera) -> Tensor | None:
-        """Which pixels count, (1, H, W) bool; None where all do."""
+        """Pixels that count, (1, H, W) bool; None where all do."""
         mask = camera.mask
-        return None if mask is None else self._part(mask)
+        return None if mask is None else self.part(mask)
 
-    def _part(self, image: Tensor) -> Tensor:
-        return right_half(image).contiguous() if self._halves else image
+    def load(self, camera: Camera) -> None:
+        """Decode the photo and the mask, so that a scoring which is timed does not."""
+        self.target(camera)
+        self.mask(camera)
+
+    def compared(self, camera: Camera, gaussians: GaussianModel) -> tuple[Tensor, Tensor, Tensor | None]:
+        """Render, target and mask, as `mean_scores` takes them."""
+        return self.image(camera, gaussians), self.target(camera), self.mask(camera)
+
+    def scores(self, cameras: Iterable[Camera], gaussians: GaussianModel) -> dict[str, float]:
+        """`mean_scores` of views."""
+        return mean_scores(self.compared(camera, gaussians) for camera in cameras)
+
+
+def mean_scores(compared: Iterable[tuple[Tensor, Tensor, Tensor | None]]) -> dict[str, float]:
+    """`l1`, `psnr` (dB) and `ssim` of (render, target, mask), each the mean over these; {} without any.
+
+    mask: (1, H, W) bool, the pixels that count, or None (utils/loss_utils.py); without one that counts it is left out.
+    render: (3, H, W) float32 in [0, 1]; target: the same, or uint8 meaning value / 255. PSNR is from one mean squared
+    error over pixels and channels of a pair, infinite where both are equal. metrics.py scores the same views from 8-bit
+    PNGs, with rounded renders; the training report takes the mean of the three channels' PSNRs. Without masks it waits
+    for a GPU once.
+    """
+    scores = []
+    with torch.no_grad():
+        for image, target, mask in compared:
+            if mask is not None and not mask.any():
+                continue
+            l1, ssim = l1_and_ssim(image, target, mask)
+            mse = pixels_that_count(image - as_float(target), mask).square().mean()
+            scores.append(torch.stack([l1, -10.0 * mse.log10(), ssim]))
+        means = torch.stack(scores).double().mean(0).tolist() if scores else []
+    return dict(zip(("l1", "psnr", "ssim"), means, strict=False))

@@ -2,7 +2,7 @@
 
 import argparse
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -10,10 +10,10 @@ from torch import Tensor
 from tqdm import tqdm
 
 from gaussian_renderer import seen
+from gaussian_renderer.scored_views import ScoredViews
 from scene.cameras import Camera
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.sh_bands import cut_bounds, needed_degree
-from utils.view_scores import mean_scores
 
 
 @dataclass
@@ -58,16 +58,16 @@ def change_on_views(
     before: GaussianModel,
     after: GaussianModel,
     cameras: Sequence[Camera],
-    image: Callable[[Camera, GaussianModel], Tensor],
-    truth: Callable[[Camera], tuple[Tensor, Tensor | None]] | None,
+    views: ScoredViews,
+    scored: bool,
 ) -> dict[str, float]:
-    """How the images (3, H, W) of two models differ: `largest`, of a value in [0, 1].
+    """Difference of what two models render: `largest`, of a value in [0, 1].
 
-    truth: target and mask of a view as `mean_scores` takes them; where given, also `psnr_before` and `psnr_after`, dB.
+    scored: also `psnr_before` and `psnr_after`, dB.
     """
-    change = {"largest": max(float((image(c, before) - image(c, after)).abs().max()) for c in cameras)}
-    if truth is not None:
+    change = {"largest": max(float((views.image(c, before) - views.image(c, after)).abs().max()) for c in cameras)}
+    if scored:
         for name, model in (("psnr_before", before), ("psnr_after", after)):
-            scores = mean_scores((image(c, model), *truth(c)) for c in cameras)
+            scores = views.scores(cameras, model)
             change |= {name: scores["psnr"]} if scores else {}
     return change

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import TypeVar
 
 import torch
-from torch import Tensor
 from tqdm import tqdm
 
 from records.curve_figure import draw_curve
@@ -17,7 +16,6 @@ from records.error_curve import COLUMNS, FIGURE, NAME, Row, write_curve
 from records.training_log import TrainingLog
 from utils.host.process import wall_seconds
 from utils.system_utils import UserError
-from utils.view_scores import mean_scores
 
 View = TypeVar("View")
 
@@ -32,9 +30,9 @@ class CurveRecorder:
     """Scores views in the iterations of a schedule, keeps the curve's file up to date, and draws it at the end.
 
     rows: of the runs before, which `log` has the seconds of. iterations: the last one; always: those scored at any
-    cost. views: those to score, by set, "test" and "train"; render(view), target(view) and mask(view) give what
-    `mean_scores` takes. A curve that can't be written is warned of once; the next point tries again, for a training is
-    worth more than its curve.
+    cost. views: those to score, by set, "test" and "train"; load(view) makes a view's photo ready, scores(views) gives
+    their mean scores by name. A curve that can't be written is warned of once, and the next point tries again: a
+    training is worth more than its curve.
     """
 
     def __init__(
@@ -45,9 +43,8 @@ class CurveRecorder:
         iterations: int,
         always: Sequence[int],
         views: dict[str, Sequence[View]],
-        render: Callable[[View], Tensor],
-        target: Callable[[View], Tensor],
-        mask: Callable[[View], Tensor | None],
+        load: Callable[[View], None],
+        scores: Callable[[Sequence[View]], dict[str, float]],
         device: torch.device,
     ) -> None:
         self.rows = rows
@@ -56,9 +53,8 @@ class CurveRecorder:
         self._count = sum(map(len, views.values()))
         self._schedule = CurveSchedule(log.first_iteration, iterations, always, self._count)
         self._views = views
-        self._render = render
-        self._target = target
-        self._mask = mask
+        self._load = load
+        self._scores = scores
         self._device = device
         self._loading = 0.0  # seconds of decoding pictures that were not needed before
         self._writing = 0.0  # seconds of writing the file
@@ -84,7 +80,7 @@ class CurveRecorder:
         }
         if not self._schedule.scorings:
             # Once, and most of it for pictures that training needs soon: no measure of what the next scoring costs.
-            self._loading = self._seconds(self._load)
+            self._loading = self._seconds(self._load_all)
         self._schedule.scored(self._seconds(lambda: self._score(row)))
         self.rows.append(row)
         self._writing += self._seconds(self._write)
@@ -95,17 +91,14 @@ class CurveRecorder:
         call()
         return time.perf_counter() - start
 
-    def _load(self) -> None:
+    def _load_all(self) -> None:
         for views in self._views.values():
             for view in views:
-                self._target(view)
-                self._mask(view)
+                self._load(view)
 
     def _score(self, row: Row) -> None:
-        with torch.no_grad():
-            for name, views in self._views.items():
-                scores = mean_scores((self._render(view), self._target(view), self._mask(view)) for view in views)
-                row |= {f"{name}_{score}": round(value, 6) for score, value in scores.items()}
+        for name, views in self._views.items():
+            row |= {f"{name}_{score}": round(value, 6) for score, value in self._scores(views).items()}
 
     def _write(self) -> None:
         try:

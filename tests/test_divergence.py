@@ -14,6 +14,7 @@ import train
 from scene import gaussian_model
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.checkpoint import load_checkpoint
+from training import objective
 from utils.system_utils import UserError
 
 BETAS, EPS, RATE = (0.9, 0.999), 1e-15, 0.01
@@ -186,14 +187,14 @@ def _train(scene: Path, out: Path, *more: object, iterations: int) -> Path:
 
 
 def _nan_loss_in(monkeypatch: pytest.MonkeyPatch, iteration: int) -> None:
-    plain, calls = train.photometric_loss, []
+    plain, calls = objective.photometric_loss, []
 
     def broken(*args: object) -> tuple[torch.Tensor, torch.Tensor]:
         calls.append(1)
         loss, l1 = plain(*args)
         return (loss * NAN if len(calls) == iteration else loss), l1
 
-    monkeypatch.setattr(train, "photometric_loss", broken)
+    monkeypatch.setattr(objective, "photometric_loss", broken)
 
 
 def _same(a: object, b: object) -> bool:
@@ -210,11 +211,11 @@ def test_the_model_before_a_loss_of_nan_is_saved(colmap_scene, tmp_path, monkeyp
     """Whether it is seen at once, as something is saved (3) or changed (13, 26), or later: nothing moved since."""
     options = ["--densify_from_iter", 10, "--densification_interval", 13, "--densify_grad_threshold", 1e-4]
     options += ["--opacity_reset_interval", 26, "--optimizer_type", optimizer]
-    monkeypatch.setattr(train, "SH_INTERVAL", 10)
+    monkeypatch.setattr("training.run.SH_INTERVAL", 10)
     _train(colmap_scene, tmp_path / "whole", *options, "--checkpoint_iterations", broken - 1, iterations=broken)
     _nan_loss_in(monkeypatch, broken)
     out = tmp_path / "broken"
-    last = rf"is saved: go on with --start_checkpoint .*chkpnt{broken - 1}.pth and lower learning rates"
+    last = rf"is saved: resume with --start_checkpoint .*chkpnt{broken - 1}.pth and lower learning rates"
     with pytest.raises(UserError, match=rf"loss became nan in iteration {broken} \(view (left|Right)/.*{last}"):
         _train(colmap_scene, out, *options, "--save_iterations", 3, "--checkpoint_iterations", 3, iterations=30)
     saved, wanted = (load_checkpoint(tmp_path / name / f"chkpnt{broken - 1}.pth") for name in ("broken", "whole"))

@@ -21,16 +21,17 @@ from skimage.metrics import peak_signal_noise_ratio
 
 import render
 import train
+from gaussian_renderer.scored_views import ScoredViews, mean_scores
 from records.curve_figure import draw_curve
 from records.curve_peak import peak_advice, schedules_follow_length
 from records.curve_recorder import CurveRecorder, evenly_spread
 from records.curve_schedule import CurveSchedule
 from records.error_curve import COLUMNS, Row, best_test, continue_curve, read_curve, write_curve
 from records.training_log import TrainingLog
+from training import objective
 from utils.host import process
 from utils.loss_utils import ssim
 from utils.system_utils import UserError
-from utils.view_scores import mean_scores
 
 ROOT = Path(__file__).parents[1]
 HEADER = (
@@ -207,16 +208,40 @@ class TestScores:
         assert means["ssim"] != pytest.approx(mean_scores([(image, target, None)])["ssim"], abs=1e-3)
 
     def test_pictures_and_masks_are_loaded_before_a_scoring_is_timed(self, tmp_path):
-        seen, image = [], torch.zeros(3, 12, 12)
+        seen = []
 
-        def giving(what: str, value: torch.Tensor | None):
-            return lambda view: (seen.append((what, view)), value)[1]
+        def load(view: str) -> None:
+            seen.append(("load", view))
 
-        parts = giving("render", image), giving("target", image), giving("mask", None)
+        def scores(views: list[str]) -> dict[str, float]:
+            seen.append(("scores", *views))
+            return {"psnr": 20.0}
+
         views, log = {"test": ["a"], "train": ["b"]}, TrainingLog(tmp_path, 0)
-        CurveRecorder(tmp_path, [], log, 1, [], views, *parts, torch.device("cpu")).add(1, 1.0, 5)
-        assert set(seen[:4]) == {(what, view) for what in ("target", "mask") for view in "ab"}
-        assert len(seen) == 10
+        recorder = CurveRecorder(tmp_path, [], log, 2, [], views, load, scores, torch.device("cpu"))
+        recorder.add(1, 1.0, 5)
+        assert seen == [("load", "a"), ("load", "b"), ("scores", "a"), ("scores", "b")]
+        recorder.add(2, 2.0, 5)
+        assert seen[4:] == [("scores", "a"), ("scores", "b")]  # loaded once
+        assert recorder.rows[0]["test_psnr"] == recorder.rows[1]["train_psnr"] == 20.0
+
+    def test_a_set_is_scored_by_render_target_and_mask_of_each_view(self):
+        image = torch.full((3, 12, 12), 0.5)
+
+        class View:
+            mask = None
+            loaded = 0
+
+            def target(self, background: torch.Tensor) -> torch.Tensor:
+                self.loaded += 1
+                return image - 0.1
+
+        views = [View(), View()]
+        scored = ScoredViews(None, torch.zeros(3), train_test_exp=False, draw=lambda camera, gaussians: image)
+        scored.load(views[0])
+        assert [view.loaded for view in views] == [1, 0]
+        scores = scored.scores(views, None)
+        assert scores["l1"] == pytest.approx(0.1) and scores["psnr"] == pytest.approx(20.0, abs=1e-4)
 
     def test_views_are_evenly_spread(self):
         assert evenly_spread(range(9), 3) == [0, 4, 8]
@@ -378,7 +403,7 @@ class TestTraining:
 
     def test_interrupted_and_gone_on(self, colmap_scene, tmp_path, monkeypatch):
         out = tmp_path / "out"
-        plain, calls = train.photometric_loss, []
+        plain, calls = objective.photometric_loss, []
 
         def interrupted(*args: object) -> tuple:
             calls.append(1)
@@ -387,7 +412,7 @@ class TestTraining:
             return plain(*args)
 
         with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-            patch.setattr(train, "photometric_loss", interrupted)
+            patch.setattr(objective, "photometric_loss", interrupted)
             _train(colmap_scene, out, "--test_iterations", 6, 8, iterations=20)
         assert _iterations(out)[-2:] == [6, 8] and not (out / "error_vs_time.png").exists()
         _train(colmap_scene, out, "--start_checkpoint", out / "chkpnt8.pth", iterations=20)
@@ -423,7 +448,7 @@ class TestTraining:
         assert "warning: no error_vs_time.png: ModuleNotFoundError" in error
 
     def test_a_loss_that_is_not_finite_makes_no_point(self, colmap_scene, tmp_path, monkeypatch):
-        monkeypatch.setattr(train, "photometric_loss", lambda image, *_: (image.sum() * torch.nan,) * 2)
+        monkeypatch.setattr(objective, "photometric_loss", lambda image, *_: (image.sum() * torch.nan,) * 2)
         with pytest.raises(UserError, match="nan in iteration 1"):
             _train(colmap_scene, tmp_path / "out", "--test_iterations", 1, iterations=2)
         assert not (tmp_path / "out" / "error_vs_time.csv").exists()

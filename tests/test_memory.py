@@ -14,10 +14,11 @@ from PIL import Image
 
 import render
 import train
+from gaussian_renderer import scored_views
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.checkpoint import load_checkpoint
 from scene.pictures import decode
-from training import memory_estimate
+from training import loop, memory_estimate
 from training.memory_estimate import training_bytes
 from utils.host import memory
 from utils.host.memory import free_memory, gib, is_out_of_memory, shortage
@@ -137,9 +138,9 @@ def _failing(function, call: int, error: Exception):
     ids=["cpu", "gpu", "instances"],
 )
 def test_the_state_before_is_saved_and_goes_on_to_the_same_end(colmap_scene, tmp_path, monkeypatch, error, said):
-    monkeypatch.setattr(train, "SH_INTERVAL", 5)  # so that the failing iteration is one that raises the degree
+    monkeypatch.setattr("training.run.SH_INTERVAL", 5)  # so that the failing iteration is one that raises the degree
     with monkeypatch.context() as patch:
-        patch.setattr(train, "render", _failing(train.render, 5, error))
+        patch.setattr(loop, "render", _failing(loop.render, 5, error))
         with pytest.raises(UserError, match="memory did not suffice in iteration 5") as caught:
             _train(colmap_scene, tmp_path / "cut")
     text = str(caught.value)
@@ -183,14 +184,14 @@ def test_a_densification_cut_short_is_saved_whole(colmap_scene, tmp_path, monkey
 
 
 def test_nothing_trained_saves_nothing(colmap_scene, tmp_path, monkeypatch):
-    monkeypatch.setattr(train, "render", _failing(train.render, 1, ON_A_GPU))
+    monkeypatch.setattr(loop, "render", _failing(loop.render, 1, ON_A_GPU))
     with pytest.raises(UserError, match="in iteration 1 .*nothing was trained yet"):
         _train(colmap_scene, tmp_path)
     assert not list(tmp_path.glob("*.pth"))
 
 
 def test_other_errors_pass(colmap_scene, tmp_path, monkeypatch):
-    monkeypatch.setattr(train, "render", _failing(train.render, 3, RuntimeError("shapes differ")))
+    monkeypatch.setattr(loop, "render", _failing(loop.render, 3, RuntimeError("shapes differ")))
     with pytest.raises(RuntimeError, match="shapes differ"):
         _train(colmap_scene, tmp_path)
     assert not list(tmp_path.glob("*.pth"))
@@ -198,7 +199,7 @@ def test_other_errors_pass(colmap_scene, tmp_path, monkeypatch):
 
 def test_rendering_says_what_did_not_fit(colmap_scene, tmp_path, monkeypatch):
     _train(colmap_scene, tmp_path)
-    monkeypatch.setattr(render, "render", _failing(render.render, 4, ON_A_GPU))
+    monkeypatch.setattr(scored_views, "render", _failing(scored_views.render, 4, ON_A_GPU))
     monkeypatch.setattr(sys, "argv", ["render.py", "-m", str(tmp_path)])
     with pytest.raises(UserError, match=r"rendering \(20.0 GiB asked for.*Gaussians; pictures of 24 x 16\).*-r"):
         render.main()
@@ -295,7 +296,7 @@ def test_threads_end_with_an_interrupted_run(colmap_scene, tmp_path):
 @pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no NVIDIA GPU")
 def test_a_full_gpu_saves_the_model(colmap_scene, tmp_path, monkeypatch):
-    plain, calls = train.render, []
+    plain, calls = loop.render, []
 
     def greedy(*args: object, **kwargs: object) -> dict:
         calls.append(1)
@@ -303,7 +304,7 @@ def test_a_full_gpu_saves_the_model(colmap_scene, tmp_path, monkeypatch):
             torch.empty(1 << 50, dtype=torch.uint8, device="cuda")
         return plain(*args, **kwargs)
 
-    monkeypatch.setattr(train, "render", greedy)
+    monkeypatch.setattr(loop, "render", greedy)
     with pytest.raises(UserError, match="GiB asked for, .* GiB free on the GPU.*chkpnt2.pth"):
         _train(colmap_scene, tmp_path)
     assert load_checkpoint(tmp_path / "chkpnt2.pth")[1] == 2

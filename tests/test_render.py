@@ -32,7 +32,7 @@ def view(target: torch.Tensor) -> SimpleNamespace:
 def rendered(monkeypatch) -> dict[int, torch.Tensor]:
     """What render() gives, by view."""
     prepared: dict[int, torch.Tensor] = {}
-    monkeypatch.setattr(render, "render", lambda view, *_, **__: {"render": prepared[id(view)]})
+    monkeypatch.setattr("gaussian_renderer.scored_views.render", lambda view, *_, **__: {"render": prepared[id(view)]})
     return prepared
 
 

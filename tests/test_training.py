@@ -19,6 +19,8 @@ from records.training_log import Stopwatch, TrainingLog
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.checkpoint import load_checkpoint
 from scene.readers.point_cloud import write_point_cloud
+from training import loop
+from training import run as training_run
 from training.observers import report
 from training.view_order import ViewOrder
 from utils.system_utils import UserError
@@ -57,7 +59,7 @@ RESUMED = [
 
 
 def test_resume_equals_uninterrupted(colmap_scene, tmp_path, monkeypatch):
-    monkeypatch.setattr(train, "SH_INTERVAL", 130)  # so that three degrees come into play within 600 iterations
+    monkeypatch.setattr("training.run.SH_INTERVAL", 130)  # so that three degrees come into play within 600 iterations
     whole = _train(colmap_scene, tmp_path / "a", *RESUMED, "--checkpoint_iterations", 300, iterations=600)
     checkpoint = tmp_path / "a" / "chkpnt300.pth"
     resumed = _train(colmap_scene, tmp_path / "b", *RESUMED, "--start_checkpoint", checkpoint, iterations=600)
@@ -160,8 +162,8 @@ def test_learning_and_what_is_said(colmap_scene, tmp_path, capfd):
 
 @pytest.mark.parametrize("degree", [0, 2, 3])
 def test_sh_degree_rises_every_interval_up_to_its_maximum(blender_scene, tmp_path, monkeypatch, degree):
-    assert train.SH_INTERVAL == 1000
-    monkeypatch.setattr(train, "SH_INTERVAL", 2)
+    assert training_run.SH_INTERVAL == 1000
+    monkeypatch.setattr("training.run.SH_INTERVAL", 2)
     cloud = tmp_path / "cloud.ply"
     write_point_cloud(cloud, np.random.default_rng(0).normal(size=(50, 3)) * 0.3, np.full((50, 3), 100))
     every = [str(t) for t in range(1, 9)]
@@ -176,7 +178,7 @@ def test_sh_degree_rises_every_interval_up_to_its_maximum(blender_scene, tmp_pat
 
 def test_interrupt_saves_a_checkpoint_that_goes_on_to_the_same_end(colmap_scene, tmp_path, monkeypatch):
     whole = _train(colmap_scene, tmp_path / "whole", iterations=9)
-    plain, calls = train.render, []
+    plain, calls = loop.render, []
 
     def interrupted(*args: object, **kwargs: object) -> dict:
         calls.append(1)
@@ -185,7 +187,7 @@ def test_interrupt_saves_a_checkpoint_that_goes_on_to_the_same_end(colmap_scene,
         return plain(*args, **kwargs)
 
     with monkeypatch.context() as patch:
-        patch.setattr(train, "render", interrupted)
+        patch.setattr(loop, "render", interrupted)
         with pytest.raises(KeyboardInterrupt):
             _train(colmap_scene, tmp_path / "cut", iterations=9)
     resumed = _train(
@@ -215,7 +217,7 @@ def test_a_killed_run_leaves_whole_files(colmap_scene, tmp_path, sent, status):
     assert run.returncode == status, error.decode()
     assert b"Traceback" not in error and b"***" not in error  # glog's stack dumps have such lines
     if sent == signal.SIGTERM:
-        assert b"go on with --start_checkpoint" in error
+        assert b"resume with --start_checkpoint" in error
     plys = list((tmp_path / "out" / "point_cloud").glob("iteration_*/point_cloud.ply"))
     assert len(plys) >= 20
     for ply in plys:
@@ -355,7 +357,7 @@ def test_seconds_leave_evaluation_and_saving_out(colmap_scene, tmp_path, monkeyp
         time.sleep(0.5)
         return {"test_psnr": 1.0}
 
-    monkeypatch.setattr(train, "training_report", slow)
+    monkeypatch.setattr("training.observers.report.training_report", slow)
     _train(colmap_scene, tmp_path, iterations=4)
     log = json.loads((tmp_path / "train_log.json").read_text())
     # Four evaluations take 2 s, four iterations some 20 ms; the first also loads parts of torch.

@@ -18,6 +18,7 @@ import train
 from arguments import ModelParams, read_cfg_args
 from diagnosis.model import check_model
 from gaussian_renderer import render
+from gaussian_renderer.scored_views import ScoredViews
 from gaussian_renderer.trimming import change_on_views, seen_by, trim
 from scene import Scene
 from scene.gaussian_model import GaussianModel
@@ -109,7 +110,7 @@ def test_what_is_reported(runs):
     # The change on test views, with the test pictures as they were scored at this iteration.
     scene, whole = _load(runs.whole)
     change = change_on_views(
-        whole, _load(runs.trimmed)[1], scene.getTestCameras(), _image, lambda camera: (camera.target(BLACK), None)
+        whole, _load(runs.trimmed)[1], scene.getTestCameras(), ScoredViews(pipeline(), BLACK, False), scored=True
     )
     assert record["test_change"] == pytest.approx(change) and set(change) == {"largest", "psnr_before", "psnr_after"}
     assert change["largest"] > 0
@@ -167,7 +168,9 @@ def test_colours_move_by_no_more_than_asked(runs):
         cut = trim(gaussians, cameras, pipeline(), keep_unseen=True, prune_sh=bound)
         assert cut.gaussians.max_sh_degree == cut.gaussians.active_sh_degree == degree
         assert cut.gaussians._features_rest.shape[1] == (degree + 1) ** 2 - 1 and len(cut.gaussians) == 200
-        moved = change_on_views(gaussians, cut.gaussians, cameras, _image, None)["largest"]
+        moved = change_on_views(gaussians, cut.gaussians, cameras, ScoredViews(pipeline(), BLACK, False), scored=False)[
+            "largest"
+        ]
         assert 0.05 * bound < moved <= bound
         assert trim(gaussians, cameras, pipeline(), True, 0.99 * bound).gaussians.max_sh_degree > degree
     assert all(torch.equal(values, before[name]) for name, values in parameters(gaussians).items())

@@ -35,14 +35,12 @@ import json, sys, time
 started = float(sys.argv[1])
 import resource, train
 from scene.pictures.store import ImageStore
-
-ROOT = Path(__file__).resolve().parents[2]
-plain, first = train.MemoryGuard.reached, []
-def reached(self, iteration):
-    plain(self, iteration)
-    if iteration == 1:
+plain, first = train.MemoryGuard.stepped, []
+def stepped(self, step):
+    plain(self, step)
+    if step.iteration == 1:
         first.append(time.time() - started)
-train.MemoryGuard.reached = reached
+train.MemoryGuard.stepped = stepped
 if sys.argv[2] == "False":
     ImageStore.prefetch = lambda *_: None
 train.main(sys.argv[4:])

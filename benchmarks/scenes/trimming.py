@@ -20,7 +20,6 @@ from scene.gaussian_model import GaussianModel
 from scene.gaussians.sh_bands import cut_bounds
 from scene.saved_model import load_saved
 from utils.system_utils import compute_device, run_cli
-from utils.view_scores import mean_scores
 
 
 def milliseconds(run: Callable[[], object], device: torch.device) -> float:
@@ -57,7 +56,7 @@ def main() -> None:
 def _row(model: GaussianModel, views: dict[str, list[Camera]], scored: ScoredViews, device: torch.device) -> list[str]:
     psnr = []
     for cameras in views.values():
-        scores = mean_scores((scored.image(c, model), scored.target(c), scored.mask(c)) for c in cameras)
+        scores = scored.scores(cameras, model)
         psnr.append(f"{scores['psnr']:.3f}" if scores else "")
     median = milliseconds(lambda: scored.image(views["train"][0], model), device)
     return [str(len(model)), f"{model.ply_bytes / 1e6:.2f}", *psnr, f"{median:.2f}"]

@@ -1,42 +1,53 @@
-"""The recorder of a training's curve of error against run time."""
+"""The curve of error against run time, recorded while the model trains."""
 
-import argparse
-from collections.abc import Sequence
-
-from torch import Tensor
+from pathlib import Path
 
 from gaussian_renderer.scored_views import ScoredViews
+from records.curve_peak import schedules_follow_length
 from records.curve_recorder import CurveRecorder, evenly_spread
-from records.error_curve import Row
-from records.training_log import TrainingLog
-from scene import Scene
+from training.objective import Losses
+from training.observer import Error, Observer
+from training.run import Run
+from training.step import Step
+from utils.system_utils import saved_iterations
 
 
-def scene_curve(
-    scene: Scene,
-    rows: list[Row],
-    log: TrainingLog,
-    iterations: int,
-    testing_iterations: Sequence[int],
-    pipe: argparse.Namespace,
-    background: Tensor,
-    train_test_exp: bool,
-) -> CurveRecorder | None:
-    """Recorder of the error of all test views and as many training views; None for a scene without test views."""
-    test = scene.getTestCameras()
-    if not test:
-        return None
-    trained = [camera for camera in scene.getTrainCameras() if camera.columns is None]  # in whole
-    scored = ScoredViews(pipe, background, train_test_exp)
-    return CurveRecorder(
-        scene.model_path,
-        rows,
-        log,
-        iterations,
-        testing_iterations,
-        {"test": test, "train": evenly_spread(trained, len(test))},
-        lambda camera: scored.image(camera, scene.gaussians),
-        scored.target,
-        scored.mask,
-        background.device,
-    )
+class Curve(Observer):
+    """Scores all test views, and as many training views, when the schedule says so; draws the curve at the end."""
+
+    def __init__(self, run: Run) -> None:
+        self._run = run
+        test = run.scene.getTestCameras()
+        trained = [camera for camera in run.scene.getTrainCameras() if camera.columns is None]  # in whole
+        views = ScoredViews(run.pipe, run.background, run.dataset.train_test_exp)
+        self._recorder = CurveRecorder(
+            run.scene.model_path,
+            run.rows,
+            run.log,
+            run.opt.iterations,
+            run.plan.test,
+            {"test": test, "train": evenly_spread(trained, len(test))},
+            views.load,
+            lambda cameras: views.scores(cameras, run.gaussians),
+            run.device,
+        )
+        self._due = False
+        self._seconds = 0.0
+
+    def due(self, step: Step) -> bool:
+        self._due = self._recorder.due(step.iteration, self._run.clock.seconds)
+        return self._due
+
+    def measured(self, step: Step, losses: Losses) -> None:
+        if self._due:
+            self._seconds = self._run.clock.seconds
+            with self._run.clock.paused():
+                self._recorder.add(step.iteration, self._seconds, len(self._run.gaussians))
+
+    def ended(self, error: Error) -> None:
+        if error is not None:
+            return
+        run = self._run
+        saved = {*run.plan.save} & {*saved_iterations(Path(run.scene.model_path) / "point_cloud")}
+        follows_length = schedules_follow_length(bool(run.dataset.depths), run.dataset.train_test_exp)
+        self._recorder.finish(self._seconds, saved, run.opt.position_lr_max_steps, follows_length)

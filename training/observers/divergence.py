@@ -1,17 +1,18 @@
-"""A training that diverges ends in a sentence, with the last good model saved, and costs no wait for the device."""
+"""Detects divergence without synchronising the device, saves the last good model and stops with one message."""
 
 import math
 import sys
 from collections import deque
-from collections.abc import Callable
 from pathlib import Path
 
-from torch import Tensor
+from tqdm import tqdm
 
-from scene.gaussian_model import GaussianModel
 from scene.gaussians.adam import StepGuard
 from scene.gaussians.checkpoint import save_checkpoint
-from training.observers.losses import LossWatch
+from training.objective import Losses
+from training.observer import Error, Observer
+from training.run import Run
+from training.step import Step
 from utils.system_utils import UserError
 
 _SHOWN = 5  # rows that are named
@@ -19,37 +20,30 @@ _COMPARED = 10  # losses of the start and of the end, each of another view
 _WORSE_AFTER = 100  # iterations that a loss is given to fall
 
 
-class DivergenceWatch:
-    """Looks now and then for a loss, or a step of the optimisers, that was not finite.
+class DivergenceWatch(Observer):
+    """Checks now and then for a loss, or a step of the optimisers, that was not finite.
 
     From that iteration on the optimisers leave everything as it is (StepGuard), so however late somebody looks, the
-    model is the last good one. losses: takes them all; name_of: the view of an iteration.
+    model is the last good one.
     """
 
-    def __init__(
-        self,
-        gaussians: GaussianModel,
-        losses: LossWatch,
-        model_path: str,
-        first_iteration: int,
-        name_of: Callable[[int], str],
-    ) -> None:
-        self._gaussians = gaussians
-        self._losses = losses
-        self._folder = Path(model_path)
-        self._first = self._iteration = first_iteration
-        self._name_of = name_of
-        self._guard = StepGuard(gaussians.get_xyz.device)
-        gaussians.guard_steps(self._guard)
-        self._sh_degrees = [gaussians.active_sh_degree] * 2  # in the last iteration but one, and in the last
+    def __init__(self, run: Run) -> None:
+        self._run = run
+        self._gaussians = run.gaussians
+        self._losses = run.losses
+        self._iteration = run.first_iteration
+        self._guard = StepGuard(run.device)
+        run.gaussians.guard_steps(self._guard)
+        self._sh_degrees = [run.gaussians.active_sh_degree] * 2  # in the last iteration but one, and in the last
         self._earliest: list[float] = []
         self._latest: deque[float] = deque(maxlen=_COMPARED)
 
-    def note(self, iteration: int, loss: Tensor) -> None:
-        """The loss of an iteration, before its step."""
-        self._losses.add(iteration, loss)
-        self._guard.watch(iteration, loss)
+    def measured(self, step: Step, losses: Losses) -> None:
+        self._losses.add(step.iteration, losses.total)
+        self._guard.watch(step.iteration, losses.total)
         self._sh_degrees = [self._sh_degrees[1], self._gaussians.active_sh_degree]
+        if step.due:
+            self.look(step.iteration)
 
     def look(self, iteration: int, stepped: bool = False) -> None:
         """UserError, after saving a checkpoint, where a loss was not finite, or a step.
@@ -74,18 +68,19 @@ class DivergenceWatch:
         self._gaussians.rewind(iteration - good if stepped else iteration - 1 - good)
         if good < iteration:
             self._gaussians.active_sh_degree = self._sh_degrees[0]
+        view = self._run.views[first].image_name
         raise UserError(
-            f"{what} in iteration {first} (view {self._name_of(first)}), so training stopped; {self._rescue(good)}, or "
+            f"{what} in iteration {first} (view {view}), so training stopped; {self._rescue(good)}, or "
             "check this view and the point cloud"
         )
 
-    def finish(self) -> None:
-        """At the end: a word on a training whose loss is above what it began with."""
-        if self._first > 0 or self._iteration < _WORSE_AFTER:
+    def ended(self, error: Error) -> None:
+        """Warn of a training whose loss is above what it began with."""
+        if error is not None or self._run.first_iteration > 0 or self._iteration < _WORSE_AFTER:
             return
         before, after = (sum(losses) / len(losses) for losses in (self._earliest, self._latest))
         if after > before:
-            print(
+            tqdm.write(
                 f"warning: the loss was {before:.3g} at first and is {after:.3g} at the end, the model is worse than "
                 "the points it began with; lower the learning rates, or look at poses and pictures (doctor.py)",
                 file=sys.stderr,
@@ -99,16 +94,16 @@ class DivergenceWatch:
         return " and ".join(parts)
 
     def _rescue(self, iteration: int) -> str:
-        if iteration == self._first:
+        if iteration == self._run.first_iteration:
             return "nothing was trained before; lower the learning rates"
-        path = self._folder / f"chkpnt{iteration}.pth"
+        path = Path(self._run.scene.model_path) / f"chkpnt{iteration}.pth"
         try:
             self._gaussians.check_finite(iteration)
             self._gaussians.drop_broken_statistics()
             save_checkpoint(path, self._gaussians.capture(), iteration)
         except UserError as error:
-            return f"and the model could not be saved ({error}); go on from an earlier checkpoint"
+            return f"and the model could not be saved ({error}); resume an earlier checkpoint"
         return (
-            f"the last good model, after iteration {iteration}, is saved: go on with --start_checkpoint {path} and "
+            f"the last good model, after iteration {iteration}, is saved: resume with --start_checkpoint {path} and "
             "lower learning rates"
         )

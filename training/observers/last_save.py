@@ -32,8 +32,7 @@ def save_last(
     change = {}
     if test and final is not trained:
         views = ScoredViews(pipe, background, dataset.train_test_exp)
-        truth = (lambda camera: (views.target(camera), views.mask(camera))) if scored else None
-        change = change_on_views(trained, final, test, views.image, truth)
+        change = change_on_views(trained, final, test, views, scored)
     scene.save(opt.iterations, final)
     write_cfg_args(scene.model_path, argparse.Namespace(**vars(dataset) | {"sh_degree": final.max_sh_degree}))
     kept_pixels, file_pixels = scene.training_pixels()

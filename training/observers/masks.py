@@ -1,4 +1,4 @@
-"""Whether masks leave anything to train on, looked at while the views train for the first time."""
+"""Check that masks leave something to train on, made while the views train for the first time."""
 
 import sys
 from collections.abc import Sequence
@@ -8,6 +8,9 @@ from torch import Tensor
 from tqdm import tqdm
 
 from scene.cameras import Camera
+from training.objective import Losses
+from training.observer import Observer
+from training.step import Step
 from utils.files.listing import some
 from utils.system_utils import UserError
 
@@ -16,7 +19,7 @@ _ALMOST_NOTHING = 1e-3  # part of the pixels
 _HINT = "are they white masks (--invert_masks), or those of another scene?"
 
 
-class MaskWatch:
+class MaskWatch(Observer):
     """Takes the views as they train, without waiting for a GPU; `look` waits, until all were seen once.
 
     views: those that train. Before training no mask is decoded for this: thousands of pictures start in seconds.
@@ -29,6 +32,11 @@ class MaskWatch:
         self._nothing = 0
         self._scanty: list[str] = []
         self._seen = 0
+
+    def measured(self, step: Step, losses: Losses) -> None:
+        self.add(step.camera, losses.mask)
+        if step.due:
+            self.look(step.last)
 
     def add(self, view: Camera, mask: Tensor | None) -> None:
         """Note how much of a view counts by its mask, if it is seen for the first time."""

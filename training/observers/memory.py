@@ -1,56 +1,52 @@
-"""Where memory does not suffice the model is saved, and a sentence says what was wanted and what helps."""
+"""Rescue of the model when a training runs out of memory, with a message of what was wanted and what helps."""
 
 import traceback
 from pathlib import Path
-from types import TracebackType
 
 from gaussian_renderer.memory_errors import situation
 from scene.cameras import Camera
-from scene.gaussian_model import GaussianModel
 from scene.gaussians.checkpoint import save_checkpoint
+from training.objective import Losses
+from training.observer import Error, Observer
+from training.run import Run
+from training.step import Step
 from utils.host.memory import is_out_of_memory
 from utils.system_utils import UserError
 
 
-class MemoryGuard:
-    """Inside `with`, where a training runs out of memory the model is saved and the error becomes a UserError.
+class MemoryGuard(Observer):
+    """Saves the model when memory runs out, and turns the error into a UserError.
 
-    The training says where it is: `reached` (an iteration is complete), `working` (which view), `changing` (from here
-    on the model is between two iterations). Before `changing`, what is saved is the state after the last iteration, and
-    going on from it equals a run that was never stopped. Afterwards it is a whole model, too, but that iteration's
-    densification or optimiser step may be done in part.
+    Before an iteration is `measured`, the state after the last iteration is saved: a resumed run then equals one that
+    was never stopped. Afterwards the model is whole, too, but that iteration's densification or optimiser step may be
+    done in part. So this observer comes after all that only read the model, and before those that need it whole.
     """
 
-    def __init__(self, gaussians: GaussianModel, model_path: str, first_iteration: int) -> None:
-        self._gaussians = gaussians
-        self._folder = Path(model_path)
-        self._first = first_iteration
-        self.reached(first_iteration)
+    def __init__(self, run: Run) -> None:
+        self._gaussians = run.gaussians
+        self._folder = Path(run.scene.model_path)
+        self._first = run.first_iteration
+        self._reached(run.first_iteration)
 
-    def reached(self, iteration: int) -> None:
-        """The model has the state after this iteration."""
+    def _reached(self, iteration: int) -> None:
         self._iteration = iteration
         self._sh_degree = self._gaussians.active_sh_degree
         self._changing = False
         self._camera: Camera | None = None
 
-    def working(self, camera: Camera) -> None:
-        """The next iteration has begun, with this view."""
-        self._camera = camera
+    def begins(self, step: Step) -> None:
+        self._camera = step.camera
 
-    def changing(self) -> None:
-        """The next iteration begins to change the model."""
+    def measured(self, step: Step, losses: Losses) -> None:
         self._changing = True
 
-    def __enter__(self) -> "MemoryGuard":
-        return self
+    def stepped(self, step: Step) -> None:
+        self._reached(step.iteration)
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def ended(self, error: Error) -> None:
         if is_out_of_memory(error):
             what = situation(error, self._gaussians, [self._camera] if self._camera else [])
-            traceback.clear_frames(trace)  # what was being computed takes memory that saving may need
+            traceback.clear_frames(error.__traceback__)  # what was being computed takes memory that saving may need
             raise UserError(
                 f"memory did not suffice in iteration {self._iteration + 1} ({what}); {self._rescue()}"
             ) from error
@@ -75,7 +71,7 @@ class MemoryGuard:
             path = self._folder / f"chkpnt{iteration}.pth"
             save_checkpoint(path, gaussians.capture(), iteration)
         except (UserError, MemoryError, RuntimeError) as error:
-            return f"and the model could not be saved ({error}); go on from an earlier checkpoint"
+            return f"and the model could not be saved ({error}); resume an earlier checkpoint"
         return (
-            f"{state} is saved: go on with --start_checkpoint {path} and {further}, or start anew with a lower {anew}"
+            f"{state} is saved: resume with --start_checkpoint {path} and {further}, or start anew with a lower {anew}"
         )

@@ -1,4 +1,4 @@
-"""What a training says of itself on the way: TensorBoard's scalars and pictures, scores in testing iterations."""
+"""Scores in testing iterations, and what TensorBoard is told."""
 
 import sys
 from collections.abc import Callable, Sequence
@@ -8,10 +8,45 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
+from gaussian_renderer import render
+from gaussian_renderer.scored_views import ScoredViews
 from scene import Scene
-from utils.image_utils import as_float, pixels_that_count, psnr, right_half
+from scene.cameras import Camera
+from scene.gaussian_model import GaussianModel
+from training.objective import Losses
+from training.observer import Error, Observer
+from training.run import Run
+from training.step import Step
+from utils.image_utils import as_float, pixels_that_count, psnr
+from utils.loss_utils import l1_loss
 
 LOG_INTERVAL = 10  # iterations between TensorBoard's losses: reading one waits for the GPU
+SHOWN = 5  # views of a set that TensorBoard gets the images of
+
+
+class Report(Observer):
+    """Calls `training_report` in every iteration, and logs the scores. writer: TensorBoard's, or None."""
+
+    def __init__(self, run: Run, writer: Any | None) -> None:
+        self._run = run
+        self._writer = writer
+
+    def due(self, step: Step) -> bool:
+        return step.iteration in self._run.plan.test
+
+    def measured(self, step: Step, losses: Losses) -> None:
+        run, seconds = self._run, self._run.clock.seconds
+        with run.clock.paused():
+            scores = training_report(
+                self._writer, step.iteration, losses.l1, losses.total, l1_loss, seconds - step.started, run.plan.test,
+                run.scene, render, (run.pipe, run.background), run.dataset.train_test_exp,
+            )  # fmt: skip
+            if scores:
+                run.log.add(step.iteration, seconds, gaussians=len(run.gaussians), loss=run.losses.mean, **scores)
+
+    def ended(self, error: Error) -> None:
+        if self._writer:
+            self._writer.close()
 
 
 def training_report(
@@ -40,39 +75,59 @@ def training_report(
     if iteration not in testing_iterations:
         return {}
     exposed = {"use_trained_exp": True} if train_test_exp else {}
+    views = ScoredViews(
+        *renderArgs[:2],
+        train_test_exp,
+        lambda camera, gaussians: renderFunc(camera, gaussians, *renderArgs, **exposed)["render"],
+    )
     train = scene.getTrainCameras()
     sets = {"test": scene.getTestCameras(), "train": [train[i % len(train)] for i in range(5, 30, 5)]}
     scores = {}
     for name, cameras in sets.items():
-        if not cameras:
-            continue
-        differences, ratios = [], []
-        for index, camera in enumerate(cameras):
-            with torch.no_grad():
-                image = renderFunc(camera, scene.gaussians, *renderArgs, **exposed)["render"]
-                target = as_float(camera.target(renderArgs[1]))
-                mask = camera.mask
-                if train_test_exp:
-                    image, target, mask = (None if x is None else right_half(x) for x in (image, target, mask))
-                if mask is not None and not mask.any():
-                    continue
-                counted = [pixels_that_count(x, mask) for x in (image, target)]
-                differences.append(l1_loss(*counted).item())
-                ratios.append(psnr(*counted).mean().item())
-            if tb_writer and index < 5:
-                tag = f"{name}_view_{camera.image_name}"
-                tb_writer.add_image(f"{tag}/render", image, global_step=iteration)
-                if iteration == testing_iterations[0]:
-                    tb_writer.add_image(f"{tag}/ground_truth", target, global_step=iteration)
-        if not ratios:
-            continue
-        l1_mean, psnr_mean = sum(differences) / len(differences), sum(ratios) / len(ratios)
-        tqdm.write(f"[ITER {iteration}] Evaluating {name}: L1 {l1_mean} PSNR {psnr_mean}", file=sys.stdout)
-        if tb_writer:
-            tb_writer.add_scalar(f"{name}/loss_viewpoint - l1_loss", l1_mean, iteration)
-            tb_writer.add_scalar(f"{name}/loss_viewpoint - psnr", psnr_mean, iteration)
-        scores |= {f"{name}_l1": l1_mean, f"{name}_psnr": psnr_mean}
+        show = _shown_by(tb_writer, name, iteration, iteration == testing_iterations[0])
+        if means := _means(views, cameras, scene.gaussians, l1_loss, show):
+            l1_mean, psnr_mean = means
+            tqdm.write(f"[ITER {iteration}] Evaluating {name}: L1 {l1_mean} PSNR {psnr_mean}", file=sys.stdout)
+            if tb_writer:
+                tb_writer.add_scalar(f"{name}/loss_viewpoint - l1_loss", l1_mean, iteration)
+                tb_writer.add_scalar(f"{name}/loss_viewpoint - psnr", psnr_mean, iteration)
+            scores |= {f"{name}_l1": l1_mean, f"{name}_psnr": psnr_mean}
     if tb_writer:
         tb_writer.add_histogram("scene/opacity_histogram", scene.gaussians.get_opacity, iteration)
         tb_writer.add_scalar("total_points", len(scene.gaussians), iteration)
     return scores
+
+
+@torch.no_grad()
+def _means(
+    views: ScoredViews,
+    cameras: Sequence[Camera],
+    gaussians: GaussianModel,
+    l1_loss: Callable[[Tensor, Tensor], Tensor],
+    show: Callable[[int, Camera, Tensor, Tensor], None],
+) -> list[float]:
+    """Mean L1, and mean PSNR of the channels, over the views with a pixel that counts; nothing without any."""
+    scores = []
+    for index, camera in enumerate(cameras):
+        image, target, mask = views.compared(camera, gaussians)
+        if mask is not None and not mask.any():
+            continue
+        target = as_float(target)
+        counted = [pixels_that_count(x, mask) for x in (image, target)]
+        scores.append((l1_loss(*counted).item(), psnr(*counted).mean().item()))
+        show(index, camera, image, target)
+    return [sum(values) / len(values) for values in zip(*scores, strict=True)]
+
+
+def _shown_by(writer: Any | None, name: str, iteration: int, first: bool) -> Callable[..., None]:
+    """Gives TensorBoard, if there, the render of a set's first views, and at the first testing their photos."""
+
+    def show(index: int, camera: Camera, image: Tensor, target: Tensor) -> None:
+        if writer is None or index >= SHOWN:
+            return
+        tag = f"{name}_view_{camera.image_name}"
+        writer.add_image(f"{tag}/render", image, global_step=iteration)
+        if first:
+            writer.add_image(f"{tag}/ground_truth", target, global_step=iteration)
+
+    return show

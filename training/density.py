@@ -1,0 +1,75 @@
+"""Density control as the training loop sees it, and the method's own: clone, split, prune, reset of opacities."""
+
+import argparse
+
+from torch import Tensor
+
+from scene.gaussian_model import GaussianModel
+from scene.gaussians import density as adc
+from training.step import Step
+from utils.system_utils import UserError
+
+
+class DensityControl:
+    """Decides how many Gaussians there are. Another strategy overrides these hooks, in a file of its own."""
+
+    def changes(self, iteration: int) -> bool:
+        """Whether this iteration will change rows of the Gaussians besides their optimiser step.
+
+        Every loss so far is then checked first, for a change cannot be taken back.
+        """
+        return False
+
+    def after_backward(self, step: Step, package: dict[str, Tensor]) -> None:
+        """Gradients are there, the optimiser has not stepped. package: of `render`."""
+
+    def after_step(self, step: Step) -> None:
+        """The optimiser has stepped, but in the last iteration, which takes no step."""
+
+
+class AdaptiveDensityControl(DensityControl):
+    """Adaptive density control (Kerbl et al. 2023, Section 5.2), with the rules of scene/gaussians/density.py.
+
+    extent: of the scene, world units; sizes are judged by it.
+    """
+
+    def __init__(
+        self, gaussians: GaussianModel, opt: argparse.Namespace, white_background: bool, extent: float
+    ) -> None:
+        self._gaussians = gaussians
+        self._opt = opt
+        self._white_background = white_background
+        self._extent = extent
+
+    def changes(self, iteration: int) -> bool:
+        todo = self._actions(iteration)
+        return todo.densify or todo.reset_opacity
+
+    def after_backward(self, step: Step, package: dict[str, Tensor]) -> None:
+        todo = self._actions(step.iteration)
+        if todo.observe:
+            self._gaussians.observe(package["viewspace_points"], package["radii"])
+        if todo.densify:
+            self._densify(step.iteration, todo.limit_size)
+        if todo.reset_opacity:
+            self._gaussians.reset_opacity()
+
+    def _actions(self, iteration: int) -> adc.Actions:
+        return adc.actions(iteration, self._opt, self._white_background)
+
+    def _densify(self, iteration: int, limit_size: bool) -> None:
+        self._gaussians.densify_and_prune(
+            self._opt.densify_grad_threshold,
+            adc.MIN_OPACITY,
+            self._extent,
+            adc.MAX_SCREEN_SIZE if limit_size else None,
+            seed=self._opt.seed,
+            iteration=iteration,
+            max_splats=self._opt.max_num_splats,
+        )
+        if len(self._gaussians) == 0:
+            raise UserError(
+                f"no Gaussian was left after the densification of iteration {iteration}: the views do not agree "
+                "with the points, or show nothing but the background; check the scene, or raise "
+                "--opacity_reset_interval"
+            )

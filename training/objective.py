@@ -1,0 +1,37 @@
+"""The loss of a render: photometric, and inverse depth where a depth map supervises. Further terms belong here."""
+
+import argparse
+from typing import NamedTuple
+
+from torch import Tensor
+
+from training.step import Step
+from utils.loss_utils import inverse_depth_loss, photometric_loss
+
+
+class Losses(NamedTuple):
+    """Scalars of one iteration, and the mask that they were computed with."""
+
+    total: Tensor  # what is differentiated
+    l1: Tensor  # of the colours
+    depth: Tensor | None  # weighted, part of the total; None without a depth map
+    mask: Tensor | None  # (1, H, W) bool, pixels that count; None where all do
+
+
+class Objective:
+    """`(1 - lambda_dssim) L1 + lambda_dssim (1 - SSIM)` (Kerbl et al. 2023, Eq. 7), and the weighted depth loss."""
+
+    def __init__(self, opt: argparse.Namespace) -> None:
+        self._lambda_dssim = opt.lambda_dssim
+
+    def __call__(self, package: dict[str, Tensor], step: Step) -> Losses:
+        """package: of `render`, with `depth` where step.depth_weight is above 0."""
+        camera = step.camera
+        target, mask = camera.ground_truth(step.background)
+        total, l1 = photometric_loss(package["render"], target, self._lambda_dssim, mask, camera.columns)
+        depth = None
+        if step.depth_weight > 0:
+            error = inverse_depth_loss(package["depth"], camera.invdepthmap, camera.columns, mask)
+            depth = step.depth_weight * error
+            total = total + depth
+        return Losses(total, l1, depth, mask)

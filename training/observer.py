@@ -1,0 +1,64 @@
+"""What happens beside the method: an observer overrides the moments it needs, and is never called for the others."""
+
+from collections.abc import Sequence
+from types import TracebackType
+from typing import TypeAlias
+
+from training.objective import Losses
+from training.step import Step
+
+Error: TypeAlias = BaseException | None
+
+
+class Observer:
+    """Base of all observers. A moment that a class does not override costs nothing."""
+
+    def due(self, step: Step) -> bool:
+        """Whether this iteration writes something. Every loss so far is then checked before `measured`."""
+        raise NotImplementedError
+
+    def begins(self, step: Step) -> None:
+        """The iteration begins, with its view."""
+
+    def measured(self, step: Step, losses: Losses) -> None:
+        """Gradients are there; the model is still the one that was rendered."""
+
+    def stepped(self, step: Step) -> None:
+        """Density control and optimiser are through; the model is the next iteration's."""
+
+    def ended(self, error: Error) -> None:
+        """Training is over: after its last iteration (None), or by an error, which may be replaced by raising."""
+
+
+class Announcer:
+    """Tells observers of each moment, in their order. Inside `with`, also of the end."""
+
+    def __init__(self, observers: Sequence[Observer]) -> None:
+        def overridden(moment: str) -> list:
+            plain = getattr(Observer, moment)
+            return [getattr(one, moment) for one in observers if getattr(type(one), moment) is not plain]
+
+        self._due, self._begins, self._measured, self._stepped, self._ended = map(
+            overridden, ("due", "begins", "measured", "stepped", "ended")
+        )
+
+    def begins(self, step: Step) -> None:
+        for tell in self._begins:
+            tell(step)
+
+    def measured(self, step: Step, losses: Losses) -> None:
+        # A list: each is asked in every iteration, whatever the others answer.
+        step.due = any([step.changes, *[due(step) for due in self._due]])
+        for tell in self._measured:
+            tell(step, losses)
+
+    def stepped(self, step: Step) -> None:
+        for tell in self._stepped:
+            tell(step)
+
+    def __enter__(self) -> "Announcer":
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: Error, trace: TracebackType | None) -> None:
+        for tell in self._ended:
+            tell(error)

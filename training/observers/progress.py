@@ -1,0 +1,43 @@
+"""The progress bar: losses and the number of Gaussians."""
+
+from tqdm import tqdm
+
+from training.objective import Losses
+from training.observer import Error, Observer
+from training.observers.losses import LossWatch
+from training.run import Run
+from training.step import Step
+
+BAR_INTERVAL = 10  # iterations between updates, each of which reads the losses and so waits for the GPU
+
+
+class ProgressBar(Observer):
+    """Shows running means. At the end of a training it says how long that took."""
+
+    def __init__(self, run: Run) -> None:
+        self._run = run
+        self._depth = LossWatch()
+        self._shown = {"Loss": run.losses} | ({"Depth Loss": self._depth} if run.dataset.depths else {})
+        self._bar = tqdm(
+            initial=run.first_iteration, total=run.opt.iterations, desc="Training progress", dynamic_ncols=True
+        )
+
+    def due(self, step: Step) -> bool:
+        return step.last or step.iteration % BAR_INTERVAL == 0
+
+    def measured(self, step: Step, losses: Losses) -> None:
+        if losses.depth is not None:
+            self._depth.add(step.iteration, losses.depth)
+        if not step.due:
+            return
+        for loss in self._shown.values():
+            loss.read()
+        means = {name: f"{loss.mean:.7f}" for name, loss in self._shown.items()}
+        self._bar.set_postfix(means, Gaussians=len(self._run.gaussians), refresh=False)
+        self._bar.update(step.iteration - self._bar.n)
+
+    def ended(self, error: Error) -> None:
+        self._bar.close()
+        if error is None:
+            count = self._run.opt.iterations - self._run.first_iteration
+            print(f"Trained {count} iterations in {self._run.clock.seconds:.1f} s, without tests and saving")

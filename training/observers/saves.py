@@ -1,0 +1,76 @@
+"""Saves of the model as PLY, and checkpoints that a training can be resumed from."""
+
+import sys
+from pathlib import Path
+
+from tqdm import tqdm
+
+from scene.gaussians.checkpoint import save_checkpoint
+from training.left_out import LeftOut, lines
+from training.objective import Losses
+from training.observer import Error, Observer
+from training.observers.divergence import DivergenceWatch
+from training.observers.last_save import save_last
+from training.run import Run
+from training.step import Step
+
+
+class Saves(Observer):
+    """Saves the PLY when planned; the last save leaves out what the model does not need.
+
+    test_in_memory: the test photos are decoded by the last iteration, so that scoring them once more costs little.
+    """
+
+    def __init__(self, run: Run, test_in_memory: bool) -> None:
+        self._run = run
+        self._test_in_memory = test_in_memory
+        self._left_out: LeftOut | None = None
+
+    def due(self, step: Step) -> bool:
+        return step.iteration in self._run.plan.save
+
+    def measured(self, step: Step, losses: Losses) -> None:
+        if step.iteration not in self._run.plan.save:
+            return
+        run, seconds, values = self._run, self._run.clock.seconds, {}
+        with run.clock.paused():
+            run.gaussians.check_finite(step.iteration)
+            tqdm.write(f"[ITER {step.iteration}] Saving Gaussians", file=sys.stdout)
+            if step.last:
+                self._left_out = save_last(
+                    run.scene, run.dataset, run.opt, run.pipe, run.background, self._test_in_memory
+                )
+                values = {"gaussians_left_out": self._left_out.unseen}
+            else:
+                run.scene.save(step.iteration)
+            run.log.add(step.iteration, seconds, gaussians=len(run.gaussians), loss=run.losses.mean, **values)
+
+    def ended(self, error: Error) -> None:
+        if error is None and self._left_out is not None:
+            print("\n".join(lines(self._left_out)))
+
+
+class Checkpoints(Observer):
+    """Writes chkpntN.pth when planned, and when a signal stops the training."""
+
+    def __init__(self, run: Run, watch: DivergenceWatch) -> None:
+        self._run = run
+        self._watch = watch
+
+    def due(self, step: Step) -> bool:
+        return step.iteration in self._run.plan.checkpoint
+
+    def stepped(self, step: Step) -> None:
+        if not step.stopping and step.iteration not in self._run.plan.checkpoint:
+            return
+        run = self._run
+        self._watch.look(step.iteration, stepped=not step.last)
+        seconds = run.clock.seconds
+        with run.clock.paused():
+            run.gaussians.check_finite(step.iteration)
+            tqdm.write(f"[ITER {step.iteration}] Saving Checkpoint", file=sys.stdout)
+            path = Path(run.scene.model_path) / f"chkpnt{step.iteration}.pth"
+            save_checkpoint(path, run.gaussians.capture(), step.iteration)
+            run.log.add(step.iteration, seconds, gaussians=len(run.gaussians), loss=run.losses.mean)
+        if step.stopping:
+            tqdm.write(f"resume with --start_checkpoint {path}", file=sys.stderr)

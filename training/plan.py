@@ -1,0 +1,15 @@
+"""What a run was asked to do besides training."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+
+class Plan(NamedTuple):
+    """Iterations that score, save and write checkpoints, and where training starts."""
+
+    test: Sequence[int]  # -1: none
+    save: Sequence[int]  # the PLY; -1: none
+    checkpoint: Sequence[int]
+    start: str | None  # a chkpntN.pth to resume, None: the dataset's points
+    debug_from: int  # pipe.debug is switched on after this iteration; -1: never
+    record_curve: bool  # error_vs_time.csv, where there are test views

@@ -1,0 +1,135 @@
+"""A training run: scene, model, objective and density control, made and checked before a file is written."""
+
+import argparse
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from records.training_log import Stopwatch
+from scene import Scene
+from scene.gaussian_model import GaussianModel
+from scene.gaussians.checkpoint import load_checkpoint
+from training.checks import check_exposures, check_scene, warn_of_late_reset
+from training.density import AdaptiveDensityControl
+from training.history import check_folder, continue_records, report_changes
+from training.memory_estimate import announce_memory
+from training.objective import Objective
+from training.observers.losses import LossWatch
+from training.plan import Plan
+from training.step import Step
+from training.view_order import ViewOrder
+from utils.exact.counter_rng import Stream, uniform
+from utils.general_utils import get_expon_lr_func
+from utils.system_utils import UserError, compute_device
+
+SH_INTERVAL = 1000  # iterations between raises of the active SH degree
+
+
+class Run:
+    """What the loop and its observers share.
+
+    scene, gaussians, views (by iteration), objective, density; dataset, opt, pipe: the options; background: (3,) of the
+    scene; first_iteration: done before this run. From `open_records` on: log, rows (of the curve so far), losses
+    (running mean of the total) and clock (seconds of training).
+    """
+
+    def __init__(
+        self, dataset: argparse.Namespace, opt: argparse.Namespace, pipe: argparse.Namespace, plan: Plan
+    ) -> None:
+        """Read and check everything that can be refused; nothing is written. UserError for what is refused."""
+        self.dataset, self.opt, self.pipe, self.plan = dataset, opt, pipe, plan
+        self.device = compute_device()
+        capture, self.first_iteration = load_checkpoint(plan.start, self.device) if plan.start else (None, 0)
+        if self.first_iteration >= opt.iterations:
+            raise UserError(
+                f"{plan.start} is at iteration {self.first_iteration}, so --iterations {opt.iterations} leaves nothing "
+                "to do; --iterations counts from the start of the first run"
+            )
+        warn_of_late_reset(opt, dataset.white_background)
+        self.gaussians = GaussianModel(dataset.sh_degree, opt.optimizer_type)
+        self.scene = Scene(dataset, self.gaussians, shuffle=False, start=False)
+        check_scene(self.scene.info)
+        self._start(capture)
+        self.views = ViewOrder(self.scene.getTrainCameras(), opt.seed)
+        saves = [iteration for iteration in plan.save if iteration <= opt.iterations]
+        check_folder(dataset.model_path, dataset.source_path, saves, plan.start, self.first_iteration)
+        if plan.start:
+            report_changes(plan.start, argparse.Namespace(**vars(dataset), **self._training_options))
+        self.background = torch.full((3,), 1.0 if dataset.white_background else 0.0, device=self.device)
+        self.objective = Objective(opt)
+        self.density = AdaptiveDensityControl(self.gaussians, opt, dataset.white_background, self.scene.cameras_extent)
+        self._depth_weight = get_expon_lr_func(
+            opt.depth_l1_weight_init, opt.depth_l1_weight_final, max_steps=opt.iterations
+        )
+
+    def _start(self, capture: tuple | None) -> None:
+        """From the dataset's points, or from the state of a checkpoint."""
+        if capture is None:
+            self.scene.create_gaussians()
+            self.gaussians.training_setup(self.opt)
+        else:
+            self.gaussians.start_exposures(self.scene.info.train_cameras)
+            self.gaussians.restore(capture, self.opt)
+            check_exposures(self.gaussians, self.dataset.train_test_exp, self.plan.start)
+
+    @property
+    def _training_options(self) -> dict[str, Any]:
+        opt = self.opt
+        return {"antialiasing": self.pipe.antialiasing, "optimizer_type": opt.optimizer_type, "seed": opt.seed}
+
+    @property
+    def kept(self) -> dict[str, Any]:
+        """What model.json keeps besides the model options (`write_model_json`)."""
+        return self._training_options | {"world_offset": self.gaussians.world_offset}
+
+    def open_records(self) -> None:
+        """Write the inputs into the output folder, say what memory will be wanted, start or continue the log."""
+        folder, start = self.scene.model_path, self.plan.start
+        if not start or not (Path(folder) / "cameras.json").exists():
+            self.scene.write_inputs()
+        announce_memory(self.scene, self.gaussians, self.opt.max_num_splats)
+        self.log, self.rows = continue_records(folder, start, self.first_iteration)
+        self.losses = LossWatch(self.log.loss)
+        self.clock = Stopwatch()
+
+    def steps(self) -> Iterator[Step]:
+        """The iterations of this run."""
+        for iteration in range(self.first_iteration + 1, self.opt.iterations + 1):
+            camera = self.views[iteration]
+            yield Step(
+                iteration,
+                last=iteration == self.opt.iterations,
+                camera=camera,
+                background=self._background(iteration),
+                depth_weight=self._depth_weight(iteration) if camera.depth_reliable else 0.0,
+                changes=self.density.changes(iteration),
+                started=self.clock.seconds,
+            )
+
+    def _background(self, iteration: int) -> Tensor:
+        if not self.opt.random_background:
+            return self.background
+        draws = uniform(self.opt.seed, Stream.BACKGROUND, iteration, torch.zeros(1, dtype=torch.int64))
+        return draws[0, :3].to(self.device)
+
+    def prepare(self, step: Step) -> None:
+        """Set learning rates and SH degree, and begin to decode the photos of the next views."""
+        self.gaussians.update_learning_rate(step.iteration)
+        if step.iteration % SH_INTERVAL == 0:
+            self.gaussians.oneupSHdegree()
+        if step.iteration - 1 == self.plan.debug_from:
+            self.pipe.debug = True
+        ahead = min(self.scene.images.ahead, self.opt.iterations - step.iteration + 1)
+        self.scene.prefetch(self.views.coming(step.iteration, ahead))
+
+    def render_options(self, step: Step) -> dict[str, bool]:
+        """What this step's loss needs of `render`, and no more."""
+        return {
+            "use_trained_exp": self.dataset.train_test_exp,
+            "want_depth": step.depth_weight > 0,
+            "want_visibility": False,
+            "clamp": False,
+        }
