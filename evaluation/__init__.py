@@ -7,5 +7,5 @@ summary, tradeoff, published spread over seeds, error against time, and comparis
 figures, contact_sheet       pictures
 document, markdown, html     the report's content, once, and its two renderings; report writes all files
 machine                      where and with what it ran
-readme_table                 README's table from report.json
+results_page                 tables of docs/results/training.md from report.json
 """
