@@ -4,7 +4,7 @@
 #
 #   benchmarks/device.sh test                    GPU tests, then the rasterizer's CPU tests
 #   benchmarks/device.sh sanitize                memcheck and racecheck of the GPU tests on small scenes
-#   benchmarks/device.sh kernels [OPTION...]     python -m benchmarks.kernels.cpu OPTION... (--peers gsplat)
+#   benchmarks/device.sh kernels [OPTION...]     python -m benchmarks.kernels.rasterizer OPTION... (--peers gsplat)
 #   benchmarks/device.sh accuracy                python -m benchmarks.accuracy.oracle; its figure is drawn elsewhere from accuracy.json
 #   benchmarks/device.sh train SCENE [OPTION...] python -m benchmarks.scenes.training SCENE OPTION...
 #   benchmarks/device.sh run COMMAND...          anything else, with the extensions built
@@ -150,7 +150,7 @@ build
     sanitize) sanitize ;;
     kernels)
       say "kernels"
-      python3 -m benchmarks.kernels.cpu --device cuda "$@"
+      python3 -m benchmarks.kernels.rasterizer --device cuda "$@"
       ;;
     accuracy)
       say "error against run time"

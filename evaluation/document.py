@@ -1,4 +1,4 @@
-"""The report's content, once, for both renderings: sections of paragraphs, tables, pictures and quoted messages."""
+"""The report's content, shared by both renderings: sections of paragraphs, tables, pictures and quoted messages."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class Picture:
 
 @dataclass(frozen=True)
 class Quote:
-    """Messages as they were."""
+    """Messages of a command, unchanged."""
 
     lines: list[str]
 
@@ -39,7 +39,7 @@ Block = str | Table | Picture | Quote
 
 @dataclass(frozen=True)
 class Section:
-    """A title and what stands under it."""
+    """A title and the blocks below it."""
 
     title: str
     blocks: list[Block] = field(default_factory=list)
@@ -67,7 +67,7 @@ def spread_cell(spread: Mapping[str, Any], digits: int) -> str:
 
 
 def results_table(rows: Sequence[Mapping[str, Any]]) -> Table:
-    """`summary` of report.json as a table; times, sizes and memory that no row has are left out."""
+    """`summary` of report.json as a table; columns of times, sizes and memory that no row has are left out."""
     configs = any(row["config"] for row in rows)
     quantities = [
         name for name in _DIGITS
@@ -121,11 +121,13 @@ def _results(report: Mapping[str, Any]) -> Section:
         blocks.append("Mean ± standard deviation of the sample over the seeds.")
     if any(row["gaussians"]["mean"] != row["gaussians_saved"]["mean"] for row in rows):
         blocks.append(
-            "Gaussians: those trained, as published tables count them. The models as saved lack those that no training "
-            "view depends on (gaussians_saved in report.json)."
+            "Gaussians: those trained, as published tables count them. Saved models lack the Gaussians that no "
+            "training view depends on (gaussians_saved in report.json)."
         )
     if rows and all(row["LPIPS"]["mean"] is None for row in rows):
-        blocks.append("LPIPS is missing: metrics.py had no weights of its network (it says what to put where).")
+        blocks.append(
+            "LPIPS is missing: metrics.py had no weights for its network (its message says which file goes where)."
+        )
     if unfinished := [run_title(run) for run in report["runs"] if not run["finished"] and not run["failure"]]:
         blocks.append(f"Not finished: {'; '.join(unfinished)}.")
     if means := report["dataset_means"]:
@@ -188,9 +190,9 @@ def _cheapest(report: Mapping[str, Any]) -> list[Section]:
     if not blocks:
         return []
     blocks.append(
-        "The option set that comes to a test PSNR in the fewest seconds of training, and the one with the fewest "
-        "Gaussians at that PSNR or better, both from the curves (scores in training, on unrounded pictures; between "
-        "two points PSNR is linear in the logarithm of time). Of several seeds all must get there, and their mean "
+        "The option set that reaches a test PSNR in the fewest seconds of training, and the one with the fewest "
+        "Gaussians at that PSNR or better. Both are read from the curves, whose scores are of unrounded images; "
+        "between two points PSNR is linear in the logarithm of time. All seeds must reach the PSNR, and their mean "
         "counts."
     )
     return [Section("Cheapest option set for a given error", blocks)]
@@ -241,7 +243,7 @@ def _manifest(report: Mapping[str, Any]) -> Section:
             f"Resize filter: {manifest['resize_filter']}",
             "Scores: " + "; ".join(f"{name}: {text}" for name, text in manifest["conventions"].items()),
             Table(header, cells),
-            "Ground truth: first digits of a digest of the test views' sizes, pixels and masks. Scores compare only "
-            "where it is the same.",
+            "Ground truth: first digits of a digest of the test views' sizes, pixels and masks. Only scores with the "
+            "same digest compare.",
         ],
     )

@@ -31,8 +31,8 @@ def _dissimilarity(row: Row, views: str) -> float | None:
 def draw_curves(path: Path, scene: str, runs: Sequence[dict[str, Any]]) -> bool:
     """Test PSNR and 1 - SSIM of a scene's runs against seconds of training; False where no run has a curve.
 
-    One colour for an option set, one line for a seed. With several option sets the Pareto front of all points is
-    marked; with one, the training views are drawn too, dashed, so that over-fitting shows.
+    An option set has one colour, a seed one line. With several option sets the Pareto front of all points is marked.
+    With one, the training views are drawn too, dashed, so that over-fitting shows.
     """
     from matplotlib.figure import Figure  # late: only a report needs it
 
@@ -83,8 +83,10 @@ def _columns(points: Sequence[tuple[float, float]]) -> tuple[list[float], list[f
 
 
 def _stairs(points: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
-    """The points with a corner between each two: every second one is a point. Matplotlib keeps its legend clear of
-    these, but not of what it draws with drawstyle "steps"."""
+    """The points with a corner between each two, so that every second one is a point.
+
+    Matplotlib keeps its legend clear of these corners, but not of lines drawn with drawstyle "steps".
+    """
     corners = [(after[0], before[1]) for before, after in zip(points, points[1:], strict=False)]
     return [point for pair in zip(points, corners, strict=False) for point in pair] + list(points[-1:])
 

@@ -1,4 +1,4 @@
-"""Where and with what a training ran. `python -m evaluation.machine` prints it as JSON."""
+"""Hardware and software that a training ran on. `python -m evaluation.machine` prints it as JSON."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ _PACKAGES = ("lpips", "numpy", "pillow", "pycolmap", "torch", "torchvision")
 
 
 def machine() -> dict[str, Any]:
-    """Processor, GPU, threads, versions, commit of this machine and checkout; {} where they cannot be found out.
+    """Processor, GPU, threads, versions, commit of this machine and checkout; {} where they cannot be read.
 
-    A process of its own asks: asking a GPU for its name takes some of its memory for as long as the asker lives.
+    A child process asks: a process that has asked a GPU for its name holds some of its memory until it ends.
     """
     command = [sys.executable, "-m", "evaluation.machine"]
     done = subprocess.run(command, cwd=_ROOT, capture_output=True, text=True, check=False)
@@ -59,7 +59,7 @@ def _version(package: str) -> str | None:
 
 
 def one_line(facts: dict[str, Any]) -> str:
-    """What people want to know of `machine()`'s answer."""
+    """The facts of `machine()` that a reader of a table needs."""
     if not facts:
         return "not known"
     where = f"{facts['gpu']}, {facts['cpu']}" if facts["gpu"] else f"{facts['cpu']}, {facts['instruction_set']}"

@@ -1,4 +1,4 @@
-"""What a scene does not need is not there: what docs/costs.md says without a clock, and the means it measures with."""
+"""Tests of what docs/results/costs.md says without a clock, and of the means it measures with."""
 
 import json
 import math
@@ -160,5 +160,5 @@ def test_tables_are_replaced_between_the_marks():
     once = replace_tables(page, "cpu", ["new", "lines"])
     assert once == f"before\n{begin}\nnew\nlines\n{end}\nafter\n"
     assert replace_tables(once, "cpu", ["new", "lines"]) == once
-    ours = (ROOT / "docs/costs.md").read_text()
+    ours = (ROOT / "docs/results/costs.md").read_text()
     assert all(mark.format(device) in ours for mark in (BEGIN, END) for device in ("cpu", "cuda"))

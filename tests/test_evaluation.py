@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from evaluation import published
-from evaluation.readme_table import BEGIN, END, replace_results
+from evaluation.results_page import BEGIN, END, replace_results, results_text
 from evaluation.scenes import DATASETS
 from evaluation.summary import QUANTITIES, spread, summarise
 from evaluation.tradeoff import cheapest, gaussians_to_reach, levels, pareto_front, seconds_to_reach
@@ -143,6 +143,23 @@ def test_nothing_imports_the_benchmarks():
 
 
 @pytest.mark.parametrize("text", ["", BEGIN, f"{END}\n{BEGIN}", f"{BEGIN}{BEGIN}{END}"])
-def test_a_readme_without_marks_is_left_alone(text):
+def test_a_page_without_marks_is_left_alone(text):
     with pytest.raises(UserError, match="one line <!-- results: begin"):
         replace_results(text, [])
+
+
+@pytest.mark.parametrize(
+    ("sets", "text"),
+    [
+        ({None: ["--iterations", "40"]}, "Options of every run: `--iterations 40`."),
+        ({"base": ["--iterations", "40"], "long": ["--iterations", "50"]},
+         "Each option set adds:\n\n- base: `--iterations 40`\n- long: `--iterations 50`"),
+        ({"base": ["--test_iterations", "-1", "-w"], "sh1": ["--test_iterations", "-1", "-w", "--sh_degree", "1"]},
+         "Options of every run: `--test_iterations -1 -w`.\n\nEach option set adds:\n\n- base: nothing\n"
+         "- sh1: `--sh_degree 1`"),
+    ],
+)  # fmt: skip
+def test_options_that_all_runs_share_are_written_once(sets, text):
+    runs = [{"config": name, "added_options": words, "machine": None} for name, words in sets.items()]
+    _, written = results_text({"summary": [], "runs": runs}).split("\n\n", 1)
+    assert written == text

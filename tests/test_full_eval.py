@@ -17,11 +17,11 @@ from PIL import Image
 from synthetic import folder_state
 
 import full_eval
-from evaluation import readme_table, stages
 from evaluation import report as report_module
+from evaluation import results_page, stages
 from evaluation.contact_sheet import GAP, HEADER
 from evaluation.figures import draw_curves, draw_worst_views
-from evaluation.readme_table import BEGIN, END
+from evaluation.results_page import BEGIN, END
 from evaluation.scenes import DATASETS
 from utils.system_utils import UserError
 
@@ -393,14 +393,14 @@ def test_seeds_and_option_sets(figures, scenes, tmp_path, capsys, monkeypatch):
     assert "attic: cheapest option set for a given error" in said and "23.10 ± 0.14" in said
     assert (out / "figures" / "attic_sh1_worst_views.png").exists()
 
-    readme = tmp_path / "README.md"
-    readme.write_text(f"before\n\n{BEGIN}\nold\n{END}\n\nafter\n")
-    monkeypatch.setattr(sys, "argv", ["readme_table", str(out / "report.json"), "--readme", str(readme)])
+    page = tmp_path / "training.md"
+    page.write_text(f"before\n\n{BEGIN}\nold\n{END}\n\nafter\n")
+    monkeypatch.setattr(sys, "argv", ["results_page", str(out / "report.json"), "--page", str(page)])
     for _ in range(2):  # the second time nothing changes
-        readme_table.main()
-        text = readme.read_text()
+        results_page.main()
+        text = page.read_text()
         assert text.startswith(f"before\n\n{BEGIN}\n\n| scene") and text.endswith(f"\n\n{END}\n\nafter\n")
-        assert "23.10 ± 0.14" in text and "sh1: `--iterations 40 --sh_degree 1`" in text and "some CPU" in text
+        assert "23.10 ± 0.14" in text and "- sh1: `--sh_degree 1`" in text and "some CPU" in text
         assert "old" not in text and text.count("| attic") == 2
 
 

@@ -10,7 +10,7 @@ from scene.gaussian_model import GaussianModel
 from utils.host.memory import free_memory, gib
 
 # Bytes beside the parameters, their gradients and two moments. Fitted to the peak memory of forward and backward in
-# docs/performance.md (100 thousand to 6 million Gaussians, within 4 %: 106 and 57); the rest is density control's
+# docs/results/kernels.md (100 thousand to 6 million Gaussians, within 4 %: 106 and 57); the rest is density control's
 # statistics, and what the loss keeps of an image.
 PER_GAUSSIAN = 106 + 20
 PER_PIXEL = 57 + 72

@@ -1,4 +1,4 @@
-"""The features of docs/costs.md that have a price to look for: what runs when one is off, and what it is compared with.
+"""Features of docs/results/costs.md whose cost is measured: the call with one switched off, and its counterpart.
 
 To add a feature: a function of `Workload` that returns a `Row`, listed in ROWS.
 """
@@ -188,7 +188,7 @@ def antialiasing(work: Workload) -> Row:
     model, off = work.model(), torch.no_grad()
     return Row(
         "antialiasing",
-        "nothing: when off, a flag is looked at once a splat",
+        "nothing: when off, a flag is read once a splat",
         off(partial(work.image, model)),
         None,
         off(partial(work.image, model, pipe=work.antialiased)),

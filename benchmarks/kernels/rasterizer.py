@@ -1,8 +1,8 @@
 """Time of the rasterizer on seeded workloads beside the work it did, on a CPU or on a GPU.
 
-    python -m benchmarks.kernels.cpu                  # on the GPU where there is one and the build has CUDA
-    python -m benchmarks.kernels.cpu --device cpu
-    python -m benchmarks.kernels.cpu --peers gsplat   # and another implementation in the same run
+    python -m benchmarks.kernels.rasterizer                  # on the GPU where there is one and the build has CUDA
+    python -m benchmarks.kernels.rasterizer --device cpu
+    python -m benchmarks.kernels.rasterizer --peers gsplat   # and another implementation in the same run
 
 Milliseconds are medians. Processed: instances (a splat in a tile) that the backward has to look at, those behind
 which no pixel of the tile is still open left out.
@@ -18,7 +18,7 @@ from benchmarks.harness.calls import Calls, Stages
 from benchmarks.harness.environment import describe, print_table
 from benchmarks.harness.timing import cpu_milliseconds
 from benchmarks.kernels.fragments import TILE, processed_per_tile
-from benchmarks.kernels.gpu import measure_on_gpu
+from benchmarks.kernels.rasterizer import measure_on_gpu
 from benchmarks.peers.published import WORKLOADS
 from benchmarks.workloads.splat_scenes import SplatScene, frustum
 from utils.system_utils import UserError, compute_device, run_cli
