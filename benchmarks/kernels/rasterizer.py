@@ -18,7 +18,7 @@ from benchmarks.harness.calls import Calls, Stages
 from benchmarks.harness.environment import describe, print_table
 from benchmarks.harness.timing import cpu_milliseconds
 from benchmarks.kernels.fragments import TILE, processed_per_tile
-from benchmarks.kernels.rasterizer import measure_on_gpu
+from benchmarks.kernels.gpu import measure_on_gpu
 from benchmarks.peers.published import WORKLOADS
 from benchmarks.workloads.splat_scenes import SplatScene, frustum
 from utils.system_utils import UserError, compute_device, run_cli
