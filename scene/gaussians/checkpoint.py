@@ -2,12 +2,16 @@
 
 import math
 import os
+from collections.abc import Sequence
 from numbers import Real
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 
+from scene.gaussians.attributes import IN_CHECKPOINT, Attribute, Rows
+from scene.gaussians.finite import check_finite
+from scene.gaussians.statistics import Statistics
 from utils.system_utils import UserError, atomic_write
 
 _ENTRIES = 12  # of the reference; the values of further attributes may follow, and a dict of the exposures
@@ -20,6 +24,76 @@ _ALLOWED = [
     np.dtypes.Float32DType,
     np.dtypes.Float64DType,
 ]
+
+
+class State(NamedTuple):
+    """Everything of a model that a resumed training needs."""
+
+    active_sh_degree: int
+    rows: Rows
+    statistics: Statistics
+    optimizer: dict[str, Any]  # its state dict
+    spatial_lr_scale: float
+    exposures: dict[str, Any] | None  # None: not trained
+
+
+def pack(state: State) -> tuple:
+    """The 12 entries of the reference, in its order.
+
+    Attributes that the reference does not have follow as further entries, then the exposures if they are trained.
+    """
+    return (
+        state.active_sh_degree,
+        *(state.rows[name] for name in IN_CHECKPOINT),
+        state.statistics.max_radii2D,
+        state.statistics.xyz_gradient_accum,
+        state.statistics.denom,
+        state.optimizer,
+        state.spatial_lr_scale,
+        *(values for name, values in state.rows.items() if name not in IN_CHECKPOINT),
+        *([] if state.exposures is None else [state.exposures]),
+    )
+
+
+def unpack(entries: Sequence[Any], table: dict[str, Attribute], max_sh_degree: int) -> State:
+    """The state that `pack` made entries of. UserError where its attributes are not those of the table."""
+    active_sh_degree, *tensors = entries[:7]
+    max_radii2D, xyz_gradient_accum, denom, optimizer, spatial_lr_scale, *others = entries[7:]
+    exposures = next((entry for entry in others if isinstance(entry, dict)), None)
+    names = (*IN_CHECKPOINT, *(name for name in table if name not in IN_CHECKPOINT))
+    tensors += [entry for entry in others if not isinstance(entry, dict)]
+    if len(tensors) != len(names):
+        raise UserError(
+            f"the checkpoint has {len(tensors)} attributes per Gaussian, where this model has {len(names)} "
+            f"({', '.join(names)}); give a checkpoint of this model"
+        )
+    rows = {name: tensor.detach() for name, tensor in zip(names, tensors, strict=True)}
+    _check_rows(rows, table, max_sh_degree)
+    if not 0 <= active_sh_degree <= max_sh_degree:
+        raise UserError(
+            f"the active SH degree of the checkpoint is {active_sh_degree}, more than --sh_degree {max_sh_degree}; "
+            "give the --sh_degree it was trained with"
+        )
+    statistics = Statistics(max_radii2D, xyz_gradient_accum, denom)
+    return State(int(active_sh_degree), rows, statistics, optimizer, float(spatial_lr_scale), exposures)
+
+
+def _check_rows(rows: Rows, table: dict[str, Attribute], max_sh_degree: int) -> None:
+    """UserError for rows that do not have the shapes of the table, or are not finite."""
+    for name, values in rows.items():
+        shape = table[name].shape
+        found = tuple(values.shape[1:])
+        if name == "f_rest" and found[1:] == shape[1:] and found != shape:
+            raise UserError(
+                f"the checkpoint has {found[0]} SH coefficients above band 0, where --sh_degree {max_sh_degree} needs "
+                f"{shape[0]}; give the --sh_degree it was trained with"
+            )
+        if found != shape or values.dtype != torch.float32:
+            raise UserError(
+                f"{name} of the checkpoint has the shape {found} and type {values.dtype} per Gaussian, not {shape} "
+                "and float32; give a checkpoint of this model"
+            )
+    check_finite(rows, "the checkpoint", "give another one")
 
 
 def save_checkpoint(path: str | os.PathLike, capture: tuple, iteration: int) -> None:
@@ -62,7 +136,7 @@ def _refuse_other_formats(path: str | os.PathLike) -> None:
 
 
 def _checked(content: Any) -> tuple[tuple, int]:
-    """Capture and iteration; ValueError saying what is wrong. Shapes of attributes are GaussianModel.restore's."""
+    """Capture and iteration; ValueError saying what is wrong. `unpack` checks the shapes of the attributes."""
     if not isinstance(content, tuple | list) or len(content) != 2:
         raise ValueError("it is no pair of a state and an iteration")
     capture, iteration = content

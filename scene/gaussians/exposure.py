@@ -10,11 +10,10 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from scene.dataset_readers import CameraInfo
 from scene.gaussians.adam import GaussianAdam
-from scene.half_images import exposure_names
 from utils.general_utils import get_expon_lr_func
-from utils.system_utils import UserError, atomic_write, compute_device
+from utils.host.device import compute_device
+from utils.system_utils import UserError, atomic_write
 
 NAME = "exposure.json"
 _ADAM_EPS = 1e-8  # torch's default, which the reference leaves for exposures
@@ -23,7 +22,7 @@ _ADAM_EPS = 1e-8  # torch's default, which the reference leaves for exposures
 class Exposures:
     """Affine maps of colours, one a training picture: `values` (N, 3, 4) float32, [I | 0] at first.
 
-    A pixel c, a row vector, becomes c A[:, :3] + A[:, 3] (`utils.exposure`). names: of the pictures, in order.
+    A pixel c, a row vector, becomes c A[:, :3] + A[:, 3] (`apply_exposure`). names: of the pictures, in order.
     """
 
     def __init__(self, names: Sequence[str] = ()) -> None:
@@ -100,8 +99,11 @@ class Exposures:
             path.write_text(json.dumps(table, indent=2, allow_nan=False) + "\n", encoding="utf-8")
 
 
-def read_exposures(folder: str | os.PathLike, cameras: Sequence[CameraInfo]) -> Exposures:
-    """Exposures of these views from a model folder's exposure.json. UserError where one is missing or broken."""
+def read_exposures(folder: str | os.PathLike, names: Sequence[str], image_names: Sequence[str]) -> Exposures:
+    """Exposures of the photos `names` from a model folder's exposure.json. UserError where one is missing or broken.
+
+    image_names: of the same photos, under which the reference's files have them, also where several photos share one.
+    """
     path = Path(folder) / NAME
     remedy = "restore it, or write train_test_exp=False into cfg_args to render without exposures"
     try:
@@ -112,10 +114,9 @@ def read_exposures(folder: str | os.PathLike, cameras: Sequence[CameraInfo]) -> 
         raise UserError(f"{path} is not JSON; {remedy}") from error
     if not isinstance(table, dict):
         raise UserError(f"{path} is no table of exposures by picture; {remedy}")
-    exposures = Exposures(exposure_names(cameras))
-    for index, (name, camera) in enumerate(zip(exposures.names, cameras, strict=True)):
-        # The reference's files have the image name alone, also where several pictures have it.
-        rows = table.get(name, table.get(camera.image_name))
+    exposures = Exposures(names)
+    for index, (name, image_name) in enumerate(zip(names, image_names, strict=True)):
+        rows = table.get(name, table.get(image_name))
         if rows is None:
             raise UserError(f"{path} has no exposure of {name}; {remedy}")
         try:
@@ -127,3 +128,13 @@ def read_exposures(folder: str | os.PathLike, cameras: Sequence[CameraInfo]) -> 
         with torch.no_grad():
             exposures.values[index] = value
     return exposures
+
+
+def apply_exposure(image: Tensor, exposure: Tensor) -> Tensor:
+    """Map the colours c of an image (3, H, W) to c A + b, for an exposure (3, 4) = [A | b] and c as a row vector.
+
+    Differentiable in both. Plain products and sums of planes: a matrix product's rounding may depend on the number of
+    threads, and so may its gradient's.
+    """
+    red, green, blue = (image[i] * exposure[i, :3, None, None] for i in range(3))
+    return red + green + blue + exposure[:, 3, None, None]
