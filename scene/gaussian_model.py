@@ -78,7 +78,7 @@ class GaussianModel(AdaptiveGaussians):
     # Optimiser
 
     def training_setup(self, training_args: argparse.Namespace) -> None:
-        """Make the optimiser and the position schedule from the optimisation options; zero the statistics."""
+        """Make the optimisers and their schedules from the optimisation options; zero the statistics."""
         self.percent_dense = training_args.percent_dense
         self._zero_statistics()
         self.optimizer = _OPTIMIZERS[self.optimizer_type](
@@ -97,16 +97,16 @@ class GaussianModel(AdaptiveGaussians):
         self.exposures.training_setup(training_args)
 
     def update_learning_rate(self, iteration: int) -> float:
-        """Set the learning rates of this iteration that change with it; return the positions'."""
+        """Set the scheduled learning rates for this iteration; return that of the positions."""
         self.exposures.update_learning_rate(iteration)
         rate = self.xyz_scheduler_args(iteration)
         self.optimizer.param_groups[0]["lr"] = rate
         return rate
 
     def step(self, radii: Tensor) -> None:
-        """One step of all optimisers, and no gradients left.
+        """Step all optimisers and drop the gradients.
 
-        radii: (N,) pixels in the view of this iteration, 0 for those that the sparse optimiser leaves alone.
+        radii: (N,) pixels in the view of this iteration; the sparse optimiser skips Gaussians of radius 0.
         """
         if self.optimizer_type == "sparse_adam":
             self.optimizer.step(radii > 0)
@@ -116,23 +116,23 @@ class GaussianModel(AdaptiveGaussians):
         self.exposures.step()
 
     def guard_steps(self, guard: StepGuard) -> None:
-        """Let a guard hold back the steps of all optimisers there are now."""
+        """Let a guard hold back the steps of all optimisers; training_setup makes unguarded ones."""
         self.optimizer.guard = self.exposures.optimizer.guard = guard
 
     def check_steps(self) -> None:
-        """UserError where a guard has held steps back, so that the model is not what it is counted as."""
+        """UserError when a guard has held steps back, so that the model is older than its iteration says."""
         if self.optimizer.guard and (iteration := self.optimizer.guard.stopped_in()):
-            raise UserError(f"loss or step of iteration {iteration} were not finite; lower the learning rates")
+            raise UserError(f"the loss or a step of iteration {iteration} was not finite; lower the learning rates")
 
     def take_marks(self) -> list[tuple[str, list[int] | list[str], int]]:
-        """What a guard kept from its step: name of the tensor, rows (of exposures the pictures), number of all rows."""
+        """Values that a guard kept from their step: name of the tensor, its rows or photos, and number of all rows."""
         marks = [(name, rows.tolist(), len(self)) for name, rows in self.optimizer.take_marks().items()]
         for name, rows in self.exposures.optimizer.take_marks().items():
             marks.append((name, [self.exposures.names[row] for row in rows.tolist()], len(self.exposures.names)))
         return marks
 
     def rewind(self, steps: int) -> None:
-        """Count back the steps that a guard held back."""
+        """Take back the counts of steps that a guard held back."""
         self.optimizer.rewind(steps)
         self.exposures.optimizer.rewind(steps)
 
@@ -179,7 +179,7 @@ class GaussianModel(AdaptiveGaussians):
         self.statistics = state.statistics.to(self._xyz.device)
 
     def check_finite(self, iteration: int) -> None:
-        """UserError where a parameter is not finite, to be called before anything of this iteration is saved."""
-        remedy = "nothing of it was saved; lower the learning rates, or go on from an earlier checkpoint"
+        """UserError for a parameter that is not finite; call it before anything of this iteration is saved."""
+        remedy = "nothing of it was saved; lower the learning rates, or resume from an earlier checkpoint"
         check_finite(self.rows(), f"iteration {iteration}", remedy)
         self.exposures.check_finite(f"iteration {iteration}", remedy)

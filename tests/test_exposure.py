@@ -136,12 +136,12 @@ def test_names_that_others_did_not_tell_apart_are_found(tmp_path):
     [
         (None, "cannot read .*exposure.json"),
         ("{", "is not JSON"),
-        ("[1]", "is no table of exposures"),
+        ("[1]", "is not a table of exposures"),
         ("{}", "has no exposure of a.png"),
         ('{"a.png": [[1, 0, 0, 0]]}', "is not 3 x 4 finite numbers"),
         ('{"a.png": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, NaN]]}', "is not 3 x 4 finite numbers"),
-        ('{"a.png": "white"}', "is no matrix of numbers"),
-        ('{"a.png": [[1, 0], [1]]}', "is no matrix of numbers"),
+        ('{"a.png": "white"}', "is not a matrix of numbers"),
+        ('{"a.png": [[1, 0], [1]]}', "is not a matrix of numbers"),
     ],
 )
 def test_a_broken_file_is_named(tmp_path, text, words):
@@ -176,7 +176,7 @@ def test_checkpoints_carry_them_behind_the_references_entries(tmp_path):
 def test_exposures_that_do_not_fit_are_refused():
     state = _trained().capture()
     cases = {
-        "exposures of other pictures": state | {"names": NAMES[:2]},
+        "exposures of other photos": state | {"names": NAMES[:2]},
         "3 x 4|float32": state | {"values": state["values"].double()},
         "optimiser state in the checkpoint does not fit": state | {"optimizer": 5},
         "the exposure of .* in the checkpoint is not finite; use another": state
@@ -185,7 +185,7 @@ def test_exposures_that_do_not_fit_are_refused():
     for words, wrong in cases.items():
         with pytest.raises(UserError, match=words):
             _trained(steps=0).restore(wrong)
-    with pytest.raises(UserError, match="exposures of other pictures"):
+    with pytest.raises(UserError, match="exposures of other photos"):
         _trained(["x.png"], steps=0).restore(state)
     Exposures().check_finite("iteration 7", "do this")
     broken = _trained()

@@ -42,10 +42,10 @@ class AdaptiveGaussians(GaussianParameters):
         self.statistics = Statistics.zero(len(self), self._xyz.device)
 
     def observe(self, viewspace_points: Tensor, radii: Tensor) -> None:
-        """Add a view to the statistics: largest radius, gradient length and count of the Gaussians that it saw.
+        """Add a view to the statistics: largest radius, gradient length and count of the Gaussians it saw.
 
-        viewspace_points: (N, 3) with `.grad` per NDC unit; radii: (N,) int32 pixels, 0 where not seen. Raises
-        max_radii2D and does what add_densification_stats does for radii > 0, in one pass.
+        viewspace_points: (N, 3) with `.grad` per NDC unit; radii: (N,) int32 pixels, 0 where not seen. One pass updates
+        max_radii2D and does the work of add_densification_stats for radii > 0.
         """
         self.statistics.observe(viewspace_points.grad, radii)
 
@@ -79,10 +79,11 @@ class AdaptiveGaussians(GaussianParameters):
     ) -> None:
         """Clone small and split large Gaussians with a mean gradient >= max_grad, then remove useless ones.
 
-        extent: of the scene, world units; max_screen_size: None, or remove wider ones (pixels) and those over a tenth
-        of the extent. seed and iteration decide the positions of split children; max_splats > 0 bounds growth.
+        min_opacity: a Gaussian below it is removed. extent: of the scene, world units. max_screen_size: pixels; unless
+        None, Gaussians wider than that or than a tenth of the extent are removed. seed and iteration decide the
+        positions of split children. max_splats > 0 bounds the number of Gaussians.
         """
-        self.optimizer.zero_grad(set_to_none=True)  # its memory is needed; new parameters have none anyway
+        self.optimizer.zero_grad(set_to_none=True)  # frees memory; the new parameters have no gradient anyway
         gradient = adc.mean_gradient(self.xyz_gradient_accum, self.denom)
         if max_splats > 0:
             gradient = adc.limit_growth(gradient, max_grad, max_splats - len(self))
@@ -143,7 +144,7 @@ class AdaptiveGaussians(GaussianParameters):
         new_rotation: Tensor,
         *new_others: Tensor,
     ) -> None:
-        """Append Gaussians (raw parameters), also when there are none; the statistics of all are zeroed."""
+        """Append Gaussians, possibly none, by raw parameters, and zero the statistics of all."""
         new = (new_xyz, new_features_dc, new_features_rest, new_opacities, new_scaling, new_rotation, *new_others)
         self._take(self.optimizer.append_rows(dict(zip(self._attributes, new, strict=True))))
         self._zero_statistics()
@@ -157,6 +158,6 @@ class AdaptiveGaussians(GaussianParameters):
         self.statistics.keep(keep)
 
     def reset_opacity(self) -> None:
-        """Bring every opacity down to at most 0.01; its Adam moments start again from zero."""
+        """Lower every opacity to at most 0.01; its Adam moments restart at zero."""
         lowered = self._opacity.detach().clamp_max(adc.logit(adc.RESET_OPACITY))
         self._opacity = self.optimizer.reset("opacity", lowered)
