@@ -64,11 +64,12 @@ def _load(model_path: str, stored: dict[str, Any], iteration: int) -> tuple[argp
 
 def check_values(gaussians: GaussianModel) -> list[Line]:
     """NaN and infinities."""
+    shapes = gaussians.raw_geometry()
     raw = {
         "position": gaussians.get_xyz,
-        "opacity": gaussians._opacity,
-        "scale": gaussians._scaling,
-        "rotation": gaussians._rotation,
+        "opacity": shapes["opacities"],
+        "scale": shapes["scales"],
+        "rotation": shapes["rotations"],
         "colour": gaussians.get_features,
     }
     lines = []

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from scene.cameras import Camera, MiniCam
 from scene.gaussian_model import GaussianModel
-from utils.exposure import apply_exposure
+from scene.gaussians.exposure import apply_exposure
 from utils.sh_utils import eval_sh
 
 
@@ -106,7 +106,7 @@ def _geometry(pc: GaussianModel, in_python: bool, scaling_modifier: float) -> di
     threads), or the plain path through the model's activations."""
     if in_python:
         return {"opacities": pc.get_opacity, "cov3d": pc.get_covariance(scaling_modifier)}
-    return {"opacities": pc._opacity, "scales": pc._scaling, "rotations": pc._rotation, "raw": True}
+    return {**pc.raw_geometry(), "raw": True}
 
 
 def _colors(

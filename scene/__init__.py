@@ -1,221 +1,31 @@
-"""A scene: the views of a dataset, and the Gaussians that are trained on them or loaded for them."""
+"""Datasets and models.
 
-import argparse
-import json
-import os
-import random
-import shutil
-import sys
-from collections.abc import Sequence
-from pathlib import Path
-from typing import Protocol
+scene                        Scene: the views of a dataset and the Gaussians that belong to them
+cameras, half_images         a view with its matrices and photo; which half of it trains (--train_test_exp)
+gaussian_model               GaussianModel, built of the modules in gaussians/
+gaussians/                   parameters of the Gaussians: start, optimiser, density control, exposures, PLY, checkpoint
+dataset_readers, readers/    a folder's dataset as plain records: COLMAP, Blender, nerfstudio; points, depth maps
+pictures/                    image files: finding, lenses, masks, decoding, keeping
+saved_iterations, saved_model  what a model folder holds, and loading it with its scene
+export_world                 a command: a model in the world's coordinates
 
-import numpy as np
-import torch
+gaussians/ and pictures/ import nothing else from here, readers/ only pictures/. The names below are imported on first
+use, so that `import scene.gaussian_model` loads no reader of datasets.
+"""
 
-from arguments.stored import OFFSET, read_model_json
-from scene.cameras import Camera, camera_to_JSON, cameraList_from_camInfos
-from scene.dataset_readers import CameraInfo, read_scene
-from scene.half_images import mark_halves, train_on_all
-from scene.pictures.masks import MaskOptions, refuse_nothing_to_ignore
-from scene.pictures.store import ImageStore, Picture
-from scene.readers.depth_maps import with_depth_maps
-from scene.readers.point_cloud import write_point_cloud
-from utils.graphics_utils import BasicPointCloud
-from utils.system_utils import UserError, atomic_write, compute_device, saved_iterations, searchForMaxIteration
+from importlib import import_module
+from typing import TYPE_CHECKING
 
+if TYPE_CHECKING:
+    from scene.gaussian_model import GaussianModel
+    from scene.scene import Scene, SceneGaussians
 
-class _Gaussians(Protocol):
-    world_offset: tuple[float, float, float]
+__all__ = ["GaussianModel", "Scene", "SceneGaussians"]
 
-    def create_from_pcd(
-        self, pcd: BasicPointCloud, cam_infos: Sequence[CameraInfo], spatial_lr_scale: float
-    ) -> None: ...
-
-    def load_ply(self, path: str) -> None: ...
-
-    def save_ply(self, path: str) -> None: ...
-
-    def load_exposures(self, folder: str, cam_infos: Sequence[CameraInfo]) -> None: ...
-
-    def save_exposures(self, folder: str) -> None: ...
+_HOMES = {"GaussianModel": "scene.gaussian_model", "Scene": "scene.scene", "SceneGaussians": "scene.scene"}
 
 
-class Scene:
-    """Views and model of one run.
-
-    args: model options (ModelParams.extract). load_iteration: None calls `create_gaussians` and `write_inputs`, unless
-    `start` is False, which leaves them to the caller; -1 loads the last saved iteration, N that one.
-    shuffle: mix the order of the views (always the same way). resolution_scales: factors by which views are made
-    smaller, one list of cameras each. info: what was read. cameras_extent: E in world units, from the training views.
-    images: the views' pictures.
-    """
-
-    def __init__(
-        self,
-        args: argparse.Namespace,
-        gaussians: _Gaussians,
-        load_iteration: int | None = None,
-        shuffle: bool = True,
-        resolution_scales: Sequence[float] = (1.0,),
-        start: bool = True,
-    ) -> None:
-        self.model_path = args.model_path
-        self.gaussians = gaussians
-        self.loaded_iter = None if load_iteration is None else find_iteration(self.model_path, load_iteration)
-
-        if self.loaded_iter is None:
-            _refuse_dataset_folder(args)
-        masks = MaskOptions(args.masks, args.invert_masks, args.mask_meaning)
-        info = read_scene(
-            args.source_path,
-            args.images,
-            args.eval,
-            args.init_pcd_path,
-            want_cloud=self.loaded_iter is None,
-            init_type=args.init_type,
-            masks=masks,
-            offset=None if self.loaded_iter is None else read_model_json(self.model_path).get(OFFSET, (0, 0, 0)),
-        )
-        if self.loaded_iter is None:
-            views = info.train_cameras + info.test_cameras
-            refuse_nothing_to_ignore([(view.image_path, view.mask) for view in views], masks)
-        self._halves = args.train_test_exp
-        if self._halves:
-            info = train_on_all(info)
-        if args.depths and self.loaded_iter is None:
-            info = with_depth_maps(info, Path(args.source_path), args.depths)
-        self.info = info
-        self.cameras_extent = info.extent
-
-        device = compute_device()
-        images = ImageStore(args.images_to_load, picture_device(args.data_device, device), device)
-        self.images = images
-        self._train = self._cameras(info.train_cameras, args, images, device, shuffle, resolution_scales)
-        self._test = self._cameras(info.test_cameras, args, images, device, shuffle, resolution_scales)
-        images.plan(_pictures(self._train), _pictures(self._test))
-
-        if self._halves:
-            for scale in resolution_scales:
-                mark_halves(self._train[scale], self._test[scale], info.train_cameras)
-
-        gaussians.world_offset = tuple(info.offset.tolist())
-        if self.loaded_iter is not None:
-            print(f"Loading trained model at iteration {self.loaded_iter}")
-            gaussians.load_ply(str(saved_ply(self.model_path, self.loaded_iter)))
-            if self._halves:
-                gaussians.load_exposures(self.model_path, info.train_cameras)
-        elif start:
-            self.create_gaussians()
-            self.write_inputs()
-
-    def getTrainCameras(self, scale: float = 1.0) -> list[Camera]:
-        """Training views at a resolution scale that the scene was made with."""
-        return self._train[scale]
-
-    def getTestCameras(self, scale: float = 1.0) -> list[Camera]:
-        """Held-out views at a resolution scale that the scene was made with."""
-        return self._test[scale]
-
-    def prefetch(self, cameras: Sequence[Camera]) -> None:
-        """Begin to make the pictures of the views ready that are used next, in that order (`images.ahead` of them)."""
-        self.images.prefetch([picture for camera in cameras for picture in camera.pictures])
-
-    def save(self, iteration: int, gaussians: _Gaussians | None = None) -> None:
-        """Write the Gaussians, or those given in their place, as `point_cloud/iteration_N/point_cloud.ply`; exposures
-        where those are trained."""
-        (self.gaussians if gaussians is None else gaussians).save_ply(str(saved_ply(self.model_path, iteration)))
-        if self._halves:
-            self.gaussians.save_exposures(self.model_path)
-
-    def training_pixels(self) -> tuple[int, int]:
-        """Pixels of all training views: as they train, and in their files."""
-        trained = sum(camera.image_width * camera.image_height for camera in self.getTrainCameras())
-        return trained, sum(width * height for width, height in (c.file_size for c in self.info.train_cameras))
-
-    def create_gaussians(self) -> None:
-        """Start from the dataset's points."""
-        self.gaussians.create_from_pcd(self.info.point_cloud, self.info.train_cameras, self.cameras_extent)
-
-    def write_inputs(self) -> None:
-        """Write the cloud and the cameras into the model folder, `input.ply` and `cameras.json`."""
-        folder, info = Path(self.model_path), self.info
-        if info.ply_path and not info.offset.any():
-            with atomic_write(folder / "input.ply") as path:
-                shutil.copyfile(info.ply_path, path)
-        else:
-            colors = np.round(info.point_cloud.colors * 255).astype(np.uint8)
-            write_point_cloud(folder / "input.ply", info.point_cloud.points, colors)
-        entries = [camera_to_JSON(i, camera) for i, camera in enumerate(info.test_cameras + info.train_cameras)]
-        with atomic_write(folder / "cameras.json") as path:
-            path.write_text(json.dumps(entries, allow_nan=False), encoding="utf-8")
-
-    @staticmethod
-    def _cameras(
-        infos: list[CameraInfo],
-        args: argparse.Namespace,
-        images: ImageStore,
-        device: torch.device,
-        shuffle: bool,
-        scales: Sequence[float],
-    ) -> dict[float, list[Camera]]:
-        order = list(range(len(infos)))
-        if shuffle:
-            # A generator of its own: the order must not depend on what else drew numbers before (resume).
-            random.Random(0).shuffle(order)
-        lists = {}
-        for scale in scales:
-            cameras = cameraList_from_camInfos(infos, scale, args, images, device)
-            lists[scale] = [cameras[index] for index in order]
-        return lists
-
-
-def saved_ply(model_path: str | os.PathLike, iteration: int) -> Path:
-    """The PLY of an iteration in a model folder."""
-    return Path(model_path) / "point_cloud" / f"iteration_{iteration}" / "point_cloud.ply"
-
-
-def find_iteration(model_path: str | os.PathLike, iteration: int) -> int:
-    """The iteration, which must be saved in a model folder; -1: the last one saved. UserError where it is not there."""
-    folder = Path(model_path) / "point_cloud"
-    last = searchForMaxIteration(folder)
-    if iteration == -1:
-        return last
-    if not saved_ply(model_path, iteration).is_file():
-        saved = ", ".join(map(str, saved_iterations(folder)))
-        raise UserError(f"iteration {iteration} was never saved in {folder}; saved are {saved}")
-    return iteration
-
-
-def _pictures(lists: dict[float, list[Camera]]) -> list[Picture]:
-    return [picture for cameras in lists.values() for camera in cameras for picture in camera.pictures]
-
-
-def _refuse_dataset_folder(args: argparse.Namespace) -> None:
-    """UserError when the model would be written into the dataset, which nothing may change."""
-    if not args.source_path or not args.model_path:
-        return
-    source, model = Path(args.source_path).resolve(), Path(args.model_path).resolve()
-    if model.is_relative_to(source):
-        raise UserError(f"the output folder {args.model_path} lies in the scene folder {source}; name another with -m")
-
-
-def picture_device(data_device: str, fallback: torch.device) -> torch.device:
-    """Device that keeps the pictures: option --data_device where it can be used, else the device that computes.
-
-    A line says so where that is another than the option names, but for plain cuda where no GPU computes.
-    """
-    try:
-        wanted = torch.device(data_device)
-    except RuntimeError:
-        wanted = None
-    if wanted is None or wanted.type not in ("cpu", "cuda"):
-        reason = "is neither cpu nor cuda"
-    elif wanted.type == "cpu" or (fallback.type == "cuda" and (wanted.index or 0) < torch.cuda.device_count()):
-        return wanted
-    elif wanted.index is None:
-        return fallback
-    else:
-        reason = "is not there, or not used"
-    print(f"warning: --data_device {data_device} {reason}; pictures are kept on {fallback}", file=sys.stderr)
-    return fallback
+def __getattr__(name: str) -> object:
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(_HOMES[name]), name)

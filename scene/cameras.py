@@ -10,10 +10,10 @@ import torch
 from fused_ssim import composite
 from torch import Tensor
 
-from scene.dataset_readers import CameraInfo
 from scene.pictures.masks import TRANSPARENT, Cutout
 from scene.pictures.resolution import training_size
 from scene.pictures.store import ImageStore, Picture, Source
+from scene.readers.records import CameraInfo
 from utils.graphics_utils import getProjectionMatrix, getWorld2View2
 
 ZNEAR = 0.01  # these two only shape the clip depth; nothing is culled by them

@@ -3,13 +3,11 @@ scored, so that the exposures of test pictures are known without training on wha
 """
 
 import os
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 
 from scene.cameras import Camera
-from scene.dataset_readers import CameraInfo, SceneInfo, scene_extent
+from scene.readers.records import CameraInfo, SceneInfo, exposure_names, scene_extent
 
 
 def train_on_all(info: SceneInfo) -> SceneInfo:
@@ -19,16 +17,6 @@ def train_on_all(info: SceneInfo) -> SceneInfo:
         views.sort(key=lambda view: os.fsencode(view.image_name))
     points = None if info.point_cloud is None else info.point_cloud.points
     return replace(info, train_cameras=views, extent=scene_extent(views, points))
-
-
-def exposure_names(cameras: Sequence[CameraInfo]) -> list[str]:
-    """A name for each view: its image name, or where several have that (Blender's train/r_0 and test/r_0) its path from
-    their common folder.
-    """
-    counts = Counter(camera.image_name for camera in cameras)
-    folder = os.path.commonpath([camera.image_path.parent for camera in cameras]) if cameras else ""
-    paths = [Path(os.path.relpath(camera.image_path, folder)).as_posix() for camera in cameras]
-    return [c.image_name if counts[c.image_name] == 1 else path for c, path in zip(cameras, paths, strict=True)]
 
 
 def mark_halves(train: list[Camera], test: list[Camera], infos: Sequence[CameraInfo]) -> None:

@@ -5,9 +5,10 @@ Its PLY, not cfg_args, says of which SH degree it is: --prune_sh cuts the last s
 
 import argparse
 
-from scene import Scene, find_iteration, saved_ply
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.ply import stored_sh_degree
+from scene.saved_iterations import find_iteration, saved_ply
+from scene.scene import Scene
 
 
 def load_saved(options: argparse.Namespace, iteration: int, sh_degree: int | None = None) -> Scene:

@@ -163,7 +163,7 @@ def test_parts_that_do_not_fit_end_in_a_sentence(tmp_path):
     nan[2, 1] = float("nan")
     empty = tuple(t[:0] if torch.is_tensor(t) else t for t in good)
     cases = {
-        "no pair": torch.zeros(2),
+        "not a pair": torch.zeros(2),
         "entries": ([1, 2], 3),
         "the iteration is -5": (good, -5),
         "the iteration is 'x'": (good, "x"),

@@ -17,8 +17,9 @@ from PIL import Image
 from synthetic import CENTER, FOCAL, FakeGaussians, folder_state, make_colmap_scene
 
 from arguments import ModelParams
-from scene import Scene, picture_device
+from scene import Scene
 from scene.dataset_readers import read_scene, scene_extent
+from scene.pictures.store import picture_device
 from scene.readers import colmap_model
 from scene.readers.point_cloud import read_point_cloud, write_point_cloud
 from utils.system_utils import UserError

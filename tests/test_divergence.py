@@ -11,8 +11,8 @@ from gaussians import model, parameters
 from rasterizer_tools import ops
 
 import train
-from scene import gaussian_model
 from scene.gaussian_model import GaussianModel
+from scene.gaussians.adam import StepGuard
 from scene.gaussians.checkpoint import load_checkpoint
 from training import objective
 from utils.system_utils import UserError
@@ -154,10 +154,10 @@ def test_float32_steps_are_doubles_from_1e_minus_30_to_1e10():
 
 def test_marks_are_taken_and_counters_go_back():
     gaussians = model(6)
-    guard = gaussian_model.StepGuard("cpu")
+    guard = StepGuard("cpu")
     gaussians.guard_steps(guard)
     for iteration in range(1, 5):
-        for values in gaussians._rows().values():
+        for values in gaussians.rows().values():
             values.grad = None
         for name, attribute in gaussians._attributes.items():
             param = getattr(gaussians, attribute.field)

@@ -338,5 +338,5 @@ def test_folders_that_are_no_models(model, tmp_path):
     assert "iteration 8 was never saved" in check_model(str(folder), 8)[0].text
     ply = folder / "point_cloud" / "iteration_7" / "point_cloud.ply"
     ply.write_bytes(ply.read_bytes()[:-100])
-    assert "is not a whole PLY file" in check_model(str(folder), -1)[0].text
+    assert "is not a complete PLY file" in check_model(str(folder), -1)[0].text
     assert "no scene folder" in check_model(model(source=tmp_path / "gone"), -1)[0].text

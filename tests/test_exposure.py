@@ -18,10 +18,10 @@ from records.error_curve import read_curve
 from scene.dataset_readers import CameraInfo, read_scene
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.checkpoint import load_checkpoint, save_checkpoint
-from scene.gaussians.exposure import Exposures, read_exposures
-from scene.half_images import exposure_names, train_on_all
+from scene.gaussians.exposure import Exposures, apply_exposure, read_exposures
+from scene.half_images import train_on_all
 from scene.readers.point_cloud import write_point_cloud
-from utils.exposure import apply_exposure
+from scene.readers.records import exposure_names
 from utils.loss_utils import inverse_depth_loss, l1_loss, photometric_loss, ssim
 from utils.system_utils import UserError
 
@@ -34,6 +34,10 @@ def _infos(*paths: str, stems: bool = False) -> list[CameraInfo]:
     return [
         replace(info, image_path=Path("/scene", path), image_name=Path(path).stem if stems else path) for path in paths
     ]
+
+
+def _read(folder: Path, infos: list[CameraInfo]) -> Exposures:
+    return read_exposures(folder, exposure_names(infos), [info.image_name for info in infos])
 
 
 def _trained(names: list[str] = NAMES, steps: int = 3, **changes: object) -> Exposures:
@@ -114,7 +118,7 @@ def test_the_file_comes_back(tmp_path):
     exposures.write(tmp_path)
     table = json.loads((tmp_path / "exposure.json").read_text())
     assert list(table) == NAMES and np.shape(table["a.png"]) == (3, 4)
-    again = read_exposures(tmp_path, _infos(*NAMES[::-1]))
+    again = _read(tmp_path, _infos(*NAMES[::-1]))
     assert again.names == NAMES[::-1] and not again.trained
     for name in NAMES:
         assert torch.equal(again[name], exposures[name]) and exposures[name].tolist() == table[name]
@@ -123,7 +127,7 @@ def test_the_file_comes_back(tmp_path):
 def test_names_that_others_did_not_tell_apart_are_found(tmp_path):
     rows = [[2, 0, 0, 0], [0, 2, 0, 0], [0, 0, 2, 0.5]]
     (tmp_path / "exposure.json").write_text(json.dumps({"r_0": rows}))
-    exposures = read_exposures(tmp_path, _infos("train/r_0.png", "test/r_0.png", stems=True))
+    exposures = _read(tmp_path, _infos("train/r_0.png", "test/r_0.png", stems=True))
     assert exposures["train/r_0.png"].tolist() == exposures["test/r_0.png"].tolist() == rows
 
 
@@ -132,19 +136,19 @@ def test_names_that_others_did_not_tell_apart_are_found(tmp_path):
     [
         (None, "cannot read .*exposure.json"),
         ("{", "is not JSON"),
-        ("[1]", "is no table of exposures"),
+        ("[1]", "is not a table of exposures"),
         ("{}", "has no exposure of a.png"),
         ('{"a.png": [[1, 0, 0, 0]]}', "is not 3 x 4 finite numbers"),
         ('{"a.png": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, NaN]]}', "is not 3 x 4 finite numbers"),
-        ('{"a.png": "white"}', "is no matrix of numbers"),
-        ('{"a.png": [[1, 0], [1]]}', "is no matrix of numbers"),
+        ('{"a.png": "white"}', "is not a matrix of numbers"),
+        ('{"a.png": [[1, 0], [1]]}', "is not a matrix of numbers"),
     ],
 )
 def test_a_broken_file_is_named(tmp_path, text, words):
     if text is not None:
         (tmp_path / "exposure.json").write_text(text)
     with pytest.raises(UserError, match=f"{words}.*; restore it, or write train_test_exp=False"):
-        read_exposures(tmp_path, _infos("a.png"))
+        _read(tmp_path, _infos("a.png"))
 
 
 # Checkpoints
@@ -172,7 +176,7 @@ def test_checkpoints_carry_them_behind_the_references_entries(tmp_path):
 def test_exposures_that_do_not_fit_are_refused():
     state = _trained().capture()
     cases = {
-        "exposures of other pictures": state | {"names": NAMES[:2]},
+        "exposures of other photos": state | {"names": NAMES[:2]},
         "3 x 4|float32": state | {"values": state["values"].double()},
         "optimiser state in the checkpoint does not fit": state | {"optimizer": 5},
         "the exposure of .* in the checkpoint is not finite; use another": state
@@ -181,7 +185,7 @@ def test_exposures_that_do_not_fit_are_refused():
     for words, wrong in cases.items():
         with pytest.raises(UserError, match=words):
             _trained(steps=0).restore(wrong)
-    with pytest.raises(UserError, match="exposures of other pictures"):
+    with pytest.raises(UserError, match="exposures of other photos"):
         _trained(["x.png"], steps=0).restore(state)
     Exposures().check_finite("iteration 7", "do this")
     broken = _trained()

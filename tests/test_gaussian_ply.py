@@ -105,12 +105,12 @@ def test_refusals(tmp_path):
     with pytest.raises(UserError, match="no file"):
         _loaded(tmp_path / "absent.ply")
     (tmp_path / "text.ply").write_text("hello")
-    with pytest.raises(UserError, match="not a whole PLY"):
+    with pytest.raises(UserError, match="not a complete PLY"):
         _loaded(tmp_path / "text.ply")
     whole = (tmp_path / "two.ply").read_bytes()
     for length in (len(whole) - 7, len(whole) // 2, 40, 0):
         (tmp_path / "cut.ply").write_bytes(whole[:length])
-        with pytest.raises(UserError, match="not a whole PLY"):
+        with pytest.raises(UserError, match="not a complete PLY"):
             _loaded(tmp_path / "cut.ply", 2)
 
 

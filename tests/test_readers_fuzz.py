@@ -161,7 +161,7 @@ def test_gaussian_ply(folder, gaussian_ply, data):
     path.write_bytes(data.draw(damaged(gaussian_ply)))
     gaussians = GaussianModel(1)
     ends_well(lambda: gaussians.load_ply(path))
-    assert len({len(gaussians), *(len(rows) for rows in gaussians._rows().values())}) == 1
+    assert len({len(gaussians), *(len(rows) for rows in gaussians.rows().values())}) == 1
 
 
 @FUZZ
@@ -254,4 +254,4 @@ def test_checkpoint(folder, checkpoint, data):
         restored = ends_well(lambda: gaussians.restore(loaded[0], options()) or gaussians)
         if restored is not None:
             take_steps(gaussians, 1)
-            assert all(rows.isfinite().all() for rows in gaussians._rows().values())
+            assert all(rows.isfinite().all() for rows in gaussians.rows().values())

@@ -21,7 +21,8 @@ from arguments import ModelParams
 from gaussian_renderer import render
 from scene import Scene, export_world
 from scene.dataset_readers import read_scene
-from scene.gaussian_model import LARGEST_OUTLIER, GaussianModel
+from scene.gaussian_model import GaussianModel
+from scene.gaussians.start import LARGEST_OUTLIER
 from scene.readers.records import standing_apart
 from utils.image_utils import psnr
 from utils.system_utils import UserError

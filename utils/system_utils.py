@@ -1,4 +1,4 @@
-"""Files, folders, exit statuses and the choice of device: what every command line needs."""
+"""Files, folders, user errors and exit statuses for every command line."""
 
 import contextlib
 import os
@@ -7,19 +7,26 @@ import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-import torch
-
+from utils.host.device import compute_device
+from utils.host.interrupt import Terminated
 from utils.host.memory import is_out_of_memory, shortage
+
+__all__ = [
+    "Terminated",
+    "UserError",
+    "atomic_write",
+    "compute_device",
+    "mkdir_p",
+    "run_cli",
+    "saved_iterations",
+    "searchForMaxIteration",
+]
 
 _ITERATION_FOLDER = re.compile(r"iteration_(\d+)")
 
 
 class UserError(Exception):
     """Something the user can mend. Its text is one sentence that names the thing and the remedy."""
-
-
-class Terminated(KeyboardInterrupt):
-    """SIGTERM or SIGHUP, where it is treated as Ctrl-C is."""
 
 
 def run_cli(main: Callable[[], object]) -> None:
@@ -110,15 +117,3 @@ def searchForMaxIteration(folder: str | os.PathLike) -> int:
     if not iterations:
         raise UserError(f"no saved iteration in {folder} (looked for folders iteration_N); train the model first")
     return iterations[-1]
-
-
-def compute_device() -> torch.device:
-    """`cuda` when a GPU is visible and the rasterizer was built with its CUDA kernels, else `cpu`.
-
-    The rasterizer's library must be loaded by then (gaussian_renderer does it); unloaded counts as "no kernels".
-    """
-    op = "diff_gaussian_rasterization::rasterize"
-    loaded = hasattr(torch.ops.diff_gaussian_rasterization, "rasterize")
-    if torch.cuda.is_available() and loaded and torch._C._dispatch_has_kernel_for_dispatch_key(op, "CUDA"):
-        return torch.device("cuda")
-    return torch.device("cpu")

@@ -64,7 +64,7 @@ class Workload:
         rows["f_rest"] = rows["f_rest"][:, : (degree + 1) ** 2 - 1].contiguous()
         rows["f_rest"][:, (active + 1) ** 2 - 1 :] = 0
         model = GaussianModel(degree)
-        model._set_rows(rows)
+        model.set_rows(rows)
         model.active_sh_degree = active
         model.training_setup(OptimizationParams(argparse.ArgumentParser()).extract(argparse.Namespace()))
         return model
@@ -77,17 +77,15 @@ class Workload:
 
     def bare_image(self, model: GaussianModel) -> Tensor:
         """The same image by the rasterizer alone, without anything that `render` adds."""
-        means2d = self._zero.expand_as(model._xyz)
+        means2d = self._zero.expand_as(model.get_xyz)
         means2d.requires_grad_(torch.is_grad_enabled())
         out = rasterize(
-            model._xyz,
+            model.get_xyz,
             means2d,
-            model._opacity,
-            self.settings,
-            scales=model._scaling,
-            rotations=model._rotation,
-            sh_dc=model._features_dc,
-            sh_rest=model._features_rest,
+            settings=self.settings,
+            **model.raw_geometry(),
+            sh_dc=model.get_features_dc,
+            sh_rest=model.get_features_rest,
             raw=True,
         )
         return out.color.clamp(0, 1)
@@ -148,10 +146,10 @@ def gradient_buffers(work: Workload) -> Row:
 def _operator(work: Workload, model: GaussianModel, train: bool) -> tuple[Tensor, ...]:
     s = work.settings
     camera = (s.viewmatrix, s.projmatrix, s.campos, s.tanfovx, s.tanfovy, s.image_height, s.image_width)
-    shape = (model._opacity, model._scaling, model._rotation, None, None, model._features_dc, model._features_rest)
+    shape = (*model.raw_geometry().values(), None, None, model.get_features_dc, model.get_features_rest)
     numbers = (model.active_sh_degree, 1.0, False, True)
     return torch.ops.diff_gaussian_rasterization.rasterize(
-        model._xyz, model._xyz, *shape, *camera, *numbers, s.bg, False, train
+        model.get_xyz, model.get_xyz, *shape, *camera, *numbers, s.bg, False, train
     )
 
 

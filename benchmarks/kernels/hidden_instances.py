@@ -25,7 +25,7 @@ from utils.system_utils import compute_device, run_cli
 def counts(camera: Camera, model: GaussianModel) -> dict[str, int]:
     """Of one view: splats and instances listed, and those of them that are processed."""
     size = camera.image_height, camera.image_width
-    shapes = model.get_xyz, model._opacity, model._scaling, model._rotation, None
+    shapes = model.get_xyz, *model.raw_geometry().values(), None
     colors = None, model.get_features_dc, model.get_features_rest
     view = camera.world_view_transform, camera.full_proj_transform, camera.camera_center
     tangents = math.tan(camera.FoVx / 2), math.tan(camera.FoVy / 2)

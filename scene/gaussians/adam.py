@@ -1,4 +1,4 @@
-"""Adam over the tensors of a Gaussian model, and what becomes of its state when Gaussians come and go."""
+"""Adam over the tensors of a Gaussian model, whose state follows as Gaussians are added and removed."""
 
 import math
 from collections.abc import Callable
@@ -10,58 +10,58 @@ from torch import Tensor, nn
 
 from utils.host.memory import is_out_of_memory
 
-_CHUNK = 1 << 16  # rows that are moved at a time where there is no memory for all
+_CHUNK = 1 << 16  # rows moved at a time when memory is too short for all of them
 _ADAM = torch.ops.diff_gaussian_rasterization.adam_
 
 
 class StepGuard:
-    """Holds all steps back from the first iteration on whose loss is not finite, or one of whose steps.
+    """Stops all optimisers at the first iteration whose loss or whose step is not finite.
 
-    A value whose step would not be finite (its gradient, or what becomes of it) stays as it is, and its first moment
-    becomes NaN as a mark, which GaussianAdam.take_marks takes away; all other values take their step in that iteration,
-    and none in later ones. The flag stays on the device: nobody waits for it but stopped_in.
+    In that iteration, a value whose gradient or step is not finite keeps its value. Its first moment becomes NaN as a
+    mark, which GaussianAdam.take_marks removes. All other values take their step. In later iterations no value does.
+    The flag stays on the device, and only `stopped_in` waits for it.
     """
 
     def __init__(self, device: torch.device | str) -> None:
         self._stopped = torch.zeros(1, dtype=torch.int64, device=device)
-        self.arguments: tuple = ()  # of the operators
+        self.arguments: tuple = ()  # the operators' last arguments
 
     def watch(self, iteration: int, loss: Tensor) -> None:
-        """Before the step of an iteration (from 1): its scalar loss."""
+        """Take the scalar loss of an iteration (from 1), before its step."""
         self.arguments = (loss, self._stopped, iteration)
 
     def stopped_in(self) -> int:
-        """The iteration it was, 0 while there is none."""
+        """The iteration that stopped the optimisers, 0 as long as none did. Waits for the device."""
         return int(self._stopped)
 
 
 class GaussianAdam(torch.optim.Adam):
-    """torch.optim.Adam, one parameter (N, ...) per named group, by a kernel with the same bits for any thread count.
+    """torch.optim.Adam with one parameter (N, ...) per named group, and the same bits for any number of threads.
 
-    State and state dict have torch's form (step, exp_avg, exp_avg_sq), so checkpoints carry over both ways. There are
-    no step hooks: torch's, with its profiler's label, take as long as the step itself. guard: may hold steps back.
+    State and state dict have torch's form (step, exp_avg, exp_avg_sq), so checkpoints of both can be exchanged. Step
+    hooks are never called: torch's wrapper for them takes as long as the step itself. guard: see StepGuard.
     """
 
     guard: StepGuard | None = None
 
     def __init__(self, groups: list[dict], eps: float = 1e-15) -> None:
-        """groups: dicts with `params` (a list of one Parameter), `lr` and `name`."""
+        """Take groups: dicts with `params` (a list of one Parameter), `lr` and `name`."""
         super().__init__(groups, lr=0.0, eps=eps)
         self._active_columns: dict[str, int] = {}
 
     def set_active_columns(self, name: str, columns: int) -> None:
         """Promise that only the first `columns` values of each row of this group ever had a gradient.
 
-        Adam's step for the others changes no bit (moments and gradient are zero), so it is left out. A group without
-        any, which gets no gradient, counts its steps along with f_dc.
+        Adam's step for the others changes no bit, as moments and gradient are zero, so it is left out. A group with no
+        active columns gets no gradient; its step counter advances with f_dc's.
         """
         self._active_columns[name] = columns
 
     @torch.no_grad()
     def step(self, closure: Callable[[], float] | None = None) -> float | None:
-        """One Adam step of every parameter that has a gradient; the others, counters included, stay as they are.
+        """Step every parameter that has a gradient; the others keep their values and step counters.
 
-        Learning rates are the groups' own, betas and eps the optimiser's.
+        Each group has its own learning rate; betas and eps are the optimiser's.
         """
         loss = None
         if closure is not None:
@@ -75,7 +75,7 @@ class GaussianAdam(torch.optim.Adam):
             if active != 0:
                 stepped, gradient = param.grad is not None, param.grad
             else:
-                # Nothing was rendered from this group; the parameter stands in, as of no columns nothing is read.
+                # Nothing was rendered from this group. With no columns to read, its values can stand in for a gradient.
                 stepped, gradient = params["f_dc"].grad is not None and param.numel() > 0, param
             if stepped:
                 state = self._state_of(param)
@@ -87,7 +87,7 @@ class GaussianAdam(torch.optim.Adam):
             _ADAM(*lists, rates, *self.defaults["betas"], self.defaults["eps"], columns, *guard)
         return loss
 
-    step.hooked = True  # torch wraps it otherwise
+    step.hooked = True  # keeps torch from wrapping it
 
     def zero_grad(self, set_to_none: bool = True) -> None:
         """Drop the gradients, or zero them."""
@@ -97,7 +97,7 @@ class GaussianAdam(torch.optim.Adam):
             group["params"][0].grad = None
 
     def take_marks(self) -> dict[str, Tensor]:
-        """Rows (n,) by group, of those with values that a guard kept from their step; these begin with zero moments."""
+        """Rows (n,) by group whose values a guard kept from their step; their marked moments restart at zero."""
         rows = {}
         for group in self.param_groups:
             state = self.state.get(group["params"][0])
@@ -111,7 +111,7 @@ class GaussianAdam(torch.optim.Adam):
         return rows
 
     def rewind(self, steps: int) -> None:
-        """Count back steps that a guard held back."""
+        """Take back the counts of steps that a guard held back."""
         for state in self.state.values():
             state["step"] = (state["step"] - steps).clamp_min(0)
 
@@ -124,9 +124,9 @@ class GaussianAdam(torch.optim.Adam):
         return state
 
     def take_state(self, state_dict: Any) -> None:
-        """Take the moments and step counters of a state dict; options of the groups stay as they are.
+        """Take the moments and step counters of a state dict; the groups keep their options.
 
-        ValueError, saying what does not fit, for anything but the state dict of such groups.
+        ValueError saying what does not fit, for anything but the state dict of such groups.
         """
         own = self.state_dict()["param_groups"]
         try:
@@ -145,7 +145,7 @@ class GaussianAdam(torch.optim.Adam):
     def append_rows(self, rows: dict[str, Tensor]) -> dict[str, nn.Parameter]:
         """Append `rows[name]` (n, ...) to each group, with zero moments. Returns the parameters, without gradient.
 
-        Where memory does not suffice, nothing is appended to any.
+        When memory runs out, no group keeps any of the new rows.
         """
         count = len(self.param_groups[0]["params"][0])
 
@@ -162,7 +162,7 @@ class GaussianAdam(torch.optim.Adam):
     def keep_rows(self, indices: Tensor) -> dict[str, nn.Parameter]:
         """Keep the rows of `indices` (n,) int64, ascending, in every group. Returns the parameters, without gradient.
 
-        Where memory does not suffice, it is done all the same, before the error is raised.
+        When memory runs out, the rows are moved within their own memory, and the error is raised afterwards.
         """
         errors = []
 
@@ -181,7 +181,7 @@ class GaussianAdam(torch.optim.Adam):
         return params
 
     def _change_rows(self, change: Callable[[Tensor, str, bool], Tensor]) -> dict[str, nn.Parameter]:
-        """Map all parameters and their moments; `change` takes values, the group's name, and whether it is a moment."""
+        """Map all parameters and moments; `change` takes values, the group's name, and whether they are a moment."""
         params = {}
         for group in self.param_groups:
             value = change(group["params"][0].detach(), group["name"], False)
@@ -194,7 +194,7 @@ class GaussianAdam(torch.optim.Adam):
         return self._replace(group, value, lambda moment, _: torch.zeros_like(moment))
 
     def _replace(self, group: dict, value: Tensor, change: Callable[[Tensor, str], Tensor]) -> nn.Parameter:
-        """Swap a group's parameter; `change` maps its moments, the step counter stays."""
+        """Swap a group's parameter; `change` maps its moments, and the step counter stays."""
         param = nn.Parameter(value.requires_grad_(True))
         old = group["params"][0]
         if self.state.get(old):
@@ -209,7 +209,7 @@ def _move_up(values: Tensor, indices: Tensor) -> Tensor:
     """values[indices] for ascending indices, in the memory of `values` itself."""
     for start in range(0, len(indices), _CHUNK):
         part = indices[start : start + _CHUNK]
-        values[start : start + len(part)] = values.index_select(0, part)  # later parts come from rows further down
+        values[start : start + len(part)] = values.index_select(0, part)  # later parts read rows further down
     return values[: len(indices)]
 
 

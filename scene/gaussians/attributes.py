@@ -1,4 +1,4 @@
-"""The table of what is trained of each Gaussian. Optimiser, density control, PLY and checkpoints go over it."""
+"""Per-Gaussian parameters, in one table that the optimiser, density control, PLY and checkpoints iterate over."""
 
 import argparse
 from collections.abc import Callable
@@ -12,16 +12,16 @@ Rows = dict[str, Tensor]  # raw values (N, *shape), float32, by optimiser group
 class Attribute(NamedTuple):
     """One raw (unactivated) parameter of every Gaussian."""
 
-    field: str  # where GaussianModel keeps it
+    field: str  # name of the model's tensor
     shape: tuple[int, ...]  # of one Gaussian's values, (..., 3) with RGB last for SH
     columns: list[str]  # in the PLY; SH band by band within a channel
-    rate: Callable[[argparse.Namespace, float], float]  # learning rate of optimisation options and scene extent
+    rate: Callable[[argparse.Namespace, float], float]  # learning rate from optimisation options and scene extent
 
 
 def attributes(sh_degree: int) -> dict[str, Attribute]:
-    """Attribute by optimiser group, in the order of groups and PLY columns, for a maximal SH degree.
+    """Attributes by optimiser group, in the order of groups and PLY columns, for a maximal SH degree.
 
-    The six of the paper come first; docs/extending.md adds one.
+    The six of the paper come first. A further attribute is one more line here.
     """
     bands = (sh_degree + 1) ** 2 - 1
     return {
@@ -36,7 +36,7 @@ def attributes(sh_degree: int) -> dict[str, Attribute]:
     }
 
 
-# Entries 1 to 6 of a checkpoint, as the reference has them; other attributes follow after its last entry.
+# Entries 1 to 6 of a checkpoint, in the reference's order. Other attributes follow after its last entry.
 IN_CHECKPOINT = ("xyz", "f_dc", "f_rest", "scaling", "rotation", "opacity")
 
 

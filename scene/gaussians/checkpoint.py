@@ -1,17 +1,21 @@
-"""chkpntN.pth: (capture of the model, N), tensors and numbers only, read without running anything it holds."""
+"""Checkpoints, files chkpntN.pth of (state of the model, N): tensors and numbers, read without running any code."""
 
 import math
 import os
+from collections.abc import Sequence
 from numbers import Real
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 
+from scene.gaussians.attributes import IN_CHECKPOINT, Attribute, Rows
+from scene.gaussians.finite import check_finite
+from scene.gaussians.statistics import Statistics
 from utils.system_utils import UserError, atomic_write
 
-_ENTRIES = 12  # of the reference; the values of further attributes may follow, and a dict of the exposures
-# The reference stores the scene extent as a NumPy scalar. NumPy 1 and 2 name its rebuilding function differently.
+_ENTRIES = 12  # the reference's; the values of further attributes may follow, and a dict of the exposures
+# The reference stores the scene extent as a NumPy scalar, which NumPy 1 and 2 rebuild by functions of other names.
 _SCALAR = np.float64(0).__reduce__()[0]
 _ALLOWED = [
     (_SCALAR, "numpy.core.multiarray.scalar"),
@@ -22,26 +26,96 @@ _ALLOWED = [
 ]
 
 
+class State(NamedTuple):
+    """Everything of a model that a resumed training needs."""
+
+    active_sh_degree: int
+    rows: Rows
+    statistics: Statistics
+    optimizer: dict[str, Any]  # its state dict
+    spatial_lr_scale: float
+    exposures: dict[str, Any] | None  # None: not trained
+
+
+def pack(state: State) -> tuple:
+    """The 12 entries of the reference, in its order.
+
+    Attributes that the reference does not have follow as further entries, then the exposures if they are trained.
+    """
+    return (
+        state.active_sh_degree,
+        *(state.rows[name] for name in IN_CHECKPOINT),
+        state.statistics.max_radii2D,
+        state.statistics.xyz_gradient_accum,
+        state.statistics.denom,
+        state.optimizer,
+        state.spatial_lr_scale,
+        *(values for name, values in state.rows.items() if name not in IN_CHECKPOINT),
+        *([] if state.exposures is None else [state.exposures]),
+    )
+
+
+def unpack(entries: Sequence[Any], table: dict[str, Attribute], max_sh_degree: int) -> State:
+    """The state that `pack` made entries of. UserError where its attributes are not those of the table."""
+    active_sh_degree, *tensors = entries[:7]
+    max_radii2D, xyz_gradient_accum, denom, optimizer, spatial_lr_scale, *others = entries[7:]
+    exposures = next((entry for entry in others if isinstance(entry, dict)), None)
+    names = (*IN_CHECKPOINT, *(name for name in table if name not in IN_CHECKPOINT))
+    tensors += [entry for entry in others if not isinstance(entry, dict)]
+    if len(tensors) != len(names):
+        raise UserError(
+            f"the checkpoint has {len(tensors)} attributes per Gaussian, where this model has {len(names)} "
+            f"({', '.join(names)}); give a checkpoint of this model"
+        )
+    rows = {name: tensor.detach() for name, tensor in zip(names, tensors, strict=True)}
+    _check_rows(rows, table, max_sh_degree)
+    if not 0 <= active_sh_degree <= max_sh_degree:
+        raise UserError(
+            f"the active SH degree of the checkpoint is {active_sh_degree}, more than --sh_degree {max_sh_degree}; "
+            "give the --sh_degree it was trained with"
+        )
+    statistics = Statistics(max_radii2D, xyz_gradient_accum, denom)
+    return State(int(active_sh_degree), rows, statistics, optimizer, float(spatial_lr_scale), exposures)
+
+
+def _check_rows(rows: Rows, table: dict[str, Attribute], max_sh_degree: int) -> None:
+    """UserError for rows that do not have the shapes of the table, or are not finite."""
+    for name, values in rows.items():
+        shape = table[name].shape
+        found = tuple(values.shape[1:])
+        if name == "f_rest" and found[1:] == shape[1:] and found != shape:
+            raise UserError(
+                f"the checkpoint has {found[0]} SH coefficients above band 0, where --sh_degree {max_sh_degree} needs "
+                f"{shape[0]}; give the --sh_degree it was trained with"
+            )
+        if found != shape or values.dtype != torch.float32:
+            raise UserError(
+                f"{name} of the checkpoint has the shape {found} and type {values.dtype} per Gaussian, not {shape} "
+                "and float32; give a checkpoint of this model"
+            )
+    check_finite(rows, "the checkpoint", "give another one")
+
+
 def save_checkpoint(path: str | os.PathLike, capture: tuple, iteration: int) -> None:
-    """Write (capture, iteration), whole or not at all."""
+    """Write (capture, iteration); the whole file or none."""
     with atomic_write(path) as temporary:
         try:
             torch.save((capture, iteration), temporary)
         except RuntimeError as error:
-            # torch hides why its writer of archives failed, but that is never the content.
+            # torch hides the cause when its archive writer fails, but the content is never the cause.
             if "inline_container" not in str(error) and "PytorchStreamWriter" not in str(error):
                 raise
-            raise OSError("no space is left, or files must not be so large") from error
+            raise OSError("no space is left, or the file is larger than allowed") from error
 
 
 def load_checkpoint(path: str | os.PathLike, device: torch.device | str = "cpu") -> tuple[tuple, int]:
-    """Read (capture, iteration), ours or the reference's. UserError, one sentence, for anything else."""
+    """Read (capture, iteration), ours or the reference's. UserError for any other file."""
     _refuse_other_kinds(path)
     try:
         _refuse_other_formats(path)
         with torch.serialization.safe_globals(_ALLOWED):
             content = torch.load(path, map_location=device, weights_only=True)
-    except Exception as error:  # a damaged file can end in any exception of the unpickler
+    except Exception as error:  # a damaged file can raise any exception in the unpickler
         raise UserError(
             f"{path} is not a checkpoint of train.py: it is damaged, or holds objects other than tensors and numbers, "
             "which are never run; give a chkpntN.pth"
@@ -50,38 +124,38 @@ def load_checkpoint(path: str | os.PathLike, device: torch.device | str = "cpu")
         return _checked(content)
     except ValueError as error:
         raise UserError(
-            f"{path} is not a checkpoint of train.py: its parts do not fit ({error}); give a chkpntN.pth"
+            f"{path} is not a checkpoint of train.py: its parts do not fit together ({error}); give a chkpntN.pth"
         ) from error
 
 
 def _refuse_other_formats(path: str | os.PathLike) -> None:
-    """ValueError for the formats before torch 1.6, whose reader believes any number of bytes that a file names."""
+    """ValueError for the formats before torch 1.6, whose reader trusts any number of bytes that a file names."""
     with open(path, "rb") as file:
         if file.read(4) != b"PK\x03\x04":
-            raise ValueError("no zip archive")
+            raise ValueError("not a zip archive")
 
 
 def _checked(content: Any) -> tuple[tuple, int]:
-    """Capture and iteration; ValueError saying what is wrong. Shapes of attributes are GaussianModel.restore's."""
+    """Capture and iteration. ValueError says what is wrong; `unpack` checks the shapes of the attributes."""
     if not isinstance(content, tuple | list) or len(content) != 2:
-        raise ValueError("it is no pair of a state and an iteration")
+        raise ValueError("it is not a pair of a state and an iteration")
     capture, iteration = content
     if not isinstance(capture, tuple | list) or len(capture) < _ENTRIES:
-        raise ValueError(f"the state has not {_ENTRIES} entries")
+        raise ValueError(f"the state has fewer than {_ENTRIES} entries")
     if type(iteration) is not int or not 0 <= iteration < 2**31:
         raise ValueError(f"the iteration is {iteration!r:.40}")
     if type(capture[0]) is not int or not 0 <= capture[0] <= 3:
         raise ValueError(f"the active SH degree is {capture[0]!r:.40}")
     per_gaussian = (*capture[1:10], *(entry for entry in capture[_ENTRIES:] if not isinstance(entry, dict)))
     if not all(torch.is_tensor(t) and t.dim() > 0 and t.dtype == torch.float32 for t in per_gaussian):
-        raise ValueError("a value per Gaussian is not a float32 tensor")
+        raise ValueError("a per-Gaussian value is not a float32 tensor")
     count = len(capture[1])
     if count == 0:
         raise ValueError("it has no Gaussians")
     if any(len(tensor) != count for tensor in per_gaussian):
         raise ValueError("tensors differ in the number of Gaussians")
     if [tuple(tensor.shape[1:]) for tensor in capture[7:10]] != [(), (1,), (1,)]:
-        raise ValueError("the statistics of density control have other shapes")
+        raise ValueError("the statistics of density control have wrong shapes")
     extent = capture[11]
     if not isinstance(extent, Real) or isinstance(extent, bool) or not 0 <= extent < math.inf:
         raise ValueError(f"the extent of the scene is {extent!r:.40}")
@@ -89,7 +163,7 @@ def _checked(content: Any) -> tuple[tuple, int]:
 
 
 def _refuse_other_kinds(path: str | os.PathLike) -> None:
-    """Name what people give by mistake: nothing, a model folder, a point cloud."""
+    """UserError for what is given by mistake: a missing file, a model folder, a point cloud."""
     if os.path.isdir(path):
         raise UserError(f"--start_checkpoint {path} is a folder; give the file chkpntN.pth in it")
     if not os.path.isfile(path):
@@ -97,5 +171,5 @@ def _refuse_other_kinds(path: str | os.PathLike) -> None:
     with open(path, "rb") as file:
         if file.read(4) in (b"ply\n", b"ply\r"):
             raise UserError(
-                f"--start_checkpoint {path} is a PLY, which has no optimiser state to go on from; give a chkpntN.pth"
+                f"--start_checkpoint {path} is a PLY, which has no optimiser state to resume from; give a chkpntN.pth"
             )

@@ -1,6 +1,6 @@
 """Rules of adaptive density control (Kerbl et al. 2023, section 5.2) on raw parameters, without any state.
 
-Sizes and opacities are compared as logarithms and logits: no exp or sigmoid, whose last bits could turn a decision.
+Sizes and opacities are compared as logarithms and logits: the last bits of an exp or sigmoid could change a decision.
 """
 
 import argparse
@@ -14,14 +14,14 @@ from utils.exact import portable_math
 from utils.exact.counter_rng import Stream, normal
 
 SHRINK = 1.6  # children of a split have 1 / 1.6 of the parent's scale (paper, section 5.2)
-PRUNE_EXTENT = 0.1  # a Gaussian wider than this part of the scene's extent is removed, once sizes are looked at
+PRUNE_EXTENT = 0.1  # a Gaussian wider than this part of the scene's extent is removed, once sizes are limited
 RESET_OPACITY = 0.01
 MIN_OPACITY = 0.005  # a Gaussian below it is removed
 MAX_SCREEN_SIZE = 20  # pixels
 
 
 class Actions(NamedTuple):
-    """What density control does in one iteration, in this order."""
+    """Steps of density control that are due in one iteration, in this order."""
 
     observe: bool  # add this view to the statistics
     densify: bool
@@ -30,7 +30,7 @@ class Actions(NamedTuple):
 
 
 def actions(iteration: int, opt: argparse.Namespace, white_background: bool) -> Actions:
-    """The schedule (paper, section 5.2, with the reference's windows): all ends before densify_until_iter."""
+    """Actions due in an iteration (paper, section 5.2, in the reference's windows): none from densify_until_iter on."""
     active = iteration < opt.densify_until_iter
     return Actions(
         observe=active,
@@ -57,7 +57,7 @@ def mean_gradient(accumulated: Tensor, count: Tensor) -> Tensor:
 
 
 def limit_growth(gradient: Tensor, threshold: float, room: int) -> Tensor:
-    """Zero the gradient of candidates (>= threshold) but for the `room` largest, ties by index. (N,)."""
+    """Zero the gradients of all candidates (>= threshold) except the `room` largest, ties by index. (N,)."""
     candidates = (gradient >= threshold).nonzero().reshape(-1)
     if len(candidates) <= room:
         return gradient
@@ -68,12 +68,12 @@ def limit_growth(gradient: Tensor, threshold: float, room: int) -> Tensor:
 
 
 def is_small(scaling: Tensor, limit: float) -> Tensor:
-    """Largest scale <= limit (world units), from log scales (N, 3). (N,) bool."""
+    """Whether the largest scale is <= limit (world units), from log scales (N, 3): (N,) bool."""
     return scaling.amax(dim=1) <= _log(limit)
 
 
 def is_useless(opacity: Tensor, min_opacity: float) -> Tensor:
-    """Opacity below `min_opacity`, from logits (N, 1). (N,) bool."""
+    """Whether the opacity is below `min_opacity`, from logits (N, 1): (N,) bool."""
     return opacity.reshape(-1) < logit(min_opacity)
 
 
@@ -82,15 +82,15 @@ def split_children(
 ) -> tuple[Tensor, Tensor]:
     """Positions (n, 3) and log scales (n, 3) of one child per parent: mu + R(q) e, e normal with the parent's scales.
 
-    Parents are given raw: xyz (n, 3), log scales (n, 3), quaternions (n, 4) wxyz; `items` (n,) are their indices, which
-    with seed, iteration and child decide the numbers drawn.
+    Parents are given raw: xyz (n, 3), log scales (n, 3), quaternions (n, 4) wxyz. Their indices `items` (n,), seed,
+    iteration and child decide the random numbers.
     """
     noise = normal(seed, Stream.SPLIT, iteration, items, child)[:, :3] * portable_math.exp(scaling)
     return (xyz.double() + _rotate(rotation.double(), noise)).float(), scaling - math.log(SHRINK)
 
 
 def _rotate(quaternion: Tensor, vector: Tensor) -> Tensor:
-    """v + 2 w (u x v) + 2 u x (u x v), unit quaternion (w, u); elementwise, so that no kernel may reorder sums."""
+    """v + 2 w (u x v) + 2 u x (u x v), unit quaternion (w, u). Elementwise, so that no kernel can reorder sums."""
     square = quaternion * quaternion
     length = (((square[:, 0] + square[:, 1]) + square[:, 2]) + square[:, 3]).sqrt().clamp_min(1e-12)
     unit = quaternion / length[:, None]

@@ -1,4 +1,4 @@
-"""A colour correction for each training picture, trained along (--train_test_exp), and exposure.json."""
+"""Colour corrections of the training photos, trained with the Gaussians (--train_test_exp), and exposure.json."""
 
 import argparse
 import json
@@ -10,20 +10,19 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from scene.dataset_readers import CameraInfo
 from scene.gaussians.adam import GaussianAdam
-from scene.half_images import exposure_names
 from utils.general_utils import get_expon_lr_func
-from utils.system_utils import UserError, atomic_write, compute_device
+from utils.host.device import compute_device
+from utils.system_utils import UserError, atomic_write
 
 NAME = "exposure.json"
-_ADAM_EPS = 1e-8  # torch's default, which the reference leaves for exposures
+_ADAM_EPS = 1e-8  # torch's default, which the reference uses for exposures
 
 
 class Exposures:
-    """Affine maps of colours, one a training picture: `values` (N, 3, 4) float32, [I | 0] at first.
+    """Affine maps of colours, one per training photo: `values` (n, 3, 4) float32, [I | 0] at first.
 
-    A pixel c, a row vector, becomes c A[:, :3] + A[:, 3] (`utils.exposure`). names: of the pictures, in order.
+    A pixel c, a row vector, becomes c A[:, :3] + A[:, 3] (`apply_exposure`). names: of the photos, in order.
     """
 
     def __init__(self, names: Sequence[str] = ()) -> None:
@@ -33,18 +32,18 @@ class Exposures:
         self.optimizer: GaussianAdam | None = None
 
     def __getitem__(self, name: str) -> Tensor:
-        """Map (3, 4) of a picture, differentiable. UserError for a picture that was not trained on."""
+        """Map (3, 4) of a photo, differentiable. UserError for a photo that was not trained on."""
         if name not in self._index:
-            raise UserError(f"there is no trained exposure of {name}; render pictures that the model was trained on")
+            raise UserError(f"there is no trained exposure of {name}; render photos that the model was trained on")
         return self.values[self._index[name]]
 
     @property
     def trained(self) -> bool:
-        """Whether they took a step of training, in this run or one that it goes on from."""
+        """Whether they took a step of training, in this run or in the one it resumes."""
         return self.optimizer is not None and bool(self.optimizer.state)
 
     def training_setup(self, opt: argparse.Namespace) -> None:
-        """Make optimiser and schedule from the optimisation options."""
+        """Make the optimiser and the schedule from the optimisation options."""
         self.optimizer = GaussianAdam([{"params": [self.values], "lr": 0.0, "name": "exposure"}], eps=_ADAM_EPS)
         self._rate = get_expon_lr_func(
             opt.exposure_lr_init,
@@ -59,51 +58,56 @@ class Exposures:
         self.optimizer.param_groups[0]["lr"] = self._rate(iteration)
 
     def step(self) -> None:
-        """One step if there is a gradient, which is dropped."""
+        """Step if there is a gradient, and drop the gradient."""
         if self.values.grad is not None:
             self.optimizer.step()
             self.optimizer.zero_grad(set_to_none=True)
 
     def capture(self) -> dict[str, Any]:
-        """What a resumed training needs, as plain values."""
+        """State that a resumed training needs, as plain values."""
         return {"names": self.names, "values": self.values.detach(), "optimizer": self.optimizer.state_dict()}
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Take the state of `capture()`, after training_setup. UserError for what does not fit."""
+        """Take the state of `capture()`, after training_setup. UserError for a state that does not fit."""
         if state.get("names") != self.names:
             raise UserError(
-                "the checkpoint has exposures of other pictures than this run trains on; give the scene and "
-                "options --eval and --train_test_exp as it was trained"
+                "the checkpoint has exposures of other photos than this run trains on; give the scene and the options "
+                "--eval and --train_test_exp that it was trained with"
             )
         values = state.get("values")
         if not torch.is_tensor(values) or values.shape != self.values.shape or values.dtype != torch.float32:
-            raise UserError(f"the checkpoint's exposures are not {tuple(self.values.shape)} float32; use another one")
+            raise UserError(
+                f"the checkpoint's exposures are not {tuple(self.values.shape)} float32; use another checkpoint"
+            )
         with torch.no_grad():
             self.values.copy_(values)
-        self.check_finite("the checkpoint", "use another one")
+        self.check_finite("the checkpoint", "use another checkpoint")
         try:
             self.optimizer.take_state(state.get("optimizer"))
         except ValueError as error:
             raise UserError(f"the exposures' optimiser state in the checkpoint does not fit ({error})") from error
 
     def check_finite(self, where: str, remedy: str) -> None:
-        """UserError naming the first picture whose map is not finite."""
+        """UserError naming the first photo whose map is not finite."""
         finite = self.values.detach().isfinite().flatten(1).all(dim=1)
         if not finite.all():
             name = self.names[int((~finite).nonzero()[0])]
             raise UserError(f"the exposure of {name} in {where} is not finite; {remedy}")
 
     def write(self, folder: str | os.PathLike) -> None:
-        """Write exposure.json: by name the three rows of each map."""
+        """Write exposure.json: the three rows of each map, by name."""
         table = dict(zip(self.names, self.values.detach().tolist(), strict=True))
         with atomic_write(Path(folder) / NAME) as path:
             path.write_text(json.dumps(table, indent=2, allow_nan=False) + "\n", encoding="utf-8")
 
 
-def read_exposures(folder: str | os.PathLike, cameras: Sequence[CameraInfo]) -> Exposures:
-    """Exposures of these views from a model folder's exposure.json. UserError where one is missing or broken."""
+def read_exposures(folder: str | os.PathLike, names: Sequence[str], image_names: Sequence[str]) -> Exposures:
+    """Exposures of the photos `names` from a model folder's exposure.json. UserError where one is missing or broken.
+
+    image_names: of the same photos, under which the reference's files have them, also where several photos share one.
+    """
     path = Path(folder) / NAME
-    remedy = "restore it, or write train_test_exp=False into cfg_args to render without exposures"
+    remedy = "restore the file, or write train_test_exp=False into cfg_args to render without exposures"
     try:
         table = json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
@@ -111,19 +115,28 @@ def read_exposures(folder: str | os.PathLike, cameras: Sequence[CameraInfo]) -> 
     except (ValueError, RecursionError) as error:
         raise UserError(f"{path} is not JSON; {remedy}") from error
     if not isinstance(table, dict):
-        raise UserError(f"{path} is no table of exposures by picture; {remedy}")
-    exposures = Exposures(exposure_names(cameras))
-    for index, (name, camera) in enumerate(zip(exposures.names, cameras, strict=True)):
-        # The reference's files have the image name alone, also where several pictures have it.
-        rows = table.get(name, table.get(camera.image_name))
+        raise UserError(f"{path} is not a table of exposures by photo; {remedy}")
+    exposures = Exposures(names)
+    for index, (name, image_name) in enumerate(zip(names, image_names, strict=True)):
+        rows = table.get(name, table.get(image_name))
         if rows is None:
             raise UserError(f"{path} has no exposure of {name}; {remedy}")
         try:
             value = torch.tensor(rows, dtype=torch.float32)
         except (TypeError, ValueError, RuntimeError, OverflowError) as error:
-            raise UserError(f"the exposure of {name} in {path} is no matrix of numbers; {remedy}") from error
+            raise UserError(f"the exposure of {name} in {path} is not a matrix of numbers; {remedy}") from error
         if value.shape != (3, 4) or not value.isfinite().all():
             raise UserError(f"the exposure of {name} in {path} is not 3 x 4 finite numbers; {remedy}")
         with torch.no_grad():
             exposures.values[index] = value
     return exposures
+
+
+def apply_exposure(image: Tensor, exposure: Tensor) -> Tensor:
+    """Map the colours c of an image (3, H, W) to c A + b, for an exposure (3, 4) = [A | b] and c as a row vector.
+
+    Differentiable in both. Uses products and sums of whole planes, because the rounding of a matrix product and of its
+    gradient may depend on the number of threads.
+    """
+    red, green, blue = (image[i] * exposure[i, :3, None, None] for i in range(3))
+    return red + green + blue + exposure[:, 3, None, None]

@@ -1,4 +1,4 @@
-"""point_cloud.ply: the trained model as other tools read it, with the columns and order of the reference."""
+"""PLY files of trained models, with the columns of the reference in its order, as other tools read them."""
 
 import os
 from collections.abc import Iterable, Iterator, Sequence
@@ -11,7 +11,7 @@ from torch import Tensor
 from scene.gaussians.attributes import Rows, attributes
 from utils.system_utils import UserError, atomic_write
 
-_NORMALS = ["nx", "ny", "nz"]  # all zero, after the positions: the reference's files have them
+_NORMALS = ["nx", "ny", "nz"]  # zeros after the positions, as in the reference's files
 
 
 def write_ply(
@@ -19,7 +19,7 @@ def write_ply(
 ) -> None:
     """Write a binary little-endian PLY, float32, SH bands channel by channel; the whole file or none.
 
-    world_offset: world coordinates of the origin; goes into a comment unless it is zero.
+    world_offset: world coordinates of the origin, written as a comment unless they are zero.
     """
     count = len(rows["xyz"])
     parts = [(attribute.columns, rows[name]) for name, attribute in attributes(sh_degree).items()]
@@ -50,9 +50,9 @@ def _comments(world_offset: Sequence[float]) -> list[str]:
 
 
 def stored_sh_degree(path: str | os.PathLike) -> int | None:
-    """SH degree by the header of a Gaussian PLY, None where its f_rest properties are of no degree that is known.
+    """SH degree by the f_rest properties of a Gaussian PLY; None when they fit no known degree.
 
-    UserError when the file can't be had or read.
+    UserError when the file is missing or cannot be read.
     """
     return _degree(read_vertices(path).dtype.names or ())
 
@@ -63,9 +63,9 @@ def _degree(names: Iterable[str]) -> int | None:
 
 
 def read_ply(path: str | os.PathLike, sh_degree: int) -> Rows:
-    """Read a Gaussian PLY of exactly this SH degree, ours or another tool's: any order, scalar type and encoding.
+    """Read a Gaussian PLY of exactly this SH degree, of any tool: any order of properties, scalar type and encoding.
 
-    UserError when the file can't be had or read, lacks properties (names them), or has another degree.
+    UserError when the file is missing or unreadable, lacks properties (the message names them), or has another degree.
     """
     vertices = read_vertices(path)
     present = set(vertices.dtype.names or ())
@@ -75,13 +75,13 @@ def read_ply(path: str | os.PathLike, sh_degree: int) -> Rows:
     missing = [name for part, a in table.items() if part != "f_rest" for name in a.columns if name not in present]
     if missing:
         raise UserError(
-            f"{path} is no Gaussian model, it lacks the properties {', '.join(missing)}; give a trained one"
+            f"{path} is not a Gaussian model: it lacks the properties {', '.join(missing)}; give a trained model"
         )
     if rest != len(wanted) or not present.issuperset(wanted):
         degree = _degree(present)
-        found = "no SH degree that is known" if degree is None else f"SH degree {degree}"
+        found = "no known SH degree" if degree is None else f"SH degree {degree}"
         raise UserError(
-            f"{path} has {rest} f_rest properties, that is {found}, where SH degree {sh_degree} needs {len(wanted)}; "
+            f"{path} has {rest} f_rest properties ({found}), where SH degree {sh_degree} needs {len(wanted)}; "
             "give the --sh_degree of the file"
         )
     rows = {}
@@ -102,16 +102,18 @@ def read_vertices(path: str | os.PathLike) -> np.ndarray:
     try:
         return PlyData.read(os.fspath(path))["vertex"].data
     except (PlyParseError, ValueError, UnicodeDecodeError) as error:
-        raise UserError(f"{path} is not a whole PLY file ({error}); make or fetch it again") from error
+        raise UserError(f"{path} is not a complete PLY file ({error}); save or download it again") from error
     except KeyError as error:
-        raise UserError(f"{path} has no element 'vertex', so it is no Gaussian model; give a trained one") from error
+        raise UserError(
+            f"{path} has no element 'vertex', so it is not a Gaussian model; give a trained model"
+        ) from error
 
 
 def _columns(vertices: np.ndarray, parts: list[list[str]]) -> Iterator[Tensor]:
     """(N, len(part)) float32 for each list of names."""
     kinds = {vertices.dtype[name] for name in vertices.dtype.names}
     if kinds == {np.dtype("<f4")} and vertices.dtype.itemsize == 4 * len(vertices.dtype.names):
-        # One float table: picking columns of it is many times faster than field by field.
+        # One table of floats: copying its columns is many times faster than copying field by field.
         table = np.asarray(vertices).view("<f4").reshape(len(vertices), len(vertices.dtype.names))
         position = {name: i for i, name in enumerate(vertices.dtype.names)}
         for part in parts:

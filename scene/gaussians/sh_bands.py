@@ -1,4 +1,4 @@
-"""How much of a model's colour lies in which spherical-harmonics bands."""
+"""Share of the spherical-harmonics bands in the colours of a model."""
 
 import math
 
@@ -7,12 +7,12 @@ from torch import Tensor
 
 
 def cut_bounds(f_rest: Tensor) -> list[float]:
-    """By degree d = 0..D: how far a colour moves at most, in any direction, when all bands above d are cut.
+    """By degree d = 0..D: the most a colour can change, in any direction, when all bands above d are cut.
 
-    f_rest: (N, (D+1)^2 - 1, 3). The largest over Gaussians and channels of
-    sum over l > d of |c_l| sqrt((2l+1) / 4 pi), c_l the coefficients of band l: Cauchy-Schwarz, and Unsoeld's theorem
-    for the length of the basis functions of a band, which is the same in every direction. It holds for images too: a
-    pixel's weights sum to at most 1, and clamping moves nothing apart.
+    f_rest: (N, (D+1)^2 - 1, 3). The bound is the largest, over Gaussians and channels, of the
+    sum over l > d of |c_l| sqrt((2l+1) / 4 pi), c_l being the coefficients of band l. It follows from Cauchy-Schwarz
+    and from Unsoeld's theorem: the basis functions of a band have the same length in every direction. The bound holds
+    for images, too: a pixel's weights sum to at most 1, and clamping never increases a difference.
     """
     degree = math.isqrt(f_rest.shape[1] + 1) - 1
     if not len(f_rest):
@@ -28,5 +28,5 @@ def cut_bounds(f_rest: Tensor) -> list[float]:
 
 
 def needed_degree(bounds: list[float], tolerance: float) -> int:
-    """The lowest degree that `cut_bounds` gives no more than `tolerance`."""
+    """The lowest degree whose bound in `cut_bounds` is at most `tolerance`."""
     return next(degree for degree, bound in enumerate(bounds) if bound <= tolerance)

@@ -1,4 +1,4 @@
-"""Adam that steps only the Gaussians that the view of this iteration has seen."""
+"""Adam that steps only the Gaussians seen in the view of an iteration."""
 
 import torch
 from torch import Tensor
@@ -9,15 +9,15 @@ _SPARSE_ADAM = torch.ops.diff_gaussian_rasterization.sparse_adam_
 
 
 class SparseGaussianAdam(GaussianAdam):
-    """Sparse Adam (Mallick et al. 2024, Taming 3DGS): as GaussianAdam, for visible rows and without bias correction.
+    """Sparse Adam (Mallick et al. 2024, Taming 3DGS): GaussianAdam for visible rows, without bias correction.
 
-    Rows that were not seen keep value and moments to the bit. State and state dict keep their form; `step` counts the
-    steps of the tensor and enters nothing.
+    Rows that were not seen keep values and moments to the bit. State and state dict keep their form. `step` counts the
+    steps of the tensor, and no formula uses it.
     """
 
     @torch.no_grad()
     def step(self, visible: Tensor) -> None:
-        """One step of the rows of `visible` (N,) bool, in every parameter that has a gradient."""
+        """Step the rows of `visible` (N,) bool in every parameter that has a gradient."""
         for group in self.param_groups:
             (param,) = group["params"]
             if param.grad is None:

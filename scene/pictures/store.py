@@ -1,6 +1,7 @@
 """Decoded pictures of a scene: where they are kept, how many, and which are made ready ahead of their use."""
 
 import os
+import sys
 from collections import OrderedDict
 from collections.abc import Iterable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
@@ -166,3 +167,24 @@ def _bytes(source: str | Decodable, size: Size) -> int:
         return source.pixel_bytes * size[0] * size[1]
     channels = 3 if source.lower().endswith((".jpg", ".jpeg")) else 4
     return channels * size[0] * size[1]
+
+
+def picture_device(data_device: str, fallback: torch.device) -> torch.device:
+    """Device that keeps the pictures: option --data_device where it can be used, else the device that computes.
+
+    A line says so where that is another than the option names, but for plain cuda where no GPU computes.
+    """
+    try:
+        wanted = torch.device(data_device)
+    except RuntimeError:
+        wanted = None
+    if wanted is None or wanted.type not in ("cpu", "cuda"):
+        reason = "is neither cpu nor cuda"
+    elif wanted.type == "cpu" or (fallback.type == "cuda" and (wanted.index or 0) < torch.cuda.device_count()):
+        return wanted
+    elif wanted.index is None:
+        return fallback
+    else:
+        reason = "is not there, or not used"
+    print(f"warning: --data_device {data_device} {reason}; pictures are kept on {fallback}", file=sys.stderr)
+    return fallback

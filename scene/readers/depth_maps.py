@@ -13,9 +13,9 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from scene.dataset_readers import CameraInfo, SceneInfo
 from scene.pictures.decode import picture_size
 from scene.readers import colmap_model
+from scene.readers.records import CameraInfo, SceneInfo
 from utils.files.image_files import UNREADABLE
 from utils.files.listing import some
 from utils.host.cache_folder import cache_folder

@@ -1,5 +1,8 @@
 """What readers of datasets return: plain records. Nothing here decodes pictures, uses a GPU or writes a file."""
 
+import os
+from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -84,6 +87,16 @@ def split_by_order(
     if not train:
         raise UserError(f"{folder} has too few pictures for --eval, which takes every {HOLD}th; leave --eval out")
     return train, test
+
+
+def exposure_names(cameras: Sequence[CameraInfo]) -> list[str]:
+    """A name for each view: its image name, or where several have that (Blender's train/r_0 and test/r_0) its path from
+    their common folder.
+    """
+    counts = Counter(camera.image_name for camera in cameras)
+    folder = os.path.commonpath([camera.image_path.parent for camera in cameras]) if cameras else ""
+    paths = [Path(os.path.relpath(camera.image_path, folder)).as_posix() for camera in cameras]
+    return [c.image_name if counts[c.image_name] == 1 else path for c, path in zip(cameras, paths, strict=True)]
 
 
 def scene_extent(cameras: list[CameraInfo], points: np.ndarray | None = None) -> float:

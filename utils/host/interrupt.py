@@ -6,9 +6,13 @@ import signal
 import threading
 from types import FrameType, TracebackType
 
-from utils.system_utils import Terminated
-
 _HANGUP = getattr(signal, "SIGHUP", None)  # Windows has none
+
+
+class Terminated(KeyboardInterrupt):
+    """SIGTERM or SIGHUP, where it is treated as Ctrl-C is."""
+
+
 _ERRORS = {signal.SIGINT: KeyboardInterrupt, signal.SIGTERM: Terminated}
 if _HANGUP is not None:
     _ERRORS[_HANGUP] = Terminated

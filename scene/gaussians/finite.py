@@ -1,0 +1,20 @@
+"""Check that the values of Gaussians are finite."""
+
+import torch
+
+from scene.gaussians.attributes import Rows
+from utils.system_utils import UserError
+
+_PART = 1 << 16  # rows checked at a time, as there may be little memory left
+
+
+def check_finite(rows: Rows, where: str, remedy: str) -> None:
+    """UserError naming the first attribute with values that are not finite, how many Gaussians, and the first one."""
+    for name, values in rows.items():
+        finite = torch.cat([part.isfinite().flatten(1).all(dim=1) for part in values.split(_PART)])
+        if not finite.all():
+            bad = (~finite).nonzero()
+            raise UserError(
+                f"{name} of {len(bad)} of {len(values)} Gaussians in {where} is not finite "
+                f"(the first is Gaussian {int(bad[0])}); {remedy}"
+            )

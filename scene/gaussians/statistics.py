@@ -1,0 +1,61 @@
+"""Observations of each Gaussian between two densifications (Kerbl et al. 2023, section 5.2)."""
+
+from dataclasses import dataclass
+
+import diff_gaussian_rasterization  # noqa: F401  (its library holds the kernel)
+import torch
+from torch import Tensor
+
+_OBSERVE = torch.ops.diff_gaussian_rasterization.observe_
+
+
+@dataclass
+class Statistics:
+    """Observations of N Gaussians; the names are the reference's.
+
+    max_radii2D (N,): largest radius in pixels. xyz_gradient_accum (N, 1): sum of the lengths of the screen-space
+    gradients, per NDC unit. denom (N, 1): number of views in that sum. All are float32.
+    """
+
+    max_radii2D: Tensor
+    xyz_gradient_accum: Tensor
+    denom: Tensor
+
+    @classmethod
+    def zero(cls, count: int, device: torch.device | str) -> "Statistics":
+        """Statistics of `count` Gaussians that nothing was observed of."""
+        return cls(*(torch.zeros(shape, device=device) for shape in ((count,), (count, 1), (count, 1))))
+
+    def observe(self, gradient: Tensor, radii: Tensor) -> None:
+        """Add a view in one pass: gradient (N, 3) per NDC unit, radii (N,) int32 pixels, 0 where it saw nothing."""
+        _OBSERVE(self.max_radii2D, self.xyz_gradient_accum, self.denom, radii, gradient)
+
+    def add_gradient(self, gradient: Tensor, seen: Tensor) -> None:
+        """Add a view without its radii: gradient (N, 3) per NDC unit, seen: indices (n,) or (n, 1), or a mask (N,)."""
+        x, y = gradient[:, 0], gradient[:, 1]
+        length = (x * x + y * y).sqrt()[:, None]
+        if seen.dtype != torch.bool:
+            none = torch.zeros(len(gradient), dtype=torch.bool, device=length.device)
+            seen = none.index_fill_(0, seen.reshape(-1), True)
+        self.xyz_gradient_accum += torch.where(seen[:, None], length, 0.0)
+        self.denom += seen[:, None]
+
+    def drop_broken(self) -> None:
+        """Restart the sum and count of Gaussians whose sum of gradients is not finite."""
+        broken = ~self.xyz_gradient_accum.isfinite()
+        self.xyz_gradient_accum[broken] = 0.0
+        self.denom[broken] = 0.0
+
+    def keep(self, indices: Tensor) -> None:
+        """Keep the rows of `indices` (n,) int64."""
+        self.xyz_gradient_accum = self.xyz_gradient_accum.index_select(0, indices)
+        self.denom = self.denom.index_select(0, indices)
+        self.max_radii2D = self.max_radii2D.index_select(0, indices)
+
+    def to(self, device: torch.device | str) -> "Statistics":
+        """The same statistics on a device."""
+        return Statistics(self.max_radii2D.to(device), self.xyz_gradient_accum.to(device), self.denom.to(device))
+
+    def fit(self, count: int) -> bool:
+        """Whether there is a row for each of `count` Gaussians in every tensor."""
+        return all(len(values) == count for values in (self.xyz_gradient_accum, self.denom, self.max_radii2D))

@@ -1,0 +1,191 @@
+"""Views of a dataset, together with the Gaussians that are trained on them or loaded for them."""
+
+import argparse
+import json
+import random
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+import torch
+
+from arguments.stored import OFFSET, read_model_json
+from scene.cameras import Camera, camera_to_JSON, cameraList_from_camInfos
+from scene.dataset_readers import read_scene
+from scene.half_images import mark_halves, train_on_all
+from scene.pictures.masks import MaskOptions, refuse_nothing_to_ignore
+from scene.pictures.store import ImageStore, Picture, picture_device
+from scene.readers.depth_maps import with_depth_maps
+from scene.readers.point_cloud import write_point_cloud
+from scene.readers.records import CameraInfo, SceneInfo
+from scene.saved_iterations import find_iteration, saved_ply
+from utils.graphics_utils import BasicPointCloud
+from utils.host.device import compute_device
+from utils.system_utils import UserError, atomic_write
+
+
+class SceneGaussians(Protocol):
+    """The part of GaussianModel that a scene uses."""
+
+    world_offset: tuple[float, float, float]
+
+    def create_from_pcd(
+        self, pcd: BasicPointCloud, cam_infos: Sequence[CameraInfo], spatial_lr_scale: float
+    ) -> None: ...
+
+    def load_ply(self, path: str) -> None: ...
+
+    def save_ply(self, path: str) -> None: ...
+
+    def load_exposures(self, folder: str, cam_infos: Sequence[CameraInfo]) -> None: ...
+
+    def save_exposures(self, folder: str) -> None: ...
+
+
+class Scene:
+    """Views and model of one run.
+
+    args: model options (ModelParams.extract). load_iteration: None calls `create_gaussians` and `write_inputs`, unless
+    `start` is False, which leaves them to the caller; -1 loads the last saved iteration, N that one.
+    shuffle: mix the order of the views (always the same way). resolution_scales: factors by which views are made
+    smaller, one list of cameras each. info: the dataset as read. cameras_extent: E in world units, from the training
+    views. images: the store of the decoded photos.
+    """
+
+    def __init__(
+        self,
+        args: argparse.Namespace,
+        gaussians: SceneGaussians,
+        load_iteration: int | None = None,
+        shuffle: bool = True,
+        resolution_scales: Sequence[float] = (1.0,),
+        start: bool = True,
+    ) -> None:
+        self.model_path = args.model_path
+        self.gaussians = gaussians
+        self.loaded_iter = None if load_iteration is None else find_iteration(self.model_path, load_iteration)
+        self._halves = args.train_test_exp
+        self.info = self._read(args)
+        self.cameras_extent = self.info.extent
+
+        device = compute_device()
+        self.images = ImageStore(args.images_to_load, picture_device(args.data_device, device), device)
+        self._train = self._cameras(self.info.train_cameras, args, device, shuffle, resolution_scales)
+        self._test = self._cameras(self.info.test_cameras, args, device, shuffle, resolution_scales)
+        self.images.plan(_pictures(self._train), _pictures(self._test))
+        if self._halves:
+            for scale in resolution_scales:
+                mark_halves(self._train[scale], self._test[scale], self.info.train_cameras)
+
+        gaussians.world_offset = tuple(self.info.offset.tolist())
+        if self.loaded_iter is not None:
+            self._load_gaussians()
+        elif start:
+            self.create_gaussians()
+            self.write_inputs()
+
+    def _read(self, args: argparse.Namespace) -> SceneInfo:
+        """The dataset as the options want it: masks, halves, depth maps."""
+        fresh = self.loaded_iter is None
+        if fresh:
+            _refuse_dataset_folder(args)
+        masks = MaskOptions(args.masks, args.invert_masks, args.mask_meaning)
+        info = read_scene(
+            args.source_path,
+            args.images,
+            args.eval,
+            args.init_pcd_path,
+            want_cloud=fresh,
+            init_type=args.init_type,
+            masks=masks,
+            offset=None if fresh else read_model_json(self.model_path).get(OFFSET, (0, 0, 0)),
+        )
+        if fresh:
+            views = info.train_cameras + info.test_cameras
+            refuse_nothing_to_ignore([(view.image_path, view.mask) for view in views], masks)
+        if self._halves:
+            info = train_on_all(info)
+        if args.depths and fresh:
+            info = with_depth_maps(info, Path(args.source_path), args.depths)
+        return info
+
+    def _load_gaussians(self) -> None:
+        print(f"Loading trained model at iteration {self.loaded_iter}")
+        self.gaussians.load_ply(str(saved_ply(self.model_path, self.loaded_iter)))
+        if self._halves:
+            self.gaussians.load_exposures(self.model_path, self.info.train_cameras)
+
+    def getTrainCameras(self, scale: float = 1.0) -> list[Camera]:
+        """Training views at a resolution scale that the scene was made with."""
+        return self._train[scale]
+
+    def getTestCameras(self, scale: float = 1.0) -> list[Camera]:
+        """Held-out views at a resolution scale that the scene was made with."""
+        return self._test[scale]
+
+    def prefetch(self, cameras: Sequence[Camera]) -> None:
+        """Begin to make the pictures of the views ready that are used next, in that order (`images.ahead` of them)."""
+        self.images.prefetch([picture for camera in cameras for picture in camera.pictures])
+
+    def save(self, iteration: int, gaussians: SceneGaussians | None = None) -> None:
+        """Write the Gaussians, or those given in their place, as `point_cloud/iteration_N/point_cloud.ply`; exposures
+        where those are trained."""
+        (self.gaussians if gaussians is None else gaussians).save_ply(str(saved_ply(self.model_path, iteration)))
+        if self._halves:
+            self.gaussians.save_exposures(self.model_path)
+
+    def training_pixels(self) -> tuple[int, int]:
+        """Pixels of all training views: as they train, and in their files."""
+        trained = sum(camera.image_width * camera.image_height for camera in self.getTrainCameras())
+        return trained, sum(width * height for width, height in (c.file_size for c in self.info.train_cameras))
+
+    def create_gaussians(self) -> None:
+        """Start from the dataset's points."""
+        self.gaussians.create_from_pcd(self.info.point_cloud, self.info.train_cameras, self.cameras_extent)
+
+    def write_inputs(self) -> None:
+        """Write the cloud and the cameras into the model folder, `input.ply` and `cameras.json`."""
+        folder, info = Path(self.model_path), self.info
+        if info.ply_path and not info.offset.any():
+            with atomic_write(folder / "input.ply") as path:
+                shutil.copyfile(info.ply_path, path)
+        else:
+            colors = np.round(info.point_cloud.colors * 255).astype(np.uint8)
+            write_point_cloud(folder / "input.ply", info.point_cloud.points, colors)
+        entries = [camera_to_JSON(i, camera) for i, camera in enumerate(info.test_cameras + info.train_cameras)]
+        with atomic_write(folder / "cameras.json") as path:
+            path.write_text(json.dumps(entries, allow_nan=False), encoding="utf-8")
+
+    def _cameras(
+        self,
+        infos: list[CameraInfo],
+        args: argparse.Namespace,
+        device: torch.device,
+        shuffle: bool,
+        scales: Sequence[float],
+    ) -> dict[float, list[Camera]]:
+        """Cameras by scale, in the same order at every scale."""
+        order = list(range(len(infos)))
+        if shuffle:
+            # A generator of its own: the order must not depend on what else drew numbers before (resume).
+            random.Random(0).shuffle(order)
+        lists = {}
+        for scale in scales:
+            cameras = cameraList_from_camInfos(infos, scale, args, self.images, device)
+            lists[scale] = [cameras[index] for index in order]
+        return lists
+
+
+def _pictures(lists: dict[float, list[Camera]]) -> list[Picture]:
+    return [picture for cameras in lists.values() for camera in cameras for picture in camera.pictures]
+
+
+def _refuse_dataset_folder(args: argparse.Namespace) -> None:
+    """UserError when the model would be written into the dataset, which nothing may change."""
+    if not args.source_path or not args.model_path:
+        return
+    source, model = Path(args.source_path).resolve(), Path(args.model_path).resolve()
+    if model.is_relative_to(source):
+        raise UserError(f"the output folder {args.model_path} lies in the scene folder {source}; name another with -m")
