@@ -1,4 +1,4 @@
-"""What the rasterizer's tests share: both renderers under one call, the error as the design defines it, scenes."""
+"""Shared by the rasterizer's tests: both renderers under one call, the error as the design defines it, and scenes."""
 
 import math
 from collections.abc import Callable
@@ -6,17 +6,27 @@ from typing import NamedTuple
 
 import pytest
 import torch
-from diff_gaussian_rasterization import GaussianRasterizationSettings, Rasterized, rasterize
+from diff_gaussian_rasterization import (
+    GaussianRasterizationSettings,
+    Gaussians,
+    Rasterized,
+    has_cuda_kernels,
+    optim,
+    rasterize,
+)
+from diff_gaussian_rasterization import ops as functions
 from torch import Tensor
 
 from benchmarks.workloads.splat_scenes import on_device, settings
 
 ops = torch.ops.diff_gaussian_rasterization
 
-BUILT = torch._C._dispatch_has_kernel_for_dispatch_key("diff_gaussian_rasterization::rasterize", "CUDA")
+BUILT = has_cuda_kernels()
 GPU_MARKS = (
     pytest.mark.gpu,
-    pytest.mark.skipif(not (torch.cuda.is_available() and BUILT), reason="needs a GPU and a build with CUDA"),
+    pytest.mark.skipif(
+        not (torch.cuda.is_available() and has_cuda_kernels()), reason="needs a GPU and a build with CUDA"
+    ),
 )
 _PLACES = {"float64": ("cpu", torch.float64), "float32": ("cpu", torch.float32), "cuda": ("cuda", torch.float32)}
 
@@ -25,22 +35,22 @@ def _param(name: str, *values: object) -> object:
     return pytest.param(*values, id=name, marks=GPU_MARKS if name == "cuda" else ())
 
 
-# What runs on a GPU as well (benchmarks/device.sh finds the files by "_AND_GPU"). DTYPES_AND_GPU is for tests that make
-# all their tensors without naming a device: the fixture `dtype` makes it torch's default.
+# For tests that run on a GPU as well (benchmarks/device.sh finds the files by "_AND_GPU"). DTYPES_AND_GPU is for tests
+# that make all their tensors without naming a device: the fixture `dtype` makes it torch's default.
 CPU_AND_GPU = pytest.mark.parametrize("device", [_param(name, name) for name in ("cpu", "cuda")])
 BOTH_AND_GPU = pytest.mark.parametrize(("device", "dtype"), [_param(k, *place) for k, place in _PLACES.items()])
 DTYPES_AND_GPU = pytest.mark.parametrize("dtype", [_param(k, place) for k, place in _PLACES.items()], indirect=True)
 
 
 class Error(NamedTuple):
-    """Of a tensor: largest and median difference over the largest reference value."""
+    """Largest and median difference of a tensor, over the largest value of its reference."""
 
     largest: float
     median: float
 
 
 def error(got: Tensor, reference: Tensor) -> Error:
-    """Infinite where `got` has a NaN; absolute where the reference is zero."""
+    """Compares two tensors: infinite where `got` has a NaN, absolute where the reference is all zero."""
     difference = (got.double() - reference.double()).abs().nan_to_num(nan=math.inf)
     scale = reference.abs().max().item() or 1.0
     return Error(difference.max().item() / scale, difference.median().item() / scale)
@@ -49,17 +59,17 @@ def error(got: Tensor, reference: Tensor) -> Error:
 def adam(
     value: Tensor,
     gradient: Tensor,
-    mean: Tensor,
-    square: Tensor,
+    exp_avg: Tensor,
+    exp_avg_sq: Tensor,
     rate: float,
     betas: tuple[float, float],
     eps: float,
     step: float,
     columns: int = -1,
 ) -> None:
-    """Step number `step`, from 1, of one tensor."""
+    """Takes Adam's step number `step`, counted from 1, of one tensor."""
     counter = torch.tensor(step - 1.0)
-    ops.adam_([value], [gradient], [mean], [square], [counter], [rate], *betas, eps, [columns])
+    optim.adam_([value], [gradient], [exp_avg], [exp_avg_sq], [counter], [rate], *betas, eps, [columns])
 
 
 def render(
@@ -71,7 +81,7 @@ def render(
     raw: bool = True,
     **wanted: bool,
 ) -> Rasterized:
-    """`rasterize`, or the oracle's `render` as function, on parameters by name."""
+    """Calls `rasterize`, or the oracle's `render` given as function, on parameters by name."""
     rest = dict(parameters)
     means, opacities = rest.pop("means"), rest.pop("opacities")
     means2d = torch.zeros_like(means) if means2d is None else means2d
@@ -81,7 +91,7 @@ def render(
 
 
 def leaves(parameters: dict[str, Tensor], dtype: torch.dtype | None = None) -> dict[str, Tensor]:
-    """Fresh copies that require gradients."""
+    """Copies parameters; the copies require gradients."""
     return {name: t.detach().clone().to(dtype or t.dtype).requires_grad_() for name, t in parameters.items()}
 
 
@@ -92,8 +102,10 @@ def gradients(
     loss: Callable[[Rasterized], Tensor] | None = None,
     **options,
 ) -> dict[str, Tensor]:
-    """Image, planes and every gradient of a loss of theirs (None: `loss_of`), by name. Computed on `device`; the
-    results are on the CPU."""
+    """Renders on `device`, and returns on the CPU, by name: the planes, and every gradient of a loss of theirs.
+
+    loss: `loss_of` if None.
+    """
     inputs = leaves({name: t.to(device) for name, t in parameters.items()})
     means2d = torch.zeros_like(inputs["means"]).requires_grad_()
     out = render(inputs, on_device(camera, device), means2d, **options)
@@ -103,7 +115,7 @@ def gradients(
 
 
 def loss_of(out: NamedTuple, keep: Tensor | None = None) -> Tensor:
-    """Sum of all three planes with fixed random weights; keep (H, W) bool: the other pixels do not count."""
+    """Sums all three planes with fixed random weights. keep (H, W) bool: only these pixels count."""
     generator = torch.Generator().manual_seed(5)
     loss = 0.0
     for plane in (out.color, out.inverse_depth, out.transmittance):
@@ -114,7 +126,7 @@ def loss_of(out: NamedTuple, keep: Tensor | None = None) -> Tensor:
 
 
 def activated(parameters: dict[str, Tensor]) -> dict[str, Tensor]:
-    """Raw parameters as the reference's API wants them."""
+    """Applies the activations to raw parameters, as the reference's API wants them."""
     out = dict(parameters)
     out["opacities"] = torch.sigmoid(out["opacities"])
     out["scales"] = torch.exp(out["scales"])
@@ -123,7 +135,7 @@ def activated(parameters: dict[str, Tensor]) -> dict[str, Tensor]:
 
 
 def rotation_matrix(q: Tensor) -> Tensor:
-    """(3, 3) of a quaternion w x y z of any length, by the product of its left and right multiplication."""
+    """Rotation (3, 3) of a quaternion w x y z of any length, as the product of its left and right multiplication."""
     w, x, y, z = (q.double() / q.double().norm()).tolist()
     left = torch.tensor([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]], dtype=torch.float64)
     right = torch.tensor([[w, x, y, z], [-x, w, -z, y], [-y, z, w, -x], [-z, -y, x, w]], dtype=torch.float64)
@@ -131,7 +143,7 @@ def rotation_matrix(q: Tensor) -> Tensor:
 
 
 def rigid(q: tuple[float, ...], translation: tuple[float, ...]) -> Tensor:
-    """(4, 4) world to view, not transposed."""
+    """Rigid motion (4, 4) from world to view, not transposed."""
     view = torch.eye(4, dtype=torch.float64)
     view[:3, :3] = rotation_matrix(torch.tensor(q))
     view[:3, 3] = torch.tensor(translation, dtype=torch.float64)
@@ -139,7 +151,7 @@ def rigid(q: tuple[float, ...], translation: tuple[float, ...]) -> Tensor:
 
 
 def few(n: int = 3, width: int = 18, height: int = 7, dtype: torch.dtype = torch.float64) -> tuple[dict, dict]:
-    """Raw parameters and arguments of `settings`: few splats, no cut-off near: 1/255 < alpha < 0.99 on every pixel."""
+    """Makes raw parameters of few splats, and the arguments of `settings`. 1/255 < alpha < 0.99 on every pixel."""
     g = torch.Generator().manual_seed(11)
     depth = 2.0 + torch.arange(n) / 2
     focal = width / (2 * math.tan(math.radians(30)))
@@ -166,7 +178,7 @@ def one_splat(
     color: tuple[float, float, float] = (1.0, 0.5, 0.25),
     dtype: torch.dtype = torch.float64,
 ) -> dict[str, Tensor]:
-    """An isotropic Gaussian, activated, with a colour of its own."""
+    """Makes one isotropic Gaussian, activated, with a colour of its own."""
     return {
         "means": torch.tensor([[x, y, z]], dtype=dtype),
         "opacities": torch.tensor([[opacity]], dtype=dtype),
@@ -177,36 +189,22 @@ def one_splat(
 
 
 def together(*splats: dict[str, Tensor]) -> dict[str, Tensor]:
-    """Several of the above in one scene."""
+    """Joins several scenes, as `one_splat` makes them, into one."""
     return {name: torch.cat([s[name] for s in splats]) for name in splats[0]}
 
 
 def pick(parameters: dict[str, Tensor], rows) -> dict[str, Tensor]:
-    """The same scene with these rows only."""
+    """Keeps these rows of a scene."""
     return {name: t[rows] for name, t in parameters.items()}
 
 
 def scene_arguments(parameters: dict[str, Tensor], camera: GaussianRasterizationSettings, raw: bool = True) -> tuple:
-    """The arguments that the ops have in common, in their order."""
-    names = ("means", "opacities", "scales", "rotations", "cov3d", "colors", "sh_dc", "sh_rest")
-    return (
-        *(parameters.get(name) for name in names),
-        camera.viewmatrix,
-        camera.projmatrix,
-        camera.campos,
-        camera.tanfovx,
-        camera.tanfovy,
-        camera.image_height,
-        camera.image_width,
-        camera.sh_degree,
-        camera.scale_modifier,
-        camera.antialiasing,
-        raw,
-    )
+    """Arguments that the operators have in common, in their order."""
+    return functions.scene_arguments(Gaussians(**parameters), camera, raw)
 
 
 def everywhere(depths: Tensor, width: int, height: int) -> tuple[Tensor, Tensor]:
-    """Instances and ranges with every splat in every tile, by depth, ties by index."""
+    """Lists every splat in every tile, by depth, ties by index: instances and ranges."""
     order = torch.argsort(depths, stable=True).to(torch.int32)
     tiles = -(-width // 16) * -(-height // 16)
     return order.repeat(tiles), len(order) * torch.arange(tiles + 1, device=depths.device)
@@ -215,9 +213,10 @@ def everywhere(depths: Tensor, width: int, height: int) -> tuple[Tensor, Tensor]
 def assert_culling_is_exact(
     splats: Tensor, depths: Tensor, rects: Tensor, counts: Tensor, width: int, height: int, also: Tensor | None = None
 ) -> tuple[int, int]:
-    """Blending `bin`'s lists gives the bits of blending all splats everywhere; returns the instances of both.
+    """Asserts that blending `bin`'s lists gives the bits of blending all splats everywhere.
 
-    also (K, 11): rows and depths of splats that `project` left out; they belong to the second list as well.
+    also (K, 11): rows and depths of splats that `project` left out, which the second list has as well. Returns the
+    numbers of instances of both lists.
     """
     background = torch.tensor([0.3, 0.6, 0.1], dtype=splats.dtype, device=splats.device)
     instances, ranges, _, _ = ops.bin(splats, depths, rects, counts, height, width, False)
@@ -234,8 +233,10 @@ def assert_culling_is_exact(
 
 
 def borderline_splats(n: int, width: int, height: int, dtype: torch.dtype, device: str = "cpu") -> tuple[Tensor, ...]:
-    """`project`'s splats, depths, rects and counts, and what it left out, of splats whose opacity is tuned so that
-    they reach 1/255 at one pixel on the rim of one tile within some units in the last place."""
+    """Projects splats whose alpha at one pixel on the rim of one tile is 1/255, within some units in the last place.
+
+    Returns `project`'s splats, depths, rects and counts, and the rows that it left out, as `also` takes them.
+    """
     g = torch.Generator().manual_seed(6)
     focal = width / (2 * math.tan(math.radians(30)))
     z = 2 + torch.rand(n, 1, generator=g)

@@ -2,7 +2,8 @@
 
 import pytest
 import torch
-from rasterizer_tools import adam, ops
+from diff_gaussian_rasterization import optim
+from rasterizer_tools import adam
 
 BETAS = (0.9, 0.999)
 
@@ -92,7 +93,7 @@ def test_many_tensors_in_one_call_are_each_by_itself():
     columns = [9 if shape == (40, 15, 3) else -1 for shape in shapes]
     for i, state in enumerate(zip(*alone, strict=True)):
         adam(state[0], gradients[i], *state[1:], rates[i], BETAS, 1e-15, i + 1.0, columns[i])
-    ops.adam_(together[0], gradients, *together[1:], counters, rates, *BETAS, 1e-15, columns)
+    optim.adam_(together[0], gradients, *together[1:], counters, rates, *BETAS, 1e-15, columns)
     for got, wanted in zip(together, alone, strict=True):
         assert all(torch.equal(one, other) for one, other in zip(got, wanted, strict=True))
     assert [int(counter) for counter in counters] == list(range(1, len(shapes) + 1))
@@ -104,7 +105,7 @@ def test_no_tensor_takes_a_step_when_one_does_not_fit():
     counters = [torch.tensor(2.0), torch.tensor(2.0)]
     with pytest.raises(RuntimeError, match="shape, dtype and device of the parameter"):
         gradients = [torch.ones(4, 3), torch.ones(3, 4)]
-        ops.adam_([good, bad], gradients, moments[:2], moments[2:], counters, [0.1] * 2, *BETAS, 1e-15, [-1] * 2)
+        optim.adam_([good, bad], gradients, moments[:2], moments[2:], counters, [0.1] * 2, *BETAS, 1e-15, [-1] * 2)
     assert all((t == 1).all() for t in (good, bad, *moments)) and all(c == 2 for c in counters)
 
 
@@ -121,6 +122,6 @@ def test_wrong_arguments_are_named():
     empty = torch.zeros(0, 45)
     adam(empty, empty.clone(), empty.clone(), empty.clone(), 0.1, BETAS, 1e-15, 1.0)
     with pytest.raises(RuntimeError, match="for each of the 1 parameters, got 2"):
-        ops.adam_([a], [a.clone()], [a.clone()], [a.clone()], [torch.zeros(())], [0.1, 0.1], *BETAS, 1e-15, [-1])
+        optim.adam_([a], [a.clone()], [a.clone()], [a.clone()], [torch.zeros(())], [0.1, 0.1], *BETAS, 1e-15, [-1])
     with pytest.raises(RuntimeError, match="step counter must be one float32 on the CPU"):
-        ops.adam_([a], [a.clone()], [a.clone()], [a.clone()], [torch.ones(1).int()], [0.1], *BETAS, 1e-15, [-1])
+        optim.adam_([a], [a.clone()], [a.clone()], [a.clone()], [torch.ones(1).int()], [0.1], *BETAS, 1e-15, [-1])

@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from diff_gaussian_rasterization import GaussianRasterizationSettings
+from diff_gaussian_rasterization import GaussianRasterizationSettings, Gaussians, fakes, optim, schema
 from rasterizer_tools import BOTH_AND_GPU, CPU_AND_GPU, few, leaves, ops, render, scene_arguments, together
 from torch import library
 
@@ -95,6 +95,25 @@ def test_the_steps_one_by_one_are_the_whole(device, dtype):
     assert gradients[1].numel() == gradients[5].numel() == 0
 
 
+def test_the_gaussians_are_the_operators_first_inputs():
+    assert schema.SCENE[: len(Gaussians._fields)] == Gaussians._fields
+    assert schema.INPUTS[: 1 + len(schema.SCENE)] == ("means2d", *schema.SCENE)
+    assert set(schema.GRADIENTS) == {"means2d", *Gaussians._fields}
+
+
+def test_the_fake_kernels_have_the_sizes_of_the_real_ones():
+    raw, camera = _few("cpu")
+    arguments = scene_arguments(raw, camera)
+    splats, depths, rects, counts, _ = ops.project(*arguments)
+    assert splats.shape[1] == fakes.SPLAT_VALUES
+    for size, tiles in ((fakes.TILE, 1), (fakes.TILE + 1, 4)):
+        assert len(ops.bin(splats, depths, rects, 0 * counts, size, size, False)[1]) == tiles + 1
+    lists = ops.bin(splats, depths, rects, counts, 7, 18, True)
+    color, transmittance, _, last = ops.blend(splats, *lists[:2], camera.bg, 7, 18, False, True)
+    moments = ops.blend_vjp(splats, *lists, camera.bg, last, transmittance, color, None, None)
+    assert moments.shape[1] == fakes.MOMENT_VALUES
+
+
 @pytest.mark.parametrize(
     ("counts", "named"),
     [
@@ -126,11 +145,11 @@ def test_statistics_that_do_not_fit_are_named():
     radii, gradient = torch.ones(4, dtype=torch.int32), torch.ones(4, 3)
     three = [torch.zeros(4), torch.zeros(4, 1), torch.zeros(4, 1)]
     with pytest.raises(RuntimeError, match="statistics must be 4 float32 on cpu, got .3"):
-        ops.observe_(torch.zeros(3), *three[1:], radii, gradient)
+        optim.observe_(torch.zeros(3), *three[1:], radii, gradient)
     with pytest.raises(RuntimeError, match="statistics must be contiguous"):
-        ops.observe_(torch.zeros(8)[::2], *three[1:], radii, gradient)
+        optim.observe_(torch.zeros(8)[::2], *three[1:], radii, gradient)
     with pytest.raises(RuntimeError, match="radii must be int32, got Float"):
-        ops.observe_(*three, radii.float(), gradient)
+        optim.observe_(*three, radii.float(), gradient)
     with pytest.raises(RuntimeError, match="the gradient must be .4, 3. float32 on cpu, got .4, 2. Float"):
-        ops.observe_(*three, radii, gradient[:, :2])
-    ops.observe_(torch.zeros(0), torch.zeros(0, 1), torch.zeros(0, 1), radii[:0], gradient[:0])
+        optim.observe_(*three, radii, gradient[:, :2])
+    optim.observe_(torch.zeros(0), torch.zeros(0, 1), torch.zeros(0, 1), radii[:0], gradient[:0])

@@ -4,7 +4,9 @@ Every measured error is printed (pytest -s), as DESIGN.md defines it; pixels wit
 count neither in the comparison nor in the loss.
 """
 
+import ast
 import functools
+from pathlib import Path
 
 import pytest
 import torch
@@ -109,3 +111,15 @@ def test_given_covariances_and_colours_agree_with_the_oracle(dtype):
     # Given covariances lose what a Cholesky decomposition of them in their own precision loses.
     _compare(got, wanted, {torch.float64: 1e-13, torch.float32: 4e-5}[dtype], f"covariances {str(dtype)[6:]}")
     assert torch.equal(got[0].radii, wanted[0].radii)
+
+
+@pytest.mark.parametrize("path", sorted(Path(reference.__file__).parent.glob("*.py")), ids=lambda path: path.stem)
+def test_the_oracle_knows_no_kernels_and_has_short_functions(path):
+    tree = ast.parse(path.read_text())
+    modules = [node.module for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)]
+    modules += [alias.name for node in ast.walk(tree) if isinstance(node, ast.Import) for alias in node.names]
+    package = "diff_gaussian_rasterization"
+    known = {"typing", "torch", package, f"{package}.gaussians"}  # of the package itself, the type of the settings
+    assert all(module in known or module.startswith(f"{package}.reference") for module in modules)
+    functions = [node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)]
+    assert all(node.end_lineno - node.lineno < 40 for node in functions)

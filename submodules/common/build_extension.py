@@ -21,7 +21,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from types import ModuleType
 
-from setuptools import Extension, setup
+from setuptools import Extension, find_packages, setup
 from setuptools.command.build_ext import build_ext
 
 VERSION = "0.1.0"
@@ -42,7 +42,7 @@ def setup_extension(name: str, package: str, root: Path) -> None:
         version=VERSION,
         license="Apache-2.0",
         python_requires=">=3.10",
-        packages=[package],
+        packages=find_packages(str(root), include=[package, f"{package}.*"]),
         install_requires=[torch_requirement()],
         # The real source list is found by the builder; setuptools only needs to know that there is a library.
         ext_modules=[Extension(f"{package}._backend", sources=[])],

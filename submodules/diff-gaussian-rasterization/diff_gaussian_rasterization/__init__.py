@@ -1,20 +1,33 @@
-"""Differentiable rasterizer for 3D Gaussian Splatting with the reference's API, and `rasterize`, which it wraps."""
+"""Differentiable rasterizer for 3D Gaussian Splatting: the reference's API, and `rasterize`, which it wraps.
+
+`optim` has the optimiser's kernels and `reference` the oracle.
+"""
 
 from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 
+from diff_gaussian_rasterization.backend import has_cuda_kernels
+from diff_gaussian_rasterization.gaussians import Gaussians
 from diff_gaussian_rasterization.ops import Rasterized, decisive, mark_visible, rasterize
 
-__all__ = ["GaussianRasterizationSettings", "GaussianRasterizer", "Rasterized", "decisive", "rasterize"]
+__all__ = [
+    "GaussianRasterizationSettings",
+    "GaussianRasterizer",
+    "Gaussians",
+    "Rasterized",
+    "decisive",
+    "has_cuda_kernels",
+    "rasterize",
+]
 
 
 class GaussianRasterizationSettings(NamedTuple):
-    """The camera and how to render; the first 13 fields are the reference's, in its order.
+    """The camera, and how to render; the first 13 fields are the reference's, in its order.
 
-    Matrices are transposed (they act on row vectors): x right, y down, z forward, pixel centres at integers. The
-    principal point comes in through `projmatrix`, the full projection (view times projection).
+    Matrices are transposed: they act on row vectors. x points right, y down, z forward; pixel centres lie at integers.
+    `projmatrix` is the full projection, view times projection, and contains the principal point.
     """
 
     image_height: int
@@ -28,7 +41,7 @@ class GaussianRasterizationSettings(NamedTuple):
     sh_degree: int  # active degree, 0..3
     campos: Tensor  # (3,) world
     prefiltered: bool  # accepted for compatibility; culling does not rely on it
-    debug: bool  # check every gradient and output for NaN and Inf, naming the tensor and row
+    debug: bool  # check inputs, image and gradients for NaN and Inf; the error names the tensor and the place
     antialiasing: bool
     inverse_depth: bool = True  # False: the third result is None and nothing is computed for it
 
@@ -41,7 +54,7 @@ class GaussianRasterizer(nn.Module):
         self.raster_settings = raster_settings
 
     def markVisible(self, positions: Tensor) -> Tensor:
-        """(N,) bool: view-space z of positions (N, 3) above 0.2, the reference's rule; no frustum test."""
+        """Marks positions (N, 3) whose z in the view is above 0.2: (N,) bool. As in the reference: no frustum test."""
         with torch.no_grad():
             return mark_visible(positions, self.raster_settings.viewmatrix)
 
@@ -58,10 +71,11 @@ class GaussianRasterizer(nn.Module):
     ) -> tuple[Tensor, Tensor, Tensor | None]:
         """Renders activated Gaussians.
 
-        means3D (N, 3) world; means2D (N, 3), values unused, whose gradient is d loss / d mean per NDC unit;
-        opacities (N, 1) in [0, 1]; shs (N, K, 3), bands beyond the active degree ignored, or colors_precomp (N, 3);
-        scales (N, 3) positive and rotations (N, 4) w x y z, used as they are, or cov3D_precomp (N, 6) as
-        xx, xy, xz, yy, yz, zz. Returns colour (3, H, W), radii (N,) int32 in px, and sum of alpha T / z (1, H, W).
+        means3D (N, 3): world. means2D (N, 3): values unused; receives d loss / d mean on the image, per NDC unit.
+        opacities (N, 1): in [0, 1]. shs (N, K, 3): bands beyond the active degree are not read; or colors_precomp
+        (N, 3). scales (N, 3): positive, and rotations (N, 4): w x y z, both used as they are; or cov3D_precomp (N, 6):
+        xx, xy, xz, yy, yz, zz.
+        Returns colour (3, H, W), radii (N,) int32 in px, and the inverse depth (1, H, W), the sum of alpha T / z.
         Raises Exception unless exactly one of each pair of alternatives is given.
         """
         if (shs is None) == (colors_precomp is None):

@@ -1,6 +1,6 @@
 """Structural similarity (SSIM) and mean absolute difference of two images, with their gradient, in one pass.
 
-And `composite`, for photos with alpha that the loss is to compare with.
+`composite` puts a photo with alpha over a background, before the loss compares it with an image.
 """
 
 from fused_ssim.ops import composite, fused_l1_ssim, fused_photometric_loss, fused_ssim

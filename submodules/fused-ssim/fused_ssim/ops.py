@@ -1,7 +1,8 @@
-"""The operators of csrc/ops.cpp, their autograd, and the public functions.
+"""The public functions of fused_ssim, with autograd and fake kernels of its operators.
 
-SSIM is that of Wang et al. 2004, per channel: 11 x 11 Gaussian window of sigma 1.5, C1 = 0.01², C2 = 0.03²; "same"
-takes pixels beyond the border as 0, "valid" leaves the rim of 5 pixels out of the mean. Only img1 gets a gradient.
+SSIM is that of Wang et al. 2004, per channel, with an 11 x 11 Gaussian window of sigma 1.5, C1 = 0.01² and C2 = 0.03².
+Padding "same" takes pixels beyond the border as 0; "valid" leaves a rim of 5 pixels out of the mean. Only img1 receives
+a gradient.
 """
 
 from functools import cache
@@ -22,20 +23,21 @@ WINDOW = 11  # pixels
 
 
 def fused_ssim(img1: Tensor, img2: Tensor, padding: str = "same", train: bool = True) -> Tensor:
-    """Mean SSIM of two images, a scalar of img1's dtype.
+    """Mean SSIM of two images: a scalar of img1's dtype (Wang et al. 2004, eq. 13).
 
-    img1: (..., H, W), float32 or, on the CPU, float64, values in [0, 1]; img2: the same shape, of the same dtype or
-    uint8 (value / 255). padding: "same" (any size) or "valid" (11 x 11 or more). train=False: no gradient, nothing kept
-    for one. The same images on the same device give the same bits.
-    Raises TypeError for a dtype, ValueError for anything else that does not fit.
+    img1: (..., H, W), values in [0, 1], float32 or, on the CPU, float64. img2: the same shape, and the same dtype or
+    uint8 (value / 255). padding: "same" (any size) or "valid" (11 x 11 pixels or more). train=False: there is no
+    gradient, and nothing is kept for one. The same images on the same device give the same bits.
+    Raises TypeError for a wrong dtype, ValueError for any other argument that does not fit.
     """
     return fused_l1_ssim(img1 if train else img1.detach(), img2, padding)[1]
 
 
 def fused_l1_ssim(img1: Tensor, img2: Tensor, padding: str = "same") -> tuple[Tensor, Tensor]:
-    """Mean |img1 - img2| (over all pixels, whatever the padding) and mean SSIM, as `fused_ssim` takes and gives them.
+    """Mean |img1 - img2| and mean SSIM: two scalars. Arguments and errors are those of `fused_ssim`.
 
-    The gradient of |img1 - img2| where both are equal is 0. Nothing is kept for the gradient unless img1 needs one.
+    The first mean is over all pixels, with either padding; its gradient is 0 where both images are equal. Nothing is
+    kept for the gradient unless img1 needs one.
     """
     _check_inputs(img1, img2, padding)
     train = torch.is_grad_enabled() and img1.requires_grad
@@ -44,10 +46,11 @@ def fused_l1_ssim(img1: Tensor, img2: Tensor, padding: str = "same") -> tuple[Te
 
 
 def fused_photometric_loss(img1: Tensor, img2: Tensor, lambda_dssim: float) -> tuple[Tensor, Tensor]:
-    """(1 - lambda) L1 + lambda (1 - SSIM) of img1 clamped to [0, 1] and img2, and that L1, which has no gradient.
+    """The loss (1 - lambda) L1 + lambda (1 - SSIM) of Kerbl et al. 2023, eq. 7, and its L1: two scalars.
 
-    Kerbl et al. 2023, eq. 7. Images as `fused_ssim` takes them, padding "same". Clamping is torch's: where img1 lies
-    outside [0, 1] it gets no gradient. Nothing is kept for the gradient unless img1 needs one.
+    Compares img1 clamped to [0, 1] with img2; images and errors are those of `fused_ssim` with padding "same". As with
+    torch's clamp, img1 receives no gradient where it lies outside [0, 1]. The L1 has no gradient. Nothing is kept for
+    the gradient unless img1 needs one.
     """
     _check_inputs(img1, img2, "same")
     train = torch.is_grad_enabled() and img1.requires_grad
@@ -57,10 +60,11 @@ def fused_photometric_loss(img1: Tensor, img2: Tensor, lambda_dssim: float) -> t
 
 
 def composite(picture: Tensor, background: Tensor) -> Tensor:
-    """A picture (4, H, W) uint8 with straight alpha over a background (3,) float32 in [0, 1]: (3, H, W) float32.
+    """Puts a picture with straight alpha, (4, H, W) uint8, over a background (3,) float32 in [0, 1].
 
-    color / 255 * alpha + background * (1 - alpha), alpha as value / 255; the same bits on every device. No gradient.
-    Raises RuntimeError for other shapes, dtypes, and tensors on two devices.
+    Returns color / 255 * alpha + background * (1 - alpha), (3, H, W) float32, where alpha is value / 255; the same bits
+    on every device. There is no gradient.
+    Raises RuntimeError for other shapes and dtypes, and for tensors on two devices.
     """
     return torch.ops.fused_ssim.composite(picture, background)
 
@@ -88,7 +92,7 @@ def _check_inputs(img1: Tensor, img2: Tensor, padding: str) -> None:
         raise TypeError(f"img1 on {img1.device} must be float32, got {img1.dtype}: pass img1.float() or img1.cpu()")
 
 
-@cache  # asking takes longer than all other checks together
+@cache  # the query takes longer than all other checks together
 def _has_backend(device: str) -> bool:
     return torch._C._dispatch_has_kernel_for_dispatch_key("fused_ssim::l1_ssim", device.upper())
 
@@ -150,18 +154,19 @@ def _photometric_backward(ctx, grad_loss: Tensor | None, *_) -> tuple[Tensor | N
     return gradient, None, None, None
 
 
-# For whoever calls the op itself, or compiles it.
+# For callers of the operator itself, and for torch.compile.
 library.register_autograd("fused_ssim::photometric", _photometric_backward, setup_context=_setup_photometric)
 
 
 class _Photometric(torch.autograd.Function):
-    """The same two functions without the dispatcher's Python in between."""
+    """The same two functions, without the Python that the dispatcher runs in between."""
 
     @classmethod
     def apply(cls, *inputs):
         if torch._C._are_functorch_transforms_active():
             return super().apply(*inputs)
-        return super(torch.autograd.Function, cls).apply(*inputs)  # torch's own looks at the signature in every call
+        # torch's own `apply` inspects the signature in every call.
+        return super(torch.autograd.Function, cls).apply(*inputs)
 
     @staticmethod
     def forward(*inputs):

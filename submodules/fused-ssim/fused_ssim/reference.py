@@ -1,4 +1,4 @@
-"""The oracle: the definition, window by window, in float64; gradients by autograd."""
+"""The oracle: SSIM by its definition, window by window, in float64; autograd differentiates it."""
 
 import torch
 import torch.nn.functional as F
@@ -6,10 +6,11 @@ from torch import Tensor
 
 
 def ssim_map(img1: Tensor, img2: Tensor) -> Tensor:
-    """SSIM of each pixel of two images (..., H, W) in [0, 1] or uint8, zero beyond the border; float64.
+    """SSIM at each pixel of two images (..., H, W) in [0, 1] or uint8, which are zero beyond the border: float64.
 
-    Wang, Bovik, Sheikh and Simoncelli 2004, eq. 13 to 16, with an 11 x 11 Gaussian window of sigma 1.5. Variances are
-    means of squared deviations, as there: E[x²] - mu² would lose digits. It takes 121 numbers a pixel and image.
+    Follows Wang, Bovik, Sheikh and Simoncelli 2004, eq. 13 to 16, with an 11 x 11 Gaussian window of sigma 1.5.
+    Variances are means of squared deviations, as in the paper: E[x²] - mu² would lose digits. Memory: 121 numbers for
+    each pixel of each image.
     """
     taps = torch.exp(-(torch.arange(-5, 6, dtype=torch.float64) ** 2) / (2 * 1.5**2))
     window = torch.outer(taps, taps).reshape(121, 1) / taps.sum() ** 2
@@ -31,7 +32,7 @@ def ssim_map(img1: Tensor, img2: Tensor) -> Tensor:
 
 
 def l1_ssim(img1: Tensor, img2: Tensor, padding: str = "same") -> tuple[Tensor, Tensor]:
-    """The definition of `fused_ssim.fused_l1_ssim`, float64."""
+    """Mean |img1 - img2| and mean SSIM, by the definition that `fused_ssim.fused_l1_ssim` is held to; float64."""
     full = ssim_map(img1, img2)
     if img2.dtype == torch.uint8:
         img2 = img2.double() / 255

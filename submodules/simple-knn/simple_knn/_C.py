@@ -1,4 +1,4 @@
-"""The name under which the reference's users import it."""
+"""`distCUDA2` under the name by which the reference's users import it."""
 
 from simple_knn.ops import distCUDA2
 

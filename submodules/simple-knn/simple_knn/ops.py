@@ -1,4 +1,4 @@
-"""The operator simple_knn::mean_distance2 and its checked Python form."""
+"""`distCUDA2`, the checked Python form of the operator simple_knn::mean_distance2."""
 
 from pathlib import Path
 
@@ -19,13 +19,13 @@ def _fake(points: torch.Tensor) -> torch.Tensor:
 
 
 def distCUDA2(points: torch.Tensor) -> torch.Tensor:
-    """Mean of the squared distances of each point to its three nearest other points, exactly (no approximation).
+    """Mean squared distance of each point to its three nearest other points, exact.
 
-    points: (N, 3) float32 or float64, any unit. Returns (N,) in the same dtype and on the same device, in that unit
-    squared; no gradient. Others are other indexes: a duplicate is a neighbour at distance 0. With fewer than three
-    others it is the mean over those there are, and 0 for a single point. A point with a NaN or infinite coordinate
-    gets 0 and is nobody's neighbour. Where float overflows, the largest finite number.
-    Raises TypeError for another dtype, ValueError for another shape or a device this build has no backend for.
+    points: (N, 3) float32 or float64, in any unit. Returns (N,) in that unit squared, with the dtype and device of
+    points and no gradient. Other points are those of another index: a duplicate is a neighbour at distance 0. If there
+    are fewer than three others, the mean is over those; a single point gets 0. A point with a NaN or an infinite
+    coordinate gets 0 and is no neighbour of any other. A result beyond the dtype's range is its largest finite number.
+    Raises TypeError for another dtype, ValueError for another shape and for a device that this build does not support.
     """
     if points.dtype not in (torch.float32, torch.float64):
         raise TypeError(f"points must be float32 or float64, got {points.dtype}: convert with points.float()")

@@ -1,10 +1,13 @@
-"""The oracle: every distance in float64, O(N²)."""
+"""The oracle: all distances in float64, in O(N²) time."""
 
 import torch
 
 
 def mean_distance2(points: torch.Tensor) -> torch.Tensor:
-    """points (N, 3) of any float dtype -> (N,) float64; the definition of `simple_knn.ops.distCUDA2`."""
+    """Mean squared distance to the three nearest others, by the definition that `simple_knn.ops.distCUDA2` is held to.
+
+    points: (N, 3) of any float dtype. Returns (N,) float64.
+    """
     points = points.double()
     out = torch.zeros(len(points), dtype=torch.float64)
     finite = points.isfinite().all(1).nonzero().squeeze(1)

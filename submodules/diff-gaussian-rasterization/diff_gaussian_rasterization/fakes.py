@@ -1,0 +1,104 @@
+"""Fake kernels: shapes and dtypes of the operators' results, for torch.compile and torch.library.opcheck."""
+
+import torch
+from torch import Tensor, library
+
+from diff_gaussian_rasterization.checks import ROWS
+from diff_gaussian_rasterization.schema import GRADIENTS, SCENE
+
+# These three are constants of csrc; tests/test_rasterizer_ops.py holds them to it.
+TILE = 16  # pixels
+SPLAT_VALUES = 10  # of a row of `splats`
+MOMENT_VALUES = 10  # of a row of `moments`
+
+
+def _fake(name: str):
+    return library.register_fake(f"diff_gaussian_rasterization::{name}")
+
+
+def _scene(arguments: tuple) -> dict:
+    return dict(zip(SCENE, arguments[: len(SCENE)], strict=True))
+
+
+def _gradients(scene: dict, wanted: list[bool]) -> tuple[Tensor, ...]:
+    means, sh_rest = scene["means"], scene["sh_rest"]
+    rows = ROWS | {"sh_rest": (0 if sh_rest is None else sh_rest.shape[1], 3)}
+    counts = [means.shape[0] if is_wanted else 0 for is_wanted in wanted]
+    return tuple(means.new_empty((count, *rows[name])) for name, count in zip(GRADIENTS, counts, strict=True))
+
+
+def _binned(like: Tensor, count: int, height: int, width: int, train: bool) -> tuple[Tensor, ...]:
+    instances = library.get_ctx().new_dynamic_size()
+    slots = library.get_ctx().new_dynamic_size() if train else 0
+    tiles = -(-height // TILE) * -(-width // TILE)
+    return (
+        like.new_empty((instances,), dtype=torch.int32),
+        like.new_empty((tiles + 1,), dtype=torch.int64),
+        like.new_empty((count + 1 if train else 0, 2), dtype=torch.int64),
+        like.new_empty((slots, 0), dtype=torch.int32),
+    )
+
+
+def _blended(like: Tensor, height: int, width: int, inverse_depth: bool, train: bool) -> tuple[Tensor, ...]:
+    return (
+        like.new_empty((3, height, width)),
+        like.new_empty((1, height, width)),
+        like.new_empty((1 if inverse_depth else 0, height, width)),
+        like.new_empty((height if train else 0, width), dtype=torch.int32),
+    )
+
+
+@_fake("project")
+def _(means, *_):
+    count = means.shape[0]
+    ints = [means.new_empty(shape, dtype=torch.int32) for shape in ((count, 4), (count,), (count,))]
+    return means.new_empty((count, SPLAT_VALUES)), means.new_empty((count,)), *ints
+
+
+@_fake("bin")
+def _(splats, depths, rects, tile_counts, height, width, train):
+    return _binned(splats, splats.shape[0], height, width, train)
+
+
+@_fake("blend")
+def _(splats, instances, ranges, background, height, width, inverse_depth, train):
+    return _blended(splats, height, width, inverse_depth, train)
+
+
+@_fake("blend_vjp")
+def _(splats, *_):
+    return splats.new_empty((splats.shape[0], MOMENT_VALUES))
+
+
+@_fake("project_vjp")
+@_fake("rasterize_vjp")
+def _(*arguments):
+    return _gradients(_scene(arguments), arguments[-1])
+
+
+@_fake("rasterize")
+def _(means2d, *arguments):
+    scene, (inverse_depth, train) = _scene(arguments), arguments[-2:]
+    means, height, width = scene["means"], scene["height"], scene["width"]
+    count = means.shape[0]
+    color, transmittance, depth, last = _blended(means, height, width, inverse_depth, train)
+    radii, tile_counts = (means.new_empty((count,), dtype=torch.int32) for _ in range(2))
+    projected = radii, means.new_empty((count, SPLAT_VALUES)), tile_counts
+    return color, transmittance, depth, *projected, *_binned(means, count, height, width, train), last
+
+
+@_fake("mark_visible")
+def _(means, view):
+    return means.new_empty((means.shape[0],), dtype=torch.bool)
+
+
+@_fake("decisive")
+def _(splats, *_):
+    return splats.new_empty((splats.shape[0],), dtype=torch.bool)
+
+
+@_fake("adam_")
+@_fake("sparse_adam_")
+@_fake("observe_")
+def _(*_args, **_keywords):
+    return None

@@ -1,0 +1,85 @@
+"""Blending front to back (Kerbl et al. 2023, eq. 3), with the limits of that paper's appendix C."""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from diff_gaussian_rasterization.reference.camera import Points
+from diff_gaussian_rasterization.reference.shape import Ellipses
+
+LEAST_ALPHA = 1 / 255  # a pixel takes no less
+LARGEST_ALPHA = 0.99
+LEAST_TRANSMITTANCE = 1e-4  # a splat that would leave less ends the pixel and is not blended itself
+
+
+class Splats(NamedTuple):
+    """The M Gaussians in front of the camera, nearest first; equal depths keep the order of their index."""
+
+    pixel: Tensor  # (M, 2) px
+    r11: Tensor  # (M,) of the ellipse, as are the next two
+    r12: Tensor
+    r22: Tensor
+    opacity: Tensor  # (M,)
+    color: Tensor  # (M, 3)
+    depth: Tensor  # (M,) world units
+    is_tie: Tensor  # (M,) bool: about as deep as the splat before, so that rounding may swap them
+
+
+class Planes(NamedTuple):
+    """Some rows of the image."""
+
+    color: Tensor  # (3, rows, W)
+    inverse_depth: Tensor  # (rows, W)
+    transmittance: Tensor  # (rows, W)
+    near_cut: Tensor  # (rows, W) bool
+
+
+def nearest_first(points: Points, ellipses: Ellipses, opacity: Tensor, colors: Tensor, cut: float) -> Splats:
+    """Drops the Gaussians that are not in front and sorts the others by depth."""
+    key = torch.where(points.in_front, points.view[:, 2], torch.inf)
+    order = torch.argsort(key, stable=True)[: int(points.in_front.sum())]
+    sorted_depth = points.view[order, 2]
+    is_tie = torch.zeros(len(order), dtype=torch.bool)
+    is_tie[1:] = sorted_depth.diff() < 0.01 * cut * sorted_depth[1:]
+    factor = (entry[order] for entry in ellipses[:3])
+    return Splats(points.pixel[order], *factor, opacity[order], colors[order], points.depth[order], is_tie)
+
+
+def blend_rows(splats: Splats, background: Tensor, rows: range, width: int, cut: float) -> Planes:
+    """Blends image rows: C = sum of c_i alpha_i T_i, where T_i is the product of 1 - alpha_j over nearer splats j."""
+    uncapped = alphas(splats, rows, width)
+    reached = uncapped >= LEAST_ALPHA
+    alpha = uncapped + (torch.clamp(uncapped, max=LARGEST_ALPHA) - uncapped).detach()  # the gradient passes the cap
+    alpha = torch.where(reached, alpha, 0.0)
+    left = torch.cumprod(1 - alpha, 0)  # transmittance behind each splat, if all were blended
+    is_near = _is_near(uncapped, LEAST_ALPHA, cut) | _is_near(left, LEAST_TRANSMITTANCE, cut)
+    is_near = is_near | (splats.is_tie[:, None, None] & reached)
+
+    alpha = torch.where(left >= LEAST_TRANSMITTANCE, alpha, 0.0)
+    behind = torch.cumprod(1 - alpha, 0)
+    transmittance = behind[-1] if len(behind) else torch.ones(len(rows), width, dtype=torch.float64)
+    T = torch.cat([torch.ones_like(behind[:1]), behind[:-1]])
+    weight = alpha * T
+    color = torch.einsum("nhw,nc->chw", weight, splats.color) + transmittance * background[:, None, None]
+    inverse_depth = (weight / splats.depth[:, None, None]).sum(0)
+    return Planes(color, inverse_depth, transmittance, is_near.any(0))
+
+
+def alphas(splats: Splats, rows: range, width: int) -> Tensor:
+    """Opacity times the Gaussian of Kerbl et al. 2023, eq. 4, on the image: (M, rows, W).
+
+    With covariance = R^T R and R^T (u, v) = (dx, dy), the exponent is -(u^2 + v^2) / 2: it can't become positive.
+    """
+    x = torch.arange(width, dtype=torch.float64)
+    y = torch.arange(rows.start, rows.stop, dtype=torch.float64)
+    dx = x[None, None, :] - splats.pixel[:, 0, None, None]
+    dy = y[None, :, None] - splats.pixel[:, 1, None, None]
+    r11, r12, r22, opacity = (t[:, None, None] for t in (splats.r11, splats.r12, splats.r22, splats.opacity))
+    u = dx / r11
+    v = (dy - r12 * u) / r22
+    return opacity * torch.exp(-0.5 * (u * u + v * v))
+
+
+def _is_near(values: Tensor, limit: float, cut: float) -> Tensor:
+    return (values * (1 / limit) - 1).abs() < cut

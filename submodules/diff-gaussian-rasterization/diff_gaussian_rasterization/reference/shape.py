@@ -1,0 +1,112 @@
+"""The shape of a Gaussian: its covariance in the world, and its ellipse on the image.
+
+The textbook's determinant, xx yy - xy xy, would leave float64 some four digits on needles a million pixels long.
+Ellipses are therefore kept as a triangular factor, which LAPACK's QR computes without squaring. Covariances given by
+the caller are squares already and are factored as they are.
+"""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from diff_gaussian_rasterization.gaussians import Gaussians
+from diff_gaussian_rasterization.reference.camera import Camera, Points, world_to_image
+
+DILATION = 0.3  # px^2, added to both variances: an ellipse covers about a pixel at least
+TILE = 16  # px; a radius counts only where its square touches a tile of the image
+
+
+class Ellipses(NamedTuple):
+    """Dilated covariances on the image, as their factor: covariance = R^T R with R upper triangular."""
+
+    r11: Tensor  # (N,) px, as are the next two
+    r12: Tensor
+    r22: Tensor
+    undilated: Tensor  # (N,) px^4: determinant before the dilation
+
+    def covariance(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Entries xx, xy and yy, px^2."""
+        return self.r11 * self.r11, self.r11 * self.r12, self.r12 * self.r12 + self.r22 * self.r22
+
+
+def activated(raw: Gaussians) -> Gaussians:
+    """Applies the activations of Kerbl et al. 2023, section 5.1: sigmoid to opacities, exp to scales.
+
+    Quaternions are normalised; a zero one means the identity.
+    """
+    return raw._replace(
+        opacities=torch.sigmoid(raw.opacities),
+        scales=None if raw.scales is None else raw.scales.exp(),
+        rotations=None if raw.rotations is None else _normalised(raw.rotations),
+    )
+
+
+def project_shapes(gaussians: Gaussians, points: Points, camera: Camera, scale_modifier: float) -> Ellipses:
+    """J W Sigma W^T J^T (Kerbl et al. 2023, eq. 5) with Sigma = R S S^T R^T (eq. 6), plus the dilation."""
+    JW = world_to_image(points, camera)
+    if gaussians.cov3d is not None:
+        Sigma = gaussians.cov3d[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
+        return _factor_of_covariance(JW @ Sigma @ JW.transpose(1, 2))
+    S = gaussians.scales * scale_modifier  # the diagonal
+    RS = rotation_matrices(gaussians.rotations) * S[:, None, :]
+    return _factor(JW @ RS)
+
+
+def rotation_matrices(quaternions: Tensor) -> Tensor:
+    """R (N, 3, 3) of quaternions (N, 4), w x y z, of unit length."""
+    w, x, y, z = quaternions.unbind(1)
+    rows = [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)]
+    rows += [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)]
+    rows += [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]
+    return torch.stack(rows, -1).reshape(-1, 3, 3)
+
+
+def compensation(ellipses: Ellipses) -> Tensor:
+    """The antialiasing factor of opacities (N,): sqrt(det / dilated det), as in Yu et al. 2024 (Mip-Splatting).
+
+    The ratio is 1 / (1 + grown / det), where grown = dilated det - det = 0.3 (trace - 0.3) with the dilated trace.
+    Subtracting the determinants would lose every digit of `grown` on splats of 1,000 px.
+    """
+    xx, _, yy = ellipses.covariance()
+    grown = DILATION * (xx + yy - DILATION)
+    ratio = 1 / (1 + grown / torch.clamp(ellipses.undilated, min=1e-8))  # a smaller det gives the floor below anyway
+    return torch.sqrt(torch.clamp(ratio, min=2.5e-5))
+
+
+def radii(points: Points, ellipses: Ellipses, camera: Camera) -> Tensor:
+    """Three standard deviations of the long axis (Kerbl et al. 2023, section 6), rounded up: (N,) int32 px.
+
+    0 for Gaussians that are not in front, or whose square of that radius touches no tile of the image.
+    """
+    xx, xy, yy = ellipses.covariance()
+    discriminant = torch.clamp(((xx - yy) / 2) ** 2 + xy * xy, min=0.1)
+    radius = torch.ceil(3 * torch.sqrt((xx + yy) / 2 + torch.sqrt(discriminant)))
+    tiles = torch.ceil(camera.size / TILE)
+    first = torch.clamp(torch.trunc((points.pixel - radius[:, None]) / TILE), min=0)
+    end = torch.trunc((points.pixel + radius[:, None] + (TILE - 1)) / TILE)
+    on_image = (torch.minimum(end, tiles) > torch.minimum(first, tiles)).all(1)
+    return torch.where(points.in_front & on_image, radius, 0.0).to(torch.int32)
+
+
+def _normalised(quaternions: Tensor) -> Tensor:
+    length = quaternions.norm(dim=1, keepdim=True)
+    is_zero = length < 1e-30
+    identity = torch.tensor([1.0, 0, 0, 0], dtype=quaternions.dtype)
+    return torch.where(is_zero, identity, quaternions / torch.where(is_zero, 1.0, length))
+
+
+def _factor(half: Tensor) -> Ellipses:
+    """The ellipses of half half^T + 0.3 I, where half (N, 2, 3) is J W R S."""
+    dilation = DILATION**0.5 * torch.eye(2, dtype=half.dtype).expand(len(half), 2, 2)
+    R = torch.linalg.qr(torch.cat([half, dilation], 2).transpose(1, 2)).R
+    undilated = torch.linalg.cross(half[:, 0], half[:, 1]).square().sum(1)  # Cauchy-Binet: nothing cancels
+    return Ellipses(R[:, 0, 0], R[:, 0, 1], R[:, 1, 1], undilated)
+
+
+def _factor_of_covariance(covariance: Tensor) -> Ellipses:
+    """The ellipses of covariances (N, 2, 2) + 0.3 I, by Cholesky's formulas."""
+    xx, xy, yy = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
+    dilated = (xx + DILATION) * (yy + DILATION) - xy * xy
+    r11 = torch.sqrt(xx + DILATION)
+    return Ellipses(r11, xy / r11, torch.sqrt(dilated) / r11, xx * yy - xy * xy)
