@@ -1,7 +1,8 @@
-"""What a scene does not need is not there: what docs/costs.md says without a clock, and the means it measures with."""
+"""Costs of features that are off: the claims of docs/results/costs.md that need no clock, and its ways to measure."""
 
 import json
 import math
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -76,9 +77,10 @@ def probed(tmp_path_factory) -> dict:
 
 
 def test_the_probe_makes_nothing_when_it_is_asked_for_help(tmp_path):
-    command = [sys.executable, ROOT / "benchmarks" / "cost_probe.py", "--help"]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True)
-    assert done.stdout.startswith("usage: cost_probe.py") and list(tmp_path.iterdir()) == []
+    command = [sys.executable, "-m", "benchmarks.costs.probe", "--help"]
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=True)
+    assert done.stdout.startswith("usage: probe.py") and list(tmp_path.iterdir()) == []
 
 
 def test_training_and_rendering_load_nothing_they_do_not_use(probed):
