@@ -1,4 +1,4 @@
-"""Every option of the command lines, and what a model folder remembers of them."""
+"""Command-line options, and their storage in a model folder."""
 
 from arguments.groups import ModelParams, OptimizationParams, PipelineParams
 from arguments.param_group import OptionParser, ParamGroup

@@ -1,4 +1,4 @@
-"""The options of the three topics, each once: name, default, effect, origin of the default."""
+"""Tables of options in three groups; each option has a name, default, effect and origin of the default."""
 
 import argparse
 import os
@@ -16,14 +16,14 @@ def _tolerance(value: float) -> str | None:
 
 
 class ModelParams(ParamGroup):
-    """What is trained from what: data, output folder, SH degree. The `stored` ones make up `cfg_args`."""
+    """Options of the data, the output folder and the SH degree. The `stored` ones make up `cfg_args`."""
 
     title = "model"
     options = (
         Option(
             "sh_degree",
             3,
-            "largest degree of the spherical harmonics that make colour depend on the view, 0 to 3; higher: more "
+            "highest degree, 0 to 3, of the spherical harmonics that make colour depend on the view; higher: more "
             "view-dependent detail, more memory",
             "paper",
             check=within(0, 3),
@@ -33,76 +33,76 @@ class ModelParams(ParamGroup):
         Option(
             "model_path",
             "",
-            "output folder; empty: a new one under ./output, named by OAR_JOB_ID or at random",
+            "output folder; empty: a new one under ./output, named after OAR_JOB_ID or at random",
             short="m",
             stored=True,
         ),
         Option(
-            "images", "images", "folder of the pictures under the scene folder (COLMAP only)", short="i", stored=True
+            "images", "images", "folder of the photos inside the scene folder (COLMAP only)", short="i", stored=True
         ),
         Option(
             "depths",
             "",
-            "folder of inverse depth maps (PNG by the pictures' names) under the scene folder, which steady what few "
-            "pictures see; empty: no depth supervision",
+            "folder of inverse depth maps inside the scene folder, PNGs with the photos' names; they stabilise regions "
+            "that few photos show; empty: no depth supervision",
             short="d",
             stored=True,
         ),
         Option(
             "resolution",
             -1,
-            "1, 2, 4, 8: divide the size of the pictures by that; -1: as they are, at most 1600 pixels wide; any other "
-            "value: width in pixels",
+            "1, 2, 4, 8: divide the size of the photos by this; -1: keep their size, but at most 1600 pixels wide; any "
+            "other value: width in pixels",
             short="r",
             check=_resolution,
             stored=True,
         ),
-        Option("white_background", False, "white behind the scene instead of black", short="w", stored=True),
+        Option("white_background", False, "white background instead of black", short="w", stored=True),
         Option(
             "train_test_exp",
             False,
-            "train a colour correction of each picture, for pictures of different exposure, also on the left halves of "
-            "the test pictures; only right halves are scored and rendered",
+            "train a colour correction of each photo, for photos of different exposure; this trains on the left halves "
+            "of the test photos too, and only right halves are scored and rendered",
             stored=True,
         ),
         Option(
             "data_device",
             "cuda",
-            "device that keeps the pictures, as 8-bit values; they are kept in pinned memory of the CPU instead, and "
-            "copied ahead of their use, where they would take more than a quarter of the GPU's free memory, and with "
-            "cpu; without a usable GPU this means the CPU",
+            "device that holds the images, as 8-bit values. With cpu, or if they would take more than a quarter of the "
+            "GPU's free memory, pinned memory of the CPU holds them and they are copied ahead of their use. Without a "
+            "usable GPU, cuda means the CPU",
             stored=True,
         ),
-        Option("eval", False, "hold out a test set: every 8th picture by name, or Blender's test frames", stored=True),
+        Option("eval", False, "hold out a test set: every 8th photo by name, or Blender's test frames", stored=True),
         Option(
             "init_pcd_path",
             "",
-            "file of points to start from instead of the scene's own: PLY, npz (points, colors), or text with x y z, "
-            "or x y z red green blue, a line",
+            "file of points to start from instead of the scene's own: PLY, npz (points, colors), or text whose lines "
+            "are x y z or x y z red green blue",
             "ours",
         ),
         Option(
             "init_type",
             "sfm",
-            "points to start from without --init_pcd_path. sfm: the scene's own; random: grey ones in the cameras' "
-            "frusta, in Blender scenes in the reference's cube",
+            "points to start from without --init_pcd_path. sfm: the scene's own; random: grey points in the cameras' "
+            "frusta, or in the reference's cube for Blender scenes",
             "ours",
             check=one_of("sfm", "random"),
         ),
         Option(
             "masks",
             "",
-            "folder of masks in the scene folder, or a whole path: by the names of the pictures, with .png appended or "
-            "another suffix, black masks; empty: those that a nerfstudio scene names",
+            "folder of mask files inside the scene folder, or an absolute path; black is masked. A mask has its "
+            "photo's name, with .png appended or with another suffix. Empty: the masks that a nerfstudio scene names",
             "ours",
             remembered=True,
         ),
-        Option("invert_masks", False, "white masks instead of black", "ours", remembered=True),
+        Option("invert_masks", False, "white is masked instead of black", "ours", remembered=True),
         Option(
             "mask_meaning",
             "auto",
-            "what is masked by mask files or the pictures' alpha. ignore: left out of loss and scores; transparent: "
-            "shows the background; auto: ignore for mask files, transparent for alpha",
+            "meaning of pixels masked by mask files or by the photos' alpha. ignore: leave them out of loss and "
+            "scores; transparent: they show the background; auto: ignore for mask files, transparent for alpha",
             "ours",
             check=one_of("auto", "ignore", "transparent"),
             remembered=True,
@@ -110,15 +110,15 @@ class ModelParams(ParamGroup):
         Option(
             "images_to_load",
             0,
-            "decoded pictures kept in memory at most, 0: all; every picture still trains, as it would with all, and "
-            "up to 32 that come next are decoded ahead",
+            "largest number of decoded images kept in memory, 0: all. Every photo still trains, with the same result; "
+            "up to 32 of the next ones are decoded ahead",
             "ours",
             check=at_least(0),
         ),
     )
 
     def extract(self, args: argparse.Namespace) -> argparse.Namespace:
-        """As ParamGroup.extract; a given source_path is made absolute. UserError for options at odds."""
+        """Do as ParamGroup.extract, and make source_path absolute. UserError for contradictory options."""
         values = super().extract(args)
         if values.init_pcd_path and values.init_type == "random":
             raise UserError(
@@ -131,23 +131,27 @@ class ModelParams(ParamGroup):
 
 
 class PipelineParams(ParamGroup):
-    """How an image is computed. Not part of `cfg_args`; antialiasing is remembered in `model.json`."""
+    """Options of rendering. They are not part of `cfg_args`; `model.json` remembers antialiasing."""
 
     title = "pipeline"
     options = (
         Option("convert_SHs_python", False, "evaluate spherical harmonics in PyTorch; slower, for experiments"),
         Option("compute_cov3D_python", False, "compute 3D covariances in PyTorch; slower, for experiments"),
-        Option("debug", False, "check what goes into and comes out of every kernel; slower"),
-        Option("antialiasing", False, "keep a splat's weight when it is smaller than a pixel; for changing distances"),
+        Option("debug", False, "check the inputs and outputs of every kernel; slower"),
+        Option(
+            "antialiasing",
+            False,
+            "keep the total weight of splats smaller than a pixel, so that views from other distances look right",
+        ),
     )
 
 
 class OptimizationParams(ParamGroup):
-    """How long and how fast is trained, and how the number of Gaussians changes."""
+    """Options of the optimisation: its length, its learning rates, and the control of the number of Gaussians."""
 
     title = "optimisation"
     options = (
-        Option("iterations", 30_000, "training steps, one picture each", "paper", check=within(1, 2**31 - 1)),
+        Option("iterations", 30_000, "training steps, one photo each", "paper", check=within(1, 2**31 - 1)),
         Option(
             "position_lr_init",
             0.00016,
@@ -163,25 +167,28 @@ class OptimizationParams(ParamGroup):
             check=at_least(0),
         ),
         Option(
-            "position_lr_delay_mult", 0.01, "no effect (no delay steps exist); kept for old commands", check=at_least(0)
+            "position_lr_delay_mult",
+            0.01,
+            "no effect, there are no delay steps; kept for old commands",
+            check=at_least(0),
         ),
         Option(
             "position_lr_max_steps",
             30_000,
-            "step at which the rate of positions reaches its final value; does not follow --iterations",
+            "step at which the learning rate of positions reaches its final value; independent of --iterations",
             check=at_least(1),
         ),
         Option(
             "feature_lr",
             0.0025,
-            "learning rate of the base colour; the view-dependent bands get 1/20 of it",
+            "learning rate of the base colour; that of the view-dependent bands is 1/20 of it",
             "paper",
             check=at_least(0),
         ),
         Option(
             "opacity_lr",
             0.025,
-            "learning rate of the opacity logits; higher: bolder fading in and out",
+            "learning rate of the opacity logits; higher: Gaussians fade in and out faster",
             "newest reference; 0.05 in the 2023 release",
             check=at_least(0),
         ),
@@ -194,25 +201,26 @@ class OptimizationParams(ParamGroup):
         Option(
             "exposure_lr_delay_steps",
             0,
-            "steps over which the rate of exposures rises to what it would be without",
+            "steps at the start over which the learning rate of exposures rises to its normal value",
             check=at_least(0),
         ),
         Option(
             "exposure_lr_delay_mult",
             0.0,
-            "factor of the rate of exposures at step 0 of that rise",
+            "factor of the learning rate of exposures at step 0, where that rise begins",
             check=within(0, 1),
         ),
         Option(
             "percent_dense",
             0.01,
-            "size, as a fraction of the scene extent, up to which a Gaussian is cloned and above which it is split",
+            "size that decides densification, as a fraction of the scene extent: smaller Gaussians are cloned, larger "
+            "ones split",
             check=at_least(0),
         ),
         Option(
             "lambda_dssim",
             0.2,
-            "weight of 1 - SSIM in the loss; the L1 term gets the rest",
+            "weight of 1 - SSIM in the loss; the weight of the L1 term is 1 minus this",
             "paper",
             check=within(0, 1),
         ),
@@ -236,41 +244,43 @@ class OptimizationParams(ParamGroup):
         Option("depth_l1_weight_init", 1.0, "weight of the depth loss (--depths) at the start", check=at_least(0)),
         Option("depth_l1_weight_final", 0.01, "weight of the depth loss in the last step", check=at_least(0)),
         Option(
-            "random_background", False, "a new random background in every step, so that nothing hides in one colour"
+            "random_background",
+            False,
+            "a new random background in every step, so that no Gaussian imitates a fixed one",
         ),
         Option(
             "optimizer_type",
             "default",
-            "default: Adam over all Gaussians; sparse_adam: steps only those that the view sees, without bias "
-            "correction; faster where views see little of the scene",
+            "default: Adam on all Gaussians; sparse_adam: Adam without bias correction, only on the Gaussians that the "
+            "view sees, which is faster if views see little of the scene",
             check=one_of("default", "sparse_adam"),
         ),
         Option(
             "max_num_splats",
             0,
-            "most Gaussians there may be, 0: no limit; at the limit those with the largest gradient are taken",
+            "largest number of Gaussians, 0: no limit; near it, densification takes those with the largest gradients",
             "ours",
             check=at_least(0),
         ),
         Option(
             "keep_unseen",
             False,
-            "save also the Gaussians that no training view depends on; otherwise the last save leaves them out, which "
-            "changes no training view at the size it was trained at, and may change other views and sizes",
+            "also save the Gaussians that no training view depends on. Without this the last save leaves them out: "
+            "training views at their training size stay the same, other views and sizes may change",
             "ours",
         ),
         Option(
             "prune_sh",
             -1.0,
-            "cut, in the last save, the SH bands of highest degree that move no colour (0 to 1) by more than this; 0: "
-            "those that are zero, -1: none; --sh_degree in cfg_args follows",
+            "in the last save, drop the highest SH bands that change no colour (0 to 1) by more than this; 0: drop "
+            "bands that are zero, -1: drop none. The sh_degree in cfg_args follows",
             "ours",
             check=_tolerance,
         ),
         Option(
             "seed",
             0,
-            "seed of every random choice; same seed, same bytes",
+            "seed of every random choice; the same seed gives the same bytes",
             "ours, and the reference's fixed seed",
             check=within(0, 2**63 - 1),
         ),

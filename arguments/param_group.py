@@ -1,4 +1,4 @@
-"""Options as records, so that parser, defaults, checks and help come from one place."""
+"""Options as records, from which parser, defaults, checks and help are made."""
 
 import argparse
 import math
@@ -16,9 +16,9 @@ class Option:
     """One command-line option.
 
     name, short: long name (also the attribute) and one-letter form; default: its type is the option's type.
-    help: effect of the option; origin: where the default comes from, "ours..." for options the reference does not have.
-    check: takes a value, returns what is wanted when the value is not that, else None.
-    stored: belongs to `cfg_args`. remembered: belongs to `model.json`, for render.py.
+    help: effect of the option. origin: source of the default; "ours..." for options that the reference does not have.
+    check: returns None for a valid value, else a description of valid values.
+    stored: written to `cfg_args`. remembered: written to `model.json`, for render.py.
     """
 
     name: str
@@ -32,7 +32,7 @@ class Option:
 
     @property
     def ours(self) -> bool:
-        """The reference does not have it."""
+        """Whether the reference does not have this option."""
         return self.origin.startswith("ours")
 
     def add_to(self, group: argparse._ArgumentGroup, sentinel: bool) -> None:
@@ -51,7 +51,7 @@ class Option:
         return {int: "N", float: "X", str: "TEXT"}[type(self.default)]
 
     def verify(self, value: Value) -> None:
-        """UserError when the value is not finite or not sensible."""
+        """Raise UserError if the value is not finite or fails the option's check."""
         if isinstance(value, float) and not math.isfinite(value):
             raise UserError(f"--{self.name} must be a finite number, got {value}")
         wanted = self.check(value) if self.check else None
@@ -60,7 +60,7 @@ class Option:
 
 
 class OptionParser(argparse.ArgumentParser):
-    """A parser in which an abbreviation of just one of the reference's options means that one, whatever we added."""
+    """A parser in which options that we added never make an abbreviation of a reference option ambiguous."""
 
     def _get_option_tuples(self, option_string: str) -> list[Any]:
         matches = super()._get_option_tuples(option_string)
@@ -69,10 +69,10 @@ class OptionParser(argparse.ArgumentParser):
 
 
 class ParamGroup:
-    """A topic's options: puts them on a parser, takes their checked values from the parsed arguments.
+    """A group of options: adds them to a parser, and extracts their checked values from the parsed arguments.
 
-    sentinel: every default becomes None ("not given"), so that get_combined_args can tell what the user typed.
-    without: options that the command line does not have, since they would have no effect.
+    sentinel: make every default None ("not given"), so that get_combined_args can tell what the user typed.
+    without: options that this command does not get, because they would have no effect.
     """
 
     title: ClassVar[str]
@@ -85,7 +85,7 @@ class ParamGroup:
                 option.add_to(group, sentinel)
 
     def extract(self, args: argparse.Namespace) -> argparse.Namespace:
-        """This group's values out of `args`; absent or None means the default. UserError for absurd values."""
+        """Return this group's values from `args`; absent or None means the default. UserError for invalid values."""
         values: dict[str, Value] = {}
         for option in self.options:
             value = getattr(args, option.name, None)
@@ -95,20 +95,20 @@ class ParamGroup:
 
 
 def at_least(low: float) -> Callable[[float], str | None]:
-    """Check for `Option`: value >= low."""
+    """Make a check for `Option`: value >= low."""
     return lambda value: None if value >= low else f"at least {low}"
 
 
 def above(low: float) -> Callable[[float], str | None]:
-    """Check for `Option`: value > low."""
+    """Make a check for `Option`: value > low."""
     return lambda value: None if value > low else f"greater than {low}"
 
 
 def within(low: float, high: float) -> Callable[[float], str | None]:
-    """Check for `Option`: low <= value <= high."""
+    """Make a check for `Option`: low <= value <= high."""
     return lambda value: None if low <= value <= high else f"between {low} and {high}"
 
 
 def one_of(*choices: str) -> Callable[[str], str | None]:
-    """Check for `Option`: value is one of the words."""
+    """Make a check for `Option`: value is one of `choices`."""
     return lambda value: None if value in choices else " or ".join(choices)

@@ -1,4 +1,4 @@
-"""What a model folder remembers of its options: `cfg_args` (the reference's file) and `model.json` (ours)."""
+"""Options stored in a model folder: `cfg_args`, the reference's file, and `model.json`, ours."""
 
 import argparse
 import ast
@@ -22,22 +22,22 @@ _OF_TRAINING = ("antialiasing", "optimizer_type", "seed")
 
 
 def write_cfg_args(model_path: str | os.PathLike, args: argparse.Namespace) -> None:
-    """Write `cfg_args`: one line, the repr of a Namespace of exactly the ten stored model options."""
+    """Write `cfg_args`: one line, the repr of a Namespace with exactly the ten stored model options."""
     line = repr(argparse.Namespace(**{name: getattr(args, name) for name in _STORED}))
     with atomic_write(Path(model_path) / "cfg_args") as path:
         path.write_text(line, encoding="utf-8")
 
 
 def read_cfg_args(model_path: str | os.PathLike) -> dict[str, Value]:
-    """Stored model options as far as the file has them; unknown keys are left out. Nothing in the file is executed.
+    """Read the stored model options that the file has; ignore unknown keys. Nothing in the file is executed.
 
-    UserError when there is no file, or when it is anything but `Namespace(name=literal, ...)`.
+    UserError if the file is missing or is anything but `Namespace(name=literal, ...)`.
     """
     path = Path(model_path) / "cfg_args"
     if not Path(model_path).is_dir():
-        raise UserError(f"no such model folder: {model_path}; give -m the folder that train.py wrote")
+        raise UserError(f"no such model folder: {model_path}; pass the folder that train.py wrote as -m")
     if not path.is_file():
-        raise UserError(f"no cfg_args in {model_path}; give -m the folder that train.py wrote")
+        raise UserError(f"no cfg_args in {model_path}; pass the folder that train.py wrote as -m")
     broken = f"{path} is not one line Namespace(name=value, ...) of plain values; restore it or train again"
     try:
         call = ast.parse(path.read_text(encoding="utf-8").strip(), mode="eval").body
@@ -70,10 +70,11 @@ def write_model_json(
     optimizer_type: str | None = None,
     world_offset: Sequence[float] = (0.0, 0.0, 0.0),
 ) -> None:
-    """Write `model.json`: what cfg_args can't hold, keys sorted. args: model options, of which what differs is kept.
+    """Write `model.json`, the options that cfg_args has no place for, with sorted keys.
 
-    optimizer_type: of the training, None: not told. world_offset: world coordinates of the origin of the model's frame
-    (scene/readers/world_offset.py); kept unless zero.
+    args: model options; those that differ from their default are written. optimizer_type: that of the training; None
+    writes no entry. world_offset: world coordinates of the origin of the model's frame
+    (scene/readers/world_offset.py); zero writes no entry.
     """
     record = {"antialiasing": antialiasing, "seed": seed, "version": VERSION}
     for name, default in _REMEMBERED.items():
@@ -96,16 +97,16 @@ def _write_record(model_path: str | os.PathLike, record: dict[str, Any]) -> None
 
 
 def read_model_json(model_path: str | os.PathLike) -> dict[str, Any]:
-    """Contents of `model.json`, or {} for a model of another program, which has none."""
+    """Read `model.json`; {} if there is none, as in a model of another program. UserError if it is broken."""
     path = Path(model_path) / "model.json"
     if not path.is_file():
         return {}
     try:
         record = read_json(path)
     except (ValueError, RecursionError) as error:
-        raise UserError(f"{path} is not JSON; restore it, or remove it and give --antialiasing yourself") from error
+        raise UserError(f"{path} is not JSON; restore it, or remove it and pass --antialiasing yourself") from error
     if not isinstance(record, dict) or not isinstance(record.get("antialiasing", False), bool):
-        raise UserError(f"{path} does not say antialiasing true or false; restore it, or remove it")
+        raise UserError(f"{path}: antialiasing must be true or false; restore the file, or remove it")
     for name, default in _REMEMBERED.items():
         if type(record.get(name, default)) is not type(default):
             raise UserError(f"{path}: {name} must be {type(default).__name__}, got {record[name]!r}; restore the file")
@@ -120,14 +121,17 @@ def _is_finite(value: Any) -> bool:
 
 
 def read_stored_options(model_path: str | os.PathLike) -> dict[str, Value]:
-    """Model options as far as a model folder has them, in cfg_args and model.json. UserError as both readers."""
+    """Read the model options that a model folder has, in cfg_args and model.json. UserError as in both readers."""
     stored, record = read_cfg_args(model_path), read_model_json(model_path)
     return stored | {name: record[name] for name in _REMEMBERED if name in record}
 
 
 def read_training_options(model_path: str | os.PathLike) -> dict[str, Any]:
-    """All options that a model folder tells of its training: those of cfg_args, and where model.json is there, masks,
-    antialiasing, seed and optimizer_type. UserError as both readers."""
+    """Read all options of its training that a model folder has.
+
+    These are the ones of cfg_args and, if there is a model.json, masks, antialiasing, seed and optimizer_type.
+    UserError as in both readers.
+    """
     stored, record = read_cfg_args(model_path), read_model_json(model_path)
     if record:
         stored |= {name: record.get(name, default) for name, default in _REMEMBERED.items()}
@@ -136,15 +140,15 @@ def read_training_options(model_path: str | os.PathLike) -> dict[str, Any]:
 
 
 def get_combined_args(parser: argparse.ArgumentParser, argv: Sequence[str] | None = None) -> argparse.Namespace:
-    """Parse the command line and fill what it leaves open from the model folder that -m names.
+    """Parse the command line and take options that were not typed from the model folder that -m names.
 
-    Whatever was typed wins; flags can only be switched on. The parser's model options must default to None
-    (`ModelParams(parser, sentinel=True)`). `typed_sh_degree` is the degree that was typed, or None: a saved PLY may be
-    of another than cfg_args. UserError without -m or without a readable cfg_args.
+    Typed options win; flags can only be switched on. The parser's model options must default to None
+    (`ModelParams(parser, sentinel=True)`). `typed_sh_degree` is the degree that was typed, or None, since a saved PLY
+    may have another degree than cfg_args. UserError without -m or without a readable cfg_args.
     """
     args = parser.parse_args(argv)
     if not getattr(args, "model_path", None):
-        raise UserError("no model folder given; name it with -m")
+        raise UserError("no model folder given; pass it as -m")
     typed = {name: value for name, value in vars(args).items() if value is not None}
     combined = argparse.Namespace(**{**vars(args), **read_stored_options(args.model_path), **typed})
     combined.typed_sh_degree = typed.get("sh_degree")

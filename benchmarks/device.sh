@@ -1,16 +1,17 @@
 #!/usr/bin/env bash
-# Builds, tests and measures on a bare machine that has an NVIDIA GPU, torch for it and nvcc; each call stays well under
-# ten minutes. Nothing is fetched: wheels of what the machine lacks lie in folders .whl* of the repository.
+# Build, test and measure on a bare machine that has an NVIDIA GPU, torch for it, and nvcc. Each call takes well under
+# ten minutes. Nothing is downloaded: wheels of missing packages are read from folders .whl* of the repository.
 #
-#   benchmarks/device.sh test                    GPU tests, then the rasterizer's CPU tests
-#   benchmarks/device.sh sanitize                memcheck and racecheck of the GPU tests on small scenes
-#   benchmarks/device.sh kernels [OPTION...]     python -m benchmarks.kernels.rasterizer OPTION... (--peers gsplat)
-#   benchmarks/device.sh accuracy                python -m benchmarks.accuracy.oracle; its figure is drawn elsewhere from accuracy.json
-#   benchmarks/device.sh train SCENE [OPTION...] python -m benchmarks.scenes.training SCENE OPTION...
-#   benchmarks/device.sh run COMMAND...          anything else, with the extensions built
+#   benchmarks/device.sh test                      GPU tests, then the rasterizer's CPU tests
+#   benchmarks/device.sh sanitize                  memcheck and racecheck of the GPU tests on small scenes
+#   benchmarks/device.sh kernels [OPTION...]       python3 -m benchmarks.kernels.rasterizer OPTION... (--peers gsplat)
+#   benchmarks/device.sh accuracy                  python3 -m benchmarks.accuracy.oracle --json OUT/accuracy.json;
+#                                                  benchmarks.accuracy.figure draws it on a machine with matplotlib
+#   benchmarks/device.sh train SCENE [OPTION...]   python3 -m benchmarks.scenes.training SCENE OPTION...
+#   benchmarks/device.sh run COMMAND...            any other command, after building the extensions
 #
-# Environment: GS_COMMIT (what is measured, where git can't say), OUT (a folder for logs and the built wheels; put those
-# back as build/device/wheels and an unchanged source is not built again).
+# Environment: GS_COMMIT, the commit measured, for a copy without git. OUT, a folder for logs and the built wheels; put
+# the wheels back as build/device/wheels to reuse them while the sources do not change.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 
@@ -20,12 +21,12 @@ out=${OUT:-build/device/out}
 site=$PWD/build/device/site
 mkdir -p "$out" "$site"
 export PYTHONPATH=$site PYTHONUNBUFFERED=1 PATH=$PATH:${CUDA_HOME:-/usr/local/cuda}/bin
-# For a peer that compiles its kernels when first used.
+# gsplat compiles its kernels on first use.
 export MAX_JOBS=${MAX_JOBS:-$(nproc)} TORCH_EXTENSIONS_DIR=$PWD/build/device/torch_extensions
 
 say() { printf '\n== %s (%d s)\n' "$1" "$SECONDS"; }
 
-# Wheels of what is missing; a version that is there stays.
+# Install wheels of missing packages; keep every version that is installed.
 install_missing() {
   local wheels
   wheels=$(python3 - .whl*/*.whl << 'PYTHON'
@@ -51,7 +52,7 @@ pip_install() {
   python3 -m pip install --quiet --no-index --no-deps --no-compile --no-cache-dir --upgrade --target "$site" "$@"
 }
 
-# The three extensions, at once, into wheels named by a hash of all that goes into them.
+# Build the three extensions in parallel, as wheels in a folder named by a hash of everything they depend on.
 build() {
   export GS_CUDA=1
   TORCH_CUDA_ARCH_LIST=${TORCH_CUDA_ARCH_LIST:-$(python3 -c \
@@ -77,7 +78,7 @@ build() {
     mv "$new" "$wheels"
   fi
   pip_install "$wheels"/*.whl
-  # Tests would only skip what is not there.
+  # Fail here: tests would silently skip missing kernels.
   python3 - << 'PYTHON'
 import sys
 
@@ -126,7 +127,7 @@ test_all() {
   return $status
 }
 
-# Without torch's pool of memory, or an access beyond an allocation would fall into a neighbour.
+# Switch torch's memory pool off, or an access beyond an allocation would hit a neighbour and go unnoticed.
 sanitize() {
   local tool gpu status=0
   gpu=$(grep -lE 'mark\.gpu|GPU_MARKS|_AND_GPU' tests/test_*.py)

@@ -1,6 +1,10 @@
-"""What the benchmarks count and read, held to plain loops."""
+"""Benchmarks: counts against plain loops, short names of kernels, `-h` of every command, imports between rooms."""
 
+import ast
+import importlib
 import math
+import sys
+from pathlib import Path
 
 import pytest
 
@@ -9,6 +13,24 @@ from benchmarks.harness.timing import short_name
 from benchmarks.kernels.fragments import TILE, fragments, processed_per_tile
 from benchmarks.kernels.host_ops import NODE, calls_per_iteration, operator_calls
 from benchmarks.workloads.splat_scenes import frustum
+
+BENCHMARKS = Path(__file__).resolve().parents[1] / "benchmarks"
+MODULES = sorted(path for path in BENCHMARKS.glob("*/*.py") if path.name != "__init__.py")
+COMMANDS = [path for path in MODULES if '__name__ == "__main__"' in path.read_text()]
+# The rooms that a room may import, besides itself.
+MAY_IMPORT = {
+    "workloads": set(),
+    "harness": {"workloads"},
+    "peers": {"harness", "workloads"},
+    "kernels": {"peers", "harness", "workloads"},
+    "accuracy": {"harness", "workloads"},
+    "costs": {"harness", "workloads"},
+    "scenes": {"harness", "workloads"},
+}
+
+
+def _name(path: Path) -> str:
+    return f"benchmarks.{path.parent.name}.{path.stem}"
 
 
 def test_fragments_are_those_of_a_loop_over_pixels():
@@ -44,10 +66,34 @@ def test_short_names(name, short):
 
 
 def test_an_iteration_makes_few_calls(colmap_scene):
-    """A step bound by the host gets slower with each: whoever adds some should know."""
+    """Each call slows a step that is bound by the host, so whoever adds calls should know."""
     calls = calls_per_iteration("-s", str(colmap_scene), "-r", "24")
     for op in ("rasterize", "rasterize_vjp", "adam_", "observe_"):
         assert calls[f"diff_gaussian_rasterization::{op}"] == 1, op
     assert calls["fused_ssim::photometric"] == calls["fused_ssim::photometric_vjp"] == 1
     assert calls[NODE] <= 8  # two ops, five parameters with a gradient and the screen means
     assert operator_calls(calls) <= 90  # 62, and some 20 for the order of the views, drawn once an epoch of 17
+
+
+@pytest.mark.parametrize("path", COMMANDS, ids=_name)
+def test_every_command_answers_h(path, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", [path.name, "-h"])
+    with pytest.raises(SystemExit) as stopped:
+        importlib.import_module(_name(path)).main()
+    assert stopped.value.code == 0
+    assert capsys.readouterr().out.startswith(f"usage: {path.name} [-h]")
+
+
+@pytest.mark.parametrize("path", COMMANDS, ids=_name)
+def test_every_command_shows_how_it_is_run(path):
+    assert f"python -m {_name(path)} " in ast.get_docstring(ast.parse(path.read_text()))
+
+
+@pytest.mark.parametrize("path", MODULES, ids=_name)
+def test_rooms_import_only_the_rooms_below_them(path):
+    source = path.read_text()
+    assert "sys.path" not in source
+    imports = [node for node in ast.walk(ast.parse(source)) if isinstance(node, ast.ImportFrom | ast.Import)]
+    modules = [getattr(node, "module", None) or alias.name for node in imports for alias in node.names]
+    rooms = {module.split(".")[1] for module in modules if module.startswith("benchmarks.")}
+    assert rooms <= {path.parent.name, *MAY_IMPORT[path.parent.name]}

@@ -1,4 +1,4 @@
-"""Tests of what docs/results/costs.md says without a clock, and of the means it measures with."""
+"""Costs of features that are off: the claims of docs/results/costs.md that need no clock, and its ways to measure."""
 
 import json
 import math

@@ -1,6 +1,6 @@
 #pragma once
-// What takes the place of csrc/math/exp2.h in the build that benchmarks/accuracy/exact_exponential.py makes: the same functions
-// by the library's exponential, lane by lane.
+// Replaces csrc/math/exp2.h in the build that benchmarks/accuracy/exact_exponential.py makes: the same functions, but
+// each lane is computed by the standard library's exponential.
 #include <cmath>
 #include <cstring>
 
@@ -28,7 +28,7 @@ inline V exp2_lanes(V t, double) {
   return exp2_by_library<V, double>(t);
 }
 
-// CUDA's own exp2f is the fast instruction with a wider range: the double one, rounded once.
+// CUDA's exp2f is the fast instruction with a wider range, so take the double function and round once.
 GS_HD float exp2_device(float t) { return float(std::exp2(double(t))); }
 
 GS_ISA_END

@@ -1,8 +1,7 @@
-"""A second build of the rasterizer, with the library's exponential in place of the fast one of csrc/math/exp2.h.
+"""A second build of the rasterizer, with the standard library's exponential instead of the fast one in math/exp2.h.
 
-The shipped code has no switch for it: the sources are copied under build/, that one header is replaced by
-exact_exp2.h, and the copy is built there. Two builds register the same operators, so each needs a process
-of its own.
+The shipped code has no switch for this. The sources are copied under build/, exact_exp2.h replaces that one header, and
+the copy is built there. Both builds register the same operators, so each needs its own process.
 """
 
 import hashlib
@@ -25,12 +24,12 @@ BUILDS = ROOT / "build" / "exact_exponential"
 
 
 def build() -> Path:
-    """A folder for PYTHONPATH with the package `diff_gaussian_rasterization` of that build.
+    """Build the second rasterizer and return the folder of its package, to be put on PYTHONPATH.
 
-    Built when the sources, the compiler's environment or torch have changed. UserError where that fails.
+    Builds again only when the sources, the compiler's environment or torch have changed. UserError if the build fails.
     """
     environment = dict(os.environ)
-    if compute_device().type == "cuda":  # what is installed has CUDA: so must this, for the GPU at hand
+    if compute_device().type == "cuda":  # the installed build has CUDA, so this one needs it too, for the same GPU
         environment.setdefault("TORCH_CUDA_ARCH_LIST", "{}.{}".format(*torch.cuda.get_device_capability()))
         environment["GS_CUDA"] = "1"
     target = BUILDS / _key(environment)
@@ -42,14 +41,14 @@ def build() -> Path:
             done = subprocess.run(command, cwd=copy, env=environment, capture_output=True, text=True)
             if done.returncode:
                 said = (done.stdout + done.stderr)[-4000:]
-                raise UserError(f"the rasterizer with the exact exponential did not build; the end of it:\n{said}")
+                raise UserError(f"building the rasterizer with the exact exponential failed; its output ends:\n{said}")
             shutil.rmtree(copy / "build")
             copy.parent.rename(target)
     return target / EXTENSION
 
 
 def copy_sources(to: Path) -> Path:
-    """Copy the extension and what it is built with into `to`, with the header replaced; the extension's folder."""
+    """Copy the extension and its build files into `to`, replace the header, and return the extension's folder."""
     ignored = shutil.ignore_patterns(*NOT_BUILT, "*.egg-info", "*.so", "__pycache__")
     for name in ("common", EXTENSION):
         shutil.copytree(ROOT / "submodules" / name, to / name, ignore=ignored)
@@ -58,7 +57,7 @@ def copy_sources(to: Path) -> Path:
 
 
 def _key(environment: dict[str, str]) -> str:
-    """A hash of everything that the build depends on."""
+    """Hash everything that the build depends on."""
     hashed = hashlib.sha256(f"{sys.version} {torch.__version__}".encode())
     for name in ("CXX", "CUDA_HOME", "GS_CUDA", "TORCH_CUDA_ARCH_LIST"):
         hashed.update(f" {name}={environment.get(name)}".encode())

@@ -1,4 +1,4 @@
-"""Draws error against run time from what accuracy.py measured.
+"""Draw error against run time, from the file that `benchmarks.accuracy.oracle --json` wrote.
 
 python -m benchmarks.accuracy.figure accuracy.json docs/accuracy.png
 """
@@ -24,15 +24,15 @@ MARKERS = {
 
 
 def require_matplotlib() -> None:
-    """UserError where it is missing."""
+    """Raise UserError if matplotlib is missing."""
     if importlib.util.find_spec("matplotlib") is None:
         raise UserError(
-            "drawing needs matplotlib: `pip install matplotlib`, or give --json and draw on another machine"
+            "drawing needs matplotlib: `pip install matplotlib`, or use --json here and draw on another machine"
         )
 
 
 def draw(measured: dict, path: Path) -> None:
-    """A panel for each scene and setting of antialiasing: a column of marks for each kernel at its time."""
+    """Draw a panel per scene and antialiasing setting; each kernel is a column of marks at its run time."""
     require_matplotlib()
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
@@ -44,7 +44,7 @@ def draw(measured: dict, path: Path) -> None:
     panels = figure.subplots(2, len(sizes), sharex="col", sharey=True)
     for row, antialiasing in enumerate((False, True)):
         for panel, scene in zip(panels[row], sizes, strict=True):
-            times = [r["milliseconds"] for r in records if r["scene"] == scene]  # of both rows: they share the axis
+            times = [r["milliseconds"] for r in records if r["scene"] == scene]  # both rows share the time axis
             for record in records:
                 if (record["scene"], record["antialiasing"]) == (scene, antialiasing):
                     _draw_record(panel, record, (max(times) / min(times)) ** 0.01)
@@ -73,7 +73,10 @@ def draw(measured: dict, path: Path) -> None:
 
 
 def _draw_record(panel, record: dict, apart: float) -> None:
-    """The quantities side by side (times `apart`) around the run's time, each from its median to its largest error."""
+    """Draw the run's quantities next to each other around its time, each from its median to its largest error.
+
+    apart: ratio of the positions of neighbours on the logarithmic axis.
+    """
     color = COLORS[record["kernel"]]
     face = color if record["exponential"] == "fast" else "white"
     for i, (name, marker) in enumerate(MARKERS.items()):
@@ -87,8 +90,8 @@ def _draw_record(panel, record: dict, apart: float) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("measured", type=Path, help="what accuracy.py --json wrote")
-    parser.add_argument("figure", type=Path, help="the picture to write")
+    parser.add_argument("measured", type=Path, help="file written by benchmarks.accuracy.oracle --json")
+    parser.add_argument("figure", type=Path, help="image file to write")
     args = parser.parse_args()
     draw(json.loads(args.measured.read_text()), args.figure)
 

@@ -1,9 +1,9 @@
-"""The rasterizer's kernels on the accuracy benchmark's scenes: what they give, and how long they take.
+"""Results and run times of the rasterizer's kernels on the scenes of the accuracy benchmark.
 
     python -m benchmarks.accuracy.kernel_runs MASKS RUNS [--times]
 
-is how accuracy.py runs a build that is not the installed one: MASKS and RUNS are torch files of what `run_all` takes
-and gives; the build is the first on PYTHONPATH, and RUNS says where it lies.
+oracle.py uses this command to measure a build other than the installed one: the first one on PYTHONPATH. MASKS and RUNS
+are torch files with the argument and the result of `run_all`; RUNS also holds the path of the build.
 """
 
 import argparse
@@ -21,8 +21,8 @@ from benchmarks.harness.timing import cpu_milliseconds, gpu_time
 from benchmarks.workloads.splat_scenes import KINDS, PARAMETERS, SplatScene
 from utils.system_utils import compute_device
 
-# The oracle bears thousands of splats on a thumbnail, whose time would be that of the calls' overhead. So times are
-# taken on more splats of the same family, drawn at a size at which work prevails on a GPU as well.
+# The oracle can only do thousands of splats on a small image, where the overhead of the calls would dominate the time.
+# Times are therefore taken on more splats of the same family, at a size where work dominates on a GPU as well.
 TIMED_SIZES = {
     "ordinary": (200_000, 1200, 900),
     "needles": (20_000, 1200, 900),
@@ -33,14 +33,14 @@ PLANES = ("image", "inverse depth", "transmittance")
 
 
 class Case(NamedTuple):
-    """What is rendered."""
+    """A scene and a setting to render it with."""
 
-    kind: str  # of KINDS
+    kind: str  # a key of KINDS
     antialiasing: bool
 
 
 class Kernel(NamedTuple):
-    """What renders it."""
+    """A device and a dtype to render with."""
 
     device: str
     dtype: torch.dtype
@@ -52,8 +52,8 @@ class Kernel(NamedTuple):
 class Run(NamedTuple):
     """A kernel's result for a case."""
 
-    tensors: dict[str, Tensor]  # planes with the pixels left out at zero, and gradients, by name; on the CPU
-    milliseconds: float | None  # forward + backward of the timed scene; None unless asked for
+    tensors: dict[str, Tensor]  # by name, on the CPU: planes, zero at the pixels left out, and gradients
+    milliseconds: float | None  # forward + backward of the timed scene; None unless timed
 
 
 CASES = [Case(kind, antialiasing) for antialiasing in (False, True) for kind in KINDS]
@@ -62,12 +62,12 @@ CUDA_FLOAT = Kernel("cuda", torch.float32)
 
 
 def kernels() -> list[Kernel]:
-    """Those of this build that can run here."""
+    """List the kernels of this build that can run on this machine."""
     return [CPU_FLOAT, CPU_DOUBLE, *([CUDA_FLOAT] if compute_device().type == "cuda" else [])]
 
 
 def run_oracle(case: Case) -> tuple[dict[str, Tensor], Tensor]:
-    """What `Run.tensors` should be, and which pixels count, (H, W) bool."""
+    """Return the true values of `Run.tensors`, and the pixels that count, (H, W) bool."""
     scene = KINDS[case.kind]()
     leaves, means2d, settings, named = _arguments(scene, CPU_DOUBLE, case.antialiasing)
     out = reference.render(leaves["means"], means2d, leaves["opacities"], settings, **named)
@@ -77,7 +77,7 @@ def run_oracle(case: Case) -> tuple[dict[str, Tensor], Tensor]:
 
 
 def run_all(masks: dict[Case, Tensor], times: bool) -> dict[tuple[Case, Kernel], Run]:
-    """Every kernel on every case of `masks` (which pixels count), with times if asked for."""
+    """Run every kernel on every case of `masks` ((H, W) bool: the pixels that count), with times if `times`."""
     jobs = [(case, kernel) for case in masks for kernel in kernels()]
     bar = tqdm(jobs, desc="Kernels", unit="run", leave=False)
     return {
@@ -96,7 +96,7 @@ def _tensors(case: Case, kernel: Kernel, keep: Tensor) -> dict[str, Tensor]:
 
 
 def _arguments(scene: SplatScene, kernel: Kernel, antialiasing: bool) -> tuple:
-    """Leaves, means2d, settings and the named arguments. The camera is float64 for all: each kernel rounds it."""
+    """Return leaves, means2d, settings and named arguments. The camera is float64; each kernel rounds it."""
     leaves = scene.leaves(kernel.dtype)
     named = {name: leaves[name] for name in ("scales", "rotations", "sh_dc", "sh_rest")} | {"raw": True}
     means2d = torch.zeros_like(leaves["means"], requires_grad=True)
@@ -106,7 +106,7 @@ def _arguments(scene: SplatScene, kernel: Kernel, antialiasing: bool) -> tuple:
 def _differentiate(
     planes: tuple[Tensor, ...], keep: Tensor, leaves: dict[str, Tensor], means2d: Tensor
 ) -> dict[str, Tensor]:
-    """Planes, and the gradients of their sum with fixed random weights over the pixels that count."""
+    """Return the planes, and the gradients of their sum over the pixels that count, with fixed random weights."""
     generator = torch.Generator().manual_seed(7)
     weights = [torch.randn(plane.shape, generator=generator, dtype=torch.float64).to(plane) for plane in planes]
     sum((plane * weight * keep).sum() for plane, weight in zip(planes, weights, strict=True)).backward()
@@ -116,7 +116,7 @@ def _differentiate(
 
 
 def _milliseconds(case: Case, kernel: Kernel) -> float:
-    """Of an image's forward and backward: on a GPU the call with the host's part, by events."""
+    """Time forward and backward of one image; on a GPU by events, which include the host's part of the call."""
     scene = KINDS[case.kind](*TIMED_SIZES[case.kind]).to(kernel.device)
     call = Calls(scene, kernel.dtype, case.antialiasing).with_backward
     return gpu_time(call).events if kernel.device == "cuda" else cpu_milliseconds(call, CPU_REPEATS)
@@ -124,7 +124,7 @@ def _milliseconds(case: Case, kernel: Kernel) -> float:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("masks", type=Path, help="torch file with the pixels that count, by case")
+    parser.add_argument("masks", type=Path, help="torch file with the pixels that count in each case")
     parser.add_argument("runs", type=Path, help="torch file to write the runs to")
     parser.add_argument("--times", action="store_true", help="time the kernels as well")
     args = parser.parse_args()

@@ -1,19 +1,19 @@
 """Error of every output and every gradient of the rasterizer against the float64 oracle, and against run time.
 
-    python -m benchmarks.accuracy.oracle                                          # the errors
-    python -m benchmarks.accuracy.oracle --figure docs/accuracy.png               # and error against run time
-    python -m benchmarks.accuracy.oracle --json accuracy.json                     # the same as numbers, where there is
-    python -m benchmarks.accuracy.figure accuracy.json docs/accuracy.png   # no matplotlib; drawn elsewhere
+    python -m benchmarks.accuracy.oracle                                    # print the errors
+    python -m benchmarks.accuracy.oracle --figure docs/accuracy.png         # and draw error against run time
+    python -m benchmarks.accuracy.oracle --json accuracy.json               # and write the numbers; a machine with
+    python -m benchmarks.accuracy.figure accuracy.json docs/accuracy.png    # matplotlib can draw them
 
-Error of a tensor = max |difference| / max |reference|, the median of |difference| / max |reference| beside it. Pixels
-within 1e-4 of a cut-off (alpha 1/255, transmittance 1e-4) or under a depth tie, where rounding alone may decide, are
-counted in their own row and left out of the loss and the comparison. The oracle gets the float32 values of every
-parameter, so all kernels answer the same question: those of the CPU, and of a GPU where there is one.
+The error of a tensor is max |difference| / max |reference|; the median of |difference| / max |reference| stands beside
+it. Rounding alone can decide a pixel that is within 1e-4 of a cut-off (alpha 1/255, transmittance 1e-4) or that has a
+depth tie. Such pixels are left out of the loss and of the comparison; a row of the table counts them. The oracle gets
+the float32 value of every parameter, so the kernels of CPU and GPU all compute the same function.
 
-With --figure or --json each kernel is timed as well, and a second build of the rasterizer with the library's
-exponential in place of the fast one is measured beside the installed one (made under build/ when first used; see
-exact_exponential.py). Errors are those of the small scenes that the oracle can bear; the time beside an error is that
-of forward and backward of an image on a larger scene of the same family (TIMED_SIZES in kernel_runs.py).
+--figure and --json also time each kernel, and also measure a second build of the rasterizer that has the standard
+library's exponential instead of the fast one (exact_exponential.py builds it under build/ on first use). Errors come
+from scenes small enough for the oracle. The time beside an error is forward and backward of one image of a larger scene
+of the same family (TIMED_SIZES in kernel_runs.py).
 """
 
 import argparse
@@ -49,20 +49,20 @@ from utils.system_utils import run_cli
 ROOT = Path(__file__).resolve().parents[2]
 Runs = dict[tuple[Case, Kernel], Run]
 
-# CUDA float against CPU double: how far above CPU float it may be.
+# Wanted bound on the error of CUDA float over the error of CPU float, both measured against CPU double.
 MOST = 3.0
-# Errors under this are a few units in the last place, where one rounding more decides a ratio.
+# Errors below this are a few units in the last place, where a single rounding changes the ratio.
 SMALL = 1e-6
 
 
 def error(got: Tensor, wanted: Tensor) -> tuple[float, float]:
-    """Largest and median |difference| over the largest |wanted|."""
+    """Return the largest and the median |difference|, both divided by the largest |wanted|."""
     difference, scale = (got.double() - wanted.double()).abs(), wanted.double().abs().max().clamp_min(1e-300)
     return float(difference.max() / scale), float(difference.median() / scale)
 
 
 def run_exact(masks: dict[Case, Tensor]) -> Runs:
-    """`run_all` with times in the build with the exact exponential, in a process of its own."""
+    """Call `run_all` with times in a new process, with the build that has the exact exponential."""
     package = exact_exponential.build()
     path = os.pathsep.join([str(package), str(ROOT), os.environ.get("PYTHONPATH", "")]).rstrip(os.pathsep)
     with tempfile.TemporaryDirectory() as folder:
@@ -76,7 +76,7 @@ def run_exact(masks: dict[Case, Tensor]) -> Runs:
 
 
 def measure(times: bool) -> tuple[list[dict], dict[Case, Runs]]:
-    """A record for each run (as --json writes them), and the installed build's runs."""
+    """Return a record per run, as --json writes them, and the runs of the installed build."""
     oracle = {case: run_oracle(case) for case in tqdm(CASES, desc="Oracle", unit="scene", leave=False)}
     masks = {case: keep for case, (_, keep) in oracle.items()}
     fast = run_all(masks, times)
@@ -100,7 +100,7 @@ def measure(times: bool) -> tuple[list[dict], dict[Case, Runs]]:
 
 
 def print_errors(records: list[dict]) -> None:
-    """A table of largest (median) errors for each setting of antialiasing and exponential."""
+    """Print a table of largest (median) errors for each exponential and antialiasing setting."""
     for exponential in dict.fromkeys(r["exponential"] for r in records):
         for antialiasing in (False, True):
             chosen = [r for r in records if (r["exponential"], r["antialiasing"]) == (exponential, antialiasing)]
@@ -118,7 +118,7 @@ def print_errors(records: list[dict]) -> None:
 
 
 def print_ratios(runs: Runs) -> None:
-    """CUDA float beside CPU float, the largest errors of both against CPU double."""
+    """Print the largest errors of CUDA float and CPU float, both against CPU double, and their ratio."""
     rows, ratios = [], {}
     for name in next(iter(runs.values())).tensors:
         row = [name]
@@ -137,8 +137,8 @@ def print_ratios(runs: Runs) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--figure", type=Path, help="time the kernels too and draw error against time to this file")
-    parser.add_argument("--json", type=Path, help="time the kernels too and write all that was measured to this file")
+    parser.add_argument("--figure", type=Path, help="also time the kernels, and draw error against time to this file")
+    parser.add_argument("--json", type=Path, help="also time the kernels, and write every measurement to this file")
     args = parser.parse_args()
     if args.figure:
         require_matplotlib()

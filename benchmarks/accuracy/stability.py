@@ -1,15 +1,20 @@
-"""Error of the rasterizer on stiff and extreme cases, beside that of the textbook's formulas in float32.
+"""Error of the rasterizer on stiff and extreme cases, beside the error of the textbook formulas in float32.
 
     python -m benchmarks.accuracy.stability [--only TEXT] [--json FILE]
 
-Each case (stability_cases.py) is a scene with ordinary and stiff Gaussians. Judge is the float64 oracle on the same
-float32 values. Error of a plane or gradient = max |difference| / max |reference|, over the pixels that no stiff
-Gaussian reaches and those that one does, or over ordinary and stiff Gaussians; where all of a part's reference is under
-1e-9 of the tensor's, the tensor's largest value divides. A median is over Gaussians: |difference| / |reference| of
-each one's gradient, those under 1e-6 of the largest left out. Pixels within `cut` of a cut-off or of a depth tie, where
-rounding may decide, count neither in the loss nor in the comparison. "inf" means NaN or Inf. "One rounding": what the
-oracle's own result changes by when every parameter is off by 2^-24 of itself and the camera is rounded to float32, so
-what no float32 arithmetic can promise to stay under.
+Each case (stability_cases.py) is a scene with ordinary and stiff Gaussians. The reference is the float64 oracle on the
+same float32 values.
+
+- The error of a plane is max |difference| / max |reference|, once over the pixels that a stiff Gaussian reaches and
+  once over the others. The error of a gradient is split into stiff and ordinary Gaussians likewise.
+- If the reference of such a part is everywhere below 1e-9 of the tensor's largest value, that value is the divisor.
+- A median is taken over Gaussians, of |difference| / |reference| of each one's gradient; gradients below 1e-6 of the
+  largest are left out.
+- Rounding alone can decide a pixel within `cut` of a cut-off or with a depth tie. Such pixels are left out of the loss
+  and of the comparison.
+- "inf" stands for NaN or Inf.
+- "One rounding" is how much the oracle's own result changes when every parameter is off by 2^-24 of itself and the
+  camera is rounded to float32. No float32 arithmetic can promise a smaller error.
 """
 
 import argparse
@@ -36,26 +41,28 @@ PARTS = ("ordinary", "stiff")
 
 
 class Error(NamedTuple):
-    """Of one part of a tensor; NaN where the part is empty."""
+    """Errors of one part of a tensor; NaN if the part is empty."""
 
     largest: float
     median: float
 
 
 class Result(NamedTuple):
-    """What a backend made of a case: errors by part and name."""
+    """Errors of a backend on a case, by name and part."""
 
-    finite: bool
+    finite: bool  # no NaN or Inf in any plane or gradient
     planes: dict[str, dict[str, Error]]
     gradients: dict[str, dict[str, Error]]
     milliseconds: float = math.nan
 
     def worst(self, kind: str, part: str) -> float:
-        """Of all `planes` or `gradients`; NaN where the part is empty."""
+        """Return the largest error of all `planes` or `gradients` (`kind`); NaN if the part is empty."""
         return max(e[part].largest for e in getattr(self, kind).values())
 
 
 class Backend(NamedTuple):
+    """A renderer with the dtype and device that it runs in."""
+
     name: str
     render: Callable
     dtype: torch.dtype
@@ -70,7 +77,7 @@ ORACLE = Backend("oracle", reference.render, torch.float64, "cpu")
 
 
 class Judged:
-    """A case with what the oracle says: run backends against it."""
+    """A case with the oracle's planes and gradients, which the results of backends are compared with."""
 
     def __init__(self, case: Case) -> None:
         self.problem = case.problem()
@@ -88,12 +95,12 @@ class Judged:
         self.pixels_left_out = int((~self.keep).sum())
 
     def result(self, backend: Backend) -> Result:
-        """How far a backend is off."""
+        """Return the errors of a backend."""
         planes, gradients, _ = _run(self.problem, backend, keep=self.keep)
         return self._compare(planes, gradients)
 
     def one_rounding(self) -> Result:
-        """How far the oracle is off when its inputs are by one rounding of float32."""
+        """Return the errors of the oracle when its inputs are off by one float32 rounding."""
         present = ~self.problem.absent
         planes, gradients, _ = _run(_nudged(self.problem), ORACLE, rows=present, keep=self.keep)
         return self._compare(planes, {name: _spread(g, present) for name, g in gradients.items()})
@@ -115,7 +122,7 @@ class Judged:
         return Result(bool(finite), by_plane, by_name)
 
     def milliseconds(self, backend: Backend) -> float:
-        """Of forward and backward, the least of three: of a case's few splats, so mostly the call itself."""
+        """Time forward and backward, least of three. A case has few splats, so this is mostly the call's overhead."""
         times = []
         for _ in range(3):
             start = time.perf_counter()
@@ -125,7 +132,7 @@ class Judged:
 
 
 def _nudged(problem: Problem) -> Problem:
-    """Each parameter off by one rounding of float32, 2^-24 of itself either way, and the camera rounded to float32."""
+    """Change each parameter by 2^-24 of itself, up or down at random, and round the camera to float32."""
     g = torch.Generator().manual_seed(3)
     parameters = {
         name: t.double() * (1 + 2.0**-24 * (2 * torch.randint(0, 2, t.shape, generator=g) - 1))
@@ -137,7 +144,11 @@ def _nudged(problem: Problem) -> Problem:
 
 
 def _run(problem: Problem, backend: Backend, rows: Tensor | None = None, keep: Tensor | None = None, cut: float = 0.0):
-    """Planes and gradients by name, on the CPU, and the pixels that count; `rows` (N,) bool: these Gaussians alone."""
+    """Return planes and gradients by name, on the CPU, and the pixels that count.
+
+    rows: (N,) bool, the Gaussians to render (default: all). keep: the pixels that count, by default those that the
+    oracle finds farther than `cut` from a cut-off.
+    """
     device = backend.device
     chosen = {k: t if rows is None else t[rows] for k, t in problem.parameters.items()}
     leaves = {k: t.to(device, backend.dtype, copy=True).requires_grad_() for k, t in chosen.items()}
@@ -201,7 +212,7 @@ def _row_error(got: Tensor, wanted: Tensor, where: Tensor) -> Error:
 
 
 def backends() -> list[Backend]:
-    """Those that this machine and build offer."""
+    """List the backends that this machine and build offer."""
     cuda = torch.cuda.is_available() and torch._C._dispatch_has_kernel_for_dispatch_key(
         "diff_gaussian_rasterization::rasterize", "CUDA"
     )
@@ -269,7 +280,7 @@ def _as_json(result: Result) -> dict:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--json", type=Path, help="also write every error to this file (default: none)")
-    parser.add_argument("--only", default="", help="measure the cases with this in group or name (default: all)")
+    parser.add_argument("--only", default="", help="measure the cases whose group or name contains this (default: all)")
     args = parser.parse_args()
     used = backends()
     machine = describe(CUDA_FLOAT.device if CUDA_FLOAT in used else "cpu")

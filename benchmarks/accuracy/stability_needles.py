@@ -1,8 +1,9 @@
-"""Along needles, by length: error of the exponent, and of the 2D covariance's gradient with the splats taken as exact.
+"""Errors along needles, by their length: of the exponent, and of the gradient of the 2D covariance.
 
-The exponent, log2 of alpha, is read off the rendered transmittance of one needle at a time, so what a user sees; judge
-is the oracle. Of the gradient this leaves out what rounding of the inputs has done before: the float32 splats that
-`project` made are the truth, judge is autograd in float64 on the definition, with those means and covariances.
+The exponent is log2 of alpha. It is computed from the rendered transmittance of one needle at a time, so it is what a
+user sees; the reference is the oracle. The gradient is measured without the rounding of the inputs: the float32 splats
+that `project` returned count as exact, and the reference is autograd in float64 on the definition of the image, with
+their means and covariances.
 """
 
 import math
@@ -20,7 +21,7 @@ _HALF_LOG2E = 0.5 / math.log(2)
 
 
 class NeedleError(NamedTuple):
-    """Ours and the textbook's in float32, needles of sigma low to high px."""
+    """Errors of our kernels and of the textbook formulas in float32, on needles of sigma low to high px."""
 
     low: float
     high: float
@@ -31,18 +32,19 @@ class NeedleError(NamedTuple):
 
 
 def needle_error(low: float, high: float, count: int = 20) -> NeedleError:
+    """Measure `count` needles of sigma low to high px."""
     make, camera = long_needles(count, low, high)
     parameters = make(torch.Generator().manual_seed(int(low)))
     exponents = [_exponents(parameters, camera, f) for f in (reference.render, rasterize, textbook.render)]
     wanted, ours, theirs = exponents
-    # Where alpha is neither near a cut nor so near 1 that 1 - T has lost it; what 1 - T rounds is 1e-5 at 0.01.
+    # Alpha must not be near the cut-off, nor so near 1 that 1 - T loses digits. At alpha 0.01, 1 - T rounds by 1e-5.
     seen = (wanted > math.log2(0.01)) & (wanted < math.log2(0.97))
     largest = [float((e - wanted)[seen].abs().nan_to_num(nan=math.inf, posinf=math.inf).max()) for e in (ours, theirs)]
     return NeedleError(low, high, *largest, *_gradient_errors(parameters, camera))
 
 
 def _exponents(parameters: dict[str, Tensor], camera, render) -> Tensor:
-    """(n, H, W) float64 log2 alpha of each needle alone; -inf where it is not blended."""
+    """Render each needle alone; return log2 of its alpha, (n, H, W) float64, -inf where it is not blended."""
     rows = []
     for i in range(len(parameters["means"])):
         one = {name: t[i : i + 1] for name, t in parameters.items()}
@@ -69,7 +71,7 @@ def _gradient_errors(parameters: dict[str, Tensor], camera) -> tuple[float, floa
     _, transmittance, _, last = _OPS.blend(splats, instances, ranges, background, height, width, False, True)
     state = (splats, instances, ranges, *slots, background, last, transmittance)
     quu, quv, qvv = _OPS.blend_vjp(*state, weights.float(), None, None)[order, 3:6].double().unbind(1)
-    uu, uv = quu * l11, quv * l11  # the gradient of a symmetric matrix, 2 ln2^2 L^T W2 L, xy standing for two entries
+    uu, uv = quu * l11, quv * l11  # gradient of a symmetric matrix, 2 ln2^2 L^T W2 L; xy stands for two entries
     vu, vv = quu * l12 + quv * l22, quv * l12 + qvv * l22
     ours = 2 * math.log(2) ** 2 * torch.stack([l11 * uu, 2 * (l12 * uu + l22 * uv), l12 * vu + l22 * vv], 1)
 
@@ -82,8 +84,11 @@ def _gradient_errors(parameters: dict[str, Tensor], camera) -> tuple[float, floa
 def _definition(
     rows: Tensor, covariance: Tensor, height: int, width: int, weights: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
-    """The gradient of covariances (n, 3) xx xy yy for a weighted sum of the image of splats in depth order, with the
-    conic by the textbook, in their dtype; and the weights (3, H, W), random but 0 near a cut-off."""
+    """Return the gradient of a weighted sum of the image's values with respect to the covariances, and the weights.
+
+    rows: splats in depth order; covariance: (n, 3) xx, xy, yy, inverted by the textbook formula in their dtype.
+    weights: (3, H, W); by default random, and 0 near a cut-off.
+    """
     leaf = covariance.clone().requires_grad_()
     a, b, c = leaf.unbind(1)
     det = a * c - b * b

@@ -1,4 +1,4 @@
-"""How many bytes a call takes from torch's allocator, whether or not it gives them back."""
+"""Bytes that a call takes from torch's allocator, whether or not it gives them back."""
 
 from collections.abc import Callable
 
@@ -7,7 +7,7 @@ from torch.profiler import ProfilerActivity, profile
 
 
 def allocated_bytes(run: Callable[[], object], device: torch.device) -> int:
-    """Sum of all allocations within one call, after one to warm up; a GPU's include the kernels' scratch."""
+    """Sum all allocations of one call, after a warm-up call. On a GPU they include the kernels' scratch memory."""
     run()
     if device.type == "cuda":
         before = torch.cuda.memory_stats(device)["requested_bytes.all.allocated"]

@@ -1,11 +1,11 @@
-"""What each feature costs when it is off: time and bytes beside what would run if the code did not know it.
+"""Cost of each feature when it is off: time and bytes, compared with code that does not have the feature.
 
-    python -m benchmarks.costs.measure                           # on the GPU where there is one
+    python -m benchmarks.costs.measure                                  # on the GPU if there is one
     python -m benchmarks.costs.measure --write docs/results/costs.md
 
-Calls are taken in turns; a difference is the median over rounds of the differences within a round, with its 95 %
-interval. It is within noise where that interval holds 0. Bytes are those that one call allocates, and where the row
-says so those that are kept. --write replaces the tables between the device's marks of that page.
+The calls of a row take turns. A difference is the median over rounds of the differences within a round, with its 95 %
+interval; it is within noise if that interval contains 0. Bytes are those that one call allocates, plus, in the rows
+that say so, those that stay allocated. --write replaces the tables between the device's marks in that page.
 """
 
 import argparse
@@ -32,11 +32,11 @@ ROOT = Path(__file__).resolve().parents[2]
 WORKLOADS = {"cpu": (50_000, 400, 400, 2.4), "cuda": (1_000_000, 1600, 1060, 1.7)}
 HEADER = ["feature, off", "compared with", "ms", "ms more than that [95 %]", "", "bytes more"]
 HEADER += ["switched on: ms more", "bytes more"]
-BEGIN, END = "<!-- begin {} -->", "<!-- end {} -->"  # of a device's tables
+BEGIN, END = "<!-- begin {} -->", "<!-- end {} -->"  # marks around a device's tables
 
 
 def measure(row: Row, rounds: int, device: torch.device) -> list[str]:
-    """Cells of a row of the first table."""
+    """Measure a row of the first table and return its cells."""
     calls: dict[str, Callable[[], object]] = {"off": row.off}
     calls |= {name: call for name, call in (("base", row.base), ("on", row.on)) if call is not None}
     times = interleaved(calls, rounds, device)
@@ -61,7 +61,7 @@ def _milliseconds(cost: Interval) -> str:
 
 
 def absent() -> list[list[str]]:
-    """Rows of the second table: what is not there at all."""
+    """Return the rows of the second table: things that do not exist at all when a feature is off."""
     with tempfile.TemporaryDirectory() as folder:
         seen = json.loads(_python("-m", "benchmarks.costs.probe", folder))
     curves = [name for name in seen["files"] if "error_vs_time" in name]
@@ -86,7 +86,7 @@ def absent() -> list[list[str]]:
 
 
 def _import_cost(module: str) -> str:
-    """Time and memory of an import in a process of its own, after Pillow and NumPy."""
+    """Measure time and memory of an import in a new process that has imported Pillow and NumPy."""
     code = f"""
 import re, time
 import numpy
@@ -108,7 +108,7 @@ def _python(*arguments: str) -> str:
 
 
 def _double_bytes() -> tuple[str, int]:
-    """Bytes of the rasterizer's functions for double, by the symbol table, and of the whole library."""
+    """Return the bytes of the rasterizer's functions for double, from the symbol table, and of the whole library."""
     library = Path(ops.__file__).with_name("_backend.so")
     try:
         done = subprocess.run(["nm", "-S", "-C", str(library)], capture_output=True, text=True, check=True)
@@ -126,12 +126,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     add = parser.add_argument
     add("--rounds", type=int, default=41, help="how often each call is timed (default: 41)")
-    add("--splats", type=int, help="size of the model (default: 50,000; on a GPU 1,000,000)")
-    add("--write", type=Path, help="page whose tables are replaced (default: print only)")
+    add("--splats", type=int, help="number of Gaussians in the model (default: 50,000; on a GPU 1,000,000)")
+    add("--write", type=Path, help="page whose tables to replace (default: only print)")
     args = parser.parse_args()
     device = compute_device()
     if args.write and BEGIN.format(device.type) not in (page := args.write.read_text(encoding="utf-8")):
-        raise UserError(f"{args.write} has no line {BEGIN.format(device.type)} after which the tables go")
+        raise UserError(f"{args.write} needs a line {BEGIN.format(device.type)} where the tables go; it has none")
     splats, width, height, sigma = WORKLOADS[device.type]
     splats = args.splats or splats
     work = Workload(splats, width, height, sigma, device)
@@ -146,7 +146,7 @@ def main() -> None:
 
 
 def replace_tables(page: str, device: str, lines: list[str]) -> str:
-    """The page with `lines` between the marks of a device type."""
+    """Return the page with `lines` between the marks of a device type."""
     begin, end = BEGIN.format(device), END.format(device)
     before, _, rest = page.partition(begin)
     return "\n".join([before + begin, *lines, end]) + rest.partition(end)[2]

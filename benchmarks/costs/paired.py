@@ -1,4 +1,4 @@
-"""Two or more calls compared on a machine whose speed drifts: taken in turns, compared round by round."""
+"""Comparison of calls on a machine whose speed drifts: the calls take turns and are compared within each round."""
 
 import math
 import statistics
@@ -10,7 +10,7 @@ import torch
 
 
 class Interval(NamedTuple):
-    """A median and where it lies with 95 % confidence."""
+    """A median with its 95 % confidence interval."""
 
     median: float
     low: float
@@ -18,13 +18,15 @@ class Interval(NamedTuple):
 
     @property
     def within_noise(self) -> bool:
-        """Zero is a possible median."""
+        """Whether 0 is in the interval."""
         return self.low <= 0 <= self.high
 
 
 def interleaved(calls: dict[str, Callable[[], object]], rounds: int, device: torch.device) -> dict[str, list[float]]:
-    """Milliseconds of each call in each round, the device idle before and done after; each round begins with another
-    call. One round before is not counted."""
+    """Return the milliseconds of each call in each round, from an idle device until the device is done.
+
+    Each round starts with the next call in turn. A first round is not counted.
+    """
 
     def once(call: Callable[[], object]) -> float:
         _wait(device)
@@ -44,12 +46,12 @@ def interleaved(calls: dict[str, Callable[[], object]], rounds: int, device: tor
 
 
 def difference(after: Sequence[float], before: Sequence[float]) -> Interval:
-    """Of the median of after - before, round by round."""
+    """Return the interval of the median of after - before within a round."""
     return median_interval([a - b for a, b in zip(after, before, strict=True)])
 
 
 def median_interval(values: Sequence[float]) -> Interval:
-    """The sign test's interval: order statistics, so no distribution is assumed."""
+    """Return the interval of the sign test, which uses order statistics and so assumes no distribution."""
     ordered, n = sorted(values), len(values)
     # The largest k with P(fewer than k of n coins show heads) <= 2.5 %.
     k, probability = 0, 0.5**n

@@ -1,8 +1,9 @@
-"""What a training and a rendering leave alone when they do not need it: modules, sockets, files, test pictures.
+"""Train and render a small scene, and print what that loaded and wrote, as JSON.
 
     python -m benchmarks.costs.probe FOLDER
 
-makes a small Blender scene in FOLDER, trains on it for 3 iterations and renders it, and prints what it saw as JSON.
+makes a small Blender scene in FOLDER, trains on it for 3 iterations and renders it. The output tells which modules,
+sockets, files and test photos were used, and so which of them a run without their feature leaves alone.
 """
 
 import argparse
@@ -39,8 +40,11 @@ def make_scene(folder: Path) -> None:
 
 
 def probe(folder: Path) -> dict:
-    """`modules` loaded of MODULES, `binds`: sockets bound, `files` written, `decoded` pictures by their path, and
-    `picture_bytes`: the memory behind each training picture, of `values` colour values."""
+    """Train and render in `folder`; return what was seen.
+
+    Keys: `modules`, those of MODULES that were loaded; `binds`, the sockets bound; `files`, those written; `decoded`,
+    the paths of decoded photos; `picture_bytes`, the memory of each training image, and `values`, its colour values.
+    """
     scene, model = folder / "scene", folder / "model"
     make_scene(scene)
     binds, decoded = [], []
@@ -82,8 +86,12 @@ def probe(folder: Path) -> dict:
     }
 
 
-if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description="Train and render a small scene; what that loads and writes, as JSON.")
-    parser.add_argument("folder", type=Path, help="folder for the scene and the model; it is made")
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("folder", type=Path, help="new folder for the scene and the model")
     folder = parser.parse_args().folder
     print(json.dumps(probe(folder)), file=sys.__stdout__)  # --quiet has silenced sys.stdout
+
+
+if __name__ == "__main__":
+    main()

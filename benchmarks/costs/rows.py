@@ -1,6 +1,6 @@
-"""Features of docs/results/costs.md whose cost is measured: the call with one switched off, and its counterpart.
+"""Features that could cost something when they are off, each with the call that it is compared with.
 
-To add a feature: a function of `Workload` that returns a `Row`, listed in ROWS.
+To add a feature, write a function that takes a `Workload` and returns a `Row`, and list it in ROWS.
 """
 
 import argparse
@@ -27,19 +27,19 @@ Call = Callable[[], object]
 
 @dataclass
 class Row:
-    """A feature; `base` is what would run if the code did not know it, None where nothing can be without it."""
+    """A feature and the calls to compare."""
 
     feature: str
-    compared: str  # what base is
+    compared: str  # describes base
     off: Call
-    base: Call | None = None
-    on: Call | None = None  # None: there is nothing to switch on in such a call
-    kept: tuple[int, int] = (0, 0)  # bytes that base and off keep beyond the call
-    base_bytes: int | None = None  # allocated, counted by hand; None: measured of base
+    base: Call | None = None  # would run if the code did not have the feature; None: no such call can be built
+    on: Call | None = None  # None: such a call has nothing to switch on
+    kept: tuple[int, int] = (0, 0)  # bytes that base and off keep after the call
+    base_bytes: int | None = None  # bytes that base would allocate, counted by hand; None: measured from base
 
 
 class Workload:
-    """A model seen by a camera, an image to train on, and the operator's arguments as `render` would pass them."""
+    """A model, a camera, an image to train on, and the operator's arguments as `render` would pass them."""
 
     def __init__(self, splats: int, width: int, height: int, sigma: float, device: torch.device) -> None:
         self.device = device
@@ -51,7 +51,7 @@ class Workload:
         s = self.settings
         fov = [2 * torch.atan(torch.tensor(t)).item() for t in (s.tanfovy, s.tanfovx)]
         self.camera = MiniCam(width, height, *fov, 0.01, 100.0, s.viewmatrix, s.projmatrix)
-        self.camera.camera_center = s.campos  # contiguous, as a Camera's
+        self.camera.camera_center = s.campos  # contiguous, as in Camera
         self.camera.exposure_name = "the view"
         generator = torch.Generator().manual_seed(1)
         self.target = torch.randint(0, 256, (3, height, width), dtype=torch.uint8, generator=generator).to(device)
@@ -59,7 +59,7 @@ class Workload:
         self.antialiased = argparse.Namespace(**vars(self.pipe) | {"antialiasing": True})
 
     def model(self, degree: int = 3, active: int = 3) -> GaussianModel:
-        """The model with SH bands up to `degree`, of which those above `active` are zero; ready to be trained."""
+        """Return a model ready for training with SH bands up to `degree`; those above `active` are zero."""
         rows = {name: values.clone() for name, values in self._rows.items()}
         rows["f_rest"] = rows["f_rest"][:, : (degree + 1) ** 2 - 1].contiguous()
         rows["f_rest"][:, (active + 1) ** 2 - 1 :] = 0
@@ -70,13 +70,13 @@ class Workload:
         return model
 
     def image(self, model: GaussianModel, *, pipe: argparse.Namespace | None = None, **options: bool) -> Tensor:
-        """What training and render.py call, with options of `render`."""
+        """Render as training and render.py do, with options of `render`; (3, H, W)."""
         return render(self.camera, model, pipe or self.pipe, self.settings.bg, want_visibility=False, **options)[
             "render"
         ]
 
     def bare_image(self, model: GaussianModel) -> Tensor:
-        """The same image by the rasterizer alone, without anything that `render` adds."""
+        """Render the same image by the rasterizer alone, without anything that `render` adds."""
         means2d = self._zero.expand_as(model.get_xyz)
         means2d.requires_grad_(torch.is_grad_enabled())
         out = rasterize(
@@ -91,7 +91,7 @@ class Workload:
         return out.color.clamp(0, 1)
 
     def step(self, model: GaussianModel) -> None:
-        """A step of training; learning rates are 0, so that every step does the same."""
+        """Do a training step with learning rate 0, so that every step does the same work."""
         for group in model.optimizer.param_groups:
             group["lr"] = 0.0
         photometric_loss(self.image(model), self.target, 0.2)[0].backward()
@@ -106,7 +106,7 @@ def _backward(model: GaussianModel, image: Callable[[], Tensor]) -> None:
 
 
 def control(work: Workload) -> Row:
-    """What the machine's noise looks like in this table."""
+    """Compare a call with itself: the machine's noise in this table."""
     call = torch.no_grad()(partial(work.image, work.model()))
     return Row("nothing (control)", "the same render once more", call, call)
 
@@ -123,8 +123,11 @@ def depth(work: Workload) -> Row:
 
 
 def gradient_buffers(work: Workload) -> Row:
-    """By hand: per splat 10 values, depth, 4 + 2 integers; an index per instance, a range per tile, color and
-    transmittance per pixel. (On a GPU, projection hands on a record in place of 4 integers, of as many bytes.)"""
+    """Compare bytes with a count by hand.
+
+    A splat has 10 values, a depth and 4 + 2 integers; an instance an index; a tile a range; a pixel colour and
+    transmittance. On a GPU, projection writes a record of the same size in place of 4 of the integers.
+    """
     model = work.model()
     with torch.no_grad():
         out = _operator(work, model, train=False)
@@ -135,7 +138,7 @@ def gradient_buffers(work: Workload) -> Row:
     off = torch.no_grad()
     return Row(
         "gradient buffers at inference",
-        "bytes: what the image takes, counted by hand (without a GPU's scratch)",
+        "bytes: those of the image, counted by hand (without a GPU's scratch)",
         off(partial(_operator, work, model, train=False)),
         None,
         off(partial(_operator, work, model, train=True)),
@@ -208,7 +211,7 @@ def inactive_bands(work: Workload) -> Row:
 
 def unneeded_bands(work: Workload) -> Row:
     model = work.model(degree=3, active=1)
-    model.active_sh_degree = 3  # as a PLY is loaded
+    model.active_sh_degree = 3  # as after loading a PLY
     pruned, off = model.part(slice(None), 1), torch.no_grad()
     return Row(
         "SH bands above the needed degree (1 of 3)",

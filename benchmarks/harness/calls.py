@@ -1,4 +1,4 @@
-"""The rasterizer's calls on one scene, as training makes them, ready to be timed."""
+"""The rasterizer's calls on one scene, as training makes them, for timing."""
 
 from collections.abc import Callable
 
@@ -12,7 +12,7 @@ OPS = torch.ops.diff_gaussian_rasterization
 
 
 class Calls:
-    """Forward alone, with backward, and with a dense Adam step; parameters raw, as they are optimised."""
+    """Forward alone, with backward, and with a dense Adam step, on raw parameters as in training."""
 
     def __init__(self, scene: SplatScene, dtype: torch.dtype = torch.float32, antialiasing: bool = False) -> None:
         self.scene = scene
@@ -23,7 +23,7 @@ class Calls:
         self._moments: list[list[Tensor]] = []
 
     def render(self) -> Tensor:
-        """(3, H, W)"""
+        """Return the image, (3, H, W)."""
         named = {name: self.leaves[name] for name in ("scales", "rotations", "sh_dc", "sh_rest")}
         means, opacities = self.leaves["means"], self.leaves["opacities"]
         return rasterize(means, self.means2d, opacities, self.settings, raw=True, **named).color
@@ -37,7 +37,7 @@ class Calls:
         self.render().backward(self.gradient)
 
     def step(self) -> None:
-        """The learning rate is 0: the arithmetic of a step, and the same scene after it."""
+        """Do a step with learning rate 0, which has the arithmetic of a step but leaves the scene as it was."""
         self.with_backward()
         if not self._moments:
             self._moments = [[torch.zeros_like(t) for t in self.leaves.values()] for _ in range(2)]
@@ -57,7 +57,7 @@ class Calls:
 
 
 class Stages:
-    """The ops of one forward and backward, each by itself."""
+    """The operators of one forward and backward, each as a call of its own."""
 
     @torch.no_grad()
     def __init__(self, scene: SplatScene) -> None:
@@ -84,6 +84,6 @@ class Stages:
 
 
 def image_gradient(scene: SplatScene) -> Tensor:
-    """(3, H, W), normal numbers: what a loss would send back."""
+    """Return normal numbers, (3, H, W), in place of a loss's gradient."""
     g = torch.Generator().manual_seed(0)
     return torch.randn(3, scene.height, scene.width, generator=g).to(scene.parameters["means"].device)

@@ -1,7 +1,8 @@
-"""What a table of measurements has to say about where it was made."""
+"""Description of the machine for the head of a table, and printing of tables."""
 
 import platform
 
+import diff_gaussian_rasterization  # noqa: F401  (`compute_device` asks its loaded library for CUDA kernels)
 import torch
 
 from utils.files.markdown_table import markdown_table
@@ -9,7 +10,7 @@ from utils.host.machine import commit, cpu_name, gpu_name, instruction_set
 
 
 def describe(device: torch.device | str = "cpu") -> str:
-    """One line: processor or GPU, threads, instruction set, versions, commit."""
+    """Return one line with processor or GPU, threads, instruction set, versions and commit."""
     python = f"Python {platform.python_version()}, torch {torch.__version__}"
     if torch.device(device).type == "cuda":
         python += f", CUDA {torch.version.cuda}"
@@ -18,10 +19,10 @@ def describe(device: torch.device | str = "cpu") -> str:
 
 
 def table(header: list[str], rows: list[list[str]]) -> list[str]:
-    """The lines of a Markdown table, every column to the left."""
+    """Return the lines of a Markdown table with every column aligned to the left."""
     return markdown_table(header, rows, right=False).splitlines()
 
 
 def print_table(header: list[str], rows: list[list[str]]) -> None:
-    """Print what `table` gives."""
+    """Print the lines of `table`."""
     print("\n".join(table(header, rows)))

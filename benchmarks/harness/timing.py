@@ -1,4 +1,4 @@
-"""Time and memory of a call, on the CPU and on a GPU."""
+"""Run time and memory of a call, on the CPU and on a GPU."""
 
 import re
 import statistics
@@ -17,7 +17,7 @@ _WAITS = ("cudaStreamSynchronize", "cudaEventSynchronize", "cudaMemcpy")
 
 @dataclass
 class Kernel:
-    """Launches of one kernel that follow each other; copies and fills count as kernels."""
+    """Consecutive launches of one kernel; copies and fills count as kernels."""
 
     name: str
     launches: int
@@ -26,21 +26,21 @@ class Kernel:
 
 @dataclass
 class GpuTime:
-    """Median milliseconds of a call with the device idle before it."""
+    """Median milliseconds of a call that starts on an idle device."""
 
-    events: float  # between CUDA events around it, so with the gaps in which the device waits for the host
+    events: float  # between CUDA events around the call; includes gaps in which the device waits for the host
     wall: float  # by the host's clock, until the device is done
-    launched: list[Kernel]  # in the order of the call
-    waits: int  # how often the host waits for the device within the call
+    launched: list[Kernel]  # in order
+    waits: int  # times that the host waits for the device within the call
 
     @property
     def kernels(self) -> float:
-        """The device's own time."""
+        """Milliseconds in which the device runs kernels."""
         return sum(kernel.milliseconds for kernel in self.launched)
 
 
 def cpu_milliseconds(run: Callable[[], object], repeats: int) -> float:
-    """Median wall time of a call, after one to warm up."""
+    """Return the median wall time of a call, after a warm-up call."""
     run()
     times = []
     for _ in range(repeats):
@@ -51,7 +51,7 @@ def cpu_milliseconds(run: Callable[[], object], repeats: int) -> float:
 
 
 def gpu_time(run: Callable[[], object]) -> GpuTime:
-    """Medians over REPEATS calls after WARM_UPS."""
+    """Return medians over REPEATS calls after WARM_UPS calls."""
     for _ in range(WARM_UPS):
         run()
     events, walls = [], []
@@ -70,7 +70,7 @@ def gpu_time(run: Callable[[], object]) -> GpuTime:
 
 
 def _profile(run: Callable[[], object], calls: int) -> tuple[list[Kernel], int] | None:
-    """Kernels (mean times) and waits of a call; None where the calls did not all launch the same."""
+    """Return kernels, with mean times, and waits of a call; None if the calls launched different kernels."""
     torch.cuda.synchronize()
     with profile(activities=[ProfilerActivity.CPU, ProfilerActivity.CUDA]) as trace:
         for _ in range(calls):
@@ -96,7 +96,7 @@ def _profile(run: Callable[[], object], calls: int) -> tuple[list[Kernel], int] 
 
 
 def peak_mib(run: Callable[[], object], clear: Callable[[], None]) -> float:
-    """Most GPU memory in use during a call above what was in use before, MiB; `clear` drops gradients beforehand."""
+    """Return the peak GPU memory of a call above what was in use before it, MiB; `clear` drops the gradients."""
     run()
     clear()
     torch.cuda.synchronize()
@@ -110,7 +110,7 @@ def peak_mib(run: Callable[[], object], clear: Callable[[], None]) -> float:
 
 
 def short_name(name: str) -> str:
-    """A kernel's name without return type, namespaces, template arguments and parameters."""
+    """Strip return type, namespaces, template arguments and parameters from a kernel's name."""
     if name.startswith(("Memcpy", "Memset")):
         return name.split(" (")[0]
     name = name.replace("(anonymous namespace)", "")

@@ -1,7 +1,8 @@
-"""How many pixel-splat pairs blending had to look at, and how many it blended: exact counts, made with torch.
+"""Exact counts, made with torch, of the pixel-splat pairs (fragments) that blending evaluates and that it blends.
 
-A splat is evaluated in a sub-tile that its alpha can reach, up to the last splat that a pixel of the sub-tile blends:
-what the backward walks through, and the forward but for the few splats that find a pixel nearly opaque and close it.
+A splat is evaluated in every sub-tile that its alpha can reach, up to the last splat that a pixel of the sub-tile
+blends. The backward evaluates exactly these. The forward also evaluates the few splats that find a pixel nearly opaque
+and end it.
 """
 
 import math
@@ -10,20 +11,23 @@ import torch
 from torch import Tensor
 
 TILE = 16
-SUB_TILES = ((8, 4), (8, 8), (16, 8), (16, 16))  # wide, high; those of a warp with 1, 2, 4 and 8 pixels a lane
-_REACH = math.log2(255)  # alpha = 1/255 where u^2 + v^2 is this much over log2 opacity
+SUB_TILES = ((8, 4), (8, 8), (16, 8), (16, 16))  # width, height; those of a warp with 1, 2, 4 and 8 pixels per lane
+_REACH = math.log2(255)  # alpha = 1/255 where u^2 + v^2 exceeds log2 opacity by this
 _CHUNK = 1 << 16  # instances at a time
 
 
 def processed_per_tile(last: Tensor) -> Tensor:
-    """(tiles,) furthest position in each tile's list that any of its pixels blended, from `last` (H, W)."""
+    """Return the number of processed instances of each tile, (tiles,).
+
+    last: (H, W), the number of instances up to the last one that a pixel blends.
+    """
     return _by_tile(last).amax((1, 2)).long()
 
 
 def fragments(splats: Tensor, instances: Tensor, ranges: Tensor, last: Tensor) -> dict[str, float]:
-    """Pairs per pixel, from the outputs of the ops project, bin and blend.
+    """Count fragments per pixel, from the outputs of the operators project, bin and blend.
 
-    Keys: "blended", and "8x4" and so on for the pairs evaluated over sub-tiles of that size.
+    Keys: "blended", and "8x4" and so on for the fragments evaluated with sub-tiles of that size.
     """
     across = -(-last.shape[1] // TILE)
     last_by_tile = _by_tile(last)
@@ -61,7 +65,7 @@ def _square(factor: tuple[Tensor, Tensor, Tensor], dx: Tensor, dy: Tensor) -> Te
 
 
 def _least_square(factor: tuple, x0: Tensor, x1: Tensor, y0: Tensor, y1: Tensor) -> Tensor:
-    """Least of `_square` over boxes x0..x1, y0..y1 about the mean: inside if that holds it, else on an edge."""
+    """Return the minimum of `_square` over boxes x0..x1, y0..y1: 0 if the mean is inside, else found on an edge."""
     factor = l11, l12, l22 = tuple(value[:, None, None] for value in factor)
     inside = (x0 <= 0) & (x1 >= 0) & (y0 <= 0) & (y1 >= 0)
     edges = [_square(factor, x, (-l11 * l12 * x / (l12**2 + l22**2)).clamp(y0, y1)) for x in (x0, x1)]

@@ -1,4 +1,4 @@
-"""The rasterizer's tables on a GPU: times beside marks and other implementations, work, memory, stages, kernels."""
+"""Tables of the rasterizer on a GPU: times beside marks and other implementations, work, memory, stages, kernels."""
 
 from dataclasses import dataclass, field
 
@@ -12,23 +12,23 @@ from benchmarks.peers import published
 from benchmarks.peers.gsplat_calls import GsplatCalls, version
 from benchmarks.workloads.splat_scenes import SplatScene, frustum
 
-# The stages of a step by the kernels that bound them: that kernel is the first, or the next one is.
+# Kernels that separate the stages of a step: the kernel begins the named stage, or the kernel after it does.
 _BEGINS = {"blend_kernel": "blend", "adam_kernel": "adam"}
 _NEXT = {"project_kernel": "bin", "blend_kernel": "blend_vjp", "blend_vjp_kernel": "project_vjp"}
 
 
 @dataclass
 class Measured:
-    """One implementation on one workload."""
+    """Measurements of one implementation on one workload."""
 
     times: dict[str, GpuTime]
     memory: tuple[float, float]  # peak above the inputs, MiB: forward, + backward
-    difference: tuple[float, float] | None = None  # of its picture from ours: largest, median
+    difference: tuple[float, float] | None = None  # between its image and ours: largest, median
 
 
 @dataclass
 class Workload:
-    """Ours on one workload, what there was to do, and the others."""
+    """Our measurements on one workload, the amount of work, and the other implementations' measurements."""
 
     name: str
     ours: Measured
@@ -39,7 +39,7 @@ class Workload:
 
 
 def measure_on_gpu(names: list[str], peers: list[str]) -> None:
-    """Time the workloads of published.py and print every table."""
+    """Time workloads of published.py, by name, and print every table."""
     gsplat = f"gsplat {version()}" if "gsplat" in peers else None
     workloads = [_measure(name, gsplat) for name in names]
     for workload in workloads:
@@ -70,7 +70,7 @@ def _measure(name: str, gsplat: str | None) -> Workload:
 
 
 def _measure_calls(calls: Calls | GsplatCalls) -> Measured:
-    # Memory first: the step's moments would not count, but what they leave in the allocator's pool could.
+    # Measure memory first: the step's moments themselves would not count, but what they leave in the pool could.
     memory = tuple(peak_mib(run, calls.clear) for run in (calls.forward, calls.with_backward))
     times = {step: gpu_time(run) for step, run in calls.steps().items()}
     calls.clear()
@@ -96,8 +96,8 @@ def _print_times(workloads: list[Workload]) -> None:
             row = [workload.name, step, f"{time.events:.3f}", f"{time.wall:.3f}", f"{time.kernels:.3f}"]
             row += [str(time.waits), f"{theirs:.2f}", f"{time.events / theirs:.2f}", f"{bound or ''}"]
             rows.append([*row, f"{mark:.2f}", f"{time.kernels / mark:.2f}"])
-    title = f"Time, ms: medians of {REPEATS} calls after {WARM_UPS}, the device idle before each. Call: events around "
-    title += "the public call, host included. Kernels: the device's own work. Waits: of the host, in a call."
+    title = f"Time, ms: medians of {REPEATS} calls after {WARM_UPS}, each on an idle device. Call: events around the "
+    title += "public call, host included. Kernels: the device's own work. Waits: of the host, in a call."
     _print(title, header, rows)
 
 
@@ -147,7 +147,7 @@ def _print_kernels(workload: Workload) -> None:
 
 
 def _stages_of(names: list[str]) -> list[str]:
-    """The stage of each kernel of a step, in order."""
+    """Return the stage of each kernel of a step, in order."""
     stage, result = "project", []
     for name in names:
         stage = _BEGINS.get(name, stage)
@@ -158,7 +158,7 @@ def _stages_of(names: list[str]) -> list[str]:
 
 def _print_peers(workloads: list[Workload]) -> None:
     header = ["workload", "implementation", *published.STEPS, "kernels", "its / ours", "peak forward, + backward MiB"]
-    header += ["picture's difference, largest (median)"]
+    header += ["difference of its image, largest (median)"]
     rows = []
     for w in workloads:
         published_times = " / ".join(f"{ms:.2f}" for ms in published.GSPLAT[w.name])

@@ -1,10 +1,10 @@
-"""How much of what a model's views bin is hidden: instances (a splat in a tile) behind where the tile is opaque.
+"""Share of a model's instances (a splat in a tile) that are hidden because the tile is opaque in front of them.
 
     python -m benchmarks.kernels.hidden_instances -m MODEL [--iteration N]
 
-Of each training view: the instances, those that the backward looks at ("processed": up to the last that a pixel of the
-tile blends), and the splats that have one of these. What is left is what a depth cut-off per tile could save at most.
-Medians over the views.
+Counts, in each training view, the instances, the processed ones (up to the last one that a pixel of the tile blends),
+and the splats that have a processed instance. The rest is the most that a depth cut-off per tile could save. Prints
+medians over the views.
 """
 
 import math
@@ -23,7 +23,7 @@ from utils.system_utils import compute_device, run_cli
 
 
 def counts(camera: Camera, model: GaussianModel) -> dict[str, int]:
-    """Of one view: splats and instances listed, and those of them that are processed."""
+    """Count the splats and instances that one view lists, and those of them that are processed."""
     size = camera.image_height, camera.image_width
     shapes = model.get_xyz, *model.raw_geometry().values(), None
     colors = None, model.get_features_dc, model.get_features_rest
@@ -49,7 +49,7 @@ def counts(camera: Camera, model: GaussianModel) -> dict[str, int]:
 def main() -> None:
     parser = OptionParser(description=__doc__.splitlines()[0])
     model_params = ModelParams(parser, sentinel=True)
-    parser.add_argument("--iteration", type=int, default=-1, help="saved iteration to look at (-1: the highest)")
+    parser.add_argument("--iteration", type=int, default=-1, help="saved iteration to load (-1: the highest)")
     args = get_combined_args(parser)
     print(describe(compute_device()))
     scene = load_saved(model_params.extract(args), args.iteration, args.typed_sh_degree)

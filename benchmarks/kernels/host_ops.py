@@ -1,9 +1,9 @@
-"""What the host does in a training iteration: operator calls, steps of autograd, and on a GPU launches and waits.
+"""Work of the host in a training iteration: operator calls, steps of autograd, and on a GPU launches and waits.
 
     python -m benchmarks.kernels.host_ops SCENE [options of train.py]
 
-Two trainings are profiled and their difference taken, so what happens once does not count. Operators that operators
-call count too.
+Profiles two trainings of different lengths and subtracts, so that calls made once per training do not count. Operators
+called by other operators count too.
 """
 
 import argparse
@@ -24,14 +24,14 @@ CALLS = ("aten::", "diff_gaussian_rasterization::", "fused_ssim::", NODE, "cuda"
 
 
 def calls_per_iteration(*options: str) -> dict[str, float]:
-    """Calls by name, the most frequent first, of an iteration of `train.py OPTIONS`; without densification."""
+    """Count calls by name, most frequent first, in an iteration of `train.py OPTIONS` without densification."""
     longer, shorter = (_calls(WARM_UP + more, options) for more in (COUNTED, 0))
     longer.subtract(shorter)
     return {name: count / COUNTED for name, count in longer.most_common() if count > 0}
 
 
 def operator_calls(calls: dict[str, float]) -> float:
-    """Calls of operators among them, autograd's steps and the CUDA runtime left out."""
+    """Sum the calls of operators, without autograd's steps and the CUDA runtime."""
     return sum(count for name, count in calls.items() if name != NODE and not name.startswith("cuda"))
 
 
@@ -48,7 +48,7 @@ def _calls(iterations: int, options: tuple[str, ...]) -> Counter[str]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description="Count what the host does in a training iteration.")
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("scene", help="folder of the scene; other options go to train.py")
     args, options = parser.parse_known_args()
     calls = calls_per_iteration("-s", args.scene, *options)

@@ -1,11 +1,11 @@
-"""Time of the rasterizer on seeded workloads beside the work it did, on a CPU or on a GPU.
+"""Run time of the rasterizer on seeded workloads, beside the amount of work, on a CPU or a GPU.
 
-    python -m benchmarks.kernels.rasterizer                  # on the GPU where there is one and the build has CUDA
+    python -m benchmarks.kernels.rasterizer                  # on the GPU if there is one and the build has CUDA
     python -m benchmarks.kernels.rasterizer --device cpu
-    python -m benchmarks.kernels.rasterizer --peers gsplat   # and another implementation in the same run
+    python -m benchmarks.kernels.rasterizer --peers gsplat   # also time another implementation in the same run
 
-Milliseconds are medians. Processed: instances (a splat in a tile) that the backward has to look at, those behind
-which no pixel of the tile is still open left out.
+Milliseconds are medians. An instance is a splat in a tile. Processed instances are those that the backward reads: in
+each tile, those up to the last one that a pixel of the tile blends.
 """
 
 import argparse
@@ -29,7 +29,7 @@ ORACLE_WORKLOAD = (1_000, 100, 100, 2.4)
 
 
 def measure(scene: SplatScene, repeats: int) -> dict[str, float]:
-    """Milliseconds of forward, forward + backward and of each stage, and counts, on the CPU."""
+    """Measure on the CPU: milliseconds of forward, forward + backward and each stage, and the amount of work."""
     calls, stages = Calls(scene), Stages(scene)
     runs: dict[str, Callable[[], object]] = {"forward": calls.forward, "+ backward": calls.with_backward}
     result = {name: cpu_milliseconds(run, repeats) for name, run in runs.items()}
@@ -41,7 +41,7 @@ def measure(scene: SplatScene, repeats: int) -> dict[str, float]:
 
 
 def compare_oracle(repeats: int) -> list[str]:
-    """A row: the oracle's and our milliseconds, forward and with backward, on the small workload."""
+    """Return a row with the oracle's and our milliseconds, forward and with backward, on the small workload."""
     scene = frustum(*ORACLE_WORKLOAD)
     ours = measure(scene, repeats)
     leaves, settings = scene.leaves(torch.float64), scene.settings(torch.float64)
@@ -60,7 +60,7 @@ def compare_oracle(repeats: int) -> list[str]:
 
 
 def measure_on_cpu(thread_counts: list[int], repeats: int) -> None:
-    """Print stage times and rates; evaluations are processed instances times 256 pixels. Then the oracle's times."""
+    """Print times and rates of the stages, then the oracle's times. Evaluations: processed instances x 256 pixels."""
     stages = ["forward", "+ backward", "project", "bin", "blend", "blend_vjp", "project_vjp"]
     header = ["splats, image, sigma", "threads", *stages, "instances", "processed"]
     header += ["G evaluations/s/core forward", "backward"]
@@ -88,11 +88,11 @@ def _name(workload: tuple) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     add = parser.add_argument
-    add("--device", choices=["cpu", "cuda"], help="default: cuda where there is a GPU and the build has CUDA")
-    add("--workloads", nargs="+", choices=list(WORKLOADS), default=list(WORKLOADS), help="GPU: which (default: all)")
+    add("--device", choices=["cpu", "cuda"], help="default: cuda if there is a GPU and the build has CUDA")
+    add("--workloads", nargs="+", choices=list(WORKLOADS), default=list(WORKLOADS), help="GPU: names (default: all)")
     add("--peers", nargs="+", choices=["gsplat"], default=[], help="GPU: other implementations to time as well")
-    add("--threads", type=int, nargs="+", default=[1, torch.get_num_threads()], help="CPU: numbers of threads")
-    add("--repeats", type=int, default=9, help="CPU: timed calls (default: 9)")
+    add("--threads", type=int, nargs="+", default=[1, torch.get_num_threads()], help="CPU: numbers of threads to use")
+    add("--repeats", type=int, default=9, help="CPU: number of timed calls (default: 9)")
     args = parser.parse_args()
     found = compute_device().type
     if args.device == "cuda" and found != "cuda":

@@ -1,7 +1,7 @@
-"""gsplat 1.5.3 (PyPI) on our scenes. Its kernels are compiled for the GPU at hand when first used, which takes minutes.
+"""gsplat 1.5.3 (PyPI) on our scenes. It compiles its kernels for the machine's GPU on first use, which takes minutes.
 
-Activations and the joining of the SH bands count as part of the call, as they do for us; the step is torch's fused
-Adam over all tensors.
+Activations and the concatenation of the SH bands count as part of the call, as they do for ours. The step is torch's
+fused Adam over all tensors.
 """
 
 import importlib.metadata
@@ -14,14 +14,13 @@ from benchmarks.harness.calls import image_gradient
 from benchmarks.workloads.splat_scenes import SplatScene
 from utils.system_utils import UserError
 
-INSTALL = "pip install gsplat==1.5.3 (with nvcc and ninja at hand; TORCH_CUDA_ARCH_LIST=9.0 makes it build for one GPU)"
+INSTALL = "pip install gsplat==1.5.3 (needs nvcc and ninja; with TORCH_CUDA_ARCH_LIST=9.0 it builds for one GPU only)"
 
 
 def version() -> str:
-    """gsplat's version; UserError where it is not installed."""
+    """Return gsplat's version; UserError if it is not installed or cannot build its kernels."""
     try:
-        import gsplat  # noqa: F401  compiles its kernels unless that has been done
-        from gsplat.cuda._backend import _C
+        from gsplat.cuda._backend import _C  # compiles the kernels on first use
     except ImportError as error:
         raise UserError(f"--peers gsplat: {error}; {INSTALL}") from error
     if _C is None:
@@ -30,7 +29,10 @@ def version() -> str:
 
 
 class GsplatCalls:
-    """As calls.Calls. packed: gsplat's other layout, its function's default but not its trainer's."""
+    """gsplat's counterpart of harness.calls.Calls.
+
+    packed: use gsplat's packed layout, the default of its function but not of its trainer.
+    """
 
     def __init__(self, scene: SplatScene, packed: bool) -> None:
         self.scene, self.packed = scene, packed
@@ -42,7 +44,7 @@ class GsplatCalls:
         self.camera = {
             "viewmats": settings.viewmatrix.T[None].contiguous(),
             "Ks": torch.tensor([rows], device=self.gradient.device),
-            # gsplat 1.5.3 checks the background's shape against its packed means, which have no dimension for cameras.
+            # gsplat 1.5.3 checks the background's shape against its packed means, which have no camera dimension.
             "backgrounds": settings.bg if packed else settings.bg[None],
             "width": scene.width,
             "height": scene.height,
@@ -50,7 +52,7 @@ class GsplatCalls:
         self._adam: torch.optim.Adam | None = None
 
     def render(self) -> Tensor:
-        """(3, H, W)"""
+        """Return the image, (3, H, W)."""
         from gsplat import rasterization
 
         p = self.leaves
@@ -75,7 +77,7 @@ class GsplatCalls:
         self.render().backward(self.gradient)
 
     def step(self) -> None:
-        """The learning rate is 0: the arithmetic of a step, and the same scene after it."""
+        """Do a step with learning rate 0, which has the arithmetic of a step but leaves the scene as it was."""
         self.with_backward()
         if self._adam is None:
             self._adam = torch.optim.Adam(self.leaves.values(), lr=0.0, eps=1e-15, fused=True)

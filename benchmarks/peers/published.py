@@ -1,7 +1,7 @@
-"""Workloads, what other implementations took for them, and what we aim at: milliseconds and MiB on one NVIDIA H200.
+"""Workloads, other implementations' figures on them, and the marks we aim at: milliseconds and MiB on one NVIDIA H200.
 
-The others were measured in one run (torch 2.11+cu130, CUDA 13.0; medians, host included) on the tensors that
-splat_scenes.frustum draws on the GPU with seed 0. Steps: forward, forward + backward, and these with one dense Adam
+The figures were measured in one run (torch 2.11+cu130, CUDA 13.0; medians, host included), on the tensors that
+splat_scenes.frustum draws on the GPU with seed 0. STEPS are forward, forward + backward, and both with one dense Adam
 step of all tensors.
 """
 
@@ -30,14 +30,14 @@ GSPLAT = {
     "L": (3.83, 9.62, 11.5),
     "XL": (6.16, 15.2, 18.9),
 }
-# Peak memory above the inputs: forward alone, and forward + backward with the gradients.
+# Peak memory above the inputs: of forward alone, and of forward + backward, gradients included.
 FASTER_GS_MEMORY = {"S": (29, 133), "M+": (159, 900), "L": (362, 2175), "XL": (651, 3942)}
 GSPLAT_MEMORY = {"S": (50, 54), "M+": (411, 482), "L": (1127, 1397), "XL": (2169, 2772)}
 
-# The call, host included, must stay under these parts of Faster-GS's times.
+# The call, host included, must stay below these fractions of Faster-GS's times.
 BINDING = {"forward": 0.6, "+ backward": 0.5}
 
-# What the kernels should take (the step's mark includes loss and density statistics), and forward + backward's memory.
+# Marks for the time of the kernels (the step's includes loss and density statistics) and the memory of + backward.
 MARKS = {
     "S": (0.18, 0.42, 0.50),
     "M": (0.35, 1.0, 1.4),
@@ -47,16 +47,16 @@ MARKS = {
 }
 MEMORY_MARKS = {"S": 70, "M": 400, "M+": 420, "L": 1126, "XL": 2150}
 
-# Ceilings of the H200: bytes a second copied, lane instructions a second (132 SMs, 128 lanes, 1.98 GHz).
+# Limits of the H200: bytes copied per second, lane instructions per second (132 SMs, 128 lanes, 1.98 GHz).
 BANDWIDTH = 4.3e12
 INSTRUCTIONS = 33.5e12
 
 
 def floors(splats: int, pixels: int, instances: int, processed: int, evaluated: float) -> dict[str, float]:
-    """Milliseconds that the chip needs for each stage at least: every byte once, an ideal blend.
+    """Return the least milliseconds that the chip needs for each stage: every byte moved once, an ideal blend.
 
-    evaluated: fragments a pixel over 8x4 sub-tiles. A splat has 11 floats of geometry and 48 of SH (45 of them beyond
-    the first band); a row of blending has 12 floats, a row of gradient sums 9.
+    evaluated: fragments per pixel with 8x4 sub-tiles. A Gaussian has 11 floats of geometry and 48 of SH, 45 of them
+    beyond the first band. A packed splat has 12 floats, a row of gradient sums 9.
     """
     read, moments, gradients = 44 + 180, 36, 236
     of_bytes = {

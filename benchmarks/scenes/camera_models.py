@@ -1,10 +1,11 @@
-"""Scenes seen through every camera model of pycolmap, each beside its pinhole twin.
+"""Quality of training with every camera model of pycolmap, each beside its pinhole twin.
 
     python -m benchmarks.scenes.camera_models OUT [--models OPENCV FOV ...] [--iterations 7000]
 
-The scene is ray-traced, through each lens exactly, from known places; the twin is traced through the very pinhole that
-the lens's pictures are undistorted to. Both start from the same points. PSNR is metrics.py's, of held-out views: of
-each model on its own pictures, and of the lens's renders on the twin's, which undistortion has not smoothed.
+The scene is ray-traced through each exact lens from known positions. The twin is traced through the same pinhole that
+the photos of the lens are undistorted to. Both trainings start from the same points. PSNR is that of metrics.py on
+held-out views: each model's renders against its own photos, and the lens's renders against the twin's photos, which no
+undistortion has smoothed.
 """
 
 import argparse
@@ -27,18 +28,21 @@ from scene.pictures.lens import Lens, undistortion
 from scene.pictures.pycolmap_import import import_pycolmap
 from utils.system_utils import UserError, compute_device, run_cli
 
-FOCAL = 0.75  # in widths
+FOCAL = 0.75  # in image widths
 
 
 def through(views: list[View], lens: Lens) -> list[LensView]:
-    """The same places seen through a lens."""
+    """Return the views from the same positions through a lens."""
     return [LensView(view.rotation, view.center, view.focal, lens.width, lens.height, lens) for view in views]
 
 
 def write_scene(
     folder: Path, views: list[LensView], points: SurfacePoints | None, rng: np.random.Generator, count: int
 ):
-    """Ray-trace the views and write them as a COLMAP scene. Returns its points: those given, or `count` found anew."""
+    """Ray-trace the views and write them as a COLMAP scene.
+
+    Returns the scene's points: `points`, or if that is None new ones from `count` tries.
+    """
     names = [f"view_{index:03d}.png" for index in range(len(views))]
     pictures = [render_view(demo_scene(), view) for view in tqdm(views, desc=folder.name, unit="view", leave=False)]
     (folder / "images").mkdir(parents=True)
@@ -56,13 +60,13 @@ def write_scene(
 
 
 def psnr_against(renders: Path, truths: Path) -> float:
-    """Mean PSNR in dB of the renders of one model on the ground truth of another."""
+    """Return the mean PSNR, dB, of the renders of one model against the ground truth of another."""
     pairs = [[np.asarray(Image.open(folder / file.name)) for folder in (renders, truths)] for file in renders.iterdir()]
     return float(np.mean([metrics.psnr(*pair) for pair in pairs]))
 
 
 def compare(name: str, out: Path, args: argparse.Namespace, options: list[str]) -> list[str]:
-    """The table's row of one camera model."""
+    """Train lens and twin of one camera model and return the model's row of the table."""
     width, height = args.size
     rng = np.random.default_rng(0)
     places = ring_views(args.views, width, height, rng)
@@ -83,15 +87,15 @@ def compare(name: str, out: Path, args: argparse.Namespace, options: list[str]) 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("out", type=Path, help="folder for scenes and models, which must not exist")
+    parser.add_argument("out", type=Path, help="new folder for scenes and models")
     parser.add_argument("--models", nargs="+", default=DISTORTED, metavar="NAME", help="camera models (default: all)")
-    parser.add_argument("--views", type=int, default=60, help="pictures of a scene (default: 60)")
+    parser.add_argument("--views", type=int, default=60, help="photos per scene (default: 60)")
     parser.add_argument("--size", type=int, nargs=2, default=(400, 300), metavar=("W", "H"), help="pixels (400 300)")
-    parser.add_argument("--points", type=int, default=8000, help="surface points tried (default: 8000)")
+    parser.add_argument("--points", type=int, default=8000, help="surface points to try (default: 8000)")
     args, options = parser.parse_known_args()
     unknown = [name for name in args.models if name not in DISTORTED]
     if unknown:
-        raise UserError(f"no distorting camera model {unknown[0]}; there are {', '.join(DISTORTED)}")
+        raise UserError(f"{unknown[0]} is no camera model with distortion; choose from {', '.join(DISTORTED)}")
     if args.out.exists():
         raise UserError(f"{args.out} exists; name a new folder")
     rows = [compare(name, args.out, args, options) for name in args.models]
@@ -105,7 +109,7 @@ def main() -> None:
         "PSNR",
         "of its twin",
         "difference",
-        "on the twin's pictures",
+        "on the twin's photos",
         "difference",
     ]
     print_table(header, rows)

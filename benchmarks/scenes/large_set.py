@@ -1,10 +1,10 @@
-"""A large set of pictures: time to the first iteration and peak memory, with and without --images_to_load.
+"""A large set of photos: time to the first iteration and peak memory, with and without --images_to_load.
 
     python -m benchmarks.scenes.large_set [--views 2000] [--images_to_load 100]
 
-Makes a COLMAP scene in a temporary folder (smooth noise as JPEGs, cameras on a ring, points in the middle) and trains
-one epoch of it three times: all pictures kept, at most N, and at most N without decoding ahead. The files were just
-written, so they come from the system's cache.
+Makes a COLMAP scene in a temporary folder: smooth noise as JPEGs, cameras on a ring, points in the middle. Trains one
+epoch three times: with all images in memory, with at most N, and with at most N and no decoding ahead. The files were
+just written, so they are read from the system's cache.
 """
 
 import argparse
@@ -21,7 +21,6 @@ from PIL import Image
 from tqdm import tqdm
 
 from benchmarks.harness.environment import describe, print_table
-from gaussian_renderer import render  # noqa: F401  (loads the rasterizer, which compute_device asks)
 from utils.system_utils import UserError, compute_device, run_cli
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -29,42 +28,19 @@ ROOT = Path(__file__).resolve().parents[2]
 POINTS = 5000
 RADIUS = 4.0  # of the ring, world units
 
-# What a run is: train.py, noting when its first iteration ends, and the most memory that the process has had.
-CHILD = """
-import json, sys, time
-started = float(sys.argv[1])
-import resource, train
-from scene.pictures.store import ImageStore
-plain, first = train.MemoryGuard.stepped, []
-def stepped(self, step):
-    plain(self, step)
-    if step.iteration == 1:
-        first.append(time.time() - started)
-train.MemoryGuard.stepped = stepped
-if sys.argv[2] == "False":
-    ImageStore.prefetch = lambda *_: None
-train.main(sys.argv[4:])
-import torch
-peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
-gpu = torch.cuda.max_memory_allocated() if torch.cuda.is_available() else 0
-result = {"first": first[0], "peak": peak, "gpu": gpu}
-with open(sys.argv[3], "w") as file:
-    json.dump(result, file)
-"""
-
 
 def make_scene(folder: Path, views: int, size: tuple[int, int]) -> None:
-    """A COLMAP model as text, and JPEGs of two colours' smooth noise, every one different."""
+    """Write a COLMAP model as text, and JPEGs of smooth noise, each with other values."""
     width, height = size
     rng = np.random.default_rng(0)
     (folder / "images").mkdir(parents=True)
     sparse = folder / "sparse" / "0"
     sparse.mkdir(parents=True)
     poses = []
-    for index in tqdm(range(views), desc="Making pictures", unit="picture"):
+    for index in tqdm(range(views), desc="Making photos", unit="photo"):
         coarse = rng.integers(0, 256, (-(-height // 16), -(-width // 16), 3), dtype=np.uint8)
         Image.fromarray(coarse).resize(size).save(folder / "images" / f"{index:05d}.jpg", quality=90)
-        # Turned about the vertical axis; the ring's middle is always RADIUS in front.
+        # Turn about the vertical axis; the centre of the ring is always RADIUS in front of the camera.
         half = math.pi * index / views
         poses.append(f"{index + 1} {math.cos(half)} 0 {math.sin(half)} 0 0 0 {RADIUS} 1 {index:05d}.jpg\n\n")
     (sparse / "cameras.txt").write_text(f"1 PINHOLE {width} {height} {width} {width} {width / 2} {height / 2}\n")
@@ -76,10 +52,15 @@ def make_scene(folder: Path, views: int, size: tuple[int, int]) -> None:
 
 
 def train(scene: Path, model: Path, options: list[str], ahead: bool) -> dict[str, float]:
-    """One run: seconds from the start of the process to the end of iteration 1, of training, of all; peaks in bytes."""
+    """Train once; return seconds and peaks in bytes.
+
+    Keys: `first`, seconds from the start of the process to the end of iteration 1; `training` and `process`, seconds of
+    the training and of the whole process; `peak` and `gpu`, peaks of host and GPU memory.
+    """
     command = ["-s", str(scene), "-m", str(model), "--test_iterations", "-1", *options]
     said, started = model.with_suffix(".json"), time.time()
-    child = [sys.executable, "-c", CHILD, str(started), str(ahead), str(said)]
+    child = [sys.executable, "-m", "benchmarks.scenes.first_iteration", str(started), str(said)]
+    child += [] if ahead else ["--not_ahead"]
     done = subprocess.run([*child, *command], cwd=ROOT, capture_output=True, text=True)
     if done.returncode:
         raise UserError(f"train.py {' '.join(command)} failed:\n{(done.stdout + done.stderr)[-4000:]}")
@@ -90,11 +71,11 @@ def train(scene: Path, model: Path, options: list[str], ahead: bool) -> dict[str
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--views", type=int, default=2000, help="pictures (default: 2000)")
+    parser.add_argument("--views", type=int, default=2000, help="photos (default: 2000)")
     parser.add_argument("--size", type=int, nargs=2, default=[1280, 720], metavar=("W", "H"),
-                        help="of the files in pixels (default: 1280 720)")  # fmt: skip
-    parser.add_argument("--width", type=int, default=320, help="at which they train, -r (default: 320)")
-    parser.add_argument("--images_to_load", type=int, default=100, help="the limit (default: 100)")
+                        help="size of the photos in pixels (default: 1280 720)")  # fmt: skip
+    parser.add_argument("--width", type=int, default=320, help="width to train at, -r (default: 320)")
+    parser.add_argument("--images_to_load", type=int, default=100, help="limit of images in memory (default: 100)")
     args = parser.parse_args()
     print(describe(compute_device()))
     rows = []
@@ -112,7 +93,7 @@ def main() -> None:
             rows.append([name, *(f"{result[key]:.1f}" for key in ("first", "training", "process"))])
             rows[-1] += [f"{result[key] / 2**20:.0f}" for key in ("peak", "gpu")]
     print_table(
-        ["pictures", "to the first iteration s", "an epoch s", "process s", "peak memory MiB", "of the GPU MiB"], rows
+        ["images", "to the first iteration s", "an epoch s", "process s", "peak memory MiB", "of the GPU MiB"], rows
     )
 
 

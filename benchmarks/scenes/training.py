@@ -1,9 +1,9 @@
-"""Training runs, one per seed, scored on the held-out views as published tables are.
+"""Training runs, one per seed, scored on the held-out views as in published tables.
 
     python -m benchmarks.scenes.training SCENE OUT --seeds 0 1 2 --iterations 7000
 
-Other options go to train.py as they are. Seconds are of training alone, without loading, tests and saving; scores are
-metrics.py's, from 8-bit pictures. A seed given twice shows whether the same command gives the same bytes.
+Other options go to train.py unchanged. Training seconds do not include loading, tests and saving. Scores are those of
+metrics.py, from 8-bit images. A seed given twice shows whether the same command gives the same bytes.
 """
 
 import argparse
@@ -16,14 +16,13 @@ import time
 from pathlib import Path
 
 from benchmarks.harness.environment import describe, print_table
-from gaussian_renderer import render  # noqa: F401  (loads the rasterizer, which compute_device asks)
 from utils.system_utils import UserError, compute_device, run_cli
 
 ROOT = Path(__file__).resolve().parents[2]
 
 
 def run(script: str, *options: str) -> float:
-    """Run one of the command lines; seconds by the clock. UserError with the end of its output where it fails."""
+    """Run a script of the repository; return its wall seconds. UserError with the end of its output if it fails."""
     start = time.perf_counter()
     done = subprocess.run([sys.executable, script, *options], cwd=ROOT, capture_output=True, text=True)
     if done.returncode:
@@ -33,7 +32,7 @@ def run(script: str, *options: str) -> float:
 
 
 def train(scene: Path, model: Path, seed: int, options: list[str]) -> dict:
-    """Train, render and score one model: seconds, PSNR (dB), SSIM, Gaussians, hash of the PLY."""
+    """Train, render and score one model; return seconds, PSNR (dB), SSIM, Gaussians and a hash of the PLY."""
     arguments = ["-s", str(scene), "-m", str(model), "--eval", "--seed", str(seed)]
     process = run("train.py", *arguments, "--test_iterations", "-1", "--no_curve", *options)
     run("render.py", "-m", str(model), "--skip_train")
@@ -56,11 +55,11 @@ def train(scene: Path, model: Path, seed: int, options: list[str]) -> dict:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("scene", type=Path, help="a COLMAP or a Blender scene")
-    parser.add_argument("out", type=Path, help="folder for the models, which must not exist")
+    parser.add_argument("out", type=Path, help="new folder for the models")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2], help="one run each (default: 0 1 2)")
     args, options = parser.parse_known_args()
     if args.out.exists():
-        raise UserError(f"{args.out} is there already: name another folder, or remove it")
+        raise UserError(f"{args.out} exists; name a new folder")
     print(describe(compute_device()))
     print("train.py -s", args.scene.name, "--eval", *options, flush=True)
     runs = []

@@ -1,9 +1,9 @@
-"""What a finished model's unseen Gaussians and its SH bands are worth: bytes beside PSNR and the time of a render.
+"""Value of a finished model's unseen Gaussians and SH bands: bytes beside PSNR and the time of a render.
 
     python -m benchmarks.scenes.trimming -m MODEL
 
-A model that train.py saved without --keep_unseen has no unseen Gaussians left. The bound is that of --prune_sh: how far
-a colour moves at most. PSNR is the mean over the views, from unrounded renders.
+A model that train.py saved without --keep_unseen has no unseen Gaussians. The bound is that of --prune_sh, the largest
+change of a colour. PSNR is the mean over the views, from unrounded renders.
 """
 
 from collections.abc import Callable
@@ -23,7 +23,7 @@ from utils.system_utils import compute_device, run_cli
 
 
 def milliseconds(run: Callable[[], object], device: torch.device) -> float:
-    """Median wall time of a call."""
+    """Return the median wall time of a call."""
     return gpu_time(run).wall if device.type == "cuda" else cpu_milliseconds(run, 9)
 
 
@@ -31,7 +31,7 @@ def milliseconds(run: Callable[[], object], device: torch.device) -> float:
 def main() -> None:
     parser = OptionParser(description=__doc__.splitlines()[0])
     model_params, pipeline_params = ModelParams(parser, sentinel=True), PipelineParams(parser)
-    parser.add_argument("--iteration", type=int, default=-1, help="saved iteration to look at (-1: the highest)")
+    parser.add_argument("--iteration", type=int, default=-1, help="saved iteration to load (-1: the highest)")
     args = get_combined_args(parser)
     options, pipe = model_params.extract(args), pipeline_params.extract(args)
     device = compute_device()
@@ -42,7 +42,7 @@ def main() -> None:
     views = {"train": scene.getTrainCameras(), "test": scene.getTestCameras()}
 
     keep = seen_by(views["train"], gaussians, pipe)
-    views["train"] = [camera for camera in views["train"] if camera.columns is None]  # in whole, not the test views
+    views["train"] = [camera for camera in views["train"] if camera.columns is None]  # whole photos, no test views
     bounds = cut_bounds(gaussians.get_features_rest[keep])
     models = [("all", "", gaussians), ("without unseen", "0", gaussians.part(keep, gaussians.max_sh_degree))]
     for degree in reversed(range(gaussians.max_sh_degree)):

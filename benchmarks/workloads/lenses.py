@@ -1,4 +1,4 @@
-"""One lens of every camera model that pycolmap knows, distorted as lenses are; and views through them."""
+"""One realistically distorted lens of every camera model of pycolmap, and views through these lenses."""
 
 from dataclasses import dataclass
 
@@ -8,7 +8,7 @@ from demo.tracer import View, normalize
 from scene.pictures.lens import Lens
 from scene.pictures.pycolmap_import import import_pycolmap
 
-# Extra parameters in COLMAP's order: at a focal length of 0.75 widths they move the corners by a twentieth and more.
+# Extra parameters in COLMAP's order. At a focal length of 0.75 widths they move the corners by a twentieth or more.
 DISTORTIONS = {
     "SIMPLE_PINHOLE": (),
     "PINHOLE": (),
@@ -32,7 +32,7 @@ DISTORTED = [name for name in DISTORTIONS if "PINHOLE" not in name]
 
 
 def make_lens(model: str, focal: float, width: int, height: int) -> Lens:
-    """A lens of DISTORTIONS with a focal length in pixels and a principal point a little off the middle."""
+    """Make a lens of DISTORTIONS with a focal length in pixels and a principal point slightly off the centre."""
     center = (round(0.52 * width, 1), round(0.48 * height, 1))
     extra = DISTORTIONS[model]
     focals = len(import_pycolmap().Camera.create_from_model_name(1, model, focal, width, height).focal_length_idxs())
@@ -40,7 +40,7 @@ def make_lens(model: str, focal: float, width: int, height: int) -> Lens:
 
 
 def colmap_camera(lens: Lens):
-    """pycolmap's camera of a lens, which projects and unprojects."""
+    """Return the pycolmap camera of a lens, which projects and unprojects."""
     return import_pycolmap().Camera(
         model=lens.model, width=lens.width, height=lens.height, params=list(lens.params), camera_id=1
     )
@@ -48,17 +48,17 @@ def colmap_camera(lens: Lens):
 
 @dataclass(frozen=True)
 class LensView(View):
-    """A view through a lens; what `View` says of its principal point does not hold."""
+    """A view through a lens, which also sets the principal point: unlike in `View` it need not be the centre."""
 
     lens: Lens
 
     def rays(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """As View.rays."""
+        """Return unit ray directions, as View.rays does."""
         local = colmap_camera(self.lens).cam_ray_from_img(np.column_stack([x, y]).astype(np.float64))
         return normalize((self.rotation.T @ local.T).astype(np.float32))
 
     def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """As View.project."""
+        """Project points, as View.project does."""
         local = self.rotation @ (points - self.center.reshape(3, 1))
         x, y = colmap_camera(self.lens).img_from_cam(np.ascontiguousarray(local.T)).T
         return x, y, local[2]

@@ -1,4 +1,4 @@
-"""Seeded scenes of Gaussians and cameras for tests and benchmarks; raw parameters, as they are optimised."""
+"""Seeded scenes of Gaussians and cameras for tests and benchmarks, with raw parameters as in training."""
 
 import math
 from dataclasses import dataclass
@@ -13,23 +13,29 @@ FOV = math.radians(60)
 
 @dataclass
 class SplatScene:
-    """Raw parameters by name (PARAMETERS; logits, log scales, unnormalised w x y z, K = 16) and an image size."""
+    """Raw parameters by name (PARAMETERS) and an image size.
+
+    Opacities are logits, scales logarithms, rotations unnormalised w x y z; SH have K = 16 coefficients.
+    """
 
     parameters: dict[str, Tensor]
     width: int
     height: int
 
     def leaves(self, dtype: torch.dtype) -> dict[str, Tensor]:
-        """New leaves that require gradients. Values are float32's, whatever the dtype, so that dtypes compare; float32
-        leaves share the scene's memory."""
+        """Return new leaves that require gradients.
+
+        Values are rounded to float32 in every dtype, so that dtypes can be compared. float32 leaves share the scene's
+        memory.
+        """
         return {k: v.detach().float().to(dtype).requires_grad_() for k, v in self.parameters.items()}
 
     def to(self, device: torch.device | str) -> "SplatScene":
-        """The same scene on another device."""
+        """Return the same scene on another device."""
         return SplatScene({k: v.to(device) for k, v in self.parameters.items()}, self.width, self.height)
 
     def settings(self, dtype: torch.dtype = torch.float64, **changes) -> GaussianRasterizationSettings:
-        """A camera at the origin that looks along +z with 60 degrees across, on the parameters' device."""
+        """Return a camera at the origin facing +z, 60 degrees wide, on the device of the parameters."""
         return on_device(settings(self.width, self.height, dtype, **changes), self.parameters["means"].device)
 
 
@@ -44,10 +50,11 @@ def settings(
     tan_ratio: float | None = None,
     **changes,
 ) -> GaussianRasterizationSettings:
-    """A pinhole camera, `fov` radians across; view: (4, 4) world to view, not transposed; principal: offset in NDC.
+    """Make a pinhole camera that is `fov` radians wide.
 
-    tan_ratio: of the half height's tangent to the half width's, that of the image if not given. `changes`
-    replace fields of the settings (antialiasing=True, bg=...).
+    view: (4, 4) world to view, not transposed. principal: offset of the principal point in NDC. tan_ratio: tangent of
+    half the vertical field of view over that of half the horizontal one; by default the image's height / width.
+    `changes` replace fields of the settings (antialiasing=True, bg=...).
     """
     tan_x = math.tan(fov / 2)
     tan_y = tan_x * height / width if tan_ratio is None else tan_x * tan_ratio
@@ -75,18 +82,18 @@ def settings(
 
 
 def on_device(camera: GaussianRasterizationSettings, device: torch.device | str) -> GaussianRasterizationSettings:
-    """The same settings with their tensors on `device`."""
+    """Return the same settings with their tensors on `device`."""
     return camera._replace(**{k: v.to(device) for k, v in camera._asdict().items() if isinstance(v, Tensor)})
 
 
 def frustum(
     n: int, width: int, height: int, sigma_px: float, seed: int = 0, device: torch.device | str = "cpu"
 ) -> SplatScene:
-    """Splats uniform in the frustum at depths 2 to 10: median size sigma_px, log-normal (0.8), axes within a factor
-    of 5, opacity sigmoid(1.5 normal).
+    """Draw Gaussians uniformly in the frustum at depths 2 to 10.
 
-    Drawn on `device`: a GPU draws other numbers than the CPU. With seed 0 and in this order of draws they are, on a
-    GPU, the tensors that the other implementations in published.py were measured on.
+    The median size is sigma_px, sizes are log-normal (0.8), axes within a factor of 5, opacities sigmoid(1.5 normal).
+    Numbers are drawn on `device`, and a GPU draws others than the CPU. On a GPU with seed 0, this order of draws gives
+    the tensors that the other implementations in published.py were measured on.
     """
     g = torch.Generator(device).manual_seed(seed)
 
@@ -115,12 +122,12 @@ def frustum(
 
 
 def ordinary(n: int = 2000, width: int = 203, height: int = 117) -> SplatScene:
-    """What a trained scene is made of; the size is no multiple of the tile."""
+    """Make Gaussians as in a trained scene; the image size is no multiple of the tile."""
     return frustum(n, width, height, sigma_px=3.0, seed=1)
 
 
 def needles(n: int = 500, width: int = 203, height: int = 117) -> SplatScene:
-    """Splats a hundred to a million times longer than wide, up to several images long."""
+    """Make Gaussians a hundred to a million times longer than wide, up to several images long."""
     scene = frustum(n, width, height, sigma_px=1.0, seed=2)
     g = torch.Generator().manual_seed(3)
     scales = scene.parameters["scales"]
@@ -130,7 +137,7 @@ def needles(n: int = 500, width: int = 203, height: int = 117) -> SplatScene:
 
 
 def huge_and_tiny(n: int = 500, width: int = 203, height: int = 117) -> SplatScene:
-    """Half of the splats a thousandth of a pixel, half of them a thousand images wide."""
+    """Make Gaussians of which half are a thousandth of a pixel and half a thousand images wide."""
     scene = frustum(n, width, height, sigma_px=1.0, seed=4)
     scene.parameters["scales"][::2] += math.log(1e-3)
     scene.parameters["scales"][1::2] += math.log(1000.0 * width)

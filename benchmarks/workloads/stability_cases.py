@@ -1,8 +1,8 @@
-"""Every stiff and extreme case that the rasterizer is held to: scene, camera, the largest error allowed and why.
+"""Stiff and extreme cases for the rasterizer: scene, camera, the largest error allowed, and the reason for that bound.
 
-Each scene is an ordinary one with some Gaussians of the case's kind in it, the stiff part; where the camera is what is
-extreme, all of it is. benchmarks/accuracy/stability.py measures the cases, tests/test_stability.py holds them to their
-bounds.
+Each scene has ordinary Gaussians and some of the case's kind, which are called stiff. If the camera is the extreme
+part, all Gaussians count as stiff. benchmarks/accuracy/stability.py measures the cases; tests/test_stability.py holds
+them to their bounds.
 """
 
 import math
@@ -23,23 +23,23 @@ Parameters = dict[str, Tensor]
 
 @dataclass(frozen=True)
 class Problem:
-    """One case, made."""
+    """The tensors of one case."""
 
     parameters: Parameters  # raw, float32 (cov3d and the like: see `raw`)
     camera: GaussianRasterizationSettings  # float64
     stiff: Tensor  # (N,) bool
-    absent: Tensor  # (N,) bool: not finite, so everything must be as if they were not there
+    absent: Tensor  # (N,) bool: not finite, so results must be as if these Gaussians did not exist
     raw: bool = True
 
 
 @dataclass(frozen=True)
 class Bound:
-    """Largest errors allowed of CPU float32, as stability.py defines them, and the reason in a sentence."""
+    """Largest errors allowed for CPU float32, as stability.py defines them, and the reason in a sentence."""
 
     image: float
     gradient: float
     reason: str
-    median: float | None = None  # of the gradients of single Gaussians, where those differ in size
+    median: float | None = None  # over single Gaussians' gradient errors, for cases where their sizes differ
 
 
 @dataclass(frozen=True)
@@ -48,8 +48,8 @@ class Case:
     name: str
     make: Callable[[Generator], Problem]
     bound: Bound
-    double: float = 1e-12  # largest error allowed of CPU float64, of anything
-    cut: float = 1e-4  # pixels this near to a cut-off (relative) don't count
+    double: float = 1e-12  # largest error of any kind allowed for CPU float64
+    cut: float = 1e-4  # pixels this near to a cut-off (relative) do not count
 
     def problem(self) -> Problem:
         return self.make(Generator().manual_seed(zlib.crc32(self.name.encode())))
@@ -59,7 +59,7 @@ class Case:
 
 
 def camera(width: int = WIDTH, height: int = HEIGHT, **changes) -> GaussianRasterizationSettings:
-    """A pinhole camera in float64; `changes` as those of `settings`."""
+    """Make a pinhole camera in float64; `changes` are those of `settings`."""
     return settings(width, height, **changes)
 
 
@@ -72,7 +72,7 @@ def uniform(g: Generator, low: float, high: float, *shape: int) -> Tensor:
 
 
 def placed(pixel: Tensor, depth: Tensor, cam: GaussianRasterizationSettings) -> Tensor:
-    """Means (n, 3) in the view's frame that show at pixels (n, 2) at depths (n,)."""
+    """Return means (n, 3) in the view's frame that project to pixels (n, 2) at depths (n,)."""
     size = torch.tensor([cam.image_width, cam.image_height], dtype=torch.float64)
     ndc = (2 * pixel + 1) / size - 1
     ray = ndc * torch.tensor([cam.tanfovx, cam.tanfovy])
@@ -90,8 +90,11 @@ def splats(
     logits: Tensor | None = None,
     cam: GaussianRasterizationSettings | None = None,
 ) -> Parameters:
-    """n Gaussians over the image at depths 2 to 6: sigma in px, (n, 3) or the middle of random ones, or scales in
-    world units; what is not given is random."""
+    """Make n Gaussians over the image at depths 2 to 6.
+
+    sigma: px, (n, 3), or the centre of random ones; scales: world units, instead of sigma. The rest is random unless
+    given.
+    """
     cam = cam or camera()
     if means is None:
         size = torch.tensor([cam.image_width, cam.image_height])
@@ -115,7 +118,7 @@ def splats(
 def among_ordinary(
     stiff: Parameters, cam: GaussianRasterizationSettings | None = None, absent: Tensor | None = None
 ) -> Problem:
-    """The stiff Gaussians after ordinary ones."""
+    """Make a problem of ordinary Gaussians followed by the stiff ones."""
     ordinary = frustum(ORDINARY, WIDTH, HEIGHT, 3.0, seed=1).parameters
     n = len(stiff["means"])
     is_stiff = torch.cat([torch.zeros(ORDINARY, dtype=torch.bool), torch.ones(n, dtype=torch.bool)])
@@ -140,9 +143,9 @@ def axes(n: int, *sigma: float) -> Tensor:
 
 # ---- bounds that many cases share ----
 
-PLAIN = Bound(5e-6, 1e-5, "sums of some 50 terms, each rounded a few times; nothing about the case adds to it")
+PLAIN = Bound(5e-6, 1e-5, "sums of some 50 terms, each rounded a few times; the case itself adds no error")
 STEEP = Bound(
-    5e-6, 3e-5, "flanks of half a pixel: one rounding of the mean, 4e-6 px, is as much of u; times few pixels' signs"
+    5e-6, 3e-5, "flanks of half a pixel: a rounding of the mean, 4e-6 px, moves u as much; few pixels average it out"
 )
 LONG = Bound(
     3e-4, 3e-3, "a needle turned by one rounding of its quaternion moves its end by 1e-4 px: conditioning", median=2e-4
@@ -162,7 +165,7 @@ def pancakes(ratio: float, cam: GaussianRasterizationSettings | None = None) -> 
 
 
 def turn_x_to(direction: Tensor) -> Tensor:
-    """Quaternions (n, 4) that turn the first axis to unit directions (n, 3)."""
+    """Return quaternions (n, 4) that turn the first axis to unit directions (n, 3)."""
     x = torch.tensor([1.0, 0, 0], dtype=torch.float64).expand_as(direction)
     return torch.cat([1 + direction[:, :1], torch.linalg.cross(x, direction)], 1)
 
@@ -170,8 +173,10 @@ def turn_x_to(direction: Tensor) -> Tensor:
 def long_needles(
     n: int, low: float, high: float, width_px: tuple[float, float] = (1e-3, 3)
 ) -> tuple[Callable[[Generator], Parameters], GaussianRasterizationSettings]:
-    """Needles of sigma low to high px, parallel to the image but for a hundredth; the image sees any part of them
-    within 2.5 sigma."""
+    """Make needles of sigma low to high px, parallel to the image up to a hundredth, and a camera.
+
+    The part of a needle in the image is anywhere within 2.5 sigma of its mean.
+    """
     cam = camera(128, 96)
 
     def make(g: Generator) -> Parameters:
@@ -208,7 +213,7 @@ def needles_as_covariances(g: Generator) -> Problem:
 
 
 def edge_on(cam: GaussianRasterizationSettings) -> Callable[[Generator], Problem]:
-    """Pancakes whose plane goes through the camera: their undilated determinant is that of a line."""
+    """Make pancakes whose plane contains the camera, so that their undilated determinant is that of a line."""
 
     def make(g: Generator) -> Problem:
         n = 30
@@ -250,7 +255,7 @@ SHAPE = [
         "shape",
         "needles of 1e4 to 1e6 px",
         needles_of(1e4, 1e6),
-        Bound(1e-2, 6e-2, "as above, a hundred times longer; what is thinner than its end's rounding is mostly cut"),
+        Bound(1e-2, 6e-2, "as above, a hundred times longer; parts thinner than their end's rounding are mostly cut"),
         double=1e-10,
         cut=0.1,
     ),
@@ -261,8 +266,8 @@ SHAPE = [
         Bound(
             2e-2,
             4e-2,
-            "a float32 covariance does not hold a needle: rounding moved short axes by 0.06 px^2; those that became "
-            "negative are taken as 0 (in float64 too); one more rounding of the input does as much",
+            "a float32 covariance cannot represent a needle: rounding moved short axes by 0.06 px^2; those that became "
+            "negative count as 0 (in float64 too); one more rounding of the input has the same effect",
         ),
         double=2e-2,
         cut=2e-3,
@@ -283,8 +288,7 @@ def at_depths(*depths: float) -> Callable[[Generator], Problem]:
 
 
 def at_rays(low: float, high: float, depth: tuple[float, float], size: float) -> Callable[[Generator], Problem]:
-    """Means at low to high half images from the axis, in a random direction; scales are `size` times their distance
-    from the axis."""
+    """Place means low to high half images from the axis; scales are `size` times the distance from the axis."""
 
     def make(g: Generator) -> Problem:
         n = 24
@@ -301,7 +305,7 @@ def at_rays(low: float, high: float, depth: tuple[float, float], size: float) ->
 
 
 def at_the_clamp(g: Generator) -> Problem:
-    """Rays at 1.3 half images, as near as a float and either side by 1e-5 and 1e-2."""
+    """Place means on both sides of the clamp, rays at 1.3 half images, relative distance 1e-5 and 1e-2."""
     cam = camera()
     by = torch.tensor([1 - 1e-2, 1 - 1e-5, 1 + 1e-5, 1 + 1e-2]).double().repeat_interleave(8)
     n = len(by)
@@ -316,7 +320,7 @@ def at_the_clamp(g: Generator) -> Problem:
 
 
 def far_from_the_origin(g: Generator) -> Problem:
-    """World and camera moved to coordinates of a map projection, unshifted."""
+    """Move world and camera to coordinates of a map projection."""
     made = splats(g, 40)
     offset = torch.tensor([5e5, 4e6, 300.0], dtype=torch.float64)
     view = torch.eye(4, dtype=torch.float64)
@@ -325,7 +329,7 @@ def far_from_the_origin(g: Generator) -> Problem:
 
 
 def in_the_dark(g: Generator) -> Problem:
-    """Behind the camera, in its plane, on it, and a thousandth of a unit around it: all culled."""
+    """Place means behind the camera, in its plane, on it, and a thousandth of a unit around it; all are culled."""
     means = torch.cat([normal(g, 8, 3) * 1e-3, normal(g, 8, 3), torch.zeros(2, 3, dtype=torch.float64)])
     means[8:16, 2] = -means[8:16, 2].abs()
     means[12:16, 2] = 0
@@ -370,7 +374,7 @@ def with_logits(logits: Tensor) -> Callable[[Generator], Problem]:
 
 
 def at_alpha(alpha: float) -> Callable[[Generator], Problem]:
-    """The alpha at a pixel's centre is `alpha` within ulps: opacities are given as they are."""
+    """Make splats whose alpha at a pixel's centre is `alpha` within ulps; opacities are given activated."""
 
     def make(g: Generator) -> Problem:
         problem = among_ordinary(splats(g, 17, sigma=4.0))
@@ -387,7 +391,7 @@ def at_alpha(alpha: float) -> Callable[[Generator], Problem]:
 
 
 def one_pixel_stack(g: Generator) -> Problem:
-    """50,000 wide splats over one pixel, each a little over 1/255: some 2,300 of them blend."""
+    """Stack 50,000 wide splats over one pixel, each with alpha a little over 1/255; some 2,300 of them blend."""
     n = 50_000
     cam = camera(1, 1)
     alpha = uniform(g, 1.005, 1.05, n) / 255
@@ -397,13 +401,13 @@ def one_pixel_stack(g: Generator) -> Problem:
 
 
 def many_opaque(g: Generator) -> Problem:
-    """Every pixel ends: 200 wide splats of alpha 0.05 to 0.99."""
+    """Make 200 wide splats of alpha 0.05 to 0.99, so that every pixel becomes opaque."""
     alpha = uniform(g, 0.05, 0.99, 200)
     return among_ordinary(splats(g, 200, sigma=25.0, logits=torch.log(alpha / (1 - alpha))))
 
 
 def tied(g: Generator, equal: bool) -> Problem:
-    """Thirty Gaussians at one depth, three times over if equal."""
+    """Make thirty Gaussians at one depth; if `equal`, ten different ones three times."""
     means = placed(uniform(g, 0, 1, 10, 2) * torch.tensor([WIDTH, HEIGHT]), torch.full((10,), 3.0), camera())
     if not equal:
         return among_ordinary(splats(g, 30, sigma=8.0, means=torch.cat([means, means + 0.0, means]).roll(1, 0)))
@@ -445,7 +449,7 @@ def bright(g: Generator) -> Problem:
 
 
 def on_the_centre(g: Generator) -> Problem:
-    """`campos` on the mean of a Gaussian that is seen: its viewing direction has no length."""
+    """Put `campos` on the mean of a visible Gaussian, so that its viewing direction has length 0."""
     made = splats(g, 1, sigma=4.0)
     cam = camera(campos=made["means"][0].double())
     return among_ordinary(made, cam)
@@ -468,12 +472,12 @@ TURNED[:3, 3] = torch.tensor([0.7, -0.4, 1.1])
 
 
 def seen_by(n: int, cam: GaussianRasterizationSettings, sigma: float = 3.0) -> Callable[[Generator], Problem]:
-    """Ordinary Gaussians in front of an extreme camera."""
+    """Place ordinary Gaussians in front of an extreme camera."""
 
     def make(g: Generator) -> Problem:
         made = splats(g, n, sigma=sigma, cam=cam)
         shift = torch.linalg.inv(cam.viewmatrix) @ cam.projmatrix
-        offset = shift[2, :2] * torch.tensor([cam.tanfovx, cam.tanfovy])  # of the rays of the image
+        offset = shift[2, :2] * torch.tensor([cam.tanfovx, cam.tanfovy])  # of the image's rays
         view = cam.viewmatrix.T
         local = made["means"].double()
         local[:, :2] -= offset * local[:, 2:]
