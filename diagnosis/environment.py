@@ -119,7 +119,9 @@ def _check_extension(name: str, package: str, torch_version: str) -> list[Line]:
     if built_for and not torch_version.startswith(built_for[0].removeprefix("torch==").rstrip("*")):
         return [Line(f"the extension {name} was built for {built_for[0]}, torch is {torch_version}", again)]
     folder = Path(module.__file__).parent
-    stale = [p.name for p in sorted((ROOT / "submodules" / name / package).glob("*.py")) if _differ(p, folder / p.name)]
+    sources = ROOT / "submodules" / name / package
+    paths = [path.relative_to(sources) for path in sorted(sources.rglob("*.py"))]
+    stale = [str(path) for path in paths if _differ(sources / path, folder / path)]
     if stale:
         return [Line(f"the extension {name} was installed from other sources than these ({', '.join(stale)})", again)]
     return [Line(f"extension {name} {installed}, built for torch {torch_version.split('+')[0]}")]

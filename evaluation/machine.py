@@ -30,7 +30,6 @@ def machine() -> dict[str, Any]:
 def _describe() -> dict[str, Any]:
     import torch
 
-    import gaussian_renderer  # noqa: F401  (compute_device asks for its library)
     from arguments.stored import VERSION
     from utils.host.machine import commit, cpu_name, gpu_name, instruction_set
     from utils.system_utils import compute_device

@@ -51,7 +51,7 @@ def _adam(values, gradients, means, squares, steps, rates, beta1, beta2, eps, co
 @pytest.mark.parametrize("background", [["--random_background"], ["-w"]], ids=["random", "white"])
 def test_fused_and_plain_steps_go_the_same_way(blender_scene, tmp_path, monkeypatch, background):
     monkeypatch.setattr(sys, "stdout", sys.stdout)  # training stamps it
-    monkeypatch.setattr(train, "SH_INTERVAL", 25)
+    monkeypatch.setattr("training.run.SH_INTERVAL", 25)
     random = np.random.default_rng(0)
     write_point_cloud(blender_scene / "points3d.ply", random.uniform(-1, 1, (300, 3)), random.random((300, 3)))
     options = ["--densify_from_iter", "20", "--densification_interval", "20", "--densify_grad_threshold", "5e-5"]
@@ -59,11 +59,11 @@ def test_fused_and_plain_steps_go_the_same_way(blender_scene, tmp_path, monkeypa
     models = []
     for fused in (True, False):
         if not fused:
-            monkeypatch.setattr(train, "render", _render)
-            monkeypatch.setattr(train, "photometric_loss", _loss)
+            monkeypatch.setattr("training.loop.render", _render)
+            monkeypatch.setattr("training.objective.photometric_loss", _loss)
             monkeypatch.setattr(Camera, "target", _target)
             monkeypatch.setattr(GaussianModel, "observe", _observe)
-            monkeypatch.setattr(adam, "_ADAM", _adam)
+            monkeypatch.setattr(adam, "adam_", _adam)
         out = tmp_path / str(fused)
         train.main(["-s", str(blender_scene), "-m", str(out), "--iterations", str(ITERATIONS), *options])
         models.append((out / f"point_cloud/iteration_{ITERATIONS}/point_cloud.ply").read_bytes())

@@ -10,7 +10,8 @@ import math
 from typing import NamedTuple
 
 import torch
-from diff_gaussian_rasterization import rasterize, reference
+from diff_gaussian_rasterization import Gaussians, rasterize, reference
+from diff_gaussian_rasterization.ops import scene_arguments
 from torch import Tensor
 
 from benchmarks.workloads import textbook
@@ -57,9 +58,8 @@ def _exponents(parameters: dict[str, Tensor], camera, render) -> Tensor:
 
 def _gradient_errors(parameters: dict[str, Tensor], camera) -> tuple[float, float]:
     height, width = camera.image_height, camera.image_width
-    names = ("means", "opacities", "scales", "rotations", "cov3d", "colors", "sh_dc", "sh_rest")
-    settings = (camera.viewmatrix, camera.projmatrix, camera.campos, camera.tanfovx, camera.tanfovy, height, width)
-    splats, depths, rects, counts, _ = _OPS.project(*(parameters.get(n) for n in names), *settings, 3, 1.0, False, True)
+    arguments = scene_arguments(Gaussians(**parameters), camera, raw=True)
+    splats, depths, rects, counts, _ = _OPS.project(*arguments)
     order = torch.argsort(torch.where(counts > 0, depths, math.inf), stable=True)[: int((counts > 0).sum())]
     l11, l12, l22 = splats[order, 2:5].double().unbind(1)
     xx, xy, yy = 1 / l11**2 + (l12 / (l11 * l22)) ** 2, -l12 / (l11 * l22**2), 1 / l22**2

@@ -9,7 +9,8 @@ from dataclasses import dataclass
 from functools import partial
 
 import torch
-from diff_gaussian_rasterization import rasterize
+from diff_gaussian_rasterization import Gaussians, rasterize
+from diff_gaussian_rasterization.ops import scene_arguments
 from fused_ssim import fused_photometric_loss
 from torch import Tensor
 
@@ -147,13 +148,11 @@ def gradient_buffers(work: Workload) -> Row:
 
 
 def _operator(work: Workload, model: GaussianModel, train: bool) -> tuple[Tensor, ...]:
-    s = work.settings
-    camera = (s.viewmatrix, s.projmatrix, s.campos, s.tanfovx, s.tanfovy, s.image_height, s.image_width)
-    shape = (*model.raw_geometry().values(), None, None, model.get_features_dc, model.get_features_rest)
-    numbers = (model.active_sh_degree, 1.0, False, True)
-    return torch.ops.diff_gaussian_rasterization.rasterize(
-        model.get_xyz, model.get_xyz, *shape, *camera, *numbers, s.bg, False, train
-    )
+    colors = {"sh_dc": model.get_features_dc, "sh_rest": model.get_features_rest}
+    gaussians = Gaussians(model.get_xyz, **model.raw_geometry(), **colors)
+    settings = work.settings._replace(sh_degree=model.active_sh_degree)
+    arguments = scene_arguments(gaussians, settings, raw=True)
+    return torch.ops.diff_gaussian_rasterization.rasterize(model.get_xyz, *arguments, settings.bg, False, train)
 
 
 def exposure(work: Workload) -> Row:

@@ -3,7 +3,10 @@
 from collections.abc import Callable
 
 import torch
-from diff_gaussian_rasterization import rasterize
+from diff_gaussian_rasterization import Gaussians, rasterize
+from diff_gaussian_rasterization.ops import scene_arguments
+from diff_gaussian_rasterization.optim import adam_
+from diff_gaussian_rasterization.schema import GRADIENTS
 from torch import Tensor
 
 from benchmarks.workloads.splat_scenes import PARAMETERS, SplatScene
@@ -45,7 +48,7 @@ class Calls:
         counters, n = [torch.zeros(()) for _ in values], len(values)
         with torch.no_grad():
             gradients = [t.grad for t in values]
-            OPS.adam_(values, gradients, *self._moments, counters, [0.0] * n, 0.9, 0.999, 1e-15, [-1] * n)
+            adam_(values, gradients, *self._moments, counters, [0.0] * n, 0.9, 0.999, 1e-15, [-1] * n)
 
     def clear(self) -> None:
         """Drop the gradients, as zero_grad(set_to_none=True) does."""
@@ -62,10 +65,9 @@ class Stages:
     @torch.no_grad()
     def __init__(self, scene: SplatScene) -> None:
         settings, size = scene.settings(torch.float32), (scene.height, scene.width)
-        camera = (settings.viewmatrix, settings.projmatrix, settings.campos, settings.tanfovx, settings.tanfovy)
-        inputs = [scene.parameters[name] for name in PARAMETERS]
-        arguments = (*inputs[:4], None, None, *inputs[4:], *camera, *size, settings.sh_degree, 1.0, False, True)
-        wanted = [True] * 5 + [False] * 2 + [True] * 2
+        inputs = {name: scene.parameters[name] for name in PARAMETERS}
+        arguments = scene_arguments(Gaussians(**inputs), settings, raw=True)
+        wanted = [name in (*PARAMETERS, "means2d") for name in GRADIENTS]
         projected = OPS.project(*arguments)
         self.splats, counts = projected[0], projected[3]
         self.instances, self.ranges, *slots = OPS.bin(*projected[:4], *size, True)

@@ -2,7 +2,6 @@
 
 import platform
 
-import diff_gaussian_rasterization  # noqa: F401  (`compute_device` asks its loaded library for CUDA kernels)
 import torch
 
 from utils.files.markdown_table import markdown_table

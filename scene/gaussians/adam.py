@@ -4,14 +4,13 @@ import math
 from collections.abc import Callable
 from typing import Any
 
-import diff_gaussian_rasterization  # noqa: F401  (its library holds the Adam kernel)
 import torch
+from diff_gaussian_rasterization.optim import adam_
 from torch import Tensor, nn
 
 from utils.host.memory import is_out_of_memory
 
 _CHUNK = 1 << 16  # rows moved at a time when memory is too short for all of them
-_ADAM = torch.ops.diff_gaussian_rasterization.adam_
 
 
 class StepGuard:
@@ -84,7 +83,7 @@ class GaussianAdam(torch.optim.Adam):
                 columns.append(active)
         if tensors:
             lists, guard = map(list, zip(*tensors, strict=True)), self.guard.arguments if self.guard else ()
-            _ADAM(*lists, rates, *self.defaults["betas"], self.defaults["eps"], columns, *guard)
+            adam_(*lists, rates, *self.defaults["betas"], self.defaults["eps"], columns, *guard)
         return loss
 
     step.hooked = True  # keeps torch from wrapping it

@@ -1,11 +1,10 @@
 """Adam that steps only the Gaussians seen in the view of an iteration."""
 
 import torch
+from diff_gaussian_rasterization.optim import sparse_adam_
 from torch import Tensor
 
 from scene.gaussians.adam import GaussianAdam
-
-_SPARSE_ADAM = torch.ops.diff_gaussian_rasterization.sparse_adam_
 
 
 class SparseGaussianAdam(GaussianAdam):
@@ -28,4 +27,4 @@ class SparseGaussianAdam(GaussianAdam):
             beta1, beta2 = group["betas"]
             columns = self._active_columns.get(group["name"], -1)
             guard = self.guard.arguments if self.guard else ()
-            _SPARSE_ADAM(param, param.grad, *moments, visible, group["lr"], beta1, beta2, group["eps"], columns, *guard)
+            sparse_adam_(param, param.grad, *moments, visible, group["lr"], beta1, beta2, group["eps"], columns, *guard)

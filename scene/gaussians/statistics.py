@@ -2,11 +2,9 @@
 
 from dataclasses import dataclass
 
-import diff_gaussian_rasterization  # noqa: F401  (its library holds the kernel)
 import torch
+from diff_gaussian_rasterization.optim import observe_
 from torch import Tensor
-
-_OBSERVE = torch.ops.diff_gaussian_rasterization.observe_
 
 
 @dataclass
@@ -28,7 +26,7 @@ class Statistics:
 
     def observe(self, gradient: Tensor, radii: Tensor) -> None:
         """Add a view in one pass: gradient (N, 3) per NDC unit, radii (N,) int32 pixels, 0 where it saw nothing."""
-        _OBSERVE(self.max_radii2D, self.xyz_gradient_accum, self.denom, radii, gradient)
+        observe_(self.max_radii2D, self.xyz_gradient_accum, self.denom, radii, gradient)
 
     def add_gradient(self, gradient: Tensor, seen: Tensor) -> None:
         """Add a view without its radii: gradient (N, 3) per NDC unit, seen: indices (n,) or (n, 1), or a mask (N,)."""

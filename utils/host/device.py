@@ -4,13 +4,13 @@ import torch
 
 
 def compute_device() -> torch.device:
-    """`cuda` when a GPU is visible and the rasterizer was built with its CUDA kernels, else `cpu`.
-
-    The rasterizer's library must be loaded by then (gaussian_renderer does it); unloaded counts as "no kernels".
-    """
+    """`cuda` when a GPU is visible and the rasterizer was built with its CUDA kernels, else `cpu`."""
     return torch.device("cuda" if torch.cuda.is_available() and _has_cuda_kernels() else "cpu")
 
 
 def _has_cuda_kernels() -> bool:
-    loaded = hasattr(torch.ops.diff_gaussian_rasterization, "rasterize")
-    return loaded and torch._C._dispatch_has_kernel_for_dispatch_key("diff_gaussian_rasterization::rasterize", "CUDA")
+    try:
+        from diff_gaussian_rasterization import has_cuda_kernels
+    except ImportError:  # metrics.py and doctor.py work without the extension
+        return False
+    return has_cuda_kernels()
