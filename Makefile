@@ -1,13 +1,17 @@
 # make demo   a scene made, trained, rendered and scored
 # make test   lint, format check, C++ tests, pytest
 # make format rewrites what the format check would complain about
+# make docs   the site, build/site/index.html; a dead link or a page outside of the navigation fails
 # All set up .venv first: pinned requirements and the three extensions, again only when their sources have changed.
+# The site needs neither and has an environment of its own, .venv-docs.
 # Variables: PYTHON (3.10 or newer); CXX, GS_CUDA, CUDA_HOME as in submodules/common/build_extension.py (after a change
 # of these `rm .venv/.built-*`).
 
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
+DOCS_VENV := .venv-docs
+CHECK_PYTHON := import sys; sys.exit(sys.version_info < (3, 10) and "Python 3.10 or newer is needed: make PYTHON=...")
 EXTENSIONS := simple-knn fused-ssim diff-gaussian-rasterization
 CXX_TESTS := $(patsubst submodules/%.cpp,build/%,$(wildcard submodules/*/csrc/tests/*.cpp))
 CXX_TEST_FLAGS := -std=c++17 -O1 -g -Wall -Wextra -Werror -fsanitize=address,undefined -fno-sanitize-recover=all -pthread
@@ -17,13 +21,13 @@ CXX_SOURCES := $(shell find submodules benchmarks -name build -prune -o \( -name
 sources = $(shell find submodules/common submodules/$(1) \( -name build -o -name tests -o -name emulation \) -prune -o \
             \( -name '*.cpp' -o -name '*.cu*' -o -name '*.h' -o -name '*.py' -o -name '*.toml' \) -print)
 
-.PHONY: install demo test lint format cpp-test clean
+.PHONY: install demo test lint format cpp-test docs clean
 .NOTPARALLEL:
 
 install: $(EXTENSIONS:%=$(VENV)/.built-%)
 
 $(VENV)/.requirements: requirements.txt requirements-dev.txt
-	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 10) and "Python 3.10 or newer is needed: make PYTHON=...")'
+	@$(PYTHON) -c '$(CHECK_PYTHON)'
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet --disable-pip-version-check -r requirements-dev.txt
 	@touch $@
@@ -74,5 +78,14 @@ build/%/csrc/tests/test_cuda_emulated: submodules/%/csrc/tests/test_cuda_emulate
 	    -Isubmodules/common/include $< $(@D)/emulated/*.cpp $(EMULATION)/emulation.cpp \
 	    $(wildcard submodules/$*/csrc/cpu/*.cpp) -o $@
 
+docs: $(DOCS_VENV)/.requirements
+	NO_MKDOCS_2_WARNING=true $(DOCS_VENV)/bin/mkdocs build --strict
+
+$(DOCS_VENV)/.requirements: requirements-docs.txt
+	@$(PYTHON) -c '$(CHECK_PYTHON)'
+	$(PYTHON) -m venv $(DOCS_VENV)
+	$(DOCS_VENV)/bin/pip install --quiet --disable-pip-version-check -r $<
+	@touch $@
+
 clean:
-	rm -rf $(VENV) build submodules/*/build submodules/*/*.egg-info
+	rm -rf $(VENV) $(DOCS_VENV) build submodules/*/build submodules/*/*.egg-info

@@ -1,6 +1,6 @@
 """Small scenes with one fault each, and what the reader says to them.
 
-PYTHONPATH=.:tests python -m broken_datasets > docs/broken_datasets.md
+PYTHONPATH=.:tests python -m broken_datasets > docs/inside/broken_datasets.md
 """
 
 import argparse
@@ -76,12 +76,21 @@ def make_masters(folder: Path) -> dict[str, Path]:
     return {"colmap": folder / "colmap", "blender": folder / "blender"}
 
 
+INTRODUCTION = """\
+# Broken datasets and their messages
+
+Each row has one fault and the message that `train.py` prints for it before it exits with status 2. SCENE stands for the
+folder given with `-s`. The script `tests/broken_datasets.py` makes the faults and writes this page:
+
+    PYTHONPATH=.:tests python -m broken_datasets > docs/inside/broken_datasets.md
+"""
+
+
 def main() -> None:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         masters = make_masters(folder)
-        print("# What broken datasets are told\n")
-        print("One fault each, made by `tests/broken_datasets.py`; SCENE is the folder given with -s.\n")
+        print(INTRODUCTION)
         print("| # | fault | message |\n|---|---|---|")
         for number, entry in enumerate(FAULTS, start=1):
             work = folder / str(number)

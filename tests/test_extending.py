@@ -1,4 +1,4 @@
-"""The worked example of docs/extending.md, applied to a copy of the code: its temperatures are learnt and kept.
+"""The worked example of docs/inside/extending.md, applied to a copy of the code: its temperatures are learnt and kept.
 
 The truth is known for every Gaussian: a model is trained by the plain code, its half with x > 0 is declared hot, and
 renders of that are the thermal pictures. The extended code trains the same Gaussians, row by row.
@@ -28,7 +28,7 @@ from scene.gaussian_model import GaussianModel
 from scene.gaussians.checkpoint import load_checkpoint
 
 ROOT = Path(__file__).parents[1]
-PAGE = ROOT / "docs" / "extending.md"
+PAGE = ROOT / "docs" / "inside" / "extending.md"
 CODE = ("arguments", "gaussian_renderer", "scene", "training", "utils", "train.py", "render.py", "pyproject.toml")
 TESTS = ("conftest.py", "gaussians.py", "synthetic.py", "test_densification.py")
 HOT, COLD, START = 0.9, 0.2, 0.5
@@ -106,7 +106,7 @@ def _extend(folder: Path) -> None:
     done = subprocess.run(
         ["git", "apply", "-"], input="".join(diffs), cwd=folder, env=environment, capture_output=True, text=True
     )
-    assert done.returncode == 0, f"the code has moved on, bring the diffs of docs/extending.md along: {done.stderr}"
+    assert done.returncode == 0, f"the code has changed; bring the diffs of {PAGE} up to date: {done.stderr}"
 
 
 def _paint(scene: Path, model: Path) -> list[np.ndarray]:
