@@ -6,7 +6,10 @@ from typing import NamedTuple
 
 from torch import Tensor
 
+from scene.gaussians.density import logit
+
 Rows = dict[str, Tensor]  # raw values (N, *shape), float32, by optimiser group
+INITIAL_OPACITY = 0.1
 
 
 class Attribute(NamedTuple):
@@ -16,6 +19,7 @@ class Attribute(NamedTuple):
     shape: tuple[int, ...]  # of one Gaussian's values, (..., 3) with RGB last for SH
     columns: list[str]  # in the PLY; SH band by band within a channel
     rate: Callable[[argparse.Namespace, float], float]  # learning rate from optimisation options and scene extent
+    start: float = 0.0  # every raw value of a new Gaussian, unless its point tells (scene/gaussians/start.py)
 
 
 def attributes(sh_degree: int) -> dict[str, Attribute]:
@@ -30,7 +34,7 @@ def attributes(sh_degree: int) -> dict[str, Attribute]:
         "f_rest": Attribute(
             "_features_rest", (bands, 3), _numbered("f_rest", 3 * bands), lambda opt, _: opt.feature_lr / 20.0
         ),
-        "opacity": Attribute("_opacity", (1,), ["opacity"], lambda opt, _: opt.opacity_lr),
+        "opacity": Attribute("_opacity", (1,), ["opacity"], lambda opt, _: opt.opacity_lr, logit(INITIAL_OPACITY)),
         "scaling": Attribute("_scaling", (3,), _numbered("scale", 3), lambda opt, _: opt.scaling_lr),
         "rotation": Attribute("_rotation", (4,), _numbered("rot", 4), lambda opt, _: opt.rotation_lr),
     }

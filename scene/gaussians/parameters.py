@@ -80,7 +80,11 @@ class GaussianParameters:
 
     def raw_geometry(self) -> dict[str, Tensor]:
         """Raw shapes by the rasterizer's names: opacities (N, 1) logit, scales (N, 3) log, rotations (N, 4) wxyz."""
-        return {"opacities": self._opacity, "scales": self._scaling, "rotations": self._rotation}
+        return {"opacities": self.raw("opacity"), "scales": self.raw("scaling"), "rotations": self.raw("rotation")}
+
+    def raw(self, name: str) -> Tensor:
+        """Raw values (N, ...) of an attribute, by its name in the table of scene/gaussians/attributes.py."""
+        return getattr(self, self._attributes[name].field)
 
     @property
     def active_bands(self) -> int:

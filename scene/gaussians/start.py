@@ -7,12 +7,10 @@ import torch
 from simple_knn._C import distCUDA2
 
 from scene.gaussians.attributes import Rows, attributes
-from scene.gaussians.density import logit
 from utils.graphics_utils import BasicPointCloud
 from utils.sh_utils import RGB2SH
 from utils.system_utils import UserError
 
-INITIAL_OPACITY = 0.1
 MIN_DISTANCE2 = 1e-7  # floor of the squared distance to the neighbours, square world units: duplicates get a size
 LONE_POINT_SCALE = 0.01  # initial scale as a part of the extent where there are too few points to have neighbours
 OUTLIER_SCALE = 100.0  # extents: a larger initial scale is that of a stray point; real scenes have up to 20 or so
@@ -35,11 +33,10 @@ def start_rows(cloud: BasicPointCloud, extent: float, sh_degree: int) -> Rows:
     # NumPy's log: one thread, so the same bits for any number of torch's threads.
     log_scale = torch.from_numpy(np.log(_initial_scales(points, extent)))
     colors = torch.from_numpy(np.asarray(cloud.colors, dtype=np.float32))
-    return {
+    rows = {name: torch.full((count, *a.shape), a.start) for name, a in attributes(sh_degree).items()}
+    return rows | {
         "xyz": torch.from_numpy(points.copy()),
         "f_dc": RGB2SH(colors).reshape(count, 1, 3),
-        "f_rest": torch.zeros(count, *attributes(sh_degree)["f_rest"].shape),
-        "opacity": torch.full((count, 1), logit(INITIAL_OPACITY)),
         "scaling": log_scale[:, None].repeat(1, 3),
         "rotation": torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1),
     }

@@ -1,0 +1,238 @@
+"""The layout of the code: rooms and what they may import, lengths of functions and files, names that users import."""
+
+import ast
+import re
+import subprocess
+import sys
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+COMMANDS = ("train", "render", "metrics", "full_eval", "convert", "doctor", "setup")
+ROOMS = (
+    *("arguments", "benchmarks", "conversion", "demo", "diagnosis", "evaluation", "gaussian_renderer", "records"),
+    *("scene", "training", "utils"),
+)
+CSRC = ROOT / "submodules"
+LONGEST = 60  # lines of a function
+
+# What a room may import besides itself: prefixes of module names. The room of a module is its longest prefix here.
+MAY_IMPORT = {
+    "utils": (),
+    "utils.host": (),
+    "utils.exact": (),
+    "utils.files": ("utils",),
+    "utils.camera_utils": ("scene.cameras",),  # a name of the reference
+    "utils.make_depth_scale": ("scene.readers.depth_scale", "utils"),  # a command of the reference
+    "arguments": ("utils",),
+    "records": ("utils",),
+    "scene.pictures": ("utils",),
+    "scene.readers": ("scene.pictures", "utils"),
+    "scene.gaussians": ("utils",),
+    "scene.gaussian_model": ("scene.gaussians", "scene.readers.records", "utils"),
+    "scene.dataset_readers": ("scene.readers", "scene.pictures", "utils"),
+    "scene.cameras": ("scene.readers.records", "scene.pictures", "utils"),
+    "scene": ("arguments", "utils"),
+    "gaussian_renderer": ("scene", "arguments", "utils"),
+    "training": ("gaussian_renderer", "scene", "records", "arguments", "utils"),
+    "training.observers": ("training", "gaussian_renderer", "scene", "records", "arguments", "utils"),
+    "diagnosis": ("gaussian_renderer", "scene", "arguments", "utils"),
+    "conversion": ("scene.readers", "scene.pictures", "utils"),
+    "evaluation": ("records", "arguments", "scene.saved_iterations", "scene.readers.records", "utils"),
+    "demo": ("evaluation", "arguments", "utils"),
+    "benchmarks": ("utils",),
+    "benchmarks.workloads": ("demo", "scene.pictures", "utils"),
+    "benchmarks.harness": ("benchmarks.workloads", "utils"),
+    "benchmarks.peers": ("benchmarks.harness", "benchmarks.workloads", "utils"),
+}
+MEASURED = ("train", "render", "metrics", *(room for room in ROOMS if room != "benchmarks"))
+for room, below in {
+    "kernels": ("benchmarks.peers", "benchmarks.harness", "benchmarks.workloads"),
+    "accuracy": ("benchmarks.harness", "benchmarks.workloads"),
+    "costs": ("benchmarks.harness", "benchmarks.workloads"),
+    "scenes": ("benchmarks.harness", "benchmarks.workloads"),
+}.items():
+    MAY_IMPORT[f"benchmarks.{room}"] = (*below, *MEASURED)
+
+# Names that users of the reference import, and what came with them.
+UTILS = {
+    *("camera_utils", "general_utils", "graphics_utils", "image_utils", "loss_utils", "make_depth_scale"),
+    *("lpips_utils", "sh_utils", "system_utils"),
+}
+
+
+@cache
+def _tree(path: Path) -> ast.Module:
+    return ast.parse(path.read_text(encoding="utf-8"))
+
+
+def _python() -> list[Path]:
+    """All Python files but tests, as a clone has them."""
+    files = [path for room in ROOMS for path in (ROOT / room).rglob("*.py")]
+    files += [ROOT / f"{name}.py" for name in COMMANDS]
+    files += [path for path in CSRC.rglob("*.py") if "build" not in path.relative_to(CSRC).parts]
+    return sorted(files)
+
+
+def _module(path: Path) -> str:
+    return ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
+
+
+def _within(module: str, room: str) -> bool:
+    return module == room or module.startswith(room + ".")
+
+
+def _room(module: str) -> str:
+    return max((room for room in MAY_IMPORT if _within(module, room)), key=len)
+
+
+def _is_module(name: str) -> bool:
+    path = ROOT / name.replace(".", "/")
+    return path.with_suffix(".py").is_file() or (path / "__init__.py").is_file()
+
+
+def _imports(path: Path) -> Iterator[str]:
+    """The project's modules that a file imports; `from a import b` counts as a.b where that is a module."""
+    for node in ast.walk(_tree(path)):
+        if isinstance(node, ast.Import):
+            names = [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            names = [f"{node.module}.{alias.name}" for alias in node.names]
+            names = [name if _is_module(name) else node.module for name in names]
+        else:
+            continue
+        yield from (name for name in names if name.split(".")[0] in (*ROOMS, *COMMANDS))
+
+
+@pytest.mark.parametrize("path", [path for path in _python() if path.relative_to(ROOT).parts[0] in ROOMS], ids=_module)
+def test_a_module_imports_only_rooms_below_it(path):
+    room = _room(_module(path))
+    allowed = (room, *MAY_IMPORT[room])
+    wrong = [name for name in _imports(path) if not any(_within(name, prefix) for prefix in allowed)]
+    assert not wrong, f"{_module(path)} imports {wrong}; {room} may import {allowed}"
+
+
+def test_tests_import_only_workloads_of_the_benchmarks_that_they_do_not_test():
+    tested = {"test_benchmarks", "test_costs", "test_stability", "test_accuracy_benchmark"}
+    for path in (ROOT / "tests").rglob("*.py"):
+        if path.stem not in tested:
+            named = [name for name in _imports(path) if _within(name, "benchmarks")]
+            assert all(_within(name, "benchmarks.workloads") for name in named), f"{path.name} imports {named}"
+
+
+def test_extensions_import_nothing_of_the_project():
+    for path in CSRC.rglob("*.py"):
+        assert not list(_imports(path)), path
+
+
+def test_utils_has_the_names_of_the_reference_at_its_top():
+    assert {path.stem for path in (ROOT / "utils").glob("*.py")} - {"__init__"} == UTILS
+
+
+def test_functions_are_short_in_python():
+    long = {
+        f"{_module(path)}.{node.name}": length
+        for path in _python()
+        for node in ast.walk(_tree(path))
+        if isinstance(node, ast.FunctionDef) and (length := node.end_lineno - node.lineno + 1) > LONGEST
+    }
+    assert not long
+
+
+def _csrc() -> list[Path]:
+    endings = {".h", ".cpp", ".cu", ".cuh"}
+    return [
+        path
+        for path in CSRC.rglob("*")
+        if path.suffix in endings and not {"build", "tests"} & set(path.relative_to(CSRC).parts)
+    ]
+
+
+def test_functions_are_short_in_c_plus_plus():
+    """clang-format puts the closing brace of a function at the margin, and besides only those of types."""
+    head = r"^(?!namespace|struct|class|enum|union|extern|static_assert)[\w\[<][^\n]*\n(?:[^}\n][^\n]*\n)*?"
+    function = re.compile(head + r"(?:(?!})[^\n]*\n)*?}$", re.MULTILINE)
+    lengths = {}
+    for path in _csrc():
+        text = path.read_text(encoding="utf-8")
+        for match in function.finditer(text):
+            if "{\n" in match[0]:
+                line = text[: match.start()].count("\n") + 1
+                lengths[f"{path.relative_to(CSRC)}:{line}"] = match[0].count("\n") + 1
+    assert len(lengths) > 250
+    assert not {place: length for place, length in lengths.items() if length > LONGEST}
+
+
+def test_files_of_the_loop_and_the_model_stay_on_a_page():
+    for name, most in {"training/loop.py": 60, "train.py": 140, "scene/gaussian_model.py": 300}.items():
+        assert len((ROOT / name).read_text(encoding="utf-8").splitlines()) <= most, name
+
+
+def _includes(path: Path) -> list[str]:
+    return re.findall(r'^#include [<"](.+)[>"]', path.read_text(encoding="utf-8"), re.MULTILINE)
+
+
+def test_the_arithmetic_includes_nothing_above_it():
+    headers = list(CSRC.glob("*/csrc/math/*.h"))
+    assert len(headers) > 15
+    for path in headers:
+        for name in _includes(path):
+            own = (path.parent / name).is_file() or name.startswith(("math/", "gs/")) or name == "data.h"
+            assert own or re.fullmatch(r"c?\w+", name), f"{path.relative_to(CSRC)} includes {name}"
+
+
+def test_tensors_are_seen_in_one_folder():
+    for path in _csrc():
+        if "torch" not in path.relative_to(CSRC).parts:
+            seen = [name for name in _includes(path) if name.startswith(("torch/", "ATen/", "c10/"))]
+            assert not seen, f"{path.relative_to(CSRC)} includes {seen}"
+
+
+def test_one_place_knows_half_images_and_one_the_operators():
+    for path in _python():
+        text = path.read_text(encoding="utf-8")
+        if _module(path) not in ("gaussian_renderer.scored_views", "utils.image_utils"):
+            assert "right_half(" not in text, path
+        if path.relative_to(ROOT).parts[0] not in ("submodules", "benchmarks"):
+            assert "torch.ops.diff_gaussian_rasterization" not in text, path
+
+
+def _loaded(statement: str) -> list[str]:
+    """The modules of scene that are loaded after a statement in a fresh process."""
+    code = f"import sys\n{statement}\nprint(*(name for name in sys.modules if name.split('.')[0] == 'scene'))"
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    return done.stdout.split()
+
+
+def test_the_model_loads_no_reader_but_the_records():
+    readers = [name for name in _loaded("import scene.gaussian_model") if name.startswith("scene.readers.")]
+    assert readers == ["scene.readers.records"]
+    assert _loaded("import scene") == ["scene"]
+
+
+def test_what_users_import_is_there():
+    code = """
+from scene import GaussianModel, Scene, cameras
+from scene.cameras import Camera, MiniCam
+from scene.dataset_readers import CameraInfo, SceneInfo, sceneLoadTypeCallbacks
+from scene.gaussian_model import GaussianModel as same
+from train import prepare_output_and_logger, training, training_report
+from utils.camera_utils import cameraList_from_camInfos, camera_to_JSON
+from utils.system_utils import Terminated, compute_device, mkdir_p, searchForMaxIteration
+assert same is GaussianModel and Scene.__module__ == "scene.scene" and cameras.Camera is Camera
+"""
+    subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True)
+    with pytest.raises(ImportError, match="no_such_name"):
+        from scene import no_such_name  # noqa: F401
+
+
+def test_private_tensors_are_read_inside_scene_alone():
+    """`pc._opacity` and its like are the model's own; the renderer takes `raw_geometry()`."""
+    private = {"_xyz", "_features_dc", "_features_rest", "_scaling", "_rotation", "_opacity"}
+    for path in _python():
+        if path.relative_to(ROOT).parts[0] not in ("scene", "submodules"):
+            found = {node.attr for node in ast.walk(_tree(path)) if isinstance(node, ast.Attribute)} & private
+            assert not found, f"{path.relative_to(ROOT)} reads {found}"
