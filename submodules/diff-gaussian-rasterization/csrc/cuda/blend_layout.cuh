@@ -3,7 +3,7 @@
 // and the ballot are shared; 32 splats at a time are tested against the sub-tile, a lane each.
 #include <cuda_runtime.h>
 
-#include "../launch.h"
+#include "../data.h"
 #include "../math/blend.h"
 #include "../math/exp2.h"
 #include "../math/footprint.h"
@@ -105,8 +105,6 @@ __device__ __forceinline__ void front_to_back(const Batch<kCount>& batch, const 
       for (int p = 0; p < L::kRun; ++p) step(k[i], p, t[i][p]);
   }
 }
-
-inline int64_t tiles_of(Image image) { return int64_t(tile_count(image.width)) * tile_count(image.height); }
 
 }  // namespace cuda
 }  // namespace gs

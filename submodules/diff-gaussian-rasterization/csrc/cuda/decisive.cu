@@ -2,7 +2,7 @@
 // the end of a training, so simple before fast.
 #include <cuda_runtime.h>
 
-#include "../launch.h"
+#include "../backend.h"
 #include "../math/blend.h"
 #include "../math/tiles.h"
 #include "queue.cuh"
@@ -37,8 +37,7 @@ __global__ void __launch_bounds__(kTile* kTile)
 
 template <>
 void mark_decisive<float>(const Queue& queue, const BlendInput<float>& in, const int32_t* last, bool* decisive) {
-  const int64_t tiles = int64_t(tile_count(in.image.width)) * tile_count(in.image.height);
-  decisive_kernel<<<unsigned(tiles), kTile * kTile, 0, stream_of(queue)>>>(in, last, decisive);
+  decisive_kernel<<<unsigned(tiles_of(in.image)), kTile * kTile, 0, stream_of(queue)>>>(in, last, decisive);
   check_launch("decisive");
 }
 

@@ -1,7 +1,7 @@
 #pragma once
 // Writing the instances (tile, splat) in depth order. Blocks share the instances evenly, not the splats: the nearest
 // splats lie side by side in that order and reach a thousand tiles each.
-#include "reached.cuh"
+#include "tile_record.cuh"
 #include "tiles.cuh"
 
 namespace gs {
