@@ -9,6 +9,7 @@
 #include "../math/footprint.h"
 #include "../math/tiles.h"
 #include "queue.cuh"
+#include "splat_row.cuh"
 
 namespace gs {
 namespace cuda {
@@ -48,9 +49,7 @@ struct Batch {
   float4 color[kCount];  // r, g, b
 
   __device__ void put(int k, const float* splats, int32_t index, float left, float top) {
-    const float2* from = reinterpret_cast<const float2*>(splats + kSplatValues * int64_t(index));
-    const float2 a = from[0], b = from[1], c = from[2], d = from[3], e = from[4];
-    const Splat<float> splat = {a.x, a.y, b.x, b.y, c.x, c.y, d.x, d.y, e.x, e.y};
+    const Splat<float> splat = load_splat(splats, index);
     const LocalSplat<float> s = localise(splat, left, top);
     shape[k] = make_float4(s.y, s.l11, s.l12, s.l22);
     rest[k] = make_float4(s.u, s.log2_opacity, splat.x - left, s.inverse_depth);

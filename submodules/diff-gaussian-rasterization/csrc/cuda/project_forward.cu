@@ -4,6 +4,7 @@
 #include "../backend.h"
 #include "../math/scene_row.h"
 #include "sh_rows.cuh"
+#include "splat_row.cuh"
 #include "tiles.cuh"
 
 namespace gs {
@@ -58,12 +59,7 @@ __global__ void __launch_bounds__(kThreads) project_kernel(Scene<float> s, Proje
   }
   if (!count) return;
   if (out.rects) reinterpret_cast<int4*>(out.rects)[i] = make_int4(rect.x0, rect.y0, rect.x1, rect.y1);
-  float2* to = reinterpret_cast<float2*>(out.splats + kSplatValues * i);
-  to[0] = make_float2(splat.x, splat.y);
-  to[1] = make_float2(splat.l11, splat.l12);
-  to[2] = make_float2(splat.l22, splat.log2_opacity);
-  to[3] = make_float2(splat.r, splat.g);
-  to[4] = make_float2(splat.b, splat.inverse_depth);
+  store_splat(out.splats, i, splat);
 }
 
 __global__ void mark_visible_kernel(int64_t count, const float* means, const float* view, bool* visible) {
