@@ -153,7 +153,8 @@ def write_extension(folder: Path, kernel: str) -> None:
     (folder / "toy" / "__init__.py").touch()
     (folder / "csrc" / "cpu").mkdir(parents=True)
     (folder / "csrc" / "cpu" / "kernel_isa.cpp").write_text(kernel)
-    (folder / "csrc" / "ops.cpp").write_text("")
+    (folder / "csrc" / "torch").mkdir()
+    (folder / "csrc" / "torch" / "ops.cpp").write_text("")
     (folder / "setup.py").write_text(
         f"import sys\nfrom pathlib import Path\nsys.path.insert(0, {str(COMMON)!r})\n"
         "from build_extension import setup_extension\n"

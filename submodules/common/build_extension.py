@@ -96,7 +96,8 @@ class BuildBackend(build_ext):
             ops_flags += ["-DGS_CUDA", "-isystem", str(toolkit / "include")]
             libraries += ["-ltorch_cuda", "-lc10_cuda", f"-L{toolkit / 'lib64'}", f"-L{toolkit / 'lib'}", "-lcudart"]
 
-        compilations = [([*compile_cxx, *ops_flags], csrc / "ops.cpp", "ops.o")]
+        ops = sorted((csrc / "torch").glob("*.cpp"))
+        compilations = [([*compile_cxx, *ops_flags], source, f"{source.stem}.torch.o") for source in ops]
         sources = sorted((csrc / "cpu").glob("*.cpp"))
         # What is compiled once rounds alike everywhere: no fused products where the machine has them (gs/rounded.h).
         once = [*compile_cxx, "-ffp-contract=off"]

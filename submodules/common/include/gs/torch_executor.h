@@ -1,5 +1,5 @@
 #pragma once
-// Executor over torch's intra-op pool (torch.set_num_threads governs it). Only ops.cpp includes this.
+// Executor over torch's intra-op pool (torch.set_num_threads governs it). For csrc/torch alone.
 #include <ATen/Parallel.h>
 
 #include "gs/parallel.h"

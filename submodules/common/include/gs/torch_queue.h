@@ -1,5 +1,5 @@
 #pragma once
-// Queue over torch's current stream and caching allocator. Only ops.cpp includes this, in CUDA builds.
+// Queue over torch's current stream and caching allocator. For csrc/torch alone, in CUDA builds.
 #include <ATen/core/Tensor.h>
 #include <ATen/ops/empty.h>
 #include <c10/cuda/CUDACachingAllocator.h>

@@ -1,6 +1,6 @@
 #include <type_traits>
 
-#include "../launch.h"
+#include "../backend.h"
 #include "../math/adam.h"
 
 GS_ISA_BEGIN

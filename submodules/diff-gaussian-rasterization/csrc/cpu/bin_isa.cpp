@@ -3,6 +3,7 @@
 #include <type_traits>
 #include <vector>
 
+#include "../backend.h"
 #include "../math/slots.h"
 #include "gs/simd.h"
 #include "list_tiles.h"
@@ -134,7 +135,7 @@ void bin(const Executor& executor, int64_t count, const Projected<T>& projected,
       std::fill(splats.begin() + offsets[i], splats.begin() + offsets[i + 1], order[i]);
     }
   });
-  const int64_t tile_total = int64_t(tile_count(image.width)) * tile_count(image.height);
+  const int64_t tile_total = tiles_of(image);
   counting_sort(
       executor, instance_count, tile_total, out.ranges, [&](int64_t i) { return int64_t(tiles[i]); },
       [&](int64_t i, int64_t place) { out.instances[place] = splats[i]; });

@@ -4,7 +4,7 @@
 #include <memory>
 #include <vector>
 
-#include "../launch.h"
+#include "../backend.h"
 #include "../math/blend.h"
 #include "../math/exp2.h"
 #include "../math/footprint.h"
@@ -310,7 +310,7 @@ void mark_tile(const BlendInput<T>& in, const int32_t* last_plane, int64_t index
 
 template <class T>
 void mark_decisive(const Executor& executor, const BlendInput<T>& in, const int32_t* last, bool* decisive) {
-  const int64_t tiles = int64_t(tile_count(in.image.width)) * tile_count(in.image.height);
+  const int64_t tiles = tiles_of(in.image);
   for_dynamic(executor, tiles, 1, [&](int64_t tile, int64_t) { mark_tile(in, last, tile, decisive); });
 }
 
@@ -318,13 +318,13 @@ template <class T>
 void blend(const Executor& executor, const BlendInput<T>& in, const Blended<T>& out) {
   const auto run = out.inverse_depth ? (out.last ? blend_tile<T, true, true> : blend_tile<T, true, false>)
                                      : (out.last ? blend_tile<T, false, true> : blend_tile<T, false, false>);
-  const int64_t tiles = int64_t(tile_count(in.image.width)) * tile_count(in.image.height);
+  const int64_t tiles = tiles_of(in.image);
   for_dynamic(executor, tiles, 1, [&](int64_t tile, int64_t) { run(in, tile, out); });
 }
 
 template <class T>
 void blend_vjp(const Executor& executor, const BlendInput<T>& in, const BlendGradient<T>& g) {
-  const int64_t tiles = int64_t(tile_count(in.image.width)) * tile_count(in.image.height);
+  const int64_t tiles = tiles_of(in.image);
   CompactRows<T> rows(g.slot_count);
   std::vector<int32_t> processed(tiles);
   for_dynamic(executor, tiles, 4, [&](int64_t begin, int64_t end) {

@@ -1,5 +1,5 @@
 #pragma once
-#include "../launch.h"
+#include "../data.h"
 #include "../math/tiles.h"
 
 GS_ISA_BEGIN

@@ -1,6 +1,6 @@
 #include "../math/observe.h"
 
-#include "../launch.h"
+#include "../backend.h"
 
 namespace gs {
 

@@ -1,5 +1,6 @@
 #include <cstring>
 
+#include "../backend.h"
 #include "../math/scene_row.h"
 #include "list_tiles.h"
 

@@ -1,6 +1,6 @@
 #include <cuda_runtime.h>
 
-#include "../launch.h"
+#include "../backend.h"
 #include "../math/adam.h"
 #include "guarded_adam.cuh"
 #include "queue.cuh"
@@ -45,7 +45,7 @@ void adam<float>(const Queue& queue, const AdamInput<float>* tensors, int64_t co
       const AdamInput<float>& in = tensors[first + i];
       some.in[i] = in;
       some.step[i] = baseline::make_adam_step<float>(in.lr, in.beta1, in.beta2, in.eps, in.step);
-      blocks += (in.rows * in.columns + kThreads - 1) / kThreads;
+      blocks += blocks_for(in.rows * in.columns, kThreads);
       some.end[i] = blocks;
     }
     if (!blocks) continue;

@@ -6,9 +6,10 @@
 
 #include <cub/cub.cuh>
 
+#include "../backend.h"
 #include "../math/slots.h"
-#include "emit.cuh"
-#include "to_host.cuh"
+#include "host_numbers.cuh"
+#include "instances.cuh"
 
 namespace gs {
 namespace cuda {
@@ -16,8 +17,6 @@ namespace cuda {
 namespace {
 
 constexpr int kThreads = 256;
-
-dim3 blocks_for(int64_t n) { return dim3(unsigned((n + kThreads - 1) / kThreads)); }
 
 constexpr int kCounted = 4;  // splats of a thread, whose loads need not wait for each other
 
@@ -49,8 +48,7 @@ __global__ void __launch_bounds__(kThreads)
 const int64_t* count_all(const Queue& queue, int64_t n, const Projected<float>& in, int32_t* index) {
   auto* totals = queue.array<unsigned long long>(2);
   GS_CUDA_CHECK(cudaMemsetAsync(totals, 0, 2 * sizeof *totals, stream_of(queue)));
-  const unsigned blocks = unsigned((n + kCounted * kThreads - 1) / (kCounted * kThreads));
-  count_kernel<<<blocks, kThreads, 0, stream_of(queue)>>>(n, in, index, totals);
+  count_kernel<<<blocks_for(n, kCounted * kThreads), kThreads, 0, stream_of(queue)>>>(n, in, index, totals);
   check_launch("count");
   return reinterpret_cast<const int64_t*>(totals);
 }
@@ -142,7 +140,7 @@ void find_slots(const Queue& queue, int64_t n, const Projected<float>& in, Splat
 template <class Key>
 void bin_with(const Queue& queue, int64_t n, const Projected<float>& in, const int32_t* order, Image image,
               int64_t instances, const Binned& out) {
-  const int64_t tiles = int64_t(tile_count(image.width)) * tile_count(image.height);
+  const int64_t tiles = tiles_of(image);
   const cudaStream_t stream = stream_of(queue);
   const int64_t blocks = (instances + kEmitted - 1) / kEmitted;
   Key *keys = queue.array<Key>(blocks * kEmitted), *sorted_keys = queue.array<Key>(blocks * kEmitted);
@@ -168,7 +166,7 @@ void bin_with(const Queue& queue, int64_t n, const Projected<float>& in, const i
     });
   }
   const int64_t loads = instances / Keys<Key>::kCount + 1;
-  ranges_kernel<Key><<<blocks_for(loads), kThreads, 0, stream>>>(instances, tiles, sorted_keys, out.ranges);
+  ranges_kernel<Key><<<blocks_for(loads, kThreads), kThreads, 0, stream>>>(instances, tiles, sorted_keys, out.ranges);
   check_launch("bin");
 }
 
@@ -180,7 +178,7 @@ void bin<float>(const Queue& queue, int64_t count, const Projected<float>& in, I
   const int32_t* order = nullptr;
   if (count) {
     int32_t* index = queue.array<int32_t>(count);
-    const ToHost<int64_t> totals(queue, count_all(queue, count, in, index), 2);
+    const HostNumbers<int64_t> totals(queue, count_all(queue, count, in, index), 2);
     // The GPU is busy with what needs no list while the host waits for the numbers.
     order = sort_by_depth(queue, count, in.depths, index);
     if (memory.slots) find_slots(queue, count, in, memory.slots);
@@ -190,7 +188,7 @@ void bin<float>(const Queue& queue, int64_t count, const Projected<float>& in, I
     GS_CUDA_CHECK(cudaMemsetAsync(memory.slots, 0, sizeof *memory.slots, stream_of(queue)));
   }
   const Binned out = memory.take(memory.context, instances, slots);
-  const int64_t tiles = int64_t(tile_count(image.width)) * tile_count(image.height);
+  const int64_t tiles = tiles_of(image);
   const auto run = tiles <= 1 << 16 ? bin_with<uint16_t> : bin_with<uint32_t>;
   run(queue, count, in, order, image, instances, out);
 }

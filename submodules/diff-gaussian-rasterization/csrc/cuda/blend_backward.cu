@@ -6,11 +6,12 @@
 #include <cub/cub.cuh>
 #include <optional>
 
+#include "../backend.h"
 #include "../math/slots.h"
-#include "backward.cuh"
 #include "blend_layout.cuh"
-#include "heaviest.cuh"
-#include "to_host.cuh"
+#include "gradient_rows.cuh"
+#include "host_numbers.cuh"
+#include "schedule.cuh"
 
 namespace gs {
 namespace cuda {
@@ -21,7 +22,7 @@ namespace {
 // but the first of a tile.
 constexpr int kChunkOfFew = 256, kChunkOfMany = 512;
 
-// Going back to front a splat costs a warp as much as several pixels do, even where few warps are at work.
+// Going back to front a splat costs a warp as much as several pixels do, even where few warps are at schedule.
 using Backward = Layout<4>;
 
 // Up to here every instance gets a gradient row, 40 MiB at most, so that the host need not wait for the number of those
@@ -176,7 +177,7 @@ __global__ void __launch_bounds__(L::kThreads)
 template <bool kDepth>
 __global__ void GS_MAX_REGISTERS(kDepth ? 96 : 80)
     blend_vjp_kernel(BlendInput<float> in, BlendGradient<float> g, const int32_t* processed, const Chunk* chunks,
-                     int chunk_size, const Layer* layers, Compact compact) {
+                     int chunk_size, const Layer* layers, GradientRows rows) {
   using L = Backward;
   constexpr int kBatch = 64, kRun = L::kRun;
   __shared__ Batch<kBatch> batch;
@@ -206,7 +207,7 @@ __global__ void GS_MAX_REGISTERS(kDepth ? 96 : 80)
     for (int k = threadIdx.x; k < count; k += L::kThreads) {
       const int32_t splat = in.instances[begin + first + k];
       batch.put(k, in.splats, splat, float(left), float(top));
-      row_of[k] = compact.row(slot_of(g.slots, splat, chunk.tile % across, chunk.tile / across));
+      row_of[k] = rows.row(slot_of(g.slots, splat, chunk.tile % across, chunk.tile / across));
     }
     for (int k = threadIdx.x; k < L::kWarps * kBatch * kGradientValues; k += L::kThreads) sums[k] = 0;
     __syncthreads();
@@ -246,7 +247,7 @@ __global__ void GS_MAX_REGISTERS(kDepth ? 96 : 80)
     for (int k = threadIdx.x; k < count * kGradientValues; k += L::kThreads) {
       float sum = 0;
       for (int w = 0; w < L::kWarps; ++w) sum += sums[w * kBatch * kGradientValues + k];
-      compact.rows[kGradientValues * row_of[k / kGradientValues] + k % kGradientValues] = sum;
+      rows.values[kGradientValues * row_of[k / kGradientValues] + k % kGradientValues] = sum;
     }
   }
 }
@@ -261,16 +262,16 @@ __global__ void __launch_bounds__(256) moments_kernel(int64_t count, SlotSums su
 }
 
 template <class L>
-void find_layers(const Queue& queue, const BlendInput<float>& in, const BlendGradient<float>& g, const Work& work,
-                 Layer* layers) {
+void find_layers(const Queue& queue, const BlendInput<float>& in, const BlendGradient<float>& g,
+                 const Schedule& schedule, Layer* layers) {
   const auto kernel = g.inverse_depth ? layers_kernel<L, true> : layers_kernel<L, false>;
-  kernel<<<work.blocks, L::kThreads, 0, stream_of(queue)>>>(in, g, work.chunks, layers);
+  kernel<<<schedule.blocks, L::kThreads, 0, stream_of(queue)>>>(in, g, schedule.chunks, layers);
   check_launch("layers");
 }
 
 }  // namespace
 
-Compact blend_rows(const Queue& queue, const BlendInput<float>& in, const BlendGradient<float>& g) {
+GradientRows blend_rows(const Queue& queue, const BlendInput<float>& in, const BlendGradient<float>& g) {
   const cudaStream_t stream = stream_of(queue);
   const unsigned tiles = unsigned(tiles_of(in.image));
   const int64_t words = (g.slot_count + 31) / 32;
@@ -285,26 +286,28 @@ Compact blend_rows(const Queue& queue, const BlendInput<float>& in, const BlendG
   });
   const int chunk_size = tiles <= kFewTiles ? kChunkOfFew : kChunkOfMany;
   int64_t rows = g.instance_count;  // at most
-  std::optional<ToHost<int32_t>> processed_count;
+  std::optional<HostNumbers<int32_t>> processed_count;
   if (rows > kRowsUnasked) processed_count.emplace(queue, before + words, 1);
-  Work work = heaviest_first(queue, tiles, ProcessedLength{processed}, chunk_size, rows);
-  if (processed_count) rows = *processed_count->wait(), work = work.shortened(rows);
-  const Compact compact{bits, before, queue.array<float>(size_t(rows) * kGradientValues)};
-  Layer* layers = queue.array<Layer>(size_t(work.places) * kTile * kTile);
-  if (work.places) (tiles <= kFewTiles ? find_layers<Layout<1>> : find_layers<Layout<2>>)(queue, in, g, work, layers);
+  Schedule schedule = longest_first(queue, tiles, ProcessedLength{processed}, chunk_size, rows);
+  if (processed_count) rows = *processed_count->wait(), schedule = schedule.shortened(rows);
+  const GradientRows gradients{bits, before, queue.array<float>(size_t(rows) * kGradientValues)};
+  Layer* layers = queue.array<Layer>(size_t(schedule.places) * kTile * kTile);
+  if (schedule.places)
+    (tiles <= kFewTiles ? find_layers<Layout<1>> : find_layers<Layout<2>>)(queue, in, g, schedule, layers);
   const auto kernel = g.inverse_depth ? blend_vjp_kernel<true> : blend_vjp_kernel<false>;
-  kernel<<<work.blocks, Backward::kThreads, 0, stream>>>(in, g, processed, work.chunks, chunk_size, layers, compact);
+  kernel<<<schedule.blocks, Backward::kThreads, 0, stream>>>(in, g, processed, schedule.chunks, chunk_size, layers,
+                                                             gradients);
   check_launch("blend_vjp");
-  for (const void* done : {static_cast<const void*>(layers), static_cast<const void*>(work.chunks)})
+  for (const void* done : {static_cast<const void*>(layers), static_cast<const void*>(schedule.chunks)})
     queue.release(queue.context, done);  // the gradients come next, and are most of what a step takes
-  return compact;
+  return gradients;
 }
 
 template <>
 void blend_vjp<float>(const Queue& queue, const BlendInput<float>& in, const BlendGradient<float>& g) {
   if (!g.count) return;
   const SlotSums sums{blend_rows(queue, in, g), g.slots};
-  moments_kernel<<<unsigned((g.count + 255) / 256), 256, 0, stream_of(queue)>>>(g.count, sums, g.moments);
+  moments_kernel<<<blocks_for(g.count, 256), 256, 0, stream_of(queue)>>>(g.count, sums, g.moments);
   check_launch("moments");
 }
 

@@ -1,6 +1,7 @@
 // Blending a tile's list front to back, a block per tile.
+#include "../backend.h"
 #include "blend_layout.cuh"
-#include "heaviest.cuh"
+#include "schedule.cuh"
 
 namespace gs {
 namespace cuda {
@@ -77,7 +78,7 @@ void blend_as(const Queue& queue, const BlendInput<float>& in, const Blended<flo
                                         : (out.last ? blend_kernel<L, false, true> : blend_kernel<L, false, false>);
   const int64_t tiles = tiles_of(in.image);
   // Many tiles even out by themselves.
-  const Chunk* order = tiles <= kFewTiles ? heaviest_first(queue, tiles, ListLength{in.ranges}).chunks : nullptr;
+  const Chunk* order = tiles <= kFewTiles ? longest_first(queue, tiles, ListLength{in.ranges}).chunks : nullptr;
   kernel<<<unsigned(tiles), L::kThreads, 0, stream_of(queue)>>>(in, order, out);
   check_launch("blend");
 }

@@ -3,12 +3,13 @@
 // and the ballot are shared; 32 splats at a time are tested against the sub-tile, a lane each.
 #include <cuda_runtime.h>
 
-#include "../launch.h"
+#include "../data.h"
 #include "../math/blend.h"
 #include "../math/exp2.h"
 #include "../math/footprint.h"
 #include "../math/tiles.h"
 #include "queue.cuh"
+#include "splat_row.cuh"
 
 namespace gs {
 namespace cuda {
@@ -48,9 +49,7 @@ struct Batch {
   float4 color[kCount];  // r, g, b
 
   __device__ void put(int k, const float* splats, int32_t index, float left, float top) {
-    const float2* from = reinterpret_cast<const float2*>(splats + kSplatValues * int64_t(index));
-    const float2 a = from[0], b = from[1], c = from[2], d = from[3], e = from[4];
-    const Splat<float> splat = {a.x, a.y, b.x, b.y, c.x, c.y, d.x, d.y, e.x, e.y};
+    const Splat<float> splat = load_splat(splats, index);
     const LocalSplat<float> s = localise(splat, left, top);
     shape[k] = make_float4(s.y, s.l11, s.l12, s.l22);
     rest[k] = make_float4(s.u, s.log2_opacity, splat.x - left, s.inverse_depth);
@@ -105,8 +104,6 @@ __device__ __forceinline__ void front_to_back(const Batch<kCount>& batch, const 
       for (int p = 0; p < L::kRun; ++p) step(k[i], p, t[i][p]);
   }
 }
-
-inline int64_t tiles_of(Image image) { return int64_t(tile_count(image.width)) * tile_count(image.height); }
 
 }  // namespace cuda
 }  // namespace gs

@@ -2,10 +2,11 @@
 // the end of a training, so simple before fast.
 #include <cuda_runtime.h>
 
-#include "../launch.h"
+#include "../backend.h"
 #include "../math/blend.h"
 #include "../math/tiles.h"
 #include "queue.cuh"
+#include "splat_row.cuh"
 
 namespace gs {
 namespace cuda {
@@ -24,8 +25,7 @@ __global__ void __launch_bounds__(kTile* kTile)
   const int64_t blended = begin + last[int64_t(top + row) * in.image.width + left + column];
   for (int64_t k = begin; k < end; ++k) {
     const int32_t index = in.instances[k];
-    const float* from = in.splats + kSplatValues * int64_t(index);
-    const Splat<float> splat = {from[0], from[1], from[2], from[3], from[4], from[5], 0, 0, 0, 0};
+    const Splat<float> splat = load_shape(in.splats, index);
     const RowTerms<float> terms = row_terms(localise(splat, float(left), float(top)), float(row));
     if (!(row_exponent(terms, row_u(terms, float(column))) >= float(kLog2MinAlpha))) continue;
     decisive[index] = true;  // by many threads, all the same
@@ -37,8 +37,7 @@ __global__ void __launch_bounds__(kTile* kTile)
 
 template <>
 void mark_decisive<float>(const Queue& queue, const BlendInput<float>& in, const int32_t* last, bool* decisive) {
-  const int64_t tiles = int64_t(tile_count(in.image.width)) * tile_count(in.image.height);
-  decisive_kernel<<<unsigned(tiles), kTile * kTile, 0, stream_of(queue)>>>(in, last, decisive);
+  decisive_kernel<<<unsigned(tiles_of(in.image)), kTile * kTile, 0, stream_of(queue)>>>(in, last, decisive);
   check_launch("decisive");
 }
 

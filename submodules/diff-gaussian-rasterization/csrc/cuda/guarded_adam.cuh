@@ -2,7 +2,7 @@
 #pragma once
 #include <cuda_runtime.h>
 
-#include "../launch.h"
+#include "../data.h"
 #include "../math/adam.h"
 
 namespace gs {

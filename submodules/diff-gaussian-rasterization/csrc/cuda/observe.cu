@@ -1,6 +1,6 @@
 #include <cuda_runtime.h>
 
-#include "../launch.h"
+#include "../backend.h"
 #include "../math/observe.h"
 #include "queue.cuh"
 
@@ -23,8 +23,7 @@ __global__ void __launch_bounds__(kThreads) observe_kernel(ObserveInput in) {
 
 void observe(const Queue& queue, const ObserveInput& in) {
   if (!in.count) return;
-  const unsigned blocks = unsigned((in.count + kThreads - 1) / kThreads);
-  observe_kernel<<<blocks, kThreads, 0, stream_of(queue)>>>(in);
+  observe_kernel<<<blocks_for(in.count, kThreads), kThreads, 0, stream_of(queue)>>>(in);
   check_launch("observe");
 }
 

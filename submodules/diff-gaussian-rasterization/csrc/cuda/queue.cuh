@@ -1,5 +1,5 @@
 #pragma once
-// What every kernel's host side does with its Queue, and the mask of a whole warp.
+// What the host side of every kernel does with its Queue, and the mask of a whole warp.
 #include <cuda_runtime.h>
 
 #include "gs/cuda_check.h"
@@ -12,7 +12,10 @@ constexpr unsigned kWarp = 0xffffffffu;
 
 inline cudaStream_t stream_of(const Queue& queue) { return static_cast<cudaStream_t>(queue.stream); }
 
-// CUB's functions want to be called twice: for the size of their memory, and with it.
+// The blocks of `threads` that `n` items need, a thread each.
+inline unsigned blocks_for(int64_t n, int threads) { return unsigned((n + threads - 1) / threads); }
+
+// CUB's functions are called twice: for the size of their memory, and with that memory.
 template <class Call>
 void with_memory(const Queue& queue, const Call& call) {
   size_t bytes = 0;

@@ -1,6 +1,6 @@
 #include <cuda_runtime.h>
 
-#include "../launch.h"
+#include "../backend.h"
 #include "../math/adam.h"
 #include "guarded_adam.cuh"
 #include "queue.cuh"
@@ -31,8 +31,7 @@ void sparse_adam<float>(const Queue& queue, const AdamInput<float>& in, const bo
   const int64_t n = in.rows * in.columns;
   if (!n) return;
   const auto step = baseline::make_uncorrected_adam_step<float>(in.lr, in.beta1, in.beta2, in.eps);
-  const cudaStream_t stream = stream_of(queue);
-  sparse_adam_kernel<<<unsigned((n + kThreads - 1) / kThreads), kThreads, 0, stream>>>(in, visible, step, guard);
+  sparse_adam_kernel<<<blocks_for(n, kThreads), kThreads, 0, stream_of(queue)>>>(in, visible, step, guard);
   check_launch("sparse_adam");
 }
 

@@ -1,6 +1,6 @@
 #pragma once
 // Counting the tiles that a splat reaches, by whole warps: a splat over a thousand tiles must not hold up 31 others.
-#include "../launch.h"
+#include "../data.h"
 #include "../math/tiles.h"
 #include "queue.cuh"
 

@@ -2,7 +2,7 @@
 #include <cmath>
 #include <cstdint>
 
-#include "../launch.h"
+#include "../data.h"
 #include "gs/hd.h"
 #include "gs/isa.h"
 

@@ -3,7 +3,7 @@
 // index.
 #include <cmath>
 
-#include "../launch.h"
+#include "../data.h"
 #include "projection.h"
 
 GS_ISA_BEGIN

@@ -4,7 +4,7 @@
 // instances, without a list of either.
 #include <cstdint>
 
-#include "../launch.h"
+#include "../data.h"
 #include "load.h"
 #include "tiles.h"
 

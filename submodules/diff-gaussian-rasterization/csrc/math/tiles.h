@@ -2,6 +2,7 @@
 // Which tiles a splat reaches: those where its alpha comes to 1/255 at a pixel centre.
 #include <cstdint>
 
+#include "../data.h"
 #include "constants.h"
 #include "splat.h"
 #include "vec.h"
@@ -14,6 +15,7 @@ struct TileRect {
 };
 
 GS_HD int tile_count(int pixels) { return (pixels + kTile - 1) / kTile; }
+GS_HD int64_t tiles_of(Image image) { return int64_t(tile_count(image.width)) * tile_count(image.height); }
 
 template <class T>
 GS_HD int clamped_floor(T value, int limit) {

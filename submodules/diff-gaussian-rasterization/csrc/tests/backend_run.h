@@ -5,8 +5,8 @@
 #include <random>
 #include <vector>
 
+#include "backend.h"
 #include "gs/check.h"
-#include "launch.h"
 #include "math/splat.h"
 
 using namespace gs::GS_ISA;

@@ -4,7 +4,7 @@
 
 #include "backend_run.h"
 #include "emulated_queue.h"
-#include "heaviest.cuh"
+#include "schedule.cuh"
 
 namespace {
 
@@ -266,7 +266,7 @@ struct Lengths {
 
 // Chunks make up every list; the longest first as far as one block sorts them, an eighth of a doubling apart at most;
 // each has a place of its own, behind that of the chunk in front.
-void test_heaviest_first() {
+void test_longest_first() {
   for (const int64_t tiles : {1, 2500, 16384, 20000})
     for (const int32_t size : {gs::cuda::kWhole, 64}) {
       std::vector<int64_t> lengths(tiles);
@@ -274,20 +274,20 @@ void test_heaviest_first() {
       lengths[tiles / 2] = size == 64 ? 7 * 64 : gs::cuda::kWhole;
       gs::emulation::Memory memory;
       const int64_t total = std::accumulate(lengths.begin(), lengths.end(), int64_t(0));
-      const gs::cuda::Work work =
-          gs::cuda::heaviest_first(memory.queue(), tiles, Lengths{lengths.data()}, size, 3 * total).shortened(total);
-      CHECK(work.places == (tiles <= 16384 ? total / size : 0) && work.blocks == tiles + work.places);
+      const gs::cuda::Schedule schedule =
+          gs::cuda::longest_first(memory.queue(), tiles, Lengths{lengths.data()}, size, 3 * total).shortened(total);
+      CHECK(schedule.places == (tiles <= 16384 ? total / size : 0) && schedule.blocks == tiles + schedule.places);
       const bool ordered = tiles <= 16384;
       std::vector<std::vector<gs::cuda::Chunk>> of_tile(tiles);
       int64_t before = int64_t(1) << 32;
-      for (unsigned i = 0; i < work.blocks; ++i) {
-        const gs::cuda::Chunk& chunk = work.chunks[i];
+      for (unsigned i = 0; i < schedule.blocks; ++i) {
+        const gs::cuda::Chunk& chunk = schedule.chunks[i];
         if (chunk.tile < 0) continue;
         of_tile[chunk.tile].push_back(chunk);
         CHECK(!ordered || 8 * (int64_t(chunk.end) - chunk.first + 1) <= 9 * (before + 1));
         before = chunk.end - chunk.first;
       }
-      std::vector<bool> taken(work.places);
+      std::vector<bool> taken(schedule.places);
       for (int64_t t = 0; t < tiles; ++t) {
         std::vector<gs::cuda::Chunk>& chunks = of_tile[t];
         std::sort(chunks.begin(), chunks.end(), [](const auto& a, const auto& b) { return a.first < b.first; });
@@ -313,6 +313,6 @@ int main() {
   test_many_tiles();
   test_long_lists();
   test_lists();
-  test_heaviest_first();
+  test_longest_first();
   return gs::finish_tests("CUDA kernels, emulated");
 }

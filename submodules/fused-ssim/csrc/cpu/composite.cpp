@@ -1,6 +1,6 @@
 #include "../math/composite.h"
 
-#include "../launch.h"
+#include "../backend.h"
 
 namespace gs {
 

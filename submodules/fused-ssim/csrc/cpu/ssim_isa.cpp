@@ -5,8 +5,8 @@
 #include <memory>
 #include <vector>
 
+#include "backend.h"
 #include "gs/simd.h"
-#include "launch.h"
 #include "math/ssim.h"
 
 GS_ISA_BEGIN

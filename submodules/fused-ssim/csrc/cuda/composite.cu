@@ -1,6 +1,6 @@
 #include <cuda_runtime.h>
 
-#include "../launch.h"
+#include "../backend.h"
 #include "../math/composite.h"
 #include "gs/cuda_check.h"
 

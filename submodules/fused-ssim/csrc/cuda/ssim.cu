@@ -1,8 +1,8 @@
 // L1 and SSIM with the gradient of SSIM in one walk over the images. A block walks down a strip (ssim_strip.h) and sums
 // in double; a last block adds the blocks' sums in their order, so the same images give the same bits.
+#include "backend.h"
 #include "cuda/ssim_strip.h"
 #include "gs/cuda_check.h"
-#include "launch.h"
 
 namespace gs {
 namespace {

@@ -4,9 +4,9 @@
 #include <random>
 #include <vector>
 
+#include "backend.h"
 #include "emulated_queue.h"
 #include "gs/check.h"
-#include "launch.h"
 
 namespace {
 

@@ -6,9 +6,9 @@
 #include <random>
 #include <vector>
 
+#include "backend.h"
 #include "cuda/ssim_strip.h"
 #include "gs/check.h"
-#include "launch.h"
 
 namespace {
 

@@ -6,8 +6,8 @@
 #include <thread>
 #include <vector>
 
+#include "backend.h"
 #include "gs/check.h"
-#include "launch.h"
 #include "math/ssim.h"
 
 namespace {

@@ -4,7 +4,7 @@
 #include <cmath>
 #include <vector>
 
-#include "launch.h"
+#include "backend.h"
 #include "math/nearest.h"
 
 namespace gs {

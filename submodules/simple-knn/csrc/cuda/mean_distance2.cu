@@ -6,9 +6,9 @@
 #include <cub/device/device_select.cuh>
 #include <stdexcept>
 
+#include "backend.h"
 #include "cuda/box_tree.h"
 #include "gs/cuda_check.h"
-#include "launch.h"
 
 namespace gs {
 namespace {

@@ -5,9 +5,9 @@
 #include <random>
 #include <vector>
 
+#include "backend.h"
 #include "cuda/box_tree.h"
 #include "gs/check.h"
-#include "launch.h"
 
 namespace {
 

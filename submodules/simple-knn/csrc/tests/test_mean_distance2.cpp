@@ -4,8 +4,8 @@
 #include <thread>
 #include <vector>
 
+#include "backend.h"
 #include "gs/check.h"
-#include "launch.h"
 
 namespace {
 

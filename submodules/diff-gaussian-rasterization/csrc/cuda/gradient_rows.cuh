@@ -1,46 +1,49 @@
 #pragma once
-// Gradient rows of the instances that the backward processed, side by side for each splat. A bit per slot tells which
-// were processed, a prefix sum over the bits where the row is: memory follows what was blended, nothing is zeroed or
-// added concurrently.
+// Gradient rows of the processed instances, side by side for each splat. A bit per slot tells which instances were
+// processed, and a prefix sum over the bits tells where a row is. So memory follows what was blended, nothing is zeroed
+// and nothing is added concurrently.
 #include <cstdint>
 
-#include "../launch.h"
+#include "../data.h"
 #include "../math/splat.h"
 #include "queue.cuh"
 
 namespace gs {
 namespace cuda {
 
-struct Compact {
+struct GradientRows {
   const uint32_t* bits;
   const int32_t* before;  // bits set before each word
-  float* rows;            // (processed, kGradientValues)
+  float* values;          // (processed, kGradientValues)
 
-  // The row of a slot, or where it would be.
+  // The row of a slot; for a slot without one, the next row.
   __device__ int64_t row(int64_t slot) const {
     const uint32_t lower = (1u << (slot & 31)) - 1;
     return before[slot >> 5] + ((slot & 31) ? __popc(bits[slot >> 5] & lower) : 0);
   }
 };
 
-// The sums of a splat over its slots, in an order that depends on their number alone. The rows of a warp's splats lie
-// side by side, so they come by whole lines through shared memory. A splat near the camera has thousands: those are
-// added by the whole warp.
+// Runs the backward of blending up to the rows. Waits for their number where they may be many.
+GradientRows blend_rows(const Queue& queue, const BlendInput<float>& in, const BlendGradient<float>& g);
+
+// Sums a splat's rows, in an order that depends on their number alone. The rows of a warp's splats lie side by side, so
+// they come through shared memory in whole lines. A splat near the camera has thousands of rows, which the whole warp
+// adds.
 struct SlotSums {
   static constexpr int kOwnRows = 48;
   static constexpr int kStaged = 32;                                  // rows at a time
   static constexpr int kStage = kStaged * baseline::kGradientValues;  // floats of shared memory for each warp
-  Compact compact;
+  GradientRows rows;
   const SplatSlots* slots;
 
   __device__ bool seen(int64_t splat) const { return slots[splat + 1].first > slots[splat].first; }
 
-  // Called by all lanes of a warp; those that want a splat's sums get them, the others nothing.
+  // All lanes of a warp call this. Those whose splat is wanted get its sums, the others zeros.
   __device__ void read(int64_t splat, bool wanted, float* sums, float* stage) const {
     constexpr int kValues = baseline::kGradientValues;
     const int lane = threadIdx.x & 31;
     unsigned begin = 0, end = 0;  // instances are fewer than 2^31
-    if (wanted) begin = unsigned(compact.row(slots[splat].first)), end = unsigned(compact.row(slots[splat + 1].first));
+    if (wanted) begin = unsigned(rows.row(slots[splat].first)), end = unsigned(rows.row(slots[splat + 1].first));
     const bool many = end - begin > kOwnRows;
     for (int v = 0; v < kValues; ++v) sums[v] = 0;
 
@@ -49,9 +52,9 @@ struct SlotSums {
       const bool open = !many && next < end;
       const unsigned first = __reduce_min_sync(kWarp, open ? next : ~0u);
       if (first == ~0u) break;
-      const float2* from = reinterpret_cast<const float2*>(compact.rows + int64_t(kValues) * first);
+      const float2* from = reinterpret_cast<const float2*>(rows.values + int64_t(kValues) * first);
       const int pairs = kValues / 2 * int(last - first < kStaged ? last - first : kStaged);
-      __syncwarp();  // the rows before have been added
+      __syncwarp();  // every lane has added the rows before
       for (int k = lane; k < pairs; k += 32) reinterpret_cast<float2*>(stage)[k] = from[k];
       __syncwarp();
       if (open)
@@ -63,7 +66,7 @@ struct SlotSums {
       const unsigned stop = __shfl_sync(kWarp, end, owner);
       float part[kValues] = {};
       for (unsigned row = __shfl_sync(kWarp, begin, owner) + lane; row < stop; row += 32)
-        add(compact.rows + int64_t(kValues) * row, part);
+        add(rows.values + int64_t(kValues) * row, part);
       for (int v = 0; v < kValues; ++v) {
         for (int step = 16; step; step /= 2) part[v] += __shfl_xor_sync(kWarp, part[v], step);
         if (lane == owner) sums[v] = part[v];

@@ -21,14 +21,14 @@ struct alignas(16) Chunk {
   int32_t behind;      // the place of the chunk behind this one, whether there is one or not
 };
 
-struct Work {
+struct Schedule {
   const Chunk* chunks;
   unsigned blocks;  // one for each chunk, and perhaps some for none
   unsigned places;  // at most
   int32_t size;     // of a chunk
 
   // The same where all lengths come to no more than `total`.
-  Work shortened(int64_t total) const {
+  Schedule shortened(int64_t total) const {
     const unsigned fewer = unsigned(std::min<int64_t>(places, total / size));
     return {chunks, blocks - places + fewer, fewer, size};
   }
@@ -99,7 +99,8 @@ __global__ void __launch_bounds__(kOrderThreads) keep_tiles_kernel(int tiles, Le
 // Chunks of `size` of the tiles' lists, the longest first; of many tiles whole lists in the usual order. total: of all
 // lengths, or more.
 template <class Length>
-Work heaviest_first(const Queue& queue, int64_t tiles, const Length& length, int32_t size = kWhole, int64_t total = 0) {
+Schedule longest_first(const Queue& queue, int64_t tiles, const Length& length, int32_t size = kWhole,
+                       int64_t total = 0) {
   const cudaStream_t stream = stream_of(queue);
   const bool ordered = tiles <= kMostOrdered;
   const int64_t places = ordered ? total / size : 0;
@@ -107,8 +108,7 @@ Work heaviest_first(const Queue& queue, int64_t tiles, const Length& length, int
   if (ordered)
     order_chunks_kernel<<<1, kOrderThreads, 0, stream>>>(int(tiles), length, size, int(tiles + places), chunks);
   else
-    keep_tiles_kernel<<<unsigned((tiles + kOrderThreads - 1) / kOrderThreads), kOrderThreads, 0, stream>>>(
-        int(tiles), length, chunks);
+    keep_tiles_kernel<<<blocks_for(tiles, kOrderThreads), kOrderThreads, 0, stream>>>(int(tiles), length, chunks);
   check_launch("order_chunks");
   return {chunks, unsigned(tiles + places), unsigned(places), size};
 }

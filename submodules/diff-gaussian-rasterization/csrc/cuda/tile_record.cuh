@@ -1,6 +1,6 @@
 #pragma once
-// What projection hands on of the tiles that splats reach, from records or, without them, from rectangles.
-#include "../launch.h"
+// Reads which tiles a splat reaches, as projection stored it: in records or, without them, in rectangles.
+#include "../data.h"
 #include "../math/load.h"
 #include "../math/tiles.h"
 
@@ -8,7 +8,7 @@ namespace gs {
 namespace cuda {
 
 struct Reached {
-  baseline::TileRect rect;  // empty where the splat reaches none
+  baseline::TileRect rect;  // empty where the splat reaches no tile
   int32_t count;
   uint64_t mask;  // a bit for each tile of the rectangle; 0 where there are too many, or no record
 };

@@ -1,8 +1,8 @@
 #include <ATen/ops/empty.h>
 #include <torch/library.h>
 
+#include "backend.h"
 #include "gs/torch_executor.h"
-#include "launch.h"
 
 #ifdef GS_CUDA
 #include <limits>

@@ -1,7 +1,8 @@
 #pragma once
 // Writing the instances (tile, splat) in depth order. Blocks share the instances evenly, not the splats: the nearest
 // splats lie side by side in that order and reach a thousand tiles each.
-#include "reached.cuh"
+#include "splat_row.cuh"
+#include "tile_record.cuh"
 #include "tiles.cuh"
 
 namespace gs {
@@ -77,12 +78,6 @@ struct EmittedSplats {
 __device__ inline int tile_at(const Lined& line, int place, int columns) {
   const int row = int((float(place) + 0.5f) / float(line.wide));
   return line.corner + place + row * (columns - line.wide);
-}
-
-__device__ inline Splat<float> load_shape(const float* splats, int32_t index) {
-  const float2* from = reinterpret_cast<const float2*>(splats + kSplatValues * int64_t(index));
-  const float2 mean = from[0], l1 = from[1], l2 = from[2];
-  return {mean.x, mean.y, l1.x, l1.y, l2.x, l2.y, 0, 0, 0, 0};
 }
 
 template <class T>

@@ -4,8 +4,8 @@
 
 #include <tuple>
 
+#include "backend.h"
 #include "gs/torch_executor.h"
-#include "launch.h"
 
 #ifdef GS_CUDA
 #include "gs/torch_queue.h"

@@ -1,26 +1,27 @@
 #pragma once
-// Numbers that the host needs before it can go on.
+// Brings numbers to the host that it needs before it can continue.
 #include "queue.cuh"
 
 namespace gs {
 namespace cuda {
 
-// Copies to the host what was computed up to here. Waiting for it is no waiting for what is queued since.
+// Copies numbers to the host once the work queued so far has computed them. Waiting for them does not wait for work
+// queued later.
 template <class T>
-class ToHost {
+class HostNumbers {
   static_assert(sizeof(T) <= sizeof(int64_t));
 
  public:
-  ToHost(const Queue& queue, const T* from, int count)
+  HostNumbers(const Queue& queue, const T* from, int count)
       : host_(reinterpret_cast<T*>(queue.pinned(queue.context, count))) {
     GS_CUDA_CHECK(cudaEventCreateWithFlags(&arrived_, cudaEventDisableTiming));
     const cudaStream_t stream = stream_of(queue);
     GS_CUDA_CHECK(cudaMemcpyAsync(host_, from, count * sizeof(T), cudaMemcpyDeviceToHost, stream));
     GS_CUDA_CHECK(cudaEventRecord(arrived_, stream));
   }
-  ToHost(const ToHost&) = delete;
-  // Waits, too: after an error in between the numbers must not come into memory that is another's by then.
-  ~ToHost() { cudaEventSynchronize(arrived_), cudaEventDestroy(arrived_); }
+  HostNumbers(const HostNumbers&) = delete;
+  // Waits as well: after an error the copy must not arrive in memory that has another owner by then.
+  ~HostNumbers() { cudaEventSynchronize(arrived_), cudaEventDestroy(arrived_); }
 
   const T* wait() const {
     GS_CUDA_CHECK(cudaEventSynchronize(arrived_));

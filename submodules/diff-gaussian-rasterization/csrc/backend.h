@@ -1,0 +1,65 @@
+#pragma once
+// The functions that every backend offers, and the callbacks through which they get memory.
+#include "data.h"
+#include "gs/cuda_queue.h"
+#include "gs/parallel.h"
+
+namespace gs {
+
+// Allocates binning's lists once it has counted them; may throw.
+struct BinMemory {
+  Binned (*take)(void* context, int64_t instances, int64_t slots);
+  void* context;
+  SplatSlots* slots;  // (N + 1), filled by binning, or null where nobody wants them
+};
+
+// Every backend's functions. `Where` says how they run: an Executor on the CPU, a Queue on a GPU.
+#define GS_BACKEND(Where)                                                                       \
+  template <class T>                                                                            \
+  void project(const Where&, const Scene<T>&, const Projected<T>&);                             \
+  template <class T>                                                                            \
+  void project_vjp(const Where&, const Scene<T>&, const int32_t* tile_counts, const T* moments, \
+                   const SceneGradient<T>&);                                                    \
+  template <class T>                                                                            \
+  void mark_visible(const Where&, int64_t count, const T* means, const T* view, bool* visible); \
+  template <class T>                                                                            \
+  void bin(const Where&, int64_t count, const Projected<T>&, Image, const BinMemory&);          \
+  template <class T>                                                                            \
+  void blend(const Where&, const BlendInput<T>&, const Blended<T>&);                            \
+  template <class T>                                                                            \
+  void blend_vjp(const Where&, const BlendInput<T>&, const BlendGradient<T>&);                  \
+  template <class T>                                                                            \
+  void mark_decisive(const Where&, const BlendInput<T>&, const int32_t* last, bool* decisive);  \
+  template <class T>                                                                            \
+  void adam(const Where&, const AdamInput<T>* tensors, int64_t count, const StepGuard<T>&);     \
+  /* Adam without bias correction on the visible rows, (rows); `step` is not read. */           \
+  template <class T>                                                                            \
+  void sparse_adam(const Where&, const AdamInput<T>&, const bool* visible, const StepGuard<T>&);
+
+void observe(const Executor&, const ObserveInput&);  // compiled once: see gs/rounded.h
+
+namespace baseline {
+GS_BACKEND(Executor)
+}
+#ifdef GS_X86
+namespace avx2 {
+GS_BACKEND(Executor)
+}
+namespace avx512 {
+GS_BACKEND(Executor)
+}
+#endif
+namespace cuda {
+GS_BACKEND(Queue)
+void observe(const Queue&, const ObserveInput&);
+// Allocates the gradients; called while the GPU is busy, so that the host's work costs no time.
+struct GradientMemory {
+  SceneGradient<float> (*take)(void* context);
+  void* context;
+};
+// blend_vjp and project_vjp in one, without the moments in between (BlendGradient::moments is not written).
+void rasterize_vjp(const Queue&, const Scene<float>&, const BlendInput<float>&, const BlendGradient<float>&,
+                   const GradientMemory&);
+}  // namespace cuda
+
+}  // namespace gs

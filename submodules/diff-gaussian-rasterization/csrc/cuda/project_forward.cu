@@ -1,0 +1,87 @@
+// Projection, and the test of which means lie in front of the camera. A thread takes a Gaussian.
+#include <cuda_runtime.h>
+
+#include "../backend.h"
+#include "../math/scene_row.h"
+#include "sh_rows.cuh"
+#include "splat_row.cuh"
+#include "tiles.cuh"
+
+namespace gs {
+namespace cuda {
+
+namespace {
+
+constexpr int kThreads = 128;
+
+// In front of the camera, and no farther off the image than a tenth of its size.
+__device__ bool near_view(const Camera<float>& cam, Vec3<float> view) {
+  const float x = cam.mean_focal_x * view.x + cam.axis_x * view.z, y = cam.mean_focal_y * view.y + cam.axis_y * view.z;
+  const float spare_x = 0.1f * cam.width * view.z, spare_y = 0.1f * cam.height * view.z;
+  return in_front(view.z) && x > -spare_x && x < cam.width * view.z + spare_x && y > -spare_y &&
+         y < cam.height * view.z + spare_y;
+}
+
+__global__ void __launch_bounds__(kThreads) project_kernel(Scene<float> s, Projected<float> out) {
+  __shared__ Camera<float> camera;
+  __shared__ __align__(16) float rest[kThreads * kRest];
+  if (threadIdx.x == 0) camera = camera_of(s);
+  __syncthreads();
+  const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
+  Splat<float> splat = {};
+  float depth = INFINITY;
+  int radius = 0;
+  unsigned flowing = 0;
+  const auto fetch = [&](bool wanted) {
+    if (!s.colors)
+      flowing = fetch_rows(s.sh_rest, i - (threadIdx.x & 31), s.count, s.rest_stride, 3 * (sh_count(s.sh_degree) - 1),
+                           __ballot_sync(kWarp, wanted), flowing, rest + (threadIdx.x & ~31) * kRest);
+  };
+  // The coefficients of Gaussians that are likely seen arrive while the warp computes shapes.
+  const bool likely = i < s.count && near_view(camera, to_view(camera, load3(s.means + 3 * i)));
+  fetch(likely);
+  const bool visible = i < s.count && project_shape(s, camera, i, splat, depth, radius);
+  TileRect rect = {0, 0, 0, 0};
+  if (visible) rect = tile_rect(splat, s.image.width, s.image.height);
+  fetch(rect.x1 > rect.x0);
+  uint64_t mask;
+  int32_t count = warp_count_tiles(splat, rect, s.image, mask);
+  wait_for_rows();
+  if (count && !project_color(s, camera, i, rest + threadIdx.x * kRest, splat)) count = 0;
+  if (i >= s.count) return;
+  out.radii[i] = radius;
+  out.tile_counts[i] = count;
+  out.depths[i] = count ? depth : INFINITY;
+  if (out.records) {
+    if (!count) rect = {0, 0, 0, 0}, mask = 0;  // a shape with tiles may still have a colour that is not finite
+    const uint64_t reached = (rect.x1 - rect.x0) * (rect.y1 - rect.y0) <= 64 ? mask : uint64_t(count);
+    out.records[i] = {reached, uint16_t(rect.x0), uint16_t(rect.y0), uint16_t(rect.x1), uint16_t(rect.y1)};
+  }
+  if (!count) return;
+  if (out.rects) reinterpret_cast<int4*>(out.rects)[i] = make_int4(rect.x0, rect.y0, rect.x1, rect.y1);
+  store_splat(out.splats, i, splat);
+}
+
+__global__ void mark_visible_kernel(int64_t count, const float* means, const float* view, bool* visible) {
+  const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
+  if (i < count) visible[i] = in_front(dot(Vec3<float>{view[2], view[6], view[10]}, load3(means + 3 * i)) + view[14]);
+}
+
+}  // namespace
+
+template <>
+void project<float>(const Queue& queue, const Scene<float>& s, const Projected<float>& out) {
+  if (!s.count) return;
+  project_kernel<<<blocks_for(s.count, kThreads), kThreads, 0, stream_of(queue)>>>(s, out);
+  check_launch("project");
+}
+
+template <>
+void mark_visible<float>(const Queue& queue, int64_t count, const float* means, const float* view, bool* visible) {
+  if (!count) return;
+  mark_visible_kernel<<<blocks_for(count, kThreads), kThreads, 0, stream_of(queue)>>>(count, means, view, visible);
+  check_launch("mark_visible");
+}
+
+}  // namespace cuda
+}  // namespace gs

@@ -1,0 +1,136 @@
+#pragma once
+// The plain structs of pointers and sizes that math and every backend share. N Gaussians, W x H image, I instances (a
+// splat in a tile). All arrays are row-major and contiguous unless a stride is given; T is float or double.
+#include <cstdint>
+
+namespace gs {
+
+struct Image {
+  int width, height;
+};
+
+// The Gaussians and the camera. The tensors come in the order of Input in torch/scene.h.
+template <class T>
+struct Scene {
+  int64_t count;
+  const T* means;                  // (N, 3)
+  const T* opacities;              // (N)
+  const T* scales;                 // (N, 3), or null with cov3d
+  const T* rotations;              // (N, 4) w x y z
+  const T* cov3d;                  // (N, 6) xx xy xz yy yz zz, or null
+  const T* colors;                 // (N, 3), or null with sh
+  const T* sh_dc;                  // (N, 3), row stride below
+  const T* sh_rest;                // (N, M, 3)
+  int64_t dc_stride, rest_stride;  // values from row to row
+  int rest_bands;                  // M
+  int sh_degree;
+  bool raw;  // opacities are logits, scales are logarithms, rotations have any length
+  bool antialiasing;
+  T scale_modifier;
+  const T* view;        // 4x4, transposed
+  const T* projection;  // 4x4, full, transposed
+  const T* center;      // 3
+  double tan_x, tan_y;
+  Image image;
+};
+
+// What a GPU's binning reads of a splat. It fits one memory sector, because binning reads splats in depth order.
+struct alignas(16) TileRecord {
+  uint64_t reached;         // a bit for each tile of a rectangle of at most 64, row by row; else the number reached
+  uint16_t x0, y0, x1, y1;  // empty where the splat reaches no tile
+};
+
+template <class T>
+struct Projected {
+  T* splats;       // (N, 10), Splat in math/splat.h; undefined where tile_counts is 0
+  T* depths;       // (N) infinite where tile_counts is 0, so that binning sorts those last
+  int32_t* rects;  // (N, 4) tiles x0 y0 x1 y1, undefined where tile_counts is 0; null allowed where there are records
+  int32_t* tile_counts;  // (N)
+  int32_t* radii;        // (N)
+  TileRecord* records;   // (N), or null
+};
+
+// Gradients of the inputs that have one, in the order of Input in torch/scene.h; null where not wanted. Every row is
+// written.
+template <class T>
+struct SceneGradient {
+  T* means;
+  T* means2d;  // (N, 3): x and y per NDC unit, then 0
+  T* opacities;
+  T* scales;
+  T* rotations;
+  T* cov3d;
+  T* colors;
+  T* sh_dc;
+  T* sh_rest;
+};
+
+// The slots (math/slots.h) of a splat: one for each tile of its rectangle, row by row. A culled splat has none.
+struct alignas(16) SplatSlots {
+  int64_t first;    // the number of slots of all splats before
+  int32_t skipped;  // tiles before the rectangle if every row of the image were as wide as it
+  int32_t wide;     // the rectangle's width
+};
+
+struct Binned {
+  int32_t* instances;  // (I) the splat; sorted by tile, then by depth, then by index
+  int64_t* ranges;     // (tiles + 1) into instances
+};
+
+template <class T>
+struct BlendInput {
+  const T* splats;
+  const int32_t* instances;
+  const int64_t* ranges;
+  const T* background;  // 3
+  Image image;
+};
+
+template <class T>
+struct Blended {
+  T* color;          // (3, H, W)
+  T* transmittance;  // (H, W)
+  T* inverse_depth;  // (H, W), or null
+  int32_t* last;     // (H, W) 1 + position in the tile's list of the last splat blended, or null
+};
+
+template <class T>
+struct BlendGradient {
+  int64_t count, instance_count, slot_count;
+  const SplatSlots* slots;
+  const T* transmittance;
+  const int32_t* last;
+  const T* color;                   // dLoss/dcolor
+  const T* inverse_depth;           // dLoss/dinverse_depth, or null
+  const T* transmittance_gradient;  // or null
+  T* moments;                       // out: (N, 10), Moments in math/footprint.h, then colour and inverse depth
+};
+
+// A tensor that takes a step of Adam in place, in the `columns` leading values of each row.
+template <class T>
+struct AdamInput {
+  T* value;
+  const T* gradient;
+  T* mean;    // of the gradients: exp_avg
+  T* square;  // mean of their squares: exp_avg_sq
+  int64_t rows, row, columns;
+  double lr, beta1, beta2, eps, step;
+};
+
+// Stops a training for good at the first step that is not finite. With `stopped` null it never does.
+template <class T>
+struct StepGuard {
+  const T* loss;     // scalar; if it is not finite, no step is taken
+  int64_t* stopped;  // the first iteration whose loss or step was not finite, else 0; later iterations take no step
+  int64_t iteration;
+};
+
+// A view to add to the statistics of density control.
+struct ObserveInput {
+  int64_t count;
+  float *max_radii, *gradient_sums, *views;  // (N), updated: Observed in math/observe.h
+  const int32_t* radii;                      // (N) of this view
+  const float* gradients;                    // (N, 3) of the means on the screen; the third value is not read
+};
+
+}  // namespace gs

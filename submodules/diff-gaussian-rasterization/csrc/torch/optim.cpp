@@ -1,0 +1,150 @@
+// The ops that change parameters and statistics in place: Adam, sparse Adam, and what density control observes.
+#include <vector>
+
+#include "tensors.h"
+
+namespace gs::ops {
+
+namespace {
+
+void check_moments(const Tensor& value, const Tensor& gradient, const Tensor& exp_avg, const Tensor& exp_avg_sq) {
+  for (const Tensor* t : {&gradient, &exp_avg, &exp_avg_sq})
+    TORCH_CHECK(t->sizes() == value.sizes() && t->scalar_type() == value.scalar_type() && t->device() == value.device(),
+                "gradient and moments must have the shape, dtype and device of the parameter, ", value.sizes(), " ",
+                value.scalar_type(), " on ", value.device(), ", got ", t->sizes(), " ", t->scalar_type(), " on ",
+                t->device());
+  TORCH_CHECK(value.is_contiguous() && exp_avg.is_contiguous() && exp_avg_sq.is_contiguous(),
+              "parameter and moments must be contiguous");
+}
+
+// Checks the inputs of a step's guard. `stopped`, one int64, comes with a loss of the parameters' dtype.
+template <class T>
+gs::StepGuard<T> step_guard(const Tensor& value, const MaybeTensor& loss, const MaybeTensor& stopped,
+                            int64_t iteration) {
+  if (!stopped) return {};
+  TORCH_CHECK(
+      loss && loss->numel() == 1 && loss->scalar_type() == value.scalar_type() && loss->device() == value.device(),
+      "a guarded step needs the loss, one ", value.scalar_type(), " on ", value.device());
+  TORCH_CHECK(stopped->numel() == 1 && stopped->scalar_type() == at::kLong && stopped->device() == value.device(),
+              "stopped must be one int64 on ", value.device(), ", got ", stopped->sizes(), " ", stopped->scalar_type(),
+              " on ", stopped->device());
+  TORCH_CHECK(iteration > 0, "iterations of guarded steps count from 1, got ", iteration);
+  return {loss->const_data_ptr<T>(), stopped->mutable_data_ptr<int64_t>(), iteration};
+}
+
+int64_t rows_of(const Tensor& t) { return t.dim() > 0 ? t.size(0) : 1; }
+
+// The tensors of one parameter as a backend takes them; all of them checked. columns: -1 for whole rows.
+template <class T>
+gs::AdamInput<T> adam_input(const Tensor& value, const Tensor& gradient, const Tensor& exp_avg,
+                            const Tensor& exp_avg_sq, int64_t columns) {
+  const int64_t rows = rows_of(value), row = rows ? value.numel() / rows : 0;
+  TORCH_CHECK(rows == 0 || columns <= row, "columns must be at most ", row, ", got ", columns);
+  gs::AdamInput<T> in{};
+  in.value = value.mutable_data_ptr<T>(), in.gradient = gradient.const_data_ptr<T>();
+  in.mean = exp_avg.mutable_data_ptr<T>(), in.square = exp_avg_sq.mutable_data_ptr<T>();
+  in.rows = rows, in.row = row, in.columns = columns < 0 ? row : columns;
+  return in;
+}
+
+// Takes one step of every parameter, in one launch on a GPU. Advances each counter first, as torch does, and also where
+// the guard holds the step back.
+void adam_op(at::TensorList values, at::TensorList gradients, at::TensorList exp_avg, at::TensorList exp_avg_sq,
+             at::TensorList steps, at::ArrayRef<double> rates, double beta1, double beta2, double eps,
+             at::IntArrayRef columns, const MaybeTensor& loss, const MaybeTensor& stopped, int64_t iteration) {
+  const size_t n = values.size();
+  for (size_t size : {gradients.size(), exp_avg.size(), exp_avg_sq.size(), steps.size(), rates.size(), columns.size()})
+    TORCH_CHECK(size == n, "every list must have an entry for each of the ", n, " parameters, got ", size);
+  if (n == 0) return;
+  const Tensor& first = values[0];
+  with_scalar(first.scalar_type(), [&](auto zero) {
+    using T = decltype(zero);
+    std::vector<gs::AdamInput<T>> inputs;
+    std::vector<Tensor> contiguous;  // keeps the gradients' memory until the call is over
+    for (size_t i = 0; i < n; ++i) {
+      TORCH_CHECK(values[i].scalar_type() == first.scalar_type() && values[i].device() == first.device(),
+                  "all parameters must have one dtype and device");
+      check_moments(values[i], gradients[i], exp_avg[i], exp_avg_sq[i]);
+      const Tensor& step = steps[i];
+      TORCH_CHECK(step.is_cpu() && step.numel() == 1 && step.scalar_type() == at::kFloat,
+                  "a step counter must be one float32 on the CPU, got ", step.sizes(), " ", step.scalar_type(), " on ",
+                  step.device());
+      contiguous.push_back(gradients[i].contiguous());
+      gs::AdamInput<T> in = adam_input<T>(values[i], contiguous.back(), exp_avg[i], exp_avg_sq[i], columns[i]);
+      in.lr = rates[i], in.beta1 = beta1, in.beta2 = beta2, in.eps = eps;
+      in.step = double(*step.const_data_ptr<float>()) + 1;
+      inputs.push_back(in);
+    }
+    GS_RUN(T, first, adam, inputs.data(), int64_t(n), step_guard<T>(first, loss, stopped, iteration));
+  });
+  for (const Tensor& step : steps) *step.mutable_data_ptr<float>() += 1;
+}
+
+void sparse_adam_op(Tensor& value, const Tensor& gradient, Tensor& exp_avg, Tensor& exp_avg_sq, const Tensor& visible,
+                    double lr, double beta1, double beta2, double eps, int64_t columns, const MaybeTensor& loss,
+                    const MaybeTensor& stopped, int64_t iteration) {
+  check_moments(value, gradient, exp_avg, exp_avg_sq);
+  const int64_t rows = rows_of(value);
+  TORCH_CHECK(visible.dim() == 1 && visible.size(0) == rows && visible.scalar_type() == at::kBool &&
+                  visible.device() == value.device(),
+              "visible must be (", rows, ") bool on ", value.device(), ", got ", visible.sizes(), " ",
+              visible.scalar_type(), " on ", visible.device());
+  if (value.numel() == 0) return;
+  const Tensor g = gradient.contiguous(), mask = visible.contiguous();
+  with_scalar(value.scalar_type(), [&](auto zero) {
+    using T = decltype(zero);
+    gs::AdamInput<T> in = adam_input<T>(value, g, exp_avg, exp_avg_sq, columns);
+    in.lr = lr, in.beta1 = beta1, in.beta2 = beta2, in.eps = eps;
+    GS_RUN(T, value, sparse_adam, in, mask.const_data_ptr<bool>(), step_guard<T>(value, loss, stopped, iteration));
+  });
+}
+
+void observe_op(Tensor& max_radii, Tensor& gradient_sums, Tensor& views, const Tensor& radii, const Tensor& gradient) {
+  const int64_t n = radii.numel();
+  for (const Tensor* t : {&max_radii, &gradient_sums, &views}) {
+    TORCH_CHECK(t->numel() == n && t->scalar_type() == at::kFloat && t->device() == radii.device(),
+                "statistics must be ", n, " float32 on ", radii.device(), ", got ", t->sizes(), " ", t->scalar_type(),
+                " on ", t->device());
+    TORCH_CHECK(t->is_contiguous(), "statistics must be contiguous");
+  }
+  TORCH_CHECK(radii.scalar_type() == at::kInt, "radii must be int32, got ", radii.scalar_type());
+  TORCH_CHECK(gradient.dim() == 2 && gradient.size(0) == n && gradient.size(1) == 3 &&
+                  gradient.scalar_type() == at::kFloat && gradient.device() == radii.device(),
+              "the gradient must be (", n, ", 3) float32 on ", radii.device(), ", got ", gradient.sizes(), " ",
+              gradient.scalar_type(), " on ", gradient.device());
+  const Tensor pixels = radii.contiguous(), rows = gradient.contiguous();
+  const gs::ObserveInput in{n,
+                            max_radii.mutable_data_ptr<float>(),
+                            gradient_sums.mutable_data_ptr<float>(),
+                            views.mutable_data_ptr<float>(),
+                            pixels.const_data_ptr<int32_t>(),
+                            rows.const_data_ptr<float>()};
+#ifdef GS_CUDA
+  if (radii.is_cuda()) {
+    gs::TorchQueue queue(radii.device());
+    return gs::cuda::observe(queue.queue(), in);
+  }
+#endif
+  gs::observe(gs::torch_executor(), in);
+}
+
+}  // namespace
+
+TORCH_LIBRARY_FRAGMENT(diff_gaussian_rasterization, m) {
+  define(m,
+         "adam_(Tensor(a!)[] values, Tensor[] gradients, Tensor(b!)[] exp_avg, Tensor(c!)[] exp_avg_sq, "
+         "Tensor(d!)[] steps, float[] rates, float beta1, float beta2, float eps, int[] columns, Tensor? loss=None, "
+         "Tensor(e!)? stopped=None, int iteration=0) -> ()",
+         &adam_op);
+  define(m,
+         "sparse_adam_(Tensor(a!) value, Tensor gradient, Tensor(b!) exp_avg, Tensor(c!) exp_avg_sq, Tensor visible, "
+         "float lr, float beta1, float beta2, float eps, int columns=-1, Tensor? loss=None, Tensor(d!)? stopped=None, "
+         "int iteration=0) -> ()",
+         &sparse_adam_op);
+  define(m,
+         "observe_(Tensor(a!) max_radii, Tensor(b!) gradient_sums, Tensor(c!) views, Tensor radii, Tensor gradient) "
+         "-> ()",
+         &observe_op);
+}
+
+}  // namespace gs::ops

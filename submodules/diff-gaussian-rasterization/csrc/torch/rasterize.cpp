@@ -1,0 +1,333 @@
+// The ops of rendering: each stage by itself, all of them in one, and their backwards.
+#include <ATen/ops/empty.h>
+#include <ATen/ops/topk.h>
+#include <ATen/ops/zeros.h>
+
+#include <algorithm>
+#include <limits>
+
+#include "math/splat.h"
+#include "math/tiles.h"
+#include "scene.h"
+
+#define BACKWARD_SCHEMA                                                                                   \
+  "Tensor splats, Tensor instances, Tensor ranges, Tensor splat_slots, Tensor slots, "                    \
+  "Tensor background, Tensor last, Tensor transmittance, Tensor grad_color, Tensor? grad_transmittance, " \
+  "Tensor? grad_inverse_depth"
+#define BACKWARD_PARAMETERS                                                                                            \
+  const Tensor &splats, const Tensor &instances, const Tensor &ranges, const Tensor &splat_slots, const Tensor &slots, \
+      const Tensor &background, const Tensor &last, const Tensor &transmittance, const Tensor &grad_color,             \
+      const MaybeTensor &grad_transmittance, const MaybeTensor &grad_inverse_depth
+#define BACKWARD_ARGUMENTS                                                                                        \
+  splats, instances, ranges, splat_slots, slots, background, last, transmittance, grad_color, grad_transmittance, \
+      grad_inverse_depth
+
+namespace gs::ops {
+
+namespace {
+
+using gs::baseline::kGradientValues, gs::baseline::kSplatValues, gs::baseline::tile_count, gs::baseline::tiles_of;
+
+struct ProjectedTensors {
+  Tensor splats, depths, rects, tile_counts, radii;
+  Tensor records;  // undefined on the CPU
+  template <class T>
+  gs::Projected<T> pointers() {
+    return {splats.mutable_data_ptr<T>(),
+            depths.mutable_data_ptr<T>(),
+            rects.defined() ? rects.mutable_data_ptr<int32_t>() : nullptr,
+            tile_counts.mutable_data_ptr<int32_t>(),
+            radii.mutable_data_ptr<int32_t>(),
+            records.defined() ? static_cast<gs::TileRecord*>(records.mutable_data_ptr()) : nullptr};
+  }
+};
+
+// rects: whether the caller wants them; with records nothing else needs them.
+ProjectedTensors project(const SceneTensors& in, bool rects) {
+  const int64_t n = in.count();
+  const auto ints = in.options().dtype(at::kInt);
+  ProjectedTensors out;
+  out.splats = at::empty({n, kSplatValues}, in.options());
+  out.depths = at::empty({n}, in.options());
+  out.tile_counts = at::empty({n}, ints);
+  out.radii = at::empty({n}, ints);
+  const int most_tiles = tile_count(std::max(in.image().width, in.image().height));
+  const bool records = in.device().is_cuda() && most_tiles <= std::numeric_limits<uint16_t>::max();
+  if (rects || !records) out.rects = at::empty({n, 4}, ints);
+  if (records) out.records = at::empty({n, int64_t(sizeof(gs::TileRecord))}, in.options().dtype(at::kByte));
+  with_scalar(in.dtype(), [&](auto zero) {
+    using T = decltype(zero);
+    GS_RUN(T, out.splats, project, in.scene<T>(), out.pointers<T>());
+  });
+  return out;
+}
+
+// Names the Gaussians with the most tiles; often a few giants cover nearly all.
+std::string giants(const Tensor& tile_counts) {
+  const auto [counts, rows] = at::topk(tile_counts.cpu(), std::min<int64_t>(3, tile_counts.size(0)));
+  std::string words;
+  for (int64_t k = 0; k < counts.size(0); ++k)
+    words += (k ? ", " : "") + std::to_string(rows.const_data_ptr<int64_t>()[k]) + " (" +
+             std::to_string(counts.const_data_ptr<int32_t>()[k]) + ")";
+  return words;
+}
+
+struct BinnedTensors {
+  Tensor instances, ranges;
+  Tensor splat_slots;  // (N + 1, 2): gs::SplatSlots, whose two 32-bit values share the second
+  Tensor slots;        // (S, 0): only carries the number of slots, which sizes the backward's memory
+};
+
+// slots: whether the backward will need them.
+BinnedTensors bin(ProjectedTensors& in, gs::Image image, bool slots) {
+  const auto ints = in.depths.options().dtype(at::kInt), longs = in.depths.options().dtype(at::kLong);
+  BinnedTensors out;
+  out.splat_slots = at::empty({slots ? in.depths.size(0) + 1 : 0, 2}, longs);
+  auto allocate = [&](int64_t total, int64_t slot_count) {
+    const int64_t n = in.depths.size(0);
+    TORCH_CHECK(total <= std::numeric_limits<int32_t>::max(), n, " Gaussians cover ", total,
+                " tile instances, more than 2^31 - 1; most are those of Gaussian ", giants(in.tile_counts),
+                ": remove such giants, or render at a lower resolution or with fewer Gaussians");
+    out.instances = at::empty({total}, ints), out.ranges = at::empty({tiles_of(image) + 1}, longs);
+    out.slots = at::empty({slot_count, 0}, ints);
+    return gs::Binned{out.instances.mutable_data_ptr<int32_t>(), out.ranges.mutable_data_ptr<int64_t>()};
+  };
+  using Allocate = decltype(allocate);
+  const gs::BinMemory memory{
+      [](void* context, int64_t total, int64_t slots) { return (*static_cast<Allocate*>(context))(total, slots); },
+      &allocate, slots ? static_cast<gs::SplatSlots*>(out.splat_slots.mutable_data_ptr()) : nullptr};
+  with_scalar(in.depths.scalar_type(), [&](auto zero) {
+    using T = decltype(zero);
+    GS_RUN(T, in.depths, bin, in.depths.size(0), in.pointers<T>(), image, memory);
+  });
+  return out;
+}
+
+template <class T>
+gs::BlendInput<T> blend_input(const Tensor& splats, const Tensor& instances, const Tensor& ranges,
+                              const Tensor& background, gs::Image image) {
+  return {splats.const_data_ptr<T>(), instances.const_data_ptr<int32_t>(), ranges.const_data_ptr<int64_t>(),
+          background.const_data_ptr<T>(), image};
+}
+
+Tensor background_like(const Tensor& background, const Tensor& splats) {
+  TORCH_CHECK(background.numel() == 3, "background must have 3 values, got ", in_words(background.sizes()));
+  return converted(background, splats);
+}
+
+struct BlendedTensors {
+  Tensor color, transmittance, inverse_depth, last;
+};
+
+// last: whether the backward will need it.
+BlendedTensors blend(const Tensor& splats, const Tensor& instances, const Tensor& ranges, const Tensor& background,
+                     gs::Image image, bool inverse_depth, bool last) {
+  const int64_t h = image.height, w = image.width;
+  BlendedTensors out{at::empty({3, h, w}, splats.options()), at::empty({1, h, w}, splats.options()),
+                     at::empty({inverse_depth ? 1 : 0, h, w}, splats.options()),
+                     at::empty({last ? h : 0, w}, splats.options().dtype(at::kInt))};
+  const Tensor bg = background_like(background, splats);
+  with_scalar(splats.scalar_type(), [&](auto zero) {
+    using T = decltype(zero);
+    const gs::Blended<T> blended{out.color.mutable_data_ptr<T>(), out.transmittance.mutable_data_ptr<T>(),
+                                 inverse_depth ? out.inverse_depth.mutable_data_ptr<T>() : nullptr,
+                                 last ? out.last.mutable_data_ptr<int32_t>() : nullptr};
+    GS_RUN(T, splats, blend, blend_input<T>(splats, instances, ranges, bg, image), blended);
+  });
+  return out;
+}
+
+// Owns the tensors that the gs::BlendInput and gs::BlendGradient of a backward point into.
+class BlendBackward {
+ public:
+  BlendBackward(const Tensor& splats, const Tensor& instances, const Tensor& ranges, const Tensor& splat_slots,
+                const Tensor& slots, const Tensor& background, const Tensor& last, const Tensor& transmittance,
+                const Tensor& grad_color, const MaybeTensor& grad_transmittance, const MaybeTensor& grad_inverse_depth)
+      : splats_(splats.contiguous()),
+        instances_(instances),
+        ranges_(ranges),
+        splat_slots_(splat_slots.contiguous()),
+        slot_count_(slots.size(0)),
+        background_(background_like(background, splats)),
+        last_(last),
+        transmittance_(transmittance),
+        image_{int(last.size(1)), int(last.size(0))},
+        color_(plane(grad_color, 3)),
+        alpha_(plane(grad_transmittance, 1)),
+        depth_(plane(grad_inverse_depth, 1)) {}
+
+  const Tensor& splats() const { return splats_; }
+
+  template <class T>
+  gs::BlendInput<T> input() const {
+    return blend_input<T>(splats_, instances_, ranges_, background_, image_);
+  }
+  template <class T>
+  gs::BlendGradient<T> gradient(T* moments) const {
+    return {splats_.size(0),
+            instances_.size(0),
+            slot_count_,
+            static_cast<const gs::SplatSlots*>(splat_slots_.const_data_ptr()),
+            transmittance_.const_data_ptr<T>(),
+            last_.const_data_ptr<int32_t>(),
+            color_.const_data_ptr<T>(),
+            depth_.defined() ? depth_.const_data_ptr<T>() : nullptr,
+            alpha_.defined() ? alpha_.const_data_ptr<T>() : nullptr,
+            moments};
+  }
+
+ private:
+  Tensor plane(const MaybeTensor& t, int64_t channels) const {
+    if (!t.has_value() || !t->defined()) return {};
+    TORCH_CHECK(t->dim() == 3 && t->size(0) == channels && t->size(1) == image_.height && t->size(2) == image_.width,
+                "the gradient of an image must be (", channels, ", ", image_.height, ", ", image_.width, "), got ",
+                in_words(t->sizes()));
+    return converted(*t, splats_);
+  }
+
+  Tensor splats_, instances_, ranges_, splat_slots_;
+  int64_t slot_count_;
+  Tensor background_, last_, transmittance_;
+  gs::Image image_;
+  Tensor color_, alpha_, depth_;
+};
+
+Tensor blend_vjp(const BlendBackward& in) {
+  Tensor moments = at::empty({in.splats().size(0), kGradientValues}, in.splats().options());
+  with_scalar(moments.scalar_type(), [&](auto zero) {
+    using T = decltype(zero);
+    GS_RUN(T, moments, blend_vjp, in.input<T>(), in.gradient<T>(moments.mutable_data_ptr<T>()));
+  });
+  return moments;
+}
+
+Gradients project_vjp(const SceneTensors& in, const Tensor& tile_counts, const Tensor& moments, const Wanted& wanted) {
+  SceneGradients out(in, wanted);
+  with_scalar(in.dtype(), [&](auto zero) {
+    using T = decltype(zero);
+    GS_RUN(T, moments, project_vjp, in.scene<T>(), tile_counts.const_data_ptr<int32_t>(), moments.const_data_ptr<T>(),
+           out.pointers<T>());
+  });
+  return out.all();
+}
+
+using Tensors5 = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor>;
+using Tensors4 = std::tuple<Tensor, Tensor, Tensor, Tensor>;
+
+Tensors5 project_op(SCENE_PARAMETERS) {
+  const ProjectedTensors p = project(SceneTensors(SCENE_ARGUMENTS), true);
+  return {p.splats, p.depths, p.rects, p.tile_counts, p.radii};
+}
+
+Tensors4 bin_op(const Tensor& splats, const Tensor& depths, const Tensor& rects, const Tensor& tile_counts,
+                int64_t height, int64_t width, bool train) {
+  ProjectedTensors p;
+  p.splats = splats.contiguous(), p.depths = depths.contiguous(), p.rects = rects.contiguous();
+  p.tile_counts = p.radii = tile_counts.contiguous();
+  const BinnedTensors b = bin(p, {int(width), int(height)}, train);
+  return {b.instances, b.ranges, b.splat_slots, b.slots};
+}
+
+Tensors4 blend_op(const Tensor& splats, const Tensor& instances, const Tensor& ranges, const Tensor& background,
+                  int64_t height, int64_t width, bool inverse_depth, bool train) {
+  const BlendedTensors b =
+      blend(splats.contiguous(), instances, ranges, background, {int(width), int(height)}, inverse_depth, train);
+  return {b.color, b.transmittance, b.inverse_depth, b.last};
+}
+
+Tensor blend_vjp_op(BACKWARD_PARAMETERS) { return blend_vjp(BlendBackward(BACKWARD_ARGUMENTS)); }
+
+Gradients project_vjp_op(SCENE_PARAMETERS, const Tensor& tile_counts, const Tensor& moments, Wanted wanted) {
+  return project_vjp(SceneTensors(SCENE_ARGUMENTS), tile_counts.contiguous(), moments.contiguous(), wanted);
+}
+
+using Rasterized = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor>;
+
+Rasterized rasterize_op(const Tensor& means2d, SCENE_PARAMETERS, const Tensor& background, bool inverse_depth,
+                        bool train) {
+  const SceneTensors scene(SCENE_ARGUMENTS);
+  scene.checked(kMeans2d, means2d);  // it only receives a gradient
+  ProjectedTensors p = project(scene, false);
+  BinnedTensors b = bin(p, scene.image(), train);
+  BlendedTensors o = blend(p.splats, b.instances, b.ranges, background, scene.image(), inverse_depth, train);
+  return {o.color,     o.transmittance, o.inverse_depth, p.radii, p.splats, p.tile_counts,
+          b.instances, b.ranges,        b.splat_slots,   b.slots, o.last};
+}
+
+Gradients rasterize_vjp_op(SCENE_PARAMETERS, BACKWARD_PARAMETERS, const Tensor& tile_counts, Wanted wanted) {
+  const SceneTensors scene(SCENE_ARGUMENTS);
+  const BlendBackward in(BACKWARD_ARGUMENTS);
+#ifdef GS_CUDA
+  if (splats.is_cuda()) {
+    gs::TorchQueue queue(splats.device());
+    std::optional<SceneGradients> out;
+    auto allocate = [&] { return out.emplace(scene, wanted).pointers<float>(); };
+    using Allocate = decltype(allocate);
+    const gs::cuda::GradientMemory memory{[](void* context) { return (*static_cast<Allocate*>(context))(); },
+                                          &allocate};
+    gs::cuda::rasterize_vjp(queue.queue(), scene.scene<float>(), in.input<float>(), in.gradient<float>(nullptr),
+                            memory);
+    if (!out) allocate();  // no Gaussians
+    return out->all();
+  }
+#endif
+  return project_vjp(scene, tile_counts, blend_vjp(in), wanted);
+}
+
+Tensor mark_visible_op(const Tensor& means, const Tensor& view) {
+  TORCH_CHECK(means.dim() == 2 && means.size(1) == 3, "positions must be (N, 3), got ", in_words(means.sizes()));
+  TORCH_CHECK(view.numel() == 16, "the view matrix must be 4x4, got ", in_words(view.sizes()));
+  const Tensor rows = means.contiguous(), matrix = converted(view, means);
+  Tensor visible = at::empty({rows.size(0)}, rows.options().dtype(at::kBool));
+  with_scalar(rows.scalar_type(), [&](auto zero) {
+    using T = decltype(zero);
+    GS_RUN(T, rows, mark_visible, rows.size(0), rows.const_data_ptr<T>(), matrix.const_data_ptr<T>(),
+           visible.mutable_data_ptr<bool>());
+  });
+  return visible;
+}
+
+Tensor decisive_op(const Tensor& splats, const Tensor& instances, const Tensor& ranges, const Tensor& last) {
+  Tensor decisive = at::zeros({splats.size(0)}, splats.options().dtype(at::kBool));
+  const Tensor rows = splats.contiguous(), no_background = at::zeros({3}, splats.options());
+  const gs::Image image{int(last.size(1)), int(last.size(0))};
+  with_scalar(rows.scalar_type(), [&](auto zero) {
+    using T = decltype(zero);
+    GS_RUN(T, rows, mark_decisive, blend_input<T>(rows, instances, ranges, no_background, image),
+           last.const_data_ptr<int32_t>(), decisive.mutable_data_ptr<bool>());
+  });
+  return decisive;
+}
+
+}  // namespace
+
+TORCH_LIBRARY_FRAGMENT(diff_gaussian_rasterization, m) {
+  define(m,
+         "project(" SCENE_SCHEMA ") -> (Tensor splats, Tensor depths, Tensor rects, Tensor tile_counts, Tensor radii)",
+         &project_op);
+  define(m,
+         "bin(Tensor splats, Tensor depths, Tensor rects, Tensor tile_counts, int height, int width, bool train) -> "
+         "(Tensor instances, Tensor ranges, Tensor splat_slots, Tensor slots)",
+         &bin_op);
+  define(m,
+         "blend(Tensor splats, Tensor instances, Tensor ranges, Tensor background, int height, int width, "
+         "bool inverse_depth, bool train) -> (Tensor color, Tensor transmittance, Tensor inverse_depth, Tensor last)",
+         &blend_op);
+  define(m, "blend_vjp(" BACKWARD_SCHEMA ") -> Tensor moments", &blend_vjp_op);
+  define(m, "project_vjp(" SCENE_SCHEMA ", Tensor tile_counts, Tensor moments, bool[9] wanted) -> " GRADIENTS_SCHEMA,
+         &project_vjp_op);
+  define(m,
+         "rasterize(Tensor means2d, " SCENE_SCHEMA
+         ", Tensor background, bool inverse_depth, bool train) -> (Tensor color, Tensor transmittance, "
+         "Tensor inverse_depth, Tensor radii, Tensor splats, Tensor tile_counts, Tensor instances, "
+         "Tensor ranges, Tensor splat_slots, Tensor slots, Tensor last)",
+         &rasterize_op);
+  define(m,
+         "rasterize_vjp(" SCENE_SCHEMA ", " BACKWARD_SCHEMA
+         ", Tensor tile_counts, bool[9] wanted) -> " GRADIENTS_SCHEMA,
+         &rasterize_vjp_op);
+  define(m, "mark_visible(Tensor means, Tensor view) -> Tensor", &mark_visible_op);
+  define(m, "decisive(Tensor splats, Tensor instances, Tensor ranges, Tensor last) -> Tensor", &decisive_op);
+}
+
+}  // namespace gs::ops

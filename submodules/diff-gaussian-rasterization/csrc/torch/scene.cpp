@@ -1,0 +1,113 @@
+#include "scene.h"
+
+#include <ATen/ops/empty.h>
+#include <c10/util/DimVector.h>
+
+#include <iterator>
+#include <limits>
+
+#include "math/sh.h"
+#include "math/tiles.h"
+
+namespace gs::ops {
+
+namespace {
+
+using namespace gs::baseline;
+
+constexpr int64_t kMostRestBands = sh_count(kMaxShDegree) - 1;
+
+// What a Gaussian has in each input: values, or bands of values. sh_rest has any number of bands.
+struct Row {
+  const char* name;
+  int64_t values, bands;
+};
+constexpr int64_t kNoBands = 0, kAnyBands = -1;
+constexpr Row kRows[] = {
+    {"means", 3, kNoBands},     {"means2d", 3, kNoBands}, {"opacities", 1, kNoBands}, {"scales", 3, kNoBands},
+    {"rotations", 4, kNoBands}, {"cov3d", 6, kNoBands},   {"colors", 3, kNoBands},    {"sh_dc", 3, 1},
+    {"sh_rest", 3, kAnyBands}};
+static_assert(std::size(kRows) == kInputs, "every input has a row");
+
+at::DimVector sizes_of(const Row& row, int64_t count, int64_t rest_bands) {
+  if (row.bands == kNoBands) return {count, row.values};
+  return {count, row.bands == kAnyBands ? rest_bands : row.bands, row.values};
+}
+
+// Rows may lie apart, so that a slice of more bands needs no copy.
+Tensor with_whole_rows(const Tensor& t) {
+  const bool whole = t.size(1) == 0 || (t.stride(2) == 1 && t.stride(1) == t.size(2));
+  return whole ? t : t.contiguous();
+}
+
+}  // namespace
+
+SceneTensors::SceneTensors(SCENE_PARAMETERS)
+    : tan_x_(tan_x),
+      tan_y_(tan_y),
+      scale_modifier_(scale_modifier),
+      sh_degree_(int(sh_degree)),
+      antialiasing_(antialiasing),
+      raw_(raw),
+      image_{int(width), int(height)} {
+  const at::ScalarType type = means.scalar_type();
+  TORCH_CHECK_TYPE(type == at::kFloat || type == at::kDouble, "means must be float32 or float64, got ", in_words(type));
+  TORCH_CHECK_VALUE(means.dim() == 2 && means.size(1) == 3, "means must be (N, 3), got ", in_words(means.sizes()));
+  TORCH_CHECK_VALUE(cov3d.has_value() != (scales.has_value() && rotations.has_value()),
+                    "give scales and rotations, or cov3d");
+  TORCH_CHECK_VALUE(colors.has_value() != (sh_dc.has_value() && sh_rest.has_value()),
+                    "give sh_dc and sh_rest, or colors");
+  TORCH_CHECK_VALUE(sh_degree >= 0 && sh_degree <= kMaxShDegree, "sh_degree must be 0 to 3, got ", sh_degree);
+  inputs_[kMeans] = means.contiguous();
+  const MaybeTensor given[kInputs] = {means, {}, opacities, scales, rotations, cov3d, colors, sh_dc, sh_rest};
+  for (int input = kMeans2d; input < kInputs; ++input) inputs_[input] = checked(Input(input), given[input]);
+  view_ = matrix(view, 16, "view");
+  projection_ = matrix(projection, 16, "projection");
+  center_ = matrix(center, 3, "center");
+  check_settings(height, width);
+}
+
+Tensor SceneTensors::checked(Input input, const MaybeTensor& given) const {
+  if (!given.has_value()) return {};
+  const Tensor& t = *given;
+  const Row& row = kRows[input];
+  TORCH_CHECK_TYPE(t.scalar_type() == dtype() && t.device() == device(), row.name, " must be ", in_words(dtype()),
+                   " on ", device(), " like means, got ", in_words(t.scalar_type()), " on ", t.device());
+  if (input == kShRest) return checked_rest(t);
+  const at::DimVector wanted = sizes_of(row, count(), 0);
+  const bool flat = input == kOpacities && t.dim() == 1 && t.size(0) == count();
+  const char* hint = input != kScales ? "" : raw_ ? " (logarithms of the scales)" : " (activated scales, one per axis)";
+  TORCH_CHECK_VALUE(t.sizes() == at::IntArrayRef(wanted) || flat, row.name, " must be ", in_words(wanted), hint,
+                    ", got ", in_words(t.sizes()));
+  return row.bands == kNoBands ? t.contiguous() : with_whole_rows(t);
+}
+
+Tensor SceneTensors::checked_rest(const Tensor& t) const {
+  const int64_t needed = sh_count(sh_degree_) - 1;
+  const bool fits = t.dim() == 3 && t.size(0) == count() && t.size(1) >= needed && t.size(2) == 3;
+  TORCH_CHECK_VALUE(fits, "sh_rest must be (", count(), ", ", needed, " or more, 3) for sh_degree ", sh_degree_,
+                    ", got ", in_words(t.sizes()));
+  TORCH_CHECK(t.size(1) <= kMostRestBands, "sh_rest has ", t.size(1), " bands, more than the ", kMostRestBands,
+              " of degree 3");
+  return with_whole_rows(t);
+}
+
+Tensor SceneTensors::matrix(const Tensor& t, int64_t values, const char* name) const {
+  TORCH_CHECK(t.numel() == values, name, " must have ", values, " values, got ", in_words(t.sizes()));
+  return converted(t, inputs_[kMeans]);
+}
+
+void SceneTensors::check_settings(int64_t height, int64_t width) const {
+  TORCH_CHECK(height > 0 && width > 0 && height < (1 << 24) && width < (1 << 24), "image size ", width, "x", height,
+              " is out of range");
+  TORCH_CHECK(tiles_of(image_) <= std::numeric_limits<int32_t>::max(), "image size ", width, "x", height,
+              " has more than 2^31 - 1 tiles of ", kTile, "x", kTile);
+  TORCH_CHECK(count() < std::numeric_limits<int32_t>::max(), "more than 2^31 Gaussians");
+}
+
+SceneGradients::SceneGradients(const SceneTensors& in, const Wanted& wanted) : wanted_(wanted) {
+  for (int input = 0; input < kInputs; ++input)
+    tensors_[input] = at::empty(sizes_of(kRows[input], wanted[input] ? in.count() : 0, in.rest_bands()), in.options());
+}
+
+}  // namespace gs::ops

@@ -1,0 +1,114 @@
+#pragma once
+// The Gaussians and the camera as tensors, and their gradients. A new input is added to SCENE_SCHEMA, GRADIENTS_SCHEMA,
+// SCENE_PARAMETERS and SCENE_ARGUMENTS, to Input, to the table of rows and the constructor in scene.cpp, and to the
+// structs of data.h.
+#include <array>
+#include <tuple>
+#include <utility>
+
+#include "tensors.h"
+
+#define SCENE_SCHEMA                                                                                          \
+  "Tensor means, Tensor opacities, Tensor? scales, Tensor? rotations, Tensor? cov3d, Tensor? colors, "        \
+  "Tensor? sh_dc, Tensor? sh_rest, Tensor view, Tensor projection, Tensor center, float tan_x, float tan_y, " \
+  "int height, int width, int sh_degree, float scale_modifier, bool antialiasing, bool raw"
+#define SCENE_PARAMETERS                                                                                              \
+  const Tensor &means, const Tensor &opacities, const MaybeTensor &scales, const MaybeTensor &rotations,              \
+      const MaybeTensor &cov3d, const MaybeTensor &colors, const MaybeTensor &sh_dc, const MaybeTensor &sh_rest,      \
+      const Tensor &view, const Tensor &projection, const Tensor &center, double tan_x, double tan_y, int64_t height, \
+      int64_t width, int64_t sh_degree, double scale_modifier, bool antialiasing, bool raw
+#define SCENE_ARGUMENTS                                                                                               \
+  means, opacities, scales, rotations, cov3d, colors, sh_dc, sh_rest, view, projection, center, tan_x, tan_y, height, \
+      width, sh_degree, scale_modifier, antialiasing, raw
+#define GRADIENTS_SCHEMA                                                                             \
+  "(Tensor means, Tensor means2d, Tensor opacities, Tensor scales, Tensor rotations, Tensor cov3d, " \
+  "Tensor colors, Tensor sh_dc, Tensor sh_rest)"
+
+namespace gs::ops {
+
+// The inputs that have a gradient, in the order of GRADIENTS_SCHEMA. means2d has nothing else: its values are not read.
+enum Input { kMeans, kMeans2d, kOpacities, kScales, kRotations, kCov3d, kColors, kShDc, kShRest, kInputs };
+
+using InputTensors = std::array<Tensor, kInputs>;
+using Gradients = decltype(std::tuple_cat(std::declval<InputTensors>()));
+using Wanted = std::array<bool, kInputs>;
+
+// Checks the inputs, and owns the contiguous tensors that a gs::Scene points into.
+class SceneTensors {
+ public:
+  explicit SceneTensors(SCENE_PARAMETERS);
+
+  // Checks the shape, dtype and device of an input. Returns it contiguous; undefined where it was not given.
+  Tensor checked(Input input, const MaybeTensor& given) const;
+
+  int64_t count() const { return inputs_[kMeans].size(0); }
+  gs::Image image() const { return image_; }
+  at::ScalarType dtype() const { return inputs_[kMeans].scalar_type(); }
+  at::Device device() const { return inputs_[kMeans].device(); }
+  at::TensorOptions options() const { return inputs_[kMeans].options(); }
+  int64_t rest_bands() const { return inputs_[kShRest].defined() ? inputs_[kShRest].size(1) : 0; }
+
+  template <class T>
+  gs::Scene<T> scene() const {
+    const auto pointer = [](const Tensor& t) { return t.defined() ? t.const_data_ptr<T>() : nullptr; };
+    const auto stride = [](const Tensor& t) { return t.defined() ? t.stride(0) : 0; };
+    return {count(),
+            pointer(inputs_[kMeans]),
+            pointer(inputs_[kOpacities]),
+            pointer(inputs_[kScales]),
+            pointer(inputs_[kRotations]),
+            pointer(inputs_[kCov3d]),
+            pointer(inputs_[kColors]),
+            pointer(inputs_[kShDc]),
+            pointer(inputs_[kShRest]),
+            stride(inputs_[kShDc]),
+            stride(inputs_[kShRest]),
+            int(rest_bands()),
+            sh_degree_,
+            raw_,
+            antialiasing_,
+            T(scale_modifier_),
+            pointer(view_),
+            pointer(projection_),
+            pointer(center_),
+            tan_x_,
+            tan_y_,
+            image_};
+  }
+
+ private:
+  Tensor checked_rest(const Tensor& t) const;
+  Tensor matrix(const Tensor& t, int64_t values, const char* name) const;
+  void check_settings(int64_t height, int64_t width) const;
+
+  InputTensors inputs_;  // means2d stays undefined
+  Tensor view_, projection_, center_;
+  double tan_x_, tan_y_, scale_modifier_;
+  int sh_degree_;
+  bool antialiasing_, raw_;
+  gs::Image image_;
+};
+
+// Owns the gradients of the inputs; those not wanted have no rows.
+class SceneGradients {
+ public:
+  SceneGradients(const SceneTensors& in, const Wanted& wanted);
+
+  template <class T>
+  gs::SceneGradient<T> pointers() {
+    return pointers<T>(std::make_index_sequence<kInputs>());
+  }
+  Gradients all() const { return std::tuple_cat(tensors_); }
+
+ private:
+  template <class T, size_t... kInput>
+  gs::SceneGradient<T> pointers(std::index_sequence<kInput...>) {
+    static_assert(sizeof(gs::SceneGradient<T>) == kInputs * sizeof(T*), "SceneGradient and Input have the same fields");
+    return {(wanted_[kInput] ? tensors_[kInput].template mutable_data_ptr<T>() : nullptr)...};
+  }
+
+  Wanted wanted_;
+  InputTensors tensors_;
+};
+
+}  // namespace gs::ops

@@ -1,0 +1,72 @@
+"""The sources of the extensions: who may include what, and the operators' schemas."""
+
+import re
+from pathlib import Path
+
+import diff_gaussian_rasterization  # noqa: F401  (loads the library with the operators)
+import pytest
+import torch
+
+ROOT = Path(__file__).parents[1]
+CSRC = sorted((ROOT / "submodules").glob("*/csrc"))
+SUFFIXES = {".cpp", ".cu", ".cuh", ".h"}
+
+SCENE = (
+    "Tensor means, Tensor opacities, Tensor? scales, Tensor? rotations, Tensor? cov3d, Tensor? colors, Tensor? sh_dc, "
+    "Tensor? sh_rest, Tensor view, Tensor projection, Tensor center, float tan_x, float tan_y, int height, int width, "
+    "int sh_degree, float scale_modifier, bool antialiasing, bool raw"
+)
+BACKWARD = (
+    "Tensor splats, Tensor instances, Tensor ranges, Tensor splat_slots, Tensor slots, Tensor background, Tensor last, "
+    "Tensor transmittance, Tensor grad_color, Tensor? grad_transmittance, Tensor? grad_inverse_depth"
+)
+GRADIENTS = (
+    "(Tensor means, Tensor means2d, Tensor opacities, Tensor scales, Tensor rotations, Tensor cov3d, Tensor colors, "
+    "Tensor sh_dc, Tensor sh_rest)"
+)
+SCHEMAS = [
+    f"project({SCENE}) -> (Tensor splats, Tensor depths, Tensor rects, Tensor tile_counts, Tensor radii)",
+    "bin(Tensor splats, Tensor depths, Tensor rects, Tensor tile_counts, int height, int width, bool train) -> "
+    "(Tensor instances, Tensor ranges, Tensor splat_slots, Tensor slots)",
+    "blend(Tensor splats, Tensor instances, Tensor ranges, Tensor background, int height, int width, "
+    "bool inverse_depth, bool train) -> (Tensor color, Tensor transmittance, Tensor inverse_depth, Tensor last)",
+    f"blend_vjp({BACKWARD}) -> Tensor moments",
+    f"project_vjp({SCENE}, Tensor tile_counts, Tensor moments, bool[9] wanted) -> {GRADIENTS}",
+    f"rasterize(Tensor means2d, {SCENE}, Tensor background, bool inverse_depth, bool train) -> (Tensor color, "
+    "Tensor transmittance, Tensor inverse_depth, Tensor radii, Tensor splats, Tensor tile_counts, Tensor instances, "
+    "Tensor ranges, Tensor splat_slots, Tensor slots, Tensor last)",
+    f"rasterize_vjp({SCENE}, {BACKWARD}, Tensor tile_counts, bool[9] wanted) -> {GRADIENTS}",
+    "mark_visible(Tensor means, Tensor view) -> Tensor",
+    "decisive(Tensor splats, Tensor instances, Tensor ranges, Tensor last) -> Tensor",
+    "adam_(Tensor(a!)[] values, Tensor[] gradients, Tensor(b!)[] exp_avg, Tensor(c!)[] exp_avg_sq, Tensor(d!)[] steps, "
+    "float[] rates, float beta1, float beta2, float eps, int[] columns, Tensor? loss=None, Tensor(e!)? stopped=None, "
+    "int iteration=0) -> ()",
+    "sparse_adam_(Tensor(a!) value, Tensor gradient, Tensor(b!) exp_avg, Tensor(c!) exp_avg_sq, Tensor visible, "
+    "float lr, float beta1, float beta2, float eps, int columns=-1, Tensor? loss=None, Tensor(d!)? stopped=None, "
+    "int iteration=0) -> ()",
+    "observe_(Tensor(a!) max_radii, Tensor(b!) gradient_sums, Tensor(c!) views, Tensor radii, Tensor gradient) -> ()",
+]
+
+
+def includes(folder: Path) -> list[tuple[Path, str]]:
+    files = [path for path in sorted(folder.rglob("*")) if path.suffix in SUFFIXES]
+    return [(path, name) for path in files for name in re.findall(r'^#include [<"](.*?)[>"]', path.read_text(), re.M)]
+
+
+@pytest.mark.parametrize("schema", SCHEMAS, ids=[schema.partition("(")[0] for schema in SCHEMAS])
+def test_schemas(schema):
+    packet = getattr(torch.ops.diff_gaussian_rasterization, schema.partition("(")[0])
+    assert str(packet.default._schema) == f"diff_gaussian_rasterization::{schema}"
+
+
+@pytest.mark.parametrize("csrc", CSRC, ids=[csrc.parent.name for csrc in CSRC])
+def test_only_the_torch_folder_sees_torch(csrc):
+    seeing = {path for path, name in includes(csrc) if re.match(r"(torch|ATen|c10)/|gs/torch_", name)}
+    assert seeing and {path.parent.name for path in seeing} == {"torch"}
+
+
+@pytest.mark.parametrize("csrc", CSRC, ids=[csrc.parent.name for csrc in CSRC])
+def test_math_stands_below_everything(csrc):
+    headers = {path.name for path in (csrc / "math").iterdir()}
+    for path, name in includes(csrc / "math"):
+        assert name in headers or name == "../data.h" or re.fullmatch(r"gs/\w+\.h|c\w+|limits|algorithm", name), path
