@@ -1,11 +1,11 @@
-"""What full_eval.py does: a table of scenes is trained, rendered and scored, and one report is made of it.
+"""The parts of full_eval.py, which trains, renders and scores a table of scenes, and writes one report.
 
-scenes, configs, runs        what is to be done: which folders, under which options, into which model folders
-child, lock, record, stages  doing it: one stage is one subprocess; what is finished is remembered in the model folder
-model_folder, results        reading what a model folder holds
-summary, tradeoff, published spread over seeds, error against time, and comparison with published tables
-figures, contact_sheet       pictures
-document, markdown, html     the report's content, once, and its two renderings; report writes all files
-machine                      where and with what it ran
+scenes, configs, runs        the plan: scene folders, options, model folders
+child, lock, record, stages  its execution: each stage is a subprocess; the model folder records finished stages
+model_folder, results        readers of model folders
+summary, tradeoff, published spread over seeds, error against time, comparison with published tables
+figures, contact_sheet       figures of the report
+document, markdown, html     the report's content and its two renderings; report writes all files
+machine                      description of the machine
 readme_table                 README's table from report.json
 """

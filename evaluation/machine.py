@@ -1,4 +1,4 @@
-"""Where and with what a training ran. `python -m evaluation.machine` prints it as JSON."""
+"""Description of the machine and software that trained. `python -m evaluation.machine` prints it as JSON."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ _PACKAGES = ("lpips", "numpy", "pillow", "pycolmap", "torch", "torchvision")
 
 
 def machine() -> dict[str, Any]:
-    """Processor, GPU, threads, versions, commit of this machine and checkout; {} where they cannot be found out.
+    """Return processor, GPU, threads, versions and commit of this machine and checkout; {} if that fails.
 
-    A process of its own asks: asking a GPU for its name takes some of its memory for as long as the asker lives.
+    A separate process asks, because asking a GPU for its name occupies GPU memory until the process ends.
     """
     command = [sys.executable, "-m", "evaluation.machine"]
     done = subprocess.run(command, cwd=_ROOT, capture_output=True, text=True, check=False)
     if done.returncode:
-        print(f"warning: this machine could not be described:\n{done.stderr}", file=sys.stderr)
+        print(f"warning: cannot describe this machine:\n{done.stderr}", file=sys.stderr)
         return {}
     return json.loads(done.stdout)
 
@@ -59,7 +59,7 @@ def _version(package: str) -> str | None:
 
 
 def one_line(facts: dict[str, Any]) -> str:
-    """What people want to know of `machine()`'s answer."""
+    """Summarise the result of `machine` in one line."""
     if not facts:
         return "not known"
     where = f"{facts['gpu']}, {facts['cpu']}" if facts["gpu"] else f"{facts['cpu']}, {facts['instruction_set']}"
