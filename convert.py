@@ -1,10 +1,10 @@
-"""From photos or a video to a scene that train.py takes: camera poses, points, undistorted pictures.
+"""Convert photos or a video to a scene for train.py: camera poses, points, undistorted photos.
 
 python convert.py -s SCENE                 photos in SCENE/input
 python convert.py -s SCENE --video FILE    frames of a video, written to SCENE/input
 
-Writes SCENE/images, SCENE/sparse/0, SCENE/convert_report.json, and what it needs again into SCENE/distorted. A second
-run goes on after the last stage that was finished, and does again what other options or other photos change.
+Writes SCENE/images, SCENE/sparse/0, SCENE/convert_report.json, and intermediate results in SCENE/distorted. A second
+run resumes after the last finished stage, and repeats the stages that changed options or photos affect.
 """
 
 import argparse
@@ -31,7 +31,7 @@ from utils.system_utils import UserError, run_cli
 
 
 def convert(layout: Layout, settings: Settings, args: argparse.Namespace) -> None:
-    """Run the stages that are not done; print what was placed and what to do about the rest."""
+    """Run the stages that are not done; print how many photos were placed, and advice about the others."""
     masks = _masks(args.mask_path)
     names = [] if args.video else find_photos(layout)
     refuse_while_working(layout.log)
@@ -56,7 +56,7 @@ def convert(layout: Layout, settings: Settings, args: argparse.Namespace) -> Non
         stages.append(resize_stage(layout))
     kept += record.run(stages)
     if kept:
-        print(f"done before: {', '.join(kept)} (remove {layout.work} to begin anew)")
+        print(f"done before: {', '.join(kept)} (to start from the beginning, remove {layout.work})")
     report = json.loads(layout.report.read_text(encoding="utf-8"))
     print(summary(report))
     for line in report["advice"]:
@@ -65,22 +65,22 @@ def convert(layout: Layout, settings: Settings, args: argparse.Namespace) -> Non
 
 
 def _masks(given: str | None) -> Path | None:
-    """The folder of --mask_path. UserError where it is none, as it would pass for a folder without masks later on."""
+    """Return the folder of --mask_path. UserError if it is none: later it would pass for a folder without masks."""
     if given is None:
         return None
     if not given or not Path(given).is_dir():
-        raise UserError(f"no folder of masks {given!r}; give an existing one with --mask_path, or leave it out")
+        raise UserError(f"no folder of masks {given!r}; pass an existing folder as --mask_path, or omit the option")
     return Path(given)
 
 
 def _video(layout: Layout, record: StageRecord, args: argparse.Namespace) -> Stage:
     video = Path(args.video)
     if not video.is_file():
-        raise UserError(f"no video {video}; give an existing file with --video")
+        raise UserError(f"no video {video}; pass an existing file as --video")
     if layout.input.is_dir() and not record.begun("video") and any(layout.input.iterdir()):
         raise UserError(
-            f"{layout.input} has files already, and the frames would be mixed with them; leave --video out, or "
-            "convert the video in another folder"
+            f"{layout.input} already has files, and the frames would be mixed with them; omit --video, or convert the "
+            "video in another folder"
         )
     return video_stage(layout, video, args.video_frames)
 
@@ -90,41 +90,45 @@ def _backend(executable: str, settings: Settings) -> Backend:
 
 
 def _check_camera(name: str) -> None:
-    """UserError for a lens model that COLMAP does not have, or that can't be undistorted."""
+    """Raise UserError for a lens model that COLMAP does not have or cannot undistort."""
     if name not in LENS_MODELS:
-        raise UserError(f"--camera {name} is no lens model that can be used; choose one of {', '.join(LENS_MODELS)}")
+        raise UserError(f"--camera {name} is not a supported lens model; choose one of {', '.join(LENS_MODELS)}")
 
 
 def main(argv: Sequence[str] | None = None) -> None:
-    """The command line."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(
-        description="Photos in SCENE/input, or a video, to a scene for train.py: poses, points, undistorted pictures."
+        description="Convert the photos in SCENE/input, or a video, to a scene for train.py."
     )
     add = parser.add_argument
-    add("-s", "--source_path", required=True, metavar="SCENE", help="folder with the photos in its sub-folder input")
+    add("-s", "--source_path", required=True, metavar="SCENE", help="scene folder; its sub-folder input has the photos")
     add("--camera", default="OPENCV", help="lens model to fit; for a fisheye lens OPENCV_FISHEYE (default: OPENCV)")
-    add("--no_gpu", action="store_true", help="features and matching on the CPU even where COLMAP could use a GPU")
-    add("--skip_matching", action="store_true", help="only undistort: the largest model in SCENE/distorted/sparse")
+    add("--no_gpu", action="store_true", help="compute features and matches on the CPU even if there is a GPU")
+    add("--skip_matching", action="store_true", help="only undistort the largest model in SCENE/distorted/sparse")
     add("--colmap_executable", default="", metavar="FILE",
         help="COLMAP program for features, matching and mapping (default: pycolmap does them)")  # fmt: skip
-    add("--magick_executable", default="", metavar="FILE", help="no effect (Pillow resizes the pictures)")
-    add("--resize", action="store_true", help="also write images_2, images_4, images_8, sides divided by that")
+    add("--magick_executable", default="", metavar="FILE", help="no effect (Pillow resizes the photos)")
+    add(
+        "--resize", action="store_true", help="also write images_2, images_4, images_8, whose sides are divided by that"
+    )
     add("--video", default="", metavar="FILE", help="take frames of this video as photos; needs imageio-ffmpeg")
     add("--video_frames", type=int, default=150, metavar="N",
-        help="frames to take, the sharpest of each of N equal spans of time (default: 150)")  # fmt: skip
+        help="number of frames, the sharpest of each of N equal spans of time (default: 150)")  # fmt: skip
     add("--matcher", choices=("exhaustive", "sequential"), default=None,
-        help="compare every pair, or neighbours by name (default: exhaustive; with --video sequential)")  # fmt: skip
+        help="match every pair, or neighbours by name (default: exhaustive; with --video sequential)")  # fmt: skip
     add("--mapper", choices=("incremental", "global"), default="incremental",
-        help="place photo after photo, or all at once: faster for hundreds (default: incremental)")  # fmt: skip
+        help="place one photo after another, or all at once, which is faster for hundreds of photos "
+        "(default: incremental)")  # fmt: skip
     add("--max_num_features", type=int, default=8192, metavar="N",
-        help="most features of a photo; more: for surfaces with little texture, slower (default: 8192)")  # fmt: skip
+        help="largest number of features per photo; more help on surfaces with little texture, but are slower "
+        "(default: 8192)")  # fmt: skip
     add("--mask_path", default=None, metavar="FOLDER",
-        help="masks named as the photos, with .png behind; black: no features there (default: none)")  # fmt: skip
+        help="masks with the photos' names and .png appended; black areas get no features (default: none)")  # fmt: skip
     add("stray", nargs="*", help=argparse.SUPPRESS)
     args = parser.parse_args(argv)
     if args.stray:
         whole = " ".join([args.source_path, *args.stray])
-        raise UserError(f"don't know what to do with {args.stray[0]}; quote paths with spaces: -s {shlex.quote(whole)}")
+        raise UserError(f"unexpected argument {args.stray[0]}; quote paths with spaces: -s {shlex.quote(whole)}")
     for option, least in (("max_num_features", 100), ("video_frames", FEWEST)):
         if getattr(args, option) < least:
             raise UserError(f"--{option} must be at least {least}, got {getattr(args, option)}")

@@ -1,8 +1,8 @@
-"""Look at the environment, a dataset and a trained model, and say in one line each what is wrong and what to do.
+"""Check the environment, a dataset and a trained model; print each problem and its remedy in one line.
 
 python doctor.py [-s SCENE] [-m MODEL]
 
-Exit status: 0 all is well, 1 there are problems, 2 it could not look.
+Exit status: 0 no problems, 1 problems, 2 the checks could not run.
 """
 
 import argparse
@@ -15,7 +15,7 @@ from diagnosis.lines import Line
 
 
 def diagnose(source: str | None, images: str, model: str | None, iteration: int) -> int:
-    """Print the lines of all checks that were asked for; number of problems. source, model: None for none."""
+    """Print the lines of the checks and return the number of problems. source, model: folders to check, or None."""
     lines = environment.check_packages()
     complete = not any(line.finding for line in lines)
     if complete:
@@ -25,13 +25,13 @@ def diagnose(source: str | None, images: str, model: str | None, iteration: int)
         complete = environment.extensions_load()
     problems = _show("environment", lines)
     if not complete:
-        print("dataset and model are not looked at, since that needs the packages")
+        print("dataset and model were not checked, since that needs the packages")
         return problems
     from utils.system_utils import UserError
 
     for option, folder in (("-s", source), ("-m", model)):
         if folder is not None and not (folder and Path(folder).is_dir()):
-            raise UserError(f"no folder {folder or repr(folder)}; give an existing one with {option}")
+            raise UserError(f"no folder {folder or repr(folder)}; pass an existing folder as {option}")
     if source is not None:
         from diagnosis.dataset import check_dataset
 
@@ -51,27 +51,25 @@ def _show(title: str, lines: list[Line]) -> int:
 
 
 def main(argv: Sequence[str] | None = None) -> None:
-    """The command line."""
-    parser = argparse.ArgumentParser(
-        description="Say what is wrong with environment, dataset and model, and what to do."
-    )
+    """Run the command line."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     add = parser.add_argument
-    add("-s", "--source_path", default=None, metavar="SCENE", help="scene folder to look at (default: none)")
-    add("-m", "--model_path", default=None, metavar="MODEL", help="model folder to look at (default: none)")
-    add("-i", "--images", default="images", help="folder of the pictures under the scene folder (default: images)")
+    add("-s", "--source_path", default=None, metavar="SCENE", help="scene folder to check (default: none)")
+    add("-m", "--model_path", default=None, metavar="MODEL", help="model folder to check (default: none)")
+    add("-i", "--images", default="images", help="folder of the photos inside the scene folder (default: images)")
     add("--iteration", type=int, default=-1, help="saved iteration of the model (default: the last)")
     args = parser.parse_args(argv)
     problems = diagnose(args.source_path, args.images, args.model_path, args.iteration)
     if problems:
         print(f"{problems} problem{'s' if problems > 1 else ''}")
         sys.exit(1)
-    print("all is well")
+    print("no problems found")
 
 
 if __name__ == "__main__":
     try:
         from utils.system_utils import run_cli
-    except ImportError:  # for want of torch, which is what main says
+    except ImportError:  # torch is missing, which main reports
         main()
     else:
         run_cli(main)

@@ -1,10 +1,10 @@
-"""Train, render and score a table of scenes, and report on all of it.
+"""Train, render and score a table of scenes, and write one report.
 
 python full_eval.py -m360 DIR -tat DIR -db DIR [--output_path DIR]
 python full_eval.py --scenes FOLDER ... [--iterations N] [--seeds 0 1 2] [--configs FILE] [-- more options of train.py]
 
 Writes report.md, report.json, report.html, figures/ and timing.txt into the output folder, and a model folder for every
-run: <scene>[/<option set>][/seed_N]. Run again after an interruption, it goes on with what is not finished.
+run: <scene>[/<option set>][/seed_N]. After an interruption, the same command resumes.
 """
 
 from __future__ import annotations
@@ -37,27 +37,27 @@ EXPOSURE = (
 
 def _parser() -> ArgumentParser:
     parser = ArgumentParser(
-        description="Train, render and score a table of scenes, and report on all of it.",
-        epilog="Whatever follows -- goes to train.py. Finished is what was trained from the same scene folder with the "
-        "same options of train.py, whatever the version of the code; a changed dataset is not noticed. Exit status: 1 "
-        "when a run failed, 2 when nothing could be started.",
+        description=__doc__.splitlines()[0],
+        epilog="Options after -- go to train.py. A training counts as finished if it used the same scene folder and "
+        "the same options of train.py, with any version of the code; a changed dataset is not detected. Exit status: 1 "
+        "if a run failed, 2 if nothing could be started.",
     )
     add = parser.add_argument
     flag = {"action": "store_true"}
-    add("--mipnerf360", "-m360", type=Path, metavar="DIR", help="folder of the nine scenes of Mip-NeRF 360")
-    add("--tanksandtemples", "-tat", type=Path, metavar="DIR", help="folder of truck and train of Tanks and Temples")
-    add("--deepblending", "-db", type=Path, metavar="DIR", help="folder of drjohnson and playroom of Deep Blending")
+    add("--mipnerf360", "-m360", type=Path, metavar="DIR", help="folder with the nine scenes of Mip-NeRF 360")
+    add("--tanksandtemples", "-tat", type=Path, metavar="DIR", help="folder with truck and train of Tanks and Temples")
+    add("--deepblending", "-db", type=Path, metavar="DIR", help="folder with drjohnson and playroom of Deep Blending")
     add("--scenes", type=Path, nargs="+", default=[], metavar="FOLDER",
         help="any COLMAP or Blender folders; Blender scenes get train.py's -w, as in published tables")  # fmt: skip
     add("--output_path", type=Path, default=Path("./eval"), metavar="DIR", help="models and report (default: ./eval)")
-    add("--skip_training", **flag, help="take the models that are in the output folder, whatever made them")
-    add("--skip_rendering", **flag, help="take the renders that are there")
-    add("--skip_metrics", **flag, help="take the scores that are there")
+    add("--skip_training", **flag, help="use the models in the output folder, whatever made them")
+    add("--skip_rendering", **flag, help="use the existing renders")
+    add("--skip_metrics", **flag, help="use the existing scores")
     add("--iterations", type=int, metavar="N", help="training steps (default: train.py's, 30000)")
     add("--seeds", type=int, nargs="+", default=[], metavar="N",
         help="train with each of these seeds and report mean and standard deviation (default: once)")  # fmt: skip
     add("--configs", type=Path, metavar="FILE",
-        help='train under each option set of a JSON file, {"name": ["--sh_degree", "1"], ...}, and say which is '
+        help='train with each option set of a JSON file, {"name": ["--sh_degree", "1"], ...}, and report which is '
         "cheapest for a given error (default: once)")  # fmt: skip
     add("--use_depth", **flag, help="supervise with inverse depth maps: train.py -d depths2/")
     add("--use_expcomp", **flag, help="exposure compensation: train.py --train_test_exp and its learning rates")
@@ -73,17 +73,17 @@ def _scenes(args: Namespace) -> list[SceneEntry]:
     if not scenes and args.skip_training and args.skip_rendering:
         scenes = finished_scenes(args.output_path)
     if not scenes:
-        raise UserError("no scenes given; name data sets with -m360, -tat, -db, or folders with --scenes")
+        raise UserError("no scenes given; pass data sets as -m360, -tat, -db, or folders as --scenes")
     check_names(scenes)
     return scenes
 
 
 def _plan(args: Namespace, more: Sequence[str]) -> list[Run]:
-    """The runs; UserError for options that cannot be meant, before hours are spent."""
+    """Plan the runs; UserError for invalid options, before hours are spent."""
     if args.iterations is not None and args.iterations < 1:
         raise UserError(f"--iterations must be at least 1, got {args.iterations}")
     if min(args.seeds, default=0) < 0 or len(set(args.seeds)) < len(args.seeds):
-        raise UserError(f"--seeds must be different numbers from 0, got {' '.join(map(str, args.seeds))}")
+        raise UserError(f"--seeds must be distinct numbers, 0 or more, got {' '.join(map(str, args.seeds))}")
     parse = None if args.skip_training else _parse_for_training
     check_options(more, "after --", parse)
     configs = read_configs(args.configs, parse) if args.configs else {}
@@ -96,7 +96,7 @@ def _plan(args: Namespace, more: Sequence[str]) -> list[Run]:
         *more,
     ]
     if args.seeds and any(word.split("=")[0] == "--seed" for word in (*common, *sum(configs.values(), ()))):
-        raise UserError("--seed is given twice: leave it out where --seeds is given")
+        raise UserError("--seed is given twice; omit it when --seeds is given")
     runs = plan_runs(_scenes(args), args.output_path.resolve(), common, configs, args.seeds)
     check_outside_scenes(runs)
     if not args.skip_training:
@@ -105,13 +105,13 @@ def _plan(args: Namespace, more: Sequence[str]) -> list[Run]:
 
 
 def _parse_for_training(words: Sequence[str]) -> None:
-    import train  # not needed for models that are there, whose machine may lack the extensions
+    import train  # imported here because scoring existing models may happen on a machine without the extensions
 
     train.parse(words)
 
 
 def _carry_out(runs: Sequence[Run], args: Namespace, failures: dict[Run, Failure]) -> None:
-    """Bring every run to its end; a failure is noted and said, and the next one follows."""
+    """Carry out every run; note and print a failure, and continue with the next run."""
     facts = {} if args.skip_training else machine()
     render_options = ("--antialiasing",) if args.aa else ()
     for number, run in enumerate(runs, 1):
@@ -133,7 +133,7 @@ def _text(table: Table) -> str:
 
 
 def main(argv: Sequence[str] | None = None) -> None:
-    """The command line."""
+    """Run the command line."""
     words = list(sys.argv[1:] if argv is None else argv)
     end = words.index("--") if "--" in words else len(words)
     args = _parser().parse_args(words[:end])
@@ -144,7 +144,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     with locked(output):
         try:
             _carry_out(runs, args, failures)
-        finally:  # after Ctrl-C too: what is finished is reported
+        finally:  # report the finished runs after Ctrl-C too
             report = make_report(["full_eval.py", *words], [read_run(run, output, failures.get(run)) for run in runs])
             write_report(report, output)
             if report["summary"]:

@@ -2,8 +2,8 @@
 
 python metrics.py -m MODEL [MODEL ...] [--lpips_net vgg|alex|both] [--lpips_weights FILE ...]
 
-Reads MODEL/test/<method>/{renders,gt} and masks where there are any, writes MODEL/results.json (means), per_view.json,
-and metrics_info.json, which says what convention each number follows.
+Reads MODEL/test/<method>/{renders,gt}, and masks if there are any. Writes MODEL/results.json (means), per_view.json,
+and metrics_info.json, which states the convention of each number.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ Scores = dict[str, dict[str, float | None]]
 
 @dataclass(frozen=True)
 class Pair:
-    """A render, its ground truth and the mask of what counts (None: all), of the same size (width, height), pixels."""
+    """Files of a render, its ground truth and the mask of pixels that count (None: all), with one size in pixels."""
 
     name: str
     render: Path
@@ -56,9 +56,9 @@ class Pair:
 
 
 def find_pairs(model: Path) -> dict[str, list[Pair]]:
-    """The image pairs of every method (sub-folder of `test`), both sorted by name. Reads headers only.
+    """List the pairs of every method (sub-folder of `test`), both sorted by name. Only headers are read.
 
-    UserError for anything that keeps them from being scored.
+    UserError if anything prevents scoring.
     """
     if not model.is_dir():
         raise UserError(f"no such model folder: {model}")
@@ -66,7 +66,9 @@ def find_pairs(model: Path) -> dict[str, list[Pair]]:
     methods = sorted(folder for folder in test.iterdir() if folder.is_dir()) if test.is_dir() else []
     if not methods:
         without_eval = trained_with_eval(model) is False
-        cause = "; it was trained without --eval and has no test views, train it with --eval" if without_eval else ""
+        cause = (
+            "; the model was trained without --eval and has no test views: train with --eval" if without_eval else ""
+        )
         raise UserError(f"no rendered test views in {test}{cause or f'; run render.py -m {model} first'}")
     return {folder.name: _pairs_of(folder) for folder in methods}
 
@@ -80,18 +82,18 @@ def _pairs_of(method: Path) -> list[Pair]:
         names[side] = {file.name for file in folder.iterdir() if not file.name.startswith(".")}
     if lonely := sorted(names["renders"] ^ names["gt"]):
         there, lacking = ("renders", "gt") if lonely[0] in names["renders"] else ("gt", "renders")
-        raise UserError(f"{method}: {lonely[0]} is in {there} and not in {lacking}; run render.py again")
+        raise UserError(f"{method}: {lonely[0]} is in {there} but not in {lacking}; run render.py again")
     if not names["gt"]:
-        raise UserError(f"{method} has no images; its model has no test views, or run render.py again")
+        raise UserError(f"{method} has no images; run render.py again, unless the model has no test views")
     pairs = []
     for name in sorted(names["gt"]):
         render, truth = method / "renders" / name, method / "gt" / name
         sizes = _size(render), _size(truth)
         if sizes[0] != sizes[1]:
-            raise UserError(f"{render} has {sizes[0]} pixels and its ground truth {sizes[1]}; run render.py again")
+            raise UserError(f"{render} has {sizes[0]} pixels, but its ground truth {sizes[1]}; run render.py again")
         mask = method / "masks" / name
         if mask.is_file() and _size(mask) != sizes[0]:
-            raise UserError(f"{mask} has {_size(mask)} pixels and its render {sizes[0]}; run render.py again")
+            raise UserError(f"{mask} has {_size(mask)} pixels, but its render {sizes[0]}; run render.py again")
         pairs.append(Pair(name, render, truth, sizes[0], mask if mask.is_file() else None))
     return pairs
 
@@ -105,7 +107,7 @@ def _size(file: Path) -> tuple[int, int]:
 
 
 def _read(file: Path) -> np.ndarray:
-    """The first three channels of an image, (H, W, 3) uint8."""
+    """Read the first three channels of an image, (H, W, 3) uint8."""
     try:
         with open_render(file) as image:
             return np.asarray(image.convert("RGB"))
@@ -114,7 +116,7 @@ def _read(file: Path) -> np.ndarray:
 
 
 def trained_with_eval(model: Path) -> bool | None:
-    """Whether the model was trained with a test set held out; None when cfg_args does not say."""
+    """Whether the model was trained with a held-out test set; None if cfg_args does not tell."""
     if not (model / "cfg_args").is_file():
         return None
     stored = read_cfg_args(model).get("eval")
@@ -122,9 +124,9 @@ def trained_with_eval(model: Path) -> bool | None:
 
 
 def psnr(render: np.ndarray, truth: np.ndarray, mask: np.ndarray | None = None) -> float | None:
-    """PSNR in dB of two images (H, W, 3) uint8, exact up to the logarithm; None when they are equal.
+    """Return the PSNR in dB of two images (H, W, 3) uint8, exact up to the logarithm; None if they are equal.
 
-    mask: (H, W) bool, the pixels that count; the same for the other metrics, of which MASKED says what they do.
+    mask: (H, W) bool, the pixels that count. MASKED describes how each metric uses it.
     """
     if mask is not None:
         render, truth = render[mask], truth[mask]
@@ -133,7 +135,7 @@ def psnr(render: np.ndarray, truth: np.ndarray, mask: np.ndarray | None = None) 
 
 
 def ssim(render: np.ndarray, truth: np.ndarray, mask: np.ndarray | None = None) -> float:
-    """Mean SSIM of two images (H, W, 3) uint8, computed in float64."""
+    """Return the mean SSIM of two images (H, W, 3) uint8, computed in float64."""
     if mask is not None:
         render, truth = render * mask[..., None], truth * mask[..., None]
     channels_first = [torch.from_numpy(image.transpose(2, 0, 1) / 255.0) for image in (render, truth)]
@@ -153,8 +155,11 @@ def _lpips_metric(distance: PerceptualDistance, unit_range: bool, device: torch.
 
 
 def make_metrics(lpips_net: str, weights: list[Path], smallest_side: int) -> dict[str, Metric]:
-    """The metrics by key, in the order of the files. A line is printed for each backbone that can't be had; its keys
-    then give None. `smallest_side`: of all the images, in pixels."""
+    """Make the metrics by key, in the order of the files.
+
+    smallest_side: smallest side of all images, in pixels. A backbone that is not available prints a line, and its
+    metrics return None.
+    """
     keys = ["SSIM", "PSNR", "LPIPS"] + [f"LPIPS_{net}" for net in ("vgg", "alex") if lpips_net in (net, "both")]
     metrics: dict[str, Metric] = dict.fromkeys(keys, lambda render, truth, mask: None)
     metrics.update(SSIM=ssim, PSNR=psnr)
@@ -165,7 +170,7 @@ def make_metrics(lpips_net: str, weights: list[Path], smallest_side: int) -> dic
         mine = [key for key in keys if BACKBONES.get(key) == net]
         try:
             if smallest_side < MIN_SIDE[net]:
-                raise LpipsUnavailable(f"it needs images of at least {MIN_SIDE[net]} pixels a side")
+                raise LpipsUnavailable(f"it needs images with sides of at least {MIN_SIDE[net]} pixels")
             distance = PerceptualDistance(net, weights, device)
         except LpipsUnavailable as reason:
             print(f"{', '.join(mine)} will be null: {reason}")
@@ -175,9 +180,9 @@ def make_metrics(lpips_net: str, weights: list[Path], smallest_side: int) -> dic
 
 
 def score(pairs: list[Pair], metrics: dict[str, Metric], title: str) -> Scores:
-    """Every metric of every pair, {metric: {file name: value}}; one pair is in memory at a time.
+    """Compute every metric of every pair, {metric: {file name: value}}, with one pair in memory at a time.
 
-    A pair of which no pixel counts has no scores and is left out.
+    A pair without pixels that count is left out.
     """
     scores: Scores = {key: {} for key in metrics}
     for pair in tqdm(pairs, desc=title, unit="view"):
@@ -191,7 +196,7 @@ def score(pairs: list[Pair], metrics: dict[str, Metric], title: str) -> Scores:
 
 
 def mean(values: dict[str, float | None]) -> float | None:
-    """Mean over the views; None as soon as one of them has no number, or when there are none."""
+    """Return the mean over the views; None if a view has no number, or if there are no views."""
     numbers = list(values.values())
     return None if None in numbers or not numbers else math.fsum(numbers) / len(numbers)
 
@@ -203,7 +208,7 @@ def main() -> None:
         "--lpips_net",
         choices=("vgg", "alex", "both"),
         default="vgg",
-        help="backbone: vgg gives LPIPS (as in the published tables) and LPIPS_vgg, alex gives LPIPS_alex (vgg)",
+        help="LPIPS backbone: vgg for LPIPS (as in published tables) and LPIPS_vgg, alex for LPIPS_alex (default: vgg)",
     )
     parser.add_argument(
         "--lpips_weights",
@@ -211,7 +216,7 @@ def main() -> None:
         nargs="+",
         default=[],
         metavar="FILE",
-        help="state dicts of torchvision's vgg16 or alexnet, instead of torch's cache and its download",
+        help="state dicts of torchvision's vgg16 or alexnet; replace torch's cache and download",
     )
     args = parser.parse_args()
 
@@ -221,7 +226,7 @@ def main() -> None:
     for model, methods in found.items():
         held_out = trained_with_eval(model)
         if held_out is False:
-            print(f"warning: {model} was trained without --eval, so these scores are of views it was trained on")
+            print(f"warning: {model} was trained without --eval, so these scores are of training views")
         per_view = {name: score(pairs, metrics, f"{model.name}/{name}") for name, pairs in methods.items()}
         results = {name: {key: mean(values) for key, values in scores.items()} for name, scores in per_view.items()}
         for name, means in results.items():

@@ -1,5 +1,6 @@
-"""`pip install .`: the dependencies and the three extensions. The code itself is run from this folder, not installed:
-`utils` and `scene` are no names for an environment that others share.
+"""`pip install .` installs the dependencies and the three extensions, but not the code, which runs from this folder.
+
+Packages called `utils` and `scene` would clash with others in a shared environment.
 """
 
 import importlib.metadata
@@ -14,17 +15,17 @@ EXTENSIONS = ("diff-gaussian-rasterization", "fused-ssim", "simple-knn")
 
 
 def requirements() -> list[str]:
-    """requirements.txt; but a torch that is installed stays, and torchvision follows it."""
+    """Read requirements.txt. If torch is installed, do not pin torch and torchvision, so that it stays."""
     lines = (ROOT / "requirements.txt").read_text().splitlines()
     lines = [line for line in lines if line and not line.startswith("#")]
-    # pip's isolation hides the environment from an import, not from a look at its folders.
+    # pip's isolation hides the environment's packages from imports, but its folders can be read.
     if any(importlib.metadata.distributions(name="torch", path=site.getsitepackages())):
         lines = [re.sub(r"^(torch|torchvision)==.*", r"\1", line) for line in lines]
     return lines
 
 
 def extension_url(name: str) -> str:
-    # "/.": pip would take a folder named like "simple-knn" for a release and serve a wheel cached from older sources.
+    # Without "/.", pip takes a folder named like "simple-knn" for a release, and uses a wheel cached from old sources.
     return (ROOT / "submodules" / name).as_uri() + "/."
 
 

@@ -1,1 +1,1 @@
-"""From photos or a video to a COLMAP scene: what convert.py is made of."""
+"""Conversion of photos or a video to a COLMAP scene; the parts of convert.py."""

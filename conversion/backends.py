@@ -1,4 +1,4 @@
-"""The commands of the long steps: pycolmap's (worker.py), or those of a COLMAP program that the user names."""
+"""Commands of the long steps: those of pycolmap (worker.py), or those of a COLMAP program that the user names."""
 
 import json
 import subprocess
@@ -12,8 +12,8 @@ from conversion.layout import Layout
 from utils.system_utils import UserError, atomic_write
 
 Command = list[str]
-TOLERANCE = 1e-6  # of the cost in global bundle adjustment, the reference's: much faster, hardly worse
-# COLMAP's lens models that can be undistorted to a pinhole's picture.
+TOLERANCE = 1e-6  # of the cost in global bundle adjustment, as in the reference: much faster, hardly worse
+# COLMAP's lens models that can be undistorted to a pinhole image.
 LENS_MODELS = (
     *("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "FOV"),
     *("SIMPLE_DIVISION", "DIVISION", "SIMPLE_FISHEYE", "FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"),
@@ -24,7 +24,7 @@ _WORKER = Path(__file__).with_name("worker.py")
 
 @dataclass(frozen=True)
 class Settings:
-    """What the user chose. camera: COLMAP's name of the lens model that is fitted."""
+    """The user's choices. camera: COLMAP's name of the lens model to fit."""
 
     camera: str
     max_num_features: int
@@ -38,9 +38,9 @@ def _mapped(layout: Layout, settings: Settings) -> Path:
 
 
 class Backend(Protocol):
-    """Commands of each step. groups: names of photos of one size each, which share a camera."""
+    """Commands of each step. groups: lists of photo names; the photos of a list have one size and share a camera."""
 
-    identity: str  # of the program; results of another are not continued
+    identity: str  # program and version; the results of another program are not resumed
 
     def features(self, layout: Layout, settings: Settings, groups: list[list[str]], masks: bool) -> list[Command]: ...
 
@@ -50,7 +50,7 @@ class Backend(Protocol):
 
 
 def worker_command(layout: Layout, step: str, **job: Any) -> Command:
-    """Command that runs one step of worker.py; its job goes through a file, since names of photos can be many."""
+    """Return the command for one step of worker.py. The job is passed in a file, since there can be many photos."""
     path = layout.work / "jobs" / f"{step}.json"
     with atomic_write(path) as temporary:
         temporary.write_text(json.dumps({"step": step, **job}), encoding="utf-8")
@@ -58,7 +58,7 @@ def worker_command(layout: Layout, step: str, **job: Any) -> Command:
 
 
 class Pycolmap:
-    """The pycolmap package that the project needs anyway."""
+    """The pycolmap package, which the project requires anyway."""
 
     def __init__(self) -> None:
         self.identity = f"pycolmap {version('pycolmap')}"
@@ -87,9 +87,9 @@ class Pycolmap:
 
 
 class Program:
-    """A COLMAP program. Options that were renamed between versions are looked up in its own help, before anything runs.
+    """A COLMAP program. Its own help tells, before any step runs, the names of options that differ between versions.
 
-    UserError when it can't be run, is no COLMAP, or lacks what the settings ask for.
+    UserError if it cannot be run, is not COLMAP, or lacks a command that the settings need.
     """
 
     def __init__(self, executable: str, settings: Settings) -> None:
@@ -97,21 +97,21 @@ class Program:
         named = [line for line in (self._output("help") or "").splitlines() if line.startswith("COLMAP")]
         if not named:
             raise UserError(
-                f"{executable} does not answer `help` as COLMAP does; give --colmap_executable the path of COLMAP, or "
-                "leave it out to use pycolmap"
+                f"{executable} does not answer `help` as COLMAP does; pass the path of COLMAP as --colmap_executable, "
+                "or omit the option to use pycolmap"
             )
         self.identity = named[0]
         self._matcher = f"{settings.matcher}_matcher"
         switch = "0" if settings.no_gpu else "1"
-        # Named anew in COLMAP 3.12, when other features than SIFT came.
+        # COLMAP 3.12 renamed these options when it got features other than SIFT.
         names = "--FeatureExtraction.use_gpu", "--SiftExtraction.use_gpu"
         self._gpu_for_features = [self._known("feature_extractor", *names), switch]
         names = "--FeatureMatching.use_gpu", "--SiftMatching.use_gpu"
         self._gpu_for_matching = [self._known(self._matcher, *names), switch]
         if settings.mapper == "global" and not all(map(self._has, ("view_graph_calibrator", "global_mapper"))):
             raise UserError(
-                f"{executable} ({self.identity}) has no global_mapper; use --mapper incremental, or leave "
-                "--colmap_executable out to use pycolmap's"
+                f"{executable} ({self.identity}) has no global_mapper; use --mapper incremental, or omit "
+                "--colmap_executable to use pycolmap's global mapper"
             )
 
     def features(self, layout: Layout, settings: Settings, groups: list[list[str]], masks: bool) -> list[Command]:
@@ -151,24 +151,24 @@ class Program:
         return self._output(name, "-h") is not None
 
     def _known(self, name: str, *options: str) -> str:
-        """The first of the options that the help of a command lists."""
+        """Return the first of the options that the help of a command lists. UserError if it lists none."""
         text = self._output(name, "-h") or ""
         for option in options:
             if option in text:
                 return option
         raise UserError(
-            f"`{self._executable} {name} -h` lists neither {' nor '.join(options)}, so it is no COLMAP that is known "
-            "here; leave --colmap_executable out to use pycolmap"
+            f"`{self._executable} {name} -h` lists neither {' nor '.join(options)}, so this version of COLMAP is not "
+            "supported; omit --colmap_executable to use pycolmap"
         )
 
     def _output(self, *arguments: str) -> str | None:
-        """What the program prints; None where it fails."""
+        """Return the program's output; None if it fails."""
         command = [self._executable, *arguments]
         try:
             done = subprocess.run(command, capture_output=True, text=True, errors="replace", timeout=60)
         except (OSError, subprocess.TimeoutExpired) as error:
             raise UserError(
-                f"cannot run --colmap_executable {self._executable} ({error}); give its full path, or leave the option "
-                "out to use pycolmap"
+                f"cannot run --colmap_executable {self._executable} ({error}); pass its full path, or omit the option "
+                "to use pycolmap"
             ) from error
         return done.stdout + done.stderr if done.returncode == 0 else None

@@ -1,4 +1,4 @@
-"""Looks into COLMAP's database while others write it: how far features and matches are, who matches whom."""
+"""Queries of COLMAP's database, also while COLMAP writes it: progress of features and matches, and matching photos."""
 
 import contextlib
 import sqlite3
@@ -9,22 +9,22 @@ _PAIR = 2147483647  # COLMAP: pair_id = smaller image_id * this + larger image_i
 
 
 def count_rows(database: Path, table: str) -> int:
-    """Rows of a table; 0 while there is none, or while it is locked."""
+    """Count the rows of a table; 0 while it does not exist or is locked."""
     rows = _query(database, f"SELECT COUNT(*) FROM {table}")
     return rows[0][0] if rows else 0
 
 
 def most_features(database: Path) -> int:
-    """Number of features of the photo that has most."""
+    """Return the largest number of features of a photo."""
     rows = _query(database, "SELECT MAX(rows) FROM keypoints")
     return (rows[0][0] or 0) if rows else 0
 
 
 def forget_matches(database: Path) -> None:
-    """Empty the tables that matching fills; the features stay."""
+    """Empty the tables that matching fills; keep the features."""
     if not database.is_file():
         return
-    # A database cut off before it had tables has nothing to forget.
+    # A database that was interrupted before it had tables has no matches.
     with contextlib.suppress(sqlite3.OperationalError), contextlib.closing(sqlite3.connect(database)) as connection:
         connection.execute("DELETE FROM matches")
         connection.execute("DELETE FROM two_view_geometries")
@@ -32,14 +32,14 @@ def forget_matches(database: Path) -> None:
 
 
 def copy_database(database: Path, target: Path) -> None:
-    """Copy a database with what is still in its log."""
+    """Copy a database, including changes that are still in its log."""
     target.unlink(missing_ok=True)
     with contextlib.closing(sqlite3.connect(database)) as source, contextlib.closing(sqlite3.connect(target)) as copy:
         source.backup(copy)
 
 
 def partners(database: Path) -> dict[str, int]:
-    """For every photo, with how many others its matches passed the geometric check."""
+    """Count, for every photo, the other photos with which its matches passed the geometric check."""
     names = dict(_query(database, "SELECT image_id, name FROM images"))
     counts = Counter({name: 0 for name in names.values()})
     for (pair,) in _query(database, "SELECT pair_id FROM two_view_geometries WHERE rows > 0"):

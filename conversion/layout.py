@@ -1,4 +1,4 @@
-"""Where things lie in a folder that is converted, and what is said when they don't."""
+"""Paths of a conversion, and checks of the folder that is given, with messages that name the fix."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -6,7 +6,7 @@ from pathlib import Path
 from utils.files.image_files import SUFFIXES
 from utils.system_utils import UserError
 
-# Frequent beside photos, and read neither by Pillow alone nor by COLMAP.
+# Frequent formats of photos that neither Pillow alone nor COLMAP can read.
 _FOREIGN = (".heic", ".heif", ".avif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".gif")
 _VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mts")
 FEWEST = 3
@@ -14,7 +14,7 @@ FEWEST = 3
 
 @dataclass(frozen=True)
 class Layout:
-    """Paths of one conversion. `input`: the photos, left alone; `work`: what can be made again; the rest: the scene."""
+    """Paths of one conversion: `input`, the photos, which are only read; `work`, intermediate results; the scene."""
 
     scene: Path
 
@@ -28,7 +28,7 @@ class Layout:
 
     @property
     def photos(self) -> Path:
-        """The photos as COLMAP gets them: upright, in formats it reads."""
+        """Folder of the photos for COLMAP: upright, in formats that it reads."""
         return self.work / "photos"
 
     @property
@@ -41,12 +41,12 @@ class Layout:
 
     @property
     def calibrated(self) -> Path:
-        """A copy of the database that global mapping writes its estimates of focal lengths into."""
+        """A copy of the database; global mapping writes its estimates of focal lengths into it."""
         return self.work / "calibrated.db"
 
     @property
     def models(self) -> Path:
-        """One folder per model of the mapper, 0, 1, ..."""
+        """Folder with one sub-folder per model of the mapper: 0, 1, ..."""
         return self.work / "sparse"
 
     @property
@@ -78,25 +78,26 @@ class Layout:
 
 
 def scene_folder(given: str) -> Path:
-    """The folder that -s names, absolute. UserError where it is none, with the usual slips named."""
+    """Return the absolute path of the folder given as -s. UserError if it is none; the message names usual mistakes."""
     bare = given.strip("'\"")
     if bare != given and not Path(given).exists() and Path(bare).exists():
-        raise UserError(
-            f"the path given with -s has quotes in it: {given}; give {bare} and quote it for the shell once"
-        )
+        raise UserError(f"the path given as -s contains quotes: {given}; pass {bare}, quoted only once for the shell")
     folder = Path(given)
     if folder.is_file():
-        hint = "give its folder with -s and the video with --video" if folder.suffix.lower() in _VIDEOS else ""
+        hint = "pass its folder as -s and the video as --video" if folder.suffix.lower() in _VIDEOS else ""
         raise UserError(
-            f"{given} is a file; {hint or 'give -s the folder that holds the folder input with the photos'}"
+            f"{given} is a file; {hint or 'pass the folder that contains the folder input with the photos as -s'}"
         )
     if not folder.is_dir():
-        raise UserError(f"no folder {given}; make it, with the photos in a folder input in it, and give it with -s")
+        raise UserError(f"no folder {given}; make it, put the photos into a folder input in it, and pass it as -s")
     return folder.absolute()
 
 
 def find_photos(layout: Layout) -> list[str]:
-    """Names of the photos below `input`, sub-folders included, sorted. UserError for too few, or some elsewhere."""
+    """List the photos below `input`, with its sub-folders, sorted.
+
+    UserError if there are too few, if some have a format that cannot be read, or if they are in another folder.
+    """
     if not layout.input.is_dir():
         raise UserError(_no_input(layout))
     files = [path for path in sorted(layout.input.rglob("*")) if path.is_file()]
@@ -104,37 +105,37 @@ def find_photos(layout: Layout) -> list[str]:
     foreign = [path for path in files if path.suffix.lower() in _FOREIGN]
     if foreign:
         raise UserError(
-            f"{len(foreign)} files in {layout.input} are of a kind that can't be read, the first is {foreign[0].name}; "
-            f"convert them to JPEG or PNG, or take them out"
+            f"{len(foreign)} files in {layout.input} have a format that cannot be read, the first is "
+            f"{foreign[0].name}; convert them to JPEG or PNG, or remove them"
         )
     if len(names) < FEWEST:
         videos = [path.name for path in files if path.suffix.lower() in _VIDEOS]
-        hint = f"; move {videos[0]} elsewhere and give it with --video" if videos else ""
+        hint = f"; move {videos[0]} elsewhere and pass it as --video" if videos else ""
         raise UserError(
-            f"{len(names)} photos ({', '.join(SUFFIXES)}) in {layout.input}, at least {FEWEST} are needed, and 20 to "
-            f"200 with much overlap are usual; put more there{hint}"
+            f"{len(names)} photos ({', '.join(SUFFIXES)}) in {layout.input}; at least {FEWEST} are needed, and 20 to "
+            f"200 with much overlap are usual; add more{hint}"
         )
     return names
 
 
 def picture_names(folder: Path) -> list[str]:
-    """Pictures below a folder, hidden ones left out, as COLMAP names them, sorted."""
+    """List the photos below a folder, without hidden files, by the names that COLMAP gives them, sorted."""
     return sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if _is_picture(path))
 
 
 def _no_input(layout: Layout) -> str:
     scene = layout.scene
     if scene.name == "input":
-        return f"{scene} is the folder of the photos itself; give -s the folder around it, {scene.parent}"
+        return f"{scene} is the folder of the photos itself; pass its parent folder as -s: {scene.parent}"
     beside = sum(map(_is_picture, scene.iterdir()))
     if beside:
         return (
-            f"no folder input in {scene}, but {beside} pictures in it itself; make {layout.input}, move them there, "
-            f"and give -s {scene} again"
+            f"no folder input in {scene}, but {beside} photos directly in it; make {layout.input}, move them there, "
+            f"and run again with -s {scene}"
         )
     if (scene / "images").is_dir() and not (scene / "sparse").is_dir():
         return f"no folder input in {scene}; rename its folder images to input"
-    return f"no folder input in {scene}; put the photos there, or give a video with --video"
+    return f"no folder input in {scene}; make it and put the photos there, or pass a video as --video"
 
 
 def _is_picture(path: Path) -> bool:
@@ -142,9 +143,9 @@ def _is_picture(path: Path) -> bool:
 
 
 def refuse_foreign_results(layout: Layout, scene_made: bool, work_made: bool, skip_matching: bool) -> None:
-    """UserError where writing would overwrite a scene or a COLMAP project that convert.py did not make.
+    """Raise UserError if writing would overwrite a scene or a COLMAP project that convert.py did not make.
 
-    scene_made, work_made: whether an earlier run here got so far as to write the scene, or into the work folder.
+    scene_made, work_made: whether an earlier run here began to write the scene, or into the work folder.
     """
     there = [] if scene_made else [path.name for path in (layout.images, layout.sparse) if path.exists()]
     ours = (

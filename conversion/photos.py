@@ -1,4 +1,4 @@
-"""Photos as COLMAP should get them: upright, readable, with their masks."""
+"""Preparation of photos for COLMAP: upright, in a readable format, with their masks."""
 
 import os
 import shutil
@@ -17,16 +17,16 @@ from utils.system_utils import UserError
 
 JPEG_QUALITY = 95
 _ORIENTATION = 0x0112  # EXIF tag; 1 or absent: upright
-_LYING = (5, 6, 7, 8)  # of its values: width and height change places
+_LYING = (5, 6, 7, 8)  # values of the tag that exchange width and height
 _MOST_NAMED = 20
 
 
 def prepare_photos(layout: Layout, names: Sequence[str], masks: Path | None) -> None:
-    """Fill `layout.photos`, and `layout.masks` where a folder of masks is given.
+    """Fill `layout.photos`, and `layout.masks` if a folder of masks is given.
 
-    A photo is linked (copied where links can't be made), unless its EXIF orientation turns it or COLMAP can't read its
-    format: then it is written anew, the orientation baked into the pixels and the other EXIF data kept. Masks: see
-    `_prepare_mask`. They were checked (`check_photos`); UserError for those whose pixels turn out to be broken.
+    A photo is linked, or copied if links are impossible. A photo that its EXIF orientation turns, or whose format
+    COLMAP cannot read, is written anew, with upright pixels and the other EXIF data kept. Masks: see `_prepare_mask`.
+    `check_photos` must have passed before; UserError for files whose pixels turn out to be broken.
     """
     with_mask = find_masks(names, masks) if masks else {}
 
@@ -40,7 +40,7 @@ def prepare_photos(layout: Layout, names: Sequence[str], masks: Path | None) -> 
 
 
 def check_photos(layout: Layout, names: Sequence[str], masks: Path | None) -> None:
-    """UserError that names all photos and masks that are broken or do not fit; decodes none that is whole."""
+    """Raise a UserError that names every photo and mask that is broken or does not fit; decode no intact one."""
     with_mask = find_masks(names, masks) if masks else {}
 
     def check(name: str) -> None:
@@ -52,7 +52,10 @@ def check_photos(layout: Layout, names: Sequence[str], masks: Path | None) -> No
 
 
 def find_masks(names: Sequence[str], folder: Path) -> dict[str, Path]:
-    """Masks by name of photo: `<name>.png` as COLMAP has them, or the same name, or with the suffix .png."""
+    """Return the masks by name of photo. A mask is called `<name>.png` as in COLMAP, `<name>`, or has the suffix .png.
+
+    UserError if no photo has a mask.
+    """
     found = {}
     for name in names:
         candidates = (folder / f"{name}.png", folder / name, (folder / name).with_suffix(".png"))
@@ -68,7 +71,7 @@ def find_masks(names: Sequence[str], folder: Path) -> dict[str, Path]:
 
 
 def sizes(layout: Layout) -> dict[tuple[int, int], list[str]]:
-    """Names of the prepared photos by size (width, height), both in order."""
+    """Return the names of the prepared photos by size (width, height), in order."""
     groups: dict[tuple[int, int], list[str]] = {}
     for name in picture_names(layout.photos):
         groups.setdefault(picture_size(layout.photos / name), []).append(name)
@@ -76,7 +79,7 @@ def sizes(layout: Layout) -> dict[tuple[int, int], list[str]]:
 
 
 def resize_images(layout: Layout, factor: int) -> None:
-    """Fill `images_<factor>` from `images`: sides divided by the factor, rounded; Pillow's bicubic filter."""
+    """Fill `images_<factor>` from `images` by Pillow's bicubic filter; sides are divided by the factor and rounded."""
 
     def resize(name: str) -> None:
         with Image.open(layout.images / name) as image:
@@ -87,7 +90,7 @@ def resize_images(layout: Layout, factor: int) -> None:
 
 
 def _prepare_photo(source: Path, target: Path) -> Path:
-    """Path of the prepared photo: `target`, with .png behind it where the format had to change."""
+    """Write the prepared photo and return its path: `target`, with .png appended if the format had to change."""
     target.parent.mkdir(parents=True, exist_ok=True)
     try:
         with Image.open(source) as image:
@@ -100,16 +103,16 @@ def _prepare_photo(source: Path, target: Path) -> Path:
             _save(upright, target, image, exif=upright.getexif())
             return target
     except UNREADABLE as error:
-        raise UserError(f"cannot turn the photo {source} upright ({error}); replace it or take it out") from error
+        raise UserError(f"cannot turn the photo {source} upright ({error}); replace or remove it") from error
 
 
 def _upright_size(photo: Path) -> tuple[int, int]:
-    width, height = picture_size(photo)  # a UserError for what is cut short or no picture
+    width, height = picture_size(photo)  # UserError for a truncated file or one of another kind
     try:
         with Image.open(photo) as image:
             lies = image.getexif().get(_ORIENTATION, 1) in _LYING
     except UNREADABLE as error:
-        raise UserError(f"cannot read the EXIF data of {photo} ({error}); replace it or take it out") from error
+        raise UserError(f"cannot read the EXIF data of {photo} ({error}); replace or remove the photo") from error
     return (height, width) if lies else (width, height)
 
 
@@ -123,9 +126,9 @@ def _check_mask(mask: Path, name: str, size: tuple[int, int]) -> None:
 
 
 def _prepare_mask(source: Path | None, target: Path, photo: Path) -> None:
-    """Write a mask as 8-bit grey PNG; black (0) is ignored.
+    """Write a mask as 8-bit grey PNG, in which black (0) is masked.
 
-    Without a source it is white: COLMAP leaves photos out that have none while others have.
+    Without a source, write a white mask: COLMAP skips photos without a mask if others have one.
     """
     target.parent.mkdir(parents=True, exist_ok=True)
     if source is None:
@@ -135,12 +138,12 @@ def _prepare_mask(source: Path | None, target: Path, photo: Path) -> None:
         with Image.open(source) as image:
             mask = image.convert("L")
     except UNREADABLE as error:
-        raise UserError(f"cannot read the mask {source} ({error}); replace it or take it out") from error
+        raise UserError(f"cannot read the mask {source} ({error}); replace or remove it") from error
     mask.save(target)
 
 
 def _save(image: Image.Image, target: Path, like: Image.Image, **options: object) -> None:
-    """Save in the format of the picture that it was made from, colour profile kept."""
+    """Save in the format and with the colour profile of the photo `like` that the image was made from."""
     target.parent.mkdir(parents=True, exist_ok=True)
     if profile := like.info.get("icc_profile"):
         options["icc_profile"] = profile
@@ -158,7 +161,7 @@ def _link(source: Path, target: Path) -> None:
 
 
 def _in_threads(work: Callable[[str], None], names: Sequence[str], title: str) -> None:
-    """Do the work for all names. UserError where it ended in any, with all of them."""
+    """Do the work for all names. If it raises UserError for any, raise one UserError that lists them."""
 
     def attempt(name: str) -> UserError | None:
         try:
@@ -180,9 +183,7 @@ def _in_threads(work: Callable[[str], None], names: Sequence[str], title: str) -
     if len(faults) == 1:
         raise faults[0]
     if faults:
-        # Of each what is wrong, without the remedy, which is the same for all.
+        # List what is wrong with each, without the remedy, which is the same for all.
         listed = "; ".join(str(fault).partition("; ")[0] for fault in faults[:_MOST_NAMED])
         more = f"; and {len(faults) - _MOST_NAMED} more" if len(faults) > _MOST_NAMED else ""
-        raise UserError(
-            f"{len(faults)} of {len(names)} pictures can't be used: {listed}{more}; replace them or take them out"
-        )
+        raise UserError(f"{len(faults)} of {len(names)} photos cannot be used: {listed}{more}; replace or remove them")

@@ -1,7 +1,7 @@
-"""Programs that work for minutes: run with a log file and a progress bar, ended with us.
+"""Programs that work for minutes: run them with a log file and a progress bar, and end them when this process ends.
 
-Where we are killed at once, nothing can end them. worker.py notices (its input closes); others, such as COLMAP, work
-on, and still hold the lock on the log that they write to.
+If this process is killed, it cannot end them. worker.py notices, because its input closes. Others, such as COLMAP, keep
+working, and keep the lock on the log that they write to.
 """
 
 import subprocess
@@ -20,16 +20,16 @@ try:
 except ImportError:  # Windows
     fcntl = None
 
-_PATIENCE = 5.0  # seconds for a program to end by itself
-_ORPHAN_PATIENCE = 2.0  # seconds for a worker to notice that its caller was killed
+_PATIENCE = 5.0  # seconds that a program gets to end by itself
+_ORPHAN_PATIENCE = 2.0  # seconds that a worker gets to notice that its caller was killed
 
 
 def run_programs(
     commands: Sequence[Sequence[str]], log: Path, title: str, total: int, done: Callable[[], int], hint: str = ""
 ) -> None:
-    """Run commands one after the other, output appended to `log`; a bar shows `done()` of `total` pictures or pairs.
+    """Run commands one after the other, append their output to `log`, and show `done()` of `total` as a bar.
 
-    UserError with the program's last words when one fails. Ctrl-C and SIGTERM end the program before they go on.
+    UserError with the last line of the output if a command fails. Ctrl-C and SIGTERM end the command first.
     """
     with tqdm(total=total, desc=title, dynamic_ncols=True) as bar, open(log, "ab") as output:
         _lock(output)
@@ -41,20 +41,20 @@ def run_programs(
             status = _run(command, output, look)
             if status:
                 raise UserError(
-                    f"{title.lower()} failed (status {status}: {_last_words(log)}); the whole story is in {log}{hint}"
+                    f"{title.lower()} failed (status {status}: {_last_words(log)}); all output is in {log}{hint}"
                 )
-        bar.update(total - bar.n)  # what can't be counted is done as well
+        bar.update(total - bar.n)  # the commands are done, whether or not `done` could count everything
 
 
 def refuse_while_working(log: Path) -> None:
-    """UserError while a program of an earlier run, or of another one, still works and writes to this log."""
+    """Raise UserError while a program of an earlier or another run still works and writes to this log."""
     if log.is_file():
         with open(log, "rb") as output:
             _lock(output)
 
 
 def _lock(output: BinaryIO) -> None:
-    """Lock a log, for us and for the programs that get it as their output, until the last of them has ended."""
+    """Lock a log, for this process and the programs that get it as their output, until the last of them has ended."""
     deadline = time.monotonic() + _ORPHAN_PATIENCE
     while fcntl:
         try:
@@ -64,7 +64,7 @@ def _lock(output: BinaryIO) -> None:
             if time.monotonic() > deadline:
                 raise UserError(
                     f"another convert.py, or a program that a killed one had started, still works in "
-                    f"{Path(output.name).parent}; wait for it or end it (`fuser {output.name}` shows its process)"
+                    f"{Path(output.name).parent}; wait for it or end it (`fuser {output.name}` shows its process id)"
                 ) from error
         except OSError:  # a file system without locks
             return
@@ -76,7 +76,7 @@ def _run(command: Sequence[str], output: BinaryIO, look: Callable[[], None]) -> 
         try:
             process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=output, stderr=subprocess.STDOUT)
         except OSError as error:
-            raise UserError(f"cannot run {command[0]} ({error.strerror}); name a program with its path") from error
+            raise UserError(f"cannot run {command[0]} ({error.strerror}); pass the program's full path") from error
         try:
             while True:
                 try:
@@ -103,4 +103,4 @@ def _end(process: subprocess.Popen) -> None:
 
 def _last_words(log: Path) -> str:
     lines = [line.strip() for line in log.read_text(encoding="utf-8", errors="replace").splitlines() if line.strip()]
-    return lines[-1][:300] if lines else "it said nothing"
+    return lines[-1][:300] if lines else "no output"

@@ -1,4 +1,4 @@
-"""What of a conversion is done, so that a second run does only the rest."""
+"""Stages of a conversion and the record of finished ones, so that a second run does only the rest."""
 
 import hashlib
 import json
@@ -11,11 +11,11 @@ from utils.system_utils import UserError
 
 
 class Stage(NamedTuple):
-    """One step. made_from: what its result depends on besides the earlier stages (JSON).
+    """One step of a conversion.
 
-    reset: removes its results as far as they are of no use once an earlier stage is done again. check: UserError for
-    inputs that can't be worked on, before anything is removed. resumable: work can go on where an interrupted run with
-    the same inputs stopped, without a reset.
+    made_from: JSON of everything that its result depends on, besides the earlier stages. reset: removes results that
+    become invalid when this or an earlier stage is done again. check: raises UserError for unusable inputs, before
+    anything is removed. resumable: `work` can resume an interrupted run with the same inputs, without a reset.
     """
 
     name: str
@@ -27,7 +27,7 @@ class Stage(NamedTuple):
 
 
 class StageRecord:
-    """stages.json: for each stage begun, a digest of all that it was made from, and whether it was finished."""
+    """The file stages.json. It has, for each stage begun, a digest of its inputs and whether it was finished."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -43,13 +43,13 @@ class StageRecord:
             del done
 
     def begun(self, name: str) -> bool:
-        """Whether this stage was ever begun here."""
+        """Whether this stage was ever begun in this folder."""
         return name in self._record
 
     def run(self, stages: list[Stage]) -> list[str]:
-        """Do what is not done, in order; names of the stages that were done before.
+        """Do the stages that are not done, in order; return the names of those that were done before.
 
-        The first stage whose inputs changed, or that was never finished, is done again with all that follow.
+        The first stage whose inputs changed or that was never finished is done again, with all later ones.
         """
         digest, kept = "", []
         for number, stage in enumerate(stages):
@@ -63,9 +63,9 @@ class StageRecord:
             stage.check()
             for later in stages[number:]:
                 if later.name in self._record:
-                    self._record[later.name]["done"] = False  # still begun: what is left of it is ours
+                    self._record[later.name]["done"] = False  # but still begun: remaining files of it are ours
             self._save()
-            # Backwards: what was made last goes first.
+            # Reset backwards, so that the newest results go first.
             for later in reversed(stages[number:]):
                 if later is not stage or not (same and stage.resumable):
                     later.reset()

@@ -1,4 +1,4 @@
-"""The steps of a conversion, each with what it is made from and how it is undone."""
+"""The steps of a conversion, each with its inputs and the way to undo it."""
 
 import contextlib
 import re
@@ -18,13 +18,13 @@ from conversion.video import PATTERN, extract_frames
 from utils.system_utils import UserError, mkdir_p
 
 FACTORS = (2, 4, 8)  # of --resize
-# How far apart by name the pairs of COLMAP's sequential matching are: 1 to 10, and powers of 2 with exponents below 10.
+# Distances, in the order of names, of the pairs of COLMAP's sequential matching: 1 to 10, and 2^0 to 2^9.
 _NEIGHBOURS = sorted({*range(1, 11), *(2**k for k in range(10))})
 _REGISTERED = re.compile(rb"num_reg_frames=(\d+)|Registering image #\d+ \((\d+)\)")
 
 
 def video_stage(layout: Layout, video: Path, count: int) -> Stage:
-    """Frames of a video into `input`."""
+    """Make the stage that writes frames of a video into `input`."""
 
     def reset() -> None:
         for frame in layout.input.glob(PATTERN):
@@ -38,7 +38,7 @@ def video_stage(layout: Layout, video: Path, count: int) -> Stage:
 
 
 def photo_stage(layout: Layout, names: list[str], masks: Path | None) -> Stage:
-    """Upright photos and masks in the work folder."""
+    """Make the stage that puts upright photos and masks into the work folder."""
     made_from = [[name, _state(layout.input / name)] for name in names]
     if masks:
         made_from.append([[str(path), _state(path)] for path in sorted(masks.rglob("*")) if path.is_file()])
@@ -56,14 +56,14 @@ def photo_stage(layout: Layout, names: list[str], masks: Path | None) -> Stage:
 
 
 def reconstruction_stages(layout: Layout, backend: Backend, settings: Settings, masks: bool) -> list[Stage]:
-    """Features, matching and mapping."""
-    hint = "" if settings.no_gpu else "; --no_gpu may help where the GPU or the display is the reason"
+    """Make the stages features, matching and mapping."""
+    hint = "" if settings.no_gpu else "; --no_gpu may help if the GPU or the display is the reason"
 
     def features() -> None:
         groups = sizes(layout)
         if len(groups) > 1:
             listed = ", ".join(f"{w} x {h} ({len(names)})" for (w, h), names in groups.items())
-            print(f"photos of {len(groups)} sizes, each gets a camera of its own: {listed}")
+            print(f"photos have {len(groups)} sizes; each size gets its own camera: {listed}")
         commands = backend.features(layout, settings, list(groups.values()), masks)
         total = sum(map(len, groups.values()))
         run_programs(commands, layout.log, "Features", total, lambda: count_rows(layout.database, "keypoints"), hint)
@@ -103,9 +103,9 @@ def reconstruction_stages(layout: Layout, backend: Backend, settings: Settings, 
 
 
 def undistortion_stage(layout: Layout, settings: Settings, made_from: Any, **made: Any) -> Stage:
-    """The largest model without distortion as `images` and `sparse/0`, and the report. made: settings to report.
+    """Make the stage that undistorts the largest model to `images` and `sparse/0`, and writes the report.
 
-    The scene of an earlier run stays until the new one is there.
+    made: settings to report. The scene of an earlier run stays until the new one is complete.
     """
 
     def reset() -> None:
@@ -136,7 +136,7 @@ def undistortion_stage(layout: Layout, settings: Settings, made_from: Any, **mad
         if missing:
             raise UserError(
                 f"{len(missing)} photos of the model in {layout.models / chosen.folder} are not in {root}, the first "
-                f"is {missing[0]}; put them there under the names that the model has"
+                f"is {missing[0]}; put them there under the names that they have in the model"
             )
         _remove(layout.images, layout.sparse, *map(layout.resized, FACTORS))
         layout.report.unlink(missing_ok=True)
@@ -153,27 +153,27 @@ def undistortion_stage(layout: Layout, settings: Settings, made_from: Any, **mad
 
 
 def resize_stage(layout: Layout) -> Stage:
-    """Smaller copies of the pictures: images_2, images_4, images_8."""
+    """Make the stage that writes smaller copies of the photos: images_2, images_4, images_8."""
 
     def work() -> None:
         for factor in FACTORS:
             _remove(layout.resized(factor))
             resize_images(layout, factor)
 
-    # No reset: they go with the pictures that they were made of, as undistortion puts others there.
+    # No reset: undistortion removes the copies when it replaces the photos that they were made from.
     return Stage("resize", list(FACTORS), lambda: None, work)
 
 
 def model_state(layout: Layout) -> list[Any]:
-    """What tells whether a model made elsewhere has changed. UserError where there is none."""
+    """Describe the files of a model made elsewhere, so that changes show. UserError if there is no model."""
     files = sorted(layout.models.rglob("*.*")) if layout.models.is_dir() else []
     if not files:
-        raise UserError(f"--skip_matching needs a COLMAP model in {layout.models}; leave it out to have one made")
+        raise UserError(f"--skip_matching needs a COLMAP model in {layout.models}; omit the option to make one")
     return [[str(path.relative_to(layout.models)), *_state(path)] for path in files]
 
 
 def _registered_since(log: Path) -> Callable[[], int]:
-    """How many photos the mapper says to have placed, counted from the log's end as it is now."""
+    """Return a function that counts the photos placed since now, according to the mapper's log."""
     position = log.stat().st_size if log.is_file() else 0
     most = 0
 
@@ -182,7 +182,7 @@ def _registered_since(log: Path) -> Callable[[], int]:
         with contextlib.suppress(OSError), open(log, "rb") as file:
             file.seek(position)
             text = file.read()
-            # Half a line stays for the next look.
+            # Leave an incomplete line for the next call.
             whole = text[: text.rfind(b"\n") + 1]
             position += len(whole)
             for match in _REGISTERED.finditer(whole):
@@ -193,7 +193,7 @@ def _registered_since(log: Path) -> Callable[[], int]:
 
 
 def _state(path: Path) -> list[Any]:
-    """What tells whether a file has changed."""
+    """Describe a file, so that changes show."""
     stat = path.stat()
     return [path.name, stat.st_size, stat.st_mtime_ns]
 

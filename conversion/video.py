@@ -1,4 +1,4 @@
-"""Frames of a video as photos: the sharpest one of each of N equal spans of time."""
+"""Frames of a video as photos: the sharpest frame of each of N equal spans of time."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,14 +12,14 @@ from conversion.photos import JPEG_QUALITY
 from utils.system_utils import UserError
 
 PATTERN = "frame_[0-9][0-9][0-9][0-9][0-9].jpg"
-_STEP = 4  # sharpness looks at every 4th row and column
+_STEP = 4  # sharpness is computed on every 4th row and column
 
 
 def extract_frames(video: Path, folder: Path, count: int) -> None:
-    """Write at most `count` frames into `folder` as frame_00001.jpg, ..., turned as the video says. UserError if not.
+    """Write at most `count` upright frames into `folder` as frame_00001.jpg, ...; UserError if that fails.
 
-    Every frame is looked at; of each span the one with the strongest differences between neighbouring pixels is kept,
-    since hand-held videos are blurred here and there.
+    Reads every frame, and keeps that of each span whose neighbouring pixels differ most, since parts of hand-held
+    videos are blurred.
     """
     decoder = _decoder()
     try:
@@ -38,13 +38,13 @@ def extract_frames(video: Path, folder: Path, count: int) -> None:
     except (OSError, RuntimeError) as error:
         reason = str(error).strip().splitlines()
         raise UserError(
-            f"cannot read the video {video} ({reason[-1] if reason else type(error).__name__}); give another file with "
+            f"cannot read the video {video} ({reason[-1] if reason else type(error).__name__}); pass another file as "
             f"--video, or put frames of it as JPEG into {folder}"
         ) from error
 
 
 def sharpness(frame: np.ndarray) -> float:
-    """Mean squared difference of neighbouring pixels of a frame (H, W, 3) uint8, green channel, along both axes."""
+    """Return the mean squared difference of neighbouring green values along both axes of a frame (H, W, 3) uint8."""
     rows, columns = frame[::_STEP, :, 1].astype(np.int16), frame[:, ::_STEP, 1].astype(np.int16)
     return sum(
         float(np.mean(np.square(np.diff(lines, axis=axis), dtype=np.float64)))

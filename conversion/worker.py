@@ -1,8 +1,8 @@
-"""pycolmap's long steps as a program of their own: `python worker.py JOB.json`, the job an object {"step": ..., ...}.
+"""pycolmap's long steps in a process of their own: `python worker.py JOB.json`, the job an object {"step": ..., ...}.
 
-In another process they can be stopped at once, can't take the caller with them when they crash, and log to a file.
-It ends when its standard input does, which the caller holds open: a caller that was killed leaves nobody at work.
-Imports nothing of the project, since only its own folder is on the path.
+In another process, steps can be stopped at once, log to a file, and do not crash the caller when they crash. The worker
+ends when its standard input closes, so it does not outlive a caller that was killed. It imports nothing of the project,
+since only its own folder is on the path.
 """
 
 import json
@@ -18,7 +18,7 @@ SEED = 0
 
 
 def features(job: dict[str, Any]) -> None:
-    """SIFT features of groups of pictures, one camera for each group, into a new database."""
+    """Write SIFT features of groups of photos into a new database, with one camera per group."""
     reader = pycolmap.ImageReaderOptions()
     reader.camera_model = job["camera"]
     if job["masks"]:
@@ -27,7 +27,7 @@ def features(job: dict[str, Any]) -> None:
     options.sift.max_num_features = job["max_num_features"]
     pycolmap.Database.open(job["database"]).close()
     for names in job["groups"]:
-        # First in order: threads would number the pictures as they happen to get ready.
+        # Import the photos first, in order: threads would number them in the order in which they happen to finish.
         pycolmap.import_images(job["database"], job["photos"], pycolmap.CameraMode.SINGLE, names, reader)
         pycolmap.extract_features(
             job["database"], job["photos"], names, pycolmap.CameraMode.SINGLE, reader, options, _device(job)
@@ -35,7 +35,7 @@ def features(job: dict[str, Any]) -> None:
 
 
 def matching(job: dict[str, Any]) -> None:
-    """Matches of pairs, verified; pairs that the database has are not done again."""
+    """Match and verify pairs of photos; skip pairs that the database already has."""
     match = {"exhaustive": pycolmap.match_exhaustive, "sequential": pycolmap.match_sequential}[job["matcher"]]
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = SEED
@@ -43,10 +43,10 @@ def matching(job: dict[str, Any]) -> None:
 
 
 def mapping(job: dict[str, Any]) -> None:
-    """Poses and points: one or more models in sub-folders of `models`."""
+    """Compute poses and points; write one or more models into sub-folders of `models`."""
     os.makedirs(job["models"])
     if job["mapper"] == "global":
-        # It does not refine focal lengths from nothing; this estimates them from the pairs.
+        # Global mapping needs initial focal lengths; this estimates them from the pairs.
         pycolmap.calibrate_view_graph(job["database"])
         options = pycolmap.GlobalPipelineOptions()
         options.random_seed = SEED
@@ -55,18 +55,18 @@ def mapping(job: dict[str, Any]) -> None:
     options = pycolmap.IncrementalPipelineOptions()
     options.random_seed = SEED
     options.ba_global_function_tolerance = job["tolerance"]
-    options.min_model_size = 3  # a small model is better than none; the report says how small it is
+    options.min_model_size = 3  # a small model is better than none; the report shows its size
     pycolmap.incremental_mapping(job["database"], job["photos"], job["models"], options)
 
 
 def survey(job: dict[str, Any]) -> None:
-    """What the models hold, written to the JSON file `out`."""
+    """Write the contents of the models to the JSON file `out`."""
     models = []
     for folder in sorted(Path(job["models"]).iterdir()):
         try:
             model = pycolmap.Reconstruction(str(folder))
         except (ValueError, RuntimeError, IndexError):
-            continue  # no model, or one that was cut off while it was written
+            continue  # no model, or one whose writing was interrupted
         models.append(
             {
                 "folder": folder.name,
@@ -89,7 +89,7 @@ def survey(job: dict[str, Any]) -> None:
 
 
 def undistort(job: dict[str, Any]) -> None:
-    """Pictures and model without lens distortion, in COLMAP's layout, into the folder `out`."""
+    """Write photos and model without lens distortion, in COLMAP's layout, into the folder `out`."""
     pycolmap.undistort_images(job["out"], job["model"], job["photos"], jpeg_quality=job["jpeg_quality"])
 
 
@@ -98,7 +98,7 @@ def _device(job: dict[str, Any]) -> pycolmap.Device:
 
 
 def _end_with_input() -> None:
-    # Not sys.stdin: its lock would be held when the interpreter shuts down.
+    # Do not read sys.stdin: its lock would be held when the interpreter shuts down.
     while os.read(0, 1024):
         pass
     os._exit(1)
@@ -108,7 +108,7 @@ STEPS = {step.__name__: step for step in (features, matching, mapping, survey, u
 
 
 def main(path: str) -> None:
-    """Do the job in a file."""
+    """Run the job of a file."""
     job = json.loads(Path(path).read_text(encoding="utf-8"))
     threading.Thread(target=_end_with_input, daemon=True).start()
     pycolmap.set_random_seed(SEED)

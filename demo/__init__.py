@@ -1,1 +1,1 @@
-"""The demo: a scene made by an analytic ray tracer, and a report on what was trained from it."""
+"""Demo: a scene made by an analytic ray tracer, and a report on a model trained from it."""

@@ -1,17 +1,17 @@
-"""A true COLMAP model of the demo's cameras and points, through pycolmap."""
+"""COLMAP model of the demo's cameras and points, written by pycolmap."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
-from PIL import Image  # noqa: F401  before pycolmap: its zlib must be the first one loaded, else PNG writing aborts
+from PIL import Image  # noqa: F401  before pycolmap: unless Pillow's zlib is loaded first, writing PNGs aborts
 
 from demo.surface_points import SurfacePoints
 from demo.tracer import View
 
 
 def write_model(folder: Path, names: list[str], views: list[View], points: SurfacePoints) -> None:
-    """Make `folder`, a binary COLMAP model: one PINHOLE camera, an image per view, points with their tracks."""
+    """Make `folder` with a binary COLMAP model: one PINHOLE camera, an image per view, points with their tracks."""
     import pycolmap
 
     first = views[0]

@@ -1,4 +1,4 @@
-"""Make the demo scene: ray-traced pictures of analytic shapes, and a COLMAP model of them.
+"""Make the demo scene: ray-traced photos of analytic shapes, and a COLMAP model of them.
 
 python -m demo.make_scene OUT [--views 60] [--size 400 300] [--points 8000] [--seed 0]
 """
@@ -25,7 +25,7 @@ from demo.views import ring_views
 from utils.host.threads import cores
 from utils.system_utils import UserError, mkdir_p, run_cli
 
-PIXELS_PER_PROCESS = 1_000_000  # below this, starting another process (2 s) takes longer than it saves
+PIXELS_PER_PROCESS = 1_000_000  # with fewer, starting another process (2 s) costs more time than it saves
 
 
 def _demo_picture(view: View) -> np.ndarray:
@@ -33,13 +33,13 @@ def _demo_picture(view: View) -> np.ndarray:
 
 
 def _pictures(views: list[View]) -> list[np.ndarray]:
-    """What the views show, (H, W, 3) uint8 each, made on all cores if it is worth it."""
+    """Ray-trace the views to photos, (H, W, 3) uint8 each, on several cores if that saves time."""
     pixels = sum(view.width * view.height for view in views)
     workers = min(cores(), 1 + pixels // PIXELS_PER_PROCESS)
     bar = partial(tqdm, total=len(views), desc="Ray tracing", unit="view")
     if workers == 1:
         return list(bar(map(_demo_picture, views)))
-    # Processes, because numpy holds the interpreter for much of the time on blocks this small.
+    # Use processes, because numpy holds the interpreter's lock most of the time on blocks this small.
     with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
         return list(bar(pool.map(_demo_picture, views)))
 
@@ -47,14 +47,14 @@ def _pictures(views: list[View]) -> list[np.ndarray]:
 def make_scene(out: Path, views: int, width: int, height: int, points: int, seed: int) -> int:
     """Write the scene to `out` (images/, sparse/0) and return its number of points.
 
-    The same arguments give the same pictures and points. `out` appears only when it is complete; UserError if it is
-    there already and not empty, can't be made, or would be a scene without points.
+    The same arguments give the same photos and points. `out` appears only when it is complete. UserError if it exists
+    and is not empty, if it cannot be made, or if the scene would have no points.
     """
     out = out.resolve()
     if out == Path.cwd():
-        raise UserError("the current folder can't be replaced by the scene; name a folder to make")
+        raise UserError("the scene cannot replace the current folder; name a new folder")
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise UserError(f"{out} exists and is not an empty folder; choose another one or delete it first")
+        raise UserError(f"{out} exists and is not an empty folder; choose another one, or delete it first")
     rng = np.random.default_rng(seed)
     cameras = ring_views(views, width, height, rng)
     names = [f"view_{k:03d}.png" for k in range(views)]
@@ -67,14 +67,14 @@ def make_scene(out: Path, views: int, width: int, height: int, points: int, seed
             Image.fromarray(picture).save(work / "images" / name)
         cloud = sample_points(demo_scene(), cameras, pictures, points, rng)
         if not len(cloud.xyz):
-            raise UserError(f"none of {points} points is seen by {MIN_TRACK} views; raise --points or --views")
+            raise UserError(f"none of {points} points is visible in {MIN_TRACK} views; raise --points or --views")
         write_model(work / "sparse" / "0", names, cameras, cloud)
         if out.exists():
             out.rmdir()
         work.rename(out)
     except OSError as error:
         raise UserError(
-            f"cannot write {out} ({error.strerror or error}); choose another place, or mend the rights there"
+            f"cannot write {out} ({error.strerror or error}); choose another place, or fix the permissions there"
         ) from error
     finally:
         shutil.rmtree(work, ignore_errors=True)
@@ -83,13 +83,18 @@ def make_scene(out: Path, views: int, width: int, height: int, points: int, seed
 
 def main() -> None:
     parser = ArgumentParser(prog="python -m demo.make_scene", description="Make the ray-traced demo scene.")
-    parser.add_argument("out", type=Path, help="folder to make; it gets images/ and sparse/0")
-    parser.add_argument("--views", type=int, default=60, help="number of pictures, on three rings (60)")
+    parser.add_argument("out", type=Path, help="folder to make, with images/ and sparse/0")
+    parser.add_argument("--views", type=int, default=60, help="number of photos, on three rings (60)")
     parser.add_argument(
-        "--size", type=int, nargs=2, default=(400, 300), metavar=("W", "H"), help="pixels of a picture (400 300)"
+        "--size",
+        type=int,
+        nargs=2,
+        default=(400, 300),
+        metavar=("W", "H"),
+        help="size of the photos in pixels (400 300)",
     )
-    parser.add_argument("--points", type=int, default=8000, help="surface points tried; a few are dropped (8000)")
-    parser.add_argument("--seed", type=int, default=0, help="of the cameras' jitter and of the points (0)")
+    parser.add_argument("--points", type=int, default=8000, help="surface points to try; a few are dropped (8000)")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the cameras' jitter and of the points (0)")
     args = parser.parse_args()
     for option, value, least in (
         ("--views", args.views, 3),
@@ -100,7 +105,7 @@ def main() -> None:
         if value < least:
             raise UserError(f"{option} must be at least {least}, got {value}")
     count = make_scene(args.out, args.views, *args.size, args.points, args.seed)
-    print(f"{args.out}: {args.views} pictures of {args.size[0]}x{args.size[1]} pixels, {count} points")
+    print(f"{args.out}: {args.views} photos of {args.size[0]}x{args.size[1]} pixels, {count} points")
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
-"""What stands in the demo scene: shapes with their textures and finish.
+"""Objects of the demo scene: shapes with textures and finish.
 
-A texture is a function of surface points (3, R) that gives diffuse colours (3, R) in [0, 1]. All of them are smooth or
-soft-edged at the scale of a pixel, so that supersampling suffices to keep the pictures free of aliasing.
+A texture is a function from surface points (3, R) to diffuse colours (3, R) in [0, 1]. All textures are smooth or
+soft-edged at the scale of a pixel, so that supersampling is enough against aliasing.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ class Thing:
     mirror: float = 0.0  # reflectance at normal incidence (Schlick's F0); 0 = matt
     highlight: float = 0.0  # strength of the sun's highlight
     exponent: float = 40.0  # Blinn-Phong exponent of that highlight
-    emissive: bool = False  # the backdrop: shown as painted, neither lit nor shadowed
+    emissive: bool = False  # true for the backdrop, which is shown as painted, without light and shadow
 
 
 def _rgb(*values: float) -> np.ndarray:
@@ -37,13 +37,13 @@ def _mix(a: np.ndarray, b: np.ndarray, weight: np.ndarray) -> np.ndarray:
 
 
 def _edge(x: np.ndarray, softness: float) -> np.ndarray:
-    """A step at zero, softened over +-softness."""
+    """Return a step at zero, softened over +-softness."""
     s = np.clip(x / np.float32(2 * softness) + np.float32(0.5), 0, 1)
     return s * s * (3 - 2 * s)
 
 
 def _waves(p: np.ndarray, frequency: float, seed: int, count: int = 6) -> np.ndarray:
-    """Smooth band-limited noise (R,) within [-1, 1]: the mean of plane waves of random direction and phase."""
+    """Return smooth band-limited noise (R,) in [-1, 1], the mean of plane waves of random direction and phase."""
     rng = np.random.default_rng(seed)
     total = np.zeros(p.shape[1], np.float32)
     for _ in range(count):
@@ -54,7 +54,7 @@ def _waves(p: np.ndarray, frequency: float, seed: int, count: int = 6) -> np.nda
 
 
 def ground_texture(p: np.ndarray) -> np.ndarray:
-    """Two-tone tiles with soft seams, mottled, fading to plain sand away from the middle."""
+    """Return mottled two-tone tiles with soft seams, which fade to plain sand away from the middle."""
     tile = np.float32(np.pi / 0.55)
     check = _edge(np.sin(tile * p[0]) * np.sin(tile * p[2]), 0.25)
     colour = _mix(_rgb(0.72, 0.63, 0.50), _rgb(0.34, 0.42, 0.46), check)
@@ -63,14 +63,14 @@ def ground_texture(p: np.ndarray) -> np.ndarray:
 
 
 def backdrop_texture(p: np.ndarray) -> np.ndarray:
-    """A sky from haze to blue with broad soft clouds."""
+    """Return a sky from haze to blue with broad soft clouds."""
     up = np.clip(-p[1] / np.float32(9), 0, 1)
     colour = _mix(_rgb(0.86, 0.84, 0.80), _rgb(0.36, 0.54, 0.80), np.sqrt(up))
     return _mix(colour, _rgb(0.95, 0.95, 0.96), _edge(_waves(p, 0.9, 3), 0.5) * np.float32(0.6))
 
 
 def stripes(axis: int, frequency: float, light: np.ndarray, dark: np.ndarray) -> Texture:
-    """Soft stripes along a world axis, slightly wavy."""
+    """Make a texture of soft, slightly wavy stripes along a world axis."""
 
     def texture(p: np.ndarray) -> np.ndarray:
         phase = np.float32(frequency) * p[axis] + np.float32(0.8) * _waves(p, 6.0, 4)
@@ -80,7 +80,7 @@ def stripes(axis: int, frequency: float, light: np.ndarray, dark: np.ndarray) ->
 
 
 def marble(light: np.ndarray, dark: np.ndarray, seed: int) -> Texture:
-    """Veins of one colour in another."""
+    """Make a texture with veins of one colour in another."""
 
     def texture(p: np.ndarray) -> np.ndarray:
         vein = np.abs(_waves(p, 7.0, seed) + np.float32(0.4) * _waves(p, 19.0, seed + 1))
@@ -90,7 +90,7 @@ def marble(light: np.ndarray, dark: np.ndarray, seed: int) -> Texture:
 
 
 def panels(box: Box) -> Texture:
-    """A frame around each face of a box and a mottled filling."""
+    """Make a texture with a frame around each face of a box and a mottled filling."""
 
     def texture(p: np.ndarray) -> np.ndarray:
         q = np.sort(np.abs(box.local(p)), axis=0)
@@ -102,7 +102,7 @@ def panels(box: Box) -> Texture:
 
 
 def ring_stripes(torus: Torus, count: int, light: np.ndarray, dark: np.ndarray) -> Texture:
-    """Bands around the tube of a torus that lies in a plane of its own."""
+    """Make a texture of bands around the tube of a tilted torus."""
     axis = np.asarray(torus.axis, np.float64) / np.linalg.norm(torus.axis)
     first = np.cross(axis, (0.31, 0.77, 0.55))
     first /= np.linalg.norm(first)
@@ -117,7 +117,10 @@ def ring_stripes(torus: Torus, count: int, light: np.ndarray, dark: np.ndarray) 
 
 
 def demo_scene() -> list[Thing]:
-    """A tiled ground under a painted sky with a glossy sphere, two textured ones, a torus and a box. Up is -y."""
+    """Make a tiled ground under a painted sky with three spheres, of which two are glossy, a torus and a box.
+
+    Up is -y.
+    """
     torus = Torus((-0.15, -0.62, 0.95), (0.35, -0.55, 0.75), 0.42, 0.16)
     box = Box((0.95, -0.38, 0.55), (0.30, 0.38, 0.30), 0.5)
     return [

@@ -1,4 +1,4 @@
-"""Say how a trained, rendered and scored model did: a short table, and a contact sheet of some test views.
+"""Report on a trained, rendered and scored model: a short table, and a contact sheet of some test views.
 
 python -m demo.report MODEL [--views 4]
 """
@@ -22,8 +22,8 @@ def _shown(value: float | None, digits: int, unit: str = "") -> str:
 
 def main() -> None:
     parser = ArgumentParser(prog="python -m demo.report", description="Table and contact sheet of a trained model.")
-    parser.add_argument("model", type=Path, help="model folder, rendered and scored")
-    parser.add_argument("--views", type=int, default=4, help="test views on the contact sheet, evenly spread (4)")
+    parser.add_argument("model", type=Path, help="model folder, already rendered and scored")
+    parser.add_argument("--views", type=int, default=4, help="number of test views on the contact sheet (4)")
     args = parser.parse_args()
     if args.views < 1:
         raise UserError(f"--views must be at least 1, got {args.views}")

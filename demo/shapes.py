@@ -1,7 +1,7 @@
-"""Analytic shapes: where a ray hits them, and their normals.
+"""Analytic shapes: their intersections with rays, and their normals.
 
-Rays and points are arrays of shape (3, R), float32, world units. The world has x right, y down, z forward, as COLMAP
-has its cameras, so that "up" is -y. A hit that does not exist has distance infinity.
+Rays and points are arrays of shape (3, R), float32, world units. The world has x right, y down, z forward, like a
+COLMAP camera, so that "up" is -y. A ray without a hit has distance infinity.
 """
 
 from __future__ import annotations
@@ -15,22 +15,22 @@ NEAR = np.float32(1e-3)  # rays that start on a surface must not hit it again
 
 
 class Shape(Protocol):
-    """What the tracer needs to know of a shape."""
+    """The interface of a shape for the tracer."""
 
     def intersect(self, origin: np.ndarray, direction: np.ndarray) -> np.ndarray:
-        """Distances (R,) along unit directions (3, R) from origins (3, R) or (3, 1) to the first hit beyond NEAR."""
+        """Return distances (R,) to the first hit beyond NEAR; origin (3, R) or (3, 1), unit direction (3, R)."""
 
     def normal(self, points: np.ndarray) -> np.ndarray:
-        """Unit normals (3, R) at surface points (3, R), pointing out of the solid."""
+        """Return unit normals (3, R) at surface points (3, R), pointing out of the solid."""
 
 
 def dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Scalar products (R,) of vectors (3, R)."""
+    """Return scalar products (R,) of vectors (3, R)."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 def normalize(v: np.ndarray) -> np.ndarray:
-    """Vectors (3, R) scaled to length one."""
+    """Scale vectors (3, R) to length one."""
     return v / np.sqrt(dot(v, v))
 
 
@@ -40,7 +40,7 @@ def _column(values: tuple[float, float, float]) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Ground:
-    """The disc of a radius around the origin in the plane y = 0, seen from above."""
+    """A disc around the origin in the plane y = 0, seen from above."""
 
     radius: float
 
@@ -89,13 +89,13 @@ class Torus:
     tube: float
 
     def _local(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Offset from the centre (3, R), height over the torus' plane (R,), and distance from its axis (R,)."""
+        """Return offset from the centre (3, R), height over the torus' plane (R,) and distance from its axis (R,)."""
         offset = points - _column(self.center)
         height = dot(offset, normalize(_column(self.axis)))
         return offset, height, np.sqrt(np.maximum(dot(offset, offset) - height * height, np.float32(1e-12)))
 
     def distance(self, points: np.ndarray) -> np.ndarray:
-        """Signed distances (R,) of points (3, R) from the surface."""
+        """Return signed distances (R,) of points (3, R) from the surface."""
         _, height, ring = self._local(points)
         return np.hypot(ring - np.float32(self.radius), height) - np.float32(self.tube)
 
@@ -145,7 +145,7 @@ class Box:
         return np.stack([c * v[0] + s * v[2], v[1], -s * v[0] + c * v[2]])
 
     def local(self, points: np.ndarray) -> np.ndarray:
-        """Points (3, R) in the box's own frame, in units of its half sizes: the surface is at max |.| = 1."""
+        """Return points (3, R) in the box's own frame, in units of its half sizes: the surface is at max |.| = 1."""
         return self._to_local(points - _column(self.center)) / _column(self.half)
 
     def intersect(self, origin: np.ndarray, direction: np.ndarray) -> np.ndarray:

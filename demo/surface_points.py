@@ -1,4 +1,4 @@
-"""Points on the surfaces of a scene, as structure from motion would find them: noisy, coloured, with their tracks."""
+"""Points on the surfaces of a scene as structure from motion would find them: noisy, coloured, with their tracks."""
 
 from __future__ import annotations
 
@@ -11,24 +11,23 @@ from demo.tracer import View, trace
 
 POSITION_NOISE = 0.004  # standard deviation of a point, as a fraction of its distance from the view that found it
 PIXEL_NOISE = 0.3  # standard deviation of an observation in pixels
-MIN_TRACK = 3  # views a point must be seen in
+MIN_TRACK = 3  # least number of views that see a point
 
 
 @dataclass(frozen=True)
 class SurfacePoints:
-    """`xyz` (N, 3) in world units, `rgb` (N, 3) uint8, and per view the points it sees: `seen[v]` indices (K,) and
-    `keypoints[v]` (K, 2), where they were observed, in pixels with pixel centres at .5."""
+    """Coloured points and their observations in the views."""
 
-    xyz: np.ndarray
-    rgb: np.ndarray
-    seen: list[np.ndarray]
-    keypoints: list[np.ndarray]
+    xyz: np.ndarray  # (N, 3), world units
+    rgb: np.ndarray  # (N, 3) uint8
+    seen: list[np.ndarray]  # for each view, the indices (K,) of the points that it sees
+    keypoints: list[np.ndarray]  # for each view, their observed positions (K, 2) in pixels; pixel centres are at .5
 
 
 def _found_by_views(
     things: list[Thing], views: list[View], count: int, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Surface points (3, count) under random pixels of random views, and their distances (count,) from them."""
+    """Return surface points (3, count) under random pixels of random views, and their distances (count,)."""
     owner = np.sort(rng.integers(len(views), size=count))
     u, v = rng.uniform(size=(2, count))
     points = np.empty((3, count))
@@ -43,14 +42,14 @@ def _found_by_views(
 
 
 def _visible(things: list[Thing], view: View, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Indices (K,) of the surface points (3, N) that a view sees unoccluded, and their image positions (K, 2)."""
+    """Return the indices (K,) of the surface points (3, N) that a view sees, and their image positions (K, 2)."""
     x, y, z = view.project(points)
     inside = np.flatnonzero((z > 0) & (x >= 0) & (x < view.width) & (y >= 0) & (y < view.height))
     origin = view.center.reshape(3, 1)
     offset = points[:, inside] - origin
     distance = np.linalg.norm(offset, axis=0)
     hit, _ = trace(things, origin.astype(np.float32), (offset / distance).astype(np.float32))
-    # A surface seen at a slant moves its hit by far more than float32's rounding; things are much thicker than this.
+    # Hits on a slanted surface move by far more than float32's rounding. All objects are much thicker than 0.02.
     near = hit > distance - 0.02
     return inside[near], np.stack([x, y], axis=1)[inside[near]]
 
@@ -58,9 +57,10 @@ def _visible(things: list[Thing], view: View, points: np.ndarray) -> tuple[np.nd
 def sample_points(
     things: list[Thing], views: list[View], pictures: list[np.ndarray], count: int, rng: np.random.Generator
 ) -> SurfacePoints:
-    """About `count` surface points with true visibility: those that fewer than MIN_TRACK views see are dropped.
+    """Sample about `count` surface points with true visibility; drop points that fewer than MIN_TRACK views see.
 
-    Colours are means over the `pictures` (H, W, 3) uint8 that see a point, so they hold no view dependence.
+    pictures: the views' photos, (H, W, 3) uint8. A point's colour is its mean over the photos that see it, so it does
+    not depend on the view.
     """
     points, distance = _found_by_views(things, views, count, rng)
     seen, exact = zip(*(_visible(things, view, points) for view in views), strict=True)

@@ -12,27 +12,26 @@ from demo.shapes import dot, normalize
 SUN = normalize(np.asarray([[-0.55], [-1.0], [-0.45]], np.float32))  # towards the sun; up is -y
 SUN_COLOUR = np.asarray([[0.74], [0.70], [0.62]], np.float32)
 SKY_COLOUR = np.asarray([[0.40], [0.44], [0.50]], np.float32)
-BLOCK = 32768  # rays worked on at once: their arrays stay in the cache of a core
+BLOCK = 32768  # rays traced at once; their arrays fit in the cache of a core
 
 
 @dataclass(frozen=True)
 class View:
-    """A pinhole camera. `rotation` (3, 3) takes world to camera (x right, y down, z forward), `center` (3,) is its
-    position in the world, `focal` is in pixels; the principal point is the picture's centre."""
+    """A pinhole camera, whose principal point is the centre of the image."""
 
-    rotation: np.ndarray
-    center: np.ndarray
-    focal: float
+    rotation: np.ndarray  # (3, 3), world to camera: x right, y down, z forward
+    center: np.ndarray  # (3,), position in the world
+    focal: float  # pixels
     width: int
     height: int
 
     def rays(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """Unit directions (3, R), world frame, through image positions (R,) in pixels; pixel centres are at .5."""
+        """Return unit directions (3, R) in the world through image positions (R,) in pixels; centres are at .5."""
         local = np.stack([(x - self.width / 2) / self.focal, (y - self.height / 2) / self.focal, np.ones_like(x)])
         return normalize((self.rotation.T @ local).astype(np.float32))
 
     def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Image positions x, y (R,) in pixels and depths z (R,) of world points (3, R)."""
+        """Return image positions x, y (R,) in pixels and depths z (R,) of world points (3, R)."""
         local = self.rotation @ (points - self.center.reshape(3, 1))
         with np.errstate(divide="ignore", invalid="ignore"):
             x = self.focal * local[0] / local[2] + self.width / 2
@@ -41,7 +40,7 @@ class View:
 
 
 def trace(things: list[Thing], origin: np.ndarray, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Distance (R,) to the nearest thing along each ray, and its index (R,)."""
+    """Return the distance (R,) to the nearest thing along each ray, and the thing's index (R,)."""
     nearest = things[0].shape.intersect(origin, direction)
     index = np.zeros(nearest.shape, np.int8)
     for k, thing in enumerate(things[1:], 1):
@@ -53,7 +52,7 @@ def trace(things: list[Thing], origin: np.ndarray, direction: np.ndarray) -> tup
 
 
 def in_shadow(things: list[Thing], points: np.ndarray) -> np.ndarray:
-    """Whether something stands between points (3, R) and the sun, (R,) bool."""
+    """Return whether something is between points (3, R) and the sun, (R,) bool."""
     direction = np.broadcast_to(SUN, points.shape)
     blocked = np.zeros(points.shape[1], bool)
     for thing in things:
@@ -63,7 +62,7 @@ def in_shadow(things: list[Thing], points: np.ndarray) -> np.ndarray:
 
 
 def shade(things: list[Thing], origin: np.ndarray, direction: np.ndarray, bounces: int = 1) -> np.ndarray:
-    """Colours (3, R) seen along rays from origins (3, R) or (3, 1) in unit directions (3, R)."""
+    """Return the colours (3, R) seen along rays from origins (3, R) or (3, 1) in unit directions (3, R)."""
     distance, index = trace(things, origin, direction)
     points = origin + distance * direction
     colour = np.empty_like(points)
@@ -93,7 +92,7 @@ def shade(things: list[Thing], origin: np.ndarray, direction: np.ndarray, bounce
 
 
 def render_view(things: list[Thing], view: View, samples: int = 3) -> np.ndarray:
-    """The picture (H, W, 3) uint8 of a view, the mean of samples x samples rays per pixel."""
+    """Render the photo (H, W, 3) uint8 of a view, the mean of samples x samples rays per pixel."""
     origin = view.center.astype(np.float32).reshape(3, 1)
     steps = (np.arange(samples) + 0.5) / samples
     columns = (np.arange(view.width)[:, None] + steps).reshape(-1)

@@ -1,4 +1,4 @@
-"""Where the demo's cameras stand: rings around the scene, at three heights."""
+"""Positions of the demo's cameras: rings around the scene at three heights."""
 
 from __future__ import annotations
 
@@ -6,12 +6,12 @@ import numpy as np
 
 from demo.tracer import View
 
-TARGET = np.asarray([0.1, -0.4, 0.1])  # world units; what the cameras look at
+TARGET = np.asarray([0.1, -0.4, 0.1])  # point that the cameras face, world units
 RINGS = ((12.0, 3.9, 0.40), (28.0, 3.6, 0.35), (50.0, 3.3, 0.25))  # elevation in degrees, distance, share of the views
 
 
 def look_at(center: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """World-to-camera rotation (3, 3) of an upright camera at `center` (3,) that looks at `target` (3,); up is -y."""
+    """Return the world-to-camera rotation (3, 3) of an upright camera at `center` facing `target`, (3,); up is -y."""
     forward = (target - center) / np.linalg.norm(target - center)
     right = np.cross((0.0, 1.0, 0.0), forward)
     right /= np.linalg.norm(right)
@@ -19,7 +19,7 @@ def look_at(center: np.ndarray, target: np.ndarray) -> np.ndarray:
 
 
 def ring_views(count: int, width: int, height: int, rng: np.random.Generator) -> list[View]:
-    """`count` cameras around the scene, with a small random jitter of place and aim; focal length 0.9 widths."""
+    """Make `count` cameras around the scene with small random jitter of position and aim; focal length 0.9 widths."""
     shares = np.round(np.cumsum([share for *_, share in RINGS]) * count).astype(int)
     views: list[View] = []
     for ring, (elevation, distance, _) in enumerate(RINGS):

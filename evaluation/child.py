@@ -1,4 +1,4 @@
-"""A subprocess whose messages are shown and kept, and which is stopped the way it wants to be stopped."""
+"""A subprocess whose messages are shown and kept, and which gets time to save when it is interrupted."""
 
 from __future__ import annotations
 
@@ -16,38 +16,39 @@ from dataclasses import dataclass
 from utils.host.interrupt import DeferredInterrupt
 from utils.system_utils import Terminated
 
-LINES = 20  # of its stderr that are kept
-_LOOK = 0.2  # seconds between looks for Ctrl-C
+LINES = 20  # lines of stderr to keep
+_LOOK = 0.2  # seconds between checks for Ctrl-C
 
 
 @dataclass(frozen=True)
 class Finished:
-    """How a subprocess ended: exit status (negative: by that signal), last lines of stderr, wall-clock seconds."""
+    """The end of a subprocess."""
 
-    status: int
-    lines: list[str]
-    seconds: float
-    interrupt: type[KeyboardInterrupt] | None
+    status: int  # exit status; negative: the signal that killed it
+    lines: list[str]  # last lines of stderr
+    seconds: float  # wall clock
+    interrupt: type[KeyboardInterrupt] | None  # the interrupt that this process got meanwhile
 
     @property
     def reason(self) -> str:
-        """One line: what it said last, or how it ended."""
+        """The last message, or the exit status, in one line."""
         if self.status < 0:
             return f"killed by {signal.Signals(-self.status).name}"
         return self.lines[-1] if self.lines else f"exit status {self.status}"
 
 
 def run_child(command: Sequence[str]) -> Finished:
-    """Run a command (no shell), copying its stderr to ours.
+    """Run a command without a shell, and copy its stderr to ours.
 
-    Ctrl-C or SIGTERM to us is handed on once, SIGHUP (a closed terminal) as SIGTERM, and what the child then does
-    (train.py saves a checkpoint) is waited for; `interrupt` says so. A second one kills it and raises.
+    Ctrl-C or SIGTERM to this process is passed on once, SIGHUP (a closed terminal) as SIGTERM. Then this function waits
+    for the child, since train.py saves a checkpoint, and sets `interrupt`. A second signal kills the child and raises.
     """
     start = time.perf_counter()
     tail = _Tail()
-    # A session of its own: else the terminal's Ctrl-C would reach it beside ours, and train.py takes two as "at once".
+    # The child gets a session of its own. Else the terminal's Ctrl-C would reach it twice, directly and through us, and
+    # train.py stops at once on the second one.
     with DeferredInterrupt() as interrupt:
-        # Inherits only what is inheritable: the folder's lock, so that it is kept as long as this child lives.
+        # The child inherits only the folder's lock, which is then kept as long as the child lives.
         child = subprocess.Popen(command, stderr=subprocess.PIPE, start_new_session=True, close_fds=False)
         try:
             handed_on = False
@@ -79,7 +80,7 @@ def _show(chunk: bytes) -> None:
 
 
 class _Tail:
-    """The last lines of a stream; of a line redrawn with carriage returns (a progress bar) nothing."""
+    """The last lines of a stream, without progress bars, which redraw their line with carriage returns."""
 
     def __init__(self) -> None:
         self._text = b""

@@ -1,4 +1,4 @@
-"""--configs FILE: named option sets for train.py."""
+"""Named option sets for train.py, read from --configs FILE."""
 
 from __future__ import annotations
 
@@ -16,25 +16,25 @@ _SHAPE = 'like {"base": [], "sh1": ["--sh_degree", "1"]}'
 
 
 def read_configs(path: Path, parse: Parse | None) -> dict[str, tuple[str, ...]]:
-    """The option sets of a JSON file, {name: [word, ...]}, in its order. Numbers may stand for words.
+    """Read the option sets of a JSON file, {name: [word, ...]}, in its order. A word may also be a number.
 
-    parse: as `check_options`. UserError for another file, or for words that train.py does not take.
+    parse: see `check_options`. UserError for any other content, or for words that train.py does not accept.
     """
     try:
         content = json.loads(path.read_text(encoding="utf-8"), object_pairs_hook=_no_duplicates)
     except OSError as error:
         raise UserError(f"cannot read {path} ({error.strerror}); --configs takes a JSON file {_SHAPE}") from error
     except ValueError as error:
-        raise UserError(f"{path} is no JSON for --configs ({error}); write it {_SHAPE}") from error
+        raise UserError(f"{path} is no table of option sets ({error}); write it {_SHAPE}") from error
     if not isinstance(content, dict) or not content:
         raise UserError(f"{path} names no option sets; write it {_SHAPE}")
     configs = {}
     for name, words in content.items():
-        # A folder, and not one that a seed or train.py makes.
+        # The name becomes a folder, so it must not be one that a seed or train.py makes.
         if not re.fullmatch(r"[A-Za-z0-9][\w.+-]*", name) or re.fullmatch(r"seed_\d+|point_cloud|test|train", name):
             raise UserError(f"{path}: {name!r} cannot name a folder; use letters, digits, _ . + -")
         if not isinstance(words, list) or not all(type(word) in (str, int, float) for word in words):
-            raise UserError(f"{path}: {name} must be a list of train.py's words, {_SHAPE}")
+            raise UserError(f"{path}: {name} must be a list of words for train.py, {_SHAPE}")
         configs[name] = tuple(str(word) for word in words)
         check_options(configs[name], f"{path}, {name}", parse)
     return configs
@@ -43,20 +43,23 @@ def read_configs(path: Path, parse: Parse | None) -> dict[str, tuple[str, ...]]:
 def _no_duplicates(pairs: list[tuple[str, object]]) -> dict[str, object]:
     names = [name for name, _ in pairs]
     if twice := [name for name in names if names.count(name) > 1]:
-        raise ValueError(f"{twice[0]} is there twice")
+        raise ValueError(f"it has {twice[0]} twice")
     return dict(pairs)
 
 
 def check_options(words: Sequence[str], where: str, parse: Parse | None) -> None:
-    """UserError for options that full_eval.py itself has to set (data, model folder, checkpoint), and for what train.py
-    would refuse: before other trainings have taken hours. parse: train.py's, None where nothing is trained."""
+    """Check options before other trainings have taken hours.
+
+    parse: train.py's parser; None if nothing is trained. UserError for options that full_eval.py sets itself (data,
+    model folder, checkpoint) and for options that train.py would refuse.
+    """
     for word in words:
         name = word.split("=")[0]
         taken = name[:2] in ("-s", "-m") or any(
             len(name) > 4 and long.startswith(name) for long in ("--source_path", "--model_path", "--start_checkpoint")
         )
         if taken:
-            raise UserError(f"{where}: {word} is set by full_eval.py itself; leave it out")
+            raise UserError(f"{where}: full_eval.py sets {word} itself; omit it")
     if words and parse:
         _try(parse, words, where)
 
@@ -66,8 +69,8 @@ def _try(parse: Parse, words: Sequence[str], where: str) -> None:
     try:
         with contextlib.redirect_stderr(said), contextlib.redirect_stdout(io.StringIO()):
             parse(words)
-    except SystemExit as error:  # argparse's way; without a message where it was asked for help
+    except SystemExit as error:  # raised by argparse; without a message for -h
         reason = said.getvalue().strip().rpartition("error: ")[2] or f"{' '.join(words)} trains nothing"
-        raise UserError(f"{where}: {reason}; train.py -h lists what there is") from error
+        raise UserError(f"{where}: {reason}; train.py -h lists the options") from error
     except UserError as error:
         raise UserError(f"{where}: {error}") from error

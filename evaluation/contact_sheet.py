@@ -1,4 +1,4 @@
-"""One picture of a few test views: ground truth, render, and their difference."""
+"""A contact sheet of test views: ground truth, render, and their difference."""
 
 from __future__ import annotations
 
@@ -7,21 +7,21 @@ from collections.abc import Sequence
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-GAIN = 5  # how much the difference is amplified
-GAP = 6  # pixels between pictures
-HEADER = 26  # pixels of height of the titles
+GAIN = 5  # amplification of the difference
+GAP = 6  # pixels between images
+HEADER = 26  # height of the titles in pixels
 
 
 def error_image(truth: Image.Image, render: Image.Image) -> Image.Image:
-    """Absolute difference per channel, amplified by GAIN, black where equal."""
+    """Return the absolute difference per channel, amplified by GAIN, black where equal."""
     difference = np.abs(np.asarray(truth.convert("RGB"), np.int16) - np.asarray(render.convert("RGB"), np.int16))
     return Image.fromarray(np.minimum(difference * GAIN, 255).astype(np.uint8))
 
 
 def contact_sheet(views: Sequence[tuple[str, Image.Image, Image.Image]], widest: int | None = None) -> Image.Image:
-    """A row for each view (label, ground truth, render), under a row of titles. The pictures may differ in size.
+    """Draw a row for each view (label, ground truth, render), under a row of titles. Images may differ in size.
 
-    widest: larger pictures are shrunk to that width in pixels, errors after they were taken.
+    widest: shrink wider images to this width in pixels, after computing the error.
     """
     cells = [
         (label, [_shrunk(image, widest) for image in (truth, render, error_image(truth, render))])

@@ -1,4 +1,4 @@
-"""The report's content, shared by both renderings: sections of paragraphs, tables, pictures and quoted messages."""
+"""Content of the report, for both renderings: sections of paragraphs, tables, pictures and quoted messages."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from evaluation.published import COMPARED, published_tables
 
 @dataclass(frozen=True)
 class Table:
-    """Cells are text already; the first column reads left, the others right."""
+    """A table of text cells; the first column is aligned to the left, the others to the right."""
 
     header: list[str]
     rows: list[list[str]]
@@ -21,7 +21,7 @@ class Table:
 
 @dataclass(frozen=True)
 class Picture:
-    """A PNG on disk, absolute."""
+    """A PNG on disk, with an absolute path."""
 
     path: Path
     caption: str
@@ -29,7 +29,7 @@ class Picture:
 
 @dataclass(frozen=True)
 class Quote:
-    """Messages of a command, unchanged."""
+    """Messages of a program, verbatim."""
 
     lines: list[str]
 
@@ -39,7 +39,7 @@ Block = str | Table | Picture | Quote
 
 @dataclass(frozen=True)
 class Section:
-    """A title and the blocks below it."""
+    """A title and the blocks under it."""
 
     title: str
     blocks: list[Block] = field(default_factory=list)
@@ -56,18 +56,18 @@ _HEADS = {
 
 
 def number(value: float | None, digits: int) -> str:
-    """A number for a cell, - for none."""
+    """Format a number for a cell; None becomes -."""
     return "-" if value is None else f"{value:,.{digits}f}"
 
 
 def spread_cell(spread: Mapping[str, Any], digits: int) -> str:
-    """Mean and standard deviation of a `summary.spread`."""
+    """Format mean and standard deviation of a `summary.spread`."""
     deviation = "" if spread["std"] is None else f" ± {spread['std']:,.{digits}f}"
     return number(spread["mean"], digits) + deviation
 
 
 def results_table(rows: Sequence[Mapping[str, Any]]) -> Table:
-    """`summary` of report.json as a table; columns of times, sizes and memory that no row has are left out."""
+    """Make a table of report.json's `summary`, without columns of times, sizes and memory that are empty."""
     configs = any(row["config"] for row in rows)
     quantities = [
         name for name in _DIGITS
@@ -86,7 +86,7 @@ def results_table(rows: Sequence[Mapping[str, Any]]) -> Table:
 
 
 def document(report: Mapping[str, Any], figures: Mapping[str, Sequence[Picture]]) -> list[Section]:
-    """The sections. `figures`: pictures by scene."""
+    """Return the sections of the report. figures: pictures by scene."""
     return [
         *_failures(report),
         _results(report),
@@ -109,7 +109,7 @@ def _failures(report: Mapping[str, Any]) -> list[Section]:
 
 
 def run_title(run: Mapping[str, Any]) -> str:
-    """Scene, option set and seed."""
+    """Name a run by scene, option set and seed."""
     seed = None if run["seed"] is None else f"seed {run['seed']}"
     return ", ".join(part for part in (run["scene"], run["config"], seed) if part)
 
@@ -118,15 +118,15 @@ def _results(report: Mapping[str, Any]) -> Section:
     rows = report["summary"]
     blocks: list[Block] = [results_table(rows) if rows else "Nothing was scored."]
     if any(row["PSNR"]["std"] is not None for row in rows):
-        blocks.append("Mean ± standard deviation of the sample over the seeds.")
+        blocks.append("Cells are mean ± sample standard deviation over the seeds.")
     if any(row["gaussians"]["mean"] != row["gaussians_saved"]["mean"] for row in rows):
         blocks.append(
-            "Gaussians: those trained, as published tables count them. Saved models lack the Gaussians that no "
-            "training view depends on (gaussians_saved in report.json)."
+            "Gaussians are counted as trained, as in published tables. The saved models lack those that no training "
+            "view depends on (gaussians_saved in report.json)."
         )
     if rows and all(row["LPIPS"]["mean"] is None for row in rows):
         blocks.append(
-            "LPIPS is missing: metrics.py had no weights for its network (its message says which file goes where)."
+            "LPIPS is missing: metrics.py found no weights of its network. Its message tells where to put them."
         )
     if unfinished := [run_title(run) for run in report["runs"] if not run["finished"] and not run["failure"]]:
         blocks.append(f"Not finished: {'; '.join(unfinished)}.")
@@ -173,7 +173,7 @@ def _published(report: Mapping[str, Any]) -> list[Section]:
 
 
 def cheapest_table(rows: Sequence[Mapping[str, Any]]) -> Table:
-    """A scene's `cheapest` of report.json."""
+    """Make a table of a scene's `cheapest` in report.json."""
     cells = []
     for row in rows:
         line = [f"{row['psnr']:.1f}"]
@@ -190,10 +190,10 @@ def _cheapest(report: Mapping[str, Any]) -> list[Section]:
     if not blocks:
         return []
     blocks.append(
-        "The option set that reaches a test PSNR in the fewest seconds of training, and the one with the fewest "
-        "Gaussians at that PSNR or better. Both are read from the curves, whose scores are of unrounded images; "
-        "between two points PSNR is linear in the logarithm of time. All seeds must reach the PSNR, and their mean "
-        "counts."
+        "For each test PSNR, the option set that reaches it in the fewest seconds of training, and the one with the "
+        "fewest Gaussians at that PSNR or better. Both come from the curves: scores during training, on unrounded "
+        "images. Between two points, PSNR is taken as linear in the logarithm of time. With several seeds, all must "
+        "reach the PSNR, and their mean counts."
     )
     return [Section("Cheapest option set for a given error", blocks)]
 
@@ -204,7 +204,7 @@ def _scenes(report: Mapping[str, Any], figures: Mapping[str, Sequence[Picture]])
         blocks: list[Block] = []
         for run in report["runs"]:
             if run["scene"] == scene and (peak := run["peak"]):
-                advice = f"; --iterations {peak['iteration']} ends there" if peak["shorter_ends_there"] else ""
+                advice = f"; --iterations {peak['iteration']} would end there" if peak["shorter_ends_there"] else ""
                 blocks.append(
                     f"{run_title(run)}: the test views were best at iteration {peak['iteration']:,} "
                     f"({peak['test_psnr']:.2f} dB) and lost {peak['lost']:.2f} dB until the end{advice}."
@@ -243,7 +243,7 @@ def _manifest(report: Mapping[str, Any]) -> Section:
             f"Resize filter: {manifest['resize_filter']}",
             "Scores: " + "; ".join(f"{name}: {text}" for name, text in manifest["conventions"].items()),
             Table(header, cells),
-            "Ground truth: first digits of a digest of the test views' sizes, pixels and masks. Only scores with the "
-            "same digest compare.",
+            "Ground truth: the first digits of a digest of the test views' sizes, pixels and masks. Scores can be "
+            "compared only if it is the same.",
         ],
     )

@@ -1,4 +1,4 @@
-"""The report's pictures: error against time of a scene, and its worst test views."""
+"""Figures of the report: error against time of a scene, and its worst test views."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from records.error_curve import Row
 from records.plain_log_axis import plain_log_axis
 from utils.system_utils import atomic_write
 
-WIDEST = 480  # pixels of a picture on a sheet
+WIDEST = 480  # largest width, in pixels, of an image on a sheet
 
 
 def _psnr(row: Row, views: str) -> float | None:
@@ -29,12 +29,12 @@ def _dissimilarity(row: Row, views: str) -> float | None:
 
 
 def draw_curves(path: Path, scene: str, runs: Sequence[dict[str, Any]]) -> bool:
-    """Test PSNR and 1 - SSIM of a scene's runs against seconds of training; False where no run has a curve.
+    """Draw test PSNR and 1 - SSIM of a scene's runs against seconds of training; return False if no run has a curve.
 
-    An option set has one colour, a seed one line. With several option sets the Pareto front of all points is marked.
-    With one, the training views are drawn too, dashed, so that over-fitting shows.
+    Each option set has a colour and each seed a line. With several option sets, the Pareto front of all points is
+    marked. With one, the training views are drawn too, dashed, so that over-fitting shows.
     """
-    from matplotlib.figure import Figure  # late: only a report needs it
+    from matplotlib.figure import Figure  # imported here because only a report needs it
 
     runs = [run for run in runs if any(row["test_psnr"] is not None for row in run["curve"])]
     if not runs:
@@ -83,9 +83,9 @@ def _columns(points: Sequence[tuple[float, float]]) -> tuple[list[float], list[f
 
 
 def _stairs(points: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
-    """The points with a corner between each two, so that every second one is a point.
+    """Return the points with a corner between each two, so that every second one is a point.
 
-    Matplotlib keeps its legend clear of these corners, but not of lines drawn with drawstyle "steps".
+    Matplotlib places its legend clear of these, but not of lines that it draws with drawstyle "steps".
     """
     corners = [(after[0], before[1]) for before, after in zip(points, points[1:], strict=False)]
     return [point for pair in zip(points, corners, strict=False) for point in pair] + list(points[-1:])
@@ -99,7 +99,7 @@ def _what_counts(method: Path, side: str, name: str) -> Image.Image:
 
 
 def draw_worst_views(path: Path, run: dict[str, Any], output: Path) -> bool:
-    """A run's worst test views, each with ground truth, render and amplified error; False where it has none.
+    """Draw a run's worst test views with ground truth, render and amplified error; return False if it has none.
 
     Pixels that do not count are white, and black in the error.
     """

@@ -1,4 +1,4 @@
-"""The report as one HTML file that needs nothing else: pictures are in it, and there is no script."""
+"""The report as one self-contained HTML file, with embedded pictures and without scripts."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from PIL import Image
 
 from evaluation.document import Picture, Quote, Section, Table
 
-_PHOTOGRAPHIC = 1 << 18  # bytes of a PNG above which a JPEG stands in for it
+_PHOTOGRAPHIC = 1 << 18  # bytes of a PNG above which a JPEG replaces it
 _QUALITY = 90
 
 
 def data_uri(path: Path) -> str:
-    """A picture as a data: URI, large ones as JPEG."""
+    """Return a picture as a data: URI; large ones become JPEG."""
     content, kind = path.read_bytes(), "png"
     if len(content) > _PHOTOGRAPHIC:
         buffer = io.BytesIO()
@@ -28,7 +28,7 @@ def data_uri(path: Path) -> str:
 
 
 def to_html(title: str, sections: Sequence[Section]) -> str:
-    """The whole page."""
+    """Render the whole page."""
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(Path(__file__).parent), autoescape=True, undefined=jinja2.StrictUndefined,
         trim_blocks=True, lstrip_blocks=True,

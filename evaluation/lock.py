@@ -1,4 +1,4 @@
-"""One full_eval.py in an output folder at a time."""
+"""Lock of an output folder, so that one full_eval.py works in it at a time."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ NAME = ".full_eval.lock"
 
 @contextlib.contextmanager
 def locked(folder: Path) -> Iterator[None]:
-    """Keep `folder` for this process and what it starts by `run_child`. UserError where another has it.
+    """Keep `folder` for this process and its `run_child` processes. UserError if another process has it.
 
-    The system lets go of it when the last of them ends, however that happens: what a killed one leaves is no obstacle,
-    and a training that outlives its full_eval.py still is one. Without file locks (Windows, some network file systems)
-    this does nothing.
+    The system releases the lock when the last of them ends in any way. So a killed full_eval.py does not block the
+    folder, but a training that outlives it does. Without file locks (Windows, some network file systems) this does
+    nothing.
     """
     if fcntl is None:
         yield
@@ -39,8 +39,8 @@ def locked(folder: Path) -> Iterator[None]:
         except BlockingIOError as error:
             file.seek(0)
             raise UserError(
-                f"full_eval.py (process {file.read().strip() or 'not known'}), or a training that it has started, is "
-                f"at work in {folder}; wait for it, stop it, or choose another --output_path"
+                f"full_eval.py (process {file.read().strip() or 'not known'}), or a training that it started, is at "
+                f"work in {folder}; wait for it, stop it, or choose another --output_path"
             ) from error
         except OSError:
             yield

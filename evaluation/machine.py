@@ -1,4 +1,4 @@
-"""Hardware and software that a training ran on. `python -m evaluation.machine` prints it as JSON."""
+"""Description of the machine and software that trained. `python -m evaluation.machine` prints it as JSON."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ _PACKAGES = ("lpips", "numpy", "pillow", "pycolmap", "torch", "torchvision")
 
 
 def machine() -> dict[str, Any]:
-    """Processor, GPU, threads, versions, commit of this machine and checkout; {} where they cannot be read.
+    """Return processor, GPU, threads, versions and commit of this machine and checkout; {} if that fails.
 
-    A child process asks: a process that has asked a GPU for its name holds some of its memory until it ends.
+    A separate process asks, because asking a GPU for its name occupies GPU memory until the process ends.
     """
     command = [sys.executable, "-m", "evaluation.machine"]
     done = subprocess.run(command, cwd=_ROOT, capture_output=True, text=True, check=False)
     if done.returncode:
-        print(f"warning: this machine could not be described:\n{done.stderr}", file=sys.stderr)
+        print(f"warning: cannot describe this machine:\n{done.stderr}", file=sys.stderr)
         return {}
     return json.loads(done.stdout)
 
@@ -58,7 +58,7 @@ def _version(package: str) -> str | None:
 
 
 def one_line(facts: dict[str, Any]) -> str:
-    """The facts of `machine()` that a reader of a table needs."""
+    """Summarise the result of `machine` in one line."""
     if not facts:
         return "not known"
     where = f"{facts['gpu']}, {facts['cpu']}" if facts["gpu"] else f"{facts['cpu']}, {facts['instruction_set']}"

@@ -22,7 +22,7 @@ def _block(block: Block, folder: Path) -> str:
 
 
 def to_markdown(title: str, sections: Sequence[Section], folder: Path) -> str:
-    """The whole page; pictures are linked relative to `folder`, where it will lie."""
+    """Render the whole page; links to pictures are relative to `folder`, the folder of the page."""
     parts = [f"# {title}"]
     for section in sections:
         parts += [f"## {section.title}", *(_block(block, folder) for block in section.blocks)]

@@ -1,4 +1,4 @@
-"""What a model folder says of itself: Gaussians, times, scores, pictures."""
+"""Readers of a model folder: number of Gaussians, times, scores, rendered images."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from utils.system_utils import UserError, saved_iterations
 
 
 def ply_file(model: Path, iteration: int) -> Path:
-    """Where a saved iteration's Gaussians lie."""
+    """Return the path of a saved iteration's Gaussians."""
     return model / "point_cloud" / f"iteration_{iteration}" / "point_cloud.ply"
 
 
 def count_gaussians(model: Path, iteration: int) -> int:
-    """Number of Gaussians of a saved iteration, from the header of its PLY."""
+    """Read the number of Gaussians of a saved iteration from the header of its PLY."""
     ply = ply_file(model, iteration)
     try:
         with ply.open("rb") as file:
@@ -37,7 +37,7 @@ def count_gaussians(model: Path, iteration: int) -> int:
 
 
 def trained_gaussians(model: Path, iteration: int) -> int:
-    """Number of Gaussians that were trained: those of the PLY and those that the last save left out as unseen."""
+    """Return the number of Gaussians that were trained: those of the PLY, and those left out as unseen."""
     saved = count_gaussians(model, iteration)
     try:
         left_out = read_model_json(model).get("left_out") or {}
@@ -48,7 +48,7 @@ def trained_gaussians(model: Path, iteration: int) -> int:
 
 
 def shorter_ends_there(model: Path) -> bool:
-    """Whether fewer --iterations end with the very model that a longer training had on its way; False: not known."""
+    """Whether a training with fewer --iterations ends with the model that a longer one has then; False if unknown."""
     try:
         options = read_cfg_args(model)
     except UserError:
@@ -57,7 +57,7 @@ def shorter_ends_there(model: Path) -> bool:
 
 
 def load_scores(model: Path, method: str) -> tuple[dict[str, float | None], dict[str, dict[str, float | None]]]:
-    """Mean scores, and scores by metric and view, that metrics.py has written for a method."""
+    """Read metrics.py's scores of a method: the means, and the scores by metric and view. UserError without them."""
     try:
         results = read_json(model / "results.json")[method]
         per_view = read_json(model / "per_view.json")[method]
@@ -70,7 +70,7 @@ def load_scores(model: Path, method: str) -> tuple[dict[str, float | None], dict
 
 
 def training_seconds(model: Path, iteration: int) -> float | None:
-    """Seconds of training until an iteration, without tests and saving; None when train.py has not logged them."""
+    """Read the seconds of training until an iteration, without tests and saving; None if train.py logged none."""
     log = model / "train_log.json"
     if not log.is_file():
         return None
@@ -83,7 +83,7 @@ def training_seconds(model: Path, iteration: int) -> float | None:
 
 
 def picture(file: Path) -> Image.Image:
-    """A render or a ground truth, RGB."""
+    """Read a render or a ground truth, RGB."""
     try:
         with open_render(file) as image:
             return image.convert("RGB")
@@ -92,7 +92,7 @@ def picture(file: Path) -> Image.Image:
 
 
 def picture_size(file: Path) -> tuple[int, int]:
-    """Width and height in pixels, from the file's header."""
+    """Read width and height in pixels from the file's header."""
     try:
         with open_render(file) as image:
             return image.size
@@ -101,20 +101,20 @@ def picture_size(file: Path) -> tuple[int, int]:
 
 
 def view_names(folder: Path) -> list[str]:
-    """Names of a folder's PNGs, sorted; none where there is no folder."""
+    """List the names of a folder's PNGs, sorted; none if there is no folder."""
     return sorted(file.name for file in folder.glob("*.png") if not file.name.startswith("."))
 
 
 def mask_of(method: Path, name: str) -> np.ndarray | None:
-    """Which pixels of a view count, (H, W) bool, as metrics.py takes it; None where all do. method: folder `ours_N`."""
+    """Read which pixels of a view count for metrics.py, (H, W) bool; None: all. method: the folder `ours_N`."""
     file = method / "masks" / name
     return np.asarray(picture(file))[..., 0] > 0 if file.is_file() else None
 
 
 def ground_truth_digest(model: Path, method: str) -> str:
-    """SHA-256 of the test views' ground truth in their order: sizes, pixels, and which of these count.
+    """Return the SHA-256 of the test views' ground truth, in order: sizes, pixels, masks.
 
-    Two scores compare only where it is the same: it changes with split, resolution, resize filter, background, masks.
+    Scores can be compared only if it is the same. It changes with split, resolution, resize filter, background, masks.
     """
     digest = hashlib.sha256()
     folder = model / "test" / method

@@ -12,18 +12,21 @@ COMPARED = ("PSNR", "SSIM", "LPIPS", "gaussians")
 
 
 def published_tables() -> list[dict[str, Any]]:
-    """Tables with name, source, hardware, note, the `groups` and what else a run must `requires` be to compare;
-    `scenes` and `means` (of a group) hold numbers by iteration. LPIPS: VGG on [0, 1]; seconds: on that hardware."""
+    """Read the published tables.
+
+    A table has name, source, hardware and note. `groups` and `requires` tell which runs can be compared with it.
+    `scenes` and `means` (of a group) have numbers by iteration. LPIPS: VGG on [0, 1]; seconds: on that hardware.
+    """
     return read_json(Path(__file__).parent / "published.json")["tables"]
 
 
 def compare(
     runs: Sequence[dict[str, Any]], rows: Sequence[dict[str, Any]], means: Sequence[dict[str, Any]]
 ) -> list[dict[str, Any]]:
-    """Ours beside each published number of the same scene (or mean of a data set) and iteration.
+    """Compare our numbers with each published one of the same scene (or mean of a data set) and iteration.
 
-    runs, rows, means: of report.json (`runs`, `summary`, `dataset_means`). `other_options`: what ours was trained with
-    beyond the table's own options (null: not known); with any, it is these that a difference shows.
+    runs, rows, means: those of report.json (`runs`, `summary`, `dataset_means`). In the result, `other_options` has the
+    options of our training that the table's did not have (null: not known); they may explain a difference.
     """
     compared = []
     for table in published_tables():

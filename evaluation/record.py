@@ -1,4 +1,4 @@
-"""full_eval.json in a model folder: which stages are finished, with what, where and in how many seconds."""
+"""The file full_eval.json in a model folder: finished stages with their inputs, machine and seconds."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ NAME = "full_eval.json"
 
 
 class Record:
-    """What full_eval.py knows of a model folder: `key` (Run.key, None for models of others) and finished stages."""
+    """full_eval.py's record of a model folder: `key` (Run.key, None if others made the model) and finished stages."""
 
     def __init__(self, model: Path) -> None:
         self._path = model / NAME
@@ -24,24 +24,24 @@ class Record:
                     raise ValueError
                 self._content = content
             except (OSError, ValueError, KeyError, TypeError, RecursionError):
-                print(f"warning: {self._path} is damaged, so nothing there counts as finished", file=sys.stderr)
+                print(f"warning: {self._path} is damaged; its stages will be repeated", file=sys.stderr)
 
     @property
     def key(self) -> dict[str, Any] | None:
         return self._content.get("key")
 
     def stage(self, name: str) -> dict[str, Any] | None:
-        """What was noted when the stage `name` ended well; None where it has not."""
+        """Return the notes of a stage that succeeded; None if it did not."""
         return self._content.get("stages", {}).get(name)
 
     def start(self, key: dict[str, Any]) -> None:
-        """Note what is going to be trained here."""
+        """Note the key of the training that starts here; another key discards the old stages."""
         if self.key != key:
             self._content = {"key": key, "stages": {}}
             self._write()
 
     def note(self, name: str, **values: Any) -> None:
-        """A stage has ended well (or, for training, was interrupted or failed): remember it."""
+        """Note that a stage succeeded, or that training was interrupted or failed."""
         self._content.setdefault("key", None)
         self._content.setdefault("stages", {})[name] = values
         self._write()

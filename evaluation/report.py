@@ -1,4 +1,4 @@
-"""report.json, report.md, report.html, the figures and timing.txt."""
+"""Files of the report: report.json, report.md, report.html, the figures and timing.txt."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from utils.files.json_files import write_json
 from utils.system_utils import UserError, atomic_write
 
 TITLE = "3D Gaussian Splatting: evaluation"
-RESIZE_FILTER = "Pillow, bicubic, antialiased where it shrinks; 8-bit pictures"
+RESIZE_FILTER = "Pillow, bicubic, antialiased when it shrinks; 8-bit images"
 
 
 def make_report(command: Sequence[str], runs: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """All of report.json from what `results.read_run` says of each run; `command`: the words of the command line."""
+    """Make the content of report.json. command: words of the command line; runs: results of `results.read_run`."""
     rows = summarise(runs)
     means = dataset_means(rows)
     return {
@@ -41,7 +41,7 @@ def make_report(command: Sequence[str], runs: Sequence[dict[str, Any]]) -> dict[
 
 
 def _cheapest(runs: Sequence[dict[str, Any]]) -> dict[str, list[dict[str, Any]]]:
-    """By scene, where there are option sets to choose from."""
+    """Return the `cheapest` table of each scene that has several option sets."""
     found = {}
     for scene in dict.fromkeys(run["scene"] for run in runs):
         curves: dict[str, list] = {}
@@ -54,14 +54,14 @@ def _cheapest(runs: Sequence[dict[str, Any]]) -> dict[str, list[dict[str, Any]]]
 
 
 def _warnings(runs: Sequence[dict[str, Any]], rows: Sequence[dict[str, Any]]) -> list[str]:
-    """What keeps numbers of one report from being compared."""
+    """Return the reasons why numbers of this report cannot be compared."""
     lines = []
     for scene in dict.fromkeys(run["scene"] for run in runs):
         truths = {run["ground_truth_sha256"] for run in runs if run["scene"] == scene and run["ground_truth_sha256"]}
         if len(truths) > 1:
             lines.append(
-                f"{scene}: its runs were scored on different ground truth (size, split, background or masks), so their "
-                "scores and curves do not compare."
+                f"{scene}: the runs were scored on different ground truth (size, split, background or masks), so their "
+                "scores and curves cannot be compared."
             )
     for name in ("commit", "cpu", "gpu", "instruction_set", "threads"):
         values = {str(run["machine"].get(name)) for run in runs if run["machine"]}
@@ -92,7 +92,7 @@ def write_report(report: Mapping[str, Any], output: Path) -> None:
 
 
 def _draw(output: Path, scene: str, runs: Sequence[dict[str, Any]]) -> list[Picture]:
-    """The pictures of a scene: its curves, and the worst views of each option set's first whole run."""
+    """Draw the figures of a scene: its curves, and the worst views of each option set's first run that succeeded."""
     folder = output / "figures"
     pictures = []
     path = folder / f"{scene}_curves.png"
@@ -109,7 +109,7 @@ def _draw(output: Path, scene: str, runs: Sequence[dict[str, Any]]) -> list[Pict
         try:
             drawn = draw_worst_views(path, run, output)
         except UserError as error:
-            print(f"warning: no worst views of {run_title(run)}: {error}", file=sys.stderr)
+            print(f"warning: no figure of the worst views of {run_title(run)}: {error}", file=sys.stderr)
             continue
         if drawn:
             seen.add(run["config"])
@@ -118,7 +118,7 @@ def _draw(output: Path, scene: str, runs: Sequence[dict[str, Any]]) -> list[Pict
 
 
 def _timing(runs: Sequence[dict[str, Any]]) -> str:
-    """Minutes that train.py took (wall clock) for each group of scenes."""
+    """Return the wall-clock minutes of train.py for each group of scenes, as text."""
     minutes: dict[str, float] = {}
     for run in runs:
         if run["wall_seconds"] is not None:

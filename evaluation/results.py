@@ -1,4 +1,4 @@
-"""One run's part of report.json, read from its model folder."""
+"""A run's part of report.json, read from its model folder."""
 
 from __future__ import annotations
 
@@ -27,18 +27,18 @@ from scene.readers.records import HOLD
 from utils.files.json_files import read_json
 from utils.system_utils import UserError, saved_iterations
 
-WORST = 3  # views with the lowest PSNR that are shown of each run
+WORST = 3  # number of views with the lowest PSNR to show of each run
 
 
 def read_run(run: Run, output: Path, failure: Failure | None) -> dict[str, Any]:
-    """What is known of a run, as JSON; parts that are missing are null or empty. Paths are relative to `output`.
+    """Return everything known of a run, as JSON; missing parts are null or empty. Paths are relative to `output`.
 
-    finished: its last iteration is scored and no stage failed. A damaged file counts as a failure. options, source,
-    added_options: null where they are not known.
+    finished: the last iteration is scored and no stage failed. A damaged file counts as a failure. options, source,
+    added_options: null if not known.
     """
     record = Record(run.model)
     trained = record.stage("train") or {}
-    # With --skip_training a model may be another's, or one made with other options than are asked for now.
+    # With --skip_training, another program or other options than this command's may have made the model.
     known = record.key or (None if (run.model / "point_cloud").exists() else run.key)
     curve = _curve(run.model)
     result = {
@@ -93,13 +93,13 @@ def _curve(model: Path) -> list[Row]:
 
 
 def _iteration(model: Path, iteration: int, curve: list[Row]) -> dict[str, Any]:
-    """Scores (metrics.py), time, size and memory at a saved iteration.
+    """Return the scores of metrics.py, time, size and memory at a saved iteration.
 
-    gaussians: as trained, which is what published tables count; gaussians_saved: without those left out as unseen.
+    gaussians: as trained, as published tables count; gaussians_saved: without those left out as unseen.
     """
     method = f"ours_{iteration}"
     point = next((row for row in curve if row["iteration"] == iteration), {})
-    # The peak only grows, so that of the last point before is a lower bound; only a point right there will do.
+    # Take memory only from a point at this very iteration: that of an earlier point would be a lower bound.
     values: dict[str, Any] = {
         "PSNR": None,
         "SSIM": None,
@@ -126,7 +126,7 @@ def _iteration(model: Path, iteration: int, curve: list[Row]) -> dict[str, Any]:
 
 
 def _json(path: Path) -> Any | None:
-    """A JSON file's content; None where there is none, or no JSON."""
+    """Read a JSON file; None if it is missing or not JSON."""
     try:
         return read_json(path)
     except (OSError, ValueError, RecursionError):
@@ -134,9 +134,9 @@ def _json(path: Path) -> Any | None:
 
 
 def _peak(curve: list[Row], model: Path) -> dict[str, Any] | None:
-    """Where the test views were clearly better before the end: that iteration, its PSNR and what was lost since.
+    """Return the iteration at which test views were clearly better than at the end, its PSNR, and the loss since.
 
-    shorter_ends_there: whether --iterations with that number gives that very model.
+    shorter_ends_there: whether --iterations with that number gives that model.
     """
     best = best_test(curve)
     if best is None or curve[-1]["test_psnr"] is None or best["test_psnr"] - curve[-1]["test_psnr"] < CLEAR:
@@ -151,20 +151,20 @@ def _peak(curve: list[Row], model: Path) -> dict[str, Any] | None:
 
 
 def _sizes(model: Path, iteration: int) -> list[list[int]]:
-    """The different sizes [width, height] of the test views, in pixels, ascending."""
+    """Return the distinct sizes [width, height] of the test views, in pixels, ascending."""
     folder = model / "test" / f"ours_{iteration}" / "gt"
     return [list(size) for size in sorted({picture_size(folder / name) for name in view_names(folder)})]
 
 
 def _view_counts(model: Path, iteration: int, scored: int) -> dict[str, int | None]:
-    """Number of training views, and of test views with a score: cameras.json lists both, and those wholly masked."""
+    """Count the training views and the scored test views. cameras.json lists all views, fully masked ones too."""
     cameras = _json(model / "cameras.json")
     held_out = len(view_names(model / "test" / f"ours_{iteration}" / "gt"))
     return {"test": scored, "train": len(cameras) - held_out if isinstance(cameras, list) else None}
 
 
 def _split(model: Path, iteration: int) -> str | None:
-    """Which views were held out, judged by the names in cameras.json, test views first; None where it cannot tell."""
+    """Name the split, judging by the names in cameras.json, which lists test views first; None if it cannot tell."""
     cameras = _json(model / "cameras.json")
     try:
         names = [str(camera["img_name"]) for camera in cameras]
@@ -176,7 +176,10 @@ def _split(model: Path, iteration: int) -> str | None:
 
 
 def _worst(model: Path, iteration: int) -> list[dict[str, Any]]:
-    """The test views with the lowest PSNR, worst first: file, picture's name (cameras.json lists test views first)."""
+    """Return the test views with the lowest PSNR, worst first: PSNR, file, name of the photo.
+
+    cameras.json has the names of the photos, test views first.
+    """
     scores = load_scores(model, f"ours_{iteration}")[1]["PSNR"]
     worst = sorted((value, name) for name, value in scores.items() if value is not None)[:WORST]
     cameras = _json(model / "cameras.json")

@@ -1,4 +1,4 @@
-"""What one training is: a scene under one option set with one seed, into a model folder of its own."""
+"""Plan of the runs: each trains a scene with one option set and one seed into its own model folder."""
 
 from __future__ import annotations
 
@@ -17,7 +17,10 @@ _DEFAULT_ITERATIONS = next(option.default for option in OptimizationParams.optio
 
 @dataclass(frozen=True)
 class Run:
-    """One training. `options`: train.py's words besides folders and silence; `added`: those that its table lacks."""
+    """One training.
+
+    options: words for train.py, without folders and --quiet. added: those of them that the data set's table lacks.
+    """
 
     scene: SceneEntry
     config: str | None
@@ -28,18 +31,18 @@ class Run:
 
     @property
     def title(self) -> str:
-        """For people: scene, option set, seed."""
+        """Scene, option set and seed, for messages."""
         seed = None if self.seed is None else f"seed {self.seed}"
         return ", ".join(part for part in (self.scene.name, self.config, seed) if part)
 
     @property
     def key(self) -> dict[str, object]:
-        """What must be the same for a finished training to stand: the scene's folder and train.py's options."""
+        """Scene folder and train.py's options; a finished training stays valid while they are the same."""
         return {"options": list(self.options), "scene": self.scene.source and str(self.scene.source)}
 
     @property
     def iterations(self) -> int | None:
-        """The last iteration, from the options; None where they are wrong (train.py says how)."""
+        """The last iteration, from the options; None if they are invalid, which train.py will report."""
         parser = argparse.ArgumentParser(add_help=False, exit_on_error=False)
         parser.add_argument("--iterations", type=int, default=_DEFAULT_ITERATIONS)
         try:
@@ -55,9 +58,9 @@ def plan_runs(
     configs: Mapping[str, Sequence[str]],
     seeds: Sequence[int],
 ) -> list[Run]:
-    """Every scene under every option set with every seed; empty `configs` or `seeds`: plain, without a folder for it.
+    """Plan a run for every scene, option set and seed. Empty `configs` or `seeds` mean one run without their folder.
 
-    common: train.py's words for all of them. Folders: output/<scene>[/<config>][/seed_N].
+    common: words for train.py in all runs. Model folders: output/<scene>[/<config>][/seed_N].
     """
     runs = []
     for scene in scenes:
@@ -74,7 +77,7 @@ def plan_runs(
 
 
 def check_outside_scenes(runs: Sequence[Run]) -> None:
-    """UserError where a model folder, and so perhaps the report, would lie in a scene's: nothing is written there."""
+    """Raise UserError if a model folder would lie in a scene folder, where nothing must be written."""
     sources = {run.scene.source.resolve() for run in runs if run.scene.source}
     for run in runs:
         for source in sources:
@@ -85,14 +88,14 @@ def check_outside_scenes(runs: Sequence[Run]) -> None:
 
 
 def check_folders(runs: Sequence[Run]) -> None:
-    """UserError where a model folder holds another training: nothing is overwritten, and nothing is mixed."""
+    """Raise UserError if a model folder has another training, which must not be overwritten or mixed."""
     for run in runs:
         record = Record(run.model)
         if record.key is None:
             if (run.model / "point_cloud").exists() or list(run.model.glob("chkpnt*.pth")):
                 raise UserError(
-                    f"{run.model} holds a model that full_eval.py has not trained; --skip_training scores it as it is, "
-                    "or choose another --output_path"
+                    f"{run.model} holds a model that full_eval.py has not trained; score it with --skip_training, or "
+                    "choose another --output_path"
                 )
         elif record.key != run.key:
             raise UserError(

@@ -11,7 +11,7 @@ from utils.system_utils import UserError
 _OUTDOOR = ("-i", "images_4")
 _INDOOR = ("-i", "images_2")
 
-# Pictures on which Kerbl et al. 2023 trained: Mip-NeRF 360 outdoors at a quarter, indoors at half the size.
+# Photos on which Kerbl et al. 2023 trained: a quarter of the size for Mip-NeRF 360 outdoors, half of it indoors.
 DATASETS: dict[str, dict[str, tuple[str, ...]]] = {
     "mipnerf360": {
         **dict.fromkeys(("bicycle", "flowers", "garden", "stump", "treehill"), _OUTDOOR),
@@ -20,13 +20,13 @@ DATASETS: dict[str, dict[str, tuple[str, ...]]] = {
     "tanksandtemples": dict.fromkeys(("truck", "train"), ()),
     "deepblending": dict.fromkeys(("drjohnson", "playroom"), ()),
 }
-FOLDERS = "scenes"  # group of what --scenes names
-RESERVED = {"figures"}  # of the report, beside the models
+FOLDERS = "scenes"  # group of the folders given as --scenes
+RESERVED = {"figures"}  # folders of the report, next to the models
 
 
 @dataclass(frozen=True)
 class SceneEntry:
-    """A scene: `source` is its folder, None where only a finished model is looked at; `options` are train.py's."""
+    """A scene: `source` is its folder, None if only a finished model is scored; `options` are words for train.py."""
 
     name: str
     group: str
@@ -35,14 +35,17 @@ class SceneEntry:
 
 
 def dataset_scenes(group: str, root: Path) -> list[SceneEntry]:
-    """The scenes of one of DATASETS under its root folder, there or not: one that is missing fails by itself."""
+    """List the scenes of one of DATASETS under its root folder, including missing ones, whose run will fail."""
     root = root.resolve()
     return [SceneEntry(name, group, root / name, options) for name, options in DATASETS[group].items()]
 
 
 def folder_scenes(folders: Sequence[Path]) -> list[SceneEntry]:
-    """A scene for each folder, named like it. Blender scenes (transforms_train.json, no sparse/) get `-w`: their
-    pictures have no background of their own, and published scores are over white. UserError for a missing folder."""
+    """Make a scene of each folder, with the folder's name. UserError for a missing folder.
+
+    Blender scenes (transforms_train.json, no sparse/) get `-w`, because their photos have no background and published
+    scores are over white.
+    """
     scenes = []
     for folder in folders:
         path = folder.resolve()
@@ -54,7 +57,7 @@ def folder_scenes(folders: Sequence[Path]) -> list[SceneEntry]:
 
 
 def finished_scenes(output: Path) -> list[SceneEntry]:
-    """The scenes of DATASETS that have a model folder in `output`: what there is to score without any data set."""
+    """List the scenes of DATASETS with a model folder in `output`, which can be scored without the data sets."""
     return [
         SceneEntry(name, group, None, options)
         for group, scenes in DATASETS.items()
@@ -64,11 +67,13 @@ def finished_scenes(output: Path) -> list[SceneEntry]:
 
 
 def check_names(scenes: Sequence[SceneEntry]) -> None:
-    """UserError where two scenes would share a model folder, or one would take the report's."""
+    """Raise UserError if two scenes would share a model folder, or one would use the report's."""
     seen = set()
     for scene in scenes:
         if scene.name in seen:
-            raise UserError(f"two scenes are named {scene.name}, and models go by the name; rename one folder")
+            raise UserError(
+                f"two scenes are named {scene.name}, but each model has its scene's name; rename one folder"
+            )
         if scene.name in RESERVED:
-            raise UserError(f"a scene cannot be named {scene.name}: the report's files lie there; rename its folder")
+            raise UserError(f"a scene cannot be named {scene.name}: the report uses that folder; rename the scene's")
         seen.add(scene.name)

@@ -1,4 +1,4 @@
-"""Train, render, score: each a subprocess, each left out, in silence, where it is finished."""
+"""The stages train, render and score. Each is a subprocess, and is skipped silently if it is finished."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _ROOT = Path(__file__).resolve().parents[1]
 
 @dataclass(frozen=True)
 class Failure:
-    """A stage that went wrong: its name, its command line (none where there was nothing to start), what was said."""
+    """A stage that failed: its name, its command line (empty if nothing was started), its last messages."""
 
     stage: str
     command: list[str]
@@ -38,14 +38,14 @@ class StageFailed(Exception):
 
 
 def train(run: Run, machine: dict[str, Any]) -> None:
-    """Train, unless that is finished; go on from the checkpoint that an interrupt has left, and from no other.
+    """Train, unless that is finished. Resume only from a checkpoint that an interrupt left.
 
-    One of a training that failed may hold half a densification, and with the same options it would fail again: then
-    training begins anew. `runs.check_folders` has seen to it that nothing in the model folder was made with other
-    options.
+    A checkpoint of a training that failed may hold half a densification, and would fail again with the same options, so
+    training then starts from the beginning. `runs.check_folders` has made sure that nothing in the model folder was
+    made with other options.
     """
     if run.scene.source is None:
-        raise StageFailed(Failure("train", [], [f"no folder was given for {run.scene.name}"]))
+        raise StageFailed(Failure("train", [], [f"no scene folder was given for {run.scene.name}"]))
     if not run.scene.source.is_dir():
         raise StageFailed(Failure("train", [], [f"no such scene folder: {run.scene.source}"]))
     record = Record(run.model)
@@ -69,7 +69,7 @@ def train(run: Run, machine: dict[str, Any]) -> None:
     _expect_success("train", command, done)
     iterations = saved_iterations(run.model / "point_cloud")
     if run.iterations not in iterations:
-        raise StageFailed(Failure("train", command, [f"train.py ended well, yet {run.model} lacks the last iteration"]))
+        raise StageFailed(Failure("train", command, [f"train.py succeeded, but {run.model} lacks the last iteration"]))
     record.note("train", iterations=iterations, machine=machine, wall_seconds=wall)
     _stop_if_asked(done)
 
@@ -82,7 +82,7 @@ def _trained(run: Run, record: Record) -> bool:
 
 
 def _checkpoints(run: Run) -> dict[Path, list[int]]:
-    """The checkpoints in the model folder that leave something to do, each with its `_stamp`."""
+    """Return the checkpoints in the model folder before the last iteration, each with its `_stamp`."""
     found = [path for path in run.model.glob("chkpnt*.pth") if re.fullmatch(r"\d+", path.stem[6:])]
     return {path: _stamp(path) for path in found if _iteration_of(path) < (run.iterations or 0)}
 
@@ -92,13 +92,13 @@ def _iteration_of(checkpoint: Path) -> int:
 
 
 def _note_stop(record: Record, done: Finished, checkpoint: Path, wall: float) -> None:
-    """Remember what a training has left that was stopped or failed, and in how many seconds with the parts before."""
+    """Note the checkpoint of a training that was stopped or failed, and its seconds including earlier parts."""
     stopped = done.interrupt and done.status in (128 + signal.SIGINT, 128 + signal.SIGTERM)
     record.note("train_interrupted" if stopped else "train_failed", checkpoint=checkpoint.name, wall_seconds=wall)
 
 
 def _interrupted(run: Run, record: Record) -> dict[str, Any] | None:
-    """What was noted of an interrupt, where its checkpoint is still there."""
+    """Return the notes of an interrupt whose checkpoint still exists; None if there are none."""
     noted = record.stage("train_interrupted") or {}
     return noted if noted.get("checkpoint") in [path.name for path in _checkpoints(run)] else None
 
@@ -115,9 +115,9 @@ def _from_where(checkpoint: Path | None, record: Record) -> str:
 
 
 def render(run: Run, options: Sequence[str]) -> None:
-    """Render the test views of every saved iteration; those whose model is as it was then are left out.
+    """Render the test views of every saved iteration, except those already rendered from the same model.
 
-    options: further words for render.py.
+    options: more words for render.py.
     """
     record = Record(run.model)
     iterations = saved_iterations(run.model / "point_cloud")
@@ -135,26 +135,26 @@ def render(run: Run, options: Sequence[str]) -> None:
         finished = run_child(command)
         _expect_success("render", command, finished)
         if not (views := _rendered(run.model, iteration)):
-            raise StageFailed(Failure("render", command, ["there are no test views, so there is nothing to score"]))
+            raise StageFailed(Failure("render", command, ["the scene has no test views, so there is nothing to score"]))
         record.note(f"render_{iteration}", **wanted, views=views, wall_seconds=round(finished.seconds, 3))
         _stop_if_asked(finished)
 
 
 def _stamp(file: Path) -> list[int]:
-    """Tells whether a file is still the same, without reading it."""
+    """Return size and time of a file, to tell whether it changed without reading it."""
     state = file.stat()
     return [state.st_size, state.st_mtime_ns]
 
 
 def _rendered(model: Path, iteration: int) -> int:
-    """Number of views of which both the render and the ground truth are there; 0 where one is missing."""
+    """Return the number of rendered views; 0 if a render or a ground truth is missing."""
     folder = model / "test" / f"ours_{iteration}"
     renders, truth = view_names(folder / "renders"), view_names(folder / "gt")
     return len(renders) if renders == truth else 0
 
 
 def score(run: Run) -> None:
-    """metrics.py, unless the same renders are scored."""
+    """Run metrics.py, unless the same renders are already scored."""
     record = Record(run.model)
     iterations = saved_iterations(run.model / "point_cloud")
     methods = [f"ours_{iteration}" for iteration in iterations if _rendered(run.model, iteration)]
@@ -174,7 +174,7 @@ def score(run: Run) -> None:
 
 
 def _times_stamp(model: Path, method: str) -> list[int] | None:
-    """Tells whether the renders are still the same: render.py times each set, last of all. None: not render.py's."""
+    """Return the `_stamp` of the file that render.py writes last, to tell whether renders changed; None without it."""
     times = model / "test" / method / render_times.NAME
     return _stamp(times) if times.is_file() else None
 

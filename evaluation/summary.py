@@ -12,9 +12,9 @@ QUANTITIES = ("PSNR", "SSIM", "LPIPS", "seconds", "gaussians", "gaussians_saved"
 
 
 def spread(values: Iterable[float | None]) -> dict[str, Any]:
-    """Mean, standard deviation of the sample (n - 1 below the sum; None for one value) and the values themselves.
+    """Return the mean, the sample standard deviation (with n - 1; None for one value) and the values.
 
-    The mean is None as soon as one value is: a mean over fewer seeds would not compare.
+    The mean is None if any value is: a mean over fewer seeds could not be compared.
     """
     numbers = list(values)
     known = bool(numbers) and None not in numbers
@@ -26,9 +26,9 @@ def spread(values: Iterable[float | None]) -> dict[str, Any]:
 
 
 def summarise(runs: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """For each scene, option set and scored iteration the spread of QUANTITIES over the seeds.
+    """Return the spread of QUANTITIES over the seeds, for each scene, option set and scored iteration.
 
-    Seeds whose run failed are left out and listed under `failed_seeds`. In the order of `runs`.
+    Rows are in the order of `runs`. Seeds whose run failed are left out and listed as `failed_seeds`.
     """
     cells: dict[tuple, list[dict[str, Any]]] = {}
     for run in runs:
@@ -55,7 +55,7 @@ def summarise(runs: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def dataset_means(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Means over the scenes of a data set, for each option set and iteration, where all its scenes are there."""
+    """Return means over the scenes of a data set, for each option set and iteration that all its scenes have."""
     cells: dict[tuple, dict[str, dict[str, Any]]] = {}
     for row in rows:
         if row["group"] in DATASETS:

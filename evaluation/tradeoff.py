@@ -1,4 +1,4 @@
-"""Error against time across option sets: the Pareto front, and the cheapest set for a given error."""
+"""Error against time across option sets: the Pareto front, and the cheapest option set for a given error."""
 
 from __future__ import annotations
 
@@ -9,14 +9,17 @@ from typing import Any
 
 from records.error_curve import Row
 
-DROPS = (0.0, 0.1, 0.2, 0.5, 1.0, 2.0, 3.0, 5.0, 8.0)  # dB below the best: dense where the last tenths cost most
-WIDEST_STEP = 2.0  # ratio of the seconds of two points to interpolate between; across more, a line tells nothing
+DROPS = (0.0, 0.1, 0.2, 0.5, 1.0, 2.0, 3.0, 5.0, 8.0)  # dB below the best; dense where the last tenths get expensive
+WIDEST_STEP = 2.0  # largest ratio of the seconds of two points to interpolate between; a wider gap tells too little
 
 Curves = Mapping[str, Sequence[Sequence[Row]]]  # option set -> a curve for each seed
 
 
 def pareto_front(points: Sequence[tuple[float, float]]) -> list[int]:
-    """Indices of the points (cost, error) that no other beats in both, by ascending cost; of equal points the first."""
+    """Return the indices of the points (cost, error) that no other beats in both, by ascending cost.
+
+    Of equal points it keeps the first.
+    """
     front: list[int] = []
     for index in sorted(range(len(points)), key=lambda i: (*points[i], i)):
         if not front or points[index][1] < points[front[-1]][1]:
@@ -25,10 +28,10 @@ def pareto_front(points: Sequence[tuple[float, float]]) -> list[int]:
 
 
 def seconds_to_reach(curve: Sequence[Row], level: float) -> float | None:
-    """Seconds of training until the test PSNR first reaches `level` (dB), None if never.
+    """Return the seconds of training until the test PSNR first reaches `level` (dB); None if it never does.
 
-    Between two scored iterations PSNR is taken as linear in the logarithm of the seconds. Where the seconds more than
-    double between them, and before the first, the time of the iteration that reached the level counts.
+    Between scored iterations, PSNR is taken as linear in the logarithm of the seconds. If the seconds more than double
+    between them, and for the first one, the time of the iteration that reaches `level` counts instead.
     """
     before: Row | None = None
     for row in curve:
@@ -44,15 +47,16 @@ def seconds_to_reach(curve: Sequence[Row], level: float) -> float | None:
 
 
 def gaussians_to_reach(curve: Sequence[Row], level: float) -> float | None:
-    """Least number of Gaussians of the scored iterations that reach `level` (dB), None if none does."""
+    """Return the least number of Gaussians of a scored iteration that reaches `level` (dB); None if none does."""
     counts = [row["gaussians"] for row in curve if row["test_psnr"] is not None and row["test_psnr"] >= level]
     return min((count for count in counts if count is not None), default=None)
 
 
 def levels(curves: Curves) -> list[float]:
-    """PSNRs (dB, descending) to ask for: the best that all seeds of some option set reach, cut to a tenth, less DROPS.
+    """Return the PSNRs (dB, descending) of the table.
 
-    Levels that every option set has reached at its first point are left out.
+    The first is the best that all seeds of some option set reach, rounded down to a tenth. The others are DROPS below
+    it, down to the lowest PSNR at which a curve starts.
     """
     top = max((min(_best(curve) for curve in seeds) for seeds in curves.values() if seeds), default=-math.inf)
     if not math.isfinite(top):
@@ -71,9 +75,9 @@ def _best(curve: Sequence[Row]) -> float:
 
 
 def cheapest(curves: Curves) -> list[dict[str, Any]]:
-    """For each level: the option set that reaches it in the fewest seconds, and the one with the fewest Gaussians.
+    """Return, for each level, the option set that reaches it in the fewest seconds, and that with fewest Gaussians.
 
-    All seeds must reach the level, and their mean counts.
+    With several seeds, all must reach the level, and their mean counts.
     """
     rows = []
     for level in levels(curves):

@@ -211,32 +211,35 @@ def _cut(scene: Path) -> list[str]:
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        (_photos_themselves, r"room/input is the folder of the photos itself; give -s the folder around it, .*room$"),
-        (_photos_beside, r"no folder input in .*room, but 3 pictures in it itself; make .*input, move them there"),
+        (_photos_themselves, r"room/input is the folder of the photos itself; pass its parent folder as -s: .*room$"),
+        (_photos_beside, r"no folder input in .*room, but 3 photos directly in it; make .*input, move them there"),
         (_called_images, r"no folder input in .*room; rename its folder images to input"),
-        (_empty, r"no folder input in .*room; put the photos there, or give a video with --video"),
-        (_few, r"^1 photos .* in .*input, at least 3 are needed.*move walk.mp4 elsewhere and give it with --video"),
-        (_phone, r"1 files in .* kind that can't be read, the first is IMG_1.HEIC; convert them to JPEG or PNG"),
+        (_empty, r"no folder input in .*room; make it and put the photos there, or pass a video as --video"),
+        (_few, r"^1 photos .* in .*input; at least 3 are needed.*move walk.mp4 elsewhere and pass it as --video"),
+        (_phone, r"1 files in .* format that cannot be read, the first is IMG_1.HEIC; convert them to JPEG or PNG"),
         (_cut, r"cannot read the picture .*photo_01.png"),
-        (lambda scene: [str(scene / "nowhere")], r"no folder .*nowhere; make it, with the photos in a folder input"),
-        (lambda scene: [f"'{scene}'"], r"has quotes in it: '.*room'; give /.*room and quote it for the shell once"),
-        (lambda scene: [str(scene), "of", "mine"], r"don't know what to do with of; quote paths.*room of mine'"),
+        (lambda scene: [str(scene / "nowhere")], r"no folder .*nowhere; make it, put the photos into a folder input"),
+        (lambda scene: [f"'{scene}'"], r"contains quotes: '.*room'; pass /.*room, quoted only once for the shell"),
+        (lambda scene: [str(scene), "of", "mine"], r"unexpected argument of; quote paths.*room of mine'"),
         (
             lambda scene: [str(scene / "input" / "photo_00.png")],
-            r"photo_00.png is a file; give -s the folder that holds",
+            r"photo_00.png is a file; pass the folder that contains",
         ),
-        (lambda scene: [str(scene), "--camera", "PINHOLEY"], r"--camera PINHOLEY is no lens model.*OPENCV_FISHEYE"),
+        (
+            lambda scene: [str(scene), "--camera", "PINHOLEY"],
+            r"--camera PINHOLEY is not a supported lens model.*OPENCV_FISHEYE",
+        ),
         (
             lambda scene: [str(scene), "--camera", "EQUIRECTANGULAR"],
-            r"EQUIRECTANGULAR is no lens model that can be used",
+            r"EQUIRECTANGULAR is not a supported lens model",
         ),
-        (lambda scene: [str(scene), "--mask_path", "no"], r"no folder of masks 'no'; give an existing one"),
-        (lambda scene: [str(scene), "--mask_path", ""], r"no folder of masks ''; give an existing one"),
+        (lambda scene: [str(scene), "--mask_path", "no"], r"no folder of masks 'no'; pass an existing folder"),
+        (lambda scene: [str(scene), "--mask_path", ""], r"no folder of masks ''; pass an existing folder"),
         (lambda scene: [str(scene), "--mask_path", str(scene)], r"none of 3 photos has a mask .*photo_00.png.png"),
         (lambda scene: [str(scene), "--max_num_features", "0"], r"--max_num_features must be at least 100, got 0"),
         (lambda scene: [str(scene), "--skip_matching"], r"--skip_matching needs a COLMAP model in .*distorted/sparse"),
-        (lambda scene: [str(scene), "--video", "walk.mp4"], r"no video walk.mp4; give an existing file"),
-        (lambda scene: [str(scene), "--video", __file__], r"input has files already, and the frames would be mixed"),
+        (lambda scene: [str(scene), "--video", "walk.mp4"], r"no video walk.mp4; pass an existing file"),
+        (lambda scene: [str(scene), "--video", __file__], r"input already has files, and the frames would be mixed"),
         (lambda scene: [str(scene), "--colmap_executable", "/no/colmap"], r"cannot run --colmap_executable /no/colmap"),
     ],
 )
@@ -398,7 +401,7 @@ def test_programs_that_outlive_a_killed_caller_are_waited_for(tmp_path, monkeypa
 
 def test_a_program_that_fails_is_quoted(tmp_path):
     script = "import sys; print('first'); print('no disk left'); sys.exit(3)"
-    with pytest.raises(UserError, match=r"features failed \(status 3: no disk left\); the whole story is in .*log"):
+    with pytest.raises(UserError, match=r"features failed \(status 3: no disk left\); all output is in .*log"):
         run_programs([[sys.executable, "-c", script]], tmp_path / "log", "Features", 1, lambda: 0)
     with pytest.raises(UserError, match="cannot run /no/program"):
         run_programs([["/no/program"]], tmp_path / "log", "Features", 1, lambda: 0)
@@ -529,7 +532,7 @@ def test_photos_and_masks_that_can_not_be_used_are_named_at_once(tmp_path):
     (layout.input / "c.jpg").write_bytes(b"<html>")
     Image.new("L", (40, 30)).save(tmp_path / "masks" / "e.jpg.png")
     with pytest.raises(
-        UserError, match="^3 of 5 pictures can't be used: .*b.jpg.*c.jpg.*mask .*e.jpg.png has 40"
+        UserError, match="^3 of 5 photos cannot be used: .*b.jpg.*c.jpg.*mask .*e.jpg.png has 40"
     ) as error:
         check_photos(layout, names, tmp_path / "masks")
     assert "\n" not in str(error.value) and "a.jpg" not in str(error.value) and "d.jpg" not in str(error.value)
@@ -545,16 +548,19 @@ def _model(registered: int, points: int = 5000, track: float = 5.0, error: float
         ([_model(40)], []),
         (
             [_model(38)],
-            [r"2 of 40 photos were left out \(038, 039\), 1 of them match no other photo; .*--matcher exhaustive"],
+            [r"2 of 40 photos were left out \(038, 039\), and 1 of them match no other photo; .*--matcher exhaustive"],
         ),
         (
             [_model(25), _model(15, first=25)],
-            ["15 of 40", r"fall into 2 parts .*\(25 photos are used, the others have 15\)"],
+            ["15 of 40", r"form 2 parts .*\(25 photos are used, the other parts have 15\)"],
         ),
         ([_model(40), _model(12)], []),
-        ([_model(40, points=900)], ["only 900 points, 1000 or more .*photos help, and --max_num_features 16384$"]),
-        ([_model(40, track=2.4)], ["seen by 2.4 photos on average, which means little overlap"]),
-        ([_model(40, error=2.0)], ["miss their pixels by 2.0 pixels"]),
+        (
+            [_model(40, points=900)],
+            ["only 900 points; .*needs 1000; use larger or more photos, or --max_num_features 16384$"],
+        ),
+        ([_model(40, track=2.4)], ["in 2.4 photos on average, so the photos overlap little"]),
+        ([_model(40, error=2.0)], ["mean reprojection error is 2.0 pixels"]),
     ],
 )
 def test_advice(models, said):

@@ -239,7 +239,7 @@ def test_a_folder_in_use_is_left_alone(tmp_path):
 
 
 def test_a_scene_without_points_is_refused(tmp_path):
-    with pytest.raises(UserError, match="none of 1 points is seen by 3 views"):
+    with pytest.raises(UserError, match="none of 1 points is visible in 3 views"):
         make_scene(tmp_path / "out", 3, 24, 18, 1, 0)
     assert list(tmp_path.iterdir()) == []
 

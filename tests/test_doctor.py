@@ -50,14 +50,14 @@ def exit_status(*argv: str) -> int:
 
 def test_exit_statuses(healthy, colmap_scene, tmp_path, capsys):
     assert exit_status() == 0
-    assert capsys.readouterr().out.endswith("all is well\n")
+    assert capsys.readouterr().out.endswith("no problems found\n")
     assert exit_status("-s", str(colmap_scene)) == 1
     out = capsys.readouterr().out
     assert "PROBLEM only 17 pictures -> " in out and "PROBLEM only 300 points" in out and out.endswith("2 problems\n")
     for option in ("-s", "-m"):
-        with pytest.raises(UserError, match=f"no folder .*nowhere; give an existing one with {option}"):
+        with pytest.raises(UserError, match=f"no folder .*nowhere; pass an existing folder as {option}"):
             doctor.main([option, str(tmp_path / "nowhere")])
-        with pytest.raises(UserError, match=f"no folder ''; give an existing one with {option}"):
+        with pytest.raises(UserError, match=f"no folder ''; pass an existing folder as {option}"):
             doctor.main([option, ""])
 
 

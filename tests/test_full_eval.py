@@ -310,7 +310,7 @@ def test_trained_gaussians_are_reported_and_those_saved_beside(scenes, tmp_path)
     values = report["runs"][0]["iterations"]["40"]
     assert (values["gaussians"], values["gaussians_saved"]) == (17000, 16000)
     text = (out / "report.md").read_text()
-    assert "17,000" in text and "16,000" not in text and "Gaussians: those trained" in text
+    assert "17,000" in text and "16,000" not in text and "Gaussians are counted as trained" in text
     left_out["left_out"]["unseen"] = 999  # of another model: the PLY's rows and these do not add up
     (out / "attic" / "model.json").write_text(json.dumps(left_out))
     assert run(*words)["runs"][0]["iterations"]["40"]["gaussians"] == 16000
@@ -411,10 +411,10 @@ def test_seeds_and_option_sets(figures, scenes, tmp_path, capsys, monkeypatch):
         ("--scenes SCENES/attic SCENES/attic", "two scenes are named attic"),
         ("--scenes nowhere", "no such scene folder: nowhere"),
         ("--scenes SCENES/attic --iterations 0", "--iterations must be at least 1"),
-        ("--scenes SCENES/attic --seeds 1 1", "--seeds must be different"),
+        ("--scenes SCENES/attic --seeds 1 1", "--seeds must be distinct"),
         ("--scenes SCENES/attic --seeds 1 -- --seed 2", "--seed is given twice"),
-        ("--scenes SCENES/attic -- -m elsewhere", "after --: -m is set by full_eval.py itself"),
-        ("--scenes SCENES/attic -- --model=elsewhere", "--model=elsewhere is set by full_eval.py"),
+        ("--scenes SCENES/attic -- -m elsewhere", "after --: full_eval.py sets -m itself"),
+        ("--scenes SCENES/attic -- --model=elsewhere", "full_eval.py sets --model=elsewhere itself"),
         ("--scenes SCENES/attic --configs nowhere.json", "cannot read nowhere.json"),
         ("--scenes SCENES/attic -- --sh_degree 1 --sh_degreee 2", "after --: unrecognized arguments: --sh_degreee 2;"),
         ("--scenes SCENES/attic -- --sh_degree 4", "after --: --sh_degree must be between 0 and 3"),
@@ -436,13 +436,13 @@ def test_refusals(scenes, tmp_path, words, sentence):
 @pytest.mark.parametrize(
     ("text", "sentence"),
     [
-        ("{", "is no JSON"),
+        ("{", "is no table of option sets"),
         ("[]", "names no option sets"),
-        ('{"a": [], "a": []}', "a is there twice"),
+        ('{"a": [], "a": []}', "it has a twice"),
         ('{"../a": []}', "cannot name a folder"),
         ('{"seed_1": []}', "cannot name a folder"),
         ('{"a": "--sh_degree 1"}', "a must be a list"),
-        ('{"a": ["-s", "x"]}', "a: -s is set by full_eval.py itself"),
+        ('{"a": ["-s", "x"]}', "a: full_eval.py sets -s itself"),
         ('{"a": [], "b": ["--sh_degreee", 1]}', "configs.json, b: unrecognized arguments: --sh_degreee 1;"),
         ('{"a": ["--sh_degree"]}', "a: argument --sh_degree: expected one argument"),
         ('{"a": ["--iterations", "many"]}', "a: argument --iterations: invalid int value"),
@@ -482,7 +482,7 @@ def test_damaged_files_do_not_cost_the_report(scenes, tmp_path, capsys):
     assert [run["finished"] for run in report["runs"]] == [False, True, True, True, False]
     assert report["runs"][0]["failure"]["stage"] == "report"
     warnings = capsys.readouterr().err
-    assert "error_vs_time.csv cannot be read" in warnings and "no worst views of picture" in warnings
+    assert "error_vs_time.csv cannot be read" in warnings and "no figure of the worst views of picture" in warnings
     assert (out / "report.html").exists()
 
 

@@ -311,7 +311,7 @@ def without_eval(model: Path) -> None:
 @pytest.mark.parametrize(
     ("damage", "words"),
     [
-        (drop_render, "00001.png is in gt and not in renders"),
+        (drop_render, "00001.png is in gt but not in renders"),
         (shrink_render, r"00001.png has \(20, 20\) pixels"),
         (empty_folders, "no images"),
         (drop_side, "renders is missing"),

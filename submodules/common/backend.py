@@ -1,6 +1,7 @@
-"""setuptools' build backend with the environment's packages in sight: pip's isolation would hide the torch that is
-installed, and `requires = ["torch"]` would build against another one. Each extension's build_backend.py hands this on
-(pip accepts a backend only from inside the folder it builds).
+"""setuptools' build backend, with access to the environment's packages.
+
+pip's isolation would hide the installed torch, and `requires = ["torch"]` would build against another one. Each
+extension's build_backend.py re-exports this module, since pip accepts a backend only from inside the folder it builds.
 """
 
 import re
@@ -16,7 +17,7 @@ from setuptools.build_meta import *  # noqa: E402, F403
 
 
 def get_requires_for_build_wheel(config_settings: dict | None = None) -> list[str]:
-    """torch as requirements.txt pins it where the environment has none; nothing where it has one."""
+    """Require torch as pinned in requirements.txt, unless the environment has one."""
     requires = build_meta.get_requires_for_build_wheel(config_settings)
     if find_spec("torch") is None:
         requirements = Path(__file__).resolve().parents[2] / "requirements.txt"

@@ -1,6 +1,6 @@
-"""Rewrite what in a .cu file is not C++, so that a C++ compiler takes it with the headers of this folder.
+"""Translate .cu files to C++ that compiles with the headers of this folder.
 
-python translate.py FOLDER FILE...    writes what becomes of X.cu and X.cuh to FOLDER/X.cpp and FOLDER/X.cuh
+python translate.py FOLDER FILE...    writes the translations of X.cu and X.cuh to FOLDER/X.cpp and FOLDER/X.cuh
 """
 
 import re
@@ -13,12 +13,12 @@ _DYNAMIC_SHARED = re.compile(r"extern __shared__ ([\w:]+) (\w+)\[\];")
 
 
 def translate(source: str) -> str:
-    """C++ for the text of a .cu file; ValueError where something of CUDA is left."""
+    """Translate the text of a .cu file to C++; ValueError if some CUDA syntax is left."""
     source = _DYNAMIC_SHARED.sub(r"\1* \2 = static_cast<\1*>(gs::emulation::dynamic_shared());", source)
     source = _LAUNCH.sub(r"gs::emulation::launch(\2, [=](auto... arguments) { \1(arguments...); })", source)
     for rest in ("<<<", "asm(", "extern __shared__"):
         if rest in source:
-            raise ValueError(f"{rest!r} is left, which the emulation does not know")
+            raise ValueError(f"the emulation cannot translate {rest!r}")
     return source
 
 
