@@ -217,7 +217,7 @@ def _cut(scene: Path) -> list[str]:
         (_empty, r"no folder input in .*room; put the photos there, or give a video with --video"),
         (_few, r"^1 photos .* in .*input, at least 3 are needed.*move walk.mp4 elsewhere and give it with --video"),
         (_phone, r"1 files in .* kind that can't be read, the first is IMG_1.HEIC; convert them to JPEG or PNG"),
-        (_cut, r"cannot read the picture .*photo_01.png"),
+        (_cut, r"cannot read .*photo_01.png"),
         (lambda scene: [str(scene / "nowhere")], r"no folder .*nowhere; make it, with the photos in a folder input"),
         (lambda scene: [f"'{scene}'"], r"has quotes in it: '.*room'; give /.*room and quote it for the shell once"),
         (lambda scene: [str(scene), "of", "mine"], r"don't know what to do with of; quote paths.*room of mine'"),
@@ -300,7 +300,7 @@ def test_a_finished_scene_stays_until_the_next_one_is_there(copy, monkeypatch):
     before, work = scene(), folder_state(copy / "distorted")
     assert {"images", "images_2", "sparse"} <= {Path(name).parts[0] for name in before}
     (copy / "input" / "new.png").write_bytes(b"no picture")
-    refused("cannot read the picture .*new.png")
+    refused("cannot read .*new.png")
     (copy / "input" / "new.png").unlink()
     (copy / "masks").mkdir()
     refused("none of 8 photos has a mask", "--mask_path", str(copy / "masks"))
