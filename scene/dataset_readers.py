@@ -1,4 +1,4 @@
-"""Readers of datasets: folders to plain records, whichever kind they are."""
+"""Readers of datasets of all kinds: a folder becomes plain records."""
 
 import os
 from collections.abc import Callable, Sequence
@@ -44,13 +44,13 @@ def read_scene(
     masks: MaskOptions = NO_MASKS,
     offset: Sequence[float] | None = None,
 ) -> SceneInfo:
-    """Read the dataset in a folder, whichever kind it is. UserError says what was looked for and what was found.
+    """Read the dataset in a folder, of any kind. UserError says what was looked for and what was found.
 
-    images: folder of the pictures (COLMAP only). hold_out: keep a test set apart, else everything trains.
-    init_pcd_path: file of points to start from instead of the dataset's own; else init_type, "sfm" (those) or "random".
-    want_cloud: without, points are not judged, for a model that is there already.
-    offset: (3,) of the frame of that model (scene/readers/world_offset.py); None: found for this scene.
-    Pictures of distorting lenses are undistorted into the user's cache folder; nothing else is written.
+    images: folder of the photos (COLMAP only). hold_out: keep a test set apart, else all views train.
+    init_pcd_path: file of points to start from instead of the dataset's own. Without one, init_type decides: "sfm" (the
+    dataset's points) or "random". want_cloud: False reads no points, for a model that exists already.
+    offset: (3,) of that model's frame (scene/readers/world_offset.py); None: computed for this scene.
+    Photos of distorting lenses are undistorted into the user's cache folder; nothing else is written.
     """
     folder = Path(source_path)
     if not str(source_path):

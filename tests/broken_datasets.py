@@ -107,7 +107,7 @@ def _sparse(scene: Path) -> Path:
     return scene / "sparse" / "0"
 
 
-def _picture(scene: Path) -> Path:
+def _photo(scene: Path) -> Path:
     return scene / "images" / "left" / "v02.png"
 
 
@@ -175,7 +175,7 @@ def _(scene: Path) -> None:
     shutil.rmtree(scene / "sparse")
 
 
-@fault("colmap", "-s names the folder of the pictures")
+@fault("colmap", "-s names the folder of the photos")
 def _(scene: Path) -> Options:
     return {"source_path": str(scene / "images")}
 
@@ -242,7 +242,7 @@ def _(scene: Path) -> None:
     (_sparse(scene) / "images.bin").write_text("<!DOCTYPE html><html><body>404 Not Found</body></html>")
 
 
-@fault("colmap", "the model registers no picture")
+@fault("colmap", "the model registers no photo")
 def _(scene: Path) -> None:
     import pycolmap
 
@@ -279,7 +279,7 @@ def _(scene: Path) -> None:
     _as_text(scene, "images.txt", _replace_at(5, "nan"))
 
 
-@fault("colmap", "a picture of a camera that is not in cameras.txt")
+@fault("colmap", "a photo of a camera that is not in cameras.txt")
 def _(scene: Path) -> None:
     _as_text(scene, "images.txt", _replace_at(8, "77"))
     for name in ("rigs.txt", "frames.txt"):
@@ -291,7 +291,7 @@ def _(scene: Path) -> None:
     _as_text(scene, "points3D.txt", _replace_at(2, "nan"))
 
 
-# The pictures
+# The photos
 
 
 @fault("colmap", "the folder images is missing")
@@ -304,45 +304,45 @@ def _(scene: Path) -> Options:
     return {"images": "images_4"}
 
 
-@fault("colmap", "one picture is missing")
+@fault("colmap", "one photo is missing")
 def _(scene: Path) -> None:
-    _picture(scene).unlink()
+    _photo(scene).unlink()
 
 
-@fault("colmap", "the pictures were converted to another format")
+@fault("colmap", "the photos were converted to another format")
 def _(scene: Path) -> None:
     for path in sorted((scene / "images").rglob("*.png")):
         Image.open(path).save(path.with_suffix(".jpg"))
         path.unlink()
 
 
-@fault("colmap", "a picture is a link to nothing")
+@fault("colmap", "a photo is a link to nothing")
 def _(scene: Path) -> None:
-    _picture(scene).unlink()
-    os.symlink(scene / "gone.png", _picture(scene))
+    _photo(scene).unlink()
+    os.symlink(scene / "gone.png", _photo(scene))
 
 
-@fault("colmap", "a picture is cut short")
+@fault("colmap", "a photo is cut short")
 def _(scene: Path) -> None:
-    _cut(_picture(scene), 40)
+    _cut(_photo(scene), 40)
 
 
-@fault("colmap", "a picture is empty")
+@fault("colmap", "a photo is empty")
 def _(scene: Path) -> None:
-    _picture(scene).write_bytes(b"")
+    _photo(scene).write_bytes(b"")
 
 
-@fault("colmap", "a picture is a pointer of Git LFS")
+@fault("colmap", "a photo is a pointer of Git LFS")
 def _(scene: Path) -> None:
-    _picture(scene).write_text("version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\nsize 12345\n")
+    _photo(scene).write_text("version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\nsize 12345\n")
 
 
-@fault("colmap", "a picture has floating-point pixels")
+@fault("colmap", "a photo has floating-point pixels")
 def _(scene: Path) -> None:
-    Image.new("F", (96, 64), 0.5).save(_picture(scene), "TIFF")
+    Image.new("F", (96, 64), 0.5).save(_photo(scene), "TIFF")
 
 
-@fault("colmap", "--eval with one picture")
+@fault("colmap", "--eval with one photo")
 def _(scene: Path) -> Options:
     shutil.rmtree(scene)
     make_colmap_scene(scene, views=1)
@@ -416,7 +416,7 @@ def _(scene: Path) -> None:
     _transforms(scene, lambda content: content["frames"][1].pop("file_path"))
 
 
-@fault("blender", "the picture of a frame is missing")
+@fault("blender", "the photo of a frame is missing")
 def _(scene: Path) -> None:
     (scene / "train" / "r_1.png").unlink()
 

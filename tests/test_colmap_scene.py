@@ -242,7 +242,7 @@ def test_another_aspect_ratio_is_reported(colmap_scene, capsys):
     Image.new("RGB", (96, 66)).save(picture)
     _read(colmap_scene)
     said = capsys.readouterr().err
-    assert said.startswith("1 of 17 pictures") and f"left/{picture.name} (96 x 66, camera 96 x 64)" in said
+    assert said.startswith("1 of 17 photos") and f"left/{picture.name} (96 x 66, camera 96 x 64)" in said
 
 
 def test_bounded_store(colmap_scene, tmp_path):
@@ -343,10 +343,10 @@ def _no_views(scene):
         (_cut("cameras.bin"), r"cannot read the COLMAP model .*cameras.bin is cut short, 59 of 64 bytes"),
         (_cut("images.bin"), r"cannot read the COLMAP model in "),
         (_cut("points3D.bin"), r"cannot read the COLMAP model in "),
-        (_missing_pictures, r"7 of 17 pictures that .* lists are missing: .*Right/V03.png, .* and 2 more; .*-i"),
-        (_cut_picture, r"cannot read the picture .*left/v02.png"),
-        (_camera_model, r"picture Right/V03.png has the camera model EQUIRECTANGULAR, a panorama .*; cut it"),
-        (_no_views, r"has no registered picture"),
+        (_missing_pictures, r"7 of 17 photos that .* lists are missing: .*Right/V03.png, .* and 2 more; .*-i"),
+        (_cut_picture, r"cannot read .*left/v02.png"),
+        (_camera_model, r"photo Right/V03.png has the camera model EQUIRECTANGULAR, a panorama .*; cut it"),
+        (_no_views, r"has no registered photo"),
     ],
 )
 def test_bad_scenes_get_one_sentence_and_no_output(colmap_scene, tmp_path, change, said):
@@ -366,7 +366,7 @@ def test_no_such_folder(tmp_path):
 
 def test_hold_out_needs_a_second_picture(tmp_path):
     make_colmap_scene(tmp_path, views=1)
-    with pytest.raises(UserError, match="too few pictures for --eval"):
+    with pytest.raises(UserError, match="too few photos for --eval"):
         _read(tmp_path, hold_out=True)
     assert _read(tmp_path).extent > 0
 
@@ -395,7 +395,7 @@ def test_hold_out_needs_a_second_picture(tmp_path):
             b"ply\nformat ascii 1.0\nelement vertex 1\nproperty list uchar float x\nproperty float y\n"
             b"property float z\nproperty uchar red\nproperty uchar green\nproperty uchar blue\nend_header\n"
             b"2 1 1 0 0 1 1 1\n",
-            "lists where numbers are needed",
+            "lists instead of numbers",
         ),
         (
             b"ply\nformat binary_little_endian 1.0\nelement vertex 9\nproperty float x\nproperty float y\n"

@@ -214,13 +214,13 @@ def _cut(scene: Path) -> list[str]:
         (_photos_themselves, r"room/input is the folder of the photos itself; pass its parent folder as -s: .*room$"),
         (_photos_beside, r"no folder input in .*room, but 3 photos directly in it; make .*input, move them there"),
         (_called_images, r"no folder input in .*room; rename its folder images to input"),
-        (_empty, r"no folder input in .*room; make it and put the photos there, or pass a video as --video"),
-        (_few, r"^1 photos .* in .*input; at least 3 are needed.*move walk.mp4 elsewhere and pass it as --video"),
-        (_phone, r"1 files in .* format that cannot be read, the first is IMG_1.HEIC; convert them to JPEG or PNG"),
-        (_cut, r"cannot read the picture .*photo_01.png"),
-        (lambda scene: [str(scene / "nowhere")], r"no folder .*nowhere; make it, put the photos into a folder input"),
-        (lambda scene: [f"'{scene}'"], r"contains quotes: '.*room'; pass /.*room, quoted only once for the shell"),
-        (lambda scene: [str(scene), "of", "mine"], r"unexpected argument of; quote paths.*room of mine'"),
+        (_empty, r"no folder input in .*room; put the photos there, or give a video with --video"),
+        (_few, r"^1 photos .* in .*input, at least 3 are needed.*move walk.mp4 elsewhere and give it with --video"),
+        (_phone, r"1 files in .* kind that can't be read, the first is IMG_1.HEIC; convert them to JPEG or PNG"),
+        (_cut, r"cannot read .*photo_01.png"),
+        (lambda scene: [str(scene / "nowhere")], r"no folder .*nowhere; make it, with the photos in a folder input"),
+        (lambda scene: [f"'{scene}'"], r"has quotes in it: '.*room'; give /.*room and quote it for the shell once"),
+        (lambda scene: [str(scene), "of", "mine"], r"don't know what to do with of; quote paths.*room of mine'"),
         (
             lambda scene: [str(scene / "input" / "photo_00.png")],
             r"photo_00.png is a file; pass the folder that contains",
@@ -303,7 +303,7 @@ def test_a_finished_scene_stays_until_the_next_one_is_there(copy, monkeypatch):
     before, work = scene(), folder_state(copy / "distorted")
     assert {"images", "images_2", "sparse"} <= {Path(name).parts[0] for name in before}
     (copy / "input" / "new.png").write_bytes(b"no picture")
-    refused("cannot read the picture .*new.png")
+    refused("cannot read .*new.png")
     (copy / "input" / "new.png").unlink()
     (copy / "masks").mkdir()
     refused("none of 8 photos has a mask", "--mask_path", str(copy / "masks"))

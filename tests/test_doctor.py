@@ -181,7 +181,7 @@ def test_what_readers_say_becomes_a_line(colmap_scene, tmp_path):
     (picture, *_) = sorted((colmap_scene / "images" / "left").iterdir())
     Image.new("RGB", (96, 70)).save(picture)
     first = check_dataset(str(colmap_scene), "images")[0]
-    assert str(first).startswith("note    1 of 17 pictures have another aspect ratio") and not first.finding
+    assert str(first).startswith("note    1 of 17 photos have another aspect ratio") and not first.finding
     picture.unlink()
     (line,) = check_dataset(str(colmap_scene), "images")
     assert line.finding and "are missing" in line.text and "-i" in line.remedy

@@ -53,7 +53,7 @@ def test_names_with_spaces_and_letters_of_all_sorts(colmap_scene, text):
 def test_names_that_are_not_utf8(colmap_scene):
     path = colmap_scene / "sparse" / "0" / "images.bin"
     path.write_bytes(path.read_bytes().replace(b"left/v02", b"left/\xe902"))
-    with pytest.raises(UserError, match="picture names that are not UTF-8, rename pictures"):
+    with pytest.raises(UserError, match="photo names that are not UTF-8, rename the photos"):
         _read(colmap_scene)
 
 
@@ -70,11 +70,13 @@ def test_names_that_match_but_for_case_accents_or_slashes(colmap_scene, capsys):
     assert len(cameras) == 17 and all(path.is_file() for path in cameras.values())
     assert cameras[olds[1]].name == Path(olds[1]).name.upper()
     said = capsys.readouterr().err
-    assert said.startswith("2 of 17 pictures have other letters in their file names") and said.count("\n") == 1
+    assert (
+        said.startswith("2 of 17 photos are used although their file names differ in letters") and said.count("\n") == 1
+    )
 
     # Two that are alike, and neither the one: not to be guessed.
     shutil.copyfile(pictures / olds[1].upper(), pictures / olds[1].upper().replace("PNG", "Png"))
-    with pytest.raises(UserError, match="1 of 17 pictures"):
+    with pytest.raises(UserError, match="1 of 17 photos"):
         _read(colmap_scene)
 
 
@@ -87,14 +89,14 @@ def test_the_largest_of_several_models(colmap_scene, capsys):
     _read(colmap_scene)
     assert (
         capsys.readouterr().err
-        == f"{sparse / '0'} registers 17 pictures and is used; {sparse / '1'} 5, {sparse / '2'} 17\n"
+        == f"{sparse / '0'} registers 17 photos and is used; {sparse / '1'} 5, {sparse / '2'} 17\n"
     )
     shutil.rmtree(sparse / "2")
     (sparse / "1").rename(sparse / "large")
     (sparse / "0").rename(sparse / "1")
     (sparse / "large").rename(sparse / "0")
     assert len(_read(colmap_scene).train_cameras) == len(whole.train_cameras)
-    assert capsys.readouterr().err == f"{sparse / '1'} registers 17 pictures and is used; {sparse / '0'} 5\n"
+    assert capsys.readouterr().err == f"{sparse / '1'} registers 17 photos and is used; {sparse / '0'} 5\n"
 
     (sparse / "1" / "images.bin").write_bytes(b"broken")
     assert len(_read(colmap_scene).train_cameras) == 5

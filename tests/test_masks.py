@@ -172,7 +172,7 @@ def test_masks_are_found_by_the_names_of_the_pictures(masked_scene, capsys):
 
     next(masked_scene.rglob("masks/left/*.png.png")).unlink()
     (lacking,) = [view.image_name for view in _views(masked_scene, masks="masks") if view.mask is None]
-    assert f"1 of 17 pictures have no mask and count whole: {lacking}" in capsys.readouterr().err
+    assert f"1 of 17 photos have no mask and count whole: {lacking}" in capsys.readouterr().err
 
 
 def test_a_transparent_mask_is_alpha(masked_scene):
@@ -219,17 +219,17 @@ def test_alpha_is_background_unless_it_is_to_be_ignored(colmap_scene):
     [
         (
             lambda masks: masks.rename(masks.parent / "elsewhere"),
-            "no folder .*/masks for --masks; name one in the scene",
+            "no folder .*/masks for --masks; name a folder in the scene",
         ),
         (
             lambda masks: [path.rename(path.parent / f"mask_{path.name}") for path in masks.rglob("*.*")],
-            "no mask in .*/masks .* belongs to a picture: looked for .*V03.png.png .* name masks as the pictures",
+            "no mask in .*/masks .* belongs to a photo: looked for .*V03.png.png .* name masks as the photos",
         ),
         (
             lambda masks: [_save(path, np.zeros((9, 9), np.uint8)) for path in masks.rglob("*.*")],
-            "the mask .* is 9 x 9 pixels and its picture 96 x 64; make masks of the same shape",
+            "the mask .* is 9 x 9 pixels and its photo 96 x 64; make masks of the same shape",
         ),
-        (lambda masks: [path.write_bytes(b"x") for path in masks.rglob("*.*")], "cannot read the picture .*/masks/"),
+        (lambda masks: [path.write_bytes(b"x") for path in masks.rglob("*.*")], "cannot read .*/masks/"),
     ],
 )
 def test_bad_masks_get_one_sentence(masked_scene, change, said):
@@ -245,7 +245,9 @@ def test_masks_to_invert_must_be_named(colmap_scene, blender_scene):
 
 
 def test_what_is_to_be_ignored_must_be_there(colmap_scene, masked_scene):
-    with pytest.raises(UserError, match="--mask_meaning ignore has nothing to ignore: no masks are named, and no pict"):
+    with pytest.raises(
+        UserError, match="--mask_meaning ignore has nothing to ignore: no masks are named, and no photo"
+    ):
         _views(colmap_scene, mask_meaning="ignore")
     assert _views(masked_scene, mask_meaning="ignore", masks="masks")
     path = next(path for path in (colmap_scene / "images").rglob("*.png"))

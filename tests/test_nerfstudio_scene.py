@@ -116,7 +116,7 @@ def test_masks_of_frames(scene):
     (mask,) = [view.mask for view in views if view.mask is not None]
     assert mask.shape == (1, 64, 96) and mask[:, 32:].all() and not mask[:, :32].any()
     _edit(scene, lambda content: content["frames"][3].update(mask_path="masks/two.png"))
-    with pytest.raises(UserError, match=r"1 of 1 pictures that \(as masks\) .*transforms.json lists are missing"):
+    with pytest.raises(UserError, match=r"1 of 1 masks that .*transforms.json lists are missing"):
         _read(scene)
 
 
@@ -199,7 +199,7 @@ def _with(**changes):
         (_with(frames=[]), "lists no frames"),
         (lambda content: content.pop("frames"), "is not a camera file .*KeyError: 'frames'"),
         (lambda content: content.pop("fl_x"), "neither camera_angle_x nor fl_x"),
-        (lambda content: content["frames"][2].update(file_path="images/gone.png"), "1 of 17 pictures .*gone.png"),
+        (lambda content: content["frames"][2].update(file_path="images/gone.png"), "1 of 17 photos .*gone.png"),
     ],
 )
 def test_bad_scenes_get_one_sentence(scene, tmp_path, change, said):

@@ -147,7 +147,7 @@ def test_a_cache_that_cannot_be_written_is_named(tmp_path, monkeypatch):
 def test_a_broken_picture_is_named(tmp_path):
     path = _photo(tmp_path / "a.png")
     path.write_bytes(path.read_bytes()[:-4000])
-    with pytest.raises(UserError, match="cannot read the picture .*a.png"):
+    with pytest.raises(UserError, match="cannot read .*a.png"):
         undistort([Photo(path, (WIDTH, HEIGHT), _lens("OPENCV"))])
 
 
@@ -268,6 +268,6 @@ def test_a_wide_lens_in_a_scene(tmp_path, capsys):
     make_colmap_scene(folder, model="RADIAL", params=(25.0, 45.0, 34.5, 0.05, -0.02), views=2)
     for camera in _read(folder).train_cameras:
         assert camera.mask is not None
-    assert "2 pictures, the first is v" in capsys.readouterr().err
+    assert "2 photos, the first is v" in capsys.readouterr().err
     for view in Scene(_options(folder, tmp_path / "out"), FakeGaussians()).getTrainCameras():
         assert view.mask.shape == (1, view.image_height, view.image_width) and 0.3 < view.mask.float().mean() < 1

@@ -1,4 +1,4 @@
-"""Pictures from files: checked early, decoded at training size as uint8."""
+"""Photos from files: checked early, decoded at training size as uint8."""
 
 import os
 import warnings
@@ -14,15 +14,15 @@ from utils.files.image_files import UNREADABLE
 from utils.system_utils import UserError
 
 _TAIL = 4096
-# Large pictures are normal here; Pillow's own limit still refuses absurd ones. Once and for all, as filters that are
-# set for a block only are shared by all threads.
+# Large photos are normal here; Pillow's own limit still refuses absurd sizes. The filter is set once, because filters
+# set for a block apply to all threads.
 warnings.filterwarnings("ignore", category=Image.DecompressionBombWarning)
 
 
 def picture_size(path: Path) -> tuple[int, int]:
-    """Size (width, height) of a picture file, from its header. UserError for a file that is broken or cut short.
+    """Size (width, height) of an image file, from its header. UserError for a file that is broken or cut short.
 
-    The end of the file is looked at too: a picture without its end mark is decoded to see whether it is whole.
+    A file that lacks its format's end mark is decoded, to find out whether it is complete.
     """
     try:
         with Image.open(path) as image:
@@ -36,16 +36,17 @@ def picture_size(path: Path) -> tuple[int, int]:
 
 
 def may_be_transparent(path: Path) -> bool:
-    """Whether a picture file that can be read has an alpha channel or a transparent colour, from its header."""
+    """Whether a readable image file has an alpha channel or a transparent colour, from its header."""
     with Image.open(path) as image:
         return image.has_transparency_data
 
 
 def decode(path: Path, size: tuple[int, int]) -> Tensor:
-    """Picture (3,H,W) uint8, or (4,H,W) with straight alpha where the file has any, resized to size (width, height).
+    """Image (3,H,W) uint8 of a file, or (4,H,W) with straight alpha if it has any, at size (width, height).
 
-    Pillow's bicubic filter, antialiased when it shrinks; alpha weighs the colours (premultiplied) in resizing. EXIF
-    orientation is ignored, as it is by COLMAP. Grey, palette, CMYK and 16-bit pictures become 8-bit RGB.
+    Resized by Pillow's bicubic filter, antialiased when shrinking, with colours weighted by alpha (premultiplied). EXIF
+    orientation is ignored, as in COLMAP. Grey, palette, CMYK and 16-bit files become 8-bit RGB. UserError for a file
+    that cannot be read.
     """
     try:
         with Image.open(path) as image:
@@ -60,14 +61,14 @@ def decode(path: Path, size: tuple[int, int]) -> Tensor:
         raise _unreadable(path, error) from error
     except MemoryError as error:
         raise UserError(
-            f"not enough memory for the picture {path} at {size[0]} x {size[1]} pixels; choose a smaller size with -r"
+            f"not enough memory for {path} at {size[0]} x {size[1]} pixels; choose a smaller size with -r"
         ) from error
 
 
 def _unreadable(path: Path, error: Exception) -> UserError:
     if other := not_the_file(path):
-        return UserError(f"the picture {path} is {other}; fetch it again or take it out of the scene")
-    return UserError(f"cannot read the picture {path} ({error}); replace it or take it out of the scene")
+        return UserError(f"{path} is {other}; download it again or take it out of the scene")
+    return UserError(f"cannot read {path} ({error}); replace it or take it out of the scene")
 
 
 def _has_end_mark(path: Path, file_format: str | None) -> bool:

@@ -1,4 +1,4 @@
-"""Copies of pinned pictures to a GPU, made while it works on something else."""
+"""Copies of pinned images to a GPU, made while it computes."""
 
 from collections.abc import Collection, Hashable
 
@@ -7,7 +7,7 @@ from torch import Tensor
 
 
 class DeviceCopies:
-    """Copies on a stream of their own: they wait for no kernel, and kernels wait only for the picture they need."""
+    """Copies on a stream of their own: they wait for no kernel, and kernels wait only for the image they need."""
 
     def __init__(self, device: torch.device) -> None:
         self._device = device
@@ -15,7 +15,7 @@ class DeviceCopies:
         self._sent: dict[Hashable, tuple[Tensor, torch.cuda.Event]] = {}
 
     def send(self, key: Hashable, picture: Tensor) -> None:
-        """Begin to copy a pinned picture, unless that was begun before."""
+        """Start to copy a pinned image, unless its copy was started before."""
         if key in self._sent:
             return
         with torch.cuda.stream(self._stream):
@@ -25,15 +25,15 @@ class DeviceCopies:
         self._sent[key] = copy, ready
 
     def take(self, key: Hashable, picture: Tensor) -> Tensor:
-        """The copy, for the current stream, which waits for it; the host does not."""
+        """The copy, for use on the current stream. The stream waits for it, the host does not."""
         self.send(key, picture)
         copy, ready = self._sent.pop(key)
         current = torch.cuda.current_stream(self._device)
         current.wait_event(ready)
-        copy.record_stream(current)  # so that its memory is not used again before that stream is done with it
+        copy.record_stream(current)  # keeps its memory until that stream is done with it
         return copy
 
     def keep_only(self, keys: Collection[Hashable]) -> None:
-        """Drop copies that were not taken and are not among these."""
+        """Drop the untaken copies of all other keys."""
         for key in self._sent.keys() - set(keys):
             del self._sent[key]

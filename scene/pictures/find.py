@@ -1,4 +1,4 @@
-"""Files that a dataset names, looked for on disk."""
+"""Search for the files that a dataset names."""
 
 import os
 import sys
@@ -11,21 +11,21 @@ from utils.system_utils import UserError
 
 
 class FileIndex:
-    """Finds files below a folder by name, and where the exact one is missing by one that differs in letter case, in
-    the way accents are encoded (as between macOS and Linux), or in the kind of slash.
+    """Files below a folder, found by name.
 
-    merely_alike: the names whose file is not the exact one, and that file.
+    If the exact name is missing, a name is found that differs only in letter case, in the encoding of accents (as
+    between macOS and Linux), or in the kind of slash. merely_alike: names found that way, with their files.
     """
 
     def __init__(self, folder: Path) -> None:
         self.merely_alike: dict[str, Path] = {}
         self._folder = folder
-        self._folded_paths: dict[str, list[Path]] | None = None  # not before the first miss: a large folder takes time
+        self._folded_paths: dict[str, list[Path]] | None = None  # built at the first miss: a large folder takes time
 
     def find(self, *names: str) -> Path | None:
-        """The file of the first of these names that has one. None also where several files are alike, none exact."""
+        """The file of the first of these names that has one. None also when several files match, but none exactly."""
         for name in names:
-            # os.path, not Path.is_file: a name that is too long for the system is missing too.
+            # Path.is_file raises an error for a name that is too long for the system; here it counts as missing.
             if os.path.isfile(exact := self._folder / name):
                 return exact
         if self._folded_paths is None:
@@ -41,7 +41,7 @@ class FileIndex:
         return None
 
     def with_another_suffix(self, name: str) -> Path | None:
-        """A file of this name but for what follows its last dot, after a miss: the same picture in another format."""
+        """After a miss: a file of this name with another suffix, likely the same photo in another format."""
         stem = os.path.splitext(_folded(name))[0]
         alike = (
             paths[0] for folded, paths in (self._folded_paths or {}).items() if os.path.splitext(folded)[0] == stem
@@ -55,14 +55,20 @@ def _folded(name: str) -> str:
 
 
 def find_pictures(
-    folder: Path, names: Sequence[str], listed_by: str, remedy: str, suffixes: Sequence[str] = ()
+    folder: Path,
+    names: Sequence[str],
+    listed_by: str,
+    remedy: str,
+    suffixes: Sequence[str] = (),
+    kind: str = "photos",
 ) -> list[Path]:
-    """The files of pictures by their names in a folder. A line says when some are found under a name merely alike.
+    """The files of photos by their names in a folder. A message says when some were found by a merely similar name.
 
-    suffixes: may be missing in the names. UserError with the missing files; listed_by and remedy are parts of it.
+    suffixes: a name may lack one of these. UserError naming the missing files; listed_by, remedy and kind (plural) are
+    parts of the messages.
     """
     if names and not folder.is_dir():
-        raise UserError(f"there is no folder {folder}, where {listed_by} has its pictures; {remedy}")
+        raise UserError(f"there is no folder {folder}, where {listed_by} has its {kind}; {remedy}")
     index = FileIndex(folder)
     paths = [index.find(name, *(name + suffix for suffix in suffixes)) for name in names]
     missing = [name for name, path in zip(names, paths, strict=True) if path is None]
@@ -72,14 +78,14 @@ def find_pictures(
         other = index.with_another_suffix(missing[0])
         instead = f" ({other.relative_to(folder)} is there instead)" if other else ""
         raise UserError(
-            f"{len(missing)} of {len(paths)} pictures that {listed_by} lists are missing: "
+            f"{len(missing)} of {len(paths)} {kind} that {listed_by} lists are missing: "
             f"{some([str(folder / name) for name in missing])}{instead}; {remedy}"
         )
     if index.merely_alike:
         name, path = next(iter(index.merely_alike.items()))
         print(
-            f"{len(index.merely_alike)} of {len(paths)} pictures have other letters in their file names than in "
-            f"{listed_by}, the first is {path.relative_to(folder)} for {name}; they are used",
+            f"{len(index.merely_alike)} of {len(paths)} {kind} are used although their file names differ in letters "
+            f"from those in {listed_by}; the first is {path.relative_to(folder)} for {name}",
             file=sys.stderr,
         )
     return paths

@@ -1,7 +1,7 @@
-"""Camera models by COLMAP's names: which are pinholes already, and which pinhole picture the others become.
+"""Lenses, by COLMAP's camera models, and the pinhole cameras that replace them.
 
-COLMAP chooses the pinhole: no pixel of it lies outside the photo. Where rays of the photo's border cannot be projected
-by a pinhole (a fisheye that sees half the world and more) it has nothing to go by, and `WIDEST` decides instead.
+COLMAP chooses the pinhole so that none of its pixels lies outside the photo. A fisheye that sees half the world or more
+has border rays that no pinhole can project; then `WIDEST` decides.
 """
 
 import functools
@@ -13,13 +13,13 @@ import numpy as np
 from scene.pictures.pycolmap_import import import_pycolmap
 from utils.system_utils import UserError
 
-WIDEST = 60.0  # degrees to either side; a pinhole stretches what is farther out more than fourfold
-_PINHOLES = {"SIMPLE_PINHOLE": 3, "PINHOLE": 4}  # parameters each
-_ROUND_TRIP = 0.5  # pixels by which a border point may miss itself, there and back, before its ray counts as useless
+WIDEST = 60.0  # degrees to either side; farther out, a pinhole stretches the photo more than fourfold
+_PINHOLES = {"SIMPLE_PINHOLE": 3, "PINHOLE": 4}  # number of parameters
+_ROUND_TRIP = 0.5  # pixels: largest error of a usable ray, from a pixel to the ray and back
 
 
 class Lens(NamedTuple):
-    """COLMAP's camera model by name, its parameters in COLMAP's order, for pictures of width x height pixels."""
+    """COLMAP's camera model by name, its parameters in COLMAP's order, for photos of width x height pixels."""
 
     model: str
     params: tuple[float, ...]
@@ -28,7 +28,7 @@ class Lens(NamedTuple):
 
 
 class Pinhole(NamedTuple):
-    """Focal lengths and principal point in pixels of a picture of width x height, pixel centres at .5."""
+    """Focal lengths and principal point in pixels of an image of width x height, pixel centres at .5."""
 
     fx: float
     fy: float
@@ -39,10 +39,10 @@ class Pinhole(NamedTuple):
 
 
 class Undistortion(NamedTuple):
-    """How pictures of a lens become pinhole pictures.
+    """Parameters for turning photos of a lens into pinhole images.
 
     camera, options: pycolmap's, for undistort_image. pinhole: of the result. widest: half the angle in degrees to which
-    a wide lens is cut, else None.
+    the field of view of a wide lens is cut, else None.
     """
 
     camera: Any
@@ -52,9 +52,9 @@ class Undistortion(NamedTuple):
 
 
 def pinhole_of(lens: Lens, name: str) -> Pinhole | None:
-    """The lens as a pinhole, or None where pictures must be undistorted first.
+    """The lens as a pinhole, or None if its photos must be undistorted first.
 
-    name: of a picture, for the UserError that a lens which is unusable, or sees all around, ends in.
+    name: of a photo, for the message. UserError for a lens that is unusable or a panorama.
     """
     if not (np.isfinite(lens.params).all() and min(lens.width, lens.height) > 0):
         raise _unusable(lens, name)
@@ -64,12 +64,12 @@ def pinhole_of(lens: Lens, name: str) -> Pinhole | None:
         camera = _camera(lens, name)
         if not camera.is_perspective():
             raise UserError(
-                f"the picture {name} has the camera model {lens.model}, a panorama that no pinhole can show; cut it "
-                "into perspective pictures and reconstruct those"
+                f"the photo {name} has the camera model {lens.model}, a panorama that no pinhole can show; cut it "
+                "into perspective photos and reconstruct those"
             )
         focal = tuple(lens.params[index] for index in camera.focal_length_idxs())
         center = tuple(lens.params[index] for index in camera.principal_point_idxs())
-        # is_undistorted alone also holds for a fisheye without further parameters.
+        # is_undistorted alone is also true of a fisheye without further parameters.
         straight = camera.is_perspective_pinhole() and camera.is_undistorted()
         if not straight and min(focal) > 0:
             return None
@@ -81,7 +81,7 @@ def pinhole_of(lens: Lens, name: str) -> Pinhole | None:
 def _unusable(lens: Lens, name: str) -> UserError:
     return UserError(
         f"the camera of {name} has no usable size or focal length ({lens.model}, {lens.width} x {lens.height}, "
-        f"{lens.params}); mend it, or export the cameras again"
+        f"{lens.params}); fix it, or export the cameras again"
     )
 
 
@@ -95,7 +95,7 @@ def _camera(lens: Lens, name: str = "") -> Any:
 
 @functools.cache
 def undistortion(lens: Lens, width: int, height: int) -> Undistortion:
-    """How to undistort pictures of a lens that are width x height pixels large (the lens is scaled to that)."""
+    """Undistortion for photos of a lens that are width x height pixels large; the lens is scaled to that size."""
     pycolmap = import_pycolmap()
     camera = _camera(lens)
     if (lens.width, lens.height) != (width, height):
@@ -111,9 +111,9 @@ def undistortion(lens: Lens, width: int, height: int) -> Undistortion:
     return Undistortion(camera, options, pinhole, widest)
 
 
-@functools.lru_cache(maxsize=4)  # few, for they are large, and pictures of one lens mostly follow each other
+@functools.lru_cache(maxsize=4)  # few: they are large, and photos of one lens mostly follow each other
 def shown_pixels(lens: Lens, width: int, height: int) -> np.ndarray:
-    """Which pixels of the undistorted picture the photo, width x height pixels large, shows: (height, width) bool."""
+    """Pixels of the undistorted image that the photo, width x height pixels large, shows: (height, width) bool."""
     pycolmap = import_pycolmap()
     plan = undistortion(lens, width, height)
     white = pycolmap.Bitmap.from_array(np.full((height, width), 255, np.uint8))
@@ -130,7 +130,7 @@ def _border_can_be_projected(camera: Any) -> bool:
 
 
 def _round_trip(camera: Any, pixels: np.ndarray) -> np.ndarray:
-    """Distance (N,) in pixels of points (N,2) from where they come back to through their rays; infinite without one."""
+    """Error (N,) in pixels of points (N,2) after projection to their rays and back; infinite without a ray."""
     with np.errstate(all="ignore"):
         rays = np.column_stack([camera.cam_from_img(pixels), np.ones(len(pixels))])
         distance = np.linalg.norm(camera.img_from_cam(rays) - pixels, axis=1)
@@ -138,9 +138,9 @@ def _round_trip(camera: Any, pixels: np.ndarray) -> np.ndarray:
 
 
 def _seen_once(camera: Any, pinhole: Any) -> np.ndarray:
-    """(height, width) bool: pixels of the pinhole whose ray the photo really shows.
+    """Pixels of the pinhole whose rays the photo really shows: (height, width) bool.
 
-    Far out a distortion polynomial turns back, and the photo would be shown there again.
+    Far from the centre a distortion polynomial turns back, and would show parts of the photo a second time.
     """
     x, y = np.meshgrid(np.arange(pinhole.width) + 0.5, np.arange(pinhole.height) + 0.5)
     rays = pinhole.cam_from_img(np.column_stack([x.ravel(), y.ravel()]))

@@ -1,8 +1,8 @@
-"""Masks beside the pictures: which files, and what their black parts mean.
+"""Masks of the photos: their files, and the meaning of their black parts.
 
-White keeps and black masks, as COLMAP and nerfstudio have it. Two meanings of black:
-ignore: nobody knows what should be seen there, so such pixels are left out of loss and scores.
-transparent: nothing is there. The mask is the picture's alpha, and the background is what should be seen there.
+White keeps a pixel and black masks it, as in COLMAP and nerfstudio. Black has one of two meanings:
+ignore: the scene behind the pixel is unknown, so the pixel is left out of loss and scores.
+transparent: nothing is there. The mask is the photo's alpha, and a render must show the background.
 """
 
 import os
@@ -26,15 +26,15 @@ from utils.system_utils import UserError
 AUTO = "auto"
 IGNORE = "ignore"
 TRANSPARENT = "transparent"
-_REACH = ImageFilter.MinFilter(5)  # as far as bicubic resizing mixes: 2 pixels of the coarser size
+_REACH = ImageFilter.MinFilter(5)  # bicubic resizing mixes pixels up to 2 pixels of the coarser size apart
 
 
 @dataclass(frozen=True)
 class MaskOptions:
-    """What the user says of masks.
+    """The user's options for masks.
 
-    folder: in the scene folder, or absolute; empty: none but those that the dataset names. invert: white masks.
-    meaning: AUTO (mask files: ignore; alpha channels: transparent), IGNORE or TRANSPARENT (both).
+    folder: in the scene folder, or absolute; empty: only the masks that the dataset names. invert: white masks.
+    meaning: IGNORE or TRANSPARENT, for mask files and alpha channels; AUTO ignores under masks and keeps alpha.
     """
 
     folder: str = ""
@@ -43,7 +43,7 @@ class MaskOptions:
 
     @property
     def ignore_alpha(self) -> bool:
-        """Whether what is transparent in a picture is to be ignored."""
+        """Whether transparent pixels of a photo are ignored."""
         return self.meaning == IGNORE
 
     def mask(self, path: Path) -> "Mask":
@@ -56,7 +56,7 @@ NO_MASKS = MaskOptions()
 
 @dataclass(frozen=True)
 class Mask:
-    """A mask's file, whether white masks in it, and what that means (IGNORE or TRANSPARENT)."""
+    """A mask's file, whether white masks in it, and the meaning of masked (IGNORE or TRANSPARENT)."""
 
     path: Path
     inverted: bool = False
@@ -66,10 +66,10 @@ class Mask:
     def decode(self, size: tuple[int, int]) -> Tensor:
         """(1,H,W) uint8 at size (width, height): 255 keeps, 0 masks.
 
-        The file's alpha where it has any, else its brightness; where its values are 0 and 1 (of 255), as of True and
-        False saved as bytes, 1 means white. IGNORE knows no other values: brightness 128 or more keeps. At another size
-        than the file's only what no masked pixel has a say in is kept, when pictures are resized as
-        `scene.pictures.decode.decode` does it.
+        The values are the file's alpha if it has any, else its brightness. In a file of values 0 and 1 (booleans saved
+        as bytes), 1 means white. For IGNORE, 128 or more keeps and the result is 0 or 255. When the size differs from
+        the file's, IGNORE keeps only pixels that no masked pixel contributes to in the resizing of
+        `scene.pictures.decode.decode`.
         """
         pixels = decode(self.path, picture_size(self.path)).numpy()
         grey = pixels[3] if len(pixels) == 4 else pixels.max(axis=0)
@@ -95,7 +95,7 @@ def _resized(grey: np.ndarray, size: tuple[int, int], resampling: Image.Resampli
 
 @dataclass(frozen=True)
 class Cutout:
-    """A picture with a TRANSPARENT mask as its alpha, times the alpha of its own."""
+    """A photo whose alpha is multiplied by a TRANSPARENT mask."""
 
     path: Path
     mask: Mask
@@ -105,23 +105,23 @@ class Cutout:
         """(4,H,W) uint8 as `scene.pictures.decode.decode` gives it, with straight alpha."""
         full = picture_size(self.path)
         image = Image.fromarray(add_alpha(decode(self.path, full), self.mask.decode(full)).permute(1, 2, 0).numpy())
-        # Pillow weighs colours by alpha when it resizes, so what is masked does not bleed in.
+        # Pillow weights colours by alpha when it resizes, so masked colours do not bleed in.
         image = image if full == size else image.resize(size, Image.Resampling.BICUBIC)
         return torch.from_numpy(np.asarray(image).transpose(2, 0, 1).copy())
 
 
 def add_alpha(pixels: Tensor, mask: Tensor) -> Tensor:
-    """Picture (3 or 4,H,W) uint8 and mask (1,H,W) uint8 to a picture (4,H,W) whose alpha is the product of both."""
+    """Image (4,H,W) uint8 of an image (3 or 4,H,W) uint8, with its alpha multiplied by a mask (1,H,W) uint8."""
     if len(pixels) == 4:
         mask = (pixels[3:].int() * mask.int() + 127).div(255, rounding_mode="floor").to(torch.uint8)
     return torch.cat([pixels[:3], mask])
 
 
 def find_masks(scene: Path, names: Sequence[str], options: MaskOptions) -> list[Mask | None]:
-    """The mask of each picture, by name: `<name>`, `<name>.png` (COLMAP's way), or the name with another suffix.
+    """The mask of each photo, by name: `<name>`, `<name>.png` (as in COLMAP), or the name with another suffix.
 
-    None for all without a folder in the options. UserError when the folder is missing or has no mask for any of them;
-    where some lack one, a line says so.
+    All None without a folder in the options. UserError when the folder is missing or no photo has a mask in it. A
+    message names photos that have none.
     """
     if not options.folder:
         if options.invert:
@@ -129,26 +129,26 @@ def find_masks(scene: Path, names: Sequence[str], options: MaskOptions) -> list[
         return [None] * len(names)
     folder = scene / options.folder
     if not folder.is_dir():
-        raise UserError(f"no folder {folder} for --masks; name one in the scene folder, or give its whole path")
+        raise UserError(f"no folder {folder} for --masks; name a folder in the scene folder, or give an absolute path")
     index = FileIndex(folder)
     found = [_find(index, name) for name in names]
     lacking = [name for name, path in zip(names, found, strict=True) if path is None]
     if len(lacking) == len(names):
         raise UserError(
-            f"no mask in {folder} (--masks) belongs to a picture: looked for {names[0]}, {names[0]}.png and other "
-            f"suffixes, found {some(sorted(path.name for path in folder.iterdir()))}; name masks as the pictures"
+            f"no mask in {folder} (--masks) belongs to a photo: looked for {names[0]}, {names[0]}.png and other "
+            f"suffixes, found {some(sorted(path.name for path in folder.iterdir()))}; name masks as the photos"
         )
     if lacking:
-        print(f"{len(lacking)} of {len(names)} pictures have no mask and count whole: {some(lacking)}", file=sys.stderr)
+        print(f"{len(lacking)} of {len(names)} photos have no mask and count whole: {some(lacking)}", file=sys.stderr)
     return [None if path is None else options.mask(path) for path in found]
 
 
 def refuse_nothing_to_ignore(pictures: Sequence[tuple[Path, Mask | None]], options: MaskOptions) -> None:
-    """UserError for --mask_meaning ignore where no picture (its file, its mask) has a mask or an alpha channel."""
+    """UserError for --mask_meaning ignore when no photo, a file and its mask, has a mask or an alpha channel."""
     if options.meaning == IGNORE and not any(mask or may_be_transparent(path) for path, mask in pictures):
         raise UserError(
-            "--mask_meaning ignore has nothing to ignore: no masks are named, and no picture has an alpha channel; "
-            "name the folder of masks with --masks, or leave it out"
+            "--mask_meaning ignore has nothing to ignore: no masks are named, and no photo has an alpha channel; "
+            "name the folder of masks with --masks, or leave --mask_meaning out"
         )
 
 

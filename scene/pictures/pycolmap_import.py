@@ -1,4 +1,4 @@
-"""The one place that imports pycolmap: late, and with what it does to the process undone."""
+"""Import of pycolmap, when it is first needed, with its side effects undone."""
 
 import signal
 import threading
@@ -9,10 +9,11 @@ from PIL import Image  # noqa: F401
 
 
 def import_pycolmap() -> ModuleType:
-    """The module `pycolmap`. Late: importing it takes time and loads libraries that a Blender scene does not need."""
+    """The module `pycolmap`, whose import takes time and loads libraries that a Blender scene does not need."""
     import pycolmap
 
-    # It lets glog answer SIGTERM with a stack dump. Python does not see that, so its own idea brings back what was.
+    # The import lets glog answer SIGTERM with a stack dump. Python does not notice, so setting the handler that Python
+    # knows of restores it.
     handler = signal.getsignal(signal.SIGTERM)
     if handler is not None and threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGTERM, handler)

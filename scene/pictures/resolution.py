@@ -1,4 +1,4 @@
-"""Training size of a picture (the reference's rules, rounding modes included)."""
+"""Training size of a photo, by the reference's rules and with its rounding."""
 
 import functools
 import sys
@@ -6,18 +6,17 @@ import sys
 from utils.system_utils import UserError
 
 WIDEST = 1600
-LARGEST = 16384  # pixels a side; beyond, a slip of the keyboard is likelier than a machine with memory for it
+LARGEST = 16384  # pixels a side; a larger -r is likelier a typing error than meant for a machine that has the memory
 
 
 def training_size(width: int, height: int, resolution: int, scale: float = 1.0) -> tuple[int, int]:
-    """Size (width, height) in pixels at which a file of the given size trains.
+    """Size (width, height) in pixels at which a photo of the given file size trains, at least 1 x 1.
 
-    resolution: option -r. 1, 2, 4, 8 divide and round half to even; -1 keeps up to 1600 pixels of width; any other
-    value is the width. The last two truncate. scale: further factor by which it is made smaller. At least 1 pixel;
-    UserError above LARGEST pixels a side.
+    resolution: option -r. 1, 2, 4 and 8 divide, rounding half to even. -1 limits the width to 1600 pixels, any other
+    value is the width; both truncate. scale: divides the size further. UserError above LARGEST pixels a side.
     """
     if resolution > LARGEST:
-        raise UserError(f"--resolution (-r) {resolution} is too wide; the most is {LARGEST} pixels")
+        raise UserError(f"--resolution (-r) {resolution} is too wide; give at most {LARGEST} pixels")
     if resolution in (1, 2, 4, 8):
         size = round(width / (scale * resolution)), round(height / (scale * resolution))
     else:
@@ -31,13 +30,13 @@ def training_size(width: int, height: int, resolution: int, scale: float = 1.0) 
         size = int(width / (factor * scale)), int(height / (factor * scale))
     if max(size) > LARGEST:
         raise UserError(
-            f"a picture of {width} x {height} pixels would train at {size[0]} x {size[1]} with --resolution (-r) "
-            f"{resolution}, and the most is {LARGEST} a side; choose another"
+            f"a photo of {width} x {height} pixels would train at {size[0]} x {size[1]} with --resolution (-r) "
+            f"{resolution}, and the most is {LARGEST} a side; choose another resolution"
         )
     return max(size[0], 1), max(size[1], 1)
 
 
 @functools.cache
 def _notice() -> None:
-    # Cached: said once per process, not once per picture.
-    print(f"pictures wider than {WIDEST} pixels are shrunk to that width; -r 1 keeps their size", file=sys.stderr)
+    # Cached: printed once per process, not once per photo.
+    print(f"photos wider than {WIDEST} pixels are shrunk to that width; -r 1 keeps their size", file=sys.stderr)

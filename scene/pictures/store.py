@@ -1,4 +1,4 @@
-"""Decoded pictures of a scene: where they are kept, how many, and which are made ready ahead of their use."""
+"""Decoded images of a scene: decoded ahead of their use, and kept in the memory of the CPU or the GPU."""
 
 import os
 import sys
@@ -16,16 +16,16 @@ from scene.pictures.device_copies import DeviceCopies
 from utils.host.memory import free_memory
 from utils.host.threads import threads
 
-GPU_SHARE = 0.25  # of the memory free at the start: what pictures may take of a GPU; the model needs the rest
-COPIES_AHEAD = 2  # pictures copied to the GPU ahead of their use; a copy takes less than an iteration
+GPU_SHARE = 0.25  # of a GPU's free memory at the start that images may take; the model needs the rest
+COPIES_AHEAD = 2  # images copied to the GPU ahead of their use; a copy takes less than an iteration
 
 Size = tuple[int, int]  # width, height
 
 
 class Decodable(Protocol):
-    """A hashable source of pixels that are more than a photo: a mask (masks.py) or a depth map (depth_maps.py).
+    """A hashable source of pixels other than a photo: a mask (masks.py) or a depth map (depth_maps.py).
 
-    pixel_bytes: of what `decode` gives at a size (width, height), (channels,H,W).
+    pixel_bytes: bytes per pixel of the tensor (channels,H,W) that `decode` gives at a size (width, height).
     """
 
     pixel_bytes: int
@@ -35,16 +35,16 @@ class Decodable(Protocol):
 
 Source = Path | Decodable
 Picture = tuple[Source, Size]
-Key = tuple[str | Decodable, Size]  # files by their names, which are quicker to look up
+Key = tuple[str | Decodable, Size]  # files by name, which is faster to hash than a Path
 
 
 class ImageStore:
-    """Pictures of `decode`, and other sources that have one, each decoded once and kept.
+    """Images of photos and other sources, each decoded once and kept.
 
-    Beyond `limit` (0: none) the longest unused one is dropped; a mask or a depth map counts as a picture.
-    keep_on: device that keeps them. device: that which `get` hands them out on (default: keep_on). Where it is a GPU
-    and keep_on is not, they lie in pinned memory and are copied without waiting. Threads exist only while there is
-    something to decode ahead. For one calling thread.
+    limit: most images kept, 0: all; beyond it the least recently used one is dropped. A mask or a depth map counts as
+    an image. keep_on: device that keeps them. device: where `get` hands them out (default: keep_on). If only `device`
+    is a GPU, images lie in pinned memory and are copied without waiting. Threads exist only while there is something to
+    decode ahead. Call all methods from one thread.
     """
 
     def __init__(
@@ -61,10 +61,10 @@ class ImageStore:
         self._copies: DeviceCopies | None = None
 
     def plan(self, training: Iterable[Picture], others: Iterable[Picture] = ()) -> None:
-        """Say which pictures there will be, before the first is asked for.
+        """Announce all images, before the first is asked for.
 
-        Where they do not fit GPU_SHARE of a GPU's free memory, as many as are kept at once, the CPU keeps them. A limit
-        that all of them fit is none.
+        If the images kept at once exceed GPU_SHARE of a GPU's free memory, the CPU keeps them. A limit that all images
+        fit into is dropped.
         """
         self._awaited = {_key(source, size) for source, size in training}
         self._planned = self._awaited | {_key(source, size) for source, size in others}
@@ -77,14 +77,14 @@ class ImageStore:
 
     @property
     def planned_bytes(self) -> int:
-        """Memory that the pictures of `plan` take at most, as many as are kept at once."""
+        """Most bytes that the images of `plan` take, as many as are kept at once."""
         sizes = sorted((_bytes(*key) for key in self._planned), reverse=True)
         if self._copies:
             sizes = [1 << (size - 1).bit_length() for size in sizes]  # torch pins memory in powers of two
         return sum(sizes[: self.limit or None])
 
     def get(self, source: Source, size: Size) -> Tensor:
-        """Picture (3 or 4,H,W) uint8 of `decode`, or what the source decodes to, on the store's device.
+        """Image (3 or 4,H,W) uint8 of a photo, or the tensor that another source decodes to, on the store's device.
 
         UserError as `decode`.
         """
@@ -97,22 +97,22 @@ class ImageStore:
 
     @property
     def ahead(self) -> int:
-        """How many pictures `prefetch` can make use of, the one in use included; 0 when it has nothing to do."""
+        """Number of images that `prefetch` can use, the current one included; 0 when it has nothing to do."""
         if self.limit or self._awaited:
             most = 1 + 2 * self._workers
             return min(self.limit, most) if self.limit else most
         return 1 + COPIES_AHEAD if self._copies else 0
 
     def prefetch(self, coming: Sequence[Picture]) -> None:
-        """Begin to make pictures ready, without waiting: those that `get` is asked for next, in that order.
+        """Start to prepare the images that `get` is asked for next, in that order and at most `limit`; never waits.
 
-        At most `limit`. A picture that can't be decoded ends in an error where it is asked for, not here.
+        An image that cannot be decoded raises its error in `get`.
         """
         keys = list(dict.fromkeys(_key(source, size) for source, size in coming))[: self.limit or None]
         for key in keys:
             if key in self._kept:
                 self._kept.move_to_end(key)
-        # Now those that are not coming are in front, and no more are dropped than there are of them.
+        # The other images are now in front. They are dropped first, and there are enough of them.
         for key in keys:
             if key not in self._kept:
                 self._make_room()
@@ -128,11 +128,11 @@ class ImageStore:
                     self._copies.send(key, self._finished(key))
 
     def __len__(self) -> int:
-        """Pictures that are kept, those being decoded included."""
+        """Number of images that are kept, those being decoded included."""
         return len(self._kept)
 
     def _finished(self, key: Key) -> Tensor:
-        """Keep a picture that a thread decodes or has decoded, or that is decoded here; it is moved to `keep_on`."""
+        """Keep an image on `keep_on`, after a thread has decoded it, or decoded here and now."""
         future = self._kept.pop(key, None)
         if future is None:
             self._make_room()
@@ -147,14 +147,14 @@ class ImageStore:
     def _decode(self, key: Key) -> Tensor:
         source, size = key
         picture = decode(Path(source), size) if isinstance(source, str) else source.decode(size)
-        # Copies to a GPU wait for nothing only from pinned memory.
+        # Only copies from pinned memory to a GPU are asynchronous.
         return picture.pin_memory() if "cuda" in (self.keep_on.type, self.device.type) else picture
 
     def _make_room(self) -> None:
         while self.limit and len(self._kept) >= self.limit:
             _, oldest = self._kept.popitem(last=False)
             if isinstance(oldest, Future) and not oldest.cancel():
-                wait([oldest])  # a thread is at it, and holds as much memory as a picture kept
+                wait([oldest])  # a thread is decoding it, and holds as much memory as a kept image
 
 
 def _key(source: Source, size: Size) -> Key:
@@ -162,7 +162,7 @@ def _key(source: Source, size: Size) -> Key:
 
 
 def _bytes(source: str | Decodable, size: Size) -> int:
-    """Bytes of a decoded picture at most: a JPEG has no alpha, of others it is not known before they are decoded."""
+    """Most bytes of a decoded image: a JPEG has no alpha; other files may have some, which only decoding shows."""
     if not isinstance(source, str):
         return source.pixel_bytes * size[0] * size[1]
     channels = 3 if source.lower().endswith((".jpg", ".jpeg")) else 4
@@ -170,9 +170,9 @@ def _bytes(source: str | Decodable, size: Size) -> int:
 
 
 def picture_device(data_device: str, fallback: torch.device) -> torch.device:
-    """Device that keeps the pictures: option --data_device where it can be used, else the device that computes.
+    """Device that keeps the images: that of the option --data_device if it can be used, else the one that computes.
 
-    A line says so where that is another than the option names, but for plain cuda where no GPU computes.
+    A message says when the option is not followed, except for plain `cuda` when no GPU computes.
     """
     try:
         wanted = torch.device(data_device)
@@ -185,6 +185,6 @@ def picture_device(data_device: str, fallback: torch.device) -> torch.device:
     elif wanted.index is None:
         return fallback
     else:
-        reason = "is not there, or not used"
-    print(f"warning: --data_device {data_device} {reason}; pictures are kept on {fallback}", file=sys.stderr)
+        reason = "is not available"
+    print(f"warning: --data_device {data_device} {reason}; photos are kept on {fallback}", file=sys.stderr)
     return fallback

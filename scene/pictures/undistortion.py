@@ -1,7 +1,7 @@
-"""Pictures of distorting lenses as pinhole pictures, made once and kept in the user's cache folder.
+"""Photos of distorting lenses as pinhole images, made once and kept in the user's cache folder.
 
-A kept picture is found by what it was made from: the bytes of photo and mask, the lens, the options, the version of
-pycolmap. So an edited photo is undistorted anew, and a copied or moved scene is not.
+The key of a kept file covers the bytes of photo and mask, the lens, the options and the version of pycolmap. So an
+edited photo is undistorted again, and a copied or moved scene is not.
 """
 
 import hashlib
@@ -24,16 +24,16 @@ from utils.host.cache_folder import cache_folder
 from utils.host.threads import threads
 from utils.system_utils import UserError, atomic_write, mkdir_p
 
-_FORMAT = "2"  # of the files in the cache: to be raised when the same input shall give other files
+_FORMAT = "2"  # of the files in the cache; raise it when the same input must give other files
 
-_HAS_MASK = "mask"  # text of a picture's file, yes or no, so that a mask that was deleted is missed
+_HAS_MASK = "mask"  # text in an undistorted file, yes or no, so that a deleted mask is noticed
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")
 
 
 class Photo(NamedTuple):
-    """A picture to undistort: file and its size (width, height), lens, mask, and whether its alpha is to be ignored."""
+    """A photo to undistort: file and its size (width, height), lens, mask, and whether to ignore its alpha."""
 
     path: Path
     size: tuple[int, int]
@@ -43,7 +43,7 @@ class Photo(NamedTuple):
 
 
 class Undistorted(NamedTuple):
-    """The pinhole picture of a Photo, and the mask of what of it counts (None: all)."""
+    """The pinhole image of a Photo, as a file, and the mask of the pixels that count (None: all)."""
 
     path: Path
     pinhole: Pinhole
@@ -51,26 +51,26 @@ class Undistorted(NamedTuple):
 
 
 def undistort(photos: Sequence[Photo]) -> list[Undistorted]:
-    """Undistort pictures, or find them in the cache; a progress bar on stderr.
+    """Undistort photos, or find them in the cache, with a progress bar on stderr.
 
-    Bilinear, as COLMAP does it. Alpha is undistorted too; colours are weighed by it. UserError for a broken picture or
-    a cache that cannot be written.
+    Bilinear, as in COLMAP. Alpha is undistorted, too, and weights the colours. UserError for a broken photo or a cache
+    that cannot be written.
     """
     folder = cache_folder() / "undistorted"
     try:
         mkdir_p(folder)
     except UserError as error:
-        raise UserError(f"{error}; undistorted pictures are kept there, GS_CACHE names another folder") from error
+        raise UserError(f"{error}; undistorted photos are kept there, and GS_CACHE names another folder") from error
     _say_which_are_cut(photos)
     version = import_pycolmap().__version__
-    keys = _in_threads(lambda photo: _key(photo, version), photos, "Looking up undistorted pictures")
+    keys = _in_threads(lambda photo: _key(photo, version), photos, "Looking up undistorted photos")
     paths = [folder / key[:2] / f"{key}.png" for key in keys]
     missing = {path: photo for path, photo in zip(paths, photos, strict=True) if not _kept(path)}
     if missing:
-        _in_threads(lambda item: _make(item[1], item[0]), list(missing.items()), "Undistorting pictures")
+        _in_threads(lambda item: _make(item[1], item[0]), list(missing.items()), "Undistorting photos")
         size = sum(path.stat().st_size for path in missing)
         print(
-            f"{len(missing)} undistorted pictures ({size / 1e6:.0f} MB) are kept in {folder}; it may be deleted at any "
+            f"{len(missing)} undistorted photos ({size / 1e6:.0f} MB) are kept in {folder}; it may be deleted at any "
             "time, and GS_CACHE names another folder",
             file=sys.stderr,
         )
@@ -82,18 +82,18 @@ def _say_which_are_cut(photos: Sequence[Photo]) -> None:
     if cut:
         plan = undistortion(cut[0].lens, *cut[0].size)
         print(
-            f"{len(cut)} pictures, the first is {cut[0].path.name}, have a lens that sees more than a pinhole picture "
-            f"can show; of its field of view {2 * plan.widest:.0f} degrees are used",
+            f"{len(cut)} photos, the first is {cut[0].path.name}, have a lens that sees more than a pinhole image can "
+            f"show; {2 * plan.widest:.0f} degrees of its field of view are used",
             file=sys.stderr,
         )
 
 
 def _in_threads(work: Callable[[Job], Result], jobs: Sequence[Job], title: str) -> list[Result]:
-    # pycolmap, Pillow and hashlib let other threads run while they work.
+    # pycolmap, Pillow and hashlib release Python's lock while they work.
     with ThreadPoolExecutor(threads()) as pool:
         futures = [pool.submit(work, job) for job in jobs]
         try:
-            return [future.result() for future in tqdm(futures, desc=title, unit="picture", leave=False)]
+            return [future.result() for future in tqdm(futures, desc=title, unit="photo", leave=False)]
         except BaseException:
             pool.shutdown(cancel_futures=True)
             raise
@@ -108,13 +108,13 @@ def _key(photo: Photo, version: str) -> str:
             try:
                 content = path.read_bytes()
             except OSError as error:
-                raise UserError(f"cannot read the picture {path} ({error.strerror}); mend its rights") from error
+                raise UserError(f"cannot read {path} ({error.strerror}); fix its permissions") from error
             digest.update(len(content).to_bytes(8, "little") + content)
     return digest.hexdigest()
 
 
 def _kept(path: Path) -> bool:
-    """Whether the picture is in the cache and whole, and its mask too if it was made with one."""
+    """Whether the undistorted photo is in the cache and complete, with its mask if it was made with one."""
     if not path.is_file():
         return False
     try:
@@ -154,7 +154,7 @@ def _make(photo: Photo, path: Path) -> None:
             counts &= mask == 255
     shown = shown_pixels(photo.lens, *photo.size)
     if not counts.all():
-        # Interpolation mixes neighbours: a pixel counts if all that went into it does.
+        # Interpolation mixes neighbours: a pixel counts only if all that contribute to it count.
         shown = shown & (_warp(np.where(counts, 255, 0).astype(np.uint8), plan) == 255)
     mask_path = _mask_path(path)
     has_mask = not shown.all()
@@ -163,7 +163,7 @@ def _make(photo: Photo, path: Path) -> None:
             Image.fromarray(np.where(shown, 255, 0).astype(np.uint8)).save(temporary)
     text = PngInfo()
     text.add_text(_HAS_MASK, "yes" if has_mask else "no")
-    # After the mask: where the picture is, its mask is too.
+    # Written after the mask, so that a file never lacks its mask.
     with atomic_write(path) as temporary:
         Image.fromarray(_warp_picture(pixels, plan)).save(temporary, compress_level=1, pnginfo=text)
 

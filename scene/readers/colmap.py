@@ -1,4 +1,4 @@
-"""COLMAP scenes: a model in `sparse`, pictures in a folder beside it."""
+"""COLMAP scenes: a model in the folder sparse, photos in a folder beside it."""
 
 import os
 import sys
@@ -24,13 +24,13 @@ def readColmapSceneInfo(
     start: StartOptions | None = OWN_POINTS,
     masks: MaskOptions = NO_MASKS,
 ) -> SceneInfo:
-    """Read a COLMAP scene: the model, pictures in `<folder>/<images>`, views sorted by name (bytes).
+    """Read a COLMAP scene: the model, photos in `<folder>/<images>`, views sorted by name (bytes).
 
-    As `scene.dataset_readers.read_scene`.
+    Arguments and errors as for `scene.dataset_readers.read_scene`; start None: without points.
     """
     model_folder, model = colmap_model.find_model(folder)
     if not model.views:
-        raise UserError(f"the COLMAP model in {model_folder} has no registered picture; reconstruct the scene again")
+        raise UserError(f"the COLMAP model in {model_folder} has no registered photo; reconstruct the scene again")
     views = sorted(model.views, key=lambda view: os.fsencode(view.name))
     names = [view.name for view in views]
     listed_by = f"the COLMAP model in {model_folder}"
@@ -68,5 +68,5 @@ def _fresh_ply(model_folder: Path) -> Path | None:
     source = colmap_model.points_file(model_folder)
     if ply.stat().st_mtime >= source.stat().st_mtime:
         return ply
-    print(f"{ply} is older than {source.name} and is not used; --init_pcd_path {ply} would use it", file=sys.stderr)
+    print(f"{ply} is older than {source.name} and is not used; to use it, give --init_pcd_path {ply}", file=sys.stderr)
     return None

@@ -13,7 +13,7 @@ from utils.system_utils import UserError
 
 
 class ColmapView(NamedTuple):
-    """A registered picture: COLMAP's name, camera id and lens, world-to-camera rotation (3,3) and translation (3,)."""
+    """A registered photo: COLMAP's name, camera id and lens, world-to-camera rotation (3,3) and translation (3,)."""
 
     name: str
     camera_id: int
@@ -23,7 +23,7 @@ class ColmapView(NamedTuple):
 
 
 class ColmapModel(NamedTuple):
-    """Views in the order of their image ids; points (N,3) float64 and colours (N,3) uint8 in the order of theirs."""
+    """Views in the order of their image ids; points (N,3) float64 and colours (N,3) uint8 in the order of point ids."""
 
     views: list[ColmapView]
     points: np.ndarray
@@ -31,10 +31,10 @@ class ColmapModel(NamedTuple):
 
 
 def find_model(scene: Path) -> tuple[Path, ColmapModel]:
-    """Folder and contents of the COLMAP model with the most registered pictures: in `sparse` or one of its sub-folders.
+    """Folder and contents of the COLMAP model with the most registered photos, in `sparse` or one of its sub-folders.
 
-    Of equal ones `sparse/0` comes first, then `sparse`. A line says which is taken where there are several. UserError
-    that says what is there where there is none, or none can be read.
+    Among equals `sparse/0` comes first, then `sparse`. A message says which of several models is used. UserError saying
+    what was found when there is no model, or none that can be read.
     """
     sparse = scene / "sparse"
     inside = sorted(path for path in sparse.iterdir() if path.is_dir())
@@ -43,7 +43,7 @@ def find_model(scene: Path) -> tuple[Path, ColmapModel]:
     if not folders:
         found = sorted(str(path.relative_to(scene)) for path in sparse.glob("**/*"))[:8]
         raise UserError(
-            f"no COLMAP model in {sparse / '0'}, {sparse} or another folder in it: looked for cameras, images and "
+            f"no COLMAP model in {sparse / '0'}, {sparse} or its other folders: looked for cameras, images and "
             f"points3D as .bin or .txt, found {', '.join(found) or 'nothing'}; copy the whole model there"
         )
     models, errors = {}, []
@@ -56,15 +56,15 @@ def find_model(scene: Path) -> tuple[Path, ColmapModel]:
         raise errors[0]
     for error in errors:
         print(f"{error}; another model is used", file=sys.stderr)
-    best = max(models, key=lambda folder: len(models[folder].views))  # the first of equal ones
+    best = max(models, key=lambda folder: len(models[folder].views))  # the first among equals
     if len(models) > 1:
         others = ", ".join(f"{folder} {len(models[folder].views)}" for folder in models if folder != best)
-        print(f"{best} registers {len(models[best].views)} pictures and is used; {others}", file=sys.stderr)
+        print(f"{best} registers {len(models[best].views)} photos and is used; {others}", file=sys.stderr)
     return best, models[best]
 
 
 def read_model(folder: Path) -> ColmapModel:
-    """Read a model, binary or (where that is missing or broken) text. UserError when neither can be read."""
+    """Read a binary model, or a text model if that is missing or broken. UserError when neither can be read."""
     pycolmap = import_pycolmap()
     errors = []
     for suffix, read in (("bin", "read_binary"), ("txt", "read_text")):
@@ -77,7 +77,7 @@ def read_model(folder: Path) -> ColmapModel:
                 _check_cameras_whole(folder / "cameras.bin", model)
             return _records(model, {} if suffix == "bin" else _spaced_names(folder / "images.txt", model))
         except UnicodeDecodeError:
-            errors.append(f".{suffix}: picture names that are not UTF-8, rename pictures in plain letters")
+            errors.append(f".{suffix}: photo names that are not UTF-8, rename the photos in plain letters")
         except (ValueError, RuntimeError, LookupError, MemoryError) as error:
             errors.append(describe(folder, suffix, error))
     raise _unreadable(folder, errors)
@@ -85,13 +85,13 @@ def read_model(folder: Path) -> ColmapModel:
 
 def _unreadable(folder: Path, faults: list[str]) -> UserError:
     return UserError(
-        f"cannot read the COLMAP model in {folder} ({'; '.join(faults)}); mend that, or copy all three files again "
+        f"cannot read the COLMAP model in {folder} ({'; '.join(faults)}); fix that, or copy all three files again "
         "from where they were made"
     )
 
 
 class Sightings(NamedTuple):
-    """Points a registered picture sees: their pixels (n,2) of width x height, centres at .5, and depths z (n,)."""
+    """Points seen in a registered photo: their pixels (n,2) of width x height, centres at .5, and depths z (n,)."""
 
     name: str
     width: int
@@ -101,7 +101,7 @@ class Sightings(NamedTuple):
 
 
 def read_sightings(folder: Path, suffix: str) -> list[Sightings]:
-    """Sightings of all registered pictures of a model in files .bin or .txt. UserError when it can't be read."""
+    """Sightings of all registered photos of a model in .bin or .txt files. UserError when it cannot be read."""
     if not _has_model(folder, suffix):
         raise UserError(f"no COLMAP model in {folder} as .{suffix}; choose the other kind with --model_type")
     model = import_pycolmap().Reconstruction()
@@ -145,7 +145,7 @@ def _check_cameras_whole(path: Path, model) -> None:
 
 
 def _spaced_names(path: Path, model) -> dict[int, str]:
-    """Names with spaces in an images.txt by image id: pycolmap 4.2.1 ends names there, the format's lines do not."""
+    """Names with spaces in an images.txt, by image id: the format allows them, but pycolmap 4.2.1 cuts them off."""
     names = {}
     for line in path.read_text(encoding="utf-8").splitlines():
         fields = line.split(maxsplit=9)  # id, quaternion, translation, camera id, name; or else 2D points

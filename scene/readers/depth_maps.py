@@ -1,4 +1,4 @@
-"""Inverse depth maps that supervise training (--depths): which view has one, what its values mean, how to decode it."""
+"""Inverse depth maps that supervise training (--depths): their files, units and decoding."""
 
 import json
 import sys
@@ -22,15 +22,15 @@ from utils.host.cache_folder import cache_folder
 from utils.system_utils import UserError
 
 PARAMS = "depth_params.json"
-COLMAP_UNIT = 65536.0  # of a map's values, before scale and offset; depth_scale.py has 65535, as the reference has both
+COLMAP_UNIT = 65536.0  # of a map's values; depth_scale.py divides by 65535, and the reference does both
 BLENDER_UNIT = 512.0
-RELIABLE = 5.0  # a scale further than this factor from the scene's median is not believed
+RELIABLE = 5.0  # largest factor between a trusted scale and the scene's median scale
 _MAKE = "python utils/make_depth_scale.py --base_dir {scene} --depths_dir {depths}"
 
 
 @dataclass(frozen=True)
 class DepthMap:
-    """A view's inverse depth, 1 / world units: values of the file / unit * scale + offset."""
+    """Inverse depth of a view, 1 / world units: values of the file / unit * scale + offset."""
 
     path: Path
     unit: float
@@ -39,25 +39,27 @@ class DepthMap:
     pixel_bytes: ClassVar[int] = 4
 
     def decode(self, size: tuple[int, int]) -> Tensor:
-        """Inverse depth (1, H, W) float32 at a size (width, height). UserError for a file that can't be read."""
+        """Inverse depth (1, H, W) float32 at a size (width, height). UserError for a file that cannot be read."""
         values = np.maximum(resize(read_values(self.path) / self.unit, size), 0.0)
         return torch.from_numpy((values * self.scale + self.offset).astype(np.float32))[None]
 
 
 def with_depth_maps(info: SceneInfo, scene: Path, depths: str) -> SceneInfo:
-    """The scene with a DepthMap for each training view that has one to be believed; a message about the others.
+    """The scene with a DepthMap for each training view that has a reliable one; a message names the others.
 
-    depths: folder of the maps under the scene folder. UserError where that, or a map or depth_params.json is missing.
+    depths: folder of the maps under the scene folder. UserError when it, a map or depth_params.json is missing.
     """
     folder = scene / depths
     if not folder.is_dir():
-        raise UserError(f"no folder of depth maps {folder}; -d names it relative to the scene folder; or leave -d out")
+        raise UserError(
+            f"no folder of depth maps {folder}; name it with -d relative to the scene folder, or leave -d out"
+        )
     undistorted = [c.image_name for c in info.train_cameras if c.image_path.is_relative_to(cache_folder())]
     if undistorted:
         raise UserError(
-            f"-d needs pictures without distortion, and {len(undistorted)} are undistorted on load "
-            f"({some(undistorted)}), their depth maps not; undistort the scene with `colmap image_undistorter`, and "
-            "make the maps of its pictures"
+            f"-d needs photos without distortion: {len(undistorted)} photos are undistorted on load, while their depth "
+            f"maps are not ({some(undistorted)}); undistort the scene with `colmap image_undistorter`, and make "
+            "maps of the undistorted photos"
         )
     if (scene / "sparse").is_dir():
         maps = _colmap_maps(info.train_cameras, scene, folder)
@@ -70,12 +72,14 @@ def with_depth_maps(info: SceneInfo, scene: Path, depths: str) -> SceneInfo:
 
 
 def read_values(path: Path) -> np.ndarray:
-    """Values (H, W) float64 of a grey picture of 8 or 16 bits, as they are. UserError for one that is not grey."""
+    """Values (H, W) float64 of a grey image file of 8 or 16 bits, unscaled. UserError for a file that is not grey."""
     try:
         with Image.open(path) as image:
             if image.mode not in ("L", "I;16", "I;16B", "I"):
                 if _is_16_bit_color(path):
-                    raise UserError(f"the depth map {path} has 16-bit colours, which are not read whole; make it grey")
+                    raise UserError(
+                        f"the depth map {path} has 16-bit colours, which are read as 8 bits; save it as grey"
+                    )
                 image = image.convert("RGB")
             values = np.asarray(image).astype(np.float64)
     except UNREADABLE as error:
@@ -89,7 +93,7 @@ def read_values(path: Path) -> np.ndarray:
 
 
 def _is_16_bit_color(path: Path) -> bool:
-    # Pillow drops their lower half and tells nobody; the header of a PNG has the depth at 24 and the kind at 25.
+    # Pillow silently drops the lower 8 bits. Byte 24 of a PNG is the bit depth, byte 25 the colour type.
     with open(path, "rb") as file:
         header = file.read(26)
     return header.startswith(b"\x89PNG") and len(header) == 26 and header[24] == 16 and header[25] in (2, 6)
@@ -102,12 +106,12 @@ def resize(values: np.ndarray, size: tuple[int, int]) -> np.ndarray:
 
 
 def _centers(count: int, new: int) -> np.ndarray:
-    """Where `new` pixel centres of an axis lie among `count` old ones, which are 0, 1, ..."""
+    """Positions of `new` pixel centres of an axis among `count` old ones, which lie at 0, 1, ..."""
     return (np.arange(new) + 0.5) * count / new - 0.5
 
 
 def sample(values: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Bilinear values of (h, w) at columns x and rows y, pixel centres at integers; outside, those of the border."""
+    """Bilinear values of (h, w) at columns x and rows y, pixel centres at integers; outside, the border's values."""
 
     def split(at: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         at = np.clip(at, 0, count - 1)
@@ -125,7 +129,7 @@ def _colmap_maps(cameras: Sequence[CameraInfo], scene: Path, folder: Path) -> li
     path = colmap_model.find_model(scene)[0] / PARAMS
     make = _MAKE.format(scene=scene, depths=folder)
     if not path.is_file():
-        raise UserError(f"no {path}, which depth maps need; make it with `{make}`")
+        raise UserError(f"no {path}, which depth maps need; create it with `{make}`")
     params = _read_params(path, make)
     scales = [scale for scale, _ in params.values() if scale > 0]
     median = float(np.median(scales)) if scales else 0.0
@@ -134,26 +138,26 @@ def _colmap_maps(cameras: Sequence[CameraInfo], scene: Path, folder: Path) -> li
     for camera in cameras:
         name = Path(camera.image_name).with_suffix("").as_posix()
         scale, offset = params.get(name, (0.0, 0.0))
-        believed = scale > 0 and median / RELIABLE <= scale <= median * RELIABLE
-        if not believed:
+        reliable = scale > 0 and median / RELIABLE <= scale <= median * RELIABLE
+        if not reliable:
             (unreliable if name in params else unknown).append(camera.image_name)
-        maps.append(DepthMap(folder / f"{name}.png", COLMAP_UNIT, scale, offset) if believed else None)
+        maps.append(DepthMap(folder / f"{name}.png", COLMAP_UNIT, scale, offset) if reliable else None)
     reasons = [
         f"{len(names)} {what} ({some(names)})"
-        for names, what in ((unknown, f"not in {path}"), (unreliable, "of an unreliable scale there"))
+        for names, what in ((unknown, f"not in {path}"), (unreliable, "with an unreliable scale there"))
         if names
     ]
-    left_out = f"{len(unknown) + len(unreliable)} of {len(cameras)} training pictures have no depth loss: "
+    left_out = f"{len(unknown) + len(unreliable)} of {len(cameras)} training photos have no depth loss: "
     left_out += ", ".join(reasons)
     if not any(maps):
-        raise UserError(f"{left_out}; make the file again with `{make}`, or leave -d out")
+        raise UserError(f"{left_out}; create the file again with `{make}`, or leave -d out")
     if reasons:
         print(left_out, file=sys.stderr)
     return maps
 
 
 def _read_params(path: Path, make: str) -> dict[str, tuple[float, float]]:
-    """Scale and offset by picture name without extension."""
+    """Scale and offset by photo name without extension."""
     try:
         table = json.loads(path.read_text(encoding="utf-8"))
         params = {name: (float(entry["scale"]), float(entry["offset"])) for name, entry in table.items()}
@@ -161,14 +165,14 @@ def _read_params(path: Path, make: str) -> dict[str, tuple[float, float]]:
             raise ValueError("a number is not finite")
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise UserError(
-            f"{path} does not give a scale and an offset for every picture ({type(error).__name__}: {error}); make it "
+            f"{path} does not give a scale and an offset for every photo ({type(error).__name__}: {error}); create it "
             f"again with `{make}`"
         ) from error
     return params
 
 
 def _blender_file(camera: CameraInfo, scene: Path, folder: Path) -> Path:
-    """By the picture's path, which no other has, else by its name."""
+    """File named by the photo's path, which is unique, else by its name."""
     if camera.image_path.is_relative_to(scene):
         by_path = folder / camera.image_path.relative_to(scene).with_suffix(".png")
         if by_path.is_file():
@@ -185,8 +189,8 @@ def _check_files(paths: Sequence[Path]) -> None:
     shared = [str(path) for path, count in Counter(paths).items() if count > 1]
     if shared:
         raise UserError(
-            f"several training pictures have the same depth map: {some(shared)}; put a map for each into the folder, "
-            "in sub-folders as the pictures are (with COLMAP, give pictures names that differ by more than the suffix)"
+            f"several training photos have the same depth map: {some(shared)}; put a map for each into the folder, in "
+            "the sub-folders of the photos (with COLMAP, give photos names that differ by more than the suffix)"
         )
     for path in paths:
         picture_size(path)

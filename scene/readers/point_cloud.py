@@ -1,4 +1,4 @@
-"""Coloured point clouds from files: PLY, text and npz. `input.ply`, a scene's own points, `--init_pcd_path`."""
+"""Coloured point clouds in files: PLY, npz and text are read, PLY is written."""
 
 import os
 import warnings
@@ -17,19 +17,19 @@ _COLOR = ("red", "green", "blue")
 
 
 def is_ply(path: Path) -> bool:
-    """Whether the file begins as a PLY does."""
+    """Whether the file starts with the magic of a PLY."""
     return _begins_with(path, b"ply")
 
 
 def read_point_cloud(path: Path) -> BasicPointCloud:
-    """Points (float64) with colours and normals (0 where not given) of a file whose content tells its kind.
+    """Points (float64) with colours and normals (0 where missing) of a file, whose content decides its kind.
 
     PLY: x y z red green blue, integers as fractions of their type's maximum. npz: `points` or `xyz` (N,3), `colors` or
-    `rgb` (N,3). Text: three or six numbers a line, x y z and red green blue, split by spaces or commas. Colours of the
-    last two go to 1, or to 255 when any is above 1; without any the points are grey.
-    UserError for a file that is missing, none of these, or holds points that are not finite.
+    `rgb` (N,3). Text: three or six numbers a line, x y z and red green blue, split by spaces or commas. In the last two
+    kinds colours range to 1, or to 255 if any is above 1; points without colours are grey.
+    UserError for a file that is missing, of another kind, or has points that are not finite.
     """
-    if not os.path.isfile(path):  # not Path's, for which a name that is too long is an error
+    if not os.path.isfile(path):  # Path.is_file raises an error for a name that is too long
         raise UserError(f"no point cloud {path}; give the path of a PLY, npz or text file of points")
     if is_ply(path) or path.suffix.lower() == ".ply":
         cloud = _read_ply(path)
@@ -47,7 +47,7 @@ def _begins_with(path: Path, magic: bytes) -> bool:
         with open(path, "rb") as file:
             return file.read(len(magic)) == magic
     except OSError as error:
-        raise UserError(f"cannot read the point cloud {path} ({error.strerror}); mend its rights") from error
+        raise UserError(f"cannot read the point cloud {path} ({error.strerror}); fix its permissions") from error
 
 
 def _read_ply(path: Path) -> BasicPointCloud:
@@ -68,7 +68,7 @@ def _read_ply(path: Path) -> BasicPointCloud:
         if has_normals:
             normals[:] = np.stack([vertices[name] for name in _NORMAL], axis=1)
     except (TypeError, ValueError) as error:
-        raise UserError(f"the point cloud {path} has lists where numbers are needed; export it again") from error
+        raise UserError(f"the point cloud {path} has lists instead of numbers; export it again") from error
     return BasicPointCloud(points, colors, normals)
 
 
@@ -92,10 +92,10 @@ def _read_npz(path: Path) -> np.ndarray:
 def _read_text(path: Path) -> np.ndarray:
     try:
         lines = path.read_text(encoding="utf-8").replace(",", " ").replace(";", " ").splitlines()
-        # A first line that begins with a letter names the columns.
+        # A first line that starts with a letter names the columns.
         skip = 1 if lines and lines[0].lstrip()[:1].isalpha() else 0
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)  # about no lines at all
+            warnings.simplefilter("ignore", UserWarning)  # about an empty file
             table = np.loadtxt(lines[skip:], dtype=np.float64, ndmin=2)
         if not table.size or table.shape[1] not in (3, 6):
             raise ValueError(f"{table.shape[1]} columns" if table.size else "no numbers")
@@ -108,7 +108,7 @@ def _read_text(path: Path) -> np.ndarray:
 
 
 def _from_table(table: np.ndarray) -> BasicPointCloud:
-    """A cloud of a table (N, 3 or 6) of x y z and red green blue."""
+    """Cloud of a table (N, 3 or 6) of x y z and red green blue."""
     points, colors = table[:, :3], table[:, 3:]
     if not colors.shape[1]:
         colors = np.full_like(table[:, :3], 127 / 255)
@@ -118,7 +118,7 @@ def _from_table(table: np.ndarray) -> BasicPointCloud:
 
 
 def check_finite(points: np.ndarray, path: Path) -> None:
-    """UserError naming the first point (N,3) of a file that is not finite in float32."""
+    """UserError naming the first of the points (N,3) of a file that is not finite in float32."""
     with np.errstate(over="ignore"):
         bad = ~np.isfinite(points.astype(np.float32)).all(axis=1)
     if bad.any():

@@ -1,4 +1,4 @@
-"""What readers of datasets return: plain records. Nothing here decodes pictures, uses a GPU or writes a file."""
+"""Plain records that readers of datasets return. Nothing here decodes photos, uses a GPU or writes a file."""
 
 import os
 from collections import Counter
@@ -13,11 +13,11 @@ from scene.pictures.store import Decodable
 from utils.graphics_utils import BasicPointCloud, focal2fov
 from utils.system_utils import UserError
 
-HOLD = 8  # every 8th picture by name is a test view (Mip-NeRF 360's split)
-NEAREST = 0.2  # depth from which on Gaussians are drawn (the rasterizer's rule)
-APART = 10.0
-NARROW = 1e-2  # Gaussians wider than 0.1 E are removed: where E is less than this of the depth, all above a pixel or so
-ROUNDING = 1e-9  # distances below this part of the scene mean nothing
+HOLD = 8  # every 8th photo by name is a test view (Mip-NeRF 360's split)
+NEAREST = 0.2  # depth from which Gaussians are drawn (the rasterizer's rule)
+APART = 10.0  # median distances from the cameras' median, beyond which a camera stands apart
+NARROW = 1e-2  # of the depth; with a smaller E, removing Gaussians wider than 0.1 E would leave only pixel-sized ones
+ROUNDING = 1e-9  # distances below this part of the scene are rounding errors
 
 
 @dataclass(frozen=True)
@@ -26,9 +26,9 @@ class CameraInfo:
 
     uid: COLMAP's camera (intrinsics) id, or the frame's index. R (3,3): camera-to-world rotation; T (3,):
     world-to-camera translation. fx, fy, cx, cy in pixels of an image of width x height (pixel centres at .5).
-    image_name: COLMAP's full name, or the file's stem. file_size: (width, height) of the file. mask: of the same size
-    as the file, None where everything counts. ignore_alpha: what is transparent in the file does not count. depth: of a
-    training view that has a map of it (scene/readers/depth_maps.py).
+    image_name: COLMAP's full name, or the file's stem. file_size: (width, height) of the photo. mask: of the photo's
+    shape, None if all pixels count. ignore_alpha: transparent pixels of the photo do not count. depth: inverse depth of
+    a training view that has a map (scene/readers/depth_maps.py).
     """
 
     uid: int
@@ -65,7 +65,7 @@ class CameraInfo:
 
 @dataclass(frozen=True)
 class SceneInfo:
-    """A dataset: start cloud (None if not wanted), views, extent E in world units, the PLY of the cloud if any.
+    """A dataset: start cloud (None if not wanted), views, extent E in world units, and the cloud's PLY if it has one.
 
     offset (3,) float64: the world's coordinates of the frame's origin (scene/readers/world_offset.py).
     """
@@ -81,17 +81,17 @@ class SceneInfo:
 def split_by_order(
     cameras: list[CameraInfo], hold_out: bool, folder: Path
 ) -> tuple[list[CameraInfo], list[CameraInfo]]:
-    """Training and test views: with hold_out every HOLD-th, from the first on, is a test view."""
+    """Training and test views: with hold_out every HOLD-th view, the first included, is a test view."""
     train = [camera for index, camera in enumerate(cameras) if not hold_out or index % HOLD]
     test = [camera for index, camera in enumerate(cameras) if hold_out and index % HOLD == 0]
     if not train:
-        raise UserError(f"{folder} has too few pictures for --eval, which takes every {HOLD}th; leave --eval out")
+        raise UserError(f"{folder} has too few photos for --eval, which holds out every {HOLD}th; leave --eval out")
     return train, test
 
 
 def exposure_names(cameras: Sequence[CameraInfo]) -> list[str]:
-    """A name for each view: its image name, or where several have that (Blender's train/r_0 and test/r_0) its path from
-    their common folder.
+    """A unique name for each view: its image name, or its path from the views' common folder if several share the name,
+    as Blender's train/r_0 and test/r_0 do.
     """
     counts = Counter(camera.image_name for camera in cameras)
     folder = os.path.commonpath([camera.image_path.parent for camera in cameras]) if cameras else ""
@@ -102,8 +102,8 @@ def exposure_names(cameras: Sequence[CameraInfo]) -> list[str]:
 def scene_extent(cameras: list[CameraInfo], points: np.ndarray | None = None) -> float:
     """Extent E: 1.1 times the largest distance of a camera from the cameras' mean, in world units.
 
-    Cameras that stand apart (`standing_apart`) are left out. Cameras in one place, or nearly so (E below NARROW times
-    the depth), have no E of their own; then 1.1 times the median depth of the points (N,3) in front of the first, or 1
+    Cameras that stand apart (`standing_apart`) are left out. If the cameras are in one place, or nearly so (E below
+    NARROW times the depth), E is 1.1 times the median depth of the points (N,3) in front of the first camera, or 1
     without such points.
     """
     centers = np.array([camera.center for camera in cameras])
@@ -120,8 +120,8 @@ def scene_extent(cameras: list[CameraInfo], points: np.ndarray | None = None) ->
 
 
 def standing_apart(centers: np.ndarray) -> np.ndarray:
-    """Which of the camera centres (N,3) are more than APART times the median distance from their median: (N,) bool."""
+    """Whether a camera centre of (N,3) is more than APART times the median distance from their median: (N,) bool."""
     distances = np.linalg.norm(centers - np.median(centers, axis=0), axis=1)
     median = float(np.median(distances))
-    # Where most cameras are in one place, but for rounding, the others are no mistake.
+    # If most cameras are in one place, up to rounding, the others are no mistake.
     return distances > (APART * median if median > ROUNDING * distances.max() else np.inf)

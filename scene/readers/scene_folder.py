@@ -1,4 +1,4 @@
-"""Which kind of dataset a folder holds, and where the user's scene may be if it holds none."""
+"""Kinds of dataset folders, and hints at the right folder for a user who gave another one."""
 
 from pathlib import Path
 
@@ -11,7 +11,7 @@ _MODEL = ("cameras.bin", "cameras.txt")
 
 
 def kind_of(folder: Path) -> str:
-    """COLMAP, BLENDER or NERFSTUDIO. UserError that says what was looked for and found, and where the scene may be."""
+    """COLMAP, BLENDER or NERFSTUDIO. UserError saying what was looked for and found, and where the scene may be."""
     if not folder.exists():
         raise UserError(f"no scene folder {folder}; name an existing one with -s")
     if not folder.is_dir():
@@ -39,22 +39,22 @@ def _remedy(folder: Path) -> str:
     if below:
         return f"give -s a scene in it: {some(list(map(str, below)))}"
     if above := _above(folder):
-        return f"give -s {above}, which is one"
+        return f"give -s {above}, which is a scene"
     if any((folder / name).is_file() for name in _MODEL):
         return "the files of a COLMAP model belong in a folder sparse/0 of the scene, beside the folder images"
     inner = [path for path in (folder / "input", folder / "images", folder) if path.is_dir() and _has_pictures(path)]
     if inner and inner[0].name == "input":
-        return f"for photos without camera poses, run python convert.py -s {folder} first"
+        return f"photos need camera poses: run python convert.py -s {folder} first"
     if inner:
         return (
-            f"for photos without camera poses, put them into a folder input of the scene and run python convert.py -s "
+            f"photos need camera poses: put them into a folder input of the scene and run python convert.py -s "
             f"{folder if inner[0] != folder else folder.parent} first"
         )
     return "give -s the folder that holds one of them"
 
 
 def _above(folder: Path) -> Path | None:
-    """The scene that this folder lies in, at most two levels up: images/left, sparse/0."""
+    """The scene that contains this folder, at most two levels up, as for images/left or sparse/0."""
     return next((path for path in (folder, *folder.absolute().parents[:2]) if _kind(path)), None)
 
 
@@ -63,5 +63,5 @@ def _or_rather(scene: Path | None) -> str:
 
 
 def _has_pictures(folder: Path) -> bool:
-    # Not deeper: it may be any folder of the disk.
+    # No deeper: the folder may be any on the disk.
     return any(path.suffix.lower() in _PICTURES for pattern in ("*", "*/*") for path in folder.glob(pattern))

@@ -1,4 +1,4 @@
-"""From views as a dataset lists them, with any lens, to pinhole views."""
+"""Conversion of views as a dataset lists them, with any lens, to pinhole views."""
 
 import sys
 from collections.abc import Sequence
@@ -16,7 +16,7 @@ from utils.system_utils import UserError
 
 
 class SourceView(NamedTuple):
-    """A picture as a dataset lists it: file, lens, world-to-camera rotation (3,3) and translation (3,), mask."""
+    """A photo as a dataset lists it: file, lens, world-to-camera rotation (3,3) and translation (3,), mask."""
 
     name: str
     path: Path
@@ -28,14 +28,14 @@ class SourceView(NamedTuple):
 
 
 def make_cameras(views: Sequence[SourceView], ignore_alpha: bool) -> list[CameraInfo]:
-    """The views as pinholes: pictures of other lenses are undistorted first (scene/pictures/undistortion.py).
+    """The views as pinholes; photos of other lenses are undistorted first (scene/pictures/undistortion.py).
 
-    ignore_alpha: what is transparent in a picture does not count. UserError names the view that cannot be used.
+    ignore_alpha: transparent pixels of a photo do not count. UserError names the view that cannot be used.
     """
     pinholes = [pinhole_of(view.lens, view.name) for view in views]
     for view in views:
         if not (np.isfinite(view.rotation).all() and np.isfinite(view.translation).all()):
-            raise UserError(f"the pose of {view.name} is not finite; take the picture out of the scene")
+            raise UserError(f"the pose of {view.name} is not finite; take the photo out of the scene")
     sizes = [picture_size(view.path) for view in views]
     _warn_of_other_shapes(views, sizes)
     for view, size in zip(views, sizes, strict=True):
@@ -79,8 +79,8 @@ def _check_mask(view: SourceView, size: tuple[int, int]) -> None:
     mask_size = picture_size(view.mask.path)
     if abs(size[0] * mask_size[1] / mask_size[0] - size[1]) > 1:
         raise UserError(
-            f"the mask {view.mask.path} is {mask_size[0]} x {mask_size[1]} pixels and its picture {size[0]} x "
-            f"{size[1]}; make masks of the same shape as the pictures"
+            f"the mask {view.mask.path} is {mask_size[0]} x {mask_size[1]} pixels and its photo {size[0]} x {size[1]}; "
+            "make masks of the same shape as the photos"
         )
 
 
@@ -93,8 +93,7 @@ def _warn_of_other_shapes(views: Sequence[SourceView], sizes: Sequence[tuple[int
     if others:
         view, size = others[0]
         print(
-            f"{len(others)} of {len(views)} pictures have another aspect ratio than their camera, the first is "
-            f"{view.name} ({size[0]} x {size[1]}, camera {view.lens.width} x {view.lens.height}); they will be "
-            "stretched",
+            f"{len(others)} of {len(views)} photos have another aspect ratio than their camera and will be stretched; "
+            f"the first is {view.name} ({size[0]} x {size[1]}, camera {view.lens.width} x {view.lens.height})",
             file=sys.stderr,
         )

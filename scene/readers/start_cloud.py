@@ -15,12 +15,12 @@ SFM = "sfm"
 RANDOM = "random"
 RANDOM_POINTS = 100_000
 RANDOM_HALF_SIZE = 1.3  # the NeRF-synthetic objects lie within this cube
-_NEAREST, _FARTHEST = 0.25, 2.5  # depths of random points, in distances of the cameras from what they look at
+_NEAREST, _FARTHEST = 0.25, 2.5  # depths of random points, as parts of the distance from cameras to their focus
 _GREY = 127 / 255
 
 
 class StartOptions(NamedTuple):
-    """What the user wants: a file of points (empty: none), else SFM (the scene's points) or RANDOM ones."""
+    """The user's choice: a file of points (empty: none), else SFM (the scene's points) or RANDOM points."""
 
     path: str = ""
     kind: str = SFM
@@ -30,7 +30,7 @@ OWN_POINTS = StartOptions()
 
 
 class StartCloud(NamedTuple):
-    """Points, and the PLY they come from, if it is one."""
+    """Points, and the PLY they come from; None for points of another kind of file or of none."""
 
     cloud: BasicPointCloud
     ply_path: Path | None
@@ -39,7 +39,7 @@ class StartCloud(NamedTuple):
 def choose_start(
     options: StartOptions, own: Callable[[], StartCloud | None], random: Callable[[], BasicPointCloud], lacking: str
 ) -> StartCloud:
-    """The start cloud. own: reads the scene's points, or None; lacking: says in a message that there are none."""
+    """The start cloud. own: reads the scene's points, if it has any; lacking: start of the message when it has none."""
     if options.path:
         path = Path(options.path)
         return StartCloud(read_point_cloud(path), path if is_ply(path) else None)
@@ -54,7 +54,7 @@ def choose_start(
 
 
 def random_in_cube() -> BasicPointCloud:
-    """Grey points spread evenly over a cube around the origin, as the reference has them for Blender scenes."""
+    """Grey points spread evenly over a cube around the origin, as in the reference for Blender scenes."""
     random = np.random.default_rng(0)
     return _grey(random.uniform(-RANDOM_HALF_SIZE, RANDOM_HALF_SIZE, (RANDOM_POINTS, 3)))
 
@@ -62,8 +62,8 @@ def random_in_cube() -> BasicPointCloud:
 def random_in_frusta(cameras: list[CameraInfo]) -> BasicPointCloud:
     """Grey points in the cameras' frusta: each in a random pixel of a random view, at an even random depth.
 
-    Depths lie around that of the point which the optical axes come nearest to, in the median camera; where the axes
-    are parallel or part, around the extent of the cameras.
+    Depths are relative to the cameras' median distance from their focus, the point nearest to all optical axes. If the
+    axes are parallel or diverge, the extent of the cameras takes the place of that distance.
     """
     random = np.random.default_rng(0)
     chosen = random.integers(len(cameras), size=RANDOM_POINTS)

@@ -1,4 +1,4 @@
-"""Scenes of a camera file with poses in OpenGL axes: Blender's transforms_train.json, nerfstudio's transforms.json."""
+"""Scenes whose camera file has poses in OpenGL axes: Blender's transforms_train.json, nerfstudio's transforms.json."""
 
 import json
 import os
@@ -45,8 +45,8 @@ def readNerfSyntheticInfo(
 ) -> SceneInfo:
     """Read a Blender scene (transforms_train.json, transforms_test.json), views in the order of the files.
 
-    Without a cloud of its own it starts from grey points spread evenly over a cube. As
-    `scene.dataset_readers.read_scene`; images plays no part.
+    A scene without a cloud of its own starts from grey points spread evenly over a cube. Arguments and errors as for
+    `scene.dataset_readers.read_scene`; images has no effect.
     """
     files = [folder / "transforms_train.json", folder / "transforms_test.json"]
     for path in files:
@@ -73,9 +73,9 @@ def readNerfstudioInfo(
 ) -> SceneInfo:
     """Read a nerfstudio or instant-ngp scene (transforms.json), views sorted by name (bytes).
 
-    hold_out: the file's own split where it has one (test_filenames, else val_filenames, are the test views), else every
-    8th view. Frames may name masks; --masks takes their place. Points come from the file's ply_file_path. As
-    `scene.dataset_readers.read_scene`; images plays no part.
+    hold_out: the file's own split if it has one (test_filenames, else val_filenames, are the test views), else every
+    8th view. Frames may name masks, which --masks replaces. Points come from the file's ply_file_path. Arguments and
+    errors as for `scene.dataset_readers.read_scene`; images has no effect.
     """
     content = _read(folder / "transforms.json")
     cameras = sorted(_cameras(content, masks, by_stem=False), key=lambda camera: os.fsencode(camera.image_name))
@@ -109,7 +109,7 @@ def _frame(path: Path, number: int, frame: Any) -> _Frame:
     try:
         lacking = [key for key in ("file_path", "transform_matrix") if key not in frame]
         if lacking:
-            raise UserError(f"{where} has no {' and no '.join(lacking)}; mend it, or take it out")
+            raise UserError(f"{where} has no {' and no '.join(lacking)}; fix the frame, or take it out")
         return _Frame(str(frame["file_path"]), _world_to_camera(frame["transform_matrix"]), dict(frame))
     except (ValueError, TypeError, OverflowError, np.linalg.LinAlgError) as error:
         raise UserError(
@@ -126,7 +126,7 @@ def _no_camera_file(path: Path, error: Exception) -> UserError:
 
 
 def _cameras(file: _CameraFile, masks: MaskOptions, by_stem: bool) -> list[CameraInfo]:
-    """The views in the order of the frames, named by the stems or by the whole relative paths of their files."""
+    """The views in the order of the frames, named by the stems or by the relative paths of their files."""
     folder = file.path.parent
     listed = [frame.file_path for frame in file.frames]
     paths = find_pictures(folder, listed, str(file.path), "put them there", SUFFIXES)
@@ -152,7 +152,8 @@ def _masks(file: _CameraFile, names: list[str], masks: MaskOptions) -> list[Mask
     listed = [frame.fields.get("mask_path") for frame in file.frames]
     if masks.folder or not any(listed):
         return find_masks(folder, names, masks)
-    found = find_pictures(folder, [str(name) for name in listed if name], f"(as masks) {file.path}", "put them there")
+    named = [str(name) for name in listed if name]
+    found = find_pictures(folder, named, str(file.path), "put them there", kind="masks")
     paths = iter(found)
     return [masks.mask(next(paths)) if name else None for name in listed]
 
@@ -160,12 +161,12 @@ def _masks(file: _CameraFile, names: list[str], masks: MaskOptions) -> list[Mask
 def _own_split(
     file: _CameraFile, cameras: list[CameraInfo], hold_out: bool
 ) -> tuple[list[CameraInfo], list[CameraInfo]] | None:
-    """Training and test views by the file's lists; None without a hold-out or without such lists."""
+    """Training and test views by the file's lists; None without hold_out or without such lists."""
     lists = []
     for name in SPLITS:
         listed = file.fields.get(name) or []
         if not isinstance(listed, list):
-            raise UserError(f"{name} in {file.path} must be a list of file names; mend it, or leave it out")
+            raise UserError(f"{name} in {file.path} must be a list of file names; fix it, or leave it out")
         lists.append({os.path.normpath(str(entry)) for entry in listed})
     train_names, test_names = lists[0], lists[2] or lists[1]
     if not hold_out or not test_names:
@@ -179,8 +180,8 @@ def _own_split(
             train.append(camera)
     if not test or not train:
         raise UserError(
-            f"of the pictures in {file.path}, {len(train)} are in train_filenames and {len(test)} in test_filenames "
-            "(or val_filenames); both need some, mend the lists or leave --eval out"
+            f"of the photos in {file.path}, {len(train)} are in train_filenames and {len(test)} in test_filenames (or "
+            "val_filenames), and both need some; fix the lists or leave --eval out"
         )
     return train, test
 

@@ -1,4 +1,4 @@
-"""Intrinsics as Blender, instant-ngp and nerfstudio write them, in COLMAP's terms."""
+"""Intrinsics of Blender, instant-ngp and nerfstudio, in COLMAP's terms."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -17,9 +17,10 @@ _FISHEYE = ("FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "OPENCV_FISHEY
 def lens_of(frame: Mapping[str, Any], shared: Mapping[str, Any], size: tuple[int, int], file: Path) -> Lens:
     """The lens of a frame: each value from the frame's own fields, else from those of the whole file.
 
-    fl_x, fl_y in pixels, or camera_angle_x, camera_angle_y in radians (y as x where missing); cx, cy (the middle), w, h
-    (size: of the picture's file, (width, height)); camera_model, or is_fisheye; k1 ... k6, p1, p2 as OpenCV has them.
-    UserError for what cannot be used; TypeError, ValueError, OverflowError for what is no number.
+    Fields: fl_x, fl_y in pixels, or camera_angle_x, camera_angle_y in radians (a missing y equals x); cx, cy (default:
+    the middle); w, h (default: `size`, the photo's width and height); camera_model, or is_fisheye; k1 ... k6, p1, p2 as
+    in OpenCV. UserError for a lens that cannot be used; TypeError, ValueError, OverflowError for a value that is no
+    number.
     """
     fields = {**shared, **frame}
 
@@ -45,15 +46,15 @@ def lens_of(frame: Mapping[str, Any], shared: Mapping[str, Any], size: tuple[int
     if model not in _BROWN:
         raise UserError(
             f"the camera_model {model} in {file} cannot be used, only {', '.join(_BROWN + _FISHEYE)}; convert the "
-            "pictures to one of these"
+            "photos to one of these"
         )
     if not any((k1, k2, k3, k4, k5, k6, p1, p2)):
         return Lens("PINHOLE", pinhole, width, height)
     if model != "FULL_OPENCV" and any((k4, k5, k6)):
-        # OpenCV divides by 1 + k4 r^2 + ..., nerfstudio adds k4 r^8: nobody can tell which is meant.
+        # OpenCV divides by 1 + k4 r^2 + ..., nerfstudio adds k4 r^8, and the file does not say which one is meant.
         raise UserError(
-            f"{file} has k4, k5 or k6 for the camera_model {model}, whose meaning programs do not agree on; set them "
-            "to 0, or camera_model to FULL_OPENCV where they are OpenCV's"
+            f"{file} has k4, k5 or k6 for the camera_model {model}, on whose meaning programs disagree; set them to 0, "
+            "or camera_model to FULL_OPENCV if they are OpenCV's"
         )
     if any((k3, k4, k5, k6)):
         return Lens("FULL_OPENCV", (*pinhole, k1, k2, p1, p2, k3, k4, k5, k6), width, height)

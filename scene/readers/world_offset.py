@@ -1,6 +1,6 @@
-"""The local frame of scenes whose coordinates are large against their extent, as map projections (UTM) have them.
+"""Local frame of scenes whose coordinates are large against their extent, as in map projections (UTM).
 
-float32 has steps of 0.06 at 1e6. Such a scene is trained as world minus an offset, found and taken off in double.
+float32 has steps of 0.06 at 1e6. Such a scene is trained as world minus an offset, computed and subtracted in double.
 """
 
 from dataclasses import replace
@@ -10,13 +10,13 @@ import numpy as np
 from scene.readers.records import CameraInfo, SceneInfo, scene_extent
 from utils.graphics_utils import BasicPointCloud
 
-# Extents from the origin: a step of float32 is a hundred-thousandth of the extent there, many times what positions move
-# by in the last iterations (1.6e-6 extents, and less).
+# Extents from the origin. There a step of float32 is a hundred-thousandth of the extent, many times the moves of
+# positions in the last iterations (1.6e-6 extents and less).
 FARTHEST = 100.0
 
 
 def world_offset(info: SceneInfo) -> np.ndarray:
-    """(3,) float64: zero for all but scenes far from their origin, else round decimal numbers near them."""
+    """Offset (3,) float64: round decimal numbers near a scene that is far from its origin, else zero."""
     cameras = info.train_cameras + info.test_cameras
     middle = np.median([camera.center for camera in cameras], axis=0)
     extent = scene_extent(cameras, None if info.point_cloud is None else info.point_cloud.points)
@@ -34,7 +34,7 @@ def local(info: SceneInfo, offset: np.ndarray) -> SceneInfo:
         train, test = ([_moved(camera, offset) for camera in cameras] for cameras in (train, test))
     cloud, points = info.point_cloud, None
     if cloud is not None:
-        with np.errstate(over="ignore"):  # becomes infinite, which nobody starts from
+        with np.errstate(over="ignore"):  # becomes infinite, which the start refuses
             points = (cloud.points - offset if moved else cloud.points).astype(np.float32)
         cloud = BasicPointCloud(points, cloud.colors, cloud.normals)
     extent = scene_extent(train, points)
