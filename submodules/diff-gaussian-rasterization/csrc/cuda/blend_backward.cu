@@ -172,34 +172,79 @@ __global__ void __launch_bounds__(L::kThreads)
 #define GS_MAX_REGISTERS(count)
 #endif
 
-// Going back to front. Within these limits the loop over splats does without spills on sm_90; ptxas makes it a tenth
-// longer where it is asked for a number of blocks a processor instead.
+using OfPixels = float[Backward::kRun];  // a value for each of a lane's pixels
+
+// Starts the backward of a lane's pixels at their chunk's end. Behind the chunk lie `count` layers from `first` on,
+// then the background: `behind` is what they show together, `through` their transmittance.
+template <bool kDepth>
+__device__ __forceinline__ void start_behind(const Pixels<Backward, kDepth>& pixels, const Backward& at,
+                                             const Layer* layers, int32_t first, int count, OfPixels& transmittance,
+                                             OfPixels& behind, OfPixels& through) {
+  constexpr int kRun = Backward::kRun;
+  for (int p = 0; p < kRun; ++p) behind[p] = pixels.background[p], through[p] = 1;
+  for (int c = count - 1; c >= 0; --c)
+    for (int p = 0; p < kRun; ++p) {
+      const int pixel = at.y * kTile + at.x + at.column(p);
+      const Layer layer = layers[int64_t(kTile * kTile) * (first + c) + pixel];
+      behind[p] = layer.value + layer.transmittance * behind[p];
+      through[p] *= layer.transmittance;
+    }
+  for (int p = 0; p < kRun; ++p) transmittance[p] = pixels.transmittance[p] / through[p];
+}
+
+// Steps the lanes over splat k of the batch, whose first splat is the chunk's splat `first`, and leaves the sums over
+// the warp's pixels in `sums`. A splat that reaches none of them changes nothing.
+template <bool kDepth, int kBatch>
+__device__ __forceinline__ void splat_gradient(const Batch<kBatch>& batch, const Pixels<Backward, kDepth>& pixels,
+                                               const Backward& at, int k, int first, OfPixels& transmittance,
+                                               OfPixels& behind, float* sums) {
+  const LocalSplat<float> splat = batch.local(k);
+  const float4 c = batch.color[k];
+  const RowTerms<float> row = row_terms(splat, float(at.y));
+  float q0 = 0, qu = 0, quu = 0, r = 0, gr = 0, b = 0, d = 0;
+  bool any = false;
+#pragma unroll
+  for (int p = 0; p < Backward::kRun; ++p) {
+    const float u = row_u(row, float(at.x + at.column(p))), t = row_exponent(row, u);
+    if (!(t >= kLeast) || first + k >= pixels.last[p]) continue;
+    any = true;
+    const float uncapped = exp2_device(t), alpha = capped<float, float>(uncapped);
+    const float value = pixels.value(p, c, splat.inverse_depth);
+    const float q = uncapped * alpha_gradient<float, float>(alpha, value, transmittance[p], behind[p]);
+    const float weight = alpha * transmittance[p], qu_here = q * u;
+    q0 += q, qu += qu_here, quu += qu_here * u;
+    r += weight * pixels.red[p], gr += weight * pixels.green[p], b += weight * pixels.blue[p];
+    if (kDepth) d += weight * pixels.depth[p];
+  }
+  if (!__any_sync(kWarp, any)) return;
+  // Along a row v is constant, so three of the moments come last.
+  const float v[kGradientValues] = {q0, qu, row.v * q0, quu, row.v * qu, row.v * row.v * q0, r, gr, b, d};
+  int value;
+  const float sum = transposed_sum(v, value);
+  if (value >= 0) sums[(threadIdx.x / 32 * kBatch + k) * kGradientValues + value] = sum;
+}
+
+// Walks each chunk back to front, a block each, and writes its gradient rows. Within these registers ptxas compiles the
+// loop over splats without spills on sm_90. Asked for a number of blocks a processor instead, it makes the loop a tenth
+// longer.
 template <bool kDepth>
 __global__ void GS_MAX_REGISTERS(kDepth ? 96 : 80)
     blend_vjp_kernel(BlendInput<float> in, BlendGradient<float> g, const int32_t* processed, const Chunk* chunks,
                      int chunk_size, const Layer* layers, GradientRows rows) {
   using L = Backward;
-  constexpr int kBatch = 64, kRun = L::kRun;
+  constexpr int kBatch = 64;
   __shared__ Batch<kBatch> batch;
   __shared__ float sums[L::kWarps * kBatch * kGradientValues];
   __shared__ int64_t row_of[kBatch];
   const Chunk chunk = chunks[blockIdx.x];
   if (chunk.tile < 0) return;
   const L at;
-  const int across = tile_count(in.image.width), warp = threadIdx.x / 32;
+  const int across = tile_count(in.image.width);
   const int left = chunk.tile % across * kTile, top = chunk.tile / across * kTile;
   const Pixels<L, kDepth> pixels(in, g, at, left, top, chunk.first);
-  float transmittance[kRun], behind[kRun], through[kRun];  // through: all layers behind the chunk
-  for (int p = 0; p < kRun; ++p) behind[p] = pixels.background[p], through[p] = 1;
+  OfPixels transmittance, behind, through;
   const int layers_behind = (processed[chunk.tile] - chunk.end + chunk_size - 1) / chunk_size;
-  for (int c = layers_behind - 1; c >= 0; --c)
-    for (int p = 0; p < kRun; ++p) {
-      const int pixel = at.y * kTile + at.x + at.column(p);
-      const Layer layer = layers[int64_t(kTile * kTile) * (chunk.behind + c) + pixel];
-      behind[p] = layer.value + layer.transmittance * behind[p];
-      through[p] *= layer.transmittance;
-    }
-  for (int p = 0; p < kRun; ++p) transmittance[p] = pixels.transmittance[p] / through[p];
+  start_behind(pixels, at, layers, chunk.behind, layers_behind, transmittance, behind, through);
   const int64_t begin = in.ranges[chunk.tile] + chunk.first;
   for (int end = chunk.end - chunk.first; end > 0; end -= kBatch) {
     const int count = end < kBatch ? end : kBatch, first = end - count;
@@ -217,30 +262,7 @@ __global__ void GS_MAX_REGISTERS(kDepth ? 96 : 80)
       while (hits) {
         const int bit = 31 - __clz(hits), k = from + bit;
         hits &= ~(1u << bit);
-        const LocalSplat<float> splat = batch.local(k);
-        const float4 c = batch.color[k];
-        const RowTerms<float> row = row_terms(splat, float(at.y));
-        float q0 = 0, qu = 0, quu = 0, r = 0, gr = 0, b = 0, d = 0;
-        bool any = false;
-#pragma unroll
-        for (int p = 0; p < kRun; ++p) {
-          const float u = row_u(row, float(at.x + at.column(p))), t = row_exponent(row, u);
-          if (!(t >= kLeast) || first + k >= pixels.last[p]) continue;
-          any = true;
-          const float uncapped = exp2_device(t), alpha = capped<float, float>(uncapped);
-          const float value = pixels.value(p, c, splat.inverse_depth);
-          const float q = uncapped * alpha_gradient<float, float>(alpha, value, transmittance[p], behind[p]);
-          const float weight = alpha * transmittance[p], qu_here = q * u;
-          q0 += q, qu += qu_here, quu += qu_here * u;
-          r += weight * pixels.red[p], gr += weight * pixels.green[p], b += weight * pixels.blue[p];
-          if (kDepth) d += weight * pixels.depth[p];
-        }
-        if (!__any_sync(kWarp, any)) continue;
-        // Along a row v is constant, so three of the moments come last.
-        const float v[kGradientValues] = {q0, qu, row.v * q0, quu, row.v * qu, row.v * row.v * q0, r, gr, b, d};
-        int value;
-        const float sum = transposed_sum(v, value);
-        if (value >= 0) sums[(warp * kBatch + k) * kGradientValues + value] = sum;
+        splat_gradient(batch, pixels, at, k, first, transmittance, behind, sums);
       }
     }
     __syncthreads();

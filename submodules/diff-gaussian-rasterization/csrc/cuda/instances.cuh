@@ -85,18 +85,10 @@ struct alignas(kEmitRun * sizeof(T)) EmitRun {
   T of[kEmitRun];
 };
 
-// order: splats by depth; tiles and owners have room for whole blocks. A splat over more tiles than a mask has bits for
-// is tested again, by the whole block, as far as the block's instances go.
-template <class Key>
-__global__ void __launch_bounds__(kEmitThreads)
-    emit_kernel(int64_t instances, const int32_t* order, const Lined* lined, const int32_t* offsets,
-                const int32_t* first_splat, Projected<float> in, Image image, Key* tiles, int32_t* owners) {
-  __shared__ EmittedSplats splats;
-  __shared__ int32_t warp_hits[2][kEmitThreads / 32];
-  const int columns = tile_count(image.width), warp = threadIdx.x / 32, lane = threadIdx.x & 31;
-  const int64_t base = int64_t(blockIdx.x) * kEmitted;
-  const int emitted = int(instances - base < kEmitted ? instances - base : kEmitted);
-  const int32_t first = first_splat[blockIdx.x], last = first_splat[blockIdx.x + 1];
+// Fills `splats` with the splats first to last of the depth order, whose instances lie in the block's range.
+__device__ __forceinline__ void gather_splats(EmittedSplats& splats, int64_t base, int emitted, int32_t first,
+                                              int32_t last, const int32_t* order, const Lined* lined,
+                                              const int32_t* offsets) {
   for (int j = threadIdx.x; j < kEmitted; j += kEmitThreads) splats.starting[j] = 0;
   if (threadIdx.x == 0) splats.unmasked_count = 0;
   __syncthreads();
@@ -107,9 +99,11 @@ __global__ void __launch_bounds__(kEmitThreads)
     if (begin < emitted) splats.put(k, index, int32_t(begin), line);
   }
   __syncthreads();
+}
 
-  // Splats begin in the order of their numbers, so the largest so far is the owner.
-  const EmitRun<int32_t> starting = reinterpret_cast<const EmitRun<int32_t>*>(splats.starting)[threadIdx.x];
+// Finds the splat that the instance before the thread's first one belongs to. Splats begin in the order of their
+// numbers, so it is the largest number so far. starting: of the thread's own instances.
+__device__ __forceinline__ int find_owner(EmittedSplats& splats, const EmitRun<int32_t>& starting, int warp, int lane) {
   int k = 0;
   for (int r = 0; r < kEmitRun; ++r) k = starting.of[r] > k ? starting.of[r] : k;
   for (int step = 1; step < 32; step *= 2) {
@@ -121,7 +115,15 @@ __global__ void __launch_bounds__(kEmitThreads)
   if (lane == 0) k = 0;
   __syncthreads();
   for (int w = 0; w < warp; ++w) k = splats.latest[w] > k ? splats.latest[w] : k;
+  return k;
+}
 
+// Writes the thread's instances by the masks of their splats; any tile for a splat without a mask.
+template <class Key>
+__device__ __forceinline__ void emit_masked(EmittedSplats& splats, int64_t base, int columns, int warp, int lane,
+                                            Key* tiles, int32_t* owners) {
+  const EmitRun<int32_t> starting = reinterpret_cast<const EmitRun<int32_t>*>(splats.starting)[threadIdx.x];
+  int k = find_owner(splats, starting, warp, lane);
   const int at = kEmitRun * threadIdx.x;
   Lined line = splats.line[k];
   if (!starting.of[0]) line.mask &= ~uint64_t(0) << nth_bit(line.mask, at - splats.first[k]);
@@ -130,14 +132,23 @@ __global__ void __launch_bounds__(kEmitThreads)
 #pragma unroll
   for (int r = 0; r < kEmitRun; ++r) {
     if (starting.of[r]) k = starting.of[r], line = splats.line[k];
-    run_tiles.of[r] = Key(tile_at(line, (__ffsll(line.mask) - 1) & 63, columns));  // any tile where there is no mask
+    run_tiles.of[r] = Key(tile_at(line, (__ffsll(line.mask) - 1) & 63, columns));
     run_owners.of[r] = splats.index[k];
     line.mask &= line.mask - 1;
   }
   reinterpret_cast<EmitRun<Key>*>(tiles + base)[threadIdx.x] = run_tiles;
   reinterpret_cast<EmitRun<int32_t>*>(owners + base)[threadIdx.x] = run_owners;
+}
 
-  if (splats.unmasked_count) __syncthreads();  // what follows writes over what these instances got
+using WarpHits = int32_t[2][kEmitThreads / 32];  // a row for every other turn
+
+// Writes the instances of splats without a mask over what emit_masked left there. The whole block tests such a splat's
+// tiles again, as far as the block's instances go.
+template <class Key>
+__device__ __forceinline__ void emit_unmasked(const EmittedSplats& splats, WarpHits& warp_hits,
+                                              const Projected<float>& in, Image image, int columns, int64_t base,
+                                              int emitted, int warp, int lane, Key* tiles, int32_t* owners) {
+  if (splats.unmasked_count) __syncthreads();  // emit_masked is done in every thread
   for (int u = 0, turn = 0; u < splats.unmasked_count; ++u) {
     const int32_t k = splats.unmasked[u], index = splats.index[k];
     const TileRect rect = reached_by(in, index).rect;
@@ -149,7 +160,7 @@ __global__ void __launch_bounds__(kEmitThreads)
       const bool reached = mine < area && tile_reached(test, float(tx), float(ty));
       const unsigned hits = __ballot_sync(kWarp, reached);
       if (lane == 0) warp_hits[turn][warp] = __popc(hits);
-      __syncthreads();  // one is enough: the next turn writes the other row
+      __syncthreads();  // one barrier is enough: the next turn writes the other row
       int before = __popc(hits & ((1u << lane) - 1)), all = 0;
       for (int w = 0; w < kEmitThreads / 32; ++w) {
         if (w < warp) before += warp_hits[turn][w];
@@ -162,6 +173,23 @@ __global__ void __launch_bounds__(kEmitThreads)
       at += all;
     }
   }
+}
+
+// Writes the tile and the splat of every instance, in depth order. order: the splats by depth; tiles and owners have
+// room for whole blocks.
+template <class Key>
+__global__ void __launch_bounds__(kEmitThreads)
+    emit_kernel(int64_t instances, const int32_t* order, const Lined* lined, const int32_t* offsets,
+                const int32_t* first_splat, Projected<float> in, Image image, Key* tiles, int32_t* owners) {
+  __shared__ EmittedSplats splats;
+  __shared__ WarpHits warp_hits;
+  const int columns = tile_count(image.width), warp = threadIdx.x / 32, lane = threadIdx.x & 31;
+  const int64_t base = int64_t(blockIdx.x) * kEmitted;
+  const int emitted = int(instances - base < kEmitted ? instances - base : kEmitted);
+  const int32_t first = first_splat[blockIdx.x], last = first_splat[blockIdx.x + 1];
+  gather_splats(splats, base, emitted, first, last, order, lined, offsets);
+  emit_masked(splats, base, columns, warp, lane, tiles, owners);
+  emit_unmasked(splats, warp_hits, in, image, columns, base, emitted, warp, lane, tiles, owners);
 }
 
 }  // namespace cuda
