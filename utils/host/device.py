@@ -6,7 +6,7 @@ import torch
 def compute_device() -> torch.device:
     """`cuda` when a GPU is visible and the rasterizer was built with its CUDA kernels, else `cpu`.
 
-    The rasterizer's library must be loaded by then (gaussian_renderer does it); unloaded counts as "no kernels".
+    The rasterizer's library must be loaded before (gaussian_renderer does that), or it counts as built without CUDA.
     """
     return torch.device("cuda" if torch.cuda.is_available() and _has_cuda_kernels() else "cpu")
 
