@@ -429,7 +429,7 @@ def test_real_scenes(shared_dir, tmp_path, name, views, held, points, extent):
 @pytest.mark.parametrize("place", [".", "out", "images/deep/out", "../colmap_scene/out"])
 def test_nothing_is_written_into_the_dataset(colmap_scene, place):
     before = folder_state(colmap_scene)
-    with pytest.raises(UserError, match="lies in the scene folder .*; name another with -m"):
+    with pytest.raises(UserError, match="lies in the scene folder .*; name another folder with -m"):
         Scene(_options(colmap_scene, colmap_scene / place), FakeGaussians())
     assert folder_state(colmap_scene) == before
     Scene(_options(colmap_scene, colmap_scene.parent / "colmap_scene_out"), FakeGaussians())
