@@ -1,1 +1,1 @@
-"""What doctor.py looks at: the environment, a dataset, a trained model. Each check gives lines; nothing is changed."""
+"""Checks of doctor.py: the environment, a dataset, a trained model. Each returns lines and changes nothing."""

@@ -1,4 +1,4 @@
-"""Can this dataset be trained, and what about it will show in the result? Through the project's own readers."""
+"""Checks of a dataset, through the project's own readers: whether it can be trained, and what will harm the result."""
 
 import contextlib
 import io
@@ -22,8 +22,8 @@ REGISTERED = 0.9  # share of the photos
 FAR_POINT = 100.0  # extents from the cameras; a sky is some tens away
 FAR_SHARE = 0.01
 OPENING = (10.0, 150.0)  # degrees; outside, the focal length is doubtful
-FEWEST_IN_VIEW = 10  # points of the cloud in a picture
-_SAMPLE = 5000  # points looked at
+FEWEST_IN_VIEW = 10  # points of the cloud in a photo
+_SAMPLE = 5000  # most points tested against the views
 _WIDE = 1600
 
 
@@ -41,32 +41,30 @@ def check_dataset(source: str, images: str) -> list[Line]:
 
 
 def check_views(cameras: list[CameraInfo]) -> list[Line]:
-    """Number and sizes of the pictures, and what they take in memory."""
+    """Number and sizes of the photos."""
     sizes = Counter(camera.file_size for camera in cameras)
     listed = ", ".join(f"{w} x {h} ({n})" for (w, h), n in sizes.most_common(3))
     listed += f" and {len(sizes) - 3} more sizes" if len(sizes) > 3 else ""
-    lines = [Line(f"{len(cameras)} pictures, all there and readable: {listed}")]
+    lines = [Line(f"{len(cameras)} photos, none missing and all readable: {listed}")]
     if len(cameras) < FEWEST_VIEWS:
         lines.append(
-            Line(f"only {len(cameras)} pictures", f"take {FEWEST_VIEWS} or more; new views will look bad with fewer")
+            Line(f"only {len(cameras)} photos", f"take {FEWEST_VIEWS} or more; new views will look bad with fewer")
         )
     wide = sum(n for (width, _), n in sizes.items() if width > _WIDE)
     if wide:
-        lines.append(Line(f"{wide} pictures are wider than {_WIDE}, they train at that width unless -r 1 is given"))
+        lines.append(Line(f"{wide} photos are wider than {_WIDE} pixels and train at that width unless -r 1 is given"))
     return lines
 
 
 def check_extent(info: SceneInfo) -> list[Line]:
-    """Scale of the scene, and cameras far off."""
+    """Scale of the scene, and cameras far away from the others."""
     centers = np.array([camera.center for camera in info.train_cameras])
     low, high = EXTENT
     lines = []
     spread = np.linalg.norm(centers - centers.mean(axis=0), axis=1).max()
     if len(centers) > 1 and spread < 1e-3 * info.extent:
         lines.append(
-            Line(
-                "all cameras stand in one place, so depth can't be found", "take pictures from places some steps apart"
-            )
+            Line("all cameras stand in one place, so depth cannot be found", "take photos from places some steps apart")
         )
     if low <= info.extent <= high:
         lines.append(Line(f"extent {info.extent:.3g}"))
@@ -83,7 +81,7 @@ def check_extent(info: SceneInfo) -> list[Line]:
         lines.append(
             Line(
                 f"{len(far)} cameras are more than {APART:g} times as far out as usual ({some(far)})",
-                "remove them from the model, their poses are likely wrong; the extent is without them",
+                "remove them from the model, as their poses are likely wrong; the extent leaves them out",
             )
         )
     return lines
@@ -99,17 +97,17 @@ def check_lenses(cameras: list[CameraInfo]) -> list[Line]:
     return [
         Line(
             f"{len(odd)} cameras have odd opening angles ({odd[0].image_name}: {angle:.1f} degrees)",
-            "check focal length and picture size, or reconstruct the scene again",
+            "check the focal length and the size of the photos, or reconstruct the scene again",
         )
     ]
 
 
 def check_cloud(info: SceneInfo) -> list[Line]:
-    """Number of points, points far away, and whether the cameras look at them."""
+    """Number of points, points far away, and points that no camera sees."""
     points = info.point_cloud.points.astype(np.float64)
     lines = [Line(f"{len(points)} points to start from")]
     if len(points) < FEWEST_POINTS:
-        more = "start from more points (--init_pcd_path), or reconstruct with more pictures or features"
+        more = "start from more points (--init_pcd_path), or reconstruct with more photos or features"
         lines = [Line(f"only {len(points)} points to start from, {FEWEST_POINTS} or more are good", more)]
     if not len(points):
         return lines
@@ -127,8 +125,8 @@ def check_cloud(info: SceneInfo) -> list[Line]:
     if unseen > 0.5:
         lines.append(
             Line(
-                f"{unseen:.0%} of the points are in no picture",
-                "poses and points don't belong together: check the axes (x right, y down, z forward) and the scale",
+                f"{unseen:.0%} of the points are in no photo",
+                "poses and points do not belong together: check the axes (x right, y down, z forward) and the scale",
             )
         )
     share = len(points) / seen.shape[1]
@@ -139,14 +137,14 @@ def check_cloud(info: SceneInfo) -> list[Line]:
         lines.append(
             Line(
                 f"{len(away)} cameras have hardly any point in view ({some(away)})",
-                "they look away or their poses are wrong; remove them from the model",
+                "remove them from the model: they face away from the scene, or their poses are wrong",
             )
         )
     return lines
 
 
 def points_in_views(cameras: list[CameraInfo], points: np.ndarray) -> np.ndarray:
-    """Which points (N,3) lie in front of a camera and inside its picture: (cameras, N) bool."""
+    """Whether points (N,3) lie in front of each camera and inside its photo: (cameras, N) bool."""
     seen = np.zeros((len(cameras), len(points)), dtype=bool)
     for row, camera in zip(seen, cameras, strict=True):
         local = points @ camera.R + camera.T
@@ -159,7 +157,7 @@ def points_in_views(cameras: list[CameraInfo], points: np.ndarray) -> np.ndarray
 
 
 def _check_registered(source: Path) -> list[Line]:
-    """What convert.py has noted, where it made the scene."""
+    """Line of convert.py's report, if convert.py made the scene."""
     path = source / "convert_report.json"
     if not path.is_file():
         return []
@@ -176,6 +174,6 @@ def _check_registered(source: Path) -> list[Line]:
 
 
 def _warnings(said: str) -> list[Line]:
-    """What the readers print beside what they return; progress bars left out."""
+    """Notes of the messages that the readers printed, without progress bars."""
     texts = [text.strip() for text in said.replace("\r", "\n").splitlines() if text.strip() and "%|" not in text]
     return [Line(text, note=True) for text in texts]

@@ -1,6 +1,6 @@
-"""Is everything installed that training needs, does it fit together, does the rasterizer compute what it should?
+"""Checks of the installation: packages, GPU, extensions and their versions, and the rasterizer's result.
 
-Imports nothing but the standard library until the packages are known to be there.
+Imports only the standard library until the packages are known to be installed.
 """
 
 import importlib
@@ -20,12 +20,12 @@ EXTENSIONS = {  # folder and distribution: package
     "simple-knn": "simple_knn",
 }
 _INSTALL = "pip install -r requirements.txt"
-# The rasterizer in float32 against its oracle on one splat: rounding of some dozen operations.
+# Largest difference of the rasterizer in float32 from its oracle on one splat: rounding of some dozen operations.
 _TOLERANCE = 1e-5
 
 
 def check_packages() -> list[Line]:
-    """The packages of requirements.txt: whether they are there, not whether they have the versions pinned."""
+    """Packages of requirements.txt: whether they are installed, in any version."""
     missing, versions = [], []
     for name in _required():
         found = _version(name)
@@ -37,7 +37,7 @@ def check_packages() -> list[Line]:
 
 
 def check_build() -> list[Line]:
-    """torch, its CUDA, the extensions and their fit; torch must be installed."""
+    """torch and its CUDA, the extensions and their versions; torch must be installed."""
     import torch
 
     lines = _check_gpu(torch)
@@ -77,20 +77,20 @@ def _check_gpu(torch) -> list[Line]:
     gpu = _nvidia_gpu()
     if gpu and torch.version.cuda is None:
         return [
-            Line(f"{gpu} is there, but torch {torch.__version__} knows no CUDA", f"install torch with CUDA: {_INSTALL}")
+            Line(f"{gpu} is there, but torch {torch.__version__} has no CUDA", f"install torch with CUDA: {_INSTALL}")
         ]
     if gpu:
         return [
             Line(
-                f"{gpu} is there, but torch (CUDA {torch.version.cuda}) can't use it",
-                "update the driver, and look whether CUDA_VISIBLE_DEVICES hides it",
+                f"{gpu} is there, but torch (CUDA {torch.version.cuda}) cannot use it",
+                "update the driver, and check whether CUDA_VISIBLE_DEVICES hides it",
             )
         ]
     return [Line("no NVIDIA GPU; everything runs on the CPU")]
 
 
 def _nvidia_gpu() -> str:
-    """Name of the first GPU that the driver's own tool lists; empty where there is none."""
+    """Name of the first GPU that the driver's own tool lists; empty if there is none."""
     tool = shutil.which("nvidia-smi")
     if not tool:
         return ""

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 
 class Line(NamedTuple):
-    """What was looked at; with a remedy it is a finding, else all is well, or, as a note, for the user to judge."""
+    """Result of one check: a finding if it has a remedy, a note for the user to judge, else a pass."""
 
     text: str
     remedy: str = ""
@@ -21,6 +21,6 @@ class Line(NamedTuple):
 
 
 def from_error(error: Exception) -> Line:
-    """A UserError's sentence: what is wrong; what to do."""
+    """Line of a UserError, whose sentence has the form: fault; remedy."""
     text, semicolon, remedy = str(error).rpartition("; ")
-    return Line(text, remedy) if semicolon else Line(remedy, "mend that and look again")
+    return Line(text, remedy) if semicolon else Line(remedy, "fix that and check again")

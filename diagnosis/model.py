@@ -1,4 +1,4 @@
-"""Is a trained model whole, and if its pictures are black or bad, why?"""
+"""Checks of a trained model: its values, and the likeliest reason for black or bad renders."""
 
 import argparse
 import contextlib
@@ -20,12 +20,12 @@ from scene.saved_model import load_saved
 from utils.image_utils import as_float, pixels_that_count, psnr
 from utils.system_utils import UserError, compute_device
 
-# Densification prunes below 0.005 and a reset leaves 0.01: a model whose median is there has not recovered.
+# Densification prunes below 0.005 and a reset leaves 0.01: a model of such a median has not recovered.
 FAINT = 0.02
 BINS = (0.0, 0.01, 0.05, 0.2, 0.5, 0.9, 1.0)
 HUGE = 1.0  # extents: one standard deviation of a splat as large as the whole scene
 HUGE_SHARE = 0.01
-BLACK = 0.02  # mean of a picture in [0, 1]
+BLACK = 0.02  # mean of an image in [0, 1]
 BAD_PSNR = 18.0  # dB on training views; models that converge reach 22 and more
 FEW_ITERATIONS = 3000
 RESET_INTERVAL = 3000  # the default of --opacity_reset_interval
@@ -39,7 +39,7 @@ def check_model(model_path: str, iteration: int) -> list[Line]:
     """Lines about the model that train.py wrote into a folder; iteration -1: the last one saved."""
     try:
         stored = read_stored_options(model_path)
-        with contextlib.redirect_stdout(io.StringIO()):  # of the readers
+        with contextlib.redirect_stdout(io.StringIO()):  # from the readers
             options, scene = _load(model_path, stored, iteration)
     except UserError as error:
         return [from_error(error)]
@@ -55,7 +55,7 @@ def check_model(model_path: str, iteration: int) -> list[Line]:
 
 
 def _load(model_path: str, stored: dict[str, Any], iteration: int) -> tuple[argparse.Namespace, Scene]:
-    # Small pictures: this is about black and bad, not about decimals.
+    # Small images tell black from bad; no decimals are needed.
     given = {**stored, "model_path": model_path, "resolution": _WIDTH, "images_to_load": 1}
     given.pop("depths", None)
     options = ModelParams(argparse.ArgumentParser()).extract(argparse.Namespace(**given))
@@ -63,7 +63,7 @@ def _load(model_path: str, stored: dict[str, Any], iteration: int) -> tuple[argp
 
 
 def check_values(gaussians: GaussianModel) -> list[Line]:
-    """NaN and infinities."""
+    """NaN and infinities among the parameters."""
     shapes = gaussians.raw_geometry()
     raw = {
         "position": gaussians.get_xyz,
@@ -79,7 +79,7 @@ def check_values(gaussians: GaussianModel) -> list[Line]:
             lines.append(
                 Line(
                     f"{bad} of {len(values)} Gaussians have a {name} that is not finite",
-                    "go on from an earlier checkpoint, or train again, with lower learning rates",
+                    "resume from an earlier checkpoint, or train again, with lower learning rates",
                 )
             )
     return lines
@@ -99,7 +99,7 @@ def check_shapes(gaussians: GaussianModel, extent: float) -> list[Line]:
         lines.append(
             Line(
                 f"{huge:.1%} of the Gaussians are larger than the extent of the cameras ({extent:.3g})",
-                "remove far points from the start cloud, and look whether the poses are right",
+                "remove far points from the start cloud, and check the poses",
             )
         )
     else:
@@ -110,26 +110,28 @@ def check_shapes(gaussians: GaussianModel, extent: float) -> list[Line]:
 
 
 def check_renders(scene: Scene, options: argparse.Namespace, stored: dict[str, Any]) -> list[Line]:
-    """A few training views, rendered small: not black, and near the pictures. Else the likeliest reasons."""
-    cameras = [camera for camera in scene.getTrainCameras() if camera.columns is None]  # in whole
+    """Line about a few training views, rendered small: close to their photos, or else the likeliest reason."""
+    cameras = [camera for camera in scene.getTrainCameras() if camera.columns is None]  # whole views
     cameras = cameras[:: max(1, len(cameras) // _VIEWS)][:_VIEWS]
-    looks = [look for camera in cameras if (look := _look(camera, scene, options))]
-    if not looks:
-        return [Line("no pixel of the training views that were looked at counts", "look at --masks and --invert_masks")]
-    brightness, truth, coverage, drawn, score = (float(np.mean(values)) for values in zip(*looks, strict=True))
+    measured = [values for camera in cameras if (values := _measure(camera, scene, options))]
+    if not measured:
+        return [Line("no pixel of the inspected training views counts", "check --masks and --invert_masks")]
+    brightness, truth, coverage, drawn, score = (float(np.mean(values)) for values in zip(*measured, strict=True))
     if brightness < BLACK and truth < BLACK:
-        return [Line("the pictures themselves are black", "look at them; where they are transparent, train with -w")]
+        return [Line("the photos themselves are black", "inspect them; if they are transparent, train with -w")]
     if brightness < BLACK:
         return [_why_black(scene, cameras, coverage, drawn)]
     if score < BAD_PSNR:
         return [Line(f"training views have a PSNR of only {score:.1f} dB", _why_bad(scene, stored))]
-    return [Line(f"{len(looks)} training views rendered {_WIDTH} pixels wide: PSNR {score:.1f} dB")]
+    return [Line(f"{len(measured)} training views rendered {_WIDTH} pixels wide: PSNR {score:.1f} dB")]
 
 
-def _look(camera: Camera, scene: Scene, options: argparse.Namespace) -> tuple[float, float, float, float, float] | None:
-    """Means of render and picture, share of the picture that is covered, share of Gaussians drawn, PSNR in dB.
+def _measure(
+    camera: Camera, scene: Scene, options: argparse.Namespace
+) -> tuple[float, float, float, float, float] | None:
+    """Means of render and photo, share of the image that is covered, share of Gaussians drawn, PSNR in dB.
 
-    Means and PSNR are of what is scored (masks, half images); None where that is no pixel.
+    Means and PSNR are of the scored pixels (masks, half images); None if there are none.
     """
     gaussians = scene.gaussians
     pipe = PipelineParams(argparse.ArgumentParser()).extract(argparse.Namespace())
@@ -162,17 +164,17 @@ def _why_black(scene: Scene, cameras: list[Camera], coverage: float, drawn: floa
                 "scale cameras and points of the scene by 10 or more and train again",
             )
         return Line(
-            f"{text}no Gaussian is in view, the cameras look away",
-            "look at the poses (x right, y down, z forward) and whether the model belongs to this dataset",
+            f"{text}no Gaussian is in view, because the cameras face away",
+            "check the poses (x right, y down, z forward) and whether the model belongs to this dataset",
         )
     if coverage < 0.1 or float(gaussians.get_opacity.detach().median()) < FAINT:
         return Line(
             f"{text}the Gaussians are almost transparent",
-            "train on, since opacities are reset every 3000 iterations; else lower --opacity_lr, and look at the poses",
+            "train on, since opacities are reset every 3000 iterations; else lower --opacity_lr, and check the poses",
         )
     return Line(
         f"{text}the Gaussians themselves are black",
-        "look whether the pictures that were trained on are (transparent ones need -w), and at --feature_lr",
+        "check whether the training photos are black (transparent ones need -w), and check --feature_lr",
     )
 
 
@@ -183,7 +185,7 @@ def _depths(camera: Camera, points: torch.Tensor) -> torch.Tensor:
 def _why_bad(scene: Scene, stored: dict[str, Any]) -> str:
     iteration = scene.loaded_iter
     if RESET_INTERVAL <= iteration < 15_000 and iteration % RESET_INTERVAL < 500:
-        return "this iteration is shortly after opacities were reset; look at a later one"
+        return "this iteration is shortly after opacities were reset; check a later one"
     if iteration < FEW_ITERATIONS:
         return f"train longer, {FEW_ITERATIONS} iterations at least"
     problems = [

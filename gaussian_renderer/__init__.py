@@ -1,4 +1,4 @@
-"""From a camera and a model to an image, and to what adaptive density control needs of it."""
+"""Rendering of a model for a camera: the image, and the values that adaptive density control needs."""
 
 import argparse
 import math
@@ -31,14 +31,15 @@ def render(
     """Render one view.
 
     bg_color: (3,) in [0, 1] on the model's device. scaling_modifier multiplies all scales. override_color: (N, 3)
-    instead of SH. separate_sh: accepted for callers of the reference; the SH bands always go separately.
-    pipe: convert_SHs_python, compute_cov3D_python, debug, antialiasing. use_trained_exp: as the picture behind the view
-    was exposed, before the clamp; a view without a picture is shown without.
+    instead of SH. separate_sh: accepted for callers of the reference; the SH bands are always passed separately.
+    pipe: convert_SHs_python, compute_cov3D_python, debug, antialiasing. use_trained_exp: apply the trained exposure of
+    the view's photo, before the clamp; a view without a photo has none.
 
-    Returns `render` (3, H, W) clamped to [0, 1], so values outside get no gradient, or as blended without clamp, for a
-    loss that clamps; `viewspace_points` (N, 3) whose gradient is that of the screen means, per NDC unit;
-    `visibility_filter` (n, 1) int64 indices of the Gaussians with radius > 0, or None without want_visibility (a GPU
-    has to be waited for it); `radii` (N,) int32 pixels; `depth` inverse depth (1, H, W), or None unless want_depth.
+    Returns
+    `render` (3, H, W), clamped to [0, 1] so that values outside get no gradient; unclamped without clamp;
+    `viewspace_points` (N, 3), whose gradient is that of the screen means, per NDC unit;
+    `visibility_filter` (n, 1) int64 indices of the Gaussians with radius > 0, or None without want_visibility, which
+    saves waiting for a GPU; `radii` (N,) int32 pixels; `depth` inverse depth (1, H, W), or None unless want_depth.
     """
     xyz = pc.get_xyz
     viewspace_points = _zero(xyz.device, xyz.dtype).expand_as(xyz)
@@ -65,13 +66,13 @@ def render(
 
 @cache
 def _zero(device: torch.device, dtype: torch.dtype) -> Tensor:
-    with torch.inference_mode(False):  # so that it can serve a training after a picture
+    with torch.inference_mode(False):  # so that training can use it after a render in inference mode
         return torch.zeros((), device=device, dtype=dtype)
 
 
 @torch.no_grad()
 def seen(camera: Camera | MiniCam, pc: GaussianModel, pipe: argparse.Namespace) -> Tensor:
-    """(N,) bool: the Gaussians that the image of `render`, over any background, depends on (`decisive`)."""
+    """Gaussians that the image of `render` depends on, over any background (`decisive`): (N,) bool."""
     background = pc.get_xyz.new_zeros(3)
     return decisive(
         pc.get_xyz,
@@ -102,8 +103,10 @@ def _settings(
 
 
 def _geometry(pc: GaussianModel, in_python: bool, scaling_modifier: float) -> dict[str, Tensor | bool]:
-    """Shapes and opacities: raw, with the activations inside the kernels (faster, and the same bits for any number of
-    threads), or the plain path through the model's activations."""
+    """Shapes and opacities: raw, so that the kernels activate them, or activated and multiplied out in PyTorch.
+
+    The kernels are faster and give the same bits for any number of threads.
+    """
     if in_python:
         return {"opacities": pc.get_opacity, "cov3d": pc.get_covariance(scaling_modifier)}
     return {**pc.raw_geometry(), "raw": True}
@@ -120,5 +123,5 @@ def _colors(
         return {"colors": (color + 0.5).clamp_min(0.0)}
     rest = pc.get_features_rest
     if pc.active_bands == 0:
-        rest = rest.detach()[:, :0]  # no band is read, so no gradient full of zeros need be written
+        rest = rest.detach()[:, :0]  # no band is read, so no gradient of zeros has to be written
     return {"sh_dc": pc.get_features_dc, "sh_rest": rest}

@@ -1,6 +1,6 @@
-"""Views: matrices for the rasterizer, and the picture behind each.
+"""Views: their matrices for the rasterizer, and their photos.
 
-Matrices are handed on transposed (they multiply row vectors from the right). Camera frame: x right, y down, z forward.
+Matrices are transposed, so that they multiply row vectors from the right. Camera frame: x right, y down, z forward.
 """
 
 import argparse
@@ -16,7 +16,7 @@ from scene.pictures.store import ImageStore, Picture, Source
 from scene.readers.records import CameraInfo
 from utils.graphics_utils import getProjectionMatrix, getWorld2View2
 
-ZNEAR = 0.01  # these two only shape the clip depth; nothing is culled by them
+ZNEAR = 0.01  # both only shape the clip depth and cull nothing
 ZFAR = 100.0
 
 
@@ -26,8 +26,8 @@ class Camera:
     uid: index in its list; colmap_id: intrinsics id. R (3,3) camera-to-world, T (3,) world-to-camera, NumPy float64.
     FoVx, FoVy: radians. fx, fy, cx, cy: pixels at image_width x image_height, pixel centres at .5 (the rasterizer's
     integer pixel coordinates are half a pixel less). world_view_transform, projection_matrix, full_proj_transform:
-    (4,4) float32, transposed; camera_center (3,) float32; all on `device`. columns: those that count, left out of loss
-    or scores is the rest; None: all (scene/half_images.py). exposure_name: the picture's among the trained exposures.
+    (4,4) float32, transposed; camera_center (3,) float32; all on `device`. columns: the columns that count in loss and
+    scores, None: all (scene/half_images.py). exposure_name: the photo's name among the trained exposures.
     """
 
     def __init__(
@@ -64,7 +64,7 @@ class Camera:
             self._source, self._mask = Cutout(info.image_path, info.mask), None
         self._depth = info.depth
 
-        # float64 up to here: the product and the inverse are rounded once.
+        # Computed in float64, so that product and inverse are rounded only once.
         view = torch.from_numpy(getWorld2View2(info.R, info.T))
         projection = getProjectionMatrix(
             ZNEAR, ZFAR, self.FoVx, self.FoVy, 2 * info.cx / info.width - 1, 2 * info.cy / info.height - 1
@@ -79,7 +79,7 @@ class Camera:
 
     @property
     def pictures(self) -> list[Picture]:
-        """What `target`, `mask` and `invdepthmap` read, each with the size (width, height) it is decoded at."""
+        """Sources of `target`, `mask` and `invdepthmap`, each with the size (width, height) it is decoded at."""
         sources = (self._source, self._mask, self._depth)
         return [(source, (self.image_width, self.image_height)) for source in sources if source is not None]
 
@@ -90,15 +90,15 @@ class Camera:
         return self._decoded(self._source)
 
     def ground_truth(self, background: Tensor) -> tuple[Tensor, Tensor | None]:
-        """`target` and `mask`; a picture that has to be copied to the device first is so once for both."""
+        """`target` and `mask`, with one copy of the image to the device for both."""
         pixels = self._pixels()
         return self._target(pixels, background), self._counting(pixels)
 
     def target(self, background: Tensor) -> Tensor:
-        """What a render of this view over `background` (3,) in [0,1] should be: (3,H,W).
+        """Image (3,H,W) that a render of this view over `background` (3,) in [0,1] should equal.
 
-        uint8, meaning value/255, for a picture without alpha, or with one that is a mask; else float32, laid over the
-        background by its alpha.
+        uint8, meaning value / 255, for a photo without alpha, or whose alpha is a mask; else float32, composited over
+        the background.
         """
         return self._target(self._pixels(), background)
 
@@ -109,7 +109,7 @@ class Camera:
 
     @property
     def mask(self) -> Tensor | None:
-        """Which pixels count in loss and scores, (1,H,W) bool; None where all do."""
+        """Pixels that count in loss and scores, (1,H,W) bool; None if all count."""
         return self._counting(self._pixels() if self._ignore_alpha else None)
 
     def _counting(self, pixels: Tensor | None) -> Tensor | None:
@@ -121,12 +121,12 @@ class Camera:
 
     @property
     def original_image(self) -> Tensor:
-        """The picture's colours (3,H,W) float32 in [0,1], straight, alpha not applied."""
+        """The photo's colours (3,H,W) float32 in [0,1], with straight alpha not applied."""
         return self._pixels()[:3].float() / 255
 
     @property
     def alpha_mask(self) -> Tensor | None:
-        """The picture's alpha (1,H,W) float32 in [0,1], 0 outside `columns`; None where it has none and all count."""
+        """The photo's alpha (1,H,W) float32 in [0,1], 0 outside `columns`; None without alpha if all columns count."""
         pixels = self._pixels()
         alpha = pixels[3:].float() / 255 if pixels.shape[0] == 4 else None
         return alpha if self.columns is None else self._within_columns(alpha)
@@ -157,7 +157,7 @@ class Camera:
 
 
 class MiniCam:
-    """A view without a picture: size in pixels, opening angles in radians, transposed (4,4) matrices."""
+    """A view without a photo: size in pixels, opening angles in radians, transposed (4,4) matrices."""
 
     def __init__(
         self,
@@ -188,7 +188,7 @@ def cameraList_from_camInfos(
     images: ImageStore,
     device: torch.device | str = "cpu",
 ) -> list[Camera]:
-    """Cameras at training size (args.resolution, made smaller by resolution_scale) that share one picture store."""
+    """Cameras at training size (args.resolution, divided by resolution_scale) that share one store of images."""
     return [
         Camera(info, uid, training_size(*info.file_size, args.resolution, resolution_scale), images, device)
         for uid, info in enumerate(cam_infos)
@@ -196,7 +196,7 @@ def cameraList_from_camInfos(
 
 
 def camera_to_JSON(id: int, camera: CameraInfo) -> dict[str, object]:
-    """Entry of `cameras.json`, keys in the order readers know: camera-to-world pose, full-size intrinsics."""
+    """Entry of `cameras.json`, keys in the order that viewers expect: camera-to-world pose, full-size intrinsics."""
     return {
         "id": id,
         "img_name": camera.image_name,

@@ -1,10 +1,10 @@
-"""Write a model in the coordinates of its scene: x, y, z in double, what else there is as it was.
+"""Write a model in the world's coordinates, with x, y, z in double and all other properties unchanged.
 
 python -m scene.export_world MODEL OUT.ply [--iteration N]
 
-For scenes whose coordinates are large against their extent, which are trained in a frame of their own
-(scene/readers/world_offset.py). Programs that read x, y, z as float lose the decimals again; CloudCompare and
-plyfile do not.
+For scenes whose coordinates are large against their extent, which are trained in a local frame
+(scene/readers/world_offset.py). CloudCompare and plyfile read the doubles; programs that read x, y, z as float lose the
+decimals again.
 """
 
 import argparse
@@ -36,7 +36,7 @@ def export_world(ply: Path, offset: np.ndarray, out: Path) -> None:
 
 def main() -> None:
     """The command line."""
-    parser = argparse.ArgumentParser(description="Write a model in the coordinates of its scene, x, y, z in double.")
+    parser = argparse.ArgumentParser(description="Write a model in the world's coordinates, x, y, z in double.")
     parser.add_argument("model", type=Path, help="folder that train.py wrote")
     parser.add_argument("out", type=Path, help="PLY to write")
     parser.add_argument("--iteration", type=int, default=-1, help="saved iteration (default: -1, the highest)")

@@ -1,5 +1,6 @@
-"""The half-image protocol (--train_test_exp): every picture trains, of test pictures the left half, whose right half is
-scored, so that the exposures of test pictures are known without training on what is scored.
+"""The half-image protocol (--train_test_exp): test photos train with their left half, and their right half is scored.
+
+So the exposures of test photos are known without training on the pixels that are scored.
 """
 
 import os
@@ -11,7 +12,7 @@ from scene.readers.records import CameraInfo, SceneInfo, exposure_names, scene_e
 
 
 def train_on_all(info: SceneInfo) -> SceneInfo:
-    """The scene with its test views among the training views, too: by name, or behind them where names clash."""
+    """The scene with its test views among the training views, too: sorted by name, or appended if names clash."""
     views = info.train_cameras + info.test_cameras
     if len({view.image_name for view in views}) == len(views):
         views.sort(key=lambda view: os.fsencode(view.image_name))
@@ -20,7 +21,7 @@ def train_on_all(info: SceneInfo) -> SceneInfo:
 
 
 def mark_halves(train: list[Camera], test: list[Camera], infos: Sequence[CameraInfo]) -> None:
-    """Tell cameras of a scene of `train_on_all` which columns count in each, and their names among the exposures.
+    """Set the columns that count and the exposure names in the cameras of a scene made by `train_on_all`.
 
     infos: of the training views.
     """

@@ -12,12 +12,12 @@ def saved_ply(model_path: str | os.PathLike, iteration: int) -> Path:
 
 
 def find_iteration(model_path: str | os.PathLike, iteration: int) -> int:
-    """The iteration, which must be saved in a model folder; -1: the last one saved. UserError where it is not there."""
+    """The iteration, -1: the last one saved. UserError if a model folder has no save of it."""
     folder = Path(model_path) / "point_cloud"
     last = searchForMaxIteration(folder)
     if iteration == -1:
         return last
     if not saved_ply(model_path, iteration).is_file():
         saved = ", ".join(map(str, saved_iterations(folder)))
-        raise UserError(f"iteration {iteration} was never saved in {folder}; saved are {saved}")
+        raise UserError(f"iteration {iteration} was never saved in {folder}; give one of {saved}")
     return iteration

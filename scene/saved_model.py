@@ -1,6 +1,6 @@
-"""A saved model with its scene.
+"""A saved model, loaded with its scene.
 
-Its PLY, not cfg_args, says of which SH degree it is: --prune_sh cuts the last save alone.
+The SH degree is read from the PLY, not from cfg_args, because --prune_sh changes the last save alone.
 """
 
 import argparse
@@ -12,9 +12,9 @@ from scene.scene import Scene
 
 
 def load_saved(options: argparse.Namespace, iteration: int, sh_degree: int | None = None) -> Scene:
-    """The views of the model options, and in `gaussians` what options.model_path has of an iteration, -1: the last.
+    """Scene of the model options, whose `gaussians` are those of a saved iteration, -1: the last one.
 
-    sh_degree: that which the PLY must have, None: any. UserError as Scene and GaussianModel.load_ply.
+    sh_degree: degree that the PLY must have, None: any. UserError as from Scene and GaussianModel.load_ply.
     """
     iteration = find_iteration(options.model_path, iteration)
     if sh_degree is None:

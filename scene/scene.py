@@ -126,18 +126,20 @@ class Scene:
         return self._test[scale]
 
     def prefetch(self, cameras: Sequence[Camera]) -> None:
-        """Begin to make the pictures of the views ready that are used next, in that order (`images.ahead` of them)."""
+        """Start to prepare the images of the views that come next, in that order (`images.ahead` of them)."""
         self.images.prefetch([picture for camera in cameras for picture in camera.pictures])
 
     def save(self, iteration: int, gaussians: SceneGaussians | None = None) -> None:
-        """Write the Gaussians, or those given in their place, as `point_cloud/iteration_N/point_cloud.ply`; exposures
-        where those are trained."""
+        """Write `point_cloud/iteration_N/point_cloud.ply`, and the exposures if they are trained.
+
+        gaussians: written in place of the scene's own; the exposures are always the scene's.
+        """
         (self.gaussians if gaussians is None else gaussians).save_ply(str(saved_ply(self.model_path, iteration)))
         if self._halves:
             self.gaussians.save_exposures(self.model_path)
 
     def training_pixels(self) -> tuple[int, int]:
-        """Pixels of all training views: as they train, and in their files."""
+        """Pixels of all training views: at training size, and in the photos."""
         trained = sum(camera.image_width * camera.image_height for camera in self.getTrainCameras())
         return trained, sum(width * height for width, height in (c.file_size for c in self.info.train_cameras))
 
@@ -169,7 +171,7 @@ class Scene:
         """Cameras by scale, in the same order at every scale."""
         order = list(range(len(infos)))
         if shuffle:
-            # A generator of its own: the order must not depend on what else drew numbers before (resume).
+            # A generator of its own: a resumed run must get the same order, whatever drew random numbers before.
             random.Random(0).shuffle(order)
         lists = {}
         for scale in scales:
@@ -183,9 +185,11 @@ def _pictures(lists: dict[float, list[Camera]]) -> list[Picture]:
 
 
 def _refuse_dataset_folder(args: argparse.Namespace) -> None:
-    """UserError when the model would be written into the dataset, which nothing may change."""
+    """UserError when the model would be written into the dataset, which must not change."""
     if not args.source_path or not args.model_path:
         return
     source, model = Path(args.source_path).resolve(), Path(args.model_path).resolve()
     if model.is_relative_to(source):
-        raise UserError(f"the output folder {args.model_path} lies in the scene folder {source}; name another with -m")
+        raise UserError(
+            f"the output folder {args.model_path} lies in the scene folder {source}; name another folder with -m"
+        )

@@ -202,7 +202,7 @@ def test_loading_a_saved_iteration(colmap_scene, tmp_path):
         assert scene.loaded_iter == loaded
         assert gaussians.loaded == str(tmp_path / "out" / "point_cloud" / f"iteration_{loaded}" / "point_cloud.ply")
     for missing in (0, 8):
-        with pytest.raises(UserError, match=rf"iteration {missing} was never saved .*saved are 7, 30"):
+        with pytest.raises(UserError, match=rf"iteration {missing} was never saved .*give one of 7, 30"):
             Scene(options, FakeGaussians(), load_iteration=missing)
     assert folder_state(tmp_path / "out") == before
 
@@ -429,7 +429,7 @@ def test_real_scenes(shared_dir, tmp_path, name, views, held, points, extent):
 @pytest.mark.parametrize("place", [".", "out", "images/deep/out", "../colmap_scene/out"])
 def test_nothing_is_written_into_the_dataset(colmap_scene, place):
     before = folder_state(colmap_scene)
-    with pytest.raises(UserError, match="lies in the scene folder .*; name another with -m"):
+    with pytest.raises(UserError, match="lies in the scene folder .*; name another folder with -m"):
         Scene(_options(colmap_scene, colmap_scene / place), FakeGaussians())
     assert folder_state(colmap_scene) == before
     Scene(_options(colmap_scene, colmap_scene.parent / "colmap_scene_out"), FakeGaussians())

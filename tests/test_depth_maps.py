@@ -236,7 +236,7 @@ def test_the_command_makes_a_file_that_training_takes(colmap_scene, tmp_path, mo
     command = ["utils/make_depth_scale.py", "--base_dir", colmap_scene, "--depths_dir", tmp_path / "maps"]
     done = subprocess.run([sys.executable, *map(str, command)], cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-    assert "17 of 17 pictures have a depth map" in done.stdout
+    assert "17 of 17 photos have a depth map" in done.stdout
     params = _params(colmap_scene)
     assert list(params[next(iter(params))]) == ["scale", "offset"]
     for name, (scale, offset) in wanted.items():

@@ -53,7 +53,7 @@ def test_exit_statuses(healthy, colmap_scene, tmp_path, capsys):
     assert capsys.readouterr().out.endswith("no problems found\n")
     assert exit_status("-s", str(colmap_scene)) == 1
     out = capsys.readouterr().out
-    assert "PROBLEM only 17 pictures -> " in out and "PROBLEM only 300 points" in out and out.endswith("2 problems\n")
+    assert "PROBLEM only 17 photos -> " in out and "PROBLEM only 300 points" in out and out.endswith("2 problems\n")
     for option in ("-s", "-m"):
         with pytest.raises(UserError, match=f"no folder .*nowhere; pass an existing folder as {option}"):
             doctor.main([option, str(tmp_path / "nowhere")])
@@ -67,7 +67,7 @@ def test_missing_packages_end_it(monkeypatch, colmap_scene, capsys):
     assert exit_status("-s", str(colmap_scene)) == 1
     out = capsys.readouterr().out
     assert "PROBLEM packages are missing: plyfile -> run `pip install -r requirements.txt`" in out
-    assert "pictures" not in out
+    assert "photos" not in out
 
 
 def _sources(root: Path, version: str = "0.1.0") -> Path:
@@ -167,7 +167,7 @@ def test_points_and_cameras_that_do_not_meet(info):
               for c in info.train_cameras]  # fmt: skip
     turned = dataclasses.replace(_with_cloud(info, many), train_cameras=around)
     assert (
-        "100% of the points are in no picture -> poses and points don't belong together"
+        "100% of the points are in no photo -> poses and points do not belong together"
         in problems(check_cloud(turned))[0]
     )
     one = dataclasses.replace(_with_cloud(info, many), train_cameras=[around[0], *info.train_cameras[1:]])
@@ -246,10 +246,10 @@ def _huge(gaussians):
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        (_nan, "1 of 300 Gaussians have a scale that is not finite -> go on from an earlier checkpoint"),
+        (_nan, "1 of 300 Gaussians have a scale that is not finite -> resume from an earlier checkpoint"),
         (_transparent, "renders of the training views are black: the Gaussians are almost transparent -> "),
-        (_elsewhere, "black: no Gaussian is in view, the cameras look away -> look at the poses"),
-        (_black, "black: the Gaussians themselves are black -> look whether the pictures"),
+        (_elsewhere, "black: no Gaussian is in view, because the cameras face away -> check the poses"),
+        (_black, "black: the Gaussians themselves are black -> check whether the training photos"),
         (_huge, "16.7% of the Gaussians are larger than the extent of the cameras"),
     ],
 )
@@ -277,7 +277,7 @@ def test_models_that_have_not_converged(model):
         "shortly after opacities were reset" in text for text in problems(check_model(model(iteration=6100), 6100))
     )
     assert any(
-        "the dataset has problems (only 17 pictures)" in text
+        "the dataset has problems (only 17 photos)" in text
         for text in problems(check_model(model(iteration=20000), -1))
     )
 
@@ -329,7 +329,7 @@ def test_views_of_which_nothing_counts(model, colmap_scene):
         Image.fromarray(np.zeros((HEIGHT, WIDTH), np.uint8)).save(path)
     write_model_json(folder, argparse.Namespace(masks="masks"), antialiasing=False, seed=0)
     (said,) = problems(check_model(folder, -1))
-    assert "no pixel of the training views that were looked at counts -> look at --masks" in said
+    assert "no pixel of the inspected training views counts -> check --masks" in said
 
 
 def test_folders_that_are_no_models(model, tmp_path):

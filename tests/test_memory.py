@@ -212,7 +212,7 @@ def test_every_command_ends_in_a_sentence(capsys):
     with pytest.raises(SystemExit) as ended:
         run_cli(full)
     assert ended.value.code == 2
-    assert re.fullmatch(r"error: memory did not suffice \(.* asked for, .*\n", capsys.readouterr().err)
+    assert re.fullmatch(r"error: ran out of memory \(.* asked for, .*\n", capsys.readouterr().err)
     with pytest.raises(RuntimeError, match="shapes"):
         run_cli(lambda: (_ for _ in ()).throw(RuntimeError("shapes differ")))
 

@@ -107,7 +107,7 @@ def test_mkdir_p(tmp_path):
     mkdir_p(tmp_path / "a" / "b")
     assert (tmp_path / "a" / "b").is_dir()
     (tmp_path / "file").write_text("")
-    with pytest.raises(UserError, match="cannot make the folder .*file"):
+    with pytest.raises(UserError, match="cannot create the folder .*file"):
         mkdir_p(tmp_path / "file" / "below")
 
 

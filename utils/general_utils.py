@@ -1,4 +1,4 @@
-"""Small tensor formulas of the method, its learning-rate curve, and the state of a run (seeds, stamped output)."""
+"""Formulas on small tensors, the learning-rate schedule, and the state of a run (seeds, stamped output)."""
 
 import random
 import sys
@@ -28,7 +28,7 @@ def build_rotation(r: Tensor) -> Tensor:
 
 
 def build_scaling_rotation(s: Tensor, r: Tensor) -> Tensor:
-    """R diag(s) (N,3,3) of scales s (N,3), activated, and quaternions r (N,4): the factor of the 3D covariance."""
+    """R diag(s) (N,3,3), the factor of the 3D covariance, of activated scales s (N,3) and quaternions r (N,4)."""
     return build_rotation(r) * s[:, None, :]
 
 
@@ -43,7 +43,7 @@ def get_expon_lr_func(
 ) -> Callable[[int], float]:
     """Learning rate by step: log-linear from lr_init to lr_final at max_steps, constant after.
 
-    With lr_delay_steps the start is damped by a quarter sine from lr_delay_mult up to 1. Zero before step 0.
+    With lr_delay_steps, a quarter sine from lr_delay_mult up to 1 damps the start. The rate is 0 before step 0.
     """
 
     def rate(step: int) -> float:
@@ -54,14 +54,14 @@ def get_expon_lr_func(
             part = min(max(step / lr_delay_steps, 0.0), 1.0)
             delay = lr_delay_mult + (1 - lr_delay_mult) * float(np.sin(0.5 * np.pi * part))
         t = min(step / max_steps, 1.0)
-        # Powers, not exp of logs: rates of zero need no case of their own.
+        # Powers instead of exp of logs, so that rates of zero need no special case.
         return delay * lr_init ** (1 - t) * lr_final**t
 
     return rate
 
 
 class _StampedOutput:
-    """A text stream whose lines end with the time, ` [dd/mm HH:MM:SS]`; or that says nothing."""
+    """A text stream that ends each line with the time, ` [dd/mm HH:MM:SS]`, or prints nothing if silent."""
 
     def __init__(self, stream: TextIO, silent: bool) -> None:
         self.stream = stream

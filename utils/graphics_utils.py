@@ -11,7 +11,7 @@ from torch import Tensor
 class BasicPointCloud(NamedTuple):
     """Coloured points: points (N,3), world units; colors (N,3) float32 in [0,1]; normals (N,3) float32.
 
-    Points are float64 as readers find them, float32 in the frame that is trained in (scene/readers/world_offset.py).
+    Points are float64 in the world, and float32 in the frame of the training (scene/readers/world_offset.py).
     """
 
     points: np.ndarray
@@ -33,7 +33,7 @@ def getProjectionMatrix(
     """Perspective matrix (4,4) float64 for column vectors: x, y to [-1,1], depth z in [znear, zfar] to [0,1].
 
     fovX, fovY: opening angles in radians of a frustum of the image's size. offsetX, offsetY: principal point minus
-    image centre, in NDC (half image sizes): 2 cx / W - 1, with COLMAP's cx, whose pixel centres lie at .5.
+    image centre in NDC (half image sizes), so 2 cx / W - 1 for COLMAP's cx, with pixel centres at .5.
     """
     P = torch.zeros(4, 4, dtype=torch.float64)
     P[0, 0] = 1 / math.tan(fovX / 2)

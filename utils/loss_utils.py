@@ -1,4 +1,4 @@
-"""Losses between a render and its photo: plain ones for reading and comparing, the fused one for training."""
+"""Losses between a render and its target: plain PyTorch for reading and comparing, fused kernels for training."""
 
 import torch
 import torch.nn.functional as F
@@ -29,10 +29,10 @@ def _gaussian_window(size: int, like: Tensor) -> Tensor:
 
 
 def ssim(img1: Tensor, img2: Tensor, window_size: int = WINDOW, size_average: bool = True) -> Tensor:
-    """Structural similarity (Wang et al. 2004, eq. 13) per channel with a Gaussian window and zeros outside the image.
+    """Structural similarity (Wang et al. 2004, eq. 13) per channel, with a Gaussian window and zeros outside the image.
 
     img1, img2: (C, H, W) or (B, C, H, W) in [0, 1]. Returns the mean over everything, or over each image of the batch
-    when `size_average` is off.
+    if `size_average` is off.
     """
     if img1.dim() == 3:
         img1, img2 = img1[None], img2[None]
@@ -58,10 +58,10 @@ def ssim(img1: Tensor, img2: Tensor, window_size: int = WINDOW, size_average: bo
 def photometric_loss(
     image: Tensor, target: Tensor, lambda_dssim: float, mask: Tensor | None = None, columns: slice | None = None
 ) -> tuple[Tensor, Tensor]:
-    """(1 - lambda) L1 + lambda (1 - SSIM) (Kerbl et al. 2023, eq. 7) and its L1 part, which is for the log.
+    """Loss (1 - lambda) L1 + lambda (1 - SSIM) (Kerbl et al. 2023, eq. 7), and its L1 part for the log.
 
-    Arguments as `l1_and_ssim`, but that the image is clamped to [0, 1] here: values outside get no gradient. columns:
-    those that count, None: all. The others are cut off, but a pixel weighs what it does in a whole image.
+    Arguments as for `l1_and_ssim`, except that the image is clamped to [0, 1], so that values outside get no gradient.
+    columns: the columns that count, None: all. The others are cut off; each pixel keeps its weight in the whole image.
     """
     if columns is not None:
         cut = [None if x is None else x[..., columns].contiguous() for x in (image, target, mask)]
@@ -78,8 +78,8 @@ def l1_and_ssim(image: Tensor, target: Tensor, mask: Tensor | None = None) -> tu
     """Mean |image - target| and mean SSIM from one fused pass.
 
     image: (3, H, W) float32 in [0, 1], differentiable; target: the same shape, float32, or uint8 meaning value / 255.
-    mask: (1, H, W) bool, the pixels that count. The others are to both terms what lies beyond the border, 0 in both
-    images: windows see them as such, and the sums of |difference| and of 1 - SSIM are divided by the pixels that count.
+    mask: (1, H, W) bool, the pixels that count. The others are treated like the zero padding outside the image, in both
+    images, and the sums of |difference| and of 1 - SSIM are divided by the number of pixels that count.
     """
     if mask is None:
         return fused_l1_ssim(image, target)
@@ -91,9 +91,10 @@ def l1_and_ssim(image: Tensor, target: Tensor, mask: Tensor | None = None) -> tu
 def inverse_depth_loss(
     inverse_depth: Tensor, target: Tensor, columns: slice | None = None, mask: Tensor | None = None
 ) -> Tensor:
-    """Mean absolute difference of inverse depths (1, H, W), 1 / world units; columns that don't count differ by 0.
+    """Mean absolute difference of inverse depths (1, H, W), 1 / world units.
 
-    mask: (1, H, W) bool, the pixels that count: of these the mean is taken, within the columns, as in photometric_loss.
+    columns: the columns that count, None: all; in the others the difference is 0. mask: (1, H, W) bool, the pixels that
+    count; the mean is over these, within the columns, as in photometric_loss.
     """
     difference = (inverse_depth - target).abs()
     pixels = difference.numel()

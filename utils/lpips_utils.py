@@ -1,7 +1,7 @@
-"""LPIPS (Zhang et al. 2018, version 0.1) through the `lpips` package, with ImageNet weights wherever they can be had.
+"""LPIPS (Zhang et al. 2018, version 0.1) through the `lpips` package, with torchvision's ImageNet weights.
 
-The package brings the linear heads; the backbone's weights are torchvision's. They come from a given file, from
-torch's cache, or are downloaded into it. A backbone without weights is never used.
+The package brings the linear heads. The backbone's weights come from a given file, from torch's cache, or are
+downloaded into it. A backbone without weights is never used.
 """
 
 from __future__ import annotations
@@ -18,22 +18,22 @@ from torch import library
 
 from utils.system_utils import UserError
 
-# The first convolution tells the backbones apart; the smallest side (pixels) is what their poolings leave a pixel of.
+# The first convolution tells the backbones apart. Images below the smallest side (pixels) shrink to nothing in pooling.
 _FIRST_LAYER = {"vgg": (64, 3, 3, 3), "alex": (64, 3, 11, 11)}
 MIN_SIDE = {"vgg": 16, "alex": 31}
 _DOWNLOAD_TIMEOUT = 10.0  # seconds without an answer before the network counts as absent
 
 
 class LpipsUnavailable(Exception):
-    """LPIPS cannot be computed here; the text says what to put where."""
+    """LPIPS cannot be computed here; the text names the missing file and its place."""
 
 
 def import_lpips() -> ModuleType:
-    """The `lpips` package, also beside a CPU-only torch.
+    """The `lpips` package, which this imports also beside a CPU-only torch.
 
-    torchvision's wheel cannot load its compiled operators there, yet its Python side attaches fake kernels to two of
-    them and stops when they do not exist (0.28). LPIPS needs neither, so their schemas are declared and the import is
-    repeated. They are declared only after the failure: where the real operators exist, theirs would clash with ours.
+    There torchvision's wheel cannot load its compiled operators, and its Python side (0.28) fails when it attaches fake
+    kernels to two of them. LPIPS needs neither, so this declares their schemas and repeats the import. It does so only
+    after the failure, because the real operators' schemas would clash with these.
     """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -59,16 +59,16 @@ def _declare_missing_operators() -> None:
 class PerceptualDistance:
     """LPIPS with one backbone, `vgg` or `alex`.
 
-    `weights` are state-dict files in torchvision's format (parameters `features.*`; others are ignored), of which the
-    one that fits the backbone is taken; without any, torch's cache and then the network. Raises LpipsUnavailable, or
-    UserError for a file of the wrong kind.
+    weights: state-dict files in torchvision's format (parameters `features.*`; others are ignored), of which the one
+    that fits the backbone is used. Without any, torch's cache is tried, and then the network. Raises LpipsUnavailable,
+    or UserError for a file of the wrong kind.
     """
 
     def __init__(self, net: str, weights: list[Path], device: torch.device) -> None:
         state = _features_from_files(net, weights) if weights else _features_from_cache(net)
         lpips = import_lpips()
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # torchvision's about an argument that lpips still uses
+            warnings.simplefilter("ignore")  # torchvision warns of an argument that lpips still uses
             model = lpips.LPIPS(net=net, pnet_rand=True, verbose=False)  # random only until the next lines
         trunk = model.net.state_dict()  # names are sliceK.N.weight, N being the layer of torchvision's `features`
         model.net.load_state_dict({name: _pick(state, name.split(".", 1)[1], trunk[name], net) for name in trunk})
@@ -80,9 +80,9 @@ class PerceptualDistance:
     ) -> float:
         """Distance of two images (3, H, W), float32 in [0, 1].
 
-        The network's normalisation expects [-1, 1]. `unit_range=True` hands it [0, 1] all the same, as the published
-        3DGS numbers do; False maps to [-1, 1] first, as the package documents. mask: (H, W) bool, the pixels over which
-        the map of distances is averaged; without one the layers' means are added, as published.
+        The network's normalisation expects [-1, 1]. unit_range: True passes [0, 1] nevertheless, as for the published
+        3DGS numbers; False maps to [-1, 1] first, as the package documents. mask: (H, W) bool, the pixels over which
+        the map of distances is averaged; without a mask the layers' means are added, as published.
         """
         self._model.spatial = mask is not None
         distance = self._model(image[None], other[None], normalize=not unit_range)
@@ -109,7 +109,7 @@ def _features_from_files(net: str, files: list[Path]) -> dict[str, torch.Tensor]
         state = _load_state(file)
         shape = tuple(getattr(state.get("features.0.weight"), "shape", ()))
         if shape not in _FIRST_LAYER.values():
-            raise UserError(f"{file} holds no weights of torchvision's vgg16 or alexnet (features.0.weight ...)")
+            raise UserError(f"{file} has no weights of torchvision's vgg16 or alexnet (features.0.weight ...)")
         if shape == _FIRST_LAYER[net]:
             return state
     raise LpipsUnavailable(f"no file of --lpips_weights holds torchvision's {_torchvision_name(net)}; add it there")
@@ -120,8 +120,8 @@ def _load_state(file: Path) -> dict[str, torch.Tensor]:
         state = torch.load(file, map_location="cpu", weights_only=True)
     except FileNotFoundError:
         raise UserError(f"no such file: {file} (--lpips_weights)") from None
-    except Exception as error:  # torch raises many kinds for damaged files and for pickles that are not plain tensors
-        raise UserError(f"{file} is no readable state dict of plain tensors ({type(error).__name__})") from error
+    except Exception as error:  # torch raises many kinds for damaged files and for pickles of other objects
+        raise UserError(f"{file} is not a readable state dict of plain tensors ({type(error).__name__})") from error
     if not isinstance(state, dict):
         raise UserError(f"{file} holds a {type(state).__name__}, wanted a state dict in torchvision's format")
     return state
@@ -141,7 +141,7 @@ def _features_from_cache(net: str) -> dict[str, torch.Tensor]:
 
 
 def _download(url: str) -> dict[str, torch.Tensor] | None:
-    """Fetch a state dict into torch's cache. None when that fails, and at once when it has failed before."""
+    """Download a state dict into torch's cache. None if that fails, and at once if it has failed before."""
     global _network_failed
     if _network_failed:
         return None

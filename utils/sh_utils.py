@@ -10,7 +10,7 @@ def sh_basis(deg: int, dirs: Tensor) -> Tensor:
     """Basis values (..., (deg+1)^2) at unit vectors dirs (..., 3).
 
     Order l = 0..deg, m = -l..l, with the Condon-Shortley sign (-1)^m. The factors are the usual normalisation
-    sqrt((2l+1)/(4 pi) (l-|m|)!/(l+|m|)!), times sqrt(2) for m != 0, with the polynomial's own factor pulled in.
+    sqrt((2l+1)/(4 pi) (l-|m|)!/(l+|m|)!), times sqrt(2) for m != 0, times the polynomial's own factor.
     """
     if not 0 <= deg <= 4:
         raise ValueError(f"degree must be 0 to 4, got {deg}")
@@ -64,5 +64,5 @@ def RGB2SH(rgb: Tensor) -> Tensor:
 
 
 def SH2RGB(sh: Tensor) -> Tensor:
-    """Colour that a coefficient of degree 0 gives."""
+    """Colour of a coefficient of degree 0."""
     return sh * C0 + 0.5

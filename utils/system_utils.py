@@ -26,19 +26,19 @@ _ITERATION_FOLDER = re.compile(r"iteration_(\d+)")
 
 
 class UserError(Exception):
-    """Something the user can mend. Its text is one sentence that names the thing and the remedy."""
+    """An error that the user can fix. Its text is one sentence that names the fault and the remedy."""
 
 
 def run_cli(main: Callable[[], object]) -> None:
     """Run a command line: a UserError prints its sentence and exits 2; a bug keeps its traceback.
 
-    As shells count signals: Ctrl-C exits 130, SIGTERM 143, and a reader of the output that went away (`| head`) 141.
+    Signals exit as in shells: Ctrl-C 130, SIGTERM 143, and 141 if the reader of the output is gone (`| head`).
     """
     try:
         status = _status(main)
-        sys.stdout.flush()  # here, where a broken pipe can still be caught
+        sys.stdout.flush()  # now, while a broken pipe can still be caught
     except BrokenPipeError:
-        # Python flushes both once more on its way out, and either may be the broken pipe.
+        # Python flushes both streams again when it exits, and either may be the broken pipe.
         nowhere = os.open(os.devnull, os.O_WRONLY)
         for stream in (sys.__stdout__, sys.__stderr__):
             os.dup2(nowhere, stream.fileno())
@@ -57,8 +57,8 @@ def _status(main: Callable[[], object]) -> int:
         if not is_out_of_memory(error):
             raise
         print(
-            f"error: memory did not suffice ({shortage(error, compute_device())}); lower --resolution (-r), or free "
-            "memory that other programs use",
+            f"error: ran out of memory ({shortage(error, compute_device())}); lower --resolution (-r), or free memory "
+            "that other programs use",
             file=sys.stderr,
         )
         return 2
@@ -73,10 +73,10 @@ def _status(main: Callable[[], object]) -> int:
 
 @contextlib.contextmanager
 def atomic_write(path: str | os.PathLike) -> Iterator[Path]:
-    """Yield a temporary path beside `path`, with its suffix; rename it to `path` when the block ends well, else drop.
+    """Yield a temporary path beside `path`, with its suffix; rename it to `path` if the block succeeds, else delete it.
 
-    Makes the folder when it is missing. A killed process may leave the hidden temporary file, never half a `path`.
-    An OSError of the block or the renaming (disk full, `path` is a folder) becomes a UserError.
+    Creates a missing folder. A killed process may leave the hidden temporary file, but never half a `path`. An OSError
+    of the block or of renaming (disk full, `path` is a folder) becomes a UserError.
     """
     target = Path(path)
     mkdir_p(target.parent)
@@ -90,29 +90,29 @@ def atomic_write(path: str | os.PathLike) -> Iterator[Path]:
         if isinstance(error, OSError):
             reason = error.strerror or error
             raise UserError(
-                f"cannot write {target} ({reason}); free space, mend the rights, or choose another place"
+                f"cannot write {target} ({reason}); free space, fix the permissions, or choose another place"
             ) from error
         raise
 
 
 def mkdir_p(folder_path: str | os.PathLike) -> None:
-    """Make a folder and its parents; one that exists is fine. UserError where the system refuses."""
+    """Create a folder and its parents; an existing folder is fine. UserError when the system refuses."""
     try:
         os.makedirs(folder_path, exist_ok=True)
     except OSError as error:
         raise UserError(
-            f"cannot make the folder {folder_path} ({error.strerror}); choose another place, or mend the rights there"
+            f"cannot create the folder {folder_path} ({error.strerror}); choose another place, or fix its permissions"
         ) from error
 
 
 def saved_iterations(folder: str | os.PathLike) -> list[int]:
-    """Every N of the sub-folders `iteration_N`, ascending; empty where the folder is missing."""
+    """Every N of the sub-folders `iteration_N`, ascending; empty if the folder is missing."""
     names = os.listdir(folder) if os.path.isdir(folder) else []
     return sorted(int(match[1]) for name in names if (match := _ITERATION_FOLDER.fullmatch(name)))
 
 
 def searchForMaxIteration(folder: str | os.PathLike) -> int:
-    """Largest N of the sub-folders `iteration_N`. UserError when there is none."""
+    """Largest N of the sub-folders `iteration_N`. UserError if there are none."""
     iterations = saved_iterations(folder)
     if not iterations:
         raise UserError(f"no saved iteration in {folder} (looked for folders iteration_N); train the model first")

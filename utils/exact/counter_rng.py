@@ -1,8 +1,8 @@
 """Random numbers without state: a pure function of (seed, stream, iteration, item, draw).
 
-Philox-4x32-10 (Salmon et al. 2011, "Parallel random numbers: as easy as 1, 2, 3") in torch integer operations. Nothing
-has to be saved for a resumed run to draw the numbers of the uninterrupted one, and every device and number of threads
-draws the same bits.
+Philox-4x32-10 (Salmon et al. 2011, "Parallel random numbers: as easy as 1, 2, 3") in torch integer operations. A run
+that resumes draws the numbers of an uninterrupted one without any saved state. Every device and number of threads draws
+the same bits.
 """
 
 from enum import IntEnum
@@ -19,7 +19,7 @@ _ROUNDS = 10
 
 
 class Stream(IntEnum):
-    """What the numbers are for; streams never overlap."""
+    """Purposes of random numbers; streams never overlap."""
 
     VIEW_ORDER = 0
     BACKGROUND = 1
@@ -27,7 +27,7 @@ class Stream(IntEnum):
 
 
 def _multiply(x: Tensor, factor: int) -> tuple[Tensor, Tensor]:
-    """High and low 32 bits of x * factor, by 16-bit halves of the factor so that int64 can't overflow."""
+    """High and low 32 bits of x * factor, by 16-bit halves of the factor so that int64 cannot overflow."""
     low = x * (factor & 0xFFFF)
     high = x * (factor >> 16)
     middle = low + ((high & 0xFFFF) << 16)
@@ -35,7 +35,7 @@ def _multiply(x: Tensor, factor: int) -> tuple[Tensor, Tensor]:
 
 
 def philox(counter: Tensor, key: tuple[int, int]) -> Tensor:
-    """Philox-4x32-10 of each row of `counter` ((n, 4) int64, values below 2^32); the same shape comes back."""
+    """Philox-4x32-10 of each row of `counter`, (n, 4) int64 below 2^32: (n, 4) int64 below 2^32."""
     c0, c1, c2, c3 = counter.unbind(-1)
     k0, k1 = key
     for _ in range(_ROUNDS):

@@ -1,7 +1,7 @@
 """exp, log, cos and sin in float64 from operations that IEEE 754 rounds in one way only (+ - * / sqrt, integers).
 
-torch's own differ in their last bits between vector body and scalar tail, so between numbers of threads, and between
-devices. A result that goes into the model (positions of split Gaussians) must not.
+torch's functions differ in their last bits between vector body and scalar tail, so also between numbers of threads, and
+between devices. Values that enter the model, the positions of split Gaussians, must not differ.
 """
 
 import math
@@ -14,7 +14,7 @@ _LN2_LOW = float.fromhex("0x1.a39ef35793c76p-33")
 
 
 def _horner(x: Tensor, coefficients: list[float]) -> Tensor:
-    """Polynomial, highest power first."""
+    """Polynomial in x by its coefficients, highest power first."""
     result = torch.full_like(x, coefficients[0])
     for coefficient in coefficients[1:]:
         result = result * x + coefficient

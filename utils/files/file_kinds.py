@@ -1,4 +1,4 @@
-"""What a file is that is not what its name says: the usual accidents of downloads and clones."""
+"""Detection of files whose content is not what their name says, after a failed download or clone."""
 
 import os
 
@@ -6,7 +6,7 @@ _HEAD = 256
 
 
 def not_the_file(path: str | os.PathLike) -> str | None:
-    """What stands in place of a file's content: nothing, a pointer of Git LFS, a web page; None: none of these."""
+    """Words for a file that is empty, a pointer of Git LFS or a web page; None for any other file."""
     try:
         with open(path, "rb") as file:
             head = file.read(_HEAD)
@@ -15,7 +15,7 @@ def not_the_file(path: str | os.PathLike) -> str | None:
     if not head:
         return "empty"
     if head.startswith(b"version https://git-lfs"):
-        return "a pointer of Git LFS, whose content git lfs pull fetches"
+        return "a pointer of Git LFS, whose content git lfs pull downloads"
     if head.lstrip()[:9].lower().startswith((b"<!doctype", b"<html")):
-        return "a web page, as downloads of a wrong address are"
+        return "a web page, likely from a wrong address"
     return None

@@ -1,17 +1,23 @@
-"""Picture files: their suffixes, what reading them raises, and renders of any size that can be rendered."""
+"""Image files: suffixes, exceptions of reading them, and opening of renders of any size."""
 
 import warnings
 from pathlib import Path
 
 from PIL import Image
 
-MOST_PIXELS = 1 << 28  # 16384 a side, the largest training size; Pillow's own limit is lower
-UNREADABLE = (OSError, SyntaxError, ValueError, EOFError, Image.DecompressionBombError)  # by format, on broken files
+MOST_PIXELS = 1 << 28  # 16384 a side, the largest training size; Pillow's default limit is lower
+UNREADABLE = (
+    OSError,
+    SyntaxError,
+    ValueError,
+    EOFError,
+    Image.DecompressionBombError,
+)  # Pillow raises these for broken files, depending on the format
 SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp")
 
 
 def open_render(path: Path) -> Image.Image:
-    """Open a picture; its pixels are read later. Raises one of UNREADABLE where that fails."""
+    """Open an image file; its pixels are read later. Raises one of UNREADABLE if that fails."""
     usual = Image.MAX_IMAGE_PIXELS
     Image.MAX_IMAGE_PIXELS = MOST_PIXELS
     try:

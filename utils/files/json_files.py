@@ -1,4 +1,4 @@
-"""Our own JSON files."""
+"""Reading and writing of the JSON files of this project."""
 
 import json
 from pathlib import Path
@@ -8,13 +8,13 @@ from utils.system_utils import atomic_write
 
 
 def read_json(path: Path) -> Any:
-    """A file's content. OSError where it can't be read; ValueError or RecursionError where it is no JSON."""
+    """Content of a file. OSError if it cannot be read; ValueError or RecursionError if it is not JSON."""
     return json.loads(path.read_text(encoding="utf-8"))
 
 
 def write_json(path: Path, content: Any, sort_keys: bool = True) -> None:
-    """Write a file, whole or not at all, without NaN: ValueError where there is one."""
+    """Write a whole file or none. ValueError for content with NaN."""
     text = json.dumps(content, indent=1, sort_keys=sort_keys, allow_nan=False, ensure_ascii=False) + "\n"
     with atomic_write(path) as temporary:
-        # Names of files that are no UTF-8 have surrogates, which JSON writes just as Python does.
+        # File names that are not UTF-8 have surrogates, which JSON escapes as Python does.
         temporary.write_text(text, encoding="utf-8", errors="backslashreplace")

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 
 def some(names: Sequence[str], most: int = 5) -> str:
-    """The first names of a list, and how many more there are."""
+    """The first names of a list, and the number of further ones."""
     if not names:
         return "nothing"
     rest = len(names) - most

@@ -4,9 +4,9 @@ from collections.abc import Sequence
 
 
 def markdown_table(header: Sequence[str], rows: Sequence[Sequence[str]], right: bool = True) -> str:
-    """A Markdown table of cells of text, padded so that it reads well in a terminal too.
+    """Markdown table of text cells, padded to be readable in a terminal, too.
 
-    right: the columns after the first stand to the right, as numbers do.
+    right: align all columns but the first to the right, as for numbers.
     """
     lines = [[cell.replace("|", "\\|").replace("\n", " ") for cell in line] for line in (header, *rows)]
     widths = [max(3, *map(len, column)) for column in zip(*lines, strict=True)]

@@ -1,4 +1,4 @@
-"""Where results that can be made again are kept between runs."""
+"""Folder that keeps reproducible results between runs."""
 
 import os
 from pathlib import Path
@@ -11,5 +11,5 @@ def cache_folder() -> Path:
     if given := os.environ.get("GS_CACHE"):
         return Path(given)
     base = os.environ.get("XDG_CACHE_HOME", "")
-    # The XDG base directory specification: a path that is not absolute counts as none.
+    # By the XDG base directory specification, a relative path is ignored.
     return (Path(base) if os.path.isabs(base) else Path.home() / ".cache") / NAME

@@ -1,4 +1,4 @@
-"""Ctrl-C, SIGTERM and SIGHUP that wait for a good moment."""
+"""Ctrl-C, SIGTERM and SIGHUP, deferred until the program can stop cleanly."""
 
 import contextlib
 import os
@@ -10,7 +10,7 @@ _HANGUP = getattr(signal, "SIGHUP", None)  # Windows has none
 
 
 class Terminated(KeyboardInterrupt):
-    """SIGTERM or SIGHUP, where it is treated as Ctrl-C is."""
+    """SIGTERM or SIGHUP, raised like Ctrl-C's KeyboardInterrupt."""
 
 
 _ERRORS = {signal.SIGINT: KeyboardInterrupt, signal.SIGTERM: Terminated}
@@ -21,10 +21,10 @@ if _HANGUP is not None:
 class DeferredInterrupt:
     """Inside `with`, a first Ctrl-C, SIGTERM or SIGHUP only sets `requested`, so that no half-done step gets saved.
 
-    requested: the exception to raise in a good moment, KeyboardInterrupt or Terminated (SIGTERM; SIGHUP, when the
-    terminal is closed), or None. A second signal raises its own at once, but SIGHUP, which may come once from the
-    terminal and once from the shell. Under nohup SIGHUP stays ignored. Outside the main thread, where Python delivers
-    no signals, it does nothing.
+    requested: the exception to raise at a safe moment: KeyboardInterrupt, Terminated (for SIGTERM, and for SIGHUP of a
+    closed terminal), or None. A second signal raises its exception at once, except SIGHUP, which both terminal and
+    shell may send. Under nohup SIGHUP stays ignored. Outside the main thread, where Python delivers no signals, this
+    does nothing.
     """
 
     def __init__(self) -> None:
@@ -54,7 +54,7 @@ class DeferredInterrupt:
 
 
 def _leave_closed_terminal() -> None:
-    """Send to nowhere what can no longer be written, or the next message would end the program before it has saved."""
+    """Redirect closed outputs to nowhere; otherwise the next message would end the program before it has saved."""
     for descriptor in (1, 2):
         try:
             os.write(descriptor, b"")

@@ -1,4 +1,4 @@
-"""What a measurement was made on: processor, GPU, instruction set, commit."""
+"""Description of the machine of a measurement: processor, GPU, instruction set, commit."""
 
 import os
 import platform
@@ -9,7 +9,7 @@ import torch
 
 
 def cpu_name() -> str:
-    """The processor's name, from the kernel where it tells."""
+    """Name of the processor, from the kernel if it tells."""
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
     except OSError:
@@ -23,7 +23,7 @@ def device_name(device: torch.device) -> str:
 
 
 def instruction_set() -> str:
-    """The instruction set that the CPU backends use here (environment variable GS_ISA narrows it)."""
+    """Instruction set that the CPU backends use here; the environment variable GS_ISA narrows it."""
     capability = {"AVX512": "avx512", "AVX2": "avx2"}.get(torch.backends.cpu.get_cpu_capability(), "baseline")
     order = ["baseline", "avx2", "avx512"]
     wanted = os.environ.get("GS_ISA", capability)
@@ -31,7 +31,7 @@ def instruction_set() -> str:
 
 
 def gpu_name() -> str:
-    """The current GPU's name with driver and clocks as nvidia-smi gives them."""
+    """Name of the current GPU, with driver and clocks from nvidia-smi."""
     fields = "driver_version,clocks.sm,clocks.mem"
     index = f"--id={torch.cuda.current_device()}"
     state = _output("nvidia-smi", index, f"--query-gpu={fields}", "--format=csv,noheader")
@@ -39,7 +39,7 @@ def gpu_name() -> str:
 
 
 def commit() -> str:
-    """GS_COMMIT where it is set (a copy without git), else the checkout's short hash, with + where files differ."""
+    """GS_COMMIT if set (for a copy without git), else the checkout's short hash, with + if files differ."""
     if os.environ.get("GS_COMMIT"):
         return os.environ["GS_COMMIT"]
     short = _output("git", "rev-parse", "--short", "HEAD")
@@ -48,7 +48,7 @@ def commit() -> str:
 
 
 def _output(*command: str) -> str:
-    """What a program prints; empty where it is missing or fails."""
+    """Output of a program; empty if it is missing or fails."""
     try:
         done = subprocess.run(command, cwd=Path(__file__).resolve().parent, capture_output=True, text=True)
     except OSError:

@@ -1,4 +1,4 @@
-"""How much memory is free, and errors that mean there is too little."""
+"""Free memory, and recognition of errors that mean there is too little of it."""
 
 import contextlib
 import re
@@ -11,7 +11,7 @@ try:
 except ImportError:  # Windows
     resource = None
 
-# torch's words on CPU and GPU, C++'s own, CUDA's, and the rasterizer's on more instances than it can count.
+# Words of torch on CPU and GPU, of C++ and CUDA, and of the rasterizer for more instances than it can count.
 _WORDS = ("can't allocate memory", "not enough memory", "out of memory", "bad_alloc", "more than 2^31")
 _ASKED = re.compile(r"(?:[Tt]ried|Unable) to allocate ([\d.]+) ?(bytes|[KMGT]iB)")
 _UNITS = {"bytes": 1, "KiB": 2**10, "MiB": 2**20, "GiB": 2**30, "TiB": 2**40}
@@ -19,7 +19,7 @@ _CGROUP = Path("/sys/fs/cgroup")
 
 
 def is_out_of_memory(error: BaseException | None) -> bool:
-    """Whether an error, or what it was raised from, says that memory did not suffice or could not be counted."""
+    """Whether an error, or its cause, says that memory ran out or that there are too many instances to count."""
     if error is None:
         return False
     if isinstance(error, RuntimeError):  # torch.OutOfMemoryError is one, too
@@ -28,7 +28,7 @@ def is_out_of_memory(error: BaseException | None) -> bool:
 
 
 def shortage(error: BaseException, device: torch.device | str) -> str:
-    """What such an error was about: the bytes asked for or its own words, and the bytes free where that is known."""
+    """Description of such an error: the bytes asked for, or its own words, and the free bytes if known."""
     asked, free = _ASKED.search(str(error)), free_memory(device)
     if asked:
         parts = [f"{gib(float(asked[1]) * _UNITS[asked[2]])} asked for"]
@@ -45,10 +45,10 @@ def gib(count: float) -> str:
 
 
 def free_memory(device: torch.device | str) -> int | None:
-    """Bytes that can still be taken on a device; None where the system does not tell.
+    """Bytes that can still be allocated on a device; None if the system does not tell.
 
-    CPU: what the kernel calls available, less where the container (control group) or a limit of the process (ulimit -v)
-    allows less. GPU: what the driver has, and what torch holds without using it.
+    CPU: the kernel's available memory, or less if the container (control group) or a limit of the process (ulimit -v)
+    allows less. GPU: the driver's free memory, and memory that torch holds unused.
     """
     device = torch.device(device)
     if device.type == "cuda":
@@ -75,7 +75,7 @@ def _group_limit() -> int | None:
         with contextlib.suppress(OSError, ValueError):
             most = int((_CGROUP / limit).read_text())  # ValueError: the word "max"
             stat = (_CGROUP / limit).with_name("memory.stat").read_text()
-            cached = re.search(r"^(?:total_)?inactive_file (\d+)$", stat, re.MULTILINE)  # given back when asked for
+            cached = re.search(r"^(?:total_)?inactive_file (\d+)$", stat, re.MULTILINE)  # the kernel frees it on demand
             return max(most - int((_CGROUP / used).read_text()) + (int(cached[1]) if cached else 0), 0)
     return None
 

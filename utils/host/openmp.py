@@ -1,7 +1,7 @@
-"""Import before torch: how the threads of torch's OpenMP wait for work.
+"""Setting of how long the threads of torch's OpenMP spin while they wait for work. Import it before torch.
 
-By default they spin for milliseconds. Where another program wants the cores they then keep each other from working: 300
-iterations of a small scene on two busy cores took 42 s so, and 9 s with short spinning. On idle cores both take 6 s.
+By default they spin for milliseconds, and block the cores if other programs want them, too: on two busy cores, 300
+iterations of a small scene took 42 s, and 9 s with short spinning. On idle cores both take 6 s.
 """
 
 import os

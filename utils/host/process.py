@@ -1,4 +1,4 @@
-"""What the running process has used so far: seconds and memory."""
+"""Seconds and memory that the running process has used so far."""
 
 import os
 import time
@@ -10,10 +10,10 @@ _IMPORTED = time.perf_counter()
 
 
 def wall_seconds() -> float:
-    """Seconds since the process started; on systems that do not tell, since the import of this module."""
+    """Seconds since the process started, or since the import of this module if the system does not tell."""
     since_import = time.perf_counter() - _IMPORTED
     try:
-        # The command's name, in brackets, may have spaces; field 22 of proc(5) is the start in clock ticks since boot.
+        # The command's name, in brackets, may have spaces. Field 22 of proc(5) is the start in clock ticks since boot.
         fields = Path("/proc/self/stat").read_text().rpartition(")")[2].split()
         started = int(fields[22 - 3]) / os.sysconf("SC_CLK_TCK")
         return max(time.clock_gettime(time.CLOCK_BOOTTIME) - started, since_import)
@@ -22,11 +22,11 @@ def wall_seconds() -> float:
 
 
 def peak_memory_mib(device: torch.device) -> float | None:
-    """Most memory held so far, MiB: torch's on a GPU, else all that was resident; None on systems that do not tell."""
+    """Peak memory so far in MiB: torch's on a GPU, else the resident memory; None if the system does not tell."""
     if device.type == "cuda":
         return torch.cuda.max_memory_allocated(device) / 2**20
     try:
-        # Not getrusage: after exec it still has the peak of the process that started this one.
+        # getrusage would also count the peak of the process that started this one, because exec keeps it.
         status = Path("/proc/self/status").read_text()
         return int(status.partition("VmHWM:")[2].split()[0]) / 2**10  # kB
     except (OSError, ValueError, IndexError):

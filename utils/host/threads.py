@@ -1,27 +1,27 @@
-"""How many processors this process may use, which in a container are fewer than the machine has."""
+"""Number of processors that this process may use; a container may allow fewer than the machine has."""
 
 import math
 import os
 from pathlib import Path
 
-MOST_THREADS = 16  # for work on pictures: more wait for memory and disk
+MOST_THREADS = 16  # for work on image files: more threads only wait for memory and disk
 _CGROUPS = Path("/sys/fs/cgroup")
 _OWN_CGROUPS = Path("/proc/self/cgroup")
 
 
 def cores() -> int:
-    """Processors by affinity (taskset, Slurm) and by the quota of the process's cgroups (Docker's --cpus)."""
+    """Processors allowed by affinity (taskset, Slurm) and by the quota of the process's cgroups (Docker's --cpus)."""
     count = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     return max(1, math.ceil(min(count, _quota())))
 
 
 def threads(most: int = MOST_THREADS) -> int:
-    """How many threads to use for work that leaves Python's lock: one for each of `cores`, `most` at most."""
+    """Number of threads for work that releases Python's lock: one for each of `cores`, `most` at most."""
     return min(cores(), most)
 
 
 def _quota() -> float:
-    """Processors' worth of time that the cgroup, or one around it, may use (cpu.max of version 2); infinite without."""
+    """Processors that the cgroup and those around it may use (cpu.max of version 2); infinite without a limit."""
     try:
         own = next(line[3:] for line in _OWN_CGROUPS.read_text().splitlines() if line.startswith("0::"))
     except (OSError, StopIteration):
