@@ -1,4 +1,4 @@
-"""Which Gaussians an image depends on: those that a pixel blends, and those that end one."""
+"""Decisive Gaussians: those that a pixel blends, and those that end one."""
 
 import math
 

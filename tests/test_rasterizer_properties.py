@@ -1,4 +1,4 @@
-"""What must hold for any scene: properties over drawn scenes.
+"""Properties that hold for every scene, tried on drawn ones.
 
 GS_FUZZ=2000 in the environment draws that many scenes for each property.
 """

@@ -3,9 +3,11 @@
 import torch
 from torch import Tensor, library
 
-from diff_gaussian_rasterization.checks import ROWS
 from diff_gaussian_rasterization.schema import GRADIENTS, SCENE
 
+# A Gaussian's values in each input; a row of sh_rest depends on the number of bands.
+_ROWS = {"means": (3,), "means2d": (3,), "opacities": (1,), "scales": (3,), "rotations": (4,), "cov3d": (6,)}
+_ROWS |= {"colors": (3,), "sh_dc": (1, 3)}
 # These three are constants of csrc; tests/test_rasterizer_ops.py holds them to it.
 TILE = 16  # pixels
 SPLAT_VALUES = 10  # of a row of `splats`
@@ -22,7 +24,7 @@ def _scene(arguments: tuple) -> dict:
 
 def _gradients(scene: dict, wanted: list[bool]) -> tuple[Tensor, ...]:
     means, sh_rest = scene["means"], scene["sh_rest"]
-    rows = ROWS | {"sh_rest": (0 if sh_rest is None else sh_rest.shape[1], 3)}
+    rows = _ROWS | {"sh_rest": (0 if sh_rest is None else sh_rest.shape[1], 3)}
     counts = [means.shape[0] if is_wanted else 0 for is_wanted in wanted]
     return tuple(means.new_empty((count, *rows[name])) for name, count in zip(GRADIENTS, counts, strict=True))
 

@@ -1,4 +1,4 @@
-"""The rasterizer as Python functions: checked arguments, named results, autograd."""
+"""The rasterizer as Python functions: named arguments and results, autograd. The operators check their inputs."""
 
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -8,7 +8,7 @@ from torch.autograd.function import once_differentiable
 
 import diff_gaussian_rasterization.fakes  # noqa: F401  (registers the fake kernels)
 from diff_gaussian_rasterization.backend import OPERATORS
-from diff_gaussian_rasterization.checks import check_finite, check_inputs
+from diff_gaussian_rasterization.checks import check_finite
 from diff_gaussian_rasterization.gaussians import Gaussians
 from diff_gaussian_rasterization.schema import GRADIENT_PLACES, INPUTS, SCENE_TENSORS
 
@@ -48,7 +48,6 @@ def rasterize(
     the image needs more than 2^31 tile instances.
     """
     gaussians = Gaussians(means, opacities, **others)
-    check_inputs(gaussians, means2d, settings.sh_degree, raw)
     given = [values for values in (*gaussians, means2d) if values is not None]
     train = torch.is_grad_enabled() and any([values.requires_grad for values in given])
     if settings.debug:
@@ -84,7 +83,6 @@ def decisive(
     bit.
     """
     gaussians = Gaussians(means, opacities, **others)
-    check_inputs(gaussians, means, settings.sh_degree, raw)
     out = OPERATORS.rasterize(means, *scene_arguments(gaussians, settings, raw), settings.bg, False, True)
     _, _, _, _, splats, _, instances, ranges, _, _, last = out
     return OPERATORS.decisive(splats, instances, ranges, last)
