@@ -3,8 +3,8 @@
 python render.py -m MODEL [--iteration N] [--skip_train] [--skip_test]
 
 Writes MODEL/{train,test}/ours_N/{renders,gt}/00000.png ..., numbered by the views' sorted order, masks/ for views of
-which not every pixel counts, and render_times.json beside these folders: the time of each view, with the device idle
-before it and done after it, without I/O.
+which not every pixel counts, and render_times.json beside these folders: the time of each view without I/O. The device
+is idle before a view and has finished after it.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ def to_bytes(image: torch.Tensor) -> torch.Tensor:
 
 
 def save_png(image: torch.Tensor, path: Path) -> None:
-    """Write an image as `to_bytes` takes it; the file is there whole or not at all."""
+    """Write an image as `to_bytes` takes it; the file is written whole or not at all."""
     with atomic_write(path) as temporary:
         Image.fromarray(to_bytes(image).numpy()).save(temporary)
 
@@ -50,7 +50,7 @@ def save_mask(mask: torch.Tensor, path: Path) -> None:
 
 
 def remove_leftovers(folder: Path, count: int) -> None:
-    """Delete the numbered PNGs beyond the first `count` that an earlier run with more views has left."""
+    """Delete numbered PNGs beyond the first `count`, which an earlier run with more views has left."""
     for file in folder.glob("*.png"):
         if re.fullmatch(r"\d{5,}", file.stem) and int(file.stem) >= count:
             file.unlink()
@@ -73,12 +73,12 @@ def render_set(
         remove_leftovers(folder / side, len(views))
         if views:
             mkdir_p(folder / side)
-    remove_leftovers(folder / "masks", 0)  # not every view need have one
+    remove_leftovers(folder / "masks", 0)  # some views may have none
     if not views:
         return []
     seconds = []
     for view in {(view.image_width, view.image_height): view for view in views}.values():
-        # The first call of a size pays for allocations and caches.
+        # The first call of a size also pays for allocations and caches.
         scored.whole(view, gaussians)
     for index, view in enumerate(tqdm(views, desc=f"Rendering {folder.parent.name}", unit="view")):
         _wait(background.device)
@@ -101,7 +101,7 @@ def _wait(device: torch.device) -> None:
 @torch.no_grad()
 def main() -> None:
     parser = OptionParser(description="Render the train and test views of a trained model.")
-    # Each picture is looked at once, so one is kept.
+    # Each photo is used once, so one is kept in memory.
     model_params = ModelParams(parser, sentinel=True, without=("images_to_load",))
     pipeline_params = PipelineParams(parser)
     parser.add_argument("--iteration", type=int, default=-1, help="saved iteration to render (-1: the highest)")
@@ -125,7 +125,7 @@ def main() -> None:
         if skip:
             continue
         folder = Path(scene.model_path) / name / f"ours_{scene.loaded_iter}"
-        (folder / render_times.NAME).unlink(missing_ok=True)  # not of what an interrupted run has left
+        (folder / render_times.NAME).unlink(missing_ok=True)  # those of an interrupted run do not count
         with memory_errors_explained(gaussians, views):
             seconds = render_set(folder, views, gaussians, pipe, background, options.train_test_exp)
         if seconds:

@@ -84,7 +84,7 @@ def _parser() -> tuple[argparse.ArgumentParser, ModelParams, OptimizationParams,
     add("--port", type=int, default=6009, help="port of the viewer (no effect)")
     add("--disable_viewer", action="store_true", help="open no port for the viewer (none is opened anyway)")
     add("--debug_from", type=int, default=-1, metavar="N", help="switch --debug on after iteration N (default: never)")
-    add("--detect_anomaly", action="store_true", help="let autograd name the operation that made a NaN; slow")
+    add("--detect_anomaly", action="store_true", help="let autograd name the operation that produced a NaN; slow")
     listed = {"type": int, "nargs": "+", "metavar": "N"}
     add("--test_iterations", **listed, default=[7_000, 30_000],
         help="iterations that score the test views, -1: none (default: 7000 30000, reference)")  # fmt: skip
@@ -93,8 +93,8 @@ def _parser() -> tuple[argparse.ArgumentParser, ModelParams, OptimizationParams,
     add("--checkpoint_iterations", **listed, default=[], help="iterations that save a checkpoint (default: none)")
     add("--start_checkpoint", type=str, default=None, metavar="FILE", help="chkpntN.pth to resume (default: none)")
     add("--no_curve", action="store_true",
-        help="no error_vs_time.csv and .png, which cost up to 5 %% of the time, more in short runs (default: with "
-        "--eval)")  # fmt: skip
+        help="write no error_vs_time.csv and .png, which cost up to 5 %% of the time, more in short runs "
+        "(default: write them with --eval)")  # fmt: skip
     add("--quiet", action="store_true", help="print nothing but the progress bar and errors")
     return parser, *groups
 
@@ -102,7 +102,7 @@ def _parser() -> tuple[argparse.ArgumentParser, ModelParams, OptimizationParams,
 def parse(argv: Sequence[str] | None = None) -> tuple[argparse.Namespace, ...]:
     """The command line as a whole, and its model, optimisation and pipeline options.
 
-    UserError for a value that cannot be meant; argparse ends the program at words that it does not know.
+    UserError for a value out of range; argparse ends the program at a word that it does not know.
     """
     parser, *groups = _parser()
     args = parser.parse_args(argv)

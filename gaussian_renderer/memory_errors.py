@@ -1,4 +1,4 @@
-"""Where memory does not suffice a sentence says what was wanted, what there is, and what helps."""
+"""Messages for rendering and training that run out of memory: what was needed, what is free, and a remedy."""
 
 import contextlib
 from collections.abc import Iterator, Sequence
@@ -11,22 +11,22 @@ from utils.system_utils import UserError
 
 @contextlib.contextmanager
 def memory_errors_explained(gaussians: GaussianModel, cameras: Sequence[Camera]) -> Iterator[None]:
-    """UserError in place of an error for want of memory while these views are rendered."""
+    """Replace an out-of-memory error by a UserError while these views are rendered."""
     try:
         yield
     except Exception as error:
         if not is_out_of_memory(error):
             raise
         raise UserError(
-            f"memory did not suffice for rendering ({situation(error, gaussians, cameras)}); lower --resolution (-r), "
+            f"rendering ran out of memory ({situation(error, gaussians, cameras)}); lower --resolution (-r), "
             "or free memory that other programs use"
         ) from error
 
 
 def situation(error: BaseException, gaussians: GaussianModel, cameras: Sequence[Camera]) -> str:
-    """What was wanted, what is free, how many Gaussians there are, and how large the largest view is."""
+    """The memory asked for and free, the number of Gaussians, and the size of the largest view."""
     parts = [shortage(error, gaussians.get_xyz.device), f"{len(gaussians):,} Gaussians"]
     if cameras:
         largest = max(cameras, key=lambda camera: camera.image_width * camera.image_height)
-        parts.append(f"pictures of {largest.image_width} x {largest.image_height}")
+        parts.append(f"images of {largest.image_width} x {largest.image_height}")
     return "; ".join(parts)

@@ -1,4 +1,4 @@
-"""What a finished model does not need: Gaussians that no training view depends on, SH bands below a tolerance."""
+"""Removal of what a finished model does not need: Gaussians that no training view depends on, needless SH bands."""
 
 import argparse
 import time
@@ -18,12 +18,12 @@ from scene.gaussians.sh_bands import cut_bounds, needed_degree
 
 @dataclass
 class Trimmed:
-    """A model without what it does not need, and what that was."""
+    """A model without what it does not need, and a record of what was removed."""
 
     gaussians: GaussianModel
     unseen: int  # Gaussians left out
-    cut_bounds: list[float]  # by degree: what cutting all SH bands above it may change in a colour, at most
-    seconds: float  # that finding it took
+    cut_bounds: list[float]  # by degree: most that a colour moves if all SH bands above the degree are cut
+    seconds: float  # that the search took
 
 
 def seen_by(cameras: Sequence[Camera], gaussians: GaussianModel, pipe: argparse.Namespace) -> Tensor:
@@ -31,16 +31,16 @@ def seen_by(cameras: Sequence[Camera], gaussians: GaussianModel, pipe: argparse.
     found = torch.zeros(len(gaussians), dtype=torch.bool, device=gaussians.get_xyz.device)
     for camera in tqdm(cameras, desc="Looking for unseen Gaussians", unit="view", leave=False):
         found |= seen(camera, gaussians, pipe)
-    return found if found.any() else ~found  # a model of no Gaussians helps nobody
+    return found if found.any() else ~found  # never an empty model
 
 
 def trim(
     gaussians: GaussianModel, cameras: Sequence[Camera], pipe: argparse.Namespace, keep_unseen: bool, prune_sh: float
 ) -> Trimmed:
-    """Leave out what the training views `cameras` do not need; `gaussians` itself stays as it is.
+    """Leave out what the training views `cameras` do not need. `gaussians` itself does not change.
 
-    keep_unseen: leave no Gaussian out. prune_sh: how far a colour (in [0, 1]) may move when SH bands are cut, -1: cut
-    none. Without cut bands the renders of `cameras` are the same, bit for bit.
+    keep_unseen: leave no Gaussian out. prune_sh: most that a colour (in [0, 1]) may move when SH bands are cut; -1 cuts
+    none. Unless bands are cut, the renders of `cameras` keep every bit.
     """
     start = time.perf_counter()
     keep = None if keep_unseen else seen_by(cameras, gaussians, pipe)

@@ -19,9 +19,9 @@ COLORS = {"test": "#0072B2", "train": "#D55E00"}  # told apart by the colour-bli
 def draw_curve(path: str | os.PathLike, rows: list[Row], title: str) -> None:
     """Draw PSNR and 1 - SSIM of test and train views against seconds of training, the gap between both shaded.
 
-    Raises what matplotlib raises, ImportError where it is missing, and UserError where `path` can't be written.
+    Raises matplotlib's errors, ImportError if it is missing, and UserError if `path` cannot be written.
     """
-    from matplotlib.figure import Figure  # late: it takes long, and no training depends on it
+    from matplotlib.figure import Figure  # imported here: it takes long, and no training depends on it
 
     rows = [row for row in rows if row["seconds"] > 0]  # the axis is logarithmic
     figure = Figure(figsize=(7.5, 7.0), layout="constrained")
@@ -45,11 +45,11 @@ def draw_curve(path: str | os.PathLike, rows: list[Row], title: str) -> None:
 
 def _dissimilarity(row: Row, views: str) -> float | None:
     ssim = row[f"{views}_ssim"]
-    return None if ssim is None or ssim >= 1 else 1 - ssim  # of equal images: no place on a logarithmic axis
+    return None if ssim is None or ssim >= 1 else 1 - ssim  # equal images have no place on a logarithmic axis
 
 
 def _compare(axes: Axes, rows: list[Row], value: Callable[[Row, str], float | None], unit: str) -> None:
-    """A line each for test and train views, and what is between them."""
+    """Draw a line each for test and train views, and shade the gap between them."""
     for views, color in COLORS.items():
         points = [(row["seconds"], value(row, views)) for row in rows if value(row, views) is not None]
         if points:

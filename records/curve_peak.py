@@ -1,26 +1,26 @@
-"""Whether the test views were better before the end of a training, and what to do then."""
+"""Advice for a training whose test views were better before its end."""
 
 from collections.abc import Container
 
 from records.error_curve import Row, best_test
 
-CLEAR = 0.1  # dB between best and last; points of a training that has settled were seen to differ by up to 0.07
+CLEAR = 0.1  # dB between best and last point; points of a settled training differed by up to 0.07
 
 
 def schedules_follow_length(depths: bool, train_test_exp: bool) -> bool:
-    """Whether --iterations sets how fast something falls: the depth loss's weight, or the exposures' learning rate."""
+    """Whether a schedule follows --iterations: the weight of the depth loss, or the exposures' learning rate."""
     return depths or train_test_exp
 
 
 def peak_advice(
     rows: list[Row], saved: Container[int], position_lr_max_steps: int, follows_length: bool = False
 ) -> str | None:
-    """A line that names the iteration with the lowest test error, None unless it was clearly before the last row.
+    """A line that names the iteration with the lowest test error; None unless that was clearly before the last row.
 
     saved: iterations whose PLY this training has written. follows_length: `schedules_follow_length`.
 
-    A PLY is written before its iteration's step, so a saved one is the very model that was scored (with exposures
-    those of the last save). A training of fewer --iterations ends with it, too, unless a schedule follows its length.
+    A PLY is written before its iteration's step, so a saved one is the model that was scored; its exposures are those
+    of the last save. A training of fewer --iterations ends with the same model, unless a schedule follows its length.
     """
     best = best_test(rows)
     if best is None or rows[-1]["test_psnr"] is None:

@@ -1,4 +1,4 @@
-"""Records the error of a model in training against its time, without changing a bit of it."""
+"""Recorder of a model's error against its run time of training; it changes no bit of the model."""
 
 import sys
 import time
@@ -21,7 +21,7 @@ View = TypeVar("View")
 
 
 def evenly_spread(views: Sequence[View], count: int) -> list[View]:
-    """`count` of the views, or all where there are no more, first and last among them from two on."""
+    """`count` of the views, or all if there are fewer; with two or more, the first and the last are among them."""
     count = min(count, len(views))
     return [views[round(index * (len(views) - 1) / max(count - 1, 1))] for index in range(count)]
 
@@ -29,10 +29,10 @@ def evenly_spread(views: Sequence[View], count: int) -> list[View]:
 class CurveRecorder:
     """Scores views in the iterations of a schedule, keeps the curve's file up to date, and draws it at the end.
 
-    rows: of the runs before, which `log` has the seconds of. iterations: the last one; always: those scored at any
-    cost. views: those to score, by set, "test" and "train"; load(view) makes a view's photo ready, scores(views) gives
-    their mean scores by name. A curve that can't be written is warned of once, and the next point tries again: a
-    training is worth more than its curve.
+    rows: those of the runs that this one resumes; `log` has their seconds. iterations: the last one; always: those
+    scored at any cost. views: those to score, by set, "test" and "train". load(view) decodes a view's photo;
+    scores(views) gives their mean scores by name. If the file cannot be written, one warning says so and the next point
+    tries again: a training is worth more than its curve.
     """
 
     def __init__(
@@ -56,12 +56,12 @@ class CurveRecorder:
         self._load = load
         self._scores = scores
         self._device = device
-        self._loading = 0.0  # seconds of decoding pictures that were not needed before
+        self._loading = 0.0  # seconds of decoding photos that were not needed before
         self._writing = 0.0  # seconds of writing the file
         self._warned = False
 
     def due(self, iteration: int, seconds: float) -> bool:
-        """Whether to `add` a point after `seconds` of training in this run; if so, waits for the GPU."""
+        """Whether to `add` a point after `seconds` of training in this run; if so, it waits for the GPU."""
         due = self._schedule.due(iteration, seconds)
         if due and self._device.type == "cuda":
             torch.cuda.synchronize(self._device)
@@ -69,7 +69,7 @@ class CurveRecorder:
 
     def add(self, iteration: int, seconds: float, gaussians: int) -> None:
         """Score after `seconds` of training in this run, and write the curve with the new point."""
-        # Both, as a rescued training has rows after its log's last record.
+        # Both, because after a rescue the curve has rows beyond the log's last record.
         peaks = [self._log.peak_memory_mib(), *(row["peak_memory_mib"] for row in self.rows[-1:])]
         row = dict.fromkeys(COLUMNS) | {
             "iteration": iteration,
@@ -79,7 +79,7 @@ class CurveRecorder:
             "peak_memory_mib": max((peak for peak in peaks if peak is not None), default=None),
         }
         if not self._schedule.scorings:
-            # Once, and most of it for pictures that training needs soon: no measure of what the next scoring costs.
+            # Happens once, mostly for photos that training needs soon: no measure of the next scoring's cost.
             self._loading = self._seconds(self._load_all)
         self._schedule.scored(self._seconds(lambda: self._score(row)))
         self.rows.append(row)
@@ -105,14 +105,14 @@ class CurveRecorder:
             write_curve(self._folder / NAME, self.rows)
         except UserError as error:
             if not self._warned:
-                tqdm.write(f"warning: {error}; training goes on without its curve", file=sys.stderr)
+                tqdm.write(f"warning: {error}; training continues without its curve", file=sys.stderr)
             self._warned = True
 
     def finish(self, seconds: float, saved: Container[int], position_lr_max_steps: int, follows_length: bool) -> None:
-        """Draw the curve; say what it has cost beside `seconds` of training in this run, and advise (`peak_advice`).
+        """Draw the curve, print its cost beside `seconds` of training in this run, and give advice (`peak_advice`).
 
         The log's last record gets the costs: `curve_scoring_seconds`, `curve_writing_seconds` (of the file),
-        `curve_drawing_seconds`, and `curve_loading_seconds` (of pictures, before the first scoring).
+        `curve_drawing_seconds`, and `curve_loading_seconds` (of photos, before the first scoring).
         """
         drawing = self._seconds(self._draw)
         scoring, writing = self._schedule.spent, self._writing

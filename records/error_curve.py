@@ -19,11 +19,12 @@ Row = dict[str, float | None]
 
 
 def read_curve(path: str | os.PathLike) -> list[Row]:
-    """Rows of a curve's file by iteration, ascending; each has all COLUMNS, None where the field is empty.
+    """Rows of a curve's file in ascending iterations; each has all COLUMNS, None for an empty field.
 
-    seconds: of training, without evaluation and saving, over all resumed parts; wall_seconds: since the start of the
-    process, those of earlier parts added; peak_memory_mib: the most of all parts so far (of the GPU where it trains);
-    `<views>_l1`, `<views>_psnr` (dB), `<views>_ssim`: `utils.view_scores`. UserError for what is no such file.
+    seconds: of training, without evaluation and saving, over all resumed parts. wall_seconds: since the start of the
+    process, with those of earlier parts. peak_memory_mib: the most of all parts so far, of the GPU if it trains.
+    `<views>_l1`, `<views>_psnr` (dB), `<views>_ssim`: gaussian_renderer/scored_views.py. UserError if the file is
+    missing or damaged.
     """
     try:
         with open(path, encoding="utf-8", newline="") as file:
@@ -35,9 +36,9 @@ def read_curve(path: str | os.PathLike) -> list[Row]:
         if iterations != sorted(set(iterations)):
             raise ValueError("its iterations do not ascend")
     except FileNotFoundError as error:
-        raise UserError(f"no curve {path}; train.py --eval records one unless --no_curve is given") from error
+        raise UserError(f"no curve {path}; train.py --eval records one unless --no_curve is set") from error
     except (OSError, ValueError, csv.Error) as error:
-        raise UserError(f"{path} cannot be read as a curve ({error}); train again to have it recorded") from error
+        raise UserError(f"{path} cannot be read as a curve ({error}); train again to record one") from error
     return rows
 
 
@@ -54,7 +55,7 @@ def _row(fields: list[str]) -> Row:
 
 
 def write_curve(path: str | os.PathLike, rows: list[Row]) -> None:
-    """Write rows that have all COLUMNS. What is None or not finite (PSNR of equal images) gives an empty field."""
+    """Write rows that have all COLUMNS. A value that is None or not finite (PSNR of equal images) is left empty."""
     with atomic_write(path) as temporary, temporary.open("w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(COLUMNS)
@@ -66,16 +67,16 @@ def write_curve(path: str | os.PathLike, rows: list[Row]) -> None:
 def continue_curve(
     model_path: str | os.PathLike, first_iteration: int, before: str | os.PathLike | None = None
 ) -> list[Row]:
-    """Rows up to `first_iteration`, which a run goes on from (0: from the start), of the curve in a model folder.
+    """Rows of the curve in a model folder up to `first_iteration`, where a run resumes (0: it starts anew).
 
-    What the folder has beyond them is another training's and goes: rows, or the file, and the figure. A file that can't
-    be read is no reason to stop a training: it goes too, with a warning. before: the folder of the run that is gone on
-    from, where it is another; nothing changes there.
+    Later rows belong to another training and are removed, and so is the figure; without rows, the file is. A damaged
+    file is removed with a warning, since it is no reason to stop a training. before: the folder of the run that is
+    resumed, if it is another one; nothing changes there.
     """
     path = Path(model_path) / NAME
     source = path if before is None else Path(before) / NAME
     rows = []
-    with contextlib.suppress(OSError, UserError):  # what can't be removed is warned of when it is written
+    with contextlib.suppress(OSError, UserError):  # a file that cannot be removed is warned of when it is written
         (path.parent / FIGURE).unlink(missing_ok=True)
         if first_iteration and source.exists():
             try:
@@ -90,6 +91,6 @@ def continue_curve(
 
 
 def best_test(rows: list[Row]) -> Row | None:
-    """The row with the highest PSNR of the test views, the first of equals; None where no row has one."""
+    """The row with the highest PSNR of the test views, the first of equals; None if no row has one."""
     scored = [row for row in rows if row["test_psnr"] is not None]
     return max(scored, key=lambda row: row["test_psnr"], default=None)

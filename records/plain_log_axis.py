@@ -9,7 +9,7 @@ if TYPE_CHECKING:
 
 
 def plain_log_axis(axis: Axis) -> None:
-    """Label a logarithmic axis at 1, 2, 5, 10, 20, ...: matplotlib's own 3 x 10^0 and 4 x 10^0 run into each other."""
+    """Label a logarithmic axis at 1, 2, 5, 10, 20, ...: matplotlib's own labels 3 x 10^0 and 4 x 10^0 overlap."""
     from matplotlib.ticker import LogLocator, NullFormatter
 
     axis.set_major_locator(LogLocator(subs=(1, 2, 5)))

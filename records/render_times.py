@@ -1,4 +1,4 @@
-"""render_times.json: how long each view of a rendered set took, and what one has to know to compare it."""
+"""render_times.json: the time of each view of a rendered set, and the facts needed to compare it."""
 
 import statistics
 from collections.abc import Sequence
@@ -16,9 +16,9 @@ NAME = "render_times.json"
 def summarise(
     seconds: Sequence[float], sizes: Sequence[tuple[int, int]], gaussians: int, antialiasing: bool, device: torch.device
 ) -> dict[str, Any]:
-    """The file's content, of `seconds` and `sizes` (width, height; px) of one view or more, in the order of their PNGs.
+    """The file's content, from `seconds` and `sizes` (width, height; pixels) of the views in the order of their PNGs.
 
-    fps: frames per second at the median. sizes: the different ones. threads: the CPU's, whatever the device.
+    fps: frames per second at the median. sizes: each size once. threads: those of the CPU, whatever the device.
     """
     median = statistics.median(seconds)
     return {
@@ -35,5 +35,5 @@ def summarise(
 
 
 def write(folder: Path, summary: dict[str, Any]) -> None:
-    """Write what `summarise` gives into `folder`."""
+    """Write the result of `summarise` into `folder`."""
     write_json(folder / NAME, summary)

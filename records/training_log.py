@@ -13,11 +13,11 @@ from utils.host.process import peak_memory_mib, wall_seconds
 from utils.system_utils import compute_device
 
 NAME = "train_log.json"
-_FINITE = ("loss", "peak_memory_mib", "wall_seconds")  # where they are there
+_FINITE = ("loss", "peak_memory_mib", "wall_seconds")  # if present
 
 
 class Stopwatch:
-    """Seconds since it was made, without what happens inside `paused()`."""
+    """Seconds since its construction, without those inside `paused()`."""
 
     def __init__(self) -> None:
         self._start = time.perf_counter()
@@ -38,21 +38,20 @@ class Stopwatch:
 class TrainingLog:
     """Records of one model folder, written whole after each addition.
 
-    A record has `iteration`, `seconds` (of training, without evaluation and saving; a resumed run adds to the seconds
-    before), `wall_seconds` (since the start of the process, likewise), `peak_memory_mib` (the most so far, of the runs
-    before as well), `gaussians`, `loss` (running mean), and per set tested `<set>_l1`, `<set>_psnr`; the last record
-    also `gaussians_left_out`, those of `gaussians` that the last save does not have, and what the curve has cost
-    (`records.curve_recorder`).
+    A record has `iteration`; `seconds` of training, without evaluation and saving; `wall_seconds` since the process
+    started; `peak_memory_mib`, the most so far; `gaussians`; `loss`, a running mean; and for each set tested
+    `<set>_l1`, `<set>_psnr`. Seconds and memory include the runs that were resumed. The last record also has
+    `gaussians_left_out`, those that the last save does not have, and the costs of the curve (curve_recorder.py).
 
-    first_iteration, seconds_before, wall_seconds_before: what the runs have done that this one goes on from.
+    first_iteration, seconds_before, wall_seconds_before: done by the runs that this one resumes.
     """
 
     def __init__(
         self, model_path: str | os.PathLike, first_iteration: int, before: str | os.PathLike | None = None
     ) -> None:
-        """Keep an existing log's records up to `first_iteration`, which a resumed run goes on from.
+        """Keep the records of an existing log up to `first_iteration`, where a run resumes.
 
-        before: the folder of that log, where it is another than model_path.
+        before: the folder of that log, unless it is model_path.
         """
         self._path = Path(model_path) / NAME
         source = self._path if before is None else Path(before) / NAME
@@ -66,17 +65,17 @@ class TrainingLog:
         self._peak_before: float | None = last.get("peak_memory_mib")
 
     def not_before(self, row: dict[str, float | None]) -> None:
-        """Count on from a row (`seconds`, `wall_seconds`) of the runs before, where that is later than their log."""
+        """Continue counting from a row of the runs before (`seconds`, `wall_seconds`) if it is later than their log."""
         self.seconds_before = max(self.seconds_before, row["seconds"])
         self.wall_seconds_before = max(self.wall_seconds_before, row["wall_seconds"] or 0.0)
 
     @property
     def loss(self) -> float:
-        """Running mean of the last record, 0 where there is none."""
+        """Running mean of the last record, 0 if there is none."""
         return (self.records[-1].get("loss") if self.records else None) or 0.0
 
     def peak_memory_mib(self) -> float | None:
-        """Most memory held so far, in this run or one that it resumes (`utils.host.process`); None if not known."""
+        """Most memory held so far, by this run or those it resumes (`utils.host.process`); None if not known."""
         peaks = [peak for peak in (self._peak_before, peak_memory_mib(compute_device())) if peak is not None]
         return round(max(peaks), 1) if peaks else None
 
@@ -99,7 +98,7 @@ class TrainingLog:
 
 
 def _read(path: Path) -> list[dict]:
-    """Records of a log; none, with a warning, where the file is damaged: it is no reason to stop a training."""
+    """Records of a log; none, with a warning, if the file is damaged: that is no reason to stop a training."""
     try:
         records = read_json(path)
         if not all(isinstance(r["iteration"], int) and math.isfinite(r["seconds"]) for r in records):

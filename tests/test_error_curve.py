@@ -442,7 +442,7 @@ class TestTraining:
         assert _train(colmap_scene, out, "--test_iterations", 3, 5, iterations=6)
         error = capfd.readouterr().err
         assert (
-            len(re.findall(r"warning: cannot write .*error_vs_time.csv .*training goes on without its curve", error))
+            len(re.findall(r"warning: cannot write .*error_vs_time.csv .*training continues without its curve", error))
             == 1
         )
         assert "warning: no error_vs_time.png: ModuleNotFoundError" in error

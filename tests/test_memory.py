@@ -141,10 +141,10 @@ def test_the_state_before_is_saved_and_goes_on_to_the_same_end(colmap_scene, tmp
     monkeypatch.setattr("training.run.SH_INTERVAL", 5)  # so that the failing iteration is one that raises the degree
     with monkeypatch.context() as patch:
         patch.setattr(loop, "render", _failing(loop.render, 5, error))
-        with pytest.raises(UserError, match="memory did not suffice in iteration 5") as caught:
+        with pytest.raises(UserError, match="training ran out of memory in iteration 5") as caught:
             _train(colmap_scene, tmp_path / "cut")
     text = str(caught.value)
-    for part in (said, "pictures of 24 x 16", "after iteration 4 is saved", "chkpnt4.pth", "--max_num_splats", "-r",
+    for part in (said, "images of 24 x 16", "after iteration 4 is saved", "chkpnt4.pth", "--max_num_splats", "-r",
                  "--images_to_load", "--sh_degree"):  # fmt: skip
         assert part in text and "\n" not in text, part
     capture, iteration = load_checkpoint(tmp_path / "cut" / "chkpnt4.pth")
@@ -201,7 +201,7 @@ def test_rendering_says_what_did_not_fit(colmap_scene, tmp_path, monkeypatch):
     _train(colmap_scene, tmp_path)
     monkeypatch.setattr(scored_views, "render", _failing(scored_views.render, 4, ON_A_GPU))
     monkeypatch.setattr(sys, "argv", ["render.py", "-m", str(tmp_path)])
-    with pytest.raises(UserError, match=r"rendering \(20.0 GiB asked for.*Gaussians; pictures of 24 x 16\).*-r"):
+    with pytest.raises(UserError, match=r"rendering \(20.0 GiB asked for.*Gaussians; images of 24 x 16\).*-r"):
         render.main()
 
 

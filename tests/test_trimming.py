@@ -207,7 +207,7 @@ def test_the_three_lines():
         "test views change by at most 0.012 of 1, PSNR 30.000 to 29.900 dB",
         "Left out no SH bands; cutting them would move colours by at most 0.3 above degree 0, 0.2 above degree 1, "
         "0.1 above degree 2 (--prune_sh)",
-        "Colours of the training pictures are kept as bytes and at training size: 3.0 MB, 45.0 MB less than as float32 "
+        "Colours of the training photos are kept as bytes and at training size: 3.0 MB, 45.0 MB less than as float32 "
         "at the size of the files",
     ]
     # 950 Gaussians lose 12 coefficients of 3 channels, 4 bytes each.

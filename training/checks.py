@@ -1,4 +1,4 @@
-"""What is looked at before a scene is trained, so that it does not train for hours to no end."""
+"""Checks made before training, so that a hopeless scene fails at once."""
 
 import argparse
 import sys
@@ -11,24 +11,24 @@ from scene.readers.records import APART, NEAREST, SceneInfo, standing_apart
 from utils.files.listing import some
 from utils.system_utils import UserError
 
-_SAMPLE = 16  # cameras whose depths are looked at
-_FEWEST_BEYOND = 0.01  # part of the points in front of them
-_RECOVERY = 1000  # iterations that a model is given to get over a reset of its opacities
+_SAMPLE = 16  # cameras whose depths are checked
+_FEWEST_BEYOND = 0.01  # share of the points in front of them that must lie beyond the nearest depth
+_RECOVERY = 1000  # iterations that a model needs to recover from a reset of its opacities
 
 
 def check_scene(info: SceneInfo) -> None:
-    """UserError for a scene that nothing can be learnt from; a line about what is taken otherwise than it stands."""
+    """Refuse a scene that nothing can be learnt from (UserError); print what is read differently from the files."""
     _check_scale(info)
     _report_cameras_apart(info)
     if info.offset.any():
         print(
-            f"the scene's coordinates are large against its extent: it is trained less {tuple(info.offset.tolist())}, "
+            f"the scene's coordinates are large against its extent: training subtracts {tuple(info.offset.tolist())}, "
             "which model.json keeps; python -m scene.export_world writes the model in the scene's own coordinates"
         )
 
 
 def _check_scale(info: SceneInfo) -> None:
-    """UserError where next to nothing lies beyond the nearest depth that is drawn."""
+    """UserError if hardly any point lies beyond the nearest depth that is drawn."""
     cameras = info.train_cameras[:: max(1, len(info.train_cameras) // _SAMPLE)]
     depths = np.concatenate([(info.point_cloud.points @ camera.R + camera.T)[:, 2] for camera in cameras])
     depths = depths[depths > 0]
@@ -41,32 +41,32 @@ def _check_scale(info: SceneInfo) -> None:
 
 
 def _report_cameras_apart(info: SceneInfo) -> None:
-    """Say which training cameras the extent is found without."""
+    """Name the training cameras that the extent leaves out."""
     apart = standing_apart(np.array([camera.center for camera in info.train_cameras]))
     if apart.any():
         names = [info.train_cameras[index].image_name for index in apart.nonzero()[0]]
         print(
             f"{len(names)} of {len(apart)} cameras stand more than {APART:g} times the median distance from the middle "
-            f"of all ({some(names)}) and are left out of the scene's extent, {info.extent:.3g}; look whether their "
-            "poses are right",
+            f"of all ({some(names)}) and are left out of the scene's extent, {info.extent:.3g}; check their "
+            "poses",
             file=sys.stderr,
         )
 
 
 def check_exposures(gaussians: GaussianModel, train_test_exp: bool, checkpoint: str) -> None:
-    """UserError for a checkpoint with exposures that this run would not use; a word on the opposite."""
+    """Refuse a checkpoint with exposures that this run would not use (UserError); report the opposite case."""
     if gaussians.exposures.trained and not train_test_exp:
         raise UserError(f"{checkpoint} was trained with --train_test_exp; give that option")
     if train_test_exp and not gaussians.exposures.trained:
-        print(f"{checkpoint} has no exposures: all pictures start without a correction")
+        print(f"{checkpoint} has no exposures: all photos start without a correction")
 
 
 def warn_of_late_reset(opt: argparse.Namespace, white_background: bool) -> None:
-    """A line where opacities are reset so late that the model cannot recover."""
+    """Warn if opacities are reset so late that the model cannot recover."""
     last = range(max(1, opt.iterations - _RECOVERY + 1), opt.iterations)
     late = [t for t in last if adc.actions(t, opt, white_background).reset_opacity]
     if late:
         print(
-            f"warning: opacities are reset in iteration {late[-1]}, and {opt.iterations - late[-1]} iterations are few "
-            "to recover from that; change --iterations or --opacity_reset_interval"
+            f"warning: opacities are reset in iteration {late[-1]}, and {opt.iterations - late[-1]} iterations are "
+            "too few to recover from that; change --iterations or --opacity_reset_interval"
         )

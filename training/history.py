@@ -1,4 +1,4 @@
-"""What earlier runs have left: in the folder that is trained into, and beside the checkpoint that is gone on from."""
+"""Traces of earlier runs, in the output folder and next to the checkpoint being resumed."""
 
 import argparse
 import contextlib
@@ -13,7 +13,7 @@ from records.error_curve import Row, continue_curve
 from records.training_log import TrainingLog
 from utils.system_utils import UserError, saved_iterations
 
-# Options that change what is learnt. Others are spoken of elsewhere (train_test_exp, sh_degree), or change nothing.
+# Options that change what is learnt. Others are checked elsewhere (train_test_exp, sh_degree), or change nothing.
 _TOLD = (
     "source_path", "images", "depths", "resolution", "white_background", "eval", "masks", "invert_masks",
     "mask_meaning", "antialiasing", "optimizer_type", "seed",
@@ -23,9 +23,9 @@ _TOLD = (
 def check_folder(
     model_path: str, source_path: str, saving_iterations: Sequence[int], checkpoint: str | None, first_iteration: int
 ) -> None:
-    """UserError where a model folder holds a model of another scene, which this training would mix with its own.
+    """Refuse a folder with a model of another scene (UserError): training would mix both.
 
-    A warning of iterations that an earlier training of this scene has saved and this one does not overwrite.
+    Warn of iterations that an earlier training of this scene has saved and this one does not overwrite.
     """
     folder = Path(model_path)
     saved = saved_iterations(folder / "point_cloud")
@@ -48,9 +48,10 @@ def check_folder(
 
 
 def report_changes(checkpoint: str, now: argparse.Namespace) -> None:
-    """A line where the run that a checkpoint lies beside had other options than `now`, those of this run.
+    """Warn if the run that wrote a checkpoint had other options than this run, `now`.
 
-    now: model options, antialiasing, optimizer_type and seed. What the checkpoint's folder does not tell is not missed.
+    now: model options, antialiasing, optimizer_type and seed. Options that the checkpoint's folder does not record are
+    not compared.
     """
     folder = Path(checkpoint).parent
     then = _options_of(folder)
@@ -61,16 +62,16 @@ def report_changes(checkpoint: str, now: argparse.Namespace) -> None:
 
 
 def continue_records(model_path: str, checkpoint: str | None, first_iteration: int) -> tuple[TrainingLog, list[Row]]:
-    """The log of a training and its curve's rows so far: those up to `first_iteration` where it goes on from there.
+    """The log of a training and the rows of its curve up to `first_iteration`; none for a training from the start.
 
-    They are read where the checkpoint lies, as that is where its training was recorded, else in model_path; they are
-    kept in model_path.
+    Both are read next to the checkpoint, whose training recorded them, or else in model_path. This run continues them
+    in model_path.
     """
     before = Path(model_path)
     if checkpoint and (Path(checkpoint).parent / training_log.NAME).is_file():
         before = Path(checkpoint).parent
     log, rows = TrainingLog(model_path, first_iteration, before), continue_curve(model_path, first_iteration, before)
-    if rows:  # a rescued training has rows after its log's last record
+    if rows:  # after a rescue the curve has rows beyond the log's last record
         log.not_before(rows[-1])
     elif checkpoint and not log.records:
         print(
@@ -82,7 +83,7 @@ def continue_records(model_path: str, checkpoint: str | None, first_iteration: i
 
 
 def _options_of(folder: Path) -> dict[str, object]:
-    """What a folder tells of its training; nothing where it can't be read: it may be no model folder at all."""
+    """Training options that a folder records; none if they cannot be read, as in a folder without a model."""
     with contextlib.suppress(UserError, OSError):
         return read_training_options(folder)
     return {}
@@ -97,7 +98,7 @@ def _same_place(one: str | os.PathLike, other: str | os.PathLike) -> bool:
 
 
 def _typed(name: str, value: object) -> str:
-    """An option as it would be typed."""
+    """Format an option as it is typed on a command line."""
     if isinstance(value, bool):
         return f"--{name}" if value else f"no --{name}"
     return f"--{name} {value if value != '' else repr(value)}"

@@ -1,4 +1,4 @@
-"""The three lines at the end of a training: what was left out of the model and of memory, and what that saved."""
+"""Three lines at the end of a training: what the saved model and the memory leave out, and how much that saves."""
 
 from dataclasses import dataclass, field
 
@@ -7,24 +7,24 @@ MB = 1e6
 
 @dataclass
 class LeftOut:
-    """What `lines` tells; `model.json` keeps it as it is."""
+    """Facts that `lines` reports and `model.json` keeps."""
 
     gaussians: int  # trained
-    unseen: int  # of them not saved, as no training view depends on them
+    unseen: int  # of these, not saved, because no training view depends on them
     keep_unseen: bool
     max_sh_degree: int  # trained
     sh_degree: int  # saved
-    cut_bounds: list[float]  # by degree: how far cutting all SH bands above it moves a colour at most
+    cut_bounds: list[float]  # by degree: most that a colour moves if all SH bands above the degree are cut
     ply_bytes: int  # of all Gaussians trained, with all bands
     ply_bytes_saved: int
-    seconds: float  # that finding it took
-    picture_bytes: int  # of the training views as they train: a byte per colour value
+    seconds: float  # that the search took
+    picture_bytes: int  # of the training photos at training size: one byte per colour value
     picture_bytes_in_files: int  # the same at the size of the files
     test_change: dict[str, float] = field(default_factory=dict)  # `trimming.change_on_views`; {} without test views
 
 
 def lines(left_out: LeftOut) -> list[str]:
-    """About Gaussians, SH bands and pictures."""
+    """The lines about Gaussians, SH bands and photos."""
     return [_gaussians(left_out) + _change(left_out.test_change), _bands(left_out), _pictures(left_out)]
 
 
@@ -60,6 +60,6 @@ def _bands(it: LeftOut) -> str:
 def _pictures(it: LeftOut) -> str:
     saved = 4 * it.picture_bytes_in_files - it.picture_bytes
     return (
-        f"Colours of the training pictures are kept as bytes and at training size: {it.picture_bytes / MB:.1f} MB, "
+        f"Colours of the training photos are kept as bytes and at training size: {it.picture_bytes / MB:.1f} MB, "
         f"{saved / MB:.1f} MB less than as float32 at the size of the files"
     )

@@ -1,4 +1,4 @@
-"""What happens beside the method: an observer overrides the moments it needs, and is never called for the others."""
+"""Observers of a training: each overrides the moments that it needs, and is called in no other."""
 
 from collections.abc import Sequence
 from types import TracebackType

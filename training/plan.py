@@ -1,11 +1,11 @@
-"""What a run was asked to do besides training."""
+"""Iterations at which a run scores and saves, and where it starts."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
 
 
 class Plan(NamedTuple):
-    """Iterations that score, save and write checkpoints, and where training starts."""
+    """What a run was asked to do besides training."""
 
     test: Sequence[int]  # -1: none
     save: Sequence[int]  # the PLY; -1: none

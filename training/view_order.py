@@ -1,4 +1,4 @@
-"""Which training camera is shown in which iteration."""
+"""Order in which training cameras are shown."""
 
 from scene.cameras import Camera
 from utils.exact.counter_rng import Stream, permutation
@@ -6,7 +6,7 @@ from utils.system_utils import UserError
 
 
 class ViewOrder:
-    """Training cameras by iteration (from 1): each once per epoch, in an order drawn anew from seed and epoch."""
+    """Training cameras by iteration, counted from 1: each once per epoch, in an order drawn from seed and epoch."""
 
     def __init__(self, cameras: list[Camera], seed: int) -> None:
         if not cameras:
@@ -18,11 +18,11 @@ class ViewOrder:
     def __getitem__(self, iteration: int) -> Camera:
         epoch, position = divmod(iteration - 1, len(self._cameras))
         if epoch not in self._orders:
-            # At most two: looking ahead from the end of one epoch goes to and fro between it and the next.
+            # Two at most: prefetching at the end of an epoch alternates between it and the next.
             order = permutation(self._seed, Stream.VIEW_ORDER, epoch, len(self._cameras))
             self._orders = {epoch: order} | {e: o for e, o in self._orders.items() if e == epoch - 1}
         return self._cameras[self._orders[epoch][position]]
 
     def coming(self, iteration: int, count: int) -> list[Camera]:
-        """The cameras of `count` iterations, this one first; of an epoch's length at most."""
+        """The cameras of `count` iterations, this one first; at most one epoch of them."""
         return [self[t] for t in range(iteration, iteration + min(count, len(self._cameras)))]

@@ -31,7 +31,7 @@ if (args.s / "broken").exists():
 
 if (args.s / "full").exists():
     (args.m / "chkpnt9.pth").write_bytes(b"")
-    sys.stderr.write("error: memory did not suffice\n")
+    sys.stderr.write("error: training ran out of memory\n")
     sys.exit(2)
 
 

@@ -15,16 +15,16 @@ from training.run import Run
 from training.step import Step
 from utils.system_utils import UserError
 
-_SHOWN = 5  # rows that are named
-_COMPARED = 10  # losses of the start and of the end, each of another view
-_WORSE_AFTER = 100  # iterations that a loss is given to fall
+_SHOWN = 5  # rows that a message names
+_COMPARED = 10  # losses compared, at the start and at the end, each of another view
+_WORSE_AFTER = 100  # iterations after which a loss should have fallen
 
 
 class DivergenceWatch(Observer):
-    """Checks now and then for a loss, or a step of the optimisers, that was not finite.
+    """Checks, when something is due, that all losses and all steps of the optimisers were finite.
 
-    From that iteration on the optimisers leave everything as it is (StepGuard), so however late somebody looks, the
-    model is the last good one.
+    After the first that was not, the optimisers change nothing (StepGuard). However late the check, the model is the
+    last good one.
     """
 
     def __init__(self, run: Run) -> None:
@@ -34,7 +34,7 @@ class DivergenceWatch(Observer):
         self._iteration = run.first_iteration
         self._guard = StepGuard(run.device)
         run.gaussians.guard_steps(self._guard)
-        self._sh_degrees = [run.gaussians.active_sh_degree] * 2  # in the last iteration but one, and in the last
+        self._sh_degrees = [run.gaussians.active_sh_degree] * 2  # in the last two iterations
         self._earliest: list[float] = []
         self._latest: deque[float] = deque(maxlen=_COMPARED)
 
@@ -46,10 +46,10 @@ class DivergenceWatch(Observer):
             self.look(step.iteration)
 
     def look(self, iteration: int, stepped: bool = False) -> None:
-        """UserError, after saving a checkpoint, where a loss was not finite, or a step.
+        """Save a checkpoint and raise UserError if a loss or a step was not finite.
 
-        To be called in every iteration that writes something, changes the number of Gaussians, zeroes moments, or
-        raises the SH degree. stepped: it has taken its step.
+        Call it in every iteration that writes a file, changes the number of Gaussians, zeroes Adam's averages, or
+        raises the SH degree. stepped: the iteration has taken its step.
         """
         losses = self._losses.read()
         self._earliest = [*self._earliest, *losses.values()][:_COMPARED]
@@ -61,7 +61,7 @@ class DivergenceWatch(Observer):
             return
         first = int(min(bad, stopped))
         if bad == first:
-            # The guard knew: nothing was stepped in that iteration either.
+            # The guard held that iteration's step back, too.
             good, what = first - 1, f"the loss became {losses[first]}"
         else:
             good, what = first, f"{self._unstepped()} could take no finite step"
@@ -82,7 +82,7 @@ class DivergenceWatch(Observer):
         if after > before:
             tqdm.write(
                 f"warning: the loss was {before:.3g} at first and is {after:.3g} at the end, the model is worse than "
-                "the points it began with; lower the learning rates, or look at poses and pictures (doctor.py)",
+                "the points it began with; lower the learning rates, or check poses and photos (doctor.py)",
                 file=sys.stderr,
             )
 
@@ -95,7 +95,7 @@ class DivergenceWatch(Observer):
 
     def _rescue(self, iteration: int) -> str:
         if iteration == self._run.first_iteration:
-            return "nothing was trained before; lower the learning rates"
+            return "no iteration before it was trained; lower the learning rates"
         path = Path(self._run.scene.model_path) / f"chkpnt{iteration}.pth"
         try:
             self._gaussians.check_finite(iteration)

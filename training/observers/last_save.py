@@ -21,12 +21,12 @@ def save_last(
     background: Tensor,
     scored: bool,
 ) -> LeftOut:
-    """Save the finished model without what it does not need; what that was goes into model.json, too.
+    """Save the finished model without what it does not need, and record in model.json what was left out.
 
-    scored: the test pictures are in memory, so that the change in PSNR costs little.
+    scored: whether to compute the change in PSNR, which is cheap if the test photos are in memory.
     """
     trained = scene.gaussians
-    trained.optimizer.zero_grad(set_to_none=True)  # the last iteration takes no step: room for the trimmed copy
+    trained.optimizer.zero_grad(set_to_none=True)  # room for the trimmed copy
     trimmed = trim(trained, scene.getTrainCameras(), pipe, opt.keep_unseen, opt.prune_sh)
     final, test = trimmed.gaussians, scene.getTestCameras()
     change = {}

@@ -1,15 +1,15 @@
-"""Losses of the last iterations, left on their device until somebody looks."""
+"""Losses of the last iterations, which stay on their device until they are read."""
 
 import torch
 from torch import Tensor
 
-NEWEST = 0.4  # weight of the newest loss in the running mean, the reference's
+NEWEST = 0.4  # weight of the newest loss in the running mean, as in the reference
 
 
 class LossWatch:
-    """Takes a loss per iteration without waiting for it; `read` waits once for all of them.
+    """Collects one loss per iteration without waiting for the device; `read` waits once for all of them.
 
-    mean: exponential running mean of all that were read, from the given one on (of the run before, or 0).
+    mean: exponential running mean of all losses read, starting at the given value.
     """
 
     def __init__(self, mean: float = 0.0) -> None:

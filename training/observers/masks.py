@@ -14,21 +14,21 @@ from training.step import Step
 from utils.files.listing import some
 from utils.system_utils import UserError
 
-_ENOUGH = 100  # views without a pixel that counts, and none with: masks that are right do not look like that
-_ALMOST_NOTHING = 1e-3  # part of the pixels
+_ENOUGH = 100  # views without a pixel that counts, and none with one: correct masks are not like that
+_ALMOST_NOTHING = 1e-3  # share of the pixels
 _HINT = "are they white masks (--invert_masks), or those of another scene?"
 
 
 class MaskWatch(Observer):
-    """Takes the views as they train, without waiting for a GPU; `look` waits, until all were seen once.
+    """Adds up, without waiting for a GPU, how much of each view counts. `look` waits, until all views were seen.
 
-    views: those that train. Before training no mask is decoded for this: thousands of pictures start in seconds.
+    views: those that train. No mask is decoded before training for this check: thousands of photos start in seconds.
     """
 
     def __init__(self, views: Sequence[Camera]) -> None:
         self._left = {view.uid for view in views}
         self._views = len(views)
-        self._new: list[tuple[str, Tensor]] = []  # name, and part of its pixels that counts
+        self._new: list[tuple[str, Tensor]] = []  # name, and share of its pixels that count
         self._nothing = 0
         self._scanty: list[str] = []
         self._seen = 0
@@ -39,7 +39,7 @@ class MaskWatch(Observer):
             self.look(step.last)
 
     def add(self, view: Camera, mask: Tensor | None) -> None:
-        """Note how much of a view counts by its mask, if it is seen for the first time."""
+        """Note the share of pixels that count in a view seen for the first time."""
         if view.uid not in self._left:
             return
         self._left.remove(view.uid)
@@ -50,9 +50,9 @@ class MaskWatch(Observer):
             self._new.append((view.image_name, part.float().mean()))
 
     def look(self, last: bool) -> None:
-        """Once all views were seen, or at the last iteration, say which ones have (almost) nothing that counts.
+        """After all views were seen, or in the last iteration, name those with hardly any pixel that counts.
 
-        UserError when nothing counts in any of them, or of the first hundred.
+        UserError if no pixel counts in any view, or in any of the first hundred.
         """
         if self._new:
             for (name, _), part in zip(self._new, torch.stack([part for _, part in self._new]).tolist(), strict=True):

@@ -1,4 +1,4 @@
-"""Rescue of the model when a training runs out of memory, with a message of what was wanted and what helps."""
+"""Rescue of the model when training runs out of memory, with a message that names a remedy."""
 
 import traceback
 from pathlib import Path
@@ -17,9 +17,9 @@ from utils.system_utils import UserError
 class MemoryGuard(Observer):
     """Saves the model when memory runs out, and turns the error into a UserError.
 
-    Before an iteration is `measured`, the state after the last iteration is saved: a resumed run then equals one that
-    was never stopped. Afterwards the model is whole, too, but that iteration's densification or optimiser step may be
-    done in part. So this observer comes after all that only read the model, and before those that need it whole.
+    Until an iteration is `measured`, the saved state is that after the iteration before: a resumed run then equals one
+    that was never stopped. After that, the saved model is whole as well, but densification or the optimiser's step may
+    be done in part. So this observer stands after those that only read the model, and before those that need it whole.
     """
 
     def __init__(self, run: Run) -> None:
@@ -46,13 +46,13 @@ class MemoryGuard(Observer):
     def ended(self, error: Error) -> None:
         if is_out_of_memory(error):
             what = situation(error, self._gaussians, [self._camera] if self._camera else [])
-            traceback.clear_frames(error.__traceback__)  # what was being computed takes memory that saving may need
+            traceback.clear_frames(error.__traceback__)  # their tensors take memory that saving may need
             raise UserError(
-                f"memory did not suffice in iteration {self._iteration + 1} ({what}); {self._rescue()}"
+                f"training ran out of memory in iteration {self._iteration + 1} ({what}); {self._rescue()}"
             ) from error
 
     def _rescue(self) -> str:
-        """Save what there is. Says what was saved, and what to do."""
+        """Save the model. Return what was saved, and what to do."""
         if self._iteration == self._first and not self._changing:
             return "nothing was trained yet; lower --resolution (-r), --max_num_splats, --images_to_load or --sh_degree"
         gaussians, iteration = self._gaussians, self._iteration + self._changing
@@ -65,7 +65,7 @@ class MemoryGuard(Observer):
                 further = f"--max_num_splats {len(gaussians)}, {further}"
             else:
                 gaussians.active_sh_degree = self._sh_degree
-                anew = "--max_num_splats or --sh_degree"  # going on with as many would end here again
+                anew = "--max_num_splats or --sh_degree"  # a resumed run with as many would end here again
             gaussians.check_finite(iteration)
             gaussians.check_steps()
             path = self._folder / f"chkpnt{iteration}.pth"

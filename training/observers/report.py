@@ -1,4 +1,4 @@
-"""Scores in testing iterations, and what TensorBoard is told."""
+"""Scores in testing iterations, and the events for TensorBoard."""
 
 import sys
 from collections.abc import Callable, Sequence
