@@ -1,4 +1,4 @@
-"""Too little memory: what is said beforehand, what is saved when it happens, and how the sentence reads."""
+"""Too little memory: the warning beforehand, the files saved when memory runs out, and the message."""
 
 import re
 import signal
@@ -25,13 +25,13 @@ from utils.system_utils import UserError, run_cli
 
 ROOT = Path(__file__).parents[1]
 HUGE = 1 << 60
-# What torch says on a GPU that is full.
+# torch's message on a full GPU.
 ON_A_GPU = torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 20.00 GiB. GPU 0 has a total capacity of ...")
 
 
 @pytest.fixture(autouse=True)
 def _stdout(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Training stamps stdout: bring it back."""
+    """Restore stdout, which training stamps."""
     monkeypatch.setattr(sys, "stdout", sys.stdout)
 
 
@@ -115,7 +115,7 @@ def _train(scene: Path, out: Path, *more: object) -> bytes:
 
 
 def _failing(function, call: int, error: Exception):
-    """`function`, but for one call that raises."""
+    """Wrap `function` so that one call raises."""
     calls = []
 
     def fails(*args: object, **kwargs: object) -> object:
@@ -137,7 +137,7 @@ def _failing(function, call: int, error: Exception):
     ids=["cpu", "gpu", "instances"],
 )
 def test_the_state_before_is_saved_and_goes_on_to_the_same_end(colmap_scene, tmp_path, monkeypatch, error, said):
-    monkeypatch.setattr(train, "SH_INTERVAL", 5)  # so that the failing iteration is one that raises the degree
+    monkeypatch.setattr(train, "SH_INTERVAL", 5)  # so that the failing iteration raises the SH degree
     with monkeypatch.context() as patch:
         patch.setattr(train, "render", _failing(train.render, 5, error))
         with pytest.raises(UserError, match="memory did not suffice in iteration 5") as caught:
@@ -165,7 +165,7 @@ def test_a_picture_that_does_not_fit_saves_too(colmap_scene, tmp_path, monkeypat
     ids=["cloning", "splitting", "pruning"],
 )
 def test_a_densification_cut_short_is_saved_whole(colmap_scene, tmp_path, monkeypatch, of, name, call, count):
-    """Of 300 Gaussians 4 are cloned and 296 split in two."""
+    """Clone 4 of 300 Gaussians and split 296 in two."""
     plain = GaussianModel.densify_and_prune
 
     def densify(*args: object, **kwargs: object) -> None:
@@ -248,7 +248,7 @@ def test_the_estimate_and_its_warnings(colmap_scene, tmp_path, monkeypatch, capf
 
 
 def test_the_estimate_counts_what_a_step_allocates():
-    """Held to torch's own count of the tensors: parameters, gradients and moments are exact."""
+    """The estimate of parameters, gradients and moments equals torch's own count of the tensors."""
     gaussians = model(50)
     gaussians.training_setup(options())
     for group in gaussians.optimizer.param_groups:
@@ -262,7 +262,7 @@ def test_the_estimate_counts_what_a_step_allocates():
     assert training_bytes(gaussians, 50, 0) - 50 * memory_estimate.PER_GAUSSIAN == counted
 
 
-# Pictures and processes
+# Images and processes
 
 
 def test_render_decodes_only_what_it_renders(colmap_scene, tmp_path, monkeypatch):
