@@ -72,15 +72,15 @@ def absent() -> list[list[str]]:
         return f"{module} loaded: {'yes' if module in seen['modules'] else 'no'}"
 
     doubles, library = _double_bytes()
-    no_test_pictures = "test pictures (--test_iterations -1 --no_curve)"
+    no_test_photos = "test photos (--test_iterations -1 --no_curve)"
     return [
         ["pycolmap at import (Blender scene)", loaded("pycolmap"), _import_cost("pycolmap")],
         ["curve recording (--no_curve)", f"files: {len(curves)}; {loaded('matplotlib')}", _import_cost("matplotlib")],
-        [no_test_pictures, f"decoded: {len(tests)} of 2", "3 bytes a pixel"],
+        [no_test_photos, f"decoded: {len(tests)} of 2", "3 bytes a pixel"],
         ["viewer", f"sockets bound: {len(seen['binds'])}", ""],
         ["TensorBoard", f"{loaded('tensorboard')} (yes wherever it is installed)", ""],
         ["LPIPS, outside metrics.py", loaded("lpips"), ""],
-        ["alpha of opaque pictures, pixels beyond training size", f"bytes kept: {extra}", ""],
+        ["alpha of opaque photos, pixels beyond training size", f"bytes kept: {extra}", ""],
         ["double kernels", "entered with float64 tensors only", f"{doubles} of {library:,} bytes on disk"],
     ]
 
