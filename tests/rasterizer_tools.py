@@ -1,4 +1,4 @@
-"""Tools for the rasterizer's tests: both renderers under one call, the error as the design defines it, scenes."""
+"""What the rasterizer's tests share: both renderers under one call, the error as the design defines it, scenes."""
 
 import math
 from collections.abc import Callable
@@ -25,22 +25,22 @@ def _param(name: str, *values: object) -> object:
     return pytest.param(*values, id=name, marks=GPU_MARKS if name == "cuda" else ())
 
 
-# Parameters for tests that also run on a GPU; benchmarks/device.sh finds their files by "_AND_GPU". DTYPES_AND_GPU is
-# for tests that make all tensors without naming a device: the fixture `dtype` makes the device torch's default.
+# What runs on a GPU as well (benchmarks/device.sh finds the files by "_AND_GPU"). DTYPES_AND_GPU is for tests that make
+# all their tensors without naming a device: the fixture `dtype` makes it torch's default.
 CPU_AND_GPU = pytest.mark.parametrize("device", [_param(name, name) for name in ("cpu", "cuda")])
 BOTH_AND_GPU = pytest.mark.parametrize(("device", "dtype"), [_param(k, *place) for k, place in _PLACES.items()])
 DTYPES_AND_GPU = pytest.mark.parametrize("dtype", [_param(k, place) for k, place in _PLACES.items()], indirect=True)
 
 
 class Error(NamedTuple):
-    """The error of a tensor: largest and median difference over the largest reference value."""
+    """Of a tensor: largest and median difference over the largest reference value."""
 
     largest: float
     median: float
 
 
 def error(got: Tensor, reference: Tensor) -> Error:
-    """The error of `got`: infinite if it has a NaN, absolute if the reference is zero."""
+    """Infinite where `got` has a NaN; absolute where the reference is zero."""
     difference = (got.double() - reference.double()).abs().nan_to_num(nan=math.inf)
     scale = reference.abs().max().item() or 1.0
     return Error(difference.max().item() / scale, difference.median().item() / scale)
@@ -57,7 +57,7 @@ def adam(
     step: float,
     columns: int = -1,
 ) -> None:
-    """Do step number `step`, counted from 1, on one tensor."""
+    """Step number `step`, from 1, of one tensor."""
     counter = torch.tensor(step - 1.0)
     ops.adam_([value], [gradient], [mean], [square], [counter], [rate], *betas, eps, [columns])
 
@@ -71,7 +71,7 @@ def render(
     raw: bool = True,
     **wanted: bool,
 ) -> Rasterized:
-    """Call `rasterize`, or the oracle's `render` if given as function, with parameters by name."""
+    """`rasterize`, or the oracle's `render` as function, on parameters by name."""
     rest = dict(parameters)
     means, opacities = rest.pop("means"), rest.pop("opacities")
     means2d = torch.zeros_like(means) if means2d is None else means2d
@@ -81,7 +81,7 @@ def render(
 
 
 def leaves(parameters: dict[str, Tensor], dtype: torch.dtype | None = None) -> dict[str, Tensor]:
-    """New copies that require gradients."""
+    """Fresh copies that require gradients."""
     return {name: t.detach().clone().to(dtype or t.dtype).requires_grad_() for name, t in parameters.items()}
 
 
@@ -92,10 +92,8 @@ def gradients(
     loss: Callable[[Rasterized], Tensor] | None = None,
     **options,
 ) -> dict[str, Tensor]:
-    """Image, planes and all gradients of a loss of these (None: `loss_of`), by name.
-
-    They are computed on `device` and returned on the CPU.
-    """
+    """Image, planes and every gradient of a loss of theirs (None: `loss_of`), by name. Computed on `device`; the
+    results are on the CPU."""
     inputs = leaves({name: t.to(device) for name, t in parameters.items()})
     means2d = torch.zeros_like(inputs["means"]).requires_grad_()
     out = render(inputs, on_device(camera, device), means2d, **options)
@@ -105,7 +103,7 @@ def gradients(
 
 
 def loss_of(out: NamedTuple, keep: Tensor | None = None) -> Tensor:
-    """The sum of all three planes with fixed random weights; keep: (H, W) bool, the pixels that count."""
+    """Sum of all three planes with fixed random weights; keep (H, W) bool: the other pixels do not count."""
     generator = torch.Generator().manual_seed(5)
     loss = 0.0
     for plane in (out.color, out.inverse_depth, out.transmittance):
@@ -116,7 +114,7 @@ def loss_of(out: NamedTuple, keep: Tensor | None = None) -> Tensor:
 
 
 def activated(parameters: dict[str, Tensor]) -> dict[str, Tensor]:
-    """Raw parameters in the form of the reference's API."""
+    """Raw parameters as the reference's API wants them."""
     out = dict(parameters)
     out["opacities"] = torch.sigmoid(out["opacities"])
     out["scales"] = torch.exp(out["scales"])
@@ -125,7 +123,7 @@ def activated(parameters: dict[str, Tensor]) -> dict[str, Tensor]:
 
 
 def rotation_matrix(q: Tensor) -> Tensor:
-    """The rotation (3, 3) of a quaternion w x y z of any length, as product of its left and right multiplication."""
+    """(3, 3) of a quaternion w x y z of any length, by the product of its left and right multiplication."""
     w, x, y, z = (q.double() / q.double().norm()).tolist()
     left = torch.tensor([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]], dtype=torch.float64)
     right = torch.tensor([[w, x, y, z], [-x, w, -z, y], [-y, z, w, -x], [-z, -y, x, w]], dtype=torch.float64)
@@ -133,7 +131,7 @@ def rotation_matrix(q: Tensor) -> Tensor:
 
 
 def rigid(q: tuple[float, ...], translation: tuple[float, ...]) -> Tensor:
-    """A view, (4, 4) world to view, not transposed."""
+    """(4, 4) world to view, not transposed."""
     view = torch.eye(4, dtype=torch.float64)
     view[:3, :3] = rotation_matrix(torch.tensor(q))
     view[:3, 3] = torch.tensor(translation, dtype=torch.float64)
@@ -141,7 +139,7 @@ def rigid(q: tuple[float, ...], translation: tuple[float, ...]) -> Tensor:
 
 
 def few(n: int = 3, width: int = 18, height: int = 7, dtype: torch.dtype = torch.float64) -> tuple[dict, dict]:
-    """Raw parameters and arguments of `settings` for few splats far from cut-offs: every alpha is in 1/255 to 0.99."""
+    """Raw parameters and arguments of `settings`: few splats, no cut-off near: 1/255 < alpha < 0.99 on every pixel."""
     g = torch.Generator().manual_seed(11)
     depth = 2.0 + torch.arange(n) / 2
     focal = width / (2 * math.tan(math.radians(30)))
@@ -168,7 +166,7 @@ def one_splat(
     color: tuple[float, float, float] = (1.0, 0.5, 0.25),
     dtype: torch.dtype = torch.float64,
 ) -> dict[str, Tensor]:
-    """An isotropic Gaussian with activated parameters and a fixed colour."""
+    """An isotropic Gaussian, activated, with a colour of its own."""
     return {
         "means": torch.tensor([[x, y, z]], dtype=dtype),
         "opacities": torch.tensor([[opacity]], dtype=dtype),
@@ -179,17 +177,17 @@ def one_splat(
 
 
 def together(*splats: dict[str, Tensor]) -> dict[str, Tensor]:
-    """Several scenes joined into one."""
+    """Several of the above in one scene."""
     return {name: torch.cat([s[name] for s in splats]) for name in splats[0]}
 
 
 def pick(parameters: dict[str, Tensor], rows) -> dict[str, Tensor]:
-    """The same scene with only these rows."""
+    """The same scene with these rows only."""
     return {name: t[rows] for name, t in parameters.items()}
 
 
 def scene_arguments(parameters: dict[str, Tensor], camera: GaussianRasterizationSettings, raw: bool = True) -> tuple:
-    """The arguments that the operators share, in their order."""
+    """The arguments that the ops have in common, in their order."""
     names = ("means", "opacities", "scales", "rotations", "cov3d", "colors", "sh_dc", "sh_rest")
     return (
         *(parameters.get(name) for name in names),
@@ -217,9 +215,9 @@ def everywhere(depths: Tensor, width: int, height: int) -> tuple[Tensor, Tensor]
 def assert_culling_is_exact(
     splats: Tensor, depths: Tensor, rects: Tensor, counts: Tensor, width: int, height: int, also: Tensor | None = None
 ) -> tuple[int, int]:
-    """Check that blending `bin`'s lists gives the bits of blending all splats in all tiles; return both instances.
+    """Blending `bin`'s lists gives the bits of blending all splats everywhere; returns the instances of both.
 
-    also: (K, 11), rows and depths of splats that `project` left out, which the second list contains too.
+    also (K, 11): rows and depths of splats that `project` left out; they belong to the second list as well.
     """
     background = torch.tensor([0.3, 0.6, 0.1], dtype=splats.dtype, device=splats.device)
     instances, ranges, _, _ = ops.bin(splats, depths, rects, counts, height, width, False)
@@ -236,11 +234,8 @@ def assert_culling_is_exact(
 
 
 def borderline_splats(n: int, width: int, height: int, dtype: torch.dtype, device: str = "cpu") -> tuple[Tensor, ...]:
-    """`project`'s splats, depths, rects and counts, and the splats that it left out.
-
-    Their opacity is tuned so that they reach 1/255 at one pixel on the rim of one tile within some units in the last
-    place.
-    """
+    """`project`'s splats, depths, rects and counts, and what it left out, of splats whose opacity is tuned so that
+    they reach 1/255 at one pixel on the rim of one tile within some units in the last place."""
     g = torch.Generator().manual_seed(6)
     focal = width / (2 * math.tan(math.radians(30)))
     z = 2 + torch.rand(n, 1, generator=g)
@@ -256,7 +251,7 @@ def borderline_splats(n: int, width: int, height: int, dtype: torch.dtype, devic
     parameters = {name: t.to(device, dtype) for name, t in parameters.items()}
     camera = on_device(settings(width, height, dtype), device)
     splats, depths, _, counts, _ = ops.project(*scene_arguments(parameters, camera, raw=False))
-    # Choose the corner of a tile near the mean, where the tile's least distance is at a pixel centre.
+    # The corner of a tile, not far from the mean: where a tile's least distance is at a pixel centre.
     u, v = (2 * torch.randn(2, n, generator=g)).clamp(-2.5, 2.5).to(device)
     dy = v / splats[:, 4]
     pixel = splats[:, :2] + torch.stack([(u - splats[:, 3] * dy) / splats[:, 2], dy], 1)

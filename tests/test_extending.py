@@ -1,7 +1,7 @@
-"""The worked example of docs/extending.md, applied to a copy of the code: temperatures are learnt and kept.
+"""The worked example of docs/extending.md, applied to a copy of the code: its temperatures are learnt and kept.
 
-The truth is known for every Gaussian. The plain code trains a model, the half of it with x > 0 is declared hot, and
-renders of these temperatures are the thermal photos. The extended code trains the same Gaussians, row by row.
+The truth is known for every Gaussian: a model is trained by the plain code, its half with x > 0 is declared hot, and
+renders of that are the thermal pictures. The extended code trains the same Gaussians, row by row.
 """
 
 import argparse
@@ -101,7 +101,7 @@ def _extend(folder: Path) -> None:
             shutil.copyfile(ROOT / name, folder / name)
     diffs = re.findall(r"^```diff\n(.*?)^```$", PAGE.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL)
     assert len(diffs) == 9
-    # Without the ceiling, git would apply to a repository around the folder.
+    # Without the ceiling git would take a repository around the folder for the one to apply to.
     environment = os.environ | {"GIT_CEILING_DIRECTORIES": str(folder.parent)}
     done = subprocess.run(
         ["git", "apply", "-"], input="".join(diffs), cwd=folder, env=environment, capture_output=True, text=True

@@ -201,8 +201,8 @@ def test_what_is_kept_and_decoded_ahead_changes_no_bit(colmap_scene, tmp_path, m
 
 
 def test_a_gpu_keeps_what_fits_its_share(files, monkeypatch):
-    """The rule that chooses the device to hold the images, tested without a GPU."""
-    free = 4 * 10 * 4 * 6 * 4  # four times the bytes of ten RGBA images
+    """The rule alone: which device keeps, without one."""
+    free = 4 * 10 * 4 * 6 * 4  # four times what ten RGBA pictures take
     monkeypatch.setattr(store, "free_memory", lambda device: free)
     monkeypatch.setattr(store, "DeviceCopies", lambda device: object())
     for room, limit, kept in ((0, 0, "cuda"), (-1, 0, "cpu"), (-1, 9, "cuda"), (-2 * 4 * 96, 8, "cuda")):

@@ -137,7 +137,7 @@ def _failing(function, call: int, error: Exception):
     ids=["cpu", "gpu", "instances"],
 )
 def test_the_state_before_is_saved_and_goes_on_to_the_same_end(colmap_scene, tmp_path, monkeypatch, error, said):
-    monkeypatch.setattr(train, "SH_INTERVAL", 5)  # so that the failing iteration raises the SH degree
+    monkeypatch.setattr(train, "SH_INTERVAL", 5)  # so that the failing iteration is one that raises the degree
     with monkeypatch.context() as patch:
         patch.setattr(train, "render", _failing(train.render, 5, error))
         with pytest.raises(UserError, match="memory did not suffice in iteration 5") as caught:

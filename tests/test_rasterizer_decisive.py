@@ -1,4 +1,4 @@
-"""Decisive Gaussians, on which an image depends: those that a pixel blends, and those that end a pixel."""
+"""Which Gaussians an image depends on: those that a pixel blends, and those that end one."""
 
 import math
 

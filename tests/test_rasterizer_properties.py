@@ -1,4 +1,4 @@
-"""Properties that must hold for any scene, tested on randomly drawn scenes.
+"""What must hold for any scene: properties over drawn scenes.
 
 GS_FUZZ=2000 in the environment draws that many scenes for each property.
 """

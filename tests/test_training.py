@@ -57,7 +57,7 @@ RESUMED = [
 
 
 def test_resume_equals_uninterrupted(colmap_scene, tmp_path, monkeypatch):
-    monkeypatch.setattr(train, "SH_INTERVAL", 130)  # so that three degrees become active within 600 iterations
+    monkeypatch.setattr(train, "SH_INTERVAL", 130)  # so that three degrees come into play within 600 iterations
     whole = _train(colmap_scene, tmp_path / "a", *RESUMED, "--checkpoint_iterations", 300, iterations=600)
     checkpoint = tmp_path / "a" / "chkpnt300.pth"
     resumed = _train(colmap_scene, tmp_path / "b", *RESUMED, "--start_checkpoint", checkpoint, iterations=600)
