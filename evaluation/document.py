@@ -1,4 +1,4 @@
-"""Content of the report, for both renderings: sections of paragraphs, tables, pictures and quoted messages."""
+"""Content of the report, for both renderings: sections of paragraphs, tables, figures and quoted messages."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ def results_table(rows: Sequence[Mapping[str, Any]]) -> Table:
 
 
 def document(report: Mapping[str, Any], figures: Mapping[str, Sequence[Picture]]) -> list[Section]:
-    """Return the sections of the report. figures: pictures by scene."""
+    """Return the sections of the report. figures: those of each scene, by scene."""
     return [
         *_failures(report),
         _results(report),

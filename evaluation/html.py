@@ -1,4 +1,4 @@
-"""The report as one self-contained HTML file, with embedded pictures and without scripts."""
+"""The report as one self-contained HTML file, with embedded figures and without scripts."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _QUALITY = 90
 
 
 def data_uri(path: Path) -> str:
-    """Return a picture as a data: URI; large ones become JPEG."""
+    """Return a figure as a data: URI; large ones become JPEG."""
     content, kind = path.read_bytes(), "png"
     if len(content) > _PHOTOGRAPHIC:
         buffer = io.BytesIO()

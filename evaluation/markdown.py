@@ -22,7 +22,7 @@ def _block(block: Block, folder: Path) -> str:
 
 
 def to_markdown(title: str, sections: Sequence[Section], folder: Path) -> str:
-    """Render the whole page; links to pictures are relative to `folder`, the folder of the page."""
+    """Render the whole page; links to figures are relative to `folder`, the folder of the page."""
     parts = [f"# {title}"]
     for section in sections:
         parts += [f"## {section.title}", *(_block(block, folder) for block in section.blocks)]

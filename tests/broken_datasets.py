@@ -1,4 +1,4 @@
-"""Small scenes with one fault each, and what the reader says to them.
+"""Small scenes with one fault each, and the reader's messages for them.
 
 PYTHONPATH=.:tests python -m broken_datasets > docs/inside/broken_datasets.md
 """
@@ -28,7 +28,7 @@ Options = dict[str, Any]
 
 
 class Fault(NamedTuple):
-    """What is wrong, in words; the scene it is made from; what makes it so, with the options to train with."""
+    """A fault: its description, the kind of scene it is made from, and the function that makes it and gives options."""
 
     what: str
     kind: str  # "colmap" or "blender"
@@ -39,7 +39,7 @@ FAULTS: list[Fault] = []
 
 
 def fault(kind: str, what: str) -> Callable:
-    """Enter a function into the list. It changes the scene it gets, and may return options of train.py."""
+    """Add a function to the list. It changes the scene that it gets, and may return options of train.py."""
 
     def enter(make: Callable[[Path], Options | None]) -> Callable[[Path], Options | None]:
         FAULTS.append(Fault(what, kind, make))
@@ -49,9 +49,9 @@ def fault(kind: str, what: str) -> Callable:
 
 
 def message(fault: Fault, masters: dict[str, Path], work: Path) -> str:
-    """What a training of the faulty scene ends with: the UserError's sentence, the folders as SCENE and OUT.
+    """Train the faulty scene and return the UserError's message, with the folders as SCENE and OUT.
 
-    Raises AssertionError where the scene is taken.
+    Raises AssertionError if the scene is accepted.
     """
     scene = Path(shutil.copytree(masters[fault.kind], work / "scene"))
     options = {"source_path": str(scene), "model_path": str(work / "out"), **(fault.make(scene) or {})}
@@ -70,7 +70,7 @@ def message(fault: Fault, masters: dict[str, Path], work: Path) -> str:
 
 
 def make_masters(folder: Path) -> dict[str, Path]:
-    """The sound scenes, by kind."""
+    """Make the intact scenes, by kind."""
     make_colmap_scene(folder / "colmap", views=9)
     make_blender_scene(folder / "blender")
     return {"colmap": folder / "colmap", "blender": folder / "blender"}
@@ -112,7 +112,7 @@ def _photo(scene: Path) -> Path:
 
 
 def _as_text(scene: Path, file: str, change: Callable[[list[str]], list[str]]) -> None:
-    """Turn the model into text and change the data lines, split at blanks, of a file."""
+    """Convert the model to text and change the data lines of a file, split at blanks."""
     import pycolmap
 
     model = pycolmap.Reconstruction(_sparse(scene))

@@ -13,7 +13,7 @@ from synthetic import make_blender_scene, make_colmap_scene
 
 @pytest.fixture(scope="session")
 def shared_dir() -> Path:
-    """Folder with real scenes and models: $GS_SHARED or `shared` beside the repository; skips where it is missing."""
+    """Folder with real scenes and models: $GS_SHARED, or `shared` beside the repository; skips if it is missing."""
     folder = Path(os.environ.get("GS_SHARED") or Path(__file__).resolve().parents[2] / "shared")
     if not (folder / "scenes").is_dir():
         pytest.skip(f"no real scenes in {folder}; set GS_SHARED")
@@ -22,7 +22,7 @@ def shared_dir() -> Path:
 
 @pytest.fixture(scope="session", autouse=True)
 def cache_folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """A cache folder of the tests' own, for subprocesses too."""
+    """A separate cache folder for the tests, used by subprocesses too."""
     folder = tmp_path_factory.mktemp("cache")
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("GS_CACHE", str(folder))
@@ -45,19 +45,19 @@ def _blender_master(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def colmap_scene(_colmap_master: Path, tmp_path: Path) -> Path:
-    """A COLMAP scene of 17 pictures, 96x64, PINHOLE with an off-centre principal point; free to be changed."""
+    """A COLMAP scene of 17 photos, 96x64, PINHOLE with an off-centre principal point; a copy that tests may change."""
     return Path(shutil.copytree(_colmap_master, tmp_path / "colmap_scene"))
 
 
 @pytest.fixture
 def blender_scene(_blender_master: Path, tmp_path: Path) -> Path:
-    """A Blender scene of 4 training and 2 test frames, 40x30 RGBA; free to be changed."""
+    """A Blender scene of 4 training and 2 test frames, 40x30 RGBA; a copy that tests may change."""
     return Path(shutil.copytree(_blender_master, tmp_path / "blender_scene"))
 
 
 @pytest.fixture
 def dtype(request: pytest.FixtureRequest) -> Iterator[torch.dtype]:
-    """The dtype of a parameter (device, dtype), whose device is torch's default during the test."""
+    """The dtype of a parameter (device, dtype); the device is torch's default during the test."""
     device, made = request.param
     with torch.device(device):
         yield made

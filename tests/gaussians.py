@@ -1,4 +1,4 @@
-"""Small models and options for the tests of model and training."""
+"""Small models and options for tests of the model and of training."""
 
 import argparse
 
@@ -14,17 +14,17 @@ GROUPS = {group: attribute.field for group, attribute in attributes(0).items()}
 
 
 def options(**changes: object) -> argparse.Namespace:
-    """Optimisation options at their defaults but for `changes`."""
+    """Optimisation options with default values, except for `changes`."""
     return OptimizationParams(argparse.ArgumentParser()).extract(argparse.Namespace(**changes))
 
 
 def pipeline(**changes: object) -> argparse.Namespace:
-    """Pipeline options at their defaults but for `changes`."""
+    """Pipeline options with default values, except for `changes`."""
     return PipelineParams(argparse.ArgumentParser()).extract(argparse.Namespace(**changes))
 
 
 def cloud(count: int, seed: int = 0) -> BasicPointCloud:
-    """`count` points in a unit ball or so."""
+    """`count` points roughly in a unit ball."""
     rng = np.random.default_rng(seed)
     points = rng.normal(size=(count, 3)).astype(np.float32) * 0.4
     return BasicPointCloud(points, rng.random((count, 3)).astype(np.float32), np.zeros_like(points))
@@ -33,7 +33,7 @@ def cloud(count: int, seed: int = 0) -> BasicPointCloud:
 def model(
     count: int, degree: int = 3, extent: float = 1.0, seed: int = 0, active: bool = True, **changes: object
 ) -> GaussianModel:
-    """A model made from a cloud, all parameters random, its optimiser set up, all SH bands active or only band 0."""
+    """A model made from a cloud, with random parameters and an optimiser; all SH bands are active, or only band 0."""
     gaussians = GaussianModel(degree, str(changes.get("optimizer_type", "default")))
     gaussians.create_from_pcd(cloud(count, seed), [], extent)
     generator = torch.Generator().manual_seed(seed)
@@ -47,7 +47,7 @@ def model(
 
 
 def take_steps(gaussians: GaussianModel, steps: int, seed: int = 0) -> None:
-    """Optimiser steps with random gradients, so that every moment has a value of its own."""
+    """Do optimiser steps with random gradients, so that every moment has another value."""
     generator = torch.Generator().manual_seed(seed)
     for _ in range(steps):
         for name in GROUPS.values():

@@ -1,4 +1,4 @@
-"""Photos of a room's corner, three walls with a texture each, from known places: what features can be found on."""
+"""Photos of a room's corner from known places; its three walls have textures on which features can be found."""
 
 from pathlib import Path
 
@@ -11,7 +11,7 @@ FOCAL = 220.0
 
 
 def camera_centers(count: int) -> np.ndarray:
-    """Places (count,3) on an arc that looks into the corner at the origin."""
+    """Camera positions (count, 3) on an arc that faces the corner at the origin."""
     angles = np.linspace(0.25, 1.3, count)
     return np.stack([4 * np.cos(angles), 4 * np.sin(angles), 1.4 + 0.5 * np.sin(5 * angles)], axis=1)
 
@@ -39,7 +39,7 @@ def _photo(center: np.ndarray, textures: list[np.ndarray]) -> np.ndarray:
     right = np.cross(forward, [0.0, 0.0, 1.0])
     right /= np.linalg.norm(right)
     down = np.cross(forward, right)
-    # Four rays a pixel: sharp edges without aliasing.
+    # Four rays per pixel give sharp edges without aliasing.
     y, x = (np.mgrid[: 2 * height, : 2 * width] + 0.5) / 2
     rays = ((x - width / 2) * right[:, None, None] + (y - height / 2) * down[:, None, None]) / FOCAL
     rays = rays + forward[:, None, None]

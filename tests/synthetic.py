@@ -1,4 +1,4 @@
-"""Tiny scenes for the tests: a COLMAP model made by pycolmap and a Blender folder, with pictures of coloured discs."""
+"""Tiny scenes for the tests: a COLMAP model made by pycolmap and a Blender folder, with photos of coloured discs."""
 
 import json
 import math
@@ -16,9 +16,9 @@ VIEWS = 17
 def make_colmap_scene(
     folder: Path, *, model: str = "PINHOLE", params: tuple[float, ...] = (FOCAL, FOCAL, *CENTER), views: int = VIEWS
 ):
-    """Write a scene of `views` pictures into `folder` and return its pycolmap model (points within a unit cube).
+    """Write a scene of `views` photos into `folder` and return its pycolmap model, whose points are in a unit cube.
 
-    Pictures lie in two sub-folders, with upper and lower case names, so that sorting by bytes shows.
+    The photos are in two sub-folders, with upper and lower case names, so that sorting by bytes shows.
     """
     import pycolmap
 
@@ -37,7 +37,7 @@ def make_colmap_scene(
     for point in reconstruction.points3D.values():
         point.color = rng.integers(0, 256, 3).astype(np.uint8)
     for image_id, image in reconstruction.images.items():
-        # Ids run against the order of the names.
+        # Ids are in the reverse order of the names.
         number = views - image_id
         image.name = f"{'Right' if number % 2 else 'left'}/{'v' if number % 3 else 'V'}{number:02d}.png"
         path = folder / "images" / image.name
@@ -87,7 +87,7 @@ def make_blender_scene(folder: Path, *, views: int = 4, size: tuple[int, int] = 
 
 
 class FakeGaussians:
-    """Stands for the model where only the data matter: keeps what the scene hands over."""
+    """A stand-in for the model in tests of data alone; keeps what the scene passes to it."""
 
     def create_from_pcd(self, pcd, cam_infos, spatial_lr_scale) -> None:
         self.pcd, self.cam_infos, self.extent = pcd, cam_infos, spatial_lr_scale
@@ -101,7 +101,7 @@ class FakeGaussians:
 
 
 def folder_state(folder: Path) -> dict[str, tuple[int, bytes]]:
-    """Time stamp and bytes of every file below a folder."""
+    """The time stamp and the bytes of every file below a folder."""
     return {
         str(path.relative_to(folder)): (path.stat().st_mtime_ns, path.read_bytes())
         for path in sorted(folder.rglob("*"))

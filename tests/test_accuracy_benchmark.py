@@ -1,4 +1,4 @@
-"""benchmarks/accuracy/oracle.py: the error, the exact exponential, the figure; the kernels' runs on small scenes."""
+"""benchmarks/accuracy: the error, the exact exponential, the figure, and runs of the kernels on small scenes."""
 
 import re
 import shutil
@@ -73,7 +73,7 @@ def test_runs_agree_with_the_oracle_and_are_reported(small_scenes, capsys):
     print_errors(records)
     said = capsys.readouterr().out
     assert said.count("| d screen mean ") == 2 and "ordinary, CPU float64" in said
-    # Without a GPU the double kernel stands in for it: a ratio of zero everywhere.
+    # Without a GPU the double kernel replaces it, so that every ratio is zero.
     for case in kernel_runs.CASES:
         runs[case, CUDA_FLOAT] = runs[case, CPU_DOUBLE]
     print_ratios(runs)
@@ -92,7 +92,7 @@ def test_the_exact_exponential_is_exact_and_the_fast_one_is_not(tmp_path):
     subprocess.run(["c++", "-std=c++17", "-O1", f"-I{COMMON}", str(source), "-o", str(program)], check=True)
     said = subprocess.run([str(program)], check=True, capture_output=True, text=True).stdout
     errors = [float(line) / unit for line, unit in zip(said.split(), 2 * (2.0**-23, 2.0**-52), strict=True)]
-    # Units in the last place (relative to 1): rounding alone is 0.5; glibc says 0.51 of its own.
+    # Units in the last place, relative to 1. Rounding alone is 0.5; glibc documents 0.51 for its function.
     assert all(0.5 < e < 2 for e in errors[:2]), errors
     assert all(0.4 < e < 0.52 for e in errors[2:]), errors
     assert errors[2] < errors[0] and errors[3] < errors[1]

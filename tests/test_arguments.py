@@ -1,4 +1,4 @@
-"""Options, and what a model folder remembers of them."""
+"""Options, and their storage in a model folder."""
 
 import argparse
 import json
@@ -318,7 +318,7 @@ def test_values_of_unknown_keys_may_be_any_literal(tmp_path):
 
 
 def _only_reference_parser() -> argparse.ArgumentParser:
-    """The options of the reference and nothing else."""
+    """A parser with the options of the reference and nothing else."""
     parser = argparse.ArgumentParser()
     for group in (ModelParams, PipelineParams, OptimizationParams):
         for option in group.options:
@@ -328,7 +328,7 @@ def _only_reference_parser() -> argparse.ArgumentParser:
 
 
 def _meaning(parser: argparse.ArgumentParser, prefix: str) -> str | None:
-    """Option that an abbreviation sets, None where it is refused."""
+    """The option that an abbreviation sets; None if the abbreviation is refused."""
     for value in ([], ["1"]):
         try:
             args = parser.parse_args([prefix, *value])

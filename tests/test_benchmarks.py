@@ -48,7 +48,7 @@ def test_fragments_are_those_of_a_loop_over_pixels():
     counted = fragments(stages.splats, stages.instances, stages.ranges, last)
     assert counted["blended"] == blended / pixels > 5
     assert counted["blended"] < counted["8x4"] < counted["8x8"] < counted["16x8"] < counted["16x16"]
-    # Instances are exact: every one reaches its tile.
+    # Instances are exact, so each one reaches its tile.
     assert counted["16x16"] == int(processed_per_tile(last).sum()) * TILE * TILE / pixels
 
 
@@ -66,7 +66,7 @@ def test_short_names(name, short):
 
 
 def test_an_iteration_makes_few_calls(colmap_scene):
-    """Each call slows a step that is bound by the host, so whoever adds calls should know."""
+    """Each call slows a step that is bound by the host, so this test must notice added calls."""
     calls = calls_per_iteration("-s", str(colmap_scene), "-r", "24")
     for op in ("rasterize", "rasterize_vjp", "adam_", "observe_"):
         assert calls[f"diff_gaussian_rasterization::{op}"] == 1, op

@@ -1,4 +1,4 @@
-"""Blender folders: poses, angles, the start cloud, pictures with alpha, and what bad ones are told."""
+"""Blender folders: poses, angles, the start cloud, photos with alpha, and messages for faulty folders."""
 
 import argparse
 import json
@@ -34,7 +34,7 @@ def _edit(scene: Path, change, name: str = "transforms_train.json") -> None:
 
 
 def test_axes_of_a_hand_made_pose(blender_scene):
-    # At (0,-4,0), looking along +y, z up: OpenGL's camera has x right, y up, z backward.
+    # A camera at (0,-4,0) facing +y, z up. OpenGL's camera has x right, y up, z backward.
     pose = [[1, 0, 0, 0], [0, 0, -1, -4], [0, 1, 0, 0], [0, 0, 0, 1]]
     _edit(blender_scene, lambda content: content["frames"][0].update(transform_matrix=pose))
     camera = _read(blender_scene).train_cameras[0]
@@ -84,7 +84,7 @@ def test_random_cloud(blender_scene):
     cloud = _read(blender_scene).point_cloud
     assert cloud.points.shape == (100_000, 3) and cloud.points.dtype == np.float32
     assert -1.3 <= cloud.points.min() < -1.299 and 1.299 < cloud.points.max() <= 1.3
-    # Even: the mean of 100,000 uniform values of deviation 0.75 is within 0.012, five deviations.
+    # The points are even: the mean of 100,000 uniform values of deviation 0.75 is within 0.012, five deviations.
     assert np.abs(cloud.points.mean(axis=0)).max() < 0.012
     assert (cloud.colors == np.float32(127 / 255)).all()
     np.testing.assert_array_equal(_read(blender_scene).point_cloud.points, cloud.points)

@@ -1,4 +1,4 @@
-"""Every fault of broken_datasets.py is answered in one sentence that a user can act on."""
+"""Every fault of broken_datasets.py gets a message of one sentence that a user can act on."""
 
 import re
 from pathlib import Path
@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from broken_datasets import FAULTS, Fault, make_masters, message
 
-# What the sentence must say of each fault, as a pattern: the file or value, and what is the matter with it.
+# The pattern that the message for each fault must match: the file or value, and what is wrong with it.
 SAID = {
     "no -s given": "no scene folder given",
     "the folder given with -s does not exist": "no scene folder SCENE/garden",
@@ -75,7 +75,7 @@ def test_one_sentence_that_names_the_thing_and_the_remedy(fault, masters, tmp_pa
     text = message(fault, masters, tmp_path)
     assert "\n" not in text and "Traceback" not in text
     assert re.search(SAID[fault.what], text), text
-    # After the semicolon what to do.
+    # The remedy follows the semicolon.
     what, semicolon, remedy = text.rpartition("; ")
     assert semicolon and len(what) > 15 and len(remedy.split()) >= 3, text
 

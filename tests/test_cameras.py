@@ -1,4 +1,4 @@
-"""Matrices of a view against the formulas and against pycolmap; its target picture."""
+"""Matrices of a view against the formulas and against pycolmap, and its target image."""
 
 import math
 from dataclasses import replace
@@ -41,7 +41,7 @@ def _camera(info: CameraInfo, size: tuple[int, int] | None = None) -> Camera:
 
 
 def _pixels(camera: Camera, points: np.ndarray) -> np.ndarray:
-    """Pixel positions, centres at integers, the way the rasterizer takes them from the matrix."""
+    """Pixel positions, centres at integers, computed from the matrix as the rasterizer does."""
     rows = np.concatenate([points, np.ones((len(points), 1))], axis=1)
     clip = rows @ camera.full_proj_transform.double().numpy()
     ndc = clip[:, :2] / clip[:, 3:]
@@ -57,7 +57,7 @@ def test_matrices_are_the_formulas_transposed():
     P = np.zeros((4, 4))
     P[0, 0], P[1, 1] = 1 / math.tan(camera.FoVx / 2), 1 / math.tan(camera.FoVy / 2)
     P[2, 2], P[2, 3], P[3, 2] = f / (f - n), -f * n / (f - n), 1
-    # One rounding to float32 of values up to 10.
+    # Values up to 10 are rounded to float32 once.
     for got, wanted in (
         (camera.world_view_transform, V.T),
         (camera.projection_matrix, P.T),
@@ -102,7 +102,7 @@ def test_projection_agrees_with_pycolmap(tmp_path, size, model, params):
         camera = _camera(info, size)
         image = reconstruction.find_image_with_name(info.image_name)
         theirs = np.array([image.project_point(point) for point in points]) * np.array(size) / (96, 64)
-        # COLMAP has pixel centres at .5. The bound: float32 matrices over some 100 pixels.
+        # COLMAP has pixel centres at .5. The bound is that of float32 matrices over some 100 pixels.
         np.testing.assert_allclose(_pixels(camera, points) + 0.5, theirs, atol=1e-4)
         np.testing.assert_allclose(camera.camera_center.numpy(), image.projection_center(), rtol=1e-6, atol=1e-6)
 
@@ -131,7 +131,7 @@ def test_target_with_alpha_lies_on_the_background(tmp_path):
     assert torch.equal(target[:, 0], background[:, None].expand(3, 8))
     assert torch.equal(target[:, 1], camera.original_image[:, 1])
     np.testing.assert_allclose(camera.alpha_mask[0].numpy(), alpha[..., 0], atol=6e-8)
-    assert torch.equal(camera.target(background), target)  # the stored picture is not touched
+    assert torch.equal(camera.target(background), target)  # the stored image is not changed
 
 
 def test_mini_camera_finds_its_centre():

@@ -1,4 +1,4 @@
-"""chkpntN.pth: ours, the reference's, and what must not be loaded."""
+"""Checkpoints chkpntN.pth: ours, the reference's, and files that must not be loaded."""
 
 import copy
 import io
@@ -39,7 +39,7 @@ def test_round_trip_of_plain_values(tmp_path):
     assert iteration == 7 and len(loaded) == 12
     for old, new in zip(capture[1:10], loaded[1:10], strict=True):
         assert torch.equal(old, new)
-    # Anyone's safe loader takes it too.
+    # torch's safe loader accepts it too.
     torch.load(tmp_path / "chkpnt7.pth", weights_only=True)
 
 
@@ -60,7 +60,7 @@ def _as_numpy_1(path) -> None:
 @pytest.mark.parametrize("numpy", [1, 2])
 @pytest.mark.parametrize("scalar", [np.float32, np.float64])
 def test_the_references_checkpoint_loads(tmp_path, scalar, numpy):
-    """Its form: parameters as nn.Parameter, the extent as a NumPy scalar, an optimiser state of torch's own Adam."""
+    """The reference's form: nn.Parameter, the extent as a NumPy scalar, an optimiser state of torch's Adam."""
     gaussians = model(6)
     take_steps(gaussians, 2)
     capture = list(gaussians.capture())
@@ -86,7 +86,7 @@ class _Bomb:
 
 
 def _wrong_files(folder) -> dict[str, str]:
-    """Path by kind -> the words that its message must have."""
+    """Faulty checkpoints by kind, with the words that their message must contain."""
     (folder / "folder").mkdir()
     (folder / "point_cloud.ply").write_bytes(b"ply\nformat binary_little_endian 1.0\n")
     (folder / "text").write_text("hello")

@@ -1,4 +1,4 @@
-"""COLMAP folders from end to end: files to views, cloud, extent and side files; and what bad ones are told."""
+"""COLMAP folders from end to end: from files to views, cloud, extent and side files; messages for faulty folders."""
 
 import argparse
 import json
@@ -275,7 +275,7 @@ def test_picture_device_beside_a_gpu(capsys, monkeypatch):
         assert f"warning: --data_device {name} is n" in capsys.readouterr().err
 
 
-# A picture written after a scene was read, in a process that imports our module first: the trap of two zlibs.
+# Write a PNG after reading a scene, in a process that imports our module first: two zlibs must not clash.
 def test_png_can_be_written_after_a_scene_was_read(colmap_scene, tmp_path):
     script = (
         "import sys\n"
@@ -466,5 +466,5 @@ def test_sigterm_stays_quiet_after_a_model_was_read(colmap_scene):
     )
     command = [sys.executable, "-c", script, str(colmap_scene / "sparse" / "0")]
     done = subprocess.run(command, cwd=Path(__file__).parents[1], capture_output=True, check=False)
-    # pycolmap's import alone would have glog dump the stack (status the same).
+    # With pycolmap's import alone, glog would dump the stack, with the same status.
     assert (done.returncode, done.stderr) == (-signal.SIGTERM, b"")

@@ -16,7 +16,7 @@ BACKGROUND = torch.tensor([0.2, 0.0, 1.0])
 
 
 def every_pair() -> Tensor:
-    """All 65,536 pairs of colour and alpha, (4, 256, 256) uint8; each channel meets another background."""
+    """All 65,536 pairs of colour and alpha, (4, 256, 256) uint8; each channel has another background."""
     values = torch.arange(256, dtype=torch.uint8)
     color, alpha = torch.meshgrid(values, values, indexing="ij")
     return torch.stack((color, color, color, alpha))
@@ -29,7 +29,7 @@ def in_torch(picture: Tensor, background: Tensor) -> Tensor:
 
 @pytest.mark.parametrize("device", ["cpu", GPU])
 def test_every_value_is_torchs_to_the_bit(device: str) -> None:
-    """On both devices the bits of torch on the CPU, which rounds each operation; and close to float64."""
+    """Both devices give the bits of torch on the CPU, which rounds each operation, and are close to float64."""
     picture = every_pair()
     got = composite(picture.to(device), BACKGROUND.to(device)).cpu()
     assert got.dtype == torch.float32 and torch.equal(got, in_torch(picture, BACKGROUND))
@@ -54,7 +54,7 @@ def test_sizes_and_strides(device: str) -> None:
         picture = torch.full((4, height, width), 128, dtype=torch.uint8)
         picture[3, :, ::2] = 255
         wanted = in_torch(picture, BACKGROUND)
-        turned = picture.permute(1, 2, 0).contiguous().permute(2, 0, 1)  # as Pillow's rows lie in memory
+        turned = picture.permute(1, 2, 0).contiguous().permute(2, 0, 1)  # strides as in Pillow's memory
         for same in (picture, turned):
             assert torch.equal(composite(same.to(device), BACKGROUND.to(device)).cpu(), wanted)
 

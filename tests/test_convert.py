@@ -1,4 +1,4 @@
-"""convert.py: photos of known places become a scene; second runs, interruptions, and what slips are told."""
+"""convert.py: scenes from photos taken at known places, second runs, interruptions, messages for mistakes."""
 
 import json
 import os
@@ -46,7 +46,7 @@ NAMES.append("photo_07.jpg")
 
 @pytest.fixture(scope="module")
 def photos(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Photos of a room in `input`: a sub-folder, blanks and an umlaut in names, one that lies on its side by EXIF."""
+    """Photos of a room in `input`, with a sub-folder, blanks and an umlaut in names, and one turned by EXIF."""
     scene = tmp_path_factory.mktemp("convert") / "my room"
     make_photos(scene / "input", VIEWS)
     for number, name in enumerate(NAMES):
@@ -75,7 +75,7 @@ def converted(photos: Path) -> Path:
 
 @pytest.fixture
 def copy(converted: Path, tmp_path: Path) -> Path:
-    """The converted scene, free to be changed."""
+    """A copy of the converted scene, which tests may change."""
     return Path(shutil.copytree(converted, tmp_path / "copy", copy_function=shutil.copy2))
 
 
@@ -85,7 +85,7 @@ def test_every_photo_is_placed_where_it_was_taken(converted):
     assert len(info.point_cloud.points) > 1000
     for camera in info.train_cameras:
         assert camera.file_size == (camera.width, camera.height)
-        # Without distortion the crop is small, and the focal length is found to 2 %.
+        # Without distortion the crop is small, and the error of the focal length is below 2 %.
         assert abs(camera.width - SIZE[0]) < 12 and abs(camera.height - SIZE[1]) < 12
         assert camera.fx == pytest.approx(FOCAL, rel=0.02)
     model = pycolmap.Reconstruction(converted / "sparse" / "0")
@@ -97,7 +97,7 @@ def test_every_photo_is_placed_where_it_was_taken(converted):
     assert transform is not None
     model.transform(transform)
     found = np.array([model.find_image_with_name(name).projection_center() for name in NAMES])
-    # Cameras stand some 4 away from the corner; 1 % of that.
+    # The bound is 1 % of the cameras' distance to the corner, some 4.
     assert np.abs(found - places).max() < 0.04
 
 
@@ -122,12 +122,12 @@ def test_a_second_run_does_only_what_changed(copy, capsys):
     assert "done before: photos, features, matching, mapping, undistortion, resize" in capsys.readouterr().out
     assert folder_state(copy) == scene
     features = Layout(copy).database.read_bytes()
-    # Resized copies of the old pictures must not stay beside new ones.
+    # Resized copies of the old photos must not stay beside new ones.
     convert.main(["-s", str(copy), "--no_gpu", "--mapper", "global"])
     out = capsys.readouterr().out
     assert "done before: photos, features, matching (" in out and f"{VIEWS} of {VIEWS} photos placed" in out
     assert not (copy / "images_2").exists()
-    # The focal lengths that global mapping estimates are not for those who go on with the features.
+    # The focal lengths that global mapping estimates must not get into the database that later runs resume from.
     assert Layout(copy).database.read_bytes() == features
     assert len(read_scene(copy, "images", False).train_cameras) == VIEWS
 
@@ -138,7 +138,7 @@ def test_a_model_made_elsewhere_is_undistorted(copy, capsys):
     shutil.copytree(copy / "distorted" / "sparse", other / "distorted" / "sparse")
     with pytest.raises(UserError, match="already has distorted, which convert.py did not make.*--skip_matching"):
         convert.main(["-s", str(other)])
-    # A model of two photos that comes first must not be taken.
+    # A model of two photos that comes first must not be chosen.
     small = other / "distorted" / "sparse" / "0"
     small.rename(small.with_name("1"))
     small.mkdir()
@@ -278,7 +278,7 @@ def test_stages_are_redone_from_the_first_that_changed(tmp_path):
     assert run(a=1, b=1, c=1) == ["-c", "-b", "-a", "a", "-c", "-b", "b", "-c", "c"]
     assert run(a=1, b=1, c=1) == ["=a", "=b", "=c"]
     assert run(a=1, b=2, c=1, fail="b") == ["-c", "-b", "b", "stopped"]
-    # b can go on: it is not reset; c was never begun.
+    # b is resumable, so it is not reset; c was never begun.
     assert run(a=1, b=2, c=1, fail="c") == ["-c", "b", "-c", "c", "stopped"]
     assert run(a=1, b=2, c=1) == ["=a", "=b", "-c", "c"]
     assert run(a=2, b=2, c=1)[:4] == ["-c", "-b", "-a", "a"]
@@ -310,7 +310,7 @@ def test_a_finished_scene_stays_until_the_next_one_is_there(copy, monkeypatch):
     refused("no folder of masks '.*/maks'", "--mask_path", str(copy / "maks"))
     (copy / "masks").rmdir()
     assert folder_state(copy / "distorted") == work
-    # What fails later, too; and that the scene is still ours is not forgotten.
+    # A later failure keeps the scene too, and the record still knows that convert.py made it.
 
     def fail(*_: object) -> None:
         raise UserError("no model")
@@ -347,7 +347,7 @@ def test_ctrl_c_ends_the_program_that_works(tmp_path):
 
 
 def _killed_while(tmp_path: Path, command: list[str]) -> None:
-    """run_programs with this command in a process that is killed as soon as the command has written to the log."""
+    """Call run_programs with this command in a process that is killed once the command has written to the log."""
     code = (
         "import sys; from pathlib import Path; from conversion.programs import run_programs; "
         "run_programs([sys.argv[2:]], Path(sys.argv[1]), 'Waiting', 1, lambda: 0)"
@@ -380,7 +380,7 @@ def test_a_killed_caller_leaves_no_worker(tmp_path):
         "worker.main(sys.argv[1])"
     )
     _killed_while(tmp_path, [sys.executable, "-c", code, str(tmp_path / "job.json")])
-    # The worker had the lock; its process id would not tell, as nobody may be there to reap it.
+    # The lock tells whether the worker ended. Its process id does not, as there may be no process to reap it.
     refuse_while_working(tmp_path / "log")
 
 
@@ -408,7 +408,7 @@ def test_a_program_that_fails_is_quoted(tmp_path):
 
 
 def _fake_colmap(folder: Path, prefix: str, without: str = "") -> str:
-    """A program that answers as COLMAP does; GPU options are called <prefix>Extraction.use_gpu, <prefix>Matching..."""
+    """A program that answers like COLMAP; its GPU options are <prefix>Extraction.use_gpu, <prefix>Matching.use_gpu."""
     path = folder / "colmap"
     path.write_text(
         f'#!/bin/sh\ncase "$1" in\n{without or "none"}) exit 1;;\nhelp) echo "COLMAP 9.9";;\n'
@@ -463,7 +463,7 @@ def test_orientation_is_baked_in_and_other_exif_kept(converted):
         assert stored.size == SIZE[::-1] and upright.size == SIZE
         assert upright.getexif().get(0x0112, 1) == 1 and upright.getexif()[0x010F] == "maker"
         straight = np.asarray(stored.transpose(Image.Transpose.ROTATE_270), dtype=float)
-        # JPEG quality 95 once more: a few levels.
+        # A second JPEG compression of quality 95 changes a few levels.
         assert np.abs(np.asarray(upright, dtype=float) - straight).mean() < 4
     plain = "distorted/photos/photo_00.png"
     assert (converted / plain).read_bytes() == (converted / "input" / "photo_00.png").read_bytes()
@@ -497,7 +497,7 @@ def test_masks_keep_features_away(photos, tmp_path):
     rows = {image.name: database.read_keypoints(image.image_id) for image in database.read_all_images()}
     for name in ("photo_00.png", "deep/photo_03.png"):
         assert len(rows[name]) > 50 and rows[name][:, 0].min() > SIZE[0] / 2 - 1
-    # Without a mask of its own it is used whole.
+    # A photo without a mask is used whole.
     assert rows["photo_01.png"][:, 0].min() < SIZE[0] / 4
     database.close()
 
@@ -573,7 +573,7 @@ def test_advice(models, said):
 
 
 class _Decoder(SimpleNamespace):
-    """Stands for imageio_ffmpeg: frames of noise, every third one sharp."""
+    """A stand-in for imageio_ffmpeg with frames of noise, of which every third is sharp."""
 
     @staticmethod
     def count_frames_and_secs(path: str) -> tuple[int, float]:

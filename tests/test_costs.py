@@ -43,7 +43,7 @@ def test_off_allocates_what_a_call_without_the_feature_does(rows, name):
 def test_nothing_is_allocated_for_gradients_at_inference(rows):
     row = rows["gradient_buffers"]
     assert _bytes(row, "off") == row.base_bytes
-    # In training: the slots of each splat and their end, the last splat of each pixel.
+    # Training adds the slots of each splat and their end, and the last splat of each pixel.
     assert _bytes(row, "on") - _bytes(row, "off") == 16 * (SPLATS + 1) + 4 * WIDTH * HEIGHT
 
 
@@ -53,9 +53,9 @@ def test_depth_is_allocated_on_request_only(rows):
 
 def test_bands_that_are_not_active_take_no_part_in_a_step(rows):
     row = rows["inactive_bands"]
-    # Counters of steps, of the six tensors and of five.
+    # The step counters of six tensors, and of five.
     assert 0 <= _bytes(row, "off") - _bytes(row, "base") < 32
-    # Kept are values and both moments of 45 numbers; a counter of steps, too, where a model without bands has none.
+    # The model keeps values and both moments of 45 numbers, and a step counter that a model without bands lacks.
     assert row.kept[1] - row.kept[0] == pytest.approx(3 * 45 * 4 * SPLATS, abs=16)
     assert rows["unneeded_bands"].kept[1] - rows["unneeded_bands"].kept[0] == (45 - 9) * 4 * SPLATS
 
@@ -84,7 +84,7 @@ def test_the_probe_makes_nothing_when_it_is_asked_for_help(tmp_path):
 
 
 def test_training_and_rendering_load_nothing_they_do_not_use(probed):
-    installed = {"torch.utils.tensorboard", "tensorboard"}  # train.py looks whether it is there
+    installed = {"torch.utils.tensorboard", "tensorboard"}  # train.py tries to import it
     assert set(probed["modules"]) <= installed
     assert probed["binds"] == []
     assert "point_cloud/iteration_3/point_cloud.ply" in probed["files"]
@@ -93,13 +93,13 @@ def test_training_and_rendering_load_nothing_they_do_not_use(probed):
 
 def test_only_pictures_that_train_are_decoded_and_none_is_kept_larger_than_used(probed):
     assert probed["decoded"] and all(name.startswith("train/") for name in probed["decoded"])
-    # Files are twice as large, and have an alpha channel that is opaque.
+    # The files are twice as large, and have an opaque alpha channel.
     assert probed["picture_bytes"] == [probed["values"]] * 4
 
 
 @CPU_AND_GPU
 def test_an_opaque_tile_takes_no_more_splats(device):
-    """Colours that are not numbers would show, weight zero or not, in any tile that still looked at them."""
+    """NaN colours would show, even with weight zero, in any tile that still reads them."""
     front, behind, tiles = 8, 600, 6  # 3 x 2 tiles
     splat = torch.tensor([20.0, 15.0, 1e-3, 0.0, 1e-3, math.log2(0.9), 0.5, 0.5, 0.5, 1.0])
     splats = splat.repeat(front + behind, 1)
@@ -110,7 +110,7 @@ def test_an_opaque_tile_takes_no_more_splats(device):
     background = torch.zeros(3, device=device)
     color, left, _, last = ops.blend(splats, instances, ranges, background, 30, 45, False, True)
     assert color.isfinite().all() and last.max() <= front and left.max() < 1e-3
-    # And they would: with one splat in front less than opaque there is room.
+    # They do show if one splat in front is less than opaque.
     splats[:front, 5] = math.log2(0.1)
     assert not ops.blend(splats, instances, ranges, background, 30, 45, False, True)[0].isfinite().any()
 
@@ -123,11 +123,11 @@ def test_calls_take_turns():
 
 
 def test_the_interval_holds_the_median_as_often_as_it_says():
-    """Exactly: it misses where fewer than k of n draws lie on one side, k the rank of its ends."""
+    """The interval misses if fewer than k of n draws are on one side, where k is the rank of its ends; exact."""
     for n in (5, 7, 41, 100):
         _, low, high = median_interval(range(1, n + 1))
         if math.isinf(low):
-            assert 2 * 0.5**n > 0.05  # so few that no interval is that sure
+            assert 2 * 0.5**n > 0.05  # with so few, no interval reaches 95 %
             continue
         assert low + high == n + 1
         miss = 2 * sum(math.comb(n, k) for k in range(int(low))) * 0.5**n
@@ -150,7 +150,7 @@ def test_bytes_are_counted_whether_or_not_they_are_given_back():
         torch.empty(1000)
         torch.empty(10, dtype=torch.uint8)
 
-    # The CPU's allocator hands out what is asked.
+    # The CPU's allocator returns exactly the requested bytes.
     assert allocated_bytes(run, CPU) == 4010
 
 

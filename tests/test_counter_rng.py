@@ -1,4 +1,4 @@
-"""The counter generator: Philox's published answers, and that it is a function of its arguments alone."""
+"""The counter generator: it gives Philox's published answers and depends on nothing but its arguments."""
 
 import numpy as np
 import pytest
@@ -49,7 +49,7 @@ def test_every_argument_matters():
 
 def test_normal_numbers_are_normal_and_independent():
     values = normal(0, Stream.SPLIT, 600, torch.arange(50_000)).numpy()
-    # Fixed numbers, so the p-value is a constant; below 1e-3 something is wrong.
+    # The numbers are fixed, so the p-value is a constant; a value below 1e-3 would mean a fault.
     assert stats.kstest(values.ravel(), "norm").pvalue > 1e-3
     correlation = np.corrcoef(values.T) - np.eye(4)
     assert np.abs(correlation).max() < 4.5 / np.sqrt(50_000)  # 4.5 standard errors of 6 correlations
@@ -79,7 +79,7 @@ def test_portable_functions_agree_with_numpy():
     turns = torch.cat((torch.arange(8) << 29, random_bits(0, Stream.SPLIT, 0, torch.arange(5000)).reshape(-1)))
     angle = turns.numpy() * (2 * np.pi / 2**32)
     cos, sin = portable_math.cos_sin_turns(turns)
-    # NumPy's argument is rounded to 2^-53 of up to 2 pi: 7e-16 of the angle.
+    # NumPy's argument, up to 2 pi, is rounded by 2^-53 of itself: 7e-16 of the angle.
     assert np.abs(cos.numpy() - np.cos(angle)).max() < 2e-15
     assert np.abs(sin.numpy() - np.sin(angle)).max() < 2e-15
 

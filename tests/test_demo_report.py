@@ -1,4 +1,4 @@
-"""The demo's report: its table and sheet, and a sentence for every part of a model that is missing or damaged."""
+"""The demo's report: its table and sheet, and a message for every missing or damaged part of a model."""
 
 import json
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""The demo's ray tracer and its COLMAP model: against closed forms, NumPy's polynomial roots and pycolmap."""
+"""The demo's ray tracer and its COLMAP model, against closed forms, NumPy's polynomial roots and pycolmap."""
 
 import subprocess
 import sys
@@ -40,7 +40,7 @@ def model(scene):
 
 
 def rays(count: int, center: tuple[float, float, float]) -> tuple[np.ndarray, np.ndarray]:
-    """Origins (3, R) around a centre, unit directions (3, R) towards somewhere near it; float64."""
+    """Origins (3, R) around a centre and unit directions (3, R) towards points near it, float64."""
     rng = np.random.default_rng(11)
     origin = rng.normal(size=(3, count))
     origin = np.asarray(center)[:, None] + 3 * origin / np.linalg.norm(origin, axis=0)
@@ -49,7 +49,7 @@ def rays(count: int, center: tuple[float, float, float]) -> tuple[np.ndarray, np
 
 
 def inside(shape: Shape, p: np.ndarray) -> np.ndarray:
-    """How deep points (3, N) are in a solid, positive inside; float64, written apart from the tracer."""
+    """The depth of points (3, N) in a solid, positive inside; float64, independent of the tracer."""
     offset = p - np.reshape(getattr(shape, "center", (0, 0, 0)), (3, 1))
     if isinstance(shape, Ground):
         return p[1]
@@ -82,11 +82,11 @@ def test_torus_hits_are_the_roots_of_its_quartic():
     found = TORUS.intersect(origin.astype(np.float32), direction.astype(np.float32))
     expected = np.array([torus_by_roots(o, d) for o, d in zip(origin.T, direction.T, strict=True)])
     assert 100 < np.isfinite(expected).sum() < 390
-    # Marching stops 2e-4 before the surface, so a ray that passes nearer than that counts as a hit: one or two here.
+    # Marching stops 2e-4 before the surface, so a ray that passes nearer counts as a hit; there are one or two here.
     differ = np.isfinite(found) != np.isfinite(expected)
     assert differ.sum() <= 2 and np.isfinite(found[differ]).all()
     hit = np.isfinite(found) & np.isfinite(expected)
-    # For the same reason distances are short by 2e-4 / cos of the angle to the normal: 99 % below 2e-3.
+    # For the same reason distances are too short by 2e-4 / cos of the angle to the normal; 99 % are below 2e-3.
     assert np.quantile(np.abs(found[hit] - expected[hit]), 0.99) < 2e-3
 
 
@@ -104,7 +104,7 @@ def test_hits_are_the_first_points_on_the_surface_and_normals_point_out(shape):
     assert np.abs(inside(shape, point)).max() < 5e-4  # float32 at distances of 10, and the marching's 2e-4
     for part in np.linspace(0.02, 0.98, 49):
         assert inside(shape, o + part * t * d).max() < 1e-3
-    # A ray that misses is never within the solid.
+    # A ray that misses is never inside the solid.
     if not isinstance(shape, Ground):
         for part in np.linspace(0, 6, 200):
             assert inside(shape, origin[:, ~hit] + part * direction[:, ~hit]).max(initial=-1) < 3e-3
@@ -113,7 +113,7 @@ def test_hits_are_the_first_points_on_the_surface_and_normals_point_out(shape):
     assert np.allclose(np.linalg.norm(normal, axis=0), 1, atol=1e-5)
     step = 1e-3
     slope = inside(shape, point - step * normal) - inside(shape, point + step * normal)
-    # 2 * step along the true normal; hits within a step of a box's edge have two of them.
+    # The change is 2 * step along the true normal; hits within a step of a box's edge have two normals.
     assert np.quantile(slope, 0.02) > 1.98 * step
 
 
@@ -134,7 +134,7 @@ def test_samples_average_what_a_pixel_covers():
     view = ring_views(3, 24, 16, np.random.default_rng(0))[0]
     things = demo_scene()
     fine = render_view(things, view, samples=8).astype(float)
-    # Supersampling converges: with the true mean as limit, more samples come nearer to it.
+    # Supersampling converges: more samples come nearer to the true mean.
     errors = [np.abs(render_view(things, view, samples=n) - fine).mean() for n in (1, 3)]
     assert errors[1] < 0.5 * errors[0]
     assert errors[1] < 2.0  # of 255
@@ -153,7 +153,7 @@ def test_pycolmap_reads_a_valid_model(model, scene):
 
 
 def test_points_project_near_their_observations(model):
-    # Expected: position noise 0.004 * 72 px (focal length) and 0.3 px of observation, per axis: mean length 0.52 px.
+    # Expected noise per axis: position 0.004 * 72 px (focal length) and observation 0.3 px; the mean length is 0.52 px.
     error = model.compute_mean_reprojection_error()
     assert 0.3 < error < 0.8
     for point in list(model.points3D.values())[::20]:
@@ -165,8 +165,10 @@ def test_points_project_near_their_observations(model):
 
 
 def test_tracks_are_what_is_visible(model):
-    """Between a camera and a point it observes there is nothing; between it and one in frame that it doesn't, there
-    is something solid. The scene's points are noisy, so both hold for nearly all of them."""
+    """Nothing is between a camera and a point that it observes; something is in front of other points in the frame.
+
+    The scene's points are noisy, so both hold for nearly all of them.
+    """
     things = demo_scene()
     part = np.linspace(0.05, 0.97, 120)
     blocked = {True: [], False: []}
@@ -186,7 +188,7 @@ def test_tracks_are_what_is_visible(model):
 
 
 def test_views_agree_on_colours_except_where_it_is_glossy(model, scene):
-    """A point has about the same colour in all views that see it, as it would not if poses and pictures disagreed."""
+    """A point has about the same colour in all views that see it; it would not if poses and photos disagreed."""
     samples: dict[int, list[np.ndarray]] = {}
     for image in model.images.values():
         pixels = np.asarray(Image.open(scene / "images" / image.name), float)
@@ -197,7 +199,7 @@ def test_views_agree_on_colours_except_where_it_is_glossy(model, scene):
     colours = np.concatenate([np.array(values) for values in samples.values()])
     assert np.median(spread) < 0.4 * colours.std(axis=0).mean()
     for point_id, values in samples.items():
-        # The model's colours come from the places without observation noise, hence not exactly these pixels.
+        # The model's colours come from positions without observation noise, so not from exactly these pixels.
         assert np.abs(np.mean(values, axis=0) - model.points3D[point_id].color).max() < 70
     colour_error = [np.abs(np.mean(v, axis=0) - model.points3D[k].color).mean() for k, v in samples.items()]
     assert np.median(colour_error) < 6

@@ -1,4 +1,4 @@
-"""Adaptive density control: the reference's rules on toy sets, its windows, and what becomes of Adam's state."""
+"""Adaptive density control: the reference's rules on toy sets, its windows, and Adam's state after it."""
 
 import math
 
@@ -50,7 +50,7 @@ def test_selection_at_equality():
     gaussians = _toy([limit, limit, above, above, limit], [threshold, below, threshold, below, 1.0])
     before = parameters(gaussians)
     gaussians.densify_and_prune(threshold, adc.MIN_OPACITY, EXTENT, None)
-    # Kept in order: 0, 1, 3, 4 (2 was split), then clones of 0 and 4, then two children of 2.
+    # The order is: kept 0, 1, 3, 4 (2 was split), then clones of 0 and 4, then two children of 2.
     assert len(gaussians) == 8
     for name, value in parameters(gaussians).items():
         assert torch.equal(value[:6], before[name][[0, 1, 3, 4, 0, 4]])
@@ -62,11 +62,11 @@ def test_selection_at_equality():
 
 
 def test_clones_and_children_inherit_from_their_own_parent():
-    """Several of each kind, so that rows in another order show."""
+    """Use several of each kind, so that a wrong order of rows shows."""
     gaussians = _toy([LIMIT / 2] * 3 + [LIMIT * 3] * 3, [1.0, 0.0, 1.0, 1.0, 0.0, 1.0])
     before = parameters(gaussians)
     _densify(gaussians)
-    # Kept: 0, 1, 2, 4 (3 and 5 were split); clones of 0 and 2; first children of 3 and 5, then the second ones.
+    # The order is: kept 0, 1, 2, 4 (3 and 5 were split), clones of 0 and 2, first children of 3 and 5, second ones.
     origin = [0, 1, 2, 4, 0, 2, 3, 5, 3, 5]
     for name, value in parameters(gaussians).items():
         assert name in ("opacity", "scaling") or not torch.equal(value[6], value[7])
@@ -132,7 +132,7 @@ def test_pruning():
     _densify(gaussians, screen=None)
     assert torch.equal(gaussians._xyz, kept[1:])  # no sizes before the first opacity reset
     _densify(gaussians, screen=20)
-    # max_radii2D was 100, yet nothing went for its screen size: the reference zeroes it just before.
+    # max_radii2D was 100, yet no Gaussian was removed for its screen size: the reference zeroes it just before.
     assert torch.equal(gaussians._xyz, kept[[1, 3, 4, 5]])
 
 
@@ -186,7 +186,7 @@ def test_statistics_take_indices_and_masks():
 
 
 def _views(gaussians: GaussianModel, views: int, seed: int) -> list[tuple[torch.Tensor, torch.Tensor]]:
-    """Screen points with a gradient and radii of some views, a third of the Gaussians unseen in each."""
+    """Screen points with a gradient, and radii, of some views; each leaves a third of the Gaussians unseen."""
     generator = torch.Generator().manual_seed(seed)
     result = []
     for _ in range(views):
@@ -199,7 +199,7 @@ def _views(gaussians: GaussianModel, views: int, seed: int) -> list[tuple[torch.
 
 
 def test_a_view_in_one_pass_is_its_two_parts():
-    """observe against max_radii2D and add_densification_stats in torch, and to the bit against NumPy."""
+    """Compare observe with max_radii2D and add_densification_stats in torch, and to the bit with NumPy."""
     fused, plain = model(3001), model(3001)
     exact = np.zeros(3001, dtype=np.float32)
     for points, radii in _views(fused, 7, seed=0):
@@ -211,7 +211,7 @@ def test_a_view_in_one_pass_is_its_two_parts():
     assert fused.denom.max() == 7 and fused.max_radii2D.max() > 0
     assert torch.equal(fused.max_radii2D, plain.max_radii2D) and torch.equal(fused.denom, plain.denom)
     assert torch.equal(fused.xyz_gradient_accum.reshape(-1), torch.from_numpy(exact))
-    # torch's square root is off by a unit in the last place here and there.
+    # torch's square root is sometimes off by a unit in the last place.
     torch.testing.assert_close(fused.xyz_gradient_accum, plain.xyz_gradient_accum, rtol=2 * 2**-23, atol=0)
 
 

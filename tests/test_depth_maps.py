@@ -1,4 +1,4 @@
-"""Depth maps: decoding, which of them are believed, and the fit that depth_params.json holds."""
+"""Depth maps: decoding, the choice of reliable ones, and the fit in depth_params.json."""
 
 import json
 import struct
@@ -53,7 +53,7 @@ def test_what_is_no_depth_map_is_named(tmp_path):
     with pytest.raises(UserError, match="colored.png is coloured"):
         read_values(_save(_random((9, 12, 3), np.uint8), tmp_path / "colored.png"))
 
-    # A PNG of one pixel, 16-bit RGB: Pillow would give the upper halves.
+    # A PNG of one pixel, 16-bit RGB; Pillow alone would give only the upper bytes.
     def chunk(kind: bytes, data: bytes) -> bytes:
         return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
 
@@ -95,12 +95,12 @@ def test_scale_and_offset_in_double(tmp_path):
     np.testing.assert_allclose(smaller, resize(grey / 512, (6, 5)), rtol=1e-7)
 
 
-# Which views have a map to be believed
+# Choice of reliable maps
 
 
 @pytest.fixture
 def scene(colmap_scene: Path) -> Path:
-    """The COLMAP scene with a map for each picture, all fitting alike."""
+    """The COLMAP scene with a depth map for each photo, all with the same fit."""
     names = [view.name for view in read_sightings(colmap_scene / "sparse/0", "bin")]
     for name in names:
         _save(_random((32, 48), np.uint16), (colmap_scene / "depths" / name).with_suffix(".png"))
@@ -200,7 +200,7 @@ def test_the_line_is_robust_and_exact_without_outliers():
     spread = np.abs(2 * mono + 1 - middle - 1).mean() / np.abs(mono - np.median(mono)).mean()
     assert fit_line(mono, 2 * mono + 1) == pytest.approx((spread, middle + 1 - spread * np.median(mono)))
     flipped = 3 * mono - 0.2
-    flipped[:5] = 100.0  # by the medians' line: the offset stays with the many
+    flipped[:5] = 100.0  # the fit uses medians, so the majority decides the offset
     scale, offset = fit_line(mono, flipped)
     assert scale * np.median(mono) + offset == pytest.approx(np.median(flipped))
     assert fit_line(mono[:10], mono[:10]) == (0, 0)
@@ -210,7 +210,7 @@ def test_the_line_is_robust_and_exact_without_outliers():
 
 
 def test_points_are_looked_up_where_colmap_sees_them():
-    """A map of twice the size, its inverse depth linear in x; points behind the camera or outside don't count."""
+    """The map has twice the size and inverse depth linear in x; points behind the camera or outside do not count."""
     rng = np.random.default_rng(0)
     pixels = rng.uniform(1, 39, (40, 2))
     depths = 1 / (0.1 + 0.02 * pixels[:, 0])
@@ -221,7 +221,7 @@ def test_points_are_looked_up_where_colmap_sees_them():
 
 
 def test_the_command_makes_a_file_that_training_takes(colmap_scene, tmp_path, monkeypatch):
-    """Maps made of the points themselves, a square around each, a scale and an offset to a picture."""
+    """Make maps of the points themselves: a square around each, with a scale and an offset per photo."""
     monkeypatch.setattr(sys, "stdout", sys.stdout)
     wanted = {}
     rng = np.random.default_rng(0)
@@ -240,7 +240,7 @@ def test_the_command_makes_a_file_that_training_takes(colmap_scene, tmp_path, mo
     params = _params(colmap_scene)
     assert list(params[next(iter(params))]) == ["scale", "offset"]
     for name, (scale, offset) in wanted.items():
-        # Some squares lie over others; means of distances are what they disturb most.
+        # Some squares cover others, which disturbs means of distances most.
         assert (params[name]["scale"], params[name]["offset"]) == pytest.approx((scale, offset), rel=0.05, abs=0.02)
     (tmp_path / "maps").rename(colmap_scene / "depths")
     train.main(["-s", str(colmap_scene), "-m", str(tmp_path / "out"), "-d", "depths", "--iterations", "3", "-r", "24"])
@@ -262,11 +262,11 @@ def _train(scene: Path, out: Path, *more: object) -> bytes:
 def test_training_follows_the_maps_or_leaves_them_alone(scene, tmp_path, monkeypatch):
     monkeypatch.setattr(sys, "stdout", sys.stdout)
     for path in (scene / "depths").rglob("*.png"):
-        _save(np.full((64, 96), 6554, np.uint16), path)  # 0.1: all is far behind where it seems
+        _save(np.full((64, 96), 6554, np.uint16), path)  # 0.1: all surfaces appear far behind their true depth
     plain = _train(scene, tmp_path / "plain")
     off = _train(scene, tmp_path / "off", "-d", "depths", "--depth_l1_weight_init", 0, "--depth_l1_weight_final", 0)
     assert off == plain
-    weight = ("--depth_l1_weight_init", 20, "--depth_l1_weight_final", 20)  # the picture's wishes are others
+    weight = ("--depth_l1_weight_init", 20, "--depth_l1_weight_final", 20)  # the photos alone would give another depth
     supervised = _train(scene, tmp_path / "on", "-d", "depths", *weight, "--images_to_load", 2)
     assert supervised != plain
     assert supervised == _train(scene, tmp_path / "unlimited", "-d", "depths", *weight)
@@ -275,7 +275,7 @@ def test_training_follows_the_maps_or_leaves_them_alone(scene, tmp_path, monkeyp
 
 
 def test_what_is_masked_has_no_depth_either(scene, tmp_path, monkeypatch):
-    """Masks and depth maps: the same model to the byte, whatever both show behind the masks."""
+    """With masks, the model is the same to the byte, whatever photos and depth maps show behind them."""
     monkeypatch.setattr(sys, "stdout", sys.stdout)
     options = ("-d", "depths", "--masks", "masks", "--depth_l1_weight_init", 20)
     for path in (scene / "depths").rglob("*.png"):

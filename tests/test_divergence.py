@@ -1,4 +1,4 @@
-"""NaN and infinities in a training: the step that is held back, the model that is saved, and what is said."""
+"""NaN and infinities in a training: the step that is not taken, the model that is saved, and the message."""
 
 import json
 import sys
@@ -24,7 +24,7 @@ INF, NAN = float("inf"), float("nan")
 
 @pytest.fixture(autouse=True)
 def _stdout(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Training stamps and may silence stdout: bring it back."""
+    """Restore stdout, which training stamps and may silence."""
     monkeypatch.setattr(sys, "stdout", sys.stdout)
 
 
@@ -34,7 +34,7 @@ State = list[torch.Tensor]  # value, first moment, second moment
 
 
 def _state(dtype: torch.dtype, rows: int = 100_000) -> tuple[State, torch.Tensor]:
-    """More than one block of values (N, 3), and a gradient."""
+    """Values (N, 3) that fill more than one block, and a gradient."""
     generator = torch.Generator().manual_seed(0)
     value, gradient = (torch.randn(rows, 3, generator=generator, dtype=dtype) for _ in range(2))
     return [value, 0.1 * gradient, gradient**2], gradient
@@ -68,7 +68,7 @@ def test_values_without_a_finite_step_are_marked_and_the_rest_goes_on(step, dtyp
     poison = {(5, 0): NAN, (60_000, 1): INF, (99_999, 0): -INF, (3, 1): huge, (9, 2): NAN, (7, 0): NAN}
     for place, value in poison.items():
         bad[place] = value
-    # Column 2 is not active, and 7 is a row that the sparse step does not see.
+    # Column 2 is inactive, and the sparse step does not see row 7.
     unseen = {(9, 2)} | ({(7, 0)} if step is _sparse else set())
     before = [t.clone() for t in guarded]
     step(guarded, bad, loss, stopped, 2)
@@ -127,7 +127,7 @@ def test_guards_that_do_not_fit_are_named(step):
 
 
 def test_float32_steps_are_doubles_from_1e_minus_30_to_1e10():
-    """Squares below 1e-38 vanish in float32, where eps of 1e-15 outweighs their roots anyway."""
+    """Squares below 1e-38 vanish in float32, but there eps of 1e-15 outweighs their roots anyway."""
     size = 10 ** torch.linspace(-30, 10, 41, dtype=torch.float64)[:, None]
     generator = torch.Generator().manual_seed(0)
     theirs = torch.nn.Parameter(torch.zeros(41, 3, dtype=torch.float64))
@@ -141,10 +141,10 @@ def test_float32_steps_are_doubles_from_1e_minus_30_to_1e10():
         lists = [[t] for t in (ours[0], gradient, *ours[1:], counter)]
         ops.adam_(*lists, [RATE], *BETAS, EPS, [-1], torch.tensor(0.5), stopped, iteration)
     assert stopped == 0 and theirs.abs().max() > 5 * RATE
-    # Fifty steps of 0.01 at most, each good to some units of float32. The bound is on steps, so that 1e-30 counts, too.
+    # Fifty steps of at most 0.01, each exact to some units of float32. The bound is on steps, so that 1e-30 counts too.
     unit = torch.finfo(torch.float32).eps
     assert ((ours[0] - theirs.detach()).abs() <= 50 * 8 * unit * RATE).all()
-    tiny = size[:, 0] < 1e-16  # steps of 1e-17 and less, for which one needs a bound of their own
+    tiny = size[:, 0] < 1e-16  # steps of 1e-17 and less, which need another bound
     ratio = ours[0].double()[tiny] / theirs.detach()[tiny]
     assert ((ratio - 1).abs() < 1e-4).all()
 
@@ -208,7 +208,7 @@ def _same(a: object, b: object) -> bool:
 @pytest.mark.parametrize("optimizer", ["default", "sparse_adam"])
 @pytest.mark.parametrize(("broken", "seen"), [(3, 3), (13, 13), (26, 26), (12, 20)])
 def test_the_model_before_a_loss_of_nan_is_saved(colmap_scene, tmp_path, monkeypatch, broken, seen, optimizer):
-    """Whether it is seen at once, as something is saved (3) or changed (13, 26), or later: nothing moved since."""
+    """Whether divergence is detected at once, on a save (3) or a change (13, 26), or later, nothing has moved since."""
     options = ["--densify_from_iter", 10, "--densification_interval", 13, "--densify_grad_threshold", 1e-4]
     options += ["--opacity_reset_interval", 26, "--optimizer_type", optimizer]
     monkeypatch.setattr("training.run.SH_INTERVAL", 10)
@@ -219,10 +219,10 @@ def test_the_model_before_a_loss_of_nan_is_saved(colmap_scene, tmp_path, monkeyp
     with pytest.raises(UserError, match=rf"loss became nan in iteration {broken} \(view (left|Right)/.*{last}"):
         _train(colmap_scene, out, *options, "--save_iterations", 3, "--checkpoint_iterations", 3, iterations=30)
     saved, wanted = (load_checkpoint(tmp_path / name / f"chkpnt{broken - 1}.pth") for name in ("broken", "whole"))
-    statistics = slice(7, 10)  # these go on until somebody looks
+    statistics = slice(7, 10)  # these continue until the next check
     for capture in (saved[0], wanted[0]):
         assert all(t.isfinite().all() for t in capture[statistics])
-    # The learning rates in there are those of the next iteration, and nobody reads them.
+    # The learning rates in the checkpoint are those of the next iteration, and are never read.
     kept = [[*capture[:7], capture[10]["state"], capture[11]] for capture in (saved[0], wanted[0])]
     assert saved[1] == wanted[1] and _same(*kept)
     assert (out / "point_cloud").exists() == (broken > 3)

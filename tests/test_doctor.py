@@ -1,4 +1,4 @@
-"""doctor.py: each fault gets its own line, and a healthy scene and model get none."""
+"""doctor.py: each fault gets its own line; an intact scene and model get none."""
 
 import argparse
 import dataclasses
@@ -35,7 +35,7 @@ def problems(lines: list[Line]) -> list[str]:
 
 @pytest.fixture
 def healthy(monkeypatch: pytest.MonkeyPatch) -> None:
-    """An environment without problems, whatever is installed here."""
+    """Simulate an environment without problems, whatever is installed."""
     monkeypatch.setattr(environment, "check_packages", lambda: [Line("packages")])
     monkeypatch.setattr(environment, "check_build", lambda: [Line("build")])
 
@@ -71,7 +71,7 @@ def test_missing_packages_end_it(monkeypatch, colmap_scene, capsys):
 
 
 def _sources(root: Path, version: str = "0.1.0") -> Path:
-    """A repository with the installed Python side of simple-knn."""
+    """A repository with the installed Python part of simple-knn."""
     common, package = root / "submodules" / "common", root / "submodules" / "simple-knn" / "simple_knn"
     common.mkdir(parents=True)
     package.mkdir(parents=True)
@@ -121,7 +121,7 @@ def test_a_gpu_that_is_not_used(monkeypatch):
 
 @pytest.fixture
 def info(colmap_scene):
-    """The synthetic scene: cameras around a unit cube of points that all look at it."""
+    """The synthetic scene: cameras around a unit cube of points, all facing it."""
     return read_scene(colmap_scene, "images", hold_out=False)
 
 
@@ -129,7 +129,7 @@ def test_the_synthetic_scene_is_sound(info):
     assert problems(check_extent(info)) == problems(check_lenses(info.train_cameras)) == []
     few = problems(check_cloud(info))
     assert len(few) == 1 and "only 300 points" in few[0]
-    # pycolmap projects its synthetic points into the pictures that see them.
+    # pycolmap projects its synthetic points into the images that see them.
     seen = points_in_views(info.train_cameras, info.point_cloud.points)
     assert seen.any(axis=0).mean() > 0.9
 
@@ -205,7 +205,7 @@ def test_what_convert_noted(colmap_scene):
 
 @pytest.fixture
 def model(colmap_scene, tmp_path):
-    """Function that writes a model of the synthetic scene, its Gaussians changed, and gives the folder."""
+    """A function that writes a model of the synthetic scene with changed Gaussians and returns the folder."""
 
     def write(change=lambda gaussians: None, iteration: int = 7, source: Path = colmap_scene) -> str:
         folder = tmp_path / "model"
@@ -288,7 +288,7 @@ def _opaque(gaussians):
 
 @pytest.mark.parametrize("kind", ["masked", "halves"])
 def test_only_what_is_scored_is_looked_at(model, colmap_scene, monkeypatch, kind):
-    """Pictures that are a model's own renders in their right halves and nonsense in the left ones."""
+    """Photos whose right halves are a model's own renders, and whose left halves are nonsense."""
     monkeypatch.setattr(diagnosis.model, "_WIDTH", WIDTH)
     folder, halves = Path(model(_opaque)), kind == "halves"
     options = ModelParams(argparse.ArgumentParser()).extract(argparse.Namespace(**read_cfg_args(folder)))
@@ -315,7 +315,7 @@ def test_only_what_is_scored_is_looked_at(model, colmap_scene, monkeypatch, kind
         write_model_json(folder, argparse.Namespace(masks="masks"), antialiasing=False, seed=0)
     lines = check_model(str(folder), -1)
     assert problems(lines) == []
-    assert float(re.search(r"PSNR (\S+) dB", lines[-1].text)[1]) > 50  # the pictures are rounded to 8 bits
+    assert float(re.search(r"PSNR (\S+) dB", lines[-1].text)[1]) > 50  # the photos are rounded to 8 bits
     if not halves:
         write_model_json(folder, argparse.Namespace(masks="masks", invert_masks=True), antialiasing=False, seed=0)
         assert any("PSNR of only" in text for text in problems(check_model(str(folder), -1)))

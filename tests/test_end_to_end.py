@@ -1,4 +1,4 @@
-"""A small demo scene trained, rendered, scored and reported on by the commands that users type."""
+"""A small demo scene: trained, rendered, scored and reported by the commands that users type."""
 
 import hashlib
 import json
@@ -25,7 +25,7 @@ HELD_OUT = [0, 8, 16, 24, 32]
 
 def call(*command: object) -> subprocess.CompletedProcess:
     words = [sys.executable, *map(str, command)]
-    # A proxy that refuses: LPIPS shall not fetch its weights here.
+    # A proxy that refuses connections, so that LPIPS does not download its weights.
     environment = os.environ | {"TORCH_HOME": os.devnull, "https_proxy": "http://127.0.0.1:9"}
     return subprocess.run(words, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=300, check=False)
 
@@ -47,7 +47,7 @@ def names(folder: Path) -> list[str]:
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory) -> SimpleNamespace:
-    """A scene, the model trained on it, and what train.py and render.py have said."""
+    """A scene, the model trained on it, and the output of train.py and render.py."""
     folder = tmp_path_factory.mktemp("end_to_end")
     scene, model = folder / "scene", folder / "model"
     make_scene(scene, VIEWS, 120, 90, 3000, seed=0)
@@ -93,11 +93,11 @@ def test_scores_of_the_held_out_views(trained, tmp_path):
     assert list(scores) == ["SSIM", "PSNR", "LPIPS", "LPIPS_alex"]
     start = float(re.search(r"\[ITER 1\] Evaluating test: L1 \S+ PSNR ([\d.]+)", trained.training)[1])
     assert start < 15
-    # Measured: 23.6 dB and SSIM 0.80. At iteration 200 it is 20.4 dB; without densification 22.5.
+    # Measured: 23.6 dB and SSIM 0.80; 20.4 dB at iteration 200, 22.5 dB without densification.
     assert scores["PSNR"] > 23.0
     assert scores["SSIM"] > 0.78
     reported = float(re.search(rf"\[ITER {ITERATIONS}\] Evaluating test: L1 \S+ PSNR ([\d.]+)", trained.training)[1])
-    # The report has unrounded pixels and the mean of three channels' PSNRs, the score one error over 8-bit pixels.
+    # The report averages the PSNRs of three channels of unrounded pixels; the score is one error over 8-bit pixels.
     assert abs(reported - scores["PSNR"]) < 0.5
 
     said = run("-m", "demo.report", trained.model)
@@ -114,14 +114,14 @@ def test_an_iteration_that_was_never_saved(trained):
 
 
 def test_skipped_views_are_not_even_opened(trained, tmp_path):
-    """render.py needs only the pictures that it writes."""
+    """render.py decodes only the photos of the views that it writes."""
     scene = tmp_path / "scene"
     (scene / "images").mkdir(parents=True)
     (scene / "sparse").symlink_to(trained.scene / "sparse")
     for view in range(VIEWS):
         source = trained.scene / "images" / f"view_{view:03d}.png"
         content = source.read_bytes()
-        # Headers and end marks are looked at when the scene is read; what is between them is missing here.
+        # Reading the scene checks headers and end marks; the data between them are missing here.
         (scene / "images" / source.name).write_bytes(content if view in HELD_OUT else content[:200] + content[-12:])
     model = tmp_path / "model"
     model.mkdir()

@@ -1,4 +1,4 @@
-"""error_vs_time.csv and .png: the file, the schedule, the scores, the figure, and that training does not feel them."""
+"""error_vs_time.csv and .png: the file, the schedule, the scores, the figure; training stays the same with them."""
 
 import csv
 import json
@@ -42,7 +42,7 @@ HEADER = (
 
 @pytest.fixture(autouse=True)
 def _stdout(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Training stamps and may silence stdout: bring it back."""
+    """Restore stdout, which training stamps and may silence."""
     monkeypatch.setattr(sys, "stdout", sys.stdout)
 
 
@@ -114,7 +114,7 @@ class TestFile:
 
 
 def _simulate(schedule: CurveSchedule, first: int, last: int, pace, cost) -> tuple[list[int], float, float]:
-    """Iterations scored, seconds of scoring and of training, when an iteration takes pace(t) and a scoring cost(t)."""
+    """Scored iterations and seconds of scoring and of training, if an iteration takes pace(t) and a scoring cost(t)."""
     points, seconds = [], 0.0
     for iteration in range(first + 1, last + 1):
         seconds += pace(iteration)
@@ -128,7 +128,7 @@ class TestSchedule:
     def test_cheap_points_are_evenly_spaced_in_log_time(self):
         points, _, _ = _simulate(CurveSchedule(0, 30_000, [], 1), 0, 30_000, lambda t: 1.0, lambda t: 1e-4)
         assert points[0] == round(30_000 / 256) and points[-1] == 30_000 and len(points) == 33
-        # Iterations are whole numbers, so a ratio is off by up to 1 / 117.
+        # Iterations are whole numbers, so a ratio can be off by 1 / 117.
         np.testing.assert_allclose(np.divide(points[1:], points[:-1]), 2**0.25, rtol=1 / 117)
 
     @pytest.mark.parametrize("views", [2, 14, 50, 400])
@@ -196,7 +196,7 @@ class TestScores:
         assert mean_scores([]) == {}
 
     def test_masks(self):
-        """A mask that leaves out a rim, against the views without it; SSIM is tested with the loss."""
+        """A mask without a rim gives the scores of views without the rim; SSIM is tested with the loss."""
         generator = torch.Generator().manual_seed(0)
         image, target = torch.rand(2, 3, 20, 30, generator=generator)
         mask = torch.zeros(1, 20, 30, dtype=torch.bool)
@@ -253,7 +253,7 @@ class TestScores:
 
 
 class TestPeak:
-    # As scenes with few views do: the test views peak, the train views go on.
+    # As in scenes with few views, the test views peak while the training views still improve.
     ROWS = (_row(500, 18.0, 18.5), _row(2000, 20.3, 23.0), _row(4000, 20.1, 26.0), _row(7000, 19.6, 29.0))
 
     def test_a_peak_before_the_end_is_named(self):
@@ -344,7 +344,7 @@ class TestTraining:
         costs = json.loads((tmp_path / "with" / "train_log.json").read_text())[-1]
         for part in ("scoring", "writing", "drawing"):
             assert costs[f"curve_{part}_seconds"] > 0
-        assert costs["curve_loading_seconds"] >= 0  # a few tiny pictures: it may be rounded away
+        assert costs["curve_loading_seconds"] >= 0  # for a few tiny photos it may round to 0
 
     def test_a_row_tells_of_the_model_saved_at_its_iteration(self, colmap_scene, tmp_path, monkeypatch):
         out = tmp_path / "out"
@@ -359,7 +359,7 @@ class TestTraining:
                 with Image.open(file) as gt, Image.open(folder / "renders" / file.name) as ours:
                     values.append(peak_signal_noise_ratio(np.asarray(gt), np.asarray(ours)))
         train_views = [psnrs["train"][index] for index in evenly_spread(range(14), 3)]
-        # PNGs are rounded to 8 bits, which at 12 dB adds or takes 1e-6 of the error, randomly.
+        # PNGs are rounded to 8 bits, which at 12 dB changes the error by 1e-6 of itself, in either direction.
         assert row["test_psnr"] == pytest.approx(np.mean(psnrs["test"]), abs=0.01)
         assert row["train_psnr"] == pytest.approx(np.mean(train_views), abs=0.01)
         log = json.loads((out / "train_log.json").read_text())
@@ -386,7 +386,7 @@ class TestTraining:
                 assert new[name] == old[0][name]
 
     def test_peak_memory_is_that_of_all_parts(self, colmap_scene, tmp_path):
-        """Of a part before that took more, by its last row or its log, whichever knows more."""
+        """The peak of an earlier part that took more, from its last row or its log, whichever is larger."""
         out = tmp_path / "out"
         _train(colmap_scene, out, "--test_iterations", 5, "--checkpoint_iterations", 5, iterations=6)
         log = json.loads((out / "train_log.json").read_text())

@@ -47,7 +47,7 @@ def test_seconds_to_reach_between_points():
     rows = curve((1, 10, 100), (4, None, 100), (100, 20, 300), (200, 19, 250), (300, 30, 400))
     assert seconds_to_reach(rows, 9) == 1
     assert seconds_to_reach(rows, 20) == 100
-    assert seconds_to_reach(rows, 15) == 100  # too far from the point before to say more
+    assert seconds_to_reach(rows, 15) == 100  # too far from the point before to interpolate
     assert seconds_to_reach(rows, 24.5) == pytest.approx((200 * 300) ** 0.5)  # halfway in the logarithm
     assert seconds_to_reach(rows, 31) is None
     assert gaussians_to_reach(rows, 20) == 300 and gaussians_to_reach(rows, 18) == 250
@@ -91,14 +91,14 @@ def test_a_failed_seed_is_left_out_and_named():
 
 
 def test_published_scenes_add_up_to_the_published_means():
-    """Two tables of the paper, transcribed by hand: each mean of scenes must be the printed mean."""
+    """Two tables of the paper were transcribed by hand: each mean over scenes must be the printed mean."""
     table = published.published_tables()[0]
     assert set(table["scenes"]) == {name for scenes in DATASETS.values() for name in scenes}
     for group, by_iteration in table["means"].items():
         for iteration, means in by_iteration.items():
             for metric, half in (("PSNR", 0.005), ("SSIM", 0.0005), ("LPIPS", 0.0005)):
                 mean = statistics.fmean(table["scenes"][name][iteration][metric] for name in DATASETS[group])
-                # The mean is rounded, and so are the numbers it was made of here.
+                # The mean is rounded, and so are the numbers that it is computed from here.
                 assert abs(mean - means[metric]) <= 1.5 * half + 1e-12, (group, iteration, metric)
 
 
@@ -129,7 +129,7 @@ def test_markdown_keeps_columns_apart():
 
 
 def test_nothing_imports_the_benchmarks():
-    """They measure the project: it runs without them."""
+    """The benchmarks measure the project, which must run without them."""
     root = Path(__file__).parents[1]
     outside = ("benchmarks", "tests", "build", "output")
     folders = [path for path in root.iterdir() if path.name not in outside and not path.name.startswith(".")]

@@ -1,4 +1,4 @@
-"""Exposures: names, schedule, files, checkpoints; and the half-image protocol that trains them."""
+"""Exposures: names, schedule, files, checkpoints, and the half-image protocol that trains them."""
 
 import json
 import math
@@ -26,7 +26,7 @@ from utils.loss_utils import inverse_depth_loss, l1_loss, photometric_loss, ssim
 from utils.system_utils import UserError
 
 NAMES = ["b.png", "a.png", "left/c.png"]
-GAIN = 0.6  # of every third picture
+GAIN = 0.6  # of every third photo
 
 
 def _infos(*paths: str, stems: bool = False) -> list[CameraInfo]:
@@ -88,7 +88,7 @@ def test_steps_are_those_of_torchs_adam_by_default():
         theirs.param_groups[0]["lr"] = ours._rate(step)
         values.grad = torch.randn(3, 3, 4, generator=generator)
         theirs.step()
-    # Twenty steps of 0.01, each good to some units in the last place of values about 1.
+    # Twenty steps of 0.01, each exact to some units in the last place of values about 1.
     torch.testing.assert_close(ours.values, values, rtol=0, atol=20 * 2**-22)
     assert (values - torch.eye(3, 4)).abs().max() > 0.05
 
@@ -219,7 +219,7 @@ def test_columns_that_do_not_count_are_cut_off():
     broken = torch.where(counts, mono, torch.nan)
     expected = (depth - mono).abs()[counts].mean()
     assert torch.allclose(inverse_depth_loss(depth, broken, None, counts), expected)
-    # A view whose left half trains weighs half, whatever part of it counts.
+    # A view of which only the left half trains has half the weight, whatever part of that half counts.
     left = (depth - mono).abs()[counts & mask].mean() * 15 / 31
     assert torch.allclose(inverse_depth_loss(depth, broken, slice(0, 15), counts), left)
     assert inverse_depth_loss(depth, mono, slice(0, 15), torch.zeros_like(counts)) == 0
@@ -230,7 +230,7 @@ def test_columns_that_do_not_count_are_cut_off():
 
 @pytest.fixture(autouse=True)
 def _stdout(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Training stamps stdout: bring it back."""
+    """Restore stdout, which training stamps."""
     monkeypatch.setattr(sys, "stdout", sys.stdout)
 
 
@@ -247,7 +247,7 @@ def _train(scene: Path, out: Path, *more: object, iterations: int = 200) -> Path
 
 
 def _pictures(scene: Path) -> list[Path]:
-    """In the order of the views."""
+    """The exposures in the order of the views."""
     return sorted((scene / "images").rglob("*.png"), key=lambda path: path.relative_to(scene).as_posix())
 
 
@@ -270,7 +270,7 @@ def test_from_pictures_of_different_exposure_to_scored_halves(colmap_scene, tmp_
         Image.fromarray(dark.round().astype(np.uint8)).save(path)
     whole = _train(colmap_scene, tmp_path / "a", "--checkpoint_iterations", 90, "--test_iterations", 200)
 
-    # It knows which pictures are dark.
+    # The exposures tell which photos are dark.
     table = json.loads((tmp_path / "a/exposure.json").read_text())
     names = [path.relative_to(colmap_scene / "images").as_posix() for path in pictures]
     assert sorted(table) == names
@@ -278,7 +278,7 @@ def test_from_pictures_of_different_exposure_to_scored_halves(colmap_scene, tmp_
     dark = np.arange(len(names)) % 3 == 1
     assert gains[dark].max() < gains[~dark].min()
 
-    # Resumed, it is the same, exposures too; without the option it is refused.
+    # A resumed training gives the same model and exposures; without the option it is refused.
     more = ("--start_checkpoint", tmp_path / "a/chkpnt90.pth")
     resumed = _train(colmap_scene, tmp_path / "b", *more)
     assert resumed.read_bytes() == whole.read_bytes()
@@ -286,7 +286,7 @@ def test_from_pictures_of_different_exposure_to_scored_halves(colmap_scene, tmp_
     with pytest.raises(UserError, match="chkpnt90.pth was trained with --train_test_exp; give that option"):
         train.main(["-s", str(colmap_scene), "-m", str(tmp_path / "c"), "-r", "32", *map(str, more)])
 
-    # render.py and the curve see right halves.
+    # render.py and the curve use right halves.
     monkeypatch.setattr(sys, "argv", ["render.py", "-m", str(tmp_path / "a"), "--quiet"])
     render.main()
     scored = []
@@ -297,7 +297,7 @@ def test_from_pictures_of_different_exposure_to_scored_halves(colmap_scene, tmp_
         scored.append(-10 * np.log10(np.mean((np.asarray(shown) / 255 - np.asarray(truth) / 255) ** 2)))
     assert len(list((tmp_path / "a/train/ours_200/renders").iterdir())) == 17
     (row,) = read_curve(tmp_path / "a/error_vs_time.csv")[-1:]
-    assert row["test_psnr"] == pytest.approx(np.mean(scored), abs=0.05)  # renders are rounded to 8 bits here alone
+    assert row["test_psnr"] == pytest.approx(np.mean(scored), abs=0.05)  # only these renders are rounded to 8 bits
 
 
 def test_what_is_scored_does_not_train(colmap_scene, tmp_path):
@@ -305,7 +305,7 @@ def test_what_is_scored_does_not_train(colmap_scene, tmp_path):
     pictures = _pictures(colmap_scene)
     changed = {path: np.array(Image.open(path)) for path in pictures[::8]}
     for path, pixels in changed.items():
-        pixels[:, 64:] = 255 - pixels[:, 64:]  # a third, so that resizing carries nothing into the left half
+        pixels[:, 64:] = 255 - pixels[:, 64:]  # only a third, so that resizing does not affect the left half
         Image.fromarray(pixels).save(path)
     assert _train(colmap_scene, tmp_path / "b", iterations=40).read_bytes() == plain.read_bytes()
     for path, pixels in changed.items():

@@ -51,7 +51,7 @@ OPTIONS = [
     "--densify_grad_threshold", 1e-4, "--opacity_reset_interval", 220,
 ]  # fmt: skip
 
-# What runs in the copy: training, resuming, a PLY read and written again, rendering, and two refusals.
+# The program that runs in the copy: training, resuming, reading and writing a PLY, rendering, and two refusals.
 SCRIPT = """
 import argparse, sys
 import render, train
@@ -85,13 +85,13 @@ for refused in (
 
 
 class Runs(NamedTuple):
-    """Model folders and what else the tests look at."""
+    """Model folders and other results that the tests check."""
 
     code: Path  # the extended copy
-    plain: Path  # trained by the code as it is
+    plain: Path  # trained by the plain code
     whole: Path  # trained by the extended code
-    resumed: Path  # the same from iteration 300 on
-    truth: list[np.ndarray]  # thermal pictures (H, W) uint8 by sorted name
+    resumed: Path  # the same training, resumed at iteration 300
+    truth: list[np.ndarray]  # thermal photos (H, W) uint8 by sorted name
     said: str
 
 
@@ -120,7 +120,7 @@ def _extend(folder: Path) -> None:
 
 
 def _paint(scene: Path, model: Path) -> list[np.ndarray]:
-    """Put thermal pictures of a plain model with a hot half into the scene. Returns them by sorted name."""
+    """Write thermal photos of a plain model with a hot half into the scene; return them by sorted name."""
     options = argparse.Namespace(source_path=str(scene), model_path=str(model), resolution=WIDTH)
     options = ModelParams(argparse.ArgumentParser()).extract(options)
     gaussians = GaussianModel(options.sh_degree)
@@ -144,7 +144,7 @@ def runs(_colmap_master: Path, tmp_path_factory: pytest.TempPathFactory) -> Runs
     shutil.copytree(_colmap_master, scene)
     options = list(map(str, OPTIONS))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sys, "stdout", sys.stdout)  # which training stamps: bring it back
+        patch.setattr(sys, "stdout", sys.stdout)  # restored afterwards, since training stamps it
         train.main(["-s", str(scene), "-m", str(plain), *options])
     truth = _paint(scene, plain)
     _extend(code)
@@ -167,10 +167,10 @@ def test_the_temperatures_are_learnt(runs):
     assert _image_error(runs, 600) < 0.03
     gaussians = PlyData.read(runs.whole / LAST)["vertex"]
     truth = np.where(gaussians["x"] > 0, HOT, COLD)
-    opacity = 1 / (1 + np.exp(-gaussians["opacity"]))  # faint Gaussians are seen too little to learn
+    opacity = 1 / (1 + np.exp(-gaussians["opacity"]))  # faint Gaussians get too little gradient to learn
     error = np.average(np.abs(gaussians["temperature"] - truth), weights=opacity)
     start = np.average(np.abs(START - truth), weights=opacity)
-    # Measured: 0.35 and 0.05. Rows in a wrong order would leave about as much as at the start.
+    # Measured: 0.35 and 0.05. With rows in a wrong order the error would stay about as large as at the start.
     assert start > 0.3 and error < 0.1
 
 
@@ -204,7 +204,7 @@ def test_files_without_temperatures_are_refused(runs):
 
 
 def test_density_control_keeps_rows_aligned(runs):
-    """Its own tests go over all parameters and moments, so in the copy over temperatures too."""
+    """The project's tests check all parameters and moments, so in the copy they check temperatures too."""
     said = _run([sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "tests"], runs.code)
     assert re.search(r"\d\d passed", said) and "skipped" not in said
 

@@ -1,4 +1,4 @@
-"""Which COLMAP model is read, how pictures are found by their names, and that pictures of any kind load in a scene."""
+"""The choice of the COLMAP model, the search for photos by name, and photos of every format in a scene."""
 
 import shutil
 import unicodedata
@@ -17,7 +17,7 @@ from utils.system_utils import UserError
 
 
 def _rename(scene: Path, new_names: dict[str, str], text: bool = False) -> None:
-    """Give pictures new names in the model and on disk."""
+    """Rename photos in the model and on disk."""
     sparse = scene / "sparse" / "0"
     reconstruction = pycolmap.Reconstruction(str(sparse))
     for image in reconstruction.images.values():
@@ -33,7 +33,7 @@ def _rename(scene: Path, new_names: dict[str, str], text: bool = False) -> None:
 
 
 def _model(folder: Path, views: int) -> None:
-    """A model with the first few pictures of the scene that the folder lies in."""
+    """Write a model with the first few photos of the scene that contains the folder."""
     reconstruction = pycolmap.Reconstruction(str(folder.parent / "0"))
     for image_id in sorted(reconstruction.reg_image_ids())[views:]:
         reconstruction.deregister_frame(reconstruction.images[image_id].frame_id)
@@ -74,7 +74,7 @@ def test_names_that_match_but_for_case_accents_or_slashes(colmap_scene, capsys):
         said.startswith("2 of 17 photos are used although their file names differ in letters") and said.count("\n") == 1
     )
 
-    # Two that are alike, and neither the one: not to be guessed.
+    # Two similar names, neither of them the exact one: the reader must not guess.
     shutil.copyfile(pictures / olds[1].upper(), pictures / olds[1].upper().replace("PNG", "Png"))
     with pytest.raises(UserError, match="1 of 17 photos"):
         _read(colmap_scene)
@@ -110,7 +110,7 @@ def test_several_cameras_and_sizes(tmp_path):
     shutil.rmtree(sparse)
     sparse.mkdir()
     reconstruction.write_text(str(sparse))
-    for name in ("rigs.txt", "frames.txt"):  # the classic three files allow any camera for any picture
+    for name in ("rigs.txt", "frames.txt"):  # the classic three files allow any camera for any photo
         (sparse / name).unlink()
     with open(sparse / "cameras.txt", "a") as file:
         file.write("7 SIMPLE_RADIAL 48 32 55 22.5 17.25 -0.1\n")
@@ -132,7 +132,7 @@ def test_several_cameras_and_sizes(tmp_path):
 
 def _kinds(image: Image.Image) -> dict[str, tuple[Image.Image, dict]]:
     exif = Image.Exif()
-    exif[0x0112] = 6  # orientation: to be turned by a quarter
+    exif[0x0112] = 6  # orientation: turn by a quarter
     grey = image.convert("L")
     sixteen = Image.fromarray(np.asarray(grey).astype(np.uint16) * 257)
     return {
@@ -163,6 +163,6 @@ def test_pictures_of_any_kind(tmp_path, kind, model):
     assert target.shape == plain.shape
     if kind in ("grey", "16 bit"):
         plain = (plain * torch.tensor([0.299, 0.587, 0.114])[:, None, None]).sum(0).expand(3, -1, -1)  # ITU-R 601
-    # A palette of 256 colours, and JPEG, lose some levels; a turned picture would be off by 30 and more.
+    # A palette of 256 colours and JPEG lose some levels; a turned photo would be off by 30 or more.
     assert (target - plain).abs().mean() < (6 if kind == "palette" else 1)
     assert folder_state(folder) == before

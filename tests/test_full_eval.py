@@ -1,4 +1,4 @@
-"""full_eval.py: what it runs, resumes, refuses and reports; with stand-ins for what it runs, and once for real."""
+"""full_eval.py: its runs, resumes, refusals and reports, with stand-ins for its programs and once with real ones."""
 
 import contextlib
 import dataclasses
@@ -42,13 +42,13 @@ def _stand_ins(monkeypatch):
 
 @pytest.fixture
 def figures(monkeypatch):
-    """For tests that look at the curves' figures."""
+    """Draw the figures of the curves, for tests that need them."""
     monkeypatch.setattr(report_module, "draw_curves", draw_curves)
 
 
 @pytest.fixture
 def scenes(tmp_path) -> Path:
-    """A folder of two scenes, `attic` (COLMAP) and `brick` (Blender)."""
+    """A folder with two scenes, `attic` (COLMAP) and `brick` (Blender)."""
     folder = tmp_path / "scenes"
     (folder / "attic" / "sparse").mkdir(parents=True)
     (folder / "brick").mkdir()
@@ -57,7 +57,7 @@ def scenes(tmp_path) -> Path:
 
 
 def calls(scenes: Path) -> list[list[str]]:
-    """Command lines of the stand-ins for train.py and render.py, in their order."""
+    """The command lines of the stand-ins for train.py and render.py, in order."""
     log = scenes / "calls.txt"
     return [json.loads(line) for line in log.read_text().splitlines()] if log.exists() else []
 
@@ -132,7 +132,7 @@ def test_data_sets_get_the_options_of_the_paper(scenes, tmp_path):
 
 @pytest.fixture(params=[None, 1.0])
 def _seconds(request, monkeypatch):
-    """Stages take as long as they take, or all the same time, as a render of an unchanged model may."""
+    """Let stages take their own time, or all the same time, as a render of an unchanged model may."""
     plain = stages.run_child
     if request.param:
         monkeypatch.setattr(stages, "run_child", lambda c: dataclasses.replace(plain(c), seconds=request.param))
@@ -176,7 +176,7 @@ def test_other_options_are_not_mixed_in(scenes, tmp_path):
 
 
 def test_finished_models_without_any_data_set(scenes, tmp_path):
-    """With --skip_training the reference dies; metrics alone need no data set at all."""
+    """With --skip_training the reference fails; metrics alone need no data set."""
     out = tmp_path / "out"
     (scenes / "attic").rename(scenes / "garden")
     run("--scenes", scenes / "garden", "--output_path", out, "--iterations", 40)
@@ -193,9 +193,9 @@ def test_a_failed_scene_is_told_and_the_others_go_on(scenes, tmp_path, capsys):
     report = report_of(out)
     attic, brick = report["runs"]
     assert attic["failure"]["stage"] == "train" and attic["failure"]["command"][1].endswith("train.py")
-    assert attic["failure"]["lines"] == ["error: <b>the scene</b> is broken; mend it"]  # no progress bar
+    assert attic["failure"]["lines"] == ["error: <b>the scene</b> is broken; fix it"]  # no progress bar
     assert brick["finished"] and [row["scene"] for row in report["summary"]] == ["brick"]
-    assert "    error: <b>the scene</b> is broken; mend it" in (out / "report.md").read_text()
+    assert "    error: <b>the scene</b> is broken; fix it" in (out / "report.md").read_text()
     assert "&lt;b&gt;the scene&lt;/b&gt; is broken" in (out / "report.html").read_text()
     assert "1 of 2 runs failed: attic" in capsys.readouterr().err
 
@@ -208,7 +208,7 @@ def test_a_failed_scene_is_told_and_the_others_go_on(scenes, tmp_path, capsys):
 
 
 def _start(scenes: Path, words: list[str]) -> subprocess.Popen:
-    """full_eval.py in a process group of its own, once it trains attic, which waits for a signal."""
+    """Start full_eval.py in its own process group; return it once it trains attic, which waits for a signal."""
     (scenes / "attic" / "slow").touch()
     program = (
         "import pathlib, sys; from evaluation import stages; import full_eval; from utils.system_utils import run_cli;"
@@ -228,7 +228,7 @@ def test_a_signal_reaches_the_training_and_the_next_call_resumes_it(scenes, tmp_
     words = ["--scenes", str(scenes / "attic"), str(scenes / "brick"), "--output_path", str(out), "--iterations", "40"]
     process = _start(scenes, words)
     try:
-        os.killpg(process.pid, sent)  # to the whole group, as a terminal does with Ctrl-C and when it is closed
+        os.killpg(process.pid, sent)  # to the whole group, as from a terminal on Ctrl-C or when it is closed
         said = process.communicate(timeout=30)[1]
     finally:
         process.kill()
@@ -261,9 +261,9 @@ def test_a_second_one_is_refused_while_the_first_or_its_training_lives(scenes, t
     (scenes / "attic" / "slow").unlink()
     deadline, report = time.monotonic() + 30, None
     while report is None and time.monotonic() < deadline:
-        with contextlib.suppress(UserError):  # the system may take a moment to bury it
+        with contextlib.suppress(UserError):  # the system may take a moment to release the lock
             report = run(*words)
-    assert report["runs"][0]["finished"]  # what is left of the first is no obstacle
+    assert report["runs"][0]["finished"]  # the remains of the first run do not block it
 
 
 def test_a_checkpoint_of_a_failure_is_not_gone_on_from(scenes, tmp_path, capsys):
@@ -281,7 +281,7 @@ def test_a_checkpoint_of_a_failure_is_not_gone_on_from(scenes, tmp_path, capsys)
 
 
 def test_an_interrupts_checkpoint_stays_the_one_to_go_on_from(scenes, tmp_path):
-    """After an interrupt at 5 a failure leaves one at 9, in the same folder and later."""
+    """After an interrupt left a checkpoint at 5, a failure leaves a later one at 9 in the same folder."""
     out = tmp_path / "out"
     words = ["--scenes", str(scenes / "attic"), "--output_path", str(out), "--iterations", "40"]
     process = _start(scenes, words)
@@ -311,7 +311,7 @@ def test_trained_gaussians_are_reported_and_those_saved_beside(scenes, tmp_path)
     assert (values["gaussians"], values["gaussians_saved"]) == (17000, 16000)
     text = (out / "report.md").read_text()
     assert "17,000" in text and "16,000" not in text and "Gaussians are counted as trained" in text
-    left_out["left_out"]["unseen"] = 999  # of another model: the PLY's rows and these do not add up
+    left_out["left_out"]["unseen"] = 999  # belongs to another model: it does not add up with the PLY's rows
     (out / "attic" / "model.json").write_text(json.dumps(left_out))
     assert run(*words)["runs"][0]["iterations"]["40"]["gaussians"] == 16000
 
@@ -335,7 +335,7 @@ def test_masks_are_part_of_the_ground_truth_and_blank_on_the_sheet(scenes, tmp_p
     method = out / "attic" / "seed_1" / "test" / "ours_40"
     (method / "masks").mkdir()
     mask = Image.new("L", (120, 80), 255)
-    mask.paste(0, (0, 0, 120, 20))  # all that differs
+    mask.paste(0, (0, 0, 120, 20))  # the only difference
     mask.save(method / "masks" / "00001.png")
     (out / "attic" / "seed_1" / "results.json").unlink()
     report = run(*words)
@@ -344,7 +344,7 @@ def test_masks_are_part_of_the_ground_truth_and_blank_on_the_sheet(scenes, tmp_p
     assert view["worst_views"][0]["file"] == "00001.png"
     assert draw_worst_views(tmp_path / "sheet.png", view, out)
     with Image.open(tmp_path / "sheet.png") as sheet:
-        # In the middle of each picture: above the label, which is masked, and in the lower half, which is not.
+        # Compare the middle of each image: above the label, which is masked, and in the lower half, which is not.
         masked, plain = ([sheet.getpixel((GAP + 60 + i * (120 + GAP), HEADER + y)) for i in range(3)] for y in (1, 60))
     assert masked == [(255,) * 3, (255,) * 3, (0,) * 3] and plain == [(90,) * 3, (90,) * 3, (0,) * 3]
 
@@ -491,7 +491,7 @@ def _browser() -> str | None:
     return next((path for name in names if (path := shutil.which(name))), None)
 
 
-# Appended to a copy: the report itself has no script.
+# Append the script to a copy: the report itself has none.
 PROBE = """<script>addEventListener("load", () => {
   const images = [...document.images];
   document.body.dataset.probe = images.length + " images, " +
@@ -522,10 +522,10 @@ def test_html_opens_in_a_browser_and_needs_nothing_else(figures, scenes, tmp_pat
 
 
 def test_for_real(colmap_scene, tmp_path):
-    """train.py, render.py and metrics.py understand what they are given, and the report has what they leave."""
+    """The real train.py, render.py and metrics.py accept their options, and the report has their results."""
     out = tmp_path / "out"
     words = ["--scenes", str(colmap_scene), "--output_path", str(out), "--iterations", "20"]
-    # A proxy that refuses: LPIPS shall not fetch its weights here.
+    # A proxy that refuses connections, so that LPIPS does not download its weights.
     environment = os.environ | {"TORCH_HOME": os.devnull, "https_proxy": "http://127.0.0.1:9"}
     done = subprocess.run([sys.executable, "full_eval.py", *words], cwd=ROOT, env=environment, capture_output=True,
                           text=True, timeout=300)  # fmt: skip

@@ -16,14 +16,14 @@ from skimage.metrics import structural_similarity
 from torch import Tensor, library
 
 EPS = {torch.float32: 2**-24, torch.float64: 2**-53}
-LARGEST_SLOPE = 2 / 0.03**2  # of SSIM by a covariance: what an error of the inputs or of the oracle is multiplied by
+LARGEST_SLOPE = 2 / 0.03**2  # of SSIM over a covariance; multiplies an error of the inputs or of the oracle
 both_dtypes = pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 both_paddings = pytest.mark.parametrize("padding", ["same", "valid"])
 
 
 @pytest.fixture(autouse=True)
 def one_thread() -> Iterator[None]:
-    """On images this small threads mostly wait for each other."""
+    """Use one thread: on images this small, threads mostly wait for each other."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     yield
@@ -31,7 +31,7 @@ def one_thread() -> Iterator[None]:
 
 
 def image_pair(name: str, shape: tuple[int, ...] = (3, 40, 47), dtype: torch.dtype = torch.float64) -> list[Tensor]:
-    """Named pairs of images, exact in float32, each hard for some way of computing SSIM."""
+    """Named pairs of images, exact in float32, each difficult for some way of computing SSIM."""
     random = torch.Generator().manual_seed(7)
     noise1, noise2 = torch.randn(shape, generator=random), torch.randn(shape, generator=random)
     if name == "noise":
@@ -48,7 +48,7 @@ def image_pair(name: str, shape: tuple[int, ...] = (3, 40, 47), dtype: torch.dty
         pair = torch.zeros(shape), torch.full(shape, 0.3)
     elif name == "salt on white":
         pair = 1 - (noise1 > 2).float(), 1 - (noise2 > 2).float()
-    elif name == "overexposed":  # a render is not clamped by nature
+    elif name == "overexposed":  # a render need not be clamped
         pair = 3 + 2 * noise1, (0.5 + 0.2 * noise2).clamp(0, 1)
     return [image.to(dtype) for image in pair]
 
@@ -59,7 +59,7 @@ CASES = [(name, (3, 40, 47)) for name in PAIRS] + [("unrelated", shape) for shap
 
 
 def with_gradient(function, img1: Tensor, img2: Tensor, padding: str) -> tuple[Tensor, Tensor, Tensor]:
-    """L1, SSIM and the gradient of SSIM summed (not averaged), which does not depend on the number of pixels."""
+    """L1, SSIM and the gradient of the sum of SSIM, which does not depend on the number of pixels as a mean does."""
     img1 = img1.clone().requires_grad_()
     l1, ssim = function(img1, img2, padding)
     rim = 10 if padding == "valid" else 0
@@ -78,7 +78,7 @@ def test_agrees_with_reference(name: str, shape: tuple[int, ...], dtype: torch.d
         wanted_l1, wanted_ssim, wanted_gradient = with_gradient(l1_ssim, img1.double(), img2.double(), padding)
         # Each pixel's difference is rounded once, and the mean once.
         assert abs(l1 - wanted_l1) <= 2 * EPS[dtype] * wanted_l1
-        # A few roundings of numbers near 1, measured: 4.3 eps; and of the sums in double where all pixels are alike.
+        # A few roundings of numbers near 1, measured: 4.3 eps; also of the sums in double if all pixels are equal.
         assert abs(ssim - wanted_ssim) <= 8 * EPS[dtype] + 50 * EPS[torch.float64]
         # Measured: 19 eps of the largest gradient for images in [0, 1]; the difference is rounded at the size of the
         # larger image. The oracle adds up terms of about 10 in size that may cancel.
@@ -88,7 +88,7 @@ def test_agrees_with_reference(name: str, shape: tuple[int, ...], dtype: torch.d
 
 
 def test_bright_images_keep_their_precision() -> None:
-    """The textbook's E[x²] - mu², in float32, is a thousand times worse: what csrc/math/ssim.h is for."""
+    """The textbook's E[x²] - mu² in float32 is a thousand times worse, which is the reason for csrc/math/ssim.h."""
     img1, img2 = image_pair("bright sky", dtype=torch.float32)
     wanted = with_gradient(l1_ssim, img1.double(), img2.double(), "same")[2]
     ours = with_gradient(fused_l1_ssim, img1, img2, "same")[2]
@@ -122,12 +122,12 @@ def test_agrees_with_scikit_image(name: str) -> None:
         use_sample_covariance=False,
         full=True,
     )
-    # scikit-image averages without the rim of 5 pixels, where its border would differ from ours. Its variances are
+    # scikit-image averages without a rim of 5 pixels, where its border would differ from ours. Its variances are
     # E[x²] - mu², divided by C2 at worst.
     tolerance = 20 * EPS[torch.float64] * LARGEST_SLOPE
     assert abs(float(fused_ssim(img1, img2, padding="valid")) - wanted) < tolerance
     difference = (ssim_map(img1, img2) - torch.from_numpy(full))[:, 5:-5, 5:-5].abs().max()
-    assert difference < tolerance  # the oracle has the same judge
+    assert difference < tolerance  # scikit-image also checks the oracle
 
 
 @both_paddings
@@ -144,7 +144,7 @@ def test_l1_gradient_is_torchs() -> None:
     for l1 in (lambda x: fused_l1_ssim(x, img2)[0], lambda x: (x - img2).abs().mean()):
         x = img1.clone().requires_grad_()
         gradients.append(torch.autograd.grad(l1(x), x)[0])
-    # 1/n, rounded once from double by us and once in float by torch.
+    # We round 1/n once from double; torch computes it in float.
     torch.testing.assert_close(gradients[0], gradients[1], rtol=2 * EPS[torch.float32], atol=0)
     assert not gradients[0][:, 3:9].any()
 
@@ -168,7 +168,7 @@ def test_opcheck(train: bool, dtype: torch.dtype) -> None:
 
 
 def loss_in_parts(image: Tensor, target: Tensor, weight: float) -> tuple[Tensor, Tensor]:
-    """What fused_photometric_loss does, by torch around fused_l1_ssim."""
+    """Compute fused_photometric_loss by torch around fused_l1_ssim."""
     l1, ssim = fused_l1_ssim(image.clamp(0, 1), target)
     return (1 - weight) * l1 + weight * (1 - ssim), l1
 
@@ -312,7 +312,7 @@ def test_number_of_threads_changes_no_bit(dtype: torch.dtype) -> None:
 
 
 def test_instruction_sets_agree_to_rounding(tmp_path: Path) -> None:
-    """GS_ISA is read when the library loads; the widest set there is runs here, narrower ones in their own process."""
+    """GS_ISA is read when the library loads, so narrower sets than the widest run in their own processes."""
     pairs = [image_pair(name, dtype=dtype) for name in ("noise", "bright sky") for dtype in EPS]
     torch.save(pairs, tmp_path / "pairs")
     script = """
@@ -335,19 +335,19 @@ torch.save(results, sys.argv[2])
             assert (gradient - wanted_gradient).abs().max() <= 40 * eps * wanted_gradient.abs().max()
         wide = torch.backends.cpu.get_cpu_capability() in ("AVX2", "AVX512") and "GS_ISA" not in os.environ
         if isa == "baseline" and wide:
-            # It has no fma: equal bits would mean that GS_ISA was not heard.
+            # This set has no fma: equal bits would mean that GS_ISA was ignored.
             assert not torch.equal(results[0][2], widest[0][2])
 
 
 @settings(max_examples=30, deadline=None)
 @given(st.integers(1, 40), st.integers(1, 40), st.integers(0, 2**31), st.sampled_from([0.0, 1e-3, 1.0]))
 def test_properties(height: int, width: int, seed: int, contrast: float) -> None:
-    """Symmetric in the images, bounded by 1, and unmoved by a mirror image or by another order of planes."""
+    """SSIM is symmetric in the images, at most 1, and unchanged by mirroring and by another order of planes."""
     random = torch.Generator().manual_seed(seed)
     img1, img2 = (1 - contrast * torch.rand((3, height, width), generator=random) for _ in range(2))
     ssim = fused_ssim(img1, img2)
     assert -1 <= ssim <= 1
-    # Variances of img1 and of the difference, instead of img2 and the difference: other roundings, of some eps each.
+    # Variances of img1 and the difference, instead of img2 and the difference, have other roundings of some eps each.
     assert abs(ssim - fused_ssim(img2, img1)) <= 8 * EPS[torch.float32]
     assert abs(ssim - fused_ssim(img1.flip(1, 2), img2.flip(1, 2))) <= 8 * EPS[torch.float32]
     assert abs(ssim - fused_ssim(img1[[2, 0, 1]], img2[[2, 0, 1]])) <= EPS[torch.float32]

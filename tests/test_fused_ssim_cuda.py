@@ -37,7 +37,7 @@ def on_gpu(img1: Tensor, img2: Tensor, padding: str) -> tuple[Tensor, Tensor, Te
 
 @pytest.mark.parametrize(("name", "shape"), CASES, ids=str)
 def test_agrees_with_reference(name: str, shape: tuple[int, ...]) -> None:
-    """The tolerances are the CPU backend's, which test_fused_ssim.py explains."""
+    """Tolerances are those of the CPU backend; test_fused_ssim.py explains them."""
     img1, img2 = image_pair(name, shape, torch.float32)
     for padding in paddings(shape):
         l1, ssim, gradient = on_gpu(img1, img2, padding)
@@ -56,7 +56,7 @@ def test_agrees_with_the_cpu(shape: tuple[int, ...], as_bytes: bool) -> None:
         img2 = (255 * img2).to(torch.uint8)
     for padding in paddings(shape):
         results, wanted = on_gpu(img1, img2, padding), with_gradient(fused_l1_ssim, img1, img2, padding)
-        # Differences of pixels are the same floats; double sums of them in another order are rounded once.
+        # Differences of pixels are the same floats; their double sums, in another order, are rounded once.
         assert abs(results[0] - wanted[0]) <= 2 * eps * wanted[0]
         assert abs(results[1] - wanted[1]) <= 8 * eps
         assert (results[2] - wanted[2]).abs().max() <= 40 * eps * wanted[2].abs().max()
@@ -202,7 +202,7 @@ def test_messages() -> None:
         fused_ssim(image.double(), image.double())
     with pytest.raises(ValueError, match="same device, got img1 on cuda:0 and img2 on cpu"):
         fused_ssim(image, image.cpu())
-    # The operator checks for itself what reaches it past the Python form.
+    # The operator itself checks inputs that bypass the Python function.
     with pytest.raises(RuntimeError, match="img1 must be float32 on a GPU"):
         torch.ops.fused_ssim.l1_ssim(image.double(), image.double(), False, False)
     with pytest.raises(RuntimeError, match="gradients must be float32"):

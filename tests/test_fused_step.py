@@ -1,4 +1,4 @@
-"""A training step's fused calls against the same step in plain parts: one trajectory, byte for byte."""
+"""Fused calls of a training step against the same step in plain parts: the trajectory is equal byte for byte."""
 
 import sys
 

@@ -106,7 +106,7 @@ def test_capture_and_restore():
     assert other.active_sh_degree == 1 and other.spatial_lr_scale == 1.5
     for name in ("max_radii2D", "denom", "xyz_gradient_accum"):
         assert torch.equal(getattr(other, name), getattr(gaussians, name))
-    # Learning rates are the command line's, not the checkpoint's.
+    # Learning rates come from the command line, not from the checkpoint.
     assert [group["lr"] for group in other.optimizer.param_groups][1:3] == [0.5, 0.025]
 
 

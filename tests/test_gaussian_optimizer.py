@@ -1,4 +1,4 @@
-"""Our Adam against torch's, and the surgery of its state."""
+"""Our Adam against torch's, and the changes of its state when Gaussians come and go."""
 
 import copy
 
@@ -21,7 +21,7 @@ def _groups(seed: int = 0) -> list[dict]:
 
 def _step(optimizers: list[torch.optim.Optimizer], generator: torch.Generator) -> None:
     for groups in zip(*(optimizer.param_groups for optimizer in optimizers), strict=True):
-        # Gradients of very different sizes, some exactly zero, as a rasterizer gives them.
+        # Gradients of very different sizes, some exactly zero, like those of a rasterizer.
         shape = groups[0]["params"][0].shape
         gradient = torch.randn(shape, generator=generator) * 10 ** (-8 * torch.rand(shape, generator=generator))
         gradient[::5] = 0
@@ -45,7 +45,7 @@ def test_steps_follow_torch():
         state, expected = ours.state[a], theirs.state[b]
         assert state.keys() == expected.keys()
         assert torch.equal(state["step"], expected["step"]) and state["step"].dtype == expected["step"].dtype
-        # Means of gradients of size 4 may cancel; squares don't, so these agree relatively.
+        # Means of gradients of size 4 may cancel. Squares cannot, so they agree relatively.
         torch.testing.assert_close(state["exp_avg"], expected["exp_avg"], rtol=0, atol=2**-22)
         torch.testing.assert_close(state["exp_avg_sq"], expected["exp_avg_sq"], rtol=1e-5, atol=0)
 
@@ -89,7 +89,7 @@ def test_zero_grad_leaves_no_gradient(to_none):
 
 @pytest.mark.parametrize("columns", [0, 9, 24])
 def test_leaving_out_inactive_bands_changes_no_bit(columns):
-    """The dense step of columns with zero gradient and moments, against the one that skips them."""
+    """A dense step of columns with zero gradient and moments equals the step that skips them."""
     dense, sparse = GaussianAdam(_groups()), GaussianAdam(_groups())
     sparse.set_active_columns("f_rest", columns)
     generator = torch.Generator().manual_seed(0)
@@ -133,7 +133,7 @@ def test_appended_rows_start_with_zero_moments_and_the_counter_stays():
         assert now["step"] == 3
         for key in ("exp_avg", "exp_avg_sq"):
             assert torch.equal(now[key][:20], state[name][key]) and not now[key][20:].any()
-    assert len(gaussians.optimizer.state) == len(GROUPS)  # nothing of the old parameters is kept alive
+    assert len(gaussians.optimizer.state) == len(GROUPS)  # the old parameters are not kept alive
 
 
 def test_kept_rows_keep_their_moments():
@@ -191,7 +191,7 @@ def _failing(function, call: int):
 
 @pytest.mark.parametrize("call", [1, 2, 3, 9, 18])
 def test_where_memory_fails_rows_are_appended_to_none_and_kept_in_all(monkeypatch, call):
-    """Six groups with two moments each: 18 tensors, of which the memory for one can't be had."""
+    """Six groups with two moments each are 18 tensors; memory runs out at one of them."""
     monkeypatch.setattr(adam, "_CHUNK", 7)
     gaussians = model(40)
     take_steps(gaussians, 2)

@@ -1,4 +1,4 @@
-"""point_cloud.ply: the reference's layout byte for byte, other writers' files, clear refusals."""
+"""point_cloud.ply: the reference's layout byte for byte, files of other writers, clear messages."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Trainings after others: into a folder that holds a model, from a checkpoint elsewhere, with other options."""
+"""Trainings after others: into a folder with a model, from a checkpoint elsewhere, with other options."""
 
 import argparse
 import json
@@ -25,7 +25,7 @@ MODEL_OPTIONS = {
 
 @pytest.fixture(autouse=True)
 def _stdout(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Training stamps and may silence stdout: bring it back."""
+    """Restore stdout, which training stamps and may silence."""
     monkeypatch.setattr(sys, "stdout", sys.stdout)
 
 
@@ -39,7 +39,7 @@ def _warnings(text: str) -> list[str]:
     return re.findall("^warning: .*$", text, re.MULTILINE)
 
 
-# Into a folder that holds a model
+# Into a folder with a model
 
 
 def test_a_model_of_another_scene_is_refused_and_nothing_of_it_changes(colmap_scene, blender_scene, tmp_path):
@@ -53,7 +53,7 @@ def test_a_model_of_another_scene_is_refused_and_nothing_of_it_changes(colmap_sc
 
 
 def _elsewhere(checkpoint: Path, folder: Path) -> Path:
-    """A copy of the checkpoint without anything beside it."""
+    """A copy of the checkpoint with nothing beside it."""
     (folder / "moved").mkdir(exist_ok=True)
     return Path(shutil.copy(checkpoint, folder / "moved"))
 
@@ -70,13 +70,13 @@ def test_the_same_command_overwrites_in_silence(colmap_scene, tmp_path, capfd):
 def test_iterations_that_stay_are_warned_of(colmap_scene, tmp_path, capfd):
     out = tmp_path / "out"
     _train(colmap_scene, out, "--save_iterations", 1, 3, iterations=5)
-    # 30000, a default of --save_iterations, is not reached and so not overwritten.
+    # 30000, a default of --save_iterations, is not reached, so it is not overwritten.
     (out / "point_cloud" / "iteration_30000").mkdir()
     capfd.readouterr()
     _train(colmap_scene, out, "--save_iterations", 1, 30000, "--checkpoint_iterations", 3, iterations=4)
     (warning,) = _warnings(capfd.readouterr().err)
     assert "point_cloud keeps iteration 3, 5, 30000 of an earlier training, and render.py takes the highest" in warning
-    # Of a run that is gone on from, what it has saved before is no other training's.
+    # Files that a resumed run saved before do not belong to another training.
     _train(colmap_scene, out, "--start_checkpoint", out / "chkpnt3.pth", iterations=6)
     (warning,) = _warnings(capfd.readouterr().err)
     assert "keeps iteration 4, 5, 30000 of" in warning
@@ -84,14 +84,14 @@ def test_iterations_that_stay_are_warned_of(colmap_scene, tmp_path, capfd):
 
 @pytest.mark.parametrize("trained", ["chkpnt5.pth", "point_cloud/iteration_5"])
 def test_what_a_folder_must_hold_to_be_refused(tmp_path, trained):
-    """Something that was trained, and cfg_args that names another scene."""
+    """Write a trained model and a cfg_args that names another scene."""
     write_cfg_args(tmp_path, argparse.Namespace(**MODEL_OPTIONS))
     check_folder(str(tmp_path), "/other", [5], None, 0)
     (tmp_path / trained).mkdir(parents=True)
     with pytest.raises(UserError, match="holds a model of another scene, /scene"):
         check_folder(str(tmp_path), "/other", [5], None, 0)
     check_folder(str(tmp_path), "/scene/../scene/", [5], None, 0)
-    # Going on in its own folder with a scene that was moved is only told (report_changes).
+    # Resuming in the same folder with a scene that was moved is only reported (report_changes).
     check_folder(str(tmp_path), "/other", [5], str(tmp_path / "chkpnt5.pth"), 5)
     (tmp_path / "cfg_args").write_text("of another program")
     check_folder(str(tmp_path), "/other", [5], None, 0)
@@ -136,14 +136,14 @@ def test_a_checkpoint_alone_counts_from_zero_and_says_so(whole, colmap_scene, tm
     said = capfd.readouterr().err
     assert f"there is no train_log.json beside {alone}: seconds count from iteration 20, in the curve too" in said
     assert all(row["iteration"] > 20 for row in read_curve(tmp_path / "new" / CURVE))
-    # In the folder that it was taken out of, the log is there.
+    # The folder that the checkpoint was taken from has the log.
     _train(colmap_scene, whole, "--eval", "--start_checkpoint", alone, iterations=40)
     assert "there is no train_log" not in capfd.readouterr().err
     assert read_curve(whole / CURVE)[0]["iteration"] < 20
 
 
 def test_seconds_go_on_from_whichever_is_later_log_or_curve(tmp_path, capsys):
-    """A rescued training has rows after its log's last record, and a log may be lost."""
+    """An interrupted training has rows after its log's last record, and a log may be lost."""
     row = dict.fromkeys(COLUMNS) | {"iteration": 8, "seconds": 80.0, "wall_seconds": None}
     write_curve(tmp_path / CURVE, [row])
     for records, seconds, wall in (
@@ -181,7 +181,7 @@ def test_changed_options_are_told_in_one_line(colmap_scene, tmp_path, capfd):
         "no --antialiasing --optimizer_type default --seed 3, this run has --resolution 32 --white_background --eval "
         "--mask_meaning transparent --antialiasing --optimizer_type sparse_adam --seed 4"
     )
-    # In the same folder cfg_args is overwritten, so the line must come before.
+    # In the same folder cfg_args is overwritten, so the message must come before.
     _train(colmap_scene, out, *options, "-w", iterations=3)
     assert len(_warnings(capfd.readouterr().err)) == 1
 
@@ -196,7 +196,7 @@ def test_another_scene_is_told(whole, colmap_scene, tmp_path, capfd):
 
 def test_what_a_folder_does_not_tell_is_not_missed(tmp_path):
     write_cfg_args(tmp_path, argparse.Namespace(**MODEL_OPTIONS))
-    assert read_training_options(tmp_path) == MODEL_OPTIONS  # of the reference, which has no model.json
+    assert read_training_options(tmp_path) == MODEL_OPTIONS  # a model of the reference, which writes no model.json
     write_model_json(tmp_path, argparse.Namespace(masks="m"), antialiasing=True, seed=2)
     told = {"masks": "m", "invert_masks": False, "mask_meaning": "auto", "antialiasing": True, "seed": 2}
     assert read_training_options(tmp_path) == MODEL_OPTIONS | told

@@ -1,4 +1,4 @@
-"""The store of decoded pictures: once each, bounded, ahead of use, and the same training whatever it does."""
+"""The store of decoded images: it decodes each once, within a limit, ahead of use, and does not change training."""
 
 import gc
 import threading
@@ -21,7 +21,7 @@ SIZE = (6, 4)
 
 @pytest.fixture
 def files(tmp_path) -> list[Path]:
-    """Ten pictures of 6x4, every one of another colour."""
+    """Ten photos of 6x4 pixels, each of another colour."""
     paths = [tmp_path / f"{number}.png" for number in range(10)]
     for number, path in enumerate(paths):
         Image.new("RGB", SIZE, (20 * number, 10, 0)).save(path)
@@ -29,7 +29,7 @@ def files(tmp_path) -> list[Path]:
 
 
 class Decodings:
-    """Counts calls of `decode` by file, and how many of the pictures are in memory at once."""
+    """Counters of the calls of `decode` by file, and of the images in memory at once."""
 
     def __init__(self) -> None:
         self.names: list[str] = []
@@ -72,7 +72,7 @@ def _pictures(paths: list[Path]) -> list[tuple[Path, tuple[int, int]]]:
 @pytest.mark.parametrize(("limit", "decoded"), [(0, 3), (2, 4), (1, 6)])
 def test_each_is_decoded_once_within_the_limit(files, decodings, limit, decoded):
     store = ImageStore(limit)
-    for name in (0, 1, 0, 2, 0, 1):  # with room for two: 2 takes the place of 1, as 0 was used after it
+    for name in (0, 1, 0, 2, 0, 1):  # with room for two: 2 replaces 1, since 0 was used later
         store.get(files[name], SIZE)
         assert not limit or len(store) <= limit
     assert len(decodings.names) == decoded
@@ -92,7 +92,7 @@ def test_decoding_ahead_gives_the_right_pictures_within_the_limit(files, decodin
         picture = store.get(files[number], SIZE)
         assert picture[0, 0, 0] == 20 * number and picture.shape == (3, 4, 6)
         del picture
-        if step % 7 == 0:  # scoring asks for views that nobody announced
+        if step % 7 == 0:  # scoring asks for views that were not prefetched
             assert store.get(files[step % 10], SIZE)[0, 0, 0] == 20 * (step % 10)
         assert not limit or len(store) <= limit
     gc.collect()
@@ -123,14 +123,14 @@ def test_a_coming_picture_that_is_there_is_not_dropped_for_another(files, decodi
     store.plan(_pictures(files))
     for number in (0, 1, 2):
         store.get(files[number], SIZE)
-    store.prefetch(_pictures([files[0], files[3]]))  # 0 is the longest unused, but 1 has to go
+    store.prefetch(_pictures([files[0], files[3]]))  # 0 is unused for longest, but 1 must be dropped
     for number in (0, 3, 2):
         store.get(files[number], SIZE)
     assert decodings.names == ["0", "1", "2", "3"]
 
 
 def test_no_threads_remain_when_all_is_there(files):
-    others = _decoders()  # of stores that earlier tests have left to the garbage collector
+    others = _decoders()  # decoders of earlier tests' stores that the garbage collector has not yet removed
     store = ImageStore(0)
     store.plan(_pictures(files))
     for step, path in enumerate(files):
@@ -220,7 +220,7 @@ def test_a_gpu_keeps_what_fits_its_share(files, monkeypatch):
 @pytest.mark.parametrize("limit", [0, 3])
 @pytest.mark.parametrize("keep_on", ["cuda", "cpu"])
 def test_pictures_reach_the_gpu_whole(tmp_path, limit, keep_on):
-    """Large enough that a copy takes a while, with kernels on the current stream that read at once."""
+    """Images so large that a copy takes a while, read at once by kernels on the current stream."""
     rng = np.random.default_rng(0)
     size = (1024, 768)
     paths = [tmp_path / f"{number}.bmp" for number in range(8)]

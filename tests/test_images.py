@@ -1,4 +1,4 @@
-"""Pictures: sizes, modes, resizing against Pillow, broken files, the bounded store."""
+"""Photos to images: sizes, modes, resizing against Pillow, broken files, the bounded store."""
 
 import io
 
@@ -105,9 +105,9 @@ def test_alpha_is_copied_at_full_size_and_weighs_colours_when_shrunk(tmp_path):
         [np.array(Image.fromarray(c.astype(np.float32)).resize((8, 8), separate)) for c in premultiplied.numpy()]
     )
     alpha = np.array(Image.fromarray(pixels[..., 3].astype(np.float32)).resize((8, 8), separate)).clip(0, 255)
-    seen = alpha > 20  # colour of nearly transparent pixels is rounded coarsely
+    seen = alpha > 20  # colours of nearly transparent pixels are rounded coarsely
     difference = np.abs(small[:3].numpy() - wanted / np.maximum(alpha, 1) * 255)[:, seen]
-    assert seen.any() and difference.max() <= 255 / 20  # half a step of the premultiplied colour, undone
+    assert seen.any() and difference.max() <= 255 / 20  # half a step of the premultiplied colour, divided by alpha
     assert np.abs(small[3].numpy() - alpha).max() <= 1
 
 

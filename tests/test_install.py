@@ -1,4 +1,4 @@
-"""What installs the project: the extensions' builder and its messages, the root's wheel."""
+"""Installation: the extensions' builder and its messages, and the root's wheel."""
 
 import ctypes
 import importlib.util
@@ -20,7 +20,7 @@ COMMON = ROOT / "submodules" / "common"
 
 
 def load(name: str) -> ModuleType:
-    """A module of submodules/common, which is on no path."""
+    """Load a module of submodules/common, which is on no path."""
     spec = importlib.util.spec_from_file_location(name, COMMON / f"{name}.py")
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
@@ -35,7 +35,7 @@ def builder(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
 
 
 def fake_nvcc(folder: Path, release: str = "13.0") -> Path:
-    """A toolkit folder whose nvcc answers --version, --list-gpu-arch and --dryrun as the real one does."""
+    """A toolkit folder whose nvcc answers --version, --list-gpu-arch and --dryrun like the real one."""
     nvcc = folder / "bin" / "nvcc"
     nvcc.parent.mkdir(parents=True)
     nvcc.write_text(
@@ -73,7 +73,7 @@ def test_missing_compiler(builder: ModuleType, monkeypatch: pytest.MonkeyPatch, 
 
 
 class TestCudaSwitch:
-    """GS_CUDA, CUDA_HOME, PATH and torch's own CUDA decide; whether a GPU is visible does not."""
+    """GS_CUDA, CUDA_HOME, PATH and torch's own CUDA decide; a visible GPU does not."""
 
     def test_unset_follows_torch_and_nvcc(
         self, builder: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
@@ -148,7 +148,7 @@ class TestCudaSwitch:
 
 
 def write_extension(folder: Path, kernel: str) -> None:
-    """A tiny extension; its ops.cpp sees no torch, to be quick."""
+    """A tiny extension whose ops.cpp includes no torch, so that it compiles quickly."""
     (folder / "toy").mkdir()
     (folder / "toy" / "__init__.py").touch()
     (folder / "csrc" / "cpu").mkdir(parents=True)
@@ -194,7 +194,7 @@ def test_compile_error_ends_without_traceback(tmp_path: Path) -> None:
     write_extension(tmp_path, "int broken() { return no_such_name; }")
     done = build_extension(tmp_path)
     assert done.returncode == 1
-    assert "kernel_isa.cpp:1:23: error:" in done.stderr  # the compiler's own words
+    assert "kernel_isa.cpp:1:23: error:" in done.stderr  # the compiler's own message
     assert "Traceback" not in done.stderr
     assert not (tmp_path / "toy" / "_backend.so").exists()
 
@@ -238,8 +238,8 @@ def test_root_wheel_has_requirements_and_no_packages(tmp_path: Path) -> None:
     requires = [line.partition(": ")[2] for line in metadata.splitlines() if line.startswith("Requires-Dist: ")]
     extensions = [requirement for requirement in requires if " @ file://" in requirement]
     assert len(extensions) == 3
-    # pip 23 to 26 may serve a wheel from their cache where the last part of the URL looks like "name-version".
+    # pip 23 to 26 may use a cached wheel if the last part of the URL looks like "name-version".
     assert not any(re.search(r"\w-\w", url.rpartition("/")[2]) for url in extensions)
-    # The torch that is installed here stays.
+    # The installed torch stays.
     assert "torch" in requires and "torchvision" in requires
     assert any(requirement.startswith("numpy==") for requirement in requires)

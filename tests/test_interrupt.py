@@ -1,4 +1,4 @@
-"""SIGHUP waits for a good moment as SIGTERM does; the terminal that it tells of is gone."""
+"""SIGHUP waits for a safe moment as SIGTERM does, although the terminal is gone by then."""
 
 import os
 import pty
@@ -14,7 +14,7 @@ from utils.system_utils import Terminated
 
 ROOT = Path(__file__).parents[1]
 
-# Writes to its terminal before and after each wait; says in a file what came of it.
+# A program that writes to its terminal before and after each wait, and the result to a file.
 WORK = """
 import sys, time
 from pathlib import Path

@@ -17,7 +17,7 @@ def _pair(height: int, width: int, seed: int = 0) -> tuple[torch.Tensor, torch.T
 
 
 def _ssim_map(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Double-precision SSIM map of (3, H, W) with zeros outside, by SciPy's correlation."""
+    """The SSIM map of (3, H, W) in double, with zeros outside, by SciPy's correlation."""
     window = np.exp(-0.5 * ((np.arange(11) - 5) / 1.5) ** 2)
     window /= window.sum()
 
@@ -33,7 +33,7 @@ def _ssim_map(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 def test_plain_ssim_equals_a_double_precision_correlation(size):
     a, b = _pair(*size)
     expected = _ssim_map(a.double().numpy(), b.double().numpy()).mean()
-    # Variances are differences of blurred squares near 1, so float32 leaves some 1e-6 (2^-24 * 11 / 9e-4 a pixel).
+    # Variances are differences of blurred squares near 1, so float32 errors are some 1e-6 (2^-24 * 11 / 9e-4 a pixel).
     assert abs(ssim(a, b).item() - expected) < 1e-5
     assert abs(ssim(a.double(), b.double()).item() - expected) < 1e-12
 

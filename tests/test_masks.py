@@ -1,4 +1,4 @@
-"""Masks: their files, their two meanings in loss, views, renders and scores."""
+"""Masks: their files, and their two meanings in loss, views, renders and scores."""
 
 import json
 import sys
@@ -27,7 +27,7 @@ from utils.system_utils import UserError
 
 
 def _pair(seed: int = 0, size: tuple[int, int] = (37, 53)) -> tuple[Tensor, Tensor, Tensor]:
-    """Image, target and a mask with a large hole, a small one, and single pixels."""
+    """An image, a target and a mask with a large hole, a small hole and single pixels."""
     generator = torch.Generator().manual_seed(seed)
     image = torch.rand(3, *size, generator=generator)
     target = (image + 0.2 * torch.randn(3, *size, generator=generator)).clamp(0, 1)
@@ -55,7 +55,7 @@ def test_loss_and_gradient_are_those_of_the_definition(weight, as_bytes):
     dissimilarity = (1 - ssim_map(exact * mask, truth * mask)).sum() / pixels
     expected = (1 - weight) * expected_l1 + weight * dissimilarity
     expected.backward()
-    # float32's share: 1 - SSIM is a difference of numbers near 1, then multiplied by what the mask leaves out (1.4).
+    # The error of float32: 1 - SSIM is a difference of numbers near 1, then multiplied by 1.4 for the masked pixels.
     assert loss.item() == pytest.approx(expected.item(), abs=1e-5)
     assert l1.item() == pytest.approx(expected_l1.item(), abs=1e-6)
     assert (image.grad - exact.grad).abs().max() < 1e-5 * exact.grad.abs().max()
@@ -120,7 +120,7 @@ def test_at_other_sizes_what_counts_is_free_of_what_is_masked(tmp_path, size):
     one, two = (decode(_save(tmp_path / f"{i}.png", p), size) for i, p in enumerate((picture, other)))
     same = (one == two).all(dim=0)
     assert (counts <= same).all()
-    # No more than needed is lost: 2 and a part pixels of the coarser size around the masked 33 x 15.
+    # Only necessary pixels are lost: 2 and a fraction, at the coarser size, around the masked 33 x 15.
     scale = min(size[0] / 120, 1)
     assert (~counts).sum() <= (max(size[0] / 120, 1)) ** 2 * (33 * scale + 6) * (15 * scale + 6)
 
@@ -142,7 +142,7 @@ def test_a_mask_may_be_the_alpha_of_a_picture(tmp_path):
 
 @pytest.fixture
 def masked_scene(colmap_scene) -> Path:
-    """Masks for all 17 pictures, named in several ways: the left third is black."""
+    """Write masks for all 17 photos, named in several ways, whose left third is black."""
     for index, camera in enumerate(_read(colmap_scene).train_cameras):
         name = Path(camera.image_name)
         grey = np.full((HEIGHT, WIDTH), 255, np.uint8)
@@ -189,7 +189,7 @@ def test_a_transparent_mask_is_alpha(masked_scene):
         assert (target[:, :, :32] == torch.tensor([0.25, 0.5, 1.0])[:, None, None]).all()
     view = _views(masked_scene, masks="masks", mask_meaning="transparent")[0]
     assert torch.equal(view.target(torch.ones(3))[:, :, 32:], (plain / 255)[:, :, 32:])
-    # At half the size too: what is cut away does not bleed into the edge.
+    # Also at half the size: masked pixels do not bleed into the edge.
     half = _views(masked_scene, masks="masks", mask_meaning="transparent", resolution=48)[0]
     edge = half._pixels()[:, :, 16].int()
     assert (edge[3] > 200).all() and (edge[:3] - smooth[:, :, 16].int()).abs().float().mean() < 4
@@ -257,7 +257,7 @@ def test_what_is_to_be_ignored_must_be_there(colmap_scene, masked_scene):
 
 def _train(scene: Path, out: Path, *options: object) -> bytes:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sys, "stdout", sys.stdout)  # which training stamps: bring it back
+        patch.setattr(sys, "stdout", sys.stdout)  # restored afterwards, since training stamps it
         command = ["-s", scene, "-m", out, "--iterations", 40, "--test_iterations", -1, "--eval", "-r", 48, *options]
         train.main(list(map(str, command)))
     return (out / "point_cloud" / "iteration_40" / "point_cloud.ply").read_bytes()
@@ -288,7 +288,7 @@ def test_training_rendering_and_scores_ignore_what_is_masked(masked_scene, tmp_p
     info = json.loads((tmp_path / "masked" / "metrics_info.json").read_text())
     assert info["masked_views"] == {"ours_40": 3} and "mean over the pixels that count" in info["masked"]["PSNR"]
 
-    # Other things behind the masks: the same model to the byte.
+    # Other pixels behind the masks give the same model to the byte.
     for path in (masked_scene / "images").rglob("*.png"):
         pixels = np.asarray(Image.open(path)).copy()
         pixels[:, : WIDTH // 3] = 255 - pixels[:, : WIDTH // 3]
@@ -296,7 +296,7 @@ def test_training_rendering_and_scores_ignore_what_is_masked(masked_scene, tmp_p
     assert _train(masked_scene, tmp_path / "masked_again", *masks, "--images_to_load", 3) == masked
     assert _train(masked_scene, tmp_path / "plain_again") != plain
 
-    # Render without masks: those of before do not stay.
+    # Rendering without masks removes the earlier ones.
     run(render, "-m", tmp_path / "masked", "--skip_train", "--quiet", "--masks", "")
     assert list((folder / "masks").iterdir()) == []
 
@@ -335,7 +335,7 @@ def test_masks_that_leave_nothing_do_not_train_silently(masked_scene, tmp_path, 
     assert not (tmp_path / "out" / "point_cloud").exists()
     assert _train(masked_scene, tmp_path / "out", "--masks", "masks", "--invert_masks")
     assert "warning: the masks" not in capsys.readouterr().err
-    # One view that trains is enough, with a word on the others.
+    # One view that trains is enough; a message names the others.
     _save(paths[1], np.full((HEIGHT, WIDTH), 255, np.uint8))
     assert _train(masked_scene, tmp_path / "out", "--masks", "masks")
     assert capsys.readouterr().err.count("warning: the masks of 13 of 14 views leave none or almost none") == 1
@@ -349,7 +349,7 @@ def test_views_that_count_are_looked_at_once(capsys):
             mask.view(-1)[:counting] = True
         return SimpleNamespace(uid=uid, image_name=f"v{uid}", mask=mask, columns=columns)
 
-    # 9 of 10000 pixels are almost nothing, and the first 50 of a row are not in its right half.
+    # 9 of 10000 pixels are too few, and the first 50 of a row are not in its right half.
     views = [view(0, 9), view(1, 10), view(2, None), view(3, 50, slice(50, 100))]
     watch = MaskWatch(views)
     for one in (*views[:3], views[0]):
@@ -362,7 +362,7 @@ def test_views_that_count_are_looked_at_once(capsys):
     said = capsys.readouterr().err
     assert said.count("warning") == 1 and "2 of 4 views" in said and "(v0, v3)" in said
 
-    # Of thousands of views some may have nothing; a hundred without a pixel are no accident.
+    # Some of thousands of views may have no pixel; a hundred such views are a mistake.
     views = [view(uid, 0) for uid in range(150)]
     watch = MaskWatch(views)
     for one in views[:99]:

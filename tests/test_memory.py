@@ -1,4 +1,4 @@
-"""Too little memory: what is said beforehand, what is saved when it happens, and how the sentence reads."""
+"""Too little memory: the warning beforehand, the files saved when memory runs out, and the message."""
 
 import re
 import signal
@@ -26,13 +26,13 @@ from utils.system_utils import UserError, run_cli
 
 ROOT = Path(__file__).parents[1]
 HUGE = 1 << 60
-# What torch says on a GPU that is full.
+# torch's message on a full GPU.
 ON_A_GPU = torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 20.00 GiB. GPU 0 has a total capacity of ...")
 
 
 @pytest.fixture(autouse=True)
 def _stdout(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Training stamps stdout: bring it back."""
+    """Restore stdout, which training stamps."""
     monkeypatch.setattr(sys, "stdout", sys.stdout)
 
 
@@ -116,7 +116,7 @@ def _train(scene: Path, out: Path, *more: object) -> bytes:
 
 
 def _failing(function, call: int, error: Exception):
-    """`function`, but for one call that raises."""
+    """Wrap `function` so that one call raises."""
     calls = []
 
     def fails(*args: object, **kwargs: object) -> object:
@@ -166,7 +166,7 @@ def test_a_picture_that_does_not_fit_saves_too(colmap_scene, tmp_path, monkeypat
     ids=["cloning", "splitting", "pruning"],
 )
 def test_a_densification_cut_short_is_saved_whole(colmap_scene, tmp_path, monkeypatch, of, name, call, count):
-    """Of 300 Gaussians 4 are cloned and 296 split in two."""
+    """Clone 4 of 300 Gaussians and split 296 in two."""
     plain = GaussianModel.densify_and_prune
 
     def densify(*args: object, **kwargs: object) -> None:
@@ -249,7 +249,7 @@ def test_the_estimate_and_its_warnings(colmap_scene, tmp_path, monkeypatch, capf
 
 
 def test_the_estimate_counts_what_a_step_allocates():
-    """Held to torch's own count of the tensors: parameters, gradients and moments are exact."""
+    """The estimate of parameters, gradients and moments equals torch's own count of the tensors."""
     gaussians = model(50)
     gaussians.training_setup(options())
     for group in gaussians.optimizer.param_groups:
@@ -263,7 +263,7 @@ def test_the_estimate_counts_what_a_step_allocates():
     assert training_bytes(gaussians, 50, 0) - 50 * memory_estimate.PER_GAUSSIAN == counted
 
 
-# Pictures and processes
+# Images and processes
 
 
 def test_render_decodes_only_what_it_renders(colmap_scene, tmp_path, monkeypatch):

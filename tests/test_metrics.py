@@ -1,4 +1,4 @@
-"""metrics.py: numbers against others' code, files by contract, LPIPS against its package, errors."""
+"""metrics.py: numbers against independent code, files by contract, LPIPS against its package, errors."""
 
 import json
 import math
@@ -24,7 +24,7 @@ ROOT = Path(__file__).parents[1]
 
 
 def picture(seed: int, height: int = 40, width: int = 56) -> np.ndarray:
-    """Smooth random (H, W, 3) uint8."""
+    """A smooth random image (H, W, 3) uint8."""
     rng = np.random.default_rng(seed)
     small = Image.fromarray(rng.integers(0, 256, (7, 9, 3), dtype=np.uint8))
     return np.asarray(small.resize((width, height), Image.Resampling.BICUBIC))
@@ -49,7 +49,7 @@ def make_model(folder: Path, names: tuple[str, ...] = ("00001.png", "00000.png")
 
 @pytest.fixture
 def run(tmp_path, monkeypatch, capsys):
-    """metrics.py's command line, with an empty weights cache and a network that refuses: (status, stdout, stderr)."""
+    """Run metrics.py without cached weights and network; return (status, stdout, stderr)."""
 
     def command(*arguments: object) -> tuple[int, str, str]:
         monkeypatch.setattr(sys, "argv", ["metrics.py", *map(str, arguments)])
@@ -69,7 +69,7 @@ def run(tmp_path, monkeypatch, capsys):
 
 @pytest.fixture(scope="module")
 def weights(tmp_path_factory) -> dict[str, tuple[Path, torch.nn.Module]]:
-    """For each backbone a state-dict file in torchvision's format, and the package's own model of the same weights."""
+    """For each backbone, a state-dict file in torchvision's format and the package's model with the same weights."""
     lpips = import_lpips()
     made = {}
     for net in ("vgg", "alex"):
@@ -112,7 +112,7 @@ def test_ssim_is_scikit_images_inside_and_zero_padded_at_the_border():
         "use_sample_covariance": False,
         "full": True,
     }
-    # scikit-image reflects at borders: black rims of the window's radius make both see zeros there.
+    # scikit-image reflects at borders. With black rims of the window's radius, both see zeros there.
     padded = [np.pad(image, ((5, 5), (5, 5), (0, 0))) / 255.0 for image in (render, truth)]
     _, full = structural_similarity(*padded, **options)
     assert metrics.ssim(render, truth) == pytest.approx(full[5:-5, 5:-5].mean(), abs=1e-9)
@@ -237,7 +237,7 @@ def test_files_by_contract(tmp_path, weights, run):
     assert info["views"] == {"ours_30": 2}
     assert info["trained_with_eval"] is True
 
-    # Inputs as they are for LPIPS, mapped to [-1, 1] for the others; told apart by the package itself.
+    # LPIPS takes unmapped inputs, the others map them to [-1, 1]; the package itself computes both.
     pair = [Image.open(model / "test" / "ours_30" / side / "00000.png") for side in ("renders", "gt")]
     images = [torch.from_numpy(np.asarray(image).transpose(2, 0, 1).copy())[None] / 255 for image in pair]
     for key, net, normalize in (("LPIPS", "vgg", False), ("LPIPS_vgg", "vgg", True), ("LPIPS_alex", "alex", True)):
@@ -267,7 +267,7 @@ def test_several_models_and_methods_and_alpha(tmp_path, run):
     truth = second / "test" / "ours_7" / "gt" / "00000.png"
     with Image.open(truth) as image:
         opaque = image.convert("RGBA")
-    opaque.putalpha(40)  # the first three channels count, whatever alpha says
+    opaque.putalpha(40)  # the first three channels count, whatever the alpha
     opaque.save(truth)
     assert run("-m", first, second)[0] == 0
     one = json.loads((first / "results.json").read_text())

@@ -1,4 +1,4 @@
-"""nerfstudio and instant-ngp folders: the same views as from the COLMAP model they were made of; and intrinsics."""
+"""nerfstudio and instant-ngp folders: the views of the COLMAP model that they were made from, and intrinsics."""
 
 import json
 import math
@@ -23,7 +23,7 @@ BROWN = (110.0, 110.0, 45.0, 34.5, -0.2, 0.03, 0.004, -0.003)
 
 
 def make_nerfstudio_scene(folder: Path, *, distorted: bool = False, views: int = 17) -> pycolmap.Reconstruction:
-    """A COLMAP scene with transforms.json beside it, written from pycolmap's poses."""
+    """A COLMAP scene with a transforms.json written from pycolmap's poses."""
     model, params = ("OPENCV", BROWN) if distorted else ("PINHOLE", BROWN[:4])
     reconstruction = make_colmap_scene(folder, model=model, params=params, views=views)
     frames = []

@@ -9,7 +9,7 @@ BETAS = (0.9, 0.999)
 
 
 def gradients_of(shape: tuple[int, ...], steps: int, dtype: torch.dtype) -> list[torch.Tensor]:
-    """Sizes from 1e-30 to 1e10, each row its own, signs changing from step to step, some exactly zero."""
+    """Gradients of sizes 1e-30 to 1e10, one size per row, with signs that change at every step, some exactly zero."""
     generator = torch.Generator().manual_seed(0)
     size = 10 ** torch.linspace(-30, 10, shape[0], dtype=torch.float64).reshape(-1, *[1] * (len(shape) - 1))
     out = [torch.randn(shape, generator=generator, dtype=torch.float64) * size for _ in range(steps)]
@@ -32,14 +32,14 @@ def test_fifty_steps_are_torchs(dtype, eps):
         adam(ours, gradient, mean, square, rate, BETAS, eps, float(step))
     unit = torch.finfo(dtype).eps
     state = optimizer.state[theirs]
-    # Each step rounds the moments anew, two or three operations of one unit each, and beta fades the old ones.
+    # Each step rounds the moments by two or three operations of one unit each, and beta fades earlier errors.
     for got, wanted in ((mean, state["exp_avg"]), (square, state["exp_avg_sq"])):
         spread = wanted.abs().amax(dim=(1, 2), keepdim=True)
         assert ((got - wanted).abs() <= 60 * unit * spread + torch.finfo(dtype).tiny).all()
     assert torch.isfinite(ours).all()
     moved = (theirs.detach() - start).abs()
     assert moved.max() > 10 * rate
-    # Fifty updates of up to `rate`, each good to some units, summed into values of about 3.
+    # Fifty updates of up to `rate`, each exact to some units, are summed into values of about 3.
     torch.testing.assert_close(ours, theirs.detach(), rtol=0, atol=50 * unit * (4 + 20 * rate))
 
 
@@ -57,7 +57,7 @@ def test_columns_left_out_are_not_touched(columns):
     for got, wanted, before in zip(part, whole, (start, 0 * start, 0 * start), strict=True):
         got, wanted, before = (t.reshape(n, 45) for t in (got, wanted, before))
         assert torch.equal(got[:, columns:], before[:, columns:])
-        # Rows cut elsewhere into vectors may round a last place otherwise.
+        # If vectors start elsewhere in a row, a last place may be rounded differently.
         torch.testing.assert_close(got[:, :columns], wanted[:, :columns], rtol=1e-5, atol=1e-6)
 
 
@@ -81,7 +81,7 @@ def test_any_number_of_threads_gives_the_same_bits(columns):
 
 
 def test_many_tensors_in_one_call_are_each_by_itself():
-    """Twenty of them, more than one launch on a GPU takes, with rates, columns and counters of their own."""
+    """Twenty tensors, more than one launch on a GPU takes, each with its own rate, columns and counter."""
     generator = torch.Generator().manual_seed(4)
     shapes = [(), (7,), (300, 1), (40, 15, 3), (0, 3)] * 4
     together = [[torch.randn(shape, generator=generator) for shape in shapes] for _ in range(3)]

@@ -14,7 +14,7 @@ def scene(n: int = 3, dtype: torch.dtype = torch.float32):
 
 
 def call(splats, camera, **changes):
-    """The public class's call, by keyword as users write it."""
+    """Call the public class with keywords, as users do."""
     arguments = {
         "means3D": splats["means"],
         "means2D": torch.zeros_like(splats["means"]),
@@ -43,7 +43,7 @@ def test_settings_are_the_references_tuple():
         "antialiasing",
     ]
     assert GaussianRasterizationSettings._fields[:13] == tuple(names)
-    # Ours come behind and have defaults, so that the reference's 13 stay valid, by place as by name.
+    # Our fields follow and have defaults, so that the reference's 13 stay valid by position and by name.
     assert set(GaussianRasterizationSettings._fields[13:]) == set(GaussianRasterizationSettings._field_defaults)
     splats, camera = scene()
     by_place = GaussianRasterizationSettings(*camera[:13])
@@ -77,7 +77,7 @@ def test_the_class_and_the_function_agree():
     assert torch.equal(color, out.color) and torch.equal(radii, out.radii)
     assert torch.equal(inverse_depth, out.inverse_depth)
     raw = render(few(3, dtype=torch.float32)[0], camera)
-    # Activated outside in float32, or inside.
+    # Parameters activated outside in float32, or inside.
     torch.testing.assert_close(raw.color, out.color, rtol=0, atol=2e-6)
 
 
@@ -125,7 +125,7 @@ def test_quaternions_are_not_normalised_without_raw():
     double = splats | {"rotations": splats["rotations"] * 1.2}
     assert not torch.equal(call(double, camera)[0], call(splats, camera)[0])
     raw, _ = few(1, dtype=torch.float32)
-    # A power of two changes no bit of the normalised one.
+    # Scaling by a power of two changes no bit of the normalised quaternion.
     assert torch.equal(render(raw | {"rotations": 4 * raw["rotations"]}, camera).color, render(raw, camera).color)
 
 
@@ -163,10 +163,10 @@ def test_strided_inputs_give_the_same_bits():
         wide = torch.full((2 * t.shape[0], *t.shape[1:-1], 2 * t.shape[-1]), float("nan"))
         wide[::2, ..., ::2] = t
         assert torch.equal(render(splats | {name: wide[::2, ..., ::2]}, camera, raw=False).color, wanted), name
-    features = torch.cat([splats["sh_dc"], splats["sh_rest"]], 1)  # as the reference's callers have them
+    features = torch.cat([splats["sh_dc"], splats["sh_rest"]], 1)  # as in the reference's callers
     sliced = splats | {"sh_dc": features[:, :1], "sh_rest": features[:, 1:]}
     assert torch.equal(render(sliced, camera, raw=False).color, wanted)
-    gradient = torch.ones_like(wanted).mT.contiguous().mT  # a backward may be handed any strides
+    gradient = torch.ones_like(wanted).mT.contiguous().mT  # a backward may get any strides
     inputs = leaves(splats)
     render(inputs, camera, raw=False).color.backward(gradient)
     plain = leaves(splats)
@@ -230,7 +230,7 @@ def test_nothing_is_kept_without_gradients():
     assert torch.equal(skipped, y0 * wide + x0)
     assert training["last"].shape == (7, 18)
     assert torch.equal(rendering["color"], training["color"])
-    # The public function decides by the grad mode and by its inputs.
+    # The public function chooses by the grad mode and by its inputs.
     with torch.no_grad():
         assert render(leaves(splats), camera, raw=False).color.grad_fn is None
     assert render(splats, camera, raw=False).color.grad_fn is None

@@ -1,4 +1,4 @@
-"""The CUDA backend against the CPU's, and with itself. Needs a GPU and a build with CUDA."""
+"""The CUDA backend against the CPU's and against itself. Needs a GPU and a build with CUDA."""
 
 import math
 
@@ -14,7 +14,7 @@ PLANES = ("color", "inverse_depth", "transmittance")
 
 
 def run(scene: SplatScene, device: str, dtype: torch.dtype = torch.float32, keep=None, **changes) -> dict:
-    """Every plane, radii and every gradient of a weighted sum of all planes; `keep` masks pixels."""
+    """All planes, the radii and all gradients of a weighted sum of the planes; keep: the pixels that count."""
     parameters = {name: t.float().to(dtype) for name, t in scene.parameters.items()}
     return gradients(parameters, scene.settings(dtype, **changes), device, lambda out: loss_of(out, keep))
 
@@ -28,7 +28,7 @@ def largest_error(got: torch.Tensor, wanted: torch.Tensor) -> float:
 def test_errors_are_those_of_cpu_float(kind, antialiasing):
     scene = KINDS[kind]()
     double = run(scene, "cpu", torch.float64, antialiasing=antialiasing)
-    # Rounding decides at cut-offs: pixels where CPU float itself is off by more than rounding are left out for all.
+    # Rounding decides at cut-offs, so leave out, for all, pixels where CPU float is off by more than rounding.
     cpu, gpu = (run(scene, device, antialiasing=antialiasing) for device in ("cpu", "cuda"))
     off = sum(((x["color"] - double["color"]).abs().amax(0) > 1e-4).int() for x in (cpu, gpu))
     keep = (off == 0)[None]
@@ -55,14 +55,14 @@ def test_errors_are_those_of_cpu_float(kind, antialiasing):
 def test_sizes(n, width, height):
     scene = frustum(n, width, height, 4.0, seed=3)
     got, wanted = run(scene, "cuda"), run(scene, "cpu")
-    # Float against float: twice an error of 3e-6, and a few pixels at a cut-off.
+    # Float against float allows twice an error of 3e-6, and a few pixels at a cut-off.
     off = torch.stack([((got[name] - wanted[name]).abs() > 2e-5).any(0) for name in PLANES]).any(0)
     assert off.float().mean() <= 0.002
     got, wanted = (run(scene, device, keep=~off) for device in ("cuda", "cpu"))
     for name in wanted:
         assert got[name].shape == wanted[name].shape
         if name.startswith("d ") and n:
-            # CPU float is off from double by up to 1.4e-6 here; CUDA may be by three times that: 6e-6 in all, doubled.
+            # CPU float differs from double by up to 1.4e-6 here; CUDA may by three times that: 6e-6 in all, doubled.
             assert largest_error(got[name], wanted[name]) <= 1.2e-5, name
 
 
@@ -84,7 +84,7 @@ def test_other_stream():
 
 
 def test_gradients_do_not_depend_on_how_many_instances_there_are():
-    """Up to 2^20 instances each has a gradient row, above only those processed: a splat notices no difference."""
+    """Up to 2^20 instances, each has a gradient row, above only processed ones; a splat's gradient is the same."""
     scene = frustum(60_000, 1280, 800, 8.0, seed=11)
     camera, p = scene.settings(torch.float32), scene.parameters
     arguments = (p["means"], p["opacities"], p["scales"], p["rotations"], None, None, p["sh_dc"], p["sh_rest"])
@@ -94,7 +94,9 @@ def test_gradients_do_not_depend_on_how_many_instances_there_are():
     left = ((counts > 0) & (rects[:, 2] <= 36)).nonzero().flatten()
     right = ((counts > 0) & (rects[:, 0] >= 44)).nonzero().flatten()
     both = torch.cat((left, right))
-    assert counts[left].sum() < 0.9 * 2**20 and counts[both].sum() > 1.1 * 2**20  # the CPU's counts, which may differ
+    assert (
+        counts[left].sum() < 0.9 * 2**20 and counts[both].sum() > 1.1 * 2**20
+    )  # the CPU's counts, from which a GPU's may differ
     few, many = (run(SplatScene({k: v[rows] for k, v in p.items()}, 1280, 800), "cuda") for rows in (left, both))
     for name in few:
         if name.startswith("d "):
@@ -102,8 +104,10 @@ def test_gradients_do_not_depend_on_how_many_instances_there_are():
 
 
 def one_long_list() -> SplatScene:
-    """A tile of 1,750 faint splats, which its pixels blend to the last one, but for those that dense ones in the middle
-    of the list close."""
+    """A tile of 1,750 faint splats, with dense ones in the middle of the list.
+
+    Most pixels blend all faint splats; the dense ones end some pixels early.
+    """
     g = torch.Generator().manual_seed(14)
     n, size = 1750, 16
     depth = 1 + torch.arange(n)[:, None] / n
@@ -122,7 +126,7 @@ def one_long_list() -> SplatScene:
 
 
 def test_several_blocks_share_a_long_list():
-    """Every part of the list starts from what lies behind it; the order in which parts are done changes no bit."""
+    """Every chunk of the list starts from the sums behind it, so the order of the chunks changes no bit."""
     scene = one_long_list()
     double, cpu, gpu = run(scene, "cpu", torch.float64), run(scene, "cpu"), run(scene, "cuda")
     closed = double["transmittance"] < 1.5e-4  # the others end at 2e-4 or so
@@ -156,7 +160,7 @@ def test_culling_changes_no_bit():
 
 
 def test_adam_is_the_cpus_to_rounding():
-    """Twenty tensors at once, more than a launch takes, some with columns left out and one empty."""
+    """Twenty tensors at once, more than a launch takes, some with inactive columns and one empty."""
     generator = torch.Generator().manual_seed(9)
     shapes = [(500, 45), (1,), (700, 3), (0, 4), (33, 15, 3)] * 4
     columns = [9 if shape == (500, 45) else -1 for shape in shapes]
@@ -170,7 +174,7 @@ def test_adam_is_the_cpus_to_rounding():
         rest = (rates, 0.9, 0.999, 1e-15, columns)
         OPS.adam_(state[0], gradients, *state[1:], counters[0], *rest)
         OPS.adam_(on_gpu[0], [g.cuda() for g in gradients], *on_gpu[1:], counters[1], *rest)
-    # Twenty steps of 1e-2, each good to some units in the last place.
+    # Twenty steps of 1e-2, each exact to some units in the last place.
     for got, wanted in zip(on_gpu[0], state[0], strict=True):
         torch.testing.assert_close(got.cpu(), wanted, rtol=1e-6, atol=1e-6)
     assert all(counter == 20 for counter in counters[1])
@@ -187,7 +191,7 @@ def test_sparse_adam_is_the_cpus_to_rounding():
         seen[:400] = torch.rand(400, generator=generator) < 0.5
         OPS.sparse_adam_(value, gradient, mean, square, seen, 1e-2, 0.9, 0.999, 1e-15, 9)
         OPS.sparse_adam_(on_gpu[0], gradient.cuda(), *on_gpu[1:], seen.cuda(), 1e-2, 0.9, 0.999, 1e-15, 9)
-    # Twenty steps of up to 3e-2, each good to some units in the last place; rows never seen to the bit.
+    # Twenty steps of up to 3e-2, each exact to some units in the last place; rows never seen are equal to the bit.
     torch.testing.assert_close(on_gpu[0].cpu(), value, rtol=1e-6, atol=1e-6)
     assert torch.equal(on_gpu[0][400:].cpu(), start[400:])
     assert not torch.equal(value[:400], start[:400])

@@ -14,7 +14,7 @@ SIZE = (75, 53)
 
 
 def _crowd(n: int = 1500) -> SplatScene:
-    """Splats so opaque and so many that most of them are hidden; some are behind the camera or beside the image."""
+    """Opaque splats, so many that most are hidden; some are behind the camera or beside the image."""
     scene = frustum(n, *SIZE, 2.0, seed=12)
     scene.parameters["opacities"] += 3.0
     scene.parameters["means"][::40] *= -1.0
@@ -27,7 +27,7 @@ def _decisive(parameters: dict[str, Tensor], camera: GaussianRasterizationSettin
 
 
 def _blended(parameters: dict[str, Tensor], camera: GaussianRasterizationSettings, raw: bool = True) -> Tensor:
-    """(N,) bool: weight in some pixel, by the gradient of the colours, a sum of weights."""
+    """The Gaussians with weight in some pixel, (N,) bool, from the gradient of the colours, a sum of weights."""
     colors = torch.full_like(parameters["means"], 0.5)
     inputs = leaves({name: t for name, t in parameters.items() if not name.startswith("sh_")} | {"colors": colors})
     render(inputs, camera, raw=raw).color.sum().backward()
@@ -75,7 +75,7 @@ def test_without_the_others_no_bit_changes(antialiasing, device, dtype):
         assert torch.equal(getattr(before, name), getattr(after, name)), name
     blended = _blended(parameters, camera)
     assert not (blended & ~mask).any()
-    for i in blended.nonzero().flatten()[::30].tolist():  # and none of them is too much
+    for i in blended.nonzero().flatten()[::30].tolist():  # and each of them is necessary
         others = mask.clone()
         others[i] = False
         assert not torch.equal(render(pick(parameters, others), camera).color, before.color)
@@ -83,7 +83,7 @@ def test_without_the_others_no_bit_changes(antialiasing, device, dtype):
 
 @BOTH_AND_GPU
 def test_one_that_only_ends_pixels_is_needed(device, dtype):
-    """Two leave 0.0004; the third would leave less than 0.0001, so it ends every pixel and keeps out the fourth."""
+    """Two leave 0.0004. The third would leave less than 0.0001, so it ends every pixel and excludes the fourth."""
     opacities = (0.98, 0.98, 0.9, 0.02)
     scene = together(*(one_splat(z=1.0 + k, opacity=a, scale=50.0) for k, a in enumerate(opacities)))
     parameters = {name: t.to(device, dtype) for name, t in scene.items()}

@@ -1,4 +1,4 @@
-"""One result: from run to run, for any number of threads, and to rounding for every instruction set."""
+"""Determinism: equal results in every run and with any number of threads, and to rounding with any instruction set."""
 
 import os
 import platform
@@ -18,7 +18,7 @@ ROOT = Path(__file__).resolve().parents[1]
 
 @pytest.fixture
 def threads():
-    """Sets how many threads torch uses, for this test."""
+    """A function that sets torch's number of threads for this test."""
     before = torch.get_num_threads()
     yield torch.set_num_threads
     torch.set_num_threads(before)
@@ -32,7 +32,7 @@ def assert_same_bits(a: dict[str, Tensor], b: dict[str, Tensor]) -> None:
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32], ids=["float64", "float32"])
 def test_any_number_of_threads_gives_the_same_bits(threads, dtype):
-    # Enough splats that sorts and sums are cut into several parts, enough tiles that threads take turns.
+    # There are enough splats for several parts in sorts and sums, and enough tiles for threads to take turns.
     scene = ordinary(9000, 203, 117)
     parameters = {name: t.to(dtype) for name, t in scene.parameters.items()}
     camera = scene.settings(dtype, antialiasing=True)
@@ -44,7 +44,7 @@ def test_any_number_of_threads_gives_the_same_bits(threads, dtype):
 
 
 def results() -> dict[str, Tensor]:
-    """Outputs and gradients of the three kinds of scene in both precisions, with this process' instruction set."""
+    """Outputs and gradients of three kinds of scene in both precisions, with this process's instruction set."""
     out = {}
     for kind, make in KINDS.items():
         scene = make(300, 75, 53)
@@ -70,7 +70,7 @@ torch.save(results(), sys.argv[1])
 @pytest.mark.skipif(platform.machine() not in ("x86_64", "AMD64"), reason="one instruction set only")
 @pytest.mark.parametrize("isa", ["baseline", "avx2"])
 def test_instruction_sets_agree_to_rounding(isa, tmp_path):
-    """And in each of them culling changes no bit."""
+    """In every instruction set, culling changes no bit."""
     environment = os.environ | {"GS_ISA": isa}
     environment["PYTHONPATH"] = os.pathsep.join([*sys.path, str(ROOT), str(ROOT / "tests")])
     subprocess.run([sys.executable, "-c", CHILD, str(tmp_path / "results.pt")], env=environment, check=True, cwd=ROOT)
@@ -80,7 +80,7 @@ def test_instruction_sets_agree_to_rounding(isa, tmp_path):
         if t.dtype == torch.int32:
             assert (got[name] - t).abs().max() <= 1
             continue
-        # Measured: 6e-6 and 2e-14, of needles. A pixel within rounding of 1/255 may fall either side: hence nearly all.
+        # Measured on needles: 6e-6 and 2e-14. A few pixels may differ, those within rounding of 1/255.
         bound = 2e-5 if t.dtype == torch.float32 else 5e-14
         near = (got[name] - t).abs() <= bound * t.abs().max()
         assert near.double().mean() > 0.999, name

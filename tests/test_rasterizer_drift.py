@@ -1,5 +1,8 @@
-"""The backward's way back to front: it gets each splat's transmittance by dividing what is behind it by 1 - alpha, on a
-GPU with an approximate reciprocal. Were that biased, its error would grow with the number of splats."""
+"""Rounding along the backward's pass from back to front.
+
+The backward computes each splat's transmittance by dividing the one behind it by 1 - alpha, on a GPU with an
+approximate reciprocal. If that were biased, the error would grow with the number of splats.
+"""
 
 import math
 
@@ -11,13 +14,13 @@ from torch import Tensor
 from benchmarks.workloads.splat_scenes import settings
 
 SIZE = 48
-# The largest error of dLoss/dalpha that exact division leaves in float32 after 1,862 blends (measured beforehand on
-# other data), three times of which a GPU may have: so much of it may come from each division.
+# The bound on the error of a division: three times the largest error of dLoss/dalpha that exact division gives in
+# float32 after 1,862 blends (measured on other data), divided by the number of blends.
 PER_DIVISION = 3 * 3e-6 / 1862
 
 
 def stack(n: int, least: float, most: float) -> dict[str, Tensor]:
-    """Wide splats behind each other over the whole image, whose opacities lie between the two."""
+    """Wide splats, one behind the other, that cover the image and have opacities in the given range."""
     g = torch.Generator().manual_seed(12)
     depth = 1 + torch.arange(n) / n
     focal = SIZE / (2 * math.tan(math.radians(30)))
@@ -32,15 +35,15 @@ def stack(n: int, least: float, most: float) -> dict[str, Tensor]:
 
 
 @CPU_AND_GPU
-# As many as a pixel takes before it is opaque, or nearly: fainter splats are not blended, denser ones end it sooner.
+# A pixel takes about this many before it is opaque: fainter splats are not blended, denser ones end it sooner.
 @pytest.mark.parametrize(("n", "least", "most"), [(900, 0.006, 0.011), (250, 0.02, 0.04)])
 def test_divisions_have_no_bias(n, least, most, device):
     parameters, rest = stack(n, least, most), {"loss": lambda out: out.color.sum(), "raw": False}
     got = gradients(parameters, settings(SIZE, SIZE, torch.float32), device, **rest)
     wanted = gradients({name: t.double() for name, t in parameters.items()}, settings(SIZE, SIZE), **rest)
-    assert 1.5e-4 < wanted["transmittance"].min() < wanted["transmittance"].max() < 0.01  # nobody is left out
-    # A colour's gradient is the sum of alpha T over the pixels. In front T is 1, found by n divisions; the mean over
-    # pixels and splats leaves of the rounding errors, which have either sign, next to nothing.
+    assert 1.5e-4 < wanted["transmittance"].min() < wanted["transmittance"].max() < 0.01  # no splat is left out
+    # A colour's gradient is the sum of alpha T over the pixels. At the front, T is 1 after n divisions. Rounding errors
+    # have either sign, so they almost vanish in the mean over pixels and splats; a bias would not.
     name, front = "d colors", n // 10
     relative = (got[name].double() / wanted[name] - 1)[:, 0]
     drift = relative[:front].mean().item() / (n - front / 2)

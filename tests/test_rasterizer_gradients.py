@@ -1,4 +1,4 @@
-"""Gradients against central differences in float64, where no cut-off is near: 1/255 < alpha < 0.99 on all pixels."""
+"""Gradients against central differences in float64, far from cut-offs: 1/255 < alpha < 0.99 on all pixels."""
 
 import math
 
@@ -12,14 +12,14 @@ from utils.sh_utils import RGB2SH
 
 @pytest.fixture(autouse=True)
 def one_thread():
-    """Images of a hundred pixels: more threads only wait for each other."""
+    """Use one thread: on images of a hundred pixels, more only wait for each other."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     yield
     torch.set_num_threads(threads)
 
 
-# Steps of 1e-6 leave a central difference some 1e-9 from truncation and rounding; a wrong term is far above 1e-6.
+# With steps of 1e-6, truncation and rounding leave errors of some 1e-9; a wrong term is far above 1e-6.
 CHECK = {"eps": 1e-6, "atol": 1e-7, "rtol": 1e-6}
 VIEW = rigid((0.95, 0.1, -0.15, 0.05), (0.1, -0.05, 0.2))
 
@@ -28,7 +28,7 @@ def _check(parameters, camera, raw=True, **check):
     with torch.no_grad():
         out = render(parameters, camera, raw=raw)
         splats = ops.project(*scene_arguments(parameters, camera, raw))[0]
-    # The scene is what this file says: every splat on every pixel, none of them opaque.
+    # The scene is as described above: every splat is on every pixel, and none is opaque.
     ys, xs = torch.meshgrid(torch.arange(7.0), torch.arange(18.0), indexing="ij")
     for s in splats:
         u = s[2] * (xs - s[0]) + s[3] * (ys - s[1])
@@ -83,7 +83,7 @@ def test_given_covariances(antialiasing):
     parameters["cov3d"] = (axes @ axes.mT)[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
     del parameters["scales"], parameters["rotations"]
     parameters["opacities"] = torch.sigmoid(parameters["opacities"])
-    # Adding 1e-6 to a covariance of 1e-3 bends more than to a scale.
+    # A change of 1e-6 has a larger second-order effect on a covariance of 1e-3 than on a scale.
     _check(parameters, settings(**size, view=VIEW, antialiasing=antialiasing), raw=False, eps=1e-7, atol=1e-6)
 
 
@@ -91,13 +91,13 @@ def test_given_covariances(antialiasing):
 @pytest.mark.parametrize("axis", [0, 1])
 @pytest.mark.parametrize("side", [-1.0, 1.0])
 def test_the_clamped_ray_has_its_exact_derivative(side, axis, antialiasing):
-    """Beyond 1.3 half images J is frozen: nothing reaches x through it, and z through its factor 1/z only (DGR#75)."""
+    """Beyond 1.3 half images J is constant: x gets no gradient through it, z only through its factor 1/z (DGR#75)."""
     parameters, size = few(2)
     camera = settings(**size, principal=(0.1, -0.1), antialiasing=antialiasing)
     tan = (camera.tanfovx, camera.tanfovy)[axis]
     means = parameters["means"]
     means[0, axis] = side * 1.6 * tan * means[0, 2]
-    if axis == 1:  # seen from that far away over the short side, alpha needs a longer splat
+    if axis == 1:  # so far outside along the short side, alpha needs a longer splat
         means[0, 0] = 0.0
     parameters["scales"][0] += 0.3
     parameters["opacities"][0] = 1.5
@@ -120,7 +120,7 @@ def test_the_gradient_of_means2d_is_that_of_the_mean_in_ndc():
 
 
 def test_each_plane_gives_its_gradient_alone():
-    """A backward from one result must not depend on the others being used or asked for."""
+    """A backward from one result must not depend on whether the others are used or requested."""
     parameters, size = few()
     camera = settings(**size)
     names = list(parameters)
@@ -157,7 +157,7 @@ def test_a_clamped_colour_channel_gets_no_gradient():
 @BOTH_AND_GPU
 @pytest.mark.parametrize("degree", [0, 3])
 def test_a_black_point_of_a_cloud_can_become_brighter(degree, device, dtype):
-    """Its colour is 0 but for rounding, on whatever side, and clamped for good it would stay black."""
+    """Its colour is 0 up to rounding of either sign; if the clamp stopped the gradient, it would stay black."""
     parameters, size = few(1, dtype=dtype)
     parameters["sh_dc"] = RGB2SH(torch.zeros(1, 1, 3, dtype=dtype))
     parameters["sh_rest"] = torch.zeros_like(parameters["sh_rest"])
@@ -168,7 +168,7 @@ def test_a_black_point_of_a_cloud_can_become_brighter(degree, device, dtype):
 
 @pytest.mark.parametrize("side", [0.9, 1.1])
 def test_the_antialiasing_factor_is_floored(side):
-    """Where det0/det comes to 2.5e-5 the factor is 0.005, whatever the scale, and gives it no gradient."""
+    """Below det0/det = 2.5e-5 the factor is 0.005 for every scale, so the scale gets no gradient through it."""
     parameters, size = few(1, 17, 7)  # odd: the mean is at the middle pixel's centre
     parameters["means"][:, :2] = 0.0
     parameters["opacities"][:] = 4.0

@@ -11,8 +11,10 @@ from benchmarks.workloads.splat_scenes import settings
 
 
 def real_harmonics(directions: np.ndarray) -> np.ndarray:
-    """(N, 16) at unit vectors (N, 3): sqrt(2) times the real (m > 0) or imaginary (m < 0) part of the complex ones,
-    Condon-Shortley's sign kept, in the order (l, m) = (0, 0), (1, -1), (1, 0), ..."""
+    """The basis (N, 16) at unit vectors (N, 3), in the order (l, m) = (0, 0), (1, -1), (1, 0), ...
+
+    It is sqrt(2) times the real (m > 0) or imaginary (m < 0) part of the complex basis, with Condon-Shortley's sign.
+    """
     theta, phi = np.arccos(directions[:, 2]), np.arctan2(directions[:, 1], directions[:, 0])
     columns = []
     for degree in range(4):
@@ -42,7 +44,7 @@ def test_the_kernels_colours(degree):
     parameters = {
         "means": torch.tensor(2.5 * d),
         "opacities": torch.ones(n, 1, dtype=torch.float64),
-        "scales": torch.full((n, 3), 3.0, dtype=torch.float64),  # so large that each is on the image
+        "scales": torch.full((n, 3), 3.0, dtype=torch.float64),  # large enough to be on the image
         "rotations": torch.tensor([[1.0, 0, 0, 0]], dtype=torch.float64).repeat(n, 1),
         "sh_dc": coefficients[:, :1],
         "sh_rest": coefficients[:, 1:],

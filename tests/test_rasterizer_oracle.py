@@ -24,8 +24,8 @@ CAMERAS = {
     "moved": {"view": VIEW, "principal": (0.15, -0.2), "scale_modifier": 1.25},
 }
 
-# Largest error allowed: the largest measured over cameras, antialiasing and several sizes, times two or so; float64 has
-# some room besides. Needles have the rounding of their ends in it, and float32 the camera's.
+# Largest error allowed: about twice the largest measured over cameras, antialiasing and several sizes; for float64 a
+# little more. It includes the rounding of needles' ends and, in float32, of the camera.
 BOUNDS = {
     ("ordinary", torch.float64): 5e-14,
     ("needles", torch.float64): 2e-13,
@@ -38,7 +38,7 @@ BOUNDS = {
 
 def _parameters(kind: str, camera: str) -> dict[str, Tensor]:
     parameters = {name: t.float() for name, t in KINDS[kind](120, *SIZE).parameters.items()}
-    if camera == "moved":  # to where that camera sees what the plain one saw
+    if camera == "moved":  # so that this camera sees the same as the plain one
         parameters["means"] = ((parameters["means"].double() - VIEW[:3, 3]) @ VIEW[:3, :3]).float()
     return parameters
 
@@ -48,7 +48,7 @@ def _camera(camera: str, antialiasing: bool, dtype: torch.dtype) -> GaussianRast
 
 
 def _evaluate(parameters: dict[str, Tensor], dtype: torch.dtype, camera, keep: Tensor | None = None, **options):
-    """The result, which of its pixels count, and the gradients by name."""
+    """The result, the pixels that count, and the gradients by name."""
     inputs = leaves(parameters, dtype)
     means2d = torch.zeros_like(inputs["means"]).requires_grad_()
     out = render(inputs, camera, means2d, **options)
@@ -85,7 +85,7 @@ def _compare(got, wanted, bound: float, title: str) -> None:
 def test_outputs_and_gradients_agree_with_the_oracle(dtype, kind, camera, antialiasing):
     wanted = _oracle(kind, camera, antialiasing)
     keep = wanted[1]
-    assert keep.double().mean() > 0.99  # what is left out is the exception
+    assert keep.double().mean() > 0.99  # pixels left out are the exception
     got = _evaluate(_parameters(kind, camera), dtype, _camera(camera, antialiasing, dtype), keep)
     _compare(got, wanted, BOUNDS[kind, dtype], f"{kind} {camera} {antialiasing=} {str(dtype)[6:]}")
     difference = (got[0].radii - wanted[0].radii).abs()
@@ -108,7 +108,7 @@ def test_given_covariances_and_colours_agree_with_the_oracle(dtype):
         parameters, torch.float64, _camera("moved", True, torch.float64), raw=False, function=reference.render
     )
     got = _evaluate(parameters, dtype, _camera("moved", True, dtype), wanted[1], raw=False)
-    # Given covariances lose what a Cholesky decomposition of them in their own precision loses.
+    # Given covariances have the error of a Cholesky decomposition in their own precision.
     _compare(got, wanted, {torch.float64: 1e-13, torch.float32: 4e-5}[dtype], f"covariances {str(dtype)[6:]}")
     assert torch.equal(got[0].radii, wanted[0].radii)
 

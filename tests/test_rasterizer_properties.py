@@ -34,7 +34,7 @@ def scene(seed: int, n: int = 60, sigma_px: float = 2.0) -> dict[str, Tensor]:
 @given(seed=SEEDS, dtype=st.sampled_from([torch.float32, torch.float64]))
 def test_permuting_the_gaussians_permutes_the_results_and_no_bit_else(seed, dtype):
     parameters = {name: t.to(dtype) for name, t in scene(seed).items()}
-    # Ties go by the index; let there be none.
+    # The index decides ties, so avoid ties.
     parameters["means"][:, 2] = 2 + torch.linspace(0, 1, 60, dtype=dtype)
     order = torch.randperm(60, generator=torch.Generator().manual_seed(seed))
     camera = settings(WIDTH, HEIGHT, dtype)
@@ -48,15 +48,18 @@ def test_permuting_the_gaussians_permutes_the_results_and_no_bit_else(seed, dtyp
 @SHORT
 @given(seed=SEEDS, cut=st.sampled_from([16, 32, 48, 23, 40]))
 def test_two_parts_of_an_image_are_the_whole(seed, cut):
-    """A crop is a camera with another principal point. Splats are small, so that the limit on the Jacobian's ray, which
-    is 1.3 of the crop's own half width, concerns none that reaches into it."""
+    """A crop is a camera with another principal point.
+
+    Splats are small, so that none that reaches into the crop is beyond the limit on the Jacobian's ray, 1.3 half widths
+    of the crop.
+    """
     parameters = scene(seed, sigma_px=0.3)
     parameters["scales"].clamp_(max=math.log(0.02))
     focal = settings(WIDTH, HEIGHT).tanfovx
     parameters["means"][:, 2].clamp_(min=4)
     whole = render(parameters, settings(WIDTH, HEIGHT, principal=(0.05, -0.1)))
     for start, width in ((0, cut), (cut, WIDTH - cut)):
-        # NDC of the whole, x, is (x W - W + 2 start + w) / w of the part: scale W / w, shift by its middle.
+        # With x in NDC of the whole, the part has (x W - W + 2 start + w) / w: scale by W / w, shift to its middle.
         shift = (0.05 * WIDTH + WIDTH - 2 * start - width) / width
         part = settings(WIDTH, HEIGHT, principal=(0.0, -0.1))
         projection = part.projmatrix.clone()
@@ -72,7 +75,7 @@ def test_two_parts_of_an_image_are_the_whole(seed, cut):
 @SHORT
 @given(seed=SEEDS, q=QUATERNIONS, t=st.tuples(UNIT, UNIT, UNIT))
 def test_moving_world_and_camera_together_changes_nothing(seed, q, t):
-    """Rotation and shift of all, degree 0 (the harmonics stay with the world)."""
+    """Rotate and shift everything, with degree 0, since the harmonics do not rotate along."""
     parameters = scene(seed)
     turn = rotation_matrix(torch.tensor(q))
     shift = 5 * torch.tensor(t, dtype=torch.float64)
@@ -110,7 +113,7 @@ def test_the_scale_of_the_world_changes_inverse_depth_alone(seed, factor, t):
     view = rigid((1, 0, 0, 0), tuple(0.2 * v for v in t))
     far = view.clone()
     far[:3, 3] *= factor
-    # The nearest splats are at 1.8, at a factor of 0.3 still in front of z = 0.2.
+    # The nearest splats are at 1.8; a factor of 0.3 leaves them in front of z = 0.2.
     a = gradients(parameters, settings(WIDTH, HEIGHT, view=view, antialiasing=True))
     b = gradients(grown, settings(WIDTH, HEIGHT, view=far, antialiasing=True))
     assert torch.equal(a["radii"], b["radii"])
@@ -128,7 +131,7 @@ def test_weights_and_transmittance_sum_to_one(seed, kind, dtype):
     parameters["colors"] = torch.ones(80, 3, dtype=dtype)
     out = render(parameters, settings(WIDTH, HEIGHT, dtype, bg=torch.zeros(3, dtype=dtype), antialiasing=True))
     total = out.color + out.transmittance
-    # 80 products and sums at most, each rounded.
+    # At most 80 rounded products and sums.
     torch.testing.assert_close(total, torch.ones_like(total), rtol=0, atol=100 * torch.finfo(dtype).eps)
     assert out.transmittance.min() >= 0.999e-4 and out.color.min() >= 0
 
@@ -144,7 +147,7 @@ FINITE = st.floats(width=32, allow_nan=False, allow_infinity=False)
     antialiasing=st.booleans(),
 )
 def test_everything_is_finite_on_any_finite_input(means, rest, colors, antialiasing):
-    """Float32 from end to end of its range, in front of the camera where it would not be culled at once."""
+    """Values over all of float32's range, in front of the camera so that they are not culled at once."""
     means, rest = torch.tensor(means).reshape(2, 3), torch.tensor(rest).reshape(2, 8)
     means[:, 2] = means[:, 2].abs().clamp(min=0.25)
     colors = torch.tensor(colors).reshape(2, 4, 3)
@@ -156,7 +159,7 @@ def test_everything_is_finite_on_any_finite_input(means, rest, colors, antialias
         assert t.isfinite().all(), name
 
 
-# Not finite, where float32 or its squares end, and the rules' own thresholds.
+# Not finite values, limits of float32 and of its squares, and thresholds of the rules.
 POISON = [math.nan, math.inf, -math.inf, 3.4e38, -3.4e38, 1e20, -1e20, 1e-20, 1e-38, -1e-45, 0.0, 0.2, 1.3, 16.0, 0.99]
 POISON += [1 / 255, 1e-4, -50.0, 50.0, 88.0, -104.0, 1e4, 1e7]
 SPOILT = st.tuples(
@@ -168,7 +171,7 @@ SPOILT = st.tuples(
 
 
 def spoilt_scene(seed: int, places: list[tuple]) -> tuple[dict[str, Tensor], Tensor]:
-    """Twenty Gaussians, float32, with poison at some places; and which of them are finite, (20,) bool."""
+    """Twenty Gaussians, float32, with poison in some places, and a flag for finite ones, (20,) bool."""
     parameters = {name: t.float() for name, t in scene(seed, 20, 4.0).items()}
     for name, row, column, value in places:
         flat = parameters[name][row].view(-1)
@@ -183,7 +186,7 @@ def spoilt_scene(seed: int, places: list[tuple]) -> tuple[dict[str, Tensor], Ten
 @MANY
 @given(seed=SEEDS, places=st.lists(SPOILT, min_size=1, max_size=8), antialiasing=st.booleans())
 def test_poison_stays_where_it_is(seed, places, antialiasing):
-    """All is finite; Gaussians that are not might as well be absent; in another order, everything is the same."""
+    """All results are finite; Gaussians that are not finite have no effect; the order of Gaussians does not matter."""
     parameters, finite = spoilt_scene(seed, places)
     camera = settings(WIDTH, HEIGHT, torch.float32, antialiasing=antialiasing)
     got = gradients(parameters, camera)
@@ -209,14 +212,14 @@ def test_weights_of_any_scene_sum_to_at_most_one(seed, places, antialiasing):
     camera = settings(WIDTH, HEIGHT, torch.float32, bg=torch.zeros(3), antialiasing=antialiasing)
     out = render(shape | colors, camera)
     assert out.color.min() >= 0
-    # 20 products and sums at most, each rounded.
+    # At most 20 rounded products and sums.
     torch.testing.assert_close(out.color + out.transmittance, torch.ones(3, HEIGHT, WIDTH), rtol=0, atol=3e-6)
 
 
 @MANY
 @given(seed=SEEDS, places=st.lists(SPOILT, max_size=8), antialiasing=st.booleans())
 def test_halves_of_an_image_are_the_whole_to_the_bit(seed, places, antialiasing):
-    """Blended from the same splats: what lies below the middle is not there for the upper half, nor the reverse."""
+    """The upper half does not depend on splats below the middle, nor the lower half on splats above it."""
     parameters, _ = spoilt_scene(seed, places)
     height, across = 32, WIDTH // 16
     camera = settings(WIDTH, height, torch.float32, antialiasing=antialiasing)
@@ -245,7 +248,7 @@ LOG_SCALES = st.floats(-100, 100, width=32)
     antialiasing=st.booleans(),
 )
 def test_everything_is_finite_for_any_shape_in_view(scales, quaternions, offsets, depth, antialiasing):
-    """Scales from nothing to more than float's range, in the middle of the image."""
+    """Splats in the middle of the image, with scales from 0 to more than float's range."""
     z = torch.full((2, 1), depth)
     parameters = {
         "means": torch.cat([torch.tensor(offsets).reshape(2, 2) * z, z], 1),
@@ -259,7 +262,7 @@ def test_everything_is_finite_for_any_shape_in_view(scales, quaternions, offsets
 
 
 def test_needles_from_end_to_end_of_the_image_stay_themselves():
-    """Float against double on pixels, of needles thousands of px long; the textbook's conic is off by whole units."""
+    """Pixels of needles thousands of px long, float against double; the textbook's conic is off by whole units."""
     parameters = {name: t.float() for name, t in needles(200, WIDTH, HEIGHT).parameters.items()}
     parameters["scales"][:, 0] += math.log(30)
     got = render(parameters, settings(WIDTH, HEIGHT, torch.float32))

@@ -1,4 +1,4 @@
-"""Poison in one Gaussian: nothing crashes, no other is disturbed, and what is not finite gets a zero gradient."""
+"""Poison in one Gaussian: nothing crashes, no other Gaussian changes, and values not finite get zero gradients."""
 
 import math
 
@@ -11,7 +11,7 @@ from benchmarks.workloads.splat_scenes import ordinary, settings
 
 N, VICTIM, SIZE = 40, 17, (75, 53)
 NOT_FINITE = [math.nan, math.inf, -math.inf]
-# The thresholds' neighbourhood, what squares or cubes leave float, what vanishes in it.
+# Values near thresholds, values whose squares or cubes overflow float, and values that vanish in it.
 EXTREME = [3.4e38, -3.4e38, 1e20, -1e20, 1e10, -1e10, 1e-20, 1e-38, 1e-45, 0.0, 0.2, 16.0, 1e4, 30.0, -50.0, 50.0]
 
 
@@ -52,7 +52,7 @@ def test_a_gaussian_that_is_not_finite_is_as_if_it_were_not_there(raw, name, cam
     wanted = gradients(pick(parameters, others), camera, device, raw=raw)
     for value in NOT_FINITE:
         if raw and name == "opacities" and math.isinf(value):
-            continue  # a logit like any other
+            continue  # a valid logit
         for whole_row in (False, True):
             bad = poisoned(parameters, name, value, whole_row)
             got = gradients(bad, camera, device, raw=raw)
@@ -61,7 +61,7 @@ def test_a_gaussian_that_is_not_finite_is_as_if_it_were_not_there(raw, name, cam
                     assert torch.equal(t, wanted[key]), (key, value)
                 else:
                     assert torch.equal(t[others], wanted[key]), (key, value)
-                    # Colours are read only where there are tiles, so they do not decide on the radius.
+                    # Colours are read only for splats with tiles, so they do not decide the radius.
                     assert not t[VICTIM].any() or (key == "radii" and name in ("sh_dc", "sh_rest", "colors")), (
                         key,
                         value,
@@ -91,7 +91,7 @@ def test_a_zero_quaternion_counts_as_the_identity(camera):
         assert torch.equal(got["d scales"], wanted["d scales"])
 
 
-# Powers of two, whose products round nothing; their squares leave float32's range.
+# Powers of two, whose products are exact; their squares exceed float32's range.
 @pytest.mark.parametrize("length", [2.0**-70, 2.0**70])
 def test_the_length_of_a_raw_quaternion_does_not_matter(length, camera):
     parameters = scene(True)
@@ -123,9 +123,9 @@ def test_infinite_logits_are_opacities_of_one_and_zero(camera):
         as_given = activated(parameters)
         assert as_given["opacities"][VICTIM] == opacity
         wanted = render(as_given, camera, raw=False)
-        # Activated in Python, scales and rotations are rounded once more.
+        # Scales and rotations activated in Python are rounded once more.
         torch.testing.assert_close(got["color"], wanted.color, rtol=0, atol=1e-5)
-        assert got["radii"][VICTIM] > 0  # whatever the opacity, as for any other
+        assert got["radii"][VICTIM] > 0  # for any opacity, as for other Gaussians
         assert all(t.isfinite().all() for t in got.values()) and not got["d opacities"][VICTIM].any()
 
 
@@ -159,7 +159,7 @@ def test_a_mean_on_the_cameras_centre_is_culled(camera, device):
     parameters["means"][VICTIM] = 0.0
     got = gradients(parameters, camera, device)
     assert got["radii"][VICTIM] == 0 and not got["d means"][VICTIM].any()
-    # With `campos` on a mean that is seen, the viewing direction is undefined: degree 0 alone is left of its colour.
+    # With `campos` on a visible mean, the viewing direction is undefined, so only degree 0 of its colour remains.
     parameters["means"][VICTIM] = torch.tensor([0.1, -0.1, 3.0])
     elsewhere = camera._replace(campos=parameters["means"][VICTIM].clone())
     got = gradients(parameters, elsewhere, device)

@@ -9,7 +9,7 @@ from rasterizer_tools import DTYPES_AND_GPU, activated, few, one_splat, ops, pic
 from benchmarks.workloads.splat_scenes import ordinary, settings
 
 BOTH = pytest.mark.parametrize("dtype", [torch.float64, torch.float32], ids=["float64", "float32"])
-MIDDLE = (..., 8, 8)  # of 17 x 17: what lies on the optical axis is exactly at this pixel's centre
+MIDDLE = (..., 8, 8)  # of 17 x 17: the optical axis goes exactly through this pixel's centre
 
 
 def camera(dtype=torch.float64, **changes):
@@ -37,18 +37,18 @@ def test_the_near_plane_is_at_0_2_and_excluded(dtype):
 @BOTH
 def test_alpha_of_1_255_is_blended_and_less_is_not(dtype):
     least = torch.tensor(1 / 255, dtype=dtype).item()
-    # Ten units in the last place: those of the logarithm are coarser than the opacity's.
+    # Ten units in the last place, since those of the logarithm are coarser than the opacity's.
     less = least * (1 - 10 * torch.finfo(dtype).eps)
     for opacity, blended in [(least, True), (less, False)]:
         out = render(one_splat(opacity=opacity, dtype=dtype), camera(dtype), raw=False)
         assert bool(out.transmittance[MIDDLE] < 1) == blended
-        assert out.radii[0] > 0  # visibility is by the radius, whether or not a pixel is reached
+        assert out.radii[0] > 0  # the radius decides visibility, even if no pixel is reached
         assert (out.transmittance == 1).sum() == 17 * 17 - blended
 
 
 @DTYPES_AND_GPU
 def test_no_pixel_is_blended_under_1_255(dtype):
-    """The rule holds at the edge, far out as well: no cut at 3 sigma, whose alpha is 0.011."""
+    """The rule also holds far from the mean: there is no cut at 3 sigma, where alpha is 0.011."""
     splat = one_splat(opacity=0.9, scale=0.2, dtype=dtype)
     out = render(splat, camera(dtype), raw=False)
     variance = (0.2 * 17 / (2 * math.tan(math.radians(30)))) ** 2 + 0.3
@@ -82,19 +82,19 @@ def test_a_saturated_splat_in_front_leaves_the_rest_a_hundredth(dtype):
     splats = leaf(together(one_splat(z=1, opacity=1.0, dtype=dtype), one_splat(z=2, opacity=0.5, dtype=dtype)))
     out = render(splats, camera(dtype), raw=False)
     out.color[0, 8, 8].backward()
-    behind = 0.5 * 1.0 + 0.5 * 0.2  # its own colour over the background
+    behind = 0.5 * 1.0 + 0.5 * 0.2  # the splat's colour over the background
     assert splats["opacities"].grad[0].item() == pytest.approx(1.0 - behind, rel=1e-4)
     assert splats["opacities"].grad[1].item() == pytest.approx(0.01 * (1.0 - 0.2), rel=1e-4)
 
 
 @DTYPES_AND_GPU
 def test_the_splat_that_would_leave_less_than_1e_4_ends_the_pixel_unblended(dtype):
-    opacities = [0.95, 0.95, 0.95, 0.95, 0.01]  # the last would fit again, but the pixel has ended
+    opacities = [0.95, 0.95, 0.95, 0.95, 0.01]  # the last would not end the pixel, but it has ended before
     splats = [one_splat(z=1 + i, opacity=o, scale=0.05 * (1 + i), dtype=dtype) for i, o in enumerate(opacities)]
     splats = leaf(together(*splats))
     splats["colors"] = torch.eye(5, 3, dtype=dtype, requires_grad=True)
     out = render(splats, camera(dtype, bg=torch.zeros(3, dtype=dtype)), raw=False)
-    # 1 - 0.95 makes 20 units in the last place of one; a GPU's exponential is good to two, and there are three factors.
+    # 1 - 0.95 turns a unit in the last place into 20. A GPU's exponential is exact to two, and there are three factors.
     bound = 2 * 3 * 20 * torch.finfo(dtype).eps
     assert out.transmittance[MIDDLE].item() == pytest.approx(0.05**3, rel=bound)
     wanted = torch.tensor([0.95, 0.95 * 0.05, 0.95 * 0.05**2], dtype=dtype)
@@ -130,7 +130,7 @@ def test_radius_is_3_sigma_of_the_longer_axis(dtype):
         c, s = math.cos(angle), math.sin(angle)
         wanted = expected_radius(x * c * c + y * s * s + 0.3, (x - y) * c * s, x * s * s + y * c * c + 0.3)
         assert render(splat, camera(dtype), raw=False).radii.tolist() == [wanted]
-    # Without the floor of 0.1 under the root a point's radius would be 2.
+    # Without the least value of 0.1 under the root, a point's radius would be 2.
     assert expected_radius(0.3, 0, 0.3) == 3
 
 
@@ -142,7 +142,7 @@ def test_radius_does_not_depend_on_opacity_and_ends_at_the_image():
     radius = out.radii.item()
     seen = set()
     for pixel in torch.arange(-40.25, 60, 1.0).tolist():
-        # Tiles that the square of that radius touches, whole ones: two across 17 pixels.
+        # The splat gets all tiles that the square of that radius touches: two across 17 pixels.
         low = min(2, max(0, math.trunc((pixel - radius) / 16)))
         high = min(2, max(0, math.trunc((pixel + radius + 15) / 16)))
         got = render(one_splat(x=(pixel - 8) / focal, opacity=1e-9), camera(), raw=False).radii.item()
@@ -158,7 +158,7 @@ def test_equal_depths_keep_the_order_of_their_index():
     for first, second, wanted in [(red, green, [0.8, 0.16, 0]), (green, red, [0.16, 0.8, 0])]:
         got = render(together(first, second), black, raw=False).color[MIDDLE]
         torch.testing.assert_close(got, torch.tensor(wanted, dtype=torch.float64), rtol=1e-12, atol=0)
-    # Many at one depth among others: bin's list in each tile is sorted by (depth, index).
+    # With many splats at one depth among others, bin's list in each tile is sorted by (depth, index).
     scene = ordinary(600, 75, 53)
     parameters = {name: t.float() for name, t in scene.parameters.items()}
     parameters["means"][::3, 2] = 4.0
@@ -192,7 +192,7 @@ def test_inverse_depth_is_the_sum_of_weights_over_z_without_background(dtype):
 
 @DTYPES_AND_GPU
 def test_the_background_shows_through_and_its_gradient_path_is_in_the_splats(dtype):
-    """What is behind the last splat is the background: d colour / d alpha = colour - background."""
+    """The background is behind the last splat: d colour / d alpha = colour - background."""
     for background in ([0.0, 0.0, 0.0], [1.0, 1.0, 1.0], [0.2, 0.7, 0.4]):
         splat = leaf(one_splat(opacity=0.6, dtype=dtype))
         bg = torch.tensor(background, dtype=dtype)
@@ -215,5 +215,5 @@ def test_the_antialiasing_factor_dims_and_nothing_else_changes():
         a, b = (1 - render(alone, settings(**size, antialiasing=on), raw=False).transmittance for on in (False, True))
         ratio = b / a
         assert ratio.max() < 1
-        # One factor for all pixels of a splat: sqrt(det / det dilated) does not know the pixel.
+        # All pixels of a splat have one factor: sqrt(det / det dilated) does not depend on the pixel.
         assert (ratio.max() - ratio.min()).item() < 1e-12

@@ -1,4 +1,4 @@
-"""Culling changes no bit: exact instance lists against lists with every splat in every tile, pixels against sums."""
+"""Culling changes no bit: exact lists of instances against lists with all splats in all tiles, pixels against sums."""
 
 import math
 
@@ -23,7 +23,7 @@ def test_no_pixel_differs(kind, device, dtype):
 
 @BOTH_AND_GPU
 def test_no_pixel_differs_where_opacities_are_tuned_to_the_cut(device, dtype):
-    """Each splat reaches 1/255 at one pixel of one tile's rim within some units in the last place, over or under."""
+    """Each splat reaches 1/255 at one pixel on a tile's rim, within some units in the last place above or below."""
     *projected, left_out = borderline_splats(600, *SIZE, dtype, device)
     instances, everywhere = assert_culling_is_exact(*projected, *SIZE, left_out)
     assert instances < 0.6 * everywhere
@@ -31,8 +31,10 @@ def test_no_pixel_differs_where_opacities_are_tuned_to_the_cut(device, dtype):
 
 @CPU_AND_GPU
 def test_the_pixels_reached_are_those_whose_exponent_comes_to_the_cut(device):
-    """Within a tile as well (rows of lanes, a GPU's sub-tiles): each tuned splat alone, its exponent by the kernels'
-    own operations, one by one."""
+    """Culling within a tile (rows of lanes, a GPU's sub-tiles) changes no bit either.
+
+    Each tuned splat is rendered alone, and its exponent is computed by the kernels' own operations, one by one.
+    """
     if device == "cpu" and instruction_set() == "baseline":
         pytest.skip("fused operations are emulated, and this instruction set has none")
     width, height = SIZE
@@ -59,12 +61,12 @@ def test_the_pixels_reached_are_those_whose_exponent_comes_to_the_cut(device):
 
 
 def _fused(a: torch.Tensor, b: torch.Tensor, c: torch.Tensor) -> torch.Tensor:
-    """a b + c in float32, rounded once: the product is exact in float64."""
+    """Return a b + c in float32, rounded once, since the product is exact in float64."""
     return (a.double() * b.double() + c.double()).float()
 
 
 def test_lists_hold_no_tile_in_vain():
-    """Exact: a tile whose pixel centres are all under 1/255 is listed only where the maximum is between them."""
+    """The lists are exact: a tile with all pixel centres below 1/255 is listed only if its maximum is between them."""
     scene = KINDS["ordinary"](400, *SIZE)
     parameters = {name: t.double() for name, t in scene.parameters.items()}
     splats, depths, rects, counts, _ = ops.project(*scene_arguments(parameters, settings(*SIZE)))

@@ -1,4 +1,4 @@
-"""Whatever stands in a file, its reader gives a valid result or one sentence, soon and in little memory."""
+"""Readers give a valid result or a message of one sentence for any content of a file, quickly and in little memory."""
 
 import argparse
 import contextlib
@@ -27,7 +27,7 @@ from scene.readers.point_cloud import read_point_cloud, write_point_cloud
 from utils.system_utils import UserError
 
 EXAMPLES = int(os.environ.get("GS_FUZZ", 40))
-# Files here are below 1 MiB, of which readers may make several copies. A random start cloud takes 5 MB.
+# Files are below 1 MiB here, and readers may make several copies. A random start cloud takes 5 MB.
 MOST_BYTES = 64 << 20
 FUZZ = settings(
     max_examples=EXAMPLES,
@@ -36,7 +36,7 @@ FUZZ = settings(
     suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow, HealthCheck.data_too_large],
 )
 
-# What people and programs put where something else should be.
+# Values that people and programs put in the place of others.
 SCALARS = st.one_of(
     st.none(),
     st.booleans(),
@@ -53,7 +53,7 @@ NUMBERS = [b"-1", b"0", b"1e999", b"nan", b"9999999999999", b"999999999999999999
 
 
 def ends_well(read: Callable[[], object]) -> object | None:
-    """What a reader gives, None where it refuses with one sentence. Anything else it does is an error of the test."""
+    """Return a reader's result; None if it refuses with one sentence. Anything else fails the test."""
     tracemalloc.start()
     try:
         with contextlib.redirect_stderr(io.StringIO()), contextlib.redirect_stdout(io.StringIO()):
@@ -70,7 +70,7 @@ def ends_well(read: Callable[[], object]) -> object | None:
 
 @st.composite
 def damaged(draw: st.DrawFn, whole: bytes) -> bytes:
-    """The bytes of a file after one to three accidents."""
+    """Draw the bytes of a file with one to three damages."""
     data = bytearray(whole)
     for _ in range(draw(st.integers(1, 3))):
         start = draw(st.integers(0, len(data)))
@@ -95,7 +95,7 @@ def damaged(draw: st.DrawFn, whole: bytes) -> bytes:
 
 @st.composite
 def changed(draw: st.DrawFn, content: Any, values: st.SearchStrategy) -> Any:
-    """A copy of nested lists, tuples and dicts in which one to three entries are other values, missing or added."""
+    """Draw a copy of nested lists, tuples and dicts with one to three entries changed, missing or added."""
     for _ in range(draw(st.integers(1, 3))):
         content = _change_one(draw, content, values)
     return content

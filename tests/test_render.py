@@ -1,4 +1,4 @@
-"""render.py: what it writes for a view, and its timing; the whole command is in test_end_to_end.py."""
+"""render.py: its files for a view, and its timing; test_end_to_end.py tests the whole command."""
 
 import json
 from argparse import Namespace
@@ -30,7 +30,7 @@ def view(target: torch.Tensor) -> SimpleNamespace:
 
 @pytest.fixture
 def rendered(monkeypatch) -> dict[int, torch.Tensor]:
-    """What render() gives, by view."""
+    """Stand-in results of render(), by view."""
     prepared: dict[int, torch.Tensor] = {}
     monkeypatch.setattr("gaussian_renderer.scored_views.render", lambda view, *_, **__: {"render": prepared[id(view)]})
     return prepared
@@ -89,7 +89,7 @@ def test_without_views_no_folders_appear_and_old_renders_go(tmp_path, rendered, 
     capsys.readouterr()
     render.render_set(folder, [], None, Namespace(), torch.zeros(3))
     assert list(folder.rglob("*.png")) == []
-    assert capsys.readouterr().err == ""  # no progress bar of nothing
+    assert capsys.readouterr().err == ""  # no progress bar without views
 
 
 def test_a_model_without_gaussians_is_refused(tmp_path, colmap_scene, monkeypatch):

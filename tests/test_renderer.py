@@ -1,4 +1,4 @@
-"""render(): its dictionary, the clamp, the raw path against the plain one."""
+"""render(): its dictionary, the clamp, and the raw path against the plain one."""
 
 import math
 
@@ -21,7 +21,7 @@ BLACK = torch.zeros(3)
 
 @pytest.fixture
 def camera() -> MiniCam:
-    """At (0, 0, -3), looking along +z."""
+    """A camera at (0, 0, -3) facing +z."""
     fov_x, fov_y = 0.9, 0.6
     view = torch.eye(4)
     view[2, 3] = 3.0
@@ -61,7 +61,7 @@ def test_depth_on_request(camera):
 def test_screen_points_are_zeros_with_a_gradient_of_their_own_in_every_render(camera):
     gaussian_renderer._zero.cache_clear()
     gaussians = model(20)
-    with torch.inference_mode():  # a picture first must not stand in a training's way
+    with torch.inference_mode():  # rendering an image first must not prevent training
         assert not render(camera, gaussians, pipeline(), BLACK)["viewspace_points"].requires_grad
     gradients = []
     for weight in (1.0, 2.0):
@@ -91,7 +91,7 @@ def test_values_outside_are_clamped_and_get_no_gradient(camera):
 @pytest.mark.parametrize("antialiasing", [False, True])
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_the_raw_path_equals_the_plain_one(camera, degree, antialiasing):
-    """Activations, SH and covariances inside the kernels against the model's own in PyTorch, image and gradients."""
+    """Activations, SH and covariances in the kernels give the image and gradients of the model's own in PyTorch."""
     weights = torch.randn(3, HEIGHT, WIDTH, generator=torch.Generator().manual_seed(0))
     results = []
     for in_python in (False, True):
@@ -102,7 +102,7 @@ def test_the_raw_path_equals_the_plain_one(camera, degree, antialiasing):
         gradients = {name: getattr(gaussians, name).grad for name in GROUPS.values()}
         results.append((image.detach(), gradients))
     (raw, raw_gradients), (plain, plain_gradients) = results
-    # Both float32 with different roundings: measured 5e-7 in the image and 1.2e-6 in the gradients.
+    # Both are float32 with different roundings; measured: 5e-7 in the image and 1.2e-6 in the gradients.
     assert (raw - plain).abs().max() < 5e-6
     for name, gradient in plain_gradients.items():
         if gradient is not None and gradient.numel():
@@ -150,7 +150,7 @@ def test_exposure_maps_row_vectors_before_the_clamp(camera):
     background = torch.tensor([0.2, 0.9, 0.4])
     colors = {"override_color": 0.1 + 0.8 * torch.rand(40, 3, generator=torch.Generator().manual_seed(1))}
     plain = render(camera, gaussians, pipeline(), background, **colors)["render"].detach().double()
-    assert plain.min() > 0 and plain.max() < 1  # nothing was cut off, so that it can be mapped again
+    assert plain.min() > 0 and plain.max() < 1  # nothing was clamped, so the image can be mapped again
     got = render(camera, gaussians, pipeline(), background, use_trained_exp=True, **colors)["render"]
     mapped = torch.einsum("ihw,ij->jhw", plain, exposure[:, :3]) + exposure[:, 3, None, None]
     assert (mapped < 0).any() and (mapped > 1).any()
@@ -175,7 +175,7 @@ def test_a_view_without_a_picture_has_no_exposure_and_an_unknown_one_is_named(ca
 
 
 def test_the_inverse_depth_is_differentiated(camera):
-    """Gradient of the depth loss by central differences, in the opacity and the distance of a Gaussian in front."""
+    """The depth loss's gradient by central differences, for the opacity and the distance of a Gaussian in front."""
     gaussians = model(1)
     with torch.no_grad():
         gaussians._xyz.zero_()
@@ -195,5 +195,5 @@ def test_the_inverse_depth_is_differentiated(camera):
                 values.append(loss().item())
                 param[index] -= sign * step
         slope = (values[0] - values[1]) / (2 * step)
-        # float32 values of 0.1, and pixels that cross the target or alpha's cut-off at 1/255.
+        # The bound allows for float32 values of 0.1, and for pixels that cross the target or alpha's cut-off at 1/255.
         assert slope != 0 and param.grad[index].item() == pytest.approx(slope, rel=0.03)

@@ -1,4 +1,4 @@
-"""The bound of cut SH bands: it holds in every direction, and it is reached."""
+"""The bound of cut SH bands holds in every direction, and is attained."""
 
 import pytest
 import torch
@@ -8,7 +8,7 @@ from utils.sh_utils import eval_sh
 
 
 def _colors(degree: int, rest: torch.Tensor, directions: torch.Tensor) -> torch.Tensor:
-    """(M, N, 3): what band 1 and those above add to the colours of N Gaussians seen along M directions."""
+    """The part, (M, N, 3), of band 1 and above in the colours of N Gaussians seen along M directions."""
     features = torch.cat([rest.new_zeros(len(rest), 1, 3), rest], dim=1).transpose(1, 2)
     return torch.stack([eval_sh(degree, features, direction.expand(len(rest), 3)) for direction in directions])
 
@@ -35,7 +35,7 @@ def test_the_bound_holds(degree):
 
 @pytest.mark.parametrize("band", [1, 2, 3])
 def test_the_bound_is_reached(band):
-    """By coefficients that are the basis functions in one direction (equality in Cauchy-Schwarz)."""
+    """Coefficients equal to the basis functions in one direction attain it (equality in Cauchy-Schwarz)."""
     direction = _directions(1)
     rest = torch.zeros(1, 15, 3, dtype=torch.float64)
     for k in range(band**2 - 1, (band + 1) ** 2 - 1):

@@ -28,7 +28,7 @@ def by_scipy(points: torch.Tensor) -> torch.Tensor:
 
 
 def cloud(name: str) -> torch.Tensor:
-    """Named clouds in float32 (N, 3), each hard for some way of searching."""
+    """Named clouds in float32 (N, 3), each difficult for some way of searching."""
     random = torch.Generator().manual_seed(3)
     x = torch.randn(3000, 3, generator=random)
     if name == "collinear":
@@ -131,9 +131,9 @@ def test_not_contiguous() -> None:
 
 
 def test_large_cloud_is_not_quadratic() -> None:
-    # All pairs of 200 k points are 4e10 distances, a minute and more; the tree takes 0.3 s on two cores. Time of the
-    # process, which other programs on the machine do not add to. The second cloud puts all but a few points into one
-    # cell of any uniform grid.
+    # All pairs of 200 k points are 4e10 distances, which take more than a minute; the tree takes 0.3 s on two cores.
+    # The process's own time is measured, to which other programs do not add. The second cloud puts nearly all points
+    # into one cell of any uniform grid.
     near = torch.rand(200_000, 3, generator=torch.Generator().manual_seed(1))
     for points in (near, torch.cat([near, near[:10] * 1e6])):
         start = time.process_time()
@@ -157,7 +157,7 @@ def test_messages() -> None:
         distCUDA2(torch.zeros(3))
     with pytest.raises(TypeError, match=r"float32 or float64, got torch.int64"):
         distCUDA2(torch.zeros(5, 3, dtype=torch.int64))
-    # The operator checks for itself what reaches it past the Python form.
+    # The operator itself checks inputs that bypass the Python function.
     with pytest.raises(RuntimeError, match=r"points must be \(N, 3\)"):
         torch.ops.simple_knn.mean_distance2(torch.zeros(5, 2))
     with pytest.raises(RuntimeError, match="points must be float32 or float64"):

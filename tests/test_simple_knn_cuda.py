@@ -17,7 +17,7 @@ pytestmark = [
 
 
 def check(points: torch.Tensor) -> torch.Tensor:
-    """Distances of `points` (on the CPU) from the GPU, compared with the CPU's, on the CPU."""
+    """Compute the distances of `points` on the GPU, compare them with the CPU's, and return them on the CPU."""
     got = distCUDA2(points.cuda())
     assert got.is_cuda and got.dtype == points.dtype and got.shape == points.shape[:1]
     wanted = distCUDA2(points)
@@ -61,7 +61,7 @@ def test_overflow_stays_finite() -> None:
     points = torch.tensor([[1e30, 0, 0], [-1e30, 0, 0], [0, 2e38, 0], [0, -2e38, 0]])
     assert (check(points) == torch.finfo(torch.float32).max).all()
     check(torch.finfo(torch.float32).max * torch.tanh(cloud("normal")))
-    check(cloud("normal").double() * 1e300)  # beyond float, in which the tree is planned
+    check(cloud("normal").double() * 1e300)  # beyond the range of float, in which the tree is planned
 
 
 def test_large_clouds() -> None:

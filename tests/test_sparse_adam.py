@@ -1,4 +1,4 @@
-"""Sparse Adam: the kernel against the formula in double, and who is stepped in a model."""
+"""Sparse Adam: the kernel against the formula in double, and the Gaussians of a model that take a step."""
 
 import pytest
 import torch
@@ -11,7 +11,7 @@ RATE, BETAS, EPS = 0.01, (0.9, 0.999), 1e-15
 
 
 def _formula(value, gradient, mean, square, seen) -> None:
-    """One step in double on the rows seen: moments as Adam's, and no bias correction."""
+    """Do one step in double on the rows seen, with Adam's moments and no bias correction."""
     mean[seen] = BETAS[0] * mean[seen] + (1 - BETAS[0]) * gradient[seen]
     square[seen] = BETAS[1] * square[seen] + (1 - BETAS[1]) * gradient[seen] ** 2
     value[seen] -= RATE * mean[seen] / (square[seen].sqrt() + EPS)
@@ -35,7 +35,7 @@ def test_it_is_the_formula_and_leaves_unseen_rows_alone(shape, dtype):
             assert torch.equal(old[~seen], new[~seen])
     assert torch.equal(ours[0][never], start[never]) and (ours[0] - start).abs().max() > 5 * RATE
     unit = torch.finfo(dtype).eps
-    # Twenty steps of up to 0.1 (no correction: at first m / sqrt(v) is up to 3.2), values of 4, some units each.
+    # Twenty steps of up to 0.1, each exact to some units of values of 4. Uncorrected m / sqrt(v) is at first up to 3.2.
     torch.testing.assert_close(ours[0].double(), exact[0], rtol=0, atol=40 * unit * (4 + 20 * 3.2 * RATE))
     for got, wanted in zip(ours[1:], exact[1:], strict=True):
         torch.testing.assert_close(got.double(), wanted, rtol=0, atol=40 * unit * wanted.abs().max().item())
@@ -106,7 +106,7 @@ def test_a_model_steps_what_the_view_saw():
         assert torch.equal(moved, radii > 0)
         now = moments(gaussians)[name]
         assert torch.equal(now["exp_avg"][1::2], state[name]["exp_avg"][1::2])
-        assert now["step"] == 2  # of the tensor, for those who go on with the dense optimiser
+        assert now["step"] == 2  # the tensor's counter, for resuming with the dense optimiser
     assert all(getattr(gaussians, name).grad is None for name in GROUPS.values())
 
 
@@ -116,7 +116,7 @@ def test_density_control_and_checkpoints_are_the_dense_optimisers():
     gaussians.step(torch.ones(20, dtype=torch.int32))
     gaussians.prune_points(torch.arange(20) < 5)
     before = parameters(gaussians)
-    gaussians.step(torch.ones(20, dtype=torch.int32))  # the radii are those of before, and nothing has a gradient
+    gaussians.step(torch.ones(20, dtype=torch.int32))  # the radii are from before, and no parameter has a gradient
     assert all(torch.equal(before[name], value) for name, value in parameters(gaussians).items())
     dense = model(3)
     dense.restore(gaussians.capture(), options())

@@ -37,22 +37,22 @@ def test_a_case_is_within_its_bound(case, backend):
     measured = judged(case)
     result = measured.result(backend)
     assert result.finite
-    # Where all is stiff, the pixels that nothing reaches are next to those that something does.
+    # If all Gaussians are stiff, the pixels that none reaches are next to pixels that one does.
     ordinary = bound.image if measured.problem.stiff.all() else PLAIN.image
     allowed = {("planes", "ordinary"): ordinary, ("planes", "stiff"): bound.image}
     allowed |= {("gradients", "ordinary"): PLAIN.gradient, ("gradients", "stiff"): bound.gradient}
-    # A GPU's fast exponential and reciprocal: the design allows three times the error of the CPU.
+    # A GPU has a fast exponential and reciprocal, for which the design allows three times the CPU's error.
     factor = 3 if backend == CUDA_FLOAT else 1
     for (kind, part), limit in allowed.items():
         limit = case.double if backend == CPU_DOUBLE else factor * limit
         for name, error in getattr(result, kind).items():
-            assert not error[part].largest > limit, (kind, name, part, error[part])  # NaN where the part is empty
+            assert not error[part].largest > limit, (kind, name, part, error[part])  # NaN if the part is empty
     if bound.median is not None and backend == CPU_FLOAT:
         assert max(error["stiff"].median for error in result.gradients.values()) < bound.median
 
 
 def test_the_bounds_could_fail():
-    """The textbook's formulas, judged in the same way, exceed those of what they are bad at."""
+    """The textbook's formulas, measured in the same way, exceed the bounds of the cases that they handle badly."""
     beyond = ["needles, axes 1 : 1e+07", "pancakes edge-on, antialiased", "needles of 300 to 2,000 px"]
     beyond += ["field of view 179 degrees", "zero quaternions", "viewing direction of no length"]
     for name in beyond:
@@ -63,10 +63,10 @@ def test_the_bounds_could_fail():
 
 
 def test_an_error_is_hardly_more_than_one_rounding_of_the_inputs_makes():
-    """Ill-conditioned cases: what is lost, is lost before any arithmetic."""
+    """In ill-conditioned cases, rounding of the inputs alone loses the accuracy, before any arithmetic."""
     for name in ("needles of 300 to 2,000 px", "conics of condition 1e7", "needles of 1e4 to 1e6 px"):
         rounding, ours = judged(BY_NAME[name]).one_rounding(), judged(BY_NAME[name]).result(CPU_FLOAT)
-        # Some ten roundings lie between a quaternion and the factor of its conic.
+        # There are some ten roundings between a quaternion and the factor of its conic.
         assert ours.worst("planes", "stiff") < 10 * rounding.worst("planes", "stiff"), name
         assert ours.worst("gradients", "stiff") < 10 * rounding.worst("gradients", "stiff"), name
 
@@ -81,7 +81,7 @@ def test_along_needles_the_exponent_and_the_covariances_gradient_hold():
 
 
 def test_the_oracle_itself_on_needles_a_million_pixels_long():
-    """a c - b b would be off by 1e-16 (1e6)^4 of 0.3 (1e6)^2; judged by mpmath with 60 digits."""
+    """a c - b b would be off by 1e-16 (1e6)^4 of 0.3 (1e6)^2; the reference is mpmath with 60 digits."""
     make, cam = long_needles(1, 1e6, 1.1e6, (0.2, 0.3))
     parameters = make(torch.Generator().manual_seed(4)) | {"opacities": torch.tensor([[1.0]])}
     inputs = leaves(parameters, torch.float64)
@@ -93,7 +93,7 @@ def test_the_oracle_itself_on_needles_a_million_pixels_long():
         mean, conic = _mean_and_conic(parameters, cam, scales)
         pixels = list(zip(columns.tolist(), rows.tolist(), strict=True))
         wanted = [float(_gaussian(pixel, mean, conic) / (1 + mpmath.exp(-1))) for pixel in pixels]
-        # In all pixels, as a sum of alphas: so its derivative by the logarithm of the needle's length and width.
+        # Take a sum of alphas over all pixels, and so its derivative by the logarithm of the needle's length and width.
         few = pixels[:: len(pixels) // 10]
 
         def total(k: int, value: mpmath.mpf) -> mpmath.mpf:
@@ -101,7 +101,7 @@ def test_the_oracle_itself_on_needles_a_million_pixels_long():
             return sum(_gaussian(pixel, *shape) for pixel in few) / (1 + mpmath.exp(-1))
 
         slopes = [float(mpmath.diff(functools.partial(total, k), scales[k])) for k in range(3)]
-    # QR is good to 1e-16 times the condition of its matrix, 2e6; then some ten operations on coordinates of 1e6.
+    # QR is exact to 1e-16 times the condition of its matrix, 2e6; then come some ten operations on values of 1e6.
     wanted = torch.tensor(wanted, dtype=torch.float64)
     torch.testing.assert_close(alpha[rows, columns].detach(), wanted, rtol=1e-8, atol=0)
     alpha[[y for _, y in few], [x for x, _ in few]].sum().backward()
@@ -110,7 +110,7 @@ def test_the_oracle_itself_on_needles_a_million_pixels_long():
 
 
 def _mean_and_conic(parameters: dict, cam, log_scales: list) -> tuple[mpmath.matrix, mpmath.matrix]:
-    """Of the first Gaussian, raw, for a camera at the origin: pixel mean (2) and inverse 2D covariance (2, 2)."""
+    """Pixel mean (2) and inverse 2D covariance (2, 2) of the first raw Gaussian, for a camera at the origin."""
     q = [mpmath.mpf(v) for v in parameters["rotations"][0].tolist()]
     w, i, j, k = (v / mpmath.sqrt(sum(u * u for u in q)) for v in q)
     turn = [[1 - 2 * (j * j + k * k), 2 * (i * j - w * k), 2 * (i * k + w * j)]]
@@ -136,7 +136,7 @@ def _gaussian(pixel: tuple[int, int], mean: mpmath.matrix, conic: mpmath.matrix)
 
 
 def test_equal_scales_are_not_turned():
-    """Exactly: Adam divides by the gradient's own size, so noise would turn Gaussians at the full rate."""
+    """The gradient is exactly zero: Adam divides by its size, so noise would turn Gaussians at the full rate."""
     problem = BY_NAME["three equal scales"].problem()
     for antialiasing in (False, True):
         cam = problem.camera._replace(antialiasing=antialiasing)
@@ -147,7 +147,7 @@ def test_equal_scales_are_not_turned():
 def test_at_most_2350_splats_blend_on_a_pixel():
     problem = BY_NAME["50,000 splats on one pixel"].problem()
     blended = gradients(problem.parameters, problem.camera)["d opacities"].count_nonzero()
-    # ln(1e-4) / ln(1 - 1/255) = 2,344 would, at the least alpha of all.
+    # At the least alpha, ln(1e-4) / ln(1 - 1/255) = 2,344 would.
     assert 2000 < blended <= 2350
 
 

@@ -1,4 +1,4 @@
-"""What training starts from: files of points of all sorts, and random points where cameras look."""
+"""The cloud that training starts from: files of points of several formats, and random points in the cameras' views."""
 
 import numpy as np
 import pytest
@@ -105,7 +105,7 @@ def test_random_points_lie_where_cameras_look(colmap_scene):
         margin = 1e-3  # pixels: the points are float32
         seen += (z > 0) & (abs(u - 48) <= 48 + margin) & (abs(v - 32) <= 32 + margin)
     assert seen.min() >= 1 and seen.max() > 1
-    # The cameras look at the cube of the points from all sides: that is where the random ones are densest.
+    # The cameras face the cube of the points from all sides, so the random ones are densest there.
     cloud = _read(colmap_scene).point_cloud.points
     middle, radius = cloud.mean(axis=0), np.linalg.norm(cloud - cloud.mean(axis=0), axis=1).max()
     near = (np.linalg.norm(points - middle, axis=1) < radius).mean()
@@ -123,7 +123,7 @@ def test_random_points_of_cameras_side_by_side(colmap_scene):
     row = [replace(camera, T=camera.T + (0.1 * step, 0, 0)) for step in range(5)]
     points = random_in_frusta(row).points
     depth = (points @ camera.R + camera.T)[:, 2]
-    # Parallel axes meet nowhere: depths are a quarter of the extent, 1.1 x 0.2, and up to 2.5 times it.
+    # Parallel axes do not meet, so depths are from a quarter of the extent, 1.1 x 0.2, up to 2.5 times it.
     assert depth.min() == pytest.approx(0.25 * 0.22, rel=0.01) and depth.max() == pytest.approx(2.5 * 0.22, rel=0.01)
 
 

@@ -1,4 +1,4 @@
-"""Files, exit statuses and the choice of device."""
+"""Files, exit statuses, and the choice of the device."""
 
 import errno
 import os
@@ -31,7 +31,7 @@ def _raise(error: BaseException):
 @pytest.mark.parametrize(
     ("error", "status", "said"),
     [
-        (UserError("mend it like this"), 2, "error: mend it like this\n"),
+        (UserError("fix it like this"), 2, "error: fix it like this\n"),
         (KeyboardInterrupt(), 130, "interrupted\n"),
         (Terminated(), 143, "terminated\n"),
     ],

@@ -1,4 +1,4 @@
-"""How many threads work on pictures: no more than the process has processors for."""
+"""The number of threads for photos: at most the number of processors that the process may use."""
 
 import os
 
@@ -9,7 +9,7 @@ from utils.host import threads
 
 @pytest.fixture
 def machine(monkeypatch, tmp_path):
-    """Function that makes a machine of 64 processors of which the process may use some; limits by cgroup."""
+    """A function that simulates a machine of 64 processors, of which the process may use some; limits by cgroup."""
     monkeypatch.setattr(os, "cpu_count", lambda: 64)
     monkeypatch.setattr(threads, "_CGROUPS", tmp_path)
     monkeypatch.setattr(threads, "_OWN_CGROUPS", tmp_path / "own")

@@ -31,7 +31,7 @@ SMALL = ["-r", "24", "--test_iterations", "-1"]
 
 @pytest.fixture(autouse=True)
 def _stdout(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Training stamps and may silence stdout: bring it back."""
+    """Restore stdout, which training stamps and may silence."""
     monkeypatch.setattr(sys, "stdout", sys.stdout)
 
 
@@ -47,7 +47,7 @@ def _raw(ply: Path, degree: int = 3) -> GaussianModel:
 
 
 def _steps(checkpoint: Path) -> list[float]:
-    """Adam's step counters by group; NaN where there is no state."""
+    """Adam's step counters by group; NaN if there is no state."""
     state = load_checkpoint(checkpoint)[0][10]["state"]
     return [state[i]["step"].item() if i in state else float("nan") for i in range(6)]
 
@@ -64,14 +64,14 @@ def test_resume_equals_uninterrupted(colmap_scene, tmp_path, monkeypatch):
     checkpoint = tmp_path / "a" / "chkpnt300.pth"
     resumed = _train(colmap_scene, tmp_path / "b", *RESUMED, "--start_checkpoint", checkpoint, iterations=600)
     assert whole.read_bytes() == resumed.read_bytes()
-    assert len(_raw(whole)) != load_checkpoint(checkpoint)[0][1].shape[0]  # densification went on after 300
+    assert len(_raw(whole)) != load_checkpoint(checkpoint)[0][1].shape[0]  # densification continued after 300
     again = _train(colmap_scene, tmp_path / "c", *RESUMED[:-1], 6, iterations=100)
     first = _train(colmap_scene, tmp_path / "d", *RESUMED, iterations=100)
     assert again.read_bytes() != first.read_bytes()  # the seed matters
 
 
 def test_order_of_a_step(colmap_scene, tmp_path):
-    """Saved before the step; no step in the last, in a densification, and for opacity in a reset iteration."""
+    """A save precedes the step. The last iteration and densifications take no step, nor do opacities in a reset."""
     every = [str(t) for t in range(1, 13)]
     _train(
         colmap_scene, tmp_path, "--save_iterations", *every, "--checkpoint_iterations", *every,
@@ -84,7 +84,7 @@ def test_order_of_a_step(colmap_scene, tmp_path):
     assert steps[7] == [7] * 6 and steps[8] == [7] * 6  # 8 densified
     assert steps[9] == [8] * 6
     assert steps[10] == [9, 9, 9, 8, 9, 9]  # 10 reset the opacities
-    assert steps[11] == [10, 10, 10, 9, 10, 10] and steps[12] == steps[11]  # nothing in the last
+    assert steps[11] == [10, 10, 10, 9, 10, 10] and steps[12] == steps[11]  # no step in the last
     for t in (3, 7, 11, 12):
         saved = _raw(tmp_path / f"point_cloud/iteration_{t}/point_cloud.ply")
         assert torch.equal(saved._xyz, load_checkpoint(tmp_path / f"chkpnt{t - 1}.pth")[0][1])
@@ -120,8 +120,8 @@ train.main(sys.argv[2:])
 
 def test_any_number_of_threads_gives_the_same_bytes(colmap_scene, tmp_path):
     rng = np.random.default_rng(0)
-    # torch cuts its loops for two threads from 32,768 values on: so many points, and pictures 160 wide, reach that.
-    # (With torch's sigmoid for the opacities in place of the kernel's this test fails.)
+    # torch divides loops between two threads from 32,768 values on; so many points and photos 160 pixels wide exceed
+    # that. (With torch's sigmoid for the opacities instead of the kernel's, this test fails.)
     count = 40_003
     write_point_cloud(tmp_path / "cloud.ply", rng.normal(size=(count, 3)), rng.integers(0, 255, (count, 3)))
     runs = []
@@ -198,7 +198,7 @@ def test_interrupt_saves_a_checkpoint_that_goes_on_to_the_same_end(colmap_scene,
     assert [record["iteration"] for record in log] == [4, 9]
     whole_log = json.loads((tmp_path / "whole" / "train_log.json").read_text())
     assert log[1]["seconds"] > log[0]["seconds"] > 0 and log[1]["gaussians"] == whole_log[0]["gaussians"]
-    assert log[1]["loss"] == whole_log[0]["loss"]  # the running mean goes on where it was
+    assert log[1]["loss"] == whole_log[0]["loss"]  # the running mean resumes where it was
 
 
 @pytest.mark.parametrize(
@@ -215,7 +215,7 @@ def test_a_killed_run_leaves_whole_files(colmap_scene, tmp_path, sent, status):
         run.send_signal(sent)
         _, error = run.communicate(timeout=60)
     assert run.returncode == status, error.decode()
-    assert b"Traceback" not in error and b"***" not in error  # glog's stack dumps have such lines
+    assert b"Traceback" not in error and b"***" not in error  # glog's stack dumps contain these
     if sent == signal.SIGTERM:
         assert b"resume with --start_checkpoint" in error
     plys = list((tmp_path / "out" / "point_cloud").glob("iteration_*/point_cloud.ply"))
@@ -311,7 +311,7 @@ def test_a_late_reset_is_announced(colmap_scene, tmp_path, capfd):
 
 
 class _Writer:
-    """Stands in for TensorBoard's, which is optional."""
+    """A stand-in for TensorBoard's writer, which is optional."""
 
     def __init__(self, folder: str) -> None:
         self.tags: list[tuple[str, int]] = []

@@ -1,4 +1,4 @@
-"""Scenes at the edges: few, equal, stray points and cameras, tiny and huge worlds, map coordinates, one colour."""
+"""Edge cases of scenes: few, equal or stray points and cameras, tiny and huge worlds, map coordinates, one colour."""
 
 import argparse
 import json
@@ -29,19 +29,19 @@ from utils.system_utils import UserError
 
 LONG = 200
 SMALL = ["-r", "48", "--test_iterations", "-1", "--no_curve"]
-# Densified five times, opacities reset in between, within some hundred iterations.
+# Options that densify five times, with a reset of opacities in between, within some hundred iterations.
 DENSE = ["--densify_from_iter", 20, "--densification_interval", 20, "--opacity_reset_interval", 70]
 DENSE += ["--densify_until_iter", 130]
 
 
 @pytest.fixture(autouse=True)
 def _stdout(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Training stamps and may silence stdout: bring it back."""
+    """Restore stdout, which training stamps and may silence."""
     monkeypatch.setattr(sys, "stdout", sys.stdout)
 
 
 def _train(scene: Path, out: Path, *more: object, iterations: int = LONG) -> GaussianModel:
-    """The model after a training, whose values are all finite."""
+    """Train, check that all values are finite, and return the model."""
     train.main(["-s", str(scene), "-m", str(out), "--iterations", str(iterations), *SMALL, *map(str, (*DENSE, *more))])
     gaussians = GaussianModel(3)
     gaussians.load_ply(_ply(out, iterations))
@@ -100,11 +100,11 @@ def test_equal_points(colmap_scene, tmp_path):
 
     _change(colmap_scene, gather)
     gaussians = _train(colmap_scene, tmp_path / "out")
-    assert len(torch.unique(gaussians.get_xyz, dim=0)) > 100  # they went apart
+    assert len(torch.unique(gaussians.get_xyz, dim=0)) > 100  # they separated
 
 
 def test_one_camera_has_the_extent_of_its_depth(tmp_path):
-    """Equal poses, and such that differ less than a hundredth of the depth: E is 1.1 times the median depth."""
+    """With poses that are equal or differ by less than a hundredth of the depth, E is 1.1 times the median depth."""
     scene = tmp_path / "scene"
     model = make_colmap_scene(scene, views=9)
     first = model.image(1).cam_from_world()
@@ -120,13 +120,13 @@ def test_one_camera_has_the_extent_of_its_depth(tmp_path):
         _change(scene, gather)
         info = read_scene(scene, "images", hold_out=False)
         assert info.extent == pytest.approx(1.1 * depth, rel=1e-3)  # 3e-4 of 5 units, and a little of the points
-    # Sizes are limited to a tenth of E: with E of 1e-3 nothing was left after the reset.
+    # Sizes are limited to a tenth of E; with E of 1e-3 no Gaussian would survive the reset.
     assert len(_train(scene, tmp_path / "out")) > 300
 
 
 def test_a_camera_far_off_is_left_out_of_the_extent(colmap_scene, tmp_path, capfd):
     before = read_scene(colmap_scene, "images", hold_out=False)
-    # The first by name too: without points it decides on the depth.
+    # Also the first by name, which decides the depth if there are no points.
     _change(colmap_scene, lambda model: [_pose(model, i, np.array([0.0, 0.0, 1e5])) for i in (-1, 3)])
     info = read_scene(colmap_scene, "images", hold_out=False)
     assert 0.8 * before.extent < info.extent <= 1.2 * before.extent
@@ -144,7 +144,7 @@ def test_which_cameras_stand_apart():
     assert not standing_apart(ring).any()
     assert standing_apart(np.vstack([ring, [[9, 0, 0]]])).sum() == 0
     assert standing_apart(np.vstack([ring, [[1e7, 0, 0]]])).tolist() == [False] * 8 + [True]
-    # Most in one place: that is a tripod, and the others are no mistake.
+    # If most are in one place, that is a tripod, and the others are valid.
     assert not standing_apart(np.vstack([np.full((9, 3), 1 / 3), ring[:3]])).any()
     assert not standing_apart(ring[:1]).any()
 
@@ -184,11 +184,11 @@ def test_real_scenes_keep_the_references_extent_and_scales(shared_dir, name):
 
 
 def test_a_huge_world_trains_as_well(colmap_scene, tmp_path):
-    """A power of two, which float32 scales without a rounding: what is not exactly as before depends on 0.2 or 1e-7."""
+    """Scaling by a power of two is exact in float32, so all differences come from the constants 0.2 and 1e-7."""
     _train(colmap_scene, tmp_path / "usual")
     _change(colmap_scene, _transform(2.0**17))
     _train(colmap_scene, tmp_path / "huge")
-    # Measured: equal to 2 %. Random children of splits differ once a threshold falls otherwise.
+    # Measured: equal to 2 %. Random children of splits differ once a threshold decides differently.
     assert _loss(tmp_path / "huge") == pytest.approx(_loss(tmp_path / "usual"), rel=0.2)
 
 
@@ -205,7 +205,7 @@ def test_a_world_nearer_than_anything_is_drawn_is_refused(colmap_scene, tmp_path
 
 @pytest.mark.parametrize("value", [0, 255])
 def test_pictures_of_one_colour(colmap_scene, tmp_path, value):
-    """Learnt where the background has the other colour; where it has the same, nothing is left in the end."""
+    """It is learnt if the background has another colour; if it has the same one, no Gaussian remains in the end."""
     _paint(colmap_scene, value)
     white = [[], ["-w"]]
     _train(colmap_scene, tmp_path / "out", *white[value == 0])
@@ -227,7 +227,7 @@ UTM = (500_000.0, 4_100_000.0, 300.0)
 
 @pytest.fixture
 def surveyed(tmp_path) -> tuple[Path, Path]:
-    """A scene, and the same in the coordinates of a map."""
+    """A scene, and the same scene in map coordinates."""
     scenes = tmp_path / "local", tmp_path / "map"
     for scene in scenes:
         make_colmap_scene(scene)
@@ -236,7 +236,7 @@ def surveyed(tmp_path) -> tuple[Path, Path]:
 
 
 def test_map_coordinates_change_no_byte_of_the_model(surveyed, tmp_path, capfd):
-    """Where nothing is rounded: cameras along the axes, and all coordinates multiples of 1/1024."""
+    """A scene without rounding: cameras along the axes, and all coordinates multiples of 1/1024."""
 
     def exact(model: pycolmap.Reconstruction) -> None:
         for point in model.points3D.values():
@@ -261,11 +261,11 @@ def test_map_coordinates_change_no_byte_of_the_model(surveyed, tmp_path, capfd):
 
 
 def test_map_coordinates_train_as_well_and_render(surveyed, tmp_path):
-    """The views of a model are shifted by what it remembers, whatever would be found now."""
+    """The views of a model are shifted by its stored offset, whatever offset would be found now."""
     outs = [tmp_path / f"{scene.name}_out" for scene in surveyed]
     for scene, out in zip(surveyed, outs, strict=True):
         _train(scene, out)
-    # Poses differ by roundings at 4e6 in double, which may turn a decision of density control.
+    # Poses differ by roundings at 4e6 in double, which may change a decision of density control.
     assert _loss(outs[1]) == pytest.approx(_loss(outs[0]), rel=0.05)
     renders, targets = [], []
     for scene, out in zip(surveyed, outs, strict=True):
@@ -275,7 +275,7 @@ def test_map_coordinates_train_as_well_and_render(surveyed, tmp_path):
         with torch.no_grad():
             renders.append(render(camera, loaded.gaussians, pipeline(), torch.zeros(3))["render"])
     here, there = (psnr(*pair).mean().item() for pair in zip(renders, targets, strict=True))
-    assert here > 10 and there == pytest.approx(here, abs=0.3)  # a black picture has 7
+    assert here > 10 and there == pytest.approx(here, abs=0.3)  # a black image has 7
 
     remembered = json.loads((outs[1] / "model.json").read_text())
     (outs[1] / "model.json").write_text(json.dumps(remembered | {"world_offset": [0.0, 0.0, 7.0]}))
@@ -330,7 +330,7 @@ def test_clouds_of_map_coordinates_keep_their_decimals(surveyed, tmp_path, kind)
 
 
 def test_ordinary_coordinates_are_not_shifted(colmap_scene):
-    """Up to a hundred extents from the origin, and in whatever units."""
+    """Offsets up to a hundred extents are kept, in any unit."""
     for change, shifted in ((_transform(0.5, (300, 0, 0)), False), (_transform(1, (9e2, -9e2, 0)), True)):
         _change(colmap_scene, change)
         assert read_scene(colmap_scene, "images", hold_out=False).offset.any() == shifted

@@ -1,4 +1,4 @@
-"""What the last save of a training leaves out: Gaussians that no training view depends on, and SH bands on request."""
+"""The last save of a training: it leaves out Gaussians that no training view depends on, and SH bands on request."""
 
 import argparse
 import json
@@ -41,7 +41,7 @@ def _ply(out: Path, iteration: int = ITERATIONS) -> np.ndarray:
 
 
 def _load(out: Path) -> tuple[Scene, GaussianModel]:
-    """As render.py does."""
+    """Render as render.py does."""
     options = argparse.Namespace(**read_cfg_args(out) | {"model_path": str(out)})
     gaussians = GaussianModel(options.sh_degree)
     options = ModelParams(argparse.ArgumentParser()).extract(options)
@@ -54,11 +54,11 @@ def _image(camera, gaussians: GaussianModel) -> torch.Tensor:
 
 @pytest.fixture(scope="module")
 def runs(_colmap_master, tmp_path_factory) -> SimpleNamespace:
-    """A training with and without --keep_unseen, with bands cut, and by the half-image protocol."""
+    """Trainings with and without --keep_unseen, with cut bands, and with the half-image protocol."""
     folder = tmp_path_factory.mktemp("trimming")
     cloud = folder / "cloud.ply"
     rng = np.random.default_rng(2)
-    # Half of them in close groups far away, so small that many are beside every training view.
+    # Half of the points are in close groups far away, so small that many are outside every training view.
     groups = np.repeat(rng.normal(size=(60, 3)) * 12, 5, axis=0)
     points = np.concatenate([rng.normal(size=(300, 3)) * 0.4, groups + 0.05 * rng.normal(size=(300, 3))])
     write_point_cloud(cloud, points, rng.integers(0, 256, (600, 3)))
@@ -70,7 +70,7 @@ def runs(_colmap_master, tmp_path_factory) -> SimpleNamespace:
         _train(scene, folder / "cut", cloud, "--save_iterations", 5, "--test_iterations", -1, "--prune_sh", 0)
         _train(scene, folder / "halves", cloud, "--test_iterations", ITERATIONS, "--train_test_exp")
     finally:
-        sys.stdout = stdout  # training stamps it
+        sys.stdout = stdout  # restore it, since training stamps it
     return SimpleNamespace(**{name: folder / name for name in ("trimmed", "whole", "cut", "halves")})
 
 
@@ -86,7 +86,7 @@ def test_training_views_are_the_same_to_the_bit(runs):
     scene, whole = _load(runs.whole)
     trimmed = _load(runs.trimmed)[1]
     changed = [not torch.equal(_image(c, whole), _image(c, trimmed)) for c in scene.getTestCameras()]
-    assert any(changed)  # so there was something to see, from elsewhere
+    assert any(changed)  # so other views do see some of them
     for camera in scene.getTrainCameras():
         assert torch.equal(_image(camera, whole), _image(camera, trimmed))
 
@@ -107,7 +107,7 @@ def test_what_is_reported(runs):
     assert record["sh_degree"] == record["max_sh_degree"] == 3 and record["cut_bounds"] == [0, 0, 0, 0]
     log = json.loads((runs.trimmed / "train_log.json").read_text())[-1]
     assert log["gaussians_left_out"] == missing and log["gaussians"] == 600
-    # The change on test views, with the test pictures as they were scored at this iteration.
+    # The change on test views, with the test images as they were scored at this iteration.
     scene, whole = _load(runs.whole)
     change = change_on_views(
         whole, _load(runs.trimmed)[1], scene.getTestCameras(), ScoredViews(pipeline(), BLACK, False), scored=True
@@ -127,7 +127,7 @@ def test_bands_that_are_zero_are_cut_and_the_model_is_read_again(runs):
         assert torch.equal(_image(camera, cut), _image(camera, trimmed))
     record = json.loads((runs.cut / "model.json").read_text())["left_out"]
     assert record["sh_degree"] == 0
-    # No test picture was in use, so none is decoded for a score.
+    # No test photo was used before, so none is decoded for a score.
     assert set(record["test_change"]) == {"largest"}
 
 
@@ -224,5 +224,5 @@ def test_training_says_them(colmap_scene, tmp_path, capfd, monkeypatch):
     said = re.sub(r" \[\d\d/\d\d \d\d:\d\d:\d\d\]$", "", capfd.readouterr().out, flags=re.MULTILINE).splitlines()
     expected = lines(LeftOut(**json.loads((tmp_path / "model.json").read_text())["left_out"]))
     assert said[-4:] == [*expected, "Training complete."]
-    # 17 pictures of 96 x 64, trained at 24 x 16.
+    # There are 17 photos of 96 x 64, trained at 24 x 16.
     assert "size: 0.0 MB, 1.2 MB less" in expected[2]

@@ -1,6 +1,6 @@
-"""Any camera model of pycolmap, undistorted: where things are seen, what is kept in the cache, what counts.
+"""Undistortion of every camera model of pycolmap: positions in the image, files in the cache, pixels that count.
 
-The judge is pycolmap's own projection of each model.
+The reference is pycolmap's own projection of each model.
 """
 
 import numpy as np
@@ -26,7 +26,7 @@ def _lens(model: str, focal: float = FOCAL) -> Lens:
 
 
 def _dot(at: np.ndarray, width: int, height: int) -> np.ndarray:
-    """A white spot, sigma 2 pixels, whose middle is at a place in pixels (centres at .5)."""
+    """A photo of a white spot, sigma 2 pixels, with its middle at a position in pixels (centres at .5)."""
     rows, columns = np.mgrid[:height, :width] + 0.5
     return np.exp(-((columns - at[0]) ** 2 + (rows - at[1]) ** 2) / 8)
 
@@ -57,9 +57,9 @@ def test_things_are_where_the_pinhole_sees_them(tmp_path, model):
         with Image.open(result.path) as image:
             assert image.size == (width, height)
             seen = np.asarray(image, dtype=np.float64)[..., 0]
-        # A round spot becomes an oval whose middle is off by the second derivative of the distortion: 0.1 pixels here.
+        # A round spot becomes an oval, whose middle is off by the distortion's second derivative: 0.1 pixels here.
         assert np.abs(_middle(seen, place) - place).max() < 0.15
-        # Without undistortion it would be elsewhere, but in the middle of the picture.
+        # Without undistortion the spot would be elsewhere, except in the middle of the photo.
         assert (
             index == 0
             or np.abs(_middle(picture, place) - place).max() > 1
@@ -78,15 +78,15 @@ def test_lenses_without_distortion_are_pinholes(model):
 
 @pytest.mark.parametrize("model", ["SIMPLE_FISHEYE", "OPENCV_FISHEYE", "FOV", "EUCM", "RADIAL"])
 def test_lenses_too_wide_for_a_pinhole_show_their_middle(model):
-    """Their border has no place in any pinhole picture, and COLMAP's choice would be arbitrary (40 x 30 pixels)."""
+    """Their border is in no pinhole image, and COLMAP's choice of size would be arbitrary (40 x 30 pixels)."""
     lens = _lens(model, focal=50.0)
-    if model == "RADIAL":  # whose polynomial turns back far out
+    if model == "RADIAL":  # its polynomial decreases again far out
         lens = lens._replace(params=(*lens.params[:-2], 0.05, -0.02))
     plan = undistortion(lens, WIDTH, HEIGHT)
     shown = shown_pixels(lens, WIDTH, HEIGHT)
     assert plan.widest == pytest.approx(WIDEST)
     assert plan.pinhole.width / 2 / plan.pinhole.fx == pytest.approx(np.tan(np.radians(WIDEST)), rel=0.02)
-    rays = colmap_camera(lens)  # the judge: what counts comes back to where it was
+    rays = colmap_camera(lens)  # the reference: pixels that count project back to where they were
     x, y = np.meshgrid(np.arange(plan.pinhole.width) + 0.5, np.arange(plan.pinhole.height) + 0.5)
     local = np.stack([(x - plan.pinhole.cx) / plan.pinhole.fx, (y - plan.pinhole.cy) / plan.pinhole.fy], -1)
     for row, column in np.random.default_rng(0).integers(0, local.shape[:2], (200, 2)):
@@ -124,7 +124,7 @@ def test_the_cache_is_keyed_by_content(tmp_path, cache_folder, capsys):
     assert again.path == other.path == first.path
     assert folder_state(cache_folder) == before and "are kept" not in capsys.readouterr().err
 
-    first.path.write_bytes(first.path.read_bytes()[:-30])  # by a full disk, or a curious user
+    first.path.write_bytes(first.path.read_bytes()[:-30])  # as after a full disk
     undistort([photo])
     assert first.path.read_bytes() == before[str(first.path.relative_to(cache_folder))][1]
 
@@ -176,7 +176,7 @@ def test_a_mask_is_undistorted_with_its_picture(tmp_path):
     rows, columns = np.nonzero(counts == 255)
     x = [(columns + 0.5 - result.pinhole.cx) / result.pinhole.fx, (rows + 0.5 - result.pinhole.cy) / result.pinhole.fy]
     seen = camera.img_from_cam(np.column_stack([*x, np.ones(len(rows))]))
-    assert seen[:, 0].min() >= WIDTH / 2  # nothing that counts is mixed with what is masked
+    assert seen[:, 0].min() >= WIDTH / 2  # masked pixels do not mix into pixels that count
     assert len(rows) == pytest.approx(0.5 * counts.size, rel=0.1)
 
 
@@ -199,7 +199,7 @@ def test_a_transparent_mask_becomes_alpha(tmp_path):
     result, pixels = _masked(tmp_path, TRANSPARENT)
     assert result.mask is None and pixels.shape[2] == 4
     assert (pixels[:, :60, 3] == 0).all() and (pixels[:, -60:, 3] == 255).all()
-    # Straight colours up to the edge: what is masked does not bleed in. 240 / 8 levels of noise above the base colour.
+    # Colours stay straight up to the edge: masked pixels do not bleed in. The noise is 240 / 8 levels over the base.
     shown = pixels[pixels[..., 3] > 128][:, 0]
     assert shown.min() >= 199 and shown.max() <= 232
 
@@ -257,13 +257,13 @@ def test_real_distorted_scenes(shared_dir, tmp_path):
         assert len(info.train_cameras) == views and len(info.point_cloud.points) == model_points
         for camera in info.train_cameras:
             assert camera.mask is None and camera.file_size == (camera.width, camera.height)
-            # COLMAP keeps focal lengths; these lenses are nearly free of distortion, so sizes stay alike too.
+            # COLMAP keeps focal lengths; these lenses have almost no distortion, so sizes stay similar too.
             with Image.open(folder / "images" / camera.image_name) as image:
                 assert abs(image.width - camera.width) < 0.05 * image.width
 
 
 def test_a_wide_lens_in_a_scene(tmp_path, capsys):
-    """What the photo does not show does not count."""
+    """Pixels that the photo does not show do not count."""
     folder = tmp_path / "scene"
     make_colmap_scene(folder, model="RADIAL", params=(25.0, 45.0, 34.5, 0.05, -0.02), views=2)
     for camera in _read(folder).train_cameras:

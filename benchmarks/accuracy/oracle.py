@@ -10,10 +10,10 @@ it. Rounding alone can decide a pixel that is within 1e-4 of a cut-off (alpha 1/
 depth tie. Such pixels are left out of the loss and of the comparison; a row of the table counts them. The oracle gets
 the float32 value of every parameter, so the kernels of CPU and GPU all compute the same function.
 
---figure and --json also time each kernel, and also measure a second build of the rasterizer that has the standard
-library's exponential instead of the fast one (exact_exponential.py builds it under build/ on first use). Errors come
-from scenes small enough for the oracle. The time beside an error is forward and backward of one image of a larger scene
-of the same family (TIMED_SIZES in kernel_runs.py).
+--figure and --json also time each kernel. They also measure a second build of the rasterizer, which has the standard
+library's exponential instead of the fast one; exact_exponential.py makes it under build/ on first use. Errors come from
+scenes small enough for the oracle. The time beside an error is forward and backward of one image of a larger scene of
+the same family (TIMED_SIZES in kernel_runs.py).
 """
 
 import argparse

@@ -2,9 +2,9 @@
 
     python -m benchmarks.kernels.hidden_instances -m MODEL [--iteration N]
 
-Counts, in each training view, the instances, the processed ones (up to the last one that a pixel of the tile blends),
-and the splats that have a processed instance. The rest is the most that a depth cut-off per tile could save. Prints
-medians over the views.
+Counts the instances of each training view, the processed ones, and the splats that have a processed instance. Processed
+are those up to the last one that a pixel of the tile blends. The rest is the most that a depth cut-off per tile could
+save. Prints medians over the views.
 """
 
 import math

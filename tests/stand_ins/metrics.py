@@ -1,4 +1,4 @@
-"""Stands in for metrics.py: the PSNR that the stand-in for train.py has left, the second view below the first."""
+"""Stand-in for metrics.py: it gives the PSNR that the stand-in for train.py left, and less for the second view."""
 
 import argparse
 import json

@@ -1,4 +1,4 @@
-"""Stands in for render.py: two test views, grey, with a brighter stripe in the renders."""
+"""Stand-in for render.py: it writes two grey test views, with a brighter stripe in the renders."""
 
 import argparse
 import json

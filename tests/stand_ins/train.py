@@ -1,7 +1,7 @@
-"""Stands in for train.py: writes at once what a training would, with numbers that follow from the options.
+"""Stand-in for train.py: it writes the files of a training at once, with numbers that depend on the options.
 
-A scene folder with a file `broken` makes it fail, one with a file `full` makes it fail and leave a checkpoint, one with
-a file `slow` makes it wait for a signal.
+A file `broken` in the scene folder makes it fail, `full` makes it fail and leave a checkpoint, `slow` makes it wait for
+a signal.
 """
 
 import argparse
@@ -26,7 +26,7 @@ with (args.s.parent / "calls.txt").open("a") as calls:
 args.m.mkdir(parents=True, exist_ok=True)
 if (args.s / "broken").exists():
     sys.stderr.write("Training progress:  50%|#####     | 5/10\r\n")
-    sys.exit("error: <b>the scene</b> is broken; mend it")
+    sys.exit("error: <b>the scene</b> is broken; fix it")
 
 
 if (args.s / "full").exists():
