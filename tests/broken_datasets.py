@@ -332,7 +332,7 @@ def _(scene: Path) -> None:
     _photo(scene).write_bytes(b"")
 
 
-@fault("colmap", "a photo is a pointer of Git LFS")
+@fault("colmap", "a photo is a Git LFS pointer")
 def _(scene: Path) -> None:
     _photo(scene).write_text("version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\nsize 12345\n")
 

@@ -79,7 +79,7 @@ def l1_and_ssim(image: Tensor, target: Tensor, mask: Tensor | None = None) -> tu
 
     image: (3, H, W) float32 in [0, 1], differentiable; target: the same shape, float32, or uint8 meaning value / 255.
     mask: (1, H, W) bool, the pixels that count. The others are treated like the zero padding outside the image, in both
-    images, and the sums of |difference| and of 1 - SSIM are divided by the number of pixels that count.
+    images. The sums of |difference| and of 1 - SSIM are divided by the number of pixels that count.
     """
     if mask is None:
         return fused_l1_ssim(image, target)

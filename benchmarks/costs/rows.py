@@ -188,7 +188,7 @@ def antialiasing(work: Workload) -> Row:
     model, off = work.model(), torch.no_grad()
     return Row(
         "antialiasing",
-        "nothing: when off, a flag is read once a splat",
+        "nothing: when off, one flag is read per splat",
         off(partial(work.image, model)),
         None,
         off(partial(work.image, model, pipe=work.antialiased)),

@@ -51,13 +51,13 @@ def _log(x: float) -> float:
 
 
 def mean_gradient(accumulated: Tensor, count: Tensor) -> Tensor:
-    """Average length of the screen-space gradient over the views that saw each Gaussian; 0 where none did. (N,)."""
+    """Average length of the screen-space gradient over the views that saw each Gaussian, 0 if none did: (N,)."""
     mean = (accumulated / count).reshape(-1)
     return torch.where(mean.isnan(), 0.0, mean)
 
 
 def limit_growth(gradient: Tensor, threshold: float, room: int) -> Tensor:
-    """Zero the gradients of all candidates (>= threshold) except the `room` largest, ties by index. (N,)."""
+    """Zero the gradients of all candidates (>= threshold) except the `room` largest, ties by index: (N,)."""
     candidates = (gradient >= threshold).nonzero().reshape(-1)
     if len(candidates) <= room:
         return gradient

@@ -102,7 +102,7 @@ class Exposures:
 
 
 def read_exposures(folder: str | os.PathLike, names: Sequence[str], image_names: Sequence[str]) -> Exposures:
-    """Exposures of the photos `names` from a model folder's exposure.json. UserError where one is missing or broken.
+    """Exposures of the photos `names` from a model folder's exposure.json. UserError if one is missing or broken.
 
     image_names: of the same photos, under which the reference's files have them, also where several photos share one.
     """
@@ -133,7 +133,7 @@ def read_exposures(folder: str | os.PathLike, names: Sequence[str], image_names:
 
 
 def apply_exposure(image: Tensor, exposure: Tensor) -> Tensor:
-    """Map the colours c of an image (3, H, W) to c A + b, for an exposure (3, 4) = [A | b] and c as a row vector.
+    """Map the colours c, row vectors, of an image (3, H, W) to c A + b. The exposure (3, 4) is [A | b].
 
     Differentiable in both. Uses products and sums of whole planes, because the rounding of a matrix product and of its
     gradient may depend on the number of threads.

@@ -9,10 +9,10 @@ from torch import Tensor
 def cut_bounds(f_rest: Tensor) -> list[float]:
     """By degree d = 0..D: the most a colour can change, in any direction, when all bands above d are cut.
 
-    f_rest: (N, (D+1)^2 - 1, 3). The bound is the largest, over Gaussians and channels, of the
-    sum over l > d of |c_l| sqrt((2l+1) / 4 pi), c_l being the coefficients of band l. It follows from Cauchy-Schwarz
-    and from Unsoeld's theorem: the basis functions of a band have the same length in every direction. The bound holds
-    for images, too: a pixel's weights sum to at most 1, and clamping never increases a difference.
+    f_rest: (N, (D+1)^2 - 1, 3). With c_l the coefficients of band l, the bound is the
+    sum over l > d of |c_l| sqrt((2l+1) / 4 pi), the largest of all Gaussians and channels. It follows from
+    Cauchy-Schwarz and from Unsoeld's theorem: the basis functions of a band have the same length in every direction.
+    The bound holds for images, too: a pixel's weights sum to at most 1, and clamping never increases a difference.
     """
     degree = math.isqrt(f_rest.shape[1] + 1) - 1
     if not len(f_rest):

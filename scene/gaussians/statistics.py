@@ -25,7 +25,7 @@ class Statistics:
         return cls(*(torch.zeros(shape, device=device) for shape in ((count,), (count, 1), (count, 1))))
 
     def observe(self, gradient: Tensor, radii: Tensor) -> None:
-        """Add a view in one pass: gradient (N, 3) per NDC unit, radii (N,) int32 pixels, 0 where it saw nothing."""
+        """Add a view in one pass: gradient (N, 3) per NDC unit, radii (N,) int32 pixels, 0 if not seen."""
         observe_(self.max_radii2D, self.xyz_gradient_accum, self.denom, radii, gradient)
 
     def add_gradient(self, gradient: Tensor, seen: Tensor) -> None:

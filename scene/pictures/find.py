@@ -13,8 +13,8 @@ from utils.system_utils import UserError
 class FileIndex:
     """Files below a folder, found by name.
 
-    If the exact name is missing, a name is found that differs only in letter case, in the encoding of accents (as
-    between macOS and Linux), or in the kind of slash. merely_alike: names found that way, with their files.
+    If the exact name is missing, a similar one is accepted: it may differ in letter case, in the encoding of accents
+    (as between macOS and Linux), or in the kind of slash. merely_alike: names found that way, with their files.
     """
 
     def __init__(self, folder: Path) -> None:

@@ -19,7 +19,7 @@ def make_depth_params(scene: Path, depths: Path, model_type: str) -> tuple[dict[
     """Fit every registered photo that has a map in `depths`, and write depth_params.json into the model's folder.
 
     model_type: bin or txt. Returns the table and the number of registered photos. The table has `scale` and `offset` by
-    photo name without extension, both 0 where there are too few points. UserError when no photo has a map, or the scene
+    photo name without extension, both 0 if there are too few points. UserError when no photo has a map, or the scene
     has no COLMAP model.
     """
     if not (scene / "sparse").is_dir():

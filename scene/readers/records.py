@@ -102,9 +102,9 @@ def exposure_names(cameras: Sequence[CameraInfo]) -> list[str]:
 def scene_extent(cameras: list[CameraInfo], points: np.ndarray | None = None) -> float:
     """Extent E: 1.1 times the largest distance of a camera from the cameras' mean, in world units.
 
-    Cameras that stand apart (`standing_apart`) are left out. If the cameras are in one place, or nearly so (E below
-    NARROW times the depth), E is 1.1 times the median depth of the points (N,3) in front of the first camera, or 1
-    without such points.
+    Cameras that stand apart (`standing_apart`) are left out. If the cameras are nearly in one place (E below NARROW
+    times the depth), E is 1.1 times the median depth of the points (N,3) in front of the first camera. Without such
+    points it is then 1.
     """
     centers = np.array([camera.center for camera in cameras])
     counted = ~standing_apart(centers)

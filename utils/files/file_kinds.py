@@ -6,7 +6,7 @@ _HEAD = 256
 
 
 def not_the_file(path: str | os.PathLike) -> str | None:
-    """Words for a file that is empty, a pointer of Git LFS or a web page; None for any other file."""
+    """Words for a file that is empty, a Git LFS pointer or a web page; None for any other file."""
     try:
         with open(path, "rb") as file:
             head = file.read(_HEAD)
@@ -15,7 +15,7 @@ def not_the_file(path: str | os.PathLike) -> str | None:
     if not head:
         return "empty"
     if head.startswith(b"version https://git-lfs"):
-        return "a pointer of Git LFS, whose content git lfs pull downloads"
+        return "a Git LFS pointer (git lfs pull downloads its content)"
     if head.lstrip()[:9].lower().startswith((b"<!doctype", b"<html")):
         return "a web page, likely from a wrong address"
     return None
