@@ -1,5 +1,5 @@
 #pragma once
-// Stands in for CUDA's header of this name. Copies happen at the wait, as late as they may.
+// Replaces CUDA's header of this name. Copies happen at the wait, as late as possible.
 #include <vector>
 
 #include "cuda_runtime.h"

@@ -1,5 +1,5 @@
 #pragma once
-// Stands in for CUDA's header of this name; see emulation.h.
+// Replaces CUDA's header of this name; see emulation.h.
 #include <algorithm>
 #include <cmath>
 #include <cstdint>
@@ -36,7 +36,7 @@ inline cudaError_t cudaMemcpyAsync(void* to, const void* from, size_t bytes, cud
   return std::memcpy(to, from, bytes), cudaSuccess;
 }
 inline cudaError_t cudaStreamSynchronize(cudaStream_t) { return cudaSuccess; }
-// Kernels run when they are launched, so an event has always happened.
+// Kernels run at their launch, so every event has already happened.
 using cudaEvent_t = void*;
 constexpr unsigned cudaEventDisableTiming = 2;
 inline cudaError_t cudaEventCreateWithFlags(cudaEvent_t* event, unsigned) { return *event = nullptr, cudaSuccess; }

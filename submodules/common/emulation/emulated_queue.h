@@ -12,7 +12,7 @@
 
 namespace gs::emulation {
 
-// Memory of exact sizes, so that a sanitizer sees a step outside; freed with this or when released.
+// Memory of exact sizes, so that a sanitizer sees an access outside. It is freed when released, or with this object.
 class Memory {
  public:
   Queue queue() { return {nullptr, &allocate, &release, &pinned, this}; }
@@ -22,7 +22,7 @@ class Memory {
     auto& pieces = static_cast<Memory*>(context)->pieces_;
     void* piece = nullptr;
     if (posix_memalign(&piece, kAlignment, bytes)) throw std::bad_alloc();
-    std::memset(piece, 0x7f, bytes);  // floats of 3.4e38: nothing may rely on zeros
+    std::memset(piece, 0x7f, bytes);  // floats of 3.4e38, because no kernel may rely on zeros
     pieces.emplace_back(piece, &std::free);
     return piece;
   }

@@ -1,3 +1,4 @@
+// The scheduler of the emulation: fibers, warps and their meetings.
 #include "emulation.h"
 
 #include <algorithm>
@@ -29,7 +30,7 @@ struct Thread {
   Meeting waits_for = Meeting::done;
   const char* what = nullptr;
   bool runnable = false;
-  int votes = 0;  // taken part in, of the block
+  int votes = 0;  // the block's votes that the thread has taken part in
 #ifdef GS_ASAN
   void* fake_stack = nullptr;
 #endif
@@ -37,7 +38,7 @@ struct Thread {
 
 struct Warp {
   uint64_t slots[2][32];  // two, since a lane may be one meeting ahead of the slowest reader
-  int turn[32];           // which of them each lane uses next
+  int turn[32];           // each lane uses this one of the two next
 };
 
 struct Grid {
@@ -47,7 +48,7 @@ struct Grid {
   ucontext_t scheduler;
   const std::function<void()>* body = nullptr;
   unsigned current = 0, count = 0;
-  bool votes[3];  // of this vote, the one before (still being read) and the one after
+  bool votes[3];  // this vote, the one before, which is still being read, and the one after
 #ifdef GS_ASAN
   void* fake_stack = nullptr;
   const void* scheduler_stack = nullptr;
@@ -93,7 +94,7 @@ void give_turn(unsigned index) {
 #endif
 }
 
-// Lets those go on whose meeting is complete. Threads that have ended are not waited for, as on a GPU.
+// Releases the threads whose meeting is complete. As on a GPU, nobody waits for threads that have ended.
 bool release() {
   const unsigned count = grid_state.count;
   bool any = false, whole_block = true;

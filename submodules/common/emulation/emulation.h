@@ -1,10 +1,11 @@
 #pragma once
-// Runs CUDA kernels on the CPU, a fiber per thread, so that they can be tested where there is no GPU: under the address
-// sanitizer (steps outside global memory, misaligned vectors), with threads taken in any order (a missing barrier
-// changes results), and with collectives checked (all lanes there, all in the same one). Blocks run one after the
-// other; shared memory is static. Says nothing about speed, rounding of PTX instructions, or races between blocks.
+// Runs CUDA kernels on the CPU, a fiber per thread, so that they can be tested without a GPU. The address sanitizer
+// finds accesses outside global memory and misaligned vectors. Threads run in any order, so that a missing barrier
+// changes results. Collectives are checked: all lanes must meet in the same one. Blocks run one after the other; shared
+// memory is static. Tests learn nothing about speed, about the rounding of PTX instructions, or about races between
+// blocks.
 //
-// translate.py rewrites the few things of a .cu that are not C++.
+// translate.py rewrites the few parts of a .cu file that are not C++.
 #include <ucontext.h>
 
 #include <cstdint>
@@ -20,26 +21,26 @@ inline dim3 threadIdx, blockIdx, blockDim, gridDim;
 namespace gs::emulation {
 
 enum class Order { forward, backward, shuffled };
-// In which order the runnable threads of a block get their turns.
+// The order in which the runnable threads of a block get their turns.
 inline Order order = Order::forward;
 
 // Runs body once per thread of each block.
 void run_grid(dim3 grid, dim3 block, size_t dynamic_shared, const std::function<void()>& body);
 void* dynamic_shared();
 
-// What a lane of a warp waits for; lanes that wait for different things at once are a bug of the kernel.
+// The meeting that a thread waits for. Lanes of a warp that wait for different ones at once are a bug of the kernel.
 enum class Meeting { none, warp, block, done };
-// Ends the thread's turn until all of its warp or block have come to the same meeting. `what` names the collective.
+// Ends the thread's turn until all of its warp or block have reached the same meeting. `what` names the collective.
 void meet(Meeting meeting, const char* what);
 
-// Leaves 8 bytes for the others of the warp, meets them, and returns where theirs lie (32 of them, until the next
-// meeting but one).
+// Leaves 8 bytes for the other lanes of the warp, meets them, and returns all 32 lanes' bytes. They stay valid until
+// the next meeting but one.
 const uint64_t* exchange(uint64_t mine, const char* what, unsigned mask);
 int lane();
-// Whether any thread of the block said yes.
+// Tells whether `mine` is true in any thread of the block.
 bool any_of_block(bool mine);
 
-// What translate.py makes of kernel<<<grid, block, shared, stream>>>(arguments...).
+// The launch that translate.py writes for kernel<<<grid, block, shared, stream>>>(arguments...).
 template <class Kernel>
 auto launch(dim3 grid, dim3 block, size_t shared, void* /*stream*/, const Kernel& kernel) {
   return [=](auto... arguments) { run_grid(grid, block, shared, [&] { kernel(arguments...); }); };
@@ -61,7 +62,7 @@ T reduce(T value, const char* what, unsigned mask, const Combine& combine) {
   std::memcpy(&bits, &value, sizeof value);
   const uint64_t* all = exchange(bits, what, mask);
   std::memcpy(&value, &all[0], sizeof value);
-  for (int k = 1; k < 32; ++k) {  // also those that have ended since
+  for (int k = 1; k < 32; ++k) {  // including lanes that have ended since
     T other;
     std::memcpy(&other, &all[k], sizeof other);
     value = combine(value, other);

@@ -11,7 +11,7 @@ struct ImagePair {
   const void* img2;  // T, or uint8_t that means value / 255
   bool img2_is_bytes;
   int64_t planes, height, width;
-  bool clamp = false;  // img1 counts as clamped to [0, 1], with no gradient outside
+  bool clamp = false;  // use img1 clamped to [0, 1]; it has no gradient outside
 };
 
 template <class T>
@@ -20,7 +20,7 @@ struct L1Ssim {
   bool valid;    // leave the rim of kRadius pixels out of the mean of SSIM
   double* l1;    // out: mean of |img1 - img2|, over all pixels
   double* ssim;  // out: mean of SSIM
-  T* gradient;   // out, like img1: d ssim / d img1, clamped or not; null: not wanted
+  T* gradient;   // out, like img1: d ssim / d img1, clamped or not; null if not wanted
 };
 
 template <class T>
@@ -35,9 +35,9 @@ struct L1SsimVjp {
 struct L1SsimCuda {
   ImagePair<float> images;
   bool valid;
-  float *l1, *ssim;  // ssim null: not wanted
+  float *l1, *ssim;  // ssim null if not wanted
   float* gradient;
-  float* loss = nullptr;  // out: l1_weight l1 + dssim_weight (1 - ssim); null: not wanted
+  float* loss = nullptr;  // out: l1_weight l1 + dssim_weight (1 - ssim); null if not wanted
   float l1_weight = 0, dssim_weight = 0;
 };
 
@@ -49,7 +49,7 @@ struct L1SsimVjpCuda {
   float l1_weight = 1, ssim_weight = 1;  // of grad_l1 and grad_ssim
 };
 
-// A picture with alpha over a background.
+// An image with alpha, to be laid over a background.
 struct Composite {
   const uint8_t* picture;   // (4, pixels): red, green, blue, straight alpha
   const float* background;  // 3

@@ -1,5 +1,5 @@
 #pragma once
-// What the backends implement.
+// The functions that the backends offer.
 #include <cstdint>
 
 #include "gs/cuda_queue.h"
@@ -7,8 +7,8 @@
 
 namespace gs {
 
-// out[i] = mean squared distance of point i to the nearest three of the other points, or as many as there are
-// (none: 0). Points with a coordinate that is not finite have no neighbours and are nobody's.
+// out[i] = mean squared distance of point i to the nearest three other points, or to fewer where there are fewer; 0
+// where there is none. A point with a coordinate that is not finite has no neighbours and is no neighbour.
 // points: n x 3, contiguous. T: float or double.
 template <class T>
 void mean_distance2_cpu(const T* points, int64_t n, T* out, const Executor& executor);

@@ -1,5 +1,5 @@
 #pragma once
-// Stands in for the functions of CUB that the kernels use: same results, first call for the size of the memory.
+// Replaces the functions of CUB that the kernels use: same results, and the first call gives the size of the memory.
 #include <algorithm>
 #include <cstdint>
 #include <numeric>

@@ -1,5 +1,5 @@
 #pragma once
-// The few macros the C++ tests need: report file, line and both values, go on, exit 1 at the end.
+// The macros of the C++ tests: a failure reports file, line and both values; the test continues and exits with 1.
 #include <cmath>
 #include <iostream>
 
@@ -25,7 +25,7 @@ inline int finish_tests(const char* name) {
     }                                                                                  \
   } while (0)
 
-// |got - wanted| <= tolerance; NaN fails.
+// Checks |got - wanted| <= tolerance; NaN fails.
 #define CHECK_NEAR(got, wanted, tolerance)                                                                \
   do {                                                                                                    \
     const double got_ = (got), wanted_ = (wanted), tolerance_ = (tolerance);                              \

@@ -1,4 +1,5 @@
 #pragma once
+// CUDA's errors as exceptions.
 #include <cuda_runtime.h>
 
 #include <stdexcept>
@@ -10,7 +11,7 @@ inline void check_cuda(cudaError_t status, const char* what) {
   if (status != cudaSuccess) throw std::runtime_error(std::string(what) + ": " + cudaGetErrorString(status));
 }
 
-// After a kernel launch: a bad configuration or a missing architecture shows here.
+// For use after a kernel launch: a bad configuration or a missing architecture shows here.
 inline void check_launch(const char* kernel) { check_cuda(cudaGetLastError(), kernel); }
 
 }  // namespace gs

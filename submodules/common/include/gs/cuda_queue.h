@@ -1,5 +1,5 @@
 #pragma once
-// Where a CUDA backend runs and gets its temporary memory from; the host framework fills it in.
+// The stream that a CUDA backend runs on, and its source of temporary memory. The host framework fills it in.
 #include <cstddef>
 #include <cstdint>
 
@@ -7,11 +7,11 @@ namespace gs {
 
 struct Queue {
   void* stream;  // cudaStream_t
-  // Device memory that lives until the call that it was handed to has been enqueued and its stream has used it.
+  // Allocates device memory. It lives until the work that the call enqueues has used it.
   void* (*allocate)(void* context, size_t bytes);
-  // Gives such memory back before the call ends: whatever is enqueued later may get it.
+  // Gives such memory back before the call ends; work that is enqueued later may get it.
   void (*release)(void* context, const void* memory);
-  // Page-locked host memory for numbers, for as long: a copy to it does not hold up the host.
+  // Allocates page-locked host memory with the same lifetime; the host does not wait for a copy to it.
   int64_t* (*pinned)(void* context, int64_t count);
   void* context;
 

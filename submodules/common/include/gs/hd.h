@@ -1,5 +1,5 @@
 #pragma once
-// Marks what both the host compiler and nvcc compile.
+// The mark of functions that both the host compiler and nvcc compile.
 #ifdef __CUDACC__
 #define GS_HD __host__ __device__ inline
 #else

@@ -1,7 +1,7 @@
 #pragma once
-// Several instruction sets in one library. Every csrc/cpu/*_isa.cpp is compiled once for each, and all of
-// its code, math headers included, lives in a namespace of that instruction set: a symbol shared between
-// two of them could be linked from the wrong one and fault on an older machine.
+// Several instruction sets in one library. Every csrc/cpu/*_isa.cpp is compiled once for each of them. All of its code,
+// math headers included, lives in a namespace of that instruction set: the linker could take a symbol that two of them
+// share from the wrong one, which would fault on an older machine.
 #include <cstdlib>
 #include <cstring>
 
@@ -19,13 +19,13 @@ namespace gs {
 
 enum class Isa { baseline, avx2, avx512 };
 
-// The widest instruction set of this machine, or a narrower one named by the environment variable GS_ISA
-// (to compare them). Internal linkage, for the reason above.
+// The widest instruction set of this machine, or a narrower one that the environment variable GS_ISA names, to compare
+// them. Internal linkage, for the reason above.
 static inline Isa best_isa() {
   static const Isa isa = [] {
     Isa found = Isa::baseline;
 #ifdef GS_X86
-    // x86-64-v3 and v4 by their parts: compilers before GCC 12 and Clang 16 don't know the levels' names.
+    // x86-64-v3 and v4 by their parts: compilers before GCC 12 and Clang 16 do not know the levels' names.
     if (__builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma") && __builtin_cpu_supports("bmi2"))
       found = Isa::avx2;
     if (found == Isa::avx2 && __builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512bw") &&

@@ -1,5 +1,5 @@
 #pragma once
-// Threads come from the host framework: ops.cpp hands its pool in, a C++ test a serial one.
+// Threads of the host framework: csrc/torch passes torch's pool to a backend, a C++ test a serial executor.
 #include <atomic>
 #include <cstdint>
 #include <functional>
@@ -7,9 +7,9 @@
 namespace gs {
 
 struct Executor {
-  int threads;  // how many bodies may run at once
-  // Calls body(begin, end) on ranges that cover [0, n). How n is cut depends on the number of threads, so a
-  // body's result must not depend on the cut.
+  int threads;  // the number of bodies that may run at once
+  // Calls body(begin, end) on ranges that cover [0, n). The cut depends on the number of threads, so a body's result
+  // must not depend on the cut.
   void (*run)(int64_t n, int64_t grain, const std::function<void(int64_t, int64_t)>& body);
 };
 
@@ -18,7 +18,7 @@ inline void run_serially(int64_t n, int64_t /*grain*/, const std::function<void(
 }
 inline Executor serial_executor() { return {1, &run_serially}; }
 
-// body(begin, end) on blocks of fixed size, taken in turn by whichever thread is free: for uneven work.
+// Calls body(begin, end) on blocks of fixed size; each free thread takes the next block. For uneven work.
 template <class Body>
 void for_dynamic(const Executor& executor, int64_t n, int64_t block, const Body& body) {
   const int64_t blocks = (n + block - 1) / block;

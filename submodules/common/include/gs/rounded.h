@@ -1,7 +1,7 @@
 #pragma once
-// For arithmetic that gives the same bits on a GPU and on every CPU: compilers fuse a product with the sum it goes into
-// wherever the machine can. On the host that is off in sources that are compiled once (build_extension.py), so a
-// formula that uses this belongs into one of those, not into a *_isa.cpp.
+// Arithmetic that gives the same bits on a GPU and on every CPU. Compilers fuse a product with a sum wherever the
+// machine can. On the host, build_extension.py turns that off for sources that are compiled once. So a formula that
+// uses this belongs into one of those, not into a *_isa.cpp.
 #include "gs/hd.h"
 
 namespace gs {

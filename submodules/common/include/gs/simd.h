@@ -1,5 +1,5 @@
 #pragma once
-// Vectors of N lanes by the compilers' vector extension (GCC, Clang): operators and ?: work lane by lane.
+// Vectors by the vector extension of GCC and Clang: operators and ?: work lane by lane.
 #include <cstdint>
 #include <cstring>
 
@@ -74,7 +74,7 @@ struct Simd {
 #endif
   }
 
-  // Sum of the lanes by halves: one fixed tree for an instruction set.
+  // Sums the lanes by halves: one fixed tree for an instruction set.
   static T sum(Vec v) { return halves<kLanes>(v); }
 
  private:

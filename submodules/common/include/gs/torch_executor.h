@@ -1,5 +1,5 @@
 #pragma once
-// Executor over torch's intra-op pool (torch.set_num_threads governs it). For csrc/torch alone.
+// An Executor over torch's intra-op pool, which torch.set_num_threads sizes. For csrc/torch alone.
 #include <ATen/Parallel.h>
 
 #include "gs/parallel.h"

@@ -1,5 +1,5 @@
 #pragma once
-// Queue over torch's current stream and caching allocator. For csrc/torch alone, in CUDA builds.
+// A Queue over torch's current stream and caching allocator. For csrc/torch alone, in CUDA builds.
 #include <ATen/core/Tensor.h>
 #include <ATen/ops/empty.h>
 #include <c10/cuda/CUDACachingAllocator.h>
@@ -13,8 +13,8 @@
 
 namespace gs {
 
-// For one call: sets the device, and keeps the call's temporary memory until it goes out of scope. Torch's allocator
-// hands memory on in stream order, so that is soon enough.
+// Serves one call: sets the device, and keeps the call's temporary memory until it goes out of scope. That is late
+// enough, because torch's allocator reuses memory in stream order.
 class TorchQueue {
  public:
   explicit TorchQueue(at::Device device) : guard_(device) {}
@@ -23,7 +23,7 @@ class TorchQueue {
 
  private:
   static void* allocate(void* context, size_t bytes) {
-    // The allocator itself: some fifteen arrays a step, each of which would be a tensor made by the dispatcher.
+    // Calls the allocator itself: a step has some fifteen arrays, and the dispatcher would make a tensor for each.
     auto& memory = static_cast<TorchQueue*>(context)->memory_;
     memory.push_back(c10::cuda::CUDACachingAllocator::get()->allocate(bytes));
     return memory.back().get();

@@ -1,3 +1,4 @@
+// Adam's steps, dense and sparse, under a guard.
 #include <type_traits>
 
 #include "../backend.h"
@@ -7,14 +8,14 @@ GS_ISA_BEGIN
 
 namespace {
 
-// `count` values of a tensor from `first` on. Returns whether all took a step.
+// Steps `count` values of a tensor from `first` on. Returns whether all took their step.
 template <class T>
 bool adam_values(const AdamStep<T>& step, const AdamInput<T>& in, int64_t first, int64_t count, bool guarded) {
   T* __restrict value = in.value + first;
   T* __restrict mean = in.mean + first;
   T* __restrict square = in.square + first;
   const T* __restrict gradient = in.gradient + first;
-  std::conditional_t<sizeof(T) == 4, int32_t, int64_t> wrong = 0;  // as wide as T, for the vector loop
+  std::conditional_t<sizeof(T) == 4, int32_t, int64_t> wrong = 0;  // as wide as T, so that the loop vectorises
   if (guarded) {
     for (int64_t i = 0; i < count; ++i)
       wrong |= adam_if_finite(step, gradient[i], value[i], mean[i], square[i]) ? 0 : 1;
@@ -30,7 +31,7 @@ bool adam_tensor(const Executor& executor, const AdamInput<T>& in, bool guarded)
   const AdamStep<T> step = make_adam_step<T>(in.lr, in.beta1, in.beta2, in.eps, in.step);
   const bool dense = in.columns == in.row;
   bool finite = true;
-  // Fixed blocks, not the pool's: the compiler's vector loop and its scalar tail may round differently.
+  // Fixed blocks, not the pool's ranges: the compiler's vector loop and its scalar tail may round differently.
   const int64_t n = dense ? in.rows * in.row : in.rows;
   for_dynamic(executor, n, dense ? 32768 : 1024, [&](int64_t begin, int64_t end) {
     bool mine = true;
@@ -56,7 +57,7 @@ template <class T>
 void sparse_adam(const Executor& executor, const AdamInput<T>& in, const bool* visible, const StepGuard<T>& guard) {
   const AdamStep<T> step = make_uncorrected_adam_step<T>(in.lr, in.beta1, in.beta2, in.eps);
   bool finite = may_step(guard);
-  // Row by row: where a vector loop ends and its scalar tail begins must not depend on which rows are visible.
+  // Row by row: the end of a vector loop, where its scalar tail begins, must not depend on which rows are visible.
   for_dynamic(executor, finite ? in.rows : 0, 1024, [&](int64_t begin, int64_t end) {
     for (int64_t r = begin; r < end; ++r)
       if (visible[r] && !adam_values(step, in, r * in.row, in.columns, guard.stopped != nullptr))

@@ -1,3 +1,4 @@
+// Binning: splats sorted by depth, then their instances by tile.
 #include <algorithm>
 #include <cstring>
 #include <type_traits>
@@ -10,7 +11,7 @@
 
 GS_ISA_BEGIN
 
-// A vector of the rectangle's tiles at a time, row by row.
+// Tests the rectangle's tiles row by row, a vector at a time.
 template <class T>
 __attribute__((noinline)) int32_t list_tiles(const Splat<T>& splat, TileRect rect, Image image, int32_t* tiles) {
   using S = Simd<T>;
@@ -45,9 +46,9 @@ template int32_t list_tiles<double>(const Splat<double>&, TileRect, Image, int32
 
 namespace {
 
-// A stable counting sort of [0, n) by digit(i) < buckets; emit(i, place) gets each element's place. Elements are cut
-// into one part per thread, each with its own counts, so the places are those of a serial sort whatever the cut.
-// `starts` (buckets + 1), if given, receives where each bucket begins.
+// Sorts [0, n) stably by digit(i) < buckets; emit(i, place) gets each element's place. Each thread has a part of the
+// elements and its own counts, so the places are those of a serial sort for any cut. `starts` (buckets + 1), if given,
+// receives where each bucket begins.
 template <class Digit, class Emit>
 void counting_sort(const Executor& executor, int64_t n, int64_t buckets, int64_t* starts, const Digit& digit,
                    const Emit& emit) {
@@ -74,8 +75,8 @@ void counting_sort(const Executor& executor, int64_t n, int64_t buckets, int64_t
   });
 }
 
-// Radix sort of splats by depth, least digit first. Depths are positive, so their bits order them; equal depths keep
-// their order of index.
+// Sorts splats by depth: a radix sort, least digit first. Depths are positive, so their bits order them. Equal depths
+// keep the order of their indices.
 template <class T>
 void sort_by_depth(const Executor& executor, const T* depths, std::vector<int32_t>& order) {
   using Key = std::conditional_t<sizeof(T) == 4, uint32_t, uint64_t>;

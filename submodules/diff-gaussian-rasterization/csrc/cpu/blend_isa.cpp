@@ -1,3 +1,4 @@
+// Blending, its backward and the decisive splats. A thread takes a tile, a vector takes pixels of one of its rows.
 #include <algorithm>
 #include <cstring>
 #include <limits>
@@ -17,7 +18,7 @@ GS_ISA_BEGIN
 namespace {
 
 constexpr int kPixels = kTile * kTile;
-constexpr int64_t kChunk = 128;  // splats held local to a tile at once: some 5 KB of float
+constexpr int64_t kChunk = 128;  // splats held local to a tile at once, some 5 KB of floats
 
 // A tile's place in the image.
 struct Tile {
@@ -30,7 +31,7 @@ struct Tile {
   }
 };
 
-// Copies between an image plane and a tile's 16x16 array; pixels outside the image stay as they are.
+// Copies between an image plane and a tile's 16x16 array. Pixels outside the image stay unchanged.
 template <class To, class From>
 void read_tile(const From* plane, Image image, const Tile& tile, To* pixels) {
   for (int r = 0; r < tile.rows; ++r)
@@ -58,15 +59,15 @@ typename Simd<T>::Vec lane_x(int first) {
   return Simd<T>::load(x);
 }
 
-// What a strip of lanes (part of a row of a tile) carries from splat to splat.
+// The state of a tile's pixels between two splats. A strip of lanes is a part of one of its rows.
 template <class T>
 struct ForwardState {
   alignas(64) T transmittance[kPixels], color[3][kPixels], depth[kPixels];
-  alignas(64) T threshold[kPixels];  // log2 alpha that a splat must reach: infinite once the pixel has ended
+  alignas(64) T threshold[kPixels];  // log2 alpha that a splat must reach; infinite once the pixel has ended
   alignas(64) typename IntOf<T>::type last[kPixels];
 };
 
-// Blends splats [0, count) of a chunk into one strip. Returns false when all its pixels have ended.
+// Blends splats [0, count) of a chunk into one strip. Returns false once all its pixels have ended.
 template <class T, bool kDepth, bool kLast>
 bool blend_strip(const LocalSplat<T>* splats, int64_t count, int64_t position, int row, int first,
                  ForwardState<T>& state) {
@@ -111,8 +112,9 @@ bool blend_strip(const LocalSplat<T>* splats, int64_t count, int64_t position, i
   return open;
 }
 
-// Splats of a tile's list from front to back, kChunk at a time, for each strip of its pixels: strip(splats, how many,
-// place of the first in the list, row, first column) says whether a pixel is open. Pixels beyond the image never are.
+// Goes through a tile's list front to back, kChunk splats at a time, for each strip of its pixels. strip(splats, count,
+// position of the first in the list, row, first column) tells whether a pixel is still open. Pixels outside the image
+// never are.
 template <class T, class Strip>
 void through_tile(const BlendInput<T>& in, const Tile& tile, int64_t index, T* threshold, const Strip& strip) {
   for (int p = 0; p < kPixels; ++p)
@@ -158,7 +160,7 @@ struct BackwardState {
   alignas(64) typename IntOf<T>::type last[kPixels];
 };
 
-// The sums of one splat over a tile, in kGradientValues; true if any pixel was reached.
+// Sums one splat's kGradientValues over a tile. Returns whether the splat reaches a pixel.
 template <class T, bool kDepth>
 bool splat_gradient(const LocalSplat<T>& splat, int64_t position, const Tile& tile, BackwardState<T>& state, T* sums) {
   using S = Simd<T>;
@@ -166,7 +168,7 @@ bool splat_gradient(const LocalSplat<T>& splat, int64_t position, const Tile& ti
   using M = typename S::Mask;
   const T least = T(kLog2MinAlpha);
   const V zero = {};
-  // Rows where the splat can be reached at all, one to spare at either end; the exact test follows.
+  // The rows that the splat can reach, and one to spare at either end; the exact test follows.
   const T reach = std::sqrt(larger(splat.log2_opacity - least, T(0))) / splat.l22 + 1;
   const int row_begin = clamped_floor(splat.y - reach, tile.rows);
   const int row_end = clamped_floor(splat.y + reach + 1, tile.rows);
@@ -208,13 +210,13 @@ bool splat_gradient(const LocalSplat<T>& splat, int64_t position, const Tile& ti
   return true;
 }
 
-// Sums of the processed instances, one row of kGradientValues each, in the order of slots: those of a splat lie side by
-// side, whatever tiles they come from. A bit per slot tells which were processed, a prefix sum over their counts where
-// the row is, so memory follows what was blended and nothing is added concurrently.
+// Sums of the processed instances, a row of kGradientValues each, in the order of slots: those of a splat lie side by
+// side, whatever tiles they come from. A bit per slot tells which instances were processed, and a prefix sum over the
+// bits tells where a row is. So memory follows what was blended, and nothing is added concurrently.
 template <class T>
-class CompactRows {
+class GradientRows {
  public:
-  explicit CompactRows(int64_t slots) : bits_((slots + 63) / 64, 0), before_(bits_.size() + 1, 0) {}
+  explicit GradientRows(int64_t slots) : bits_((slots + 63) / 64, 0), before_(bits_.size() + 1, 0) {}
 
   void mark(int64_t slot) { __atomic_fetch_or(&bits_[slot >> 6], uint64_t(1) << (slot & 63), __ATOMIC_RELAXED); }
 
@@ -223,7 +225,7 @@ class CompactRows {
     rows_.reset(new T[kGradientValues * before_.back()]);  // not zeroed: every row is written
   }
 
-  // The row of a slot, or where it would be.
+  // The row of a slot; for a slot without one, the next row.
   T* row(int64_t slot) {
     const uint64_t lower = (uint64_t(1) << (slot & 63)) - 1;
     const int64_t rank = before_[slot >> 6] + (slot & 63 ? __builtin_popcountll(bits_[slot >> 6] & lower) : 0);
@@ -238,7 +240,7 @@ class CompactRows {
 
 template <class T, bool kDepth>
 void blend_tile_vjp(const BlendInput<T>& in, const BlendGradient<T>& g, int64_t index, int64_t processed,
-                    CompactRows<T>& rows) {
+                    GradientRows<T>& rows) {
   const Tile tile(index, in.image);
   const int64_t begin = in.ranges[index], plane = int64_t(in.image.width) * in.image.height;
   BackwardState<T> state;
@@ -266,8 +268,8 @@ void blend_tile_vjp(const BlendInput<T>& in, const BlendGradient<T>& g, int64_t 
   }
 }
 
-// Marks what one strip takes of splats [0, count) of a chunk: `last` is what the strip's pixels blend, and the next
-// splat that reaches a pixel ends it. Returns false when all its pixels have ended.
+// Marks those of splats [0, count) of a chunk that are decisive for a strip: a pixel blends splats up to its `last`,
+// and the next splat that reaches it ends it. Returns false once all the strip's pixels have ended.
 template <class T>
 bool mark_strip(const LocalSplat<T>* splats, const int32_t* instances, int64_t count, int64_t position, int row,
                 int first, const typename IntOf<T>::type* last_of_tile, T* threshold_of_tile, bool* decisive) {
@@ -325,7 +327,7 @@ void blend(const Executor& executor, const BlendInput<T>& in, const Blended<T>& 
 template <class T>
 void blend_vjp(const Executor& executor, const BlendInput<T>& in, const BlendGradient<T>& g) {
   const int64_t tiles = tiles_of(in.image);
-  CompactRows<T> rows(g.slot_count);
+  GradientRows<T> rows(g.slot_count);
   std::vector<int32_t> processed(tiles);
   for_dynamic(executor, tiles, 4, [&](int64_t begin, int64_t end) {
     for (int64_t index = begin; index < end; ++index) {

@@ -1,3 +1,4 @@
+// Adds a view to the statistics of density control.
 #include "../math/observe.h"
 
 #include "../backend.h"

@@ -1,3 +1,4 @@
+// Projection and its backward, Gaussian by Gaussian.
 #include <cstring>
 
 #include "../backend.h"

@@ -1,3 +1,4 @@
+// Adam's step of many tensors, in one launch.
 #include <cuda_runtime.h>
 
 #include "../backend.h"
@@ -11,12 +12,12 @@ namespace cuda {
 namespace {
 
 constexpr int kThreads = 256;
-constexpr int kTensors = 16;  // of one launch: 130 bytes each, and a kernel's parameters have 4 KiB
+constexpr int kTensors = 16;  // of one launch; each takes 130 bytes of the 4 KiB that a kernel's parameters may have
 
 struct Tensors {
   AdamInput<float> in[kTensors];
   baseline::AdamStep<float> step[kTensors];
-  int64_t end[kTensors];  // the first block that is not this tensor's or an earlier one's
+  int64_t end[kTensors];  // the first block behind this tensor's
   StepGuard<float> guard;
 };
 

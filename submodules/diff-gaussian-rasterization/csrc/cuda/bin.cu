@@ -1,5 +1,5 @@
-// Two small sorts instead of one large one: splats by depth, then their instances, emitted in that order, stably by
-// tile.
+// Binning by two small sorts instead of a large one: the splats by depth, then their instances by tile. The second sort
+// is stable, and instances are emitted in depth order.
 #include <cuda_runtime.h>
 #include <thrust/iterator/counting_iterator.h>
 #include <thrust/iterator/transform_iterator.h>
@@ -18,9 +18,9 @@ namespace {
 
 constexpr int kThreads = 256;
 
-constexpr int kCounted = 4;  // splats of a thread, whose loads need not wait for each other
+constexpr int kCounted = 4;  // splats of a thread; their loads do not wait for each other
 
-// Adds all splats' instances and slots to `totals`, and numbers the splats for the depth sort.
+// Adds the instances and slots of all splats to `totals`, and numbers the splats for the depth sort.
 __global__ void __launch_bounds__(kThreads)
     count_kernel(int64_t n, Projected<float> in, int32_t* index, unsigned long long* totals) {
   __shared__ unsigned long long of_block[2];
@@ -44,7 +44,7 @@ __global__ void __launch_bounds__(kThreads)
   if (threadIdx.x < 2) atomicAdd(totals + threadIdx.x, of_block[threadIdx.x]);
 }
 
-// The numbers of instances and slots. Fills `index` with the splats' numbers.
+// Counts all instances and slots. Fills `index` with the splats' numbers.
 const int64_t* count_all(const Queue& queue, int64_t n, const Projected<float>& in, int32_t* index) {
   auto* totals = queue.array<unsigned long long>(2);
   GS_CUDA_CHECK(cudaMemsetAsync(totals, 0, 2 * sizeof *totals, stream_of(queue)));
@@ -70,7 +70,7 @@ struct SlotCounts {
   __host__ __device__ int64_t operator()(int64_t splat) const { return slot_count(rects(splat)); }
 };
 
-// Takes the sum of all counts before a splat's, and stores it with the rest of the splat's slots: whole sectors.
+// Takes the number of slots before a splat's and stores it with the rest of its SplatSlots, in whole memory sectors.
 struct SlotsAt {
   Rects rects;
   SplatSlots* slots;
@@ -84,15 +84,15 @@ struct Slots {
   __host__ __device__ SlotsAt operator()(int64_t splat) const { return {rects, slots, splat}; }
 };
 
-// Of one load from memory.
+// The keys of one load from memory.
 template <class Key>
 struct alignas(16) Keys {
   static constexpr int kCount = 16 / sizeof(Key);
   Key of[kCount];
 };
 
-// Where each tile's list begins: every tile from that of the instance before to this one's starts here. The memory of
-// `sorted` ends with a whole load.
+// Finds where each tile's list begins. An instance begins the lists of all tiles after the previous instance's tile, up
+// to its own. The memory of `sorted` ends with a whole load.
 template <class Key>
 __global__ void ranges_kernel(int64_t instances, int64_t tiles, const Key* sorted, int64_t* ranges) {
   constexpr int kCount = Keys<Key>::kCount;
@@ -114,7 +114,8 @@ int bits_for(int64_t values) {
   return bits;
 }
 
-// Splats by depth, ties by index (the sort is stable and starts from that order); culled ones, infinitely far, last.
+// Sorts splats by depth, ties by index: the sort is stable and starts from that order. Culled splats are infinitely far
+// and come last.
 const int32_t* sort_by_depth(const Queue& queue, int64_t n, const float* depths, const int32_t* index) {
   uint32_t* sorted_keys = queue.array<uint32_t>(n);
   int32_t* order = queue.array<int32_t>(n);
@@ -136,7 +137,7 @@ void find_slots(const Queue& queue, int64_t n, const Projected<float>& in, Splat
   });
 }
 
-// order: splats by depth.
+// Emits the instances and sorts them by tile. order: the splats by depth.
 template <class Key>
 void bin_with(const Queue& queue, int64_t n, const Projected<float>& in, const int32_t* order, Image image,
               int64_t instances, const Binned& out) {
@@ -179,7 +180,7 @@ void bin<float>(const Queue& queue, int64_t count, const Projected<float>& in, I
   if (count) {
     int32_t* index = queue.array<int32_t>(count);
     const HostNumbers<int64_t> totals(queue, count_all(queue, count, in, index), 2);
-    // The GPU is busy with what needs no list while the host waits for the numbers.
+    // While the host waits for the numbers, the GPU does the work that needs no list.
     order = sort_by_depth(queue, count, in.depths, index);
     if (memory.slots) find_slots(queue, count, in, memory.slots);
     instances = totals.wait()[0];

@@ -1,5 +1,5 @@
-// The backward of blending. A tile's list is cut into chunks, a block each, since one long list would outlast all
-// others together: first every chunk becomes a layer, which tells the chunks in front of it what lies behind them.
+// The backward of blending. A tile's list is cut into chunks, a block each, because one long list would outlast all
+// others together. First every chunk becomes a layer, which tells the chunks in front of it what lies behind them.
 #include <thrust/iterator/counting_iterator.h>
 #include <thrust/iterator/transform_iterator.h>
 
@@ -18,15 +18,14 @@ namespace cuda {
 
 namespace {
 
-// Splats of a chunk, in an image of few tiles and of many. Shorter ones fill a GPU better, and cost a layer for each
-// but the first of a tile.
+// Splats of a chunk, in an image of few tiles and of many. Shorter chunks fill a GPU better, but each costs a layer.
 constexpr int kChunkOfFew = 256, kChunkOfMany = 512;
 
-// Going back to front a splat costs a warp as much as several pixels do, even where few warps are at schedule.
+// Going back to front, a splat costs a warp as much as several pixels, even where few warps are at work.
 using Backward = Layout<4>;
 
-// Up to here every instance gets a gradient row, 40 MiB at most, so that the host need not wait for the number of those
-// that want one.
+// Up to this many, every instance gets a gradient row, 40 MiB at most. The host need not wait for the number of
+// processed instances then.
 constexpr int64_t kRowsUnasked = 1 << 20;
 
 struct ProcessedLength {
@@ -46,7 +45,7 @@ struct CountBits {
   }
 };
 
-// How far each tile's backward has to go, and the slots of the instances up to there.
+// Finds how far each tile's backward has to go, and marks the slots of the instances up to there.
 __global__ void __launch_bounds__(kTile* kTile)
     mark_kernel(BlendInput<float> in, const int32_t* last, const SplatSlots* slots, int32_t* processed,
                 uint32_t* bits) {
@@ -66,8 +65,8 @@ __global__ void __launch_bounds__(kTile* kTile)
   }
 }
 
-// Ten values summed over a warp in 12 shuffles: each step halves the values a lane keeps while doubling the lanes that
-// are summed. `value` is the one whose sum this lane ends with, or -1.
+// Sums ten values over a warp in 12 shuffles: each step halves the values that a lane keeps and doubles the lanes that
+// are summed. The lane ends with the sum of `value`, or with none (-1).
 __device__ __forceinline__ float transposed_sum(const float (&v)[kGradientValues], int& value) {
   const int lane = threadIdx.x % 32;
   const bool b16 = lane & 16, b8 = lane & 8, b4 = lane & 4, b2 = lane & 2;
@@ -92,17 +91,17 @@ __device__ __forceinline__ float transposed_sum(const float (&v)[kGradientValues
   return sum;
 }
 
-// A chunk as its pixel sees it: with `behind` behind it the pixel has value + transmittance * behind.
+// A chunk as a pixel sees it: with `behind` behind the chunk, the pixel has value + transmittance * behind.
 struct alignas(8) Layer {
   float value, transmittance;
 };
 
-// What the backward knows of a lane's pixels. Positions count from the chunk's first, which needs no register then.
+// The backward's inputs at a lane's pixels. Positions count from the chunk's first splat, which saves a register.
 template <class L, bool kDepth>
 struct Pixels {
   float red[L::kRun], green[L::kRun], blue[L::kRun], depth[L::kRun];  // image gradients
-  float background[L::kRun], transmittance[L::kRun];                  // what is behind all, and how it is seen
-  int last[L::kRun], furthest;                                        // the latter of the warp
+  float background[L::kRun], transmittance[L::kRun];                  // of the background: its value, its share
+  int last[L::kRun], furthest;                                        // furthest: the warp's largest
 
   __device__ Pixels(const BlendInput<float>& in, const BlendGradient<float>& g, const L& at, int left, int top,
                     int first) {
@@ -131,7 +130,7 @@ struct Pixels {
   }
 };
 
-// The layers of all chunks but the first of each tile, a block each.
+// Computes the layers of all chunks but the first of each tile, a block each.
 template <class L, bool kDepth>
 __global__ void __launch_bounds__(L::kThreads)
     layers_kernel(BlendInput<float> in, BlendGradient<float> g, const Chunk* chunks, Layer* layers) {
@@ -165,7 +164,7 @@ __global__ void __launch_bounds__(L::kThreads)
   for (int p = 0; p < kRun; ++p) to[at.column(p)] = {value[p], transmittance[p]};
 }
 
-// CUDA has it from 12.4 on; without it the kernel is the same, with more registers.
+// CUDA has this from 12.4 on; without it the kernel takes more registers.
 #if __CUDACC_VER_MAJOR__ > 12 || (__CUDACC_VER_MAJOR__ == 12 && __CUDACC_VER_MINOR__ >= 4)
 #define GS_MAX_REGISTERS(count) __maxnreg__(count)
 #else
@@ -307,7 +306,7 @@ GradientRows blend_rows(const Queue& queue, const BlendInput<float>& in, const B
     return cub::DeviceScan::ExclusiveSum(memory, bytes, counts, before, words + 1, stream);
   });
   const int chunk_size = tiles <= kFewTiles ? kChunkOfFew : kChunkOfMany;
-  int64_t rows = g.instance_count;  // at most
+  int64_t rows = g.instance_count;  // an upper bound
   std::optional<HostNumbers<int32_t>> processed_count;
   if (rows > kRowsUnasked) processed_count.emplace(queue, before + words, 1);
   Schedule schedule = longest_first(queue, tiles, ProcessedLength{processed}, chunk_size, rows);
@@ -321,7 +320,7 @@ GradientRows blend_rows(const Queue& queue, const BlendInput<float>& in, const B
                                                              gradients);
   check_launch("blend_vjp");
   for (const void* done : {static_cast<const void*>(layers), static_cast<const void*>(schedule.chunks)})
-    queue.release(queue.context, done);  // the gradients come next, and are most of what a step takes
+    queue.release(queue.context, done);  // the gradients come next, and take most of a step's memory
   return gradients;
 }
 

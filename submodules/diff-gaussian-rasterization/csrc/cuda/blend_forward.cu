@@ -1,4 +1,4 @@
-// Blending a tile's list front to back, a block per tile.
+// Blends each tile's list front to back, a block per tile.
 #include "../backend.h"
 #include "blend_layout.cuh"
 #include "schedule.cuh"
@@ -13,7 +13,8 @@ struct ListLength {
   __device__ int64_t operator()(int tile) const { return ranges[tile + 1] - ranges[tile]; }
 };
 
-// Blocks a processor, which keep it to 56 (48 with one pixel a lane) registers, without spills on sm_90.
+// The bound on blocks a multiprocessor keeps the kernel to 56 registers, or 48 with one pixel a lane, without spills on
+// sm_90.
 template <class L, bool kDepth, bool kLast>
 __global__ void __launch_bounds__(L::kThreads, L::kRun == 1 ? 5 : 9)
     blend_kernel(BlendInput<float> in, const Chunk* order, Blended<float> out) {
@@ -40,7 +41,7 @@ __global__ void __launch_bounds__(L::kThreads, L::kRun == 1 ? 5 : 9)
     for (int from = 0; open && from < count; from += 32) {
       front_to_back(batch, at, from, count, [&](int k, int p, float t) {
         const bool reached = t >= threshold[p];
-        if (kTogether<L> == 1 && !reached) return;  // where splats are taken together, no branch keeps them apart
+        if (kTogether<L> == 1 && !reached) return;  // no branch where splats are taken together
         const float alpha = capped<float, float>(exp2_device(t));
         const float after = transmittance[p] - alpha * transmittance[p];
         const bool ends = reached && after < float(kMinTransmittance), blended = reached && !ends;
@@ -77,7 +78,7 @@ void blend_as(const Queue& queue, const BlendInput<float>& in, const Blended<flo
   const auto kernel = out.inverse_depth ? (out.last ? blend_kernel<L, true, true> : blend_kernel<L, true, false>)
                                         : (out.last ? blend_kernel<L, false, true> : blend_kernel<L, false, false>);
   const int64_t tiles = tiles_of(in.image);
-  // Many tiles even out by themselves.
+  // Many tiles balance without a schedule.
   const Chunk* order = tiles <= kFewTiles ? longest_first(queue, tiles, ListLength{in.ranges}).chunks : nullptr;
   kernel<<<unsigned(tiles), L::kThreads, 0, stream_of(queue)>>>(in, order, out);
   check_launch("blend");

@@ -1,6 +1,7 @@
 #pragma once
-// How a block blends a tile. A warp owns a sub-tile, a lane several pixels of a row, so that a splat's loads, the loop
-// and the ballot are shared; 32 splats at a time are tested against the sub-tile, a lane each.
+// The layout of a block that blends a tile. A warp owns a sub-tile and a lane several pixels of a row, so that they
+// share a splat's loads, the loop and the ballot. 32 splats at a time are tested against the sub-tile, one by each
+// lane.
 #include <cuda_runtime.h>
 
 #include "../data.h"
@@ -18,11 +19,11 @@ using namespace baseline;
 
 constexpr float kLeast = float(kLog2MinAlpha);
 
-// Images of up to so many tiles do not fill a GPU with blocks, and wait for their longest lists: more warps share a
+// Images of up to this many tiles do not fill a GPU with blocks and wait for their longest lists, so more warps share a
 // tile.
 constexpr int64_t kFewTiles = 3000;
 
-// How a tile is shared out: a lane has kRun pixels of one row, 4 (or 8, if one) columns apart.
+// The share of a lane is kRun pixels of one row, 4 columns apart.
 template <int kRun_>
 struct Layout {
   static constexpr int kRun = kRun_;
@@ -61,7 +62,7 @@ struct Batch {
     return {a.x, a.y, a.z, a.w, b.x, b.y, 0, 0, 0, b.w};
   }
 
-  // Can splat k reach the box of pixels, in the tile?
+  // Tells whether splat k can reach a box of the tile's pixels.
   __device__ bool reaches(int k, float x0, float x1, float y0, float y1) const {
     const float4 a = shape[k], b = rest[k];
     const Splat<float> splat = {b.z, a.x, a.y, a.z, a.w, b.y, 0, 0, 0, 0};
@@ -76,12 +77,12 @@ __device__ inline unsigned reached_by_warp(const Batch<kCount>& batch, const L& 
   return __ballot_sync(kWarp, hit);
 }
 
-// Splats whose exponents a warp works out at once, going front to back: with one pixel a lane it would mostly wait.
+// The splats whose exponents a warp computes at once, going front to back; with one pixel a lane it would mostly wait.
 template <class L>
 constexpr int kTogether = L::kRun == 1 ? 2 : 1;
 
-// Front to back through the splats that reach the warp, of 32 from `from`: step(k, p, exponent) for each and each pixel
-// of the lane.
+// Goes front to back through those of 32 splats from `from` that reach the warp. Calls step(k, p, exponent) for each
+// and for each pixel of the lane.
 template <class L, int kCount, class Step>
 __device__ __forceinline__ void front_to_back(const Batch<kCount>& batch, const L& at, int from, int count,
                                               const Step& step) {

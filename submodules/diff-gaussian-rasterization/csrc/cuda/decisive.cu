@@ -1,5 +1,5 @@
-// A thread per pixel: all threads of a tile read the same splat at the same time, so it comes from the cache. Once at
-// the end of a training, so simple before fast.
+// Marks the decisive splats. A thread takes a pixel; all threads of a tile read the same splat at the same time, so it
+// comes from the cache. This runs once, at the end of a training, so it is simple rather than fast.
 #include <cuda_runtime.h>
 
 #include "../backend.h"
@@ -28,7 +28,7 @@ __global__ void __launch_bounds__(kTile* kTile)
     const Splat<float> splat = load_shape(in.splats, index);
     const RowTerms<float> terms = row_terms(localise(splat, float(left), float(top)), float(row));
     if (!(row_exponent(terms, row_u(terms, float(column))) >= float(kLog2MinAlpha))) continue;
-    decisive[index] = true;  // by many threads, all the same
+    decisive[index] = true;  // many threads write the same
     if (k >= blended) return;
   }
 }

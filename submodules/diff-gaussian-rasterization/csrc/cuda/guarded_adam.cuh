@@ -1,5 +1,5 @@
-// Adam's step of one value, for kernels, under a guard that ends a training at what is not finite.
 #pragma once
+// Adam's step of one value in a kernel, under a guard that stops a training at the first value that is not finite.
 #include <cuda_runtime.h>
 
 #include "../data.h"
@@ -8,7 +8,7 @@
 namespace gs {
 namespace cuda {
 
-// Whether there is a step in this iteration; a loss that is not finite is noted.
+// Tells whether this iteration takes a step, and records a loss that is not finite.
 __device__ inline bool begin_step(const StepGuard<float>& guard) {
   if (baseline::may_step(guard)) return true;
   if (blockIdx.x == 0 && threadIdx.x == 0 && *guard.stopped == 0) *guard.stopped = guard.iteration;
@@ -21,7 +21,7 @@ __device__ inline void step_value(const StepGuard<float>& guard, const baseline:
   if (!guard.stopped)
     baseline::adam(step, in.gradient[i], value, mean, square);
   else if (!baseline::adam_if_finite(step, in.gradient[i], value, mean, square))
-    *guard.stopped = guard.iteration;  // whoever writes it, it is the same
+    *guard.stopped = guard.iteration;  // every thread writes the same
   in.value[i] = value, in.mean[i] = mean, in.square[i] = square;
 }
 

@@ -1,5 +1,5 @@
 #pragma once
-// Writing the instances (tile, splat) in depth order. Blocks share the instances evenly, not the splats: the nearest
+// Writes the instances (tile, splat) in depth order. Blocks share the instances evenly, not the splats: the nearest
 // splats lie side by side in that order and reach a thousand tiles each.
 #include "splat_row.cuh"
 #include "tile_record.cuh"
@@ -12,7 +12,7 @@ constexpr int kEmitThreads = 256;
 constexpr int kEmitRun = 4;  // instances of a thread, side by side, stored at once
 constexpr int kEmitted = kEmitRun * kEmitThreads;
 
-// The place of the n-th set bit (from 0).
+// The place of the n-th set bit, n from 0.
 __device__ inline int nth_bit(uint64_t mask, int n) {
   int place = 0;
   for (int half = 32; half; half /= 2) {
@@ -33,8 +33,8 @@ struct alignas(16) Lined {
   int32_t wide;
 };
 
-// Splats and their numbers of tiles side by side in depth order, so that they are looked up all over memory but once.
-// counts: (n + 1), the last 0.
+// Copies what emission needs of the splats into depth order, so that they are read all over memory only once. counts:
+// (n + 1), the last 0.
 __global__ void __launch_bounds__(kEmitThreads)
     line_up_kernel(int64_t n, const int32_t* order, Projected<float> in, int columns, Lined* lined, int32_t* counts) {
   const int64_t k = int64_t(blockIdx.x) * kEmitThreads + threadIdx.x;
@@ -46,8 +46,8 @@ __global__ void __launch_bounds__(kEmitThreads)
   lined[k] = {reached.mask, rect.y0 * columns + rect.x0, rect.x1 - rect.x0};
 }
 
-// For each block the splat, in depth order, that its first instance belongs to, and after the last block the last splat
-// that has an instance. offsets: (n + 1) the first instance of each splat in that order.
+// Finds for each block the splat of its first instance; the entry after the last block gets the last splat with an
+// instance. Splats count in depth order. offsets: (n + 1), the first instance of each splat.
 __global__ void __launch_bounds__(kEmitThreads) share_kernel(int64_t n, const int32_t* offsets, int32_t* first) {
   const int64_t k = int64_t(blockIdx.x) * kEmitThreads + threadIdx.x;
   if (k >= n) return;
@@ -74,7 +74,8 @@ struct EmittedSplats {
   }
 };
 
-// The tile at a place below 64 of a rectangle. A half keeps the quotient off whole numbers, so rounding can't matter.
+// The tile at a place below 64 of a rectangle. Adding a half keeps the quotient off whole numbers, so that rounding
+// does not matter.
 __device__ inline int tile_at(const Lined& line, int place, int columns) {
   const int row = int((float(place) + 0.5f) / float(line.wide));
   return line.corner + place + row * (columns - line.wide);

@@ -1,3 +1,4 @@
+// Adds a view to the statistics of density control. A thread takes a Gaussian.
 #include <cuda_runtime.h>
 
 #include "../backend.h"

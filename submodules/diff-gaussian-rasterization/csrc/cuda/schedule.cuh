@@ -1,6 +1,6 @@
 #pragma once
-// Which lists, or chunks of lists, blocks should take in which order: a long one that is started last keeps one
-// processor busy while the others are done.
+// Longest-first schedule of tile lists, or of chunks of them: a long list started last would leave one multiprocessor
+// working alone.
 #include <algorithm>
 #include <cstdint>
 
@@ -11,23 +11,23 @@ namespace cuda {
 
 constexpr int kOrderThreads = 1024;
 constexpr int kLengthClasses = 256;            // eight to a doubling
-constexpr int64_t kMostOrdered = 16384;        // tiles; more would take one block too long
+constexpr int64_t kMostOrdered = 16384;        // tiles; sorting more would take a block too long
 constexpr int32_t kWhole = int32_t(~0u >> 1);  // the size of chunks where lists are not cut
 
-// A part of a tile's list for one block. A tile's chunks but the first one have places side by side.
+// A part of a tile's list, for one block. All chunks of a tile but the first have places, side by side.
 struct alignas(16) Chunk {
   int32_t tile;        // -1 where there is none
   int32_t first, end;  // positions in the list
-  int32_t behind;      // the place of the chunk behind this one, whether there is one or not
+  int32_t behind;      // the place of the chunk behind this one, even where there is none
 };
 
 struct Schedule {
   const Chunk* chunks;
-  unsigned blocks;  // one for each chunk, and perhaps some for none
+  unsigned blocks;  // one for each chunk; some may have none
   unsigned places;  // at most
   int32_t size;     // of a chunk
 
-  // The same where all lengths come to no more than `total`.
+  // The schedule for lists whose lengths sum to at most `total`.
   Schedule shortened(int64_t total) const {
     const unsigned fewer = unsigned(std::min<int64_t>(places, total / size));
     return {chunks, blocks - places + fewer, fewer, size};
@@ -40,11 +40,11 @@ __device__ inline int length_class(int64_t length) {
   return kLengthClasses - 1 - int((bits - 0x3f800000u) >> 20);  // exponent and three bits of the mantissa
 }
 
-// How many chunks a list has besides the last one, which has the rest.
+// The chunks of a list before its last one, which has the rest.
 __device__ inline int32_t full_chunks(int32_t length, int32_t size) { return length ? (length - 1) / size : 0; }
 
-// One block sorts chunks by class. Within a class they lie in any order and places are given in any, which no result
-// depends on.
+// Sorts chunks by class, in one block. The order within a class and the order of places are arbitrary; no result
+// depends on them.
 template <class Length>
 __global__ void __launch_bounds__(kOrderThreads)
     order_chunks_kernel(int tiles, Length length, int32_t size, int blocks, Chunk* chunks) {
@@ -96,8 +96,8 @@ __global__ void __launch_bounds__(kOrderThreads) keep_tiles_kernel(int tiles, Le
   if (t < tiles) chunks[t] = {t, 0, int32_t(length(t)), 0};
 }
 
-// Chunks of `size` of the tiles' lists, the longest first; of many tiles whole lists in the usual order. total: of all
-// lengths, or more.
+// Schedules the tiles' lists in chunks of `size`, the longest first. Many tiles keep whole lists, in the order of the
+// tiles. total: the sum of all lengths, or more.
 template <class Length>
 Schedule longest_first(const Queue& queue, int64_t tiles, const Length& length, int32_t size = kWhole,
                        int64_t total = 0) {

@@ -1,3 +1,4 @@
+// Adam's step of the visible rows of a tensor.
 #include <cuda_runtime.h>
 
 #include "../backend.h"

@@ -1,5 +1,5 @@
 #pragma once
-// Counting the tiles that a splat reaches, by whole warps: a splat over a thousand tiles must not hold up 31 others.
+// Counts the tiles that a splat reaches, by whole warps: a splat over a thousand tiles must not hold up 31 others.
 #include "../data.h"
 #include "../math/tiles.h"
 #include "queue.cuh"
@@ -9,14 +9,14 @@ namespace cuda {
 
 using namespace baseline;  // the math headers' namespace in a build without instruction sets
 
-constexpr int kShared = 32;  // tiles of a rectangle up to which it is tested along with those of other lanes
+constexpr int kShared = 32;  // rectangles of at most this many tiles are pooled across the warp
 
 template <class V>
 __device__ V from_lane(V value, int lane) {
   return __shfl_sync(kWarp, value, lane);
 }
 
-// Of what tile_reached reads, all that differs between lanes.
+// Takes over what tile_reached reads and what differs between lanes.
 template <>
 __device__ inline TileTest<float> from_lane(TileTest<float> test, int lane) {
   Splat<float>& s = test.splat;
@@ -27,8 +27,8 @@ __device__ inline TileTest<float> from_lane(TileTest<float> test, int lane) {
   return test;
 }
 
-// Called by all lanes of a warp, with tests of `tiles` tiles each, 1 to 32; in rows of `wide` from (x0, y0). Returns a
-// bit for each tile that is reached. The tests of all lanes, one lane's after the other's, are shared out evenly.
+// Tests the tiles of every lane's rectangle: 1 to 32 `tiles` in rows of `wide` from (x0, y0). All lanes of a warp call
+// this, and share all tests evenly. Returns a bit for each of the lane's own tiles that is reached.
 __device__ inline uint32_t warp_tiles_reached(const TileTest<float>& test, int x0, int y0, int wide, int tiles) {
   const int lane = threadIdx.x & 31;
   const int inverse = int(__fdividef(1024, float(wide))) + 1;  // k * inverse >> 10 is k / wide for all k < 32
@@ -53,8 +53,8 @@ __device__ inline uint32_t warp_tiles_reached(const TileTest<float>& test, int x
   return uint32_t((high << 32 | low) >> start % 32) & uint32_t((uint64_t(1) << tiles) - 1);
 }
 
-// Called by all lanes of a warp, each with a splat of its own (an empty rectangle for none). Returns the number of
-// tiles that the splat reaches, and in `mask` a bit for each of the rectangle's first 64.
+// Returns the number of tiles that the lane's splat reaches, and in `mask` a bit for each of its rectangle's first 64.
+// All lanes of a warp call this; a lane without a splat gives an empty rectangle.
 __device__ inline int32_t warp_count_tiles(const Splat<float>& splat, TileRect rect, Image image, uint64_t& mask) {
   const int lane = threadIdx.x & 31;
   const int wide = rect.x1 - rect.x0, tiles = wide * (rect.y1 - rect.y0);
@@ -63,7 +63,7 @@ __device__ inline int32_t warp_count_tiles(const Splat<float>& splat, TileRect r
   int32_t count = 0;
   mask = 0;
   const bool shared = tiles > 0 && tiles <= kShared;
-  if (__any_sync(kWarp, shared)) {  // those without take part with one tile, for nothing
+  if (__any_sync(kWarp, shared)) {  // lanes without such a splat test one tile in vain
     const uint32_t reached = warp_tiles_reached(test, rect.x0, rect.y0, shared ? wide : 1, shared ? tiles : 1);
     if (shared) mask = reached, count = __popc(reached);
   }

@@ -1,11 +1,12 @@
 #pragma once
-// From what is optimised (log scale, logit, free quaternion) to what is rendered, with derivatives.
+// Activations, from the optimised parameters (log scale, logit, free quaternion) to the rendered ones, with
+// derivatives.
 #include "constants.h"
 #include "vec.h"
 
 GS_ISA_BEGIN
 
-// log2 of the logistic function, good for any logit: sigmoid(x) = 1/(1+e^-x).
+// log2 of the logistic function sigmoid(x) = 1/(1+e^-x), accurate for any logit.
 template <class T>
 GS_HD T log2_sigmoid(T logit) {
   const T away = std::log1p(std::exp(-std::abs(logit)));
@@ -24,11 +25,11 @@ struct Quat {
   T w, x, y, z;
 };
 
-// q / |q|; a quaternion shorter than 1e-30 counts as the identity. `norm` is what normalise_vjp needs (0 for that
-// case).
+// q / |q|; a quaternion shorter than 1e-30 counts as the identity. Gives normalise_vjp its `norm`, which is 0 for such
+// a quaternion.
 template <class T>
 GS_HD Quat<T> normalise(Quat<T> q, T& norm) {
-  // Scaled by the largest entry first: squares of 1e-20 and 1e20 leave the range of float.
+  // Divides by the largest entry first: squares of 1e-20 and 1e20 leave the range of float.
   const T m = larger(larger(std::abs(q.w), std::abs(q.x)), larger(std::abs(q.y), std::abs(q.z)));
   norm = 0;
   if (m < T(kMinQuaternion)) return {1, 0, 0, 0};
@@ -38,7 +39,8 @@ GS_HD Quat<T> normalise(Quat<T> q, T& norm) {
   return {s.w / r, s.x / r, s.y / r, s.z / r};
 }
 
-// From the torque about the rotation's own axes: turned by small angles a about them, n = q / |q| becomes n (1, a/2).
+// The gradient of q from the torque about the rotation's own axes: small angles a about them turn n = q / |q| into
+// n (1, a/2).
 template <class T>
 GS_HD Quat<T> normalise_vjp(Quat<T> n, T norm, Vec3<T> torque) {
   if (!(norm > 0)) return {0, 0, 0, 0};

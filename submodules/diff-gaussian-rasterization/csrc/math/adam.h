@@ -1,4 +1,5 @@
 #pragma once
+// A step of Adam for one value, and its guard.
 #include <cmath>
 #include <cstdint>
 
@@ -8,10 +9,11 @@
 
 GS_ISA_BEGIN
 
-// One step of Adam (Kingma and Ba 2015, algorithm 1) in torch's arrangement: eps is added to the corrected root.
+// The constants of one step of Adam (Kingma and Ba 2015, algorithm 1), arranged as torch does: eps is added to the
+// corrected root.
 template <class T>
 struct AdamStep {
-  T keep1, take1;     // beta1, 1 - beta1; the difference taken in double (1 - 0.999f is off by 5e-5)
+  T keep1, take1;     // beta1, 1 - beta1; the difference is computed in double (1 - 0.999f is off by 5e-5)
   T keep2, take2;     // beta2, 1 - beta2
   T rate;             // lr / (1 - beta1^t)
   T root_correction;  // 1 / sqrt(1 - beta2^t)
@@ -29,8 +31,8 @@ GS_HD AdamStep<T> make_adam_step(double lr, double beta1, double beta2, double e
           T(eps)};
 }
 
-// The same without the bias corrections: the step of sparse Adam (Mallick et al. 2024, Taming 3DGS), in which nobody
-// counts the steps of a row.
+// The same without the bias corrections: the step of sparse Adam (Mallick et al. 2024, Taming 3DGS), which does not
+// count the steps of a row.
 template <class T>
 GS_HD AdamStep<T> make_uncorrected_adam_step(double lr, double beta1, double beta2, double eps) {
   return {T(beta1), T(1 - beta1), T(beta2), T(1 - beta2), T(lr), T(1), T(eps)};
@@ -48,15 +50,16 @@ GS_HD bool is_finite(T x) {
   return x - x == T(0);  // inf - inf is not a number
 }
 
-// Whether the tensors of this iteration take their step.
+// Tells whether the tensors take their step in this iteration.
 template <class T>
 GS_HD bool may_step(const StepGuard<T>& guard) {
   if (!guard.stopped) return true;
-  const int64_t stopped = *static_cast<const volatile int64_t*>(guard.stopped);  // others may set it to this iteration
+  const int64_t stopped =
+      *static_cast<const volatile int64_t*>(guard.stopped);  // other threads may set it to this iteration
   return (stopped == 0 || stopped == guard.iteration) && is_finite(*guard.loss);
 }
 
-// The step where all it makes is finite, else none: then the value stays, and its mean becomes NaN as a mark.
+// Takes the step if all its results are finite. Otherwise the value stays, and its mean becomes NaN as a mark.
 template <class T>
 GS_HD bool adam_if_finite(const AdamStep<T>& a, T gradient, T& value, T& mean, T& square) {
   T v = value, m = mean, s = square;

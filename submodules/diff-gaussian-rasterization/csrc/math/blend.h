@@ -1,5 +1,5 @@
 #pragma once
-// What happens at a pixel. V is a lane type (a scalar or a vector of the compiler's), T its scalar.
+// Blending at a pixel. V is a lane type (a scalar, or a vector type of the compiler), T its scalar.
 #include "constants.h"
 #include "gs/hd.h"
 #include "splat.h"
@@ -7,9 +7,9 @@
 
 GS_ISA_BEGIN
 
-// A splat in coordinates local to a tile, always: small splats lose 1.3e-3 of the exponent in image coordinates where
-// these lose 1.1e-5. Products are arranged so that a compiler has one way only to fuse them: forward and backward
-// must agree on which pixels are reached.
+// A splat in coordinates local to a tile. In image coordinates, small splats lose 1.3e-3 of the exponent where these
+// lose 1.1e-5. Products are arranged so that a compiler can fuse them in one way only: forward and backward must agree
+// on which pixels are reached.
 template <class T>
 struct LocalSplat {
   T y, l11, l12, l22;
@@ -20,7 +20,7 @@ struct LocalSplat {
 
 constexpr double kTileCentre = (kTile - 1) / 2.0;
 
-// u in double: far along a needle it is the small difference of two products of thousands.
+// u is computed in double: far along a needle it is the small difference of two products in the thousands.
 template <class T>
 GS_HD LocalSplat<T> localise(const Splat<T>& s, T origin_x, T origin_y) {
   const double dx = origin_x + kTileCentre - s.x, dy = origin_y + kTileCentre - s.y;
@@ -54,8 +54,8 @@ GS_HD V capped(V alpha, T cap = T(kMaxAlpha)) {
   return alpha < cap ? alpha : V{} + cap;
 }
 
-// a / b; on a GPU by the hardware's reciprocal and a step of correction, without which a division is 2e-8 off on
-// average and 2,000 of them in a row 4e-5.
+// a / b. On a GPU by the hardware's reciprocal and a correction step. Without the correction a division is 2e-8 off on
+// average, and 2,000 of them in a row are 4e-5 off.
 template <class V>
 GS_HD V quotient(V a, V b) {
 #ifdef __CUDA_ARCH__
@@ -66,9 +66,9 @@ GS_HD V quotient(V a, V b) {
 #endif
 }
 
-// Walking back to front with one scalar for the colour: s = colour . image gradient of this splat, `behind` the
-// value of all behind it, normalised: dLoss/dalpha = T (s - behind), T the transmittance in front of the splat.
-// transmittance holds T (1 - alpha) on entry and T on return. Nothing is subtracted from a stored colour.
+// dLoss/dalpha, walking back to front with one scalar for the colour: s = colour . image gradient of this splat, and
+// `behind` the normalised value of everything behind it. dLoss/dalpha = T (s - behind), T the transmittance in front of
+// the splat. transmittance holds T (1 - alpha) on entry and T on return. Nothing is subtracted from a stored colour.
 template <class T, class V>
 GS_HD V alpha_gradient(V alpha, V s, V& transmittance, V& behind) {
   transmittance = quotient(transmittance, T(1) - alpha);

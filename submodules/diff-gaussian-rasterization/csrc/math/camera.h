@@ -1,4 +1,5 @@
 #pragma once
+// The camera: from the world to its view, and the constants of perspective.
 #include "constants.h"
 #include "vec.h"
 
@@ -10,17 +11,18 @@ struct Camera {
   Vec3<T> row_x, row_y, row_z;   // world-to-view rotation
   Vec3<T> translation;           // world-to-view
   Vec3<T> center;                // in the world
-  T focal_x, focal_y;            // px, of the covariance's Jacobian
-  T mean_focal_x, mean_focal_y;  // px, of the mean: equal to the above unless the caller's matrices disagree
+  T focal_x, focal_y;            // px, in the covariance's Jacobian
+  T mean_focal_x, mean_focal_y;  // px, for the mean; as above unless the caller's matrices disagree
   T axis_x, axis_y;              // px, where the optical axis meets the image
   T ray_min_x, ray_max_x;        // limits of x/z in the Jacobian
   T ray_min_y, ray_max_y;
   int width, height;
 };
 
-// From the reference's settings: view and full projection matrix, both transposed (row vectors), row-major.
-// The projection's own entries come out of the product by dot products with the rotation's rows; in double, and with
-// what rounding left of x . z taken out, because in a narrow field of view the scale is 1e5 times the shift.
+// Makes a camera from the reference's settings: the view and the full projection matrix, both transposed (for row
+// vectors), row-major. Dot products with the rotation's rows extract the projection's own entries from the full matrix.
+// They are computed in double, less what rounding left of x . z: in a narrow field of view the scale is 1e5 times the
+// shift.
 template <class T>
 GS_HD Camera<T> make_camera(const T* view, const T* full, const T* center, double tan_x, double tan_y, int width,
                             int height) {

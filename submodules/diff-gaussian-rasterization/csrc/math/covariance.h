@@ -1,5 +1,5 @@
 #pragma once
-// A splat's shape as three axes: its 3D covariance is the sum of axis axis^T, axis_k = scale_k * column k of R.
+// A Gaussian's shape as three axes: its 3D covariance is the sum of axis axis^T, axis_k = scale_k * column k of R.
 #include "activation.h"
 #include "vec.h"
 
@@ -11,7 +11,7 @@ struct Axes {
   T scale[3];
 };
 
-// Columns of R(q), the quaternion taken as it is (as the reference does): for |q| != 1 no rotation.
+// Columns of R(q). As in the reference, q is used as it is: for |q| != 1 the result is no rotation.
 template <class T>
 GS_HD void rotation_columns(Quat<T> q, Vec3<T> column[3]) {
   column[0] = {1 - 2 * (q.y * q.y + q.z * q.z), 2 * (q.x * q.y + q.w * q.z), 2 * (q.x * q.z - q.w * q.y)};
@@ -19,7 +19,7 @@ GS_HD void rotation_columns(Quat<T> q, Vec3<T> column[3]) {
   column[2] = {2 * (q.x * q.z + q.w * q.y), 2 * (q.y * q.z - q.w * q.x), 1 - 2 * (q.x * q.x + q.y * q.y)};
 }
 
-// From gradients of the columns to that of q, entry by entry of the above.
+// The gradient of q from those of the columns, entry by entry of the above.
 template <class T>
 GS_HD Quat<T> rotation_columns_vjp(Quat<T> q, const Vec3<T> g[3]) {
   return {
@@ -29,7 +29,7 @@ GS_HD Quat<T> rotation_columns_vjp(Quat<T> q, const Vec3<T> g[3]) {
       2 * (q.x * (g[0].z + g[2].x) + q.y * (g[1].z + g[2].y) + q.w * (g[0].y - g[1].x)) - 4 * q.z * (g[0].x + g[1].y)};
 }
 
-// Axes of a given covariance (xx, xy, xz, yy, yz, zz) by Cholesky; a pivot that rounding made negative is zero.
+// Axes of a given covariance (xx, xy, xz, yy, yz, zz) by Cholesky. A pivot that rounding made negative counts as zero.
 template <class T>
 GS_HD Axes<T> axes_of_covariance(const T* c) {
   const T a = std::sqrt(larger(c[0], T(0)));

@@ -1,4 +1,5 @@
 #pragma once
+// 2^t, for vectors of a CPU and for a GPU.
 #include <cmath>
 #include <cstring>
 
@@ -6,9 +7,9 @@
 
 GS_ISA_BEGIN
 
-// 2^t on lanes, |t| < 120. t = n + f, |f| <= 1/2: adding 1.5 * 2^mantissa rounds to n and leaves n in the low
-// bits, which go onto the exponent of 2^f by integer addition. 2^f is a polynomial: float the minimax one of degree
-// 6 (relative error 1.9e-9, under rounding), double Taylor's of degree 13 (4e-18).
+// 2^t on lanes, |t| < 120. t = n + f, |f| <= 1/2: adding 1.5 * 2^mantissa rounds to n and leaves n in the low bits.
+// Integer addition puts those onto the exponent of 2^f. 2^f is a polynomial: in float the minimax one of degree 6
+// (relative error 1.9e-9, below rounding), in double Taylor's of degree 13 (4e-18).
 template <class V, class I>
 inline V exp2_lanes(V t, float) {
   const float magic = 12582912.0f;
@@ -45,7 +46,7 @@ inline V exp2_lanes(V t, double) {
   return p;
 }
 
-// 2^t by the GPU's own instruction: good to 2 units in the last place; results under the normal range are 0.
+// 2^t by the GPU's own instruction, accurate to 2 units in the last place. Results below the normal range are 0.
 #ifdef __CUDACC__
 __device__ __forceinline__ float exp2_device(float t) {
   float y;

@@ -1,6 +1,6 @@
 #pragma once
-// The splat on the image plane: from M (2x3, rows m1, m2; covariance M M^T + dilation) to the factor of the
-// conic, and back.
+// A splat's footprint on the image plane: from M (2x3, rows m1, m2; covariance M M^T + dilation) to the factor of the
+// conic, and the derivative.
 #include "constants.h"
 #include "vec.h"
 
@@ -20,8 +20,8 @@ struct Footprint {
   bool floored;
 };
 
-// det = |m1 x m2|^2 + h (|m1|^2 + |m2|^2) + h^2 (Cauchy-Binet): only non-negative terms, so nothing cancels, and
-// divided by c throughout, so that it does not overflow either. With S = log2(e)/2 covariance^-1 = L^T L:
+// det = |m1 x m2|^2 + h (|m1|^2 + |m2|^2) + h^2 (Cauchy-Binet) has only non-negative terms, so nothing cancels. All is
+// divided by c, so that nothing overflows. With S = log2(e)/2 covariance^-1 = L^T L:
 // l22 = sqrt(k/c), l11 = sqrt(k c/det), l12 = -(b/c) l11.
 template <class T>
 GS_HD Footprint<T> make_footprint(Vec3<T> m1, Vec3<T> m2, Vec3<T> minors) {
@@ -44,7 +44,7 @@ GS_HD Footprint<T> make_footprint(Vec3<T> m1, Vec3<T> m2, Vec3<T> minors) {
   return f;
 }
 
-// Sums over pixels, whitened: q = alpha uncapped times dLoss/dalpha.
+// Sums over a splat's pixels, in its whitened coordinates (u, v): q = uncapped alpha times dLoss/dalpha.
 template <class T>
 struct Moments {
   T q, qu, qv, quu, quv, qvv;
@@ -58,14 +58,14 @@ GS_HD void mean_vjp(const Footprint<T>& f, const Moments<T>& s, T& gx, T& gy) {
   gy = two_ln2 * (f.l12 * s.qu + f.l22 * s.qv);
 }
 
-// det/det0 - 1, where the compensation is not floored.
+// det/det0 - 1 where the compensation is not floored.
 template <class T>
 GS_HD T compensation_excess(const Footprint<T>& f) {
   return f.excess / (f.compensation * f.compensation * f.schur);
 }
 
-// What M receives: by rows, and in the splat's own frame the symmetric matrix M^T dM. Scales and rotation come from the
-// latter, so that nothing cancels between an axis' length and its direction.
+// The gradient of M by rows, and in the splat's own frame the symmetric matrix M^T dM. Scales and rotation come from
+// that matrix, so that nothing cancels between an axis' length and its direction.
 template <class T>
 struct ShapeGradient {
   Vec3<T> m1, m2;
@@ -74,9 +74,9 @@ struct ShapeGradient {
 
 // dM = L^T W (L M): covariance's gradient is L^T W L / 2, and covariance = M M^T + const. So M^T dM = (L M)^T W (L M).
 // The first row of L M is l11 (m1 - (b/c) m2) = l11 (m2 x (m1 x m2) + h m1) / c, without the cancellation.
-// W is 4 ln2^2 W2, and with antialiasing, where the opacity carries sqrt(det0/det), also L^-T (adj0/det0 - adj/det)
-// L^-1, adj0 and adj the adjugates of the covariance before and after dilation; multiplied out with det0 = a0 c0 - b^2
-// its terms in b and c cancel on paper.
+// W is 4 ln2^2 W2, W2 the second moments. With antialiasing the opacity carries sqrt(det0/det), which adds
+// L^-T (adj0/det0 - adj/det) L^-1, adj0 and adj the adjugates of the covariance before and after dilation. Multiplied
+// out with det0 = a0 c0 - b^2, its terms in b and c cancel on paper.
 template <class T>
 GS_HD ShapeGradient<T> footprint_vjp(const Footprint<T>& f, const Moments<T>& s, bool antialiasing) {
   const T h = T(kDilation), four_ln2_sq = T(4 * kLn2 * kLn2);
@@ -88,7 +88,7 @@ GS_HD ShapeGradient<T> footprint_vjp(const Footprint<T>& f, const Moments<T>& s,
     uv -= k * (slope / std::sqrt(f.schur) / std::sqrt(f.c));
     vv += k * ((f.compensation * f.compensation + h * (f.a0 / f.c / f.schur)) / f.c);
   }
-  const T root = 1 / std::sqrt(f.c);  // both factors by this: the product overflows
+  const T root = 1 / std::sqrt(f.c);  // scales both factors, because their product overflows
   const Vec3<T> lm_u = f.l11 * (cross(root * f.m2, root * f.minors) + (h / f.c) * f.m1), lm_v = f.l22 * f.m2;
   const Vec3<T> wu = uu * lm_u + uv * lm_v, wv = uv * lm_u + vv * lm_v;
   return {f.l11 * wu,
@@ -97,7 +97,7 @@ GS_HD ShapeGradient<T> footprint_vjp(const Footprint<T>& f, const Moments<T>& s,
           {lm_u.y * wu.z + lm_v.y * wv.z, lm_u.z * wu.x + lm_v.z * wv.x, lm_u.x * wu.y + lm_v.x * wv.y}};
 }
 
-// Gradient of the 2D covariance (xx, xy, yy; xy once, of the symmetric matrix), for covariances that were given.
+// The gradient of the 2D covariance (xx, xy, yy; xy once, of the symmetric matrix), for Gaussians given by cov3d.
 template <class T>
 GS_HD void covariance2d_vjp(const Footprint<T>& f, const Moments<T>& s, bool antialiasing, T g[3]) {
   const T two_ln2_sq = T(2 * kLn2 * kLn2);

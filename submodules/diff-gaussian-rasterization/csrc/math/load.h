@@ -1,4 +1,5 @@
 #pragma once
+// A load that nvcc does not split.
 #include <cstring>
 
 #include "gs/hd.h"
@@ -6,7 +7,7 @@
 
 GS_ISA_BEGIN
 
-// A struct of 16 bytes by one load, for which nvcc would take one for each part of a member's size.
+// Loads a struct of 16 bytes at once; nvcc alone would load it member by member.
 template <class T>
 GS_HD T load_whole(const T* from) {
   static_assert(sizeof(T) == 16 && alignof(T) == 16);

@@ -1,4 +1,5 @@
 #pragma once
+// The statistics of density control.
 #include <cmath>
 #include <cstdint>
 
@@ -6,12 +7,12 @@
 
 namespace gs {
 
-// What adaptive density control keeps of a Gaussian over the views between two densifications (Kerbl et al. 2023,
+// A Gaussian's statistics over the views between two densifications, for adaptive density control (Kerbl et al. 2023,
 // section 5.2).
 struct Observed {
   float max_radius;    // pixels
-  float gradient_sum;  // lengths of the gradients of its mean on the screen, per NDC unit
-  float views;         // that saw it
+  float gradient_sum;  // sum of the lengths of its mean's gradients on the screen, per NDC unit
+  float views;         // views that saw it
 };
 
 // Adds a view, for a Gaussian of the given radius (0: not seen) and screen gradient.

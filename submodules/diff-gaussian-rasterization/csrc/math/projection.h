@@ -1,5 +1,5 @@
 #pragma once
-// One Gaussian through one camera, and back.
+// Projection of one Gaussian by one camera, and its derivative.
 #include "camera.h"
 #include "covariance.h"
 #include "footprint.h"
@@ -9,7 +9,7 @@
 
 GS_ISA_BEGIN
 
-// A Gaussian as it is rendered (activated).
+// A Gaussian with activated parameters.
 template <class T>
 struct Gaussian {
   Vec3<T> mean;
@@ -17,8 +17,8 @@ struct Gaussian {
   T log2_opacity;
 };
 
-// Perspective at a view-space point: mean, and the rows p1, p2 of J W (J the Jacobian of Zwicker et al. 2001, eq. 29,
-// at the ray clamped to 1.3 half images). ray = (x/z, y/z).
+// Perspective at a view-space point: the ray (x/z, y/z) and the rows p1, p2 of J W. J is the Jacobian of Zwicker et al.
+// 2001, eq. 29, at the ray clamped to 1.3 half images.
 template <class T>
 struct Perspective {
   T inverse_z;
@@ -38,8 +38,8 @@ GS_HD Perspective<T> perspective(const Camera<T>& cam, Vec3<T> view) {
   return p;
 }
 
-// M = J W R S and its minors. p1 x p2 = fx fy / z^2 (W^T (clamped ray, 1)) and the minor of columns i, j is that dotted
-// with axis_i x axis_j: no difference of large products, however thin the splat.
+// M = J W R S and its minors. p1 x p2 = fx fy / z^2 (W^T (clamped ray, 1)), and the minor of columns i, j is its dot
+// product with axis_i x axis_j: no difference of large products, however thin the splat.
 template <class T>
 GS_HD Footprint<T> splat_footprint(const Camera<T>& cam, const Perspective<T>& p, const Axes<T>& axes) {
   const auto& d = axes.direction;
@@ -54,8 +54,8 @@ GS_HD Footprint<T> splat_footprint(const Camera<T>& cam, const Perspective<T>& p
   return make_footprint(m1, m2, minors);
 }
 
-// Everything of a splat but its colour; opacity, scales and rotation must be finite. False: culled (behind, not finite
-// on the image, too faint to be seen anywhere).
+// Computes a splat except its colour. Opacity, scales and rotation must be finite. Returns false if it is culled:
+// behind the camera, not finite on the image, or too faint to be seen anywhere.
 template <class T>
 GS_HD bool project_splat(const Camera<T>& cam, const Gaussian<T>& gaussian, bool antialiasing, Splat<T>& splat,
                          T& depth, int& radius) {
@@ -75,29 +75,29 @@ GS_HD bool project_splat(const Camera<T>& cam, const Gaussian<T>& gaussian, bool
   if (!radius_on_image(splat.x, splat.y, radius, cam.width, cam.height)) radius = 0;
   const T log2_opacity = gaussian.log2_opacity + (antialiasing ? std::log2(f.compensation) : T(0));
   splat.log2_opacity = log2_opacity < T(kMaxLog2Opacity) ? log2_opacity : T(kMaxLog2Opacity);
-  return splat.log2_opacity >= T(kLog2MinAlpha) - T(1e-3);  // the margin is tile_rect's
+  return splat.log2_opacity >= T(kLog2MinAlpha) - T(1e-3);  // the margin of tile_rect
 }
 
-// What project_splat's inputs receive; log2_opacity as d/d ln(opacity).
+// The gradients of project_splat's inputs; the opacity's is d/d ln(opacity).
 template <class T>
 struct GaussianGradient {
   Vec3<T> mean;
-  Vec3<T> torque;        // of turns about the axes, where they are known to be perpendicular
-  Vec3<T> direction[3];  // of the axes, where they are not
+  Vec3<T> torque;        // of turns about the axes, where the axes are known to be perpendicular
+  Vec3<T> direction[3];  // of the axes, where they may not be perpendicular
   T log_scale[3];
   T log_opacity;
   T pixel_x, pixel_y;
 };
 
-// About an axis, from M^T dM between the other two, of scales a and b: off (a/b - b/a), exactly 0 where they are equal.
-// `off` has both as factors, so by the smaller it can be divided.
+// The torque about an axis, from the entry of M^T dM between the other two, whose scales are a and b: off (a/b - b/a),
+// exactly 0 where they are equal. `off` has both scales as factors, so it can be divided by the smaller one.
 template <class T>
 GS_HD T torque(T off, T a, T b) {
   const T low = a < b ? a : b, high = larger(a, b);
   return low > 0 ? off / low * (a + b) * ((a - b) / high) : T(0);
 }
 
-// perpendicular: whether the axes are. g_covariance (6, or null): of the covariance that the axes came from.
+// perpendicular: whether the axes are. g_covariance (6, or null): the gradient of the covariance that gave the axes.
 template <class T>
 GS_HD GaussianGradient<T> project_splat_vjp(const Camera<T>& cam, const Gaussian<T>& gaussian, bool antialiasing,
                                             bool perpendicular, T* g_covariance, const Moments<T>& s,
@@ -123,7 +123,7 @@ GS_HD GaussianGradient<T> project_splat_vjp(const Camera<T>& cam, const Gaussian
     g.torque = {torque(shape.off.x, c[1], c[2]), torque(shape.off.y, c[2], c[0]), torque(shape.off.z, c[0], c[1])};
   else
     for (int k = 0; k < 3; ++k) g.direction[k] = c[k] * (row1[k] * p.p1 + row2[k] * p.p2);
-  if (g_covariance) {  // d cov3d = P^T G P, off-diagonal entries stand for two
+  if (g_covariance) {  // d cov3d = P^T G P; off-diagonal entries stand for two
     T c2[3];
     covariance2d_vjp(f, s, antialiasing, c2);
     const Vec3<T> a = c2[0] * p.p1 + c2[1] * p.p2, b = c2[1] * p.p1 + c2[2] * p.p2;
@@ -135,7 +135,7 @@ GS_HD GaussianGradient<T> project_splat_vjp(const Camera<T>& cam, const Gaussian
     g_covariance[5] = p.p1.z * a.z + p.p2.z * b.z;
   }
 
-  // A clamped ray is a constant: its coordinate gets nothing through J, and z only through the factor 1/z.
+  // A clamped ray is constant: its coordinate gets no gradient through J, and z only through the factor 1/z.
   T g_ray_x = cam.mean_focal_x * g.pixel_x, g_ray_y = cam.mean_focal_y * g.pixel_y;
   if (p.clamped_x == p.ray_x) g_ray_x -= cam.focal_x * p.inverse_z * along1;
   if (p.clamped_y == p.ray_y) g_ray_y -= cam.focal_y * p.inverse_z * along2;

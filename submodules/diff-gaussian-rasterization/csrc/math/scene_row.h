@@ -1,6 +1,5 @@
 #pragma once
-// One Gaussian, from a Scene's rows to a Splat and from moments to gradients' rows: what every backend does for an
-// index.
+// The work of every backend on one Gaussian: from the Scene's rows to a Splat, and from moments to rows of gradients.
 #include <cmath>
 
 #include "../data.h"
@@ -13,7 +12,7 @@ GS_HD Camera<T> camera_of(const Scene<T>& s) {
   return make_camera(s.view, s.projection, s.center, s.tan_x, s.tan_y, s.image.width, s.image.height);
 }
 
-// A Gaussian and what its activations' derivatives need.
+// A Gaussian, and what the derivatives of its activations need.
 template <class T>
 struct Loaded {
   Gaussian<T> gaussian;
@@ -42,8 +41,8 @@ GS_HD Loaded<T> load(const Scene<T>& s, int64_t i) {
   return out;
 }
 
-// What need not show in the mean or the footprint, which are checked once computed. Infinite logits are the opacities 0
-// and 1: programs that set an opacity write them.
+// Checks what may not show in the mean or the footprint, which are checked after they are computed. Infinite logits are
+// the opacities 0 and 1: programs that set an opacity write them.
 template <class T>
 GS_HD bool finite_shape(const Scene<T>& s, int64_t i) {
   const T opacity = s.opacities[i];
@@ -53,7 +52,7 @@ GS_HD bool finite_shape(const Scene<T>& s, int64_t i) {
          std::isfinite(s.rotations[4 * i + 3]);
 }
 
-// Everything of a splat but its colour. False: culled; depth is infinite then, so that it sorts last.
+// Computes a splat except its colour. Returns false if it is culled; its depth is infinite then, so that it sorts last.
 template <class T>
 GS_HD bool project_shape(const Scene<T>& s, const Camera<T>& camera, int64_t i, Splat<T>& splat, T& depth,
                          int& radius) {
@@ -66,7 +65,7 @@ GS_HD bool project_shape(const Scene<T>& s, const Camera<T>& camera, int64_t i, 
   return true;
 }
 
-// The colour's basis at the direction from which Gaussian i is seen; returns its distance.
+// Computes the colour's basis at the direction from which Gaussian i is seen; returns its distance.
 template <class T>
 GS_HD T color_basis(const Scene<T>& s, const Camera<T>& camera, int64_t i, Vec3<T>& direction, T* basis) {
   const T norm = sh_direction(load3(s.means + 3 * i) - camera.center, direction);
@@ -74,7 +73,8 @@ GS_HD T color_basis(const Scene<T>& s, const Camera<T>& camera, int64_t i, Vec3<
   return norm;
 }
 
-// Colour of a splat; `rest` is its row of sh_rest, wherever that lies. False: not finite, or beyond use.
+// Computes a splat's colour; `rest` is its row of sh_rest, which may be a copy. Returns false if the colour is not
+// finite or too large.
 template <class T>
 GS_HD bool project_color(const Scene<T>& s, const Camera<T>& camera, int64_t i, const T* rest, Splat<T>& splat) {
   Vec3<T> c;
@@ -87,7 +87,8 @@ GS_HD bool project_color(const Scene<T>& s, const Camera<T>& camera, int64_t i, 
     c = sh_color(s.sh_degree, basis, s.sh_dc + s.dc_stride * i, rest);
   }
   if (!finite(c) || !(larger(larger(std::abs(c.x), std::abs(c.y)), std::abs(c.z)) < T(kMaxColor))) return false;
-  if (!s.colors) c = {larger(c.x, T(0)), larger(c.y, T(0)), larger(c.z, T(0))};  // after the test: it hides -Inf
+  if (!s.colors)
+    c = {larger(c.x, T(0)), larger(c.y, T(0)), larger(c.z, T(0))};  // after the test, because this hides -Inf
   splat.r = c.x, splat.g = c.y, splat.b = c.z;
   return true;
 }
@@ -98,7 +99,7 @@ GS_HD void zero_row(T* rows, int64_t i, int row) {
     for (int k = 0; k < row; ++k) rows[row * i + k] = 0;
 }
 
-// All gradients of a Gaussian that was not seen, but for sh_rest.
+// Zeroes all gradients of a Gaussian that was not seen, except that of sh_rest.
 template <class T>
 GS_HD void zero_gradient(int64_t i, const SceneGradient<T>& out) {
   zero_row(out.means, i, 3), zero_row(out.means2d, i, 3), zero_row(out.opacities, i, 1);
@@ -106,8 +107,8 @@ GS_HD void zero_gradient(int64_t i, const SceneGradient<T>& out) {
   zero_row(out.colors, i, 3), zero_row(out.sh_dc, i, 3);
 }
 
-// Gradients of the coefficients and, returned, of the mean through the viewing direction. `rest` and g_rest are the
-// rows of sh_rest and of its gradient (or null), wherever they lie; they may be the same.
+// Computes the coefficients' gradients, and returns the mean's through the viewing direction. `rest` and g_rest are the
+// rows of sh_rest and of its gradient (or null). They may be copies, and may be the same memory.
 template <class T>
 GS_HD Vec3<T> color_vjp(const Scene<T>& s, const Camera<T>& camera, int64_t i, Vec3<T> g, const T* rest, T* g_dc,
                         T* g_rest) {
@@ -120,7 +121,7 @@ GS_HD Vec3<T> color_vjp(const Scene<T>& s, const Camera<T>& camera, int64_t i, V
   g = {c.x >= black ? g.x : T(0), c.y >= black ? g.y : T(0), c.z >= black ? g.z : T(0)};
   if (g_dc) store3(g_dc + 3 * i, basis[0] * g);
   const int active = sh_count(s.sh_degree);
-  // Of constant length, so that a GPU keeps the arrays in registers; all is read before the same row is written.
+  // Loops of constant length let a GPU keep the arrays in registers. All of a row is read before it may be written.
   for (int k = 1; k < kCount; ++k)
     if (k < active) weight[k] = dot(load3(rest + 3 * (k - 1)), g);
   if (g_rest)
@@ -156,7 +157,7 @@ GS_HD void project_vjp_row(const Scene<T>& s, const Camera<T>& camera, int64_t i
   if (out.scales)
     for (int k = 0; k < 3; ++k) {
       const T scale = s.raw ? T(1) : s.scales[3 * i + k];
-      out.scales[3 * i + k] = scale != 0 ? g.log_scale[k] / scale : T(0);  // even in the scale
+      out.scales[3 * i + k] = scale != 0 ? g.log_scale[k] / scale : T(0);  // the loss is even in the scale
     }
   if (out.rotations) {
     const Quat<T> q =

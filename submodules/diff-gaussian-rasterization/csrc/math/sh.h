@@ -8,7 +8,7 @@ constexpr int kMaxShDegree = 3;
 
 GS_HD constexpr int sh_count(int degree) { return (degree + 1) * (degree + 1); }
 
-// basis[k], k < sh_count(degree), at the unit vector d.
+// Computes basis[k], k < sh_count(degree), at the unit vector d.
 template <class T>
 GS_HD void sh_basis(int degree, Vec3<T> d, T* basis) {
   basis[0] = T(0.28209479177387814);
@@ -58,7 +58,7 @@ GS_HD Vec3<T> sh_basis_vjp(int degree, Vec3<T> d, const T* weight) {
   return g;
 }
 
-// d = v / |v|; the zero vector stays zero (only degree 0 is left of the colour). Returns |v|.
+// d = v / |v|. The zero vector stays zero, which leaves only degree 0 of the colour. Returns |v|.
 template <class T>
 GS_HD T sh_direction(Vec3<T> v, Vec3<T>& d) {
   const T norm = length(v);
@@ -71,12 +71,12 @@ GS_HD Vec3<T> sh_direction_vjp(Vec3<T> d, T norm, Vec3<T> g) {
   return norm > 0 ? (1 / norm) * (g - dot(d, g) * d) : Vec3<T>{0, 0, 0};
 }
 
-// Colour before the clamp at 0: 1/2 + sum_k basis[k] coefficient_k; dc is coefficient 0, rest the others.
+// The colour before the clamp at 0: 1/2 + sum_k basis[k] coefficient_k. dc is coefficient 0, rest has the others.
 template <class T>
 GS_HD Vec3<T> sh_color(int degree, const T* basis, const T* dc, const T* rest) {
   Vec3<T> c = Vec3<T>{T(0.5), T(0.5), T(0.5)} + basis[0] * load3(dc);
   const int active = sh_count(degree);
-  for (int k = 1; k < sh_count(kMaxShDegree); ++k)  // of constant length, so that a GPU keeps the basis in registers
+  for (int k = 1; k < sh_count(kMaxShDegree); ++k)  // constant length: a GPU keeps the basis in registers
     if (k < active) c = c + basis[k] * load3(rest + 3 * (k - 1));
   return c;
 }

@@ -1,7 +1,7 @@
 #pragma once
-// Where the backward keeps what an instance adds to a splat's gradient: by splat, not by tile as the instances lie. A
-// slot is a tile of a splat's rectangle, reached or not, so an instance finds its slot, and a splat the slots of its
-// instances, without a list of either.
+// Slots, the places of the instances' gradients: sorted by splat, while instances are sorted by tile. A slot is a tile
+// of a splat's rectangle, reached or not. So an instance finds its slot, and a splat finds its instances' slots,
+// without a list of either.
 #include <cstdint>
 
 #include "../data.h"
@@ -12,7 +12,7 @@ GS_ISA_BEGIN
 
 GS_HD int64_t slot_count(TileRect rect) { return int64_t(rect.x1 - rect.x0) * (rect.y1 - rect.y0); }
 
-// first: the slots of all splats before.
+// first: the number of slots of all splats before.
 GS_HD SplatSlots splat_slots(int64_t first, TileRect rect) {
   const int32_t wide = rect.x1 - rect.x0;
   return {first, rect.y0 * wide + rect.x0, wide};

@@ -1,9 +1,10 @@
 #pragma once
+// A splat, a Gaussian projected to the image, and the number of values in its rows.
 #include "gs/isa.h"
 
 GS_ISA_BEGIN
 
-// What blending needs of a splat; a row of the `splats` tensor.
+// A row of the tensor `splats`: all that blending needs.
 template <class T>
 struct Splat {
   T x, y;           // mean, px, pixel centres at integers

@@ -1,5 +1,5 @@
 #pragma once
-// Which tiles a splat reaches: those where its alpha comes to 1/255 at a pixel centre.
+// The tiles that a splat reaches: those where its alpha is at least 1/255 at some pixel centre.
 #include <cstdint>
 
 #include "../data.h"
@@ -22,7 +22,7 @@ GS_HD int clamped_floor(T value, int limit) {
   return value > 0 ? (value < T(limit) ? int(value) : limit) : 0;
 }
 
-// Does the square of 3-sigma radius meet the image? (The reference's rule for `radii`, by whole tiles.)
+// Tells whether the square of 3-sigma radius meets the image: the reference's rule for `radii`, by whole tiles.
 template <class T>
 GS_HD bool radius_on_image(T x, T y, int radius, int width, int height) {
   const T r = T(radius), tile = T(kTile);
@@ -31,8 +31,8 @@ GS_HD bool radius_on_image(T x, T y, int radius, int width, int height) {
          clamped_floor((y + r + tile - 1) / tile, ny) > clamped_floor((y - r) / tile, ny);
 }
 
-// The box of tiles that can be reached. |dx| is at most sqrt(reach) / |column of L^-1|: L^-1 = (1/l11, -l12/(l11
-// l22); 0, 1/l22).
+// The box of tiles that the splat can reach. |dx| is at most sqrt(reach) / |column of L^-1|, with
+// L^-1 = (1/l11, -l12/(l11 l22); 0, 1/l22).
 template <class T>
 GS_HD TileRect tile_rect(const Splat<T>& s, int width, int height) {
   const T level = s.log2_opacity - T(kLog2MinAlpha);
@@ -46,8 +46,8 @@ GS_HD TileRect tile_rect(const Splat<T>& s, int width, int height) {
           clamped_floor((s.x + dx) / tile, nx - 1) + 1, clamped_floor((s.y + dy) / tile, ny - 1) + 1};
 }
 
-// Decides tile by tile for one splat; what does not depend on the tile is worked out once. l11 and l22 are above 0:
-// projection leaves out the rest.
+// The part of one splat's tile tests that does not depend on the tile. l11 and l22 are above 0, because projection
+// culls other splats.
 template <class T>
 struct TileTest {
   Splat<T> splat;
@@ -57,10 +57,9 @@ struct TileTest {
   T level;           // u^2 + v^2 up to which a pixel is reached, rounding margin included
 };
 
-// The margin, log2 units: u and v are sums of products with a relative error of some units in the last place of their
-// terms, and (u, v) stays under 2.83 where it matters. A design study
-// without margin dropped 1,678 of 478,183 borderline tiles wrongly. With it, leaving tiles out changes no bit of the
-// image; the tests hold it to that.
+// The margin, in log2 units: u and v are sums of products with a relative error of some units in the last place of
+// their terms, and (u, v) stays below 2.83 where it matters. A design study without a margin dropped 1,678 of 478,183
+// borderline tiles wrongly. With it, leaving tiles out changes no bit of the image; the tests check this.
 template <class T>
 GS_HD TileTest<T> make_tile_test(const Splat<T>& s, TileRect rect, int width, int height) {
   const T unit = sizeof(T) == 4 ? T(5.9604644775390625e-8) : T(1.1102230246251565e-16);
@@ -75,10 +74,11 @@ GS_HD TileTest<T> make_tile_test(const Splat<T>& s, TileRect rect, int width, in
           multiply_add(48 * unit, terms, s.log2_opacity - T(kLog2MinAlpha))};
 }
 
-// Compares the least u^2 + v^2 over the box of pixel centres x0..x1, y0..y1 (px, inclusive): 0 if the mean is inside,
-// else on an edge that faces the mean, where it is a parabola in one coordinate. The box lies between the centres too,
-// so this may keep a tile that no pixel needs, never the other way round. V is T or a vector of boxes; products are
-// arranged so that a compiler has one way only to fuse them, for counting must agree with emission.
+// Compares the least u^2 + v^2 over the box of pixel centres x0..x1, y0..y1 (px, inclusive). It is 0 if the mean is
+// inside; else it lies on an edge that faces the mean, where it is a parabola in one coordinate. The box has points
+// between the centres too, so this may keep a tile that no pixel needs, but never drops one that a pixel needs. V is T
+// or a vector of boxes. Products are arranged so that a compiler can fuse them in one way only, because counting must
+// agree with emission.
 template <class T, class V>
 GS_HD auto box_reached(const TileTest<T>& test, V left, V right, V top, V bottom) {
   const Splat<T>& s = test.splat;
@@ -95,7 +95,7 @@ GS_HD auto box_reached(const TileTest<T>& test, V left, V right, V top, V bottom
   return (beside & side) | (above & edge) | ((!outside) & (V{} + test.level >= T(0)));
 }
 
-// Tiles by column and row, V as above.
+// Tests tiles given by column and row; V as above.
 template <class T, class V>
 GS_HD auto tile_reached(const TileTest<T>& test, V tile_x, V tile_y) {
   const V left = tile_x * T(kTile), right = left + T(kTile - 1), top = tile_y * T(kTile), bottom = top + T(kTile - 1);

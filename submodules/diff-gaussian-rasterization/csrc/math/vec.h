@@ -1,4 +1,5 @@
 #pragma once
+// Vectors of three, and scalar helpers.
 #include <cmath>
 
 #include "gs/hd.h"
@@ -33,13 +34,14 @@ GS_HD Vec3<T> cross(Vec3<T> a, Vec3<T> b) {
 }
 template <class T>
 GS_HD bool finite(Vec3<T> a) {
-  return std::isfinite(a.x) & std::isfinite(a.y) & std::isfinite(a.z);  // without waiting for one to load the next
+  return std::isfinite(a.x) & std::isfinite(a.y) &
+         std::isfinite(a.z);  // & instead of &&: no load waits for another's test
 }
 template <class T>
 GS_HD T clamp(T value, T low, T high) {
   return value < low ? low : value > high ? high : value;
 }
-// a b + c rounded one way wherever it is compiled: counting and emission must not differ by what a compiler fuses.
+// a b + c, rounded in one way wherever it is compiled: counting and emission must not differ by what a compiler fuses.
 template <class T>
 GS_HD T multiply_add(T a, T b, T c) {
 #if defined(__CUDA_ARCH__) || defined(__FMA__)

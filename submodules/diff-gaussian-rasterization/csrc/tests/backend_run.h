@@ -1,5 +1,5 @@
 #pragma once
-// A random scene, and a pass forward and backward through a backend, for tests.
+// A random scene, and a forward and a backward pass through a backend, for tests.
 #include <cmath>
 #include <numeric>
 #include <random>
@@ -40,7 +40,7 @@ struct Result {
   int64_t instances;
 };
 
-// The parameters as a camera at the origin sees them, 62 degrees across.
+// The scene of a camera at the origin, 62 degrees wide.
 template <class T>
 gs::Scene<T> scene_of(Parameters<T>& p, gs::Image image, bool antialiasing) {
   static const T view[16] = {1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1};
@@ -58,8 +58,8 @@ gs::Scene<T> scene_of(Parameters<T>& p, gs::Image image, bool antialiasing) {
   return scene;
 }
 
-// What binning gives for a scene, on an Executor or a Queue. rects, records: what projection hands on (a GPU needs one
-// of them, the CPU rects); slots: whether they are asked for.
+// Binning's results for a scene, on an Executor or a Queue. rects, records: whether projection gives them to binning (a
+// GPU needs one of the two, the CPU needs rects). slots: whether binning fills them.
 template <class T>
 struct Bins {
   std::vector<int32_t> instances;
@@ -72,7 +72,7 @@ Bins<T> bin_scene(const Where& where, const gs::Scene<T>& scene, bool rects, boo
   using gs::cuda::bin, gs::cuda::project, gs::GS_ISA::bin, gs::GS_ISA::project;
   const size_t n = scene.count;
   std::vector<T> splats(kSplatValues * n), depths(n);
-  std::vector<int32_t> rect(4 * n, 0x7fffffff), tile_counts(n), radii(n);  // where undefined, nobody may use it
+  std::vector<int32_t> rect(4 * n, 0x7fffffff), tile_counts(n), radii(n);  // undefined values must not be used
   std::vector<gs::TileRecord> record(n);
   const gs::Projected<T> projected = {splats.data(),      depths.data(), rects ? rect.data() : nullptr,
                                       tile_counts.data(), radii.data(),  records ? record.data() : nullptr};
@@ -90,9 +90,9 @@ Bins<T> bin_scene(const Where& where, const gs::Scene<T>& scene, bool rects, boo
   return out;
 }
 
-// Forward and backward of the sum of all pixels of all planes, on an Executor or a Queue; allocations are exact, so
-// that a sanitizer sees a step outside. The gradient holds means, means2d, opacities, scales, rotations, dc, rest, one
-// after the other. records: projection hands binning one record a splat besides its rectangles.
+// Forward and backward of the sum of all pixels of all planes, on an Executor or a Queue. Allocations are exact, so
+// that a sanitizer sees an access outside. The gradient holds means, means2d, opacities, scales, rotations, dc, rest,
+// one after the other. records: projection gives binning a record of each splat besides its rectangle.
 template <class T, class Where>
 Result<T> run(const Where& where, Parameters<T>& p, gs::Image image, bool antialiasing, bool records = false) {
   using gs::cuda::bin, gs::cuda::blend, gs::cuda::blend_vjp, gs::cuda::project, gs::cuda::project_vjp;

@@ -1,4 +1,4 @@
-// The whole CPU backend, several threads, under the sanitizers: random scenes with poison in them, and its own sums.
+// The whole CPU backend under the sanitizers: threads, sizes, gradients by differences, and poisoned scenes.
 #include <limits>
 #include <thread>
 
@@ -36,7 +36,7 @@ void test_threads_and_sizes() {
     }
 }
 
-// A gradient row for one splat, by finite differences of the sum that `run` takes the gradient of.
+// Gradients against finite differences of the sum that `run` differentiates.
 void test_gradient() {
   Parameters<double> p(40);
   const gs::Image image = {23, 19};
@@ -50,7 +50,7 @@ void test_gradient() {
   const Result<double> at = run(gs::serial_executor(), p, image, false);
   const size_t n = p.count, offset[6] = {0, 6 * n, 7 * n, 10 * n, 14 * n, 17 * n};
   double covered = 0;
-  for (int which : {1, 4, 5}) {  // the image is smooth in opacity and colour but for the 1/255 edge
+  for (int which : {1, 4, 5}) {  // the image is smooth in opacity and colour except at the 1/255 edge
     std::vector<double>& values = *p.all()[which];
     const size_t row = values.size() / n;
     for (size_t i = 0; i < n; i += 3) {
@@ -61,7 +61,7 @@ void test_gradient() {
       const double low = sum();
       values[i * row] = before;
       const double got = at.gradient[offset[which] + i * row];
-      // A sum of some 2,000 with 1e-16 each, over 2 h.
+      // A sum of some 2,000 values with errors of 1e-16 each, over 2 h.
       CHECK_NEAR(got, (high - low) / (2 * h), 2e-5);
       covered += std::abs(got);
     }
@@ -69,13 +69,13 @@ void test_gradient() {
   CHECK(covered > 1);
 }
 
-// Every poison in every parameter: no undefined step, no other splat disturbed, its own gradient finite; zero where
-// it is not a number.
+// Every poison in every parameter: no undefined behaviour, no other splat changes, and the splat's own gradient is
+// finite. A splat with a value that is not finite is left out.
 template <class T>
 void test_poison() {
   using Limits = std::numeric_limits<T>;
   const gs::Image image = {40, 24};
-  // Scales are logarithms: exp(30) px squared is within float's range, its cube is not.
+  // Scales are logarithms: the square of exp(30) px is within float's range, its cube is not.
   const T poison[] = {Limits::quiet_NaN(),
                       Limits::infinity(),
                       -Limits::infinity(),
@@ -106,9 +106,9 @@ void test_poison() {
         const Result<T> got = run(gs::serial_executor(), p, image, true);
         check_finite(got.color), check_finite(got.transmittance), check_finite(got.depth);
         check_finite(got.gradient);
-        if (std::isfinite(value) || (&values == &p.opacities && std::isinf(value))) continue;  // a logit like any other
+        if (std::isfinite(value) || (&values == &p.opacities && std::isinf(value))) continue;  // such a logit is valid
         CHECK(got.tile_counts[kVictim] == 0);
-        if (which < 4) CHECK(got.radii[kVictim] == 0);  // colours are read of splats with tiles only
+        if (which < 4) CHECK(got.radii[kVictim] == 0);  // only splats with tiles have their colours read
         CHECK(got.color == wanted.color && got.gradient == wanted.gradient);
       }
 }

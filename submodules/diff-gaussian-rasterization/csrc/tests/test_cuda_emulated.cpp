@@ -1,5 +1,5 @@
-// The CUDA kernels on the CPU (submodules/common/emulation), under the sanitizers, against the CPU backend: threads
-// taken in several orders must give the same bits, and every result lies within rounding of the CPU's.
+// The CUDA kernels on the CPU (submodules/common/emulation), under the sanitizers, against the CPU backend. Several
+// orders of the threads must give the same bits, and every result must lie within rounding of the CPU's.
 #include <algorithm>
 
 #include "backend_run.h"
@@ -34,7 +34,7 @@ void check_results(const Result<float>& got, const Result<float>& cpu) {
   check_near(got.gradient, cpu.gradient, 2e-5);
 }
 
-// Near the CPU, and the same bits in every order; with either form of what binning reads.
+// Checks results near the CPU's, and the same bits in every order, with records and with rectangles.
 void check_scene(Parameters<float>& p, gs::Image image, bool antialiasing) {
   using gs::emulation::Order;
   const Result<float> got = run_emulated(p, image, antialiasing, true, Order::forward);
@@ -51,14 +51,15 @@ void test_against_cpu() {
     for (int64_t count : {0, 1, 33, 300})
       for (bool antialiasing : {false, true}) {
         Parameters<float> p(count);
-        if (count == 300)  // one over all tiles, which whole warps list
+        if (count == 300)  // one covers all tiles: a whole warp tests them
           for (int k = 0; k < 3; ++k) p.scales[3 * 17 + k] = 1;
-        if (count > 1) p.dc[3 * 20] = NAN, p.rest[45 * 21] = INFINITY;  // left out for their colour alone
+        if (count > 1) p.dc[3 * 20] = NAN, p.rest[45 * 21] = INFINITY;  // culled for their colours alone
         check_scene(p, image, antialiasing);
       }
 }
 
-// More tiles than kFewTiles, so that fewer warps share one; a list of two chunks. Slow, so in one order.
+// More tiles than kFewTiles, so that fewer warps share one, and a list of two chunks. One order only, because it is
+// slow.
 void test_many_tiles() {
   constexpr gs::Image image{1040, 1024};
   Parameters<float> p(700);
@@ -70,8 +71,8 @@ void test_many_tiles() {
                 run(gs::serial_executor(), p, image, false));
 }
 
-// Two tiles whose lists the backward cuts into several chunks: wide splats, of which some pixels close in the middle of
-// the list, behind the opaque ones, and the others stay open to its end.
+// Two tiles whose lists the backward cuts into several chunks. The splats are wide. Some pixels end in the middle of
+// the list, at opaque splats, and the others stay open to its end.
 void test_long_lists() {
   constexpr int64_t count = 2100;
   Parameters<float> p(count);
@@ -91,8 +92,8 @@ bool same_slots(const gs::SplatSlots& a, const gs::SplatSlots& b) {
   return a.first == b.first && a.skipped == b.skipped && a.wide == b.wide;
 }
 
-// Lists alone, of splats over a thousand tiles among small ones: more tiles than 16 bits count, from records or from
-// rectangles, with slots or without.
+// Binning alone, of splats over a thousand tiles among small ones: more tiles than 16 bits count, records or
+// rectangles, with slots and without.
 void test_lists() {
   using gs::emulation::Order;
   for (const gs::Image image : {gs::Image{330, 70}, gs::Image{1040, 1024}, gs::Image{4112, 4096}})
@@ -139,14 +140,14 @@ void test_sparse_adam() {
     gs::emulation::Memory memory;
     step(memory.queue(), got);
     for (int part = 0; part < 3; ++part) {
-      check_near(got[part], cpu[part], 1e-6);  // some units in the last place
+      check_near(got[part], cpu[part], 1e-6);  // a few units in the last place
       for (int64_t i = 0; i < rows * row; ++i)
         CHECK((got[part][i] != start[part][i]) == (visible[i / row] && i % row < columns));
     }
   }
 }
 
-// Twenty tensors in one call, more than a launch takes: empty ones, one value, whole rows and leading columns of them.
+// Twenty tensors in one call, more than a launch takes: empty tensors, a single value, whole rows, leading columns.
 void test_adam() {
   struct Tensor {
     int64_t rows, row, columns;
@@ -177,7 +178,7 @@ void test_adam() {
   gs::emulation::Memory memory;
   gs::cuda::adam(memory.queue(), inputs(got).data(), int64_t(got.size()), gs::StepGuard<float>{});
   for (size_t i = 0; i < tensors.size(); ++i) {
-    // The same operations, but for fused ones.
+    // The same operations, except that some are fused.
     check_near(got[i].value, wanted[i].value, 1e-6);
     check_near(got[i].mean, wanted[i].mean, 1e-6), check_near(got[i].square, wanted[i].square, 1e-6);
     for (size_t k = 0; k < got[i].value.size(); ++k)
@@ -185,7 +186,8 @@ void test_adam() {
   }
 }
 
-// Under a guard, dense and sparse: what is not finite is marked, the rest goes on, and later steps change nothing.
+// Under a guard, dense and sparse: values that are not finite are marked, the others take their step, and later steps
+// change nothing.
 void test_step_guard() {
   constexpr int64_t rows = 700, row = 4;
   for (const bool sparse : {false, true}) {
@@ -264,8 +266,8 @@ struct Lengths {
   int64_t operator()(int tile) const { return lengths[tile]; }
 };
 
-// Chunks make up every list; the longest first as far as one block sorts them, an eighth of a doubling apart at most;
-// each has a place of its own, behind that of the chunk in front.
+// Chunks make up every list. The longest come first as far as one block sorts them, up to an eighth of a doubling. Each
+// has a place of its own, after that of the chunk in front.
 void test_longest_first() {
   for (const int64_t tiles : {1, 2500, 16384, 20000})
     for (const int32_t size : {gs::cuda::kWhole, 64}) {

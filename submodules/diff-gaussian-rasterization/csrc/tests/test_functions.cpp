@@ -31,7 +31,7 @@ double exp2_error() {
 }
 
 void test_exp2() {
-  // Rounding of the polynomial's steps: twice the unit in the last place, 1.2e-7 and 2.2e-16, holds with room.
+  // Rounding of the polynomial's steps: a bound of twice the unit in the last place, 1.2e-7 and 2.2e-16, has room.
   CHECK(exp2_error<float>() < 2.4e-7);
   CHECK(exp2_error<double>() < 4.5e-16);
 }
@@ -76,7 +76,8 @@ void test_rotation() {
     CHECK_NEAR(dot(cross(c[0], c[1]), c[2]), 1, 1e-14);
 
     Quat<double> as_is = rotation_columns_vjp(q, weight);
-    // The torque about column i is weight's part along column k less weight's along column j, of the other two.
+    // The torque about column i comes from the other two: weight k's part along column j, less weight j's along column
+    // k.
     const auto part = [&](int i, int j) { return dot(c[i], weight[j]); };
     Quat<double> unit =
         normalise_vjp(n, norm, Vec3<double>{part(2, 1) - part(1, 2), part(0, 2) - part(2, 0), part(1, 0) - part(0, 1)});
@@ -97,7 +98,7 @@ void test_rotation() {
 template <class T>
 void test_degenerate_quaternions() {
   T norm;
-  // Zero, and what is so short that a gradient divided by it would leave the range.
+  // Zero, and quaternions so short that a gradient divided by their length would overflow.
   for (T size : {T(0), std::numeric_limits<T>::denorm_min(), std::numeric_limits<T>::min()}) {
     const Quat<T> none = normalise(Quat<T>{0, size, -size, 0}, norm);
     CHECK(none.w == 1 && none.x == 0 && none.y == 0 && none.z == 0 && norm == 0);
@@ -132,7 +133,7 @@ void test_covariance_axes() {
     for (int i = 0; i < 3; ++i)
       for (int j = 0; j < 3; ++j) CHECK_NEAR(back[i][j], full[i][j], 1e-13 * (1 + std::abs(full[i][j])));
   }
-  // Flat ones: pivots of zero, or a little below by rounding.
+  // Flat covariances: pivots of zero, or a little below by rounding.
   const float flat[6] = {0, 0, 0, 1, 1, 1}, negative[6] = {1, 1, 1, 1, 1, 0.9999999f};
   for (const float* c : {flat, negative})
     for (const Vec3<float>& d : axes_of_covariance(c).direction) CHECK(finite(d));
@@ -163,7 +164,7 @@ void test_harmonics() {
           sh_basis(degree, moved, basis);
           for (int k = 0; k < sh_count(degree); ++k) difference += sign * weight[k] * basis[k] / (2 * h);
         }
-        // The basis is taken as the polynomial it is, off the sphere as well; cubic, so h^2 is the truncation.
+        // The basis counts as a polynomial off the sphere too; it is cubic, so truncation is of the order of h^2.
         CHECK_NEAR(got[axis], difference, 1e-9);
       }
     }
@@ -186,7 +187,7 @@ void test_direction() {
     }
     CHECK_NEAR(got[axis], difference, 1e-9);
   }
-  // On the camera's centre there is no direction: the bands above 0 vanish, and nothing is NaN.
+  // At the camera's centre there is no direction: the bands above 0 vanish, and nothing is NaN.
   Vec3<float> none;
   CHECK(sh_direction(Vec3<float>{0, 0, 0}, none) == 0);
   CHECK(none.x == 0 && none.y == 0 && none.z == 0);

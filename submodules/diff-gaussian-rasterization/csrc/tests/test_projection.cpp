@@ -107,7 +107,7 @@ void check_gradient(double ray_x, double ray_y, bool antialiasing, bool given_co
   CHECK_NEAR(s.x, ((ray_x + 1) * kWidth - 1) / 2, 1e-10);
   CHECK_NEAR(s.y, ((ray_y + 1) * kHeight - 1) / 2, 1e-10);
   CHECK_NEAR(depth, z, 1e-12);
-  std::vector<Pixel> pixels;  // where the splat is, wherever that be
+  std::vector<Pixel> pixels;  // around the splat
   for (int i = 0; i < 6; ++i) {
     const double v = normal(), u = normal();
     const double dy = v / s.l22;
@@ -138,7 +138,7 @@ void check_gradient(double ray_x, double ray_y, bool antialiasing, bool given_co
               objective(cam, low, antialiasing, pixels, depth_weight)) /
              (2 * h);
     };
-    // Richardson's extrapolation: what is left of truncation and rounding is under 1e-7 of the largest gradients.
+    // Richardson's extrapolation leaves errors of truncation and rounding under 1e-7 of the largest gradients.
     const double h = given_covariance && k >= 3 && k < 9 ? 1e-6 : 1e-5;
     const double wanted = (4 * central(h) - central(2 * h)) / 3;
     CHECK_NEAR(got[k], wanted, 1e-6 * (1 + std::abs(wanted)));
@@ -152,7 +152,7 @@ void test_gradients() {
         for (double ray_y : {-1.5, 0.2, 1.8}) check_gradient(ray_x, ray_y, antialiasing, given_covariance);
 }
 
-// Turning about the axes of a unit quaternion: the torque against the gradient of the axes' directions.
+// Turns about the axes of a unit quaternion: the torque against the gradient of the axes' directions.
 void test_torque() {
   for (bool antialiasing : {false, true}) {
     const Camera<double> cam = camera(0.1, -0.15);
@@ -180,7 +180,7 @@ void test_torque() {
   }
 }
 
-// A field of view of 0.001 degrees: rows that rounding left a little oblique are no shift of the principal point.
+// A field of view of 0.001 degrees: rows that rounding made a little oblique must not shift the principal point.
 void test_narrow_camera() {
   const double tan = 1.0 / (1 << 17);  // a power of two, so the projection is exact
   const Camera<double> turned = camera(0, 0);
@@ -192,7 +192,7 @@ void test_narrow_camera() {
   }
   const float center[3] = {};
   const Camera<float> cam = make_camera(view, full, center, tan, tan, kWidth, kHeight);
-  // Before the rows' angle was taken out, 0.1 px or so.
+  // Without the correction for the rows' angle the error is some 0.1 px.
   CHECK_NEAR(cam.axis_x, 0.5 * (kWidth - 1), 1e-5);
   CHECK_NEAR(cam.axis_y, 0.5 * (kHeight - 1), 1e-5);
   CHECK_NEAR(cam.mean_focal_x / cam.focal_x, 1, 1e-6);
@@ -202,7 +202,7 @@ void test_narrow_camera() {
 template <class T>
 double exponent(const double m[2][3], double dx, double dy) {
   const Vec3<T> m1 = {T(m[0][0]), T(m[0][1]), T(m[0][2])}, m2 = {T(m[1][0]), T(m[1][1]), T(m[1][2])};
-  // The minors from the splat's axes (projection.h); here exact, as those are good to rounding.
+  // projection.h has the minors from the splat's axes, good to rounding; here they are exact.
   const auto minor = [&](int i, int j) {
     const long double a = (long double)T(m[0][i]) * T(m[1][j]), b = (long double)T(m[0][j]) * T(m[1][i]);
     return T(a - b);
@@ -213,7 +213,7 @@ double exponent(const double m[2][3], double dx, double dy) {
 }
 
 void test_needles() {
-  // DESIGN.md, numerics: 0.00011, 0.00035 and 0.00078 measured on 20,000; here on fewer, and twice as much is allowed.
+  // 0.00011, 0.00035 and 0.00078 were measured on 20,000 needles. This tests fewer, and allows twice as much.
   const double lengths[3][3] = {{100, 300, 2.2e-4}, {300, 1000, 7e-4}, {1000, 2000, 1.6e-3}};
   for (const auto& [shortest, longest, allowed] : lengths) {
     double worst = 0;

@@ -1,4 +1,4 @@
-// Which tiles a splat is given, against every pixel centre of the image, evaluated as blending evaluates it.
+// The tiles of a splat against every pixel centre of the image, evaluated as blending evaluates it.
 #include <random>
 #include <vector>
 
@@ -57,16 +57,16 @@ std::vector<bool> listed(const Splat<T>& splat) {
   CHECK(list_tiles(splat, rect, gs::Image{kWidth, kHeight}, nullptr) == int(tiles.size()));
   const TileTest<T> test = make_tile_test(splat, rect, kWidth, kHeight);
   for (int tile : tiles) {
-    CHECK(tile > previous);  // row by row, each once
+    CHECK(tile > previous);  // row by row, each tile once
     CHECK(tile < int(out.size()));
-    CHECK(tile_reached(test, T(tile % tile_count(kWidth)), T(tile / tile_count(kWidth))));  // alone as among others
+    CHECK(tile_reached(test, T(tile % tile_count(kWidth)), T(tile / tile_count(kWidth))));  // alone as in a vector
     previous = tile;
     out[tile] = true;
   }
   return out;
 }
 
-// Returns how many tiles were listed without need; none may be missing.
+// Returns the number of tiles listed without need; none may be missing.
 template <class T>
 int check(const Splat<T>& splat) {
   const std::vector<T> best = brute_force(splat);
@@ -89,11 +89,11 @@ void test_random() {
     for (bool tile : listed(splat)) total += tile;
   }
   CHECK(total > 2000);
-  // The box of a tile's pixel centres has points between them: needles pass there. Measured: 4 of 2,595.
+  // Needles pass between the pixel centres of a tile's box. Measured: 4 of 2,595.
   CHECK(spare < 10);
 }
 
-// Opacities within a few units in the last place of what reaches 1/255 in one tile only just, or only just not.
+// Opacities within a few units in the last place of the one that just reaches 1/255 in a tile.
 template <class T>
 void test_borderline() {
   int reached = 0, not_reached = 0;

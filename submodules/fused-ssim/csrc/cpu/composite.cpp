@@ -1,3 +1,4 @@
+// Lays an image with alpha over a background.
 #include "../math/composite.h"
 
 #include "../backend.h"

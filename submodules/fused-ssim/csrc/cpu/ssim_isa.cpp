@@ -1,5 +1,5 @@
-// L1 and SSIM with the gradient of SSIM in one walk over tiles that stay in the L2 cache. Tiles depend on the image's
-// size alone and are summed in their order, so the number of threads changes no bit.
+// L1 and SSIM with the gradient of SSIM, in one walk over tiles that stay in the L2 cache. The tiles depend on the
+// image's size alone and their sums are added in order, so the number of threads changes no bit.
 #include <algorithm>
 #include <cmath>
 #include <memory>
@@ -22,11 +22,12 @@ struct Range {
   int64_t size() const { return end - begin; }
 };
 
-// [0, n) cut into as few parts as are no longer than `longest`, alike to one; and the part i of them.
+// The number of parts of [0, n) if none is longer than `longest`, and part i of them; their sizes differ by one at
+// most.
 int64_t parts(int64_t n, int64_t longest) { return (n + longest - 1) / longest; }
 Range part(int64_t n, int64_t count, int64_t i) { return {n * i / count, n * (i + 1) / count}; }
 
-// Working memory of one tile. Its inputs reach two windows beyond the tile, its maps one.
+// The working memory of a tile. Its inputs reach two windows beyond the tile, its maps one.
 template <class T>
 struct Scratch {
   static constexpr int64_t kColumns = 2048 / sizeof(T);
@@ -49,7 +50,7 @@ T to_value(uint8_t v) {
   return T(v) / T(255);
 }
 
-// Columns [begin, begin + width) of a row of the images (null: beyond the border), zero where they have none.
+// Loads columns [begin, begin + width) of a row of the images, and zeros outside them. A row above or below is null.
 template <class T, class Source>
 void load_row(const T* img1, const Source* img2, bool clamp, int64_t columns, int64_t begin, int64_t width, T* x1,
               T* delta) {
@@ -78,7 +79,7 @@ double row_sum(const T* values, int64_t n) {
   return lanes[0];
 }
 
-// Statistics down the columns of one row of windows whose topmost row is `top`.
+// Computes the statistics down the columns of one row of windows, whose topmost row is `top`.
 template <class T>
 void column_stats(Scratch<T>& s, int64_t top, int64_t width) {
   using V = Simd<T>;
@@ -96,7 +97,7 @@ void column_stats(Scratch<T>& s, int64_t top, int64_t width) {
   }
 }
 
-// SSIM of one row of pixels from its columns' statistics, and (maps given) what the gradient needs.
+// Computes SSIM of one row of pixels from its columns' statistics and, if maps are given, what the gradient needs.
 template <class T>
 void ssim_row(Scratch<T>& s, int64_t width, typename Scratch<T>::Maps* maps) {
   using V = Simd<T>;
@@ -117,7 +118,7 @@ void ssim_row(Scratch<T>& s, int64_t width, typename Scratch<T>::Maps* maps) {
   }
 }
 
-// Gradient of the sum of SSIM at row `row` of the tile, down the columns and then across.
+// Computes the gradient of the sum of SSIM at a row of the tile, down the columns and then across.
 template <class T>
 void gradient_row(Scratch<T>& s, int64_t row, int64_t width) {
   using V = Simd<T>;
@@ -178,7 +179,7 @@ Sums tile(const L1Ssim<T>& args, int64_t plane, Range rows, Range columns, doubl
   }
 
   Sums sums;
-  // Columns of the map that count: those of the tile for the value, all that exist for the gradient.
+  // The map's columns that count: for the value those of the tile, for the gradient all inside the image.
   const int64_t map_begin = columns.begin - margin;
   const int64_t exist_begin = std::max(rim - map_begin, int64_t(0));
   const int64_t exist_end = std::max(std::min(width - rim - map_begin, map_columns), exist_begin);
@@ -248,7 +249,7 @@ void vjp_block(const T* img1, const Source* img2, bool clamp, const T* ssim_grad
 
 template <class T, class Source>
 void vjp(const L1SsimVjp<T>& args, const Executor& executor) {
-  constexpr int64_t kBlock = 1 << 14;  // fixed, so that a pixel is always in the same place of the vectorised loop
+  constexpr int64_t kBlock = 1 << 14;  // fixed, so that a pixel always has the same place in the vectorised loop
   const auto& image = args.images;
   const int64_t n = image.planes * image.height * image.width;
   const Source* img2 = static_cast<const Source*>(image.img2);

@@ -1,5 +1,5 @@
-// L1 and SSIM with the gradient of SSIM in one walk over the images. A block walks down a strip (ssim_strip.h) and sums
-// in double; a last block adds the blocks' sums in their order, so the same images give the same bits.
+// L1 and SSIM with the gradient of SSIM, in one walk over the images. A block walks down a strip (ssim_strip.h) and
+// sums in double. A last block adds the blocks' sums in order, so the same images give the same bits.
 #include "backend.h"
 #include "cuda/ssim_strip.h"
 #include "gs/cuda_check.h"
@@ -9,7 +9,7 @@ namespace {
 
 using namespace GS_ISA;
 
-// Sum over the block in a fixed tree; thread 0 has it. All threads call it, once.
+// Sums over the block in a fixed tree; thread 0 gets the sum. All threads call this once.
 template <int kBlock>
 __device__ Sums block_sum(Sums own) {
   __shared__ Sums warps[kBlock / 32];
@@ -54,7 +54,7 @@ __global__ void __launch_bounds__(kThreads, 3)
       __syncthreads();
     }
     const int next = step * kStep + kRing;
-    const Rows rows = load(part, img1, img2, images.clamp, next, thread);  // under way while the gradient is computed
+    const Rows rows = load(part, img1, img2, images.clamp, next, thread);  // they arrive while the gradient is computed
     if constexpr (kGradient) gather_across(strip, thread);
     put(strip, part, rows, next, next + kStep, thread, own);
     __syncthreads();
@@ -101,7 +101,7 @@ void l1_ssim(const L1SsimCuda& args, const Queue& queue) {
 }
 
 constexpr int kVjpThreads = 256;
-constexpr int kVjpPixels = 4;  // of a thread, kVjpThreads apart: loads under way at once, whatever the alignment
+constexpr int kVjpPixels = 4;  // of a thread, kVjpThreads apart: their loads overlap, whatever the alignment
 
 template <class Source>
 __global__ void __launch_bounds__(kVjpThreads) l1_ssim_vjp_kernel(L1SsimVjpCuda args, int64_t n, double mean) {

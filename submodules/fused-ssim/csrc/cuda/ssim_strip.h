@@ -1,14 +1,14 @@
 #pragma once
-// A block's walk down a strip of an image, kStep rows a step: what one thread does between two barriers. No CUDA
-// runtime in it, so that csrc/tests runs the very same lines on the host.
+// A block's walk down a strip of an image, kStep rows a step: the work of one thread between two barriers. This
+// includes no CUDA runtime, so that csrc/tests runs the same lines on the host.
 //
-// Columns of a strip, counted from its first input: 128 of inputs and of their statistics (downwards), 118 of windows
-// (two columns of statistics more on either side than the middle ones), 108 of gradients. Rows likewise: window m
-// takes inputs m to m + 10, gradient o takes windows o to o + 10 and lies at input o + 10. Step s has
+// A strip has 128 columns of inputs and of their statistics (downwards), 118 of windows and 108 of gradients, each
+// counted from the strip's first. A window takes five columns on either side. Rows likewise: window m takes inputs m to
+// m + 10, and gradient o takes windows o to o + 10 and lies at input o + 10. Step s has
 //   inputs    s kStep ...  s kStep + kStep + 9      (a ring, of which kStep rows are new)
 //   windows   s kStep ...  s kStep + kStep - 1      (into a ring that keeps ten earlier rows)
 //   gradients s kStep - 10 ...  s kStep + kStep - 11
-// A thread takes kPerThread neighbours along the direction it sums in, so that 11 taps cost it 3.5 loads a pixel.
+// A thread takes kPerThread neighbours along the direction of its sum, so that 11 taps cost 3.5 loads a pixel.
 #include <cmath>
 #include <cstdint>
 #include <initializer_list>
@@ -25,7 +25,7 @@ GS_ISA_BEGIN
 
 constexpr int kReach = 2 * kRadius;
 constexpr int kPerThread = 4;
-constexpr int kTaps = kPerThread + kReach;  // what kPerThread neighbours read of a row or column
+constexpr int kTaps = kPerThread + kReach;  // that kPerThread neighbours read of a row or column
 constexpr int kStep = 4;
 constexpr int kColumns = 128, kMapColumns = kColumns - kReach, kOutColumns = kMapColumns - kReach;
 constexpr int kThreads = kColumns * kStep / kPerThread;
@@ -42,21 +42,21 @@ struct alignas(16) Four {
 GS_HD float& at(Four* row, unsigned column) { return row[column / 4].of[column % 4]; }
 GS_HD float at(const Four* row, unsigned column) { return row[column / 4].of[column % 4]; }
 
-// Shared memory of a block. Quantities of a window: mu1, mu_delta, var1, var_delta, cov in `stats`; value, slope1,
-// slope_delta, anchor.x1, anchor.delta in `maps`, and in `stats` again once they are gathered down the columns.
+// The shared memory of a block. `stats` has the windows' mu1, mu_delta, var1, var_delta and cov. `maps` has value,
+// slope1, slope_delta, anchor.x1 and anchor.delta; gathered down the columns, those take the place of `stats`.
 struct Strip {
-  Four stats[5][kStep][fours(kColumns) + 1];  // one more: the last lane reads past the end, into nothing that counts
+  Four stats[5][kStep][fours(kColumns) + 1];  // one more: the last lane reads past the end, values that do not count
   Four maps[5][kRing][fours(kMapColumns)];
   Four gradient[kStep][fours(kOutColumns)];
   float x1[kRing][kColumns], delta[kRing][kColumns];
 };
 
-// The part of the plane that the block answers for.
+// The part of the plane that a block computes.
 struct Part {
   int64_t height, width;  // of the plane
   int64_t row, column;    // the first pixel
   int rows;               // at most kOutColumns columns, both cut at the plane's edge by the reader
-  int rim;                // windows this near to the edge don't count
+  int rim;                // windows this near to the edge do not count
 };
 
 struct Sums {
@@ -69,7 +69,7 @@ GS_HD int slot(int begin, int after) { return begin + after < kRing ? begin + af
 GS_HD float to_float(float v) { return v; }
 GS_HD float to_float(uint8_t v) { return float(v) / 255.0f; }
 
-// Input rows first, first + 1, ... of which each thread holds kPerThread pixels of one column.
+// A thread's pixels, kPerThread of one column, of the input rows from `first` on.
 struct Rows {
   float x1[kPerThread], delta[kPerThread];
 };
@@ -91,7 +91,7 @@ GS_HD Rows load(const Part& part, const float* img1, const Source* img2, bool cl
   return rows;
 }
 
-// Stores the rows before `end`, and sums |delta| over the pixels that are the block's own.
+// Stores the rows before `end`, and sums |delta| over the block's own pixels.
 GS_HD void put(Strip& strip, const Part& part, const Rows& rows, int first, int end, int thread, Sums& sums) {
   const int column = thread % kColumns;
   const bool own_column = column >= kReach && column < kReach + kOutColumns;
@@ -125,7 +125,7 @@ GS_HD void column_stats(Strip& strip, int step, int thread) {
   }
 }
 
-// Five quantities of kTaps neighbours of a row, and of up to three more.
+// Five quantities of kTaps neighbours in a row, and of up to three more.
 struct Neighbours {
   Four of[5][fours(kTaps)];
   GS_HD float operator()(int quantity, int i) const { return of[quantity][i / 4].of[i % 4]; }
@@ -141,7 +141,7 @@ GS_HD Neighbours load_neighbours(const Strip& strip, int row, int first) {
   return n;
 }
 
-// SSIM of a row's windows, and what its gradient needs.
+// Computes SSIM of a row's windows, and what its gradient needs.
 template <bool kGradient>
 GS_HD void window_row(Strip& strip, const Part& part, int step, int thread, Sums& sums) {
   const int row = thread / kLanes, first = thread % kLanes * kPerThread;
@@ -230,7 +230,7 @@ GS_HD void write_gradient(const Strip& strip, const Part& part, int step, float 
 
 GS_HD int step_count(int rows) { return (rows + kReach + kStep - 1) / kStep; }
 
-// How the planes are cut. It depends on the size alone, so that a picture has one sum on every GPU.
+// The cut of the planes into parts. It depends on their size alone, so that an image has the same sum on every GPU.
 struct Cut {
   int rows;               // of a part, at most
   int64_t across, parts;  // parts side by side, and all
@@ -244,7 +244,8 @@ struct Cut {
   }
 
   static Cut of(int64_t planes, int64_t height, int64_t width) {
-    constexpr int64_t kEnough = 512;  // blocks to fill a large GPU; a longer part repeats less of its neighbours' work
+    constexpr int64_t kEnough =
+        512;  // blocks that fill a large GPU; longer parts repeat less of their neighbours' work
     for (const int steps : {20, 12}) {
       const Cut cut = with_steps(steps, planes, height, width);
       if (cut.parts >= kEnough) return cut;

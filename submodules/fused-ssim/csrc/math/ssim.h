@@ -3,8 +3,8 @@
 //
 //   SSIM = l s,   l = (2 mu1 mu2 + C1) / (mu1^2 + mu2^2 + C1),   s = (2 cov + C2) / (var1 + var2 + C2)
 //
-// with mean, variance and covariance under an 11 x 11 Gaussian of sigma 1.5, taken as 11 taps down, then 11 across.
-// All of it from x1 and the difference x2 - x1, called delta: with e = mean of delta,
+// with mean, variance and covariance under an 11 x 11 Gaussian of sigma 1.5, computed as 11 taps down, then 11 across.
+// Everything comes from x1 and the difference x2 - x1, called delta. With e = mean of delta,
 //
 //   l = 1 - e^2 / (mu1^2 + mu2^2 + C1),   s = 1 - var(delta) / (var1 + var2 + C2)
 //
@@ -37,9 +37,9 @@ struct Stats {
   V mu1, mu_delta, var1, var_delta, cov;  // cov: of x1 and delta
 };
 
-// One pass over values. With d_k = x_k - x_0, D = sum w_k d_k and Q = sum w_k d_k^2: mean = x_0 + D, var = Q - D^2.
-// The centre's own share of the variance is w_0 D^2, so Q = var + D^2 <= (1 + 1/w_0) var = 4.8 var: however bright the
-// image, the subtraction magnifies rounding at most 4.8 times, and var is never negative. The same holds for cov
+// The first pass, over values. With d_k = x_k - x_0, D = sum w_k d_k and Q = sum w_k d_k^2: mean = x_0 + D, var = Q -
+// D^2. The centre's own share of the variance is w_0 D^2, so Q = var + D^2 <= (1 + 1/w_0) var = 4.8 var. However bright
+// the image, the subtraction magnifies rounding at most 4.8 times, and var is never negative. The same holds for cov
 // against sqrt(var1 var_delta). The textbook's E[x^2] - mu^2 has no such bound.
 template <class S, class V, class At>
 GS_HD Stats<V> stats_of_values(const At& at) {
@@ -59,8 +59,8 @@ GS_HD Stats<V> stats_of_values(const At& at) {
   return {centre.x1 + d1, centre.delta + dd, q1 - d1 * d1, qd - dd * dd, q1d - d1 * dd};
 }
 
-// The other pass, over the first one's results. Law of total variance: variance of the whole window = mean of the
-// columns' variances + variance of the columns' means.
+// The second pass, over the first one's results. By the law of total variance, the variance of the whole window = mean
+// of the columns' variances + variance of the columns' means.
 template <class S, class V, class At>
 GS_HD Stats<V> stats_of_stats(const At& at) {
   Stats<V> all = stats_of_values<S, V>([&](int k) {
@@ -77,7 +77,7 @@ GS_HD Stats<V> stats_of_stats(const At& at) {
   return all;
 }
 
-// The function value + slope1 (x1 - anchor.x1) + slope_delta (delta - anchor.delta) of a pixel.
+// The linear function value + slope1 (x1 - anchor.x1) + slope_delta (delta - anchor.delta) of a pixel.
 template <class V>
 struct Anchored {
   V value, slope1, slope_delta;
@@ -87,7 +87,7 @@ struct Anchored {
 template <class V>
 struct Ssim {
   V value;
-  Anchored<V> by_pixel;  // times the window's weight: the derivative of `value` by a pixel x1 of its window
+  Anchored<V> by_pixel;  // times the window's weight it is the derivative of `value` by a pixel x1 of the window
 };
 
 // Of window q, pixel p's share of mu1, var1 and cov12 has the derivatives w, 2 w (x1 - mu1) and w (x2 - mu2) by x1, so
@@ -106,9 +106,10 @@ GS_HD Ssim<V> ssim(const Stats<V>& q) {
   return {l * s, {two * s * r * (one + q.mu1 * r), slope_delta * unlike, slope_delta, {q.mu1, q.mu_delta}}};
 }
 
-// Sum of w_k at(k), anchored at `anchor`. The derivative at a pixel is this sum over the windows that hold it, down
-// (anchored at the pixel of the same row in each column), then across (at the pixel itself: the value). Only
-// differences of neighbours meet the slopes, which reach 2 / C2; the textbook's x1 sum(w a) - sum(w mu1 a) cancels.
+// The sum of w_k at(k), anchored at `anchor`. The derivative at a pixel is this sum over the windows that hold it. It
+// is taken down first, anchored at the pixel of the same row in each column; then across, anchored at the pixel itself,
+// where it is the value. The slopes reach 2 / C2 and multiply differences of neighbours only; the textbook's
+// x1 sum(w a) - sum(w mu1 a) cancels.
 template <class S, class V, class At>
 GS_HD Anchored<V> gather(const At& at, const Pixel<V>& anchor) {
   Anchored<V> sum{V{}, V{}, V{}, anchor};
@@ -123,7 +124,7 @@ GS_HD Anchored<V> gather(const At& at, const Pixel<V>& anchor) {
   return sum;
 }
 
-// x clamped to [0, 1], and whether its derivative there is 1 and not 0; as torch has it, NaN stays and gets no
+// x clamped to [0, 1], and whether its derivative there is 1 and not 0. As in torch, NaN stays NaN and gets no
 // gradient.
 template <class S>
 GS_HD S clamp_to_unit(S x) {
@@ -134,7 +135,7 @@ GS_HD bool in_unit(S x) {
   return x >= 0 && x <= 1;
 }
 
-// Derivative of |x2 - x1| by x1; 0 where they are equal, as torch has it.
+// The derivative of |x2 - x1| by x1; 0 where they are equal, as in torch.
 template <class V>
 GS_HD V abs_difference_vjp(V x1, V x2) {
   return V(x1 > x2) - V(x1 < x2);

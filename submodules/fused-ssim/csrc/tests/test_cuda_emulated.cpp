@@ -1,5 +1,5 @@
-// The CUDA kernels on the CPU (submodules/common/emulation), under the sanitizers, against the CPU backend, with
-// threads taken in several orders.
+// The CUDA kernels on the CPU (submodules/common/emulation), under the sanitizers, against the CPU backend, in several
+// orders of the threads.
 #include <cmath>
 #include <random>
 #include <vector>
@@ -49,12 +49,12 @@ void check(int64_t planes, int64_t height, int64_t width, bool valid, bool clamp
       CHECK_NEAR(got.gradient[i], gradient[i], 2e-5 * largest);
       CHECK_NEAR(got.vjp[i], vjp[i], 2e-6 * (largest + 1.0 / img1.size()));
     }
-    std::vector<float> weighted(img1.size());  // weights and gradients trade places
+    std::vector<float> weighted(img1.size());  // weights and gradients change places
     const float one = 1;
     float no_l1 = -1;
     gs::l1_ssim_vjp_cuda({images, gradient.data(), &one, &one, weighted.data(), grad_l1, grad_ssim}, memory.queue());
     CHECK(weighted == got.vjp);
-    gs::l1_ssim_cuda({images, valid, &no_l1, nullptr, nullptr}, memory.queue());  // nothing but what is asked for
+    gs::l1_ssim_cuda({images, valid, &no_l1, nullptr, nullptr}, memory.queue());  // only the mean of L1 is wanted
     CHECK(no_l1 == got.l1);
     if (order == gs::emulation::Order::forward) first = got;
     CHECK(got.l1 == first.l1 && got.ssim == first.ssim && got.gradient == first.gradient && got.vjp == first.vjp);

@@ -1,4 +1,5 @@
-// What the CUDA kernel's threads do, one after the other on the host between two barriers, against the CPU backend.
+// The work of the CUDA kernel's threads between two barriers, run one after the other on the host, against the CPU
+// backend.
 #include <algorithm>
 #include <cmath>
 #include <limits>
@@ -33,11 +34,12 @@ Result run_kernel(const Cut& cut, int64_t planes, int64_t height, int64_t width,
   const double ssim_count = double(planes) * (height - rim) * (width - rim);
   const float nan = std::numeric_limits<float>::quiet_NaN();
   Result result;
-  result.gradient.assign(img1.size(), nan);  // what is not written shows
+  result.gradient.assign(img1.size(), nan);  // shows pixels that are not written
   const auto strip = std::make_unique<Strip>();
   std::vector<Rows> rows(kThreads);
   for (int64_t block = 0; block < cut.parts; ++block) {
-    std::fill_n(reinterpret_cast<float*>(strip.get()), sizeof(Strip) / sizeof(float), nan);  // so does what is not set
+    std::fill_n(reinterpret_cast<float*>(strip.get()), sizeof(Strip) / sizeof(float),
+                nan);  // shows values that are not set
     const Part part = part_of(cut, height, width, valid, block);
     const int64_t plane = block / (cut.across * cut.down(height)) * height * width;
     const float* plane1 = &img1[plane];
@@ -80,14 +82,14 @@ void check(int steps, int64_t planes, int64_t height, int64_t width, bool valid,
       {{img1.data(), img2.data(), sizeof(Source) == 1, planes, height, width, clamp}, valid, &l1, &ssim, wanted.data()},
       gs::serial_executor());
   const Result got = run_kernel<true>(cut, planes, height, width, valid, img1, img2, clamp);
-  // The same floats, but for fused multiply-adds where the compiler takes them; sums of doubles in another order.
+  // The same floats, except for fused multiply-adds of the compiler; sums of doubles in another order.
   CHECK_NEAR(got.l1, l1, 1e-12);
   CHECK_NEAR(got.ssim, ssim, 4 * 6e-8);
   float largest = 0;
   for (float x : wanted) largest = std::max(largest, std::abs(x));
   for (size_t i = 0; i < wanted.size(); ++i) CHECK_NEAR(got.gradient[i], wanted[i], 40 * 6e-8 * largest);
 
-  last_thread_first = true;  // a thread that needed another's result of the same phase would show
+  last_thread_first = true;  // shows a thread that needs another's result of the same phase
   CHECK(run_kernel<true>(cut, planes, height, width, valid, img1, img2, clamp).gradient == got.gradient);
   last_thread_first = false;
   const Result plain = run_kernel<false>(cut, planes, height, width, valid, img1, img2, clamp);
@@ -104,7 +106,7 @@ void check_cut() {
 
 int main() {
   check_cut();
-  // Around the sizes where parts, steps and the strip's width end.
+  // Sizes around the ends of parts, steps and the strip's width.
   for (const int64_t height : {1, 2, 5, 21, 22, 23, 45})
     for (const int64_t width : {1, 4, 11, 107, 108, 109}) check<float>(8, 1, height, width, false);
   for (const int64_t width : {213, 216, 217, 230}) check<float>(8, 2, 13, width, true);

@@ -106,7 +106,7 @@ void check_derivative(Window window) {
     }
 }
 
-// Down, then across, must give what the sum over all windows that hold the pixel gives at once.
+// Down, then across, must give the same as one sum over all windows that hold the pixel.
 void check_gather() {
   using namespace gs::GS_ISA;
   static Anchored<double> maps[kSide][kSide];

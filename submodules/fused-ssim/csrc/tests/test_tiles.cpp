@@ -1,5 +1,4 @@
-// The tiled loops, under the address sanitizer, at sizes around those where tiles begin, against every window by
-// itself.
+// The tiled loops, under the address sanitizer, at sizes around those where tiles begin, against single windows.
 #include <algorithm>
 #include <cmath>
 #include <random>
@@ -31,7 +30,7 @@ struct Image {
   }
 };
 
-// SSIM of the window at (i, j), and its derivative by the pixels of img1 times `scale`, added to `gradient`.
+// Returns SSIM of the window at (i, j), and adds `scale` times its derivative by the pixels of img1 to `gradient`.
 double window(const Image& image, int64_t i, int64_t j, double scale, std::vector<double>& gradient) {
   using namespace gs::GS_ISA;
   const auto pixel = [&](int64_t y, int64_t x) {
@@ -89,7 +88,7 @@ void check_size(int64_t planes, int64_t height, int64_t width, bool valid) {
   args.gradient = threaded.data();
   gs::GS_ISA::l1_ssim_cpu(args, threads());
   CHECK(got_l1 == kept_l1 && got_ssim == kept_ssim && got == threaded);
-  args.gradient = nullptr;  // the tiles' margins are others: the value must not be
+  args.gradient = nullptr;  // other margins of the tiles must give the same value
   gs::GS_ISA::l1_ssim_cpu(args, gs::serial_executor());
   CHECK(got_l1 == kept_l1 && got_ssim == kept_ssim);
 }

@@ -1,3 +1,4 @@
+// The ops of the photometric loss, and of compositing: checks, memory and the way to a backend.
 #include <ATen/ops/empty.h>
 #include <ATen/ops/empty_like.h>
 #include <torch/library.h>
@@ -36,7 +37,7 @@ gs::ImagePair<T> image_pair(const at::Tensor& img1, const at::Tensor& img2, bool
           clamp};
 }
 
-// The gradient that the backward of an image will need, or nothing.
+// Memory for the gradient that the backward will need, if there will be one.
 at::Tensor kept_gradient(const at::Tensor& img1, bool train) {
   return train ? at::empty(img1.sizes(), img1.options()) : at::empty({0}, img1.options());
 }

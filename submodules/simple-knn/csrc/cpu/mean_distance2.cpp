@@ -1,5 +1,5 @@
-// A balanced kd-tree (a grid would be slow on clouds with far outliers): ranges are halved at the median of their
-// widest axis until a leaf's few points are left, so the tree's shape depends on n alone and needs no links.
+// Nearest neighbours by a balanced kd-tree; a grid would be slow on clouds with far outliers. Ranges are halved at the
+// median of their widest axis down to a leaf's few points. So the tree's shape depends on n alone and needs no links.
 #include <algorithm>
 #include <cmath>
 #include <vector>
@@ -54,7 +54,7 @@ class KdTree {
     int64_t middle() const { return begin + (end - begin) / 2; }
   };
 
-  // Nodes of a level are numbered from the left; the path to one is its number's bits, highest first.
+  // Nodes of a level are numbered from the left. The bits of a node's number, highest first, are the path to it.
   Range range(int64_t node, int64_t nodes) const {
     Range r{0, int64_t(points_.size())};
     for (int64_t bit = nodes / 2; bit > 0; bit /= 2) (node & bit ? r.begin : r.end) = r.middle();
@@ -78,7 +78,7 @@ class KdTree {
     splits_[node] = {points_[r.middle()].x[axis], axis};
   }
 
-  // `outside`: how far the point lies outside the node's box, along each axis.
+  // outside: the distance from the point to the node's box, along each axis.
   void visit(int64_t node, Range r, int64_t self, const T outside[3], Nearest3<T>& found) const {
     const T* x = points_[self].x;
     if (node >= leaves_begin_) {
@@ -116,7 +116,7 @@ void mean_distance2_cpu(const T* points, int64_t n, T* out, const Executor& exec
     if (std::isfinite(x[0]) && std::isfinite(x[1]) && std::isfinite(x[2])) finite.push_back({{x[0], x[1], x[2]}, i});
   }
   const KdTree<T> tree(std::move(finite), executor);
-  // In the tree's order neighbours in memory ask for the same nodes.
+  // In the tree's order, points that are neighbours in memory visit the same nodes.
   for_dynamic(executor, tree.points().size(), 512, [&](int64_t begin, int64_t end) {
     for (int64_t i = begin; i < end; ++i) out[tree.points()[i].index] = tree.nearest(i).mean();
   });

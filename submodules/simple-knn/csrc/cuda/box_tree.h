@@ -1,10 +1,10 @@
 #pragma once
-// A balanced tree of boxes over points in an order of ours, and the search in it. No CUDA runtime in it, so that
-// csrc/tests runs the very same lines on the host.
+// A balanced tree of boxes over sorted points, and the search in it. This includes no CUDA runtime, so that csrc/tests
+// runs the same lines on the host.
 //
-// Nodes are numbered from 1 as in a heap: those of level l are 2^l to 2^(l+1) - 1, the children of v are 2 v and
-// 2 v + 1, all leaves are on the last level. Node i of a level's 2^l has the points floor(n i / 2^l) to
-// floor(n (i + 1) / 2^l), so the tree needs no links.
+// Nodes are numbered from 1 as in a heap: level l has the nodes 2^l to 2^(l+1) - 1, the children of v are 2 v and
+// 2 v + 1, and all leaves are on the last level. Node i of a level's 2^l has the points from floor(n i / 2^l) up to,
+// but without, floor(n (i + 1) / 2^l), so the tree needs no links.
 #include <cstdint>
 #include <cstring>
 
@@ -25,7 +25,7 @@ GS_HD int64_t first_point(int64_t n, int level, int64_t i) { return (n * i) >> l
 // The node of `level` that holds point `at`: the largest i with first_point(i) <= at.
 GS_HD int64_t node_of(int64_t n, int level, int64_t at) { return (((at + 1) << level) - 1) / n; }
 
-// A monotone map of float to integers. Values of -0 and 0 differ, which does no harm here.
+// A monotone map from float to integers. -0 and 0 get different integers, which does no harm here.
 GS_HD uint32_t sortable(float x) {
   uint32_t bits;
   std::memcpy(&bits, &x, sizeof bits);
@@ -38,15 +38,15 @@ GS_HD float from_sortable(uint32_t bits) {
   return x;
 }
 
-// Smallest and largest coordinates of a node's points, as sortable integers of the nearest float: good enough to
-// choose an axis, and their minima and maxima don't depend on the order in which threads come.
+// The smallest and largest coordinates of a node's points, as sortable integers of the nearest float. They are accurate
+// enough to choose an axis, and their minima and maxima do not depend on the order of the threads.
 struct Extent {
   uint32_t low[3], high[3];
 };
 
 GS_HD int widest_axis(const Extent& e) {
   int axis = 0;
-  float widest = -1;  // a width that is not a number, of doubles beyond float, is never the widest
+  float widest = -1;  // doubles beyond float may give NaN, which is never the widest
   for (int k = 0; k < 3; ++k) {
     const float width = from_sortable(e.high[k]) - from_sortable(e.low[k]);
     if (!(width > widest)) continue;
@@ -56,7 +56,8 @@ GS_HD int widest_axis(const Extent& e) {
   return axis;
 }
 
-// Sorted by this, the points of each node of a level fall into its children at the median of the widest axis.
+// The sort key: sorted by it, the points of each node of a level fall into its children at the median of the widest
+// axis.
 template <class T>
 GS_HD uint64_t split_key(int64_t node, const Extent& extent, const T* point) {
   return uint64_t(node) << 32 | sortable(float(point[widest_axis(extent)]));
@@ -114,8 +115,8 @@ struct BoxTree {
     }
   }
 
-  // From the point's own leaf upwards: the nearest are found first, and no stack is needed. Bit l of `pending` says
-  // that the sibling of the node l levels above has yet to be looked at.
+  // Searches from the point's own leaf upwards, which finds the nearest first and needs no stack. Bit l of `pending` is
+  // set while the sibling of the node l levels above still has to be visited.
   GS_HD Nearest3<T> nearest(int64_t self) const {
     const TreePoint<T> point = points[self];
     Nearest3<T> found;

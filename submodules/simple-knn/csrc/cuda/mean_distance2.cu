@@ -1,5 +1,6 @@
-// A tree like the CPU's (box_tree.h), built level by level: a sort by node and by the coordinate along the node's
-// widest axis puts the halves of every node of the level in their places at once. Then a search for each point.
+// Nearest neighbours by a tree like the CPU's (box_tree.h), built level by level: a sort by node and by the coordinate
+// along the node's widest axis puts the halves of every node of the level into their places at once. A search for each
+// point follows.
 #include <thrust/iterator/counting_iterator.h>
 
 #include <cub/device/device_radix_sort.cuh>
@@ -34,10 +35,10 @@ __global__ void clear_extents(Extent* extents, int64_t count) {
   if (i < count) extents[i] = {{~0u, ~0u, ~0u}, {0, 0, 0}};
 }
 
-// Integer minima and maxima: the result does not depend on who comes first.
+// Measures the extent of every node. Minima and maxima of integers do not depend on the order of the threads.
 template <class T>
 __global__ void measure(const T* points, const int32_t* order, int64_t n, int level, Extent* extents) {
-  // Threads beyond the end repeat the last point, which changes no minimum, so that warps stay whole.
+  // Threads beyond the end repeat the last point, so that warps stay whole; that changes no minimum.
   const int64_t at = min(global_thread(), n - 1);
   const T* x = points + 3 * int64_t(order[at]);
   const int node = int(node_of(n, level, at));
@@ -96,7 +97,7 @@ __global__ void __launch_bounds__(kSearchThreads) search(BoxTree<T> tree, T* out
   if (at < tree.n) out[tree.points[at].index] = tree.nearest(at).mean();
 }
 
-// Indexes of the finite points, ascending; how many there are.
+// Finds the indices of the finite points, ascending; returns their number.
 template <class T>
 int64_t select_finite(const T* points, int64_t n, int32_t* indexes, const Queue& queue) {
   const auto stream = static_cast<cudaStream_t>(queue.stream);
@@ -112,7 +113,7 @@ int64_t select_finite(const T* points, int64_t n, int32_t* indexes, const Queue&
   return count;
 }
 
-// Brings the points' indexes into the tree's order.
+// Sorts the points' indices into the tree's order.
 template <class T>
 void sort_into_tree(const T* points, int64_t n, cub::DoubleBuffer<int32_t>& order, const Queue& queue) {
   const auto stream = static_cast<cudaStream_t>(queue.stream);
@@ -142,7 +143,7 @@ template <class T>
 void mean_distance2_cuda(const T* points, int64_t n_all, T* out, const Queue& queue) {
   if (n_all == 0) return;
   const auto stream = static_cast<cudaStream_t>(queue.stream);
-  GS_CUDA_CHECK(cudaMemsetAsync(out, 0, n_all * sizeof(T), stream));  // what points that are not finite get
+  GS_CUDA_CHECK(cudaMemsetAsync(out, 0, n_all * sizeof(T), stream));  // the result of points that are not finite
   int32_t* indexes = queue.array<int32_t>(n_all);
   const int64_t n = select_finite(points, n_all, indexes, queue);
   if (n == 0) return;

@@ -10,7 +10,7 @@ namespace gs {
 template <class T>
 constexpr T kLargest = std::numeric_limits<T>::max();
 
-// a * b, rounded by itself: nvcc would fuse it with a sum, and the result would differ from the CPU's.
+// a * b, rounded before it is added to anything: nvcc would fuse the two, and the result would differ from the CPU's.
 template <class T>
 GS_HD T product(T a, T b) {
 #ifdef __CUDA_ARCH__
@@ -23,15 +23,15 @@ GS_HD T product(T a, T b) {
 #endif
 }
 
-// Squared length of (x, y, z), at most the largest finite number. Rounding is monotone in |x|, |y| and |z|: the
-// distance to a box, computed here too, never exceeds that to a point inside it.
+// The squared length of (x, y, z), at most the largest finite number. Rounding is monotone in |x|, |y| and |z|. So the
+// distance to a box, which is computed here too, never exceeds that to a point inside it.
 template <class T>
 GS_HD T squared_length(T x, T y, T z) {
   const T sum = product(x, x) + product(y, y) + product(z, z);
   return sum < kLargest<T> ? sum : kLargest<T>;
 }
 
-// The three smallest distances seen, ascending; infinite where fewer were seen.
+// The three smallest distances so far, ascending; infinite where there were fewer.
 template <class T>
 struct Nearest3 {
   static constexpr T kNone = std::numeric_limits<T>::infinity();
@@ -44,7 +44,7 @@ struct Nearest3 {
     if (d < d0) d0 = d;
   }
 
-  // Mean of those seen, 0 for none, at most the largest finite number.
+  // Their mean, 0 if there were none; at most the largest finite number.
   GS_HD T mean() const {
     if (d0 == kNone) return 0;
     if (d1 == kNone) return d0;

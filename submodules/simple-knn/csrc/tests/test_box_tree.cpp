@@ -24,7 +24,7 @@ Extent extent_of(const std::vector<T>& points, const std::vector<int32_t>& order
   return e;
 }
 
-// As mean_distance2.cu, a level at a time.
+// Builds and searches the tree as mean_distance2.cu does, level by level.
 template <class T>
 std::vector<T> search(const std::vector<T>& points) {
   const int64_t n = points.size() / 3;
@@ -70,7 +70,7 @@ void check_cloud(const std::vector<T>& points) {
   std::vector<T> wanted(n);
   mean_distance2_cpu(points.data(), n, wanted.data(), serial_executor());
   const std::vector<T> got = search(points);
-  // The same sums of the same pairs; compilers that fuse a product with a sum may do so in one of them only.
+  // The same sums of the same pairs, but a compiler may fuse a product with a sum in one of them only.
   for (int64_t i = 0; i < n; ++i)
     CHECK_NEAR(got[i], wanted[i], 4 * std::numeric_limits<T>::epsilon() * double(wanted[i]));
 }
@@ -79,7 +79,7 @@ template <class T>
 void check_clouds() {
   std::mt19937 random(1);
   std::normal_distribution<T> normal;
-  // Around the sizes where leaves and levels change.
+  // Sizes around those where leaves and levels change.
   for (int n : {1, 2, 3, 4, 5, 7, 8, 9, 15, 16, 17, 18, 31, 32, 33, 65, 500, 1023}) {
     std::vector<T> points(3 * n);
     for (T& x : points) x = normal(random);
@@ -102,7 +102,7 @@ void check_keys() {
     CHECK(from_sortable(sortable(a)) == a);
     for (const float b : values) CHECK((a < b) == (sortable(a) < sortable(b)));
   }
-  // Nodes and points of a level that is far too large to build.
+  // Nodes and points of a level too large to build.
   const int64_t n = (int64_t(1) << 31) - 1;
   const int level = leaf_level(n);
   for (const int64_t node : {int64_t(0), int64_t(1), int64_t(12345), (int64_t(1) << level) - 1}) {

@@ -1,5 +1,5 @@
 // The CUDA kernels on the CPU (submodules/common/emulation), under the sanitizers, against the CPU backend: the same
-// bits, with threads taken in any order.
+// bits in any order of the threads.
 #include <limits>
 #include <random>
 #include <vector>

@@ -1,4 +1,4 @@
-// The kd-tree against all pairs, on clouds that are awkward for a tree.
+// The kd-tree against all pairs, on clouds that are hard for a tree.
 #include <algorithm>
 #include <random>
 #include <thread>
@@ -43,7 +43,7 @@ void check_cloud(const std::vector<T>& points) {
   CHECK(serial == threaded);
   for (int64_t i = 0; i < n; ++i) {
     const double wanted = all_pairs(points, i);
-    // Both round each of some eight operations.
+    // Both round some eight operations.
     CHECK_NEAR(serial[i], wanted, 8 * wanted * std::numeric_limits<T>::epsilon());
   }
 }
@@ -52,7 +52,7 @@ template <class T>
 void check_clouds() {
   std::mt19937 random(1);
   std::normal_distribution<T> normal;
-  // Around the sizes where leaves and levels change.
+  // Sizes around those where leaves and levels change.
   for (int n : {0, 1, 2, 3, 4, 5, 7, 8, 9, 15, 16, 17, 18, 33, 64, 65, 500}) {
     std::vector<T> points(3 * n);
     for (T& x : points) x = normal(random);

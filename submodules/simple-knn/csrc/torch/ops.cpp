@@ -1,3 +1,4 @@
+// The op of the mean squared distance to the nearest points.
 #include <ATen/ops/empty.h>
 #include <torch/library.h>
 
