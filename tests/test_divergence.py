@@ -232,7 +232,7 @@ def test_the_model_before_a_loss_of_nan_is_saved(colmap_scene, tmp_path, monkeyp
 
 def test_a_first_loss_of_nan_leaves_nothing_to_save(colmap_scene, tmp_path, monkeypatch):
     _nan_loss_in(monkeypatch, 1)
-    with pytest.raises(UserError, match="nothing was trained before; lower the learning rates"):
+    with pytest.raises(UserError, match="no iteration before it was trained; lower the learning rates"):
         _train(colmap_scene, tmp_path, iterations=5)
     assert not (tmp_path / "point_cloud").exists() and not list(tmp_path.glob("*.pth"))
 
