@@ -201,7 +201,9 @@ def test_rendering_says_what_did_not_fit(colmap_scene, tmp_path, monkeypatch):
     _train(colmap_scene, tmp_path)
     monkeypatch.setattr(scored_views, "render", _failing(scored_views.render, 4, ON_A_GPU))
     monkeypatch.setattr(sys, "argv", ["render.py", "-m", str(tmp_path)])
-    with pytest.raises(UserError, match=r"rendering ran out of memory \(20.0 GiB asked for.*Gaussians; images of 24 x 16\).*-r"):
+    with pytest.raises(
+        UserError, match=r"rendering ran out of memory \(20.0 GiB asked for.*Gaussians; images of 24 x 16\).*-r"
+    ):
         render.main()
 
 
