@@ -14,7 +14,7 @@ from utils.host.interrupt import DeferredInterrupt
 def run_training(run: Run, observers: Sequence[Observer]) -> None:
     """Render a view, compare it with its photo, follow the gradient, control density, step.
 
-    Whatever else happens is an observer's business, in the order of the list (training/observers/__init__.py).
+    Whatever else happens is an observer's business, in the order of the list (training/observers/standard.py).
     KeyboardInterrupt or Terminated, after a complete step, where a signal asked for it.
     """
     tell = Announcer(observers)

@@ -1,0 +1,155 @@
+"""The training loop: the moments that observers are told of, in their order, and the hooks of density control."""
+
+import sys
+from argparse import Namespace
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+import train
+from training import loop, run
+from training.density import AdaptiveDensityControl, DensityControl
+from training.observer import Announcer, Observer
+from training.observers.standard import standard_observers
+
+ITERATIONS = 24
+
+
+class Recorder(Observer):
+    """Notes every moment with its iteration."""
+
+    def __init__(self, told: list[tuple[str, int]], name: str = "", writes: tuple[int, ...] = ()) -> None:
+        self._told = told
+        self._name = name
+        self._writes = writes
+
+    def _note(self, moment: str, iteration: int) -> None:
+        self._told.append((self._name + moment, iteration))
+
+    def due(self, step) -> bool:
+        self._note("due", step.iteration)
+        return step.iteration in self._writes
+
+    def begins(self, step) -> None:
+        self._note("begins", step.iteration)
+
+    def measured(self, step, losses) -> None:
+        assert losses.total.isfinite() and losses.l1.isfinite()
+        self._note("measured" + " due" * step.due, step.iteration)
+
+    def stepped(self, step) -> None:
+        self._note("stepped", step.iteration)
+
+    def ended(self, error) -> None:
+        self._note("ended" if error is None else type(error).__name__, 0)
+
+
+@pytest.fixture(autouse=True)
+def _stdout(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "stdout", sys.stdout)  # training stamps it
+
+
+def _train(scene, out, monkeypatch, observers, *options: object) -> None:
+    monkeypatch.setattr(train, "standard_observers", observers)
+    words = ["-s", scene, "-m", out, "-r", 24, "--iterations", ITERATIONS, "--test_iterations", -1, *options]
+    train.main(list(map(str, words)))
+
+
+def test_every_moment_comes_once_an_iteration_and_in_order(colmap_scene, tmp_path, monkeypatch):
+    told = []
+    _train(colmap_scene, tmp_path, monkeypatch, lambda run, writer: [Recorder(told, writes=(7,))],
+           "--densify_from_iter", 5, "--densification_interval", 10)  # fmt: skip
+    expected = []
+    for t in range(1, ITERATIONS + 1):
+        # The observer writes in 7; density control changes the Gaussians in 10 and 20.
+        due = " due" if t in (7, 10, 20) else ""
+        expected += [("begins", t), ("due", t), ("measured" + due, t), ("stepped", t)]
+    assert told == [*expected, ("ended", 0)]
+
+
+def test_observers_are_told_in_the_order_of_the_list_and_of_the_error(colmap_scene, tmp_path, monkeypatch):
+    told = []
+
+    class Broken(Observer):
+        def stepped(self, step) -> None:
+            if step.iteration == 2:
+                raise RuntimeError("broken")
+
+    def observers(run, writer) -> list[Observer]:
+        return [Recorder(told, "a "), Broken(), Recorder(told, "b ")]
+
+    with pytest.raises(RuntimeError, match="broken"):
+        _train(colmap_scene, tmp_path, monkeypatch, observers)
+    moments = ("begins", "due", "measured", "stepped")
+    first = [(f"{name} {moment}", 1) for moment in moments for name in "ab"]
+    second = [(f"{name} {moment}", 2) for moment in moments for name in "ab"][:-1]  # b is not told that 2 has stepped
+    assert told == [*first, *second, ("a RuntimeError", 0), ("b RuntimeError", 0)]
+
+
+def test_a_moment_that_is_not_overridden_costs_nothing(monkeypatch):
+    for moment in ("due", "begins", "measured", "stepped", "ended"):
+        monkeypatch.setattr(Observer, moment, lambda *_: pytest.fail("called"))
+    step = SimpleNamespace(changes=False, due=True)
+    with Announcer([Observer()]) as tell:
+        tell.begins(step)
+        tell.measured(step, None)
+        tell.stepped(step)
+    assert step.due is False
+
+
+def test_the_guards_stand_where_they_must(colmap_scene, tmp_path, monkeypatch):
+    """The list's order is meant: checks first, writers next, then the guard of a changing model, checkpoints last."""
+    names = []
+
+    def observers(run, writer) -> list[Observer]:
+        listed = standard_observers(run, writer)
+        names.extend(type(one).__name__ for one in listed)
+        return listed
+
+    _train(colmap_scene, tmp_path, monkeypatch, observers, "--eval")
+    assert names[0] == "DivergenceWatch" and names[-2:] == ["MemoryGuard", "Checkpoints"]
+    assert names.index("Curve") < names.index("Report") < names.index("Saves") < names.index("MemoryGuard")
+
+
+def test_another_strategy_is_another_object(colmap_scene, tmp_path, monkeypatch):
+    calls = []
+
+    class Strategy(DensityControl):
+        def __init__(self, gaussians, opt: Namespace, white_background: bool, extent: float) -> None:
+            assert not white_background and extent > 0
+            self._gaussians = gaussians
+
+        def changes(self, iteration: int) -> bool:
+            return iteration == 3
+
+        def after_backward(self, step, package) -> None:
+            assert self._gaussians.get_xyz.grad is not None and package["radii"].any()
+            calls.append(("after_backward", step.iteration))
+
+        def after_step(self, step) -> None:
+            assert self._gaussians.get_xyz.grad is None
+            calls.append(("after_step", step.iteration))
+
+    monkeypatch.setattr(run, "AdaptiveDensityControl", Strategy)
+    told = []
+    _train(colmap_scene, tmp_path, monkeypatch, lambda run, writer: [Recorder(told)])
+    steps = range(1, ITERATIONS + 1)
+    assert [t for moment, t in told if moment == "measured due"] == [3]
+    # As in the reference, the last iteration takes no step.
+    assert [t for moment, t in calls if moment == "after_backward"] == list(steps)
+    assert [t for moment, t in calls if moment == "after_step"] == list(steps[:-1])
+
+
+def test_a_strategy_may_do_nothing():
+    nothing = DensityControl()
+    assert nothing.changes(1) is False
+    assert nothing.after_backward(None, {}) is nothing.after_step(None) is None
+    assert issubclass(AdaptiveDensityControl, DensityControl)
+
+
+def test_backward_runs_on_the_callers_thread():
+    before = torch.autograd.is_multithreading_enabled()
+    with loop._backward_on_this_thread():
+        assert not torch.autograd.is_multithreading_enabled()
+    assert torch.autograd.is_multithreading_enabled() is before
