@@ -76,7 +76,7 @@ def measure_on_cpu(thread_counts: list[int], repeats: int) -> None:
             rows.append([*row, f"{evaluations / m['blend']:.2f}", f"{evaluations / m['blend_vjp']:.2f}"])
     print_table(header, rows)
     print()
-    oracle_header = ["", "reference.py, ms forward / + backward", "ours, ms", "ratio"]
+    oracle_header = ["", "the oracle, ms forward / + backward", "ours, ms", "ratio"]
     print_table(oracle_header, [compare_oracle(repeats)])
 
 
