@@ -73,7 +73,7 @@ def _program(words: list[str]) -> tuple[str, tuple[str, ...]] | None:
         return DEVICE[words[1]], tuple(words[2:])
     python = re.fullmatch(r"(\S*/)?python3?", words[0]) is not None
     rest = words[python:]
-    if python and rest[:1] == ["-m"] and rest[1].split(".")[0] in ROOMS:
+    if python and rest[:1] == ["-m"] and rest[1].split(".")[0] in ROOMS and rest[1].islower():  # ROOM.NAME is none
         return rest[1], tuple(rest[2:])
     if rest and rest[0].endswith(".py") and (python or len(rest) > 1):
         return rest[0], tuple(rest[1:])
