@@ -52,7 +52,7 @@ def training(
     run = Run(dataset, opt, pipe, plan)
     # Write nothing before every input check has passed: a mistyped option must not overwrite a finished model.
     writer = prepare_output_and_logger(dataset, **run.kept)
-    run.open_records()
+    run.begin()
     run_training(run, standard_observers(run, writer))
 
 

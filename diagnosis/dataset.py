@@ -9,7 +9,7 @@ import numpy as np
 
 from diagnosis.lines import Line, from_error
 from scene.dataset_readers import CameraInfo, SceneInfo, read_scene
-from scene.readers.records import APART, standing_apart
+from scene.readers.info import APART, standing_apart
 from utils.files.json_files import read_json
 from utils.files.listing import some
 from utils.system_utils import UserError

@@ -23,7 +23,7 @@ from evaluation.stages import Failure
 from records.curve_peak import CLEAR
 from records.error_curve import NAME as CURVE
 from records.error_curve import Row, best_test, read_curve
-from scene.readers.records import HOLD
+from scene.readers.info import HOLD
 from utils.files.json_files import read_json
 from utils.system_utils import UserError, saved_iterations
 

@@ -71,7 +71,7 @@ def _zero(device: torch.device, dtype: torch.dtype) -> Tensor:
 
 
 @torch.no_grad()
-def seen(camera: Camera | MiniCam, pc: GaussianModel, pipe: argparse.Namespace) -> Tensor:
+def decisive_for(camera: Camera | MiniCam, pc: GaussianModel, pipe: argparse.Namespace) -> Tensor:
     """Gaussians that the image of `render` depends on, over any background (`decisive`): (N,) bool."""
     background = pc.get_xyz.new_zeros(3)
     return decisive(

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from gaussian_renderer import seen
+from gaussian_renderer import decisive_for
 from gaussian_renderer.scored_views import ScoredViews
 from scene.cameras import Camera
 from scene.gaussian_model import GaussianModel
@@ -26,11 +26,11 @@ class Trimmed:
     seconds: float  # that the search took
 
 
-def seen_by(cameras: Sequence[Camera], gaussians: GaussianModel, pipe: argparse.Namespace) -> Tensor:
+def decisive_for_any(cameras: Sequence[Camera], gaussians: GaussianModel, pipe: argparse.Namespace) -> Tensor:
     """(N,) bool: the Gaussians that the image of any of the cameras, at its size, depends on; all where none is."""
     found = torch.zeros(len(gaussians), dtype=torch.bool, device=gaussians.get_xyz.device)
     for camera in tqdm(cameras, desc="Looking for unseen Gaussians", unit="view", leave=False):
-        found |= seen(camera, gaussians, pipe)
+        found |= decisive_for(camera, gaussians, pipe)
     return found if found.any() else ~found  # never an empty model
 
 
@@ -43,7 +43,7 @@ def trim(
     none. Unless bands are cut, the renders of `cameras` keep every bit.
     """
     start = time.perf_counter()
-    keep = None if keep_unseen else seen_by(cameras, gaussians, pipe)
+    keep = None if keep_unseen else decisive_for_any(cameras, gaussians, pipe)
     unseen = 0 if keep is None else int((~keep).sum())
     rest = gaussians.get_features_rest.detach()
     bounds = cut_bounds(rest[keep] if unseen else rest)

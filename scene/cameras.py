@@ -13,7 +13,7 @@ from torch import Tensor
 from scene.pictures.masks import TRANSPARENT, Cutout
 from scene.pictures.resolution import training_size
 from scene.pictures.store import ImageStore, Picture, Source
-from scene.readers.records import CameraInfo
+from scene.readers.info import CameraInfo
 from utils.graphics_utils import getProjectionMatrix, getWorld2View2
 
 ZNEAR = 0.01  # both only shape the clip depth and cull nothing

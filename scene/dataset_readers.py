@@ -8,7 +8,7 @@ import numpy as np
 
 from scene.pictures.masks import NO_MASKS, MaskOptions
 from scene.readers.colmap import readColmapSceneInfo
-from scene.readers.records import HOLD, CameraInfo, SceneInfo, scene_extent
+from scene.readers.info import HOLD, CameraInfo, SceneInfo, scene_extent
 from scene.readers.scene_folder import BLENDER, COLMAP, NERFSTUDIO, kind_of
 from scene.readers.start_cloud import SFM, StartOptions
 from scene.readers.transforms import readNerfstudioInfo, readNerfSyntheticInfo

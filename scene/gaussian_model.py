@@ -14,7 +14,7 @@ from scene.gaussians.exposure import Exposures, read_exposures
 from scene.gaussians.finite import check_finite
 from scene.gaussians.sparse_adam import SparseGaussianAdam
 from scene.gaussians.start import start_rows
-from scene.readers.records import exposure_names
+from scene.readers.info import exposure_names
 from utils.general_utils import get_expon_lr_func
 from utils.graphics_utils import BasicPointCloud
 from utils.system_utils import UserError

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from scene.cameras import Camera
-from scene.readers.records import CameraInfo, SceneInfo, exposure_names, scene_extent
+from scene.readers.info import CameraInfo, SceneInfo, exposure_names, scene_extent
 
 
 def train_on_all(info: SceneInfo) -> SceneInfo:

@@ -18,8 +18,8 @@ from scene.half_images import mark_halves, train_on_all
 from scene.pictures.masks import MaskOptions, refuse_nothing_to_ignore
 from scene.pictures.store import ImageStore, Picture, picture_device
 from scene.readers.depth_maps import with_depth_maps
+from scene.readers.info import CameraInfo, SceneInfo
 from scene.readers.point_cloud import write_point_cloud
-from scene.readers.records import CameraInfo, SceneInfo
 from scene.saved_iterations import find_iteration, saved_ply
 from utils.graphics_utils import BasicPointCloud
 from utils.host.device import compute_device

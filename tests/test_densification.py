@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from scene.gaussian_model import GaussianModel
-from scene.gaussians import density as adc
+from scene.gaussians import density_rules as rules
 from utils.general_utils import build_rotation
 
 EXTENT = 2.0
@@ -38,7 +38,7 @@ def _toy(scales: list[float], gradients: list[float], opacity: float = 0.5) -> G
 
 
 def _densify(gaussians: GaussianModel, screen: int | None = None, **more: int) -> None:
-    gaussians.densify_and_prune(THRESHOLD, adc.MIN_OPACITY, EXTENT, screen, **more)
+    gaussians.densify_and_prune(THRESHOLD, rules.MIN_OPACITY, EXTENT, screen, **more)
 
 
 def test_selection_at_equality():
@@ -49,7 +49,7 @@ def test_selection_at_equality():
     above = limit * (1 + 1e-5)
     gaussians = _toy([limit, limit, above, above, limit], [threshold, below, threshold, below, 1.0])
     before = parameters(gaussians)
-    gaussians.densify_and_prune(threshold, adc.MIN_OPACITY, EXTENT, None)
+    gaussians.densify_and_prune(threshold, rules.MIN_OPACITY, EXTENT, None)
     # The order is: kept 0, 1, 3, 4 (2 was split), then clones of 0 and 4, then two children of 2.
     assert len(gaussians) == 8
     for name, value in parameters(gaussians).items():
@@ -113,7 +113,7 @@ def test_reset_freezes_opacity_alone():
     gaussians.reset_opacity()
     assert not moments(gaussians)["opacity"]["exp_avg"].any()
     gaussians.optimizer.step()
-    low = torch.tensor(adc.logit(0.01), dtype=torch.float32).item()
+    low = torch.tensor(rules.logit(0.01), dtype=torch.float32).item()
     assert gaussians._opacity.reshape(-1).tolist() == [-6.0, low, low]
     assert gaussians.get_opacity[1:].detach().numpy() == pytest.approx(0.01)
     for name, value in parameters(gaussians).items():
@@ -122,7 +122,7 @@ def test_reset_freezes_opacity_alone():
 
 def test_pruning():
     gaussians = _toy([LIMIT] * 6, [0.0] * 6)
-    low = adc.logit(adc.MIN_OPACITY)
+    low = rules.logit(rules.MIN_OPACITY)
     with torch.no_grad():
         gaussians._opacity[0] = low - 1e-3
         gaussians._opacity[1] = low + 1e-3
@@ -142,19 +142,19 @@ def test_children_are_drawn_from_their_parent():
     scaling = torch.tensor([0.5, -1.0, -3.0]).repeat(n, 1)
     rotation = torch.tensor([0.9, -0.4, 1.3, 0.2]).repeat(n, 1)
     centre = torch.tensor([1.0, -2.0, 0.5]).repeat(n, 1)
-    children, scales = adc.split_children(centre, scaling, rotation, torch.arange(n), 0, seed=3, iteration=600)
+    children, scales = rules.split_children(centre, scaling, rotation, torch.arange(n), 0, seed=3, iteration=600)
     offset = (children - centre).double() @ build_rotation(rotation[:1].double())[0] / scaling.double().exp()
     assert offset.mean(0).abs().max() < 4 / math.sqrt(n)
     assert (offset.T @ offset / n - torch.eye(3)).abs().max() < 4 * math.sqrt(2 / n)
     assert torch.equal(scales, scaling - math.log(1.6))
-    again, _ = adc.split_children(centre[:5], scaling[:5], rotation[:5], torch.arange(5), 0, seed=3, iteration=600)
+    again, _ = rules.split_children(centre[:5], scaling[:5], rotation[:5], torch.arange(5), 0, seed=3, iteration=600)
     assert torch.equal(again, children[:5])
-    other, _ = adc.split_children(centre[:5], scaling[:5], rotation[:5], torch.arange(5), 1, seed=3, iteration=600)
+    other, _ = rules.split_children(centre[:5], scaling[:5], rotation[:5], torch.arange(5), 1, seed=3, iteration=600)
     assert (other != again).all()
 
 
 def test_a_zero_quaternion_splits_to_finite_places():
-    children, _ = adc.split_children(
+    children, _ = rules.split_children(
         torch.zeros(2, 3), torch.zeros(2, 3), torch.zeros(2, 4), torch.arange(2), 0, seed=0, iteration=1
     )
     assert children.isfinite().all()
@@ -162,17 +162,17 @@ def test_a_zero_quaternion_splits_to_finite_places():
 
 def test_windows_of_the_defaults():
     opt = options()
-    todo = {t: adc.actions(t, opt, white_background=False) for t in range(1, 30_001)}
+    todo = {t: rules.actions(t, opt, white_background=False) for t in range(1, 30_001)}
     assert [t for t in todo if todo[t].densify] == list(range(600, 15_000, 100))
     assert [t for t in todo if todo[t].reset_opacity] == [3000, 6000, 9000, 12_000]
     assert [t for t in todo if todo[t].observe] == list(range(1, 15_000))
     assert [t for t in todo if todo[t].densify and todo[t].limit_size] == list(range(3100, 15_000, 100))
-    white = [t for t in range(1, 30_001) if adc.actions(t, opt, white_background=True).reset_opacity]
+    white = [t for t in range(1, 30_001) if rules.actions(t, opt, white_background=True).reset_opacity]
     assert white == [500, 3000, 6000, 9000, 12_000]
 
 
 def test_never_seen_gaussians_have_no_gradient():
-    assert adc.mean_gradient(torch.tensor([[0.0], [3.0]]), torch.tensor([[0.0], [2.0]])).tolist() == [0.0, 1.5]
+    assert rules.mean_gradient(torch.tensor([[0.0], [3.0]]), torch.tensor([[0.0], [2.0]])).tolist() == [0.0, 1.5]
 
 
 def test_statistics_take_indices_and_masks():
@@ -231,10 +231,10 @@ def test_any_number_of_threads_observes_the_same():
 
 def test_the_cap_takes_the_largest_gradients_ties_by_index():
     gradient = torch.tensor([5.0, 1.0, 5.0, 7.0, 5.0, 0.5])
-    assert adc.limit_growth(gradient, 1.0, 3).nonzero().reshape(-1).tolist() == [0, 2, 3, 5]
-    assert adc.limit_growth(gradient, 1.0, 0).tolist() == [0, 0, 0, 0, 0, 0.5]
-    assert adc.limit_growth(gradient, 1.0, -2).tolist() == [0, 0, 0, 0, 0, 0.5]
-    assert torch.equal(adc.limit_growth(gradient, 1.0, 5), gradient)
+    assert rules.limit_growth(gradient, 1.0, 3).nonzero().reshape(-1).tolist() == [0, 2, 3, 5]
+    assert rules.limit_growth(gradient, 1.0, 0).tolist() == [0, 0, 0, 0, 0, 0.5]
+    assert rules.limit_growth(gradient, 1.0, -2).tolist() == [0, 0, 0, 0, 0, 0.5]
+    assert torch.equal(rules.limit_growth(gradient, 1.0, 5), gradient)
 
 
 @settings(max_examples=25, deadline=None)
@@ -248,6 +248,6 @@ def test_the_cap_is_never_passed_and_reached_when_it_can(count, cap, seed):
     scales = (LIMIT * (0.5 + torch.rand(count, generator=generator))).tolist()
     gradients = (2 * THRESHOLD * torch.rand(count, generator=generator)).tolist()
     gaussians = _toy(scales, gradients)
-    candidates = int((adc.mean_gradient(gaussians.xyz_gradient_accum, gaussians.denom) >= THRESHOLD).sum())
+    candidates = int((rules.mean_gradient(gaussians.xyz_gradient_accum, gaussians.denom) >= THRESHOLD).sum())
     _densify(gaussians, max_splats=cap)
     assert len(gaussians) == max(count, min(cap, count + candidates))

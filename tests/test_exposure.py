@@ -20,8 +20,8 @@ from scene.gaussian_model import GaussianModel
 from scene.gaussians.checkpoint import load_checkpoint, save_checkpoint
 from scene.gaussians.exposure import Exposures, apply_exposure, read_exposures
 from scene.half_images import train_on_all
+from scene.readers.info import exposure_names
 from scene.readers.point_cloud import write_point_cloud
-from scene.readers.records import exposure_names
 from utils.loss_utils import inverse_depth_loss, l1_loss, photometric_loss, ssim
 from utils.system_utils import UserError
 

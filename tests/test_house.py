@@ -32,16 +32,16 @@ MAY_IMPORT = {
     "scene.pictures": ("utils",),
     "scene.readers": ("scene.pictures", "utils"),
     "scene.gaussians": ("utils",),
-    "scene.gaussian_model": ("scene.gaussians", "scene.readers.records", "utils"),
+    "scene.gaussian_model": ("scene.gaussians", "scene.readers.info", "utils"),
     "scene.dataset_readers": ("scene.readers", "scene.pictures", "utils"),
-    "scene.cameras": ("scene.readers.records", "scene.pictures", "utils"),
+    "scene.cameras": ("scene.readers.info", "scene.pictures", "utils"),
     "scene": ("arguments", "utils"),
     "gaussian_renderer": ("scene", "arguments", "utils"),
     "training": ("gaussian_renderer", "scene", "records", "arguments", "utils"),
     "training.observers": ("training", "gaussian_renderer", "scene", "records", "arguments", "utils"),
     "diagnosis": ("gaussian_renderer", "scene", "arguments", "utils"),
     "conversion": ("scene.readers", "scene.pictures", "utils"),
-    "evaluation": ("records", "arguments", "scene.saved_iterations", "scene.readers.records", "utils"),
+    "evaluation": ("records", "arguments", "scene.saved_iterations", "scene.readers.info", "utils"),
     "demo": ("evaluation", "arguments", "utils"),
     "benchmarks": ("utils",),
     "benchmarks.workloads": ("demo", "scene.pictures", "utils"),
@@ -209,7 +209,7 @@ def _loaded(statement: str) -> list[str]:
 
 def test_the_model_loads_no_reader_but_the_records():
     readers = [name for name in _loaded("import scene.gaussian_model") if name.startswith("scene.readers.")]
-    assert readers == ["scene.readers.records"]
+    assert readers == ["scene.readers.info"]
     assert _loaded("import scene") == ["scene"]
 
 

@@ -1,4 +1,4 @@
-"""The training loop: the moments that observers are told of, in their order, and the hooks of density control."""
+"""The training loop: the hooks of observers and of density control, each called in its place."""
 
 import sys
 from argparse import Namespace
@@ -17,15 +17,15 @@ ITERATIONS = 24
 
 
 class Recorder(Observer):
-    """Notes every moment with its iteration."""
+    """Notes every hook with its iteration."""
 
     def __init__(self, told: list[tuple[str, int]], name: str = "", writes: tuple[int, ...] = ()) -> None:
         self._told = told
         self._name = name
         self._writes = writes
 
-    def _note(self, moment: str, iteration: int) -> None:
-        self._told.append((self._name + moment, iteration))
+    def _note(self, hook: str, iteration: int) -> None:
+        self._told.append((self._name + hook, iteration))
 
     def due(self, step) -> bool:
         self._note("due", step.iteration)
@@ -56,7 +56,7 @@ def _train(scene, out, monkeypatch, observers, *options: object) -> None:
     train.main(list(map(str, words)))
 
 
-def test_every_moment_comes_once_an_iteration_and_in_order(colmap_scene, tmp_path, monkeypatch):
+def test_every_hook_is_called_once_an_iteration_and_in_order(colmap_scene, tmp_path, monkeypatch):
     told = []
     _train(colmap_scene, tmp_path, monkeypatch, lambda run, writer: [Recorder(told, writes=(7,))],
            "--densify_from_iter", 5, "--densification_interval", 10)  # fmt: skip
@@ -81,15 +81,15 @@ def test_observers_are_told_in_the_order_of_the_list_and_of_the_error(colmap_sce
 
     with pytest.raises(RuntimeError, match="broken"):
         _train(colmap_scene, tmp_path, monkeypatch, observers)
-    moments = ("begins", "due", "measured", "stepped")
-    first = [(f"{name} {moment}", 1) for moment in moments for name in "ab"]
-    second = [(f"{name} {moment}", 2) for moment in moments for name in "ab"][:-1]  # b is not told that 2 has stepped
+    hooks = ("begins", "due", "measured", "stepped")
+    first = [(f"{name} {hook}", 1) for hook in hooks for name in "ab"]
+    second = [(f"{name} {hook}", 2) for hook in hooks for name in "ab"][:-1]  # b is not told that 2 has stepped
     assert told == [*first, *second, ("a RuntimeError", 0), ("b RuntimeError", 0)]
 
 
-def test_a_moment_that_is_not_overridden_costs_nothing(monkeypatch):
-    for moment in ("due", "begins", "measured", "stepped", "ended"):
-        monkeypatch.setattr(Observer, moment, lambda *_: pytest.fail("called"))
+def test_a_hook_that_is_not_overridden_costs_nothing(monkeypatch):
+    for hook in ("due", "begins", "measured", "stepped", "ended"):
+        monkeypatch.setattr(Observer, hook, lambda *_: pytest.fail("called"))
     step = SimpleNamespace(changes=False, due=True)
     with Announcer([Observer()]) as tell:
         tell.begins(step)
@@ -135,10 +135,10 @@ def test_another_strategy_is_another_object(colmap_scene, tmp_path, monkeypatch)
     told = []
     _train(colmap_scene, tmp_path, monkeypatch, lambda run, writer: [Recorder(told)])
     steps = range(1, ITERATIONS + 1)
-    assert [t for moment, t in told if moment == "measured due"] == [3]
+    assert [t for hook, t in told if hook == "measured due"] == [3]
     # As in the reference, the last iteration takes no step.
-    assert [t for moment, t in calls if moment == "after_backward"] == list(steps)
-    assert [t for moment, t in calls if moment == "after_step"] == list(steps[:-1])
+    assert [t for hook, t in calls if hook == "after_backward"] == list(steps)
+    assert [t for hook, t in calls if hook == "after_step"] == list(steps[:-1])
 
 
 def test_a_strategy_may_do_nothing():

@@ -23,7 +23,7 @@ from scene import Scene, export_world
 from scene.dataset_readers import read_scene
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.start import LARGEST_OUTLIER
-from scene.readers.records import standing_apart
+from scene.readers.info import standing_apart
 from utils.image_utils import psnr
 from utils.system_utils import UserError
 

@@ -19,7 +19,7 @@ from arguments import ModelParams, read_cfg_args
 from diagnosis.model import check_model
 from gaussian_renderer import render
 from gaussian_renderer.scored_views import ScoredViews
-from gaussian_renderer.trimming import change_on_views, seen_by, trim
+from gaussian_renderer.trimming import change_on_views, decisive_for_any, trim
 from scene import Scene
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.checkpoint import load_checkpoint
@@ -76,7 +76,7 @@ def runs(_colmap_master, tmp_path_factory) -> SimpleNamespace:
 
 def test_only_rows_that_no_training_view_depends_on_are_missing(runs):
     scene, whole = _load(runs.whole)
-    seen = seen_by(scene.getTrainCameras(), whole, pipeline()).numpy()
+    seen = decisive_for_any(scene.getTrainCameras(), whole, pipeline()).numpy()
     assert 400 < seen.sum() < 580
     np.testing.assert_array_equal(_ply(runs.trimmed), _ply(runs.whole)[seen])
     assert len(_ply(runs.whole)) == 600

@@ -6,8 +6,8 @@ import sys
 import numpy as np
 
 from scene.gaussian_model import GaussianModel
-from scene.gaussians import density as adc
-from scene.readers.records import APART, NEAREST, SceneInfo, standing_apart
+from scene.gaussians import density_rules as rules
+from scene.readers.info import APART, NEAREST, SceneInfo, standing_apart
 from utils.files.listing import some
 from utils.system_utils import UserError
 
@@ -64,7 +64,7 @@ def check_exposures(gaussians: GaussianModel, train_test_exp: bool, checkpoint: 
 def warn_of_late_reset(opt: argparse.Namespace, white_background: bool) -> None:
     """Warn if opacities are reset so late that the model cannot recover."""
     last = range(max(1, opt.iterations - _RECOVERY + 1), opt.iterations)
-    late = [t for t in last if adc.actions(t, opt, white_background).reset_opacity]
+    late = [t for t in last if rules.actions(t, opt, white_background).reset_opacity]
     if late:
         print(
             f"warning: opacities are reset in iteration {late[-1]}, and {opt.iterations - late[-1]} iterations are "

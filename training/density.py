@@ -5,7 +5,7 @@ import argparse
 from torch import Tensor
 
 from scene.gaussian_model import GaussianModel
-from scene.gaussians import density as adc
+from scene.gaussians import density_rules as rules
 from training.step import Step
 from utils.system_utils import UserError
 
@@ -28,7 +28,7 @@ class DensityControl:
 
 
 class AdaptiveDensityControl(DensityControl):
-    """Adaptive density control (Kerbl et al. 2023, Section 5.2), with the rules of scene/gaussians/density.py.
+    """Adaptive density control (Kerbl et al. 2023, Section 5.2), with the rules of scene/gaussians/density_rules.py.
 
     extent: of the scene, world units; sizes are judged by it.
     """
@@ -54,15 +54,15 @@ class AdaptiveDensityControl(DensityControl):
         if todo.reset_opacity:
             self._gaussians.reset_opacity()
 
-    def _actions(self, iteration: int) -> adc.Actions:
-        return adc.actions(iteration, self._opt, self._white_background)
+    def _actions(self, iteration: int) -> rules.Actions:
+        return rules.actions(iteration, self._opt, self._white_background)
 
     def _densify(self, iteration: int, limit_size: bool) -> None:
         self._gaussians.densify_and_prune(
             self._opt.densify_grad_threshold,
-            adc.MIN_OPACITY,
+            rules.MIN_OPACITY,
             self._extent,
-            adc.MAX_SCREEN_SIZE if limit_size else None,
+            rules.MAX_SCREEN_SIZE if limit_size else None,
             seed=self._opt.seed,
             iteration=iteration,
             max_splats=self._opt.max_num_splats,

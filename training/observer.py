@@ -1,4 +1,4 @@
-"""Observers of a training: each overrides the moments that it needs, and is called in no other."""
+"""Observers of a training. Each overrides the hooks that it needs; the loop calls no others."""
 
 from collections.abc import Sequence
 from types import TracebackType
@@ -11,7 +11,7 @@ Error: TypeAlias = BaseException | None
 
 
 class Observer:
-    """Base of all observers. A moment that a class does not override costs nothing."""
+    """Base of all observers. A hook that a class does not override costs nothing."""
 
     def due(self, step: Step) -> bool:
         """Whether this iteration writes something. Every loss so far is then checked before `measured`."""
@@ -31,12 +31,12 @@ class Observer:
 
 
 class Announcer:
-    """Tells observers of each moment, in their order. Inside `with`, also of the end."""
+    """Calls the hooks of observers, in the order of the list. Inside `with`, also at the end."""
 
     def __init__(self, observers: Sequence[Observer]) -> None:
-        def overridden(moment: str) -> list:
-            plain = getattr(Observer, moment)
-            return [getattr(one, moment) for one in observers if getattr(type(one), moment) is not plain]
+        def overridden(hook: str) -> list:
+            plain = getattr(Observer, hook)
+            return [getattr(one, hook) for one in observers if getattr(type(one), hook) is not plain]
 
         self._due, self._begins, self._measured, self._stepped, self._ended = map(
             overridden, ("due", "begins", "measured", "stepped", "ended")
@@ -47,7 +47,7 @@ class Announcer:
             tell(step)
 
     def measured(self, step: Step, losses: Losses) -> None:
-        # A list: each is asked in every iteration, whatever the others answer.
+        # A list, so that each observer is asked in every iteration, whatever the others answer.
         step.due = any([step.changes, *[due(step) for due in self._due]])
         for tell in self._measured:
             tell(step, losses)

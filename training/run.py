@@ -15,9 +15,9 @@ from scene.gaussians.checkpoint import load_checkpoint
 from training.checks import check_exposures, check_scene, warn_of_late_reset
 from training.density import AdaptiveDensityControl
 from training.history import check_folder, continue_records, report_changes
+from training.loss_watch import LossWatch
 from training.memory_estimate import announce_memory
 from training.objective import Objective
-from training.observers.losses import LossWatch
 from training.plan import Plan
 from training.step import Step
 from training.view_order import ViewOrder
@@ -32,7 +32,7 @@ class Run:
     """What the loop and its observers share.
 
     scene, gaussians, views (by iteration), objective, density; dataset, opt, pipe: the options; background: (3,) of the
-    scene; first_iteration: done before this run. From `open_records` on: log, rows (of the curve so far), losses
+    scene; first_iteration: done before this run. From `begin` on: log, rows (of the curve so far), losses
     (running mean of the total) and clock (seconds of training).
     """
 
@@ -85,7 +85,7 @@ class Run:
         """What model.json keeps besides the model options (`write_model_json`)."""
         return self._training_options | {"world_offset": self.gaussians.world_offset}
 
-    def open_records(self) -> None:
+    def begin(self) -> None:
         """Write the inputs into the output folder, say what memory will be wanted, start or continue the log."""
         folder, start = self.scene.model_path, self.plan.start
         if not start or not (Path(folder) / "cameras.json").exists():

@@ -14,7 +14,7 @@ from arguments import ModelParams, OptionParser, PipelineParams, get_combined_ar
 from benchmarks.harness.environment import describe, print_table
 from benchmarks.harness.timing import cpu_milliseconds, gpu_time
 from gaussian_renderer.scored_views import ScoredViews
-from gaussian_renderer.trimming import seen_by
+from gaussian_renderer.trimming import decisive_for_any
 from scene.cameras import Camera
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.sh_bands import cut_bounds
@@ -41,7 +41,7 @@ def main() -> None:
     background = torch.full((3,), 1.0 if options.white_background else 0.0, device=device)
     views = {"train": scene.getTrainCameras(), "test": scene.getTestCameras()}
 
-    keep = seen_by(views["train"], gaussians, pipe)
+    keep = decisive_for_any(views["train"], gaussians, pipe)
     views["train"] = [camera for camera in views["train"] if camera.columns is None]  # whole photos, no test views
     bounds = cut_bounds(gaussians.get_features_rest[keep])
     models = [("all", "", gaussians), ("without unseen", "0", gaussians.part(keep, gaussians.max_sh_degree))]

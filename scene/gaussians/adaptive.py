@@ -5,7 +5,7 @@ from operator import attrgetter
 import torch
 from torch import Tensor
 
-from scene.gaussians import density as adc
+from scene.gaussians import density_rules as rules
 from scene.gaussians.adam import GaussianAdam
 from scene.gaussians.attributes import Rows
 from scene.gaussians.parameters import GaussianParameters
@@ -84,21 +84,21 @@ class AdaptiveGaussians(GaussianParameters):
         positions of split children. max_splats > 0 bounds the number of Gaussians.
         """
         self.optimizer.zero_grad(set_to_none=True)  # frees memory; the new parameters have no gradient anyway
-        gradient = adc.mean_gradient(self.xyz_gradient_accum, self.denom)
+        gradient = rules.mean_gradient(self.xyz_gradient_accum, self.denom)
         if max_splats > 0:
-            gradient = adc.limit_growth(gradient, max_grad, max_splats - len(self))
+            gradient = rules.limit_growth(gradient, max_grad, max_splats - len(self))
         self.densify_and_clone(gradient, max_grad, extent)
         self.densify_and_split(gradient, max_grad, extent, seed=seed, iteration=iteration)
-        remove = adc.is_useless(self._opacity, min_opacity)
+        remove = rules.is_useless(self._opacity, min_opacity)
         if max_screen_size:
             # Appending has just zeroed max_radii2D, so the first test never fires, as in the reference.
             remove |= self.max_radii2D > max_screen_size
-            remove |= ~adc.is_small(self._scaling, adc.PRUNE_EXTENT * extent)
+            remove |= ~rules.is_small(self._scaling, rules.PRUNE_EXTENT * extent)
         self.prune_points(remove)
 
     def densify_and_clone(self, grads: Tensor, grad_threshold: float, scene_extent: float) -> None:
         """Append an exact copy of each Gaussian with gradient >= threshold and scale <= percent_dense * extent."""
-        small = adc.is_small(self._scaling, self.percent_dense * scene_extent)
+        small = rules.is_small(self._scaling, self.percent_dense * scene_extent)
         chosen = ((grads.reshape(-1) >= grad_threshold) & small).nonzero().reshape(-1)
         self.densification_postfix(*(values.index_select(0, chosen) for values in self.rows().values()))
 
@@ -117,14 +117,14 @@ class AdaptiveGaussians(GaussianParameters):
         grads: (n,) or (n, 1) for the first n Gaussians; those appended since (fresh clones) have gradient 0.
         """
         before = len(self)
-        large = ~adc.is_small(self._scaling, self.percent_dense * scene_extent)
+        large = ~rules.is_small(self._scaling, self.percent_dense * scene_extent)
         grads = grads.reshape(-1)
         large[len(grads) :] = False
         large[: len(grads)] &= grads >= grad_threshold
         parents = large.nonzero().reshape(-1)
         rows = {name: values.index_select(0, parents) for name, values in self.rows().items()}
         children = [
-            adc.split_children(
+            rules.split_children(
                 rows["xyz"], rows["scaling"], rows["rotation"], parents, child, seed=seed, iteration=iteration
             )
             for child in range(N)
@@ -159,5 +159,5 @@ class AdaptiveGaussians(GaussianParameters):
 
     def reset_opacity(self) -> None:
         """Lower every opacity to at most 0.01; its Adam moments restart at zero."""
-        lowered = self._opacity.detach().clamp_max(adc.logit(adc.RESET_OPACITY))
+        lowered = self._opacity.detach().clamp_max(rules.logit(rules.RESET_OPACITY))
         self._opacity = self.optimizer.reset("opacity", lowered)

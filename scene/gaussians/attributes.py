@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 from torch import Tensor
 
-from scene.gaussians.density import logit
+from scene.gaussians.density_rules import logit
 
 Rows = dict[str, Tensor]  # raw values (N, *shape), float32, by optimiser group
 INITIAL_OPACITY = 0.1

@@ -9,8 +9,8 @@ import numpy as np
 from scene.pictures.find import find_pictures
 from scene.pictures.masks import NO_MASKS, MaskOptions, find_masks
 from scene.readers import colmap_model
+from scene.readers.info import SceneInfo, scene_extent, split_by_order
 from scene.readers.point_cloud import check_finite, read_point_cloud
-from scene.readers.records import SceneInfo, scene_extent, split_by_order
 from scene.readers.source_views import SourceView, make_cameras
 from scene.readers.start_cloud import OWN_POINTS, StartCloud, StartOptions, choose_start, random_in_frusta
 from utils.graphics_utils import BasicPointCloud

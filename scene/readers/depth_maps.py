@@ -15,7 +15,7 @@ from torch import Tensor
 
 from scene.pictures.decode import picture_size
 from scene.readers import colmap_model
-from scene.readers.records import CameraInfo, SceneInfo
+from scene.readers.info import CameraInfo, SceneInfo
 from utils.files.image_files import UNREADABLE
 from utils.files.listing import some
 from utils.host.cache_folder import cache_folder

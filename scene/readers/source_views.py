@@ -11,7 +11,7 @@ from scene.pictures.decode import picture_size
 from scene.pictures.lens import Lens, Pinhole, pinhole_of
 from scene.pictures.masks import Mask
 from scene.pictures.undistortion import Photo, undistort
-from scene.readers.records import CameraInfo
+from scene.readers.info import CameraInfo
 from utils.system_utils import UserError
 
 

@@ -6,8 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from scene.readers.info import CameraInfo, scene_extent
 from scene.readers.point_cloud import is_ply, read_point_cloud
-from scene.readers.records import CameraInfo, scene_extent
 from utils.graphics_utils import BasicPointCloud
 from utils.system_utils import UserError
 

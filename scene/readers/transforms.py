@@ -10,8 +10,8 @@ import numpy as np
 from scene.pictures.decode import picture_size
 from scene.pictures.find import find_pictures
 from scene.pictures.masks import NO_MASKS, Mask, MaskOptions, find_masks
+from scene.readers.info import CameraInfo, SceneInfo, scene_extent, split_by_order
 from scene.readers.point_cloud import read_point_cloud
-from scene.readers.records import CameraInfo, SceneInfo, scene_extent, split_by_order
 from scene.readers.source_views import SourceView, make_cameras
 from scene.readers.start_cloud import (
     OWN_POINTS,

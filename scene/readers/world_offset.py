@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from scene.readers.records import CameraInfo, SceneInfo, scene_extent
+from scene.readers.info import CameraInfo, SceneInfo, scene_extent
 from utils.graphics_utils import BasicPointCloud
 
 # Extents from the origin. There a step of float32 is a hundred-thousandth of the extent, many times the moves of

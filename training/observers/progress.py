@@ -2,9 +2,9 @@
 
 from tqdm import tqdm
 
+from training.loss_watch import LossWatch
 from training.objective import Losses
 from training.observer import Error, Observer
-from training.observers.losses import LossWatch
 from training.run import Run
 from training.step import Step
 

@@ -6,11 +6,11 @@ from pathlib import Path
 from tqdm import tqdm
 
 from scene.gaussians.checkpoint import save_checkpoint
+from training.last_save import save_last
 from training.left_out import LeftOut, lines
 from training.objective import Losses
 from training.observer import Error, Observer
 from training.observers.divergence import DivergenceWatch
-from training.observers.last_save import save_last
 from training.run import Run
 from training.step import Step
 

@@ -14,7 +14,7 @@ from training.run import Run
 
 
 def standard_observers(run: Run, writer: Any | None) -> list[Observer]:
-    """All that a training tells of its moments. writer: TensorBoard's, or None."""
+    """The observers of every training. writer: TensorBoard's, or None."""
     with_curve = run.plan.record_curve and bool(run.scene.getTestCameras())
     test_in_memory = with_curve or run.opt.iterations in run.plan.test
     watch = DivergenceWatch(run)
