@@ -1,16 +1,12 @@
 """The loss of a render: photometric, and inverse depth where a depth map supervises. Further terms belong here."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING, NamedTuple
+import argparse
+from typing import NamedTuple
 
 from torch import Tensor
 
 from training.step import Step
 from utils.loss_utils import inverse_depth_loss, photometric_loss
-
-if TYPE_CHECKING:
-    from training.run import Run
 
 
 class Losses(NamedTuple):
@@ -23,19 +19,16 @@ class Losses(NamedTuple):
 
 
 class Objective:
-    """`(1 - lambda_dssim) L1 + lambda_dssim (1 - SSIM)` (Kerbl et al. 2023, Eq. 7), and the weighted depth loss.
+    """`(1 - lambda_dssim) L1 + lambda_dssim (1 - SSIM)` (Kerbl et al. 2023, Eq. 7), and the weighted depth loss."""
 
-    run: has options, model and pipeline, for terms that need another render or the Gaussians themselves.
-    """
-
-    def __init__(self, run: Run) -> None:
-        self._run = run
+    def __init__(self, opt: argparse.Namespace) -> None:
+        self._lambda_dssim = opt.lambda_dssim
 
     def __call__(self, package: dict[str, Tensor], step: Step) -> Losses:
         """package: of `render`, with `depth` where step.depth_weight is above 0."""
         camera = step.camera
         target, mask = camera.ground_truth(step.background)
-        total, l1 = photometric_loss(package["render"], target, self._run.opt.lambda_dssim, mask, camera.columns)
+        total, l1 = photometric_loss(package["render"], target, self._lambda_dssim, mask, camera.columns)
         depth = None
         if step.depth_weight > 0:
             error = inverse_depth_loss(package["depth"], camera.invdepthmap, camera.columns, mask)
