@@ -116,7 +116,7 @@ def _read(file: Path) -> np.ndarray:
 
 
 def trained_with_eval(model: Path) -> bool | None:
-    """Whether the model was trained with a held-out test set; None if cfg_args does not tell."""
+    """Whether the model was trained with a held-out test set; None if cfg_args does not say."""
     if not (model / "cfg_args").is_file():
         return None
     stored = read_cfg_args(model).get("eval")
@@ -157,7 +157,7 @@ def _lpips_metric(distance: PerceptualDistance, unit_range: bool, device: torch.
 def make_metrics(lpips_net: str, weights: list[Path], smallest_side: int) -> dict[str, Metric]:
     """Make the metrics by key, in the order of the files.
 
-    smallest_side: smallest side of all images, in pixels. A backbone that is not available prints a line, and its
+    smallest_side: smallest side of all images, in pixels. If a backbone is not available, a line says so and its
     metrics return None.
     """
     keys = ["SSIM", "PSNR", "LPIPS"] + [f"LPIPS_{net}" for net in ("vgg", "alex") if lpips_net in (net, "both")]

@@ -1,10 +1,10 @@
-"""Render a trained model's train and test views as PNG, with the ground truth beside, and time it.
+"""Render a trained model's train and test views as PNG beside the ground truth, and time the renders.
 
 python render.py -m MODEL [--iteration N] [--skip_train] [--skip_test]
 
 Writes MODEL/{train,test}/ours_N/{renders,gt}/00000.png ..., numbered by the views' sorted order, masks/ for views of
 which not every pixel counts, and render_times.json beside these folders: the time of each view without I/O. The device
-is idle before a view and has finished after it.
+is idle before the clock starts, and done when it stops.
 """
 
 from __future__ import annotations
@@ -125,7 +125,7 @@ def main() -> None:
         if skip:
             continue
         folder = Path(scene.model_path) / name / f"ours_{scene.loaded_iter}"
-        (folder / render_times.NAME).unlink(missing_ok=True)  # those of an interrupted run do not count
+        (folder / render_times.NAME).unlink(missing_ok=True)  # times of an interrupted run do not count
         with memory_errors_explained(gaussians, views):
             seconds = render_set(folder, views, gaussians, pipe, background, options.train_test_exp)
         if seconds:

@@ -53,7 +53,7 @@ def training(
     # Write nothing before every input check has passed: a mistyped option must not overwrite a finished model.
     writer = prepare_output_and_logger(dataset, **run.kept)
     run.begin()
-    run_training(run, standard_observers(run, writer))
+    run_training(run, standard_observers(run, writer, training_report))
 
 
 def _new_output_folder() -> str:
@@ -64,7 +64,7 @@ def _new_output_folder() -> str:
 def prepare_output_and_logger(args: argparse.Namespace, **kept: Any) -> Any | None:
     """Make the output folder, args.model_path, with cfg_args and model.json (kept: as write_model_json takes it).
 
-    Returns a TensorBoard writer, or None where TensorBoard is not installed.
+    Returns a TensorBoard writer, or None if TensorBoard is not installed.
     """
     print(f"Output folder: {args.model_path}")
     mkdir_p(args.model_path)
@@ -100,7 +100,7 @@ def _parser() -> tuple[argparse.ArgumentParser, ModelParams, OptimizationParams,
 
 
 def parse(argv: Sequence[str] | None = None) -> tuple[argparse.Namespace, ...]:
-    """The command line as a whole, and its model, optimisation and pipeline options.
+    """Parse the command line: all options, and those of the groups model, optimisation and pipeline.
 
     UserError for a value out of range; argparse ends the program at a word that it does not know.
     """
@@ -110,7 +110,7 @@ def parse(argv: Sequence[str] | None = None) -> tuple[argparse.Namespace, ...]:
     for name in ("test_iterations", "save_iterations", "checkpoint_iterations"):
         wrong = [t for t in getattr(args, name) if t < 1 and t != -1]
         if wrong:
-            raise UserError(f"--{name} counts from 1, or is -1 for none, got {wrong[0]}")
+            raise UserError(f"--{name} takes iterations from 1 on, or -1 for none, got {wrong[0]}")
     return args, *options
 
 

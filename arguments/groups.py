@@ -258,7 +258,7 @@ class OptimizationParams(ParamGroup):
         Option(
             "max_num_splats",
             0,
-            "largest number of Gaussians, 0: no limit; near it, densification takes those with the largest gradients",
+            "largest number of Gaussians, 0: no limit; near it, only those with the largest gradients are densified",
             "ours",
             check=at_least(0),
         ),

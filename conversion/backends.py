@@ -87,7 +87,7 @@ class Pycolmap:
 
 
 class Program:
-    """A COLMAP program. Its own help tells, before any step runs, the names of options that differ between versions.
+    """A COLMAP program. Before any step runs, its own help gives the names of options that differ between versions.
 
     UserError if it cannot be run, is not COLMAP, or lacks a command that the settings need.
     """

@@ -25,7 +25,7 @@ def prepare_photos(layout: Layout, names: Sequence[str], masks: Path | None) -> 
     """Fill `layout.photos`, and `layout.masks` if a folder of masks is given.
 
     A photo is linked, or copied if links are impossible. A photo that its EXIF orientation turns, or whose format
-    COLMAP cannot read, is written anew, with upright pixels and the other EXIF data kept. Masks: see `_prepare_mask`.
+    COLMAP cannot read, is rewritten, with upright pixels and the other EXIF data kept. Masks: see `_prepare_mask`.
     `check_photos` must have passed before; UserError for files whose pixels turn out to be broken.
     """
     with_mask = find_masks(names, masks) if masks else {}

@@ -68,7 +68,7 @@ def advice(
     if others:
         sizes = ", ".join(map(str, others))
         lines.append(
-            f"the photos form {len(others) + 1} parts without connection ({len(chosen.registered)} photos are used, "
+            f"the photos form {len(others) + 1} unconnected parts ({len(chosen.registered)} photos are used, "
             f"the other parts have {sizes}); take photos that lead from one part to the next, or try --mapper global"
         )
     if chosen.points < FEWEST_POINTS:

@@ -18,7 +18,7 @@ _STEP = 4  # sharpness is computed on every 4th row and column
 def extract_frames(video: Path, folder: Path, count: int) -> None:
     """Write at most `count` upright frames into `folder` as frame_00001.jpg, ...; UserError if that fails.
 
-    Reads every frame, and keeps that of each span whose neighbouring pixels differ most, since parts of hand-held
+    Reads every frame, and keeps the one in each span whose neighbouring pixels differ most, since parts of hand-held
     videos are blurred.
     """
     decoder = _decoder()

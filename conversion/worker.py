@@ -1,4 +1,4 @@
-"""pycolmap's long steps in a process of their own: `python worker.py JOB.json`, the job an object {"step": ..., ...}.
+"""pycolmap's long steps in their own process: `python worker.py JOB.json`, a file with {"step": ..., ...}.
 
 In another process, steps can be stopped at once, log to a file, and do not crash the caller when they crash. The worker
 ends when its standard input closes, so it does not outlive a caller that was killed. It imports nothing of the project,

@@ -108,7 +108,7 @@ def check_cloud(info: SceneInfo) -> list[Line]:
     lines = [Line(f"{len(points)} points to start from")]
     if len(points) < FEWEST_POINTS:
         more = "start from more points (--init_pcd_path), or reconstruct with more photos or features"
-        lines = [Line(f"only {len(points)} points to start from, {FEWEST_POINTS} or more are good", more)]
+        lines = [Line(f"only {len(points)} points to start from; {FEWEST_POINTS} or more are good", more)]
     if not len(points):
         return lines
     centers = np.array([camera.center for camera in info.train_cameras])

@@ -110,7 +110,7 @@ def _check_extension(name: str, package: str, torch_version: str) -> list[Line]:
         1
     ]
     if installed != wanted:
-        return [Line(f"the extension {name} is version {installed}, this code is {wanted}", again)]
+        return [Line(f"the extension {name} is version {installed}, but this code is {wanted}", again)]
     try:
         module = importlib.import_module(package)
     except ImportError as error:

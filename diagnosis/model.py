@@ -55,7 +55,7 @@ def check_model(model_path: str, iteration: int) -> list[Line]:
 
 
 def _load(model_path: str, stored: dict[str, Any], iteration: int) -> tuple[argparse.Namespace, Scene]:
-    # Small images tell black from bad; no decimals are needed.
+    # Small images are enough to tell black renders from bad ones.
     given = {**stored, "model_path": model_path, "resolution": _WIDTH, "images_to_load": 1}
     given.pop("depths", None)
     options = ModelParams(argparse.ArgumentParser()).extract(argparse.Namespace(**given))
@@ -170,7 +170,7 @@ def _why_black(scene: Scene, cameras: list[Camera], coverage: float, drawn: floa
     if coverage < 0.1 or float(gaussians.get_opacity.detach().median()) < FAINT:
         return Line(
             f"{text}the Gaussians are almost transparent",
-            "train on, since opacities are reset every 3000 iterations; else lower --opacity_lr, and check the poses",
+            "train longer, since opacities are reset every 3000 iterations, or lower --opacity_lr and check the poses",
         )
     return Line(
         f"{text}the Gaussians themselves are black",

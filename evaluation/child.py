@@ -45,7 +45,7 @@ def run_child(command: Sequence[str]) -> Finished:
     """
     start = time.perf_counter()
     tail = _Tail()
-    # The child gets a session of its own. Else the terminal's Ctrl-C would reach it twice, directly and through us, and
+    # The child gets its own session. Otherwise the terminal's Ctrl-C would reach it twice, directly and through us, and
     # train.py stops at once on the second one.
     with DeferredInterrupt() as interrupt:
         # The child inherits only the folder's lock, which is then kept as long as the child lives.

@@ -25,7 +25,7 @@ def read_configs(path: Path, parse: Parse | None) -> dict[str, tuple[str, ...]]:
     except OSError as error:
         raise UserError(f"cannot read {path} ({error.strerror}); --configs takes a JSON file {_SHAPE}") from error
     except ValueError as error:
-        raise UserError(f"{path} is no table of option sets ({error}); write it {_SHAPE}") from error
+        raise UserError(f"{path} is not a table of option sets ({error}); write it {_SHAPE}") from error
     if not isinstance(content, dict) or not content:
         raise UserError(f"{path} names no option sets; write it {_SHAPE}")
     configs = {}

@@ -126,7 +126,7 @@ def _results(report: Mapping[str, Any]) -> Section:
         )
     if rows and all(row["LPIPS"]["mean"] is None for row in rows):
         blocks.append(
-            "LPIPS is missing: metrics.py found no weights of its network. Its message tells where to put them."
+            "LPIPS is missing: metrics.py found no weights of its network, and its message says where to put them."
         )
     if unfinished := [run_title(run) for run in report["runs"] if not run["finished"] and not run["failure"]]:
         blocks.append(f"Not finished: {'; '.join(unfinished)}.")
@@ -190,7 +190,7 @@ def _cheapest(report: Mapping[str, Any]) -> list[Section]:
     if not blocks:
         return []
     blocks.append(
-        "For each test PSNR, the option set that reaches it in the fewest seconds of training, and the one with the "
+        "Each row has the option set that reaches its test PSNR in the fewest seconds of training and the one with the "
         "fewest Gaussians at that PSNR or better. Both come from the curves: scores during training, on unrounded "
         "images. Between two points, PSNR is taken as linear in the logarithm of time. With several seeds, all must "
         "reach the PSNR, and their mean counts."

@@ -101,7 +101,7 @@ def _what_counts(method: Path, side: str, name: str) -> Image.Image:
 def draw_worst_views(path: Path, run: dict[str, Any], output: Path) -> bool:
     """Draw a run's worst test views with ground truth, render and amplified error; return False if it has none.
 
-    Pixels that do not count are white, and black in the error.
+    Pixels that do not count are white in the images and black in the error.
     """
     folder = output / run["model"] / "test" / f"ours_{run['final_iteration']}"
     if not run["worst_views"]:

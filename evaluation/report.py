@@ -18,7 +18,7 @@ from utils.files.json_files import write_json
 from utils.system_utils import UserError, atomic_write
 
 TITLE = "3D Gaussian Splatting: evaluation"
-RESIZE_FILTER = "Pillow, bicubic, antialiased when it shrinks; 8-bit images"
+RESIZE_FILTER = "Pillow, bicubic, antialiased where it shrinks; 8-bit pictures"
 
 
 def make_report(command: Sequence[str], runs: Sequence[dict[str, Any]]) -> dict[str, Any]:
@@ -69,7 +69,7 @@ def _warnings(runs: Sequence[dict[str, Any]], rows: Sequence[dict[str, Any]]) ->
             lines.append(f"Trained with different {name}: {', '.join(sorted(values))}.")
     for row in rows:
         if row["failed_seeds"]:
-            lines.append(f"{row['scene']} {row['config'] or ''}: without the failed seeds {row['failed_seeds']}.")
+            lines.append(f"{row['scene']} {row['config'] or ''}: means without failed seeds {row['failed_seeds']}.")
     return lines
 
 

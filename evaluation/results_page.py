@@ -63,7 +63,7 @@ def _is_option(word: str) -> bool:
 def replace_results(page: str, reports: Sequence[Mapping[str, Any]]) -> str:
     """`page` with new text between BEGIN and END.
 
-    UserError where the two markers are not there once each, in this order.
+    UserError unless each marker is there once, in this order.
     """
     if page.count(BEGIN) != 1 or page.count(END) != 1 or page.index(BEGIN) > page.index(END):
         raise UserError(
@@ -80,7 +80,7 @@ def _read(path: Path) -> dict[str, Any]:
         if not report["summary"] or not report["runs"]:
             raise ValueError("nothing was scored")
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise UserError(f"{path} is no report with results ({error}); give the report.json of full_eval.py") from error
+        raise UserError(f"{path} is not a scored report ({error}); give the report.json of full_eval.py") from error
     return report
 
 

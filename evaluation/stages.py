@@ -38,7 +38,7 @@ class StageFailed(Exception):
 
 
 def train(run: Run, machine: dict[str, Any]) -> None:
-    """Train, unless that is finished. Resume only from a checkpoint that an interrupt left.
+    """Train, unless the training is finished. Resume only from a checkpoint that an interrupt left.
 
     A checkpoint of a training that failed may hold half a densification, and would fail again with the same options, so
     training then starts from the beginning. `runs.check_folders` has made sure that nothing in the model folder was

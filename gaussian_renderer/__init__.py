@@ -36,7 +36,7 @@ def render(
     the view's photo, before the clamp; a view without a photo has none.
 
     Returns
-    `render` (3, H, W), clamped to [0, 1] so that values outside get no gradient; unclamped without clamp;
+    `render` (3, H, W), clamped to [0, 1] so that values outside get no gradient; unclamped if clamp is False;
     `viewspace_points` (N, 3), whose gradient is that of the screen means, per NDC unit;
     `visibility_filter` (n, 1) int64 indices of the Gaussians with radius > 0, or None without want_visibility, which
     saves waiting for a GPU; `radii` (N,) int32 pixels; `depth` inverse depth (1, H, W), or None unless want_depth.

@@ -14,10 +14,10 @@ from utils.loss_utils import l1_and_ssim
 
 
 class ScoredViews:
-    """Renders of views beside what they should be, as they are scored.
+    """Renders of views and their targets, as they are scored.
 
-    By the half-image protocol (train_test_exp) the right halves alone count, rendered with exposures.
-    draw: gives the whole render (3, H, W) in [0, 1] of camera and model; None: by `render`.
+    By the half-image protocol (train_test_exp), only right halves count, and they are rendered with exposures.
+    draw: renders a camera and a model to (3, H, W) in [0, 1]; None: `render` does.
     """
 
     def __init__(
@@ -37,28 +37,28 @@ class ScoredViews:
         return render(camera, gaussians, self._pipe, self._background, **exposed, want_visibility=False)["render"]
 
     def whole(self, camera: Camera, gaussians: GaussianModel) -> Tensor:
-        """Render (3, H, W) float32 in [0, 1] before it is cut to what counts (`part`)."""
+        """The whole render (3, H, W), float32 in [0, 1], before `part` cuts it."""
         return self._draw(camera, gaussians)
 
     def part(self, image: Tensor) -> Tensor:
-        """What is scored of an image (C, H, W): all of it, or its right half."""
+        """The scored part of an image (C, H, W): all of it, or its right half."""
         return right_half(image).contiguous() if self._halves else image
 
     def image(self, camera: Camera, gaussians: GaussianModel) -> Tensor:
-        """What is scored of the render, (3, H, W) float32 in [0, 1]."""
+        """The scored part of the render, (3, H, W) float32 in [0, 1]."""
         return self.part(self.whole(camera, gaussians))
 
     def target(self, camera: Camera) -> Tensor:
-        """What the render should be, as `Camera.target`."""
+        """The scored part of `Camera.target`, which the render should equal."""
         return self.part(camera.target(self._background))
 
     def mask(self, camera: Camera) -> Tensor | None:
-        """Pixels that count, (1, H, W) bool; None where all do."""
+        """Pixels that count, (1, H, W) bool; None if all do."""
         mask = camera.mask
         return None if mask is None else self.part(mask)
 
     def load(self, camera: Camera) -> None:
-        """Decode the photo and the mask, so that a scoring which is timed does not."""
+        """Decode the photo and the mask, so that a timed scoring does not have to."""
         self.target(camera)
         self.mask(camera)
 
@@ -74,9 +74,9 @@ class ScoredViews:
 def mean_scores(compared: Iterable[tuple[Tensor, Tensor, Tensor | None]]) -> dict[str, float]:
     """`l1`, `psnr` (dB) and `ssim` of (render, target, mask), each the mean over these; {} without any.
 
-    mask: (1, H, W) bool, the pixels that count, or None (utils/loss_utils.py); without one that counts it is left out.
+    mask: (1, H, W) bool, the pixels that count, or None (utils/loss_utils.py); a view in which none counts is left out.
     render: (3, H, W) float32 in [0, 1]; target: the same, or uint8 meaning value / 255. PSNR is from one mean squared
-    error over pixels and channels of a pair, infinite where both are equal. metrics.py scores the same views from 8-bit
+    error over pixels and channels of a pair, infinite if both are equal. metrics.py scores the same views from 8-bit
     PNGs, with rounded renders; the training report takes the mean of the three channels' PSNRs. Without masks it waits
     for a GPU once.
     """

@@ -22,12 +22,12 @@ class Trimmed:
 
     gaussians: GaussianModel
     unseen: int  # Gaussians left out
-    cut_bounds: list[float]  # by degree: most that a colour moves if all SH bands above the degree are cut
+    cut_bounds: list[float]  # by degree: bound on a colour's change if all SH bands above the degree are cut
     seconds: float  # that the search took
 
 
 def decisive_for_any(cameras: Sequence[Camera], gaussians: GaussianModel, pipe: argparse.Namespace) -> Tensor:
-    """(N,) bool: the Gaussians that the image of any of the cameras, at its size, depends on; all where none is."""
+    """(N,) bool: the Gaussians that the image of any camera, at its size, depends on; all if there is none."""
     found = torch.zeros(len(gaussians), dtype=torch.bool, device=gaussians.get_xyz.device)
     for camera in tqdm(cameras, desc="Looking for unseen Gaussians", unit="view", leave=False):
         found |= decisive_for(camera, gaussians, pipe)
@@ -39,7 +39,7 @@ def trim(
 ) -> Trimmed:
     """Leave out what the training views `cameras` do not need. `gaussians` itself does not change.
 
-    keep_unseen: leave no Gaussian out. prune_sh: most that a colour (in [0, 1]) may move when SH bands are cut; -1 cuts
+    keep_unseen: leave no Gaussian out. prune_sh: by how much cut SH bands may change a colour (in [0, 1]); -1 cuts
     none. Unless bands are cut, the renders of `cameras` keep every bit.
     """
     start = time.perf_counter()
@@ -61,7 +61,7 @@ def change_on_views(
     views: ScoredViews,
     scored: bool,
 ) -> dict[str, float]:
-    """Difference of what two models render: `largest`, of a value in [0, 1].
+    """Difference between the renders of two models: `largest`, of a value in [0, 1].
 
     scored: also `psnr_before` and `psnr_after`, dB.
     """

@@ -15,7 +15,7 @@ def schedules_follow_length(depths: bool, train_test_exp: bool) -> bool:
 def peak_advice(
     rows: list[Row], saved: Container[int], position_lr_max_steps: int, follows_length: bool = False
 ) -> str | None:
-    """A line that names the iteration with the lowest test error; None unless that was clearly before the last row.
+    """A line that names the iteration with the best test views; None unless they were clearly worse in the last row.
 
     saved: iterations whose PLY this training has written. follows_length: `schedules_follow_length`.
 
@@ -37,13 +37,13 @@ def peak_advice(
     if iteration in saved:
         line += f"; that model is saved, use it with render.py --iteration {iteration}"
     elif follows_length:
-        line += f"; --save_iterations {iteration} keeps that model on the way"
+        line += f"; --save_iterations {iteration} saves that model during the training"
     else:
-        line += f"; --iterations {iteration} ends with that model, --save_iterations {iteration} keeps it on the way"
+        line += f"; --iterations {iteration} ends with that model, --save_iterations {iteration} also saves it"
     if iteration < position_lr_max_steps:
         length = f"--iterations {iteration} " if follows_length else ""
         line += (
-            f"; {length}--position_lr_max_steps {iteration} {'' if follows_length else 'beside that '}is another "
-            f"training, whose learning rate of positions falls by then instead of by {position_lr_max_steps}"
+            f"; {length}--position_lr_max_steps {iteration} {'' if follows_length else 'as well '}is a different "
+            f"training: its learning rate of positions falls by then instead of by {position_lr_max_steps}"
         )
     return line

@@ -69,7 +69,7 @@ class CurveRecorder:
 
     def add(self, iteration: int, seconds: float, gaussians: int) -> None:
         """Score after `seconds` of training in this run, and write the curve with the new point."""
-        # Both, because after a rescue the curve has rows beyond the log's last record.
+        # The peaks of log and curve, because after a rescue the curve has rows beyond the log's last record.
         peaks = [self._log.peak_memory_mib(), *(row["peak_memory_mib"] for row in self.rows[-1:])]
         row = dict.fromkeys(COLUMNS) | {
             "iteration": iteration,

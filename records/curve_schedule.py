@@ -4,19 +4,19 @@ from collections.abc import Iterable
 
 PER_OCTAVE = 4  # points while the number of iterations doubles
 OCTAVES = 8  # before the last iteration: the first point lies at 1/256 of the training
-SHARE = 0.04  # of the training's seconds go to scoring: costs are predicted, and 0.05 is promised
+SHARE = 0.04  # of the training's seconds that scoring may take; 0.05 is promised, and predicted costs may be too low
 VIEW_COST = 0.5  # of scoring a view, in iterations, until it is measured: it takes no gradient and no step
 
 
 class CurveSchedule:
-    """Points evenly spaced in the logarithm of the iteration, as many as scoring may cost.
+    """Points evenly spaced in the logarithm of the iteration, as many as the budget for scoring allows.
 
     The points are a fixed grid that ends with the last iteration, so that runs of one length share theirs. If scoring
-    all would take too long, every second, fourth, ... point is scored. Each point decides from the seconds measured so
-    far: the cost of the last scoring, and the length of the training at the pace since the point before. A pace may
+    all would take too long, every second, fourth, ... point is scored. Each decision uses the seconds measured so
+    far: the cost of the last scoring, and the length of the training at the pace since the previous point. A pace may
     mislead: a training from 100,000 random Gaussians soon has a third of them. So a part of the grid may spend no more
-    than the same part of the budget. The iterations in `always` and the last one are scored at any cost, which is
-    reserved.
+    than the same part of the budget. The iterations in `always` and the last one are scored at any cost; the budget
+    reserves it.
     """
 
     def __init__(self, first_iteration: int, iterations: int, always: Iterable[int], views: int) -> None:
@@ -41,7 +41,7 @@ class CurveSchedule:
         if iteration in self._always:
             return True
         place = self._places[iteration]
-        # The first scoring also warms up. Taken as a measure, a slow one would end the curve.
+        # The first scoring includes warm-up. If a slow one counted as the cost, the curve would end with it.
         cost = self._costs[-1] if len(self._costs) > 1 else VIEW_COST * self._views * pace
         budget = SHARE * (seconds + pace * (self._iterations - iteration))
         if self.spent + cost > budget * (1 - place / (PER_OCTAVE * OCTAVES + 1)):

@@ -30,7 +30,7 @@ def read_curve(path: str | os.PathLike) -> list[Row]:
         with open(path, encoding="utf-8", newline="") as file:
             lines = list(csv.reader(file, strict=True))
         if not lines or lines[0] != list(COLUMNS):
-            raise ValueError("its columns are others")
+            raise ValueError("its columns are different")
         rows = [_row(line) for line in lines[1:]]
         iterations = [row["iteration"] for row in rows]
         if iterations != sorted(set(iterations)):
@@ -69,14 +69,14 @@ def continue_curve(
 ) -> list[Row]:
     """Rows of the curve in a model folder up to `first_iteration`, where a run resumes (0: it starts anew).
 
-    Later rows belong to another training and are removed, and so is the figure; without rows, the file is. A damaged
+    Later rows belong to another training and are removed, with the figure. A file without rows is removed. A damaged
     file is removed with a warning, since it is no reason to stop a training. before: the folder of the run that is
     resumed, if it is another one; nothing changes there.
     """
     path = Path(model_path) / NAME
     source = path if before is None else Path(before) / NAME
     rows = []
-    with contextlib.suppress(OSError, UserError):  # a file that cannot be removed is warned of when it is written
+    with contextlib.suppress(OSError, UserError):  # if a file cannot be removed, writing it later will warn
         (path.parent / FIGURE).unlink(missing_ok=True)
         if first_iteration and source.exists():
             try:

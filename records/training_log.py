@@ -65,7 +65,7 @@ class TrainingLog:
         self._peak_before: float | None = last.get("peak_memory_mib")
 
     def not_before(self, row: dict[str, float | None]) -> None:
-        """Continue counting from a row of the runs before (`seconds`, `wall_seconds`) if it is later than their log."""
+        """Continue counting from a row of the earlier runs' curve if it is later than their log."""
         self.seconds_before = max(self.seconds_before, row["seconds"])
         self.wall_seconds_before = max(self.wall_seconds_before, row["wall_seconds"] or 0.0)
 
@@ -92,7 +92,8 @@ class TrainingLog:
             "wall_seconds": round(self.wall_seconds_before + wall_seconds(), 3),
         }
         if self.records and self.records[-1]["iteration"] == iteration:
-            record = self.records.pop() | record
+            before = self.records.pop()
+            record = before | record | {"seconds": max(before["seconds"], record["seconds"])}
         self.records.append(record)
         write_json(self._path, self.records)
 

@@ -6,7 +6,7 @@ gaussian_model               GaussianModel, built of the modules in gaussians/
 gaussians/                   parameters of the Gaussians: start, optimiser, density control, exposures, PLY, checkpoint
 dataset_readers, readers/    a folder's dataset as plain records: COLMAP, Blender, nerfstudio; points, depth maps
 pictures/                    image files: finding, lenses, masks, decoding, keeping
-saved_iterations, saved_model  what a model folder holds, and loading it with its scene
+saved_iterations, saved_model  the saves in a model folder, and loading one with its scene
 export_world                 a command: a model in the world's coordinates
 
 gaussians/ and pictures/ import nothing else from here, readers/ only pictures/. The names below are imported on first
@@ -22,10 +22,26 @@ if TYPE_CHECKING:
 
 __all__ = ["GaussianModel", "Scene", "SceneGaussians"]
 
-_HOMES = {"GaussianModel": "scene.gaussian_model", "Scene": "scene.scene", "SceneGaussians": "scene.scene"}
+_HOMES = {
+    "GaussianModel": "scene.gaussian_model",
+    "Scene": "scene.scene",
+    "SceneGaussians": "scene.scene",
+    "cameraList_from_camInfos": "scene.cameras",
+    "camera_to_JSON": "scene.cameras",
+    "find_iteration": "scene.saved_iterations",
+    "saved_ply": "scene.saved_iterations",
+    "searchForMaxIteration": "utils.system_utils",
+}
+_MODULES = ("cameras", "colmap_loader", "dataset_readers", "gaussian_model")
 
 
 def __getattr__(name: str) -> object:
+    if name in _MODULES:
+        return import_module(f"scene.{name}")
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(import_module(_HOMES[name]), name)
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *_HOMES, *_MODULES])

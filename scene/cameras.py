@@ -16,7 +16,7 @@ from scene.pictures.store import ImageStore, Picture, Source
 from scene.readers.info import CameraInfo
 from utils.graphics_utils import getProjectionMatrix, getWorld2View2
 
-ZNEAR = 0.01  # both only shape the clip depth and cull nothing
+ZNEAR = 0.01  # ZNEAR and ZFAR only shape the clip depth and cull nothing
 ZFAR = 100.0
 
 

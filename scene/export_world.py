@@ -2,7 +2,7 @@
 
 python -m scene.export_world MODEL OUT.ply [--iteration N]
 
-For scenes whose coordinates are large against their extent, which are trained in a local frame
+Meant for scenes whose coordinates are much larger than their extent: they are trained in a local frame
 (scene/readers/world_offset.py). CloudCompare and plyfile read the doubles; programs that read x, y, z as float lose the
 decimals again.
 """

@@ -25,7 +25,7 @@ _OPTIMIZERS = {"default": GaussianAdam, "sparse_adam": SparseGaussianAdam}
 class GaussianModel(AdaptiveGaussians):
     """Gaussians as they are trained, with the reference's names.
 
-    The parameters and their activated forms are GaussianParameters', density control is AdaptiveGaussians'.
+    GaussianParameters has the parameters and their activated forms, AdaptiveGaussians has density control.
     optimizer_type: "default" or "sparse_adam", whose step takes a mask of the visible Gaussians. exposures: of the
     training photos, identities unless trained. spatial_lr_scale: extent of the scene, world units.
     """
@@ -120,19 +120,19 @@ class GaussianModel(AdaptiveGaussians):
         self.optimizer.guard = self.exposures.optimizer.guard = guard
 
     def check_steps(self) -> None:
-        """UserError when a guard has held steps back, so that the model is older than its iteration says."""
+        """UserError if a guard has held steps back, so that the model is older than its iteration number."""
         if self.optimizer.guard and (iteration := self.optimizer.guard.stopped_in()):
             raise UserError(f"the loss or a step of iteration {iteration} was not finite; lower the learning rates")
 
     def take_marks(self) -> list[tuple[str, list[int] | list[str], int]]:
-        """Values that a guard kept from their step: name of the tensor, its rows or photos, and number of all rows."""
+        """Values whose step a guard held back: name of the tensor, its rows or photos, and number of all rows."""
         marks = [(name, rows.tolist(), len(self)) for name, rows in self.optimizer.take_marks().items()]
         for name, rows in self.exposures.optimizer.take_marks().items():
             marks.append((name, [self.exposures.names[row] for row in rows.tolist()], len(self.exposures.names)))
         return marks
 
     def rewind(self, steps: int) -> None:
-        """Take back the counts of steps that a guard held back."""
+        """Reduce the step counters by the steps that a guard held back."""
         self.optimizer.rewind(steps)
         self.exposures.optimizer.rewind(steps)
 
@@ -180,6 +180,6 @@ class GaussianModel(AdaptiveGaussians):
 
     def check_finite(self, iteration: int) -> None:
         """UserError for a parameter that is not finite; call it before anything of this iteration is saved."""
-        remedy = "nothing of it was saved; lower the learning rates, or resume from an earlier checkpoint"
+        remedy = "nothing of this iteration was saved; lower the learning rates, or resume from an earlier checkpoint"
         check_finite(self.rows(), f"iteration {iteration}", remedy)
         self.exposures.check_finite(f"iteration {iteration}", remedy)

@@ -94,7 +94,7 @@ def test_extensions_that_do_not_fit(monkeypatch, tmp_path):
     (package / "ops.py").write_text("changed")
     assert "installed from other sources than these (ops.py) -> run `pip install ./submodules/simple-knn`" in check()[0]
     (tmp_path / "submodules" / "common" / "build_extension.py").write_text('VERSION = "0.2.0"\n')
-    assert "is version 0.1.0, this code is 0.2.0" in check()[0]
+    assert "is version 0.1.0, but this code is 0.2.0" in check()[0]
     monkeypatch.setattr(environment, "_version", lambda name: None)
     assert "simple-knn is not installed" in check()[0]
 
@@ -181,7 +181,10 @@ def test_what_readers_say_becomes_a_line(colmap_scene, tmp_path):
     (picture, *_) = sorted((colmap_scene / "images" / "left").iterdir())
     Image.new("RGB", (96, 70)).save(picture)
     first = check_dataset(str(colmap_scene), "images")[0]
-    assert str(first).startswith("note    1 of 17 photos have another aspect ratio") and not first.finding
+    assert (
+        str(first).startswith("note    1 of 17 photos do not have the aspect ratio of their camera")
+        and not first.finding
+    )
     picture.unlink()
     (line,) = check_dataset(str(colmap_scene), "images")
     assert line.finding and "are missing" in line.text and "-i" in line.remedy

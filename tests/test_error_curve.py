@@ -260,8 +260,8 @@ class TestPeak:
         line = peak_advice(list(self.ROWS), {7000}, 30_000)
         assert line == (
             "Test views were best at iteration 2000: PSNR 20.30 dB, 0.70 dB above the end (train views 23.00 there, "
-            "29.00 at the end); --iterations 2000 ends with that model, --save_iterations 2000 keeps it on the way; "
-            "--position_lr_max_steps 2000 beside that is another training, whose learning rate of positions falls by "
+            "29.00 at the end); --iterations 2000 ends with that model, --save_iterations 2000 also saves it; "
+            "--position_lr_max_steps 2000 as well is a different training: its learning rate of positions falls by "
             "then instead of by 30000"
         )
         assert "that model is saved, use it with render.py --iteration 2000" in peak_advice(
@@ -274,7 +274,7 @@ class TestPeak:
         assert schedules_follow_length(depths=False, train_test_exp=True)
         line = peak_advice(list(self.ROWS), {7000}, 30_000, follows_length=True)
         assert "ends with that model" not in line
-        assert "; --save_iterations 2000 keeps that model on the way; --iterations 2000 --position_lr" in line
+        assert "; --save_iterations 2000 saves that model during the training; --iterations 2000 --position_lr" in line
 
     def test_no_peak_no_advice(self):
         assert peak_advice(list(self.ROWS[:2]), (), 30_000) is None

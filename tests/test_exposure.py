@@ -176,7 +176,7 @@ def test_checkpoints_carry_them_behind_the_references_entries(tmp_path):
 def test_exposures_that_do_not_fit_are_refused():
     state = _trained().capture()
     cases = {
-        "exposures of other photos": state | {"names": NAMES[:2]},
+        "exposures are of other photos": state | {"names": NAMES[:2]},
         "3 x 4|float32": state | {"values": state["values"].double()},
         "optimiser state in the checkpoint does not fit": state | {"optimizer": 5},
         "the exposure of .* in the checkpoint is not finite; use another": state
@@ -185,7 +185,7 @@ def test_exposures_that_do_not_fit_are_refused():
     for words, wrong in cases.items():
         with pytest.raises(UserError, match=words):
             _trained(steps=0).restore(wrong)
-    with pytest.raises(UserError, match="exposures of other photos"):
+    with pytest.raises(UserError, match="exposures are of other photos"):
         _trained(["x.png"], steps=0).restore(state)
     Exposures().check_finite("iteration 7", "do this")
     broken = _trained()

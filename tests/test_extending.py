@@ -200,7 +200,7 @@ def test_files_without_temperatures_are_refused(runs):
     said = [line for line in runs.said.splitlines() if line.startswith("refused:")]
     assert len(said) == 2
     assert "lacks the properties temperature" in said[0]
-    assert "has 6 attributes per Gaussian, where this model has 7" in said[1]
+    assert "has 6 attributes per Gaussian, but this model has 7" in said[1]
 
 
 def test_density_control_keeps_rows_aligned(runs):

@@ -436,7 +436,7 @@ def test_refusals(scenes, tmp_path, words, sentence):
 @pytest.mark.parametrize(
     ("text", "sentence"),
     [
-        ("{", "is no table of option sets"),
+        ("{", "is not a table of option sets"),
         ("[]", "names no option sets"),
         ('{"a": [], "a": []}', "it has a twice"),
         ('{"../a": []}', "cannot name a folder"),

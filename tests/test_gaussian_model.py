@@ -1,5 +1,6 @@
 """GaussianModel: start from clouds, activations, schedules, capture and restore."""
 
+import copy
 import math
 
 import numpy as np
@@ -124,3 +125,19 @@ def test_restore_refuses_other_attributes():
 def test_unknown_optimizer_is_refused():
     with pytest.raises(UserError, match="optimizer_type must be default or sparse_adam, got 'sgd'"):
         GaussianModel(3, "sgd")
+
+
+def test_a_copy_has_statistics_of_its_own():
+    gaussians = model(50)
+    other = copy.copy(gaussians)
+    other.max_radii2D = torch.ones(50)
+    other.denom = torch.ones(3, 1)
+    assert gaussians.max_radii2D.sum() == 0 and gaussians.denom.shape == (50, 1)
+
+
+def test_a_model_that_loads_a_ply_keeps_its_optimiser(tmp_path):
+    gaussians = model(5)
+    optimiser = gaussians.optimizer = object()
+    gaussians.save_ply(tmp_path / "a.ply")
+    gaussians.load_ply(tmp_path / "a.ply")
+    assert gaussians.optimizer is optimiser and gaussians.part(slice(2), 1).optimizer is None

@@ -215,13 +215,16 @@ def test_the_model_loads_no_reader_but_the_records():
 
 def test_what_users_import_is_there():
     code = """
-from scene import GaussianModel, Scene, cameras
+from scene import GaussianModel, Scene, cameras, searchForMaxIteration
+from scene.colmap_loader import read_model
 from scene.cameras import Camera, MiniCam
 from scene.dataset_readers import CameraInfo, SceneInfo, sceneLoadTypeCallbacks
 from scene.gaussian_model import GaussianModel as same
 from train import prepare_output_and_logger, training, training_report
 from utils.camera_utils import cameraList_from_camInfos, camera_to_JSON
 from utils.system_utils import Terminated, compute_device, mkdir_p, searchForMaxIteration
+import scene
+assert scene.cameras is cameras and {"Scene", "cameras"} <= set(dir(scene))
 assert same is GaussianModel and Scene.__module__ == "scene.scene" and cameras.Camera is Camera
 """
     subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True)

@@ -1,5 +1,8 @@
 """The training loop: the hooks of observers and of density control, each called in its place."""
 
+import json
+import os
+import signal
 import sys
 from argparse import Namespace
 from types import SimpleNamespace
@@ -8,6 +11,7 @@ import pytest
 import torch
 
 import train
+from records.training_log import TrainingLog
 from training import loop, run
 from training.density import AdaptiveDensityControl, DensityControl
 from training.observer import Announcer, Observer
@@ -58,7 +62,7 @@ def _train(scene, out, monkeypatch, observers, *options: object) -> None:
 
 def test_every_hook_is_called_once_an_iteration_and_in_order(colmap_scene, tmp_path, monkeypatch):
     told = []
-    _train(colmap_scene, tmp_path, monkeypatch, lambda run, writer: [Recorder(told, writes=(7,))],
+    _train(colmap_scene, tmp_path, monkeypatch, lambda *_: [Recorder(told, writes=(7,))],
            "--densify_from_iter", 5, "--densification_interval", 10)  # fmt: skip
     expected = []
     for t in range(1, ITERATIONS + 1):
@@ -76,7 +80,7 @@ def test_observers_are_told_in_the_order_of_the_list_and_of_the_error(colmap_sce
             if step.iteration == 2:
                 raise RuntimeError("broken")
 
-    def observers(run, writer) -> list[Observer]:
+    def observers(*_) -> list[Observer]:
         return [Recorder(told, "a "), Broken(), Recorder(told, "b ")]
 
     with pytest.raises(RuntimeError, match="broken"):
@@ -102,14 +106,20 @@ def test_the_guards_stand_where_they_must(colmap_scene, tmp_path, monkeypatch):
     """The list's order is meant: checks first, writers next, then the guard of a changing model, checkpoints last."""
     names = []
 
-    def observers(run, writer) -> list[Observer]:
-        listed = standard_observers(run, writer)
+    def observers(*given) -> list[Observer]:
+        listed = standard_observers(*given)
         names.extend(type(one).__name__ for one in listed)
         return listed
 
     _train(colmap_scene, tmp_path, monkeypatch, observers, "--eval")
     assert names[0] == "DivergenceWatch" and names[-2:] == ["MemoryGuard", "Checkpoints"]
-    assert names.index("Curve") < names.index("Report") < names.index("Saves") < names.index("MemoryGuard")
+    assert (
+        names.index("Curve")
+        < names.index("Report")
+        < names.index("Saves")
+        < names.index("Records")
+        < names.index("MemoryGuard")
+    )
 
 
 def test_another_strategy_is_another_object(colmap_scene, tmp_path, monkeypatch):
@@ -133,7 +143,7 @@ def test_another_strategy_is_another_object(colmap_scene, tmp_path, monkeypatch)
 
     monkeypatch.setattr(run, "AdaptiveDensityControl", Strategy)
     told = []
-    _train(colmap_scene, tmp_path, monkeypatch, lambda run, writer: [Recorder(told)])
+    _train(colmap_scene, tmp_path, monkeypatch, lambda *_: [Recorder(told)])
     steps = range(1, ITERATIONS + 1)
     assert [t for hook, t in told if hook == "measured due"] == [3]
     # As in the reference, the last iteration takes no step.
@@ -153,3 +163,53 @@ def test_backward_runs_on_the_callers_thread():
     with loop._backward_on_this_thread():
         assert not torch.autograd.is_multithreading_enabled()
     assert torch.autograd.is_multithreading_enabled() is before
+
+
+def test_a_signal_while_the_curve_is_drawn_ends_the_program_at_once(colmap_scene, tmp_path, monkeypatch):
+    """Nothing is left to save by then. During an iteration a first signal waits for the step to be complete."""
+
+    def draw(*_: object) -> None:
+        os.kill(os.getpid(), signal.SIGINT)
+
+    monkeypatch.setattr("records.curve_recorder.draw_curve", draw)
+    with pytest.raises(KeyboardInterrupt):
+        _train(colmap_scene, tmp_path, monkeypatch, standard_observers, "--eval")
+    assert (tmp_path / f"point_cloud/iteration_{ITERATIONS}/point_cloud.ply").is_file()
+
+
+def test_an_iteration_that_is_scored_and_saved_gets_one_record(colmap_scene, tmp_path, monkeypatch):
+    added = []
+    add = TrainingLog.add
+
+    def noted(log: TrainingLog, iteration: int, seconds: float, **values: float) -> None:
+        added.append((iteration, sorted(values)))
+        add(log, iteration, seconds, **values)
+
+    monkeypatch.setattr(TrainingLog, "add", noted)
+    options = ["--eval", "--no_curve", "--test_iterations", 5, "--save_iterations", 5, 9]
+    _train(colmap_scene, tmp_path, monkeypatch, standard_observers, *options)
+    scores = ["gaussians", "loss", "test_l1", "test_psnr", "train_l1", "train_psnr"]
+    last = ["gaussians", "gaussians_left_out", "loss"]
+    assert added == [(5, scores), (9, ["gaussians", "loss"]), (ITERATIONS, last)]
+
+
+def test_a_checkpoint_of_the_last_iteration_does_not_turn_seconds_back(tmp_path):
+    log = TrainingLog(tmp_path, 0)
+    log.add(7, 2.0, loss=0.5)
+    log.add(7, 1.5, loss=0.25)
+    assert log.records[-1]["seconds"] == 2.0 and log.records[-1]["loss"] == 0.25
+
+
+def test_what_replaces_training_report_is_called(colmap_scene, tmp_path, monkeypatch):
+    """Programs that import train.py as a module put their own in its place."""
+    reported = []
+
+    def report(writer, iteration: int, *_: object) -> dict[str, float]:
+        reported.append(iteration)
+        return {"test_psnr": 30.0} if iteration == 4 else {}
+
+    monkeypatch.setattr(train, "training_report", report)
+    _train(colmap_scene, tmp_path, monkeypatch, standard_observers)
+    assert reported == list(range(1, ITERATIONS + 1))
+    records = json.loads((tmp_path / "train_log.json").read_text())
+    assert [record["iteration"] for record in records if "test_psnr" in record] == [4]

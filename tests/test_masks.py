@@ -223,7 +223,7 @@ def test_alpha_is_background_unless_it_is_to_be_ignored(colmap_scene):
         ),
         (
             lambda masks: [path.rename(path.parent / f"mask_{path.name}") for path in masks.rglob("*.*")],
-            "no mask in .*/masks .* belongs to a photo: looked for .*V03.png.png .* name masks as the photos",
+            "no mask in .*/masks .* belongs to a photo: looked for .*V03.png.png .* name masks like the photos",
         ),
         (
             lambda masks: [_save(path, np.zeros((9, 9), np.uint8)) for path in masks.rglob("*.*")],
@@ -329,7 +329,9 @@ def test_masks_that_leave_nothing_do_not_train_silently(masked_scene, tmp_path, 
     paths = [path for path in sorted(masked_scene.rglob("masks/**/*")) if path.is_file()]
     for path in paths:
         _save(path, np.zeros((HEIGHT, WIDTH), np.uint8))
-    said = r"the masks of all 14 views seen so far leave no pixel to train on; are they white masks \(--invert_masks\)"
+    said = (
+        r"the masks of all 14 views seen so far leave no pixel to train on; is white masked in them \(--invert_masks\)"
+    )
     with pytest.raises(UserError, match=said):
         _train(masked_scene, tmp_path / "out", "--masks", "masks")
     assert not (tmp_path / "out" / "point_cloud").exists()

@@ -176,7 +176,7 @@ def test_a_densification_cut_short_is_saved_whole(colmap_scene, tmp_path, monkey
 
     with monkeypatch.context() as patch:
         patch.setattr(GaussianModel, "densify_and_prune", densify)
-        with pytest.raises(UserError, match="in iteration 3 .*may be done in part, is saved: .*chkpnt3.pth"):
+        with pytest.raises(UserError, match="in iteration 3 .*may be incomplete, is saved: .*chkpnt3.pth"):
             _train(colmap_scene, tmp_path)
     capture, iteration = load_checkpoint(tmp_path / "chkpnt3.pth")
     assert iteration == 3 and len(capture[1]) == count

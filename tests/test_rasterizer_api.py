@@ -315,3 +315,15 @@ def test_debug_names_a_gradient_that_is_not_finite():
     out = render(inputs, camera._replace(debug=True), raw=False)
     with pytest.raises(FloatingPointError, match="gradient of .* not finite"):
         (out.color.sum() * float("inf")).backward()
+
+
+def test_screen_means_may_be_left_out():
+    """Callers that need no gradient of theirs pass None."""
+    splats, camera = scene()
+    images = [call(splats, camera, means2D=means2d)[0] for means2d in (torch.zeros_like(splats["means"]), None)]
+    assert torch.equal(*images)
+    inputs = leaves(splats)
+    call(inputs, camera, means2D=None)[0].sum().backward()
+    assert inputs["means"].grad.any()
+    with pytest.raises(TypeError, match="opacities must be a tensor, got None"):
+        call(splats, camera, opacities=None)

@@ -237,7 +237,7 @@ def test_refusals_before_anything_is_written(colmap_scene, tmp_path):
         "leaves nothing to do": ["--start_checkpoint", checkpoint, "--iterations", 2],
         "save_iterations": ["--save_iterations", 0],
         "checkpoint_iterations": ["--checkpoint_iterations", -5],
-        "--test_iterations counts from 1": ["--test_iterations", 0],
+        "--test_iterations takes iterations from 1 on": ["--test_iterations", 0],
         "-r) 100000 is too wide": ["-r", 100_000],
         "--iterations": ["--iterations", -1],
         "absent": ["-s", tmp_path / "absent"],
@@ -357,7 +357,7 @@ def test_seconds_leave_evaluation_and_saving_out(colmap_scene, tmp_path, monkeyp
         time.sleep(0.5)
         return {"test_psnr": 1.0}
 
-    monkeypatch.setattr("training.observers.report.training_report", slow)
+    monkeypatch.setattr(train, "training_report", slow)
     _train(colmap_scene, tmp_path, iterations=4)
     log = json.loads((tmp_path / "train_log.json").read_text())
     # Four evaluations take 2 s, four iterations some 20 ms; the first also loads parts of torch.

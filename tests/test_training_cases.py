@@ -134,8 +134,7 @@ def test_a_camera_far_off_is_left_out_of_the_extent(colmap_scene, tmp_path, capf
     _train(colmap_scene, tmp_path / "out", iterations=20)
     said = capfd.readouterr().err
     assert (
-        f"2 of 17 cameras stand more than 10 times the median distance from the middle of all ({', '.join(far)})"
-        in said
+        f"2 of 17 cameras are more than 10 times as far from the middle as the median camera ({', '.join(far)})" in said
     )
 
 

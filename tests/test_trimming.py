@@ -143,7 +143,7 @@ def test_saves_before_the_cut_are_read_with_the_bands_they_have(runs, monkeypatc
         render_iteration(iteration)
         assert len(list((runs.cut / "test" / f"ours_{iteration}" / "renders").glob("*.png"))) == 3
         assert check_model(str(runs.cut), iteration)[0].text.endswith(f"of SH degree {degree}")
-    with pytest.raises(UserError, match="SH degree 3, where SH degree 1 needs 9"):
+    with pytest.raises(UserError, match="SH degree 3, but SH degree 1 needs 9"):
         render_iteration(5, "--sh_degree", 1)
 
 
@@ -204,7 +204,7 @@ def test_the_three_lines():
     said = lines(_left_out())
     assert said == [
         "Left out 50 of 1000 Gaussians (5.0 %, 0.01 MB of the PLY) that no training view depends on, found in 1.2 s; "
-        "test views change by at most 0.012 of 1, PSNR 30.000 to 29.900 dB",
+        "test views change by at most 0.012 (values 0 to 1), PSNR 30.000 to 29.900 dB",
         "Left out no SH bands; cutting them would move colours by at most 0.3 above degree 0, 0.2 above degree 1, "
         "0.1 above degree 2 (--prune_sh)",
         "Colours of the training photos are kept as bytes and at training size: 3.0 MB, 45.0 MB less than as float32 "
@@ -212,8 +212,9 @@ def test_the_three_lines():
     ]
     # 950 Gaussians lose 12 coefficients of 3 channels, 4 bytes each.
     cut = lines(_left_out(sh_degree=1, test_change={"largest": 0.0}))
-    assert cut[1] == "Left out the SH bands above degree 1 (0.14 MB of the PLY): colours move by at most 0.2 of 1"
-    assert cut[0].endswith("; test views change by at most 0 of 1")
+    moved = "colours move by at most 0.2 (values 0 to 1)"
+    assert cut[1] == f"Left out the SH bands above degree 1 (0.14 MB of the PLY): {moved}"
+    assert cut[0].endswith("; test views change by at most 0 (values 0 to 1)")
     assert lines(_left_out(keep_unseen=True, unseen=0, test_change={}))[0].startswith("Left out no Gaussians (--keep")
     assert "none above degree 0" in lines(_left_out(max_sh_degree=0, sh_degree=0, cut_bounds=[0.0]))[1]
 

@@ -140,7 +140,7 @@ def test_the_cache_is_keyed_by_content(tmp_path, cache_folder, capsys):
 def test_a_cache_that_cannot_be_written_is_named(tmp_path, monkeypatch):
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("GS_CACHE", str(tmp_path / "file" / "cache"))
-    with pytest.raises(UserError, match="cannot create the folder .*file/cache/undistorted .*GS_CACHE names another"):
+    with pytest.raises(UserError, match="cannot create the folder .*file/cache/undistorted .*set GS_CACHE to use"):
         undistort([Photo(_photo(tmp_path / "a.png"), (WIDTH, HEIGHT), _lens("OPENCV"))])
 
 

@@ -17,7 +17,7 @@ _RECOVERY = 1000  # iterations that a model needs to recover from a reset of its
 
 
 def check_scene(info: SceneInfo) -> None:
-    """Refuse a scene that nothing can be learnt from (UserError); print what is read differently from the files."""
+    """Refuse a scene that cannot be trained (UserError); print where training departs from the dataset's files."""
     _check_scale(info)
     _report_cameras_apart(info)
     if info.offset.any():
@@ -46,8 +46,8 @@ def _report_cameras_apart(info: SceneInfo) -> None:
     if apart.any():
         names = [info.train_cameras[index].image_name for index in apart.nonzero()[0]]
         print(
-            f"{len(names)} of {len(apart)} cameras stand more than {APART:g} times the median distance from the middle "
-            f"of all ({some(names)}) and are left out of the scene's extent, {info.extent:.3g}; check their "
+            f"{len(names)} of {len(apart)} cameras are more than {APART:g} times as far from the middle as the median "
+            f"camera ({some(names)}) and are left out of the scene's extent, {info.extent:.3g}; check their "
             "poses",
             file=sys.stderr,
         )

@@ -1,4 +1,4 @@
-"""Density control as the training loop sees it, and the method's own: clone, split, prune, reset of opacities."""
+"""Density control: the hooks that the training loop calls, and the method's rules (clone, split, prune, reset)."""
 
 import argparse
 
@@ -16,15 +16,15 @@ class DensityControl:
     def changes(self, iteration: int) -> bool:
         """Whether this iteration will change rows of the Gaussians besides their optimiser step.
 
-        Every loss so far is then checked first, for a change cannot be taken back.
+        If so, every loss so far is checked first, because a change cannot be undone.
         """
         return False
 
     def after_backward(self, step: Step, package: dict[str, Tensor]) -> None:
-        """Gradients are there, the optimiser has not stepped. package: of `render`."""
+        """Called with the gradients computed, before the optimiser's step. package: the result of `render`."""
 
     def after_step(self, step: Step) -> None:
-        """The optimiser has stepped, but in the last iteration, which takes no step."""
+        """Called after the optimiser's step, so not in the last iteration, which takes none."""
 
 
 class AdaptiveDensityControl(DensityControl):

@@ -41,7 +41,7 @@ def check_folder(
     if stay:
         print(
             f"warning: {folder / 'point_cloud'} keeps iteration {', '.join(map(str, stay))} of an earlier training, "
-            "and render.py takes the highest unless --iteration says which; remove what is old, or name another folder "
+            "and render.py takes the highest unless --iteration is given; remove the old ones, or name another folder "
             "with -m",
             file=sys.stderr,
         )
@@ -64,7 +64,7 @@ def report_changes(checkpoint: str, now: argparse.Namespace) -> None:
 def continue_records(model_path: str, checkpoint: str | None, first_iteration: int) -> tuple[TrainingLog, list[Row]]:
     """The log of a training and the rows of its curve up to `first_iteration`; none for a training from the start.
 
-    Both are read next to the checkpoint, whose training recorded them, or else in model_path. This run continues them
+    Both are read from the checkpoint's folder if that has a log, else from model_path. This run continues them
     in model_path.
     """
     before = Path(model_path)

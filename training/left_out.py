@@ -14,7 +14,7 @@ class LeftOut:
     keep_unseen: bool
     max_sh_degree: int  # trained
     sh_degree: int  # saved
-    cut_bounds: list[float]  # by degree: most that a colour moves if all SH bands above the degree are cut
+    cut_bounds: list[float]  # by degree: bound on a colour's change if all SH bands above the degree are cut
     ply_bytes: int  # of all Gaussians trained, with all bands
     ply_bytes_saved: int
     seconds: float  # that the search took
@@ -39,7 +39,7 @@ def _gaussians(it: LeftOut) -> str:
 def _change(change: dict[str, float]) -> str:
     if not change:
         return ""
-    text = f"; test views change by at most {change['largest']:.2g} of 1"
+    text = f"; test views change by at most {change['largest']:.2g} (values 0 to 1)"
     if "psnr_before" in change:
         text += f", PSNR {change['psnr_before']:.3f} to {change['psnr_after']:.3f} dB"
     return text
@@ -49,7 +49,7 @@ def _bands(it: LeftOut) -> str:
     if it.sh_degree < it.max_sh_degree:
         rows = it.gaussians - it.unseen
         saved = 12 * ((it.max_sh_degree + 1) ** 2 - (it.sh_degree + 1) ** 2) * rows / MB
-        moved = f"colours move by at most {it.cut_bounds[it.sh_degree]:.2g} of 1"
+        moved = f"colours move by at most {it.cut_bounds[it.sh_degree]:.2g} (values 0 to 1)"
         return f"Left out the SH bands above degree {it.sh_degree} ({saved:.2f} MB of the PLY): {moved}"
     if it.max_sh_degree == 0:
         return "Left out no SH bands: there are none above degree 0"

@@ -15,7 +15,7 @@ def run_training(run: Run, observers: Sequence[Observer]) -> None:
     """Render a view, compare it with its photo, follow the gradient, control density, step.
 
     Whatever else happens is an observer's business, in the order of the list (training/observers/standard.py).
-    KeyboardInterrupt or Terminated, after a complete step, where a signal asked for it.
+    Raises KeyboardInterrupt or Terminated, after a complete step, if a signal asked for it.
     """
     tell = Announcer(observers)
     with DeferredInterrupt() as interrupt, tell, _backward_on_this_thread():
@@ -36,6 +36,7 @@ def run_training(run: Run, observers: Sequence[Observer]) -> None:
             tell.stepped(step)
             if step.stopping:
                 raise step.stopping
+    tell.ended()  # out here a signal stops at once what is only drawn and printed
 
 
 @contextmanager

@@ -20,7 +20,7 @@ GROWTH = 20  # photo scenes grow 10- to 100-fold in 7,000 iterations (docs/resul
 def announce_memory(scene: Scene, gaussians: GaussianModel, max_splats: int) -> None:
     """Print the memory that photos and Gaussians need and what is free; warn, with a remedy, if they do not fit.
 
-    max_splats: limit of the number of Gaussians. Without a limit (0), the estimate is for GROWTH times today's number.
+    max_splats: limit of the number of Gaussians. Without a limit (0), the estimate is for GROWTH times the number now.
     """
     images, device = scene.images, gaussians.get_xyz.device
     pixels = max(camera.image_width * camera.image_height for camera in scene.getTrainCameras())

@@ -15,7 +15,7 @@ class Losses(NamedTuple):
     total: Tensor  # what is differentiated
     l1: Tensor  # of the colours
     depth: Tensor | None  # weighted, part of the total; None without a depth map
-    mask: Tensor | None  # (1, H, W) bool, pixels that count; None where all do
+    mask: Tensor | None  # (1, H, W) bool, pixels that count; None if all do
 
 
 class Objective:

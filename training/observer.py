@@ -14,24 +14,24 @@ class Observer:
     """Base of all observers. A hook that a class does not override costs nothing."""
 
     def due(self, step: Step) -> bool:
-        """Whether this iteration writes something. Every loss so far is then checked before `measured`."""
+        """Whether this iteration writes something. If so, every loss so far is checked first in `measured`."""
         raise NotImplementedError
 
     def begins(self, step: Step) -> None:
         """The iteration begins, with its view."""
 
     def measured(self, step: Step, losses: Losses) -> None:
-        """Gradients are there; the model is still the one that was rendered."""
+        """The gradients are computed; the model is still the one that was rendered."""
 
     def stepped(self, step: Step) -> None:
-        """Density control and optimiser are through; the model is the next iteration's."""
+        """Density control and optimiser are done; the model is that of the next iteration."""
 
     def ended(self, error: Error) -> None:
         """Training is over: after its last iteration (None), or by an error, which may be replaced by raising."""
 
 
 class Announcer:
-    """Calls the hooks of observers, in the order of the list. Inside `with`, also at the end."""
+    """Calls the hooks of observers, in the order of the list. Inside `with`, an error is told to `ended`."""
 
     def __init__(self, observers: Sequence[Observer]) -> None:
         def overridden(hook: str) -> list:
@@ -56,9 +56,13 @@ class Announcer:
         for tell in self._stepped:
             tell(step)
 
+    def ended(self, error: Error = None) -> None:
+        for tell in self._ended:
+            tell(error)
+
     def __enter__(self) -> "Announcer":
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: Error, trace: TracebackType | None) -> None:
-        for tell in self._ended:
-            tell(error)
+        if error is not None:
+            self.ended(error)

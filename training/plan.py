@@ -5,11 +5,11 @@ from typing import NamedTuple
 
 
 class Plan(NamedTuple):
-    """What a run was asked to do besides training."""
+    """The user's requests for a run, besides training itself."""
 
     test: Sequence[int]  # -1: none
     save: Sequence[int]  # the PLY; -1: none
     checkpoint: Sequence[int]
     start: str | None  # a chkpntN.pth to resume, None: the dataset's points
     debug_from: int  # pipe.debug is switched on after this iteration; -1: never
-    record_curve: bool  # error_vs_time.csv, where there are test views
+    record_curve: bool  # error_vs_time.csv, if there are test views

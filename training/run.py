@@ -29,7 +29,7 @@ SH_INTERVAL = 1000  # iterations between raises of the active SH degree
 
 
 class Run:
-    """What the loop and its observers share.
+    """The objects that the loop and its observers share.
 
     scene, gaussians, views (by iteration), objective, density; dataset, opt, pipe: the options; background: (3,) of the
     scene; first_iteration: done before this run. From `begin` on: log, rows (of the curve so far), losses
@@ -66,7 +66,7 @@ class Run:
         )
 
     def _start(self, capture: tuple | None) -> None:
-        """From the dataset's points, or from the state of a checkpoint."""
+        """Start the model from the dataset's points, or from the state of a checkpoint."""
         if capture is None:
             self.scene.create_gaussians()
             self.gaussians.training_setup(self.opt)
@@ -82,11 +82,11 @@ class Run:
 
     @property
     def kept(self) -> dict[str, Any]:
-        """What model.json keeps besides the model options (`write_model_json`)."""
+        """Entries of model.json besides the model options (`write_model_json`)."""
         return self._training_options | {"world_offset": self.gaussians.world_offset}
 
     def begin(self) -> None:
-        """Write the inputs into the output folder, say what memory will be wanted, start or continue the log."""
+        """Write the inputs into the output folder, print the memory estimate, start or continue the log."""
         folder, start = self.scene.model_path, self.plan.start
         if not start or not (Path(folder) / "cameras.json").exists():
             self.scene.write_inputs()
@@ -126,7 +126,7 @@ class Run:
         self.scene.prefetch(self.views.coming(step.iteration, ahead))
 
     def render_options(self, step: Step) -> dict[str, bool]:
-        """What this step's loss needs of `render`, and no more."""
+        """Options of `render` that make it compute what this step's loss needs, and no more."""
         return {
             "use_trained_exp": self.dataset.train_test_exp,
             "want_depth": step.depth_weight > 0,

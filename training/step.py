@@ -9,14 +9,15 @@ from scene.cameras import Camera
 
 @dataclass(slots=True)
 class Step:
-    """One iteration, counted from 1. The loop makes it; only `due` and `stopping` change on the way."""
+    """One iteration, counted from 1. Run.steps makes it; only `due`, `record` and `stopping` change later."""
 
     iteration: int
     last: bool
     camera: Camera
     background: Tensor  # (3,), random or that of the scene
-    depth_weight: float  # of the depth loss, 0 where the view has no depth map that is trusted
+    depth_weight: float  # of the depth loss, 0 if the view has no reliable depth map
     changes: bool  # density control will change the Gaussians in this iteration
     started: float  # seconds of training before it
     due: bool = False  # something is written or changed, so every loss so far must be checked first
+    record: dict[str, float] | None = None  # what train_log.json gets of this iteration; None: no record
     stopping: type[KeyboardInterrupt] | None = None  # raised once the step is complete

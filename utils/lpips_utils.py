@@ -29,7 +29,7 @@ class LpipsUnavailable(Exception):
 
 
 def import_lpips() -> ModuleType:
-    """The `lpips` package, which this imports also beside a CPU-only torch.
+    """Import the `lpips` package, also if torch is CPU-only.
 
     There torchvision's wheel cannot load its compiled operators, and its Python side (0.28) fails when it attaches fake
     kernels to two of them. LPIPS needs neither, so this declares their schemas and repeats the import. It does so only

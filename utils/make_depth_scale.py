@@ -21,7 +21,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description="Fit a scene's depth maps to its COLMAP points: depth_params.json.")
     parser.add_argument("--base_dir", required=True, metavar="SCENE", help="scene folder (COLMAP)")
     parser.add_argument("--depths_dir", required=True, metavar="FOLDER",
-        help="folder of inverse depth maps, grey PNG of 8 or 16 bits, named as the photos")  # fmt: skip
+        help="folder of inverse depth maps, grey PNG of 8 or 16 bits, named like the photos")  # fmt: skip
     parser.add_argument("--model_type", choices=("bin", "txt"), default="bin",
         help="kind of the COLMAP model's files (default: bin)")  # fmt: skip
     args = parser.parse_args(argv)

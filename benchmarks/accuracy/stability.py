@@ -6,9 +6,9 @@ Each case (stability_cases.py) is a scene with ordinary and stiff Gaussians. The
 same float32 values.
 
 - The error of a plane is max |difference| / max |reference|, once over the pixels that a stiff Gaussian reaches and
-  once over the others. The error of a gradient is split into stiff and ordinary Gaussians likewise.
+  once over the others. Likewise, the error of a gradient is split into stiff and ordinary Gaussians.
 - If the reference of such a part is everywhere below 1e-9 of the tensor's largest value, that value is the divisor.
-- A median is taken over Gaussians, of |difference| / |reference| of each one's gradient; gradients below 1e-6 of the
+- A median is over the Gaussians' values of |difference| / |reference| of the gradient; gradients below 1e-6 of the
   largest are left out.
 - Rounding alone can decide a pixel within `cut` of a cut-off or with a depth tie. Such pixels are left out of the loss
   and of the comparison.

@@ -2,7 +2,7 @@
 
     python -m benchmarks.costs.probe FOLDER
 
-makes a small Blender scene in FOLDER, trains on it for 3 iterations and renders it. The output tells which modules,
+It makes a small Blender scene in FOLDER, trains on it for 3 iterations and renders it. The output tells which modules,
 sockets, files and test photos were used, and so which of them a run without their feature leaves alone.
 """
 

@@ -33,7 +33,7 @@ class Row:
     feature: str
     compared: str  # describes base
     off: Call
-    base: Call | None = None  # would run if the code did not have the feature; None: no such call can be built
+    base: Call | None = None  # the call of code without the feature; None: no such call can be built
     on: Call | None = None  # None: such a call has nothing to switch on
     kept: tuple[int, int] = (0, 0)  # bytes that base and off keep after the call
     base_bytes: int | None = None  # bytes that base would allocate, counted by hand; None: measured from base

@@ -12,7 +12,7 @@ from benchmarks.peers import published
 from benchmarks.peers.gsplat_calls import GsplatCalls, version
 from benchmarks.workloads.splat_scenes import SplatScene, frustum
 
-# Kernels that separate the stages of a step: the kernel begins the named stage, or the kernel after it does.
+# Kernels that separate the stages of a step: those of _BEGINS begin the named stage; it begins after those of _NEXT.
 _BEGINS = {"blend_kernel": "blend", "adam_kernel": "adam"}
 _NEXT = {"project_kernel": "bin", "blend_kernel": "blend_vjp", "blend_vjp_kernel": "project_vjp"}
 
@@ -70,7 +70,7 @@ def _measure(name: str, gsplat: str | None) -> Workload:
 
 
 def _measure_calls(calls: Calls | GsplatCalls) -> Measured:
-    # Measure memory first: the step's moments themselves would not count, but what they leave in the pool could.
+    # Measure memory first: Adam's averages would not count, but the memory that they leave in the pool could.
     memory = tuple(peak_mib(run, calls.clear) for run in (calls.forward, calls.with_backward))
     times = {step: gpu_time(run) for step, run in calls.steps().items()}
     calls.clear()

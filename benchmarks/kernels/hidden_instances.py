@@ -2,8 +2,8 @@
 
     python -m benchmarks.kernels.hidden_instances -m MODEL [--iteration N]
 
-Counts the instances of each training view, the processed ones, and the splats that have a processed instance. Processed
-are those up to the last one that a pixel of the tile blends. The rest is the most that a depth cut-off per tile could
+Counts the instances of each training view, the processed ones, and the splats that have a processed instance. Those up
+to the last one that a pixel of the tile blends are processed. The rest is the most that a depth cut-off per tile could
 save. Prints medians over the views.
 """
 

@@ -95,7 +95,7 @@ def main() -> None:
     args, options = parser.parse_known_args()
     unknown = [name for name in args.models if name not in DISTORTED]
     if unknown:
-        raise UserError(f"{unknown[0]} is no camera model with distortion; choose from {', '.join(DISTORTED)}")
+        raise UserError(f"{unknown[0]} is not a camera model with distortion; choose from {', '.join(DISTORTED)}")
     if args.out.exists():
         raise UserError(f"{args.out} exists; name a new folder")
     rows = [compare(name, args.out, args, options) for name in args.models]

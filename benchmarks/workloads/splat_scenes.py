@@ -92,7 +92,7 @@ def frustum(
     """Draw Gaussians uniformly in the frustum at depths 2 to 10.
 
     The median size is sigma_px, sizes are log-normal (0.8), axes within a factor of 5, opacities sigmoid(1.5 normal).
-    Numbers are drawn on `device`, and a GPU draws others than the CPU. On a GPU with seed 0, this order of draws gives
+    Numbers are drawn on `device`; a GPU's differ from the CPU's. On a GPU with seed 0, this order of draws gives
     the tensors that the other implementations in published.py were measured on.
     """
     g = torch.Generator(device).manual_seed(seed)

@@ -16,7 +16,7 @@ _CHUNK = 1 << 16  # rows moved at a time when memory is too short for all of the
 class StepGuard:
     """Stops all optimisers at the first iteration whose loss or whose step is not finite.
 
-    In that iteration, a value whose gradient or step is not finite keeps its value. Its first moment becomes NaN as a
+    In that iteration, a value whose gradient or step is not finite keeps its value. Its exp_avg becomes NaN as a
     mark, which GaussianAdam.take_marks removes. All other values take their step. In later iterations no value does.
     The flag stays on the device, and only `stopped_in` waits for it.
     """
@@ -51,7 +51,7 @@ class GaussianAdam(torch.optim.Adam):
     def set_active_columns(self, name: str, columns: int) -> None:
         """Promise that only the first `columns` values of each row of this group ever had a gradient.
 
-        Adam's step for the others changes no bit, as moments and gradient are zero, so it is left out. A group with no
+        Adam's step for the others changes no bit, as averages and gradient are zero, so it is left out. A group with no
         active columns gets no gradient; its step counter advances with f_dc's.
         """
         self._active_columns[name] = columns
@@ -96,7 +96,7 @@ class GaussianAdam(torch.optim.Adam):
             group["params"][0].grad = None
 
     def take_marks(self) -> dict[str, Tensor]:
-        """Rows (n,) by group whose values a guard kept from their step; their marked moments restart at zero."""
+        """Rows (n,), by group, of the values whose step a guard held back; their averages restart at zero."""
         rows = {}
         for group in self.param_groups:
             state = self.state.get(group["params"][0])
@@ -110,7 +110,7 @@ class GaussianAdam(torch.optim.Adam):
         return rows
 
     def rewind(self, steps: int) -> None:
-        """Take back the counts of steps that a guard held back."""
+        """Reduce the step counters by the steps that a guard held back."""
         for state in self.state.values():
             state["step"] = (state["step"] - steps).clamp_min(0)
 
@@ -123,18 +123,18 @@ class GaussianAdam(torch.optim.Adam):
         return state
 
     def take_state(self, state_dict: Any) -> None:
-        """Take the moments and step counters of a state dict; the groups keep their options.
+        """Take Adam's averages and the step counters of a state dict; the groups keep their options.
 
-        ValueError saying what does not fit, for anything but the state dict of such groups.
+        ValueError that says what does not fit, unless it is the state dict of the same groups.
         """
         own = self.state_dict()["param_groups"]
         try:
             state, groups = dict(state_dict["state"]), list(state_dict["param_groups"])
             names, keys = [group["name"] for group in groups], [list(group["params"]) for group in groups]
         except (TypeError, ValueError, KeyError, IndexError) as error:
-            raise ValueError("it is no state of an optimiser") from error
+            raise ValueError("it is not the state of an optimiser") from error
         if names != [group["name"] for group in own] or any(len(params) != 1 for params in keys):
-            raise ValueError("its groups are others")
+            raise ValueError("its groups are different")
         taken = {}
         for group, mine, (key,) in zip(self.param_groups, own, keys, strict=True):
             if key in state:
@@ -142,7 +142,7 @@ class GaussianAdam(torch.optim.Adam):
         super().load_state_dict({"state": taken, "param_groups": own})
 
     def append_rows(self, rows: dict[str, Tensor]) -> dict[str, nn.Parameter]:
-        """Append `rows[name]` (n, ...) to each group, with zero moments. Returns the parameters, without gradient.
+        """Append `rows[name]` (n, ...) to each group, with averages of zero. Returns the parameters, without gradient.
 
         When memory runs out, no group keeps any of the new rows.
         """
@@ -180,7 +180,7 @@ class GaussianAdam(torch.optim.Adam):
         return params
 
     def _change_rows(self, change: Callable[[Tensor, str, bool], Tensor]) -> dict[str, nn.Parameter]:
-        """Map all parameters and moments; `change` takes values, the group's name, and whether they are a moment."""
+        """Map all parameters and averages; `change` takes values, the group's name, and whether they are averages."""
         params = {}
         for group in self.param_groups:
             value = change(group["params"][0].detach(), group["name"], False)
@@ -188,12 +188,12 @@ class GaussianAdam(torch.optim.Adam):
         return params
 
     def reset(self, name: str, value: Tensor) -> nn.Parameter:
-        """Give one group a new value and zero moments. Returns the new parameter, without gradient."""
+        """Give one group a new value and averages of zero. Returns the new parameter, without gradient."""
         (group,) = (group for group in self.param_groups if group["name"] == name)
         return self._replace(group, value, lambda moment, _: torch.zeros_like(moment))
 
     def _replace(self, group: dict, value: Tensor, change: Callable[[Tensor, str], Tensor]) -> nn.Parameter:
-        """Swap a group's parameter; `change` maps its moments, and the step counter stays."""
+        """Swap a group's parameter; `change` maps its averages, and the step counter stays."""
         param = nn.Parameter(value.requires_grad_(True))
         old = group["params"][0]
         if self.state.get(old):
@@ -219,11 +219,11 @@ def _fitting(entry: Any, param: Tensor, name: str) -> dict[str, Tensor]:
     for key in ("exp_avg", "exp_avg_sq"):
         moment = entry[key]
         if not torch.is_tensor(moment) or moment.shape != param.shape or moment.dtype != param.dtype:
-            raise ValueError(f"{key} of {name} is not like {name}")
+            raise ValueError(f"{key} and {name} differ in shape or type")
     try:
         step = float(entry["step"])  # a tensor; a number where an older torch wrote it
     except (TypeError, ValueError, RuntimeError) as error:
-        raise ValueError(f"step of {name} is no number") from error
+        raise ValueError(f"step of {name} is not a number") from error
     if not (math.isfinite(step) and step >= 0):
         raise ValueError(f"step of {name} is {step}")
     return {

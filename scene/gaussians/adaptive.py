@@ -1,5 +1,6 @@
 """Adaptive density control (Kerbl et al. 2023, section 5.2) of a set of Gaussians."""
 
+from dataclasses import replace
 from operator import attrgetter
 
 import torch
@@ -13,15 +14,19 @@ from scene.gaussians.statistics import Statistics
 
 
 def _statistic(name: str) -> property:
-    """A property that reads and replaces one tensor of `statistics`."""
-    return property(attrgetter(f"statistics.{name}"), lambda self, values: setattr(self.statistics, name, values))
+    """A property that reads one tensor of `statistics`, and replaces it for this model but not for copies of it."""
+
+    def put(self: "AdaptiveGaussians", values: Tensor) -> None:
+        self.statistics = replace(self.statistics, **{name: values})
+
+    return property(attrgetter(f"statistics.{name}"), put)
 
 
 class AdaptiveGaussians(GaussianParameters):
     """Gaussians that density control clones, splits and removes, together with their optimiser state.
 
     statistics: observations since the last densification, whose tensors can be read and replaced here, too. optimizer:
-    None until training is set up, and again once rows come from elsewhere. percent_dense: largest scale, as a part of
+    None until training is set up. percent_dense: largest scale, as a part of
     the scene's extent, of a Gaussian that is cloned; a larger one is split.
     """
 
@@ -29,14 +34,19 @@ class AdaptiveGaussians(GaussianParameters):
     max_radii2D = _statistic("max_radii2D")
     xyz_gradient_accum = _statistic("xyz_gradient_accum")
     denom = _statistic("denom")
-    optimizer: GaussianAdam | None
+    optimizer: GaussianAdam | None = None
     percent_dense = 0.0
 
     def set_rows(self, rows: Rows) -> None:
-        """Take raw values as GaussianParameters does, with new statistics and without an optimiser."""
+        """Take raw values as GaussianParameters does, with new statistics."""
         super().set_rows(rows)
-        self.optimizer = None
         self._zero_statistics()
+
+    def part(self, keep: Tensor | slice, sh_degree: int) -> "AdaptiveGaussians":
+        """A copy of the Gaussians `keep` as GaussianParameters makes it, without an optimiser."""
+        other = super().part(keep, sh_degree)
+        other.optimizer = None
+        return other
 
     def _zero_statistics(self) -> None:
         self.statistics = Statistics.zero(len(self), self._xyz.device)
@@ -155,9 +165,9 @@ class AdaptiveGaussians(GaussianParameters):
         if len(keep) == len(self):
             return
         self._take(self.optimizer.keep_rows(keep))
-        self.statistics.keep(keep)
+        self.statistics = self.statistics.keep(keep)
 
     def reset_opacity(self) -> None:
-        """Lower every opacity to at most 0.01; its Adam moments restart at zero."""
+        """Lower every opacity to at most 0.01; Adam's averages of it restart at zero."""
         lowered = self._opacity.detach().clamp_max(rules.logit(rules.RESET_OPACITY))
         self._opacity = self.optimizer.reset("opacity", lowered)

@@ -56,7 +56,7 @@ def pack(state: State) -> tuple:
 
 
 def unpack(entries: Sequence[Any], table: dict[str, Attribute], max_sh_degree: int) -> State:
-    """The state that `pack` made entries of. UserError where its attributes are not those of the table."""
+    """The state from the entries that `pack` made. UserError if its attributes are not those of the table."""
     active_sh_degree, *tensors = entries[:7]
     max_radii2D, xyz_gradient_accum, denom, optimizer, spatial_lr_scale, *others = entries[7:]
     exposures = next((entry for entry in others if isinstance(entry, dict)), None)
@@ -64,7 +64,7 @@ def unpack(entries: Sequence[Any], table: dict[str, Attribute], max_sh_degree: i
     tensors += [entry for entry in others if not isinstance(entry, dict)]
     if len(tensors) != len(names):
         raise UserError(
-            f"the checkpoint has {len(tensors)} attributes per Gaussian, where this model has {len(names)} "
+            f"the checkpoint has {len(tensors)} attributes per Gaussian, but this model has {len(names)} "
             f"({', '.join(names)}); give a checkpoint of this model"
         )
     rows = {name: tensor.detach() for name, tensor in zip(names, tensors, strict=True)}
@@ -85,7 +85,7 @@ def _check_rows(rows: Rows, table: dict[str, Attribute], max_sh_degree: int) -> 
         found = tuple(values.shape[1:])
         if name == "f_rest" and found[1:] == shape[1:] and found != shape:
             raise UserError(
-                f"the checkpoint has {found[0]} SH coefficients above band 0, where --sh_degree {max_sh_degree} needs "
+                f"the checkpoint has {found[0]} SH coefficients above band 0, but --sh_degree {max_sh_degree} needs "
                 f"{shape[0]}; give the --sh_degree it was trained with"
             )
         if found != shape or values.dtype != torch.float32:

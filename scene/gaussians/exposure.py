@@ -71,7 +71,7 @@ class Exposures:
         """Take the state of `capture()`, after training_setup. UserError for a state that does not fit."""
         if state.get("names") != self.names:
             raise UserError(
-                "the checkpoint has exposures of other photos than this run trains on; give the scene and the options "
+                "the checkpoint's exposures are of other photos than this run's; give the scene and the options "
                 "--eval and --train_test_exp that it was trained with"
             )
         values = state.get("values")
@@ -104,7 +104,7 @@ class Exposures:
 def read_exposures(folder: str | os.PathLike, names: Sequence[str], image_names: Sequence[str]) -> Exposures:
     """Exposures of the photos `names` from a model folder's exposure.json. UserError if one is missing or broken.
 
-    image_names: of the same photos, under which the reference's files have them, also where several photos share one.
+    image_names: the same photos' names in the reference's files, which several photos may share.
     """
     path = Path(folder) / NAME
     remedy = "restore the file, or write train_test_exp=False into cfg_args to render without exposures"

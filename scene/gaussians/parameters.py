@@ -106,7 +106,7 @@ class GaussianParameters:
         return len(self) * row_bytes(self.max_sh_degree)
 
     def part(self, keep: Tensor | slice, sh_degree: int) -> "GaussianParameters":
-        """A copy of the Gaussians `keep`, (N,) bool or a slice, with the SH bands up to sh_degree and no optimiser."""
+        """A copy of the Gaussians `keep`, (N,) bool or a slice, with the SH bands up to sh_degree."""
         rows = {name: values[keep] for name, values in self.rows().items()}
         rows["f_rest"] = rows["f_rest"][:, : (sh_degree + 1) ** 2 - 1].contiguous()
         other = copy.copy(self)

@@ -81,7 +81,7 @@ def read_ply(path: str | os.PathLike, sh_degree: int) -> Rows:
         degree = _degree(present)
         found = "no known SH degree" if degree is None else f"SH degree {degree}"
         raise UserError(
-            f"{path} has {rest} f_rest properties, those of {found}, where SH degree {sh_degree} needs {len(wanted)}; "
+            f"{path} has {rest} f_rest properties, those of {found}, but SH degree {sh_degree} needs {len(wanted)}; "
             "give the --sh_degree of the file"
         )
     rows = {}

@@ -10,7 +10,7 @@ from scene.gaussians.adam import GaussianAdam
 class SparseGaussianAdam(GaussianAdam):
     """Sparse Adam (Mallick et al. 2024, Taming 3DGS): GaussianAdam for visible rows, without bias correction.
 
-    Rows that were not seen keep values and moments to the bit. State and state dict keep their form. `step` counts the
+    Rows that were not seen keep values and averages exactly. State and state dict keep their form. `step` counts the
     steps of the tensor, and no formula uses it.
     """
 

@@ -21,7 +21,7 @@ class Statistics:
 
     @classmethod
     def zero(cls, count: int, device: torch.device | str) -> "Statistics":
-        """Statistics of `count` Gaussians that nothing was observed of."""
+        """Statistics of `count` Gaussians without any observation."""
         return cls(*(torch.zeros(shape, device=device) for shape in ((count,), (count, 1), (count, 1))))
 
     def observe(self, gradient: Tensor, radii: Tensor) -> None:
@@ -44,11 +44,10 @@ class Statistics:
         self.xyz_gradient_accum[broken] = 0.0
         self.denom[broken] = 0.0
 
-    def keep(self, indices: Tensor) -> None:
-        """Keep the rows of `indices` (n,) int64."""
-        self.xyz_gradient_accum = self.xyz_gradient_accum.index_select(0, indices)
-        self.denom = self.denom.index_select(0, indices)
-        self.max_radii2D = self.max_radii2D.index_select(0, indices)
+    def keep(self, indices: Tensor) -> "Statistics":
+        """The statistics of the rows `indices` (n,) int64."""
+        kept = (values.index_select(0, indices) for values in (self.max_radii2D, self.xyz_gradient_accum, self.denom))
+        return Statistics(*kept)
 
     def to(self, device: torch.device | str) -> "Statistics":
         """The same statistics on a device."""

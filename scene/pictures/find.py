@@ -23,7 +23,7 @@ class FileIndex:
         self._folded_paths: dict[str, list[Path]] | None = None  # built at the first miss: a large folder takes time
 
     def find(self, *names: str) -> Path | None:
-        """The file of the first of these names that has one. None also when several files match, but none exactly."""
+        """The file of the first name that has one; None if none has, or if several files match but none exactly."""
         for name in names:
             # Path.is_file raises an error for a name that is too long for the system; here it counts as missing.
             if os.path.isfile(exact := self._folder / name):
@@ -84,7 +84,7 @@ def find_pictures(
     if index.merely_alike:
         name, path = next(iter(index.merely_alike.items()))
         print(
-            f"{len(index.merely_alike)} of {len(paths)} {kind} are used although their file names differ in letters "
+            f"{len(index.merely_alike)} of {len(paths)} {kind} are used although their file names differ slightly "
             f"from those in {listed_by}; the first is {path.relative_to(folder)} for {name}",
             file=sys.stderr,
         )

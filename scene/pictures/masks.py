@@ -33,7 +33,7 @@ _REACH = ImageFilter.MinFilter(5)  # bicubic resizing mixes pixels up to 2 pixel
 class MaskOptions:
     """The user's options for masks.
 
-    folder: in the scene folder, or absolute; empty: only the masks that the dataset names. invert: white masks.
+    folder: in the scene folder, or absolute; empty: only the masks that the dataset names. invert: white is masked.
     meaning: IGNORE or TRANSPARENT, for mask files and alpha channels; AUTO ignores under masks and keeps alpha.
     """
 
@@ -56,7 +56,7 @@ NO_MASKS = MaskOptions()
 
 @dataclass(frozen=True)
 class Mask:
-    """A mask's file, whether white masks in it, and the meaning of masked (IGNORE or TRANSPARENT)."""
+    """A mask file, whether white is masked in it, and the meaning of masked pixels (IGNORE or TRANSPARENT)."""
 
     path: Path
     inverted: bool = False
@@ -68,7 +68,7 @@ class Mask:
 
         The values are the file's alpha if it has any, else its brightness. In a file of values 0 and 1 (booleans saved
         as bytes), 1 means white. For IGNORE, 128 or more keeps and the result is 0 or 255. When the size differs from
-        the file's, IGNORE keeps only pixels that no masked pixel contributes to in the resizing of
+        the file's, IGNORE keeps only pixels to which no masked pixel contributes when resized by
         `scene.pictures.decode.decode`.
         """
         pixels = decode(self.path, picture_size(self.path)).numpy()
@@ -136,7 +136,7 @@ def find_masks(scene: Path, names: Sequence[str], options: MaskOptions) -> list[
     if len(lacking) == len(names):
         raise UserError(
             f"no mask in {folder} (--masks) belongs to a photo: looked for {names[0]}, {names[0]}.png and other "
-            f"suffixes, found {some(sorted(path.name for path in folder.iterdir()))}; name masks as the photos"
+            f"suffixes, found {some(sorted(path.name for path in folder.iterdir()))}; name masks like the photos"
         )
     if lacking:
         print(f"{len(lacking)} of {len(names)} photos have no mask and count whole: {some(lacking)}", file=sys.stderr)
@@ -144,7 +144,7 @@ def find_masks(scene: Path, names: Sequence[str], options: MaskOptions) -> list[
 
 
 def refuse_nothing_to_ignore(pictures: Sequence[tuple[Path, Mask | None]], options: MaskOptions) -> None:
-    """UserError for --mask_meaning ignore when no photo, a file and its mask, has a mask or an alpha channel."""
+    """UserError for --mask_meaning ignore if no photo has a mask or an alpha channel. pictures: photos and masks."""
     if options.meaning == IGNORE and not any(mask or may_be_transparent(path) for path, mask in pictures):
         raise UserError(
             "--mask_meaning ignore has nothing to ignore: no masks are named, and no photo has an alpha channel; "

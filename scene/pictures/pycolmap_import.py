@@ -12,8 +12,8 @@ def import_pycolmap() -> ModuleType:
     """The module `pycolmap`, whose import takes time and loads libraries that a Blender scene does not need."""
     import pycolmap
 
-    # The import lets glog answer SIGTERM with a stack dump. Python does not notice, so setting the handler that Python
-    # knows of restores it.
+    # The import makes glog answer SIGTERM with a stack dump. Python still reports its own handler, and setting that
+    # again restores it.
     handler = signal.getsignal(signal.SIGTERM)
     if handler is not None and threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGTERM, handler)

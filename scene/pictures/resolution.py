@@ -6,7 +6,7 @@ import sys
 from utils.system_utils import UserError
 
 WIDEST = 1600
-LARGEST = 16384  # pixels a side; a larger -r is likelier a typing error than meant for a machine that has the memory
+LARGEST = 16384  # pixels a side; a larger -r is more likely a typing error than a plan for a machine with that memory
 
 
 def training_size(width: int, height: int, resolution: int, scale: float = 1.0) -> tuple[int, int]:
@@ -31,7 +31,7 @@ def training_size(width: int, height: int, resolution: int, scale: float = 1.0) 
     if max(size) > LARGEST:
         raise UserError(
             f"a photo of {width} x {height} pixels would train at {size[0]} x {size[1]} with --resolution (-r) "
-            f"{resolution}, and the most is {LARGEST} a side; choose another resolution"
+            f"{resolution}, but at most {LARGEST} a side are allowed; choose another resolution"
         )
     return max(size[0], 1), max(size[1], 1)
 

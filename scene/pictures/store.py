@@ -42,7 +42,7 @@ class ImageStore:
     """Images of photos and other sources, each decoded once and kept.
 
     limit: most images kept, 0: all; beyond it the least recently used one is dropped. A mask or a depth map counts as
-    an image. keep_on: device that keeps them. device: where `get` hands them out (default: keep_on). If only `device`
+    an image. keep_on: device that keeps them. device: where `get` returns them (default: keep_on). If only `device`
     is a GPU, images lie in pinned memory and are copied without waiting. Threads exist only while there is something to
     decode ahead. Call all methods from one thread.
     """
@@ -77,7 +77,7 @@ class ImageStore:
 
     @property
     def planned_bytes(self) -> int:
-        """Most bytes that the images of `plan` take, as many as are kept at once."""
+        """Upper bound on the bytes of the images of `plan` that are kept at once."""
         sizes = sorted((_bytes(*key) for key in self._planned), reverse=True)
         if self._copies:
             sizes = [1 << (size - 1).bit_length() for size in sizes]  # torch pins memory in powers of two
@@ -132,7 +132,7 @@ class ImageStore:
         return len(self._kept)
 
     def _finished(self, key: Key) -> Tensor:
-        """Keep an image on `keep_on`, after a thread has decoded it, or decoded here and now."""
+        """Keep an image on `keep_on` once a thread has decoded it; if none is at it, decode it here."""
         future = self._kept.pop(key, None)
         if future is None:
             self._make_room()

@@ -60,7 +60,7 @@ def undistort(photos: Sequence[Photo]) -> list[Undistorted]:
     try:
         mkdir_p(folder)
     except UserError as error:
-        raise UserError(f"{error}; undistorted photos are kept there, and GS_CACHE names another folder") from error
+        raise UserError(f"{error}; undistorted photos are kept there; set GS_CACHE to use another folder") from error
     _say_which_are_cut(photos)
     version = import_pycolmap().__version__
     keys = _in_threads(lambda photo: _key(photo, version), photos, "Looking up undistorted photos")
@@ -71,7 +71,7 @@ def undistort(photos: Sequence[Photo]) -> list[Undistorted]:
         size = sum(path.stat().st_size for path in missing)
         print(
             f"{len(missing)} undistorted photos ({size / 1e6:.0f} MB) are kept in {folder}; it may be deleted at any "
-            "time, and GS_CACHE names another folder",
+            "time; set GS_CACHE to use another folder",
             file=sys.stderr,
         )
     return [_result(photo, path) for photo, path in zip(photos, paths, strict=True)]

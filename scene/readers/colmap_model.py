@@ -77,7 +77,7 @@ def read_model(folder: Path) -> ColmapModel:
                 _check_cameras_whole(folder / "cameras.bin", model)
             return _records(model, {} if suffix == "bin" else _spaced_names(folder / "images.txt", model))
         except UnicodeDecodeError:
-            errors.append(f".{suffix}: photo names that are not UTF-8, rename the photos in plain letters")
+            errors.append(f".{suffix}: photo names are not UTF-8 (rename the photos in plain letters)")
         except (ValueError, RuntimeError, LookupError, MemoryError) as error:
             errors.append(describe(folder, suffix, error))
     raise _unreadable(folder, errors)

@@ -22,7 +22,7 @@ from utils.host.cache_folder import cache_folder
 from utils.system_utils import UserError
 
 PARAMS = "depth_params.json"
-COLMAP_UNIT = 65536.0  # of a map's values; depth_scale.py divides by 65535, and the reference does both
+COLMAP_UNIT = 65536.0  # of a map's values; depth_scale.py divides by 65535; the reference uses both, too
 BLENDER_UNIT = 512.0
 RELIABLE = 5.0  # largest factor between a trusted scale and the scene's median scale
 _MAKE = "python utils/make_depth_scale.py --base_dir {scene} --depths_dir {depths}"

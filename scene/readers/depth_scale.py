@@ -36,7 +36,7 @@ def make_depth_params(scene: Path, depths: Path, model_type: str) -> tuple[dict[
             scale, offset = fit_picture(sightings, read_values(path) / UNIT)
             table[name] = {"scale": scale, "offset": offset}
     if not table:
-        raise UserError(f"no depth map in {depths} belongs to a photo of {model}; name maps as the photos, with .png")
+        raise UserError(f"no depth map in {depths} belongs to a photo of {model}; name maps like the photos, with .png")
     with atomic_write(model / PARAMS) as path:
         path.write_text(json.dumps(table, indent=2, allow_nan=False) + "\n", encoding="utf-8")
     return table, len(pictures)

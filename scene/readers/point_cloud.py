@@ -81,7 +81,7 @@ def _read_npz(path: Path) -> np.ndarray:
             )
         parts = [np.asarray(part, np.float64) for part in (points, colors) if part is not None]
         if points is None or any(part.ndim != 2 or part.shape[1] != 3 for part in parts):
-            raise ValueError("no array points (N,3), and colors (N,3) if any")
+            raise ValueError("it needs an array points (N,3), and may have colors (N,3)")
         return np.concatenate(parts, axis=1)
     except (ValueError, TypeError, OSError, EOFError, KeyError, MemoryError, zipfile.BadZipFile) as error:
         raise UserError(

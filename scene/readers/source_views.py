@@ -93,7 +93,7 @@ def _warn_of_other_shapes(views: Sequence[SourceView], sizes: Sequence[tuple[int
     if others:
         view, size = others[0]
         print(
-            f"{len(others)} of {len(views)} photos have another aspect ratio than their camera and will be stretched; "
+            f"{len(others)} of {len(views)} photos do not have the aspect ratio of their camera and will be stretched; "
             f"the first is {view.name} ({size[0]} x {size[1]}, camera {view.lens.width} x {view.lens.height})",
             file=sys.stderr,
         )

@@ -181,7 +181,7 @@ def _own_split(
     if not test or not train:
         raise UserError(
             f"of the photos in {file.path}, {len(train)} are in train_filenames and {len(test)} in test_filenames (or "
-            "val_filenames), and both need some; fix the lists or leave --eval out"
+            "val_filenames), but each list needs at least one; fix the lists or leave --eval out"
         )
     return train, test
 

@@ -19,7 +19,7 @@ def lens_of(frame: Mapping[str, Any], shared: Mapping[str, Any], size: tuple[int
 
     Fields: fl_x, fl_y in pixels, or camera_angle_x, camera_angle_y in radians (a missing y equals x); cx, cy (default:
     the middle); w, h (default: `size`, the photo's width and height); camera_model, or is_fisheye; k1 ... k6, p1, p2 as
-    in OpenCV. UserError for a lens that cannot be used; TypeError, ValueError, OverflowError for a value that is no
+    in OpenCV. UserError for a lens that cannot be used; TypeError, ValueError, OverflowError for a value that is not a
     number.
     """
     fields = {**shared, **frame}

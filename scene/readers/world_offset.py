@@ -1,4 +1,4 @@
-"""Local frame of scenes whose coordinates are large against their extent, as in map projections (UTM).
+"""Local frame of scenes whose coordinates are large compared with their extent, as in map projections (UTM).
 
 float32 has steps of 0.06 at 1e6. Such a scene is trained as world minus an offset, computed and subtracted in double.
 """
@@ -34,7 +34,7 @@ def local(info: SceneInfo, offset: np.ndarray) -> SceneInfo:
         train, test = ([_moved(camera, offset) for camera in cameras] for cameras in (train, test))
     cloud, points = info.point_cloud, None
     if cloud is not None:
-        with np.errstate(over="ignore"):  # becomes infinite, which the start refuses
+        with np.errstate(over="ignore"):  # the points become infinite, which start_rows refuses
             points = (cloud.points - offset if moved else cloud.points).astype(np.float32)
         cloud = BasicPointCloud(points, cloud.colors, cloud.normals)
     extent = scene_extent(train, points)

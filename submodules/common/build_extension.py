@@ -2,7 +2,7 @@
 
 Each extension's setup.py calls `setup_extension`; pip does the rest. The result is <package>/_backend.so, which
 registers its operators when torch.ops.load_library loads it. setuptools' own extension builder and torch's know
-neither several instruction sets of one source nor parallel compilation without ninja, so the few commands are here.
+neither several instruction sets of one source nor parallel compilation without ninja, so this runs the commands.
 
 Environment: CXX (compiler), CUDA_HOME (toolkit), GS_CUDA=0|1 (never, or always, build CUDA; unset: where nvcc is
 found and torch was built with CUDA), TORCH_CUDA_ARCH_LIST ("9.0" or "8.0;9.0+PTX"; unset: those of the GPUs that are
@@ -23,12 +23,13 @@ from types import ModuleType
 
 from setuptools import Extension, find_packages, setup
 from setuptools.command.build_ext import build_ext
+from setuptools.command.build_py import build_py
 
 VERSION = "0.1.0"
 OLDEST_TORCH = (2, 11)
 OLDEST_ARCHITECTURE = 80  # reductions over a warp in one instruction
 COMMON_INCLUDE = Path(__file__).resolve().parent / "include"
-# No -ffast-math: NaN, infinities and the order of sums matter. errno and traps nobody reads.
+# No -ffast-math: NaN, infinities and the order of sums matter. Nobody reads errno or traps.
 CXX_FLAGS = ["-O3", "-std=c++17", "-fPIC", "-Wall", "-Wextra", "-fno-math-errno", "-fno-trapping-math"]
 # Symbols stay inside: the three libraries hold templates of the same names.
 CXX_FLAGS += ["-fvisibility=hidden", "-fvisibility-inlines-hidden"]
@@ -46,13 +47,26 @@ def setup_extension(name: str, package: str, root: Path) -> None:
         install_requires=[torch_requirement()],
         # The real source list is found by the builder; setuptools only needs to know that there is a library.
         ext_modules=[Extension(f"{package}._backend", sources=[])],
-        cmdclass={"build_ext": type("BuildBackend", (BuildBackend,), {"root": Path(root).resolve()})},
+        cmdclass={
+            "build_ext": type("BuildBackend", (BuildBackend,), {"root": Path(root).resolve()}),
+            "build_py": BuildModules,
+        },
         zip_safe=False,
     )
 
 
+class BuildModules(build_py):
+    """Copies the package's modules, after removing those that an earlier build of the same folder has left."""
+
+    def run(self) -> None:
+        for package in self.packages or []:
+            for stale in (Path(self.build_lib) / package.replace(".", "/")).glob("*.py"):
+                stale.unlink()
+        super().run()
+
+
 def torch_requirement() -> str:
-    """A compiled extension works with the torch minor version it was built against, and says so."""
+    """The requirement on torch: a compiled extension works only with the minor version it was built against."""
     try:
         major, minor = importlib.metadata.version("torch").split(".")[:2]
     except importlib.metadata.PackageNotFoundError:
@@ -99,11 +113,11 @@ class BuildBackend(build_ext):
         ops = sorted((csrc / "torch").glob("*.cpp"))
         compilations = [([*compile_cxx, *ops_flags], source, f"{source.stem}.torch.o") for source in ops]
         sources = sorted((csrc / "cpu").glob("*.cpp"))
-        # What is compiled once rounds alike everywhere: no fused products where the machine has them (gs/rounded.h).
+        # Sources that are compiled once round alike on every machine, so products are never fused (gs/rounded.h).
         once = [*compile_cxx, "-ffp-contract=off"]
         compilations += [(once, source, f"{source.stem}.o") for source in sources if not is_per_isa(source)]
-        # Baseline first: where the standard library's templates come out of line in several objects, the linker keeps
-        # the first, and that one must run on every machine.
+        # Baseline first: if several objects have the same template of the standard library, the linker keeps
+        # the first one, which must run on every machine.
         for isa, flags in isas.items():
             command = [*compile_cxx, *flags, f"-DGS_ISA={isa}"]
             compilations += [(command, source, f"{source.stem}.{isa}.o") for source in sources if is_per_isa(source)]
@@ -116,8 +130,8 @@ class BuildBackend(build_ext):
         with ThreadPoolExecutor(os.cpu_count()) as pool:
             commands = [[*compiler, "-c", str(source), "-o", obj] for compiler, source, obj in compilations]
             list(pool.map(lambda command: run(command, objects_dir), commands))
-        # Linked without -fopenmp: its runtime must be the one torch has loaded, not a second one. So must the C++
-        # library's, named in full since some machines have only the static one to link by default.
+        # Linked without -fopenmp: its runtime must be the one torch has loaded, not a second one. The same holds
+        # for the C++ library, named in full since some machines link only the static one by default.
         libraries += ["-l:libstdc++.so.6"] if sys.platform == "linux" else []
         shared = ["-dynamiclib", "-undefined", "dynamic_lookup"] if sys.platform == "darwin" else ["-shared"]
         run([*cxx, *shared, *(obj for _, _, obj in compilations), *libraries, "-o", str(library)], objects_dir)
@@ -197,8 +211,8 @@ def architecture_flags(nvcc: str, at_hand: list[tuple[int, int]]) -> list[str]:
         number = name.removesuffix("+PTX").replace(".", "")
         if int(re.sub(r"\D", "", number) or 0) < OLDEST_ARCHITECTURE:
             fail(
-                f"the CUDA backend needs compute capability 8.0 or newer, not {name}: set TORCH_CUDA_ARCH_LIST to what "
-                "it is to run on, or GS_CUDA=0 to build for the CPU only"
+                f"the CUDA backend needs compute capability 8.0 or newer, not {name}: set TORCH_CUDA_ARCH_LIST to the "
+                "GPUs to run on, or GS_CUDA=0 to build for the CPU only"
             )
         code = f"sm_{number},compute_{number}" if name.endswith("+PTX") else f"sm_{number}"
         flags.append(f"-gencode=arch=compute_{number},code=[{code}]")
@@ -206,7 +220,7 @@ def architecture_flags(nvcc: str, at_hand: list[tuple[int, int]]) -> list[str]:
 
 
 def run(command: list[str], folder: Path | None = None) -> str:
-    """Runs a tool and gives back what it printed; ends the build with that if it fails."""
+    """Runs a tool and returns its output; ends the build with that output if the tool fails."""
     done = subprocess.run(command, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
     if done.returncode:
         fail(f"{shlex.join(command)}\n{done.stdout}failed with status {done.returncode}")

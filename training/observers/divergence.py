@@ -16,15 +16,15 @@ from training.step import Step
 from utils.system_utils import UserError
 
 _SHOWN = 5  # rows that a message names
-_COMPARED = 10  # losses compared, at the start and at the end, each of another view
+_COMPARED = 10  # losses compared, at the start and at the end, each of a different view
 _WORSE_AFTER = 100  # iterations after which a loss should have fallen
 
 
 class DivergenceWatch(Observer):
     """Checks, when something is due, that all losses and all steps of the optimisers were finite.
 
-    After the first that was not, the optimisers change nothing (StepGuard). However late the check, the model is the
-    last good one.
+    After the first one that was not, the optimisers change nothing (StepGuard), so even a late check finds the
+    last good model.
     """
 
     def __init__(self, run: Run) -> None:
@@ -64,7 +64,7 @@ class DivergenceWatch(Observer):
             # The guard held that iteration's step back, too.
             good, what = first - 1, f"the loss became {losses[first]}"
         else:
-            good, what = first, f"{self._unstepped()} could take no finite step"
+            good, what = first, f"{self._unstepped()} had no finite step"
         self._gaussians.rewind(iteration - good if stepped else iteration - 1 - good)
         if good < iteration:
             self._gaussians.active_sh_degree = self._sh_degrees[0]
@@ -81,7 +81,7 @@ class DivergenceWatch(Observer):
         before, after = (sum(losses) / len(losses) for losses in (self._earliest, self._latest))
         if after > before:
             tqdm.write(
-                f"warning: the loss was {before:.3g} at first and is {after:.3g} at the end, the model is worse than "
+                f"warning: the loss was {before:.3g} at first and is {after:.3g} at the end: the model is worse than "
                 "the points it began with; lower the learning rates, or check poses and photos (doctor.py)",
                 file=sys.stderr,
             )
@@ -95,7 +95,7 @@ class DivergenceWatch(Observer):
 
     def _rescue(self, iteration: int) -> str:
         if iteration == self._run.first_iteration:
-            return "no iteration before it was trained; lower the learning rates"
+            return "no iteration was trained before it; lower the learning rates"
         path = Path(self._run.scene.model_path) / f"chkpnt{iteration}.pth"
         try:
             self._gaussians.check_finite(iteration)

@@ -14,15 +14,15 @@ from training.step import Step
 from utils.files.listing import some
 from utils.system_utils import UserError
 
-_ENOUGH = 100  # views without a pixel that counts, and none with one: correct masks are not like that
+_ENOUGH = 100  # if so many views have no pixel that counts, and no view has one, the masks are wrong
 _ALMOST_NOTHING = 1e-3  # share of the pixels
-_HINT = "are they white masks (--invert_masks), or those of another scene?"
+_HINT = "is white masked in them (--invert_masks), or do they belong to another scene?"
 
 
 class MaskWatch(Observer):
-    """Adds up, without waiting for a GPU, how much of each view counts. `look` waits, until all views were seen.
+    """Adds up, without waiting for a GPU, how much of each view counts. Only `look` waits for it, while views are new.
 
-    views: those that train. No mask is decoded before training for this check: thousands of photos start in seconds.
+    views: those that train. This check decodes no mask ahead, so training on thousands of photos starts in seconds.
     """
 
     def __init__(self, views: Sequence[Camera]) -> None:
@@ -66,7 +66,7 @@ class MaskWatch(Observer):
         if self._scanty and (last or not self._left):
             tqdm.write(
                 f"warning: the masks of {len(self._scanty)} of {self._seen} views leave none or almost none of their "
-                f"pixels ({some(self._scanty)}), so they teach nothing; {_HINT}",
+                f"pixels ({some(self._scanty)}), so these views teach nothing; {_HINT}",
                 file=sys.stderr,
             )
             self._scanty.clear()

@@ -18,8 +18,8 @@ class MemoryGuard(Observer):
     """Saves the model when memory runs out, and turns the error into a UserError.
 
     Until an iteration is `measured`, the saved state is that after the iteration before: a resumed run then equals one
-    that was never stopped. After that, the saved model is whole as well, but densification or the optimiser's step may
-    be done in part. So this observer stands after those that only read the model, and before those that need it whole.
+    that was never stopped. After that, the saved model is usable as well, but densification or the optimiser's step may
+    be incomplete. So this observer comes after those that only read the model, and before those that need it whole.
     """
 
     def __init__(self, run: Run) -> None:
@@ -61,11 +61,11 @@ class MemoryGuard(Observer):
         try:
             if self._changing:
                 gaussians.take_from_optimizer()
-                state = f"the model in iteration {iteration}, whose last changes may be done in part,"
+                state = f"the model in iteration {iteration}, whose last changes may be incomplete,"
                 further = f"--max_num_splats {len(gaussians)}, {further}"
             else:
                 gaussians.active_sh_degree = self._sh_degree
-                anew = "--max_num_splats or --sh_degree"  # a resumed run with as many would end here again
+                anew = "--max_num_splats or --sh_degree"  # a resumed run with as many Gaussians would end here again
             gaussians.check_finite(iteration)
             gaussians.check_steps()
             path = self._folder / f"chkpnt{iteration}.pth"
@@ -73,5 +73,5 @@ class MemoryGuard(Observer):
         except (UserError, MemoryError, RuntimeError) as error:
             return f"and the model could not be saved ({error}); resume an earlier checkpoint"
         return (
-            f"{state} is saved: resume with --start_checkpoint {path} and {further}, or start anew with a lower {anew}"
+            f"{state} is saved: resume with --start_checkpoint {path} and {further}, or start again with a lower {anew}"
         )

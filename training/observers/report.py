@@ -21,15 +21,16 @@ from utils.image_utils import as_float, pixels_that_count, psnr
 from utils.loss_utils import l1_loss
 
 LOG_INTERVAL = 10  # iterations between TensorBoard's losses: reading one waits for the GPU
-SHOWN = 5  # views of a set that TensorBoard gets the images of
+SHOWN = 5  # views of a set whose images TensorBoard gets
 
 
 class Report(Observer):
-    """Calls `training_report` in every iteration, and logs the scores. writer: TensorBoard's, or None."""
+    """Scores in testing iterations. writer: TensorBoard's, or None. report: `training_report` or what replaces it."""
 
-    def __init__(self, run: Run, writer: Any | None) -> None:
+    def __init__(self, run: Run, writer: Any | None, report: Callable[..., dict[str, float]]) -> None:
         self._run = run
         self._writer = writer
+        self._report = report
 
     def due(self, step: Step) -> bool:
         return step.iteration in self._run.plan.test
@@ -37,15 +38,15 @@ class Report(Observer):
     def measured(self, step: Step, losses: Losses) -> None:
         run, seconds = self._run, self._run.clock.seconds
         with run.clock.paused():
-            scores = training_report(
+            scores = self._report(
                 self._writer, step.iteration, losses.l1, losses.total, l1_loss, seconds - step.started, run.plan.test,
                 run.scene, render, (run.pipe, run.background), run.dataset.train_test_exp,
             )  # fmt: skip
-            if scores:
-                run.log.add(step.iteration, seconds, gaussians=len(run.gaussians), loss=run.losses.mean, **scores)
+        if scores:
+            step.record = scores
 
     def ended(self, error: Error) -> None:
-        if self._writer:
+        if self._writer and error is None:
             self._writer.close()
 
 
@@ -62,7 +63,7 @@ def training_report(
     renderArgs: tuple,
     train_test_exp: bool = False,
 ) -> dict[str, float]:
-    """Log every tenth iteration to TensorBoard; in a testing one score test views and five training views, and print.
+    """Log every tenth iteration to TensorBoard; in testing iterations, score and print test and five training views.
 
     elapsed: seconds of this iteration; renderArgs: what follows camera and model in renderFunc, (pipe, background).
     train_test_exp: render with exposures, and score right halves only.

@@ -32,7 +32,8 @@ class Saves(Observer):
     def measured(self, step: Step, losses: Losses) -> None:
         if step.iteration not in self._run.plan.save:
             return
-        run, seconds, values = self._run, self._run.clock.seconds, {}
+        run = self._run
+        step.record = step.record or {}
         with run.clock.paused():
             run.gaussians.check_finite(step.iteration)
             tqdm.write(f"[ITER {step.iteration}] Saving Gaussians", file=sys.stdout)
@@ -40,10 +41,9 @@ class Saves(Observer):
                 self._left_out = save_last(
                     run.scene, run.dataset, run.opt, run.pipe, run.background, self._test_in_memory
                 )
-                values = {"gaussians_left_out": self._left_out.unseen}
+                step.record["gaussians_left_out"] = self._left_out.unseen
             else:
                 run.scene.save(step.iteration)
-            run.log.add(step.iteration, seconds, gaussians=len(run.gaussians), loss=run.losses.mean, **values)
 
     def ended(self, error: Error) -> None:
         if error is None and self._left_out is not None:

@@ -1,5 +1,6 @@
 """The observers of a training, in their order."""
 
+from collections.abc import Callable
 from typing import Any
 
 from training.observer import Observer
@@ -8,23 +9,25 @@ from training.observers.divergence import DivergenceWatch
 from training.observers.masks import MaskWatch
 from training.observers.memory import MemoryGuard
 from training.observers.progress import ProgressBar
+from training.observers.records import Records
 from training.observers.report import Report
 from training.observers.saves import Checkpoints, Saves
 from training.run import Run
 
 
-def standard_observers(run: Run, writer: Any | None) -> list[Observer]:
-    """The observers of every training. writer: TensorBoard's, or None."""
+def standard_observers(run: Run, writer: Any | None, report: Callable[..., dict[str, float]]) -> list[Observer]:
+    """The observers of every training. writer: TensorBoard's, or None. report: `training_report`."""
     with_curve = run.plan.record_curve and bool(run.scene.getTestCameras())
     test_in_memory = with_curve or run.opt.iterations in run.plan.test
     watch = DivergenceWatch(run)
     return [
-        watch,  # first: all that write rely on every loss so far being finite
+        watch,  # first: observers that write rely on all losses so far being finite
         ProgressBar(run),  # reads the losses that the watch has checked
         MaskWatch(run.scene.getTrainCameras()),  # may refuse the scene before anything is written
         *([Curve(run)] if with_curve else []),  # the scores are those of the model saved at the same iteration
-        Report(run, writer),
+        Report(run, writer, report),
         Saves(run, test_in_memory),  # before the model changes
+        Records(run),  # after all that add to the iteration's record
         MemoryGuard(run),  # from `measured` to `stepped` the model changes; otherwise it is whole
         Checkpoints(run, watch),  # last: writes the whole state after the step
     ]

@@ -10,7 +10,7 @@ _IMPORTED = time.perf_counter()
 
 
 def wall_seconds() -> float:
-    """Seconds since the process started, or since the import of this module if the system does not tell."""
+    """Seconds since the process started, or since the import of this module if the system does not say."""
     since_import = time.perf_counter() - _IMPORTED
     try:
         # The command's name, in brackets, may have spaces. Field 22 of proc(5) is the start in clock ticks since boot.
@@ -22,7 +22,7 @@ def wall_seconds() -> float:
 
 
 def peak_memory_mib(device: torch.device) -> float | None:
-    """Peak memory so far in MiB: torch's on a GPU, else the resident memory; None if the system does not tell."""
+    """Peak memory so far in MiB: torch's on a GPU, else the resident memory; None if the system does not say."""
     if device.type == "cuda":
         return torch.cuda.max_memory_allocated(device) / 2**20
     try:

@@ -10,7 +10,7 @@ namespace gs {
 struct BinMemory {
   Binned (*take)(void* context, int64_t instances, int64_t slots);
   void* context;
-  SplatSlots* slots;  // (N + 1), filled by binning, or null where nobody wants them
+  SplatSlots* slots;  // (N + 1), filled by binning, or null if not wanted
 };
 
 // Every backend's functions. `Where` says how they run: an Executor on the CPU, a Queue on a GPU.

@@ -44,7 +44,7 @@ template <class T>
 struct Projected {
   T* splats;       // (N, 10), Splat in math/splat.h; undefined where tile_counts is 0
   T* depths;       // (N) infinite where tile_counts is 0, so that binning sorts those last
-  int32_t* rects;  // (N, 4) tiles x0 y0 x1 y1, undefined where tile_counts is 0; null allowed where there are records
+  int32_t* rects;  // (N, 4) tiles x0 y0 x1 y1, undefined where tile_counts is 0; null allowed if there are records
   int32_t* tile_counts;  // (N)
   int32_t* radii;        // (N)
   TileRecord* records;   // (N), or null
@@ -68,7 +68,7 @@ struct SceneGradient {
 // The slots (math/slots.h) of a splat: one for each tile of its rectangle, row by row. A culled splat has none.
 struct alignas(16) SplatSlots {
   int64_t first;    // the number of slots of all splats before
-  int32_t skipped;  // tiles before the rectangle if every row of the image were as wide as it
+  int32_t skipped;  // tiles before the rectangle if every row of the image were as wide as the rectangle
   int32_t wide;     // the rectangle's width
 };
 

@@ -44,7 +44,7 @@ def rasterize(
     means2d (N, 3): values unused; receives d loss / d mean on the image, per NDC unit.
     raw: opacities are logits, scales are logarithms, and rotations have any length (zero means the identity).
     Gaussians with a NaN or an infinite value are left out and receive zero gradients.
-    Raises TypeError for wrong dtypes and ValueError for wrong shapes. Raises RuntimeError for wrong settings, and where
+    Raises TypeError for wrong dtypes and ValueError for wrong shapes. Raises RuntimeError for wrong settings, and if
     the image needs more than 2^31 tile instances.
     """
     gaussians = Gaussians(means, opacities, **others)
@@ -78,7 +78,7 @@ def decisive(
 ) -> Tensor:
     """Finds the decisive Gaussians, those that the image of `rasterize` depends on: (N,) bool. Same arguments.
 
-    A decisive Gaussian is blended in some pixel, or ends one. It ends a pixel where it would leave less than 1e-4 of
+    A decisive Gaussian is blended in some pixel, or ends one. It ends a pixel if it would leave less than 1e-4 of
     the transmittance: the pixel takes neither it nor any Gaussian behind it. Without the others the image keeps every
     bit.
     """

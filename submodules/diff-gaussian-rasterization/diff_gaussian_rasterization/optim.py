@@ -6,7 +6,7 @@ whose shape, dtype, device or layout does not fit; then nothing was changed.
 A guard may hold steps back. It is given by the last three arguments: `loss`, the scalar loss of this iteration;
 `stopped`, one int64 on the parameters' device, 0 at the start; and `iteration`, counted from 1. The first iteration
 whose loss or step is not finite is written to `stopped`, and no later iteration takes a step. In that iteration a value
-whose step would not be finite keeps its value, and its first moment becomes NaN as a mark. Without `stopped` there is
+whose step would not be finite keeps its value, and its exp_avg becomes NaN as a mark. Without `stopped` there is
 no guard.
 """
 
@@ -38,11 +38,11 @@ def adam_(
 ) -> None:
     """Takes one step of Adam (Kingma and Ba 2015, algorithm 1, eps as in torch.optim.Adam) of several parameters.
 
-    Each list has an entry for every parameter. values, gradients and both moments: tensors of one shape (N, ...), all
+    Each list has an entry for every parameter. values, gradients and both averages: tensors of one shape (N, ...), all
     parameters of one dtype (float32, or on the CPU float64) and device; all but gradients contiguous. steps: one
     float32 each, on the CPU, the number of steps taken before. rates: learning rates. columns: how many leading values
     of each row take part, -1 for all.
-    Changes values, exp_avgs, exp_avg_sqs and `stopped`, and adds 1 to every entry of steps, also where the guard holds
+    Changes values, exp_avgs, exp_avg_sqs and `stopped`, and adds 1 to every entry of steps, even if the guard holds
     the step back.
     """
     lists = values, gradients, exp_avgs, exp_avg_sqs, steps
@@ -66,7 +66,7 @@ def sparse_adam_(
 ) -> None:
     """Takes one step of sparse Adam (Mallick et al. 2024, Taming 3DGS) of one parameter's visible rows.
 
-    value, gradient and both moments: (N, ...) as for `adam_`. visible: (N,) bool. There is no bias correction.
+    value, gradient and both averages: (N, ...) as for `adam_`. visible: (N,) bool. There is no bias correction.
     Changes value, exp_avg, exp_avg_sq and `stopped`; rows that are not visible keep every bit.
     """
     tensors = value, gradient, exp_avg, exp_avg_sq, visible

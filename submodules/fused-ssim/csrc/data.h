@@ -49,7 +49,7 @@ struct L1SsimVjpCuda {
   float l1_weight = 1, ssim_weight = 1;  // of grad_l1 and grad_ssim
 };
 
-// An image with alpha, to be laid over a background.
+// An image with alpha, to be composited on a background.
 struct Composite {
   const uint8_t* picture;   // (4, pixels): red, green, blue, straight alpha
   const float* background;  // 3

@@ -1,6 +1,6 @@
 """Structural similarity (SSIM) and mean absolute difference of two images, with their gradient, in one pass.
 
-`composite` puts a photo with alpha over a background, before the loss compares it with an image.
+`composite` puts an image with alpha on a background, before the loss compares it with a render.
 """
 
 from fused_ssim.ops import composite, fused_l1_ssim, fused_photometric_loss, fused_ssim

@@ -60,7 +60,7 @@ def fused_photometric_loss(img1: Tensor, img2: Tensor, lambda_dssim: float) -> t
 
 
 def composite(picture: Tensor, background: Tensor) -> Tensor:
-    """Puts a picture with straight alpha, (4, H, W) uint8, over a background (3,) float32 in [0, 1].
+    """Composites an image with straight alpha, (4, H, W) uint8, on a background (3,) float32 in [0, 1].
 
     Returns color / 255 * alpha + background * (1 - alpha), (3, H, W) float32, where alpha is value / 255; the same bits
     on every device. There is no gradient.

@@ -67,7 +67,7 @@ struct ForwardState {
   alignas(64) typename IntOf<T>::type last[kPixels];
 };
 
-// Blends splats [0, count) of a chunk into one strip. Returns false once all its pixels have ended.
+// Blends splats [0, count) of a batch into one strip. Returns false once all its pixels have ended.
 template <class T, bool kDepth, bool kLast>
 bool blend_strip(const LocalSplat<T>* splats, int64_t count, int64_t position, int row, int first,
                  ForwardState<T>& state) {
@@ -212,7 +212,7 @@ bool splat_gradient(const LocalSplat<T>& splat, int64_t position, const Tile& ti
 
 // Sums of the processed instances, a row of kGradientValues each, in the order of slots: those of a splat lie side by
 // side, whatever tiles they come from. A bit per slot tells which instances were processed, and a prefix sum over the
-// bits tells where a row is. So memory follows what was blended, and nothing is added concurrently.
+// bits tells where a row is. So memory is for these rows only, and nothing is added concurrently.
 template <class T>
 class GradientRows {
  public:
@@ -268,8 +268,8 @@ void blend_tile_vjp(const BlendInput<T>& in, const BlendGradient<T>& g, int64_t 
   }
 }
 
-// Marks those of splats [0, count) of a chunk that are decisive for a strip: a pixel blends splats up to its `last`,
-// and the next splat that reaches it ends it. Returns false once all the strip's pixels have ended.
+// Marks the splats of a batch, [0, count), that are decisive for a strip: a pixel blends splats up to its `last`,
+// and the next splat that reaches the pixel ends it. Returns false once all the strip's pixels have ended.
 template <class T>
 bool mark_strip(const LocalSplat<T>* splats, const int32_t* instances, int64_t count, int64_t position, int row,
                 int first, const typename IntOf<T>::type* last_of_tile, T* threshold_of_tile, bool* decisive) {

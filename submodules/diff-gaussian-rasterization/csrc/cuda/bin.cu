@@ -92,7 +92,7 @@ struct alignas(16) Keys {
 };
 
 // Finds where each tile's list begins. An instance begins the lists of all tiles after the previous instance's tile, up
-// to its own. The memory of `sorted` ends with a whole load.
+// to its own. The memory of `sorted` has room for whole loads.
 template <class Key>
 __global__ void ranges_kernel(int64_t instances, int64_t tiles, const Key* sorted, int64_t* ranges) {
   constexpr int kCount = Keys<Key>::kCount;

@@ -21,11 +21,11 @@ namespace {
 // Splats of a chunk, in an image of few tiles and of many. Shorter chunks fill a GPU better, but each costs a layer.
 constexpr int kChunkOfFew = 256, kChunkOfMany = 512;
 
-// Going back to front, a splat costs a warp as much as several pixels, even where few warps are at work.
+// Going back to front, a splat costs a warp as much as several pixels. So a lane takes 4, even if few warps run.
 using Backward = Layout<4>;
 
-// Up to this many, every instance gets a gradient row, 40 MiB at most. The host need not wait for the number of
-// processed instances then.
+// Up to this many instances, each one gets a gradient row, 40 MiB at most. Then the host need not wait for the number
+// of processed instances.
 constexpr int64_t kRowsUnasked = 1 << 20;
 
 struct ProcessedLength {
@@ -224,7 +224,7 @@ __device__ __forceinline__ void splat_gradient(const Batch<kBatch>& batch, const
 }
 
 // Walks each chunk back to front, a block each, and writes its gradient rows. Within these registers ptxas compiles the
-// loop over splats without spills on sm_90. Asked for a number of blocks a processor instead, it makes the loop a tenth
+// loop over splats without spills on sm_90. If blocks per multiprocessor are bounded instead, it makes the loop a tenth
 // longer.
 template <bool kDepth>
 __global__ void GS_MAX_REGISTERS(kDepth ? 96 : 80)

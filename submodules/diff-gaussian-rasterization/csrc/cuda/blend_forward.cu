@@ -13,7 +13,7 @@ struct ListLength {
   __device__ int64_t operator()(int tile) const { return ranges[tile + 1] - ranges[tile]; }
 };
 
-// The bound on blocks a multiprocessor keeps the kernel to 56 registers, or 48 with one pixel a lane, without spills on
+// Bounding blocks per multiprocessor limits the kernel to 56 registers, or 48 with one pixel a lane, without spills on
 // sm_90.
 template <class L, bool kDepth, bool kLast>
 __global__ void __launch_bounds__(L::kThreads, L::kRun == 1 ? 5 : 9)

@@ -77,11 +77,11 @@ __device__ inline unsigned reached_by_warp(const Batch<kCount>& batch, const L& 
   return __ballot_sync(kWarp, hit);
 }
 
-// The splats whose exponents a warp computes at once, going front to back; with one pixel a lane it would mostly wait.
+// Splats that a warp evaluates at once, going front to back. With one pixel a lane, a single splat would leave it idle.
 template <class L>
 constexpr int kTogether = L::kRun == 1 ? 2 : 1;
 
-// Goes front to back through those of 32 splats from `from` that reach the warp. Calls step(k, p, exponent) for each
+// Goes front to back through the splats that reach the warp, of 32 from `from`. Calls step(k, p, exponent) for each
 // and for each pixel of the lane.
 template <class L, int kCount, class Step>
 __device__ __forceinline__ void front_to_back(const Batch<kCount>& batch, const L& at, int from, int count,

@@ -1,6 +1,6 @@
 #pragma once
 // Gradient rows of the processed instances, side by side for each splat. A bit per slot tells which instances were
-// processed, and a prefix sum over the bits tells where a row is. So memory follows what was blended, nothing is zeroed
+// processed, and a prefix sum over the bits tells where a row is. So memory is for these rows only, nothing is zeroed
 // and nothing is added concurrently.
 #include <cstdint>
 
@@ -23,7 +23,7 @@ struct GradientRows {
   }
 };
 
-// Runs the backward of blending up to the rows. Waits for their number where they may be many.
+// Runs the backward of blending up to the rows. Waits for the number of rows if there may be many.
 GradientRows blend_rows(const Queue& queue, const BlendInput<float>& in, const BlendGradient<float>& g);
 
 // Sums a splat's rows, in an order that depends on their number alone. The rows of a warp's splats lie side by side, so

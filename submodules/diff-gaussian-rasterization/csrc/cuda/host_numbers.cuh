@@ -1,5 +1,5 @@
 #pragma once
-// Brings numbers to the host that it needs before it can continue.
+// Brings the host the numbers that it needs before it can continue.
 #include "queue.cuh"
 
 namespace gs {

@@ -26,14 +26,14 @@ __device__ inline int nth_bit(uint64_t mask, int n) {
   return place;
 }
 
-// What emission needs of a splat.
+// The data of a splat that emission needs.
 struct alignas(16) Lined {
   uint64_t mask;   // of reached tiles, 0 where emission has to test them
   int32_t corner;  // the first tile of the rectangle
   int32_t wide;
 };
 
-// Copies what emission needs of the splats into depth order, so that they are read all over memory only once. counts:
+// Copies this data of the splats into depth order, so that scattered memory is read only once. counts:
 // (n + 1), the last 0.
 __global__ void __launch_bounds__(kEmitThreads)
     line_up_kernel(int64_t n, const int32_t* order, Projected<float> in, int columns, Lined* lined, int32_t* counts) {

@@ -42,7 +42,7 @@ __global__ void __launch_bounds__(kThreads)
   source.read(i, seen, m, stage + threadIdx.x / 32 * SlotSums::kStage);
   wait_for_rows();
   if (seen) {
-    // Writes the row even where nobody wants it: a null pointer would be tested for every band.
+    // Writes the row even if it is not wanted: a null pointer would be tested for every band.
     project_vjp_row(s, camera, i, m, row, row, out);
   } else if (i < s.count) {
     zero_gradient(i, out);

@@ -1,5 +1,5 @@
 #pragma once
-// What the host side of every kernel does with its Queue, and the mask of a whole warp.
+// The host side's common uses of a Queue, and the mask of a whole warp.
 #include <cuda_runtime.h>
 
 #include "gs/cuda_check.h"

@@ -12,13 +12,13 @@ namespace cuda {
 constexpr int kOrderThreads = 1024;
 constexpr int kLengthClasses = 256;            // eight to a doubling
 constexpr int64_t kMostOrdered = 16384;        // tiles; sorting more would take a block too long
-constexpr int32_t kWhole = int32_t(~0u >> 1);  // the size of chunks where lists are not cut
+constexpr int32_t kWhole = int32_t(~0u >> 1);  // the size of chunks if lists are not cut
 
 // A part of a tile's list, for one block. All chunks of a tile but the first have places, side by side.
 struct alignas(16) Chunk {
   int32_t tile;        // -1 where there is none
   int32_t first, end;  // positions in the list
-  int32_t behind;      // the place of the chunk behind this one, even where there is none
+  int32_t behind;      // the place of the chunk behind this one, even if there is none
 };
 
 struct Schedule {
@@ -40,7 +40,7 @@ __device__ inline int length_class(int64_t length) {
   return kLengthClasses - 1 - int((bits - 0x3f800000u) >> 20);  // exponent and three bits of the mantissa
 }
 
-// The chunks of a list before its last one, which has the rest.
+// The number of chunks of a list before its last one, which has the rest.
 __device__ inline int32_t full_chunks(int32_t length, int32_t size) { return length ? (length - 1) / size : 0; }
 
 // Sorts chunks by class, in one block. The order within a class and the order of places are arbitrary; no result
@@ -96,8 +96,8 @@ __global__ void __launch_bounds__(kOrderThreads) keep_tiles_kernel(int tiles, Le
   if (t < tiles) chunks[t] = {t, 0, int32_t(length(t)), 0};
 }
 
-// Schedules the tiles' lists in chunks of `size`, the longest first. Many tiles keep whole lists, in the order of the
-// tiles. total: the sum of all lengths, or more.
+// Schedules the tiles' lists in chunks of `size`, the longest first. If there are too many tiles to sort, lists stay
+// whole, in the order of the tiles. total: the sum of all lengths, or more.
 template <class Length>
 Schedule longest_first(const Queue& queue, int64_t tiles, const Length& length, int32_t size = kWhole,
                        int64_t total = 0) {

@@ -7,7 +7,7 @@
 
 GS_ISA_BEGIN
 
-// A splat in coordinates local to a tile. In image coordinates, small splats lose 1.3e-3 of the exponent where these
+// A splat in coordinates local to a tile. In image coordinates, small splats lose 1.3e-3 of the exponent; in these they
 // lose 1.1e-5. Products are arranged so that a compiler can fuse them in one way only: forward and backward must agree
 // on which pixels are reached.
 template <class T>
@@ -54,7 +54,7 @@ GS_HD V capped(V alpha, T cap = T(kMaxAlpha)) {
   return alpha < cap ? alpha : V{} + cap;
 }
 
-// a / b. On a GPU by the hardware's reciprocal and a correction step. Without the correction a division is 2e-8 off on
+// a / b. A GPU uses the hardware's reciprocal and a correction step. Without the correction a division is 2e-8 off on
 // average, and 2,000 of them in a row are 4e-5 off.
 template <class V>
 GS_HD V quotient(V a, V b) {

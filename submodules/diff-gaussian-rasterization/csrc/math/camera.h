@@ -21,8 +21,8 @@ struct Camera {
 
 // Makes a camera from the reference's settings: the view and the full projection matrix, both transposed (for row
 // vectors), row-major. Dot products with the rotation's rows extract the projection's own entries from the full matrix.
-// They are computed in double, less what rounding left of x . z: in a narrow field of view the scale is 1e5 times the
-// shift.
+// They are computed in double, without the part from x . z, which is 0 up to rounding: in a narrow field of view the
+// scale is 1e5 times the shift.
 template <class T>
 GS_HD Camera<T> make_camera(const T* view, const T* full, const T* center, double tan_x, double tan_y, int width,
                             int height) {

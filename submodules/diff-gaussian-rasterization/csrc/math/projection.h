@@ -82,8 +82,8 @@ GS_HD bool project_splat(const Camera<T>& cam, const Gaussian<T>& gaussian, bool
 template <class T>
 struct GaussianGradient {
   Vec3<T> mean;
-  Vec3<T> torque;        // of turns about the axes, where the axes are known to be perpendicular
-  Vec3<T> direction[3];  // of the axes, where they may not be perpendicular
+  Vec3<T> torque;        // of turns about the axes, if they are known to be perpendicular
+  Vec3<T> direction[3];  // of the axes, if they may not be perpendicular
   T log_scale[3];
   T log_opacity;
   T pixel_x, pixel_y;

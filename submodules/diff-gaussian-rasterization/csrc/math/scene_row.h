@@ -41,8 +41,8 @@ GS_HD Loaded<T> load(const Scene<T>& s, int64_t i) {
   return out;
 }
 
-// Checks what may not show in the mean or the footprint, which are checked after they are computed. Infinite logits are
-// the opacities 0 and 1: programs that set an opacity write them.
+// Checks values whose faults may not show in the mean or the footprint, which are checked later. Infinite logits are
+// valid: programs that set the opacities 0 and 1 write them.
 template <class T>
 GS_HD bool finite_shape(const Scene<T>& s, int64_t i) {
   const T opacity = s.opacities[i];

@@ -266,8 +266,8 @@ struct Lengths {
   int64_t operator()(int tile) const { return lengths[tile]; }
 };
 
-// Chunks make up every list. The longest come first as far as one block sorts them, up to an eighth of a doubling. Each
-// has a place of its own, after that of the chunk in front.
+// The chunks cover every list. If one block can sort them, the longest come first, up to an eighth of a doubling. Each
+// but a list's first has its own place, after that of the chunk in front.
 void test_longest_first() {
   for (const int64_t tiles : {1, 2500, 16384, 20000})
     for (const int32_t size : {gs::cuda::kWhole, 64}) {

@@ -10,11 +10,11 @@ namespace {
 void check_moments(const Tensor& value, const Tensor& gradient, const Tensor& exp_avg, const Tensor& exp_avg_sq) {
   for (const Tensor* t : {&gradient, &exp_avg, &exp_avg_sq})
     TORCH_CHECK(t->sizes() == value.sizes() && t->scalar_type() == value.scalar_type() && t->device() == value.device(),
-                "gradient and moments must have the shape, dtype and device of the parameter, ", value.sizes(), " ",
+                "gradient and averages must have the shape, dtype and device of the parameter, ", value.sizes(), " ",
                 value.scalar_type(), " on ", value.device(), ", got ", t->sizes(), " ", t->scalar_type(), " on ",
                 t->device());
   TORCH_CHECK(value.is_contiguous() && exp_avg.is_contiguous() && exp_avg_sq.is_contiguous(),
-              "parameter and moments must be contiguous");
+              "parameter and averages must be contiguous");
 }
 
 // Checks the inputs of a step's guard. `stopped`, one int64, comes with a loss of the parameters' dtype.
@@ -47,7 +47,7 @@ gs::AdamInput<T> adam_input(const Tensor& value, const Tensor& gradient, const T
   return in;
 }
 
-// Takes one step of every parameter, in one launch on a GPU. Advances each counter first, as torch does, and also where
+// Takes one step of every parameter, in one launch on a GPU. Advances each counter first, as torch does, even if
 // the guard holds the step back.
 void adam_op(at::TensorList values, at::TensorList gradients, at::TensorList exp_avg, at::TensorList exp_avg_sq,
              at::TensorList steps, at::ArrayRef<double> rates, double beta1, double beta2, double eps,

@@ -17,7 +17,7 @@ using namespace gs::baseline;
 
 constexpr int64_t kMostRestBands = sh_count(kMaxShDegree) - 1;
 
-// What a Gaussian has in each input: values, or bands of values. sh_rest has any number of bands.
+// A Gaussian's part of each input: values, or bands of values. sh_rest has any number of bands.
 struct Row {
   const char* name;
   int64_t values, bands;
@@ -52,6 +52,7 @@ SceneTensors::SceneTensors(SCENE_PARAMETERS)
       image_{int(width), int(height)} {
   const at::ScalarType type = means.scalar_type();
   TORCH_CHECK_TYPE(type == at::kFloat || type == at::kDouble, "means must be float32 or float64, got ", in_words(type));
+  TORCH_CHECK_TYPE(means.defined(), "means must be a tensor, got None");
   TORCH_CHECK_VALUE(means.dim() == 2 && means.size(1) == 3, "means must be (N, 3), got ", in_words(means.sizes()));
   TORCH_CHECK_VALUE(cov3d.has_value() != (scales.has_value() && rotations.has_value()),
                     "give scales and rotations, or cov3d");
@@ -68,9 +69,11 @@ SceneTensors::SceneTensors(SCENE_PARAMETERS)
 }
 
 Tensor SceneTensors::checked(Input input, const MaybeTensor& given) const {
-  if (!given.has_value()) return {};
-  const Tensor& t = *given;
   const Row& row = kRows[input];
+  const bool none = !given.has_value() || !given->defined();  // Python's None for an argument that must be a tensor
+  TORCH_CHECK_TYPE(!none || input != kOpacities, row.name, " must be a tensor, got None");
+  if (none) return {};
+  const Tensor& t = *given;
   TORCH_CHECK_TYPE(t.scalar_type() == dtype() && t.device() == device(), row.name, " must be ", in_words(dtype()),
                    " on ", device(), " like means, got ", in_words(t.scalar_type()), " on ", t.device());
   if (input == kShRest) return checked_rest(t);

@@ -1,5 +1,5 @@
 #pragma once
-// What all ops need: contiguous tensors, words for messages, and the way to a backend and back to the dispatcher.
+// Helpers of all ops: contiguous tensors, words for messages, calls of a backend, and registration.
 #include <ATen/core/Tensor.h>
 #include <torch/library.h>
 

@@ -8,7 +8,7 @@ from torch import Tensor
 from diff_gaussian_rasterization.reference.camera import Points
 from diff_gaussian_rasterization.reference.shape import Ellipses
 
-LEAST_ALPHA = 1 / 255  # a pixel takes no less
+LEAST_ALPHA = 1 / 255  # a pixel blends no smaller alpha
 LARGEST_ALPHA = 0.99
 LEAST_TRANSMITTANCE = 1e-4  # a splat that would leave less ends the pixel and is not blended itself
 
@@ -69,7 +69,7 @@ def blend_rows(splats: Splats, background: Tensor, rows: range, width: int, cut:
 def alphas(splats: Splats, rows: range, width: int) -> Tensor:
     """Opacity times the Gaussian of Kerbl et al. 2023, eq. 4, on the image: (M, rows, W).
 
-    With covariance = R^T R and R^T (u, v) = (dx, dy), the exponent is -(u^2 + v^2) / 2: it can't become positive.
+    With covariance = R^T R and R^T (u, v) = (dx, dy), the exponent is -(u^2 + v^2) / 2: it cannot become positive.
     """
     x = torch.arange(width, dtype=torch.float64)
     y = torch.arange(rows.start, rows.stop, dtype=torch.float64)

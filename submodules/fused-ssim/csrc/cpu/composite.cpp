@@ -1,4 +1,4 @@
-// Lays an image with alpha over a background.
+// Composites an image with alpha on a background.
 #include "../math/composite.h"
 
 #include "../backend.h"

@@ -1,4 +1,4 @@
-// Lays an image with alpha over a background. A thread takes a pixel.
+// Composites an image with alpha on a background. A thread takes a pixel.
 #include <cuda_runtime.h>
 
 #include "../backend.h"

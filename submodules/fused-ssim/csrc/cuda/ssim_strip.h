@@ -25,7 +25,7 @@ GS_ISA_BEGIN
 
 constexpr int kReach = 2 * kRadius;
 constexpr int kPerThread = 4;
-constexpr int kTaps = kPerThread + kReach;  // that kPerThread neighbours read of a row or column
+constexpr int kTaps = kPerThread + kReach;  // inputs that kPerThread neighbours read of a row or column
 constexpr int kStep = 4;
 constexpr int kColumns = 128, kMapColumns = kColumns - kReach, kOutColumns = kMapColumns - kReach;
 constexpr int kThreads = kColumns * kStep / kPerThread;
@@ -45,7 +45,7 @@ GS_HD float at(const Four* row, unsigned column) { return row[column / 4].of[col
 // The shared memory of a block. `stats` has the windows' mu1, mu_delta, var1, var_delta and cov. `maps` has value,
 // slope1, slope_delta, anchor.x1 and anchor.delta; gathered down the columns, those take the place of `stats`.
 struct Strip {
-  Four stats[5][kStep][fours(kColumns) + 1];  // one more: the last lane reads past the end, values that do not count
+  Four stats[5][kStep][fours(kColumns) + 1];  // one more: the last lane reads past the end, where values do not count
   Four maps[5][kRing][fours(kMapColumns)];
   Four gradient[kStep][fours(kOutColumns)];
   float x1[kRing][kColumns], delta[kRing][kColumns];
@@ -55,7 +55,7 @@ struct Strip {
 struct Part {
   int64_t height, width;  // of the plane
   int64_t row, column;    // the first pixel
-  int rows;               // at most kOutColumns columns, both cut at the plane's edge by the reader
+  int rows;               // and at most kOutColumns columns; the reader cuts both at the plane's edge
   int rim;                // windows this near to the edge do not count
 };
 
@@ -63,7 +63,7 @@ struct Sums {
   double l1, ssim;
 };
 
-// Ring slot of the row `after` rows behind the one at `begin`; after < kRing.
+// Place in the ring of the row `after` rows past the one at `begin`; after < kRing.
 GS_HD int slot(int begin, int after) { return begin + after < kRing ? begin + after : begin + after - kRing; }
 
 GS_HD float to_float(float v) { return v; }

@@ -108,7 +108,7 @@ GS_HD Ssim<V> ssim(const Stats<V>& q) {
 
 // The sum of w_k at(k), anchored at `anchor`. The derivative at a pixel is this sum over the windows that hold it. It
 // is taken down first, anchored at the pixel of the same row in each column; then across, anchored at the pixel itself,
-// where it is the value. The slopes reach 2 / C2 and multiply differences of neighbours only; the textbook's
+// where `value` is the sum. The slopes reach 2 / C2 and multiply differences of neighbours only; the textbook's
 // x1 sum(w a) - sum(w mu1 a) cancels.
 template <class S, class V, class At>
 GS_HD Anchored<V> gather(const At& at, const Pixel<V>& anchor) {

@@ -4,7 +4,7 @@
 //
 // Nodes are numbered from 1 as in a heap: level l has the nodes 2^l to 2^(l+1) - 1, the children of v are 2 v and
 // 2 v + 1, and all leaves are on the last level. Node i of a level's 2^l has the points from floor(n i / 2^l) up to,
-// but without, floor(n (i + 1) / 2^l), so the tree needs no links.
+// but not including, floor(n (i + 1) / 2^l), so the tree needs no links.
 #include <cstdint>
 #include <cstring>
 
