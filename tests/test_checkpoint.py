@@ -185,7 +185,7 @@ def test_parts_that_do_not_fit_end_in_a_sentence(tmp_path):
         "exp_avg and f_dc differ": (_with_state(good, lambda s: s["state"][1].update(exp_avg=torch.zeros(3))), 1),
         "step of xyz": (_with_state(good, lambda s: s["state"][0].update(step="x")), 1),
         "step of xyz is nan": (_with_state(good, lambda s: s["state"][0].update(step=torch.tensor(torch.nan))), 1),
-        "groups are others": (_with_state(good, lambda s: s["param_groups"].pop()), 1),
+        "groups are different": (_with_state(good, lambda s: s["param_groups"].pop()), 1),
     }
     for words, content in cases.items():
         torch.save(content, tmp_path / "wrong.pth")
