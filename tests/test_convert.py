@@ -552,7 +552,7 @@ def _model(registered: int, points: int = 5000, track: float = 5.0, error: float
         ),
         (
             [_model(25), _model(15, first=25)],
-            ["15 of 40", r"form 2 parts .*\(25 photos are used, the other parts have 15\)"],
+            ["15 of 40", r"form 2 unconnected parts \(25 photos are used, the other parts have 15\)"],
         ),
         ([_model(40), _model(12)], []),
         (

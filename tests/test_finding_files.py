@@ -53,7 +53,7 @@ def test_names_with_spaces_and_letters_of_all_sorts(colmap_scene, text):
 def test_names_that_are_not_utf8(colmap_scene):
     path = colmap_scene / "sparse" / "0" / "images.bin"
     path.write_bytes(path.read_bytes().replace(b"left/v02", b"left/\xe902"))
-    with pytest.raises(UserError, match="photo names are not UTF-8 \(rename the photos"):
+    with pytest.raises(UserError, match=r"photo names are not UTF-8 \(rename the photos"):
         _read(colmap_scene)
 
 
