@@ -1,4 +1,4 @@
-"""Benchmarks: counts against plain loops, short names of kernels, `-h` of every command, imports between rooms."""
+"""Benchmarks: counts against plain loops, short names of kernels, `-h` of every command."""
 
 import ast
 import importlib
@@ -17,16 +17,6 @@ from benchmarks.workloads.splat_scenes import frustum
 BENCHMARKS = Path(__file__).resolve().parents[1] / "benchmarks"
 MODULES = sorted(path for path in BENCHMARKS.glob("*/*.py") if path.name != "__init__.py")
 COMMANDS = [path for path in MODULES if '__name__ == "__main__"' in path.read_text()]
-# The rooms that a room may import, besides itself.
-MAY_IMPORT = {
-    "workloads": set(),
-    "harness": {"workloads"},
-    "peers": {"harness", "workloads"},
-    "kernels": {"peers", "harness", "workloads"},
-    "accuracy": {"harness", "workloads"},
-    "costs": {"harness", "workloads"},
-    "scenes": {"harness", "workloads"},
-}
 
 
 def _name(path: Path) -> str:
@@ -87,13 +77,3 @@ def test_every_command_answers_h(path, monkeypatch, capsys):
 @pytest.mark.parametrize("path", COMMANDS, ids=_name)
 def test_every_command_shows_how_it_is_run(path):
     assert f"python -m {_name(path)} " in ast.get_docstring(ast.parse(path.read_text()))
-
-
-@pytest.mark.parametrize("path", MODULES, ids=_name)
-def test_rooms_import_only_the_rooms_below_them(path):
-    source = path.read_text()
-    assert "sys.path" not in source
-    imports = [node for node in ast.walk(ast.parse(source)) if isinstance(node, ast.ImportFrom | ast.Import)]
-    modules = [getattr(node, "module", None) or alias.name for node in imports for alias in node.names]
-    rooms = {module.split(".")[1] for module in modules if module.startswith("benchmarks.")}
-    assert rooms <= {path.parent.name, *MAY_IMPORT[path.parent.name]}

@@ -200,6 +200,13 @@ def test_one_place_knows_half_images_and_one_the_operators():
             assert "torch.ops.diff_gaussian_rasterization" not in text, path
 
 
+def test_commands_run_as_modules_instead_of_editing_the_path_of_imports():
+    """But for utils/make_depth_scale.py, which the reference runs by its path."""
+    for path in _python():
+        if path.relative_to(ROOT).parts[0] != "submodules" and _module(path) != "utils.make_depth_scale":
+            assert "sys.path" not in path.read_text(encoding="utf-8"), path
+
+
 def _loaded(statement: str) -> list[str]:
     """The modules of scene that are loaded after a statement in a fresh process."""
     code = f"import sys\n{statement}\nprint(*(name for name in sys.modules if name.split('.')[0] == 'scene'))"
