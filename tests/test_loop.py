@@ -172,8 +172,12 @@ def test_a_signal_while_the_curve_is_drawn_ends_the_program_at_once(colmap_scene
         os.kill(os.getpid(), signal.SIGINT)
 
     monkeypatch.setattr("records.curve_recorder.draw_curve", draw)
-    with pytest.raises(KeyboardInterrupt):
-        _train(colmap_scene, tmp_path, monkeypatch, standard_observers, "--eval")
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore it
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            _train(colmap_scene, tmp_path, monkeypatch, standard_observers, "--eval")
+    finally:
+        signal.signal(signal.SIGINT, before)
     assert (tmp_path / f"point_cloud/iteration_{ITERATIONS}/point_cloud.ply").is_file()
 
 
