@@ -1,4 +1,4 @@
-"""Fake kernels: shapes and dtypes of the operators' results, for torch.compile and torch.library.opcheck."""
+"""Fake kernels: shapes and dtypes of the operators' results, for torch.compile and opcheck of torch's library."""
 
 import torch
 from torch import Tensor, library
