@@ -4,7 +4,7 @@
 
 The checkouts take turns, each with its own .venv if it has one. The loop is benchmarks/scenes/borrowed_program.py. Its
 milliseconds are of an iteration after the first 50; those of train.py are of all its iterations, without tests, saves
-and loading.
+and loading. Imports are timed after torch's, without garbage collection, which takes 70 ms whenever it happens to run.
 """
 
 import argparse
@@ -22,7 +22,8 @@ from utils.system_utils import UserError, compute_device, run_cli
 
 PROGRAM = Path(__file__).with_name("borrowed_program.py")
 IMPORTS = """
-import time, torch
+import gc, time, torch
+gc.disable()
 start = time.perf_counter()
 {statement}
 print(1e3 * (time.perf_counter() - start))
