@@ -300,11 +300,11 @@ def test_depth_maps_of_a_colmap_scene(colmap_scene):
     folders = str(colmap_scene / "images"), str(colmap_scene / "depths")
     views = readColmapCameras(images, cameras, params, *folders, [names[0]])
     views = {view.image_name: view for view in views}
-    assert views[names[1]].depth_params is None and views[names[1]].depth is None
+    assert (views[names[1]].depth_path, views[names[1]].depth_params, views[names[1]].depth) == ("", None, None)
     assert views[names[2]].depth_params["scale"] == 99 and views[names[2]].depth is None
-    for name in names:
+    for name in [names[0], *names[2:]]:
         assert views[name].depth_path == os.path.join(folders[1], name.removesuffix(".png") + ".png")
-        assert views[name].is_test == (name == names[0])
+    assert [name for name, view in views.items() if view.is_test] == [names[0]]
     assert views[names[3]].depth == DepthMap(Path(views[names[3]].depth_path), COLMAP_UNIT, 2.0, 0.25)
 
 

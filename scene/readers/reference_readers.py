@@ -50,9 +50,10 @@ def readColmapCameras(
 ) -> list[CameraInfo]:
     """The photos of a COLMAP model, as `scene.colmap_loader` reads it, as views in the order of the model.
 
-    depths_params: scale, offset and med_scale by photo name without extension. depths_folder: folder of the inverse
-    depth maps; "" for none. test_cam_names_list: names of the test views. The photos need not exist, unless their lens
-    distorts. 2023's form: (cam_extrinsics, cam_intrinsics, images_folder), with names up to the first dot.
+    depths_params: scale, offset and med_scale by photo name without extension; a photo that is not listed has no depth
+    map. depths_folder: folder of the inverse depth maps; "" for none. test_cam_names_list: names of the test views. The
+    photos need not exist, unless their lens distorts. 2023's form: (cam_extrinsics, cam_intrinsics, images_folder),
+    with names up to the first dot.
     """
     old = images_folder is None
     folder = Path(depths_params if old else images_folder)
@@ -86,7 +87,8 @@ def readColmapSceneInfo(
 
     eval: hold out every llffhold-th view by name, or with llffhold 0 those that sparse/0/test.txt names, one a line.
     train_test_exp: test views are training views, too. 2023's form: (path, images, eval, llffhold=8), known by the
-    missing depths and train_test_exp; its names end before the first dot, and decide the order.
+    missing depths and train_test_exp; its names end before the first dot, and decide the order. The field `image` of
+    that release stays empty.
     """
     old = isinstance(depths, bool) or (depths is None and train_test_exp is None)
     if isinstance(depths, bool):
@@ -170,11 +172,14 @@ def _published(camera: CameraInfo, is_test: bool | None = None) -> CameraInfo:
 
 def _with_depth(camera: CameraInfo, params: Mapping[str, Mapping[str, float]] | None, depths_folder: str) -> CameraInfo:
     name = os.path.splitext(camera.image_name)[0]
-    path = os.path.join(depths_folder, f"{name}.png") if depths_folder else ""
-    named = replace(camera, depth_params=None if params is None else params.get(name), depth_path=path)
-    # A photo missing in the table has no depth loss (depth_maps.py).
-    trusted = params is None or named.depth_params is not None
-    return replace(named, depth=named_depth_map(named, COLMAP_UNIT)) if trusted else named
+    if not depths_folder or (params is not None and name not in params):
+        return camera
+    named = replace(
+        camera,
+        depth_path=os.path.join(depths_folder, f"{name}.png"),
+        depth_params=None if params is None else params[name],
+    )
+    return replace(named, depth=named_depth_map(named, COLMAP_UNIT))
 
 
 def _test_views(views: Sequence[CameraInfo], folder: Path, hold: int) -> set[int]:
