@@ -7,30 +7,55 @@ from pathlib import Path
 import numpy as np
 
 from scene.pictures.masks import NO_MASKS, MaskOptions
-from scene.readers.colmap import readColmapSceneInfo
+from scene.readers.colmap import read_colmap
 from scene.readers.info import HOLD, CameraInfo, SceneInfo, scene_extent
+from scene.readers.point_cloud import fetchPly, storePly
+from scene.readers.reference_readers import (
+    getNerfppNorm,
+    readCamerasFromTransforms,
+    readColmapCameras,
+    readColmapSceneInfo,
+    readNerfstudioInfo,
+    readNerfSyntheticInfo,
+)
 from scene.readers.scene_folder import BLENDER, COLMAP, NERFSTUDIO, kind_of
 from scene.readers.start_cloud import SFM, StartOptions
-from scene.readers.transforms import readNerfstudioInfo, readNerfSyntheticInfo
+from scene.readers.transforms import read_blender, read_nerfstudio
 from scene.readers.world_offset import local, world_offset
+from utils.graphics_utils import BasicPointCloud, focal2fov, fov2focal
 from utils.system_utils import UserError
 
 __all__ = [
     "HOLD",
+    "BasicPointCloud",
     "CameraInfo",
     "SceneInfo",
+    "fetchPly",
+    "focal2fov",
+    "fov2focal",
+    "getNerfppNorm",
+    "readCamerasFromTransforms",
+    "readColmapCameras",
     "readColmapSceneInfo",
     "readNerfSyntheticInfo",
     "readNerfstudioInfo",
     "read_scene",
     "sceneLoadTypeCallbacks",
     "scene_extent",
+    "storePly",
 ]
 
-sceneLoadTypeCallbacks: dict[str, Callable[[Path, str, bool, StartOptions | None, MaskOptions], SceneInfo]] = {
+# For other code to call, or to replace: read_scene calls what stands here in place of these three.
+sceneLoadTypeCallbacks: dict[str, Callable[..., SceneInfo]] = {
     COLMAP: readColmapSceneInfo,
     BLENDER: readNerfSyntheticInfo,
     NERFSTUDIO: readNerfstudioInfo,
+}
+_OURS = dict(sceneLoadTypeCallbacks)
+_READERS: dict[str, Callable[[Path, str, bool, StartOptions | None, MaskOptions], SceneInfo]] = {
+    COLMAP: read_colmap,
+    BLENDER: read_blender,
+    NERFSTUDIO: read_nerfstudio,
 }
 
 
@@ -51,11 +76,20 @@ def read_scene(
     dataset's points) or "random". want_cloud: False reads no points, for a model that exists already.
     offset: (3,) of that model's frame (scene/readers/world_offset.py); None: computed for this scene.
     Photos of distorting lenses are undistorted into the user's cache folder; nothing else is written.
+
+    A reader that other code has put into `sceneLoadTypeCallbacks` is called with the reference's arguments, without
+    depth maps and with test views apart: both are added later. It brings its own points and masks.
     """
     folder = Path(source_path)
     if not str(source_path):
         raise UserError("no scene folder given; name it with -s")
     kind = kind_of(folder)
-    start = StartOptions(init_pcd_path, init_type) if want_cloud else None
-    info = sceneLoadTypeCallbacks[kind](folder, images, hold_out, start, masks)
+    callback = sceneLoadTypeCallbacks[kind]
+    if callback is _OURS[kind]:
+        start = StartOptions(init_pcd_path, init_type) if want_cloud else None
+        info = _READERS[kind](folder, images, hold_out, start, masks)
+    elif kind == COLMAP:
+        info = callback(str(folder), images, "", hold_out, False)
+    else:
+        info = callback(str(folder), False, "", hold_out)
     return local(info, world_offset(info) if offset is None else np.asarray(offset, dtype=np.float64))

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from scene.cameras import Camera
-from scene.readers.info import CameraInfo, SceneInfo, exposure_names, scene_extent
+from scene.readers.info import CameraInfo, SceneInfo, exposure_names, normalization
 
 
 def train_on_all(info: SceneInfo) -> SceneInfo:
@@ -17,7 +17,7 @@ def train_on_all(info: SceneInfo) -> SceneInfo:
     if len({view.image_name for view in views}) == len(views):
         views.sort(key=lambda view: os.fsencode(view.image_name))
     points = None if info.point_cloud is None else info.point_cloud.points
-    return replace(info, train_cameras=views, extent=scene_extent(views, points))
+    return replace(info, train_cameras=views, nerf_normalization=normalization(views, points))
 
 
 def mark_halves(train: list[Camera], test: list[Camera], infos: Sequence[CameraInfo]) -> None:

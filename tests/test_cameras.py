@@ -12,8 +12,9 @@ from scipy.spatial.transform import Rotation
 from synthetic import FOCAL, make_colmap_scene
 
 from scene.cameras import Camera, MiniCam, camera_to_JSON
-from scene.dataset_readers import CameraInfo, readColmapSceneInfo
+from scene.dataset_readers import CameraInfo
 from scene.pictures.store import ImageStore
+from scene.readers.colmap import read_colmap
 from utils import camera_utils
 from utils.graphics_utils import focal2fov, fov2focal, getProjectionMatrix, getWorld2View2
 
@@ -96,7 +97,7 @@ def test_an_off_centre_principal_point_moves_points_by_the_offset():
 def test_projection_agrees_with_pycolmap(tmp_path, size, model, params):
     reconstruction = make_colmap_scene(tmp_path, model=model, params=params, views=3)
     points = np.array([point.xyz for point in reconstruction.points3D.values()])
-    infos = readColmapSceneInfo(tmp_path, "images", False).train_cameras
+    infos = read_colmap(tmp_path, "images", False).train_cameras
     assert len(infos) == 3
     for info in infos:
         camera = _camera(info, size)

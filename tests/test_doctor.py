@@ -137,14 +137,16 @@ def test_the_synthetic_scene_is_sound(info):
 def test_scale(info):
     for factor, remedy in ((1e-3, "by 1000;"), (1e3, "by 0.001;")):
         cameras = [dataclasses.replace(camera, T=camera.T * factor) for camera in info.train_cameras]
-        scaled = dataclasses.replace(info, train_cameras=cameras, extent=info.extent * factor)
+        scaled = dataclasses.replace(info, train_cameras=cameras, nerf_normalization={"radius": info.extent * factor})
         assert remedy in problems(check_extent(scaled))[0]
 
 
 def test_stray_cameras(info):
     cameras = list(info.train_cameras)
     cameras[3] = dataclasses.replace(cameras[3], T=cameras[3].T + 200)
-    (line,) = problems(check_extent(dataclasses.replace(info, train_cameras=cameras, extent=50.0)))
+    (line,) = problems(
+        check_extent(dataclasses.replace(info, train_cameras=cameras, nerf_normalization={"radius": 50.0}))
+    )
     assert f"1 cameras are more than 10 times as far out as usual ({cameras[3].image_name})" in line
     cameras = [dataclasses.replace(c, T=-c.R.T @ np.ones(3)) for c in info.train_cameras]
     (line,) = problems(check_extent(dataclasses.replace(info, train_cameras=cameras)))

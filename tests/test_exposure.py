@@ -30,7 +30,7 @@ GAIN = 0.6  # of every third photo
 
 
 def _infos(*paths: str, stems: bool = False) -> list[CameraInfo]:
-    info = CameraInfo(0, np.eye(3), np.zeros(3), 9.0, 9.0, 4.0, 3.0, 8, 6, Path(), "", (8, 6))
+    info = CameraInfo(0, np.eye(3), np.zeros(3), fx=9.0, fy=9.0, width=8, height=6)
     return [
         replace(info, image_path=Path("/scene", path), image_name=Path(path).stem if stems else path) for path in paths
     ]

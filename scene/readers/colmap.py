@@ -9,7 +9,7 @@ import numpy as np
 from scene.pictures.find import find_pictures
 from scene.pictures.masks import NO_MASKS, MaskOptions, find_masks
 from scene.readers import colmap_model
-from scene.readers.info import SceneInfo, scene_extent, split_by_order
+from scene.readers.info import SceneInfo, normalization, split_by_order
 from scene.readers.point_cloud import check_finite, read_point_cloud
 from scene.readers.source_views import SourceView, make_cameras
 from scene.readers.start_cloud import OWN_POINTS, StartCloud, StartOptions, choose_start, random_in_frusta
@@ -17,7 +17,7 @@ from utils.graphics_utils import BasicPointCloud
 from utils.system_utils import UserError
 
 
-def readColmapSceneInfo(
+def read_colmap(
     folder: Path,
     images: str,
     hold_out: bool,
@@ -45,11 +45,11 @@ def readColmapSceneInfo(
     )
     train, test = split_by_order(cameras, hold_out, folder)
     if start is None:
-        return SceneInfo(None, train, test, scene_extent(train), None)
+        return SceneInfo(None, train, test, normalization(train), None)
     cloud, ply_path = choose_start(
         start, lambda: _own_cloud(model_folder, model), lambda: random_in_frusta(train), f"{listed_by} has no points"
     )
-    return SceneInfo(cloud, train, test, scene_extent(train, cloud.points), ply_path)
+    return SceneInfo(cloud, train, test, normalization(train, cloud.points), ply_path)
 
 
 def _own_cloud(model_folder: Path, model: colmap_model.ColmapModel) -> StartCloud:

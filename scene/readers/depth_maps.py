@@ -54,7 +54,7 @@ def with_depth_maps(info: SceneInfo, scene: Path, depths: str) -> SceneInfo:
         raise UserError(
             f"no folder of depth maps {folder}; name it with -d relative to the scene folder, or leave -d out"
         )
-    undistorted = [c.image_name for c in info.train_cameras if c.image_path.is_relative_to(cache_folder())]
+    undistorted = [c.image_name for c in info.train_cameras if Path(c.image_path).is_relative_to(cache_folder())]
     if undistorted:
         raise UserError(
             f"-d needs photos without distortion: {len(undistorted)} photos are undistorted on load, while their depth "
@@ -62,13 +62,35 @@ def with_depth_maps(info: SceneInfo, scene: Path, depths: str) -> SceneInfo:
             "maps of the undistorted photos"
         )
     if (scene / "sparse").is_dir():
-        maps = _colmap_maps(info.train_cameras, scene, folder)
+        cameras = _with_colmap_maps(info.train_cameras, scene, folder)
     else:
-        maps = [DepthMap(_blender_file(camera, scene, folder), BLENDER_UNIT) for camera in info.train_cameras]
-    _check_files([depth.path for depth in maps if depth])
-    return replace(
-        info, train_cameras=[replace(c, depth=depth) for c, depth in zip(info.train_cameras, maps, strict=True)]
-    )
+        cameras = [_with_map(c, _blender_file(c, scene, folder), None, BLENDER_UNIT) for c in info.train_cameras]
+    _check_files([camera.depth.path for camera in cameras if camera.depth])
+    return replace(info, train_cameras=cameras)
+
+
+def named_depth_map(camera: CameraInfo, unit: float) -> DepthMap | None:
+    """The map that a view names by depth_path and depth_params; None without one, or if its scale is unreliable.
+
+    unit: COLMAP_UNIT or BLENDER_UNIT. A map without parameters is taken as it is, as in the reference.
+    """
+    if not camera.depth_path:
+        return None
+    params = camera.depth_params
+    if params is None:
+        return DepthMap(Path(camera.depth_path), unit)
+    scale = params["scale"]
+    median = params.get("med_scale", scale)
+    if not (scale > 0 and median / RELIABLE <= scale <= median * RELIABLE):
+        return None
+    return DepthMap(Path(camera.depth_path), unit, scale, params["offset"])
+
+
+def _with_map(camera: CameraInfo, path: Path, params: dict[str, float] | None, unit: float) -> CameraInfo:
+    """The view with its map, or unchanged if the map is unreliable."""
+    named = replace(camera, depth_path=str(path), depth_params=params)
+    depth = named_depth_map(named, unit)
+    return replace(named, depth=depth) if depth else camera
 
 
 def read_values(path: Path) -> np.ndarray:
@@ -125,23 +147,21 @@ def sample(values: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     return upper * (1 - v) + lower * v
 
 
-def _colmap_maps(cameras: Sequence[CameraInfo], scene: Path, folder: Path) -> list[DepthMap | None]:
+def _with_colmap_maps(cameras: Sequence[CameraInfo], scene: Path, folder: Path) -> list[CameraInfo]:
     path = colmap_model.find_model(scene)[0] / PARAMS
     make = _MAKE.format(scene=scene, depths=folder)
     if not path.is_file():
         raise UserError(f"no {path}, which depth maps need; create it with `{make}`")
-    params = _read_params(path, make)
-    scales = [scale for scale, _ in params.values() if scale > 0]
-    median = float(np.median(scales)) if scales else 0.0
-    maps: list[DepthMap | None] = []
+    table = _read_params(path, make)
+    found = []
     unknown, unreliable = [], []
     for camera in cameras:
         name = Path(camera.image_name).with_suffix("").as_posix()
-        scale, offset = params.get(name, (0.0, 0.0))
-        reliable = scale > 0 and median / RELIABLE <= scale <= median * RELIABLE
-        if not reliable:
-            (unreliable if name in params else unknown).append(camera.image_name)
-        maps.append(DepthMap(folder / f"{name}.png", COLMAP_UNIT, scale, offset) if reliable else None)
+        if name in table:
+            camera = _with_map(camera, folder / f"{name}.png", table[name], COLMAP_UNIT)
+        if not camera.depth:
+            (unreliable if name in table else unknown).append(camera.image_name)
+        found.append(camera)
     reasons = [
         f"{len(names)} {what} ({some(names)})"
         for names, what in ((unknown, f"not in {path}"), (unreliable, "with an unreliable scale there"))
@@ -149,32 +169,35 @@ def _colmap_maps(cameras: Sequence[CameraInfo], scene: Path, folder: Path) -> li
     ]
     left_out = f"{len(unknown) + len(unreliable)} of {len(cameras)} training photos have no depth loss: "
     left_out += ", ".join(reasons)
-    if not any(maps):
+    if len(unknown) + len(unreliable) == len(cameras):
         raise UserError(f"{left_out}; create the file again with `{make}`, or leave -d out")
     if reasons:
         print(left_out, file=sys.stderr)
-    return maps
+    return found
 
 
-def _read_params(path: Path, make: str) -> dict[str, tuple[float, float]]:
-    """Scale and offset by photo name without extension."""
+def _read_params(path: Path, make: str) -> dict[str, dict[str, float]]:
+    """Parameters as in `CameraInfo.depth_params`, by photo name without extension."""
     try:
         table = json.loads(path.read_text(encoding="utf-8"))
-        params = {name: (float(entry["scale"]), float(entry["offset"])) for name, entry in table.items()}
-        if not np.isfinite(list(params.values())).all():
+        params = {name: {key: float(entry[key]) for key in ("scale", "offset")} for name, entry in table.items()}
+        if not np.isfinite([list(entry.values()) for entry in params.values()]).all():
             raise ValueError("a number is not finite")
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise UserError(
             f"{path} does not give a scale and an offset for every photo ({type(error).__name__}: {error}); create it "
             f"again with `{make}`"
         ) from error
-    return params
+    scales = [entry["scale"] for entry in params.values() if entry["scale"] > 0]
+    median = float(np.median(scales)) if scales else 0.0
+    return {name: {**entry, "med_scale": median} for name, entry in params.items()}
 
 
 def _blender_file(camera: CameraInfo, scene: Path, folder: Path) -> Path:
     """File named by the photo's path, which is unique, else by its name."""
-    if camera.image_path.is_relative_to(scene):
-        by_path = folder / camera.image_path.relative_to(scene).with_suffix(".png")
+    photo = Path(camera.image_path)
+    if photo.is_relative_to(scene):
+        by_path = folder / photo.relative_to(scene).with_suffix(".png")
         if by_path.is_file():
             return by_path
     return folder / f"{camera.image_name}.png"

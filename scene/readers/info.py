@@ -1,16 +1,19 @@
 """Plain records that readers of datasets return. Nothing here decodes photos, uses a GPU or writes a file."""
 
+import math
 import os
 from collections import Counter
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import KW_ONLY, dataclass, field, fields, replace
 from pathlib import Path
+from typing import Any, ClassVar
 
 import numpy as np
 
+from scene.pictures.decode import picture_size
 from scene.pictures.masks import Mask
 from scene.pictures.store import Decodable
-from utils.graphics_utils import BasicPointCloud, focal2fov
+from utils.graphics_utils import BasicPointCloud, focal2fov, fov2focal
 from utils.system_utils import UserError
 
 HOLD = 8  # every 8th photo by name is a test view (Mip-NeRF 360's split)
@@ -20,42 +23,122 @@ NARROW = 1e-2  # of the depth; with a smaller E, removing Gaussians wider than 0
 ROUNDING = 1e-9  # distances below this part of the scene are rounding errors
 
 
+class _LikeNamedTuple:
+    """The methods of a named tuple of `_fields`, which are the reference's; further fields have names only."""
+
+    _fields: ClassVar[tuple[str, ...]]
+
+    def _asdict(self) -> dict[str, Any]:
+        return {name: getattr(self, name) for name in self._fields}
+
+    def __iter__(self) -> Iterator[Any]:
+        return iter(self._asdict().values())
+
+    def __len__(self) -> int:
+        return len(self._fields)
+
+    def __getitem__(self, index: int | slice) -> Any:
+        return tuple(self)[index]
+
+
+class _FileSize:
+    """`CameraInfo.file_size`: as given, else from the photo when it is first asked for."""
+
+    def __get__(self, camera: "CameraInfo | None", owner: type) -> tuple[int, int] | None:
+        if camera is None:
+            return None  # the field's default
+        if camera.__dict__["file_size"] is None:
+            camera.__dict__["file_size"] = _size_of_photo(camera)
+        return camera.__dict__["file_size"]
+
+    def __set__(self, camera: "CameraInfo", size: tuple[int, int] | None) -> None:
+        camera.__dict__["file_size"] = size
+
+
+def _size_of_photo(camera: "CameraInfo") -> tuple[int, int]:
+    if camera.image is not None:
+        return camera.image.size
+    try:
+        return picture_size(Path(camera.image_path))
+    except UserError:
+        return camera.width, camera.height
+
+
 @dataclass(frozen=True)
-class CameraInfo:
-    """One view.
+class CameraInfo(_LikeNamedTuple):
+    """One view. The fields up to is_test are the reference's; the others are given by name.
 
     uid: COLMAP's camera (intrinsics) id, or the frame's index. R (3,3): camera-to-world rotation; T (3,):
-    world-to-camera translation. fx, fy, cx, cy in pixels of an image of width x height (pixel centres at .5).
-    image_name: COLMAP's full name, or the file's stem. file_size: (width, height) of the photo. mask: of the photo's
-    shape, None if all pixels count. ignore_alpha: transparent pixels of the photo do not count. depth: inverse depth of
-    a training view that has a map (scene/readers/depth_maps.py).
+    world-to-camera translation. FovY, FovX: opening angles in radians of a frustum of the image's size. depth_params,
+    depth_path: scale, offset and the scene's median scale (med_scale) of an inverse depth map, and its file; None and
+    "" without a map. image_name: COLMAP's full name, or the file's stem. width, height: of the image that the
+    intrinsics belong to. is_test: a held-out view.
+
+    fx, fy, cx, cy: pixels of that image, pixel centres at .5. Either FovX and FovY or fx and fy must be given; the
+    others follow from them. Where they disagree, fx and fy count. The principal point is the middle by default.
+    file_size: (width, height) of the photo, read from the file when first asked for; width, height if that fails.
+    mask: of the photo's shape, None if all pixels count. ignore_alpha: transparent pixels of the photo do not count.
+    depth: inverse depth of a training view that has a map (scene/readers/depth_maps.py). image: the photo as a PIL
+    image, as the 2023 release gave it; readers leave it out.
     """
 
     uid: int
     R: np.ndarray
     T: np.ndarray
-    fx: float
-    fy: float
-    cx: float
-    cy: float
-    width: int
-    height: int
-    image_path: Path
-    image_name: str
-    file_size: tuple[int, int]
+    FovY: float | None = None
+    FovX: float | None = None
+    depth_params: Mapping[str, float] | None = None
+    image_path: str | Path = ""
+    image_name: str = ""
+    depth_path: str = ""
+    width: int = 0
+    height: int = 0
+    is_test: bool = False
+    _: KW_ONLY
+    fx: float | None = None
+    fy: float | None = None
+    cx: float | None = None
+    cy: float | None = None
+    file_size: tuple[int, int] = _FileSize()
     mask: Mask | None = None
     ignore_alpha: bool = False
     depth: Decodable | None = None
+    image: Any = None
 
-    @property
-    def FovX(self) -> float:
-        """Horizontal opening angle in radians of a frustum of the image's width."""
-        return focal2fov(self.fx, self.width)
+    _fields: ClassVar[tuple[str, ...]] = (
+        *("uid", "R", "T", "FovY", "FovX", "depth_params", "image_path", "image_name", "depth_path"),
+        *("width", "height", "is_test"),
+    )
 
-    @property
-    def FovY(self) -> float:
-        """Vertical opening angle in radians of a frustum of the image's height."""
-        return focal2fov(self.fy, self.height)
+    def __post_init__(self) -> None:
+        for fov, focal, center, side in _AXES:
+            size, angle, length = getattr(self, side), getattr(self, fov), getattr(self, focal)
+            if not size or (angle is None and length is None):
+                raise TypeError(f"a CameraInfo needs {side}, and {fov} or {focal}")
+            if length is None:
+                object.__setattr__(self, focal, fov2focal(angle, size))
+            elif angle is None or not math.isclose(angle, focal2fov(length, size), rel_tol=_SAME_ANGLE):
+                object.__setattr__(self, fov, focal2fov(length, size))
+            if getattr(self, center) is None:
+                object.__setattr__(self, center, size / 2)
+
+    def _replace(self, **changes: Any) -> "CameraInfo":
+        """A copy with some fields changed, and with those that follow from them.
+
+        A change of FovX changes fx, and the other way round. A change of width keeps FovX, as in the reference, and the
+        principal point's place in the image. Another photo has its own file_size. Likewise for the vertical.
+        """
+        values = {item.name: self.__dict__[item.name] for item in fields(self)}
+        for fov, focal, center, side in _AXES:
+            if fov in changes or side in changes:
+                values[focal] = None
+            elif focal in changes:
+                values[fov] = None
+            if side in changes:
+                values[center] *= changes[side] / values[side]
+        if {"image_path", "image"} & set(changes):
+            values["file_size"] = None
+        return type(self)(**{**values, **changes})
 
     @property
     def center(self) -> np.ndarray:
@@ -63,19 +146,39 @@ class CameraInfo:
         return -self.R @ self.T
 
 
-@dataclass(frozen=True)
-class SceneInfo:
-    """A dataset: start cloud (None if not wanted), views, extent E in world units, and the cloud's PLY if it has one.
+_SAME_ANGLE = 1e-9  # relative; FovX, turned into fx and back, differs by rounding
+_AXES = (("FovX", "fx", "cx", "width"), ("FovY", "fy", "cy", "height"))
 
-    offset (3,) float64: the world's coordinates of the frame's origin (scene/readers/world_offset.py).
+
+@dataclass(frozen=True)
+class SceneInfo(_LikeNamedTuple):
+    """A dataset: start cloud (None if not wanted), views, their size, and the cloud's PLY if it has one.
+
+    nerf_normalization: "radius", the extent E in world units, and "translate" (3,), minus the cameras' centre.
+    is_nerf_synthetic: a Blender scene. offset (3,) float64: the world's coordinates of the frame's origin
+    (scene/readers/world_offset.py); zero by default.
     """
 
     point_cloud: BasicPointCloud | None
     train_cameras: list[CameraInfo]
     test_cameras: list[CameraInfo]
-    extent: float
-    ply_path: Path | None
+    nerf_normalization: Mapping[str, Any]
+    ply_path: str | Path | None
+    is_nerf_synthetic: bool = False
     offset: np.ndarray = field(default_factory=lambda: np.zeros(3))
+
+    _fields: ClassVar[tuple[str, ...]] = (
+        *("point_cloud", "train_cameras", "test_cameras", "nerf_normalization", "ply_path", "is_nerf_synthetic"),
+    )
+
+    def _replace(self, **changes: Any) -> "SceneInfo":
+        """A copy with some fields changed."""
+        return replace(self, **changes)
+
+    @property
+    def extent(self) -> float:
+        """The extent E in world units."""
+        return float(self.nerf_normalization["radius"])
 
 
 def split_by_order(
@@ -83,30 +186,52 @@ def split_by_order(
 ) -> tuple[list[CameraInfo], list[CameraInfo]]:
     """Training and test views: with hold_out every HOLD-th view, the first included, is a test view."""
     train = [camera for index, camera in enumerate(cameras) if not hold_out or index % HOLD]
-    test = [camera for index, camera in enumerate(cameras) if hold_out and index % HOLD == 0]
+    test = held_out([camera for index, camera in enumerate(cameras) if hold_out and index % HOLD == 0])
     if not train:
         raise UserError(f"{folder} has too few photos for --eval, which holds out every {HOLD}th; leave --eval out")
     return train, test
 
 
+def held_out(cameras: Sequence[CameraInfo]) -> list[CameraInfo]:
+    """The views, marked as test views."""
+    return [replace(camera, is_test=True) for camera in cameras]
+
+
 def exposure_names(cameras: Sequence[CameraInfo]) -> list[str]:
     """A unique name for each view: its image name, or its path from the views' common folder if several share the name,
-    as Blender's train/r_0 and test/r_0 do.
+    as Blender's train/r_0 and test/r_0 do. A view without a path keeps its name.
     """
-    counts = Counter(camera.image_name for camera in cameras)
-    folder = os.path.commonpath([camera.image_path.parent for camera in cameras]) if cameras else ""
-    paths = [Path(os.path.relpath(camera.image_path, folder)).as_posix() for camera in cameras]
-    return [c.image_name if counts[c.image_name] == 1 else path for c, path in zip(cameras, paths, strict=True)]
+    names = [camera.image_name for camera in cameras]
+    shared = {name for name, count in Counter(names).items() if count > 1}
+    if not shared:
+        return names
+    paths = [Path(getattr(camera, "image_path", None) or "") for camera in cameras]
+    folder = os.path.commonpath([path.parent for path in paths if path.name] or [""])
+    return [
+        Path(os.path.relpath(path, folder)).as_posix() if name in shared and path.name else name
+        for name, path in zip(names, paths, strict=True)
+    ]
 
 
-def scene_extent(cameras: list[CameraInfo], points: np.ndarray | None = None) -> float:
+def normalization(cameras: Sequence[CameraInfo], points: np.ndarray | None = None) -> dict[str, Any]:
+    """`SceneInfo.nerf_normalization` of the training views: the radius is `scene_extent`."""
+    centers = camera_centers(cameras)
+    return {"translate": -centers[~standing_apart(centers)].mean(axis=0), "radius": scene_extent(cameras, points)}
+
+
+def camera_centers(cameras: Sequence[CameraInfo]) -> np.ndarray:
+    """Camera centres (N,3) in the world, of any records with R and T."""
+    return np.array([-camera.R @ camera.T for camera in cameras])
+
+
+def scene_extent(cameras: Sequence[CameraInfo], points: np.ndarray | None = None) -> float:
     """Extent E: 1.1 times the largest distance of a camera from the cameras' mean, in world units.
 
     Cameras that stand apart (`standing_apart`) are left out. If the cameras are nearly in one place (E below NARROW
     times the depth), E is 1.1 times the median depth of the points (N,3) in front of the first camera. Without such
     points it is then 1.
     """
-    centers = np.array([camera.center for camera in cameras])
+    centers = camera_centers(cameras)
     counted = ~standing_apart(centers)
     centers, first = centers[counted], cameras[counted.argmax()]
     extent = 1.1 * float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).max())

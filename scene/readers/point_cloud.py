@@ -22,13 +22,35 @@ def is_ply(path: Path) -> bool:
 
 
 def read_point_cloud(path: Path) -> BasicPointCloud:
-    """Points (float64) with colours and normals (0 where missing) of a file, whose content decides its kind.
+    """Points (float64) with colours (float32) and normals (0 where missing) of a file, whose content decides its kind.
 
     PLY: x y z red green blue, integers as fractions of their type's maximum. npz: `points` or `xyz` (N,3), `colors` or
     `rgb` (N,3). Text: three or six numbers a line, x y z and red green blue, split by spaces or commas. In the last two
     kinds colours range to 1, or to 255 if any is above 1; points without colours are grey.
     UserError for a file that is missing, of another kind, or has points that are not finite.
     """
+    cloud = _read(path)
+    return BasicPointCloud(cloud.points, cloud.colors.astype(np.float32), cloud.normals)
+
+
+def fetchPly(path: str | os.PathLike) -> BasicPointCloud:
+    """The cloud of a file as the reference gives it: points float32, colours float64 in [0,1]; normals 0 where missing.
+
+    Points that float32 cannot hold stay float64. Kinds of files and errors as for `read_point_cloud`.
+    """
+    cloud = _read(Path(path))
+    points = cloud.points.astype(np.float32)
+    points = points if np.array_equal(points, cloud.points) else cloud.points
+    return BasicPointCloud(points, cloud.colors.astype(np.float64), cloud.normals)
+
+
+def storePly(path: str | os.PathLike, xyz: np.ndarray, rgb: np.ndarray) -> None:
+    """Write points (N,3), stored as float32, with colours (N,3) from 0 to 255, decimals dropped, and zero normals."""
+    write_point_cloud(Path(path), np.asarray(xyz), np.clip(np.asarray(rgb), 0, 255).astype(np.uint8))
+
+
+def _read(path: Path) -> BasicPointCloud:
+    """The cloud with colours as exact as the file has them."""
     if not os.path.isfile(path):  # Path.is_file raises an error for a name that is too long
         raise UserError(f"no point cloud {path}; give the path of a PLY, npz or text file of points")
     if is_ply(path) or path.suffix.lower() == ".ply":
@@ -37,7 +59,8 @@ def read_point_cloud(path: Path) -> BasicPointCloud:
         table = _read_npz(path) if _begins_with(path, b"PK") else _read_text(path)
         cloud = _from_table(table)
     check_finite(cloud.points, path)
-    if not ((cloud.colors >= 0) & (cloud.colors <= 1)).all():
+    colors = cloud.colors.astype(np.float32)
+    if not ((colors >= 0) & (colors <= 1)).all():
         raise UserError(f"colours in {path} are neither integers nor between 0 and 1; save red green blue as uchar")
     return cloud
 
@@ -114,7 +137,7 @@ def _from_table(table: np.ndarray) -> BasicPointCloud:
         colors = np.full_like(table[:, :3], 127 / 255)
     elif colors.size and colors.max() > 1:
         colors = colors / 255
-    return BasicPointCloud(points, colors.astype(np.float32), np.zeros_like(points, dtype=np.float32))
+    return BasicPointCloud(points, colors, np.zeros_like(points, dtype=np.float32))
 
 
 def check_finite(points: np.ndarray, path: Path) -> None:
@@ -141,4 +164,4 @@ def write_point_cloud(path: Path, points: np.ndarray, colors: np.ndarray) -> Non
 
 def _fraction(values: np.ndarray) -> np.ndarray:
     top = np.iinfo(values.dtype).max if np.issubdtype(values.dtype, np.integer) else 1.0
-    return (values / top).astype(np.float32)
+    return values / top

@@ -55,13 +55,19 @@ def make_cameras(views: Sequence[SourceView], ignore_alpha: bool) -> list[Camera
             size, ignore = (pinhole.width, pinhole.height), False
         else:
             path, pinhole, mask, size, ignore = view.path, pinholes[index], view.mask, sizes[index], ignore_alpha
-        cameras.append(_camera(view, pinhole, path, size, mask, ignore))
+        cameras.append(camera_of(view, pinhole, path, size, mask, ignore))
     return cameras
 
 
-def _camera(
-    view: SourceView, pinhole: Pinhole, path: Path, size: tuple[int, int], mask: Mask | None, ignore_alpha: bool
+def camera_of(
+    view: SourceView,
+    pinhole: Pinhole,
+    path: Path,
+    size: tuple[int, int] | None,
+    mask: Mask | None = None,
+    ignore_alpha: bool = False,
 ) -> CameraInfo:
+    """The record of a view as a pinhole, with a photo of a size (width, height); None: read when first asked for."""
     return CameraInfo(
         uid=view.uid,
         R=view.rotation.T.copy(),

@@ -2,6 +2,7 @@
 
 import json
 import os
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -10,7 +11,7 @@ import numpy as np
 from scene.pictures.decode import picture_size
 from scene.pictures.find import find_pictures
 from scene.pictures.masks import NO_MASKS, Mask, MaskOptions, find_masks
-from scene.readers.info import CameraInfo, SceneInfo, scene_extent, split_by_order
+from scene.readers.info import CameraInfo, SceneInfo, held_out, normalization, split_by_order
 from scene.readers.point_cloud import read_point_cloud
 from scene.readers.source_views import SourceView, make_cameras
 from scene.readers.start_cloud import (
@@ -40,35 +41,44 @@ class _CameraFile(NamedTuple):
     frames: list[_Frame]
 
 
-def readNerfSyntheticInfo(
-    folder: Path, images: str, hold_out: bool, start: StartOptions | None = OWN_POINTS, masks: MaskOptions = NO_MASKS
+def read_blender(
+    folder: Path,
+    images: str,
+    hold_out: bool,
+    start: StartOptions | None = OWN_POINTS,
+    masks: MaskOptions = NO_MASKS,
+    suffixes: Sequence[str] = SUFFIXES,
 ) -> SceneInfo:
     """Read a Blender scene (transforms_train.json, transforms_test.json), views in the order of the files.
 
-    A scene without a cloud of its own starts from grey points spread evenly over a cube. Arguments and errors as for
-    `scene.dataset_readers.read_scene`; images has no effect.
+    A scene without a cloud of its own starts from grey points spread evenly over a cube. suffixes: of photos that the
+    files name without one. Other arguments and errors as for `scene.dataset_readers.read_scene`; images has no effect.
     """
     files = [folder / "transforms_train.json", folder / "transforms_test.json"]
     for path in files:
         if not path.is_file():
             raise UserError(f"no {path.name} in {folder}; a Blender scene needs {files[0].name} and {files[1].name}")
-    train, test = (_cameras(_read(path), masks, by_stem=True) for path in files)
-    if not hold_out:
-        train, test = train + test, []
+    train, test = (read_frames(path, masks, suffixes) for path in files)
+    train, test = (train, held_out(test)) if hold_out else (train + test, [])
     if not train:
         raise UserError(f"{files[0]} lists no frames; export the scene again")
     if start is None:
-        return SceneInfo(None, train, test, scene_extent(train), None)
+        return SceneInfo(None, train, test, normalization(train), None, is_nerf_synthetic=True)
 
     def own() -> StartCloud:
         ply = folder / "points3d.ply"
         return StartCloud(read_point_cloud(ply), ply) if ply.is_file() else StartCloud(random_in_cube(), None)
 
     cloud, ply_path = choose_start(start, own, random_in_cube, f"{folder / 'points3d.ply'} has no points")
-    return SceneInfo(cloud, train, test, scene_extent(train, cloud.points), ply_path)
+    return SceneInfo(cloud, train, test, normalization(train, cloud.points), ply_path, is_nerf_synthetic=True)
 
 
-def readNerfstudioInfo(
+def read_frames(path: Path, masks: MaskOptions = NO_MASKS, suffixes: Sequence[str] = SUFFIXES) -> list[CameraInfo]:
+    """The views of one of a Blender scene's two files, in its order."""
+    return _cameras(_read(path), masks, suffixes, by_stem=True)
+
+
+def read_nerfstudio(
     folder: Path, images: str, hold_out: bool, start: StartOptions | None = OWN_POINTS, masks: MaskOptions = NO_MASKS
 ) -> SceneInfo:
     """Read a nerfstudio or instant-ngp scene (transforms.json), views sorted by name (bytes).
@@ -78,12 +88,14 @@ def readNerfstudioInfo(
     errors as for `scene.dataset_readers.read_scene`; images has no effect.
     """
     content = _read(folder / "transforms.json")
-    cameras = sorted(_cameras(content, masks, by_stem=False), key=lambda camera: os.fsencode(camera.image_name))
+    cameras = sorted(
+        _cameras(content, masks, SUFFIXES, by_stem=False), key=lambda camera: os.fsencode(camera.image_name)
+    )
     if not cameras:
         raise UserError(f"{content.path} lists no frames; export the scene again")
     train, test = _own_split(content, cameras, hold_out) or split_by_order(cameras, hold_out, folder)
     if start is None:
-        return SceneInfo(None, train, test, scene_extent(train), None)
+        return SceneInfo(None, train, test, normalization(train), None)
 
     def own() -> StartCloud | None:
         name = content.fields.get("ply_file_path")
@@ -91,14 +103,14 @@ def readNerfstudioInfo(
 
     lacking = f"{content.path} names no points (ply_file_path)"
     cloud, ply_path = choose_start(start, own, lambda: random_in_frusta(train), lacking)
-    return SceneInfo(cloud, train, test, scene_extent(train, cloud.points), ply_path)
+    return SceneInfo(cloud, train, test, normalization(train, cloud.points), ply_path)
 
 
 def _read(path: Path) -> _CameraFile:
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
         listed = list(content["frames"])
-    except (ValueError, KeyError, TypeError, RecursionError) as error:
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise _no_camera_file(path, error) from error
     return _CameraFile(path, content, [_frame(path, number, frame) for number, frame in enumerate(listed, start=1)])
 
@@ -125,11 +137,11 @@ def _no_camera_file(path: Path, error: Exception) -> UserError:
     )
 
 
-def _cameras(file: _CameraFile, masks: MaskOptions, by_stem: bool) -> list[CameraInfo]:
+def _cameras(file: _CameraFile, masks: MaskOptions, suffixes: Sequence[str], by_stem: bool) -> list[CameraInfo]:
     """The views in the order of the frames, named by the stems or by the relative paths of their files."""
     folder = file.path.parent
     listed = [frame.file_path for frame in file.frames]
-    paths = find_pictures(folder, listed, str(file.path), "put them there", SUFFIXES)
+    paths = find_pictures(folder, listed, str(file.path), "put them there", suffixes)
     names = [_relative(path, folder) for path in paths]
     views = []
     for index, (frame, path, mask) in enumerate(zip(file.frames, paths, _masks(file, names, masks), strict=True)):
@@ -183,7 +195,7 @@ def _own_split(
             f"of the photos in {file.path}, {len(train)} are in train_filenames and {len(test)} in test_filenames (or "
             "val_filenames), but each list needs at least one; fix the lists or leave --eval out"
         )
-    return train, test
+    return train, held_out(test)
 
 
 def _world_to_camera(rows: list[list[float]]) -> np.ndarray:

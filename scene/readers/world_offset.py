@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from scene.readers.info import CameraInfo, SceneInfo, scene_extent
+from scene.readers.info import CameraInfo, SceneInfo, normalization, scene_extent
 from utils.graphics_utils import BasicPointCloud
 
 # Extents from the origin. There a step of float32 is a hundred-thousandth of the extent, many times the moves of
@@ -37,8 +37,10 @@ def local(info: SceneInfo, offset: np.ndarray) -> SceneInfo:
         with np.errstate(over="ignore"):  # the points become infinite, which start_rows refuses
             points = (cloud.points - offset if moved else cloud.points).astype(np.float32)
         cloud = BasicPointCloud(points, cloud.colors, cloud.normals)
-    extent = scene_extent(train, points)
-    return replace(info, point_cloud=cloud, train_cameras=train, test_cameras=test, extent=extent, offset=offset)
+    size = normalization(train, points)
+    return replace(
+        info, point_cloud=cloud, train_cameras=train, test_cameras=test, nerf_normalization=size, offset=offset
+    )
 
 
 def _moved(camera: CameraInfo, offset: np.ndarray) -> CameraInfo:
