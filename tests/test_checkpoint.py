@@ -26,7 +26,7 @@ def _plain(value: object) -> bool:
         return all(_plain(part) for part in (*value.keys(), *value.values()))
     if isinstance(value, list | tuple):
         return all(_plain(part) for part in value)
-    return value is None or type(value) in (torch.Tensor, int, float, bool, str)
+    return value is None or type(value) in (torch.Tensor, torch.nn.Parameter, int, float, bool, str)
 
 
 def test_round_trip_of_plain_values(tmp_path):

@@ -85,7 +85,7 @@ def test_steps_are_those_of_torchs_adam_by_default():
     theirs = torch.optim.Adam([values])
     generator = torch.Generator().manual_seed(0)
     for step in range(1, 21):
-        theirs.param_groups[0]["lr"] = ours._rate(step)
+        theirs.param_groups[0]["lr"] = ours.schedule(step)
         values.grad = torch.randn(3, 3, 4, generator=generator)
         theirs.step()
     # Twenty steps of 0.01, each exact to some units in the last place of values about 1.

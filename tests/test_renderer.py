@@ -35,7 +35,7 @@ def test_what_it_returns(camera):
         gaussians._xyz[3] = torch.tensor([0.0, 0.0, -5.0])  # behind the camera
     package = render(camera, gaussians, pipeline(), BLACK)
     assert list(package) == ["render", "viewspace_points", "visibility_filter", "radii", "depth"]
-    assert package["render"].shape == (3, HEIGHT, WIDTH) and package["depth"] is None
+    assert package["render"].shape == (3, HEIGHT, WIDTH) and package["depth"].shape == (1, HEIGHT, WIDTH)
     assert package["radii"].shape == (40,) and package["radii"].dtype == torch.int32
     visible = package["visibility_filter"]
     assert visible.shape[1] == 1 and visible.dtype == torch.int64
@@ -47,13 +47,14 @@ def test_what_it_returns(camera):
         assert getattr(gaussians, name).grad.shape == getattr(gaussians, name).shape
 
 
-def test_depth_on_request(camera):
+def test_depth_unless_it_is_not_wanted(camera):
     gaussians = model(1)
     with torch.no_grad():
         gaussians._xyz.zero_()
         gaussians._scaling.fill_(math.log(0.5))
         gaussians._opacity.fill_(0.0)
-    depth = render(camera, gaussians, pipeline(), BLACK, want_depth=True)["depth"]
+    depth = render(camera, gaussians, pipeline(), BLACK)["depth"]
+    assert render(camera, gaussians, pipeline(), BLACK, want_depth=False)["depth"] is None
     assert depth.shape == (1, HEIGHT, WIDTH)
     assert depth.max().item() == pytest.approx(0.5 / 3.0, rel=0.01)  # opacity / distance, at the nearest pixel centre
 
