@@ -41,7 +41,7 @@ class GaussianModel(Exposed, AdaptiveGaussians):
         self.spatial_lr_scale = 0.0
 
     def create_from_pcd(
-        self, pcd: BasicPointCloud, cam_infos: Sequence | float, spatial_lr_scale: float | None = None
+        self, pcd: BasicPointCloud, cam_infos: Sequence | float = (), spatial_lr_scale: float | None = None
     ) -> None:
         """Start from a point cloud: round Gaussians as wide as the distance to their neighbours, opacity 0.1.
 

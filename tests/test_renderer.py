@@ -1,5 +1,6 @@
 """render(): its dictionary, the clamp, and the raw path against the plain one."""
 
+import argparse
 import math
 
 import pytest
@@ -7,12 +8,13 @@ import torch
 from gaussians import GROUPS, model, pipeline
 
 import gaussian_renderer
-from gaussian_renderer import render
+from gaussian_renderer import render, scored_views
 from scene.cameras import MiniCam
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.exposure import Exposures
 from utils.graphics_utils import getProjectionMatrix
-from utils.loss_utils import inverse_depth_loss
+from training.observers import report
+from utils.loss_utils import inverse_depth_loss, l1_loss
 from utils.system_utils import UserError
 
 WIDTH, HEIGHT = 41, 27
@@ -57,6 +59,29 @@ def test_depth_unless_it_is_not_wanted(camera):
     assert render(camera, gaussians, pipeline(), BLACK, want_depth=False)["depth"] is None
     assert depth.shape == (1, HEIGHT, WIDTH)
     assert depth.max().item() == pytest.approx(0.5 / 3.0, rel=0.01)  # opacity / distance, at the nearest pixel centre
+
+
+def test_scores_are_computed_without_depth(camera, monkeypatch):
+    """Neither the scores nor the training report computes an inverse depth, which nothing reads."""
+    asked = []
+
+    def spy(*args: object, **options: object) -> dict:
+        asked.append(options["want_depth"])
+        return render(*args, **options)
+
+    gaussians = model(5)
+    scene = argparse.Namespace(gaussians=gaussians, getTrainCameras=lambda: [camera], getTestCameras=lambda: [])
+    camera.target, camera.mask, camera.image_name = lambda _: torch.zeros(3, HEIGHT, WIDTH), None, "a"
+    for module in (scored_views, report):
+        monkeypatch.setattr(module, "render", spy)
+    scored_views.ScoredViews(pipeline(), BLACK, False).image(camera, gaussians)
+    zero = torch.zeros(())
+    report.training_report(None, 1, zero, zero, l1_loss, 0.0, [1], scene, spy, (pipeline(), BLACK))
+    assert asked == [False] * 6
+    # Somebody else's renderer is given the reference's arguments alone.
+    report.training_report(
+        None, 1, zero, zero, l1_loss, 0.0, [1], scene, lambda *four: render(*four), (pipeline(), BLACK)
+    )
 
 
 def test_screen_points_are_zeros_with_a_gradient_of_their_own_in_every_render(camera):
