@@ -136,7 +136,8 @@ class GaussianModel(Exposed, AdaptiveGaussians):
 
     def check_steps(self) -> None:
         """UserError if a guard has held steps back, so that the model is older than its iteration number."""
-        if self.optimizer.guard and (iteration := self.optimizer.guard.stopped_in()):
+        guard = getattr(self.optimizer, "guard", None)
+        if guard and (iteration := guard.stopped_in()):
             raise UserError(f"the loss or a step of iteration {iteration} was not finite; lower the learning rates")
 
     def take_marks(self) -> list[tuple[str, list[int] | list[str], int]]:

@@ -171,6 +171,26 @@ def test_a_network_trains_beside_the_gaussians(make):
     assert scale.max() < 1 and len(gaussians) == 18 and gaussians.optimizer.state[gaussians._xyz]["step"] >= 5
 
 
+def test_the_state_of_a_network_comes_back_from_a_checkpoint():
+    class Client(GaussianModel):
+        def training_setup(self, training_args):
+            super().training_setup(training_args)
+            self.network = _Network()
+            self.optimizer.add_param_group({"params": self.network.parameters(), "lr": 0.01, "amsgrad": True})
+
+    gaussians, other = model(30), Client(3)
+    gaussians.__class__ = Client
+    gaussians.training_setup(options())
+    for param in gaussians.network.parameters():
+        param.grad = torch.full_like(param, 0.5)
+    _step(gaussians, 0, torch.arange(30))
+    other.restore(gaussians.capture(), options())
+    for mine, theirs in zip(other.network.parameters(), gaussians.network.parameters(), strict=True):
+        assert gaussians.optimizer.state[theirs]["max_exp_avg_sq"].any()
+        for key, value in gaussians.optimizer.state[theirs].items():
+            assert torch.equal(other.optimizer.state[mine][key], value)
+
+
 def test_density_control_leaves_gradients_of_a_network_alone():
     gaussians, network = model(30), _Network()
     gaussians.optimizer.add_param_group({"params": network.parameters(), "lr": 0.01})

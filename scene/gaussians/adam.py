@@ -180,15 +180,16 @@ class GaussianAdam(torch.optim.Adam):
         own = self.state_dict()["param_groups"]
         try:
             state, groups = dict(state_dict["state"]), list(state_dict["param_groups"])
-            names, keys = [group["name"] for group in groups], [list(group["params"]) for group in groups]
-        except (TypeError, ValueError, KeyError, IndexError) as error:
+            found = [(group.get("name"), list(group["params"])) for group in groups]
+        except (TypeError, ValueError, KeyError, IndexError, AttributeError) as error:
             raise ValueError("it is not the state of an optimiser") from error
-        if names != [group["name"] for group in own] or any(len(params) != 1 for params in keys):
+        if [(name, len(keys)) for name, keys in found] != [(g.get("name"), len(g["params"])) for g in own]:
             raise ValueError("its groups are different")
         taken = {}
-        for group, mine, (key,) in zip(self.param_groups, own, keys, strict=True):
-            if key in state:
-                taken[mine["params"][0]] = _fitting(state[key], group["params"][0], group["name"])
+        for group, mine, (name, keys) in zip(self.param_groups, own, found, strict=True):
+            for param, index, key in zip(group["params"], mine["params"], keys, strict=True):
+                if key in state:
+                    taken[index] = _fitting(state[key], param, name)
         super().load_state_dict({"state": taken, "param_groups": own})
 
 
@@ -202,7 +203,7 @@ def _has_gradient(groups: list[Group], name: str) -> bool:
     return any(group.get("name") == name and group["params"][0].grad is not None for group in groups)
 
 
-def _fitting(entry: Any, param: Tensor, name: str) -> dict[str, Tensor]:
+def _fitting(entry: Any, param: Tensor, name: str | None) -> dict[str, Tensor]:
     """Adam's state of one parameter, checked against it."""
     if not isinstance(entry, dict) or not {"step", "exp_avg", "exp_avg_sq"} <= entry.keys():
         raise ValueError(f"step, exp_avg or exp_avg_sq of {name} is missing")
@@ -216,8 +217,5 @@ def _fitting(entry: Any, param: Tensor, name: str) -> dict[str, Tensor]:
         raise ValueError(f"step of {name} is not a number") from error
     if not (math.isfinite(step) and step >= 0):
         raise ValueError(f"step of {name} is {step}")
-    return {
-        "step": torch.tensor(step, dtype=torch.float32),
-        "exp_avg": entry["exp_avg"],
-        "exp_avg_sq": entry["exp_avg_sq"],
-    }
+    averages = {key: value for key, value in entry.items() if torch.is_tensor(value) and value.shape == param.shape}
+    return averages | {"step": torch.tensor(step, dtype=torch.float32)}
