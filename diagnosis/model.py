@@ -146,7 +146,9 @@ def _measure(
             pixels_that_count(x, mask) for x in (views.image(camera, gaussians), as_float(views.target(camera)))
         )
         black = torch.zeros_like(gaussians.get_xyz)
-        silhouette = render(camera, gaussians, pipe, torch.ones_like(background), override_color=black)
+        silhouette = render(
+            camera, gaussians, pipe, torch.ones_like(background), override_color=black, want_depth=False
+        )
     ratio = min(float(psnr(image, target).mean()), 99.0)
     drawn = float((silhouette["radii"] > 0).float().mean())
     return float(image.mean()), float(target.mean()), 1 - float(silhouette["render"].mean()), drawn, ratio

@@ -24,16 +24,18 @@ def render(
     override_color: Tensor | None = None,
     use_trained_exp: bool = False,
     *,
-    want_depth: bool = False,
+    want_depth: bool = True,
     want_visibility: bool = True,
     clamp: bool = True,
 ) -> dict[str, Tensor | None]:
     """Render one view.
 
-    bg_color: (3,) in [0, 1] on the model's device. scaling_modifier multiplies all scales. override_color: (N, 3)
-    instead of SH. separate_sh: accepted for callers of the reference; the SH bands are always passed separately.
-    pipe: convert_SHs_python, compute_cov3D_python, debug, antialiasing. use_trained_exp: apply the trained exposure of
-    the view's photo, before the clamp; a view without a photo has none.
+    viewpoint_camera: a Camera, or an object with the attributes of MiniCam. pc: a GaussianModel, or an object with its
+    get_xyz, get_opacity, get_scaling, get_rotation, get_features and active_sh_degree. bg_color: (3,) in [0, 1] on the
+    model's device. scaling_modifier multiplies all scales. separate_sh: take get_features_dc and get_features_rest even
+    if a subclass has overridden them; the 2023 release has override_color in its place. override_color: (N, 3) instead
+    of SH. pipe: convert_SHs_python, compute_cov3D_python, debug and, if it is there, antialiasing. use_trained_exp:
+    apply the trained exposure of the view's photo, before the clamp; a view without a photo has none.
 
     Returns
     `render` (3, H, W), clamped to [0, 1] so that values outside get no gradient; unclamped if clamp is False;
@@ -41,19 +43,26 @@ def render(
     `visibility_filter` (n, 1) int64 indices of the Gaussians with radius > 0, or None without want_visibility, which
     saves waiting for a GPU; `radii` (N,) int32 pixels; `depth` inverse depth (1, H, W), or None unless want_depth.
     """
+    if torch.is_tensor(separate_sh):
+        separate_sh, override_color = False, separate_sh
     xyz = pc.get_xyz
+    geometry, raw = _geometry(pc, pipe.compute_cov3D_python, scaling_modifier)
+    colors = _colors(pc, pipe.convert_SHs_python, viewpoint_camera, separate_sh, override_color)
     viewspace_points = _zero(xyz.device, xyz.dtype).expand_as(xyz)
-    viewspace_points.requires_grad_(xyz.requires_grad and torch.is_grad_enabled())
+    viewspace_points.requires_grad_(
+        torch.is_grad_enabled() and any(x.requires_grad for x in (xyz, *geometry.values(), *colors.values()))
+    )
     result = rasterize(
         xyz,
         viewspace_points,
         settings=_settings(viewpoint_camera, pc.active_sh_degree, pipe, bg_color, scaling_modifier),
         want_inverse_depth=want_depth,
-        **_geometry(pc, pipe.compute_cov3D_python, scaling_modifier),
-        **_colors(pc, pipe.convert_SHs_python, viewpoint_camera, override_color),
+        raw=raw,
+        **geometry,
+        **colors,
     )
     color = result.color
-    if use_trained_exp and (name := getattr(viewpoint_camera, "exposure_name", None)) is not None:
+    if use_trained_exp and (name := _photo(viewpoint_camera)) is not None:
         color = apply_exposure(color, pc.get_exposure_from_name(name))
     return {
         "render": color.clamp(0, 1) if clamp else color,
@@ -74,11 +83,13 @@ def _zero(device: torch.device, dtype: torch.dtype) -> Tensor:
 def decisive_for(camera: Camera | MiniCam, pc: GaussianModel, pipe: argparse.Namespace) -> Tensor:
     """Gaussians that the image of `render` depends on, over any background (`decisive`): (N,) bool."""
     background = pc.get_xyz.new_zeros(3)
+    geometry, raw = _geometry(pc, pipe.compute_cov3D_python, 1.0)
     return decisive(
         pc.get_xyz,
         settings=_settings(camera, pc.active_sh_degree, pipe, background, 1.0),
-        **_geometry(pc, pipe.compute_cov3D_python, 1.0),
-        **_colors(pc, pipe.convert_SHs_python, camera, None),
+        raw=raw,
+        **geometry,
+        **_colors(pc, pipe.convert_SHs_python, camera, False, None),
     )
 
 
@@ -98,30 +109,43 @@ def _settings(
         campos=camera.camera_center,
         prefiltered=False,
         debug=pipe.debug,
-        antialiasing=pipe.antialiasing,
+        antialiasing=getattr(pipe, "antialiasing", False),  # the 2023 release's options have none
     )
 
 
-def _geometry(pc: GaussianModel, in_python: bool, scaling_modifier: float) -> dict[str, Tensor | bool]:
-    """Shapes and opacities: raw, so that the kernels activate them, or activated and multiplied out in PyTorch.
+def _photo(camera: Camera | MiniCam) -> str | None:
+    """The name by which the exposure of a view is known, None for a view without a photo."""
+    name = getattr(camera, "exposure_name", None)
+    return getattr(camera, "image_name", None) if name is None else name
 
-    The kernels are faster and give the same bits for any number of threads.
+
+def _geometry(pc: GaussianModel, in_python: bool, scaling_modifier: float) -> tuple[dict[str, Tensor], bool]:
+    """Shapes and opacities, and whether they are raw, so that the kernels activate them.
+
+    The kernels are faster and give the same bits for any number of threads. They take activated values of a model that
+    has activations of its own, or is of another class.
     """
     if in_python:
-        return {"opacities": pc.get_opacity, "cov3d": pc.get_covariance(scaling_modifier)}
-    return {**pc.raw_geometry(), "raw": True}
+        return {"opacities": pc.get_opacity, "cov3d": pc.get_covariance(scaling_modifier)}, False
+    if getattr(pc, "kernels_activate", False):
+        return pc.raw_geometry(), True
+    return {"opacities": pc.get_opacity, "scales": pc.get_scaling, "rotations": pc.get_rotation}, False
 
 
 def _colors(
-    pc: GaussianModel, in_python: bool, camera: Camera | MiniCam, override_color: Tensor | None
+    pc: GaussianModel, in_python: bool, camera: Camera | MiniCam, separate_sh: bool, override_color: Tensor | None
 ) -> dict[str, Tensor]:
     if override_color is not None:
         return {"colors": override_color}
     if in_python:
-        direction = torch.nn.functional.normalize(pc.get_xyz - camera.camera_center)
+        direction = torch.nn.functional.normalize(pc.get_xyz - camera.camera_center.to(pc.get_xyz.dtype))
         color = eval_sh(pc.active_sh_degree, pc.get_features.transpose(1, 2), direction)
         return {"colors": (color + 0.5).clamp_min(0.0)}
-    rest = pc.get_features_rest
-    if pc.active_bands == 0:
+    if separate_sh or getattr(pc, "features_are_raw", False):
+        dc, rest = pc.get_features_dc, pc.get_features_rest
+    else:
+        features = pc.get_features
+        dc, rest = features[:, :1], features[:, 1:]
+    if pc.active_sh_degree == 0:
         rest = rest.detach()[:, :0]  # no band is read, so no gradient of zeros has to be written
-    return {"sh_dc": pc.get_features_dc, "sh_rest": rest}
+    return {"sh_dc": dc, "sh_rest": rest}

@@ -33,8 +33,8 @@ class ScoredViews:
         self._draw = draw or self._render
 
     def _render(self, camera: Camera, gaussians: GaussianModel) -> Tensor:
-        exposed = {"use_trained_exp": self._halves}
-        return render(camera, gaussians, self._pipe, self._background, **exposed, want_visibility=False)["render"]
+        options = {"use_trained_exp": self._halves, "want_depth": False, "want_visibility": False}
+        return render(camera, gaussians, self._pipe, self._background, **options)["render"]
 
     def whole(self, camera: Camera, gaussians: GaussianModel) -> Tensor:
         """The whole render (3, H, W), float32 in [0, 1], before `part` cuts it."""

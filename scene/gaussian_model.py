@@ -3,17 +3,20 @@
 import argparse
 import os
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
-from torch import Tensor
+from torch import Tensor, nn
 
 from scene.gaussians.adam import GaussianAdam, StepGuard
 from scene.gaussians.adaptive import AdaptiveGaussians
 from scene.gaussians.checkpoint import State, pack, unpack
-from scene.gaussians.exposure import Exposures, read_exposures
+from scene.gaussians.exposed import Exposed
+from scene.gaussians.exposure import Exposures, read_exposures, read_pretrained
 from scene.gaussians.finite import check_finite
 from scene.gaussians.sparse_adam import SparseGaussianAdam
 from scene.gaussians.start import start_rows
+from scene.gaussians.trainable import trainable
 from scene.readers.info import exposure_names
 from utils.general_utils import get_expon_lr_func
 from utils.graphics_utils import BasicPointCloud
@@ -22,12 +25,12 @@ from utils.system_utils import UserError
 _OPTIMIZERS = {"default": GaussianAdam, "sparse_adam": SparseGaussianAdam}
 
 
-class GaussianModel(AdaptiveGaussians):
+class GaussianModel(Exposed, AdaptiveGaussians):
     """Gaussians as they are trained, with the reference's names.
 
-    GaussianParameters has the parameters and their activated forms, AdaptiveGaussians has density control.
-    optimizer_type: "default" or "sparse_adam", whose step takes a mask of the visible Gaussians. exposures: of the
-    training photos, identities unless trained. spatial_lr_scale: extent of the scene, world units.
+    GaussianParameters has the parameters and their activated forms, AdaptiveGaussians has density control, and Exposed
+    the exposures. optimizer_type: "default" or "sparse_adam", whose step takes a mask of the visible Gaussians.
+    spatial_lr_scale: extent of the scene, world units.
     """
 
     def __init__(self, sh_degree: int, optimizer_type: str = "default") -> None:
@@ -36,14 +39,18 @@ class GaussianModel(AdaptiveGaussians):
         super().__init__(sh_degree)
         self.optimizer_type = optimizer_type
         self.spatial_lr_scale = 0.0
-        self.exposures = Exposures()
 
-    def create_from_pcd(self, pcd: BasicPointCloud, cam_infos: Sequence, spatial_lr_scale: float) -> None:
+    def create_from_pcd(
+        self, pcd: BasicPointCloud, cam_infos: Sequence | float = (), spatial_lr_scale: float | None = None
+    ) -> None:
         """Start from a point cloud: round Gaussians as wide as the distance to their neighbours, opacity 0.1.
 
         spatial_lr_scale: extent of the scene in world units; scales position learning rates and size limits.
-        cam_infos: the training cameras, each of which gets an exposure.
+        cam_infos: the training cameras, records with an `image_name`, each of which gets an exposure. As in the 2023
+        release, the extent may stand in their place.
         """
+        if spatial_lr_scale is None:
+            cam_infos, spatial_lr_scale = (), cam_infos
         rows = start_rows(pcd, spatial_lr_scale, self.max_sh_degree)
         self.spatial_lr_scale = float(spatial_lr_scale)
         self.active_sh_degree = 0
@@ -51,25 +58,26 @@ class GaussianModel(AdaptiveGaussians):
         self.start_exposures(cam_infos)
         print(f"Number of points at initialisation :  {len(self)}")
 
+    def load_ply(self, path: str | os.PathLike, use_train_test_exp: bool = False) -> None:
+        """Take all parameters from a PLY of this model's SH degree (else UserError); all SH bands become active.
+
+        use_train_test_exp: also read the exposures, from the model folder that has the PLY in
+        point_cloud/iteration_N. They are then `pretrained_exposures`.
+        """
+        super().load_ply(path)
+        if use_train_test_exp:
+            self.pretrained_exposures = read_pretrained((Path(path).absolute().parent / "../..").resolve())
+
     # Exposures
-
-    @property
-    def get_exposure(self) -> Tensor:
-        """Maps of colours (n, 3, 4) of the n training photos."""
-        return self.exposures.values
-
-    def get_exposure_from_name(self, image_name: str) -> Tensor:
-        """Map of colours (3, 4) of a training photo, by its name in exposure.json."""
-        return self.exposures[image_name]
 
     def start_exposures(self, cam_infos: Sequence) -> None:
         """Give each training camera an exposure that changes nothing."""
-        self.exposures = Exposures(exposure_names(cam_infos))
+        self.exposures = Exposures(_photo_names(cam_infos))
 
     def load_exposures(self, folder: str | os.PathLike, cam_infos: Sequence) -> None:
         """Take the exposures of the training cameras from a model folder."""
         image_names = [camera.image_name for camera in cam_infos]
-        self.exposures = read_exposures(folder, exposure_names(cam_infos), image_names)
+        self.exposures = read_exposures(folder, _photo_names(cam_infos), image_names)
 
     def save_exposures(self, folder: str | os.PathLike) -> None:
         """Write the exposures into a model folder."""
@@ -78,8 +86,12 @@ class GaussianModel(AdaptiveGaussians):
     # Optimiser
 
     def training_setup(self, training_args: argparse.Namespace) -> None:
-        """Make the optimisers and their schedules from the optimisation options; zero the statistics."""
+        """Make the optimisers and their schedules from the optimisation options; zero the statistics.
+
+        Parameters become contiguous in place. Plain tensors, which code may have assigned, become parameters.
+        """
         self.percent_dense = training_args.percent_dense
+        self._take({name: trainable(self.raw(name)) for name in self._attributes})
         self._zero_statistics()
         self.optimizer = _OPTIMIZERS[self.optimizer_type](
             [
@@ -100,7 +112,10 @@ class GaussianModel(AdaptiveGaussians):
         """Set the scheduled learning rates for this iteration; return that of the positions."""
         self.exposures.update_learning_rate(iteration)
         rate = self.xyz_scheduler_args(iteration)
-        self.optimizer.param_groups[0]["lr"] = rate
+        for group in self.optimizer.param_groups:
+            if group.get("name") == "xyz":
+                group["lr"] = rate
+                break
         return rate
 
     def step(self, radii: Tensor) -> None:
@@ -108,7 +123,7 @@ class GaussianModel(AdaptiveGaussians):
 
         radii: (N,) pixels in the view of this iteration; the sparse optimiser skips Gaussians of radius 0.
         """
-        if self.optimizer_type == "sparse_adam":
+        if isinstance(self.optimizer, SparseGaussianAdam):
             self.optimizer.step(radii > 0)
         else:
             self.optimizer.step()
@@ -121,7 +136,8 @@ class GaussianModel(AdaptiveGaussians):
 
     def check_steps(self) -> None:
         """UserError if a guard has held steps back, so that the model is older than its iteration number."""
-        if self.optimizer.guard and (iteration := self.optimizer.guard.stopped_in()):
+        guard = getattr(self.optimizer, "guard", None)
+        if guard and (iteration := guard.stopped_in()):
             raise UserError(f"the loss or a step of iteration {iteration} was not finite; lower the learning rates")
 
     def take_marks(self) -> list[tuple[str, list[int] | list[str], int]]:
@@ -139,20 +155,24 @@ class GaussianModel(AdaptiveGaussians):
     def oneupSHdegree(self) -> None:
         """Raise the active SH degree by one, up to the maximum."""
         self.active_sh_degree = min(self.active_sh_degree + 1, self.max_sh_degree)
-        if self.optimizer is not None:
-            self._limit_columns()
+        self._limit_columns()
 
     def _limit_columns(self) -> None:
-        self.optimizer.set_active_columns("f_rest", 3 * self.active_bands)
+        if isinstance(self.optimizer, GaussianAdam):
+            self.optimizer.set_active_columns("f_rest", 3 * self.active_bands)
 
     # Checkpoints
 
     def capture(self) -> tuple:
-        """Everything a resumed training needs, as tensors and numbers; `pack` gives the order."""
+        """Everything a resumed training needs, as tensors and numbers; `pack` gives the order.
+
+        Values of Gaussians are parameters: the reference trains on with the very tensors that a checkpoint holds.
+        """
+        raw = {name: self.raw(name) for name in self._attributes}
         return pack(
             State(
                 self.active_sh_degree,
-                self.rows(),
+                {name: x if isinstance(x, nn.Parameter) else nn.Parameter(x.detach()) for name, x in raw.items()},
                 self.statistics,
                 self.optimizer.state_dict(),
                 float(self.spatial_lr_scale),
@@ -171,7 +191,10 @@ class GaussianModel(AdaptiveGaussians):
         self.set_rows(state.rows)
         self.training_setup(training_args)
         try:
-            self.optimizer.take_state(state.optimizer)
+            if isinstance(self.optimizer, GaussianAdam):
+                self.optimizer.take_state(state.optimizer)
+            else:  # a subclass has set up another
+                self.optimizer.load_state_dict(state.optimizer)
         except ValueError as error:
             raise UserError(f"the optimiser state of the checkpoint does not fit ({error}); use another one") from error
         if state.exposures is not None:
@@ -183,3 +206,11 @@ class GaussianModel(AdaptiveGaussians):
         remedy = "nothing of this iteration was saved; lower the learning rates, or resume from an earlier checkpoint"
         check_finite(self.rows(), f"iteration {iteration}", remedy)
         self.exposures.check_finite(f"iteration {iteration}", remedy)
+
+
+def _photo_names(cam_infos: Sequence) -> list[str]:
+    """A name for each camera's exposure. Cameras of one name need an `image_path`, or they share an exposure."""
+    names = [camera.image_name for camera in cam_infos]
+    if len(set(names)) == len(names):
+        return names
+    return exposure_names(cam_infos) if all(hasattr(c, "image_path") for c in cam_infos) else list(dict.fromkeys(names))

@@ -10,8 +10,9 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 import torch
-from gaussians import model, options, parameters, take_steps
+from gaussians import GROUPS, model, options, parameters, take_steps
 
+from scene.gaussian_model import GaussianModel
 from scene.gaussians.checkpoint import load_checkpoint, save_checkpoint
 from utils.system_utils import UserError
 
@@ -26,7 +27,7 @@ def _plain(value: object) -> bool:
         return all(_plain(part) for part in (*value.keys(), *value.values()))
     if isinstance(value, list | tuple):
         return all(_plain(part) for part in value)
-    return value is None or type(value) in (torch.Tensor, int, float, bool, str)
+    return value is None or type(value) in (torch.Tensor, torch.nn.Parameter, int, float, bool, str)
 
 
 def test_round_trip_of_plain_values(tmp_path):
@@ -78,6 +79,50 @@ def test_the_references_checkpoint_loads(tmp_path, scalar, numpy):
     for name, value in parameters(gaussians).items():
         assert torch.equal(parameters(other)[name], value)
     take_steps(other, 1)
+
+
+def test_a_loop_that_takes_the_tensors_as_they_are_trains_on(tmp_path):
+    """The reference's restore: parameters straight from the file, a new Adam of torch, its state from the file."""
+    gaussians = model(12)
+    take_steps(gaussians, 2)
+    save_checkpoint(tmp_path / "chkpnt2.pth", gaussians.capture(), 2)
+    (capture, _) = torch.load(tmp_path / "chkpnt2.pth", weights_only=True)
+    _, xyz, f_dc, f_rest, scaling, rotation, opacity, _, _, _, state, _ = capture
+    taken = {"xyz": xyz, "f_dc": f_dc, "f_rest": f_rest, "opacity": opacity, "scaling": scaling, "rotation": rotation}
+    assert all(isinstance(t, torch.nn.Parameter) and t.requires_grad and t.is_leaf for t in taken.values())
+    theirs = torch.optim.Adam([{"params": [t], "lr": 0.0, "name": name} for name, t in taken.items()], eps=1e-15)
+    theirs.load_state_dict(state)
+    generator = torch.Generator().manual_seed(9)
+    for name, param in taken.items():
+        param.grad = torch.randn(param.shape, generator=generator)
+        getattr(gaussians, GROUPS[name]).grad = param.grad.clone()
+    theirs.step()
+    gaussians.optimizer.step()
+    for name, value in parameters(gaussians).items():
+        torch.testing.assert_close(taken[name].detach(), value, rtol=0, atol=2**-20)
+
+
+def test_plain_tensors_and_other_optimisers_are_captured_and_restored():
+    gaussians = model(12)
+    gaussians._opacity = gaussians._opacity.detach() * 0.5
+    gaussians.optimizer = torch.optim.Adam(gaussians.optimizer.param_groups, lr=0.0, eps=1e-15)
+    gaussians._xyz.grad = torch.ones(12, 3)
+    gaussians.optimizer.step()
+    capture = gaussians.capture()
+    assert all(isinstance(t, torch.nn.Parameter) and t.requires_grad for t in capture[1:7])
+
+    class Client(GaussianModel):
+        def training_setup(self, training_args):
+            super().training_setup(training_args)
+            self.optimizer = torch.optim.Adam(self.optimizer.param_groups, lr=0.0, eps=1e-15)
+
+    for kind in (GaussianModel, Client):
+        other = kind(3)
+        other.restore(capture, options())
+        assert torch.equal(other._opacity, gaussians._opacity)
+        assert torch.equal(
+            other.optimizer.state[other._xyz]["exp_avg"], gaussians.optimizer.state[gaussians._xyz]["exp_avg"]
+        )
 
 
 class _Bomb:

@@ -3,6 +3,7 @@
 import json
 import math
 import sys
+import types
 from dataclasses import replace
 from pathlib import Path
 
@@ -85,7 +86,7 @@ def test_steps_are_those_of_torchs_adam_by_default():
     theirs = torch.optim.Adam([values])
     generator = torch.Generator().manual_seed(0)
     for step in range(1, 21):
-        theirs.param_groups[0]["lr"] = ours._rate(step)
+        theirs.param_groups[0]["lr"] = ours.schedule(step)
         values.grad = torch.randn(3, 3, 4, generator=generator)
         theirs.step()
     # Twenty steps of 0.01, each exact to some units in the last place of values about 1.
@@ -149,6 +150,71 @@ def test_a_broken_file_is_named(tmp_path, text, words):
         (tmp_path / "exposure.json").write_text(text)
     with pytest.raises(UserError, match=f"{words}.*; restore the file, or write train_test_exp=False"):
         _read(tmp_path, _infos("a.png"))
+
+
+# The reference's names
+
+
+def test_parts_can_be_read_and_replaced_by_the_references_names():
+    gaussians = model(6)
+    gaussians.exposures = _trained()
+    assert gaussians._exposure is gaussians.get_exposure is gaussians.exposures.values
+    assert gaussians.exposure_mapping == {name: index for index, name in enumerate(NAMES)}
+    assert gaussians.pretrained_exposures is None and gaussians.exposure_optimizer is gaussians.exposures.optimizer
+    gaussians.exposure_mapping = {"x": 1, "y": 0}
+    gaussians._exposure = torch.nn.Parameter(torch.rand(2, 3, 4))
+    assert torch.equal(gaussians.get_exposure_from_name("x"), gaussians._exposure[1])
+    assert gaussians.exposures.names == ["y", "x"]
+    gaussians.exposure_optimizer = torch.optim.Adam([gaussians._exposure], lr=0.5)
+    gaussians.exposure_scheduler_args = lambda iteration: 0.125 * iteration
+    gaussians.update_learning_rate(2)
+    before = gaussians._exposure.detach().clone()
+    gaussians._exposure.grad = torch.ones(2, 3, 4)
+    gaussians.step(torch.ones(6, dtype=torch.int32))
+    torch.testing.assert_close(gaussians._exposure, before - 0.25)
+    maps = {"x": torch.rand(3, 4)}
+    gaussians.pretrained_exposures = maps
+    assert gaussians.get_exposure_from_name("x") is maps["x"]
+    gaussians.update_learning_rate(3)
+    assert gaussians.exposure_optimizer.param_groups[0]["lr"] == 0.25  # they are not trained further
+    with pytest.raises(UserError, match="no trained exposure of y"):
+        gaussians.get_exposure_from_name("y")
+
+
+def test_steps_without_training_do_nothing():
+    gaussians = model(6)
+    gaussians.start_exposures(_infos(*NAMES))
+    gaussians.training_setup(options())
+    gaussians.exposure_optimizer.step()
+    gaussians.exposure_optimizer.zero_grad(set_to_none=True)
+    assert torch.equal(gaussians.get_exposure, torch.eye(3, 4).expand(3, 3, 4)) and not gaussians.exposures.trained
+
+
+def test_records_need_a_name_only():
+    record = types.SimpleNamespace
+    gaussians = GaussianModel(0)
+    gaussians.create_from_pcd(cloud(5), [record(image_name="a"), record(image_name="b")], 1.0)
+    assert gaussians.exposure_mapping == {"a": 0, "b": 1} and gaussians.get_exposure.shape == (2, 3, 4)
+    gaussians.create_from_pcd(cloud(5), [record(image_name=name) for name in "aba"], 1.0)
+    assert gaussians.exposure_mapping == {"a": 0, "b": 1} and gaussians.get_exposure.shape == (2, 3, 4)
+
+
+def test_a_ply_brings_the_exposures_of_its_model_folder(tmp_path, capsys):
+    gaussians = model(6)
+    gaussians.exposures = _trained()
+    path = tmp_path / "point_cloud/iteration_7/point_cloud.ply"
+    path.parent.mkdir(parents=True)
+    gaussians.save_ply(path)
+    loaded = GaussianModel(3)
+    loaded.load_ply(path, use_train_test_exp=True)
+    assert loaded.pretrained_exposures is None and "no exposures are loaded" in capsys.readouterr().out
+    gaussians.save_exposures(tmp_path)
+    loaded.load_ply(path)
+    assert loaded.pretrained_exposures is None
+    loaded.load_ply(str(path), True)
+    assert list(loaded.pretrained_exposures) == NAMES
+    for name in NAMES:
+        assert torch.equal(loaded.get_exposure_from_name(name), gaussians.get_exposure_from_name(name))
 
 
 # Checkpoints

@@ -6,7 +6,7 @@ import pytest
 import torch
 from gaussians import GROUPS, model, moments, options, parameters, take_steps
 
-from scene.gaussians import adam
+from scene.gaussians import row_surgery
 from scene.gaussians.adam import GaussianAdam
 
 
@@ -125,7 +125,7 @@ def test_appended_rows_start_with_zero_moments_and_the_counter_stays():
     take_steps(gaussians, 3)
     values, state = parameters(gaussians), moments(gaussians)
     new = {name: torch.full((4, *value.shape[1:]), 0.5) for name, value in values.items()}
-    taken = gaussians.optimizer.append_rows(new)
+    taken = gaussians.cat_tensors_to_optimizer(new)
     for name, param in taken.items():
         assert param.grad is None and param.requires_grad
         assert torch.equal(param.detach(), torch.cat((values[name], new[name])))
@@ -141,7 +141,8 @@ def test_kept_rows_keep_their_moments():
     take_steps(gaussians, 2)
     values, state = parameters(gaussians), moments(gaussians)
     indices = torch.tensor([1, 5, 19])
-    for name, param in gaussians.optimizer.keep_rows(indices).items():
+    kept = torch.zeros(20, dtype=torch.bool).index_fill_(0, indices, True)
+    for name, param in gaussians._prune_optimizer(kept).items():
         assert torch.equal(param.detach(), values[name][indices])
         assert torch.equal(gaussians.optimizer.state[param]["exp_avg_sq"], state[name]["exp_avg_sq"][indices])
 
@@ -192,23 +193,23 @@ def _failing(function, call: int):
 @pytest.mark.parametrize("call", [1, 2, 3, 9, 18])
 def test_where_memory_fails_rows_are_appended_to_none_and_kept_in_all(monkeypatch, call):
     """Six groups with two moments each are 18 tensors; memory runs out at one of them."""
-    monkeypatch.setattr(adam, "_CHUNK", 7)
+    monkeypatch.setattr(row_surgery, "_CHUNK", 7)
     gaussians = model(40)
     take_steps(gaussians, 2)
     before, state = parameters(gaussians), moments(gaussians)
     rows = {name: values[:5] for name, values in before.items()}
     with monkeypatch.context() as patch, pytest.raises(MemoryError):
         patch.setattr(torch, "cat", _failing(torch.cat, call))
-        gaussians.optimizer.append_rows(rows)
+        gaussians.cat_tensors_to_optimizer(rows)
     gaussians.take_from_optimizer()
     _assert_rows(gaussians, before, state, torch.arange(40))
 
-    kept = torch.arange(40)[torch.randperm(40, generator=torch.Generator().manual_seed(0)) < 30]
+    mask = torch.randperm(40, generator=torch.Generator().manual_seed(0)) < 30
     with monkeypatch.context() as patch, pytest.raises(MemoryError):
         patch.setattr(torch.Tensor, "index_select", _failing(torch.Tensor.index_select, call))
-        gaussians.optimizer.keep_rows(kept)
+        gaussians._prune_optimizer(mask)
     gaussians.take_from_optimizer()
-    _assert_rows(gaussians, before, state, kept)
+    _assert_rows(gaussians, before, state, torch.arange(40)[mask])
     assert [len(values) for values in (gaussians.denom, gaussians.max_radii2D)] == [30, 30]
 
 

@@ -1,5 +1,6 @@
 """render(): its dictionary, the clamp, and the raw path against the plain one."""
 
+import argparse
 import math
 
 import pytest
@@ -7,12 +8,13 @@ import torch
 from gaussians import GROUPS, model, pipeline
 
 import gaussian_renderer
-from gaussian_renderer import render
+from gaussian_renderer import render, scored_views
 from scene.cameras import MiniCam
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.exposure import Exposures
+from training.observers import report
 from utils.graphics_utils import getProjectionMatrix
-from utils.loss_utils import inverse_depth_loss
+from utils.loss_utils import inverse_depth_loss, l1_loss
 from utils.system_utils import UserError
 
 WIDTH, HEIGHT = 41, 27
@@ -35,7 +37,7 @@ def test_what_it_returns(camera):
         gaussians._xyz[3] = torch.tensor([0.0, 0.0, -5.0])  # behind the camera
     package = render(camera, gaussians, pipeline(), BLACK)
     assert list(package) == ["render", "viewspace_points", "visibility_filter", "radii", "depth"]
-    assert package["render"].shape == (3, HEIGHT, WIDTH) and package["depth"] is None
+    assert package["render"].shape == (3, HEIGHT, WIDTH) and package["depth"].shape == (1, HEIGHT, WIDTH)
     assert package["radii"].shape == (40,) and package["radii"].dtype == torch.int32
     visible = package["visibility_filter"]
     assert visible.shape[1] == 1 and visible.dtype == torch.int64
@@ -47,15 +49,39 @@ def test_what_it_returns(camera):
         assert getattr(gaussians, name).grad.shape == getattr(gaussians, name).shape
 
 
-def test_depth_on_request(camera):
+def test_depth_unless_it_is_not_wanted(camera):
     gaussians = model(1)
     with torch.no_grad():
         gaussians._xyz.zero_()
         gaussians._scaling.fill_(math.log(0.5))
         gaussians._opacity.fill_(0.0)
-    depth = render(camera, gaussians, pipeline(), BLACK, want_depth=True)["depth"]
+    depth = render(camera, gaussians, pipeline(), BLACK)["depth"]
+    assert render(camera, gaussians, pipeline(), BLACK, want_depth=False)["depth"] is None
     assert depth.shape == (1, HEIGHT, WIDTH)
     assert depth.max().item() == pytest.approx(0.5 / 3.0, rel=0.01)  # opacity / distance, at the nearest pixel centre
+
+
+def test_scores_are_computed_without_depth(camera, monkeypatch):
+    """Neither the scores nor the training report computes an inverse depth, which nothing reads."""
+    asked = []
+
+    def spy(*args: object, **options: object) -> dict:
+        asked.append(options["want_depth"])
+        return render(*args, **options)
+
+    gaussians = model(5)
+    scene = argparse.Namespace(gaussians=gaussians, getTrainCameras=lambda: [camera], getTestCameras=lambda: [])
+    camera.target, camera.mask, camera.image_name = lambda _: torch.zeros(3, HEIGHT, WIDTH), None, "a"
+    for module in (scored_views, report):
+        monkeypatch.setattr(module, "render", spy)
+    scored_views.ScoredViews(pipeline(), BLACK, False).image(camera, gaussians)
+    zero = torch.zeros(())
+    report.training_report(None, 1, zero, zero, l1_loss, 0.0, [1], scene, spy, (pipeline(), BLACK))
+    assert asked == [False] * 6
+    # Somebody else's renderer is given the reference's arguments alone.
+    report.training_report(
+        None, 1, zero, zero, l1_loss, 0.0, [1], scene, lambda *four: render(*four), (pipeline(), BLACK)
+    )
 
 
 def test_screen_points_are_zeros_with_a_gradient_of_their_own_in_every_render(camera):

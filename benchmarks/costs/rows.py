@@ -72,9 +72,8 @@ class Workload:
 
     def image(self, model: GaussianModel, *, pipe: argparse.Namespace | None = None, **options: bool) -> Tensor:
         """Render as training and render.py do, with options of `render`; (3, H, W)."""
-        return render(self.camera, model, pipe or self.pipe, self.settings.bg, want_visibility=False, **options)[
-            "render"
-        ]
+        options = {"want_depth": False, "want_visibility": False} | options
+        return render(self.camera, model, pipe or self.pipe, self.settings.bg, **options)["render"]
 
     def bare_image(self, model: GaussianModel) -> Tensor:
         """Render the same image by the rasterizer alone, without anything that `render` adds."""

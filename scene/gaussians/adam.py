@@ -1,16 +1,17 @@
-"""Adam over the tensors of a Gaussian model, whose state follows as Gaussians are added and removed."""
+"""Adam over the tensors of a Gaussian model."""
 
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from diff_gaussian_rasterization.optim import adam_
-from torch import Tensor, nn
+from torch import Tensor
 
-from utils.host.memory import is_out_of_memory
+from scene.gaussians.row_surgery import Group
 
-_CHUNK = 1 << 16  # rows moved at a time when memory is too short for all of them
+# Options of a group that the kernel takes from the optimiser's defaults, or does not know.
+_COMMON = ("betas", "eps", "weight_decay", "amsgrad", "maximize", "capturable", "differentiable", "fused")
 
 
 class StepGuard:
@@ -34,25 +35,46 @@ class StepGuard:
         return int(self._stopped)
 
 
+class _Stepped(NamedTuple):
+    """The groups of an optimiser by who steps them."""
+
+    by_kernel: list[Group]  # one contiguous parameter each, all of one kind, with the optimiser's options
+    by_torch: list[Group]
+
+
 class GaussianAdam(torch.optim.Adam):
     """torch.optim.Adam with one parameter (N, ...) per named group, and the same bits for any number of threads.
 
     State and state dict have torch's form (step, exp_avg, exp_avg_sq), so checkpoints of both can be exchanged. Step
     hooks are never called: torch's wrapper for them takes as long as the step itself. guard: see StepGuard.
+    Groups that the kernel cannot step are stepped by torch, unguarded: several parameters, or another dtype, device,
+    betas, eps or further option than the optimiser's. That is decided when a group is added.
     """
 
     guard: StepGuard | None = None
+    _stepped: _Stepped | None = None  # None: to be decided
 
     def __init__(self, groups: list[dict], eps: float = 1e-15) -> None:
         """Take groups: dicts with `params` (a list of one Parameter), `lr` and `name`."""
         super().__init__(groups, lr=0.0, eps=eps)
         self._active_columns: dict[str, int] = {}
 
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Take a state dict, or become a copy; copies know of no inactive columns."""
+        super().__setstate__(state)
+        self.__dict__.setdefault("_active_columns", {})
+        self._stepped = None
+
+    def add_param_group(self, param_group: Group) -> None:
+        """Add any group that torch.optim.Adam takes."""
+        super().add_param_group(param_group)
+        self._stepped = None
+
     def set_active_columns(self, name: str, columns: int) -> None:
         """Promise that only the first `columns` values of each row of this group ever had a gradient.
 
         Adam's step for the others changes no bit, as averages and gradient are zero, so it is left out. A group with no
-        active columns gets no gradient; its step counter advances with f_dc's.
+        active columns gets no gradient, and its step counter advances with f_dc's; if it gets one, all columns step.
         """
         self._active_columns[name] = columns
 
@@ -66,17 +88,19 @@ class GaussianAdam(torch.optim.Adam):
         if closure is not None:
             with torch.enable_grad():
                 loss = closure()
+        groups, others = self._groups()
         rates, columns, tensors = [], [], []
-        params = {group["name"]: group["params"][0] for group in self.param_groups}
-        for group in self.param_groups:
+        for group in groups:
             (param,) = group["params"]
-            active = self._active_columns.get(group["name"], -1)
-            if active != 0:
-                stepped, gradient = param.grad is not None, param.grad
-            else:
-                # Nothing was rendered from this group. With no columns to read, its values can stand in for a gradient.
-                stepped, gradient = params["f_dc"].grad is not None and param.numel() > 0, param
-            if stepped:
+            gradient, active = param.grad, self._active_columns.get(group.get("name"), -1)
+            if active == 0:
+                if gradient is not None:
+                    active = -1
+                elif param.numel() and _has_gradient(groups, "f_dc"):
+                    # Nothing was rendered from this group. With no columns to read, its values can stand in for a
+                    # gradient.
+                    gradient = param
+            if gradient is not None:
                 state = self._state_of(param)
                 tensors.append((param, gradient, state["exp_avg"], state["exp_avg_sq"], state["step"]))
                 rates.append(group["lr"])
@@ -84,21 +108,46 @@ class GaussianAdam(torch.optim.Adam):
         if tensors:
             lists, guard = map(list, zip(*tensors, strict=True)), self.guard.arguments if self.guard else ()
             adam_(*lists, rates, *self.defaults["betas"], self.defaults["eps"], columns, *guard)
+        if others:
+            self._step_by_torch(others)
         return loss
 
     step.hooked = True  # keeps torch from wrapping it
+
+    def _groups(self) -> _Stepped:
+        stepped = self._stepped
+        if stepped is None or len(stepped.by_kernel) + len(stepped.by_torch) != len(self.param_groups):
+            stepped = self._stepped = self._decide()
+        return stepped
+
+    def _decide(self) -> _Stepped:
+        stepped, kind = _Stepped([], []), None
+        for group in self.param_groups:
+            common = all(group.get(option) == self.defaults.get(option) for option in _COMMON)
+            own = _kind(group["params"][0]) if common and len(group["params"]) == 1 else None
+            kind = own if kind is None else kind
+            (stepped.by_torch if own is None or own != kind else stepped.by_kernel).append(group)
+        return stepped
+
+    def _step_by_torch(self, groups: list[Group]) -> None:
+        every, self.param_groups = self.param_groups, groups
+        try:
+            torch.optim.Adam.step(self)
+        finally:
+            self.param_groups = every
 
     def zero_grad(self, set_to_none: bool = True) -> None:
         """Drop the gradients, or zero them."""
         if not set_to_none:
             return super().zero_grad(set_to_none=False)
         for group in self.param_groups:
-            group["params"][0].grad = None
+            for param in group["params"]:
+                param.grad = None
 
     def take_marks(self) -> dict[str, Tensor]:
         """Rows (n,), by group, of the values whose step a guard held back; their averages restart at zero."""
         rows = {}
-        for group in self.param_groups:
+        for group in self._groups().by_kernel:
             state = self.state.get(group["params"][0])
             if not state:
                 continue
@@ -111,8 +160,9 @@ class GaussianAdam(torch.optim.Adam):
 
     def rewind(self, steps: int) -> None:
         """Reduce the step counters by the steps that a guard held back."""
-        for state in self.state.values():
-            state["step"] = (state["step"] - steps).clamp_min(0)
+        for group in self._groups().by_kernel:
+            if state := self.state.get(group["params"][0]):
+                state["step"] = (state["step"] - steps).clamp_min(0)
 
     def _state_of(self, param: Tensor) -> dict[str, Tensor]:
         state = self.state[param]
@@ -130,89 +180,30 @@ class GaussianAdam(torch.optim.Adam):
         own = self.state_dict()["param_groups"]
         try:
             state, groups = dict(state_dict["state"]), list(state_dict["param_groups"])
-            names, keys = [group["name"] for group in groups], [list(group["params"]) for group in groups]
-        except (TypeError, ValueError, KeyError, IndexError) as error:
+            found = [(group.get("name"), list(group["params"])) for group in groups]
+        except (TypeError, ValueError, KeyError, IndexError, AttributeError) as error:
             raise ValueError("it is not the state of an optimiser") from error
-        if names != [group["name"] for group in own] or any(len(params) != 1 for params in keys):
+        if [(name, len(keys)) for name, keys in found] != [(g.get("name"), len(g["params"])) for g in own]:
             raise ValueError("its groups are different")
         taken = {}
-        for group, mine, (key,) in zip(self.param_groups, own, keys, strict=True):
-            if key in state:
-                taken[mine["params"][0]] = _fitting(state[key], group["params"][0], group["name"])
+        for group, mine, (name, keys) in zip(self.param_groups, own, found, strict=True):
+            for param, index, key in zip(group["params"], mine["params"], keys, strict=True):
+                if key in state:
+                    taken[index] = _fitting(state[key], param, name)
         super().load_state_dict({"state": taken, "param_groups": own})
 
-    def append_rows(self, rows: dict[str, Tensor]) -> dict[str, nn.Parameter]:
-        """Append `rows[name]` (n, ...) to each group, with averages of zero. Returns the parameters, without gradient.
 
-        When memory runs out, no group keeps any of the new rows.
-        """
-        count = len(self.param_groups[0]["params"][0])
-
-        def grow(values: Tensor, name: str, is_moment: bool) -> Tensor:
-            return torch.cat((values, torch.zeros_like(rows[name]) if is_moment else rows[name]))
-
-        try:
-            return self._change_rows(grow)
-        except (MemoryError, RuntimeError) as error:
-            if is_out_of_memory(error):
-                self._change_rows(lambda values, *_: values[:count])
-            raise
-
-    def keep_rows(self, indices: Tensor) -> dict[str, nn.Parameter]:
-        """Keep the rows of `indices` (n,) int64, ascending, in every group. Returns the parameters, without gradient.
-
-        When memory runs out, the rows are moved within their own memory, and the error is raised afterwards.
-        """
-        errors = []
-
-        def select(values: Tensor, *_: object) -> Tensor:
-            try:
-                return values.index_select(0, indices)
-            except (MemoryError, RuntimeError) as error:
-                if not is_out_of_memory(error):
-                    raise
-                errors.append(error)
-                return _move_up(values, indices)
-
-        params = self._change_rows(select)
-        if errors:
-            raise errors[0]
-        return params
-
-    def _change_rows(self, change: Callable[[Tensor, str, bool], Tensor]) -> dict[str, nn.Parameter]:
-        """Map all parameters and averages; `change` takes values, the group's name, and whether they are averages."""
-        params = {}
-        for group in self.param_groups:
-            value = change(group["params"][0].detach(), group["name"], False)
-            params[group["name"]] = self._replace(group, value, lambda moment, name: change(moment, name, True))
-        return params
-
-    def reset(self, name: str, value: Tensor) -> nn.Parameter:
-        """Give one group a new value and averages of zero. Returns the new parameter, without gradient."""
-        (group,) = (group for group in self.param_groups if group["name"] == name)
-        return self._replace(group, value, lambda moment, _: torch.zeros_like(moment))
-
-    def _replace(self, group: dict, value: Tensor, change: Callable[[Tensor, str], Tensor]) -> nn.Parameter:
-        """Swap a group's parameter; `change` maps its averages, and the step counter stays."""
-        param = nn.Parameter(value.requires_grad_(True))
-        old = group["params"][0]
-        if self.state.get(old):
-            for key in ("exp_avg", "exp_avg_sq"):
-                self.state[old][key] = change(self.state[old][key], group["name"])
-            self.state[param] = self.state.pop(old)
-        group["params"] = [param]
-        return param
+def _kind(param: Tensor) -> tuple[torch.dtype, torch.device] | None:
+    """Dtype and device of a parameter, None for one of a dtype or layout that the kernel does not take."""
+    known = param.dtype == torch.float32 or (param.dtype == torch.float64 and not param.is_cuda)
+    return (param.dtype, param.device) if known and param.dim() > 0 and param.is_contiguous() else None
 
 
-def _move_up(values: Tensor, indices: Tensor) -> Tensor:
-    """values[indices] for ascending indices, in the memory of `values` itself."""
-    for start in range(0, len(indices), _CHUNK):
-        part = indices[start : start + _CHUNK]
-        values[start : start + len(part)] = values.index_select(0, part)  # later parts read rows further down
-    return values[: len(indices)]
+def _has_gradient(groups: list[Group], name: str) -> bool:
+    return any(group.get("name") == name and group["params"][0].grad is not None for group in groups)
 
 
-def _fitting(entry: Any, param: Tensor, name: str) -> dict[str, Tensor]:
+def _fitting(entry: Any, param: Tensor, name: str | None) -> dict[str, Tensor]:
     """Adam's state of one parameter, checked against it."""
     if not isinstance(entry, dict) or not {"step", "exp_avg", "exp_avg_sq"} <= entry.keys():
         raise ValueError(f"step, exp_avg or exp_avg_sq of {name} is missing")
@@ -226,8 +217,5 @@ def _fitting(entry: Any, param: Tensor, name: str) -> dict[str, Tensor]:
         raise ValueError(f"step of {name} is not a number") from error
     if not (math.isfinite(step) and step >= 0):
         raise ValueError(f"step of {name} is {step}")
-    return {
-        "step": torch.tensor(step, dtype=torch.float32),
-        "exp_avg": entry["exp_avg"],
-        "exp_avg_sq": entry["exp_avg_sq"],
-    }
+    averages = {key: value for key, value in entry.items() if torch.is_tensor(value) and value.shape == param.shape}
+    return averages | {"step": torch.tensor(step, dtype=torch.float32)}

@@ -1,41 +1,46 @@
 """Adaptive density control (Kerbl et al. 2023, section 5.2) of a set of Gaussians."""
 
-from dataclasses import replace
 from operator import attrgetter
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from scene.gaussians import density_rules as rules
-from scene.gaussians.adam import GaussianAdam
 from scene.gaussians.attributes import Rows
 from scene.gaussians.parameters import GaussianParameters
-from scene.gaussians.statistics import Statistics
+from scene.gaussians.row_surgery import Group, States, append_rows, keep_rows, replace_values, row_groups
+from scene.gaussians.statistics import NAMES, Statistics
+from utils.general_utils import inverse_sigmoid
 
-
-def _statistic(name: str) -> property:
-    """A property that reads one tensor of `statistics`, and replaces it for this model but not for copies of it."""
-
-    def put(self: "AdaptiveGaussians", values: Tensor) -> None:
-        self.statistics = replace(self.statistics, **{name: values})
-
-    return property(attrgetter(f"statistics.{name}"), put)
+_STANDARD = ("xyz", "f_dc", "f_rest", "opacity", "scaling", "rotation")  # the order of densification_postfix
+_read_statistics = attrgetter(*NAMES)
 
 
 class AdaptiveGaussians(GaussianParameters):
     """Gaussians that density control clones, splits and removes, together with their optimiser state.
 
-    statistics: observations since the last densification, whose tensors can be read and replaced here, too. optimizer:
-    None until training is set up. percent_dense: largest scale, as a part of
-    the scene's extent, of a Gaussian that is cloned; a larger one is split.
+    max_radii2D, xyz_gradient_accum, denom: observations since the last densification (Statistics has shapes and units).
+    optimizer: any of torch's, with `name` in its groups; None until training is set up, and then rows alone change.
+    tmp_radii: (N,) pixels of the present view, or None; density control keeps it in step with the rows. percent_dense:
+    largest scale, as a part of the scene's extent, of a Gaussian that is cloned; a larger one is split.
     """
 
-    statistics: Statistics
-    max_radii2D = _statistic("max_radii2D")
-    xyz_gradient_accum = _statistic("xyz_gradient_accum")
-    denom = _statistic("denom")
-    optimizer: GaussianAdam | None = None
+    max_radii2D: Tensor
+    xyz_gradient_accum: Tensor
+    denom: Tensor
+    optimizer: torch.optim.Optimizer | None = None
+    tmp_radii: Tensor | None = None
     percent_dense = 0.0
+
+    @property
+    def statistics(self) -> Statistics:
+        """The observations since the last densification, in one record of the model's own tensors."""
+        return Statistics(*_read_statistics(self))
+
+    @statistics.setter
+    def statistics(self, statistics: Statistics) -> None:
+        for name in NAMES:
+            setattr(self, name, getattr(statistics, name))
 
     def set_rows(self, rows: Rows) -> None:
         """Take raw values as GaussianParameters does, with new statistics."""
@@ -72,7 +77,7 @@ class AdaptiveGaussians(GaussianParameters):
 
     def take_from_optimizer(self) -> None:
         """Adopt the rows that densification had reached when memory ran out, so that they can be saved."""
-        self._take({group["name"]: group["params"][0] for group in self.optimizer.param_groups})
+        self._take({group.get("name"): group["params"][0] for group in self.optimizer.param_groups})
         if not self.statistics.fit(len(self)):
             self._zero_statistics()
 
@@ -82,35 +87,43 @@ class AdaptiveGaussians(GaussianParameters):
         min_opacity: float,
         extent: float,
         max_screen_size: int | None,
+        radii: Tensor | None = None,
         *,
-        seed: int = 0,
+        seed: int | None = None,
         iteration: int = 0,
         max_splats: int = 0,
     ) -> None:
         """Clone small and split large Gaussians with a mean gradient >= max_grad, then remove useless ones.
 
         min_opacity: a Gaussian below it is removed. extent: of the scene, world units. max_screen_size: pixels; unless
-        None, Gaussians wider than that or than a tenth of the extent are removed. seed and iteration decide the
-        positions of split children. max_splats > 0 bounds the number of Gaussians.
+        None, Gaussians wider than that or than a tenth of the extent are removed. radii: (N,) pixels of this view,
+        `tmp_radii` until the end. seed and iteration decide the positions of split children; without a seed, torch's
+        generator draws one. max_splats > 0 bounds the number of Gaussians.
         """
-        self.optimizer.zero_grad(set_to_none=True)  # frees memory; the new parameters have no gradient anyway
+        if radii is not None:
+            self.tmp_radii = radii
+        for attribute in self._attributes.values():  # frees memory; the new parameters have no gradient anyway
+            getattr(self, attribute.field).grad = None
         gradient = rules.mean_gradient(self.xyz_gradient_accum, self.denom)
         if max_splats > 0:
             gradient = rules.limit_growth(gradient, max_grad, max_splats - len(self))
+        draws = {} if seed is None else {"seed": seed, "iteration": iteration}
         self.densify_and_clone(gradient, max_grad, extent)
-        self.densify_and_split(gradient, max_grad, extent, seed=seed, iteration=iteration)
-        remove = rules.is_useless(self._opacity, min_opacity)
+        self.densify_and_split(gradient, max_grad, extent, **draws)
+        remove = rules.is_useless(self._opacity_logits(), min_opacity)
         if max_screen_size:
             # Appending has just zeroed max_radii2D, so the first test never fires, as in the reference.
             remove |= self.max_radii2D > max_screen_size
-            remove |= ~rules.is_small(self._scaling, rules.PRUNE_EXTENT * extent)
+            remove |= ~rules.is_small(self._log_scales(), rules.PRUNE_EXTENT * extent)
         self.prune_points(remove)
+        if radii is not None:
+            self.tmp_radii = None
 
     def densify_and_clone(self, grads: Tensor, grad_threshold: float, scene_extent: float) -> None:
         """Append an exact copy of each Gaussian with gradient >= threshold and scale <= percent_dense * extent."""
-        small = rules.is_small(self._scaling, self.percent_dense * scene_extent)
+        small = rules.is_small(self._log_scales(), self.percent_dense * scene_extent)
         chosen = ((grads.reshape(-1) >= grad_threshold) & small).nonzero().reshape(-1)
-        self.densification_postfix(*(values.index_select(0, chosen) for values in self.rows().values()))
+        self._append({name: values.index_select(0, chosen) for name, values in self.rows().items()}, chosen)
 
     def densify_and_split(
         self,
@@ -119,30 +132,39 @@ class AdaptiveGaussians(GaussianParameters):
         scene_extent: float,
         N: int = 2,
         *,
-        seed: int = 0,
+        seed: int | None = None,
         iteration: int = 0,
     ) -> None:
         """Replace each Gaussian with gradient >= threshold and scale > percent_dense * extent by N smaller ones.
 
-        grads: (n,) or (n, 1) for the first n Gaussians; those appended since (fresh clones) have gradient 0.
+        grads: (n,) or (n, 1) for the first n Gaussians; those appended since (fresh clones) have gradient 0. seed,
+        iteration: as in densify_and_prune.
         """
-        before = len(self)
-        large = ~rules.is_small(self._scaling, self.percent_dense * scene_extent)
+        if seed is None:
+            seed = int(torch.randint(2**62, ()))
+        before, log_scales = len(self), self._log_scales()
+        large = ~rules.is_small(log_scales, self.percent_dense * scene_extent)
         grads = grads.reshape(-1)
         large[len(grads) :] = False
         large[: len(grads)] &= grads >= grad_threshold
         parents = large.nonzero().reshape(-1)
         rows = {name: values.index_select(0, parents) for name, values in self.rows().items()}
+        shapes = rows["xyz"], log_scales.index_select(0, parents), rows["rotation"]
         children = [
-            rules.split_children(
-                rows["xyz"], rows["scaling"], rows["rotation"], parents, child, seed=seed, iteration=iteration
-            )
-            for child in range(N)
+            rules.split_children(*shapes, parents, child, count=N, seed=seed, iteration=iteration) for child in range(N)
         ]
         rows = {name: torch.cat([values] * N) for name, values in rows.items()}
-        rows["xyz"], rows["scaling"] = (torch.cat(parts) for parts in zip(*children, strict=True))
-        self.densification_postfix(*rows.values())
+        rows["xyz"], scales = (torch.cat(parts) for parts in zip(*children, strict=True))
+        rows["scaling"] = scales if self.kernels_activate else self.scaling_inverse_activation(scales.exp())
+        self._append(rows, parents.repeat(N))
         self.prune_points(torch.cat((large, large.new_zeros(len(self) - before))))
+
+    def _append(self, rows: Rows, origins: Tensor) -> None:
+        """Append rows by `densification_postfix`, or what overrides it, with the radii of their origins (n,) if set."""
+        standard = [rows.pop(name) for name in _STANDARD]
+        if self.tmp_radii is not None:
+            standard.append(self.tmp_radii.index_select(0, origins))
+        self.densification_postfix(*standard, **rows)
 
     def densification_postfix(
         self,
@@ -152,22 +174,83 @@ class AdaptiveGaussians(GaussianParameters):
         new_opacities: Tensor,
         new_scaling: Tensor,
         new_rotation: Tensor,
-        *new_others: Tensor,
+        new_tmp_radii: Tensor | None = None,
+        **new_others: Tensor,
     ) -> None:
-        """Append Gaussians, possibly none, by raw parameters, and zero the statistics of all."""
-        new = (new_xyz, new_features_dc, new_features_rest, new_opacities, new_scaling, new_rotation, *new_others)
-        self._take(self.optimizer.append_rows(dict(zip(self._attributes, new, strict=True))))
+        """Append n Gaussians, possibly none, by raw parameters, and zero the statistics of all.
+
+        new_tmp_radii: (n,), appended to `tmp_radii` if that is set; 0 if missing. new_others: further attributes, by
+        their names in the table of scene/gaussians/attributes.py.
+        """
+        standard = new_xyz, new_features_dc, new_features_rest, new_opacities, new_scaling, new_rotation
+        self._take(self.cat_tensors_to_optimizer(dict(zip(_STANDARD, standard, strict=True)) | new_others))
+        if self.tmp_radii is not None:
+            new = self.tmp_radii.new_zeros(len(new_xyz)) if new_tmp_radii is None else new_tmp_radii
+            self.tmp_radii = torch.cat((self.tmp_radii, new))
         self._zero_statistics()
 
     def prune_points(self, mask: Tensor) -> None:
         """Remove the Gaussians of a mask (N,) bool, with their optimiser state and statistics."""
-        keep = (~mask).nonzero().reshape(-1)
-        if len(keep) == len(self):
+        kept = ~mask.reshape(-1).bool()
+        keep = kept.nonzero().reshape(-1)
+        if len(keep) == len(kept):
             return
-        self._take(self.optimizer.keep_rows(keep))
-        self.statistics = self.statistics.keep(keep)
+        self._take(self._prune_optimizer(kept))
+        for name in (*NAMES, "tmp_radii"):
+            values = getattr(self, name, None)  # users delete those that they do not need
+            if values is not None:
+                setattr(self, name, values.index_select(0, keep))
 
     def reset_opacity(self) -> None:
         """Lower every opacity to at most 0.01; Adam's averages of it restart at zero."""
-        lowered = self._opacity.detach().clamp_max(rules.logit(rules.RESET_OPACITY))
-        self._opacity = self.optimizer.reset("opacity", lowered)
+        if self.kernels_activate:
+            lowered = self._opacity.detach().clamp_max(rules.logit(rules.RESET_OPACITY))
+        else:
+            lowered = self.inverse_opacity_activation(self.get_opacity.detach().clamp_max(rules.RESET_OPACITY))
+        self._take(self.replace_tensor_to_optimizer(lowered, "opacity"))
+
+    def _log_scales(self) -> Tensor:
+        """Logarithms (N, 3) of the scales, whatever their activation is."""
+        return (self._scaling if self.kernels_activate else self.get_scaling.log()).detach()
+
+    def _opacity_logits(self) -> Tensor:
+        """Logits (N, 1) of the opacities, whatever their activation is."""
+        return (self._opacity if self.kernels_activate else inverse_sigmoid(self.get_opacity)).detach()
+
+    # The reference's names for changes of the optimiser's parameters; the model's own attributes stay as they are.
+
+    def replace_tensor_to_optimizer(self, tensor: Tensor, name: str) -> dict[str, nn.Parameter]:
+        """Give an optimiser group a new value, without gradient, and averages of zero. Returns its parameter by name.
+
+        Without an optimiser the parameter is made all the same; {} for a name that is not there.
+        """
+        optimised, others, states = self._groups()
+        groups = [group for group in optimised + others if group.get("name") == name]
+        return {group["name"]: replace_values(group, states, tensor) for group in groups}
+
+    def cat_tensors_to_optimizer(self, tensors_dict: Rows) -> dict[str, nn.Parameter]:
+        """Append rows (n, ...) by group name, with averages of zero. Returns the parameters by name, without gradient.
+
+        Groups that do not have a row per Gaussian stay as they are. ValueError for one that has, but gets no rows.
+        """
+        groups, others, states = self._groups()
+        groups += [group for group in others if self.optimizer is None or group["name"] in tensors_dict]
+        counts = [len(group["params"][0]) for group in groups if group.get("name") in tensors_dict]
+        return append_rows(row_groups(groups, counts[0] if counts else len(self)), states, tensors_dict)
+
+    def _prune_optimizer(self, mask: Tensor) -> dict[str, nn.Parameter]:
+        """Keep the rows of a mask (N,) bool in all groups with N rows. Returns the parameters by name."""
+        keep = mask.reshape(-1).nonzero().reshape(-1)
+        optimised, others, states = self._groups()
+        return keep_rows(row_groups(optimised + others, len(mask)), states, keep)
+
+    def _groups(self) -> tuple[list[Group], list[Group], States]:
+        """The optimiser's groups, a group for each attribute that is not optimised, and the optimiser's state."""
+        optimised = [] if self.optimizer is None else list(self.optimizer.param_groups)
+        names = {group.get("name") for group in optimised}
+        others = [
+            {"name": name, "params": [getattr(self, attribute.field)]}
+            for name, attribute in self._attributes.items()
+            if name not in names
+        ]
+        return optimised, others, {} if self.optimizer is None else self.optimizer.state

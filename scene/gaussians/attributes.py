@@ -2,6 +2,7 @@
 
 import argparse
 from collections.abc import Callable
+from functools import cache
 from typing import NamedTuple
 
 from torch import Tensor
@@ -22,10 +23,11 @@ class Attribute(NamedTuple):
     start: float = 0.0  # every raw value of a new Gaussian, unless its point tells (scene/gaussians/start.py)
 
 
+@cache
 def attributes(sh_degree: int) -> dict[str, Attribute]:
     """Attributes by optimiser group, in the order of groups and PLY columns, for a maximal SH degree.
 
-    The six of the paper come first. A further attribute is one more line here.
+    The six of the paper come first. A further attribute is one more line here. Callers share the table.
     """
     bands = (sh_degree + 1) ** 2 - 1
     return {

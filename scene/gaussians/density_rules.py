@@ -13,7 +13,7 @@ from torch import Tensor
 from utils.exact import portable_math
 from utils.exact.counter_rng import Stream, normal
 
-SHRINK = 1.6  # children of a split have 1 / 1.6 of the parent's scale (paper, section 5.2)
+SHRINK = 0.8  # N children of a split have 1 / (0.8 N) of the parent's scale: 1 / 1.6 for two (paper, section 5.2)
 PRUNE_EXTENT = 0.1  # a Gaussian wider than this part of the scene's extent is removed, once sizes are limited
 RESET_OPACITY = 0.01
 MIN_OPACITY = 0.005  # a Gaussian below it is removed
@@ -50,6 +50,11 @@ def _log(x: float) -> float:
     return math.log(x) if x > 0 else -math.inf
 
 
+def _logit(p: float) -> float:
+    """`logit` for any number: below 0 and above 1 the limits."""
+    return logit(p) if 0 < p < 1 else math.copysign(math.inf, p - 0.5)
+
+
 def mean_gradient(accumulated: Tensor, count: Tensor) -> Tensor:
     """Average length of the screen-space gradient over the views that saw each Gaussian, 0 if none did: (N,)."""
     mean = (accumulated / count).reshape(-1)
@@ -74,19 +79,28 @@ def is_small(scaling: Tensor, limit: float) -> Tensor:
 
 def is_useless(opacity: Tensor, min_opacity: float) -> Tensor:
     """Whether the opacity is below `min_opacity`, from logits (N, 1): (N,) bool."""
-    return opacity.reshape(-1) < logit(min_opacity)
+    return opacity.reshape(-1) < _logit(min_opacity)
 
 
 def split_children(
-    xyz: Tensor, scaling: Tensor, rotation: Tensor, items: Tensor, child: int, *, seed: int, iteration: int
+    xyz: Tensor,
+    scaling: Tensor,
+    rotation: Tensor,
+    items: Tensor,
+    child: int,
+    *,
+    count: int = 2,
+    seed: int,
+    iteration: int,
 ) -> tuple[Tensor, Tensor]:
-    """Positions (n, 3) and log scales (n, 3) of one child per parent: mu + R(q) e, e normal with the parent's scales.
+    """Positions (n, 3) and log scales (n, 3) of one of `count` children per parent.
 
-    Parents are given raw: xyz (n, 3), log scales (n, 3), quaternions (n, 4) wxyz. Their indices `items` (n,), seed,
-    iteration and child decide the random numbers.
+    A position is mu + R(q) e, where e is normal with the parent's scales. Parents are given raw: xyz (n, 3), log
+    scales (n, 3), quaternions (n, 4) wxyz. Their indices `items` (n,), seed, iteration and child decide the random
+    numbers.
     """
     noise = normal(seed, Stream.SPLIT, iteration, items, child)[:, :3] * portable_math.exp(scaling)
-    return (xyz.double() + _rotate(rotation.double(), noise)).float(), scaling - math.log(SHRINK)
+    return (xyz.double() + _rotate(rotation.double(), noise)).float(), scaling - math.log(SHRINK * count)
 
 
 def _rotate(quaternion: Tensor, vector: Tensor) -> Tensor:

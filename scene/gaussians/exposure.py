@@ -3,7 +3,7 @@
 import argparse
 import json
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,31 +11,43 @@ import torch
 from torch import Tensor, nn
 
 from scene.gaussians.adam import GaussianAdam
+from scene.gaussians.trainable import trainable
 from utils.general_utils import get_expon_lr_func
 from utils.host.device import compute_device
 from utils.system_utils import UserError, atomic_write
 
 NAME = "exposure.json"
+_REMEDY = "restore the file, or write train_test_exp=False into cfg_args to render without exposures"
 _ADAM_EPS = 1e-8  # torch's default, which the reference uses for exposures
 
 
 class Exposures:
     """Affine maps of colours, one per training photo: `values` (n, 3, 4) float32, [I | 0] at first.
 
-    A pixel c, a row vector, becomes c A[:, :3] + A[:, 3] (`apply_exposure`). names: of the photos, in order.
+    A pixel c, a row vector, becomes c A[:, :3] + A[:, 3] (`apply_exposure`). mapping: index by the photo's name.
+    pretrained: None, or maps (3, 4) by name that are used in place of the values. optimizer: of the values, None before
+    training_setup. schedule: the learning rate by iteration.
     """
 
     def __init__(self, names: Sequence[str] = ()) -> None:
-        self.names = list(names)
-        self._index = {name: index for index, name in enumerate(self.names)}
-        self.values = nn.Parameter(torch.eye(3, 4, device=compute_device()).repeat(len(self.names), 1, 1))
-        self.optimizer: GaussianAdam | None = None
+        self.mapping = {name: index for index, name in enumerate(names)}
+        self.values: Tensor = nn.Parameter(torch.eye(3, 4, device=compute_device()).repeat(len(names), 1, 1))
+        self.pretrained: dict[str, Tensor] | None = None
+        self.optimizer: torch.optim.Optimizer | None = None
+        self.schedule: Callable[[int], float] | None = None
 
     def __getitem__(self, name: str) -> Tensor:
         """Map (3, 4) of a photo, differentiable. UserError for a photo that was not trained on."""
-        if name not in self._index:
+        if self.pretrained is not None and name in self.pretrained:
+            return self.pretrained[name]
+        if self.pretrained is not None or name not in self.mapping:
             raise UserError(f"there is no trained exposure of {name}; render photos that the model was trained on")
-        return self.values[self._index[name]]
+        return self.values[self.mapping[name]]
+
+    @property
+    def names(self) -> list[str]:
+        """Names of the photos, in the order of the values."""
+        return sorted(self.mapping, key=self.mapping.__getitem__)
 
     @property
     def trained(self) -> bool:
@@ -43,23 +55,28 @@ class Exposures:
         return self.optimizer is not None and bool(self.optimizer.state)
 
     def training_setup(self, opt: argparse.Namespace) -> None:
-        """Make the optimiser and the schedule from the optimisation options."""
+        """Make the optimiser and the schedule from the optimisation options, or their defaults where `opt` lacks them.
+
+        The 2023 release has no such options.
+        """
+        self.values = trainable(self.values)
         self.optimizer = GaussianAdam([{"params": [self.values], "lr": 0.0, "name": "exposure"}], eps=_ADAM_EPS)
-        self._rate = get_expon_lr_func(
-            opt.exposure_lr_init,
-            opt.exposure_lr_final,
-            opt.exposure_lr_delay_steps,
-            opt.exposure_lr_delay_mult,
-            opt.iterations,
+        self.schedule = get_expon_lr_func(
+            getattr(opt, "exposure_lr_init", 0.01),
+            getattr(opt, "exposure_lr_final", 0.001),
+            getattr(opt, "exposure_lr_delay_steps", 0),
+            getattr(opt, "exposure_lr_delay_mult", 0.0),
+            getattr(opt, "iterations", 30_000),
         )
 
     def update_learning_rate(self, iteration: int) -> None:
-        """Set the learning rate of this iteration."""
-        self.optimizer.param_groups[0]["lr"] = self._rate(iteration)
+        """Set the learning rate of this iteration, if there is an optimiser and a schedule."""
+        if self.optimizer is not None and self.schedule is not None and self.pretrained is None:
+            self.optimizer.param_groups[0]["lr"] = self.schedule(iteration)
 
     def step(self) -> None:
         """Step if there is a gradient, and drop the gradient."""
-        if self.values.grad is not None:
+        if self.optimizer is not None and self.values.grad is not None:
             self.optimizer.step()
             self.optimizer.zero_grad(set_to_none=True)
 
@@ -96,7 +113,7 @@ class Exposures:
 
     def write(self, folder: str | os.PathLike) -> None:
         """Write exposure.json: the three rows of each map, by name."""
-        table = dict(zip(self.names, self.values.detach().tolist(), strict=True))
+        table = {name: self[name].detach().tolist() for name in self.mapping}
         with atomic_write(Path(folder) / NAME) as path:
             path.write_text(json.dumps(table, indent=2, allow_nan=False) + "\n", encoding="utf-8")
 
@@ -107,29 +124,48 @@ def read_exposures(folder: str | os.PathLike, names: Sequence[str], image_names:
     image_names: the same photos' names in the reference's files, which several photos may share.
     """
     path = Path(folder) / NAME
-    remedy = "restore the file, or write train_test_exp=False into cfg_args to render without exposures"
-    try:
-        table = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise UserError(f"cannot read {path} ({error.strerror}); {remedy}") from error
-    except (ValueError, RecursionError) as error:
-        raise UserError(f"{path} is not JSON; {remedy}") from error
-    if not isinstance(table, dict):
-        raise UserError(f"{path} is not a table of exposures by photo; {remedy}")
+    table = _read(path)
     exposures = Exposures(names)
     for index, (name, image_name) in enumerate(zip(names, image_names, strict=True)):
         rows = table.get(name, table.get(image_name))
         if rows is None:
-            raise UserError(f"{path} has no exposure of {name}; {remedy}")
-        try:
-            value = torch.tensor(rows, dtype=torch.float32)
-        except (TypeError, ValueError, RuntimeError, OverflowError) as error:
-            raise UserError(f"the exposure of {name} in {path} is not a matrix of numbers; {remedy}") from error
-        if value.shape != (3, 4) or not value.isfinite().all():
-            raise UserError(f"the exposure of {name} in {path} is not 3 x 4 finite numbers; {remedy}")
+            raise UserError(f"{path} has no exposure of {name}; {_REMEDY}")
         with torch.no_grad():
-            exposures.values[index] = value
+            exposures.values[index] = _map(rows, name, path)
     return exposures
+
+
+def read_pretrained(folder: str | os.PathLike) -> dict[str, Tensor] | None:
+    """All maps (3, 4) of a model folder's exposure.json, by name; None, and a line that says so, without that file."""
+    path = Path(folder) / NAME
+    if not path.exists():
+        print(f"no exposures are loaded: there is no {path}")
+        return None
+    return {name: _map(rows, name, path).to(compute_device()) for name, rows in _read(path).items()}
+
+
+def _read(path: Path) -> dict[str, Any]:
+    """The table of an exposure.json; UserError for a file that has none."""
+    try:
+        table = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise UserError(f"cannot read {path} ({error.strerror}); {_REMEDY}") from error
+    except (ValueError, RecursionError) as error:
+        raise UserError(f"{path} is not JSON; {_REMEDY}") from error
+    if not isinstance(table, dict):
+        raise UserError(f"{path} is not a table of exposures by photo; {_REMEDY}")
+    return table
+
+
+def _map(rows: Any, name: str, path: Path) -> Tensor:
+    """One map (3, 4) of the table, checked."""
+    try:
+        value = torch.tensor(rows, dtype=torch.float32)
+    except (TypeError, ValueError, RuntimeError, OverflowError) as error:
+        raise UserError(f"the exposure of {name} in {path} is not a matrix of numbers; {_REMEDY}") from error
+    if value.shape != (3, 4) or not value.isfinite().all():
+        raise UserError(f"the exposure of {name} in {path} is not 3 x 4 finite numbers; {_REMEDY}")
+    return value
 
 
 def apply_exposure(image: Tensor, exposure: Tensor) -> Tensor:

@@ -1,15 +1,26 @@
 """Parameters of N Gaussians: raw tensors, their activated forms, and the PLY they are kept in."""
 
 import copy
+import math
 import os
 
 import torch
 from torch import Tensor, nn
 
-from scene.gaussians.attributes import Rows, attributes
-from scene.gaussians.ply import read_ply, row_bytes, write_ply
-from utils.general_utils import build_scaling_rotation, strip_symmetric
+from scene.gaussians.attributes import Attribute, Rows, attributes
+from scene.gaussians.ply import column_names, read_ply, row_bytes, write_ply
+from utils.general_utils import build_scaling_rotation, inverse_sigmoid, strip_symmetric
 from utils.host.device import compute_device
+from utils.system_utils import UserError
+
+
+def covariance(scaling: Tensor, scaling_modifier: float, rotation: Tensor) -> Tensor:
+    """World covariances R S S R^T, S = modifier * scales (N, 3), R of quaternions (N, 4) wxyz of any length.
+
+    Returns (N, 6), order xx xy xz yy yz zz.
+    """
+    factor = build_scaling_rotation(scaling_modifier * scaling, rotation)
+    return strip_symmetric(factor @ factor.transpose(1, 2))
 
 
 class GaussianParameters:
@@ -17,7 +28,7 @@ class GaussianParameters:
 
     `_xyz` (N,3) world; `_features_dc` (N,1,3), `_features_rest` (N,K,3), K = (D+1)^2 - 1; `_scaling` (N,3) log;
     `_rotation` (N,4) wxyz, any length; `_opacity` (N,1) logit. world_offset: the world's coordinates of the origin
-    (scene/readers/world_offset.py), kept in the PLY.
+    (scene/readers/world_offset.py), kept in the PLY. Activations are attributes, which `setup_functions` sets.
     """
 
     _xyz: nn.Parameter
@@ -31,8 +42,22 @@ class GaussianParameters:
         self.active_sh_degree = 0
         self.max_sh_degree = sh_degree
         self.world_offset = (0.0, 0.0, 0.0)
-        self._attributes = attributes(sh_degree)
         self.set_rows({name: torch.empty(0, *attribute.shape) for name, attribute in self._attributes.items()})
+        self.setup_functions()
+
+    def setup_functions(self) -> None:
+        """Set the activations and their inverses: attributes that may be replaced, or set by a subclass here."""
+        self.scaling_activation = torch.exp
+        self.scaling_inverse_activation = torch.log
+        self.covariance_activation = covariance
+        self.opacity_activation = torch.sigmoid
+        self.inverse_opacity_activation = inverse_sigmoid
+        self.rotation_activation = nn.functional.normalize
+
+    @property
+    def _attributes(self) -> dict[str, Attribute]:
+        """The table of the attributes, for the maximal SH degree."""
+        return attributes(self.max_sh_degree)
 
     def __len__(self) -> int:
         """Number of Gaussians."""
@@ -61,30 +86,63 @@ class GaussianParameters:
     @property
     def get_scaling(self) -> Tensor:
         """Standard deviations (N, 3) along the Gaussian's own axes, world units."""
-        return torch.exp(self._scaling)
+        return self.scaling_activation(self._scaling)
 
     @property
     def get_rotation(self) -> Tensor:
         """Unit quaternions (N, 4), wxyz."""
-        return nn.functional.normalize(self._rotation)
+        return self.rotation_activation(self._rotation)
 
     @property
     def get_opacity(self) -> Tensor:
         """Opacities (N, 1) in (0, 1)."""
-        return torch.sigmoid(self._opacity)
+        return self.opacity_activation(self._opacity)
 
     def get_covariance(self, scaling_modifier: float = 1.0) -> Tensor:
         """World covariances R S S R^T, S = modifier * scales: (N, 6), order xx xy xz yy yz zz."""
-        factor = build_scaling_rotation(scaling_modifier * self.get_scaling, self._rotation)
-        return strip_symmetric(factor @ factor.transpose(1, 2))
+        return self.covariance_activation(self.get_scaling, scaling_modifier, self._rotation)
 
     def raw_geometry(self) -> dict[str, Tensor]:
         """Raw shapes by the rasterizer's names: opacities (N, 1) logit, scales (N, 3) log, rotations (N, 4) wxyz."""
-        return {"opacities": self.raw("opacity"), "scales": self.raw("scaling"), "rotations": self.raw("rotation")}
+        return {"opacities": self._opacity, "scales": self._scaling, "rotations": self._rotation}
+
+    @property
+    def kernels_activate(self) -> bool:
+        """Whether the rasterizer's kernels activate `raw_geometry()` as this model does.
+
+        They do not once an activation was replaced, or a getter of opacities, scales or rotations overridden.
+        """
+        kind = type(self)
+        return (
+            self.opacity_activation is torch.sigmoid
+            and self.scaling_activation is torch.exp
+            and self.rotation_activation is nn.functional.normalize
+            and (kind.get_opacity, kind.get_scaling, kind.get_rotation) == _GEOMETRY
+        )
+
+    @property
+    def features_are_raw(self) -> bool:
+        """Whether the getters of SH coefficients give the raw ones; not if a subclass overrides one of them."""
+        kind = type(self)
+        return (kind.get_features, kind.get_features_dc, kind.get_features_rest) == _FEATURES
 
     def raw(self, name: str) -> Tensor:
         """Raw values (N, ...) of an attribute, by its name in the table of scene/gaussians/attributes.py."""
         return getattr(self, self._attributes[name].field)
+
+    def construct_list_of_attributes(self) -> list[str]:
+        """Names of the properties of the PLY, in its order."""
+        return column_names(self._degree_of_tensors())
+
+    def _degree_of_tensors(self) -> int:
+        """SH degree of the tensors. It is below max_sh_degree once bands were cut. UserError for a part of a band."""
+        bands = self._features_rest.shape[1]
+        degree = math.isqrt(bands + 1) - 1
+        if (degree + 1) ** 2 - 1 != bands:
+            raise UserError(
+                f"a colour has {bands} SH coefficients above band 0, those of no SH degree; keep 0, 3, 8 or 15 of them"
+            )
+        return degree
 
     @property
     def active_bands(self) -> int:
@@ -98,7 +156,7 @@ class GaussianParameters:
 
     def save_ply(self, path: str | os.PathLike) -> None:
         """Write the raw parameters as a PLY in the reference's layout."""
-        write_ply(path, self.rows(), self.max_sh_degree, self.world_offset)
+        write_ply(path, self.rows(), self._degree_of_tensors(), self.world_offset)
 
     @property
     def ply_bytes(self) -> int:
@@ -111,7 +169,6 @@ class GaussianParameters:
         rows["f_rest"] = rows["f_rest"][:, : (sh_degree + 1) ** 2 - 1].contiguous()
         other = copy.copy(self)
         other.max_sh_degree, other.active_sh_degree = sh_degree, min(sh_degree, self.active_sh_degree)
-        other._attributes = attributes(sh_degree)
         other.set_rows(rows)
         return other
 
@@ -125,5 +182,16 @@ class GaussianParameters:
         self._take({name: nn.Parameter(rows[name].to(device)) for name in self._attributes})
 
     def _take(self, params: dict[str, nn.Parameter]) -> None:
-        for name, param in params.items():
-            setattr(self, self._attributes[name].field, param)
+        """Set the tensors of these attributes; parameters of other names are not the table's."""
+        for name, attribute in self._attributes.items():
+            if name in params:
+                setattr(self, attribute.field, params[name])
+
+
+# Read once, so that a getter is told from one that replaces it, in a subclass or in this class.
+_GEOMETRY = GaussianParameters.get_opacity, GaussianParameters.get_scaling, GaussianParameters.get_rotation
+_FEATURES = (
+    GaussianParameters.get_features,
+    GaussianParameters.get_features_dc,
+    GaussianParameters.get_features_rest,
+)

@@ -24,7 +24,7 @@ def write_ply(
     count = len(rows["xyz"])
     parts = [(attribute.columns, rows[name]) for name, attribute in attributes(sh_degree).items()]
     parts.insert(1, (_NORMALS, torch.zeros(count, 3)))
-    names = [name for columns, _ in parts for name in columns]
+    names = column_names(sh_degree)
     matrix = np.zeros((count, len(names)), dtype="<f4")
     start = 0
     for columns, values in parts:
@@ -40,9 +40,15 @@ def write_ply(
         matrix.tofile(file)
 
 
+def column_names(sh_degree: int) -> list[str]:
+    """The properties of a Gaussian, in the order of the file."""
+    parts = [attribute.columns for attribute in attributes(sh_degree).values()]
+    return [name for columns in (parts[0], _NORMALS, *parts[1:]) for name in columns]
+
+
 def row_bytes(sh_degree: int) -> int:
     """Bytes of one Gaussian."""
-    return 4 * (len(_NORMALS) + sum(len(attribute.columns) for attribute in attributes(sh_degree).values()))
+    return 4 * len(column_names(sh_degree))
 
 
 def _comments(world_offset: Sequence[float]) -> list[str]:
@@ -117,7 +123,8 @@ def _columns(vertices: np.ndarray, parts: list[list[str]]) -> Iterator[Tensor]:
         table = np.asarray(vertices).view("<f4").reshape(len(vertices), len(vertices.dtype.names))
         position = {name: i for i, name in enumerate(vertices.dtype.names)}
         for part in parts:
-            yield torch.from_numpy(table[:, [position[name] for name in part]])
+            columns = table[:, [position[name] for name in part]]  # NumPy lays these out column by column
+            yield torch.from_numpy(np.ascontiguousarray(columns))
         return
     for part in parts:
         matrix = np.empty((len(vertices), len(part)), dtype=np.float32)

@@ -15,16 +15,25 @@ class SparseGaussianAdam(GaussianAdam):
     """
 
     @torch.no_grad()
-    def step(self, visible: Tensor) -> None:
-        """Step the rows of `visible` (N,) bool in every parameter that has a gradient."""
-        for group in self.param_groups:
+    def step(self, visible: Tensor, N: int | None = None) -> None:
+        """Step the rows of `visible` (N,) bool in every parameter that has a gradient.
+
+        Groups that do not have a row per Gaussian are stepped by torch. N: not needed, the reference takes it.
+        """
+        groups, others = self._groups()
+        for group in groups:
             (param,) = group["params"]
             if param.grad is None:
+                continue
+            if len(param) != len(visible):
+                others = [*others, group]
                 continue
             state = self._state_of(param)
             state["step"] += 1
             moments = state["exp_avg"], state["exp_avg_sq"]
             beta1, beta2 = group["betas"]
-            columns = self._active_columns.get(group["name"], -1)
+            columns = self._active_columns.get(group.get("name"), -1) or -1  # 0, yet with a gradient: all
             guard = self.guard.arguments if self.guard else ()
             sparse_adam_(param, param.grad, *moments, visible, group["lr"], beta1, beta2, group["eps"], columns, *guard)
+        if others:
+            self._step_by_torch(others)

@@ -1,6 +1,6 @@
 """Observations of each Gaussian between two densifications (Kerbl et al. 2023, section 5.2)."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import torch
 from diff_gaussian_rasterization.optim import observe_
@@ -44,15 +44,13 @@ class Statistics:
         self.xyz_gradient_accum[broken] = 0.0
         self.denom[broken] = 0.0
 
-    def keep(self, indices: Tensor) -> "Statistics":
-        """The statistics of the rows `indices` (n,) int64."""
-        kept = (values.index_select(0, indices) for values in (self.max_radii2D, self.xyz_gradient_accum, self.denom))
-        return Statistics(*kept)
-
     def to(self, device: torch.device | str) -> "Statistics":
         """The same statistics on a device."""
-        return Statistics(self.max_radii2D.to(device), self.xyz_gradient_accum.to(device), self.denom.to(device))
+        return Statistics(*(getattr(self, name).to(device) for name in NAMES))
 
     def fit(self, count: int) -> bool:
         """Whether there is a row for each of `count` Gaussians in every tensor."""
-        return all(len(values) == count for values in (self.xyz_gradient_accum, self.denom, self.max_radii2D))
+        return all(len(getattr(self, name)) == count for name in NAMES)
+
+
+NAMES = tuple(field.name for field in fields(Statistics))

@@ -75,11 +75,13 @@ def training_report(
         tb_writer.add_scalar("iter_time", elapsed * 1000.0, iteration)
     if iteration not in testing_iterations:
         return {}
-    exposed = {"use_trained_exp": True} if train_test_exp else {}
+    options = {"use_trained_exp": True} if train_test_exp else {}
+    if renderFunc is render:
+        options["want_depth"] = False  # our own addition: only images are scored
     views = ScoredViews(
         *renderArgs[:2],
         train_test_exp,
-        lambda camera, gaussians: renderFunc(camera, gaussians, *renderArgs, **exposed)["render"],
+        lambda camera, gaussians: renderFunc(camera, gaussians, *renderArgs, **options)["render"],
     )
     train = scene.getTrainCameras()
     sets = {"test": scene.getTestCameras(), "train": [train[i % len(train)] for i in range(5, 30, 5)]}

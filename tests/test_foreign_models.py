@@ -1,0 +1,460 @@
+"""Models and loops as other people write them: other classes, overridden getters, replaced activations, own loops."""
+
+import argparse
+import math
+import types
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import torch
+from gaussians import GROUPS, cloud, model, options, parameters, pipeline
+from torch import Tensor, nn
+
+import gaussian_renderer
+from gaussian_renderer import GaussianModel, network_gui, render
+from scene.cameras import MiniCam
+from scene.gaussians.checkpoint import save_checkpoint
+from utils.general_utils import inverse_sigmoid
+from utils.graphics_utils import getProjectionMatrix
+from utils.system_utils import UserError
+
+WIDTH, HEIGHT = 41, 27
+BLACK = torch.zeros(3)
+CLOSE = {"rtol": 0, "atol": 5e-6}  # activations in the kernels and in PyTorch are rounded differently
+OLD = argparse.Namespace(convert_SHs_python=False, compute_cov3D_python=False, debug=False)  # the 2023 release's
+
+
+def _camera(dtype: torch.dtype = torch.float32) -> MiniCam:
+    """A camera at (0, 0, -3) facing +z."""
+    view = torch.eye(4, dtype=dtype)
+    view[2, 3] = 3.0
+    projection = torch.as_tensor(getProjectionMatrix(0.01, 100.0, 0.9, 0.6)).to(dtype)
+    return MiniCam(WIDTH, HEIGHT, 0.6, 0.9, 0.01, 100.0, view.T.contiguous(), (projection @ view).T.contiguous())
+
+
+def _image(pc: object, camera: MiniCam | None = None, pipe: object = OLD, **more: object) -> Tensor:
+    return render(camera or _camera(), pc, pipe, BLACK, **more)["render"]
+
+
+# Cameras and pipes
+
+
+def test_a_view_may_have_matrices_of_doubles_and_a_row_as_its_centre():
+    gaussians = model(40)
+    for in_python in (False, True):
+        pipe = pipeline(convert_SHs_python=in_python)
+        wanted = _image(gaussians, pipe=pipe)
+        double, row = _camera(torch.float64), _camera()
+        row.camera_center = row.camera_center[None]
+        torch.testing.assert_close(_image(gaussians, double, pipe), wanted, **CLOSE)
+        assert torch.equal(_image(gaussians, row, pipe), wanted)
+
+
+def test_the_2023_release_has_no_antialiasing_and_the_colours_in_the_sixth_place():
+    gaussians = model(40)
+    colors = torch.rand(40, 3)
+    old = render(_camera(), gaussians, OLD, BLACK, 0.7, colors)
+    new = render(_camera(), gaussians, pipeline(), BLACK, 0.7, False, colors)
+    assert torch.equal(old["render"], new["render"]) and old["depth"].shape == (1, HEIGHT, WIDTH)
+
+
+def test_points_on_the_screen_have_gradients_while_anything_trains():
+    gaussians = model(40)
+    gaussians._xyz.requires_grad_(False)
+    package = render(_camera(), gaussians, OLD, BLACK)
+    package["render"].sum().backward()
+    assert package["viewspace_points"].grad[:, :2].any()
+
+
+# Models
+
+
+class Foreign:
+    """Another project's model, with what the reference's renderer reads."""
+
+    active_sh_degree = 3
+
+    def __init__(self, gaussians: GaussianModel) -> None:
+        self._of = gaussians
+
+    get_xyz = property(lambda self: self._of._xyz)
+    get_features = property(lambda self: torch.cat((self._of._features_dc, self._of._features_rest), dim=1))
+    get_opacity = property(lambda self: torch.sigmoid(self._of._opacity))
+    get_scaling = property(lambda self: torch.exp(self._of._scaling))
+    get_rotation = property(lambda self: nn.functional.normalize(self._of._rotation))
+
+    def get_covariance(self, scaling_modifier: float = 1) -> Tensor:
+        return self._of.get_covariance(scaling_modifier)
+
+
+@pytest.mark.parametrize("degree", [0, 1, 3])
+@pytest.mark.parametrize("in_python", [False, True])
+def test_any_class_with_the_getters_is_rendered(degree, in_python):
+    ours = model(40)
+    ours.active_sh_degree = degree
+    foreign = Foreign(ours)
+    foreign.active_sh_degree = degree
+    weights = torch.randn(3, HEIGHT, WIDTH, generator=torch.Generator().manual_seed(0))
+    gradients = []
+    pipe = argparse.Namespace(convert_SHs_python=in_python, compute_cov3D_python=in_python, debug=False)
+    images = [_image(pc, pipe=pipe, scaling_modifier=0.8, separate_sh=False) for pc in (ours, foreign)]
+    torch.testing.assert_close(*images, **CLOSE)
+    for image in images:
+        (image * weights).sum().backward()
+        gradients.append({name: getattr(ours, field).grad for name, field in GROUPS.items()})
+        ours.optimizer.zero_grad(set_to_none=True)
+    for name, gradient in gradients[1].items():
+        if gradients[0][name] is not None:
+            assert (gradients[0][name] - gradient).abs().max() <= 1e-5 * gradient.abs().max(), name
+
+
+class Opaque(GaussianModel):
+    get_opacity = property(lambda self: torch.ones_like(self._opacity))
+
+
+class Round(GaussianModel):
+    get_scaling = property(lambda self: torch.full_like(self._scaling, 0.05))
+
+
+class Upright(GaussianModel):
+    get_rotation = property(lambda self: torch.tensor([1.0, 0, 0, 0]).expand(len(self), 4).contiguous())
+
+
+class Grey(GaussianModel):
+    get_features = property(lambda self: torch.zeros(len(self), 16, 3))
+
+
+def _own_activations(gaussians: GaussianModel) -> None:
+    gaussians.scaling_activation = nn.functional.softplus
+    gaussians.scaling_inverse_activation = lambda x: x + torch.log(-torch.expm1(-x))
+
+
+CHANGES = {
+    "opacity": (Opaque, lambda rows: rows | {"opacity": torch.full_like(rows["opacity"], 30.0)}),
+    "scales": (Round, lambda rows: rows | {"scaling": torch.full_like(rows["scaling"], math.log(0.05))}),
+    "rotations": (Upright, lambda rows: rows | {"rotation": torch.tensor([[1.0, 0, 0, 0]]).expand(40, 4).clone()}),
+    "features": (Grey, lambda rows: rows | {"f_dc": rows["f_dc"] * 0, "f_rest": rows["f_rest"] * 0}),
+}
+
+
+@pytest.mark.parametrize("name", CHANGES)
+def test_overridden_getters_are_what_is_rendered(name):
+    kind, change = CHANGES[name]
+    gaussians, wanted = model(40), model(40)
+    plain = _image(wanted)
+    wanted.set_rows(change(parameters(wanted)))
+    gaussians.__class__ = kind
+    image = _image(gaussians)
+    torch.testing.assert_close(image, _image(wanted), **CLOSE)
+    assert (image - plain).abs().max() > 0.01
+
+
+def test_getters_of_single_bands_count_where_the_reference_reads_them():
+    class Tinted(GaussianModel):
+        get_features_dc = property(lambda self: torch.ones_like(self._features_dc))
+
+    gaussians = model(40)
+    plain = _image(gaussians)
+    gaussians.__class__ = Tinted
+    assert torch.equal(_image(gaussians), plain)
+    assert not torch.equal(_image(gaussians, separate_sh=True), plain)
+
+
+def test_a_getter_replaced_in_the_class_is_seen_at_once(monkeypatch):
+    gaussians = model(40)
+    plain = _image(gaussians)
+    monkeypatch.setattr(GaussianModel, "get_opacity", property(lambda self: 0.5 * torch.sigmoid(self._opacity)))
+    assert (_image(gaussians) - plain).abs().max() > 0.01
+    monkeypatch.undo()
+    assert torch.equal(_image(gaussians), plain)
+
+
+def test_replaced_activations_are_what_is_rendered():
+    gaussians = model(40)
+    wanted = _image(gaussians)
+    scales = gaussians.get_scaling.detach()
+    _own_activations(gaussians)
+    assert not torch.allclose(_image(gaussians), wanted, **CLOSE)
+    with torch.no_grad():
+        gaussians._scaling.copy_(gaussians.scaling_inverse_activation(scales))
+    torch.testing.assert_close(_image(gaussians), wanted, **CLOSE)
+
+
+def test_density_control_follows_replaced_activations():
+    """The same scales and opacities by other activations give the same Gaussians."""
+    plain, other = model(60), model(60)
+
+    def activate(x: Tensor) -> Tensor:
+        return 0.5 + 0.5 * torch.tanh(x)
+
+    other.opacity_activation, other.inverse_opacity_activation = activate, lambda y: torch.atanh(2 * y - 1)
+    _own_activations(other)
+    with torch.no_grad():
+        other._scaling.copy_(other.scaling_inverse_activation(plain.get_scaling))
+        other._opacity.copy_(other.inverse_opacity_activation(plain.get_opacity))
+        plain._opacity[0], other._opacity[0] = -9.0, -4.5
+    for gaussians in (plain, other):
+        gaussians.xyz_gradient_accum, gaussians.denom = torch.arange(60.0)[:, None], torch.ones(60, 1)
+        gaussians.densify_and_prune(30.0, 0.005, 20.0, 20, seed=4, iteration=1)
+    assert len(plain) == len(other) > 60
+    for name in ("get_xyz", "get_scaling", "get_opacity"):
+        torch.testing.assert_close(getattr(other, name), getattr(plain, name), rtol=1e-4, atol=1e-5)
+    for gaussians in (plain, other):
+        gaussians.reset_opacity()
+        assert gaussians.get_opacity.max() < 0.0101
+    torch.testing.assert_close(other.get_opacity, plain.get_opacity, rtol=1e-3, atol=1e-6)
+
+
+def test_activations_have_the_references_names_and_forms():
+    gaussians = model(10)
+    x = torch.tensor([[0.3, 0.6]])
+    assert gaussians.scaling_activation is torch.exp and gaussians.scaling_inverse_activation is torch.log
+    assert gaussians.opacity_activation is torch.sigmoid and gaussians.inverse_opacity_activation is inverse_sigmoid
+    torch.testing.assert_close(gaussians.inverse_opacity_activation(gaussians.opacity_activation(x)), x)
+    assert torch.equal(gaussians.rotation_activation(x), nn.functional.normalize(x))
+    packed = gaussians.covariance_activation(gaussians.get_scaling, 1.5, gaussians._rotation)
+    assert torch.equal(packed, gaussians.get_covariance(1.5)) and packed.shape == (10, 6)
+
+    class Client(GaussianModel):
+        def setup_functions(self) -> None:
+            super().setup_functions()
+            self.opacity_activation = torch.relu
+
+    client = Client(1)
+    client.create_from_pcd(cloud(5), 1.0)
+    assert torch.equal(client.get_opacity, torch.relu(client._opacity)) and client.kernels_activate is False
+
+
+def test_statistics_are_plain_attributes():
+    class Bare(GaussianModel):
+        def __init__(self) -> None:
+            self.max_radii2D = torch.empty(0)
+            self.xyz_gradient_accum = torch.empty(0)
+            self.denom = torch.empty(0)
+            self.exposure_mapping = {"a": 0}
+            self.tmp_radii = None
+
+    bare = Bare()
+    assert bare.statistics.denom is bare.denom and bare.exposure_mapping == {"a": 0}
+    gaussians = model(10)
+    gaussians.denom = torch.full((10, 1), 3.0)
+    assert gaussians.statistics.denom is gaussians.denom and "denom" in vars(gaussians)
+    del gaussians.xyz_gradient_accum
+    gaussians.prune_points(torch.arange(10) < 4)
+    assert len(gaussians) == len(gaussians.denom) == 6 and not hasattr(gaussians, "xyz_gradient_accum")
+
+
+# Loops
+
+
+def _target() -> Tensor:
+    return torch.rand(3, HEIGHT, WIDTH, generator=torch.Generator().manual_seed(1))
+
+
+@pytest.mark.parametrize("kind", ["default", "sparse_adam"])
+def test_a_loop_as_the_reference_writes_it(kind, tmp_path):
+    """Steps of both optimisers, statistics by index, density control with radii, reset, and a depth."""
+    gaussians = GaussianModel(3, kind)
+    gaussians.create_from_pcd(cloud(60), [types.SimpleNamespace(image_name="a.png")], 2.0)
+    gaussians.training_setup(options(densify_grad_threshold=1e-7))
+    camera = _camera()
+    camera.image_name = "a.png"
+    losses = []
+    for iteration in range(1, 31):
+        gaussians.update_learning_rate(iteration)
+        if iteration % 8 == 0:
+            gaussians.oneupSHdegree()
+        package = render(camera, gaussians, OLD, BLACK, use_trained_exp=True, separate_sh=kind != "default")
+        loss = (package["render"] - _target()).abs().mean() + 1e-3 * package["depth"].mean()
+        loss.backward()
+        losses.append(loss.item())
+        with torch.no_grad():
+            radii, seen = package["radii"], package["visibility_filter"]
+            gaussians.max_radii2D[seen] = torch.max(gaussians.max_radii2D[seen], radii[seen])
+            gaussians.add_densification_stats(package["viewspace_points"], seen)
+            if iteration % 7 == 0:
+                gaussians.densify_and_prune(1e-7, 0.005, 20.0, 20, radii)
+                assert gaussians.tmp_radii is None
+            if iteration == 10:
+                gaussians.reset_opacity()
+            gaussians.exposure_optimizer.step()
+            gaussians.exposure_optimizer.zero_grad(set_to_none=True)
+            if kind == "default":
+                gaussians.optimizer.step()
+            else:
+                gaussians.optimizer.step(radii > 0, radii.shape[0])
+            gaussians.optimizer.zero_grad(set_to_none=True)
+    assert len(gaussians) > 60 and losses[-1] < losses[0]
+    assert not torch.equal(gaussians.get_exposure_from_name("a.png"), torch.eye(3, 4))
+    save_checkpoint(tmp_path / "chkpnt30.pth", gaussians.capture(), 30)
+
+
+def test_options_of_the_2023_release_are_enough():
+    names = ("position_lr_init", "position_lr_final", "position_lr_delay_mult", "position_lr_max_steps", "feature_lr",
+             "opacity_lr", "scaling_lr", "rotation_lr", "percent_dense")  # fmt: skip
+    gaussians = GaussianModel(3)
+    gaussians.create_from_pcd(cloud(20), 1.5)
+    assert gaussians.spatial_lr_scale == 1.5 and gaussians.get_exposure.shape == (0, 3, 4)
+    gaussians.training_setup(argparse.Namespace(**{name: getattr(options(), name) for name in names}))
+    gaussians.update_learning_rate(7)
+    assert gaussians.exposure_scheduler_args(0) == pytest.approx(0.01)
+    assert gaussians.exposure_scheduler_args(30_000) == pytest.approx(0.001)
+    for _ in range(2):
+        _image(gaussians).sum().backward()
+        gaussians.optimizer.step()
+        gaussians.exposure_optimizer.step()
+        gaussians.exposure_optimizer.zero_grad(set_to_none=True)
+    keyword = GaussianModel(0)
+    keyword.create_from_pcd(pcd=cloud(20), spatial_lr_scale=1.5)
+    assert keyword.spatial_lr_scale == 1.5
+
+
+def _fine_tuned(gaussians: GaussianModel) -> None:
+    gaussians.training_setup(options())
+    before = parameters(gaussians)
+    _image(gaussians).sum().backward()
+    gaussians.optimizer.step()
+    for name, values in parameters(gaussians).items():
+        assert not torch.equal(values, before[name]), name
+
+
+def _sliced(gaussians: GaussianModel) -> None:
+    gaussians.max_sh_degree = gaussians.active_sh_degree = 2
+    gaussians._features_rest = gaussians._features_rest[:, :8]
+
+
+def _transposed(gaussians: GaussianModel) -> None:
+    gaussians._xyz = nn.Parameter(gaussians._xyz.detach().T.contiguous().T)
+
+
+def _plain(gaussians: GaussianModel) -> None:
+    gaussians._scaling = gaussians.scaling_inverse_activation(gaussians.get_scaling * 0.5)
+    gaussians._opacity = gaussians._opacity.detach() * 0.9
+
+
+@pytest.mark.parametrize("change", [_sliced, _transposed, _plain])
+def test_tensors_assigned_from_outside_train(change: Callable, tmp_path):
+    gaussians = model(20)
+    change(gaussians)
+    held = gaussians._xyz
+    _fine_tuned(gaussians)
+    assert gaussians._xyz is held  # parameters stay the same objects
+    gaussians.prune_points(torch.arange(20) < 3)
+    gaussians.save_ply(tmp_path / "a.ply")
+    again = GaussianModel(gaussians.max_sh_degree)
+    again.load_ply(tmp_path / "a.ply")
+    assert torch.equal(again._features_rest, gaussians._features_rest)
+
+
+def test_a_loaded_ply_is_fine_tuned(tmp_path):
+    model(20).save_ply(tmp_path / "a.ply")
+    gaussians = GaussianModel(3)
+    gaussians.load_ply(tmp_path / "a.ply")
+    assert all(getattr(gaussians, field).is_contiguous() for field in GROUPS.values())
+    gaussians.spatial_lr_scale = 1.0
+    _fine_tuned(gaussians)
+
+
+def test_the_degree_follows_what_is_assigned(tmp_path):
+    gaussians = model(6)
+    assert gaussians.construct_list_of_attributes()[:10] == [
+        "x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "f_rest_0",
+    ]  # fmt: skip
+    assert len(gaussians.construct_list_of_attributes()) == 62
+    gaussians._features_rest = nn.Parameter(gaussians._features_rest.detach()[:, :3].contiguous())
+    assert len(gaussians.construct_list_of_attributes()) == 26
+    gaussians.save_ply(tmp_path / "a.ply")
+    gaussians.max_sh_degree = 1
+    gaussians.load_ply(tmp_path / "a.ply")
+    assert gaussians._features_rest.shape == (6, 3, 3) and gaussians.active_sh_degree == 1
+    gaussians._features_rest = nn.Parameter(torch.zeros(6, 5, 3))
+    with pytest.raises(UserError, match="5 SH coefficients above band 0, those of no SH degree"):
+        gaussians.save_ply(tmp_path / "b.ply")
+
+
+# Density control
+
+
+def _ready(count: int = 30) -> GaussianModel:
+    """A model of which half is cloned or split: the Gaussians with odd index."""
+    gaussians = model(count)
+    gaussians.xyz_gradient_accum, gaussians.denom = torch.arange(float(count))[:, None] % 2, torch.ones(count, 1)
+    return gaussians
+
+
+@pytest.mark.parametrize("dtype", [torch.int32, torch.float32])
+def test_radii_follow_their_gaussians(dtype):
+    """A client's own order of the steps: each row keeps the radius of its origin, told by its rotation."""
+    gaussians = _ready()
+    with torch.no_grad():
+        gaussians._rotation[:, 0] = torch.arange(30.0) + 1
+        gaussians._scaling[::4] = -6.0
+        gaussians._scaling[1::4] = -6.0
+    gaussians.tmp_radii = (torch.arange(30) + 1).to(dtype)
+    grads = gaussians.xyz_gradient_accum / gaussians.denom
+    gaussians.densify_and_clone(grads, 0.5, 20.0)
+    assert len(gaussians) == 38 and torch.equal(gaussians.tmp_radii[30:], 1 + torch.arange(1, 30, 4).to(dtype))
+    gaussians.densify_and_split(grads, 0.5, 20.0)
+    assert len(gaussians) == 45
+    gaussians.prune_points(torch.arange(45) % 5 == 0)
+    assert gaussians.tmp_radii.dtype == dtype and len(gaussians.tmp_radii) == 36
+    assert torch.equal(gaussians._rotation[:, 0], gaussians.tmp_radii.float())
+    gaussians.densification_postfix(*(values[:2] for values in parameters(gaussians).values()))
+    assert gaussians.tmp_radii[36:].tolist() == [0, 0]
+    gaussians.densification_postfix(*(values[:1] for values in parameters(gaussians).values()), torch.tensor([5]))
+    assert gaussians.tmp_radii[38:].tolist() == [5]
+
+
+@pytest.mark.parametrize("radii", [None, torch.arange(30)])
+def test_an_override_gets_as_many_arguments_as_there_are_values(radii):
+    gaussians, seen = _ready(), []
+
+    class Client(GaussianModel):
+        def densification_postfix(self, *new: Tensor) -> None:
+            seen.append(len(new))
+            super().densification_postfix(*new)
+
+        def densify_and_split(self, grads: Tensor, grad_threshold: float, scene_extent: float, N: int = 2) -> None:
+            seen.append("split")
+            super().densify_and_split(grads, grad_threshold, scene_extent, N)
+
+    gaussians.__class__ = Client
+    gaussians.densify_and_prune(0.5, 0.005, 20.0, 20, radii)
+    count = 6 if radii is None else 7
+    assert seen == [count, "split", count] and gaussians.tmp_radii is None and len(gaussians) > 30
+
+
+def test_without_a_seed_torchs_generator_decides():
+    def children() -> Tensor:
+        gaussians = _ready()
+        gaussians.densify_and_prune(0.5, 0.005, 20.0, None)
+        return gaussians.get_xyz.detach()
+
+    torch.manual_seed(5)
+    first, second = children(), children()
+    torch.manual_seed(5)
+    assert torch.equal(first, children())
+    assert first.shape == second.shape and not torch.equal(first, second)
+
+
+def test_three_children_are_smaller_than_two():
+    """Each of N has 1 / (0.8 N) of the scale, as in the reference."""
+    gaussians = _ready(2)
+    scaling = gaussians._scaling.detach().clone()
+    gaussians.densify_and_split(torch.ones(2, 1), 0.5, 0.0, N=3)
+    assert torch.equal(gaussians._scaling, torch.cat([scaling] * 3) - math.log(0.8 * 3))
+
+
+# The viewer
+
+
+def test_nobody_is_served(capfd):
+    network_gui.init("127.0.0.2", 7)
+    assert capfd.readouterr().err.count("\n") == 1 and (network_gui.host, network_gui.port) == ("127.0.0.2", 7)
+    network_gui.try_connect()
+    assert network_gui.conn is None and network_gui.addr is None and network_gui.listener is None
+    for call in (network_gui.read, network_gui.receive, lambda: network_gui.send(b"", "/scene")):
+        with pytest.raises(UserError, match="no viewer is connected"):
+            call()
+    assert gaussian_renderer.GaussianModel is GaussianModel and np.isfinite(network_gui.port)
