@@ -18,7 +18,7 @@ import train
 from records.error_curve import read_curve
 from scene.dataset_readers import CameraInfo, read_scene
 from scene.gaussian_model import GaussianModel
-from scene.gaussians.checkpoint import load_checkpoint, save_checkpoint
+from scene.gaussians.checkpoint import EXPOSURES, load_checkpoint, save_checkpoint
 from scene.gaussians.exposure import Exposures, apply_exposure, read_exposures
 from scene.half_images import train_on_all
 from scene.readers.info import exposure_names
@@ -220,12 +220,18 @@ def test_a_ply_brings_the_exposures_of_its_model_folder(tmp_path, capsys):
 # Checkpoints
 
 
-def test_checkpoints_carry_them_behind_the_references_entries(tmp_path):
+@pytest.mark.parametrize(
+    "last_entry", [False, True], ids=["in the optimiser's state", "as the last entry, as until 0.1.0"]
+)
+def test_checkpoints_carry_them_within_the_references_entries(tmp_path, last_entry):
     gaussians = model(6)
     gaussians.exposures = _trained()
     take_steps(gaussians, 1)
     capture = gaussians.capture()
-    assert len(capture) == 13 and len(model(6).capture()) == 12
+    assert len(capture) == len(model(6).capture()) == 12
+    if last_entry:
+        optimizer = dict(capture[10])
+        capture = (*capture[:10], optimizer, capture[11], optimizer.pop(EXPOSURES))
     save_checkpoint(tmp_path / "c.pth", capture, 5)
     loaded, _ = load_checkpoint(tmp_path / "c.pth")
     other = model(2)

@@ -14,7 +14,8 @@ from scene.gaussians.finite import check_finite
 from scene.gaussians.statistics import Statistics
 from utils.system_utils import UserError, atomic_write
 
-_ENTRIES = 12  # the reference's; the values of further attributes may follow, and a dict of the exposures
+_ENTRIES = 12  # the reference's; the values of further attributes may follow
+EXPOSURES = "exposures"  # key in the optimiser's state dict
 # The reference stores the scene extent as a NumPy scalar, which NumPy 1 and 2 rebuild by functions of other names.
 _SCALAR = np.float64(0).__reduce__()[0]
 _ALLOWED = [
@@ -40,18 +41,19 @@ class State(NamedTuple):
 def pack(state: State) -> tuple:
     """The 12 entries of the reference, in its order.
 
-    Attributes that the reference does not have follow as further entries, then the exposures if they are trained.
+    Attributes that the reference does not have follow as further entries. Exposures, if they are trained, stand in the
+    optimiser's state dict, where the reference, which takes exactly 12 entries, does not see them.
     """
+    exposures = {} if state.exposures is None else {EXPOSURES: state.exposures}
     return (
         state.active_sh_degree,
         *(state.rows[name] for name in IN_CHECKPOINT),
         state.statistics.max_radii2D,
         state.statistics.xyz_gradient_accum,
         state.statistics.denom,
-        state.optimizer,
+        state.optimizer | exposures,
         state.spatial_lr_scale,
         *(values for name, values in state.rows.items() if name not in IN_CHECKPOINT),
-        *([] if state.exposures is None else [state.exposures]),
     )
 
 
@@ -59,7 +61,10 @@ def unpack(entries: Sequence[Any], table: dict[str, Attribute], max_sh_degree: i
     """The state from the entries that `pack` made. UserError if its attributes are not those of the table."""
     active_sh_degree, *tensors = entries[:7]
     max_radii2D, xyz_gradient_accum, denom, optimizer, spatial_lr_scale, *others = entries[7:]
+    # Until 0.1.0, the exposures were the last entry.
     exposures = next((entry for entry in others if isinstance(entry, dict)), None)
+    if isinstance(optimizer, dict):
+        exposures = optimizer.get(EXPOSURES, exposures)
     names = (*IN_CHECKPOINT, *(name for name in table if name not in IN_CHECKPOINT))
     tensors += [entry for entry in others if not isinstance(entry, dict)]
     if len(tensors) != len(names):
