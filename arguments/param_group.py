@@ -16,7 +16,7 @@ class Option:
     """One command-line option.
 
     name, short: long name (also the attribute) and one-letter form; default: its type is the option's type.
-    help: effect of the option, may be empty. origin: source of the default; "ours..." for options that the reference does not have.
+    help: effect, may be empty. origin: source of the default; "ours..." for options that the reference does not have.
     check: returns None for a valid value, else a description of valid values.
     stored: written to `cfg_args`. remembered: written to `model.json`, for render.py.
     """

@@ -25,7 +25,7 @@ MAY_IMPORT = {
     "utils.host": (),
     "utils.exact": (),
     "utils.files": ("utils",),
-    "utils.camera_utils": ("scene.cameras",),  # a name of the reference
+    "utils.camera_utils": ("scene.cameras", "scene.views", "scene.options", "scene.pictures", "scene.readers", "utils"),
     "utils.make_depth_scale": ("scene.readers.depth_scale", "utils"),  # a command of the reference
     "arguments": ("utils",),
     "records": ("utils",),
@@ -34,9 +34,11 @@ MAY_IMPORT = {
     "scene.gaussians": ("utils",),
     "scene.gaussian_model": ("scene.gaussians", "scene.readers.info", "utils"),
     "scene.dataset_readers": ("scene.readers", "scene.pictures", "utils"),
-    "scene.cameras": ("scene.readers.info", "scene.pictures", "utils"),
-    "scene": ("arguments", "utils"),
-    "gaussian_renderer": ("scene", "arguments", "utils"),
+    "scene.options": (),
+    "scene.views": ("scene.readers.depth_maps", "scene.readers.info", "scene.pictures", "utils"),
+    "scene.cameras": ("scene.views", "scene.pictures", "utils"),
+    "scene": ("utils",),  # not arguments: a client's own package of that name may be found first
+    "gaussian_renderer": ("scene", "utils"),
     "training": ("gaussian_renderer", "scene", "records", "arguments", "utils"),
     "training.observers": ("training", "gaussian_renderer", "scene", "records", "arguments", "utils"),
     "diagnosis": ("gaussian_renderer", "scene", "arguments", "utils"),
