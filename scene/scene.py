@@ -168,9 +168,8 @@ class Scene:
         """Cameras of the training or test list, in the same order at every scale."""
         views = self.info.test_cameras if test else self.info.train_cameras
         # By names of the package, because code of others may replace them there or in utils.camera_utils.
-        cameras = scene.cameraList_from_camInfos(
-            views, scale, args, getattr(self.info, "is_nerf_synthetic", False), test
-        )
+        synthetic = getattr(self.info, "is_nerf_synthetic", False)
+        cameras = list(scene.cameraList_from_camInfos(views, scale, args, synthetic, test))
         for camera in cameras:
             if isinstance(camera, Camera):
                 camera.images = self.images
