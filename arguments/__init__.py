@@ -1,7 +1,7 @@
 """Command-line options, and their storage in a model folder."""
 
 from arguments.groups import ModelParams, OptimizationParams, PipelineParams
-from arguments.param_group import OptionParser, ParamGroup
+from arguments.param_group import GroupParams, OptionParser, ParamGroup
 from arguments.stored import (
     VERSION,
     add_to_model_json,
@@ -16,6 +16,7 @@ from arguments.stored import (
 
 __all__ = [
     "VERSION",
+    "GroupParams",
     "ModelParams",
     "OptimizationParams",
     "OptionParser",

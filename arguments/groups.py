@@ -3,7 +3,7 @@
 import argparse
 import os
 
-from arguments.param_group import Option, ParamGroup, above, at_least, one_of, within
+from arguments.param_group import GroupParams, Option, OptionTable, above, at_least, one_of, within
 from utils.system_utils import UserError
 
 
@@ -15,7 +15,7 @@ def _tolerance(value: float) -> str | None:
     return None if value == -1 or value >= 0 else "at least 0, or -1"
 
 
-class ModelParams(ParamGroup):
+class ModelParams(OptionTable):
     """Options of the data, the output folder and the SH degree. The `stored` ones make up `cfg_args`."""
 
     title = "model"
@@ -117,8 +117,8 @@ class ModelParams(ParamGroup):
         ),
     )
 
-    def extract(self, args: argparse.Namespace) -> argparse.Namespace:
-        """Do as ParamGroup.extract, and make source_path absolute. UserError for contradictory options."""
+    def extract(self, args: argparse.Namespace) -> GroupParams:
+        """Do as OptionTable.extract, and make source_path absolute. UserError for contradictory options."""
         values = super().extract(args)
         if values.init_pcd_path and values.init_type == "random":
             raise UserError(
@@ -130,7 +130,7 @@ class ModelParams(ParamGroup):
         return values
 
 
-class PipelineParams(ParamGroup):
+class PipelineParams(OptionTable):
     """Options of rendering. They are not part of `cfg_args`; `model.json` remembers antialiasing."""
 
     title = "pipeline"
@@ -146,7 +146,7 @@ class PipelineParams(ParamGroup):
     )
 
 
-class OptimizationParams(ParamGroup):
+class OptimizationParams(OptionTable):
     """Options of the optimisation: its length, its learning rates, and the control of the number of Gaussians."""
 
     title = "optimisation"

@@ -16,7 +16,7 @@ class Option:
     """One command-line option.
 
     name, short: long name (also the attribute) and one-letter form; default: its type is the option's type.
-    help: effect of the option. origin: source of the default; "ours..." for options that the reference does not have.
+    help: effect, may be empty. origin: source of the default; "ours..." for options that the reference does not have.
     check: returns None for a valid value, else a description of valid values.
     stored: written to `cfg_args`. remembered: written to `model.json`, for render.py.
     """
@@ -35,20 +35,25 @@ class Option:
         """Whether the reference does not have this option."""
         return self.origin.startswith("ours")
 
+    @property
+    def attribute(self) -> str:
+        """Name of the group's attribute that holds the default: with a leading underscore if there is a short form."""
+        return f"_{self.name}" if self.short else self.name
+
     def add_to(self, group: argparse._ArgumentGroup, sentinel: bool) -> None:
         flags = [f"--{self.name}"] + ([f"-{self.short}"] if self.short else [])
         default = None if sentinel else self.default
         shown = "off" if self.default is False else repr(self.default) if self.default == "" else self.default
-        text = f"{self.help} (default: {shown}; {self.origin})".replace("%", "%%")
+        text = f"{self.help} (default: {shown}; {self.origin})" if self.help else f"default: {shown}"
         if isinstance(self.default, bool):
             kind: dict[str, Any] = {"action": "store_true"}
         else:
             kind = {"type": type(self.default), "metavar": self._metavar()}
-        action = group.add_argument(*flags, **kind, default=default, help=text)
+        action = group.add_argument(*flags, **kind, default=default, help=text.replace("%", "%%"))
         action.ours = self.ours  # type: ignore[attr-defined]  # for OptionParser
 
-    def _metavar(self) -> str:
-        return {int: "N", float: "X", str: "TEXT"}[type(self.default)]
+    def _metavar(self) -> str | None:
+        return {int: "N", float: "X", str: "TEXT"}.get(type(self.default))
 
     def verify(self, value: Value) -> None:
         """Raise UserError if the value is not finite or fails the option's check."""
@@ -68,30 +73,75 @@ class OptionParser(argparse.ArgumentParser):
         return others if len(others) == 1 else matches
 
 
-class ParamGroup:
-    """A group of options: adds them to a parser, and extracts their checked values from the parsed arguments.
+class GroupParams(argparse.Namespace):
+    """Values of a group's options, as `ParamGroup.extract` returns them."""
 
-    sentinel: make every default None ("not given"), so that get_combined_args can tell what the user typed.
+
+class ParamGroup:
+    """A group of options: adds them to a parser, and extracts their values from the parsed arguments.
+
+    Its attributes are its options, and their values the defaults. A subclass sets them, then calls this constructor:
+    `self.steps = 7` adds `--steps`, `self._folder = ""` adds `--folder` and `-f`, and a bool adds a flag.
+    fill_none: make every default None ("not given"), so that get_combined_args can tell what the user typed.
     without: options that this command does not get, because they would have no effect.
+    """
+
+    def __init__(
+        self, parser: argparse.ArgumentParser, name: str, fill_none: bool = False, without: Collection[str] = ()
+    ) -> None:
+        group = parser.add_argument_group(name)
+        for option in self._options():
+            if option.name not in without:
+                option.add_to(group, fill_none)
+
+    def _options(self) -> list[Option]:
+        return [_of_attribute(name, value) for name, value in vars(self).items()]
+
+    def extract(self, args: argparse.Namespace) -> GroupParams:
+        """Return this group's values from `args`; absent or None means the default."""
+        values = GroupParams()
+        for option in self._options():
+            value = getattr(args, option.name, None)
+            setattr(values, option.name, option.default if value is None else value)
+        return values
+
+
+def _of_attribute(name: str, value: Any) -> Option:
+    plain = name.removeprefix("_")
+    return Option(plain, value, "", short=plain[0] if name.startswith("_") else None)
+
+
+class OptionTable(ParamGroup):
+    """A group whose options are records, with help and checks; its attributes hold the defaults.
+
+    Attributes that a subclass sets before it calls this constructor are options, too. One named like an option that we
+    added replaces it. sentinel: as fill_none of ParamGroup.
     """
 
     title: ClassVar[str]
     options: ClassVar[tuple[Option, ...]]
 
     def __init__(self, parser: argparse.ArgumentParser, sentinel: bool = False, without: Collection[str] = ()) -> None:
-        group = parser.add_argument_group(self.title)
+        taken = {name.removeprefix("_") for name in vars(self)}
         for option in self.options:
-            if option.name not in without:
-                option.add_to(group, sentinel)
+            if not (option.ours and option.name in taken):
+                setattr(self, option.attribute, option.default)
+        super().__init__(parser, self.title, sentinel, without)
 
-    def extract(self, args: argparse.Namespace) -> argparse.Namespace:
-        """Return this group's values from `args`; absent or None means the default. UserError for invalid values."""
-        values: dict[str, Value] = {}
+    def _options(self) -> list[Option]:
+        options = {option.name: option for option in super()._options()}
         for option in self.options:
-            value = getattr(args, option.name, None)
-            values[option.name] = option.default if value is None else value
-            option.verify(values[option.name])
-        return argparse.Namespace(**values)
+            if not option.ours or options[option.name].default == option.default:
+                options[option.name] = option
+        return list(options.values())
+
+    def extract(self, args: argparse.Namespace) -> GroupParams:
+        """Do as ParamGroup.extract. UserError for invalid values."""
+        values = super().extract(args)
+        for option in self._options():
+            if option in self.options:
+                option.verify(getattr(values, option.name))
+        return values
 
 
 def at_least(low: float) -> Callable[[float], str | None]:

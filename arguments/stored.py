@@ -3,18 +3,17 @@
 import argparse
 import ast
 import os
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from arguments.groups import ModelParams
 from arguments.param_group import Value
-from utils.files.json_files import read_json, write_json
+from utils.files import model_json
+from utils.files.model_json import OFFSET
 from utils.system_utils import UserError, atomic_write
 
 VERSION = "0.1.0"
-OFFSET = "world_offset"
 
 _STORED = {option.name: option.default for option in ModelParams.options if option.stored}
 _REMEMBERED = {option.name: option.default for option in ModelParams.options if option.remembered}
@@ -84,40 +83,22 @@ def write_model_json(
         record["optimizer_type"] = optimizer_type
     if any(world_offset):
         record[OFFSET] = list(world_offset)
-    _write_record(model_path, record)
+    model_json.write_model_json(model_path, record)
 
 
 def add_to_model_json(model_path: str | os.PathLike, **entries: Any) -> None:
     """Add entries to `model.json`, or replace those of the same names."""
-    _write_record(model_path, read_model_json(model_path) | entries)
-
-
-def _write_record(model_path: str | os.PathLike, record: dict[str, Any]) -> None:
-    write_json(Path(model_path) / "model.json", record)
+    model_json.write_model_json(model_path, read_model_json(model_path) | entries)
 
 
 def read_model_json(model_path: str | os.PathLike) -> dict[str, Any]:
-    """Read `model.json`; {} if there is none, as in a model of another program. UserError if it is broken."""
-    path = Path(model_path) / "model.json"
-    if not path.is_file():
-        return {}
-    try:
-        record = read_json(path)
-    except (ValueError, RecursionError) as error:
-        raise UserError(f"{path} is not JSON; restore it, or remove it and pass --antialiasing yourself") from error
-    if not isinstance(record, dict) or not isinstance(record.get("antialiasing", False), bool):
-        raise UserError(f"{path}: antialiasing must be true or false; restore the file, or remove it")
+    """Do as utils.files.model_json.read_model_json; UserError also for an option of the wrong type."""
+    record = model_json.read_model_json(model_path)
     for name, default in _REMEMBERED.items():
         if type(record.get(name, default)) is not type(default):
+            path = Path(model_path) / model_json.NAME
             raise UserError(f"{path}: {name} must be {type(default).__name__}, got {record[name]!r}; restore the file")
-    offset = record.get(OFFSET, [0, 0, 0])
-    if not isinstance(offset, list) or len(offset) != 3 or not all(_is_finite(value) for value in offset):
-        raise UserError(f"{path}: {OFFSET} must be three numbers, got {offset!r:.40}; restore the file")
     return record
-
-
-def _is_finite(value: Any) -> bool:
-    return type(value) in (int, float) and abs(value) <= sys.float_info.max
 
 
 def read_stored_options(model_path: str | os.PathLike) -> dict[str, Value]:

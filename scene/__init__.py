@@ -6,10 +6,13 @@ gaussian_model               GaussianModel, built of the modules in gaussians/
 gaussians/                   parameters of the Gaussians: start, optimiser, density control, exposures, PLY, checkpoint
 dataset_readers, readers/    a folder's dataset as plain records: COLMAP, Blender, nerfstudio; points, depth maps
 pictures/                    image files: finding, lenses, masks, decoding, keeping
+views/                       records that cameras are made of: from datasets, or from the reference's arguments
+options                      defaults of the options that code for the reference lacks
 saved_iterations, saved_model  the saves in a model folder, and loading one with its scene
 export_world                 a command: a model in the world's coordinates
 
-gaussians/ and pictures/ import nothing else from here, readers/ only pictures/. The names below are imported on first
+gaussians/ and pictures/ import nothing else from here, readers/ only pictures/, and nothing here imports `arguments`,
+because other people's code may have its own package of that name. The names below are imported on first
 use, so that `import scene.gaussian_model` loads no reader of datasets.
 """
 
@@ -24,12 +27,14 @@ __all__ = ["GaussianModel", "Scene", "SceneGaussians"]
 
 _HOMES = {
     "GaussianModel": "scene.gaussian_model",
+    "ModelParams": "arguments",  # of whoever's package has that name
     "Scene": "scene.scene",
     "SceneGaussians": "scene.scene",
-    "cameraList_from_camInfos": "scene.cameras",
-    "camera_to_JSON": "scene.cameras",
+    "cameraList_from_camInfos": "utils.camera_utils",
+    "camera_to_JSON": "utils.camera_utils",
     "find_iteration": "scene.saved_iterations",
     "saved_ply": "scene.saved_iterations",
+    "sceneLoadTypeCallbacks": "scene.dataset_readers",
     "searchForMaxIteration": "utils.system_utils",
 }
 _MODULES = ("cameras", "colmap_loader", "dataset_readers", "gaussian_model")
@@ -40,7 +45,13 @@ def __getattr__(name: str) -> object:
         return import_module(f"scene.{name}")
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(_HOMES[name]), name)
+    try:
+        home = import_module(_HOMES[name])
+    except ModuleNotFoundError as error:
+        if error.name != "arguments":
+            raise
+        raise AttributeError(f"module {__name__!r} has no {name}: there is no package arguments") from error
+    return getattr(home, name)
 
 
 def __dir__() -> list[str]:

@@ -3,91 +3,140 @@
 Matrices are transposed, so that they multiply row vectors from the right. Camera frame: x right, y down, z forward.
 """
 
-import argparse
+import copy
+from collections.abc import Callable
+from typing import Any
 
-import numpy as np
 import torch
 from fused_ssim import composite
-from torch import Tensor
+from torch import Tensor, nn
 
-from scene.pictures.masks import TRANSPARENT, Cutout
-from scene.pictures.resolution import training_size
-from scene.pictures.store import ImageStore, Picture, Source
-from scene.readers.info import CameraInfo
-from utils.graphics_utils import getProjectionMatrix, getWorld2View2
+from scene.pictures.in_memory import InMemory
+from scene.pictures.store import ImageStore, Picture, Source, usable_device
+from scene.views.forms import SIGNATURE, view_of
+from utils.graphics_utils import camera_center, fov2focal, projection, world_to_camera
+from utils.host.device import compute_device
 
 ZNEAR = 0.01  # ZNEAR and ZFAR only shape the clip depth and cull nothing
 ZFAR = 100.0
+_OF_TARGET = frozenset(("original_image", "alpha_mask"))
 
 
-class Camera:
+def _assignable(compute: Callable[["Camera"], Any]) -> property:
+    """A property that is what was assigned to it, and until then what `compute` returns."""
+    name = compute.__name__
+
+    def read(camera: "Camera") -> Any:
+        return camera._assigned[name] if name in camera._assigned else compute(camera)
+
+    def assign(camera: "Camera", value: Any) -> None:
+        camera._assigned[name] = value
+
+    return property(read, assign, doc=compute.__doc__)
+
+
+class Camera(nn.Module):
     """One view at training resolution.
+
+    Made of a scene.views.view.View, or of the arguments of either release of the reference (scene/views/forms.py).
 
     uid: index in its list; colmap_id: intrinsics id. R (3,3) camera-to-world, T (3,) world-to-camera, NumPy float64.
     FoVx, FoVy: radians. fx, fy, cx, cy: pixels at image_width x image_height, pixel centres at .5 (the rasterizer's
     integer pixel coordinates are half a pixel less). world_view_transform, projection_matrix, full_proj_transform:
-    (4,4) float32, transposed; camera_center (3,) float32; all on `device`. columns: the columns that count in loss and
-    scores, None: all (scene/half_images.py). exposure_name: the photo's name among the trained exposures.
+    (4,4) float32, transposed; camera_center (3,) float32; all on `device`. trans, scale: moved the camera's centre c to
+    (c + trans) * scale in these. columns: the columns that count in loss and scores, None: all (scene/half_images.py).
+    exposure_name: the photo's name among the trained exposures. data_device: where photos in memory lie.
+    All may be assigned, and other attributes added; nothing is computed again from an assigned one. A copy shares the
+    store of the decoded photos. A pickle leaves it out, and the photos are decoded again.
     """
 
-    def __init__(
-        self,
-        info: CameraInfo,
-        uid: int,
-        size: tuple[int, int],
-        images: ImageStore,
-        device: torch.device | str = "cpu",
-    ) -> None:
-        self.uid = uid
-        self.colmap_id = info.uid
-        self.R = info.R
-        self.T = info.T
-        self.FoVx = info.FovX
-        self.FoVy = info.FovY
-        self.image_name = info.image_name
-        self.image_path = info.image_path
-        self.exposure_name = info.image_name
-        self.columns: slice | None = None
-        self.image_width, self.image_height = size
-        self.fx = info.fx * self.image_width / info.width
-        self.fy = info.fy * self.image_height / info.height
-        self.cx = info.cx * self.image_width / info.width
-        self.cy = info.cy * self.image_height / info.height
-        self.znear = ZNEAR
-        self.zfar = ZFAR
-        self.device = torch.device(device)
-        self._images = images
-        self._source = info.image_path
-        self._mask = info.mask
-        self._ignore_alpha = info.ignore_alpha
-        if info.mask is not None and info.mask.meaning == TRANSPARENT:
-            self._source, self._mask = Cutout(info.image_path, info.mask), None
-        self._depth = info.depth
+    __signature__ = SIGNATURE
 
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__()
+        view = view_of(*args, **kwargs)
+        self.uid, self.colmap_id = view.uid, view.colmap_id
+        self.R, self.T = view.R, view.T
+        self.FoVx, self.FoVy = view.FoVx, view.FoVy
+        self.image_name = self.exposure_name = view.image_name
+        self.image_path = view.image_path
+        self.columns = view.columns
+        self.image_width, self.image_height = self._size = view.size
+        self.fx, self.fy = fov2focal(view.FoVx, view.size[0]), fov2focal(view.FoVy, view.size[1])
+        self.cx, self.cy = ((offset + 1) * pixels / 2 for offset, pixels in zip(view.offset, view.size, strict=True))
+        self.znear, self.zfar = ZNEAR, ZFAR
+        self.trans, self.scale = view.trans, view.scale
+        self.device = compute_device()
+        self.data_device = usable_device(view.data_device, self.device)
+        self._images: ImageStore | None = None
+        self._source, self._mask, self._depth = self._placed(view.source), view.mask, self._placed(view.depth)
+        self._ignore_alpha = view.ignore_alpha
+        self._reliable = view.depth_reliable
+        self._assigned: dict[str, Any] = {}
+        self._made: dict[str, Tensor] = {}
+        self._set_matrices(view.offset)
+
+    def _placed(self, source: Source | InMemory | None) -> Source | InMemory | None:
+        return InMemory(source.pixels.to(self.data_device)) if isinstance(source, InMemory) else source
+
+    def _set_matrices(self, offset: tuple[float, float]) -> None:
         # Computed in float64, so that product and inverse are rounded only once.
-        view = torch.from_numpy(getWorld2View2(info.R, info.T))
-        projection = getProjectionMatrix(
-            ZNEAR, ZFAR, self.FoVx, self.FoVy, 2 * info.cx / info.width - 1, 2 * info.cy / info.height - 1
-        )
+        moved = world_to_camera(self.R, self.T, self.trans, self.scale)
+        view, project = torch.from_numpy(moved), projection(ZNEAR, ZFAR, self.FoVx, self.FoVy, *offset)
         self.world_view_transform = self._hand_on(view.T)
-        self.projection_matrix = self._hand_on(projection.T)
-        self.full_proj_transform = self._hand_on((projection @ view).T)
-        self.camera_center = self._hand_on(torch.from_numpy(info.center))
+        self.projection_matrix = self._hand_on(project.T)
+        self.full_proj_transform = self._hand_on((project @ view).T)
+        self.camera_center = self._hand_on(torch.from_numpy(camera_center(self.R, moved[:3, 3].copy())))
 
     def _hand_on(self, matrix: Tensor) -> Tensor:
         return matrix.to(self.device, torch.float32).contiguous()
 
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_images": None, "_made": {}}
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> "Camera":
+        twin = type(self).__new__(type(self))
+        memo[id(self)] = twin
+        twin.__setstate__(copy.deepcopy(self.__getstate__(), memo))
+        twin._images = self._images
+        return twin
+
+    @property
+    def images(self) -> ImageStore:
+        """Store of the decoded pictures: the scene's, or one of this view's own."""
+        if self._images is None:
+            self._images = ImageStore(0, self.data_device, self.device)
+        return self._images
+
+    @images.setter
+    def images(self, store: ImageStore) -> None:
+        self._images = store
+
     @property
     def pictures(self) -> list[Picture]:
-        """Sources of `target`, `mask` and `invdepthmap`, each with the size (width, height) it is decoded at."""
-        sources = (self._source, self._mask, self._depth)
-        return [(source, (self.image_width, self.image_height)) for source in sources if source is not None]
+        """Sources of `target`, `mask` and `invdepthmap` to decode, each with the size (width, height) it is decoded at.
 
-    def _decoded(self, source: Source) -> Tensor:
-        return self._images.get(source, (self.image_width, self.image_height)).to(self.device, non_blocking=True)
+        Empty if they were given as pixels.
+        """
+        sources = (self._source, self._mask, self._depth)
+        return [(s, self._size) for s in sources if s is not None and not isinstance(s, InMemory)]
+
+    def _decoded(self, source: Source | InMemory) -> Tensor:
+        pixels = source.pixels if isinstance(source, InMemory) else self.images.get(source, self._size)
+        return pixels.to(self.device, non_blocking=True)
 
     def _pixels(self) -> Tensor:
         return self._decoded(self._source)
+
+    def _float_pixels(self) -> Tensor:
+        """The pixels (3 or 4,H,W) as float in [0,1]; kept if the store allows it, because others read them often."""
+        if "pixels" in self._made:
+            return self._made["pixels"]
+        pixels = self._pixels()
+        pixels = pixels.clone() if pixels.is_floating_point() else pixels.float() / 255
+        if isinstance(self._source, InMemory) or self.images.keeps_floats:
+            self._made["pixels"] = pixels
+        return pixels
 
     def ground_truth(self, background: Tensor) -> tuple[Tensor, Tensor | None]:
         """`target` and `mask`, with one copy of the image to the device for both."""
@@ -98,14 +147,29 @@ class Camera:
         """Image (3,H,W) that a render of this view over `background` (3,) in [0,1] should equal.
 
         uint8, meaning value / 255, for a photo without alpha, or whose alpha is a mask; else float32, composited over
-        the background.
+        the background. An original_image or alpha_mask that was assigned takes the place of the photo's.
         """
         return self._target(self._pixels(), background)
 
     def _target(self, pixels: Tensor, background: Tensor) -> Tensor:
+        if not _OF_TARGET.isdisjoint(self._assigned):
+            return self._assigned_target(pixels, background.to(self.device))
         if pixels.shape[0] == 3 or self._ignore_alpha:
-            return pixels[:3]
-        return composite(pixels, background.to(self.device))
+            return pixels[:3] if pixels.dtype == torch.uint8 else pixels[:3].float()
+        if pixels.dtype == torch.uint8:
+            return composite(pixels, background.to(self.device))
+        pixels = pixels.float()
+        return pixels[:3] + (1 - pixels[3:]) * background.to(self.device)[:, None, None]
+
+    def _assigned_target(self, pixels: Tensor, background: Tensor) -> Tensor:
+        colors = self.original_image.to(self.device, torch.float32)
+        if "alpha_mask" in self._assigned:
+            alpha = self.alpha_mask.to(self.device, torch.float32)
+        elif pixels.shape[0] == 4 and not self._ignore_alpha:
+            alpha = self._float_pixels()[3:].float()
+        else:
+            return colors
+        return colors * alpha + (1 - alpha) * background[:, None, None]
 
     @property
     def mask(self) -> Tensor | None:
@@ -119,38 +183,44 @@ class Camera:
             counts = opaque if counts is None else counts & opaque
         return counts
 
-    @property
+    @_assignable
     def original_image(self) -> Tensor:
-        """The photo's colours (3,H,W) float32 in [0,1], with straight alpha not applied."""
-        return self._pixels()[:3].float() / 255
+        """The photo's colours (3,H,W) float32 in [0,1]; straight alpha is not applied.
 
-    @property
-    def alpha_mask(self) -> Tensor | None:
-        """The photo's alpha (1,H,W) float32 in [0,1], 0 outside `columns`; None without alpha if all columns count."""
-        pixels = self._pixels()
-        alpha = pixels[3:].float() / 255 if pixels.shape[0] == 4 else None
-        return alpha if self.columns is None else self._within_columns(alpha)
+        A change in place lasts only where the store keeps such images (ImageStore.keeps_floats), and `target` never
+        sees it; assigning has neither limit.
+        """
+        return self._float_pixels()[:3]
 
-    @property
+    @_assignable
+    def alpha_mask(self) -> Tensor:
+        """The photo's alpha (1,H,W) float32 in [0,1], ones without alpha; 0 outside `columns`."""
+        pixels = self._float_pixels()
+        alpha = pixels[3:] if pixels.shape[0] == 4 else None
+        return self._within_columns(alpha) if alpha is None or self.columns is not None else alpha
+
+    @_assignable
     def depth_reliable(self) -> bool:
         """Whether there is an inverse depth map to train on."""
-        return self._depth is not None
+        return self._reliable
 
-    @property
+    @_assignable
     def invdepthmap(self) -> Tensor | None:
-        """Inverse depth (1,H,W) float32, 1 / world units; None without a reliable map."""
+        """Inverse depth (1,H,W) float32, 1 / world units; None without a map."""
+        return None if self._depth is None else self._decoded(self._depth)
+
+    @_assignable
+    def depth_mask(self) -> Tensor | None:
+        """(1,H,W) float32: 1 where the inverse depth counts, 0 outside `columns` and for an unreliable map; None
+        without a map.
+        """
         if self._depth is None:
             return None
-        return self._decoded(self._depth)
-
-    @property
-    def depth_mask(self) -> Tensor | None:
-        """(1,H,W) float32: 1 where the inverse depth counts, 0 outside `columns`; None without a reliable map."""
-        return None if self._depth is None else self._within_columns()
+        return self._within_columns() * float(self._reliable)
 
     def _within_columns(self, values: Tensor | None = None) -> Tensor:
         """Values (1,H,W), ones by default, in the columns that count; 0 elsewhere."""
-        mask = torch.zeros(1, self.image_height, self.image_width, device=self.device)
+        mask = torch.zeros(1, *self._size[::-1], device=self.device)
         columns = slice(None) if self.columns is None else self.columns
         mask[..., columns] = 1.0 if values is None else values[..., columns]
         return mask
@@ -179,31 +249,3 @@ class MiniCam:
         self.world_view_transform = world_view_transform
         self.full_proj_transform = full_proj_transform
         self.camera_center = torch.inverse(world_view_transform)[3, :3]
-
-
-def cameraList_from_camInfos(
-    cam_infos: list[CameraInfo],
-    resolution_scale: float,
-    args: argparse.Namespace,
-    images: ImageStore,
-    device: torch.device | str = "cpu",
-) -> list[Camera]:
-    """Cameras at training size (args.resolution, divided by resolution_scale) that share one store of images."""
-    return [
-        Camera(info, uid, training_size(*info.file_size, args.resolution, resolution_scale), images, device)
-        for uid, info in enumerate(cam_infos)
-    ]
-
-
-def camera_to_JSON(id: int, camera: CameraInfo) -> dict[str, object]:
-    """Entry of `cameras.json`, keys in the order that viewers expect: camera-to-world pose, full-size intrinsics."""
-    return {
-        "id": id,
-        "img_name": camera.image_name,
-        "width": camera.width,
-        "height": camera.height,
-        "position": np.asarray(camera.center).tolist(),
-        "rotation": [row.tolist() for row in camera.R],
-        "fy": camera.fy,
-        "fx": camera.fx,
-    }

@@ -39,13 +39,14 @@ __all__ = [
     "readColmapSceneInfo",
     "readNerfSyntheticInfo",
     "readNerfstudioInfo",
+    "read_by_callback",
     "read_scene",
     "sceneLoadTypeCallbacks",
     "scene_extent",
     "storePly",
 ]
 
-# For other code to call, or to replace: read_scene calls what stands here in place of these three.
+# For other code to call, or to replace: Scene then calls what stands here in place of read_scene.
 sceneLoadTypeCallbacks: dict[str, Callable[..., SceneInfo]] = {
     COLMAP: readColmapSceneInfo,
     BLENDER: readNerfSyntheticInfo,
@@ -76,20 +77,27 @@ def read_scene(
     dataset's points) or "random". want_cloud: False reads no points, for a model that exists already.
     offset: (3,) of that model's frame (scene/readers/world_offset.py); None: computed for this scene.
     Photos of distorting lenses are undistorted into the user's cache folder; nothing else is written.
-
-    A reader that other code has put into `sceneLoadTypeCallbacks` is called with the reference's arguments, without
-    depth maps and with test views apart: both are added later. It brings its own points and masks.
     """
     folder = Path(source_path)
     if not str(source_path):
         raise UserError("no scene folder given; name it with -s")
     kind = kind_of(folder)
-    callback = sceneLoadTypeCallbacks[kind]
-    if callback is _OURS[kind]:
-        start = StartOptions(init_pcd_path, init_type) if want_cloud else None
-        info = _READERS[kind](folder, images, hold_out, start, masks)
-    elif kind == COLMAP:
-        info = callback(str(folder), images, "", hold_out, False)
-    else:
-        info = callback(str(folder), False, "", hold_out)
+    start = StartOptions(init_pcd_path, init_type) if want_cloud else None
+    info = _READERS[kind](folder, images, hold_out, start, masks)
     return local(info, world_offset(info) if offset is None else np.asarray(offset, dtype=np.float64))
+
+
+def read_by_callback(
+    source_path: str | os.PathLike, images: str, white_background: bool, depths: str, hold_out: bool, halves: bool
+) -> SceneInfo | None:
+    """The scene by the reader that other code has put into `sceneLoadTypeCallbacks`; None where ours stand.
+
+    It is called with the reference's arguments. halves: the half-image protocol, train_test_exp.
+    """
+    kind = kind_of(Path(source_path)) if str(source_path) else None
+    read = sceneLoadTypeCallbacks.get(kind)
+    if read is _OURS.get(kind):
+        return None
+    if kind == COLMAP:
+        return read(str(source_path), images, depths, hold_out, halves)
+    return read(str(source_path), white_background, depths, hold_out)

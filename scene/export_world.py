@@ -13,9 +13,8 @@ from pathlib import Path
 import numpy as np
 from plyfile import PlyData, PlyElement
 
-from arguments import read_model_json
-from arguments.stored import OFFSET
 from scene.gaussians.ply import read_vertices
+from utils.files.model_json import OFFSET, read_model_json
 from utils.system_utils import UserError, atomic_write, run_cli, searchForMaxIteration
 
 _AXES = ("x", "y", "z")

@@ -9,6 +9,7 @@ from dataclasses import replace
 
 from scene.cameras import Camera
 from scene.readers.info import CameraInfo, SceneInfo, exposure_names, normalization
+from scene.views.view import half
 
 
 def train_on_all(info: SceneInfo) -> SceneInfo:
@@ -20,17 +21,16 @@ def train_on_all(info: SceneInfo) -> SceneInfo:
     return replace(info, train_cameras=views, nerf_normalization=normalization(views, points))
 
 
-def mark_halves(train: list[Camera], test: list[Camera], infos: Sequence[CameraInfo]) -> None:
+def mark_halves(cameras: Sequence[Camera], views: Sequence[CameraInfo], info: SceneInfo, in_test_list: bool) -> None:
     """Set the columns that count and the exposure names in the cameras of a scene made by `train_on_all`.
 
-    infos: of the training views.
+    views: of these cameras, in their order. in_test_list: they are the test list, else the training list.
     """
-    tested = {camera.image_path for camera in test}
-    names = {info.image_path: name for info, name in zip(infos, exposure_names(infos), strict=True)}
-    for camera in train:
-        if camera.image_path in tested:
-            camera.columns = slice(0, camera.image_width // 2)
-    for camera in test:
-        camera.columns = slice(camera.image_width // 2, camera.image_width)  # utils.image_utils.right_half
-    for camera in train + test:
-        camera.exposure_name = names[camera.image_path]
+    tested = {view.image_path for view in info.test_cameras}
+    paths = [view.image_path for view in info.train_cameras]
+    names = dict(zip(paths, exposure_names(info.train_cameras), strict=True))
+    for camera, view in zip(cameras, views, strict=False):
+        if isinstance(camera, Camera):  # code of others may replace utils.camera_utils.loadCam
+            camera.exposure_name = names.get(view.image_path, view.image_name)
+            if view.image_path in tested:
+                camera.columns = half(camera.image_width, in_test_list)

@@ -9,18 +9,19 @@ from pathlib import Path
 from typing import Protocol
 
 import numpy as np
-import torch
 
-from arguments.stored import OFFSET, read_model_json
-from scene.cameras import Camera, camera_to_JSON, cameraList_from_camInfos
-from scene.dataset_readers import read_scene
+import scene
+from scene.cameras import Camera
+from scene.dataset_readers import read_by_callback, read_scene
 from scene.half_images import mark_halves, train_on_all
+from scene.options import option
 from scene.pictures.masks import MaskOptions, refuse_nothing_to_ignore
 from scene.pictures.store import ImageStore, Picture, picture_device
 from scene.readers.depth_maps import with_depth_maps
 from scene.readers.info import CameraInfo, SceneInfo
 from scene.readers.point_cloud import write_point_cloud
 from scene.saved_iterations import find_iteration, saved_ply
+from utils.files.model_json import OFFSET, read_model_json
 from utils.graphics_utils import BasicPointCloud
 from utils.host.device import compute_device
 from utils.system_utils import UserError, atomic_write
@@ -47,11 +48,12 @@ class SceneGaussians(Protocol):
 class Scene:
     """Views and model of one run.
 
-    args: model options (ModelParams.extract). load_iteration: None calls `create_gaussians` and `write_inputs`, unless
-    `start` is False, which leaves them to the caller; -1 loads the last saved iteration, N that one.
-    shuffle: mix the order of the views (always the same way). resolution_scales: factors by which views are made
-    smaller, one list of cameras each. info: the dataset as read. cameras_extent: E in world units, from the training
-    views. images: the store of the decoded photos.
+    args: model options, as ModelParams.extract gives them; those of scene/options.py may be missing. load_iteration:
+    None calls `create_gaussians` and `write_inputs`, unless `start` is False, which leaves them to the caller; -1 loads
+    the last saved iteration, N that one. shuffle: mix the order of the views (always the same way). resolution_scales:
+    factors by which views are made smaller, one list of cameras each. train_cameras, test_cameras: these lists by
+    scale, which may be replaced. info: the dataset as read. cameras_extent: E in world units, from the training views.
+    images: the store of the decoded photos.
     """
 
     def __init__(
@@ -66,18 +68,15 @@ class Scene:
         self.model_path = args.model_path
         self.gaussians = gaussians
         self.loaded_iter = None if load_iteration is None else find_iteration(self.model_path, load_iteration)
-        self._halves = args.train_test_exp
+        self._halves = option(args, "train_test_exp")
         self.info = self._read(args)
         self.cameras_extent = self.info.extent
 
         device = compute_device()
-        self.images = ImageStore(args.images_to_load, picture_device(args.data_device, device), device)
-        self._train = self._cameras(self.info.train_cameras, args, device, shuffle, resolution_scales)
-        self._test = self._cameras(self.info.test_cameras, args, device, shuffle, resolution_scales)
-        self.images.plan(_pictures(self._train), _pictures(self._test))
-        if self._halves:
-            for scale in resolution_scales:
-                mark_halves(self._train[scale], self._test[scale], self.info.train_cameras)
+        self.images = ImageStore(option(args, "images_to_load"), picture_device(args.data_device, device), device)
+        self.train_cameras = {scale: self._cameras(args, scale, shuffle, False) for scale in resolution_scales}
+        self.test_cameras = {scale: self._cameras(args, scale, shuffle, True) for scale in resolution_scales}
+        self.images.plan(self._pictures(self.train_cameras), self._pictures(self.test_cameras))
 
         gaussians.world_offset = tuple(self.info.offset.tolist())
         if self.loaded_iter is not None:
@@ -91,14 +90,18 @@ class Scene:
         fresh = self.loaded_iter is None
         if fresh:
             _refuse_dataset_folder(args)
-        masks = MaskOptions(args.masks, args.invert_masks, args.mask_meaning)
+        depths = option(args, "depths")
+        info = read_by_callback(args.source_path, args.images, args.white_background, depths, args.eval, self._halves)
+        if info is not None:
+            return info
+        masks = MaskOptions(*(option(args, name) for name in ("masks", "invert_masks", "mask_meaning")))
         info = read_scene(
             args.source_path,
             args.images,
             args.eval,
-            args.init_pcd_path,
+            option(args, "init_pcd_path"),
             want_cloud=fresh,
-            init_type=args.init_type,
+            init_type=option(args, "init_type"),
             masks=masks,
             offset=None if fresh else read_model_json(self.model_path).get(OFFSET, (0, 0, 0)),
         )
@@ -107,8 +110,8 @@ class Scene:
             refuse_nothing_to_ignore([(view.image_path, view.mask) for view in views], masks)
         if self._halves:
             info = train_on_all(info)
-        if args.depths and fresh:
-            info = with_depth_maps(info, Path(args.source_path), args.depths)
+        if depths and fresh:
+            info = with_depth_maps(info, Path(args.source_path), depths)
         return info
 
     def _load_gaussians(self) -> None:
@@ -119,15 +122,16 @@ class Scene:
 
     def getTrainCameras(self, scale: float = 1.0) -> list[Camera]:
         """Training views at a resolution scale that the scene was made with."""
-        return self._train[scale]
+        return self.train_cameras[scale]
 
     def getTestCameras(self, scale: float = 1.0) -> list[Camera]:
         """Held-out views at a resolution scale that the scene was made with."""
-        return self._test[scale]
+        return self.test_cameras[scale]
 
     def prefetch(self, cameras: Sequence[Camera]) -> None:
         """Start to prepare the images of the views that come next, in that order (`images.ahead` of them)."""
-        self.images.prefetch([picture for camera in cameras for picture in camera.pictures])
+        ours = (camera for camera in cameras if getattr(camera, "images", None) is self.images)
+        self.images.prefetch([picture for camera in ours for picture in camera.pictures])
 
     def save(self, iteration: int, gaussians: SceneGaussians | None = None) -> None:
         """Write `point_cloud/iteration_N/point_cloud.ply`, and the exposures if they are trained.
@@ -156,32 +160,28 @@ class Scene:
         else:
             colors = np.round(info.point_cloud.colors * 255).astype(np.uint8)
             write_point_cloud(folder / "input.ply", info.point_cloud.points, colors)
-        entries = [camera_to_JSON(i, camera) for i, camera in enumerate(info.test_cameras + info.train_cameras)]
+        entries = [scene.camera_to_JSON(i, camera) for i, camera in enumerate(info.test_cameras + info.train_cameras)]
         with atomic_write(folder / "cameras.json") as path:
             path.write_text(json.dumps(entries, allow_nan=False), encoding="utf-8")
 
-    def _cameras(
-        self,
-        infos: list[CameraInfo],
-        args: argparse.Namespace,
-        device: torch.device,
-        shuffle: bool,
-        scales: Sequence[float],
-    ) -> dict[float, list[Camera]]:
-        """Cameras by scale, in the same order at every scale."""
-        order = list(range(len(infos)))
+    def _cameras(self, args: argparse.Namespace, scale: float, shuffle: bool, test: bool) -> list[Camera]:
+        """Cameras of the training or test list, in the same order at every scale."""
+        views = self.info.test_cameras if test else self.info.train_cameras
+        # By names of the package, because code of others may replace them there or in utils.camera_utils.
+        cameras = list(scene.cameraList_from_camInfos(views, scale, args, self.info.is_nerf_synthetic, test))
+        for camera in cameras:
+            if isinstance(camera, Camera):
+                camera.images = self.images
+        if self._halves:
+            mark_halves(cameras, views, self.info, test)
         if shuffle:
             # A generator of its own: a resumed run must get the same order, whatever drew random numbers before.
-            random.Random(0).shuffle(order)
-        lists = {}
-        for scale in scales:
-            cameras = cameraList_from_camInfos(infos, scale, args, self.images, device)
-            lists[scale] = [cameras[index] for index in order]
-        return lists
+            random.Random(0).shuffle(cameras)
+        return cameras
 
-
-def _pictures(lists: dict[float, list[Camera]]) -> list[Picture]:
-    return [picture for cameras in lists.values() for camera in cameras for picture in camera.pictures]
+    def _pictures(self, lists: dict[float, list[Camera]]) -> list[Picture]:
+        cameras = [camera for cameras in lists.values() for camera in cameras]
+        return [p for camera in cameras if getattr(camera, "images", None) is self.images for p in camera.pictures]
 
 
 def _refuse_dataset_folder(args: argparse.Namespace) -> None:

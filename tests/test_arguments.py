@@ -8,9 +8,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from arguments import (
+    GroupParams,
     ModelParams,
     OptimizationParams,
     OptionParser,
+    ParamGroup,
     PipelineParams,
     get_combined_args,
     read_cfg_args,
@@ -357,3 +359,73 @@ def test_abbreviations_of_the_reference_mean_the_same_in_spite_of_our_options(ca
 def test_options_of_ours_are_marked():
     options = [*ModelParams.options, *PipelineParams.options, *OptimizationParams.options]
     assert {option.name for option in options if option.ours} == set(OURS)
+
+
+def test_groups_carry_their_defaults_as_the_references_do():
+    parser = argparse.ArgumentParser()
+    model, pipeline, optimisation = ModelParams(parser), PipelineParams(parser), OptimizationParams(parser)
+    short = {"source_path", "model_path", "images", "depths", "resolution", "white_background"}
+    wanted = {f"_{name}" if name in short else name: value for name, value in MODEL.items()}
+    assert vars(model).items() >= wanted.items()
+    assert vars(pipeline) == PIPELINE
+    assert vars(optimisation).items() >= OPTIMISATION.items()
+    assert all(name.removeprefix("_") in {**MODEL, **PIPELINE, **OPTIMISATION, **OURS} for name in vars(model))
+    assert vars(ModelParams(argparse.ArgumentParser(), sentinel=True)) == vars(model)
+
+
+class _Style(ParamGroup):
+    """A group as code for the reference writes it."""
+
+    def __init__(self, parser, fill_none=False):
+        self.steps = 7
+        self.rate = 0.5
+        self._folder = "there"
+        self._loud = False
+        super().__init__(parser, "Style", fill_none)
+
+
+def test_attributes_of_a_group_are_its_options():
+    parser = argparse.ArgumentParser()
+    group = _Style(parser)
+    values = group.extract(parser.parse_args(["-f", "here", "--rate", "2", "-l"]))
+    assert isinstance(values, GroupParams) and isinstance(values, argparse.Namespace)
+    assert vars(values) == {"steps": 7, "rate": 2.0, "folder": "here", "loud": True}
+    assert repr(values) == "GroupParams(steps=7, rate=2.0, folder='here', loud=True)"
+    assert vars(group.extract(parser.parse_args([]))) == {"steps": 7, "rate": 0.5, "folder": "there", "loud": False}
+    assert (group.steps, group._folder) == (7, "there")
+    parser = argparse.ArgumentParser()
+    group = _Style(parser, True)
+    given = parser.parse_args(["--steps", "3"])
+    assert vars(given) == {"steps": 3, "rate": None, "folder": None, "loud": None}
+    assert vars(group.extract(given)) == {"steps": 3, "rate": 0.5, "folder": "there", "loud": False}
+
+
+class _MoreModelParams(ModelParams):
+    """A subclass with an option of its own, one that the reference has, and one that only we have."""
+
+    def __init__(self, parser, sentinel=False):
+        self.layers = 4
+        self.sh_degree = 1
+        self.masks = 2.5
+        super().__init__(parser, sentinel)
+
+
+def test_a_subclass_adds_options():
+    parser = argparse.ArgumentParser()
+    group = _MoreModelParams(parser)
+    values = group.extract(parser.parse_args(["--layers", "5", "-s", "a", "--masks", "inf"]))
+    assert (values.layers, values.masks) == (5, float("inf"))
+    assert values.sh_degree == group.sh_degree == 3  # the reference's own default wins there, too
+    assert vars(values).keys() == {"layers", *MODEL, *(o.name for o in ModelParams.options)}
+    with pytest.raises(UserError, match="^--sh_degree "):
+        group.extract(parser.parse_args(["--sh_degree", "7"]))
+
+
+def test_extracted_groups_take_foreign_and_lacking_names():
+    given = argparse.Namespace(sh_degree=2, source_path="/data", foreign=1)
+    values = ModelParams(argparse.ArgumentParser()).extract(given)
+    assert (values.sh_degree, values.source_path, values.images) == (2, "/data", "images")
+    assert not hasattr(values, "foreign")
+    empty = GroupParams()
+    empty.anything = 1
+    assert vars(empty) == {"anything": 1}

@@ -11,12 +11,21 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 from synthetic import FOCAL, make_colmap_scene
 
-from scene.cameras import Camera, MiniCam, camera_to_JSON
+from scene.cameras import Camera, MiniCam
 from scene.dataset_readers import CameraInfo
-from scene.pictures.store import ImageStore
 from scene.readers.colmap import read_colmap
-from utils import camera_utils
-from utils.graphics_utils import focal2fov, fov2focal, getProjectionMatrix, getWorld2View2
+from scene.views.of_info import view_of_info
+from utils.camera_utils import camera_to_JSON
+from utils.graphics_utils import (
+    focal2fov,
+    fov2focal,
+    geom_transform_points,
+    getProjectionMatrix,
+    getWorld2View,
+    getWorld2View2,
+    projection,
+    world_to_camera,
+)
 
 
 def _info(path: Path = Path("none.png"), **changes) -> CameraInfo:
@@ -38,7 +47,7 @@ def _info(path: Path = Path("none.png"), **changes) -> CameraInfo:
 
 
 def _camera(info: CameraInfo, size: tuple[int, int] | None = None) -> Camera:
-    return Camera(info, 3, size or info.file_size, ImageStore())
+    return Camera(view_of_info(info, 3, size or info.file_size))
 
 
 def _pixels(camera: Camera, points: np.ndarray) -> np.ndarray:
@@ -68,8 +77,40 @@ def test_matrices_are_the_formulas_transposed():
         assert got.dtype == torch.float32 and got.is_contiguous()
         np.testing.assert_allclose(got.numpy(), wanted, rtol=6e-8, atol=1e-7)
     assert (camera.uid, camera.colmap_id) == (3, 7)
-    np.testing.assert_array_equal(getWorld2View2(info.R, info.T), V)
-    np.testing.assert_allclose(getProjectionMatrix(n, f, camera.FoVx, camera.FoVy).numpy(), P, rtol=1e-15)
+    np.testing.assert_array_equal(world_to_camera(info.R, info.T), V)
+    np.testing.assert_allclose(projection(n, f, camera.FoVx, camera.FoVy).numpy(), P, rtol=1e-15)
+    for got, wanted in (
+        (getWorld2View(info.R, info.T), V),
+        (getWorld2View2(info.R, info.T), V),
+        (getProjectionMatrix(n, f, camera.FoVx, camera.FoVy).numpy(), P),
+    ):
+        assert got.dtype == np.float32
+        np.testing.assert_array_equal(got, wanted.astype(np.float32))
+
+
+@pytest.mark.parametrize("size", [1.0, 1.7])  # 1.7: the matrix of a scaled pose, no rotation
+def test_a_camera_is_moved_and_scaled_about_the_origin(size):
+    info = _info()
+    translate, scale = np.array([1.0, -2.0, 0.5]), 3.0
+    R = info.R * size
+    V = np.eye(4)
+    V[:3, :3], V[:3, 3] = R.T, info.T
+    pose = np.linalg.inv(V)
+    pose[:3, 3] = (pose[:3, 3] + translate) * scale
+    np.testing.assert_allclose(getWorld2View2(R, info.T, translate, scale), np.linalg.inv(pose), rtol=1e-6, atol=1e-6)
+    for moved, there in ((Camera(replace(view_of_info(info, 0, (8, 6)), R=R, trans=translate, scale=scale)), pose),
+                         (Camera(replace(view_of_info(info, 0, (8, 6)), R=R)), np.linalg.inv(V))):  # fmt: skip
+        np.testing.assert_allclose(moved.camera_center.numpy(), there[:3, 3], rtol=1e-6)
+        np.testing.assert_allclose(moved.world_view_transform.T.numpy(), np.linalg.inv(there), rtol=1e-6, atol=1e-6)
+    assert (moved.trans == 0).all() and moved.scale == 1
+
+
+def test_points_are_transformed_and_divided():
+    matrix = np.random.default_rng(0).uniform(0.5, 1, (4, 4))
+    points = np.random.default_rng(1).uniform(0, 1, (5, 3))
+    moved = np.concatenate([points, np.ones((5, 1))], axis=1) @ matrix
+    got = geom_transform_points(torch.from_numpy(points), torch.from_numpy(matrix))
+    np.testing.assert_allclose(got.numpy(), moved[:, :3] / (moved[:, 3:] + 1e-7), rtol=1e-14)
 
 
 def test_field_of_view_is_the_models_at_every_size():
@@ -113,7 +154,7 @@ def test_target_without_alpha_stays_uint8(tmp_path):
     Image.fromarray(pixels).save(tmp_path / "a.png")
     camera = _camera(_info(tmp_path / "a.png"), (8, 6))
     target = camera.target(torch.ones(3))
-    assert target.dtype == torch.uint8 and camera.alpha_mask is None
+    assert target.dtype == torch.uint8 and torch.equal(camera.alpha_mask, torch.ones(1, 6, 8))
     np.testing.assert_array_equal(target.permute(1, 2, 0).numpy(), pixels)
     assert torch.equal(camera.original_image, target.float() / 255)
 
@@ -152,8 +193,3 @@ def test_json_entry_has_the_known_keys_and_full_size_values():
     assert (entry["fx"], entry["fy"]) == (210.0, 190.0)
     np.testing.assert_allclose(entry["position"], -info.R @ info.T)
     np.testing.assert_array_equal(entry["rotation"], info.R)
-
-
-def test_names_known_to_users_of_the_reference():
-    assert camera_utils.camera_to_JSON is camera_to_JSON
-    assert callable(camera_utils.cameraList_from_camInfos)

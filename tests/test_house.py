@@ -25,7 +25,7 @@ MAY_IMPORT = {
     "utils.host": (),
     "utils.exact": (),
     "utils.files": ("utils",),
-    "utils.camera_utils": ("scene.cameras",),  # a name of the reference
+    "utils.camera_utils": ("scene.cameras", "scene.views", "scene.options", "scene.pictures", "scene.readers", "utils"),
     "utils.make_depth_scale": ("scene.readers.depth_scale", "utils"),  # a command of the reference
     "arguments": ("utils",),
     "records": ("utils",),
@@ -34,9 +34,11 @@ MAY_IMPORT = {
     "scene.gaussians": ("utils",),
     "scene.gaussian_model": ("scene.gaussians", "scene.readers.info", "utils"),
     "scene.dataset_readers": ("scene.readers", "scene.pictures", "utils"),
-    "scene.cameras": ("scene.readers.info", "scene.pictures", "utils"),
-    "scene": ("arguments", "utils"),
-    "gaussian_renderer": ("scene", "arguments", "utils"),
+    "scene.options": (),
+    "scene.views": ("scene.readers.depth_maps", "scene.readers.info", "scene.pictures", "utils"),
+    "scene.cameras": ("scene.views", "scene.pictures", "utils"),
+    "scene": ("utils",),  # not arguments: a client's own package of that name may be found first
+    "gaussian_renderer": ("scene", "utils"),
     "training": ("gaussian_renderer", "scene", "records", "arguments", "utils"),
     "training.observers": ("training", "gaussian_renderer", "scene", "records", "arguments", "utils"),
     "diagnosis": ("gaussian_renderer", "scene", "arguments", "utils"),
@@ -222,17 +224,23 @@ def test_the_model_loads_no_reader_but_the_records():
 
 def test_what_users_import_is_there():
     code = """
+from arguments import GroupParams, ModelParams, OptimizationParams, ParamGroup, PipelineParams, get_combined_args
 from scene import GaussianModel, Scene, cameras, searchForMaxIteration
+from scene import cameraList_from_camInfos as listed, camera_to_JSON as entry, sceneLoadTypeCallbacks as callbacks
 from scene.colmap_loader import read_model
 from scene.cameras import Camera, MiniCam
 from scene.dataset_readers import CameraInfo, SceneInfo, sceneLoadTypeCallbacks
 from scene.gaussian_model import GaussianModel as same
 from train import prepare_output_and_logger, training, training_report
-from utils.camera_utils import cameraList_from_camInfos, camera_to_JSON
+from utils.camera_utils import Camera as camera_class, cameraList_from_camInfos, camera_to_JSON, loadCam
+from utils.graphics_utils import BasicPointCloud, focal2fov, fov2focal, geom_transform_points
+from utils.graphics_utils import getProjectionMatrix, getWorld2View, getWorld2View2
 from utils.system_utils import Terminated, compute_device, mkdir_p, searchForMaxIteration
 import scene
 assert scene.cameras is cameras and {"Scene", "cameras"} <= set(dir(scene))
-assert same is GaussianModel and Scene.__module__ == "scene.scene" and cameras.Camera is Camera
+assert same is GaussianModel and Scene.__module__ == "scene.scene" and cameras.Camera is Camera is camera_class
+assert (listed, entry, callbacks) == (cameraList_from_camInfos, camera_to_JSON, sceneLoadTypeCallbacks)
+assert scene.ModelParams is ModelParams
 """
     subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True)
     with pytest.raises(ImportError, match="no_such_name"):

@@ -215,6 +215,18 @@ def test_a_gpu_keeps_what_fits_its_share(files, monkeypatch):
     assert store.keep_on.type == "cpu" and store.planned_bytes == 10 * 128  # pinned in powers of two
 
 
+def test_floats_are_kept_where_there_is_room_for_them(files, monkeypatch):
+    assert ImageStore(0).keeps_floats and not ImageStore(3).keeps_floats
+    assert not ImageStore(0, "cpu", "cuda").keeps_floats  # a copy of the bytes is faster than one of floats
+    share = 10 * 4 * 6 * 4 * 4  # of a GPU's free memory that ten RGBA pictures take if a quarter of it may be used
+    monkeypatch.setattr("scene.pictures.store.DeviceCopies", lambda device: object())
+    for free, kept in ((4 * share, True), (4 * share - 1, False)):
+        monkeypatch.setattr("scene.pictures.store.free_memory", lambda device, free=free: free)
+        store = ImageStore(0, "cuda", "cuda")
+        store.plan(_pictures(files))
+        assert store.keep_on.type == "cuda" and store.keeps_floats == kept
+
+
 @pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no NVIDIA GPU")
 @pytest.mark.parametrize("limit", [0, 3])

@@ -16,8 +16,7 @@ from PIL import Image
 from plyfile import PlyData
 from synthetic import make_colmap_scene
 
-from scene import colmap_loader, dataset_readers
-from scene.cameras import camera_to_JSON
+from scene import colmap_loader
 from scene.dataset_readers import (
     BasicPointCloud,
     CameraInfo,
@@ -412,27 +411,6 @@ def test_callbacks_are_the_readers_and_can_be_called(colmap_scene, blender_scene
     assert sceneLoadTypeCallbacks["Blender"] is readNerfSyntheticInfo
     assert len(sceneLoadTypeCallbacks["Colmap"](str(colmap_scene), "images", "", True, False).test_cameras) == 3
     assert len(sceneLoadTypeCallbacks["Blender"](str(blender_scene), False, "", True).test_cameras) == 2
-
-
-def test_a_callback_of_other_code_takes_the_place_of_ours(colmap_scene, blender_scene, monkeypatch):
-    calls = []
-
-    def colmap(path, images, depths, eval, train_test_exp, llffhold=8):
-        calls.append((path, images, depths, eval, train_test_exp))
-        info = readColmapSceneInfo(path, images, depths, eval, train_test_exp, 4)
-        return SceneInfo(
-            info.point_cloud, info.train_cameras, info.test_cameras, info.nerf_normalization, info.ply_path
-        )
-
-    def blender(path, white_background, depths, eval, extension=".png"):
-        calls.append((path, white_background, depths, eval))
-        return readNerfSyntheticInfo(path, white_background, depths, eval, extension)
-
-    monkeypatch.setitem(sceneLoadTypeCallbacks, "Colmap", colmap)
-    monkeypatch.setitem(dataset_readers.sceneLoadTypeCallbacks, "Blender", blender)
-    assert len(read_scene(colmap_scene, "images", True).test_cameras) == 5
-    assert len(read_scene(blender_scene, "images", True).test_cameras) == 2
-    assert calls == [(str(colmap_scene), "images", "", True, False), (str(blender_scene), False, "", True)]
 
 
 def test_argument_names_are_the_references():

@@ -1,5 +1,72 @@
-"""Names that users of the reference import from here; the code lives with the cameras."""
+"""Cameras of a dataset's views, and their entries in `cameras.json`."""
 
-from scene.cameras import camera_to_JSON, cameraList_from_camInfos
+import argparse
+from collections.abc import Sequence
 
-__all__ = ["cameraList_from_camInfos", "camera_to_JSON"]
+import numpy as np
+
+from scene.cameras import Camera
+from scene.options import option
+from scene.pictures.resolution import training_size
+from scene.readers.info import CameraInfo
+from scene.views.of_info import file_size, view_of_info
+from scene.views.view import half
+from utils.graphics_utils import camera_center, fov2focal
+
+__all__ = ["Camera", "cameraList_from_camInfos", "camera_to_JSON", "loadCam"]
+
+
+def loadCam(
+    args: argparse.Namespace,
+    id: int,
+    cam_info: CameraInfo,
+    resolution_scale: float,
+    is_nerf_synthetic: bool = False,
+    is_test_dataset: bool = False,
+) -> Camera:
+    """Camera at training size (args.resolution, divided by resolution_scale), whose photo is decoded on first use.
+
+    args: resolution, data_device and train_test_exp count. id: uid of the camera. cam_info: a CameraInfo, or any record
+    with the reference's fields. is_nerf_synthetic: depth maps named by `depth_path` have Blender's unit.
+    is_test_dataset: the view is in the test list. UserError for a photo or depth map that cannot be read.
+    """
+    size = training_size(*file_size(cam_info), args.resolution, resolution_scale)
+    view = view_of_info(cam_info, id, size, is_nerf_synthetic)
+    view.data_device = args.data_device
+    if option(args, "train_test_exp") and getattr(cam_info, "is_test", False):
+        view.columns = half(size[0], is_test_dataset)
+    return Camera(view)
+
+
+def cameraList_from_camInfos(
+    cam_infos: Sequence[CameraInfo],
+    resolution_scale: float,
+    args: argparse.Namespace,
+    is_nerf_synthetic: bool = False,
+    is_test_dataset: bool = False,
+) -> list[Camera]:
+    """`loadCam` of each view; their uids count from 0."""
+    return [
+        loadCam(args, uid, info, resolution_scale, is_nerf_synthetic, is_test_dataset)
+        for uid, info in enumerate(cam_infos)
+    ]
+
+
+def camera_to_JSON(id: int, camera: CameraInfo) -> dict[str, object]:
+    """Entry of `cameras.json`, keys in the order that viewers expect: camera-to-world pose, full-size intrinsics.
+
+    camera: any object with R, T, FovX, FovY, width, height and image_name; its fx and fy count if it has them.
+    """
+    focal = {"fy": ("FovY", "height"), "fx": ("FovX", "width")}
+    return {
+        "id": id,
+        "img_name": camera.image_name,
+        "width": camera.width,
+        "height": camera.height,
+        "position": camera_center(camera.R, camera.T).tolist(),
+        "rotation": [row.tolist() for row in np.asarray(camera.R)],
+        **{
+            name: getattr(camera, name, None) or fov2focal(getattr(camera, fov), getattr(camera, size))
+            for name, (fov, size) in focal.items()
+        },
+    }

@@ -7,6 +7,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+_NOT_MOVED = np.zeros(3)
+
 
 class BasicPointCloud(NamedTuple):
     """Coloured points: points (N,3), world units; colors (N,3) float32 in [0,1]; normals (N,3) float32.
@@ -19,15 +21,40 @@ class BasicPointCloud(NamedTuple):
     normals: np.ndarray
 
 
-def getWorld2View2(R: np.ndarray, t: np.ndarray) -> np.ndarray:
-    """World-to-camera matrix (4,4) float64 of a camera-to-world rotation R (3,3) and world-to-camera translation t."""
+def world_to_camera(R: np.ndarray, t: np.ndarray, translate: np.ndarray = _NOT_MOVED, scale: float = 1.0) -> np.ndarray:
+    """World-to-camera matrix (4,4) float64 of a camera-to-world rotation R (3,3), a world-to-camera translation t (3,).
+
+    translate (3,), scale: put the camera's centre c at (c + translate) * scale.
+    """
     matrix = np.eye(4)
     matrix[:3, :3] = np.transpose(R)
     matrix[:3, 3] = t
+    if scale != 1 or np.any(translate):
+        matrix[:3, 3] = -matrix[:3, :3] @ ((camera_center(R, t) + translate) * scale)
     return matrix
 
 
-def getProjectionMatrix(
+def camera_center(R: np.ndarray, t: np.ndarray) -> np.ndarray:
+    """Centre (3,) of a camera in the world. R (3,3): camera-to-world rotation; t (3,): world-to-camera translation.
+
+    An R that is no rotation, as of a scaled pose, is inverted.
+    """
+    R = np.asarray(R)
+    is_rotation = np.allclose(R.T @ R, np.eye(3), rtol=0, atol=1e-3)
+    return -R @ t if is_rotation else -np.linalg.solve(R.T, t)
+
+
+def getWorld2View(R: np.ndarray, t: np.ndarray) -> np.ndarray:
+    """World-to-camera matrix (4,4) float32 of a camera-to-world rotation R (3,3) and world-to-camera translation t."""
+    return world_to_camera(R, t).astype(np.float32)
+
+
+def getWorld2View2(R: np.ndarray, t: np.ndarray, translate: np.ndarray = _NOT_MOVED, scale: float = 1.0) -> np.ndarray:
+    """Do as `world_to_camera`; float32."""
+    return world_to_camera(R, t, translate, scale).astype(np.float32)
+
+
+def projection(
     znear: float, zfar: float, fovX: float, fovY: float, offsetX: float = 0.0, offsetY: float = 0.0
 ) -> Tensor:
     """Perspective matrix (4,4) float64 for column vectors: x, y to [-1,1], depth z in [znear, zfar] to [0,1].
@@ -44,6 +71,17 @@ def getProjectionMatrix(
     P[2, 3] = -zfar * znear / (zfar - znear)
     P[3, 2] = 1
     return P
+
+
+def getProjectionMatrix(znear: float, zfar: float, fovX: float, fovY: float) -> Tensor:
+    """`projection` of a principal point in the middle; float32."""
+    return projection(znear, zfar, fovX, fovY).float()
+
+
+def geom_transform_points(points: Tensor, transf_matrix: Tensor) -> Tensor:
+    """Points (N,3) under a transposed (4,4) matrix, divided by w + 1e-7: (N,3)."""
+    moved = torch.cat([points, torch.ones_like(points[:, :1])], dim=1) @ transf_matrix
+    return moved[:, :3] / (moved[:, 3:] + 1e-7)
 
 
 def fov2focal(fov: float, pixels: float) -> float:

@@ -42,27 +42,31 @@ def may_be_transparent(path: Path) -> bool:
 
 
 def decode(path: Path, size: tuple[int, int]) -> Tensor:
-    """Image (3,H,W) uint8 of a file, or (4,H,W) with straight alpha if it has any, at size (width, height).
-
-    Resized by Pillow's bicubic filter, antialiased when shrinking, with colours weighted by alpha (premultiplied). EXIF
-    orientation is ignored, as in COLMAP. Grey, palette, CMYK and 16-bit files become 8-bit RGB. UserError for a file
-    that cannot be read.
-    """
+    """Do as `pixels_of` for a file; EXIF orientation is ignored, as in COLMAP. UserError if it cannot be read."""
     try:
         with Image.open(path) as image:
-            image = _to_rgb_or_rgba(image)
-        if image.size != size:
-            image = image.resize(size, Image.Resampling.BICUBIC)
-        pixels = np.asarray(image)
-        if pixels.shape[-1] == 4 and pixels[..., 3].min() == 255:
-            pixels = pixels[..., :3]
-        return torch.from_numpy(np.ascontiguousarray(pixels.transpose(2, 0, 1)))
+            return pixels_of(image, size)
     except UNREADABLE as error:
         raise _unreadable(path, error) from error
     except MemoryError as error:
         raise UserError(
             f"not enough memory for {path} at {size[0]} x {size[1]} pixels; choose a smaller size with -r"
         ) from error
+
+
+def pixels_of(image: Image.Image, size: tuple[int, int]) -> Tensor:
+    """Image (3,H,W) uint8, or (4,H,W) with straight alpha if it has any, at size (width, height).
+
+    Resized by Pillow's bicubic filter, antialiased when shrinking, with colours weighted by alpha (premultiplied).
+    Grey, palette, CMYK and 16-bit images become 8-bit RGB.
+    """
+    image = _to_rgb_or_rgba(image)
+    if image.size != size:
+        image = image.resize(size, Image.Resampling.BICUBIC)
+    pixels = np.asarray(image)
+    if pixels.shape[-1] == 4 and pixels[..., 3].min() == 255:
+        pixels = pixels[..., :3]
+    return torch.from_numpy(np.ascontiguousarray(pixels.transpose(2, 0, 1)))
 
 
 def _unreadable(path: Path, error: Exception) -> UserError:

@@ -57,6 +57,7 @@ class ImageStore:
         self._planned: set[Key] = set()
         self._awaited: set[Key] = set()  # planned for training, and not decoded yet
         self._workers = threads()
+        self._room_for_floats = True
         self._threads: ThreadPoolExecutor | None = None
         self._copies: DeviceCopies | None = None
 
@@ -70,8 +71,11 @@ class ImageStore:
         self._planned = self._awaited | {_key(source, size) for source, size in others}
         if self.limit >= len(self._planned):
             self.limit = 0
-        if self.keep_on.type == "cuda" and self.planned_bytes > GPU_SHARE * free_memory(self.keep_on):
-            self.keep_on = torch.device("cpu")
+        if self.keep_on.type == "cuda":
+            free = free_memory(self.keep_on)
+            self._room_for_floats = 4 * self.planned_bytes <= GPU_SHARE * free
+            if self.planned_bytes > GPU_SHARE * free:
+                self.keep_on = torch.device("cpu")
         if self.device.type == "cuda" and self.keep_on.type == "cpu":
             self._copies = DeviceCopies(self.device)
 
@@ -82,6 +86,11 @@ class ImageStore:
         if self._copies:
             sizes = [1 << (size - 1).bit_length() for size in sizes]  # torch pins memory in powers of two
         return sum(sizes[: self.limit or None])
+
+    @property
+    def keeps_floats(self) -> bool:
+        """Whether images may also be kept as float32 where they are computed with, four times as large."""
+        return not self.limit and self.keep_on.type == self.device.type and self._room_for_floats
 
     def get(self, source: Source, size: Size) -> Tensor:
         """Image (3 or 4,H,W) uint8 of a photo, or the tensor that another source decodes to, on the store's device.
@@ -174,17 +183,25 @@ def picture_device(data_device: str, fallback: torch.device) -> torch.device:
 
     A message says when the option is not followed, except for plain `cuda` when no GPU computes.
     """
+    device, reason = _choice(data_device, fallback)
+    if reason:
+        print(f"warning: --data_device {data_device} {reason}; photos are kept on {fallback}", file=sys.stderr)
+    return device
+
+
+def usable_device(data_device: str, fallback: torch.device) -> torch.device:
+    """Do as `picture_device`, without a message."""
+    return _choice(data_device, fallback)[0]
+
+
+def _choice(data_device: str, fallback: torch.device) -> tuple[torch.device, str | None]:
+    """The device, and the reason why it is not the wanted one, if that needs a message."""
     try:
         wanted = torch.device(data_device)
     except RuntimeError:
         wanted = None
     if wanted is None or wanted.type not in ("cpu", "cuda"):
-        reason = "is neither cpu nor cuda"
-    elif wanted.type == "cpu" or (fallback.type == "cuda" and (wanted.index or 0) < torch.cuda.device_count()):
-        return wanted
-    elif wanted.index is None:
-        return fallback
-    else:
-        reason = "is not available"
-    print(f"warning: --data_device {data_device} {reason}; photos are kept on {fallback}", file=sys.stderr)
-    return fallback
+        return fallback, "is neither cpu nor cuda"
+    if wanted.type == "cpu" or (fallback.type == "cuda" and (wanted.index or 0) < torch.cuda.device_count()):
+        return wanted, None
+    return fallback, None if wanted.index is None else "is not available"

@@ -1,0 +1,353 @@
+"""Cameras made with the arguments of either release of the reference, and what other code does with a camera."""
+
+import copy
+import inspect
+import math
+import pickle
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from gaussians import model, pipeline
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+from gaussian_renderer import render
+from gaussian_renderer.scored_views import ScoredViews
+from scene.cameras import Camera
+from scene.pictures.masks import Mask
+from scene.pictures.store import ImageStore
+from scene.readers.info import CameraInfo
+from scene.views.of_info import view_of_info
+
+WIDTH, HEIGHT = 40, 24
+R = Rotation.from_euler("xyz", [20, -35, 60], degrees=True).as_matrix()
+T = np.array([0.3, -0.2, 4.0])
+FOV_X, FOV_Y = 0.8, 0.5
+MATRICES = ("world_view_transform", "projection_matrix", "full_proj_transform", "camera_center")
+RNG = np.random.default_rng(0)
+
+
+def _photo(channels: int = 3) -> Image.Image:
+    return Image.fromarray(RNG.integers(0, 256, (HEIGHT, WIDTH, channels), dtype=np.uint8))
+
+
+def _newer(image: Image.Image | None = None, **changes) -> Camera:
+    """A camera of the 2024 release, by keyword as that release's code makes it."""
+    values = {
+        "resolution": (WIDTH, HEIGHT), "colmap_id": 7, "R": R, "T": T, "FoVx": FOV_X, "FoVy": FOV_Y,
+        "depth_params": None, "image": _photo() if image is None else image, "invdepthmap": None,
+        "image_name": "a.png", "uid": 3,
+    }  # fmt: skip
+    return Camera(**{**values, **changes})
+
+
+def _older(image: torch.Tensor, alpha: torch.Tensor | None = None, **changes) -> Camera:
+    values = {"colmap_id": 7, "R": R, "T": T, "FoVx": FOV_X, "FoVy": FOV_Y, "image_name": "a", "uid": 3}
+    return Camera(image=image, gt_alpha_mask=alpha, **{**values, **changes})
+
+
+def _of_file(path: Path, size: tuple[int, int] = (WIDTH, HEIGHT), **changes) -> Camera:
+    focal = {"fx": 50.0, "fy": 50.0, "cx": WIDTH / 2, "cy": HEIGHT / 2, "width": WIDTH, "height": HEIGHT}
+    info = CameraInfo(uid=1, R=R, T=T, **focal, image_path=path, image_name=path.name, file_size=size, **changes)
+    return Camera(view_of_info(info, 0, size))
+
+
+def _wanted_matrices(center_moved_by: np.ndarray, scale: float) -> dict[str, np.ndarray]:
+    V = np.eye(4)
+    V[:3, :3], V[:3, 3] = R.T, T
+    pose = np.linalg.inv(V)
+    pose[:3, 3] = (pose[:3, 3] + center_moved_by) * scale
+    V = np.linalg.inv(pose)
+    near, far = 0.01, 100.0
+    P = np.zeros((4, 4))
+    P[0, 0], P[1, 1] = 1 / math.tan(FOV_X / 2), 1 / math.tan(FOV_Y / 2)
+    P[2, 2], P[2, 3], P[3, 2] = far / (far - near), -far * near / (far - near), 1
+    return dict(zip(MATRICES, (V.T, P.T, V.T @ P.T, pose[:3, 3]), strict=True))
+
+
+@pytest.mark.parametrize(("trans", "scale"), [(np.zeros(3), 1.0), (np.array([0.5, -1.0, 2.0]), 1.5)])
+@pytest.mark.parametrize("newer", [True, False])
+def test_both_forms_have_the_references_attributes(newer, trans, scale):
+    moved = {"trans": trans, "scale": scale}
+    camera = _newer(**moved) if newer else _older(torch.zeros(3, HEIGHT, WIDTH), **moved)
+    for name, wanted in _wanted_matrices(trans, scale).items():
+        got = getattr(camera, name)
+        assert got.dtype == torch.float32 and got.device == camera.device
+        np.testing.assert_allclose(got.cpu().numpy(), wanted, rtol=2e-7, atol=2e-7)
+    assert (camera.uid, camera.colmap_id, camera.image_name) == (3, 7, "a.png" if newer else "a")
+    assert camera.R is R and camera.T is T and (camera.FoVx, camera.FoVy) == (FOV_X, FOV_Y)
+    assert (camera.image_width, camera.image_height, camera.znear, camera.zfar) == (WIDTH, HEIGHT, 0.01, 100.0)
+    assert (camera.trans == trans).all() and camera.scale == scale and camera.data_device == camera.device
+    assert camera.fx == pytest.approx(WIDTH / 2 / math.tan(FOV_X / 2)) and (camera.cx, camera.cy) == (20, 12)
+    assert camera.original_image.shape == (3, HEIGHT, WIDTH) and camera.alpha_mask.shape == (1, HEIGHT, WIDTH)
+    assert camera.alpha_mask.all() and camera.mask is None and camera.columns is None
+    assert camera.invdepthmap is None and camera.depth_mask is None and camera.depth_reliable is False
+    assert isinstance(camera, torch.nn.Module) and not list(camera.parameters())
+
+
+def test_arguments_by_position():
+    photo = _photo()
+    common = (7, R, T, FOV_X, FOV_Y)
+    moved = (np.array([1.0, 0.0, 0.0]), 2.0, "cpu")
+    depth = RNG.random((HEIGHT, WIDTH))
+    newer = Camera((WIDTH, HEIGHT), *common, None, photo, depth, "a.png", 3, *moved, True, True, True)
+    image = torch.from_numpy(np.asarray(photo).transpose(2, 0, 1) / 255.0).float()
+    older = Camera(*common, image, torch.ones(1, HEIGHT, WIDTH), "a.png", 3, *moved)
+    for name in MATRICES:
+        assert torch.equal(getattr(newer, name), getattr(older, name))
+    assert torch.equal(newer.original_image, older.original_image)
+    assert (newer.uid, older.uid, newer.scale, older.scale) == (3, 3, 2.0, 2.0)
+    assert newer.columns == slice(WIDTH // 2, WIDTH) and newer.depth_reliable
+    for size in ([WIDTH, HEIGHT], np.array([WIDTH, HEIGHT]), torch.Size([WIDTH, HEIGHT])):
+        assert Camera(size, *common, None, photo, None, "a.png", 3).image_width == WIDTH
+
+
+def test_what_is_neither_form_is_refused():
+    names = [*inspect.signature(Camera).parameters]
+    assert names[:6] == ["resolution", "colmap_id", "R", "T", "FoVx", "FoVy"] and names[-1] == "is_test_view"
+    with pytest.raises(TypeError, match="resolution"):
+        Camera(colmap_id=7, R=R, T=T)
+    with pytest.raises(TypeError, match="gt_alpha_mask"):
+        Camera(7, R, T, FOV_X, FOV_Y, image=torch.zeros(3, 2, 2), image_name="a", uid=0)
+    with pytest.raises(TypeError, match="unknown"):
+        _newer(unknown=1)
+
+
+KINDS = {
+    "rgb": lambda: _photo(),
+    "rgba": lambda: _photo(4),
+    "opaque": lambda: _photo().convert("RGBA"),
+    "grey": lambda: _photo().convert("L"),
+    "palette": lambda: _photo().convert("P"),
+    "16-bit": lambda: Image.fromarray(RNG.integers(0, 65536, (HEIGHT, WIDTH), dtype=np.uint16)),
+}
+
+
+@pytest.mark.parametrize("size", [(WIDTH, HEIGHT), (17, 11)])
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_pil_image_is_seen_as_its_file_is(tmp_path, kind, size):
+    path = tmp_path / "a.png"
+    KINDS[kind]().save(path)
+    of_file = _of_file(path, size)
+    with Image.open(path) as image:
+        given = _newer(image, resolution=size)
+    background = torch.tensor([0.2, 0.5, 1.0])
+    target = given.target(background)
+    assert target.dtype == of_file.target(background).dtype and target.shape == (3, size[1], size[0])
+    assert torch.equal(target, of_file.target(background))
+    assert torch.equal(given.original_image, of_file.original_image)
+    assert torch.equal(given.alpha_mask, of_file.alpha_mask) and (given.alpha_mask == 1).all() == (kind != "rgba")
+    assert given.pictures == [] and of_file.pictures == [(path, size)]
+
+
+def test_resized_by_pillow():
+    photo = _photo()
+    wanted = np.asarray(photo.resize((17, 11))).transpose(2, 0, 1) / np.float32(255)
+    np.testing.assert_array_equal(_newer(photo, resolution=(17, 11)).original_image.cpu().numpy(), wanted)
+
+
+@pytest.mark.parametrize(
+    ("params", "wanted", "reliable"),
+    [
+        (None, (1, 0), True),
+        ({"scale": 2.0, "offset": 0.25, "med_scale": 1.0}, (2, 0.25), True),
+        ({"scale": 0.19, "offset": 0.25, "med_scale": 1.0}, (0.19, 0.25), False),
+        ({"scale": 5.1, "offset": 0.25, "med_scale": 1.0}, (5.1, 0.25), False),
+        ({"scale": 0.0, "offset": 0.25, "med_scale": 1.0}, (1, 0), False),
+    ],
+)
+def test_inverse_depth_in_memory(params, wanted, reliable):
+    depth = RNG.uniform(-0.5, 1, (HEIGHT, WIDTH)).astype(np.float32)
+    camera = _newer(invdepthmap=depth, depth_params=params)
+    expected = np.maximum(depth, 0).astype(np.float64) * wanted[0] + wanted[1]
+    np.testing.assert_allclose(camera.invdepthmap[0].cpu().numpy(), expected, rtol=1e-6)
+    assert camera.invdepthmap.dtype == torch.float32 and camera.depth_reliable is reliable
+    assert torch.equal(camera.depth_mask, torch.full((1, HEIGHT, WIDTH), float(reliable)))
+
+
+def test_inverse_depth_is_resized_bilinearly():
+    depth = RNG.random((2, 2, 3))
+    (a, b), (c, d) = depth[..., 0]  # the first channel counts
+    camera = _newer(invdepthmap=depth, resolution=(4, 2))
+    wanted = [[a, 0.75 * a + 0.25 * b, 0.25 * a + 0.75 * b, b], [c, 0.75 * c + 0.25 * d, 0.25 * c + 0.75 * d, d]]
+    np.testing.assert_allclose(camera.invdepthmap[0].cpu().numpy(), wanted, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("flags", "counted"),
+    [
+        ((True, False, False), slice(None)),
+        ((True, False, True), slice(0, 20)),
+        ((True, True, True), slice(20, None)),
+        ((False, True, True), slice(None)),
+    ],
+)
+def test_a_half_of_a_test_view_counts(flags, counted):
+    names = ("train_test_exp", "is_test_dataset", "is_test_view")
+    camera = _newer(_photo(4), invdepthmap=RNG.random((3, 4)), **dict(zip(names, flags, strict=True)))
+    whole = _newer(_photo(4)).alpha_mask
+    assert (camera.alpha_mask[..., counted] > 0).any() and camera.depth_mask[..., counted].all()
+    for mask in (camera.alpha_mask, camera.depth_mask):
+        mask[..., counted] = 0
+        assert not mask.any() and mask.shape == whole.shape
+
+
+def test_a_float_image_keeps_its_values():
+    image = torch.from_numpy(RNG.uniform(-0.5, 1.5, (3, HEIGHT, WIDTH))).float()
+    clamped = image.clamp(0, 1)
+    camera = _older(image)
+    assert torch.equal(camera.original_image, clamped) and camera.original_image.dtype == torch.float32
+    assert torch.equal(camera.target(torch.ones(3)), clamped) and camera.pictures == []
+    alpha = torch.from_numpy(RNG.random((1, HEIGHT, WIDTH))).float()
+    camera = _older(image, alpha)
+    assert torch.equal(camera.original_image, clamped * alpha) and torch.equal(camera.alpha_mask, alpha)
+    background = torch.tensor([0.2, 0.5, 1.0])
+    wanted = clamped * alpha + (1 - alpha) * background[:, None, None]
+    torch.testing.assert_close(camera.target(background), wanted, rtol=0, atol=1e-6)
+    assert camera.ground_truth(background)[1] is None
+    assert _older(image.double()).original_image.dtype == torch.float64
+    assert _older(image.double()).target(background).dtype == torch.float32  # as the loss wants it
+
+
+ASSIGNED = {
+    "uid": 9, "colmap_id": 8, "R": np.eye(3), "T": np.ones(3), "FoVx": 1.1, "FoVy": 1.2, "image_name": "b",
+    "data_device": "somewhere", "original_image": torch.rand(3, 2, 2), "alpha_mask": None, "image_width": 5,
+    "image_height": 6, "invdepthmap": torch.rand(1, 2, 2), "depth_mask": torch.rand(1, 2, 2), "depth_reliable": True,
+    "zfar": 7.0, "znear": 0.5, "trans": np.ones(3), "scale": 4.0, "world_view_transform": torch.rand(4, 4),
+    "projection_matrix": torch.rand(4, 4), "full_proj_transform": torch.rand(4, 4), "camera_center": torch.rand(3),
+    "features_of_their_own": torch.rand(2),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", ASSIGNED)
+def test_what_is_assigned_is_read_back(name):
+    camera = _newer()
+    before = camera.world_view_transform.clone()
+    setattr(camera, name, ASSIGNED[name])
+    assert getattr(camera, name) is ASSIGNED[name]
+    if name != "world_view_transform":
+        assert torch.equal(camera.world_view_transform, before)  # nothing is computed again
+    copied, loaded = copy.deepcopy(camera), pickle.loads(pickle.dumps(camera))
+    for other in (copied, loaded):
+        np.testing.assert_array_equal(getattr(other, name), ASSIGNED[name])
+
+
+def test_parameters_may_be_added():
+    camera = _newer()
+    camera.delta = torch.nn.Parameter(torch.zeros(6))
+    assert [name for name, _ in camera.named_parameters()] == ["delta"]
+    assert copy.deepcopy(camera).delta.requires_grad
+
+
+def test_an_assigned_image_is_the_target():
+    background = torch.tensor([0.2, 0.5, 1.0])
+    image, alpha = torch.rand(3, HEIGHT, WIDTH), torch.rand(1, HEIGHT, WIDTH)
+    camera = _newer()
+    camera.original_image = image
+    assert torch.equal(camera.target(background), image)
+    camera.alpha_mask = alpha
+    wanted = image * alpha + (1 - alpha) * background[:, None, None]
+    torch.testing.assert_close(camera.ground_truth(background)[0], wanted, rtol=0, atol=1e-6)
+    camera = _newer(_photo(4))
+    own = camera.alpha_mask
+    camera.original_image = image
+    wanted = image * own + (1 - own) * background[:, None, None]
+    torch.testing.assert_close(camera.target(background), wanted, rtol=0, atol=1e-6)
+
+
+def test_the_renderer_uses_what_is_assigned():
+    gaussians, black = model(30), torch.zeros(3)
+    here, there = _newer(), _newer(T=T + 0.3)
+    wanted = render(there, gaussians, pipeline(), black)["render"]
+    assert not torch.equal(render(here, gaussians, pipeline(), black)["render"], wanted)
+    for name in MATRICES:
+        setattr(here, name, getattr(there, name))
+    assert torch.equal(render(here, gaussians, pipeline(), black)["render"], wanted)
+    here.image_width, here.image_height = 16, 8
+    assert render(here, gaussians, pipeline(), black)["render"].shape == (3, 8, 16)
+    assert here.original_image.shape == (3, HEIGHT, WIDTH)  # the photo's size stays
+
+
+def test_views_in_memory_are_scored_as_those_of_files(tmp_path):
+    photo = _photo(4)
+    photo.save(tmp_path / "a.png")
+    views = [_of_file(tmp_path / "a.png"), _newer(photo)]
+    views[1].FoVx, views[1].FoVy = views[0].FoVx, views[0].FoVy
+    for name in MATRICES:
+        setattr(views[1], name, getattr(views[0], name))
+    scored, gaussians = ScoredViews(pipeline(), torch.ones(3), False), model(30)
+    of_file, in_memory = (scored.scores([view], gaussians) for view in views)
+    assert of_file == in_memory and of_file["l1"] > 0
+
+
+def test_colours_read_again_and_again_are_made_once(tmp_path):
+    _photo(4).save(tmp_path / "a.png")
+    camera = _of_file(tmp_path / "a.png")
+    camera.images = ImageStore(0)
+    first = camera.original_image
+    assert camera.original_image.data_ptr() == first.data_ptr()
+    first[:, 0] = 0.5  # as it stays in the reference
+    assert (camera.original_image[:, 0] == 0.5).all()
+    bounded = _of_file(tmp_path / "a.png")
+    bounded.images = ImageStore(1)
+    kept = bounded.original_image
+    assert bounded.original_image.data_ptr() != kept.data_ptr()
+
+
+@pytest.fixture
+def used(tmp_path: Path) -> Camera:
+    """A camera of a large photo with a mask, all pictures of which are decoded, in a store with others."""
+    Image.fromarray(RNG.integers(0, 256, (600, 800, 4), dtype=np.uint8)).save(tmp_path / "a.png")
+    Image.fromarray(RNG.integers(0, 2, (600, 800), dtype=np.uint8) * np.uint8(255)).save(tmp_path / "mask.png")
+    camera = _of_file(tmp_path / "a.png", (800, 600), mask=Mask(tmp_path / "mask.png"))
+    camera.images = ImageStore(0)
+    for picture in camera.pictures:
+        camera.images.get(*picture)
+    assert camera.original_image.shape == (3, 600, 800) and camera.alpha_mask.shape == (1, 600, 800)
+    return camera
+
+
+def test_a_copy_shares_the_photos_and_nothing_else(used, monkeypatch):
+    used.note = [1]
+    twin = copy.deepcopy(used)
+    assert twin.images is used.images and twin.pictures == used.pictures and type(twin) is Camera
+    monkeypatch.setattr("scene.pictures.store.decode", lambda *_: pytest.fail("decoded again"))
+    assert torch.equal(twin.original_image, used.original_image) and torch.equal(twin.mask, used.mask)
+    assert twin.original_image.data_ptr() != used.original_image.data_ptr()
+    before = [copy.deepcopy(getattr(used, name)) for name in ("R", "T", *MATRICES)]
+    for name in ("R", "T", *MATRICES):
+        getattr(twin, name)[:] = 7.0
+    twin.note.append(2)
+    twin.columns, twin.original_image = slice(0, 3), torch.zeros(3, 1, 1)
+    assert used.columns is None and used.original_image.shape == (3, 600, 800) and used.note == [1]
+    for name, value in zip(("R", "T", *MATRICES), before, strict=True):
+        np.testing.assert_array_equal(getattr(used, name), value)
+
+
+def test_a_copy_allocates_little(used):
+    class Counting(torch.utils._python_dispatch.TorchDispatchMode):
+        """Counts the elements of all tensors made."""
+
+        made = 0
+
+        def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+            result = func(*args, **(kwargs or {}))
+            self.made += result.numel() if isinstance(result, torch.Tensor) else 0
+            return result
+
+    memory = _newer(Image.new("RGB", (800, 600)), resolution=(800, 600))
+    for camera in (used, memory):
+        with Counting() as counting:
+            copy.deepcopy(camera)
+        assert counting.made < 1000
+
+
+def test_a_pickle_leaves_the_photos_out(used):
+    content = pickle.dumps(used)
+    assert len(content) < 8192
+    loaded = pickle.loads(content)
+    assert loaded.images is not used.images and len(loaded.images) == 0
+    assert torch.equal(loaded.original_image, used.original_image) and torch.equal(loaded.mask, used.mask)
+    assert torch.equal(loaded.full_proj_transform, used.full_proj_transform)

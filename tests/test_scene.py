@@ -1,0 +1,139 @@
+"""Scene as other people's code calls it: with their options, their readers, and their own package `arguments`."""
+
+import argparse
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+from synthetic import FakeGaussians
+
+import scene as scene_package
+from arguments import ModelParams
+from scene import Scene
+from scene.dataset_readers import read_scene, sceneLoadTypeCallbacks
+from scene.gaussian_model import GaussianModel
+from scene.options import DEFAULTS, option
+from training import run
+from utils.files.model_json import OFFSET
+from utils.system_utils import UserError
+
+ROOT = Path(__file__).resolve().parents[1]
+OF_2023 = {"sh_degree": 3, "images": "images", "resolution": -1, "white_background": False, "data_device": "cuda",
+           "eval": True}  # fmt: skip
+OF_2024 = {**OF_2023, "depths": "", "train_test_exp": False}
+
+
+def _args(folder: Path, out: Path, values: dict[str, object] = OF_2024, **changes: object) -> SimpleNamespace:
+    return SimpleNamespace(source_path=str(folder), model_path=str(out), **{**values, **changes})
+
+
+def test_defaults_are_those_of_the_command_line():
+    options = ModelParams(argparse.ArgumentParser()).extract(argparse.Namespace())
+    assert DEFAULTS.items() <= vars(options).items()
+    needed = {"source_path", "model_path", *OF_2023}
+    assert vars(options).keys() - DEFAULTS.keys() == needed  # the options of 2023
+    assert option(SimpleNamespace(masks=None), "masks") == "" and option(SimpleNamespace(masks="m"), "masks") == "m"
+
+
+@pytest.mark.parametrize("values", [OF_2023, OF_2024])
+def test_options_of_the_reference_suffice(colmap_scene, tmp_path, values):
+    gaussians = FakeGaussians()
+    made = Scene(_args(colmap_scene, tmp_path / "out", values), gaussians)
+    ours = Scene(
+        ModelParams(argparse.ArgumentParser()).extract(argparse.Namespace(**vars(_args(colmap_scene, tmp_path / "o")))),
+        FakeGaussians(),
+    )
+    names = [camera.image_name for camera in made.getTrainCameras()]
+    assert names == [camera.image_name for camera in ours.getTrainCameras()] and len(names) == 14
+    assert len(made.getTestCameras()) == 3 and made.images.limit == 0
+    for name in ("cameras.json", "input.ply"):
+        assert (tmp_path / "out" / name).read_bytes() == (tmp_path / "o" / name).read_bytes()
+    assert gaussians.extent == made.cameras_extent == ours.cameras_extent
+
+
+def test_lists_of_cameras_may_be_replaced(colmap_scene, tmp_path):
+    made = Scene(_args(colmap_scene, tmp_path / "out"), FakeGaussians(), resolution_scales=[1.0, 2.0])
+    assert made.train_cameras.keys() == made.test_cameras.keys() == {1.0, 2.0}
+    assert made.getTrainCameras(2.0) is made.train_cameras[2.0] and made.train_cameras[2.0][0].image_width == 48
+    few, others = made.train_cameras[1.0][:2], [object()]
+    made.train_cameras[1.0], made.test_cameras = few, {1.0: others}
+    assert made.getTrainCameras() is few and made.getTestCameras() is others
+
+
+def test_replaced_training_views_train(colmap_scene, tmp_path):
+    options = ModelParams(argparse.ArgumentParser()).extract(_args(colmap_scene, tmp_path / "out", resolution=24))
+    made = Scene(options, GaussianModel(0), shuffle=False)
+    made.train_cameras = {1.0: made.train_cameras[1.0][:3]}
+    views = run.ViewOrder(made.getTrainCameras(), 0)
+    made.prefetch(views.coming(1, made.images.ahead))
+    assert {views[t].uid for t in range(1, 10)} == {0, 1, 2} and made.training_pixels()[0] == 3 * 24 * 16
+
+
+def test_a_readers_replacement_gets_the_references_arguments(colmap_scene, tmp_path, monkeypatch):
+    calls = []
+    known = read_scene(colmap_scene, "images", True)
+
+    def theirs(*given):
+        calls.append(given)
+        return replace(known, test_cameras=known.test_cameras[:1])
+
+    assert scene_package.sceneLoadTypeCallbacks is sceneLoadTypeCallbacks
+    monkeypatch.setitem(sceneLoadTypeCallbacks, "Colmap", theirs)
+    args = _args(colmap_scene, tmp_path / "out", images="photos", depths="d", train_test_exp=True)
+    made = Scene(args, FakeGaussians(), start=False)
+    assert calls == [(str(colmap_scene), "photos", "d", True, True)]
+    assert (len(made.getTrainCameras()), len(made.getTestCameras())) == (14, 1)
+    assert made.cameras_extent == known.extent
+    monkeypatch.undo()
+    assert len(Scene(_args(colmap_scene, tmp_path / "out"), FakeGaussians(), start=False).getTestCameras()) == 3
+
+
+def test_a_replaced_reader_of_blender_scenes(blender_scene, tmp_path, monkeypatch):
+    calls = []
+    known = read_scene(blender_scene, "images", True)
+    monkeypatch.setitem(sceneLoadTypeCallbacks, "Blender", lambda *given: calls.append(given) or known)
+    made = Scene(_args(blender_scene, tmp_path / "out", OF_2023, white_background=True), FakeGaussians(), start=False)
+    assert calls == [(str(blender_scene), True, "", True)] and made.info is known
+
+
+def _run(code: str, folder: Path) -> None:
+    """Run code in a folder whose packages are found before ours."""
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    done = subprocess.run([sys.executable, "-c", code], cwd=folder, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
+def test_a_package_of_options_of_their_own_does_not_matter(colmap_scene, tmp_path):
+    (tmp_path / "arguments").mkdir()
+    (tmp_path / "arguments" / "__init__.py").write_text("class ModelParams:\n    theirs = True\n")
+    values = dict(vars(_args(colmap_scene, tmp_path / "out")), resolution=24)
+    _run(
+        f"""
+from types import SimpleNamespace
+import gaussian_renderer, scene.export_world, scene.saved_model, utils.camera_utils
+from scene import GaussianModel, ModelParams, Scene, sceneLoadTypeCallbacks
+import arguments
+assert ModelParams is arguments.ModelParams and ModelParams.theirs
+scene = Scene(SimpleNamespace(**{values!r}), GaussianModel(3))
+assert len(scene.getTrainCameras()) == 14
+scene.save(1)
+Scene(SimpleNamespace(**{values!r}), GaussianModel(3), load_iteration=-1)
+""",
+        tmp_path,
+    )
+    (tmp_path / "arguments" / "__init__.py").write_text("raise ModuleNotFoundError('gone', name='arguments')")
+    _run("import scene; assert not hasattr(scene, 'ModelParams') and scene.Scene", tmp_path)
+    (tmp_path / "arguments" / "__init__.py").write_text("")
+    _run("import scene; assert not hasattr(scene, 'ModelParams')", tmp_path)
+
+
+def test_a_broken_model_json_is_refused_when_a_model_is_loaded(colmap_scene, tmp_path):
+    args = _args(colmap_scene, tmp_path / "out")
+    Scene(args, FakeGaussians()).save(1)
+    (tmp_path / "out" / "model.json").write_text(f'{{"{OFFSET}": [1, 2]}}')
+    with pytest.raises(UserError, match="model.json: world_offset must be three numbers"):
+        Scene(args, FakeGaussians(), load_iteration=1)
