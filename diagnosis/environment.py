@@ -49,8 +49,9 @@ def check_build() -> list[Line]:
 
 
 def extensions_load() -> bool:
-    """Whether all three extensions can be imported."""
+    """Whether all three extensions can be imported, and are those of this code."""
     try:
+        importlib.import_module("utils.host.extensions")
         for package in EXTENSIONS.values():
             importlib.import_module(package)
     except ImportError:

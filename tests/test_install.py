@@ -238,6 +238,28 @@ def test_an_extension_without_torch_says_what_to_do(package: str, tmp_path: Path
     assert last_line("import part_of_torch") == "ModuleNotFoundError: No module named 'part_of_torch'"
 
 
+@pytest.mark.parametrize(
+    ("statement", "package", "lacking"),
+    [
+        ("from utils.loss_utils import ssim", "fused_ssim", "backend.py"),
+        ("from gaussian_renderer import render", "diff_gaussian_rasterization", "rasterizer.py"),
+        ("from scene.gaussian_model import GaussianModel", "diff_gaussian_rasterization", "optim.py"),
+    ],
+)
+def test_an_older_extension_ends_in_the_remedy(statement: str, package: str, lacking: str, tmp_path: Path) -> None:
+    name = package.replace("_", "-")
+    older = tmp_path / package
+    shutil.copytree(ROOT / "submodules" / name / package, older, ignore=shutil.ignore_patterns("*.so", "__pycache__"))
+    (older / lacking).unlink()
+    env = os.environ | {"PYTHONPATH": os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")])}
+    command = [sys.executable, "-c", statement]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, env=env)
+    assert done.returncode == 1 and done.stderr.splitlines()[-1] == (
+        f"ImportError: the installed {package} does not fit this checkout (it has no {lacking}): "
+        f"run `pip install ./submodules/{name}` in the repository"
+    )
+
+
 def test_build_fetches_torch_only_where_there_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "path", list(sys.path))
     backend = load("backend")
