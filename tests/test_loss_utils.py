@@ -92,6 +92,20 @@ def test_gradients_of_either_image_or_both_are_the_same(dtype, average):
             assert (got - exact[place]).abs().max() < tolerance * exact[place].abs().max()
 
 
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="torch finds no NVIDIA GPU")
+def test_ssim_on_a_gpu_is_the_cpus():
+    a, b = _pair(40, 50)
+    for wanted in [(True, False), (False, True), (True, True)]:
+        there = _gradients(a.cuda(), b.cuda(), wanted)
+        for got, exact in zip(there, _gradients(a.double(), b.double(), wanted), strict=True):
+            assert (got is None) == (exact is None)
+            assert got is None or (got.cpu() - exact).abs().max() < 1e-4 * exact.abs().max()
+    assert abs(ssim(a.cuda(), b.cuda()).item() - ssim(a.double(), b.double()).item()) < 1e-5
+    # The kernels have no float64 on a GPU.
+    assert abs(ssim(a.double().cuda(), b.double().cuda()).item() - ssim(a.double(), b.double()).item()) < 1e-12
+
+
 def test_the_kernels_compute_what_they_can(monkeypatch):
     calls = []
     kernel = loss_utils.fused_l1_ssim

@@ -3,14 +3,14 @@
 import pytest
 import torch
 from diff_gaussian_rasterization import _C, GaussianRasterizer, optim
-from rasterizer_tools import activated, few, leaves
+from rasterizer_tools import CPU_AND_GPU, activated, few, leaves
 
-from benchmarks.workloads.splat_scenes import settings
+from benchmarks.workloads.splat_scenes import on_device, settings
 
 EMPTY = torch.Tensor([])
 
 
-def scene(colors: bool, covariances: bool, **changes):
+def scene(colors: bool, covariances: bool, device: str = "cpu", **changes):
     """Leaves by the reference's names, and a camera."""
     raw, size = few(3, dtype=torch.float32)
     splats = activated(raw)
@@ -28,7 +28,8 @@ def scene(colors: bool, covariances: bool, **changes):
         del inputs[name]
     for name in ("scales", "rotations") if covariances else ("cov3D_precomp",):
         del inputs[name]
-    return leaves(inputs), settings(**size, **changes)
+    moved = {name: values.to(device) for name, values in inputs.items()}
+    return leaves(moved), on_device(settings(**size, **changes), device)
 
 
 def forward_arguments(inputs, camera) -> tuple:
@@ -58,13 +59,14 @@ def forward_arguments(inputs, camera) -> tuple:
     )
 
 
+@CPU_AND_GPU
 @pytest.mark.parametrize("antialiasing", [False, True])
 @pytest.mark.parametrize(("colors", "covariances"), [(False, False), (True, True), (False, True)])
-def test_forward_and_backward_are_those_of_the_class(colors, covariances, antialiasing):
-    inputs, camera = scene(colors, covariances, antialiasing=antialiasing)
+def test_forward_and_backward_are_those_of_the_class(colors, covariances, antialiasing, device):
+    inputs, camera = scene(colors, covariances, device, antialiasing=antialiasing)
     wanted = GaussianRasterizer(camera)(**inputs)
     generator = torch.Generator().manual_seed(1)
-    gradients = [torch.randn(image.shape, generator=generator) for image in wanted[::2]]
+    gradients = [torch.randn(image.shape, generator=generator).to(device) for image in wanted[::2]]
     torch.autograd.backward(wanted[::2], gradients)
 
     given = forward_arguments(inputs, camera)

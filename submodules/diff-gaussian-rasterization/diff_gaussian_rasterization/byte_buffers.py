@@ -8,12 +8,12 @@ from torch import Tensor
 
 
 def packed(*tensors: Tensor) -> Tensor:
-    """Copies tensors into one of bytes, (B,) uint8. Those with wider values come first, so that all stay aligned."""
+    """Copies tensors into one of bytes, (B,) uint8."""
     return torch.cat([values.contiguous().reshape(-1).view(torch.uint8) for values in tensors])
 
 
 def unpacked(buffer: Tensor, parts: Iterable[tuple[torch.dtype, tuple[int, ...]]]) -> list[Tensor]:
-    """Reads the tensors of `packed`, given their dtypes and shapes. They share the buffer's memory.
+    """Copies the tensors of `packed` out again, given their dtypes and shapes.
 
     Raises ValueError if the buffer has another size.
     """
@@ -23,4 +23,5 @@ def unpacked(buffer: Tensor, parts: Iterable[tuple[torch.dtype, tuple[int, ...]]
         found = f"{tuple(buffer.shape)} {buffer.dtype}"
         raise ValueError(f"the buffer must be the one of this rendering, ({sum(sizes)},) uint8, got {found}")
     pieces = zip(buffer.split(sizes), parts, strict=True)
-    return [piece.view(dtype).reshape(shape) for piece, (dtype, shape) in pieces]
+    # In memory of their own, since kernels may want more alignment than a place within the buffer has.
+    return [piece.clone().view(dtype).reshape(shape) for piece, (dtype, shape) in pieces]
