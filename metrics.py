@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from argparse import ArgumentParser
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -24,7 +24,7 @@ from arguments import read_cfg_args
 from utils.files.image_files import UNREADABLE, open_render
 from utils.files.json_files import write_json
 from utils.lpips_utils import MIN_SIDE, LpipsUnavailable, PerceptualDistance
-from utils.system_utils import UserError, run_cli
+from utils.system_utils import UserError, compute_device, run_cli
 
 CONVENTIONS = {
     "PSNR": "dB, from one mean squared error over pixels and channels of the 8-bit images; null where infinite",
@@ -201,6 +201,57 @@ def mean(values: dict[str, float | None]) -> float | None:
     return None if None in numbers or not numbers else math.fsum(numbers) / len(numbers)
 
 
+def readImages(renders_dir: str | Path, gt_dir: str | Path) -> tuple[list[torch.Tensor], list[torch.Tensor], list[str]]:
+    """Read the images of two folders of equal names, sorted: renders, ground truth, names.
+
+    Images are (1, 3, H, W) float32 in [0, 1] on the device that computes. UserError for a damaged image.
+    """
+    names = sorted(file.name for file in Path(renders_dir).iterdir() if not file.name.startswith("."))
+
+    def read(folder: str | Path) -> list[torch.Tensor]:
+        pixels = [torch.from_numpy(_read(Path(folder) / name).copy()) for name in names]
+        return [image.to(compute_device()).permute(2, 0, 1)[None].contiguous() / 255 for image in pixels]
+
+    return read(renders_dir), read(gt_dir), names
+
+
+def evaluate(
+    model_paths: Sequence[str | Path], lpips_net: str = "vgg", lpips_weights: Sequence[str | Path] = ()
+) -> None:
+    """Score model folders, print the means and write the files of scores, as the command does.
+
+    lpips_net: "vgg", "alex" or "both". lpips_weights: state dicts of torchvision's vgg16 or alexnet, instead of torch's
+    cache and a download. UserError if a folder cannot be scored.
+    """
+    found = {model: find_pairs(model) for model in map(Path, model_paths)}
+    sides = [side for methods in found.values() for pairs in methods.values() for pair in pairs for side in pair.size]
+    metrics = make_metrics(lpips_net, [Path(file) for file in lpips_weights], min(sides))
+    for model, methods in found.items():
+        _score_model(model, methods, metrics)
+
+
+def _score_model(model: Path, methods: dict[str, list[Pair]], metrics: dict[str, Metric]) -> None:
+    held_out = trained_with_eval(model)
+    if held_out is False:
+        print(f"warning: {model} was trained without --eval, so these scores are of training views")
+    per_view = {name: score(pairs, metrics, f"{model.name}/{name}") for name, pairs in methods.items()}
+    results = {name: {key: mean(values) for key, values in scores.items()} for name, scores in per_view.items()}
+    for name, means in results.items():
+        shown = "  ".join(f"{key} {'null' if value is None else f'{value:.4f}'}" for key, value in means.items())
+        print(f"{model} {name} ({len(methods[name])} views): {shown}")
+    info = {
+        "conventions": {key: CONVENTIONS[key] for key in metrics},
+        "trained_with_eval": held_out,
+        "views": {name: len(pairs) for name, pairs in methods.items()},
+    }
+    masked = {name: sum(pair.mask is not None for pair in pairs) for name, pairs in methods.items()}
+    if any(masked.values()):
+        info |= {"masked": {key: MASKED[key.split("_")[0]] for key in metrics}, "masked_views": masked}
+    write_json(model / "results.json", results, sort_keys=False)
+    write_json(model / "per_view.json", per_view, sort_keys=False)
+    write_json(model / "metrics_info.json", info)
+
+
 def main() -> None:
     parser = ArgumentParser(description="Score rendered test views: PSNR, SSIM, LPIPS.")
     parser.add_argument("-m", "--model_paths", type=Path, nargs="+", required=True, help="model folders to score")
@@ -219,30 +270,7 @@ def main() -> None:
         help="state dicts of torchvision's vgg16 or alexnet; replace torch's cache and download",
     )
     args = parser.parse_args()
-
-    found = {model: find_pairs(model) for model in args.model_paths}
-    sides = [side for methods in found.values() for pairs in methods.values() for pair in pairs for side in pair.size]
-    metrics = make_metrics(args.lpips_net, args.lpips_weights, min(sides))
-    for model, methods in found.items():
-        held_out = trained_with_eval(model)
-        if held_out is False:
-            print(f"warning: {model} was trained without --eval, so these scores are of training views")
-        per_view = {name: score(pairs, metrics, f"{model.name}/{name}") for name, pairs in methods.items()}
-        results = {name: {key: mean(values) for key, values in scores.items()} for name, scores in per_view.items()}
-        for name, means in results.items():
-            shown = "  ".join(f"{key} {'null' if value is None else f'{value:.4f}'}" for key, value in means.items())
-            print(f"{model} {name} ({len(methods[name])} views): {shown}")
-        info = {
-            "conventions": {key: CONVENTIONS[key] for key in metrics},
-            "trained_with_eval": held_out,
-            "views": {name: len(pairs) for name, pairs in methods.items()},
-        }
-        masked = {name: sum(pair.mask is not None for pair in pairs) for name, pairs in methods.items()}
-        if any(masked.values()):
-            info |= {"masked": {key: MASKED[key.split("_")[0]] for key in metrics}, "masked_views": masked}
-        write_json(model / "results.json", results, sort_keys=False)
-        write_json(model / "per_view.json", per_view, sort_keys=False)
-        write_json(model / "metrics_info.json", info)
+    evaluate(args.model_paths, args.lpips_net, args.lpips_weights)
 
 
 if __name__ == "__main__":

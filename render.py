@@ -10,6 +10,7 @@ is idle before the clock starts, and done when it stops.
 from __future__ import annotations
 
 import argparse
+import copy
 import re
 import time
 from pathlib import Path
@@ -56,7 +57,7 @@ def remove_leftovers(folder: Path, count: int) -> None:
             file.unlink()
 
 
-def render_set(
+def write_views(
     folder: Path,
     views: list[Camera],
     gaussians: GaussianModel,
@@ -99,6 +100,67 @@ def _wait(device: torch.device) -> None:
 
 
 @torch.no_grad()
+def render_set(
+    model_path: str | Path,
+    name: str,
+    iteration: int,
+    views: list[Camera],
+    gaussians: GaussianModel,
+    pipeline: argparse.Namespace,
+    background: torch.Tensor,
+    train_test_exp: bool = False,
+    separate_sh: bool = False,
+) -> None:
+    """Write renders, ground truth, masks and times of `views` under model_path/name/ours_ITERATION; say how long.
+
+    train_test_exp: render with exposures, and write right halves only. separate_sh: accepted for callers of the
+    reference; the SH bands are always passed separately.
+    """
+    folder = Path(model_path) / name / f"ours_{iteration}"
+    (folder / render_times.NAME).unlink(missing_ok=True)  # times of an interrupted run do not count
+    with memory_errors_explained(gaussians, views):
+        seconds = write_views(folder, views, gaussians, pipeline, background, train_test_exp)
+    if not seconds:
+        print(f"{name}: no views" + ("; the model was trained without --eval" if name == "test" else ""))
+        return
+    sizes = [(view.image_width, view.image_height) for view in views]
+    antialiasing = getattr(pipeline, "antialiasing", False)  # options of 2023 lack it
+    times = render_times.summarise(seconds, sizes, len(gaussians), antialiasing, background.device)
+    render_times.write(folder, times)
+    median = f"median {times['median_ms']:.2f} ms a view ({times['fps']:.1f} frames per second)"
+    print(f"{name}: {len(views)} views, {median}")
+
+
+@torch.no_grad()
+def render_sets(
+    dataset: argparse.Namespace,
+    iteration: int,
+    pipeline: argparse.Namespace,
+    skip_train: bool,
+    skip_test: bool,
+    separate_sh: bool = False,
+    *,
+    sh_degree: int | None = None,
+) -> None:
+    """Render the views of a saved iteration, -1: the last one, by `render_set`.
+
+    dataset: the model options. sh_degree: degree that the PLY must have, None: any. UserError if nothing can be loaded.
+    """
+    options = copy.copy(dataset)
+    options.images_to_load = 1  # each photo is used once
+    scene = load_saved(options, iteration, sh_degree)
+    gaussians = scene.gaussians
+    if len(gaussians) == 0:
+        raise UserError(f"iteration {scene.loaded_iter} of {scene.model_path} has no Gaussians; train it again")
+    background = torch.full((3,), 1.0 if options.white_background else 0.0, device=compute_device())
+    halves = getattr(options, "train_test_exp", False)  # options of 2023 lack it
+    drawn = gaussians, pipeline, background, halves, separate_sh
+    if not skip_train:
+        render_set(scene.model_path, "train", scene.loaded_iter, scene.getTrainCameras(), *drawn)
+    if not skip_test:
+        render_set(scene.model_path, "test", scene.loaded_iter, scene.getTestCameras(), *drawn)
+
+
 def main() -> None:
     parser = OptionParser(description="Render the train and test views of a trained model.")
     # Each photo is used once, so one is kept in memory.
@@ -109,33 +171,9 @@ def main() -> None:
     parser.add_argument("--skip_test", action="store_true", help="leave the test views out")
     parser.add_argument("--quiet", action="store_true", help="print nothing to stdout")
     args = get_combined_args(parser)
-    options, pipe = model_params.extract(args), pipeline_params.extract(args)
+    options, pipeline = model_params.extract(args), pipeline_params.extract(args)
     safe_state(args.quiet)
-
-    options.images_to_load = 1
-    scene = load_saved(options, args.iteration, args.typed_sh_degree)
-    gaussians = scene.gaussians
-    if len(gaussians) == 0:
-        raise UserError(f"iteration {scene.loaded_iter} of {scene.model_path} has no Gaussians; train it again")
-    background = torch.full((3,), 1.0 if options.white_background else 0.0, device=compute_device())
-    for name, skip, views in (
-        ("train", args.skip_train, scene.getTrainCameras()),
-        ("test", args.skip_test, scene.getTestCameras()),
-    ):
-        if skip:
-            continue
-        folder = Path(scene.model_path) / name / f"ours_{scene.loaded_iter}"
-        (folder / render_times.NAME).unlink(missing_ok=True)  # times of an interrupted run do not count
-        with memory_errors_explained(gaussians, views):
-            seconds = render_set(folder, views, gaussians, pipe, background, options.train_test_exp)
-        if seconds:
-            sizes = [(view.image_width, view.image_height) for view in views]
-            times = render_times.summarise(seconds, sizes, len(gaussians), pipe.antialiasing, background.device)
-            render_times.write(folder, times)
-            median = f"median {times['median_ms']:.2f} ms a view ({times['fps']:.1f} frames per second)"
-            print(f"{name}: {len(views)} views, {median}")
-        else:
-            print(f"{name}: no views" + ("; the model was trained without --eval" if name == "test" else ""))
+    render_sets(options, args.iteration, pipeline, args.skip_train, args.skip_test, sh_degree=args.typed_sh_degree)
 
 
 if __name__ == "__main__":

@@ -49,8 +49,9 @@ def check_build() -> list[Line]:
 
 
 def extensions_load() -> bool:
-    """Whether all three extensions can be imported."""
+    """Whether all three extensions can be imported, and are those of this code."""
     try:
+        importlib.import_module("utils.host.extensions")
         for package in EXTENSIONS.values():
             importlib.import_module(package)
     except ImportError:
@@ -115,7 +116,7 @@ def _check_extension(name: str, package: str, torch_version: str) -> list[Line]:
         module = importlib.import_module(package)
     except ImportError as error:
         return [Line(f"the extension {name} does not load ({error})", again)]
-    built_for = [r for r in importlib.metadata.requires(name) or [] if r.startswith("torch==")]
+    built_for = [r.split(";")[0].strip() for r in importlib.metadata.requires(name) or [] if r.startswith("torch==")]
     if built_for and not torch_version.startswith(built_for[0].removeprefix("torch==").rstrip("*")):
         return [Line(f"the extension {name} was built for {built_for[0]}, torch is {torch_version}", again)]
     folder = Path(module.__file__).parent

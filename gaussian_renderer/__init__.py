@@ -4,6 +4,7 @@ import argparse
 import math
 from functools import cache
 
+import utils.host.extensions  # noqa: F401  isort: skip  (before the extensions)
 import torch
 from diff_gaussian_rasterization import GaussianRasterizationSettings, decisive, rasterize
 from torch import Tensor

@@ -90,6 +90,9 @@ def test_extensions_that_do_not_fit(monkeypatch, tmp_path):
     package = _sources(tmp_path)
     monkeypatch.setattr(environment, "ROOT", tmp_path)
     assert check() == []
+    built_for = ["torch==2.13.*; extra == 'built-for'"]
+    monkeypatch.setattr(environment.importlib.metadata, "requires", lambda name: built_for)
+    assert check("2.13.7") == []
     assert "was built for torch==2.13.*, torch is 9.0.1" in check("9.0.1")[0]
     (package / "ops.py").write_text("changed")
     assert "installed from other sources than these (ops.py) -> run `pip install ./submodules/simple-knn`" in check()[0]

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from fused_ssim import fused_l1_ssim, fused_photometric_loss, fused_ssim
+from fused_ssim import allowed_padding, fused_l1_ssim, fused_photometric_loss, fused_ssim
 from fused_ssim.reference import l1_ssim, ssim_map
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -18,7 +18,7 @@ from torch import Tensor, library
 EPS = {torch.float32: 2**-24, torch.float64: 2**-53}
 LARGEST_SLOPE = 2 / 0.03**2  # of SSIM over a covariance; multiplies an error of the inputs or of the oracle
 both_dtypes = pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-both_paddings = pytest.mark.parametrize("padding", ["same", "valid"])
+both_paddings = pytest.mark.parametrize("padding", allowed_padding)
 
 
 @pytest.fixture(autouse=True)
@@ -411,3 +411,9 @@ IMAGE = torch.zeros(3, 20, 20)
 def test_messages(img1: Tensor, img2: Tensor, padding: str, error: type[Exception], words: str) -> None:
     with pytest.raises(error, match=words):
         fused_ssim(img1, img2, padding)
+
+
+def test_the_paddings_have_a_name() -> None:
+    assert allowed_padding == ["same", "valid"]
+    pair = image_pair("noise")
+    assert len({fused_ssim(*pair, padding).item() for padding in allowed_padding}) == 2

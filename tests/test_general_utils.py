@@ -7,14 +7,17 @@ import sys
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from utils.general_utils import (
+    PILtoTorch,
     build_rotation,
     build_scaling_rotation,
     get_expon_lr_func,
     inverse_sigmoid,
     safe_state,
+    strip_lowerdiag,
     strip_symmetric,
 )
 
@@ -34,6 +37,24 @@ def test_covariance_from_scales_and_rotations():
     wanted = np.einsum("nij,nj,nkj->nik", R, s.numpy() ** 2, R)
     packed = strip_symmetric(factor @ factor.transpose(1, 2)).numpy()
     np.testing.assert_allclose(packed, wanted[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]], atol=1e-15)
+
+
+def test_upper_triangles_in_their_order():
+    matrices = torch.arange(18.0).reshape(2, 3, 3)
+    assert strip_lowerdiag(matrices)[1].tolist() == [9, 10, 11, 13, 14, 17]
+    assert torch.equal(strip_lowerdiag(matrices), strip_symmetric(matrices))
+
+
+@pytest.mark.parametrize(("mode", "channels"), [("RGB", 3), ("RGBA", 4), ("L", 1)])
+def test_pictures_become_tensors(mode, channels):
+    rng = np.random.default_rng(0)
+    picture = Image.fromarray(rng.integers(0, 256, (20, 30, 4), dtype=np.uint8)).convert(mode)
+    image = PILtoTorch(picture, (15, 11))
+    assert image.shape == (channels, 11, 15) and image.dtype == torch.float32
+    wanted = np.asarray(picture.resize((15, 11)), dtype=np.float32).reshape(11, 15, channels) / 255
+    np.testing.assert_array_equal(image.numpy(), wanted.transpose(2, 0, 1))
+    same = PILtoTorch(picture, picture.size)
+    assert torch.equal((same * 255).round().to(torch.uint8).permute(1, 2, 0).squeeze(), torch.tensor(np.array(picture)))
 
 
 def test_inverse_sigmoid():

@@ -14,7 +14,7 @@ ROOT = Path(__file__).resolve().parents[1]
 COMMANDS = ("train", "render", "metrics", "full_eval", "convert", "doctor", "setup")
 ROOMS = (
     *("arguments", "benchmarks", "conversion", "demo", "diagnosis", "evaluation", "gaussian_renderer", "records"),
-    *("scene", "training", "utils"),
+    *("lpipsPyTorch", "scene", "training", "utils"),
 )
 CSRC = ROOT / "submodules"
 LONGEST = 60  # lines of a function
@@ -29,6 +29,7 @@ MAY_IMPORT = {
     "utils.make_depth_scale": ("scene.readers.depth_scale", "utils"),  # a command of the reference
     "arguments": ("utils",),
     "records": ("utils",),
+    "lpipsPyTorch": ("utils",),  # a name of the reference
     "scene.pictures": ("utils",),
     "scene.readers": ("scene.pictures", "utils"),
     "scene.gaussians": ("utils",),

@@ -199,9 +199,65 @@ def test_compile_error_ends_without_traceback(tmp_path: Path) -> None:
     assert not (tmp_path / "toy" / "_backend.so").exists()
 
 
-def test_extension_asks_for_the_torch_it_was_built_with(builder: ModuleType) -> None:
+def wheel_of(folder: Path) -> tuple[list[str], list[str]]:
+    """Build the wheel of a folder by setuptools' backend: the names of its files, and what its metadata requires."""
+    code = "from setuptools import build_meta; print(build_meta.build_wheel('.'))"
+    env = os.environ | {"PYTHONDONTWRITEBYTECODE": "1"}
+    done = subprocess.run([sys.executable, "-c", code], cwd=folder, capture_output=True, text=True, env=env)
+    assert done.returncode == 0, done.stderr
+    with zipfile.ZipFile(folder / done.stdout.splitlines()[-1]) as wheel:
+        names = wheel.namelist()
+        metadata = wheel.read(next(name for name in names if name.endswith("/METADATA"))).decode()
+    return names, [line.partition(": ")[2] for line in metadata.splitlines() if line.startswith("Requires-Dist: ")]
+
+
+def test_installing_an_extension_leaves_torch_alone(tmp_path: Path) -> None:
+    """Even with --force-reinstall, for which pip installs every requirement again."""
+    write_extension(tmp_path, "")
+    _, requires = wheel_of(tmp_path)
     major, minor = torch.__version__.split(".")[:2]
-    assert builder.torch_requirement() == f"torch=={major}.{minor}.*"
+    # An extra, which is not installed unless it is asked for; doctor.py reads it.
+    assert [line.replace('"', "'") for line in requires] == [f"torch=={major}.{minor}.*; extra == 'built-for'"]
+
+
+@pytest.mark.parametrize("package", ["diff_gaussian_rasterization", "fused_ssim", "simple_knn"])
+def test_an_extension_without_torch_says_what_to_do(package: str, tmp_path: Path) -> None:
+    folder = ROOT / "submodules" / package.replace("_", "-")
+    env = os.environ | {"PYTHONPATH": os.pathsep.join(map(str, (tmp_path, folder)))}
+
+    def last_line(torch_py: str) -> str:
+        (tmp_path / "torch.py").write_text(torch_py)
+        command = [sys.executable, "-B", "-c", f"import {package}"]
+        done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, env=env)
+        assert done.returncode == 1
+        return done.stderr.splitlines()[-1]
+
+    remedy = f"install it, then run `pip install ./submodules/{folder.name}` in the repository"
+    missing = "raise ModuleNotFoundError(\"No module named 'torch'\", name='torch')"
+    assert last_line(missing) == f"ImportError: {package} needs torch: {remedy}"
+    assert last_line("import part_of_torch") == "ModuleNotFoundError: No module named 'part_of_torch'"
+
+
+@pytest.mark.parametrize(
+    ("statement", "package", "lacking"),
+    [
+        ("from utils.loss_utils import ssim", "fused_ssim", "backend.py"),
+        ("from gaussian_renderer import render", "diff_gaussian_rasterization", "rasterizer.py"),
+        ("from scene.gaussian_model import GaussianModel", "diff_gaussian_rasterization", "optim.py"),
+    ],
+)
+def test_an_older_extension_ends_in_the_remedy(statement: str, package: str, lacking: str, tmp_path: Path) -> None:
+    name = package.replace("_", "-")
+    older = tmp_path / package
+    shutil.copytree(ROOT / "submodules" / name / package, older, ignore=shutil.ignore_patterns("*.so", "__pycache__"))
+    (older / lacking).unlink()
+    env = os.environ | {"PYTHONPATH": os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")])}
+    command = [sys.executable, "-c", statement]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, env=env)
+    assert done.returncode == 1 and done.stderr.splitlines()[-1] == (
+        f"ImportError: the installed {package} does not fit this checkout (it has no {lacking}): "
+        f"run `pip install ./submodules/{name}` in the repository"
+    )
 
 
 def test_build_fetches_torch_only_where_there_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -227,15 +283,8 @@ def test_root_wheel_has_requirements_and_no_packages(tmp_path: Path) -> None:
         (tmp_path / package).mkdir()
         (tmp_path / package / "__init__.py").touch()
     (tmp_path / "train.py").touch()
-    code = "from setuptools import build_meta; print(build_meta.build_wheel('.'))"
-    env = os.environ | {"PYTHONDONTWRITEBYTECODE": "1"}
-    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, env=env)
-    assert done.returncode == 0, done.stderr
-    with zipfile.ZipFile(tmp_path / done.stdout.splitlines()[-1]) as wheel:
-        names = wheel.namelist()
-        metadata = wheel.read(next(name for name in names if name.endswith("/METADATA"))).decode()
+    names, requires = wheel_of(tmp_path)
     assert {name.split("/")[0].rpartition(".")[2] for name in names} == {"dist-info"}
-    requires = [line.partition(": ")[2] for line in metadata.splitlines() if line.startswith("Requires-Dist: ")]
     extensions = [requirement for requirement in requires if " @ file://" in requirement]
     assert len(extensions) == 3
     # pip 23 to 26 may use a cached wheel if the last part of the URL looks like "name-version".

@@ -6,8 +6,21 @@ import torch
 from scipy.ndimage import correlate1d
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
+from utils import loss_utils
 from utils.image_utils import as_float, mse, psnr
-from utils.loss_utils import l1_loss, l2_loss, photometric_loss, ssim
+from utils.loss_utils import (
+    C1,
+    C2,
+    FusedSSIMMap,
+    _ssim,
+    create_window,
+    fast_ssim,
+    gaussian,
+    l1_loss,
+    l2_loss,
+    photometric_loss,
+    ssim,
+)
 
 
 def _pair(height: int, width: int, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
@@ -16,9 +29,9 @@ def _pair(height: int, width: int, seed: int = 0) -> tuple[torch.Tensor, torch.T
     return first, (first + 0.2 * torch.randn(3, height, width, generator=generator)).clamp(0, 1)
 
 
-def _ssim_map(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+def _ssim_map(a: np.ndarray, b: np.ndarray, size: int = 11) -> np.ndarray:
     """The SSIM map of (3, H, W) in double, with zeros outside, by SciPy's correlation."""
-    window = np.exp(-0.5 * ((np.arange(11) - 5) / 1.5) ** 2)
+    window = np.exp(-0.5 * ((np.arange(size) - size // 2) / 1.5) ** 2)
     window /= window.sum()
 
     def blur(x: np.ndarray) -> np.ndarray:
@@ -29,13 +42,142 @@ def _ssim_map(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return (2 * ma * mb + 1e-4) * (2 * cab + 9e-4) / ((ma * ma + mb * mb + 1e-4) * (va + vb + 9e-4))
 
 
+@pytest.fixture(params=["fused", "plain"])
+def form(request, monkeypatch) -> str:
+    """Both ways that `ssim` has; the plain one is what it takes where the kernels do not fit."""
+    if request.param == "plain":
+        monkeypatch.setattr(loss_utils, "_kernels_fit", lambda *_: False)
+    return request.param
+
+
 @pytest.mark.parametrize("size", [(37, 53), (7, 9), (1, 1), (11, 24)])
-def test_plain_ssim_equals_a_double_precision_correlation(size):
+def test_ssim_equals_a_double_precision_correlation(size, form):
     a, b = _pair(*size)
     expected = _ssim_map(a.double().numpy(), b.double().numpy()).mean()
     # Variances are differences of blurred squares near 1, so float32 errors are some 1e-6 (2^-24 * 11 / 9e-4 a pixel).
     assert abs(ssim(a, b).item() - expected) < 1e-5
     assert abs(ssim(a.double(), b.double()).item() - expected) < 1e-12
+
+
+@pytest.mark.parametrize("window", [3, 7, 15])
+def test_ssim_of_other_windows(window):
+    a, b = _pair(21, 30)
+    expected = _ssim_map(a.double().numpy(), b.double().numpy(), window).mean()
+    assert abs(ssim(a, b, window).item() - expected) < 1e-5
+    assert abs(ssim(a.double(), b.double(), window_size=window).item() - expected) < 1e-12
+
+
+def _gradients(a: torch.Tensor, b: torch.Tensor, wanted: tuple[bool, bool], function=ssim) -> list[torch.Tensor]:
+    leaves = [image.clone().requires_grad_(want) for image, want in zip((a, b), wanted, strict=True)]
+    function(*leaves).sum().backward()
+    return [leaf.grad for leaf in leaves]
+
+
+@pytest.mark.parametrize("average", [True, False])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_gradients_of_either_image_or_both_are_the_same(dtype, average):
+    pairs = [_pair(20, 33, seed) for seed in (0, 1)]
+    a, b = (torch.stack(images).to(dtype) for images in zip(*pairs, strict=True))
+
+    def function(x: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
+        return ssim(x, y, size_average=average)
+
+    both = _gradients(a, b, (True, True), function)
+    exact = _gradients(a.double(), b.double(), (True, True), function)
+    tolerance = 1e-4 if dtype == torch.float32 else 1e-11  # of the largest; the plain form loses digits in variances
+    for place, wanted in enumerate([(True, False), (False, True)]):
+        one = _gradients(a, b, wanted, function)
+        assert one[1 - place] is None
+        for got in (one[place], both[place]):
+            assert (got - exact[place]).abs().max() < tolerance * exact[place].abs().max()
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="torch finds no NVIDIA GPU")
+def test_ssim_on_a_gpu_is_the_cpus():
+    a, b = _pair(40, 50)
+    for wanted in [(True, False), (False, True), (True, True)]:
+        there = _gradients(a.cuda(), b.cuda(), wanted)
+        for got, exact in zip(there, _gradients(a.double(), b.double(), wanted), strict=True):
+            assert (got is None) == (exact is None)
+            assert got is None or (got.cpu() - exact).abs().max() < 1e-4 * exact.abs().max()
+    assert abs(ssim(a.cuda(), b.cuda()).item() - ssim(a.double(), b.double()).item()) < 1e-5
+    # The kernels have no float64 on a GPU.
+    assert abs(ssim(a.double().cuda(), b.double().cuda()).item() - ssim(a.double(), b.double()).item()) < 1e-12
+
+
+def test_the_kernels_compute_what_they_can(monkeypatch):
+    calls = []
+    kernel = loss_utils.fused_l1_ssim
+    monkeypatch.setattr(loss_utils, "fused_l1_ssim", lambda *images: calls.append(images) or kernel(*images))
+
+    def fused(x: torch.Tensor, y: torch.Tensor, *options: object) -> int:
+        calls.clear()
+        ssim(x, y, *options)
+        return len(calls)
+
+    a, b = _pair(16, 16)
+    batch = torch.stack((a, b, a))
+    for x, y in ((a, b), (a[None], b), (a.double(), b.double()), (a.clone().requires_grad_(), b), (a.mT, b.mT)):
+        assert fused(x, y) == fused(y, x) == 1
+    assert fused(batch, batch, 11, False) == 3
+    leaf = a.clone().requires_grad_()
+    assert fused(leaf, leaf) == 0
+    with torch.no_grad():
+        assert fused(leaf, leaf) == 1
+    assert fused(a, b, 7) == fused(a.bfloat16(), b.bfloat16()) == fused(batch, b[None]) == 0
+
+
+def test_the_plain_form_takes_what_the_kernels_do_not():
+    a, b = _pair(16, 16)
+    assert abs(ssim(a.bfloat16(), b.bfloat16()).item() - ssim(a, b).item()) < 0.1  # 8 bits of precision
+    batch = torch.stack((a, b))
+    torch.testing.assert_close(ssim(batch, a[None]), (ssim(a, a) + ssim(b, a)) / 2)
+    mapped = torch.vmap(lambda x, y: ssim(x, y))(batch, batch.flip(0))
+    torch.testing.assert_close(mapped, torch.stack((ssim(a, b), ssim(b, a))))
+    leaf = a.double().requires_grad_()
+    other = b.double().requires_grad_()
+    (slope,) = torch.autograd.grad(ssim(leaf, other), leaf, create_graph=True)  # of two images that need gradients
+    assert torch.autograd.grad(slope.sum(), leaf)[0].isfinite().all()
+
+
+def test_windows_of_the_caller():
+    window = create_window(11, 3)
+    assert window.shape == (3, 1, 11, 11) and window.dtype == torch.float32 and window.is_contiguous()
+    taps = gaussian(11, 1.5)
+    assert taps.shape == (11,) and taps.dtype == torch.float32
+    np.testing.assert_allclose(taps.numpy(), np.exp(-((np.arange(11) - 5) ** 2) / 4.5) / 3.7592, rtol=1e-4)
+    torch.testing.assert_close(window, torch.outer(taps, taps).expand(3, 1, 11, 11))
+    torch.testing.assert_close(window.sum((1, 2, 3)), torch.ones(3))
+    a, b = _pair(20, 21)
+    assert abs(_ssim(a[None], b[None], window, 11, 3) - ssim(a, b)) < 1e-5
+    assert abs(_ssim(a, b, window, 11, 3) - ssim(a, b)) < 1e-5
+    each = _ssim(torch.stack((a, b)), torch.stack((b, b)), window, 11, 3, False)
+    torch.testing.assert_close(each, torch.stack((ssim(a, b), ssim(b, b))), rtol=0, atol=1e-5)
+    ones = torch.ones(3, 1, 3, 3) / 9  # another window than a Gaussian
+    assert abs(_ssim(a, b, ones, 3, 3) - ssim(a, b)) > 1e-3
+
+
+def test_fast_ssim_differentiates_its_first_image():
+    a, b = _pair(20, 21)
+    assert fast_ssim(a[None], b[None]) == ssim(a, b)
+    first, second = _gradients(a, b, (True, True), fast_ssim)
+    assert torch.equal(first, _gradients(a, b, (True, False))[0]) and second is None
+
+
+def test_the_map_of_older_code():
+    a, b = (image[None] for image in _pair(20, 21))
+    whole = FusedSSIMMap.apply(C1, C2, a, b)
+    wanted = _ssim_map(a[0].double().numpy(), b[0].double().numpy())
+    np.testing.assert_allclose(whole[0].numpy(), wanted, atol=1e-3)  # a pixel in float32; see the error of the mean
+    assert torch.equal(FusedSSIMMap.apply(C1, C2, a, b, "valid"), whole[..., 5:-5, 5:-5])
+    leaf, other = a.clone().requires_grad_(), b.clone().requires_grad_()
+    FusedSSIMMap.apply(C1, C2, leaf, other, "same", True).mean().backward()
+    exact = _gradients(a.double(), b.double(), (True, False))[0]
+    assert (leaf.grad - exact).abs().max() < 1e-4 * exact.abs().max() and other.grad is None
+    assert not FusedSSIMMap.apply(C1, C2, leaf, b, train=False).requires_grad
+    with pytest.raises(ValueError, match='"same" or "valid", got \'full\''):
+        FusedSSIMMap.apply(C1, C2, a, b, "full")
 
 
 def test_plain_ssim_agrees_with_scikit_image_inside():

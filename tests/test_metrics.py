@@ -18,7 +18,7 @@ import metrics
 from utils import lpips_utils
 from utils.files import image_files
 from utils.lpips_utils import LpipsUnavailable, PerceptualDistance, import_lpips
-from utils.system_utils import UserError, run_cli
+from utils.system_utils import UserError, compute_device, run_cli
 
 ROOT = Path(__file__).parents[1]
 
@@ -244,6 +244,34 @@ def test_files_by_contract(tmp_path, weights, run):
         with torch.no_grad():
             expected = weights[net][1](*images, normalize=normalize).item()
         assert per_view["ours_30"][key]["00000.png"] == expected
+
+
+def test_images_of_two_folders_as_tensors(tmp_path):
+    folder = make_model(tmp_path / "model") / "test" / "ours_30"
+    Image.fromarray(picture(9)).convert("RGBA").save(folder / "gt" / "00001.png")
+    renders, truths, names = metrics.readImages(folder / "renders", folder / "gt")
+    assert names == ["00000.png", "00001.png"]
+    for side, images in (("renders", renders), ("gt", truths)):
+        for name, image in zip(names, images, strict=True):
+            assert image.shape == (1, 3, 40, 56) and image.dtype == torch.float32 and image.is_contiguous()
+            assert image.device.type == compute_device().type
+            with Image.open(folder / side / name) as file:
+                pixels = np.asarray(file.convert("RGB"), dtype=np.float32)
+            np.testing.assert_array_equal(image[0].cpu().numpy().transpose(1, 2, 0), pixels / 255)
+    by_text = metrics.readImages(str(folder / "renders"), str(folder / "gt"))
+    assert torch.equal(by_text[0][1], renders[1])
+
+
+def test_scores_of_folders_by_a_call_are_the_commands(tmp_path, run, monkeypatch, capsys):
+    first, second = make_model(tmp_path / "a"), make_model(tmp_path / "b")
+    assert run("-m", first)[0] == 0
+    monkeypatch.setattr(lpips_utils, "_network_failed", True)
+    assert metrics.evaluate([str(second)]) is None
+    for name in ("results.json", "per_view.json", "metrics_info.json"):
+        assert (second / name).read_bytes() == (first / name).read_bytes()
+    assert f"{second} ours_30 (2 views): SSIM" in capsys.readouterr().out
+    with pytest.raises(UserError, match="no such model folder"):
+        metrics.evaluate([tmp_path / "nowhere"])
 
 
 def test_without_weights_lpips_is_null_and_says_what_to_do(tmp_path, run):

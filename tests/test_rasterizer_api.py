@@ -1,11 +1,24 @@
 """The public interface (CONTRACT.md 6.1): arguments, results, exceptions and their messages."""
 
+import inspect
+
 import pytest
 import torch
-from diff_gaussian_rasterization import GaussianRasterizationSettings, GaussianRasterizer, rasterize
+from diff_gaussian_rasterization import (
+    GaussianRasterizationSettings,
+    GaussianRasterizer,
+    Gaussians,
+    cpu_deep_copy_tuple,
+    decisive,
+    rasterize,
+    rasterize_gaussians,
+    reference,
+)
 from rasterizer_tools import activated, few, leaves, ops, render, scene_arguments
 
 from benchmarks.workloads.splat_scenes import settings
+
+COVARIANCE = torch.eye(3)[[0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]].repeat(3, 1)  # of three spheres
 
 
 def scene(n: int = 3, dtype: torch.dtype = torch.float32):
@@ -43,13 +56,25 @@ def test_settings_are_the_references_tuple():
         "antialiasing",
     ]
     assert GaussianRasterizationSettings._fields[:13] == tuple(names)
-    # Our fields follow and have defaults, so that the reference's 13 stay valid by position and by name.
-    assert set(GaussianRasterizationSettings._fields[13:]) == set(GaussianRasterizationSettings._field_defaults)
+    # Our fields follow and have defaults, so that the reference's 13 stay valid by position and by name. The last of
+    # these has one because 2023 did not know it.
+    assert set(GaussianRasterizationSettings._fields[12:]) == set(GaussianRasterizationSettings._field_defaults)
     splats, camera = scene()
     by_place = GaussianRasterizationSettings(*camera[:13])
     assert torch.equal(call(splats, by_place)[0], call(splats, camera)[0])
     with pytest.raises(TypeError):
-        GaussianRasterizationSettings(*camera[:12])
+        GaussianRasterizationSettings(*camera[:11])
+
+
+def test_settings_of_2023_give_two_results():
+    splats, camera = scene()
+    inputs = leaves(splats)
+    result = call(inputs, GaussianRasterizationSettings(*camera[:12]))
+    assert isinstance(result, tuple) and len(result) == 2
+    wanted = call(splats, camera._replace(antialiasing=False))
+    assert torch.equal(result[0], wanted[0]) and torch.equal(result[1], wanted[1])
+    result[0].sum().backward()
+    assert inputs["means"].grad.any()
 
 
 def test_three_results():
@@ -83,20 +108,19 @@ def test_the_class_and_the_function_agree():
 
 def test_exactly_one_of_each_pair_of_alternatives():
     splats, camera = scene()
-    covariance = torch.eye(3)[[0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]].repeat(3, 1)
     for changes in (
         {"shs": None},
         {"colors_precomp": torch.rand(3, 3)},
         {"scales": None},
         {"rotations": None},
         {"scales": None, "rotations": None},
-        {"cov3D_precomp": covariance},
-        {"cov3D_precomp": covariance, "scales": None},
+        {"cov3D_precomp": COVARIANCE},
+        {"cov3D_precomp": COVARIANCE, "scales": None},
     ):
         with pytest.raises(Exception, match="exactly one"):
             call(splats, camera, **changes)
     call(splats, camera, shs=None, colors_precomp=torch.rand(3, 3))
-    call(splats, camera, scales=None, rotations=None, cov3D_precomp=covariance)
+    call(splats, camera, scales=None, rotations=None, cov3D_precomp=COVARIANCE)
 
 
 @pytest.mark.parametrize("degree", [0, 3])
@@ -172,6 +196,138 @@ def test_strided_inputs_give_the_same_bits():
     plain = leaves(splats)
     render(plain, camera, raw=False).color.sum().backward()
     assert torch.equal(inputs["means"].grad, plain["means"].grad)
+
+
+def test_results_are_contiguous_float32():
+    splats, camera = scene()
+    for image in call(leaves(splats), camera)[::2]:
+        assert image.is_contiguous() and image.dtype == torch.float32
+
+
+def test_the_band_of_degree_0_may_come_apart():
+    """As callers of the accelerated branch pass it: dc and the rest by keyword."""
+    splats, camera = scene()
+    whole, apart = leaves(splats), leaves(splats)
+    images = [call(whole, camera)[0], call(apart, camera, dc=apart["sh_dc"], shs=apart["sh_rest"])[0]]
+    assert torch.equal(*images)
+    for image in images:
+        image.square().sum().backward()
+    for name in splats:
+        assert torch.equal(whole[name].grad, apart[name].grad)
+    flat = camera._replace(sh_degree=0)
+    assert torch.equal(call(splats, flat, dc=splats["sh_dc"], shs=None)[0], call(splats, flat)[0])
+    with pytest.raises(Exception, match="exactly one"):
+        call(splats, camera, dc=splats["sh_dc"], shs=None, colors_precomp=torch.rand(3, 3))
+
+
+def _screen_gradient(splats, camera, leaf, made=lambda leaf: leaf):
+    """The gradient of `leaf`, of which `made` makes the screen means of a call."""
+    call(splats, camera, means2D=made(leaf))[0].square().sum().backward()
+    return leaf.grad
+
+
+def test_screen_means_of_any_kind_receive_the_gradient():
+    splats, camera = scene()
+    wanted = _screen_gradient(splats, camera, torch.zeros(3, 3, requires_grad=True))
+    assert wanted[:, :2].any()
+    for kind, leaf, made in [
+        ("not a leaf", torch.zeros(3, 3), lambda t: t + 0),
+        ("a view", torch.zeros(5, 6), lambda t: t[1:4, ::2]),
+        ("expanded", torch.zeros(()), lambda t: t.expand(3, 3)),
+        ("float64", torch.zeros(3, 3, dtype=torch.float64), lambda t: t),
+        ("float16", torch.zeros(3, 3, dtype=torch.float16), lambda t: t),
+    ]:
+        got = _screen_gradient(splats, camera, leaf.requires_grad_(), made)
+        assert got.dtype == leaf.dtype, kind
+        if kind == "a view":
+            got = got[1:4, ::2]
+        if kind == "expanded":
+            torch.testing.assert_close(got, wanted.sum())
+        else:
+            torch.testing.assert_close(got, wanted.to(got.dtype), msg=kind)
+
+
+def test_screen_means_that_need_no_gradient_may_have_any_form():
+    splats, camera = scene()
+    wanted = call(splats, camera)[0]
+    for means2D in (torch.zeros(3, 2), torch.zeros(0), torch.zeros(7, 3), torch.zeros(3, 3, dtype=torch.int64)):
+        assert torch.equal(call(splats, camera, means2D=means2D)[0], wanted)
+    with pytest.raises(ValueError, match=r"means2d must be \(3, 3\), got \(3, 2\)"):
+        call(splats, camera, means2D=torch.zeros(3, 2, requires_grad=True))
+
+
+def test_empty_tensors_stand_for_none():
+    splats, camera = scene()
+    empty = torch.Tensor([])
+    assert torch.equal(call(splats, camera, colors_precomp=empty, cov3D_precomp=empty)[0], call(splats, camera)[0])
+    colors = torch.rand(3, 3)
+    changes = {"colors_precomp": colors, "cov3D_precomp": COVARIANCE}
+    got = call(splats, camera, shs=empty, scales=empty, rotations=empty, **changes)[0]
+    assert torch.equal(got, call(splats, camera, shs=None, scales=None, rotations=None, **changes)[0])
+    with pytest.raises(Exception, match="exactly one"):
+        call(splats, camera, shs=empty)
+
+
+def test_the_function_behind_the_class():
+    splats, camera = scene()
+    sh, empty = torch.cat([splats["sh_dc"], splats["sh_rest"]], 1), torch.Tensor([])
+    shape = splats["scales"], splats["rotations"]
+    means2d = torch.zeros(3, 3, requires_grad=True)
+    places = (splats["means"], means2d, sh, empty, splats["opacities"], *shape, empty, camera)
+    result = rasterize_gaussians(*places)
+    for got, wanted in zip(result, call(splats, camera), strict=True):
+        assert torch.equal(got, wanted)
+    result[0].sum().backward()
+    assert means2d.grad.any()
+    assert len(rasterize_gaussians(*places[:-1], GaussianRasterizationSettings(*camera[:12]))) == 2
+    # Of two alternatives the precomputed values count, as in the reference.
+    colors = torch.rand(3, 3)
+    both = rasterize_gaussians(splats["means"], None, sh, colors, splats["opacities"], *shape, COVARIANCE, camera)
+    one = {"shs": None, "scales": None, "rotations": None, "colors_precomp": colors, "cov3D_precomp": COVARIANCE}
+    assert torch.equal(both[0], call(splats, camera, **one)[0])
+
+
+def test_copies_of_a_tuple_lie_on_the_cpu():
+    tensor = torch.arange(3.0)
+    copied = cpu_deep_copy_tuple((tensor, 7, None))
+    assert isinstance(copied, tuple) and copied[1:] == (7, None)
+    assert torch.equal(copied[0], tensor) and copied[0].data_ptr() != tensor.data_ptr()
+
+
+@pytest.mark.parametrize("function", [rasterize, decisive, reference.render])
+def test_signatures_list_every_input(function):
+    parameters = inspect.signature(function).parameters
+    assert all(parameter.kind is not parameter.VAR_KEYWORD for parameter in parameters.values())
+    for name in Gaussians._fields:
+        assert name in parameters
+    for name, default in Gaussians._field_defaults.items():
+        assert parameters[name].kind is inspect.Parameter.KEYWORD_ONLY and parameters[name].default is default
+    splats, camera = scene()
+    with pytest.raises(TypeError, match="no_such_input"):
+        render(splats | {"no_such_input": None}, camera, raw=False)
+
+
+@pytest.mark.parametrize("grad", [True, False])
+@pytest.mark.parametrize("as_other", [torch.Tensor.numpy, torch.Tensor.tolist], ids=["array", "list"])
+def test_other_types_than_tensors_are_named(as_other, grad):
+    splats, camera = scene()
+    kind = "numpy.ndarray" if as_other is torch.Tensor.numpy else "list"
+    with torch.set_grad_enabled(grad):
+        for name, values in splats.items():
+            wrong = splats | {name: as_other(values)}
+            with pytest.raises(TypeError, match=f"^{name} must be a tensor, got {kind}: convert"):
+                render(wrong, camera, torch.zeros(3, 3), raw=False)
+            with pytest.raises(TypeError, match=f"^{name} must be a tensor, got {kind}"):
+                rest = {k: v for k, v in wrong.items() if k not in ("means", "opacities")}
+                decisive(wrong["means"], wrong["opacities"], camera, **rest)
+        for name in ("viewmatrix", "bg"):
+            with pytest.raises(TypeError, match=f"^{name} must be a tensor, got {kind}"):
+                render(splats, camera._replace(**{name: as_other(getattr(camera, name))}), raw=False)
+        for name, key in (("means3D", "means"), ("scales", "scales"), ("means2D", "means"), ("opacities", "opacities")):
+            with pytest.raises(TypeError, match=f"^{name} must be a tensor, got {kind}"):
+                call(splats, camera, **{name: as_other(splats[key])})
+        with pytest.raises(TypeError, match=f"^sh must be a tensor, got {kind}"):
+            call(splats, camera, shs=as_other(torch.zeros(3, 16, 3)))
 
 
 def test_only_asked_gradients_are_made():

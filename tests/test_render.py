@@ -1,7 +1,7 @@
 """render.py: its files for a view, and its timing; test_end_to_end.py tests the whole command."""
 
 import json
-from argparse import Namespace
+from argparse import ArgumentParser, Namespace
 from types import SimpleNamespace
 
 import numpy as np
@@ -9,6 +9,7 @@ import pytest
 import torch
 from PIL import Image
 
+from arguments import ModelParams, PipelineParams
 from records import render_times
 from scene.gaussians.attributes import attributes
 from scene.gaussians.ply import write_ply
@@ -58,7 +59,7 @@ def test_renders_and_ground_truth_side_by_side(tmp_path, rendered):
     views = [view(plain), view(composited)]
     rendered.update({id(views[0]): first, id(views[1]): second})
     folder = tmp_path / "test" / "ours_7"
-    seconds = render.render_set(folder, views, None, Namespace(), torch.zeros(3))
+    seconds = render.write_views(folder, views, None, Namespace(), torch.zeros(3))
     assert len(seconds) == 2 and min(seconds) > 0
     assert sorted(file.relative_to(folder).as_posix() for file in folder.rglob("*.png")) == [
         "gt/00000.png", "gt/00001.png", "renders/00000.png", "renders/00001.png",
@@ -72,22 +73,22 @@ def test_renders_and_ground_truth_side_by_side(tmp_path, rendered):
 def test_pngs_of_an_earlier_larger_run_are_removed_and_nothing_else(tmp_path, rendered):
     views = [view(torch.zeros(3, 4, 4, dtype=torch.uint8)) for _ in range(3)]
     rendered.update({id(one): torch.zeros(3, 4, 4) for one in views})
-    render.render_set(tmp_path, views, None, Namespace(), torch.zeros(3))
+    render.write_views(tmp_path, views, None, Namespace(), torch.zeros(3))
     (tmp_path / "gt" / "notes.png").write_text("mine")
-    render.render_set(tmp_path, views[:1], None, Namespace(), torch.zeros(3))
+    render.write_views(tmp_path, views[:1], None, Namespace(), torch.zeros(3))
     assert sorted(file.name for file in (tmp_path / "renders").iterdir()) == ["00000.png"]
     assert sorted(file.name for file in (tmp_path / "gt").iterdir()) == ["00000.png", "notes.png"]
 
 
 def test_without_views_no_folders_appear_and_old_renders_go(tmp_path, rendered, capsys):
     folder = tmp_path / "test" / "ours_1"
-    assert render.render_set(folder, [], None, Namespace(), torch.zeros(3)) == []
+    assert render.write_views(folder, [], None, Namespace(), torch.zeros(3)) == []
     assert not (tmp_path / "test").exists()
     one = view(torch.zeros(3, 4, 4, dtype=torch.uint8))
     rendered[id(one)] = torch.zeros(3, 4, 4)
-    render.render_set(folder, [one], None, Namespace(), torch.zeros(3))
+    render.write_views(folder, [one], None, Namespace(), torch.zeros(3))
     capsys.readouterr()
-    render.render_set(folder, [], None, Namespace(), torch.zeros(3))
+    render.write_views(folder, [], None, Namespace(), torch.zeros(3))
     assert list(folder.rglob("*.png")) == []
     assert capsys.readouterr().err == ""  # no progress bar without views
 
@@ -100,6 +101,51 @@ def test_a_model_without_gaussians_is_refused(tmp_path, colmap_scene, monkeypatc
     with pytest.raises(UserError, match="iteration 7 of .* has no Gaussians"):
         render.main()
     assert sorted(path.name for path in (tmp_path / "model").iterdir()) == ["cfg_args", "point_cloud"]
+
+
+def test_views_by_the_references_arguments(tmp_path, rendered, capsys):
+    image = torch.rand(3, 4, 5, generator=torch.Generator().manual_seed(2))
+    one = view(torch.zeros(3, 4, 5, dtype=torch.uint8))
+    rendered[id(one)] = image
+    pipe, background = Namespace(antialiasing=False), torch.zeros(3)
+    places = (str(tmp_path), "test", 30, [one], range(7), pipe, background)  # a model of which only the length is read
+    assert render.render_set(*places) is None
+    folder = tmp_path / "test" / "ours_30"
+    files = sorted(file.relative_to(folder).as_posix() for file in folder.rglob("*.*"))
+    assert files == ["gt/00000.png", "render_times.json", "renders/00000.png"]
+    assert json.loads((folder / "render_times.json").read_text())["gaussians"] == 7
+    assert np.array_equal(read(folder / "renders" / "00000.png"), render.to_bytes(image).numpy())
+    assert "test: 1 views, median" in capsys.readouterr().out
+    # Half images, and the two arguments that 2023 did not have; its options lack antialiasing.
+    render.render_set(str(tmp_path), "train", 30, [one], range(7), Namespace(), background, True, True)
+    half = read(tmp_path / "train" / "ours_30" / "renders" / "00000.png")
+    assert np.array_equal(half, render.to_bytes(image[..., 2:]).numpy())
+
+
+def test_sets_by_the_references_arguments(tmp_path, colmap_scene):
+    model = tmp_path / "model"
+    rows = {name: torch.zeros(5, *attribute.shape) for name, attribute in attributes(3).items()}
+    for iteration in (7, 30):
+        write_ply(model / "point_cloud" / f"iteration_{iteration}" / "point_cloud.ply", rows, 3)
+    (model / "cfg_args").write_text(f"Namespace(sh_degree=3, source_path={str(colmap_scene)!r}, eval=True)")
+    parser = ArgumentParser()
+    options, pipeline = ModelParams(parser), PipelineParams(parser)
+    args = parser.parse_args(["-s", str(colmap_scene), "-m", str(model), "--eval"])
+    dataset = options.extract(args)
+    before = vars(dataset).copy()
+
+    def written() -> dict[str, int]:
+        counts = {}
+        for file in model.rglob("*/renders/*.png"):
+            folder = file.parents[1].relative_to(model).as_posix()
+            counts[folder] = counts.get(folder, 0) + 1
+        return counts
+
+    assert render.render_sets(dataset, 7, pipeline.extract(args), True, False) is None
+    assert written() == {"test/ours_7": 3}
+    render.render_sets(dataset, -1, pipeline.extract(args), False, True, False)
+    assert written() == {"test/ours_7": 3, "train/ours_30": 14}
+    assert vars(dataset) == before
 
 
 def test_times_are_in_milliseconds_by_picture():

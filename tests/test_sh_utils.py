@@ -5,7 +5,7 @@ import pytest
 import torch
 from scipy.special import sph_harm_y
 
-from utils.sh_utils import RGB2SH, SH2RGB, eval_sh, sh_basis
+from utils.sh_utils import C0, C1, C2, C3, C4, RGB2SH, SH2RGB, eval_sh, sh_basis
 
 
 def _directions(count: int) -> torch.Tensor:
@@ -27,6 +27,16 @@ def test_basis_is_scipys():
     theta, phi = np.arccos(z), np.arctan2(y, x)
     wanted = np.stack([_real(l, m, theta, phi) for l in range(5) for m in range(-l, l + 1)], axis=-1)  # noqa: E741
     np.testing.assert_allclose(sh_basis(4, d).numpy(), wanted, atol=1e-13)  # arccos near the poles loses some digits
+
+
+def test_factors_by_degree():
+    """Those that other code multiplies with its own polynomials; the signs are those of the rasterizer."""
+    np.testing.assert_allclose([C0, C1], np.sqrt(np.array([1, 3]) / (4 * np.pi)), rtol=1e-15)
+    assert [len(factors) for factors in (C2, C3, C4)] == [5, 7, 9]
+    x, y, z = d = _directions(1)[0]
+    basis = sh_basis(4, d)
+    assert basis[1] == -C1 * y and basis[4] == C2[0] * x * y and basis[10] == C3[1] * x * y * z
+    assert basis[16] == C4[0] * x * y * (x * x - y * y) and basis[8] == C2[4] * (x * x - y * y)
 
 
 @pytest.mark.parametrize("degree", range(5))

@@ -8,12 +8,19 @@ from typing import TextIO
 
 import numpy as np
 import torch
+from PIL import Image
 from torch import Tensor
 
 
 def inverse_sigmoid(x: Tensor) -> Tensor:
     """Logit of x in (0, 1), any shape: log(x / (1 - x))."""
     return torch.log(x / (1 - x))
+
+
+def PILtoTorch(pil_image: Image.Image, resolution: tuple[int, int]) -> Tensor:
+    """Picture as (C,H,W) float32 in [0,1], (1,H,W) if it is grey, after Pillow's resize to (width, height)."""
+    pixels = torch.from_numpy(np.array(pil_image.resize(resolution))) / 255.0
+    return pixels[None] if pixels.dim() == 2 else pixels.permute(2, 0, 1)
 
 
 def build_rotation(r: Tensor) -> Tensor:
@@ -32,10 +39,15 @@ def build_scaling_rotation(s: Tensor, r: Tensor) -> Tensor:
     return build_rotation(r) * s[:, None, :]
 
 
+def strip_lowerdiag(L: Tensor) -> Tensor:
+    """Upper triangles (N,6), order xx xy xz yy yz zz, of matrices (N,3,3)."""
+    row, column = torch.triu_indices(3, 3, device=L.device)
+    return L[:, row, column]
+
+
 def strip_symmetric(sym: Tensor) -> Tensor:
-    """Upper triangles (N,6), order xx xy xz yy yz zz, of symmetric matrices (N,3,3)."""
-    row, column = torch.triu_indices(3, 3, device=sym.device)
-    return sym[:, row, column]
+    """`strip_lowerdiag` of symmetric matrices (N,3,3), which loses nothing."""
+    return strip_lowerdiag(sym)
 
 
 def get_expon_lr_func(

@@ -1,9 +1,24 @@
-"""Losses between a render and its target: plain PyTorch for reading and comparing, fused kernels for training."""
+"""Losses between a render and its target: by fused kernels where they can, in plain PyTorch elsewhere."""
 
+import utils.host.extensions  # noqa: F401  isort: skip  (before the extensions)
 import torch
 import torch.nn.functional as F
-from fused_ssim import fused_l1_ssim, fused_photometric_loss
+from fused_ssim import FusedSSIMMap, fused_l1_ssim, fused_photometric_loss, has_backend
+from fused_ssim.maps import gaussian_taps, separable_blur, similarity
 from torch import Tensor
+
+__all__ = [
+    "FusedSSIMMap",
+    "create_window",
+    "fast_ssim",
+    "gaussian",
+    "inverse_depth_loss",
+    "l1_and_ssim",
+    "l1_loss",
+    "l2_loss",
+    "photometric_loss",
+    "ssim",
+]
 
 WINDOW = 11
 SIGMA = 1.5  # pixels
@@ -21,38 +36,63 @@ def l2_loss(network_output: Tensor, gt: Tensor) -> Tensor:
     return ((network_output - gt) ** 2).mean()
 
 
-def _gaussian_window(size: int, like: Tensor) -> Tensor:
-    """Normalised 1D Gaussian of `size` taps, sigma 1.5."""
-    x = torch.arange(size, dtype=torch.float64) - size // 2
-    weights = torch.exp(-0.5 * (x / SIGMA) ** 2)
-    return (weights / weights.sum()).to(like)
-
-
 def ssim(img1: Tensor, img2: Tensor, window_size: int = WINDOW, size_average: bool = True) -> Tensor:
     """Structural similarity (Wang et al. 2004, eq. 13) per channel, with a Gaussian window and zeros outside the image.
 
     img1, img2: (C, H, W) or (B, C, H, W) in [0, 1]. Returns the mean over everything, or over each image of the batch
-    if `size_average` is off.
+    if `size_average` is off. Fused kernels compute it where they can: for a window of 11 pixels, and unless both images
+    need gradients. Their gradient cannot be differentiated again.
     """
-    if img1.dim() == 3:
-        img1, img2 = img1[None], img2[None]
-    channels = img1.shape[1]
-    window = _gaussian_window(window_size, img1)
-    rows = window.view(1, 1, -1, 1).repeat(channels, 1, 1, 1)
-    columns = window.view(1, 1, 1, -1).repeat(channels, 1, 1, 1)
+    img1, img2 = (image[None] if image.dim() == 3 else image for image in (img1, img2))
+    if window_size != WINDOW or not _kernels_fit(img1, img2):
+        blur = separable_blur(gaussian_taps(window_size, SIGMA), img1)
+        return _mean(similarity(img1, img2, blur, C1, C2), size_average)
+    if img2.requires_grad:
+        img1, img2 = img2, img1  # SSIM is symmetric, and the kernels differentiate it by their first image
+    if size_average:
+        return fused_l1_ssim(img1, img2)[1]
+    return torch.stack([fused_l1_ssim(*pair)[1] for pair in zip(img1, img2, strict=True)])
+
+
+def _kernels_fit(img1: Tensor, img2: Tensor) -> bool:
+    """Whether the fused kernels give the value and all gradients of the plain formula."""
+    both = torch.is_grad_enabled() and img1.requires_grad and img2.requires_grad
+    if both or torch._C._are_functorch_transforms_active():
+        return False
+    dtypes = (torch.float32, torch.float64) if img1.device.type == "cpu" else (torch.float32,)
+    alike = img1.shape == img2.shape and img1.dtype == img2.dtype and img1.device == img2.device
+    return alike and img1.dtype in dtypes and img1.numel() > 0 and has_backend(img1.device.type)
+
+
+def _mean(similarities: Tensor, size_average: bool) -> Tensor:
+    return similarities.mean() if size_average else similarities.mean(dim=(1, 2, 3))
+
+
+def fast_ssim(img1: Tensor, img2: Tensor) -> Tensor:
+    """Mean of `ssim` over two images of one shape (..., H, W); only img1 receives a gradient."""
+    return fused_l1_ssim(img1, img2)[1]
+
+
+def gaussian(window_size: int, sigma: float) -> Tensor:
+    """Normalised Gaussian (window_size,) float32; sigma in pixels."""
+    return gaussian_taps(window_size, sigma).float()
+
+
+def create_window(window_size: int, channel: int) -> Tensor:
+    """Normalised Gaussian windows (channel, 1, window_size, window_size) float32, sigma 1.5, for `_ssim`."""
+    taps = gaussian_taps(window_size, SIGMA)
+    return torch.outer(taps, taps).float().repeat(channel, 1, 1, 1)
+
+
+def _ssim(
+    img1: Tensor, img2: Tensor, window: Tensor, window_size: int, channel: int, size_average: bool = True
+) -> Tensor:
+    """`ssim` with windows of the caller, as `create_window` makes them."""
 
     def blur(image: Tensor) -> Tensor:
-        image = F.conv2d(image, rows, padding=(window_size // 2, 0), groups=channels)
-        return F.conv2d(image, columns, padding=(0, window_size // 2), groups=channels)
+        return F.conv2d(image, window, padding=window_size // 2, groups=channel)
 
-    mean1, mean2 = blur(img1), blur(img2)
-    variance1 = blur(img1 * img1) - mean1 * mean1
-    variance2 = blur(img2 * img2) - mean2 * mean2
-    covariance = blur(img1 * img2) - mean1 * mean2
-    luminance = (2 * mean1 * mean2 + C1) / (mean1 * mean1 + mean2 * mean2 + C1)
-    structure = (2 * covariance + C2) / (variance1 + variance2 + C2)
-    similarity = luminance * structure
-    return similarity.mean() if size_average else similarity.mean(dim=(1, 2, 3))
+    return _mean(similarity(img1, img2, blur, C1, C2), size_average)
 
 
 def photometric_loss(

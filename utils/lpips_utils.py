@@ -14,11 +14,13 @@ from pathlib import Path
 from types import ModuleType
 
 import torch
-from torch import library
+from torch import library, nn
 
 from utils.system_utils import UserError
 
-# The first convolution tells the backbones apart. Images below the smallest side (pixels) shrink to nothing in pooling.
+NETS = {"alex": "alexnet", "vgg": "vgg16", "squeeze": "squeezenet1_1"}  # backbones, and torchvision's names for them
+# Of files, the first convolution tells the backbones apart. Images below the smallest side (pixels) shrink to nothing
+# in pooling.
 _FIRST_LAYER = {"vgg": (64, 3, 3, 3), "alex": (64, 3, 11, 11)}
 MIN_SIDE = {"vgg": 16, "alex": 31}
 _DOWNLOAD_TIMEOUT = 10.0  # seconds without an answer before the network counts as absent
@@ -56,23 +58,28 @@ def _declare_missing_operators() -> None:
             _schemas.define(f"{name}(Tensor dets, Tensor scores, float iou_threshold) -> Tensor")
 
 
-class PerceptualDistance:
-    """LPIPS with one backbone, `vgg` or `alex`.
+def load_network(net: str, weights: list[Path], device: torch.device) -> nn.Module:
+    """Load the module of the `lpips` package with one backbone of NETS, for evaluation, without gradients of its own.
 
     weights: state-dict files in torchvision's format (parameters `features.*`; others are ignored), of which the one
-    that fits the backbone is used. Without any, torch's cache is tried, and then the network. Raises LpipsUnavailable,
-    or UserError for a file of the wrong kind.
+    that fits the backbone, `vgg` or `alex`, is used. Without any, torch's cache is tried, and then the network. Raises
+    LpipsUnavailable, or UserError for a file of the wrong kind.
     """
+    state = _features_from_files(net, weights) if weights else _features_from_cache(net)
+    lpips = import_lpips()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # torchvision warns of an argument that lpips still uses
+        model = lpips.LPIPS(net=net, pnet_rand=True, verbose=False)  # random only until the next lines
+    trunk = model.net.state_dict()  # names are sliceK.N.weight, N being the layer of torchvision's `features`
+    model.net.load_state_dict({name: _pick(state, name.split(".", 1)[1], trunk[name], net) for name in trunk})
+    return model.to(device).eval().requires_grad_(False)
+
+
+class PerceptualDistance:
+    """LPIPS with one backbone, `vgg` or `alex`. Arguments and errors are those of `load_network`."""
 
     def __init__(self, net: str, weights: list[Path], device: torch.device) -> None:
-        state = _features_from_files(net, weights) if weights else _features_from_cache(net)
-        lpips = import_lpips()
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # torchvision warns of an argument that lpips still uses
-            model = lpips.LPIPS(net=net, pnet_rand=True, verbose=False)  # random only until the next lines
-        trunk = model.net.state_dict()  # names are sliceK.N.weight, N being the layer of torchvision's `features`
-        model.net.load_state_dict({name: _pick(state, name.split(".", 1)[1], trunk[name], net) for name in trunk})
-        self._model = model.to(device).eval().requires_grad_(False)
+        self._model = load_network(net, weights, device)
 
     @torch.no_grad()
     def __call__(
@@ -95,13 +102,9 @@ def _pick(state: dict[str, torch.Tensor], name: str, like: torch.Tensor, net: st
         found = "nothing" if value is None else str(tuple(getattr(value, "shape", ())))
         raise UserError(
             f"the LPIPS weights for {net} have {found} as features.{name}, wanted {tuple(like.shape)}; "
-            f"give --lpips_weights the state dict of torchvision's {_torchvision_name(net)}"
+            f"give --lpips_weights the state dict of torchvision's {NETS[net]}"
         )
     return value
-
-
-def _torchvision_name(net: str) -> str:
-    return {"vgg": "vgg16", "alex": "alexnet"}[net]
 
 
 def _features_from_files(net: str, files: list[Path]) -> dict[str, torch.Tensor]:
@@ -112,7 +115,7 @@ def _features_from_files(net: str, files: list[Path]) -> dict[str, torch.Tensor]
             raise UserError(f"{file} has no weights of torchvision's vgg16 or alexnet (features.0.weight ...)")
         if shape == _FIRST_LAYER[net]:
             return state
-    raise LpipsUnavailable(f"no file of --lpips_weights holds torchvision's {_torchvision_name(net)}; add it there")
+    raise LpipsUnavailable(f"no file of --lpips_weights holds torchvision's {NETS[net]}; add it there")
 
 
 def _load_state(file: Path) -> dict[str, torch.Tensor]:
@@ -130,13 +133,13 @@ def _load_state(file: Path) -> dict[str, torch.Tensor]:
 def _features_from_cache(net: str) -> dict[str, torch.Tensor]:
     import_lpips()  # makes torchvision importable
     models = importlib.import_module("torchvision.models")
-    url = {"vgg": models.VGG16_Weights, "alex": models.AlexNet_Weights}[net].IMAGENET1K_V1.url
+    url = models.get_model_weights(NETS[net]).IMAGENET1K_V1.url
     cached = Path(torch.hub.get_dir()) / "checkpoints" / url.rsplit("/", 1)[1]
     if cached.is_file():
         return _load_state(cached)
     state = _download(url)
     if state is None:
-        raise LpipsUnavailable(f"put {url} at {cached}, or name the file with --lpips_weights")
+        raise LpipsUnavailable(f"put {url} at {cached}, or name the file with --lpips_weights of metrics.py")
     return state
 
 

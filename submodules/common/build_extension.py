@@ -26,6 +26,7 @@ from setuptools.command.build_ext import build_ext
 from setuptools.command.build_py import build_py
 
 VERSION = "0.1.0"
+BUILT_FOR = "built-for"  # the extra that tells doctor.py which torch an extension was built for
 OLDEST_TORCH = (2, 11)
 OLDEST_ARCHITECTURE = 80  # reductions over a warp in one instruction
 COMMON_INCLUDE = Path(__file__).resolve().parent / "include"
@@ -44,7 +45,8 @@ def setup_extension(name: str, package: str, root: Path) -> None:
         license="Apache-2.0",
         python_requires=">=3.10",
         packages=find_packages(str(root), include=[package, f"{package}.*"]),
-        install_requires=[torch_requirement()],
+        # A requirement on torch would let pip replace the one that is there, and an extra is not installed unasked.
+        extras_require={BUILT_FOR: [torch_requirement()]},
         # The real source list is found by the builder; setuptools only needs to know that there is a library.
         ext_modules=[Extension(f"{package}._backend", sources=[])],
         cmdclass={
@@ -66,7 +68,7 @@ class BuildModules(build_py):
 
 
 def torch_requirement() -> str:
-    """The requirement on torch: a compiled extension works only with the minor version it was built against."""
+    """The torch that an extension works with, only the minor version that it was built against, as pip writes it."""
     try:
         major, minor = importlib.metadata.version("torch").split(".")[:2]
     except importlib.metadata.PackageNotFoundError:

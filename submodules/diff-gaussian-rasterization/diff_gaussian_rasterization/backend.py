@@ -2,15 +2,20 @@
 
 from pathlib import Path
 
-import torch
+_BUILD = "run `pip install ./submodules/diff-gaussian-rasterization` in the repository"
+try:
+    import torch
+except ModuleNotFoundError as error:
+    if error.name != "torch":
+        raise
+    raise ImportError(f"diff_gaussian_rasterization needs torch: install it, then {_BUILD}") from error
 
 _LIBRARY = Path(__file__).with_name("_backend.so")
 try:
     torch.ops.load_library(_LIBRARY)
 except OSError as error:
     what = f"does not fit torch {torch.__version__}" if _LIBRARY.exists() else "is not built"
-    remedy = "run `pip install ./submodules/diff-gaussian-rasterization` in the repository"
-    raise ImportError(f"diff_gaussian_rasterization {what}: {remedy}") from error
+    raise ImportError(f"diff_gaussian_rasterization {what}: {_BUILD}") from error
 
 OPERATORS = torch.ops.diff_gaussian_rasterization
 

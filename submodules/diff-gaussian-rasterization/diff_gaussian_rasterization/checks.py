@@ -1,7 +1,18 @@
-"""The check of `settings.debug`; the operators themselves check shapes, dtypes and devices."""
+"""Checks of inputs that the operators cannot make: other types than tensors, and values that are not finite."""
+
+from collections.abc import Mapping
 
 import torch
 from torch import Tensor
+
+
+def check_tensors(inputs: Mapping[str, object]) -> None:
+    """Raises TypeError that names the first input that is neither a tensor nor None."""
+    for name, values in inputs.items():
+        if values is not None and not isinstance(values, Tensor):
+            kind = type(values)
+            found = kind.__name__ if kind.__module__ == "builtins" else f"{kind.__module__}.{kind.__name__}"
+            raise TypeError(f"{name} must be a tensor, got {found}: convert it with torch.as_tensor")
 
 
 def check_finite(what: str, values: Tensor) -> None:

@@ -1,8 +1,12 @@
 """The inputs of a set of Gaussians, listed once: `rasterize`, `decisive` and the oracle take these names."""
 
-from typing import NamedTuple
+import inspect
+from collections.abc import Callable
+from typing import NamedTuple, TypeVar
 
 from torch import Tensor
+
+_Function = TypeVar("_Function", bound=Callable)
 
 
 class Gaussians(NamedTuple):
@@ -20,3 +24,17 @@ class Gaussians(NamedTuple):
     colors: Tensor | None = None  # (N, 3)
     sh_dc: Tensor | None = None  # (N, 1, 3) spherical harmonics of degree 0
     sh_rest: Tensor | None = None  # (N, K - 1, 3) those of higher degrees; bands above the active degree are not read
+
+
+def lists_gaussians(function: _Function) -> _Function:
+    """Lets help() and inspect.signature list the optional fields of `Gaussians` in place of `**others`."""
+    fields = [
+        inspect.Parameter(
+            name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=Gaussians.__annotations__[name]
+        )
+        for name, default in Gaussians._field_defaults.items()
+    ]
+    signature = inspect.signature(function)
+    named = [p for p in signature.parameters.values() if p.kind is not inspect.Parameter.VAR_KEYWORD]
+    function.__signature__ = signature.replace(parameters=[*named, *fields])
+    return function

@@ -1,6 +1,6 @@
 """The rasterizer as Python functions: named arguments and results, autograd. The operators check their inputs."""
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, library
@@ -8,12 +8,10 @@ from torch.autograd.function import once_differentiable
 
 import diff_gaussian_rasterization.fakes  # noqa: F401  (registers the fake kernels)
 from diff_gaussian_rasterization.backend import OPERATORS
-from diff_gaussian_rasterization.checks import check_finite
-from diff_gaussian_rasterization.gaussians import Gaussians
+from diff_gaussian_rasterization.checks import check_finite, check_tensors
+from diff_gaussian_rasterization.gaussians import Gaussians, lists_gaussians
 from diff_gaussian_rasterization.schema import GRADIENT_PLACES, INPUTS, SCENE_TENSORS
-
-if TYPE_CHECKING:
-    from diff_gaussian_rasterization import GaussianRasterizationSettings
+from diff_gaussian_rasterization.settings import GaussianRasterizationSettings
 
 _OPACITIES = INPUTS.index("opacities")
 
@@ -27,11 +25,12 @@ class Rasterized(NamedTuple):
     transmittance: Tensor | None  # (1, H, W): what is left for the background
 
 
+@lists_gaussians
 def rasterize(
     means: Tensor,
     means2d: Tensor,
     opacities: Tensor,
-    settings: "GaussianRasterizationSettings",
+    settings: GaussianRasterizationSettings,
     *,
     raw: bool = False,
     want_inverse_depth: bool = False,
@@ -44,19 +43,23 @@ def rasterize(
     means2d (N, 3): values unused; receives d loss / d mean on the image, per NDC unit.
     raw: opacities are logits, scales are logarithms, and rotations have any length (zero means the identity).
     Gaussians with a NaN or an infinite value are left out and receive zero gradients.
-    Raises TypeError for wrong dtypes and ValueError for wrong shapes. Raises RuntimeError for wrong settings, and if
-    the image needs more than 2^31 tile instances.
+    Raises TypeError for wrong types and dtypes and ValueError for wrong shapes. Raises RuntimeError for wrong settings,
+    and if the image needs more than 2^31 tile instances.
     """
     gaussians = Gaussians(means, opacities, **others)
-    given = [values for values in (*gaussians, means2d) if values is not None]
-    train = torch.is_grad_enabled() and any([values.requires_grad for values in given])
-    if settings.debug:
-        for name, values in gaussians._asdict().items():
-            if values is not None:
-                check_finite(name, values)
-    arguments = scene_arguments(gaussians, settings, raw)
-    function = _Rasterize.apply if train else OPERATORS.rasterize
-    out = function(means2d, *arguments, settings.bg, want_inverse_depth, train)
+    try:
+        given = [values for values in (*gaussians, means2d) if values is not None]
+        train = torch.is_grad_enabled() and any([values.requires_grad for values in given])
+        if settings.debug:
+            for name, values in gaussians._asdict().items():
+                if values is not None:
+                    check_finite(name, values)
+        arguments = scene_arguments(gaussians, settings, raw)
+        function = _Rasterize.apply if train else OPERATORS.rasterize
+        out = function(means2d, *arguments, settings.bg, want_inverse_depth, train)
+    except (AttributeError, TypeError, RuntimeError):
+        _check_types(gaussians, settings, means2d)
+        raise
     color, transmittance, inverse_depth, radii = out[:4]
     if settings.debug:
         check_finite("the rendered image", color)
@@ -67,11 +70,12 @@ def rasterize(
     )
 
 
+@lists_gaussians
 @torch.no_grad()
 def decisive(
     means: Tensor,
     opacities: Tensor,
-    settings: "GaussianRasterizationSettings",
+    settings: GaussianRasterizationSettings,
     *,
     raw: bool = False,
     **others: Tensor | None,
@@ -83,7 +87,11 @@ def decisive(
     bit.
     """
     gaussians = Gaussians(means, opacities, **others)
-    out = OPERATORS.rasterize(means, *scene_arguments(gaussians, settings, raw), settings.bg, False, True)
+    try:
+        out = OPERATORS.rasterize(means, *scene_arguments(gaussians, settings, raw), settings.bg, False, True)
+    except RuntimeError:
+        _check_types(gaussians, settings)
+        raise
     _, _, _, _, splats, _, instances, ranges, _, _, last = out
     return OPERATORS.decisive(splats, instances, ranges, last)
 
@@ -93,7 +101,7 @@ def mark_visible(positions: Tensor, view: Tensor) -> Tensor:
     return OPERATORS.mark_visible(positions, view)
 
 
-def scene_arguments(gaussians: Gaussians, settings: "GaussianRasterizationSettings", raw: bool) -> tuple:
+def scene_arguments(gaussians: Gaussians, settings: GaussianRasterizationSettings, raw: bool) -> tuple:
     """Puts Gaussians and camera into the order of the operators' arguments (`schema.SCENE`)."""
     return (
         *gaussians,
@@ -106,9 +114,15 @@ def scene_arguments(gaussians: Gaussians, settings: "GaussianRasterizationSettin
         settings.image_width,
         settings.sh_degree,
         settings.scale_modifier,
-        settings.antialiasing,
+        bool(settings.antialiasing),
         raw,
     )
+
+
+def _check_types(gaussians: Gaussians, settings: GaussianRasterizationSettings, means2d: object = None) -> None:
+    """Finds the input that is no tensor after a call has failed, since the call's own message may not name it."""
+    camera = {name: getattr(settings, name) for name in ("viewmatrix", "projmatrix", "campos", "bg")}
+    check_tensors(gaussians._asdict() | {"means2d": means2d} | camera)
 
 
 def _check_gradients(inputs: dict[str, Tensor | None]) -> None:

@@ -3,6 +3,18 @@
 `composite` puts an image with alpha on a background, before the loss compares it with a render.
 """
 
-from fused_ssim.ops import composite, fused_l1_ssim, fused_photometric_loss, fused_ssim
+import fused_ssim.backend  # noqa: F401  (first, because it says whether torch is missing)
+from fused_ssim.maps import FusedSSIMMap
+from fused_ssim.ops import PADDINGS, composite, fused_l1_ssim, fused_photometric_loss, fused_ssim, has_backend
 
-__all__ = ["composite", "fused_l1_ssim", "fused_photometric_loss", "fused_ssim"]
+allowed_padding = list(PADDINGS)  # a name of the reference
+
+__all__ = [
+    "FusedSSIMMap",
+    "allowed_padding",
+    "composite",
+    "fused_l1_ssim",
+    "fused_photometric_loss",
+    "fused_ssim",
+    "has_backend",
+]

@@ -6,20 +6,15 @@ a gradient.
 """
 
 from functools import cache
-from pathlib import Path
 
 import torch
 from torch import Tensor, library
 from torch.autograd.function import once_differentiable
 
-_LIBRARY = Path(__file__).with_name("_backend.so")
-try:
-    torch.ops.load_library(_LIBRARY)
-except OSError as error:
-    what = f"does not fit torch {torch.__version__}" if _LIBRARY.exists() else "is not built"
-    raise ImportError(f"fused_ssim {what}: run `pip install ./submodules/fused-ssim` in the repository") from error
+from fused_ssim.backend import OPERATORS
 
 WINDOW = 11  # pixels
+PADDINGS = ("same", "valid")
 
 
 def fused_ssim(img1: Tensor, img2: Tensor, padding: str = "same", train: bool = True) -> Tensor:
@@ -41,7 +36,7 @@ def fused_l1_ssim(img1: Tensor, img2: Tensor, padding: str = "same") -> tuple[Te
     """
     _check_inputs(img1, img2, padding)
     train = torch.is_grad_enabled() and img1.requires_grad
-    l1, ssim, _ = torch.ops.fused_ssim.l1_ssim(img1, img2.detach(), padding == "valid", train)
+    l1, ssim, _ = OPERATORS.l1_ssim(img1, img2.detach(), padding == "valid", train)
     return l1, ssim
 
 
@@ -56,7 +51,7 @@ def fused_photometric_loss(img1: Tensor, img2: Tensor, lambda_dssim: float) -> t
     train = torch.is_grad_enabled() and img1.requires_grad
     if train:
         return _Photometric.apply(img1, img2, float(lambda_dssim), True)[:2]
-    return torch.ops.fused_ssim.photometric(img1, img2.detach(), float(lambda_dssim), False)[:2]
+    return OPERATORS.photometric(img1, img2.detach(), float(lambda_dssim), False)[:2]
 
 
 def composite(picture: Tensor, background: Tensor) -> Tensor:
@@ -66,11 +61,11 @@ def composite(picture: Tensor, background: Tensor) -> Tensor:
     on every device. There is no gradient.
     Raises RuntimeError for other shapes and dtypes, and for tensors on two devices.
     """
-    return torch.ops.fused_ssim.composite(picture, background)
+    return OPERATORS.composite(picture, background)
 
 
 def _check_inputs(img1: Tensor, img2: Tensor, padding: str) -> None:
-    if padding not in ("same", "valid"):
+    if padding not in PADDINGS:
         raise ValueError(f'padding must be "same" or "valid", got {padding!r}')
     if img1.dtype not in (torch.float32, torch.float64):
         raise TypeError(f"img1 must be float32 or float64, got {img1.dtype}: convert with img1.float()")
@@ -86,14 +81,15 @@ def _check_inputs(img1: Tensor, img2: Tensor, padding: str) -> None:
     if img1.device != img2.device:
         raise ValueError(f"the images must be on the same device, got img1 on {img1.device} and img2 on {img2.device}")
     device = img1.device.type
-    if not _has_backend(device):
+    if not has_backend(device):
         raise ValueError(f"this build of fused_ssim has no {device} backend: pass img1.cpu() and img2.cpu()")
     if device == "cuda" and img1.dtype != torch.float32:
         raise TypeError(f"img1 on {img1.device} must be float32, got {img1.dtype}: pass img1.float() or img1.cpu()")
 
 
 @cache  # the query takes longer than all other checks together
-def _has_backend(device: str) -> bool:
+def has_backend(device: str) -> bool:
+    """Whether this build computes on devices of a type, "cpu" or "cuda"."""
     return torch._C._dispatch_has_kernel_for_dispatch_key("fused_ssim::l1_ssim", device.upper())
 
 
@@ -116,7 +112,7 @@ def _setup_context(ctx, inputs: tuple, output: tuple[Tensor, Tensor, Tensor]) ->
 @once_differentiable  # a second derivative would be silently wrong
 def _backward(ctx, grad_l1: Tensor, grad_ssim: Tensor, _) -> tuple[Tensor, None, None, None]:
     img1, img2, ssim_gradient = ctx.saved_tensors
-    return torch.ops.fused_ssim.l1_ssim_vjp(img1, img2, ssim_gradient, grad_l1, grad_ssim), None, None, None
+    return OPERATORS.l1_ssim_vjp(img1, img2, ssim_gradient, grad_l1, grad_ssim), None, None, None
 
 
 library.register_autograd("fused_ssim::l1_ssim", _backward, setup_context=_setup_context)
@@ -150,7 +146,7 @@ def _setup_photometric(ctx, inputs: tuple, output: tuple[Tensor, Tensor, Tensor]
 def _photometric_backward(ctx, grad_loss: Tensor | None, *_) -> tuple[Tensor | None, None, None, None]:
     if grad_loss is None:
         return None, None, None, None
-    gradient = torch.ops.fused_ssim.photometric_vjp(*ctx.saved_tensors, ctx.lambda_dssim, grad_loss)
+    gradient = OPERATORS.photometric_vjp(*ctx.saved_tensors, ctx.lambda_dssim, grad_loss)
     return gradient, None, None, None
 
 
@@ -171,7 +167,7 @@ class _Photometric(torch.autograd.Function):
     @staticmethod
     def forward(*inputs):
         with torch._C._AutoDispatchBelowAutograd():
-            return torch.ops.fused_ssim.photometric(*inputs)
+            return OPERATORS.photometric(*inputs)
 
     setup_context = staticmethod(_setup_photometric)
     backward = staticmethod(_photometric_backward)

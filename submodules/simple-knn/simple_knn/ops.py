@@ -1,16 +1,9 @@
 """`distCUDA2`, the checked Python form of the operator simple_knn::mean_distance2."""
 
-from pathlib import Path
-
 import torch
 from torch import library
 
-_LIBRARY = Path(__file__).with_name("_backend.so")
-try:
-    torch.ops.load_library(_LIBRARY)
-except OSError as error:
-    what = f"does not fit torch {torch.__version__}" if _LIBRARY.exists() else "is not built"
-    raise ImportError(f"simple_knn {what}: run `pip install ./submodules/simple-knn` in the repository") from error
+from simple_knn.backend import OPERATORS
 
 
 @library.register_fake("simple_knn::mean_distance2")
@@ -34,4 +27,4 @@ def distCUDA2(points: torch.Tensor) -> torch.Tensor:
     device = points.device.type
     if not torch._C._dispatch_has_kernel_for_dispatch_key("simple_knn::mean_distance2", device.upper()):
         raise ValueError(f"this build of simple_knn has no {device} backend: pass points.cpu()")
-    return torch.ops.simple_knn.mean_distance2(points.detach())
+    return OPERATORS.mean_distance2(points.detach())

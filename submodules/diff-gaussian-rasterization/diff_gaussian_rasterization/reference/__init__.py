@@ -5,19 +5,17 @@ shares no code with csrc and decides in disputes. It has no tiles: every Gaussia
 needs some 100 bytes for each Gaussian and pixel of the rows rendered at once.
 """
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from diff_gaussian_rasterization.gaussians import Gaussians
+from diff_gaussian_rasterization.gaussians import Gaussians, lists_gaussians
 from diff_gaussian_rasterization.reference.blend import blend_rows, nearest_first
 from diff_gaussian_rasterization.reference.camera import camera_of, project
 from diff_gaussian_rasterization.reference.colour import seen_colors
 from diff_gaussian_rasterization.reference.shape import activated, compensation, project_shapes, radii
-
-if TYPE_CHECKING:
-    from diff_gaussian_rasterization import GaussianRasterizationSettings
+from diff_gaussian_rasterization.settings import GaussianRasterizationSettings
 
 __all__ = ["Rendered", "render"]
 
@@ -32,11 +30,12 @@ class Rendered(NamedTuple):
     near_cut: Tensor  # (H, W) bool: within `cut` (relative) of a cut-off or a depth tie, where rounding may decide
 
 
+@lists_gaussians
 def render(
     means: Tensor,
     means2d: Tensor,
     opacities: Tensor,
-    settings: "GaussianRasterizationSettings",
+    settings: GaussianRasterizationSettings,
     *,
     raw: bool = False,
     rows_at_once: int = 32,

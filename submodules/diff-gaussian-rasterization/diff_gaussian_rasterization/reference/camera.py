@@ -1,12 +1,11 @@
 """The pinhole camera: where a point appears on the image, and how the image changes around it."""
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-if TYPE_CHECKING:
-    from diff_gaussian_rasterization import GaussianRasterizationSettings
+from diff_gaussian_rasterization.settings import GaussianRasterizationSettings
 
 NEAR = 0.2  # world units; a Gaussian whose depth is not above is culled
 RAY_LIMIT = 1.3  # half images from the centre; beyond it the Jacobian is taken at this limit
@@ -34,7 +33,7 @@ class Points(NamedTuple):
     pixel: Tensor  # (N, 2) px, pixel centres at integers
 
 
-def camera_of(settings: "GaussianRasterizationSettings") -> Camera:
+def camera_of(settings: GaussianRasterizationSettings) -> Camera:
     """The camera that the settings describe."""
     width, height = settings.image_width, settings.image_height
     world_to_view, world_to_clip = settings.viewmatrix.double(), settings.projmatrix.double()

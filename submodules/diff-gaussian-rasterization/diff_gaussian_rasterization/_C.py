@@ -1,0 +1,157 @@
+"""The functions of the reference's compiled module, for code that calls them itself.
+
+Arguments go by place, in the order of the 2024 release. An empty tensor stands for one that is not given. `debug` and
+`prefiltered` have no effect.
+"""
+
+import torch
+from torch import Tensor
+
+from diff_gaussian_rasterization.backend import OPERATORS
+from diff_gaussian_rasterization.byte_buffers import packed, unpacked
+from diff_gaussian_rasterization.fakes import SPLAT_VALUES, TILE
+from diff_gaussian_rasterization.gaussians import Gaussians
+from diff_gaussian_rasterization.optim import sparse_adam_
+from diff_gaussian_rasterization.schema import GRADIENTS
+
+__all__ = ["adamUpdate", "mark_visible", "rasterize_gaussians", "rasterize_gaussians_backward"]
+
+
+@torch.no_grad()
+def mark_visible(positions: Tensor, viewmatrix: Tensor, projmatrix: Tensor) -> Tensor:
+    """Marks positions (N, 3) whose z in the view (4, 4, transposed) is above 0.2: (N,) bool. projmatrix is not read."""
+    return OPERATORS.mark_visible(positions, viewmatrix)
+
+
+@torch.no_grad()
+def rasterize_gaussians(
+    background: Tensor,
+    means3D: Tensor,
+    colors: Tensor,
+    opacity: Tensor,
+    scales: Tensor,
+    rotations: Tensor,
+    scale_modifier: float,
+    cov3D_precomp: Tensor,
+    viewmatrix: Tensor,
+    projmatrix: Tensor,
+    tan_fovx: float,
+    tan_fovy: float,
+    image_height: int,
+    image_width: int,
+    sh: Tensor,
+    degree: int,
+    campos: Tensor,
+    prefiltered: bool,
+    antialiasing: bool,
+    debug: bool | None = None,
+) -> tuple:
+    """Renders activated Gaussians; inputs are those of `GaussianRasterizer`.
+
+    Returns the number of tile instances, colour (3, H, W), radii (N,) int32, three buffers of bytes for
+    `rasterize_gaussians_backward`, and the inverse depth (1, H, W). Called as in 2023, where the last argument but one
+    is `prefiltered`, it returns no inverse depth.
+    """
+    of_2023 = debug is None
+    camera = viewmatrix, projmatrix, campos, tan_fovx, tan_fovy, image_height, image_width, degree, scale_modifier
+    gaussians = _gaussians(means3D, opacity, scales, rotations, cov3D_precomp, colors, sh)
+    smooth = not of_2023 and bool(antialiasing)
+    out = OPERATORS.rasterize(None, *gaussians, *camera, smooth, False, background, True, True)
+    color, transmittance, inverse_depth, radii, splats, tile_counts, instances, ranges, splat_slots, _, last = out
+    buffers = packed(splat_slots, splats, tile_counts), packed(instances), packed(ranges, transmittance, last)
+    rendered = len(instances), color, radii, *buffers
+    return rendered if of_2023 else (*rendered, inverse_depth)
+
+
+@torch.no_grad()
+def rasterize_gaussians_backward(
+    background: Tensor,
+    means3D: Tensor,
+    radii: Tensor,
+    colors: Tensor,
+    opacities: Tensor,
+    scales: Tensor,
+    rotations: Tensor,
+    scale_modifier: float,
+    cov3D_precomp: Tensor,
+    viewmatrix: Tensor,
+    projmatrix: Tensor,
+    tan_fovx: float,
+    tan_fovy: float,
+    grad_out_color: Tensor,
+    grad_out_invdepth: Tensor,
+    sh: Tensor,
+    degree: int,
+    campos: Tensor,
+    geomBuffer: Tensor,
+    num_rendered: int,
+    binningBuffer: Tensor,
+    imgBuffer: Tensor,
+    antialiasing: bool,
+    debug: bool,
+) -> tuple[Tensor, ...]:
+    """Gradients of a rendering of `rasterize_gaussians`, given the gradients of its colour and inverse depth.
+
+    Returns those of the means on the image (N, 3), per NDC unit, then of colors, opacities, means3D, cov3D_precomp, sh,
+    scales and rotations; zeros for what was not given.
+    """
+    gaussians = _gaussians(means3D, opacities, scales, rotations, cov3D_precomp, colors, sh)
+    count, (height, width) = len(means3D), grad_out_color.shape[1:]
+    floats, ints, longs = means3D.dtype, torch.int32, torch.int64
+    geometry = (longs, (count + 1, 2)), (floats, (count, SPLAT_VALUES)), (ints, (count,))
+    splat_slots, splats, tile_counts = unpacked(geomBuffer, geometry)
+    (instances,) = unpacked(binningBuffer, [(ints, (num_rendered,))])
+    tiles = -(-height // TILE) * -(-width // TILE)
+    image = (longs, (tiles + 1,)), (floats, (1, height, width)), (ints, (height, width))
+    ranges, transmittance, last = unpacked(imgBuffer, image)
+    slots = instances.new_empty(int(splat_slots[-1, 0]), 0)
+
+    camera = viewmatrix, projmatrix, campos, tan_fovx, tan_fovy, height, width, degree, scale_modifier
+    state = splats, instances, ranges, splat_slots, slots, background, last, transmittance
+    arguments = *gaussians, *camera, bool(antialiasing), False, *state, grad_out_color, None, _given(grad_out_invdepth)
+    wanted = [name == "means2d" or getattr(gaussians, name) is not None for name in GRADIENTS]
+    gradients = dict(zip(GRADIENTS, OPERATORS.rasterize_vjp(*arguments, tile_counts, wanted), strict=True))
+    for name, is_wanted in zip(GRADIENTS, wanted, strict=True):
+        if not is_wanted:
+            gradients[name] = means3D.new_zeros(count, *gradients[name].shape[1:])
+    bands = (
+        torch.cat([gradients["sh_dc"], gradients["sh_rest"]], 1)
+        if gaussians.sh_dc is not None
+        else gradients["sh_rest"]
+    )
+    names = "means2d", "colors", "opacities", "means", "cov3d"
+    return *(gradients[name] for name in names), bands, gradients["scales"], gradients["rotations"]
+
+
+@torch.no_grad()
+def adamUpdate(
+    param: Tensor,
+    grad: Tensor,
+    exp_avg: Tensor,
+    exp_avg_sq: Tensor,
+    visibility: Tensor,
+    lr: float,
+    b1: float,
+    b2: float,
+    eps: float,
+    N: int,
+    M: int,
+) -> None:
+    """Takes one step of sparse Adam in place, see `optim.sparse_adam_`. N rows of M values each are not read."""
+    sparse_adam_(param, grad, exp_avg, exp_avg_sq, visibility, lr, b1, b2, eps)
+
+
+def _gaussians(
+    means: Tensor, opacities: Tensor, scales: Tensor, rotations: Tensor, cov3d: Tensor, colors: Tensor, sh: Tensor
+) -> Gaussians:
+    """The operators' inputs; of two alternatives the precomputed one counts."""
+    cov3d, colors = _given(cov3d), _given(colors)
+    scales, rotations = (None, None) if cov3d is not None else (_given(scales), _given(rotations))
+    sh = _given(sh) if colors is None else None
+    bands = (None, None) if sh is None else (sh[:, :1], sh[:, 1:])
+    return Gaussians(means, opacities, scales, rotations, cov3d, colors, *bands)
+
+
+def _given(values: Tensor | None) -> Tensor | None:
+    """None for the empty tensor that stands for it; a tensor of no Gaussians has more axes."""
+    return None if values is None or values.shape == (0,) else values

@@ -1,0 +1,28 @@
+"""The camera of an image, and how to render it."""
+
+from typing import NamedTuple
+
+from torch import Tensor
+
+
+class GaussianRasterizationSettings(NamedTuple):
+    """The camera, and how to render; the first 13 fields are the reference's, in its order.
+
+    Matrices are transposed: they act on row vectors. x points right, y down, z forward; pixel centres lie at integers.
+    `projmatrix` is the full projection, view times projection, and contains the principal point.
+    """
+
+    image_height: int
+    image_width: int
+    tanfovx: float  # tan of half the field of view
+    tanfovy: float
+    bg: Tensor  # (3,)
+    scale_modifier: float
+    viewmatrix: Tensor  # (4, 4) world to view, transposed
+    projmatrix: Tensor  # (4, 4) world to clip, transposed
+    sh_degree: int  # active degree, 0..3
+    campos: Tensor  # (3,) world
+    prefiltered: bool  # accepted for compatibility; culling does not rely on it
+    debug: bool  # check inputs, image and gradients for NaN and Inf; the error names the tensor and the place
+    antialiasing: bool | None = None  # None, as in the 12 fields of 2023: off, and GaussianRasterizer has two results
+    inverse_depth: bool = True  # False: the third result is None and nothing is computed for it

@@ -1,0 +1,141 @@
+"""diff_gaussian_rasterization._C: the functions of the reference's compiled module, against the public ones."""
+
+import pytest
+import torch
+from diff_gaussian_rasterization import _C, GaussianRasterizer, optim
+from rasterizer_tools import CPU_AND_GPU, activated, few, leaves
+
+from benchmarks.workloads.splat_scenes import on_device, settings
+
+EMPTY = torch.Tensor([])
+
+
+def scene(colors: bool, covariances: bool, device: str = "cpu", **changes):
+    """Leaves by the reference's names, and a camera."""
+    raw, size = few(3, dtype=torch.float32)
+    splats = activated(raw)
+    inputs = {
+        "means3D": splats["means"],
+        "means2D": torch.zeros(3, 3),
+        "opacities": splats["opacities"],
+        "shs": torch.cat([splats["sh_dc"], splats["sh_rest"]], 1),
+        "colors_precomp": torch.rand(3, 3, generator=torch.Generator().manual_seed(0)),
+        "scales": splats["scales"],
+        "rotations": splats["rotations"],
+        "cov3D_precomp": 0.05 * torch.eye(3)[[0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]].repeat(3, 1),
+    }
+    for name in ("shs",) if colors else ("colors_precomp",):
+        del inputs[name]
+    for name in ("scales", "rotations") if covariances else ("cov3D_precomp",):
+        del inputs[name]
+    moved = {name: values.to(device) for name, values in inputs.items()}
+    return leaves(moved), on_device(settings(**size, **changes), device)
+
+
+def forward_arguments(inputs, camera) -> tuple:
+    """In the order of the 2024 release."""
+    tensors = {name: values.detach() for name, values in inputs.items()}
+    return (
+        camera.bg,
+        tensors["means3D"],
+        tensors.get("colors_precomp", EMPTY),
+        tensors["opacities"],
+        tensors.get("scales", EMPTY),
+        tensors.get("rotations", EMPTY),
+        camera.scale_modifier,
+        tensors.get("cov3D_precomp", EMPTY),
+        camera.viewmatrix,
+        camera.projmatrix,
+        camera.tanfovx,
+        camera.tanfovy,
+        camera.image_height,
+        camera.image_width,
+        tensors.get("shs", EMPTY),
+        camera.sh_degree,
+        camera.campos,
+        camera.prefiltered,
+        camera.antialiasing,
+        camera.debug,
+    )
+
+
+@CPU_AND_GPU
+@pytest.mark.parametrize("antialiasing", [False, True])
+@pytest.mark.parametrize(("colors", "covariances"), [(False, False), (True, True), (False, True)])
+def test_forward_and_backward_are_those_of_the_class(colors, covariances, antialiasing, device):
+    inputs, camera = scene(colors, covariances, device, antialiasing=antialiasing)
+    wanted = GaussianRasterizer(camera)(**inputs)
+    generator = torch.Generator().manual_seed(1)
+    gradients = [torch.randn(image.shape, generator=generator).to(device) for image in wanted[::2]]
+    torch.autograd.backward(wanted[::2], gradients)
+
+    given = forward_arguments(inputs, camera)
+    count, color, radii, *buffers, depth = _C.rasterize_gaussians(*given)
+    assert isinstance(count, int) and count > 0
+    for got, image in zip((color, radii, depth), wanted, strict=True):
+        assert torch.equal(got, image) and not got.requires_grad
+    assert all(buffer.dtype == torch.uint8 and buffer.dim() == 1 for buffer in buffers)
+
+    background, means, colors_precomp, opacities, scales, rotations, modifier, covariance, *camera_places = given
+    view, projection, tan_x, tan_y, _, _, sh, degree, center, _, smooth, debug = camera_places
+    got = _C.rasterize_gaussians_backward(
+        *(background, means, radii, colors_precomp, opacities, scales, rotations, modifier, covariance),
+        *(view, projection, tan_x, tan_y, *gradients, sh, degree, center),
+        *(buffers[0], count, buffers[1], buffers[2], smooth, debug),
+    )
+    names = "means2D", "colors_precomp", "opacities", "means3D", "cov3D_precomp", "shs", "scales", "rotations"
+    for name, gradient in zip(names, got, strict=True):
+        if name in inputs:
+            assert torch.equal(gradient, inputs[name].grad), name
+        else:
+            assert len(gradient) == 3 and not gradient.any(), name
+
+
+def test_called_as_in_2023_there_is_no_inverse_depth():
+    inputs, camera = scene(False, False)
+    given = forward_arguments(inputs, camera)
+    of_2024, of_2023 = _C.rasterize_gaussians(*given), _C.rasterize_gaussians(*given[:-2], False)
+    assert len(of_2024) == 7 and len(of_2023) == 6
+    for got, wanted in zip(of_2023, of_2024, strict=False):
+        assert torch.equal(torch.as_tensor(got), torch.as_tensor(wanted))
+
+
+def test_without_gaussians_both_ways():
+    inputs, camera = scene(False, False)
+    given = forward_arguments({name: values[:0] for name, values in inputs.items()}, camera)
+    count, color, radii, *buffers, _ = _C.rasterize_gaussians(*given)
+    assert count == 0 and torch.equal(color, camera.bg[:, None, None].expand_as(color)) and radii.shape == (0,)
+    backward = (*given[:2], radii, *given[2:12], color, EMPTY, given[14], *given[15:17], buffers[0], count)
+    gradients = _C.rasterize_gaussians_backward(*backward, *buffers[1:], *given[-2:])
+    assert all(len(gradient) == 0 for gradient in gradients)
+
+
+def test_buffers_of_another_rendering_are_refused():
+    inputs, camera = scene(False, False)
+    given = forward_arguments(inputs, camera)
+    count, color, radii, *buffers, depth = _C.rasterize_gaussians(*given)
+    backward = [*given[:2], radii, *given[2:12], color, depth, given[14], *given[15:17], buffers[0], count]
+    for place in range(3):
+        wrong = list(buffers)
+        wrong[place] = wrong[place][:-4]
+        with pytest.raises(ValueError, match="the buffer must be the one of this rendering"):
+            _C.rasterize_gaussians_backward(*backward[:-2], wrong[0], count, *wrong[1:], *given[-2:])
+
+
+def test_mark_visible_takes_both_matrices():
+    inputs, camera = scene(False, False)
+    visible = _C.mark_visible(inputs["means3D"], camera.viewmatrix, camera.projmatrix)
+    assert torch.equal(visible, GaussianRasterizer(camera).markVisible(inputs["means3D"]))
+    assert visible.any() and visible.dtype == torch.bool
+
+
+def test_a_step_of_adam():
+    generator = torch.Generator().manual_seed(0)
+    param = torch.nn.Parameter(torch.randn(6, 5, 3, generator=generator))
+    gradient, seen = torch.randn(6, 5, 3, generator=generator), torch.arange(6) % 2 == 0
+    ours = [param.detach().clone(), torch.zeros(6, 5, 3), torch.zeros(6, 5, 3)]
+    theirs = [param, torch.zeros(6, 5, 3), torch.zeros(6, 5, 3)]
+    optim.sparse_adam_(ours[0], gradient, *ours[1:], seen, 0.1, 0.9, 0.999, 1e-15)
+    assert _C.adamUpdate(theirs[0], gradient, *theirs[1:], seen, 0.1, 0.9, 0.999, 1e-15, 6, 15) is None
+    for got, wanted in zip(theirs, ours, strict=True):
+        assert torch.equal(got, wanted)

@@ -1,0 +1,84 @@
+"""SparseGaussianAdam of diff_gaussian_rasterization: the numbers of the model's own, and torch's interface."""
+
+import io
+
+import pytest
+import torch
+from diff_gaussian_rasterization import SparseGaussianAdam
+
+from scene.gaussians.sparse_adam import SparseGaussianAdam as OfTheModel
+
+RATES = {"xyz": 0.01, "f_dc": 0.0025, "f_rest": 0.000125}
+SHAPES = {"xyz": (40, 3), "f_dc": (40, 1, 3), "f_rest": (40, 15, 3)}
+
+
+def groups() -> list[dict]:
+    generator = torch.Generator().manual_seed(0)
+    return [
+        {"params": [torch.nn.Parameter(torch.randn(shape, generator=generator))], "lr": RATES[name], "name": name}
+        for name, shape in SHAPES.items()
+    ]
+
+
+def give_gradients(optimizer: torch.optim.Optimizer, seed: int) -> torch.Tensor:
+    """Sets gradients and returns the rows that are visible."""
+    generator = torch.Generator().manual_seed(seed)
+    for group in optimizer.param_groups:
+        group["params"][0].grad = torch.randn(group["params"][0].shape, generator=generator)
+    return torch.rand(40, generator=generator) < 0.5
+
+
+def values(optimizer: torch.optim.Optimizer) -> list[torch.Tensor]:
+    params = [group["params"][0] for group in optimizer.param_groups]
+    return [t.detach().clone() for p in params for t in (p, *optimizer.state[p].values())]
+
+
+def test_steps_are_those_of_the_models_optimiser():
+    ours, models = SparseGaussianAdam(groups(), lr=0.0, eps=1e-15), OfTheModel(groups(), eps=1e-15)
+    start = values(ours)
+    for seed in range(5):
+        visible = give_gradients(ours, seed)
+        give_gradients(models, seed)
+        if seed % 2:
+            ours.step(visible)
+        else:
+            ours.step(visible, visible.shape[0])
+        models.step(visible)
+        for got, wanted in zip(values(ours), values(models), strict=True):
+            assert torch.equal(got, wanted)
+    assert not torch.equal(start[0], values(ours)[0])
+
+
+def test_it_is_an_adam_of_torch():
+    optimizer = SparseGaussianAdam(groups(), 0.0, 1e-15)
+    assert isinstance(optimizer, torch.optim.Adam)
+    assert [group["lr"] for group in optimizer.param_groups] == list(RATES.values())
+    schedule = torch.optim.lr_scheduler.ExponentialLR(optimizer, 0.5)
+    visible = give_gradients(optimizer, 0)
+    optimizer.step(visible)
+    schedule.step()
+    assert optimizer.param_groups[0]["lr"] == pytest.approx(RATES["xyz"] / 2)
+    file = io.BytesIO()
+    torch.save(optimizer.state_dict(), file)
+    file.seek(0)
+    again = SparseGaussianAdam(groups(), 0.0, 1e-15)
+    again.load_state_dict(torch.load(file, weights_only=True))
+    for group, other in zip(again.param_groups, optimizer.param_groups, strict=True):
+        other_state = optimizer.state[other["params"][0]]
+        for name, value in again.state[group["params"][0]].items():
+            assert torch.equal(value, other_state[name])
+
+
+def test_parameters_without_a_gradient_keep_their_values():
+    optimizer = SparseGaussianAdam(groups(), 0.0, 1e-15)
+    optimizer.step(give_gradients(optimizer, 0))
+    before = values(optimizer)
+    optimizer.zero_grad(set_to_none=True)
+    optimizer.step(torch.ones(7, dtype=torch.bool), 7)  # rows of before a densification; nobody reads them
+    assert all(torch.equal(*pair) for pair in zip(values(optimizer), before, strict=True))
+
+
+def test_several_parameters_in_a_group_are_refused():
+    params = [torch.nn.Parameter(torch.zeros(4, 3)) for _ in range(2)]
+    with pytest.raises(ValueError, match="one parameter in each group, got 2"):
+        SparseGaussianAdam(params, lr=0.1, eps=1e-15).step(torch.ones(4, dtype=torch.bool))
