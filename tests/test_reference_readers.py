@@ -37,6 +37,7 @@ from scene.dataset_readers import (
 )
 from scene.readers.depth_maps import BLENDER_UNIT, COLMAP_UNIT, DepthMap
 from scene.readers.info import exposure_names
+from utils.camera_utils import camera_to_JSON
 from utils.system_utils import UserError
 
 FIELDS = (

@@ -1,0 +1,108 @@
+"""The names of docs/inside/reference_names.md: each is there, and takes the arguments of both releases."""
+
+import argparse
+import ast
+import inspect
+import re
+from importlib import import_module
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+
+PAGE = Path(__file__).parents[1] / "docs" / "inside" / "reference_names.md"
+SHORT = {
+    "GaussianModel": "scene.gaussian_model.GaussianModel",
+    "Scene": "scene.Scene",
+    "Camera": "scene.cameras.Camera",
+}
+ABSENT, VALUE = "–", "yes"
+
+
+class Name(NamedTuple):
+    """A row of the page."""
+
+    name: str
+    release2023: str
+    release2024: str
+
+
+def _rows() -> list[Name]:
+    rows = re.findall(r"^\| `([\w.]+)` \| (.+?) \| (.+?) \|", PAGE.read_text(encoding="utf-8"), re.MULTILINE)
+    return [Name(name, *(cell.strip("`") for cell in cells)) for name, *cells in rows]
+
+
+def _resolve(dotted: str) -> object:
+    """The object of a dotted name, whose first parts are modules."""
+    first, _, rest = dotted.partition(".")
+    dotted = f"{SHORT[first]}.{rest}" if first in SHORT else dotted
+    parts = dotted.split(".")
+    for count in range(len(parts), 0, -1):
+        try:
+            found = import_module(".".join(parts[:count]))
+        except ModuleNotFoundError:
+            continue
+        for part in parts[count:]:
+            found = getattr(found, part)
+        return found
+    raise ImportError(dotted)
+
+
+@pytest.fixture(scope="session")
+def instances(tmp_path_factory: pytest.TempPathFactory, _colmap_master: Path) -> dict[str, object]:
+    """A scene with its first camera and its model, as training has them."""
+    from arguments import ModelParams, OptimizationParams
+    from scene import GaussianModel, Scene
+
+    parser = argparse.ArgumentParser()
+    model, optimisation = ModelParams(parser), OptimizationParams(parser)
+    args = parser.parse_args(["-s", str(_colmap_master), "-m", str(tmp_path_factory.mktemp("model"))])
+    gaussians = GaussianModel(3)
+    scene = Scene(model.extract(args), gaussians)
+    gaussians.training_setup(optimisation.extract(args))
+    return {"GaussianModel": gaussians, "Scene": scene, "Camera": scene.getTrainCameras()[0]}
+
+
+def _arguments(cell: str) -> ast.arguments:
+    return ast.parse(f"def f{cell}: pass").body[0].args
+
+
+def _bind(signature: inspect.Signature, cell: str, bound_to_class: bool) -> None:
+    """Bind the arguments of a cell by position and by keyword; check the defaults."""
+    arguments = _arguments(cell)
+    names = [argument.arg for argument in arguments.args]
+    itself = [object()] if bound_to_class else []
+    signature.bind(*itself, *names)
+    required = names[: len(names) - len(arguments.defaults)]
+    signature.bind(*itself, *required)
+    if any(parameter.kind is parameter.VAR_POSITIONAL for parameter in signature.parameters.values()):
+        return  # told apart at the call; tests of its own call it
+    for name, node in zip(names[len(required) :], arguments.defaults, strict=True):
+        parameter = signature.parameters.get(name)
+        if parameter is not None and (default := ast.literal_eval(node)) is not None:
+            wanted = tuple(default) if isinstance(default, list) else default
+            assert parameter.default == wanted, (name, parameter.default, wanted)
+
+
+@pytest.mark.parametrize("row", _rows(), ids=lambda row: row.name)
+def test_a_name_of_the_reference_is_here(row, instances):
+    first, _, attribute = row.name.partition(".")
+    cells = [cell for cell in row[1:] if cell != ABSENT]
+    assert cells
+    if first in SHORT:
+        assert hasattr(instances[first], attribute)
+    for cell in cells:
+        if cell == VALUE:
+            if first not in SHORT:
+                _resolve(row.name)
+            continue
+        found = _resolve(row.name)
+        method = first in SHORT or row.name.split(".")[-2][0].isupper()
+        _bind(inspect.signature(found), cell, method)
+
+
+def test_the_page_lists_all_names_of_the_contract():
+    """The names by which users import the reference's classes and functions."""
+    listed = {row.name for row in _rows()}
+    assert len(listed) > 150
+    assert {"scene.Scene", "scene.cameras.MiniCam", "gaussian_renderer.render", "train.training"} <= listed
