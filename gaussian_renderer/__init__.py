@@ -27,6 +27,7 @@ def render(
     *,
     want_depth: bool = True,
     want_visibility: bool = True,
+    want_inactive_bands: bool = True,
     clamp: bool = True,
 ) -> dict[str, Tensor | None]:
     """Render one view.
@@ -43,12 +44,15 @@ def render(
     `viewspace_points` (N, 3), whose gradient is that of the screen means, per NDC unit;
     `visibility_filter` (n, 1) int64 indices of the Gaussians with radius > 0, or None without want_visibility, which
     saves waiting for a GPU; `radii` (N,) int32 pixels; `depth` inverse depth (1, H, W), or None unless want_depth.
+    Without want_inactive_bands, get_features_rest gets no gradient at the active degree 0, instead of zeros.
     """
     if torch.is_tensor(separate_sh):
         separate_sh, override_color = False, separate_sh
     xyz = pc.get_xyz
     geometry, raw = _geometry(pc, pipe.compute_cov3D_python, scaling_modifier)
     colors = _colors(pc, pipe.convert_SHs_python, viewpoint_camera, separate_sh, override_color)
+    if pc.active_sh_degree == 0 and not want_inactive_bands and "sh_rest" in colors:
+        colors["sh_rest"] = colors["sh_rest"].detach()[:, :0]
     viewspace_points = _zero(xyz.device, xyz.dtype).expand_as(xyz)
     viewspace_points.requires_grad_(
         torch.is_grad_enabled() and any(x.requires_grad for x in (xyz, *geometry.values(), *colors.values()))
@@ -147,6 +151,4 @@ def _colors(
     else:
         features = pc.get_features
         dc, rest = features[:, :1], features[:, 1:]
-    if pc.active_sh_degree == 0:
-        rest = rest.detach()[:, :0]  # no band is read, so no gradient of zeros has to be written
     return {"sh_dc": dc, "sh_rest": rest}

@@ -135,15 +135,19 @@ def test_the_raw_path_equals_the_plain_one(camera, degree, antialiasing):
             assert (raw_gradients[name] - gradient).abs().max() < 1e-5 * gradient.abs().max(), name
 
 
-def test_inactive_bands_are_not_looked_at(camera):
+def test_inactive_bands_are_not_read(camera):
     gaussians = model(20, active=False)
     image = render(camera, gaussians, pipeline(), BLACK)["render"]
     with torch.no_grad():
         gaussians._features_rest.fill_(torch.nan)
-    again = render(camera, gaussians, pipeline(), BLACK)["render"]
+    again = render(camera, gaussians, pipeline(), BLACK, want_inactive_bands=False)["render"]
     assert torch.equal(image, again)
     again.sum().backward()
     assert gaussians._features_rest.grad is None
+    again = render(camera, gaussians, pipeline(), BLACK)["render"]
+    assert torch.equal(image, again)
+    again.sum().backward()
+    assert torch.equal(gaussians._features_rest.grad, torch.zeros_like(gaussians._features_rest))
     gaussians.oneupSHdegree()
     with torch.no_grad():
         gaussians._features_rest[:, :3] = 0.0

@@ -131,5 +131,6 @@ class Run:
             "use_trained_exp": self.dataset.train_test_exp,
             "want_depth": step.depth_weight > 0,
             "want_visibility": False,
+            "want_inactive_bands": False,
             "clamp": False,
         }

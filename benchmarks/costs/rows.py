@@ -72,7 +72,7 @@ class Workload:
 
     def image(self, model: GaussianModel, *, pipe: argparse.Namespace | None = None, **options: bool) -> Tensor:
         """Render as training and render.py do, with options of `render`; (3, H, W)."""
-        options = {"want_depth": False, "want_visibility": False} | options
+        options = {"want_depth": False, "want_visibility": False, "want_inactive_bands": False} | options
         return render(self.camera, model, pipe or self.pipe, self.settings.bg, **options)["render"]
 
     def bare_image(self, model: GaussianModel) -> Tensor:

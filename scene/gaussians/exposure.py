@@ -18,7 +18,8 @@ from utils.system_utils import UserError, atomic_write
 
 NAME = "exposure.json"
 _REMEDY = "restore the file, or write train_test_exp=False into cfg_args to render without exposures"
-_ADAM_EPS = 1e-8  # torch's default, which the reference uses for exposures
+# torch's defaults, which the reference uses for exposures; update_learning_rate replaces the rate.
+_ADAM_EPS, _ADAM_RATE = 1e-8, 1e-3
 
 
 class Exposures:
@@ -60,7 +61,7 @@ class Exposures:
         The 2023 release has no such options.
         """
         self.values = trainable(self.values)
-        self.optimizer = GaussianAdam([{"params": [self.values], "lr": 0.0, "name": "exposure"}], eps=_ADAM_EPS)
+        self.optimizer = GaussianAdam([{"params": [self.values], "lr": _ADAM_RATE, "name": "exposure"}], eps=_ADAM_EPS)
         self.schedule = get_expon_lr_func(
             getattr(opt, "exposure_lr_init", 0.01),
             getattr(opt, "exposure_lr_final", 0.001),

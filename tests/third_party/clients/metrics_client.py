@@ -10,11 +10,11 @@ import sys
 from argparse import ArgumentParser, Namespace
 
 import torch
-from lpipsPyTorch import lpips
 
 import metrics
 import render
 from arguments import ModelParams, PipelineParams
+from lpipsPyTorch import lpips
 from utils.image_utils import psnr
 from utils.loss_utils import ssim
 
