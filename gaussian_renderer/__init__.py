@@ -51,12 +51,11 @@ def render(
     xyz = pc.get_xyz
     geometry, raw = _geometry(pc, pipe.compute_cov3D_python, scaling_modifier)
     colors = _colors(pc, pipe.convert_SHs_python, viewpoint_camera, separate_sh, override_color)
-    if pc.active_sh_degree == 0 and not want_inactive_bands and "sh_rest" in colors:
-        colors["sh_rest"] = colors["sh_rest"].detach()[:, :0]
+    if pc.active_sh_degree == 0 and not want_inactive_bands:
+        colors = _without_rest(colors)
     viewspace_points = _zero(xyz.device, xyz.dtype).expand_as(xyz)
-    viewspace_points.requires_grad_(
-        torch.is_grad_enabled() and any(x.requires_grad for x in (xyz, *geometry.values(), *colors.values()))
-    )
+    leaves = (xyz, *geometry.values(), *colors.values())
+    viewspace_points.requires_grad_(torch.is_grad_enabled() and any(x.requires_grad for x in leaves))
     result = rasterize(
         xyz,
         viewspace_points,
@@ -152,3 +151,8 @@ def _colors(
         features = pc.get_features
         dc, rest = features[:, :1], features[:, 1:]
     return {"sh_dc": dc, "sh_rest": rest}
+
+
+def _without_rest(colors: dict[str, Tensor]) -> dict[str, Tensor]:
+    """The colours without the bands above 0, for which no gradient then has to be written."""
+    return {**colors, "sh_rest": colors["sh_rest"].detach()[:, :0]} if "sh_rest" in colors else colors
