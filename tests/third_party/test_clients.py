@@ -31,7 +31,8 @@ VIEWS, HELD_OUT = 17, 3
 
 def command(*words: object, cwd: Path, paths: tuple[Path, ...] = (ROOT,), **environment: str) -> str:
     """Run Python with these words in a folder, without a network; returns its standard output."""
-    env = os.environ | {"PYTHONPATH": os.pathsep.join(map(str, paths)), "https_proxy": "http://127.0.0.1:9"}
+    places = [*map(str, paths), *filter(None, [os.environ.get("PYTHONPATH")])]  # packages may be installed there
+    env = os.environ | {"PYTHONPATH": os.pathsep.join(places), "https_proxy": "http://127.0.0.1:9"}
     env |= {"OMP_NUM_THREADS": "1"} | environment
     words = [sys.executable, *map(str, words)]
     done = subprocess.run(words, cwd=cwd, env=env, capture_output=True, text=True, timeout=300, check=False)
