@@ -25,7 +25,7 @@ from gaussian_renderer.scored_views import ScoredViews
 from records import render_times
 from scene.cameras import Camera
 from scene.gaussian_model import GaussianModel
-from scene.saved_model import load_saved
+from scene.saved_model import load_saved, warn_of_background
 from utils.general_utils import safe_state
 from utils.system_utils import UserError, atomic_write, compute_device, mkdir_p, run_cli
 
@@ -111,6 +111,7 @@ def main() -> None:
     args = get_combined_args(parser)
     options, pipe = model_params.extract(args), pipeline_params.extract(args)
     safe_state(args.quiet)
+    warn_of_background(options)
 
     options.images_to_load = 1
     scene = load_saved(options, args.iteration, args.typed_sh_degree)
