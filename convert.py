@@ -7,6 +7,9 @@ Writes SCENE/images, SCENE/sparse/0, SCENE/convert_report.json, and intermediate
 run resumes after the last finished stage, and repeats the stages that changed options or photos affect.
 """
 
+if __name__ == "__main__":
+    import utils.host.early  # noqa: F401  (before the other imports, which take a second)
+
 import argparse
 import json
 import shlex

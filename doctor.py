@@ -5,6 +5,9 @@ python doctor.py [-s SCENE] [-m MODEL]
 Exit status: 0 no problems, 1 problems, 2 the checks could not run.
 """
 
+if __name__ == "__main__":
+    import utils.host.early  # noqa: F401  (before the other imports, which take a second)
+
 import argparse
 import sys
 from collections.abc import Sequence

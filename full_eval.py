@@ -9,6 +9,9 @@ run: <scene>[/<option set>][/seed_N]. After an interruption, the same command re
 
 from __future__ import annotations
 
+if __name__ == "__main__":
+    import utils.host.early  # noqa: F401  (before the other imports, which take a second)
+
 import sys
 from argparse import ArgumentParser, Namespace
 from collections.abc import Sequence

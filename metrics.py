@@ -8,6 +8,9 @@ and metrics_info.json, which states the convention of each number.
 
 from __future__ import annotations
 
+if __name__ == "__main__":
+    import utils.host.early  # noqa: F401  (before the other imports, which take a second)
+
 import math
 from argparse import ArgumentParser
 from collections.abc import Callable

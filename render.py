@@ -9,6 +9,9 @@ is idle before the clock starts, and done when it stops.
 
 from __future__ import annotations
 
+if __name__ == "__main__":
+    import utils.host.early  # noqa: F401  (before the other imports, which take a second)
+
 import argparse
 import re
 import time
