@@ -53,8 +53,9 @@ def _run(script: str, redirection: str, tmp_path: Path) -> subprocess.CompletedP
         f"import sys\nfrom utils.system_utils import run_cli\ndef main():\n    {script}\nrun_cli(main)\n"
     )
     command = f'"{sys.executable}" "{program}" {redirection}'
-    return subprocess.run(["sh", "-c", command], cwd=ROOT, env=os.environ | {"PYTHONPATH": str(ROOT), "PYTHONIOENCODING": "utf-8:strict"},
-                          capture_output=True, text=True, timeout=60)  # fmt: skip
+    environment = os.environ | {"PYTHONPATH": str(ROOT), "PYTHONIOENCODING": "utf-8:strict"}
+    words = ["sh", "-c", command]
+    return subprocess.run(words, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=60)
 
 
 @needs_full
