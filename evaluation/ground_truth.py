@@ -1,4 +1,4 @@
-"""Which runs of a scene can be compared: those that were scored on the same ground truth."""
+"""Comparable runs of a scene: those that were scored on the same ground truth."""
 
 from __future__ import annotations
 
