@@ -128,6 +128,7 @@ def _carry_out(runs: Sequence[Run], args: Namespace, failures: dict[Run, Failure
     """Carry out every run; note and print a failure, and continue with the next run."""
     facts = {} if args.skip_training else machine()
     render_options = ("--antialiasing",) if args.aa else ()
+    download = True
     for number, run in enumerate(runs, 1):
         print(f"[{number}/{len(runs)}] {run.title}", flush=True)
         try:
@@ -136,7 +137,7 @@ def _carry_out(runs: Sequence[Run], args: Namespace, failures: dict[Run, Failure
             if not args.skip_rendering:
                 stages.render(run, render_options)
             if not args.skip_metrics:
-                stages.score(run)
+                download = stages.score(run, download)
         except StageFailed as failed:
             failures[run] = failed.failure
             print(f"  FAILED ({failed.failure.stage}): {failed}", flush=True)

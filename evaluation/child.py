@@ -43,8 +43,8 @@ class Finished:
         return self.lines[-1] if self.lines else f"exit status {self.status}"
 
 
-def run_child(command: Sequence[str]) -> Finished:
-    """Run a command without a shell, and copy its stderr to ours.
+def run_child(command: Sequence[str], **environment: str) -> Finished:
+    """Run a command without a shell, and copy its stderr to ours. environment: variables beside our own.
 
     Ctrl-C or SIGTERM to this process is passed on once, SIGHUP (a closed terminal) as SIGTERM. Then this function waits
     for the child, since train.py saves a checkpoint, and sets `interrupt`. A second signal kills the child and raises.
@@ -55,7 +55,8 @@ def run_child(command: Sequence[str]) -> Finished:
     # train.py stops at once on the second one.
     with DeferredInterrupt() as interrupt:
         # The child inherits only the folder's lock, which is then kept as long as the child lives.
-        child = subprocess.Popen(command, stderr=subprocess.PIPE, start_new_session=True, close_fds=False)
+        child = subprocess.Popen(command, stderr=subprocess.PIPE, start_new_session=True, close_fds=False,
+                                 env=os.environ | environment)  # fmt: skip
         try:
             handed_on = False
             with selectors.DefaultSelector() as selector:

@@ -166,8 +166,12 @@ def _rendered(model: Path, iteration: int) -> int:
     return len(renders) if renders == truth else 0
 
 
-def score(run: Run) -> None:
-    """Run metrics.py, unless the same renders are already scored."""
+def score(run: Run, download: bool = True) -> bool:
+    """Run metrics.py, unless the same renders are already scored.
+
+    download: whether it may try to download the weights of LPIPS; return whether another run may. A try without an
+    answer takes 10 seconds.
+    """
     record = Record(run.model)
     iterations = saved_iterations(run.model / "point_cloud")
     methods = [f"ours_{iteration}" for iteration in iterations if _rendered(run.model, iteration)]
@@ -176,14 +180,15 @@ def score(run: Run) -> None:
     renders = {method: _times_stamp(run.model, method) for method in methods}
     done = record.stage("metrics")
     if done and done["renders"] == renders and None not in renders.values() and _scored(run.model, methods):
-        return
+        return download
     command = _script("metrics.py", "-m", str(run.model))
     _say("scoring")
-    finished = run_child(command)
+    finished = run_child(command) if download else run_child(command, GS_DOWNLOAD="0")
     _expect_success("metrics", command, finished)
     truth = ground_truth_digest(run.model, methods[-1])
     record.note("metrics", ground_truth_sha256=truth, renders=renders, wall_seconds=round(finished.seconds, 3))
     _stop_if_asked(finished)
+    return download and load_scores(run.model, methods[-1])[0].get("LPIPS") is not None
 
 
 def _times_stamp(model: Path, method: str) -> list[int] | None:

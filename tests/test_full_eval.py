@@ -139,7 +139,9 @@ def _seconds(request, monkeypatch):
     """Let stages take their own time, or all the same time, as a render of an unchanged model may."""
     plain = stages.run_child
     if request.param:
-        monkeypatch.setattr(stages, "run_child", lambda c: dataclasses.replace(plain(c), seconds=request.param))
+        monkeypatch.setattr(
+            stages, "run_child", lambda *a, **k: dataclasses.replace(plain(*a, **k), seconds=request.param)
+        )
 
 
 @pytest.mark.usefixtures("_seconds")
@@ -161,6 +163,13 @@ def test_a_second_call_does_nothing_again(scenes, tmp_path):
     run(*command)
     assert [words[0] for words in calls(scenes)[len(done) + 1 :]] == ["train", "render"]
     assert len((out / "attic" / "scored.txt").read_text().splitlines()) == 4
+
+
+def test_only_the_first_scoring_tries_a_download(scenes, tmp_path):
+    """The stand-in scores no LPIPS, as metrics.py without weights."""
+    run("--scenes", scenes / "attic", scenes / "brick", "--output_path", tmp_path, "--iterations", 40)
+    tried = [json.loads((tmp_path / name / "scored.txt").read_text())[0] for name in ("attic", "brick")]
+    assert tried == [None, "0"]
 
 
 def test_other_options_are_not_mixed_in(scenes, tmp_path):
@@ -596,6 +605,23 @@ def test_a_second_call_whose_models_would_lie_in_those_of_the_first_is_refused(s
         with pytest.raises(UserError, match="would lie in each other; give the same --seeds and --configs, or none"):
             run("--scenes", scenes / words[0], *shared, *words[1:])
     assert folder_state(out) == before
+
+
+def test_peers_are_shown_and_stay_in_the_report(figures, scenes, tmp_path):
+    out, peer = tmp_path / "out", tmp_path / "other.csv"
+    peer.write_text("iteration,seconds,test_psnr,gaussians\n40,2.5,31.25,1234\n")
+    shared = ("--scenes", scenes / "attic", "--output_path", out, "--iterations", 40)
+    report = run(*shared, "--peer", "other", peer, "--peer", "third", peer)
+    assert [(peer["scene"], peer["name"], peer["curve"][0]["test_psnr"]) for peer in report["peers"]] == [
+        ("attic", "other", 31.25), ("attic", "third", 31.25),
+    ]  # fmt: skip
+    for kind in ("md", "html"):
+        text = (out / f"report.{kind}").read_text()
+        assert "Other programs" in text and "31.25" in text and "1,234" in text
+    assert report["cheapest"] == {}
+    peer.write_text("seconds,test_psnr\n3,32\n")
+    again = run("--scenes", scenes / "attic", scenes / "brick", *shared[2:], "--peer", "attic/other", peer)
+    assert [(peer["name"], peer["curve"][-1]["seconds"]) for peer in again["peers"]] == [("other", 3), ("third", 2.5)]
 
 
 @pytest.mark.parametrize("name", ["<script>alert(1)<", "[x](javascript:alert(1))", "a\nb", "# a", "caf\udce9"])

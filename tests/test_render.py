@@ -153,3 +153,23 @@ def test_a_model_trained_on_black_is_not_rendered_on_white_without_a_word(tmp_pa
 
     assert "has a black background in its cfg_args, but -w asks for white; leave -w out" in said(False, "-w")
     assert said(False) == said(True) == said(True, "-w") == ""
+
+
+def test_help_says_what_happens_without_an_option(monkeypatch, capsys):
+    monkeypatch.setattr("sys.argv", ["render.py", "-h"])
+    with pytest.raises(SystemExit):
+        render.main()
+    text = " ".join(capsys.readouterr().out.split())
+    for option, default in {
+        "--model_path TEXT, -m TEXT": "none, must be given",
+        "--sh_degree N": "that of the saved PLY",
+        "--resolution N, -r N": "that of the model",
+        "--white_background, -w": "that of the model",
+        "--masks TEXT": "that of the model",
+        "--antialiasing": "that of the model",
+        "--debug": "off; reference",
+        "--skip_train": "off",
+        "--iteration ITERATION": "-1, the last",
+    }.items():
+        _, _, after = text.partition(f" {option} ")[2].partition("(default: ")
+        assert after.startswith(f"{default})"), option
