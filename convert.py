@@ -7,6 +7,9 @@ Writes SCENE/images, SCENE/sparse/0, SCENE/convert_report.json, and intermediate
 run resumes after the last finished stage, and repeats the stages that changed options or photos affect.
 """
 
+if __name__ == "__main__":
+    import utils.host.early  # noqa: F401  (before the other imports, which take a second)
+
 import argparse
 import json
 import shlex
@@ -101,7 +104,8 @@ def main(argv: Sequence[str] | None = None) -> None:
         description="Convert the photos in SCENE/input, or a video, to a scene for train.py."
     )
     add = parser.add_argument
-    add("-s", "--source_path", required=True, metavar="SCENE", help="scene folder; its sub-folder input has the photos")
+    add("-s", "--source_path", required=True, metavar="SCENE",
+        help="scene folder; its sub-folder input has the photos; --video makes a missing one")  # fmt: skip
     add("--camera", default="OPENCV", help="lens model to fit; for a fisheye lens OPENCV_FISHEYE (default: OPENCV)")
     add("--no_gpu", action="store_true", help="compute features and matches on the CPU even if there is a GPU")
     add("--skip_matching", action="store_true", help="only undistort the largest model in SCENE/distorted/sparse")
@@ -132,7 +136,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     for option, least in (("max_num_features", 100), ("video_frames", FEWEST)):
         if getattr(args, option) < least:
             raise UserError(f"--{option} must be at least {least}, got {getattr(args, option)}")
-    layout = Layout(scene_folder(args.source_path))
+    layout = Layout(scene_folder(args.source_path, made=bool(args.video)))
     _check_camera(args.camera)
     matcher = args.matcher or ("sequential" if args.video else "exhaustive")
     convert(layout, Settings(args.camera, args.max_num_features, matcher, args.mapper, args.no_gpu), args)

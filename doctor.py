@@ -5,6 +5,9 @@ python doctor.py [-s SCENE] [-m MODEL]
 Exit status: 0 no problems, 1 problems, 2 the checks could not run.
 """
 
+if __name__ == "__main__":
+    import utils.host.early  # noqa: F401  (before the other imports, which take a second)
+
 import argparse
 import sys
 from collections.abc import Sequence
@@ -14,8 +17,12 @@ from diagnosis import environment
 from diagnosis.lines import Line
 
 
-def diagnose(source: str | None, images: str, model: str | None, iteration: int) -> int:
-    """Print the lines of the checks and return the number of problems. source, model: folders to check, or None."""
+def diagnose(source: str | None, images: str | None, model: str | None, iteration: int) -> int:
+    """Print the lines of the checks and return the number of problems.
+
+    source, model: folders to check, or None. With both, the model is checked against that scene. images: folder of the
+    photos, None: `images`, and for a model the one that it was trained on.
+    """
     lines = environment.check_packages()
     complete = not any(line.finding for line in lines)
     if complete:
@@ -35,11 +42,11 @@ def diagnose(source: str | None, images: str, model: str | None, iteration: int)
     if source is not None:
         from diagnosis.dataset import check_dataset
 
-        problems += _show(f"dataset {source}", check_dataset(source, images))
+        problems += _show(f"dataset {source}", check_dataset(source, images or "images"))
     if model is not None:
         from diagnosis.model import check_model
 
-        problems += _show(f"model {model}", check_model(model, iteration))
+        problems += _show(f"model {model}", check_model(model, iteration, source, images))
     return problems
 
 
@@ -54,9 +61,12 @@ def main(argv: Sequence[str] | None = None) -> None:
     """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     add = parser.add_argument
-    add("-s", "--source_path", default=None, metavar="SCENE", help="scene folder to check (default: none)")
-    add("-m", "--model_path", default=None, metavar="MODEL", help="model folder to check (default: none)")
-    add("-i", "--images", default="images", help="folder of the photos inside the scene folder (default: images)")
+    add("-s", "--source_path", default=None, metavar="SCENE",
+        help="scene folder to check; with -m the model is compared with it (default: none)")  # fmt: skip
+    add("-m", "--model_path", default=None, metavar="MODEL",
+        help="model folder to check, without -s with the scene that it was trained on (default: none)")  # fmt: skip
+    add("-i", "--images", default=None,
+        help="folder of the photos inside the scene folder (default: images, or that of the model)")  # fmt: skip
     add("--iteration", type=int, default=-1, help="saved iteration of the model (default: the last)")
     args = parser.parse_args(argv)
     problems = diagnose(args.source_path, args.images, args.model_path, args.iteration)

@@ -4,26 +4,34 @@ python full_eval.py -m360 DIR -tat DIR -db DIR [--output_path DIR]
 python full_eval.py --scenes FOLDER ... [--iterations N] [--seeds 0 1 2] [--configs FILE] [-- more options of train.py]
 
 Writes report.md, report.json, report.html, figures/ and timing.txt into the output folder, and a model folder for every
-run: <scene>[/<option set>][/seed_N]. After an interruption, the same command resumes.
+run: <scene>[/<option set>][/seed_N]. After an interruption, the same command resumes. Another command with the same
+output folder adds its runs to the report.
 """
 
 from __future__ import annotations
 
+if __name__ == "__main__":
+    import utils.host.early  # noqa: F401  (before the other imports, which take a second)
+
+import os
 import sys
 from argparse import ArgumentParser, Namespace
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import utils.host.openmp  # noqa: F401  isort: skip  (before torch)
 
 from evaluation import stages
 from evaluation.configs import check_options, read_configs
-from evaluation.document import Table, cheapest_table, results_table
+from evaluation.document import Table, cheapest_table, result_blocks
+from evaluation.earlier import joined, joined_peers, read_earlier
 from evaluation.lock import locked
 from evaluation.machine import machine
+from evaluation.peers import peers_of
 from evaluation.report import make_report, write_report
 from evaluation.results import read_run
-from evaluation.runs import Run, check_folders, check_outside_scenes, plan_runs
+from evaluation.runs import Run, check_folders, check_nesting, check_outside_scenes, plan_runs
 from evaluation.scenes import SceneEntry, check_names, dataset_scenes, finished_scenes, folder_scenes
 from evaluation.stages import Failure, StageFailed
 from utils.files.markdown_table import markdown_table
@@ -40,7 +48,7 @@ def _parser() -> ArgumentParser:
         description=__doc__.splitlines()[0],
         epilog="Options after -- go to train.py. A training counts as finished if it used the same scene folder and "
         "the same options of train.py, with any version of the code; a changed dataset is not detected. Exit status: 1 "
-        "if a run failed, 2 if nothing could be started.",
+        "if a run failed or nothing was scored, 2 if nothing could be started.",
     )
     add = parser.add_argument
     flag = {"action": "store_true"}
@@ -48,7 +56,8 @@ def _parser() -> ArgumentParser:
     add("--tanksandtemples", "-tat", type=Path, metavar="DIR", help="folder with truck and train of Tanks and Temples")
     add("--deepblending", "-db", type=Path, metavar="DIR", help="folder with drjohnson and playroom of Deep Blending")
     add("--scenes", type=Path, nargs="+", default=[], metavar="FOLDER",
-        help="any COLMAP or Blender folders; Blender scenes get train.py's -w, as in published tables")  # fmt: skip
+        help="any COLMAP, Blender or nerfstudio folders; Blender scenes get train.py's -w, as in published "
+        "tables")  # fmt: skip
     add("--output_path", type=Path, default=Path("./eval"), metavar="DIR", help="models and report (default: ./eval)")
     add("--skip_training", **flag, help="use the models in the output folder, whatever made them")
     add("--skip_rendering", **flag, help="use the existing renders")
@@ -59,6 +68,10 @@ def _parser() -> ArgumentParser:
     add("--configs", type=Path, metavar="FILE",
         help='train with each option set of a JSON file, {"name": ["--sh_degree", "1"], ...}, and report which is '
         "cheapest for a given error (default: once)")  # fmt: skip
+    add("--peer", nargs=2, action="append", default=[], metavar=("NAME", "FILE"),
+        help="draw another program's error against time beside ours, from a CSV file with the columns seconds and "
+        "test_psnr (`python -m evaluation.peer_curve` makes it); with several scenes NAME is SCENE/NAME; may be given "
+        "again (default: none)")  # fmt: skip
     add("--use_depth", **flag, help="supervise with inverse depth maps: train.py -d depths2/")
     add("--use_expcomp", **flag, help="exposure compensation: train.py --train_test_exp and its learning rates")
     add("--fast", **flag, help="train.py --optimizer_type sparse_adam")
@@ -99,6 +112,7 @@ def _plan(args: Namespace, more: Sequence[str]) -> list[Run]:
         raise UserError("--seed is given twice; omit it when --seeds is given")
     runs = plan_runs(_scenes(args), args.output_path.resolve(), common, configs, args.seeds)
     check_outside_scenes(runs)
+    check_nesting(runs, args.output_path.resolve())
     if not args.skip_training:
         check_folders(runs)
     return runs
@@ -114,6 +128,7 @@ def _carry_out(runs: Sequence[Run], args: Namespace, failures: dict[Run, Failure
     """Carry out every run; note and print a failure, and continue with the next run."""
     facts = {} if args.skip_training else machine()
     render_options = ("--antialiasing",) if args.aa else ()
+    download = True
     for number, run in enumerate(runs, 1):
         print(f"[{number}/{len(runs)}] {run.title}", flush=True)
         try:
@@ -122,10 +137,37 @@ def _carry_out(runs: Sequence[Run], args: Namespace, failures: dict[Run, Failure
             if not args.skip_rendering:
                 stages.render(run, render_options)
             if not args.skip_metrics:
-                stages.score(run)
+                download = stages.score(run, download)
         except StageFailed as failed:
             failures[run] = failed.failure
             print(f"  FAILED ({failed.failure.stage}): {failed}", flush=True)
+
+
+def _report(
+    command: Sequence[str], runs: Sequence[Run], failures: dict[Run, Failure], peers: list[dict[str, Any]], output: Path
+) -> bool:
+    """Write and print the report of these runs and those of earlier calls; return whether any of these has scores.
+
+    If none has, a report with scores stays as it is.
+    """
+    earlier = read_earlier(output)
+    results = [read_run(run, output, failure) for run, failure in joined(earlier, runs, failures)]
+    models = {os.path.relpath(run.model, output) for run in runs}
+    scored = any(result["final_iteration"] is not None for result in results if result["model"] in models)
+    if not scored:
+        stays = f"; the report of an earlier call stays: {output / 'report.html'}" if earlier.scored else ""
+        print(f"nothing was scored{stays}", file=sys.stderr)
+        if earlier.scored:
+            return False
+    scenes = {result["scene"] for result in results}
+    report = make_report(command, results, joined_peers(earlier, peers, scenes), earlier.commands)
+    write_report(report, output)
+    for block in result_blocks(report["summary"]) if report["summary"] else []:
+        print(_text(block) if isinstance(block, Table) else f"\n{block}")
+    for scene, rows in report["cheapest"].items():
+        print(f"\n{scene}: cheapest option set for a given error\n{_text(cheapest_table(rows))}")
+    print(f"\nreport: {output / 'report.html'}")
+    return scored
 
 
 def _text(table: Table) -> str:
@@ -138,6 +180,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     end = words.index("--") if "--" in words else len(words)
     args = _parser().parse_args(words[:end])
     runs = _plan(args, words[end + 1 :])
+    peers = peers_of(args.peer, list(dict.fromkeys(run.scene.name for run in runs)))
     output = args.output_path.resolve()
     mkdir_p(output)
     failures: dict[Run, Failure] = {}
@@ -145,17 +188,12 @@ def main(argv: Sequence[str] | None = None) -> None:
         try:
             _carry_out(runs, args, failures)
         finally:  # report the finished runs after Ctrl-C too
-            report = make_report(["full_eval.py", *words], [read_run(run, output, failures.get(run)) for run in runs])
-            write_report(report, output)
-            if report["summary"]:
-                print(_text(results_table(report["summary"])))
-            for scene, rows in report["cheapest"].items():
-                print(f"\n{scene}: cheapest option set for a given error\n{_text(cheapest_table(rows))}")
-            print(f"\nreport: {output / 'report.html'}")
+            scored = _report(["full_eval.py", *words], runs, failures, peers, output)
     if failures:
         print(
             f"{len(failures)} of {len(runs)} runs failed: {', '.join(run.title for run in failures)}", file=sys.stderr
         )
+    if failures or not scored:
         sys.exit(1)
 
 

@@ -8,6 +8,9 @@ and metrics_info.json, which states the convention of each number.
 
 from __future__ import annotations
 
+if __name__ == "__main__":
+    import utils.host.early  # noqa: F401  (before the other imports, which take a second)
+
 import math
 from argparse import ArgumentParser
 from collections.abc import Callable, Sequence
@@ -21,6 +24,7 @@ from fused_ssim import fused_ssim
 from tqdm import tqdm
 
 from arguments import read_cfg_args
+from records.earlier_lpips import keep_lpips
 from utils.files.image_files import UNREADABLE, open_render
 from utils.files.json_files import write_json
 from utils.lpips_utils import MIN_SIDE, LpipsUnavailable, PerceptualDistance
@@ -157,8 +161,8 @@ def _lpips_metric(distance: PerceptualDistance, unit_range: bool, device: torch.
 def make_metrics(lpips_net: str, weights: list[Path], smallest_side: int) -> dict[str, Metric]:
     """Make the metrics by key, in the order of the files.
 
-    smallest_side: smallest side of all images, in pixels. If a backbone is not available, a line says so and its
-    metrics return None.
+    smallest_side: smallest side of all images, in pixels. If a backbone or its weights are missing, a line says so and
+    its metrics return None.
     """
     keys = ["SSIM", "PSNR", "LPIPS"] + [f"LPIPS_{net}" for net in ("vgg", "alex") if lpips_net in (net, "both")]
     metrics: dict[str, Metric] = dict.fromkeys(keys, lambda render, truth, mask: None)
@@ -173,7 +177,10 @@ def make_metrics(lpips_net: str, weights: list[Path], smallest_side: int) -> dic
                 raise LpipsUnavailable(f"it needs images with sides of at least {MIN_SIDE[net]} pixels")
             distance = PerceptualDistance(net, weights, device)
         except LpipsUnavailable as reason:
-            print(f"{', '.join(mine)} will be null: {reason}")
+            print(f"{', '.join(mine)} are null unless scored before: {reason}")
+            continue
+        except ImportError as error:
+            print(f"{', '.join(mine)} are null unless scored before: {error}; run pip install -r requirements.txt")
             continue
         metrics.update({key: _lpips_metric(distance, key == "LPIPS", device) for key in mine})
     return metrics
@@ -235,12 +242,15 @@ def _score_model(model: Path, methods: dict[str, list[Pair]], metrics: dict[str,
     if held_out is False:
         print(f"warning: {model} was trained without --eval, so these scores are of training views")
     per_view = {name: score(pairs, metrics, f"{model.name}/{name}") for name, pairs in methods.items()}
+    for name, scores in per_view.items():
+        if kept := keep_lpips(model, name, scores):
+            print(f"{model} {name}: kept {', '.join(kept)} of an earlier scoring of the same pictures")
     results = {name: {key: mean(values) for key, values in scores.items()} for name, scores in per_view.items()}
     for name, means in results.items():
         shown = "  ".join(f"{key} {'null' if value is None else f'{value:.4f}'}" for key, value in means.items())
         print(f"{model} {name} ({len(methods[name])} views): {shown}")
     info = {
-        "conventions": {key: CONVENTIONS[key] for key in metrics},
+        "conventions": {key: CONVENTIONS[key] for scores in per_view.values() for key in scores},
         "trained_with_eval": held_out,
         "views": {name: len(pairs) for name, pairs in methods.items()},
     }
@@ -254,7 +264,8 @@ def _score_model(model: Path, methods: dict[str, list[Pair]], metrics: dict[str,
 
 def main() -> None:
     parser = ArgumentParser(description="Score rendered test views: PSNR, SSIM, LPIPS.")
-    parser.add_argument("-m", "--model_paths", type=Path, nargs="+", required=True, help="model folders to score")
+    parser.add_argument("-m", "--model_paths", type=Path, nargs="+", required=True,
+                        help="model folders to score (default: none, must be given)")  # fmt: skip
     parser.add_argument(
         "--lpips_net",
         choices=("vgg", "alex", "both"),
@@ -267,7 +278,8 @@ def main() -> None:
         nargs="+",
         default=[],
         metavar="FILE",
-        help="state dicts of torchvision's vgg16 or alexnet; replace torch's cache and download",
+        help="state dicts of torchvision's vgg16 or alexnet; replace torch's cache and download (default: torch's "
+        "cache, or else a download into it)",
     )
     args = parser.parse_args()
     evaluate(args.model_paths, args.lpips_net, args.lpips_weights)

@@ -9,6 +9,9 @@ is idle before the clock starts, and done when it stops.
 
 from __future__ import annotations
 
+if __name__ == "__main__":
+    import utils.host.early  # noqa: F401  (before the other imports, which take a second)
+
 import argparse
 import copy
 import re
@@ -26,7 +29,7 @@ from gaussian_renderer.scored_views import ScoredViews
 from records import render_times
 from scene.cameras import Camera
 from scene.gaussian_model import GaussianModel
-from scene.saved_model import load_saved
+from scene.saved_model import load_saved, warn_of_background
 from utils.general_utils import safe_state
 from utils.system_utils import UserError, atomic_write, compute_device, mkdir_p, run_cli
 
@@ -165,14 +168,15 @@ def main() -> None:
     parser = OptionParser(description="Render the train and test views of a trained model.")
     # Each photo is used once, so one is kept in memory.
     model_params = ModelParams(parser, sentinel=True, without=("images_to_load",))
-    pipeline_params = PipelineParams(parser)
-    parser.add_argument("--iteration", type=int, default=-1, help="saved iteration to render (-1: the highest)")
-    parser.add_argument("--skip_train", action="store_true", help="leave the training views out")
-    parser.add_argument("--skip_test", action="store_true", help="leave the test views out")
-    parser.add_argument("--quiet", action="store_true", help="print nothing to stdout")
+    pipeline_params = PipelineParams(parser, sentinel=True)
+    parser.add_argument("--iteration", type=int, default=-1, help="saved iteration to render (default: -1, the last)")
+    parser.add_argument("--skip_train", action="store_true", help="leave the training views out (default: off)")
+    parser.add_argument("--skip_test", action="store_true", help="leave the test views out (default: off)")
+    parser.add_argument("--quiet", action="store_true", help="print nothing to stdout (default: off)")
     args = get_combined_args(parser)
     options, pipeline = model_params.extract(args), pipeline_params.extract(args)
     safe_state(args.quiet)
+    warn_of_background(options)
     render_sets(options, args.iteration, pipeline, args.skip_train, args.skip_test, sh_degree=args.typed_sh_degree)
 
 

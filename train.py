@@ -3,6 +3,9 @@
 python train.py -s SCENE -m OUT --eval
 """
 
+if __name__ == "__main__":
+    import utils.host.early  # noqa: F401  (before the other imports, which take a second)
+
 import argparse
 import os
 import uuid

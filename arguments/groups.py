@@ -28,14 +28,24 @@ class ModelParams(OptionTable):
             "paper",
             check=within(0, 3),
             stored=True,
+            loaded="that of the saved PLY",
         ),
-        Option("source_path", "", "scene folder (COLMAP or Blender)", "none, must be given", short="s", stored=True),
+        Option(
+            "source_path",
+            "",
+            "scene folder (COLMAP, Blender or nerfstudio)",
+            "none, must be given",
+            short="s",
+            stored=True,
+        ),
         Option(
             "model_path",
             "",
-            "output folder; empty: a new one under ./output, named after OAR_JOB_ID or at random",
+            "folder of the model",
+            "a new one under ./output, named after OAR_JOB_ID or at random, as in the reference",
             short="m",
             stored=True,
+            loaded="none, must be given",
         ),
         Option(
             "images", "images", "folder of the photos inside the scene folder (COLMAP only)", short="i", stored=True
@@ -110,8 +120,9 @@ class ModelParams(OptionTable):
         Option(
             "images_to_load",
             0,
-            "largest number of decoded images kept in memory, 0: all. Every photo still trains, with the same result; "
-            "up to 32 of the next ones are decoded ahead",
+            "largest number of decoded images (photos, masks and depth maps) kept in memory, 0: all. The one unused "
+            "for longest goes. Every photo still trains, with the same result; up to 32 that come next are decoded "
+            "ahead",
             "ours",
             check=at_least(0),
         ),
@@ -142,6 +153,7 @@ class PipelineParams(OptionTable):
             "antialiasing",
             False,
             "keep the total weight of splats smaller than a pixel, so that views from other distances look right",
+            loaded="that of the model",
         ),
     )
 

@@ -19,6 +19,7 @@ class Option:
     help: effect, may be empty. origin: source of the default; "ours..." for options that the reference does not have.
     check: returns None for a valid value, else a description of valid values.
     stored: written to `cfg_args`. remembered: written to `model.json`, for render.py.
+    loaded: what a command that loads a model takes if the option is not given; empty: what the model was trained with.
     """
 
     name: str
@@ -29,6 +30,7 @@ class Option:
     check: Callable[[Any], str | None] | None = None
     stored: bool = False
     remembered: bool = False
+    loaded: str = ""
 
     @property
     def ours(self) -> bool:
@@ -43,14 +45,22 @@ class Option:
     def add_to(self, group: argparse._ArgumentGroup, sentinel: bool) -> None:
         flags = [f"--{self.name}"] + ([f"-{self.short}"] if self.short else [])
         default = None if sentinel else self.default
-        shown = "off" if self.default is False else repr(self.default) if self.default == "" else self.default
-        text = f"{self.help} (default: {shown}; {self.origin})" if self.help else f"default: {shown}"
+        text = f"{self.help} (default: {self._shown_default(sentinel)})" if self.help else f"default: {self._shown()}"
         if isinstance(self.default, bool):
             kind: dict[str, Any] = {"action": "store_true"}
         else:
             kind = {"type": type(self.default), "metavar": self._metavar()}
         action = group.add_argument(*flags, **kind, default=default, help=text.replace("%", "%%"))
         action.ours = self.ours  # type: ignore[attr-defined]  # for OptionParser
+
+    def _shown(self) -> str:
+        return "off" if self.default is False else repr(self.default) if self.default == "" else str(self.default)
+
+    def _shown_default(self, sentinel: bool) -> str:
+        """Text about what counts if the option is not given. sentinel: by a command that loads a model."""
+        if sentinel and (self.loaded or self.stored or self.remembered):
+            return self.loaded or "that of the model"
+        return f"{self._shown()}; {self.origin}"
 
     def _metavar(self) -> str | None:
         return {int: "N", float: "X", str: "TEXT"}.get(type(self.default))

@@ -77,8 +77,11 @@ class Layout:
         return self.scene / f"images_{factor}"
 
 
-def scene_folder(given: str) -> Path:
-    """Return the absolute path of the folder given as -s. UserError if it is none; the message names usual mistakes."""
+def scene_folder(given: str, made: bool = False) -> Path:
+    """Return the absolute path of the folder given as -s. UserError if it is none; the message names usual mistakes.
+
+    made: the folder may be missing, since a video's frames will make it.
+    """
     bare = given.strip("'\"")
     if bare != given and not Path(given).exists() and Path(bare).exists():
         raise UserError(f"the path given as -s contains quotes: {given}; pass {bare}, quoted only once for the shell")
@@ -88,7 +91,7 @@ def scene_folder(given: str) -> Path:
         raise UserError(
             f"{given} is a file; {hint or 'pass the folder that contains the folder input with the photos as -s'}"
         )
-    if not folder.is_dir():
+    if not given or not (made or folder.is_dir()):
         raise UserError(f"no folder {given}; make it, put the photos into a folder input in it, and pass it as -s")
     return folder.absolute()
 

@@ -14,7 +14,7 @@ from conversion.layout import Layout, picture_names
 from conversion.photos import JPEG_QUALITY, check_photos, prepare_photos, resize_images, sizes
 from conversion.programs import run_programs
 from conversion.stages import Stage
-from conversion.video import PATTERN, extract_frames
+from conversion.video import PATTERN, extract_frames, find_decoder
 from utils.system_utils import UserError, mkdir_p
 
 FACTORS = (2, 4, 8)  # of --resize
@@ -34,7 +34,7 @@ def video_stage(layout: Layout, video: Path, count: int) -> Stage:
         mkdir_p(layout.input)
         extract_frames(video, layout.input, count)
 
-    return Stage("video", [_state(video), count], reset, work)
+    return Stage("video", [_state(video), count], reset, work, check=find_decoder)
 
 
 def photo_stage(layout: Layout, names: list[str], masks: Path | None) -> Stage:

@@ -21,7 +21,7 @@ def extract_frames(video: Path, folder: Path, count: int) -> None:
     Reads every frame, and keeps the one in each span whose neighbouring pixels differ most, since parts of hand-held
     videos are blurred.
     """
-    decoder = _decoder()
+    decoder = find_decoder()
     try:
         total, _ = decoder.count_frames_and_secs(str(video))
         total = max(total, 1)
@@ -65,7 +65,8 @@ def _write(frame: np.ndarray, folder: Path, written: int) -> int:
     return written + 1
 
 
-def _decoder() -> Any:
+def find_decoder() -> Any:
+    """Return the package that reads videos. UserError if it is not installed."""
     try:
         import imageio_ffmpeg
     except ImportError as error:

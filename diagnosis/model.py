@@ -11,6 +11,7 @@ import torch
 from arguments import ModelParams, PipelineParams, read_model_json, read_stored_options
 from diagnosis.dataset import check_dataset
 from diagnosis.lines import Line, from_error
+from diagnosis.values import only_reset, wrong_positions, wrong_sizes
 from gaussian_renderer import render
 from gaussian_renderer.scored_views import ScoredViews
 from scene import Scene
@@ -22,6 +23,7 @@ from utils.system_utils import UserError, compute_device
 
 # Densification prunes below 0.005 and a reset leaves 0.01: a model of such a median has not recovered.
 FAINT = 0.02
+UNRECOVERED = 0.2  # median within 500 iterations of a reset
 BINS = (0.0, 0.01, 0.05, 0.2, 0.5, 0.9, 1.0)
 HUGE = 1.0  # extents: one standard deviation of a splat as large as the whole scene
 HUGE_SHARE = 0.01
@@ -31,16 +33,21 @@ FEW_ITERATIONS = 3000
 RESET_INTERVAL = 3000  # the default of --opacity_reset_interval
 NEAREST = 0.2  # depth below which nothing is drawn
 FEW_GAUSSIANS = 2000
+_CLEARLY = 3.0  # dB
 _VIEWS = 4
 _WIDTH = 200
 
 
-def check_model(model_path: str, iteration: int) -> list[Line]:
-    """Lines about the model that train.py wrote into a folder; iteration -1: the last one saved."""
+def check_model(model_path: str, iteration: int, source: str | None = None, images: str | None = None) -> list[Line]:
+    """Lines about the model that train.py wrote into a folder; iteration -1: the last one saved.
+
+    source, images: scene folder and its folder of photos, None: those that the model was trained on.
+    """
     try:
         stored = read_stored_options(model_path)
-        with contextlib.redirect_stdout(io.StringIO()):  # from the readers
-            options, scene = _load(model_path, stored, iteration)
+        stored |= {"source_path": source} if source is not None else {}
+        stored |= {"images": images} if images is not None else {}
+        options, scene = _load(model_path, stored, iteration)
     except UserError as error:
         return [from_error(error)]
     gaussians = scene.gaussians
@@ -51,6 +58,8 @@ def check_model(model_path: str, iteration: int) -> list[Line]:
     lines = [Line(f"{name}, {len(gaussians)} Gaussians of SH degree {degree}"), *check_values(gaussians)]
     if any(line.finding for line in lines):
         return lines
+    if wrong := wrong_sizes(gaussians, scene.cameras_extent):
+        return [*lines, wrong]
     return lines + check_shapes(gaussians, scene.cameras_extent) + check_renders(scene, options, stored)
 
 
@@ -59,7 +68,8 @@ def _load(model_path: str, stored: dict[str, Any], iteration: int) -> tuple[argp
     given = {**stored, "model_path": model_path, "resolution": _WIDTH, "images_to_load": 1}
     given.pop("depths", None)
     options = ModelParams(argparse.ArgumentParser()).extract(argparse.Namespace(**given))
-    return options, load_saved(options, iteration)
+    with contextlib.redirect_stdout(io.StringIO()):  # from the readers
+        return options, load_saved(options, iteration)
 
 
 def check_values(gaussians: GaussianModel) -> list[Line]:
@@ -111,19 +121,50 @@ def check_shapes(gaussians: GaussianModel, extent: float) -> list[Line]:
 
 def check_renders(scene: Scene, options: argparse.Namespace, stored: dict[str, Any]) -> list[Line]:
     """Line about a few training views, rendered small: close to their photos, or else the likeliest reason."""
-    cameras = [camera for camera in scene.getTrainCameras() if camera.columns is None]  # whole views
-    cameras = cameras[:: max(1, len(cameras) // _VIEWS)][:_VIEWS]
-    measured = [values for camera in cameras if (values := _measure(camera, scene, options))]
-    if not measured:
+    views = _looked_at(scene)
+    means = _means(views, scene, options)
+    if means is None:
         return [Line("no pixel of the inspected training views counts", "check --masks and --invert_masks")]
-    brightness, truth, coverage, drawn, score = (float(np.mean(values)) for values in zip(*measured, strict=True))
+    brightness, truth, coverage, drawn, score = means
     if brightness < BLACK and truth < BLACK:
         return [Line("the photos themselves are black", "inspect them; if they are transparent, train with -w")]
-    if brightness < BLACK:
-        return [_why_black(scene, cameras, coverage, drawn)]
-    if score < BAD_PSNR:
-        return [Line(f"training views have a PSNR of only {score:.1f} dB", _why_bad(scene, stored))]
-    return [Line(f"{len(measured)} training views rendered {_WIDTH} pixels wide: PSNR {score:.1f} dB")]
+    if brightness >= BLACK and score >= BAD_PSNR:
+        return [Line(f"{len(views)} training views rendered {_WIDTH} pixels wide: PSNR {score:.1f} dB")]
+    black = brightness < BLACK
+    text = "renders of the training views are black" if black else f"training views have a PSNR of only {score:.1f} dB"
+    if wrong := _wrong_values(scene) or _other_background(scene, options, stored, score):
+        return [wrong._replace(text=f"{text}: {wrong.text}")]
+    return [_why_black(scene, views, coverage, drawn) if black else Line(text, _why_bad(scene, stored))]
+
+
+def _looked_at(scene: Scene) -> list[Camera]:
+    cameras = [camera for camera in scene.getTrainCameras() if camera.columns is None]  # whole views
+    return cameras[:: max(1, len(cameras) // _VIEWS)][:_VIEWS]
+
+
+def _means(cameras: list[Camera], scene: Scene, options: argparse.Namespace) -> tuple[float, ...] | None:
+    """Means of `_measure` over the views of which some pixel counts; None if there are none."""
+    measured = [values for camera in cameras if (values := _measure(camera, scene, options))]
+    return tuple(float(np.mean(values)) for values in zip(*measured, strict=True)) if measured else None
+
+
+def _wrong_values(scene: Scene) -> Line | None:
+    return wrong_positions(scene.gaussians, scene.cameras_extent) or only_reset(scene.gaussians)
+
+
+def _other_background(scene: Scene, options: argparse.Namespace, stored: dict[str, Any], score: float) -> Line | None:
+    """Line if photos and renders agree over the other background, black or white; None if not."""
+    white = not options.white_background
+    other_options, other = _load(scene.model_path, stored | {"white_background": white}, scene.loaded_iter)
+    means = _means(_looked_at(other), other, other_options)
+    if means is None or means[-1] < max(BAD_PSNR, score + _CLEARLY):
+        return None
+    name = "white" if white else "black"
+    return Line(
+        f"over {name} it is {means[-1]:.1f} dB",
+        f"the model was trained on {name}: set white_background={white} in {scene.model_path}/cfg_args"
+        + ("" if white else ", and render without -w"),
+    )
 
 
 def _measure(
@@ -172,7 +213,7 @@ def _why_black(scene: Scene, cameras: list[Camera], coverage: float, drawn: floa
     if coverage < 0.1 or float(gaussians.get_opacity.detach().median()) < FAINT:
         return Line(
             f"{text}the Gaussians are almost transparent",
-            "train longer, since opacities are reset every 3000 iterations, or lower --opacity_lr and check the poses",
+            "check the poses, and lower --opacity_lr; in a PLY of another program opacities must be logits",
         )
     return Line(
         f"{text}the Gaussians themselves are black",
@@ -186,8 +227,11 @@ def _depths(camera: Camera, points: torch.Tensor) -> torch.Tensor:
 
 def _why_bad(scene: Scene, stored: dict[str, Any]) -> str:
     iteration = scene.loaded_iter
-    if RESET_INTERVAL <= iteration < 15_000 and iteration % RESET_INTERVAL < 500:
+    faint = float(scene.gaussians.get_opacity.detach().median()) < UNRECOVERED
+    if faint and RESET_INTERVAL <= iteration < 15_000 and iteration % RESET_INTERVAL < 500:
         return "this iteration is shortly after opacities were reset; check a later one"
+    if wrong := [line for line in check_shapes(scene.gaussians, scene.cameras_extent) if line.finding]:
+        return wrong[0].remedy
     if iteration < FEW_ITERATIONS:
         return f"train longer, {FEW_ITERATIONS} iterations at least"
     problems = [

@@ -4,8 +4,10 @@ scenes, configs, runs        the plan: scene folders, options, model folders
 child, lock, record, stages  its execution: each stage is a subprocess; the model folder records finished stages
 model_folder, results        readers of model folders
 summary, tradeoff, published spread over seeds, error against time, comparison with published tables
+ground_truth, earlier, peers runs that can be compared, those of earlier calls, curves of other programs
 figures, contact_sheet       figures of the report
 document, markdown, html     the report's content and its two renderings; report writes all files
+peer_curve                   files for peers, made from outputs of other programs; tensorboard_scalars reads some
 machine                      description of the machine
 results_page                 tables of docs/results/training.md from report.json
 """

@@ -16,6 +16,11 @@ from dataclasses import dataclass
 from utils.host.interrupt import DeferredInterrupt
 from utils.system_utils import Terminated
 
+try:
+    import resource
+except ImportError:  # Windows
+    resource = None
+
 LINES = 20  # lines of stderr to keep
 _LOOK = 0.2  # seconds between checks for Ctrl-C
 
@@ -27,6 +32,7 @@ class Finished:
     status: int  # exit status; negative: the signal that killed it
     lines: list[str]  # last lines of stderr
     seconds: float  # wall clock
+    cpu_seconds: float | None  # of all its threads; None where the system does not tell
     interrupt: type[KeyboardInterrupt] | None  # the interrupt that this process got meanwhile
 
     @property
@@ -37,19 +43,20 @@ class Finished:
         return self.lines[-1] if self.lines else f"exit status {self.status}"
 
 
-def run_child(command: Sequence[str]) -> Finished:
-    """Run a command without a shell, and copy its stderr to ours.
+def run_child(command: Sequence[str], **environment: str) -> Finished:
+    """Run a command without a shell, and copy its stderr to ours. environment: variables beside our own.
 
     Ctrl-C or SIGTERM to this process is passed on once, SIGHUP (a closed terminal) as SIGTERM. Then this function waits
     for the child, since train.py saves a checkpoint, and sets `interrupt`. A second signal kills the child and raises.
     """
-    start = time.perf_counter()
+    start, cpu_before = time.perf_counter(), _children_cpu_seconds()
     tail = _Tail()
     # The child gets its own session. Otherwise the terminal's Ctrl-C would reach it twice, directly and through us, and
     # train.py stops at once on the second one.
     with DeferredInterrupt() as interrupt:
         # The child inherits only the folder's lock, which is then kept as long as the child lives.
-        child = subprocess.Popen(command, stderr=subprocess.PIPE, start_new_session=True, close_fds=False)
+        child = subprocess.Popen(command, stderr=subprocess.PIPE, start_new_session=True, close_fds=False,
+                                 env=os.environ | environment)  # fmt: skip
         try:
             handed_on = False
             with selectors.DefaultSelector() as selector:
@@ -70,7 +77,16 @@ def run_child(command: Sequence[str]) -> Finished:
                 child.wait()
             child.stderr.close()
         requested = interrupt.requested
-    return Finished(status, tail.lines, time.perf_counter() - start, requested)
+    cpu = None if cpu_before is None else _children_cpu_seconds() - cpu_before
+    return Finished(status, tail.lines, time.perf_counter() - start, cpu, requested)
+
+
+def _children_cpu_seconds() -> float | None:
+    """CPU seconds of all child processes that have ended; None where the system does not tell."""
+    if resource is None:
+        return None
+    usage = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return usage.ru_utime + usage.ru_stime
 
 
 def _show(chunk: bytes) -> None:

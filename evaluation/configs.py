@@ -11,6 +11,7 @@ from pathlib import Path
 
 from utils.system_utils import UserError
 
+LONGEST = 100  # bytes of a name, which is also part of a figure's name
 Parse = Callable[[Sequence[str]], object]
 _SHAPE = 'like {"base": [], "sh1": ["--sh_degree", "1"]}'
 
@@ -24,13 +25,15 @@ def read_configs(path: Path, parse: Parse | None) -> dict[str, tuple[str, ...]]:
         content = json.loads(path.read_text(encoding="utf-8"), object_pairs_hook=_no_duplicates)
     except OSError as error:
         raise UserError(f"cannot read {path} ({error.strerror}); --configs takes a JSON file {_SHAPE}") from error
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise UserError(f"{path} is not a table of option sets ({error}); write it {_SHAPE}") from error
     if not isinstance(content, dict) or not content:
         raise UserError(f"{path} names no option sets; write it {_SHAPE}")
     configs = {}
     for name, words in content.items():
         # The name becomes a folder, so it must not be one that a seed or train.py makes.
+        if len(name.encode()) > LONGEST:
+            raise UserError(f"{path}: the name {name[:20]}... is too long for a folder; use at most {LONGEST} letters")
         if not re.fullmatch(r"[A-Za-z0-9][\w.+-]*", name) or re.fullmatch(r"seed_\d+|point_cloud|test|train", name):
             raise UserError(f"{path}: {name!r} cannot name a folder; use letters, digits, _ . + -")
         if not isinstance(words, list) or not all(type(word) in (str, int, float) for word in words):

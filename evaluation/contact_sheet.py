@@ -7,6 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
+from evaluation.printable import printable
+
 GAIN = 5  # amplification of the difference
 GAP = 6  # pixels between images
 HEADER = 26  # height of the titles in pixels
@@ -39,7 +41,7 @@ def contact_sheet(views: Sequence[tuple[str, Image.Image, Image.Image]], widest:
         y = HEADER + row * (cell_height + GAP)
         for column, picture in enumerate(images):
             sheet.paste(picture.convert("RGB"), (GAP + column * (cell_width + GAP), y))
-        draw.text((GAP + 6, y + 4), label, fill="white", font=font, stroke_width=2, stroke_fill="black")
+        draw.text((GAP + 6, y + 4), printable(label), fill="white", font=font, stroke_width=2, stroke_fill="black")
     return sheet
 
 

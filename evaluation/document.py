@@ -9,6 +9,7 @@ from typing import Any
 
 from evaluation.machine import one_line
 from evaluation.published import COMPARED, published_tables
+from evaluation.summary import SCORES
 
 
 @dataclass(frozen=True)
@@ -45,10 +46,16 @@ class Section:
     blocks: list[Block] = field(default_factory=list)
 
 
-_DIGITS = {"PSNR": 2, "SSIM": 4, "LPIPS": 4, "seconds": 1, "gaussians": 0, "peak_memory_mib": 0, "render_ms": 2}
+_DIGITS = {
+    **{"PSNR": 2, "SSIM": 4, "LPIPS": 4, "seconds": 1, "process_seconds": 1, "cpu_seconds": 1},
+    **{"gaussians": 0, "peak_memory_mib": 0, "render_ms": 2},
+}
+_LAST_OF_PEER = {"iteration": 0, "seconds": 1, "test_psnr": 2, "test_ssim": 4, "gaussians": 0}
 _HEADS = {
     "PSNR": "PSNR (dB)",
     "seconds": "training (s)",
+    "process_seconds": "process (s)",
+    "cpu_seconds": "CPU (s)",
     "gaussians": "Gaussians",
     "peak_memory_mib": "peak memory (MiB)",
     "render_ms": "render (ms)",
@@ -71,7 +78,7 @@ def results_table(rows: Sequence[Mapping[str, Any]]) -> Table:
     configs = any(row["config"] for row in rows)
     quantities = [
         name for name in _DIGITS
-        if name in ("PSNR", "SSIM", "LPIPS") or any(row[name]["mean"] is not None for row in rows)
+        if name in SCORES or any(row[name]["mean"] is not None for row in rows if name in row)
     ]  # fmt: skip
     header = ["scene", *(["options"] if configs else []), "iteration", "seeds"]
     header += [_HEADS.get(name, name) for name in quantities]
@@ -90,6 +97,7 @@ def document(report: Mapping[str, Any], figures: Mapping[str, Sequence[Picture]]
     return [
         *_failures(report),
         _results(report),
+        *_peers(report),
         *_published(report),
         *_cheapest(report),
         *_scenes(report, figures),
@@ -114,11 +122,28 @@ def run_title(run: Mapping[str, Any]) -> str:
     return ", ".join(part for part in (run["scene"], run["config"], seed) if part)
 
 
+def result_blocks(rows: Sequence[Mapping[str, Any]]) -> list[Block]:
+    """Return the table of `summary`, and one of the rows that stand apart from the others."""
+    apart = [row for row in rows if row.get("apart")]  # reports of older versions lack it
+    if not apart:
+        return [results_table(rows)]
+    comparable = [row for row in rows if not row["apart"]]
+    title = "Scored on other ground truth, so not to be compared with other rows:"
+    return [*([results_table(comparable)] if comparable else []), title, results_table(apart)]
+
+
 def _results(report: Mapping[str, Any]) -> Section:
     rows = report["summary"]
-    blocks: list[Block] = [results_table(rows) if rows else "Nothing was scored."]
+    blocks: list[Block] = result_blocks(rows) if rows else ["Nothing was scored."]
     if any(row["PSNR"]["std"] is not None for row in rows):
         blocks.append("Cells are mean ± sample standard deviation over the seeds.")
+    elif rows and any(row["seconds"]["mean"] is not None for row in rows):
+        blocks.append("Each number is of one training, so nothing is known of the spread; --seeds would show it.")
+    if any(row["cpu_seconds"]["mean"] is not None for row in rows):
+        blocks.append(
+            "Process and CPU are seconds of the whole of train.py: on the clock, and of all its threads together. "
+            "Where the clock ran longer for the same CPU seconds, other programs used the machine."
+        )
     if any(row["gaussians"]["mean"] != row["gaussians_saved"]["mean"] for row in rows):
         blocks.append(
             "Gaussians are counted as trained, as in published tables. The saved models lack those that no training "
@@ -178,7 +203,7 @@ def cheapest_table(rows: Sequence[Mapping[str, Any]]) -> Table:
     for row in rows:
         line = [f"{row['psnr']:.1f}"]
         for name, digits in (("seconds", 1), ("gaussians", 0)):
-            line += [row[name]["config"] or "-", number(row[name]["value"], digits)]
+            line += [row[name]["config"] or "-", spread_cell({**row[name], "mean": row[name]["value"]}, digits)]
         cells.append(line)
     return Table(["test PSNR (dB)", "first there", "seconds", "smallest", "Gaussians"], cells)
 
@@ -193,9 +218,26 @@ def _cheapest(report: Mapping[str, Any]) -> list[Section]:
         "Each row has the option set that reaches its test PSNR in the fewest seconds of training and the one with the "
         "fewest Gaussians at that PSNR or better. Both come from the curves: scores during training, on unrounded "
         "images. Between two points, PSNR is taken as linear in the logarithm of time. With several seeds, all must "
-        "reach the PSNR, and their mean counts."
+        "reach the PSNR, and their mean counts; ± is the sample standard deviation."
     )
     return [Section("Cheapest option set for a given error", blocks)]
+
+
+def _peers(report: Mapping[str, Any]) -> list[Section]:
+    if not report["peers"]:
+        return []
+    header = ["scene", "program", "points", "iteration", "seconds", "PSNR (dB)", "SSIM", "Gaussians", "file"]
+    cells = []
+    for peer in report["peers"]:
+        last = peer["curve"][-1]
+        numbers = [number(last[name], digits) for name, digits in _LAST_OF_PEER.items()]
+        cells.append([peer["scene"], peer["name"], str(len(peer["curve"])), *numbers, peer["file"]])
+    note = (
+        "The last point of curves that other programs measured, as their files give it. Whether their seconds leave "
+        "out scoring and saving, and whether they scored the same pixels, the files do not say. So these curves are "
+        "drawn beside ours, but they count in no ranking."
+    )
+    return [Section("Other programs", [Table(header, cells), note])]
 
 
 def _scenes(report: Mapping[str, Any], figures: Mapping[str, Sequence[Picture]]) -> list[Section]:
@@ -238,7 +280,7 @@ def _manifest(report: Mapping[str, Any]) -> Section:
     return Section(
         "What was run",
         [
-            f"Command: {' '.join(manifest['command'])}",
+            *(f"Command: {' '.join(words)}" for words in (*manifest["earlier_commands"], manifest["command"])),
             *(f"Trained on: {line}" for line in machines),
             f"Resize filter: {manifest['resize_filter']}",
             "Scores: " + "; ".join(f"{name}: {text}" for name, text in manifest["conventions"].items()),

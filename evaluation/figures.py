@@ -4,19 +4,29 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from PIL import Image
 
 from evaluation.contact_sheet import contact_sheet
 from evaluation.model_folder import mask_of, picture
+from evaluation.printable import printable
 from evaluation.tradeoff import pareto_front
 from records.error_curve import Row
 from records.plain_log_axis import plain_log_axis
 from utils.system_utils import atomic_write
 
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
 WIDEST = 480  # largest width, in pixels, of an image on a sheet
+
+
+Point = tuple[float, float]
+Value = Callable[[Row, str], float | None]
+STYLES = ("-", "-.", ":")
+PEER_MARKERS = "xs^vDP*"
 
 
 def _psnr(row: Row, views: str) -> float | None:
@@ -28,42 +38,37 @@ def _dissimilarity(row: Row, views: str) -> float | None:
     return None if ssim is None else 1 - ssim
 
 
-def draw_curves(path: Path, scene: str, runs: Sequence[dict[str, Any]]) -> bool:
+def _gap(row: Row, views: str) -> float | None:
+    both = row["train_psnr"], row["test_psnr"]
+    return None if None in both else both[0] - both[1]
+
+
+def draw_curves(path: Path, scene: str, runs: Sequence[dict[str, Any]], peers: Sequence[dict[str, Any]] = ()) -> bool:
     """Draw test PSNR and 1 - SSIM of a scene's runs against seconds of training; return False if no run has a curve.
 
     Each option set has a colour and each seed a line. With several option sets, the Pareto front of all points is
-    marked. With one, the training views are drawn too, dashed, so that over-fitting shows.
+    marked, without runs that stand apart, and a third panel has the gap between training and test views. With one, the
+    training views are drawn too, dashed. peers: curves of other programs, in grey; they are no part of the front.
     """
     from matplotlib.figure import Figure  # imported here because only a report needs it
 
     runs = [run for run in runs if any(row["test_psnr"] is not None for row in run["curve"])]
     if not runs:
         return False
-    configs = list(dict.fromkeys(run["config"] for run in runs))
-    figure = Figure(figsize=(12, 4.8), layout="constrained")
-    figure.suptitle(f"{scene}: error against time")
-    panels = ((_psnr, "PSNR of the test views (dB)", -1), (_dissimilarity, "1 - SSIM of the test views", 1))
-    for axes, (value, label, sign) in zip(figure.subplots(1, 2), panels, strict=True):
-        every: list[tuple[float, float]] = []
-        for run in runs:
-            index = configs.index(run["config"])
-            first = run is next(other for other in runs if other["config"] == run["config"])
-            points = _points(run["curve"], value, "test")
-            every += points
-            style = {"color": f"C{index % 10}", "linestyle": ("-", "-.", ":")[index // 10 % 3], "linewidth": 1.2}
-            axes.plot(*_columns(points), marker=".", label=(run["config"] or "test") if first else None, **style)
-            if len(configs) == 1 and (train := _points(run["curve"], value, "train")):
-                style |= {"linestyle": "--", "alpha": 0.6}
-                axes.plot(*_columns(train), label="train" if first else None, **style)
-        if len(configs) > 1:
-            front = [every[i] for i in pareto_front([(seconds, sign * number) for seconds, number in every])]
-            axes.plot(
-                *_columns(_stairs(front)), color="black", linewidth=0.6, marker="o", markevery=2,
-                markerfacecolor="none", markersize=8, label="Pareto front",
-            )  # fmt: skip
+    several = len({run["config"] for run in runs}) > 1
+    panels = [(_psnr, "PSNR of the test views (dB)", -1), (_dissimilarity, "1 - SSIM of the test views", 1)]
+    if several and any(_points(run["curve"], _gap, "") for run in runs):
+        panels.append((_gap, "PSNR of the training views above the test views (dB)", 0))
+    figure = Figure(figsize=(6 * len(panels), 4.8), layout="constrained")
+    figure.suptitle(f"{printable(scene)}: error against time")
+    for axes, (value, label, sign) in zip(figure.subplots(1, len(panels)), panels, strict=True):
+        every = _draw_runs(axes, runs, value, several)
+        if several and sign:
+            _draw_front(axes, every, sign)
+        drawn = every + _draw_peers(axes, peers, value)
         axes.set(xscale="log", xlabel="seconds of training, without scoring and saving", ylabel=label)
         plain_log_axis(axes.xaxis)
-        if value is _dissimilarity and all(number > 0 for _, number in every):
+        if value is _dissimilarity and all(number > 0 for _, number in drawn):
             axes.set_yscale("log")
             plain_log_axis(axes.yaxis)
         axes.grid(True, which="both", alpha=0.3)
@@ -73,16 +78,58 @@ def draw_curves(path: Path, scene: str, runs: Sequence[dict[str, Any]]) -> bool:
     return True
 
 
-def _points(curve: Sequence[Row], value: Callable[[Row, str], float | None], views: str) -> list[tuple[float, float]]:
+def _draw_runs(axes: Axes, runs: Sequence[dict[str, Any]], value: Value, several: bool) -> list[Point]:
+    """Draw a line for each run; return the points of those that do not stand apart."""
+    configs = list(dict.fromkeys(run["config"] for run in runs))
+    every: list[Point] = []
+    for run in runs:
+        index = configs.index(run["config"])
+        first = run is next(other for other in runs if other["config"] == run["config"])
+        points = _points(run["curve"], value, "test")
+        name = run["config"] or ("no option set" if several else "test")
+        style = {"color": f"C{index % 10}", "linestyle": STYLES[index // 10 % len(STYLES)], "linewidth": 1.2}
+        if run["apart"]:
+            name, style["alpha"] = f"{name} (other ground truth)", 0.4
+        else:
+            every += points
+        axes.plot(*_columns(points), marker=".", label=name if first else None, **style)
+        if not several and (train := _points(run["curve"], value, "train")):
+            style |= {"linestyle": "--", "alpha": 0.6}
+            axes.plot(*_columns(train), label="train" if first else None, **style)
+    return every
+
+
+def _draw_front(axes: Axes, points: Sequence[Point], sign: int) -> None:
+    """Mark the Pareto front. sign: 1 if a lower number is better, -1 if a higher one is."""
+    front = [points[i] for i in pareto_front([(seconds, sign * number) for seconds, number in points])]
+    axes.plot(
+        *_columns(_stairs(front)), color="black", linewidth=0.6, marker="o", markevery=2, markerfacecolor="none",
+        markersize=8, label="Pareto front",
+    )  # fmt: skip
+
+
+def _draw_peers(axes: Axes, peers: Sequence[dict[str, Any]], value: Value) -> list[Point]:
+    every: list[Point] = []
+    for index, peer in enumerate(peers):
+        points = _points(peer["curve"], value, "test")
+        marker = PEER_MARKERS[index % len(PEER_MARKERS)]
+        if points:
+            axes.plot(*_columns(points), color="0.35", linestyle="--", marker=marker, markersize=5, linewidth=1.2,
+                      label=f"{printable(peer['name'])} (another program)")  # fmt: skip
+        every += points
+    return every
+
+
+def _points(curve: Sequence[Row], value: Value, views: str) -> list[Point]:
     pairs = ((row["seconds"], value(row, views)) for row in curve)
     return [(seconds, number) for seconds, number in pairs if seconds > 0 and number is not None]
 
 
-def _columns(points: Sequence[tuple[float, float]]) -> tuple[list[float], list[float]]:
+def _columns(points: Sequence[Point]) -> tuple[list[float], list[float]]:
     return [x for x, _ in points], [y for _, y in points]
 
 
-def _stairs(points: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
+def _stairs(points: Sequence[Point]) -> list[Point]:
     """Return the points with a corner between each two, so that every second one is a point.
 
     Matplotlib places its legend clear of these, but not of lines that it draws with drawstyle "steps".

@@ -9,6 +9,7 @@ from typing import Any
 
 from evaluation.document import Picture, document, run_title
 from evaluation.figures import draw_curves, draw_worst_views
+from evaluation.ground_truth import stand_apart
 from evaluation.html import to_html
 from evaluation.markdown import to_markdown
 from evaluation.published import compare
@@ -18,11 +19,23 @@ from utils.files.json_files import write_json
 from utils.system_utils import UserError, atomic_write
 
 TITLE = "3D Gaussian Splatting: evaluation"
+SHORTEST = 10.0  # seconds of a process whose share of the processors says something
+EVEN = 0.8  # share of the best that trainings get on a machine of their own
 RESIZE_FILTER = "Pillow, bicubic, antialiased where it shrinks; 8-bit pictures"
 
 
-def make_report(command: Sequence[str], runs: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Make the content of report.json. command: words of the command line; runs: results of `results.read_run`."""
+def make_report(
+    command: Sequence[str],
+    runs: Sequence[dict[str, Any]],
+    peers: Sequence[dict[str, Any]] = (),
+    earlier_commands: Sequence[Sequence[str]] = (),
+) -> dict[str, Any]:
+    """Make the content of report.json.
+
+    command: words of the command line; runs: results of `results.read_run`; peers: as `peers.peers_of` returns them;
+    earlier_commands: those of calls that made other runs.
+    """
+    runs = stand_apart(runs)
     rows = summarise(runs)
     means = dataset_means(rows)
     return {
@@ -30,23 +43,25 @@ def make_report(command: Sequence[str], runs: Sequence[dict[str, Any]]) -> dict[
         "dataset_means": means,
         "manifest": {
             "command": list(command),
+            "earlier_commands": [list(words) for words in earlier_commands if list(words) != list(command)],
             "conventions": next((run["conventions"] for run in runs if run["conventions"]), {}),
             "resize_filter": RESIZE_FILTER,
         },
+        "peers": list(peers),
         "published": compare(runs, rows, means),
-        "runs": list(runs),
+        "runs": runs,
         "summary": rows,
         "warnings": _warnings(runs, rows),
     }
 
 
 def _cheapest(runs: Sequence[dict[str, Any]]) -> dict[str, list[dict[str, Any]]]:
-    """Return the `cheapest` table of each scene that has several option sets."""
+    """Return the `cheapest` table of each scene that has several option sets, without those that stand apart."""
     found = {}
     for scene in dict.fromkeys(run["scene"] for run in runs):
         curves: dict[str, list] = {}
         for run in runs:
-            if run["scene"] == scene and run["config"] and not run["failure"]:
+            if run["scene"] == scene and run["config"] and not run["failure"] and not run["apart"]:
                 curves.setdefault(run["config"], []).append(run["curve"])
         if len(curves) > 1 and (rows := cheapest(curves)):
             found[scene] = rows
@@ -59,10 +74,13 @@ def _warnings(runs: Sequence[dict[str, Any]], rows: Sequence[dict[str, Any]]) ->
     for scene in dict.fromkeys(run["scene"] for run in runs):
         truths = {run["ground_truth_sha256"] for run in runs if run["scene"] == scene and run["ground_truth_sha256"]}
         if len(truths) > 1:
+            apart = dict.fromkeys(run["config"] or "-" for run in runs if run["scene"] == scene and run["apart"])
             lines.append(
                 f"{scene}: the runs were scored on different ground truth (size, split, background or masks), so their "
-                "scores and curves cannot be compared."
+                "scores and curves cannot be compared. Left out of rankings and the Pareto front: "
+                f"{', '.join(apart)}."
             )
+        lines += _load_warning(scene, runs)
     for name in ("commit", "cpu", "gpu", "instruction_set", "threads"):
         values = {str(run["machine"].get(name)) for run in runs if run["machine"]}
         if len(values) > 1:
@@ -73,10 +91,30 @@ def _warnings(runs: Sequence[dict[str, Any]], rows: Sequence[dict[str, Any]]) ->
     return lines
 
 
+def _load_warning(scene: str, runs: Sequence[dict[str, Any]]) -> list[str]:
+    """Return a line if some trainings of a scene got much less of the processors than others."""
+    shares = [
+        run["cpu_seconds"] / run["wall_seconds"]
+        for run in runs
+        if run["scene"] == scene and run["cpu_seconds"] is not None and (run["wall_seconds"] or 0) >= SHORTEST
+    ]
+    if not shares or min(shares) > EVEN * max(shares):
+        return []
+    return [
+        f"{scene}: the trainings got {min(shares):.2f} to {max(shares):.2f} CPU seconds a second. Where they got less, "
+        "other programs used the machine, or the option set leaves processors idle; compare CPU seconds, too."
+    ]
+
+
 def write_report(report: Mapping[str, Any], output: Path) -> None:
     """Write all files of the report into `output`."""
     pictures = {
-        scene: _draw(output, scene, [run for run in report["runs"] if run["scene"] == scene])
+        scene: _draw(
+            output,
+            scene,
+            [run for run in report["runs"] if run["scene"] == scene],
+            [peer for peer in report["peers"] if peer["scene"] == scene],
+        )
         for scene in dict.fromkeys(run["scene"] for run in report["runs"])
     }
     sections = document(report, pictures)
@@ -88,16 +126,17 @@ def write_report(report: Mapping[str, Any], output: Path) -> None:
     write_json(output / "report.json", report)
     for name, text in texts.items():
         with atomic_write(output / name) as temporary:
-            temporary.write_text(text, encoding="utf-8")
+            # Names that are not UTF-8 have surrogates, which appear as numbers.
+            temporary.write_text(text, encoding="utf-8", errors="backslashreplace")
 
 
-def _draw(output: Path, scene: str, runs: Sequence[dict[str, Any]]) -> list[Picture]:
+def _draw(output: Path, scene: str, runs: Sequence[dict[str, Any]], peers: Sequence[dict[str, Any]]) -> list[Picture]:
     """Draw the figures of a scene: its curves, and the worst views of each option set's first run that succeeded."""
     folder = output / "figures"
     pictures = []
     path = folder / f"{scene}_curves.png"
     try:
-        if draw_curves(path, scene, runs):
+        if draw_curves(path, scene, runs, peers):
             pictures.append(Picture(path, f"{scene}: error of the test views against seconds of training"))
     except ImportError as error:
         print(f"warning: no figure of {scene}'s curves: matplotlib cannot be imported ({error})", file=sys.stderr)

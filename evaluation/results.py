@@ -44,6 +44,7 @@ def read_run(run: Run, output: Path, failure: Failure | None) -> dict[str, Any]:
     result = {
         "added_options": list(run.added) if known == run.key else None,
         "config": run.config,
+        "cpu_seconds": trained.get("cpu_seconds"),
         "conventions": (_json(run.model / "metrics_info.json") or {}).get("conventions", {}),
         "curve": curve,
         "final_iteration": None,
@@ -66,6 +67,9 @@ def read_run(run: Run, output: Path, failure: Failure | None) -> dict[str, Any]:
     saved = saved_iterations(run.model / "point_cloud")
     try:
         iterations = {str(n): _iteration(run.model, n, curve) for n in saved}
+        if saved:  # the process trained to the end
+            both = {"process_seconds": trained.get("wall_seconds"), "cpu_seconds": trained.get("cpu_seconds")}
+            iterations[str(saved[-1])] |= both
         last = max((int(n) for n, values in iterations.items() if values["views"]), default=None)
         result |= {"final_iteration": last, "iterations": iterations}
         if last is not None:
@@ -104,10 +108,12 @@ def _iteration(model: Path, iteration: int, curve: list[Row]) -> dict[str, Any]:
         "PSNR": None,
         "SSIM": None,
         "LPIPS": None,
+        "cpu_seconds": None,
         "fps": None,
         "gaussians": trained_gaussians(model, iteration),
         "gaussians_saved": count_gaussians(model, iteration),
         "peak_memory_mib": point.get("peak_memory_mib"),
+        "process_seconds": None,
         "render_ms": None,
         "seconds": point.get("seconds") if (logged := training_seconds(model, iteration)) is None else logged,
         "views": 0,

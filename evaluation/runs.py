@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from arguments import OptimizationParams
+from evaluation.record import NAME as RECORD
 from evaluation.record import Record
 from evaluation.scenes import SceneEntry
 from utils.system_utils import UserError
@@ -85,6 +86,26 @@ def check_outside_scenes(runs: Sequence[Run]) -> None:
                 raise UserError(
                     f"the model folder {run.model} would lie in the scene folder {source}; choose another --output_path"
                 )
+
+
+def check_nesting(runs: Sequence[Run], output: Path) -> None:
+    """Raise UserError if a model folder would lie in another one of an earlier call, or around one.
+
+    That happens when one call has option sets or seeds and another one in the same output folder has none.
+    """
+    for run in runs:
+        around = [parent for parent in run.model.parents if parent.is_relative_to(output) and parent != output]
+        inside = [path.parent for depth in ("*", "*/*") for path in run.model.glob(f"{depth}/{RECORD}")]
+        if there := [folder for folder in around if is_model(folder)] + inside:
+            raise UserError(
+                f"the model folder {run.model} and that of an earlier call, {there[0]}, would lie in each other; give "
+                "the same --seeds and --configs, or none, as that call, or choose another --output_path"
+            )
+
+
+def is_model(folder: Path) -> bool:
+    """Whether a folder holds a model, or what full_eval.py has begun of one."""
+    return (folder / RECORD).is_file() or (folder / "point_cloud").is_dir()
 
 
 def check_folders(runs: Sequence[Run]) -> None:

@@ -35,7 +35,13 @@ class SceneEntry:
 
 
 def dataset_scenes(group: str, root: Path) -> list[SceneEntry]:
-    """List the scenes of one of DATASETS under its root folder, including missing ones, whose run will fail."""
+    """List the scenes of one of DATASETS under its root folder, including missing ones, whose run will fail.
+
+    UserError if the root has none of them.
+    """
+    if not any((root / name).is_dir() for name in DATASETS[group]):
+        wrong = f"{root} has none of the scenes of {group}" if root.is_dir() else f"no such folder: {root}"
+        raise UserError(f"{wrong}; pass the folder that has {', '.join(DATASETS[group])}")
     root = root.resolve()
     return [SceneEntry(name, group, root / name, options) for name, options in DATASETS[group].items()]
 
@@ -50,7 +56,7 @@ def folder_scenes(folders: Sequence[Path]) -> list[SceneEntry]:
     for folder in folders:
         path = folder.resolve()
         if not path.is_dir():
-            raise UserError(f"no such scene folder: {folder}; --scenes takes COLMAP or Blender folders")
+            raise UserError(f"no such scene folder: {folder}; --scenes takes COLMAP, Blender or nerfstudio folders")
         blender = not (path / "sparse").exists() and (path / "transforms_train.json").exists()
         scenes.append(SceneEntry(path.name, FOLDERS, path, ("-w",) if blender else ()))
     return scenes

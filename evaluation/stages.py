@@ -54,24 +54,37 @@ def train(run: Run, machine: dict[str, Any]) -> None:
     record.start(run.key)
     interrupted = _interrupted(run, record)
     checkpoint = interrupted and run.model / interrupted["checkpoint"]
-    before = interrupted["wall_seconds"] if interrupted else 0.0
+    before = _spent(interrupted)
     resume = ("--start_checkpoint", str(checkpoint)) if checkpoint else ()
     command = _script("train.py", "-s", str(run.scene.source), "-m", str(run.model), "--disable_viewer", "--quiet")
     command += [*run.options, *resume]
     _say("training" + _from_where(checkpoint, record))
     there = _checkpoints(run)
     done = run_child(command)
-    wall = round(before + done.seconds, 3)
+    spent = _sum(before, done)
     if done.status:
         left = [path for path, stamp in _checkpoints(run).items() if stamp != there.get(path)]
         if left:
-            _note_stop(record, done, max(left, key=_iteration_of), wall)
+            _note_stop(record, done, max(left, key=_iteration_of), spent)
     _expect_success("train", command, done)
     iterations = saved_iterations(run.model / "point_cloud")
     if run.iterations not in iterations:
         raise StageFailed(Failure("train", command, [f"train.py succeeded, but {run.model} lacks the last iteration"]))
-    record.note("train", iterations=iterations, machine=machine, wall_seconds=wall)
+    record.note("train", iterations=iterations, machine=machine, **spent)
     _stop_if_asked(done)
+
+
+def _spent(interrupted: dict[str, Any] | None) -> dict[str, float | None]:
+    """Return the seconds of the parts of a training before it was interrupted; CPU seconds None if not known."""
+    if interrupted is None:
+        return {"wall_seconds": 0.0, "cpu_seconds": 0.0}
+    return {"wall_seconds": interrupted["wall_seconds"], "cpu_seconds": interrupted.get("cpu_seconds")}
+
+
+def _sum(before: dict[str, float | None], done: Finished) -> dict[str, float | None]:
+    cpu = None if None in (before["cpu_seconds"], done.cpu_seconds) else before["cpu_seconds"] + done.cpu_seconds
+    wall = before["wall_seconds"] + done.seconds
+    return {"wall_seconds": round(wall, 3), "cpu_seconds": None if cpu is None else round(cpu, 3)}
 
 
 def _trained(run: Run, record: Record) -> bool:
@@ -91,10 +104,10 @@ def _iteration_of(checkpoint: Path) -> int:
     return int(checkpoint.stem[6:])
 
 
-def _note_stop(record: Record, done: Finished, checkpoint: Path, wall: float) -> None:
+def _note_stop(record: Record, done: Finished, checkpoint: Path, spent: dict[str, float | None]) -> None:
     """Note the checkpoint of a training that was stopped or failed, and its seconds including earlier parts."""
     stopped = done.interrupt and done.status in (128 + signal.SIGINT, 128 + signal.SIGTERM)
-    record.note("train_interrupted" if stopped else "train_failed", checkpoint=checkpoint.name, wall_seconds=wall)
+    record.note("train_interrupted" if stopped else "train_failed", checkpoint=checkpoint.name, **spent)
 
 
 def _interrupted(run: Run, record: Record) -> dict[str, Any] | None:
@@ -153,8 +166,12 @@ def _rendered(model: Path, iteration: int) -> int:
     return len(renders) if renders == truth else 0
 
 
-def score(run: Run) -> None:
-    """Run metrics.py, unless the same renders are already scored."""
+def score(run: Run, download: bool = True) -> bool:
+    """Run metrics.py, unless the same renders are already scored.
+
+    download: whether it may try to download the weights of LPIPS; return whether another run may. A try without an
+    answer takes 10 seconds.
+    """
     record = Record(run.model)
     iterations = saved_iterations(run.model / "point_cloud")
     methods = [f"ours_{iteration}" for iteration in iterations if _rendered(run.model, iteration)]
@@ -163,14 +180,15 @@ def score(run: Run) -> None:
     renders = {method: _times_stamp(run.model, method) for method in methods}
     done = record.stage("metrics")
     if done and done["renders"] == renders and None not in renders.values() and _scored(run.model, methods):
-        return
+        return download
     command = _script("metrics.py", "-m", str(run.model))
     _say("scoring")
-    finished = run_child(command)
+    finished = run_child(command) if download else run_child(command, GS_DOWNLOAD="0")
     _expect_success("metrics", command, finished)
     truth = ground_truth_digest(run.model, methods[-1])
     record.note("metrics", ground_truth_sha256=truth, renders=renders, wall_seconds=round(finished.seconds, 3))
     _stop_if_asked(finished)
+    return download and load_scores(run.model, methods[-1])[0].get("LPIPS") is not None
 
 
 def _times_stamp(model: Path, method: str) -> list[int] | None:

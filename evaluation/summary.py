@@ -8,7 +8,11 @@ from typing import Any
 
 from evaluation.scenes import DATASETS
 
-QUANTITIES = ("PSNR", "SSIM", "LPIPS", "seconds", "gaussians", "gaussians_saved", "peak_memory_mib", "render_ms", "fps")
+SCORES = ("PSNR", "SSIM", "LPIPS")
+QUANTITIES = (
+    *(*SCORES, "seconds", "process_seconds", "cpu_seconds", "gaussians", "gaussians_saved", "peak_memory_mib"),
+    *("render_ms", "fps"),
+)
 
 
 def spread(values: Iterable[float | None]) -> dict[str, Any]:
@@ -28,7 +32,8 @@ def spread(values: Iterable[float | None]) -> dict[str, Any]:
 def summarise(runs: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     """Return the spread of QUANTITIES over the seeds, for each scene, option set and scored iteration.
 
-    Rows are in the order of `runs`. Seeds whose run failed are left out and listed as `failed_seeds`.
+    Rows are in the order of `runs`. Seeds whose run failed are left out and listed as `failed_seeds`. Where the seeds
+    were scored on different ground truth, scores have no mean. apart: see `ground_truth.stand_apart`.
     """
     cells: dict[tuple, list[dict[str, Any]]] = {}
     for run in runs:
@@ -41,12 +46,16 @@ def summarise(runs: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
         ):
             there = [run for run in whole if run["iterations"].get(str(iteration), {}).get("views")]
             row = {name: spread(run["iterations"][str(iteration)][name] for run in there) for name in QUANTITIES}
+            one = len({run["ground_truth_sha256"] for run in there}) == 1
+            if not one:
+                row |= {name: row[name] | {"mean": None, "std": None} for name in SCORES}
             row |= {
+                "apart": any(run["apart"] for run in there),
                 "config": config,
                 "failed_seeds": [run["seed"] for run in members if run["failure"]],
                 "group": members[0]["group"],
                 "iteration": iteration,
-                "one_ground_truth": len({run["ground_truth_sha256"] for run in there}) == 1,
+                "one_ground_truth": one,
                 "scene": scene,
                 "seeds": [run["seed"] for run in there],
             }

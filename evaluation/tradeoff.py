@@ -77,18 +77,19 @@ def _best(curve: Sequence[Row]) -> float:
 def cheapest(curves: Curves) -> list[dict[str, Any]]:
     """Return, for each level, the option set that reaches it in the fewest seconds, and that with fewest Gaussians.
 
-    With several seeds, all must reach the level, and their mean counts.
+    With several seeds, all must reach the level, and their mean counts; std is their sample standard deviation.
     """
     rows = []
     for level in levels(curves):
         row: dict[str, Any] = {"psnr": level}
         for name, measure in (("seconds", seconds_to_reach), ("gaussians", gaussians_to_reach)):
-            costs = {}
+            costs, spreads = {}, {}
             for config, seeds in curves.items():
                 values = [measure(curve, level) for curve in seeds]
                 if values and None not in values:
                     costs[config] = statistics.fmean(values)
+                    spreads[config] = statistics.stdev(values) if len(values) > 1 else None
             best = min(costs, key=costs.__getitem__, default=None)
-            row[name] = {"all": costs, "config": best, "value": costs.get(best)}
+            row[name] = {"all": costs, "config": best, "std": spreads.get(best), "value": costs.get(best)}
         rows.append(row)
     return rows

@@ -607,6 +607,24 @@ def test_a_video_without_decoder(tmp_path, monkeypatch):
         convert.main(["-s", str(tmp_path), "--video", str(video)])
 
 
+def test_a_video_makes_its_scene_folder(tmp_path, monkeypatch):
+    video, scene = tmp_path / "walk.mp4", tmp_path / "deep" / "new"
+    words = ["-s", str(scene), "--video", str(video), "--video_frames", "3", "--mask_path", str(tmp_path)]
+    with pytest.raises(UserError, match="no video"):
+        convert.main(words)
+    video.touch()
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    with pytest.raises(UserError, match="--video needs the package"):
+        convert.main(words)
+    assert not scene.parent.exists()
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", _Decoder())
+    with pytest.raises(UserError, match="none of 3 photos has a mask"):  # the stage after the frames
+        convert.main(words)
+    assert len(list((scene / "input").glob("frame_*.jpg"))) == 3
+    with pytest.raises(UserError, match="no folder .*other; make it"):
+        convert.main(["-s", str(tmp_path / "other")])
+
+
 def test_a_real_video(tmp_path):
     ffmpeg = pytest.importorskip("imageio_ffmpeg", reason="the extra imageio-ffmpeg is not installed")
     make_photos(tmp_path / "photos", 6)

@@ -17,7 +17,7 @@ PROGRAMS = sorted({command.program for command in COMMANDS})
 # Programs that hand words which they do not know to train.py.
 FORWARDING = ("benchmarks.kernels.host_ops", "benchmarks.scenes.camera_models", "benchmarks.scenes.training")
 # Flags of other programs.
-FOREIGN = {"--peers"}
+FOREIGN = {"--peers", "--eval_steps", "--save_steps"}
 
 
 @functools.cache

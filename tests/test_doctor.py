@@ -215,13 +215,15 @@ def test_what_convert_noted(colmap_scene):
 def model(colmap_scene, tmp_path):
     """A function that writes a model of the synthetic scene with changed Gaussians and returns the folder."""
 
-    def write(change=lambda gaussians: None, iteration: int = 7, source: Path = colmap_scene) -> str:
+    def write(
+        change=lambda gaussians: None, iteration: int = 7, source: Path = colmap_scene, cloud: Path = colmap_scene
+    ) -> str:
         folder = tmp_path / "model"
         given = argparse.Namespace(source_path=str(source), model_path=str(folder))
         write_cfg_args(folder, ModelParams(argparse.ArgumentParser()).extract(given))
         gaussians = GaussianModel(3)
-        cloud = read_scene(colmap_scene, "images", hold_out=False).point_cloud
-        gaussians.create_from_pcd(cloud, [], 1.0)
+        points = read_scene(cloud, "images", hold_out=False).point_cloud
+        gaussians.create_from_pcd(points, [], 1.0)
         with torch.no_grad():
             change(gaussians)
         gaussians.save_ply(folder / "point_cloud" / f"iteration_{iteration}" / "point_cloud.ply")
@@ -251,6 +253,26 @@ def _huge(gaussians):
     gaussians._scaling[:50] = 3
 
 
+def _just_reset(gaussians):
+    gaussians._opacity.fill_(float(np.log(0.01 / 0.99)))
+
+
+def _tiny(gaussians):
+    gaussians._scaling.fill_(float(np.log(1e-9)))
+
+
+def _vast(gaussians):
+    gaussians._scaling.fill_(float(np.log(1e4)))
+
+
+def _spread(gaussians):
+    gaussians._xyz *= 1e4
+
+
+def _shrunk(gaussians):
+    gaussians._xyz *= 1e-4
+
+
 @pytest.mark.parametrize(
     ("change", "said"),
     [
@@ -259,10 +281,56 @@ def _huge(gaussians):
         (_elsewhere, "black: no Gaussian is in view, because the cameras face away -> check the poses"),
         (_black, "black: the Gaussians themselves are black -> check whether the training photos"),
         (_huge, "16.7% of the Gaussians are larger than the extent of the cameras"),
+        (_just_reset, "100% of the opacities are near 0.01, as a reset leaves them, and nothing was trained after it"),
+        (_tiny, "the Gaussians are too small for these cameras: their median size is "),
+        (_vast, "the Gaussians are too large for these cameras: their median size is "),
+        (_spread, "the positions of the Gaussians spread over "),
+        (_shrunk, "the positions of the Gaussians spread over "),
     ],
 )
 def test_models_with_a_fault(model, change, said):
-    assert any(said in text for text in problems(check_model(model(change), -1)))
+    found = problems(check_model(model(change, iteration=2000), -1))
+    assert any(said in text for text in found)
+    assert not any("train longer" in text for text in found)
+
+
+def test_a_model_is_checked_against_the_scene_that_is_given(healthy, model, colmap_scene, tmp_path, capsys):
+    moved = colmap_scene.rename(tmp_path / "moved")
+    folder = model(source=tmp_path / "gone", cloud=moved)
+    assert "no scene folder" in check_model(folder, -1)[0].text
+    lines = check_model(folder, -1, str(moved))
+    assert lines[0].text == "iteration 7, 300 Gaussians of SH degree 3" and "renders" not in lines[0].text
+    exit_status("-s", str(moved), "-m", folder)
+    out = capsys.readouterr().out
+    assert "no scene folder" not in out and "iteration 7, 300 Gaussians" in out
+    (moved / "images").rename(moved / "pictures")
+    assert "has its photos" in problems(check_model(folder, -1, str(moved)))[0]
+    assert not any("has its photos" in text for text in problems(check_model(folder, -1, str(moved), "pictures")))
+
+
+def _half_black(gaussians):
+    gaussians._opacity.fill_(5)
+    gaussians._features_dc[::2] = -5
+
+
+def test_a_model_of_the_other_background(model, colmap_scene, monkeypatch):
+    """Photos with alpha that are a model's own renders on black, transparent where they are black."""
+    monkeypatch.setattr(diagnosis.model, "_WIDTH", WIDTH)
+    folder = Path(model(_half_black))
+    scene = load_saved(ModelParams(argparse.ArgumentParser()).extract(argparse.Namespace(**read_cfg_args(folder))), -1)
+    for camera in scene.getTrainCameras():
+        with torch.no_grad():
+            image = render(camera, scene.gaussians, pipeline(), torch.zeros(3))["render"].clamp(0, 1)
+        pixels = (image.permute(1, 2, 0) * 255).round().to(torch.uint8).numpy()
+        alpha = np.where(pixels.max(axis=2, keepdims=True) > 4, 255, 0).astype(np.uint8)
+        Image.fromarray(np.concatenate([pixels, alpha], axis=2)).save(colmap_scene / "images" / camera.image_name)
+    assert problems(check_model(str(folder), -1)) == []
+    options = ModelParams(argparse.ArgumentParser()).extract(argparse.Namespace(**read_cfg_args(folder)))
+    options.white_background = True
+    write_cfg_args(folder, options)
+    (line,) = problems(check_model(str(folder), -1))
+    assert "over black it is " in line and "the model was trained on black: set white_background=False" in line
+    assert line.endswith("render without -w")
 
 
 def test_a_scene_too_small_to_be_drawn(model, colmap_scene):

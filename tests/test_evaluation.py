@@ -64,7 +64,8 @@ def test_cheapest_wants_every_seed_and_takes_the_mean():
     assert rows[29.0]["seconds"]["config"] == "slow" and set(rows[29.0]["seconds"]["all"]) == {"slow"}
     assert rows[28.0]["seconds"]["config"] == "fast" and set(rows[28.0]["seconds"]["all"]) == {"slow", "fast"}
     assert rows[28.0]["seconds"]["value"] == pytest.approx((2 ** (8 / 9) + 30) / 2)
-    assert rows[28.0]["gaussians"] == {"all": {"slow": 60, "fast": 90}, "config": "slow", "value": 60}
+    assert rows[28.0]["seconds"]["std"] == pytest.approx((30 - 2 ** (8 / 9)) / 2**0.5)
+    assert rows[28.0]["gaussians"] == {"all": {"slow": 60, "fast": 90}, "config": "slow", "std": 0.0, "value": 60}
 
 
 def test_cheapest_of_nothing():
@@ -83,7 +84,7 @@ def test_a_failed_seed_is_left_out_and_named():
     def run(seed, failure):
         values = dict.fromkeys(QUANTITIES, 1.0 + seed) | {"views": 3}
         return {"scene": "a", "group": "scenes", "config": None, "seed": seed, "failure": failure,
-                "iterations": {"10": values}, "ground_truth_sha256": "x"}  # fmt: skip
+                "iterations": {"10": values}, "ground_truth_sha256": "x", "apart": False}  # fmt: skip
 
     (row,) = summarise([run(0, None), run(1, {"stage": "train"}), run(2, None)])
     assert row["PSNR"] == {"mean": 2.0, "std": pytest.approx(2**0.5), "values": [1.0, 3.0]}

@@ -23,6 +23,7 @@ from evaluation.contact_sheet import GAP, HEADER
 from evaluation.figures import draw_curves, draw_worst_views
 from evaluation.results_page import BEGIN, END
 from evaluation.scenes import DATASETS
+from records.error_curve import COLUMNS
 from utils.system_utils import UserError
 
 ROOT = Path(__file__).parents[1]
@@ -84,6 +85,9 @@ def test_commands_of_a_plain_scene(figures, scenes, tmp_path):
     assert attic_render == ["render", "-m", str(out / "attic"), "-s", str(scenes / "attic"), "--iteration", "40",
                             "--skip_train", "--eval", "--quiet", "--antialiasing"]  # fmt: skip
     first = report["runs"][0]
+    load = {name: first["iterations"]["40"].pop(name) for name in ("process_seconds", "cpu_seconds")}
+    assert load == {"process_seconds": first["wall_seconds"], "cpu_seconds": first["cpu_seconds"]}
+    assert 0 < first["cpu_seconds"] < 30 and "| process (s) | CPU (s) |" in (out / "report.md").read_text()
     assert first["finished"] and first["failure"] is None and first["model"] == "attic"
     assert first["iterations"]["40"] == {
         "PSNR": 23.0, "SSIM": 0.9, "LPIPS": None, "fps": 250.0, "gaussians": 16000, "gaussians_saved": 16000,
@@ -135,7 +139,9 @@ def _seconds(request, monkeypatch):
     """Let stages take their own time, or all the same time, as a render of an unchanged model may."""
     plain = stages.run_child
     if request.param:
-        monkeypatch.setattr(stages, "run_child", lambda c: dataclasses.replace(plain(c), seconds=request.param))
+        monkeypatch.setattr(
+            stages, "run_child", lambda *a, **k: dataclasses.replace(plain(*a, **k), seconds=request.param)
+        )
 
 
 @pytest.mark.usefixtures("_seconds")
@@ -157,6 +163,13 @@ def test_a_second_call_does_nothing_again(scenes, tmp_path):
     run(*command)
     assert [words[0] for words in calls(scenes)[len(done) + 1 :]] == ["train", "render"]
     assert len((out / "attic" / "scored.txt").read_text().splitlines()) == 4
+
+
+def test_only_the_first_scoring_tries_a_download(scenes, tmp_path):
+    """The stand-in scores no LPIPS, as metrics.py without weights."""
+    run("--scenes", scenes / "attic", scenes / "brick", "--output_path", tmp_path, "--iterations", 40)
+    tried = [json.loads((tmp_path / name / "scored.txt").read_text())[0] for name in ("attic", "brick")]
+    assert tried == [None, "0"]
 
 
 def test_other_options_are_not_mixed_in(scenes, tmp_path):
@@ -358,7 +371,11 @@ def test_the_legend_leaves_the_pareto_front_free(tmp_path, monkeypatch):
         "fast start": [(0.3, 21.0, 0.8), (3.3, 29.5, 0.95)],
     } | {f"set {i}": [(0.31, 15.0, 0.7), (2.9, 28.5, 0.94)] for i in range(6)}  # fmt: skip
     runs = [
-        {"config": config, "curve": [dict(zip(names, row, strict=True)) for row in curve]}
+        {
+            "apart": False,
+            "config": config,
+            "curve": [dict.fromkeys(COLUMNS) | dict(zip(names, row, strict=True)) for row in curve],
+        }
         for config, curve in curves.items()
     ]
     assert draw_curves(tmp_path / "curves.png", "attic", runs)
@@ -423,6 +440,10 @@ def test_seeds_and_option_sets(figures, scenes, tmp_path, capsys, monkeypatch):
         ("--scenes SCENES/attic --output_path SCENES", "attic would lie in the scene folder"),
         ("--scenes SCENES/attic --output_path SCENES/attic --skip_training", "would lie in the scene folder"),
         ("--skip_training --skip_rendering", "no scenes given"),
+        ("-m360 SCENES/nowhere", "no such folder: .*nowhere; pass the folder that has bicycle, flowers"),
+        ("-m360 SCENES", "scenes has none of the scenes of mipnerf360; pass the folder that has bicycle"),
+        ("--scenes SCENES/attic --peer other nowhere.csv", "cannot read nowhere.csv"),
+        ("--scenes SCENES/attic SCENES/brick --peer other x.csv", "--peer other: name the scene, too"),
     ],
 )
 def test_refusals(scenes, tmp_path, words, sentence):
@@ -447,6 +468,8 @@ def test_refusals(scenes, tmp_path, words, sentence):
         ('{"a": ["--sh_degree"]}', "a: argument --sh_degree: expected one argument"),
         ('{"a": ["--iterations", "many"]}', "a: argument --iterations: invalid int value"),
         ('{"a": ["--opacity_lr", -1]}', "a: --opacity_lr must be at least 0"),
+        ('{"' + "a" * 300 + '": []}', "the name aaaaaaaaaaaaaaaaaaaa... is too long for a folder"),
+        ("[" * 100_000, "is not a table of option sets"),
     ],
 )
 def test_refused_option_sets(scenes, tmp_path, text, sentence):
@@ -484,6 +507,136 @@ def test_damaged_files_do_not_cost_the_report(scenes, tmp_path, capsys):
     warnings = capsys.readouterr().err
     assert "error_vs_time.csv cannot be read" in warnings and "no figure of the worst views of picture" in warnings
     assert (out / "report.html").exists()
+
+
+def test_option_sets_of_another_ground_truth_stand_apart(figures, scenes, tmp_path, monkeypatch):
+    out, configs = tmp_path / "out", tmp_path / "configs.json"
+    configs.write_text('{"base": ["--sh_degree", 1], "best": [], "flat": ["--sh_degree", 0]}')
+    command = ("--scenes", scenes / "attic", "--output_path", out, "--iterations", 40, "--configs", configs)
+    assert run(*command)["cheapest"]["attic"][0]["seconds"]["config"] == "best"
+    Image.new("RGB", (120, 80)).save(out / "attic" / "best" / "test" / "ours_40" / "gt" / "00000.png")
+    (out / "attic" / "best" / "results.json").unlink()
+    drawn, plain = [], Figure.savefig
+    monkeypatch.setattr(Figure, "savefig", lambda self, *a, **k: (drawn.append(self), plain(self, *a, **k)))
+    report = run(*command)
+    assert [run["apart"] for run in report["runs"]] == [False, True, False]
+    assert {name for row in report["cheapest"]["attic"] for name in row["seconds"]["all"]} == {"base", "flat"}
+    assert "Left out of rankings and the Pareto front: best." in report["warnings"][0]
+    first, second = (out / "report.md").read_text().split("Scored on other ground truth", 1)
+    assert " base |" in first and " best |" not in first and " best |" in second
+    lines = {line.get_label(): line for line in drawn[0].axes[0].lines}
+    assert "best (other ground truth)" in lines
+    apart = {tuple(point) for point in lines["best (other ground truth)"].get_xydata()}
+    assert not apart & {tuple(point) for point in lines["Pareto front"].get_xydata()}
+
+
+def test_seeds_of_different_ground_truth_have_no_mean(scenes, tmp_path):
+    out = tmp_path / "out"
+    command = ("--scenes", scenes / "attic", "--output_path", out, "--iterations", 40, "--seeds", 0, 1)
+    run(*command)
+    Image.new("RGB", (120, 80)).save(out / "attic" / "seed_1" / "test" / "ours_40" / "gt" / "00000.png")
+    (out / "attic" / "seed_1" / "results.json").unlink()
+    (row,) = run(*command)["summary"]
+    assert not row["one_ground_truth"] and row["PSNR"] == {"mean": None, "std": None, "values": [23.0, 23.1]}
+    assert row["seconds"]["mean"] == 16.0
+
+
+def test_the_gap_to_the_training_views_is_a_panel_of_option_sets(figures, scenes, tmp_path, monkeypatch):
+    drawn, plain = [], Figure.savefig
+    monkeypatch.setattr(Figure, "savefig", lambda self, *a, **k: (drawn.append(self), plain(self, *a, **k)))
+    configs = tmp_path / "configs.json"
+    configs.write_text('{"base": [], "sh1": ["--sh_degree", 1]}')
+    run("--scenes", scenes / "attic", "--output_path", tmp_path / "out", "--iterations", 40, "--configs", configs)
+    panel = drawn[0].axes[2]
+    assert panel.get_ylabel() == "PSNR of the training views above the test views (dB)"
+    base, small = panel.lines
+    assert base.get_ydata().tolist() == pytest.approx([14.5, 12.0, 7.0])  # 30 dB on training views, 23 on test views
+    assert small.get_ydata().tolist() == pytest.approx([16.5, 14.0, 9.0])
+
+
+def test_a_call_that_scores_nothing_says_so_and_keeps_a_good_report(scenes, tmp_path, capsys):
+    out = tmp_path / "out"
+    nothing = ("--skip_training", "--skip_rendering", "--skip_metrics", "--output_path", out)
+    with pytest.raises(SystemExit) as status:
+        run("--scenes", scenes / "attic", *nothing)
+    assert status.value.code == 1 and "nothing was scored" in capsys.readouterr().err
+    assert report_of(out)["summary"] == []
+    run("--scenes", scenes / "brick", "--output_path", out, "--iterations", 40)
+    good = folder_state(out)
+    del good[".full_eval.lock"]
+    with pytest.raises(SystemExit) as status:
+        run("--scenes", scenes / "attic", *nothing)
+    assert status.value.code == 1 and "the report of an earlier call stays" in capsys.readouterr().err
+    assert good.items() <= folder_state(out).items()
+
+
+def test_a_second_call_with_other_scenes_or_seeds_joins_the_report(scenes, tmp_path):
+    out = tmp_path / "out"
+    (scenes / "cellar" / "sparse").mkdir(parents=True)
+    shared = ("--output_path", out, "--iterations", 40)
+    first = run("--scenes", scenes / "attic", *shared)
+    second = run("--scenes", scenes / "brick", *shared)
+    assert [run["scene"] for run in second["runs"]] == ["attic", "brick"] and second["runs"][0] == first["runs"][0]
+    assert second["manifest"]["earlier_commands"] == [first["manifest"]["command"]]
+    assert run("--scenes", scenes / "attic", *shared)["runs"] == second["runs"]
+    text = (out / "report.md").read_text()
+    assert text.count("| attic |") == text.count("| brick |") == 2 and (out / "timing.txt").read_text()  # two tables
+
+    run("--scenes", scenes / "cellar", *shared, "--seeds", 1)
+    report = run("--scenes", scenes / "cellar", *shared, "--seeds", 2)
+    (row,) = [row for row in report["summary"] if row["scene"] == "cellar"]
+    assert row["seeds"] == [1, 2] and row["PSNR"]["std"] > 0
+    shutil.rmtree(out / "brick")
+    assert [run["scene"] for run in run("--scenes", scenes / "attic", *shared)["runs"]] == ["attic", "cellar", "cellar"]
+
+
+def test_a_second_call_whose_models_would_lie_in_those_of_the_first_is_refused(scenes, tmp_path):
+    out = tmp_path / "out"
+    configs = tmp_path / "configs.json"
+    configs.write_text('{"base": []}')
+    shared = ("--output_path", out, "--iterations", 40)
+    run("--scenes", scenes / "attic", *shared)
+    run("--scenes", scenes / "brick", *shared, "--configs", configs, "--seeds", 1)
+    before = folder_state(out)
+    for words in (
+        ("attic", "--seeds", 1), ("attic", "--configs", configs), ("brick",),
+        ("brick", "--configs", configs),
+    ):  # fmt: skip
+        with pytest.raises(UserError, match="would lie in each other; give the same --seeds and --configs, or none"):
+            run("--scenes", scenes / words[0], *shared, *words[1:])
+    assert folder_state(out) == before
+
+
+def test_peers_are_shown_and_stay_in_the_report(figures, scenes, tmp_path):
+    out, peer = tmp_path / "out", tmp_path / "other.csv"
+    peer.write_text("iteration,seconds,test_psnr,gaussians\n40,2.5,31.25,1234\n")
+    shared = ("--scenes", scenes / "attic", "--output_path", out, "--iterations", 40)
+    report = run(*shared, "--peer", "other", peer, "--peer", "third", peer)
+    assert [(peer["scene"], peer["name"], peer["curve"][0]["test_psnr"]) for peer in report["peers"]] == [
+        ("attic", "other", 31.25), ("attic", "third", 31.25),
+    ]  # fmt: skip
+    for kind in ("md", "html"):
+        text = (out / f"report.{kind}").read_text()
+        assert "Other programs" in text and "31.25" in text and "1,234" in text
+    assert report["cheapest"] == {}
+    peer.write_text("seconds,test_psnr\n3,32\n")
+    again = run("--scenes", scenes / "attic", scenes / "brick", *shared[2:], "--peer", "attic/other", peer)
+    assert [(peer["name"], peer["curve"][-1]["seconds"]) for peer in again["peers"]] == [("other", 3), ("third", 2.5)]
+
+
+@pytest.mark.parametrize("name", ["<script>alert(1)<", "[x](javascript:alert(1))", "a\nb", "# a", "caf\udce9"])
+def test_names_stay_names_in_the_report(figures, scenes, tmp_path, name):
+    (scenes / name / "sparse").mkdir(parents=True)
+    out = tmp_path / "out"
+    report = run("--scenes", scenes / name, "--output_path", out, "--iterations", 40)
+    assert report["runs"][0]["finished"]
+    for file in ("report.md", "report.html"):
+        assert "<script" not in (out / file).read_text(encoding="utf-8")
+    assert "[x](" not in (out / "report.md").read_text(encoding="utf-8")
+    tables = [line for line in (out / "report.md").read_text(encoding="utf-8").splitlines() if line.startswith("|")]
+    assert len(tables) == 6 and len({line.count("|") for line in tables[:3]}) == 1  # header, rule and row of two tables
+    with Image.open(out / "figures" / f"{name}_curves.png") as image:
+        assert image.width > 300
 
 
 def _browser() -> str | None:

@@ -7,6 +7,7 @@ from gaussians import model, parameters
 from plyfile import PlyData, PlyElement
 
 from scene.gaussian_model import GaussianModel
+from scene.gaussians.ply import stored_sh_degree
 from utils.system_utils import UserError
 
 ORDER = (
@@ -124,3 +125,22 @@ def test_a_failed_write_leaves_no_file(tmp_path, monkeypatch):
     with pytest.raises(UserError, match="cannot write .*disk full"):
         gaussians.save_ply(tmp_path / "point_cloud.ply")
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("count", ["1" + "0" * 40, "4000000000", "9" * 500])
+@pytest.mark.parametrize("kind", ["binary_little_endian", "ascii"])
+def test_a_header_that_promises_more_rows_than_the_file_has(tmp_path, kind, count):
+    model(2).save_ply(tmp_path / "a.ply")
+    content = (tmp_path / "a.ply").read_bytes().replace(b"element vertex 2", f"element vertex {count}".encode())
+    (tmp_path / "a.ply").write_bytes(content.replace(b"binary_little_endian", kind.encode()))
+    for read in (stored_sh_degree, _loaded):
+        with pytest.raises(
+            UserError, match=r"is not a complete PLY file \(its header promises .* vertices, and it has"
+        ):
+            read(tmp_path / "a.ply")
+
+
+def test_rows_without_columns_are_no_reason_for_a_traceback(tmp_path):
+    (tmp_path / "a.ply").write_text(f"ply\nformat ascii 1.0\nelement vertex 1{'0' * 40}\nend_header\n")
+    with pytest.raises(UserError):
+        _loaded(tmp_path / "a.ply")

@@ -241,6 +241,8 @@ def test_the_estimate_and_its_warnings(colmap_scene, tmp_path, monkeypatch, capf
         and "6,000 (scenes often grow 20-fold); 1024.0 GiB free" in line
     )
     assert not warning
+    assert "--images_to_load" not in line and "--images_to_load" not in said("--images_to_load", 17)[0]
+    assert "photos 0.00 GiB (--images_to_load keeps 5 of 17 decoded images), " in said("--images_to_load", 5)[0]
     line, warning = said("--max_num_splats", 2_000_000_000)
     assert f"{gib(2e9 * 1070)} with 2,000,000,000 (--max_num_splats)" in line
     assert "too small for 2,000,000,000 Gaussians; set a lower --max_num_splats" in warning

@@ -279,13 +279,66 @@ def test_without_weights_lpips_is_null_and_says_what_to_do(tmp_path, run):
     (model / "cfg_args").write_text("Namespace(sh_degree=3, eval=False)")
     status, out, _ = run("-m", model)
     assert status == 0
-    lines = [line for line in out.splitlines() if "LPIPS, LPIPS_vgg will be null: put" in line]
+    lines = [line for line in out.splitlines() if "LPIPS, LPIPS_vgg are null unless scored before: its weights" in line]
     assert len(lines) == 1 and str(tmp_path / "cache" / "hub" / "checkpoints") in lines[0]
     assert "warning" in out and "without --eval" in out
     scores = json.loads((model / "results.json").read_text())["ours_30"]
     assert scores["LPIPS"] is None and scores["LPIPS_vgg"] is None and scores["PSNR"] > 20
     per_view = json.loads((model / "per_view.json").read_text())["ours_30"]
     assert per_view["LPIPS"] == {"00000.png": None, "00001.png": None}
+
+
+def test_lpips_scored_before_is_kept_where_it_cannot_be_scored_again(tmp_path, weights, run):
+    model = make_model(tmp_path / "model")
+    files = [path for path, _ in weights.values()]
+    run("-m", model, "--lpips_net", "both", "--lpips_weights", *files)
+    names = ("results.json", "per_view.json", "metrics_info.json")
+    before = [json.loads((model / name).read_text()) for name in names]
+    status, out, err = run("-m", model)
+    assert status == 0 and "Traceback" not in err
+    assert "kept LPIPS, LPIPS_vgg, LPIPS_alex of an earlier scoring of the same pictures" in out
+    assert [json.loads((model / name).read_text()) for name in names] == before
+
+    Image.fromarray(picture(5)).save(model / "test" / "ours_30" / "renders" / "00001.png")  # another render
+    status, out, _ = run("-m", model)
+    assert status == 0 and "kept" not in out
+    scores = json.loads((model / "results.json").read_text())["ours_30"]
+    assert scores["LPIPS"] is None and "LPIPS_alex" not in scores and scores["PSNR"] > 0
+
+
+@pytest.mark.parametrize("content", ["{", "[]", '{"ours_30": {"PSNR": {}}}', '{"ours_30": {"LPIPS": {"a": 1.0}}}'])
+def test_earlier_scores_that_nobody_can_use_do_not_matter(tmp_path, run, content):
+    model = make_model(tmp_path / "model")
+    (model / "per_view.json").write_text(content)
+    status, out, _ = run("-m", model)
+    assert status == 0 and "kept" not in out
+
+
+def test_without_the_package_lpips_one_line_says_so(tmp_path, run, monkeypatch):
+    def missing():
+        raise ModuleNotFoundError("No module named 'lpips'")
+
+    monkeypatch.setattr(lpips_utils, "import_lpips", missing)
+    status, out, err = run("-m", make_model(tmp_path / "model"), "--lpips_net", "both")
+    assert status == 0 and "Traceback" not in err
+    lines = [line for line in out.splitlines() if "No module named 'lpips'; run pip install" in line]
+    assert len(lines) == 2  # one for each network
+
+
+def test_no_download_is_tried_where_the_environment_forbids_it(tmp_path, monkeypatch):
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
+    monkeypatch.setenv("GS_DOWNLOAD", "0")
+    monkeypatch.setattr(torch.hub, "load_state_dict_from_url", lambda *_, **__: pytest.fail("it was tried"))
+    monkeypatch.setattr(lpips_utils, "_network_failed", False)
+    with pytest.raises(LpipsUnavailable, match="its weights are missing; put "):
+        PerceptualDistance("vgg", [], torch.device("cpu"))
+
+
+def test_help_says_what_happens_without_an_option(run):
+    status, out, _ = run("-h")
+    text = " ".join(out.split())
+    assert status == 0 and "(default: none, must be given)" in text
+    assert "(default: torch's cache, or else a download into it)" in text
 
 
 def test_several_models_and_methods_and_alpha(tmp_path, run):

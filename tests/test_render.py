@@ -183,3 +183,39 @@ def test_times_on_disk_are_those_of_the_last_run(tmp_path, colmap_scene, monkeyp
     assert times["gaussians"] == 5 and times["sizes"] == [[96, 64]] and not times["antialiasing"]
     assert times["median_ms"] == sorted(times["milliseconds"].values())[1] > 0
     assert timed_views(held_out=False) == [17, 0]
+
+
+def test_a_model_trained_on_black_is_not_rendered_on_white_without_a_word(tmp_path, colmap_scene, monkeypatch, capsys):
+    rows = {name: torch.zeros(5, *attribute.shape) for name, attribute in attributes(3).items()}
+    write_ply(tmp_path / "model" / "point_cloud" / "iteration_7" / "point_cloud.ply", rows, 3)
+
+    def said(trained_on_white: bool, *words: str) -> str:
+        options = f"Namespace(source_path={str(colmap_scene)!r}, white_background={trained_on_white})"
+        (tmp_path / "model" / "cfg_args").write_text(options)
+        command = ["render.py", "-m", str(tmp_path / "model"), "--skip_train", "--skip_test", *words]
+        monkeypatch.setattr("sys.argv", command)
+        render.main()
+        return capsys.readouterr().err
+
+    assert "has a black background in its cfg_args, but -w asks for white; leave -w out" in said(False, "-w")
+    assert said(False) == said(True) == said(True, "-w") == ""
+
+
+def test_help_says_what_happens_without_an_option(monkeypatch, capsys):
+    monkeypatch.setattr("sys.argv", ["render.py", "-h"])
+    with pytest.raises(SystemExit):
+        render.main()
+    text = " ".join(capsys.readouterr().out.split())
+    for option, default in {
+        "--model_path TEXT, -m TEXT": "none, must be given",
+        "--sh_degree N": "that of the saved PLY",
+        "--resolution N, -r N": "that of the model",
+        "--white_background, -w": "that of the model",
+        "--masks TEXT": "that of the model",
+        "--antialiasing": "that of the model",
+        "--debug": "off; reference",
+        "--skip_train": "off",
+        "--iteration ITERATION": "-1, the last",
+    }.items():
+        _, _, after = text.partition(f" {option} ")[2].partition("(default: ")
+        assert after.startswith(f"{default})"), option

@@ -30,13 +30,16 @@ def announce_memory(scene: Scene, gaussians: GaussianModel, max_splats: int) -> 
     at_start, at_end = training_bytes(gaussians, now, pixels), training_bytes(gaussians, later, pixels)
     training = f"training {gib(at_start)} with {now:,} Gaussians, {gib(at_end)} with {later:,} ({why})"
     pictures = images.planned_bytes
+    photos = f"photos {gib(pictures)}"
+    if images.limit:
+        photos += f" (--images_to_load keeps {images.limit:,} of {images.planned:,} decoded images)"
     together = images.keep_on.type == device.type and (images.keep_on.index or 0) == (device.index or 0)
     if not together:
-        room = _announce(images.keep_on, f"photos {gib(pictures)}", pictures)
+        room = _announce(images.keep_on, photos, pictures)
         if room < 0:
             _warn(images.keep_on, "all photos", "set --images_to_load, or lower --resolution (-r)")
         pictures = 0
-    room = _announce(device, f"photos {gib(pictures)}, {training}" if together else training, pictures)
+    room = _announce(device, f"{photos}, {training}" if together else training, pictures)
     if room < at_start:
         _warn(device, f"{now:,} Gaussians", "set --images_to_load, or lower --resolution (-r) or --sh_degree")
     elif room < at_end:

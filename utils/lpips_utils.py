@@ -6,7 +6,9 @@ downloaded into it. A backbone without weights is never used.
 
 from __future__ import annotations
 
+import http.client
 import importlib
+import os
 import socket
 import sys
 import warnings
@@ -139,20 +141,25 @@ def _features_from_cache(net: str) -> dict[str, torch.Tensor]:
         return _load_state(cached)
     state = _download(url)
     if state is None:
-        raise LpipsUnavailable(f"put {url} at {cached}, or name the file with --lpips_weights of metrics.py")
+        raise LpipsUnavailable(
+            f"its weights are missing; put {url} at {cached}, or name the file with --lpips_weights of metrics.py"
+        )
     return state
 
 
 def _download(url: str) -> dict[str, torch.Tensor] | None:
-    """Download a state dict into torch's cache. None if that fails, and at once if it has failed before."""
+    """Download a state dict into torch's cache.
+
+    None if that fails, and at once if it has failed before or the environment forbids it (GS_DOWNLOAD=0).
+    """
     global _network_failed
-    if _network_failed:
+    if _network_failed or os.environ.get("GS_DOWNLOAD") == "0":
         return None
     before = socket.getdefaulttimeout()
     socket.setdefaulttimeout(_DOWNLOAD_TIMEOUT)
     try:
         return torch.hub.load_state_dict_from_url(url, map_location="cpu", check_hash=True)
-    except (OSError, RuntimeError):  # no network, refused, or a damaged download
+    except (OSError, RuntimeError, http.client.HTTPException):  # no network, refused, or a damaged download
         _network_failed = True
         return None
     finally:

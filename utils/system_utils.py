@@ -7,6 +7,7 @@ import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+from utils.host import start
 from utils.host.device import compute_device
 from utils.host.interrupt import Terminated
 from utils.host.memory import is_out_of_memory, shortage
@@ -32,19 +33,42 @@ class UserError(Exception):
 def run_cli(main: Callable[[], object]) -> None:
     """Run a command line: a UserError prints its sentence and exits 2; a bug keeps its traceback.
 
-    Signals exit as in shells: Ctrl-C 130, SIGTERM 143, and 141 if the reader of the output is gone (`| head`).
+    Signals exit as in shells: Ctrl-C 130, SIGTERM 143, and 141 if the reader of the output is gone (`| head`). An
+    output that cannot be written (disk full) exits 2, and one that is closed does not matter.
     """
+    start.imported()
     try:
         status = _status(main)
         sys.stdout.flush()  # now, while a broken pipe can still be caught
     except BrokenPipeError:
-        # Python flushes both streams again when it exits, and either may be the broken pipe.
-        nowhere = os.open(os.devnull, os.O_WRONLY)
-        for stream in (sys.__stdout__, sys.__stderr__):
-            os.dup2(nowhere, stream.fileno())
+        _discard_output()
         status = 141
+    except OSError as error:
+        if error.filename is not None or not _output_fails():
+            raise
+        with contextlib.suppress(OSError):
+            reason = f"cannot write to the standard output ({error.strerror})"
+            print(f"error: {reason}; free space there, or send the output elsewhere", file=sys.stderr)
+        _discard_output()
+        status = 2
     if status:
         sys.exit(status)
+
+
+def _output_fails() -> bool:
+    try:
+        sys.stdout.flush()
+        os.write(sys.__stdout__.fileno(), b"\n")
+    except OSError:
+        return True
+    return False
+
+
+def _discard_output() -> None:
+    """Lead both streams nowhere: Python flushes them again when it exits, and either may be broken."""
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    for stream in (sys.__stdout__, sys.__stderr__):
+        os.dup2(nowhere, stream.fileno())
 
 
 def _status(main: Callable[[], object]) -> int:

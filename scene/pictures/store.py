@@ -80,6 +80,11 @@ class ImageStore:
             self._copies = DeviceCopies(self.device)
 
     @property
+    def planned(self) -> int:
+        """Number of the images of `plan`."""
+        return len(self._planned)
+
+    @property
     def planned_bytes(self) -> int:
         """Upper bound on the bytes of the images of `plan` that are kept at once."""
         sizes = sorted((_bytes(*key) for key in self._planned), reverse=True)

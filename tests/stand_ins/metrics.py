@@ -2,6 +2,7 @@
 
 import argparse
 import json
+import os
 import sys
 from pathlib import Path
 
@@ -10,7 +11,7 @@ parser.add_argument("-m", type=Path)
 args = parser.parse_args()
 
 with (args.m / "scored.txt").open("a") as calls:
-    calls.write(json.dumps(["metrics", *sys.argv[1:]]) + "\n")
+    calls.write(json.dumps([os.environ.get("GS_DOWNLOAD"), *sys.argv[1:]]) + "\n")
 psnr = json.loads((args.m / "stand_in.json").read_text())["psnr"]
 means, per_view = {}, {}
 for folder in (args.m / "test").iterdir():

@@ -33,7 +33,8 @@ class ProgressBar(Observer):
         for loss in self._shown.values():
             loss.read()
         means = {name: f"{loss.mean:.7f}" for name, loss in self._shown.items()}
-        self._bar.set_postfix(means, Gaussians=len(self._run.gaussians), refresh=False)
+        # As text: tqdm would round the number to three digits.
+        self._bar.set_postfix(means, Gaussians=f"{len(self._run.gaussians):,}", refresh=False)
         self._bar.update(step.iteration - self._bar.n)
 
     def ended(self, error: Error) -> None:

@@ -1,0 +1,221 @@
+"""Curves of other programs: the CSV, its making from hand-made outputs of theirs, and how a report shows them."""
+
+import csv
+import json
+import struct
+import sys
+from pathlib import Path
+
+import pytest
+from matplotlib.figure import Figure
+
+from evaluation import peer_curve
+from evaluation.figures import draw_curves
+from evaluation.peers import COLUMNS, peers_of, read_peer, write_peer
+from evaluation.tensorboard_scalars import read_scalars
+from records.error_curve import COLUMNS as OURS
+from records.error_curve import write_curve
+from utils.system_utils import UserError
+
+
+def written(path: Path, *lines: str) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+def test_a_curve_may_have_few_columns_in_any_order(tmp_path):
+    file = written(tmp_path / "a.csv", "test_psnr,colour,seconds", "21.5,red,20", "", "20.0,,7")
+    rows = read_peer(file)
+    assert [set(row) for row in rows] == [set(COLUMNS)] * 2
+    assert [(row["seconds"], row["test_psnr"], row["test_ssim"]) for row in rows] == [(7, 20, None), (20, 21.5, None)]
+    write_peer(tmp_path / "b.csv", rows)
+    assert (tmp_path / "b.csv").read_text() == "seconds,test_psnr\n7,20\n20,21.5\n"
+    assert read_peer(tmp_path / "b.csv") == rows
+
+
+def test_a_curve_of_train_py_is_one(tmp_path):
+    row = dict.fromkeys(OURS) | {"iteration": 7, "seconds": 1.5, "test_psnr": 20.0, "gaussians": 5}
+    write_curve(tmp_path / "a.csv", [row])
+    (found,) = read_peer(tmp_path / "a.csv")
+    assert {name: found[name] for name in row if name in found} == {name: row[name] for name in row if name in found}
+
+
+@pytest.mark.parametrize(
+    ("lines", "sentence"),
+    [
+        ((), "has no column seconds"),
+        (("seconds,psnr", "1,2"), "has no column test_psnr"),
+        (("seconds,test_psnr",), "has no points"),
+        (("seconds,test_psnr", "1"), "is not a curve"),
+        (("seconds,test_psnr", "1,"), "a row without test_psnr"),
+        (("seconds,test_psnr", "1,inf"), "test_psnr is inf"),
+        (("seconds,test_psnr", "0,20"), "seconds are 0, and must be above 0"),
+        (("seconds,test_psnr", "one,20"), "could not convert"),
+    ],
+)
+def test_files_that_are_no_curves(tmp_path, lines, sentence):
+    with pytest.raises(UserError, match=sentence):
+        read_peer(written(tmp_path / "a.csv", *lines))
+
+
+def test_a_peer_belongs_to_a_scene(tmp_path):
+    file = written(tmp_path / "a.csv", "seconds,test_psnr", "7,20")
+    (peer,) = peers_of([["other", str(file)]], ["attic"])
+    assert (peer["scene"], peer["name"], peer["file"]) == ("attic", "other", str(file))
+    peers = peers_of([["attic/other", str(file)], ["brick/other", str(file)]], ["attic", "brick"])
+    assert [(peer["scene"], peer["name"]) for peer in peers] == [("attic", "other"), ("brick", "other")]
+    for names in (["other"], ["cellar/other"], ["attic/"]):
+        with pytest.raises(UserError, match="name the scene, too"):
+            peers_of([[name, str(file)] for name in names], ["attic", "brick"])
+    with pytest.raises(UserError, match="is given twice"):
+        peers_of([["other", str(file)]] * 2, ["attic"])
+
+
+def test_a_peer_is_drawn_beside_ours_and_is_in_no_front(tmp_path, monkeypatch):
+    figures, plain = [], Figure.savefig
+    monkeypatch.setattr(Figure, "savefig", lambda self, *a, **k: (figures.append(self), plain(self, *a, **k)))
+    curve = [
+        dict.fromkeys(OURS) | {"seconds": s, "test_psnr": p, "test_ssim": p / 30} for s, p in ((1.0, 20.0), (9, 25))
+    ]
+    runs = [{"apart": False, "config": name, "curve": curve} for name in ("base", "sh1")]
+    best = [dict.fromkeys(COLUMNS) | {"seconds": 0.5, "test_psnr": 40.0}]  # would be the whole front
+    assert draw_curves(tmp_path / "a.png", "attic", runs, [{"name": "other", "curve": best}])
+    left, right = figures[0].axes
+    lines = {line.get_label(): line for line in left.lines}
+    assert lines["other (another program)"].get_xydata().tolist() == [[0.5, 40.0]]
+    assert [0.5, 40.0] not in lines["Pareto front"].get_xydata().tolist()
+    assert "other (another program)" not in [line.get_label() for line in right.lines]  # it has no SSIM
+
+
+def _result_of_gsplat(folder: Path) -> Path:
+    """What its trainer writes at two scored steps; a third one was not saved, so that its seconds are not known."""
+    for step, seconds, psnr in ((6999, 40.5, 28.25), (29999, 201.0, 30.5)):
+        scores = {"psnr": psnr, "ssim": 0.9, "lpips": 0.12, "ellipse_time": 0.004, "num_GS": 5000}
+        costs = {"mem": 1.5, "ellipse_time": seconds, "num_GS": 5000}
+        written(folder / "stats" / f"val_step{step:04d}.json", json.dumps(scores))
+        written(folder / "stats" / f"train_step{step:04d}_rank0.json", json.dumps(costs))
+    written(folder / "stats" / "val_step9999.json", json.dumps({"psnr": 29}))
+    return folder
+
+
+def test_gsplats_seconds_are_those_of_training_not_of_a_render(tmp_path):
+    rows = peer_curve.from_gsplat(_result_of_gsplat(tmp_path))
+    assert [(row["iteration"], row["seconds"], row["test_psnr"]) for row in rows] == [
+        (7000, 40.5, 28.25), (30000, 201.0, 30.5),
+    ]  # fmt: skip
+    assert (rows[0]["peak_memory_mib"], rows[0]["gaussians"], rows[0]["test_lpips"]) == (1536, 5000, 0.12)
+    with pytest.raises(UserError, match="whose --save_steps are its --eval_steps"):
+        peer_curve.from_gsplat(tmp_path / "stats" / "nothing")
+
+
+LOG = """Optimizing output/a [31/12 23:58:00]
+Output folder: output/a [31/12 23:58:00]
+Number of points at initialisation :  1000 [31/12 23:58:10]
+Training progress:  10%|#  | 500/5000 [00:20<03:00, Loss=0.1] [31/12 23:58:55]
+[ITER 500] Saving Gaussians [31/12 23:58:56]
+ [31/12 23:59:50]
+[ITER 1000] Evaluating test: L1 0.03125 PSNR 24.5 [31/12 23:59:50]
+ [31/12 23:59:52]
+[ITER 1000] Evaluating train: L1 0.025 PSNR 26.5 [31/12 23:59:52]
+ [01/01 00:03:10]
+[ITER 5000] Evaluating test: L1 0.02 PSNR 27.125 [01/01 00:03:10]
+
+Training complete. [01/01 00:03:11]
+"""
+
+
+def test_the_references_console_output_across_a_new_year(tmp_path):
+    rows = peer_curve.from_log(written(tmp_path / "log.txt", LOG))
+    assert [(row["iteration"], row["seconds"], row["test_psnr"], row.get("train_psnr")) for row in rows] == [
+        (1000, 100, 24.5, 26.5), (5000, 300, 27.125, None),
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        ("nothing\n", "has no scores of test views"),
+        ("[ITER 7] Evaluating test: L1 0.1 PSNR 20.0\n", "has no times at the ends of its lines"),
+        ("a [31/02 10:00:00]\n", "whose time does not exist: .31/02 10:00:00."),
+    ],
+)
+def test_console_outputs_without_what_is_needed(tmp_path, text, sentence):
+    with pytest.raises(UserError, match=sentence):
+        peer_curve.from_log(written(tmp_path / "log.txt", text))
+
+
+def _varint(value: int) -> bytes:
+    low, rest = value & 127, value >> 7
+    return bytes([low | 128]) + _varint(rest) if rest else bytes([low])
+
+
+def _field(number: int, content: bytes) -> bytes:
+    return _varint(number << 3 | 2) + _varint(len(content)) + content
+
+
+def _record(wall: float, step: int, tag: str, value: float) -> bytes:
+    summary = _field(1, _field(1, tag.encode()) + b"\x15" + struct.pack("<f", value))
+    event = b"\x09" + struct.pack("<d", wall) + b"\x10" + _varint(step) + _field(5, summary)
+    return struct.pack("<Q", len(event)) + bytes(4) + event + bytes(4)
+
+
+def _events(folder: Path, scored: tuple[int, ...], last: int, every: int = 1) -> Path:
+    """Iterations of 0.1 s, the first one logged at 1000.1 s; each scored one is followed by a pause of 60 s."""
+    folder.mkdir(exist_ok=True)
+    data, wall = b"", 1000.0
+    for step in range(1, last + 1):
+        wall += 0.1
+        if step % every == 0 or step == 1:
+            data += _record(wall, step, "iter_time", 100.0)
+        if step in scored:
+            data += _record(wall + 50, step, "test/loss_viewpoint - psnr", 20 + step / 100)
+            data += _record(wall + 50, step, "total_points", 10 * step)
+            wall += 60
+    (folder / "events.out.tfevents.1.host").write_bytes(data)
+    return folder
+
+
+@pytest.mark.parametrize("every", [1, 10])
+def test_the_references_tensorboard_files_give_seconds_without_pauses(tmp_path, every):
+    rows = peer_curve.from_events(_events(tmp_path / "m", (100, 200, 300), 300, every))
+    assert [row["iteration"] for row in rows] == [100, 200, 300]
+    assert [row["seconds"] for row in rows] == pytest.approx([10, 20, 30], abs=1e-3)
+    assert [row["wall_seconds"] for row in rows] == pytest.approx([60, 130, 200], abs=1e-3)
+    assert [row["test_psnr"] for row in rows] == [21, 22, 23] and rows[1]["gaussians"] == 2000
+
+
+def test_event_files_that_are_cut_or_empty(tmp_path):
+    folder = _events(tmp_path / "m", (100,), 120)
+    (file,) = folder.iterdir()
+    whole = file.read_bytes()
+    file.write_bytes(whole[:-3])
+    assert len(read_scalars(folder)["iter_time"]) == 119
+    file.write_bytes(b"")
+    with pytest.raises(UserError, match="have no iter_time"):
+        peer_curve.from_events(folder)
+    file.write_bytes(whole[:12] + b"\xff" * (len(whole) - 12))
+    with pytest.raises(UserError, match="are damaged"):
+        peer_curve.from_events(folder)
+
+
+def test_the_command(tmp_path, monkeypatch, capsys):
+    def made(*words: object) -> list[dict[str, str]]:
+        monkeypatch.setattr(sys, "argv", ["peer_curve", *map(str, words), str(tmp_path / "out.csv")])
+        peer_curve.main()
+        with (tmp_path / "out.csv").open() as file:
+            return list(csv.DictReader(file))
+
+    assert [row["seconds"] for row in made("gsplat", _result_of_gsplat(tmp_path / "g"))] == ["40.5", "201"]
+    assert "wrote 2 points to" in (said := capsys.readouterr().out) and "contain the scoring and saving" in said
+    assert len(made("reference", _events(tmp_path / "m", (5, 9), 9))) == 2
+    assert "seconds are of training, without scoring" in capsys.readouterr().out
+    assert [row["iteration"] for row in made("reference", written(tmp_path / "log", LOG))] == ["1000", "5000"]
+    assert "whole seconds" in capsys.readouterr().out
+    read_peer(tmp_path / "out.csv")
+    for words, sentence in (
+        (("gsplat", tmp_path / "nowhere"), "there is no"),
+        (("reference", tmp_path / "g"), "has no TensorBoard files; give a saved console output"),
+    ):
+        with pytest.raises(UserError, match=sentence):
+            made(*words)

@@ -1,0 +1,94 @@
+"""Start and end of a command: Ctrl-C while modules are imported, and outputs that are closed or full."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+COMMANDS = ("train", "render", "metrics", "full_eval", "convert", "doctor")
+needs_full = pytest.mark.skipif(not os.path.exists("/dev/full"), reason="the system has no /dev/full")
+
+
+def _heed_ctrl_c() -> None:
+    signal.signal(signal.SIGINT, signal.SIG_DFL)  # a shell's background ignores it
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_ctrl_c_while_modules_are_imported_is_no_traceback(tmp_path, command):
+    """A package that every command imports early waits, as a slow disk would, and then swallows what is raised."""
+    (tmp_path / "numpy.py").write_text(
+        "import pathlib, time\n"
+        "try:\n"
+        f"    pathlib.Path({str(tmp_path / 'there')!r}).touch()\n"
+        "    time.sleep(30)\n"
+        "except BaseException:\n"
+        "    pass\n"
+        "raise ImportError\n"
+    )
+    (tmp_path / "torch.py").write_text((tmp_path / "numpy.py").read_text())
+    words = {"convert": ["-s", "nowhere"], "doctor": []}.get(command, ["-m", "nowhere"])
+    process = subprocess.Popen(
+        [sys.executable, f"{command}.py", *words], cwd=ROOT, env=os.environ | {"PYTHONPATH": str(tmp_path)},
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, preexec_fn=_heed_ctrl_c,
+    )  # fmt: skip
+    try:
+        deadline = time.monotonic() + 60
+        while not (tmp_path / "there").exists() and time.monotonic() < deadline:
+            time.sleep(0.02)
+        process.send_signal(signal.SIGINT)
+        assert process.communicate(timeout=20) == (b"", b"")
+    finally:
+        process.kill()
+    assert process.returncode == -signal.SIGINT
+
+
+def _run(script: str, redirection: str, tmp_path: Path) -> subprocess.CompletedProcess:
+    program = tmp_path / "program.py"
+    program.write_text(
+        f"import sys\nfrom utils.system_utils import run_cli\ndef main():\n    {script}\nrun_cli(main)\n"
+    )
+    command = f'"{sys.executable}" "{program}" {redirection}'
+    environment = os.environ | {"PYTHONPATH": str(ROOT), "PYTHONIOENCODING": "utf-8:strict"}
+    words = ["sh", "-c", command]
+    return subprocess.run(words, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=60)
+
+
+@needs_full
+@pytest.mark.parametrize("script", ["print('a')", "print('a', flush=True)", "print('a' * 100_000)"])
+def test_a_full_output_is_one_sentence(tmp_path, script):
+    done = _run(script, ">/dev/full", tmp_path)
+    assert done.returncode == 2
+    assert done.stderr == (
+        "error: cannot write to the standard output (No space left on device); free space there, or send the output "
+        "elsewhere\n"
+    )
+    assert _run(script, ">/dev/full 2>/dev/full", tmp_path).returncode == 2
+
+
+@pytest.mark.parametrize("redirection", [">&-", "2>&-", ">&- 2>&-"])
+def test_a_closed_output_does_not_matter(tmp_path, redirection):
+    done = _run(f"print('a', flush=True); sys.stderr.write('b'); open({str(tmp_path / 'done')!r}, 'w')", redirection,
+                tmp_path)  # fmt: skip
+    assert done.returncode == 0 and (tmp_path / "done").exists()
+    assert "Traceback" not in done.stderr
+
+
+def test_errors_of_other_files_stay_what_they_are(tmp_path):
+    done = _run("open('/nowhere/at/all')", "", tmp_path)
+    assert done.returncode == 1 and "FileNotFoundError" in done.stderr
+
+
+def test_train_with_a_closed_output_trains(tmp_path, colmap_scene):
+    words = f'"{sys.executable}" train.py -s "{colmap_scene}" -m "{tmp_path / "model"}" --iterations 3 >&- 2>&-'
+    assert subprocess.run(["sh", "-c", words], cwd=ROOT, timeout=120).returncode == 0
+    assert (tmp_path / "model" / "point_cloud" / "iteration_3" / "point_cloud.ply").exists()
+
+
+def test_letters_that_an_output_does_not_have(tmp_path):
+    done = _run(r"print('caf\xe9 \udcff')", "", tmp_path)
+    assert done.returncode == 0 and done.stdout == "café \\udcff\n"

@@ -1,0 +1,37 @@
+"""Start of a command: Ctrl-C while its modules are imported, and outputs that are closed or refuse letters."""
+
+import io
+import os
+import signal
+import sys
+import threading
+
+
+def prepare() -> None:
+    """Call before a command's imports, which take a second: Ctrl-C then ends it at once, without a traceback.
+
+    Python raises KeyboardInterrupt inside whatever is being imported, and some packages swallow it. A SIGINT that is
+    ignored, as in the background of a shell, stays ignored.
+    """
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+    open_outputs()
+
+
+def imported() -> None:
+    """Call when all is imported: Ctrl-C raises KeyboardInterrupt again."""
+    if threading.current_thread() is threading.main_thread() and signal.getsignal(signal.SIGINT) is signal.SIG_DFL:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+    open_outputs()
+
+
+def open_outputs() -> None:
+    """Let an output that is closed (`>&-`) lead nowhere, and one that cannot write a letter write its number."""
+    for name in ("stdout", "stderr"):
+        stream = getattr(sys, name)
+        if stream is None:
+            nowhere = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115  (open to the end)
+            setattr(sys, name, nowhere)
+            setattr(sys, f"__{name}__", nowhere)
+        elif isinstance(stream, io.TextIOWrapper) and stream.errors == "strict":
+            stream.reconfigure(errors="backslashreplace")
