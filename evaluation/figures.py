@@ -12,10 +12,11 @@ from PIL import Image
 from evaluation.contact_sheet import contact_sheet
 from evaluation.model_folder import mask_of, picture
 from evaluation.tradeoff import pareto_front
-from records.error_curve import Row
+from records.error_curve import SUBSET, Row, whole_sets
 from records.plain_log_axis import plain_log_axis
 from utils.system_utils import atomic_write
 
+HOLLOW = {"fillstyle": "none", "linewidth": 0.6, "markersize": 4}  # points of subsets
 WIDEST = 480  # largest width, in pixels, of an image on a sheet
 
 
@@ -32,7 +33,8 @@ def draw_curves(path: Path, scene: str, runs: Sequence[dict[str, Any]]) -> bool:
     """Draw test PSNR and 1 - SSIM of a scene's runs against seconds of training; return False if no run has a curve.
 
     Each option set has a colour and each seed a line. With several option sets, the Pareto front of all points is
-    marked. With one, the training views are drawn too, dashed, so that over-fitting shows.
+    marked. With one, the training views are drawn too, dashed, so that over-fitting shows. Points that score a subset
+    of the views are hollow, on a thin line of their own, and in no front.
     """
     from matplotlib.figure import Figure  # imported here because only a report needs it
 
@@ -48,13 +50,18 @@ def draw_curves(path: Path, scene: str, runs: Sequence[dict[str, Any]]) -> bool:
         for run in runs:
             index = configs.index(run["config"])
             first = run is next(other for other in runs if other["config"] == run["config"])
-            points = _points(run["curve"], value, "test")
+            points = _points(whole_sets(run["curve"]), value, "test")
             every += points
             style = {"color": f"C{index % 10}", "linestyle": ("-", "-.", ":")[index // 10 % 3], "linewidth": 1.2}
             axes.plot(*_columns(points), marker=".", label=(run["config"] or "test") if first else None, **style)
-            if len(configs) == 1 and (train := _points(run["curve"], value, "train")):
+            parts = [row for row in run["curve"] if row.get(SUBSET) is not None]
+            if part := _points(parts, value, "test"):
+                label = "a subset of the test views" if run is runs[0] else None
+                axes.plot(*_columns(part), marker="o", label=label, **style | HOLLOW)
+            if len(configs) == 1 and (train := _points(whole_sets(run["curve"]), value, "train")):
                 style |= {"linestyle": "--", "alpha": 0.6}
                 axes.plot(*_columns(train), label="train" if first else None, **style)
+                axes.plot(*_columns(_points(parts, value, "train")), marker="o", **style | HOLLOW)
         if len(configs) > 1:
             front = [every[i] for i in pareto_front([(seconds, sign * number) for seconds, number in every])]
             axes.plot(
@@ -63,7 +70,7 @@ def draw_curves(path: Path, scene: str, runs: Sequence[dict[str, Any]]) -> bool:
             )  # fmt: skip
         axes.set(xscale="log", xlabel="seconds of training, without scoring and saving", ylabel=label)
         plain_log_axis(axes.xaxis)
-        if value is _dissimilarity and all(number > 0 for _, number in every):
+        if value is _dissimilarity and every and all(number > 0 for _, number in every):
             axes.set_yscale("log")
             plain_log_axis(axes.yaxis)
         axes.grid(True, which="both", alpha=0.3)
