@@ -1,10 +1,11 @@
 """Render a trained model's train and test views as PNG beside the ground truth, and time the renders.
 
-python render.py -m MODEL [--iteration N] [--skip_train] [--skip_test]
+python render.py -m MODEL [--iteration N] [--skip_train] [--skip_test] [--depth] [--alpha]
 
 Writes MODEL/{train,test}/ours_N/{renders,gt}/00000.png ..., numbered by the views' sorted order, masks/ for views of
 which not every pixel counts, and render_times.json beside these folders: the time of each view without I/O. The device
-is idle before the clock starts, and done when it stops.
+is idle before the clock starts, and done when it stops. --depth and --alpha write inverse depth and alpha into folders
+of these names, 16-bit PNGs with their scale in a text chunk (utils/files/plane_files.py).
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from __future__ import annotations
 import argparse
 import re
 import time
+from collections.abc import Collection
 from pathlib import Path
 
 import utils.host.openmp  # noqa: F401  isort: skip  (before torch)
@@ -22,10 +24,12 @@ from tqdm import tqdm
 from arguments import ModelParams, OptionParser, PipelineParams, get_combined_args
 from gaussian_renderer.memory_errors import memory_errors_explained
 from gaussian_renderer.scored_views import ScoredViews
+from gaussian_renderer.view_planes import PLANES, view_planes
 from records import render_times
 from scene.cameras import Camera
 from scene.gaussian_model import GaussianModel
 from scene.saved_model import load_saved
+from utils.files.plane_files import write_plane
 from utils.general_utils import safe_state
 from utils.system_utils import UserError, atomic_write, compute_device, mkdir_p, run_cli
 
@@ -49,6 +53,11 @@ def save_mask(mask: torch.Tensor, path: Path) -> None:
         Image.fromarray(mask[0].to(torch.uint8).mul(255).cpu().numpy()).save(temporary)
 
 
+def save_plane(values: torch.Tensor, path: Path, plane: str) -> None:
+    """Write a plane (1, H, W) of PLANES. White is 1 for alpha, and the nearest value of the view for depth."""
+    write_plane(path, values[0].cpu().numpy(), 1.0 if plane == "alpha" else None)
+
+
 def remove_leftovers(folder: Path, count: int) -> None:
     """Delete numbered PNGs beyond the first `count`, which an earlier run with more views has left."""
     for file in folder.glob("*.png"):
@@ -63,10 +72,11 @@ def render_set(
     pipe: argparse.Namespace,
     background: torch.Tensor,
     train_test_exp: bool = False,
+    planes: Collection[str] = (),
 ) -> list[float]:
     """Write renders, ground truth and masks of `views` under `folder`; seconds of rendering per view (without I/O).
 
-    train_test_exp: render with exposures, and write right halves only.
+    train_test_exp: render with exposures, and write right halves only. planes: those of PLANES to write, too.
     """
     scored = ScoredViews(pipe, background, train_test_exp)
     for side in ("renders", "gt"):
@@ -74,6 +84,8 @@ def render_set(
         if views:
             mkdir_p(folder / side)
     remove_leftovers(folder / "masks", 0)  # some views may have none
+    for plane in PLANES:
+        remove_leftovers(folder / plane, len(views) if plane in planes else 0)
     if not views:
         return []
     seconds = []
@@ -88,6 +100,9 @@ def render_set(
         seconds.append(time.perf_counter() - start)
         save_png(scored.part(image), folder / "renders" / f"{index:05d}.png")
         save_png(scored.target(view), folder / "gt" / f"{index:05d}.png")
+        for plane, values in view_planes(view, gaussians, pipe).items() if planes else ():
+            if plane in planes:
+                save_plane(scored.part(values), folder / plane / f"{index:05d}.png", plane)
         if (mask := scored.mask(view)) is not None:
             save_mask(mask, folder / "masks" / f"{index:05d}.png")
     return seconds
@@ -107,6 +122,8 @@ def main() -> None:
     parser.add_argument("--iteration", type=int, default=-1, help="saved iteration to render (-1: the highest)")
     parser.add_argument("--skip_train", action="store_true", help="leave the training views out")
     parser.add_argument("--skip_test", action="store_true", help="leave the test views out")
+    parser.add_argument("--depth", action="store_true", help="also write inverse depth, 16-bit PNGs in depth/")
+    parser.add_argument("--alpha", action="store_true", help="also write alpha, 16-bit PNGs in alpha/")
     parser.add_argument("--quiet", action="store_true", help="print nothing to stdout")
     args = get_combined_args(parser)
     options, pipe = model_params.extract(args), pipeline_params.extract(args)
@@ -118,6 +135,7 @@ def main() -> None:
     if len(gaussians) == 0:
         raise UserError(f"iteration {scene.loaded_iter} of {scene.model_path} has no Gaussians; train it again")
     background = torch.full((3,), 1.0 if options.white_background else 0.0, device=compute_device())
+    planes = [plane for plane in PLANES if getattr(args, plane)]
     for name, skip, views in (
         ("train", args.skip_train, scene.getTrainCameras()),
         ("test", args.skip_test, scene.getTestCameras()),
@@ -127,7 +145,7 @@ def main() -> None:
         folder = Path(scene.model_path) / name / f"ours_{scene.loaded_iter}"
         (folder / render_times.NAME).unlink(missing_ok=True)  # times of an interrupted run do not count
         with memory_errors_explained(gaussians, views):
-            seconds = render_set(folder, views, gaussians, pipe, background, options.train_test_exp)
+            seconds = render_set(folder, views, gaussians, pipe, background, options.train_test_exp, planes)
         if seconds:
             sizes = [(view.image_width, view.image_height) for view in views]
             times = render_times.summarise(seconds, sizes, len(gaussians), pipe.antialiasing, background.device)
