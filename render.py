@@ -1,10 +1,11 @@
 """Render a trained model's train and test views as PNG beside the ground truth, and time the renders.
 
-python render.py -m MODEL [--iteration N] [--skip_train] [--skip_test]
+python render.py -m MODEL [--iteration N] [--skip_train] [--skip_test] [--depth] [--alpha]
 
 Writes MODEL/{train,test}/ours_N/{renders,gt}/00000.png ..., numbered by the views' sorted order, masks/ for views of
 which not every pixel counts, and render_times.json beside these folders: the time of each view without I/O. The device
-is idle before the clock starts, and done when it stops.
+is idle before the clock starts, and done when it stops. --depth and --alpha write inverse depth and alpha into folders
+of these names, 16-bit PNGs with their scale in a text chunk (utils/files/plane_files.py).
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import argparse
 import copy
 import re
 import time
+from collections.abc import Collection
 from pathlib import Path
 
 import utils.host.openmp  # noqa: F401  isort: skip  (before torch)
@@ -26,10 +28,12 @@ from tqdm import tqdm
 from arguments import ModelParams, OptionParser, PipelineParams, get_combined_args
 from gaussian_renderer.memory_errors import memory_errors_explained
 from gaussian_renderer.scored_views import ScoredViews
+from gaussian_renderer.view_planes import PLANES, view_planes
 from records import render_times
 from scene.cameras import Camera
 from scene.gaussian_model import GaussianModel
 from scene.saved_model import load_saved, warn_of_background
+from utils.files.plane_files import write_plane
 from utils.general_utils import safe_state
 from utils.system_utils import UserError, atomic_write, compute_device, mkdir_p, run_cli
 
@@ -53,6 +57,11 @@ def save_mask(mask: torch.Tensor, path: Path) -> None:
         Image.fromarray(mask[0].to(torch.uint8).mul(255).cpu().numpy()).save(temporary)
 
 
+def save_plane(values: torch.Tensor, path: Path, plane: str) -> None:
+    """Write a plane (1, H, W) of PLANES. White is 1 for alpha, and the nearest value of the view for depth."""
+    write_plane(path, values[0].cpu().numpy(), 1.0 if plane == "alpha" else None)
+
+
 def remove_leftovers(folder: Path, count: int) -> None:
     """Delete numbered PNGs beyond the first `count`, which an earlier run with more views has left."""
     for file in folder.glob("*.png"):
@@ -67,10 +76,11 @@ def write_views(
     pipe: argparse.Namespace,
     background: torch.Tensor,
     train_test_exp: bool = False,
+    planes: Collection[str] = (),
 ) -> list[float]:
     """Write renders, ground truth and masks of `views` under `folder`; seconds of rendering per view (without I/O).
 
-    train_test_exp: render with exposures, and write right halves only.
+    train_test_exp: render with exposures, and write right halves only. planes: those of PLANES to write, too.
     """
     scored = ScoredViews(pipe, background, train_test_exp)
     for side in ("renders", "gt"):
@@ -78,6 +88,8 @@ def write_views(
         if views:
             mkdir_p(folder / side)
     remove_leftovers(folder / "masks", 0)  # some views may have none
+    for plane in PLANES:
+        remove_leftovers(folder / plane, len(views) if plane in planes else 0)
     if not views:
         return []
     seconds = []
@@ -92,6 +104,9 @@ def write_views(
         seconds.append(time.perf_counter() - start)
         save_png(scored.part(image), folder / "renders" / f"{index:05d}.png")
         save_png(scored.target(view), folder / "gt" / f"{index:05d}.png")
+        for plane, values in view_planes(view, gaussians, pipe).items() if planes else ():
+            if plane in planes:
+                save_plane(scored.part(values), folder / plane / f"{index:05d}.png", plane)
         if (mask := scored.mask(view)) is not None:
             save_mask(mask, folder / "masks" / f"{index:05d}.png")
     return seconds
@@ -113,16 +128,18 @@ def render_set(
     background: torch.Tensor,
     train_test_exp: bool = False,
     separate_sh: bool = False,
+    *,
+    planes: Collection[str] = (),
 ) -> None:
     """Write renders, ground truth, masks and times of `views` under model_path/name/ours_ITERATION; say how long.
 
     train_test_exp: render with exposures, and write right halves only. separate_sh: accepted for callers of the
-    reference; the SH bands are always passed separately.
+    reference; the SH bands are always passed separately. planes: those of PLANES to write, too.
     """
     folder = Path(model_path) / name / f"ours_{iteration}"
     (folder / render_times.NAME).unlink(missing_ok=True)  # times of an interrupted run do not count
     with memory_errors_explained(gaussians, views):
-        seconds = write_views(folder, views, gaussians, pipeline, background, train_test_exp)
+        seconds = write_views(folder, views, gaussians, pipeline, background, train_test_exp, planes)
     if not seconds:
         print(f"{name}: no views" + ("; the model was trained without --eval" if name == "test" else ""))
         return
@@ -144,10 +161,12 @@ def render_sets(
     separate_sh: bool = False,
     *,
     sh_degree: int | None = None,
+    planes: Collection[str] = (),
 ) -> None:
     """Render the views of a saved iteration, -1: the last one, by `render_set`.
 
-    dataset: the model options. sh_degree: degree that the PLY must have, None: any. UserError if nothing can be loaded.
+    dataset: the model options. sh_degree: degree that the PLY must have, None: any. planes: those of PLANES to write,
+    too. UserError if nothing can be loaded.
     """
     options = copy.copy(dataset)
     options.images_to_load = 1  # each photo is used once
@@ -159,9 +178,9 @@ def render_sets(
     halves = getattr(options, "train_test_exp", False)  # options of 2023 lack it
     drawn = gaussians, pipeline, background, halves, separate_sh
     if not skip_train:
-        render_set(scene.model_path, "train", scene.loaded_iter, scene.getTrainCameras(), *drawn)
+        render_set(scene.model_path, "train", scene.loaded_iter, scene.getTrainCameras(), *drawn, planes=planes)
     if not skip_test:
-        render_set(scene.model_path, "test", scene.loaded_iter, scene.getTestCameras(), *drawn)
+        render_set(scene.model_path, "test", scene.loaded_iter, scene.getTestCameras(), *drawn, planes=planes)
 
 
 def main() -> None:
@@ -172,12 +191,15 @@ def main() -> None:
     parser.add_argument("--iteration", type=int, default=-1, help="saved iteration to render (default: -1, the last)")
     parser.add_argument("--skip_train", action="store_true", help="leave the training views out (default: off)")
     parser.add_argument("--skip_test", action="store_true", help="leave the test views out (default: off)")
+    for plane, what in (("depth", "inverse depth"), ("alpha", "alpha")):
+        parser.add_argument(f"--{plane}", action="store_true", help=f"also write {what}, 16-bit PNGs (default: off)")
     parser.add_argument("--quiet", action="store_true", help="print nothing to stdout (default: off)")
     args = get_combined_args(parser)
     options, pipeline = model_params.extract(args), pipeline_params.extract(args)
     safe_state(args.quiet)
     warn_of_background(options)
-    render_sets(options, args.iteration, pipeline, args.skip_train, args.skip_test, sh_degree=args.typed_sh_degree)
+    chosen = {"sh_degree": args.typed_sh_degree, "planes": [plane for plane in PLANES if getattr(args, plane)]}
+    render_sets(options, args.iteration, pipeline, args.skip_train, args.skip_test, **chosen)
 
 
 if __name__ == "__main__":

@@ -277,15 +277,16 @@ class OptimizationParams(OptionTable):
         Option(
             "keep_unseen",
             False,
-            "also save the Gaussians that no training view depends on. Without this the last save leaves them out: "
-            "training views at their training size stay the same, other views and sizes may change",
+            "also save the Gaussians that nobody sees. Without this the last save leaves out those that no training "
+            "view and no view between neighbouring ones depends on: training views at their training size stay the "
+            "same, views from elsewhere may change",
             "ours",
         ),
         Option(
             "prune_sh",
-            -1.0,
+            0.0,
             "in the last save, drop the highest SH bands that change no colour (0 to 1) by more than this; 0: drop "
-            "bands that are zero, -1: drop none. The sh_degree in cfg_args follows",
+            "bands that are zero throughout, -1: drop none. The sh_degree in cfg_args follows",
             "ours",
             check=_tolerance,
         ),

@@ -101,6 +101,7 @@ def document(report: Mapping[str, Any], figures: Mapping[str, Sequence[Picture]]
         *_published(report),
         *_cheapest(report),
         *_scenes(report, figures),
+        *_closing(report),
         _manifest(report),
     ]
 
@@ -255,6 +256,11 @@ def _scenes(report: Mapping[str, Any], figures: Mapping[str, Sequence[Picture]])
         if blocks:
             sections.append(Section(scene, blocks))
     return sections
+
+
+def _closing(report: Mapping[str, Any]) -> list[Section]:
+    said = [f"{run_title(run)}: {'. '.join(run['lines'])}." for run in report["runs"] if run["lines"]]
+    return [Section("What training said at its end", said)] if said else []
 
 
 def _manifest(report: Mapping[str, Any]) -> Section:

@@ -13,13 +13,14 @@ from evaluation.contact_sheet import contact_sheet
 from evaluation.model_folder import mask_of, picture
 from evaluation.printable import printable
 from evaluation.tradeoff import pareto_front
-from records.error_curve import Row
+from records.error_curve import SUBSET, Row, whole_sets
 from records.plain_log_axis import plain_log_axis
 from utils.system_utils import atomic_write
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+HOLLOW = {"fillstyle": "none", "linewidth": 0.6, "markersize": 4}  # points of subsets
 WIDEST = 480  # largest width, in pixels, of an image on a sheet
 
 
@@ -48,7 +49,8 @@ def draw_curves(path: Path, scene: str, runs: Sequence[dict[str, Any]], peers: S
 
     Each option set has a colour and each seed a line. With several option sets, the Pareto front of all points is
     marked, without runs that stand apart, and a third panel has the gap between training and test views. With one, the
-    training views are drawn too, dashed. peers: curves of other programs, in grey; they are no part of the front.
+    training views are drawn too, dashed. Points that score a subset of the views are hollow, on a thin line of their
+    own, and in no front. peers: curves of other programs, in grey; they are no part of the front.
     """
     from matplotlib.figure import Figure  # imported here because only a report needs it
 
@@ -57,7 +59,7 @@ def draw_curves(path: Path, scene: str, runs: Sequence[dict[str, Any]], peers: S
         return False
     several = len({run["config"] for run in runs}) > 1
     panels = [(_psnr, "PSNR of the test views (dB)", -1), (_dissimilarity, "1 - SSIM of the test views", 1)]
-    if several and any(_points(run["curve"], _gap, "") for run in runs):
+    if several and any(_points(whole_sets(run["curve"]), _gap, "") for run in runs):
         panels.append((_gap, "PSNR of the training views above the test views (dB)", 0))
     figure = Figure(figsize=(6 * len(panels), 4.8), layout="constrained")
     figure.suptitle(f"{printable(scene)}: error against time")
@@ -85,7 +87,8 @@ def _draw_runs(axes: Axes, runs: Sequence[dict[str, Any]], value: Value, several
     for run in runs:
         index = configs.index(run["config"])
         first = run is next(other for other in runs if other["config"] == run["config"])
-        points = _points(run["curve"], value, "test")
+        whole, part = whole_sets(run["curve"]), [row for row in run["curve"] if row.get(SUBSET) is not None]
+        points = _points(whole, value, "test")
         name = run["config"] or ("no option set" if several else "test")
         style = {"color": f"C{index % 10}", "linestyle": STYLES[index // 10 % len(STYLES)], "linewidth": 1.2}
         if run["apart"]:
@@ -93,9 +96,13 @@ def _draw_runs(axes: Axes, runs: Sequence[dict[str, Any]], value: Value, several
         else:
             every += points
         axes.plot(*_columns(points), marker=".", label=name if first else None, **style)
-        if not several and (train := _points(run["curve"], value, "train")):
+        if few := _points(part, value, "test"):
+            label = "a subset of the test views" if run is runs[0] else None
+            axes.plot(*_columns(few), marker="o", label=label, **style | HOLLOW)
+        if not several and (train := _points(whole, value, "train")):
             style |= {"linestyle": "--", "alpha": 0.6}
             axes.plot(*_columns(train), label="train" if first else None, **style)
+            axes.plot(*_columns(_points(part, value, "train")), marker="o", **style | HOLLOW)
     return every
 
 

@@ -82,6 +82,14 @@ def training_seconds(model: Path, iteration: int) -> float | None:
     return seconds.get(iteration)
 
 
+def closing_lines(model: Path) -> list[str]:
+    """Read what train.py said at its end: costs of the curve, what it left out; none if it logged nothing."""
+    try:
+        return [str(line) for line in read_json(model / "train_log.json")[-1].get("lines", [])]
+    except (OSError, IndexError, AttributeError, ValueError, TypeError, KeyError):
+        return []
+
+
 def picture(file: Path) -> Image.Image:
     """Read a render or a ground truth, RGB."""
     try:

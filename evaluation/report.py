@@ -15,6 +15,7 @@ from evaluation.markdown import to_markdown
 from evaluation.published import compare
 from evaluation.summary import dataset_means, summarise
 from evaluation.tradeoff import cheapest
+from records.error_curve import whole_sets
 from utils.files.json_files import write_json
 from utils.system_utils import UserError, atomic_write
 
@@ -62,7 +63,7 @@ def _cheapest(runs: Sequence[dict[str, Any]]) -> dict[str, list[dict[str, Any]]]
         curves: dict[str, list] = {}
         for run in runs:
             if run["scene"] == scene and run["config"] and not run["failure"] and not run["apart"]:
-                curves.setdefault(run["config"], []).append(run["curve"])
+                curves.setdefault(run["config"], []).append(whole_sets(run["curve"]))
         if len(curves) > 1 and (rows := cheapest(curves)):
             found[scene] = rows
     return found

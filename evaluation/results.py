@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from evaluation.model_folder import (
+    closing_lines,
     count_gaussians,
     load_scores,
     picture_size,
@@ -22,7 +23,7 @@ from evaluation.runs import Run
 from evaluation.stages import Failure
 from records.curve_peak import CLEAR
 from records.error_curve import NAME as CURVE
-from records.error_curve import Row, best_test, read_curve
+from records.error_curve import Row, best_test, read_curve, whole_sets
 from scene.readers.info import HOLD
 from utils.files.json_files import read_json
 from utils.system_utils import UserError, saved_iterations
@@ -51,6 +52,7 @@ def read_run(run: Run, output: Path, failure: Failure | None) -> dict[str, Any]:
         "ground_truth_sha256": (record.stage("metrics") or {}).get("ground_truth_sha256"),
         "group": run.scene.group,
         "iterations": {},
+        "lines": closing_lines(run.model),
         "machine": trained.get("machine") or {},
         "model": os.path.relpath(run.model, output),
         "options": known and known["options"],
@@ -144,6 +146,7 @@ def _peak(curve: list[Row], model: Path) -> dict[str, Any] | None:
 
     shorter_ends_there: whether --iterations with that number gives that model.
     """
+    curve = whole_sets(curve)
     best = best_test(curve)
     if best is None or curve[-1]["test_psnr"] is None or best["test_psnr"] - curve[-1]["test_psnr"] < CLEAR:
         return None

@@ -1,19 +1,38 @@
-"""Removal of what a finished model does not need: Gaussians that no training view depends on, needless SH bands."""
+"""Removal of what a finished model does not need: Gaussians that nobody sees, needless SH bands."""
 
 import argparse
+import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import chain
 
 import torch
 from torch import Tensor
 from tqdm import tqdm
 
 from gaussian_renderer import decisive_for
+from gaussian_renderer.between import FRACTIONS, NEAREST, neighbours, views_between
 from gaussian_renderer.scored_views import ScoredViews
-from scene.cameras import Camera
+from scene.cameras import Camera, MiniCam
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.sh_bands import cut_bounds, needed_degree
+
+FAINT = -math.log(254) - 1e-4  # logit of opacity 1/255, below which no pixel draws a Gaussian, less some rounding
+WORTH = 0.01  # share of the Gaussians; fewer unseen ones stay, because leaving them out saves little and is a risk
+ITERATIONS_PER_VIEW = 15  # of training, for each view that the search may look at: some 4 % of the time
+
+KEPT, TOO_LONG, FEW, DONE = "not wanted", "too long", "too few", "done"  # ends of a search
+
+
+@dataclass
+class Search:
+    """What a search for unseen Gaussians found."""
+
+    keep: Tensor  # (N,) bool
+    faint: int = 0  # Gaussians of an opacity below 1/255
+    views: int = 0  # looked at; for TOO_LONG, those that it would have taken
+    end: str = KEPT
 
 
 @dataclass
@@ -21,36 +40,88 @@ class Trimmed:
     """A model without what it does not need, and a record of what was removed."""
 
     gaussians: GaussianModel
-    unseen: int  # Gaussians left out
+    unseen: int  # Gaussians left out, those of `search.faint` included
     cut_bounds: list[float]  # by degree: bound on a colour's change if all SH bands above the degree are cut
     seconds: float  # that the search took
+    search: Search
 
 
-def decisive_for_any(cameras: Sequence[Camera], gaussians: GaussianModel, pipe: argparse.Namespace) -> Tensor:
-    """(N,) bool: the Gaussians that the image of any camera, at its size, depends on; all if there is none."""
+def decisive_for_any(cameras: Sequence[Camera | MiniCam], gaussians: GaussianModel, pipe: argparse.Namespace) -> Tensor:
+    """(N,) bool: the Gaussians that the image of any camera, at its size, depends on."""
     found = torch.zeros(len(gaussians), dtype=torch.bool, device=gaussians.get_xyz.device)
     for camera in tqdm(cameras, desc="Looking for unseen Gaussians", unit="view", leave=False):
         found |= decisive_for(camera, gaussians, pipe)
-    return found if found.any() else ~found  # never an empty model
+    return found
+
+
+def walk(cameras: Sequence[Camera], most: float) -> tuple[list[tuple[int, int]], int]:
+    """Pairs of cameras to walk between, and how many views that makes with the cameras themselves.
+
+    As many neighbours count, up to NEAREST, as need at most `most` views; the fewest, if none do.
+    """
+    pairs, views = [], (1 + len(FRACTIONS)) * len(cameras) - len(FRACTIONS)  # those of the minimum spanning tree
+    for nearest in range(NEAREST, -1, -1) if views <= most else ():
+        pairs = neighbours(cameras, nearest)
+        views = len(cameras) + len(FRACTIONS) * len(pairs)
+        if views <= most:
+            break
+    return pairs, views
+
+
+def search_unseen(
+    gaussians: GaussianModel, cameras: Sequence[Camera], pipe: argparse.Namespace, iterations: int
+) -> Search:
+    """Find the Gaussians that no one sees who walks from camera to camera.
+
+    Those below FAINT are in no image at all. Of the others, those are unseen that neither the cameras nor the views
+    between neighbouring ones depend on (gaussian_renderer/between.py). If they are fewer than WORTH, or if looking
+    takes more than a view for ITERATIONS_PER_VIEW of the `iterations` trained, they are kept.
+    """
+    keep = gaussians.raw("opacity").detach()[:, 0] >= FAINT
+    search = Search(keep, faint=int((~keep).sum()))
+    pairs, search.views = walk(cameras, iterations / ITERATIONS_PER_VIEW)
+    if search.views > iterations / ITERATIONS_PER_VIEW:
+        search.end = TOO_LONG
+        return search
+    seen, search.views = decisive_for_any(cameras, gaussians, pipe), len(cameras)
+    walks = chain.from_iterable(views_between(cameras[i], cameras[j]) for i, j in pairs)
+    for camera in tqdm(walks, desc="Looking between", total=len(FRACTIONS) * len(pairs), unit="view", leave=False):
+        if int((keep & ~seen).sum()) < WORTH * len(gaussians):
+            break
+        seen |= decisive_for(camera, gaussians, pipe)
+        search.views += 1
+    few = int((keep & ~seen).sum()) < WORTH * len(gaussians)
+    search.end = FEW if few else DONE
+    search.keep = keep if few else keep & seen
+    return search
 
 
 def trim(
-    gaussians: GaussianModel, cameras: Sequence[Camera], pipe: argparse.Namespace, keep_unseen: bool, prune_sh: float
+    gaussians: GaussianModel,
+    cameras: Sequence[Camera],
+    pipe: argparse.Namespace,
+    keep_unseen: bool,
+    prune_sh: float,
+    iterations: int,
 ) -> Trimmed:
-    """Leave out what the training views `cameras` do not need. `gaussians` itself does not change.
+    """Leave out what the training views `cameras` and those between them do not need. `gaussians` does not change.
 
     keep_unseen: leave no Gaussian out. prune_sh: by how much cut SH bands may change a colour (in [0, 1]); -1 cuts
-    none. Unless bands are cut, the renders of `cameras` keep every bit.
+    none, 0 those that are zero. iterations: of the training. Unless bands that are not zero are cut, the renders of
+    `cameras` keep every bit.
     """
     start = time.perf_counter()
-    keep = None if keep_unseen else decisive_for_any(cameras, gaussians, pipe)
-    unseen = 0 if keep is None else int((~keep).sum())
+    every = torch.ones(len(gaussians), dtype=torch.bool, device=gaussians.get_xyz.device)
+    search = Search(every) if keep_unseen else search_unseen(gaussians, cameras, pipe, iterations)
+    if not search.keep.any():  # never an empty model
+        search = Search(every, end=FEW)
+    unseen = int((~search.keep).sum())
     rest = gaussians.get_features_rest.detach()
-    bounds = cut_bounds(rest[keep] if unseen else rest)
+    bounds = cut_bounds(rest[search.keep] if unseen else rest)
     degree = gaussians.max_sh_degree if prune_sh < 0 else needed_degree(bounds, prune_sh)
     if unseen or degree < gaussians.max_sh_degree:
-        gaussians = gaussians.part(keep if unseen else slice(None), degree)
-    return Trimmed(gaussians, unseen, bounds, time.perf_counter() - start)
+        gaussians = gaussians.part(search.keep if unseen else slice(None), degree)
+    return Trimmed(gaussians, unseen, bounds, time.perf_counter() - start, search)
 
 
 @torch.no_grad()

@@ -2,7 +2,7 @@
 
 from collections.abc import Container
 
-from records.error_curve import Row, best_test
+from records.error_curve import Row, best_test, whole_sets
 
 CLEAR = 0.1  # dB between best and last point; points of a settled training differed by up to 0.07
 
@@ -17,11 +17,13 @@ def peak_advice(
 ) -> str | None:
     """A line that names the iteration with the best test views; None unless they were clearly worse in the last row.
 
-    saved: iterations whose PLY this training has written. follows_length: `schedules_follow_length`.
+    Rows that score a subset of the views do not count. saved: iterations whose PLY this training has written.
+    follows_length: `schedules_follow_length`.
 
     A PLY is written before its iteration's step, so a saved one is the model that was scored; its exposures are those
     of the last save. A training of fewer --iterations ends with the same model, unless a schedule follows its length.
     """
+    rows = whole_sets(rows)
     best = best_test(rows)
     if best is None or rows[-1]["test_psnr"] is None:
         return None

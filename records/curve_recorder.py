@@ -1,5 +1,6 @@
 """Recorder of a model's error against its run time of training; it changes no bit of the model."""
 
+import random
 import sys
 import time
 from collections.abc import Callable, Container, Sequence
@@ -11,9 +12,9 @@ from tqdm import tqdm
 
 from records.curve_figure import draw_curve
 from records.curve_peak import peak_advice
-from records.curve_schedule import CurveSchedule
-from records.error_curve import COLUMNS, FIGURE, NAME, Row, write_curve
-from records.training_log import TrainingLog
+from records.curve_schedule import CurveSchedule, subset_size
+from records.error_curve import COLUMNS, FIGURE, NAME, SUBSET, Row, write_curve
+from records.training_log import SHORT, TrainingLog
 from utils.host.process import wall_seconds
 from utils.system_utils import UserError
 
@@ -26,12 +27,20 @@ def evenly_spread(views: Sequence[View], count: int) -> list[View]:
     return [views[round(index * (len(views) - 1) / max(count - 1, 1))] for index in range(count)]
 
 
+def drawn(views: Sequence[View], count: int) -> list[View]:
+    """`count` of the views, drawn with a fixed seed and in their order. A larger count has those of a smaller one."""
+    indices = list(range(len(views)))
+    random.Random(0).shuffle(indices)
+    return [views[index] for index in sorted(indices[:count])]
+
+
 class CurveRecorder:
     """Scores views in the iterations of a schedule, keeps the curve's file up to date, and draws it at the end.
 
     rows: those of the runs that this one resumes; `log` has their seconds. iterations: the last one; always: those
-    scored at any cost. views: those to score, by set, "test" and "train". load(view) decodes a view's photo;
-    scores(views) gives their mean scores by name. If the file cannot be written, one warning says so and the next point
+    that score all views, as the last one does; the others score a fixed part of each set (`subset_size`, `drawn`).
+    views: those to score, by set, "test" and "train". load(view) decodes a view's photo; scores(views) gives their mean
+    scores by name. If the file cannot be written, one warning says so and the next point
     tries again: a training is worth more than its curve.
     """
 
@@ -50,9 +59,14 @@ class CurveRecorder:
         self.rows = rows
         self._folder = Path(model_path)
         self._log = log
-        self._count = sum(map(len, views.values()))
-        self._schedule = CurveSchedule(log.first_iteration, iterations, always, self._count)
-        self._views = views
+        tested = len({t for t in always if 0 < t < iterations}) + 1
+        most = max(map(len, views.values()))
+        size = subset_size(iterations, tested, len(views), most)
+        self._views, self._subset = views, {name: drawn(of_set, size) for name, of_set in views.items()}
+        self._size = size if size < most else None
+        self._count, count = (sum(map(len, sets.values())) for sets in (self._views, self._subset))
+        self._schedule = CurveSchedule(log.first_iteration, iterations, always, self._count, count)
+        self._iterations = iterations
         self._load = load
         self._scores = scores
         self._device = device
@@ -77,11 +91,13 @@ class CurveRecorder:
             "wall_seconds": round(self._log.wall_seconds_before + wall_seconds(), 3),
             "gaussians": gaussians,
             "peak_memory_mib": max((peak for peak in peaks if peak is not None), default=None),
+            SUBSET: None if self._schedule.whole(iteration) else self._size,
         }
         if not self._schedule.scorings:
             # Happens once, mostly for photos that training needs soon: no measure of the next scoring's cost.
             self._loading = self._seconds(self._load_all)
-        self._schedule.scored(self._seconds(lambda: self._score(row)))
+        views = self._views if row[SUBSET] is None else self._subset
+        self._schedule.scored(iteration, self._seconds(lambda: self._score(row, views)))
         self.rows.append(row)
         self._writing += self._seconds(self._write)
 
@@ -96,9 +112,9 @@ class CurveRecorder:
             for view in views:
                 self._load(view)
 
-    def _score(self, row: Row) -> None:
-        for name, views in self._views.items():
-            row |= {f"{name}_{score}": round(value, 6) for score, value in self._scores(views).items()}
+    def _score(self, row: Row, views: dict[str, Sequence[View]]) -> None:
+        for name, of_set in views.items():
+            row |= {f"{name}_{score}": round(value, 6) for score, value in self._scores(of_set).items()}
 
     def _write(self) -> None:
         try:
@@ -116,13 +132,6 @@ class CurveRecorder:
         """
         drawing = self._seconds(self._draw)
         scoring, writing = self._schedule.spent, self._writing
-        print(
-            f"Scored {self._count} views at {self._schedule.scorings} iterations in {scoring:.2f} s "
-            f"({100 * scoring / seconds:.1f} % of the training), wrote {NAME} in {writing:.3f} s "
-            f"({100 * writing / seconds:.2f} %), drew it in {drawing:.1f} s"
-        )
-        if advice := peak_advice(self.rows, saved, position_lr_max_steps, follows_length):
-            print(advice)
         self._log.add(
             self.rows[-1]["iteration"],
             seconds,
@@ -130,6 +139,20 @@ class CurveRecorder:
             curve_writing_seconds=round(writing, 4),
             curve_drawing_seconds=round(drawing, 3),
             curve_loading_seconds=round(self._loading, 3),
+        )
+        self._log.tell(self._costs(scoring, writing, drawing, seconds))
+        if advice := peak_advice(self.rows, saved, position_lr_max_steps, follows_length):
+            self._log.tell(advice)
+
+    def _costs(self, scoring: float, writing: float, drawing: float, seconds: float) -> str:
+        share = f"{100 * scoring / seconds:.1f} % of the training"
+        if self._iterations <= SHORT:
+            return f"Curve of {len(self.rows)} points, scored in {scoring:.2f} s ({share})"
+        between = "" if self._size is None else f", {self._size} of each set between --test_iterations"
+        return (
+            f"Scored {self._count} views at {self._schedule.scorings} iterations{between}, "
+            f"in {scoring:.2f} s ({share}), wrote {NAME} in {writing:.3f} s ({100 * writing / seconds:.2f} %), "
+            f"drew it in {drawing:.1f} s"
         )
 
     def _draw(self) -> None:

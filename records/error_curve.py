@@ -5,15 +5,18 @@ import csv
 import math
 import os
 import sys
+from collections.abc import Iterable
 from pathlib import Path
 
 from utils.system_utils import UserError, atomic_write
 
 NAME = "error_vs_time.csv"
 FIGURE = "error_vs_time.png"
-COUNTS = ("iteration", "gaussians")
+SUBSET = "subset"
+COUNTS = ("iteration", "gaussians", SUBSET)
 SCORES = tuple(f"{views}_{score}" for views in ("test", "train") for score in ("l1", "psnr", "ssim"))
-COLUMNS = ("iteration", "seconds", "wall_seconds", "gaussians", "peak_memory_mib", *SCORES)
+COLUMNS = ("iteration", "seconds", "wall_seconds", "gaussians", "peak_memory_mib", *SCORES, SUBSET)
+_HEADERS = (list(COLUMNS), list(COLUMNS[:-1]))  # older files have no subsets
 
 Row = dict[str, float | None]
 
@@ -23,15 +26,15 @@ def read_curve(path: str | os.PathLike) -> list[Row]:
 
     seconds: of training, without evaluation and saving, over all resumed parts. wall_seconds: since the start of the
     process, with those of earlier parts. peak_memory_mib: the most of all parts so far, of the GPU if it trains.
-    `<views>_l1`, `<views>_psnr` (dB), `<views>_ssim`: gaussian_renderer/scored_views.py. UserError if the file is
-    missing or damaged.
+    `<views>_l1`, `<views>_psnr` (dB), `<views>_ssim`: gaussian_renderer/scored_views.py. subset: number of views of
+    each set that were scored, the same ones in all such rows; None: all. UserError if the file is missing or damaged.
     """
     try:
         with open(path, encoding="utf-8", newline="") as file:
             lines = list(csv.reader(file, strict=True))
-        if not lines or lines[0] != list(COLUMNS):
+        if not lines or lines[0] not in _HEADERS:
             raise ValueError("its columns are different")
-        rows = [_row(line) for line in lines[1:]]
+        rows = [_row(lines[0], line) for line in lines[1:]]
         iterations = [row["iteration"] for row in rows]
         if iterations != sorted(set(iterations)):
             raise ValueError("its iterations do not ascend")
@@ -42,9 +45,9 @@ def read_curve(path: str | os.PathLike) -> list[Row]:
     return rows
 
 
-def _row(fields: list[str]) -> Row:
-    row: Row = {}
-    for name, field in zip(COLUMNS, fields, strict=True):
+def _row(names: list[str], fields: list[str]) -> Row:
+    row: Row = {SUBSET: None}
+    for name, field in zip(names, fields, strict=True):
         value = None if field == "" else int(field) if name in COUNTS else float(field)
         if value is None and name in ("iteration", "seconds"):
             raise ValueError(f"a row without {name}")
@@ -90,7 +93,12 @@ def continue_curve(
     return rows
 
 
-def best_test(rows: list[Row]) -> Row | None:
-    """The row with the highest PSNR of the test views, the first of equals; None if no row has one."""
-    scored = [row for row in rows if row["test_psnr"] is not None]
+def whole_sets(rows: Iterable[Row]) -> list[Row]:
+    """The rows that score whole sets. Only these compare with scores of other places, and with each other's best."""
+    return [row for row in rows if row.get(SUBSET) is None]
+
+
+def best_test(rows: Iterable[Row]) -> Row | None:
+    """The whole-set row with the highest PSNR of the test views, the first of equals; None if no row has one."""
+    scored = [row for row in whole_sets(rows) if row["test_psnr"] is not None]
     return max(scored, key=lambda row: row["test_psnr"], default=None)

@@ -13,6 +13,7 @@ from utils.host.process import peak_memory_mib, wall_seconds
 from utils.system_utils import compute_device
 
 NAME = "train_log.json"
+SHORT = 2000  # iterations; after trainings up to this length, what training says at its end is short
 _FINITE = ("loss", "peak_memory_mib", "wall_seconds")  # if present
 
 
@@ -41,7 +42,8 @@ class TrainingLog:
     A record has `iteration`; `seconds` of training, without evaluation and saving; `wall_seconds` since the process
     started; `peak_memory_mib`, the most so far; `gaussians`; `loss`, a running mean; and for each set tested
     `<set>_l1`, `<set>_psnr`. Seconds and memory include the runs that were resumed. The last record also has
-    `gaussians_left_out`, those that the last save does not have, and the costs of the curve (curve_recorder.py).
+    `gaussians_left_out`, those that the last save does not have, the costs of the curve (curve_recorder.py), and
+    `lines`, what training said at its end.
 
     first_iteration, seconds_before, wall_seconds_before: done by the runs that this one resumes.
     """
@@ -96,6 +98,13 @@ class TrainingLog:
             record = before | record | {"seconds": max(before["seconds"], record["seconds"])}
         self.records.append(record)
         write_json(self._path, self.records)
+
+    def tell(self, *lines: str) -> None:
+        """Print lines about the finished training, and keep them as `lines` of the last record, for reports."""
+        print(*lines, sep="\n")
+        if self.records:
+            self.records[-1].setdefault("lines", []).extend(lines)
+            write_json(self._path, self.records)
 
 
 def _read(path: Path) -> list[dict]:

@@ -70,7 +70,7 @@ OURS = {
     "images_to_load": 0,
     "max_num_splats": 0,
     "keep_unseen": False,
-    "prune_sh": -1.0,
+    "prune_sh": 0.0,
     "seed": 0,
 }
 

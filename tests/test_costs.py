@@ -12,9 +12,9 @@ import torch
 from rasterizer_tools import CPU_AND_GPU, ops
 
 from benchmarks.costs.allocations import allocated_bytes
-from benchmarks.costs.measure import BEGIN, END, replace_tables
 from benchmarks.costs.paired import difference, interleaved, median_interval
 from benchmarks.costs.rows import ROWS, Row, Workload
+from benchmarks.harness.page import BEGIN, END, replace_tables
 
 ROOT = Path(__file__).parents[1]
 CPU = torch.device("cpu")

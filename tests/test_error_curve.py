@@ -24,9 +24,9 @@ import train
 from gaussian_renderer.scored_views import ScoredViews, mean_scores
 from records.curve_figure import draw_curve
 from records.curve_peak import peak_advice, schedules_follow_length
-from records.curve_recorder import CurveRecorder, evenly_spread
-from records.curve_schedule import CurveSchedule
-from records.error_curve import COLUMNS, Row, best_test, continue_curve, read_curve, write_curve
+from records.curve_recorder import CurveRecorder, drawn, evenly_spread
+from records.curve_schedule import CurveSchedule, subset_size
+from records.error_curve import COLUMNS, Row, best_test, continue_curve, read_curve, whole_sets, write_curve
 from records.training_log import TrainingLog
 from training import objective
 from utils.host import process
@@ -36,8 +36,9 @@ from utils.system_utils import UserError
 ROOT = Path(__file__).parents[1]
 HEADER = (
     "iteration,seconds,wall_seconds,gaussians,peak_memory_mib,"
-    "test_l1,test_psnr,test_ssim,train_l1,train_psnr,train_ssim\n"
+    "test_l1,test_psnr,test_ssim,train_l1,train_psnr,train_ssim,subset\n"
 )
+OLD = HEADER.replace(",subset", "")  # of files without subsets
 
 
 @pytest.fixture(autouse=True)
@@ -68,7 +69,7 @@ class TestFile:
         write_curve(path, rows)
         assert (
             path.read_text()
-            == HEADER + "3,0.3,0.3333333333333333,7,,,20.25,,,,\n5,0.5,0.5555555555555556,,,0.125,,,,,\n"
+            == HEADER + "3,0.3,0.3333333333333333,7,,,20.25,,,,,\n5,0.5,0.5555555555555556,,,0.125,,,,,,\n"
         )
         assert read_curve(path) == [_row(3, 20.25, None, gaussians=7), _row(5, None, test_l1=0.125)]
         with path.open(newline="") as file:
@@ -80,11 +81,13 @@ class TestFile:
             b"",
             b"iteration,seconds\n1,2\n",
             HEADER.encode() + b"3,0.3\n",
-            HEADER.encode() + b"x,0.3,,,,,,,,,\n",
-            HEADER.encode() + b"3,,,,,,,,,,\n",
-            HEADER.encode() + b",0.3,,,,,,,,,\n",
-            HEADER.encode() + b"3,0.3,,,,,nan,,,,\n",
-            HEADER.encode() + b"3,0.3,,,,,,,,,\n3,0.4,,,,,,,,,\n",
+            HEADER.encode() + b"x,0.3,,,,,,,,,,\n",
+            HEADER.encode() + b"3,,,,,,,,,,,\n",
+            HEADER.encode() + b",0.3,,,,,,,,,,\n",
+            HEADER.encode() + b"3,0.3,,,,,nan,,,,,\n",
+            HEADER.encode() + b"3,0.3,,,,,,,,,,1.5\n",
+            HEADER.encode() + b"3,0.3,,,,,,,,,\n",  # a line of an older file
+            HEADER.encode() + b"3,0.3,,,,,,,,,,\n3,0.4,,,,,,,,,,\n",
             b"\xff\xfe\x00",
         ],
     )
@@ -96,6 +99,14 @@ class TestFile:
         assert continue_curve(tmp_path, 5) == []
         assert re.fullmatch(r"warning: .*error_vs_time.csv cannot be read .*\n", capsys.readouterr().err)
         assert not path.exists()
+
+    def test_files_without_subsets_are_read_and_continued(self, tmp_path):
+        path = tmp_path / "error_vs_time.csv"
+        path.write_text(OLD + "3,0.3,0.4,7,,,20.25,,,,\n5,0.5,0.6,7,,,21.25,,,,\n")
+        wanted = [_row(3, 20.25, gaussians=7, wall_seconds=0.4), _row(5, 21.25, gaussians=7, wall_seconds=0.6)]
+        assert read_curve(path) == wanted and whole_sets(wanted) == wanted
+        assert continue_curve(tmp_path, 4) == wanted[:1]
+        assert path.read_text() == HEADER + "3,0.3,0.4,7,,,20.25,,,,,\n"
 
     def test_absent(self, tmp_path):
         with pytest.raises(UserError, match="--eval"):
@@ -120,53 +131,66 @@ def _simulate(schedule: CurveSchedule, first: int, last: int, pace, cost) -> tup
         seconds += pace(iteration)
         if schedule.due(iteration, seconds):
             points.append(iteration)
-            schedule.scored(cost(iteration))
+            schedule.scored(iteration, cost(iteration, schedule.whole(iteration)))
     return points, schedule.spent, seconds
 
 
 class TestSchedule:
     def test_cheap_points_are_evenly_spaced_in_log_time(self):
-        points, _, _ = _simulate(CurveSchedule(0, 30_000, [], 1), 0, 30_000, lambda t: 1.0, lambda t: 1e-4)
+        points, _, _ = _simulate(CurveSchedule(0, 30_000, [], 1, 1), 0, 30_000, lambda t: 1.0, lambda *_: 1e-4)
         assert points[0] == round(30_000 / 256) and points[-1] == 30_000 and len(points) == 33
         # Iterations are whole numbers, so a ratio can be off by 1 / 117.
         np.testing.assert_allclose(np.divide(points[1:], points[:-1]), 2**0.25, rtol=1 / 117)
 
-    @pytest.mark.parametrize("views", [2, 14, 50, 400])
+    @pytest.mark.parametrize("views", [1, 2, 7, 25, 200])
     @pytest.mark.parametrize("growth", [-0.75, 0.0, 1.0, 30.0])
-    @pytest.mark.parametrize("iterations", [2000, 30_000])
-    def test_scoring_stays_under_five_percent(self, views, growth, iterations):
+    @pytest.mark.parametrize("iterations", [200, 600, 2000, 30_000])
+    def test_twelve_points_within_five_percent(self, views, growth, iterations):
+        """views: of a set. The whole sets at the end, and a view of each set between, are taken at any cost."""
+
         def pace(t: int) -> float:  # models grow, most of it in the first half; from random points they shrink
             return 0.01 * (1 + growth * min(1.0, 2 * t / iterations))
 
-        def cost(t: int) -> float:  # of a view 0.46 iterations, as measured on a CPU
-            return 0.46 * views * pace(t)
+        size = subset_size(iterations, 1, 2, views)
+        assert 1 <= size <= views
 
-        points, spent, seconds = _simulate(CurveSchedule(0, iterations, [], views), 0, iterations, pace, cost)
-        assert points[-1] == iterations
-        if cost(iterations) < 0.025 * seconds:
-            assert len(points) > 1
-            assert spent < 0.05 * seconds
-            assert spent > 0.01 * seconds or len(points) == 33  # and the budget is used
+        def cost(t: int, whole: bool) -> float:  # of a view 0.46 iterations, as measured on a CPU
+            return 0.46 * 2 * (views if whole else size) * pace(t)
+
+        schedule = CurveSchedule(0, iterations, [], 2 * views, 2 * size)
+        points, spent, seconds = _simulate(schedule, 0, iterations, pace, cost)
+        assert points[-1] == iterations and len(points) >= 12
         assert set(points) <= {round(iterations * 2 ** (-k / 4)) for k in range(33)}
+        sure = {round(iterations * 2 ** (-k / 2)) for k in range(1, 13)}
+        least = cost(iterations, True) + sum(0.46 * 2 * pace(t) for t in sure)
+        assert spent < max(0.05 * seconds, 1.05 * least)
+
+    def test_the_subset_takes_what_the_budget_leaves(self):
+        assert subset_size(30_000, 3, 2, 25) == 25  # all: every point is whole
+        assert subset_size(2000, 1, 2, 25) == 2
+        assert subset_size(2000, 1, 2, 3) == 3
+        assert subset_size(600, 1, 2, 25) == subset_size(1, 1, 2, 25) == 1
+        assert subset_size(12_000, 1, 2, 200) == 13
 
     def test_a_dear_first_scoring_does_not_end_the_curve(self):
-        schedule = CurveSchedule(0, 2000, [], 14)
-        points, spent, seconds = _simulate(schedule, 0, 2000, lambda t: 0.01, lambda t: 0.4 if t < 20 else 0.06)
-        assert len(points) > 5
-        assert spent < 0.05 * seconds
+        schedule = CurveSchedule(0, 2000, [], 14, 14)
+        points, _, _ = _simulate(schedule, 0, 2000, lambda t: 0.01, lambda t, _: 0.4 if t < 20 else 0.02)
+        assert len(points) > 13
 
     def test_what_must_be_scored_is(self):
         always = [-1, 7, 90, 3000]
-        points, _, _ = _simulate(CurveSchedule(0, 100, always, 10_000), 0, 100, lambda t: 1.0, lambda t: 5000.0)
-        assert points == [7, 90, 100]
-        points, _, _ = _simulate(CurveSchedule(50, 100, always, 10_000), 50, 100, lambda t: 1.0, lambda t: 5000.0)
-        assert points == [90, 100]
-        points, _, _ = _simulate(CurveSchedule(0, 1, [-1], 2), 0, 1, lambda t: 1.0, lambda t: 1.0)
+        for last, sure in ((100, []), (400, [6, 9, 12, 18, 25, 35, 50, 71, 100, 141, 200, 283])):
+            for first in (0, 50):
+                schedule = CurveSchedule(first, last, always, 10_000, 2)
+                points, _, _ = _simulate(schedule, first, last, lambda t: 1.0, lambda *_: 5000.0)
+                assert points == [t for t in sorted([*sure, 7, 90, last]) if t > first]
+                assert [t for t in points if schedule.whole(t)] == [t for t in (7, 90, last) if t > first]
+        points, _, _ = _simulate(CurveSchedule(0, 1, [-1], 2, 2), 0, 1, lambda t: 1.0, lambda *_: 1.0)
         assert points == [1]
 
     def test_a_resumed_run_has_the_points_ahead(self):
-        whole, _, _ = _simulate(CurveSchedule(0, 1000, [], 1), 0, 1000, lambda t: 1.0, lambda t: 1e-4)
-        resumed, _, _ = _simulate(CurveSchedule(400, 1000, [], 1), 400, 1000, lambda t: 1.0, lambda t: 1e-4)
+        whole, _, _ = _simulate(CurveSchedule(0, 1000, [], 1, 1), 0, 1000, lambda t: 1.0, lambda *_: 1e-4)
+        resumed, _, _ = _simulate(CurveSchedule(400, 1000, [], 1, 1), 400, 1000, lambda t: 1.0, lambda *_: 1e-4)
         assert resumed == [t for t in whole if t > 400]
 
 
@@ -243,6 +267,30 @@ class TestScores:
         scores = scored.scores(views, None)
         assert scores["l1"] == pytest.approx(0.1) and scores["psnr"] == pytest.approx(20.0, abs=1e-4)
 
+    def test_between_a_fixed_part_of_each_set_is_scored(self, tmp_path):
+        seen = []
+
+        def scores(views: list[int]) -> dict[str, float]:
+            seen.append(views)
+            return {"psnr": 20.0}
+
+        views = {"test": list(range(25)), "train": list(range(100, 125))}
+        recorder = CurveRecorder(tmp_path, [], TrainingLog(tmp_path, 0), 2000, [500], views, lambda view: None, scores,
+                                 torch.device("cpu"))  # fmt: skip
+        for iteration in (250, 500, 1000, 2000):
+            recorder.add(iteration, iteration / 10, 5)
+        assert [row["subset"] for row in recorder.rows] == [1, None, 1, None]
+        assert seen[0] == seen[4] and seen[1] == seen[5] == [100 + view for view in seen[0]]
+        assert [len(views) for views in seen] == [1, 1, 25, 25] * 2
+        assert read_curve(tmp_path / "error_vs_time.csv") == recorder.rows
+
+    def test_a_part_is_drawn_by_a_seed_of_its_own(self):
+        torch.manual_seed(1)
+        few = drawn(list("abcdefghijklmnop"), 3)
+        assert few == drawn(list("abcdefghijklmnop"), 3) == sorted(few) != list("abc")
+        assert set(few) < set(drawn(list("abcdefghijklmnop"), 9))
+        assert drawn([1, 2], 5) == [1, 2] and drawn([], 5) == []
+
     def test_views_are_evenly_spread(self):
         assert evenly_spread(range(9), 3) == [0, 4, 8]
         assert evenly_spread(range(9), 1) == [0]
@@ -276,6 +324,12 @@ class TestPeak:
         assert "ends with that model" not in line
         assert "; --save_iterations 2000 saves that model during the training; --iterations 2000 --position_lr" in line
 
+    def test_a_subset_is_no_peak_and_no_end(self):
+        rows = [_row(500, 18.0), _row(1000, 30.0, subset=2), *self.ROWS[1:], _row(7001, 10.0, subset=2)]
+        assert peak_advice(rows, {7000}, 30_000) == peak_advice(list(self.ROWS), {7000}, 30_000)
+        assert best_test(rows)["iteration"] == 2000 and len(whole_sets(rows)) == 4
+        assert best_test([_row(1000, 30.0, subset=2)]) is None
+
     def test_no_peak_no_advice(self):
         assert peak_advice(list(self.ROWS[:2]), (), 30_000) is None
         assert peak_advice([_row(5, 20.09), _row(7, 20.0)], (), 30_000) is None
@@ -293,6 +347,8 @@ class TestPeak:
             "--densify_grad_threshold",
             1e-5,
             "--no_curve",
+            "--prune_sh",
+            -1,
         ]
         _train(colmap_scene, tmp_path / "long", *options, "--save_iterations", 20, iterations=40)
         short = _train(colmap_scene, tmp_path / "short", *options, iterations=20)
@@ -320,6 +376,19 @@ class TestFigure:
         legends = [text.get_text() for axes in (upper, lower) for text in axes.get_legend().get_texts()]
         assert "gap, 6 dB at the end" in legends and "gap, 0.125 at the end" in legends
 
+    def test_subsets_are_hollow_on_a_line_of_their_own(self, tmp_path, monkeypatch):
+        figures = []
+        plain = Figure.savefig
+        monkeypatch.setattr(Figure, "savefig", lambda self, *a, **k: (figures.append(self), plain(self, *a, **k)))
+        part = {"subset": 4, "test_ssim": 0.5, "train_ssim": 0.5}
+        rows = [_row(10, 30.0, 31.0, **part), _row(20, 12.0, 13.0, **part), _row(40, 14.0, 20.0)]
+        draw_curve(tmp_path / "error_vs_time.png", rows, "")
+        lines = {line.get_label(): line for line in figures[0].axes[0].lines}
+        assert lines["test views, 4 of them"].get_xydata().tolist() == [[1, 30], [2, 12]]
+        assert lines["test views"].get_xydata().tolist() == [[4, 14]]
+        assert lines["test views, 4 of them"].get_fillstyle() == "none" != lines["test views"].get_fillstyle()
+        assert lines["best test: 14.00 dB, iteration 40"].get_xydata().tolist() == [[4, 14]]
+
     @pytest.mark.parametrize(
         "rows", [[], [_row(1, None)], [_row(1, 5.0)], [_row(1, 5.0, test_ssim=1.0, train_ssim=1.0)]]
     )
@@ -334,7 +403,9 @@ class TestTraining:
         options = ["--densify_from_iter", 10, "--densification_interval", 20, "--densify_grad_threshold", 1e-5,
                    "--opacity_reset_interval", 45, "--random_background", "--images_to_load", 3]  # fmt: skip
         with_curve = _train(colmap_scene, tmp_path / "with", *options, "--test_iterations", 9, 30, iterations=80)
-        assert re.search(r"^Scored 6 views at \d+ iterations in", capfd.readouterr().out, re.MULTILINE)
+        said = capfd.readouterr().out
+        line = re.search(r"^Curve of (\d+) points, scored in [\d.]+ s \([\d.]+ % of the training\)", said, re.MULTILINE)
+        assert int(line[1]) == len(_iterations(tmp_path / "with"))
         without = _train(colmap_scene, tmp_path / "without", *options, "--no_curve", iterations=80)
         assert with_curve == without
         assert len(PlyData.read(tmp_path / "with/point_cloud/iteration_80/point_cloud.ply")["vertex"]) > 300
@@ -345,6 +416,18 @@ class TestTraining:
         for part in ("scoring", "writing", "drawing"):
             assert costs[f"curve_{part}_seconds"] > 0
         assert costs["curve_loading_seconds"] >= 0  # for a few tiny photos it may round to 0
+
+    def test_two_hundred_iterations_have_twelve_points(self, colmap_scene, tmp_path, monkeypatch, capfd):
+        monkeypatch.setattr("records.curve_recorder.SHORT", 0)
+        _train(colmap_scene, tmp_path / "out", "--test_iterations", 90, iterations=200)
+        rows = read_curve(tmp_path / "out" / "error_vs_time.csv")
+        assert len(rows) >= 12
+        assert [row["iteration"] for row in whole_sets(rows)] == [90, 200]
+        assert {row["subset"] for row in rows} == {1, None}
+        said = re.search(r"^Scored 6 views at \d+ iterations, 1 of each set between --test_iterations, in .*", 
+                         capfd.readouterr().out, re.MULTILINE)  # fmt: skip
+        log = json.loads((tmp_path / "out" / "train_log.json").read_text())
+        assert said[0].startswith(log[-1]["lines"][0])
 
     def test_a_row_tells_of_the_model_saved_at_its_iteration(self, colmap_scene, tmp_path, monkeypatch):
         out = tmp_path / "out"

@@ -9,6 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from evaluation import published
+from evaluation.report import _cheapest
+from evaluation.results import _peak
 from evaluation.results_page import BEGIN, END, replace_results, results_text
 from evaluation.scenes import DATASETS
 from evaluation.summary import QUANTITIES, spread, summarise
@@ -66,6 +68,20 @@ def test_cheapest_wants_every_seed_and_takes_the_mean():
     assert rows[28.0]["seconds"]["value"] == pytest.approx((2 ** (8 / 9) + 30) / 2)
     assert rows[28.0]["seconds"]["std"] == pytest.approx((30 - 2 ** (8 / 9)) / 2**0.5)
     assert rows[28.0]["gaussians"] == {"all": {"slow": 60, "fast": 90}, "config": "slow", "std": 0.0, "value": 60}
+
+
+def test_subsets_are_in_no_table_and_no_peak(tmp_path):
+    part = [row | {"subset": 2} for row in curve((1, 35, 10), (2, 36, 10))]
+    whole = [row | {"iteration": row["iteration"] + 2} for row in curve((3, 20, 10), (4, 20.05, 10))]
+    rising = [*curve((2.5, 18, 10)), *whole]
+    runs = [{"scene": "s", "config": name, "failure": None, "curve": part + rising} for name in ("a", "b")]
+    assert max(row["psnr"] for row in _cheapest(runs)["s"]) == 20.0
+    late = [row | {"iteration": 9, "subset": 2, "test_psnr": 1.0} for row in part[:1]]
+    assert _peak(part + whole + late, tmp_path) is None
+    assert _peak(part + whole[::-1], tmp_path) is None  # 0.05 dB is not clear
+    assert _peak(part, tmp_path) is None
+    lost = [*whole, whole[0] | {"iteration": 8, "test_psnr": 19.0}]
+    assert _peak(part + lost, tmp_path)["iteration"] == 4
 
 
 def test_cheapest_of_nothing():

@@ -48,7 +48,7 @@ LAST = "point_cloud/iteration_600/point_cloud.ply"
 OPTIONS = [
     "-r", WIDTH, "--iterations", 600, "--test_iterations", -1, "--save_iterations", 1, "--checkpoint_iterations", 300,
     "--densify_from_iter", 100, "--densification_interval", 50, "--densify_until_iter", 400, "--max_num_splats", 500,
-    "--densify_grad_threshold", 1e-4, "--opacity_reset_interval", 220,
+    "--densify_grad_threshold", 1e-4, "--opacity_reset_interval", 220, "--prune_sh", -1,
 ]  # fmt: skip
 
 # The program that runs in the copy: training, resuming, reading and writing a PLY, rendering, and two refusals.

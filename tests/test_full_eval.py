@@ -388,6 +388,40 @@ def test_the_legend_leaves_the_pareto_front_free(tmp_path, monkeypatch):
         assert not drawn.intersects_bbox(axes.get_legend().get_window_extent(), filled=False)
 
 
+def test_points_of_subsets_are_hollow_and_in_no_front(tmp_path, monkeypatch):
+    figures, plain = [], Figure.savefig
+    monkeypatch.setattr(Figure, "savefig", lambda self, *a, **k: (figures.append(self), plain(self, *a, **k)))
+    names = ("seconds", "test_psnr", "test_ssim", "train_psnr", "train_ssim", "subset")
+    rows = [(0.3, 35.0, 0.9, 36.0, 0.9, 2), (1.0, 36.0, 0.95, 37.0, 0.9, 2), (2.0, 20.0, 0.8, 21.0, 0.8, None)]
+    curve = [dict(zip(names, row, strict=True)) for row in rows]
+    unfinished = curve[:2]
+    for runs in (
+        [{"config": None, "curve": curve}],
+        [{"config": "a", "curve": curve}, {"config": "b", "curve": unfinished}],
+    ):
+        assert draw_curves(tmp_path / "curves.png", "attic", runs)
+        lines = figures[-1].axes[0].lines
+        hollow = [line.get_xydata().tolist() for line in lines if line.get_fillstyle() == "none"]
+        assert [[0.3, 35.0], [1.0, 36.0]] in hollow
+        assert [[2.0, 20.0]] in [line.get_xydata().tolist() for line in lines if line.get_fillstyle() == "full"]
+        if len(runs) == 1:
+            assert [[0.3, 36.0], [1.0, 37.0]] in hollow  # the training views
+    (front,) = (line for line in lines if line.get_label() == "Pareto front")
+    assert front.get_xydata().tolist() == [[2.0, 20.0]]
+
+
+def test_the_report_repeats_what_training_said_at_its_end(scenes, tmp_path):
+    words = ("--scenes", scenes / "attic", "--output_path", tmp_path / "out", "--iterations", 40)
+    assert run(*words)["runs"][0]["lines"] == []
+    log = tmp_path / "out" / "attic" / "train_log.json"
+    records = json.loads(log.read_text())
+    records[-1]["lines"] = ["Curve of 14 points", "Saved 9 of 10 Gaussians"]
+    log.write_text(json.dumps(records))
+    assert run(*words)["runs"][0]["lines"] == ["Curve of 14 points", "Saved 9 of 10 Gaussians"]
+    for name in ("report.md", "report.html"):
+        assert "attic: Curve of 14 points. Saved 9 of 10 Gaussians." in (tmp_path / "out" / name).read_text()
+
+
 def test_seeds_and_option_sets(figures, scenes, tmp_path, capsys, monkeypatch):
     out, configs = tmp_path / "out", tmp_path / "configs.json"
     configs.write_text('{"base": [], "sh1": ["--sh_degree", 1]}')

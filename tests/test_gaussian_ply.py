@@ -92,10 +92,22 @@ def test_an_empty_model_round_trips(tmp_path):
     assert len(_loaded(tmp_path / "none.ply", 1)) == 0
 
 
+def test_bands_that_the_file_lacks_are_zero(tmp_path):
+    """As the last save writes it of a model whose bands are zero: a program that wants degree 3 gets the same model."""
+    for degree in (0, 1, 2):
+        gaussians = model(5, degree=degree)
+        gaussians.save_ply(tmp_path / "low.ply")
+        again = _loaded(tmp_path / "low.ply", 3)
+        count = (degree + 1) ** 2
+        assert again.active_sh_degree == 3 and again._features_rest.shape == (5, 15, 3)
+        torch.testing.assert_close(again.get_features[:, :count], gaussians.get_features, rtol=0, atol=0)
+        assert not again.get_features[:, count:].any()
+
+
 def test_refusals(tmp_path):
     model(5, degree=2).save_ply(tmp_path / "two.ply")
-    with pytest.raises(UserError, match="SH degree 2.*SH degree 3 needs 45.*--sh_degree"):
-        _loaded(tmp_path / "two.ply")
+    with pytest.raises(UserError, match="SH degree 2.*SH degree 1 needs 9.*--sh_degree"):
+        _loaded(tmp_path / "two.ply", 1)
     points = np.zeros(4, dtype=[(name, "f4") for name in "xyz"])
     PlyData([PlyElement.describe(points, "vertex")]).write(tmp_path / "points.ply")
     with pytest.raises(UserError, match="f_dc_0, f_dc_1, f_dc_2, opacity, scale_0.*rot_3"):

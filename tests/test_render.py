@@ -1,18 +1,28 @@
 """render.py: its files for a view, and its timing; test_end_to_end.py tests the whole command."""
 
+import argparse
 import json
+import math
+import sys
 from argparse import ArgumentParser, Namespace
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
+from diff_gaussian_rasterization import GaussianRasterizationSettings, rasterize
+from gaussians import model
 from PIL import Image
 
 from arguments import ModelParams, PipelineParams
 from records import render_times
+from scene.cameras import Camera
+from scene.gaussian_model import GaussianModel
 from scene.gaussians.attributes import attributes
 from scene.gaussians.ply import write_ply
+from scene.saved_model import load_saved
+from utils.files.plane_files import read_plane, write_plane
 from utils.system_utils import UserError
 
 render = pytest.importorskip("render", reason="the extensions are not built: make test")
@@ -219,3 +229,89 @@ def test_help_says_what_happens_without_an_option(monkeypatch, capsys):
     }.items():
         _, _, after = text.partition(f" {option} ")[2].partition("(default: ")
         assert after.startswith(f"{default})"), option
+
+
+def _saved(tmp_path, colmap_scene) -> tuple[Path, GaussianModel]:
+    """A folder with a model of large and small Gaussians, and the model."""
+    gaussians = model(60, seed=3)
+    gaussians.save_ply(str(tmp_path / "model" / "point_cloud" / "iteration_7" / "point_cloud.ply"))
+    (tmp_path / "model" / "cfg_args").write_text(
+        f"Namespace(sh_degree=3, source_path={str(colmap_scene)!r}, eval=True)"
+    )
+    return tmp_path / "model", gaussians
+
+
+def _rasterized(view: Camera, gaussians: GaussianModel) -> dict[str, np.ndarray]:
+    """Inverse depth and alpha of a view, straight from the rasterizer."""
+    settings = GaussianRasterizationSettings(
+        view.image_height, view.image_width, math.tan(view.FoVx / 2), math.tan(view.FoVy / 2), torch.zeros(3), 1.0,
+        view.world_view_transform, view.full_proj_transform, 3, view.camera_center, False, False, False,
+    )  # fmt: skip
+    with torch.no_grad():
+        drawn = rasterize(
+            gaussians.get_xyz, torch.zeros_like(gaussians.get_xyz), gaussians.get_opacity, settings,
+            scales=gaussians.get_scaling, rotations=gaussians.get_rotation, sh_dc=gaussians.get_features_dc,
+            sh_rest=gaussians.get_features_rest, want_inverse_depth=True, want_transmittance=True,
+        )  # fmt: skip
+    return {"depth": drawn.inverse_depth[0].numpy(), "alpha": 1 - drawn.transmittance[0].numpy()}
+
+
+def test_depth_and_alpha_are_read_back_as_the_rasterizer_drew_them(tmp_path, colmap_scene, monkeypatch):
+    folder, gaussians = _saved(tmp_path, colmap_scene)
+    monkeypatch.setattr("sys.argv", ["render.py", "-m", str(folder), "--depth", "--alpha", "--quiet"])
+    monkeypatch.setattr("sys.stdout", sys.stdout)
+    render.main()
+    options = argparse.Namespace(source_path=str(colmap_scene), model_path=str(folder), eval=True)
+    options = ModelParams(argparse.ArgumentParser()).extract(options)
+    scene = load_saved(options, 7)
+    for name, views in (("train", scene.getTrainCameras()), ("test", scene.getTestCameras())):
+        for index, view in enumerate(views):
+            for plane, wanted in _rasterized(view, gaussians).items():
+                file = folder / name / "ours_7" / plane / f"{index:05d}.png"
+                with Image.open(file) as image:
+                    assert image.mode == "I;16" and image.size == (view.image_width, view.image_height)
+                    scale = float(image.text["scale"])
+                assert scale == (1 / 65535 if plane == "alpha" else pytest.approx(wanted.max() / 65535, rel=1e-5))
+                # Half a step, and the rasterizer's roundings.
+                np.testing.assert_allclose(read_plane(file), wanted, rtol=0, atol=0.5001 * scale + 1e-6 * wanted.max())
+                assert wanted.max() > 0.1
+        assert len(list((folder / name / "ours_7" / "alpha").iterdir())) == len(views)
+
+
+def test_planes_are_written_on_request_and_old_ones_go(tmp_path, colmap_scene, monkeypatch):
+    folder, _ = _saved(tmp_path, colmap_scene)
+    monkeypatch.setattr("sys.stdout", sys.stdout)
+    counts = []
+    for options in ([], ["--depth"], ["--alpha"]):
+        monkeypatch.setattr("sys.argv", ["render.py", "-m", str(folder), "--skip_train", "--quiet", *options])
+        render.main()
+        counts.append([len(list((folder / "test" / "ours_7" / plane).glob("*"))) for plane in ("depth", "alpha")])
+    assert counts == [[0, 0], [3, 0], [0, 3]]
+
+
+def test_planes_are_written_whole_or_not_at_all(tmp_path, monkeypatch):
+    values = np.array([[0.0, 0.25, 3.0]], dtype=np.float32)
+    write_plane(tmp_path / "a.png", values)
+    np.testing.assert_allclose(read_plane(tmp_path / "a.png"), values, rtol=0, atol=1.5 / 65535)
+    before = (tmp_path / "a.png").read_bytes()
+
+    def broken(self, path, *_, **__) -> None:
+        Path(path).write_bytes(b"half")
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(Image.Image, "save", broken)
+    with pytest.raises(UserError, match="cannot write"):
+        write_plane(tmp_path / "a.png", 2 * values)
+    assert (tmp_path / "a.png").read_bytes() == before and len(list(tmp_path.iterdir())) == 1
+
+
+def test_planes_of_nothing_and_files_that_are_none(tmp_path):
+    write_plane(tmp_path / "zero.png", np.zeros((2, 3)))
+    assert read_plane(tmp_path / "zero.png").tolist() == [[0.0] * 3] * 2
+    write_plane(tmp_path / "past.png", np.array([[0.5, 2.0]]), largest=1.0)
+    assert read_plane(tmp_path / "past.png").tolist() == pytest.approx(np.array([[0.5, 1.0]]), abs=1 / 65535)
+    Image.new("L", (2, 2)).save(tmp_path / "grey.png")
+    (tmp_path / "text.png").write_text("hello")
+    for name in ("grey", "text", "absent"):
+        with pytest.raises(UserError, match=f"{name}.png as a plane"):
+            read_plane(tmp_path / f"{name}.png")

@@ -3,6 +3,7 @@
 import functools
 import json
 import math
+import re
 import sys
 
 import mpmath
@@ -11,9 +12,11 @@ import torch
 from diff_gaussian_rasterization import reference
 from rasterizer_tools import gradients, leaves, render
 
-from benchmarks.accuracy import stability
-from benchmarks.accuracy.stability import CPU_DOUBLE, CPU_FLOAT, CUDA_FLOAT, TEXTBOOK, Judged
+from benchmarks.accuracy import stability, stability_figure, training_ab
+from benchmarks.accuracy.stability import CPU_DOUBLE, CPU_FLOAT, CUDA_FLOAT, TEXTBOOK, Judged, beyond
+from benchmarks.accuracy.stability_figure import SWEEPS
 from benchmarks.accuracy.stability_needles import needle_error
+from benchmarks.accuracy.training_ab import KINDS, PIVOT
 from benchmarks.workloads.stability_cases import CASES, PLAIN, Case, long_needles
 
 BY_NAME = {case.name: case for case in CASES}
@@ -32,23 +35,9 @@ BACKENDS = [CPU_FLOAT, CPU_DOUBLE, pytest.param(CUDA_FLOAT, marks=pytest.mark.gp
 def test_a_case_is_within_its_bound(case, backend):
     if backend not in stability.backends():
         pytest.skip("needs a GPU and a build with CUDA")
-    bound = case.bound
-    assert bound.reason
+    assert case.bound.reason
     measured = judged(case)
-    result = measured.result(backend)
-    assert result.finite
-    # If all Gaussians are stiff, the pixels that none reaches are next to pixels that one does.
-    ordinary = bound.image if measured.problem.stiff.all() else PLAIN.image
-    allowed = {("planes", "ordinary"): ordinary, ("planes", "stiff"): bound.image}
-    allowed |= {("gradients", "ordinary"): PLAIN.gradient, ("gradients", "stiff"): bound.gradient}
-    # A GPU has a fast exponential and reciprocal, for which the design allows three times the CPU's error.
-    factor = 3 if backend == CUDA_FLOAT else 1
-    for (kind, part), limit in allowed.items():
-        limit = case.double if backend == CPU_DOUBLE else factor * limit
-        for name, error in getattr(result, kind).items():
-            assert not error[part].largest > limit, (kind, name, part, error[part])  # NaN if the part is empty
-    if bound.median is not None and backend == CPU_FLOAT:
-        assert max(error["stiff"].median for error in result.gradients.values()) < bound.median
+    assert beyond(case, backend, measured, measured.result(backend)) == []
 
 
 def test_the_bounds_could_fail():
@@ -157,7 +146,79 @@ def test_the_benchmark_writes_its_tables(tmp_path, monkeypatch, capsys):
     stability.main()
     printed = capsys.readouterr().out
     assert "CPU float64: largest error" in printed and "17 x 31 px" in printed
+    verdict = printed.splitlines()[-1]
+    assert verdict == "Verdict: stable. All 1 cases are finite and within their bounds on CPU float32, CPU float64."
     written = json.loads(report.read_text())
     assert written["CPU float32"]["17 x 31 px"]["gradients"]["means"]["stiff"]["largest"] < PLAIN.gradient
     assert written["CPU float32"]["17 x 31 px"]["gradients"]["means"]["ordinary"]["largest"] is None
     assert math.isfinite(written["one rounding"]["17 x 31 px"]["planes"]["color"]["stiff"]["median"])
+
+
+def test_the_verdict_fails_where_a_bound_is_passed(monkeypatch, capsys):
+    """Here the textbook's formulas stand in for ours."""
+    textbook_as_ours = CPU_FLOAT._replace(render=TEXTBOOK.render)
+    monkeypatch.setattr(stability, "CPU_FLOAT", textbook_as_ours)
+    monkeypatch.setattr(stability, "backends", lambda: [textbook_as_ours, TEXTBOOK])
+    monkeypatch.setattr(sys, "argv", ["stability.py", "--only", "edge-on"])
+    with pytest.raises(SystemExit) as stopped:
+        stability.main()
+    assert stopped.value.code == 1
+    said = capsys.readouterr().out.splitlines()
+    assert said[-1].startswith("Verdict: NOT STABLE. Of 1 cases on CPU float32, ")
+    assert said[-2].startswith("CPU float32: pancakes edge-on, antialiased: ")
+    monkeypatch.setattr(sys, "argv", ["stability.py", "--only", "no such case"])
+    with pytest.raises(SystemExit):
+        stability.main()  # nothing was shown
+
+
+def test_the_figure_draws_every_backend(tmp_path, monkeypatch):
+    monkeypatch.setattr(stability_figure, "SWEEPS", [sweep._replace(values=sweep.values[1:3]) for sweep in SWEEPS])
+    monkeypatch.setattr(
+        sys, "argv", ["stability_figure.py", str(tmp_path / "a.png"), "--json", str(tmp_path / "a.json")]
+    )
+    stability_figure.main()
+    assert (tmp_path / "a.png").stat().st_size > 10_000
+    measured = json.loads((tmp_path / "a.json").read_text())
+    assert set(measured["sweeps"]) == {sweep.name for sweep in SWEEPS}
+    needles = measured["sweeps"]["length of needles, px"]["points"]
+    assert {"CPU float32", "CPU float64", "textbook float32", "textbook float64", "one rounding"} <= needles[0].keys()
+    for point in needles:
+        assert point["CPU float64"]["gradients"] < point["CPU float32"]["gradients"]
+        assert point["CPU float32"]["image"] < point["textbook float32"]["image"]
+        assert point["CPU float32"]["milliseconds"] > 0
+
+
+def test_a_training_by_the_textbook_loses_what_ours_keeps():
+    scene = KINDS["needles of 300 to 2,000 px"]()
+    theirs, ours, double = (training_ab.train(scene, backend, 60) for backend in training_ab.BACKENDS)
+    assert theirs.lost > 0 and ours.lost == ours.steps_lost == double.lost == 0
+    assert ours.psnr > max(ours.psnr_at_start, theirs.psnr + 1)
+    assert ours.psnr == pytest.approx(double.psnr, abs=0.2)
+
+
+def test_the_training_scenes_are_what_they_are_called():
+    kinds = {name: make() for name, make in KINDS.items()}
+    for scene in kinds.values():
+        assert len(scene.views) == len(scene.photos) == 8
+        assert all(values.dtype == torch.float32 for values in scene.start.values())
+    assert kinds["far from the origin, at 1e5"].start["means"][:, :2].mean() == pytest.approx(1e5, rel=1e-3)
+    longest, *_, widest = kinds["needles of 300 to 2,000 px"].start["scales"].sort(1, descending=True).values.unbind(1)
+    assert (longest - widest).exp().median() > 1e4
+    tiny, usual = (kinds[name].start["scales"] for name in ("tiny scale, a thousandth of a pixel", "ordinary"))
+    assert (usual.median() - tiny.median()).exp() == pytest.approx(4000, rel=0.3)
+    # A view from aside shows the same world: what is far away lies elsewhere, the pivot in the middle.
+    for view in kinds["ordinary"].views:
+        middle = torch.tensor([*PIVOT, 1.0], dtype=torch.float64) @ view.projmatrix
+        assert middle[:2].abs().max() < 1e-9 and middle[3] == pytest.approx(6.0)
+
+
+def test_the_comparison_of_trainings_prints_and_writes(tmp_path, monkeypatch, capsys):
+    page = tmp_path / "page.md"
+    page.write_text("a\n<!-- begin training -->\nold\n<!-- end training -->\nb\n")
+    monkeypatch.setattr(training_ab, "KINDS", {"ordinary": KINDS["ordinary"]})
+    monkeypatch.setattr(sys, "argv", ["training_ab.py", "--iterations", "4", "--write", str(page)])
+    training_ab.main()
+    said = capsys.readouterr().out
+    for name in ("textbook float32", "CPU float32", "CPU float64"):
+        assert re.search(rf"ordinary *\| {name} ", said) and name in page.read_text()
+    assert "old" not in page.read_text() and page.read_text().endswith("<!-- end training -->\nb\n")

@@ -1,9 +1,11 @@
-"""The last save of a training: it leaves out Gaussians that no training view depends on, and SH bands on request."""
+"""The last save of a training: it leaves out Gaussians that nobody sees, and SH bands that are zero or as asked."""
 
 import argparse
 import json
+import math
 import re
 import sys
+from itertools import chain
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -12,15 +14,18 @@ import pytest
 import torch
 from gaussians import model, parameters, pipeline
 from plyfile import PlyData
+from scipy.spatial.transform import Rotation, Slerp
 
 import render as render_script
 import train
 from arguments import ModelParams, read_cfg_args
 from diagnosis.model import check_model
-from gaussian_renderer import render
+from gaussian_renderer import decisive_for, render, trimming
+from gaussian_renderer.between import FRACTIONS, NEAREST, WIDER, neighbours, views_between
 from gaussian_renderer.scored_views import ScoredViews
-from gaussian_renderer.trimming import change_on_views, decisive_for_any, trim
+from gaussian_renderer.trimming import DONE, FAINT, FEW, TOO_LONG, change_on_views, decisive_for_any, trim, walk
 from scene import Scene
+from scene.cameras import Camera
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.checkpoint import load_checkpoint
 from scene.readers.point_cloud import write_point_cloud
@@ -54,7 +59,10 @@ def _image(camera, gaussians: GaussianModel) -> torch.Tensor:
 
 @pytest.fixture(scope="module")
 def runs(_colmap_master, tmp_path_factory) -> SimpleNamespace:
-    """Trainings with and without --keep_unseen, with cut bands, and with the half-image protocol."""
+    """Trainings with and without --keep_unseen, with all bands, and with the half-image protocol.
+
+    They are so short that the search would take too long, were it not allowed any number of views.
+    """
     folder = tmp_path_factory.mktemp("trimming")
     cloud = folder / "cloud.ply"
     rng = np.random.default_rng(2)
@@ -63,30 +71,43 @@ def runs(_colmap_master, tmp_path_factory) -> SimpleNamespace:
     points = np.concatenate([rng.normal(size=(300, 3)) * 0.4, groups + 0.05 * rng.normal(size=(300, 3))])
     write_point_cloud(cloud, points, rng.integers(0, 256, (600, 3)))
     stdout = sys.stdout
-    try:
-        scene, often = _colmap_master, ("--save_iterations", 5, "--checkpoint_iterations", ITERATIONS)
-        _train(scene, folder / "trimmed", cloud, *often, "--test_iterations", ITERATIONS)
-        _train(scene, folder / "whole", cloud, *often, "--test_iterations", -1, "--keep_unseen")
-        _train(scene, folder / "cut", cloud, "--save_iterations", 5, "--test_iterations", -1, "--prune_sh", 0)
-        _train(scene, folder / "halves", cloud, "--test_iterations", ITERATIONS, "--train_test_exp")
-    finally:
-        sys.stdout = stdout  # restore it, since training stamps it
+    often = ("--save_iterations", 5, "--checkpoint_iterations", 5, ITERATIONS)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(trimming, "ITERATIONS_PER_VIEW", 1e-3)
+        scene, all_bands = _colmap_master, ("--prune_sh", -1)
+        _train(scene, folder / "trimmed", cloud, *often, *all_bands, "--test_iterations", ITERATIONS)
+        _train(scene, folder / "whole", cloud, *often, *all_bands, "--test_iterations", -1, "--keep_unseen")
+        _train(scene, folder / "cut", cloud, *often, "--test_iterations", -1)
+        _train(scene, folder / "halves", cloud, "--test_iterations", ITERATIONS, "--train_test_exp", *all_bands)
+    sys.stdout = stdout  # restore it, since training stamps it
     return SimpleNamespace(**{name: folder / name for name in ("trimmed", "whole", "cut", "halves")})
 
 
-def test_only_rows_that_no_training_view_depends_on_are_missing(runs):
+def _walked(scene: Scene) -> list:
+    """Views between neighbouring training cameras."""
+    cameras = scene.getTrainCameras()
+    return list(chain.from_iterable(views_between(cameras[i], cameras[j]) for i, j in neighbours(cameras)))
+
+
+def test_only_rows_that_neither_training_views_nor_those_between_depend_on_are_missing(runs):
     scene, whole = _load(runs.whole)
-    seen = decisive_for_any(scene.getTrainCameras(), whole, pipeline()).numpy()
-    assert 400 < seen.sum() < 580
+    photographed = decisive_for_any(scene.getTrainCameras(), whole, pipeline()).numpy()
+    seen = photographed | decisive_for_any(_walked(scene), whole, pipeline()).numpy()
+    assert 400 < photographed.sum() < seen.sum() < 580  # so views between see some that no photo shows
     np.testing.assert_array_equal(_ply(runs.trimmed), _ply(runs.whole)[seen])
     assert len(_ply(runs.whole)) == 600
+
+
+def test_a_walk_between_neighbours_sees_the_whole_model(runs):
+    scene, whole = _load(runs.whole)
+    trimmed = _load(runs.trimmed)[1]
+    for camera in _walked(scene)[::5]:
+        assert torch.equal(_image(camera, whole), _image(camera, trimmed))
 
 
 def test_training_views_are_the_same_to_the_bit(runs):
     scene, whole = _load(runs.whole)
     trimmed = _load(runs.trimmed)[1]
-    changed = [not torch.equal(_image(c, whole), _image(c, trimmed)) for c in scene.getTestCameras()]
-    assert any(changed)  # so other views do see some of them
     for camera in scene.getTrainCameras():
         assert torch.equal(_image(camera, whole), _image(camera, trimmed))
 
@@ -107,13 +128,14 @@ def test_what_is_reported(runs):
     assert record["sh_degree"] == record["max_sh_degree"] == 3 and record["cut_bounds"] == [0, 0, 0, 0]
     log = json.loads((runs.trimmed / "train_log.json").read_text())[-1]
     assert log["gaussians_left_out"] == missing and log["gaussians"] == 600
+    assert record["search"] == DONE and record["faint"] == 0
+    assert record["views"] == len(_load(runs.whole)[0].getTrainCameras()) + len(_walked(_load(runs.whole)[0]))
     # The change on test views, with the test images as they were scored at this iteration.
     scene, whole = _load(runs.whole)
     change = change_on_views(
         whole, _load(runs.trimmed)[1], scene.getTestCameras(), ScoredViews(pipeline(), BLACK, False), scored=True
     )
     assert record["test_change"] == pytest.approx(change) and set(change) == {"largest", "psnr_before", "psnr_after"}
-    assert change["largest"] > 0
     kept = json.loads((runs.whole / "model.json").read_text())["left_out"]
     assert kept["unseen"] == 0 and kept["keep_unseen"] and kept["test_change"] == {}
 
@@ -127,8 +149,28 @@ def test_bands_that_are_zero_are_cut_and_the_model_is_read_again(runs):
         assert torch.equal(_image(camera, cut), _image(camera, trimmed))
     record = json.loads((runs.cut / "model.json").read_text())["left_out"]
     assert record["sh_degree"] == 0
+    assert record["ply_bytes_saved"] == 600 * 62 * 4 - len(_ply(runs.cut)) * 17 * 4
     # No test photo was used before, so none is decoded for a score.
     assert set(record["test_change"]) == {"largest"}
+
+
+def test_a_resumed_training_has_the_bands_that_the_last_save_left_out(runs, _colmap_master, tmp_path, monkeypatch):
+    monkeypatch.setattr(sys, "stdout", sys.stdout)
+    monkeypatch.setattr(trimming, "ITERATIONS_PER_VIEW", 1e-3)
+    cloud = runs.cut.parent / "cloud.ply"
+    for degree, again in (("--prune_sh", -1), runs.trimmed), ((), runs.cut):
+        checkpoint = ("--start_checkpoint", runs.cut / "chkpnt5.pth")
+        _train(_colmap_master, tmp_path, cloud, *degree, *checkpoint, "--test_iterations", -1)
+        np.testing.assert_array_equal(_ply(tmp_path), _ply(again))
+
+
+def test_without_options_a_short_training_saves_all_it_drew(runs, _colmap_master, tmp_path, monkeypatch):
+    """Its search would take too long; bands that are zero go all the same."""
+    monkeypatch.setattr(sys, "stdout", sys.stdout)
+    _train(_colmap_master, tmp_path, runs.cut.parent / "cloud.ply", "--test_iterations", -1)
+    assert len(_ply(tmp_path)) == 600 and len(_ply(tmp_path).dtype) == 17
+    record = json.loads((tmp_path / "model.json").read_text())["left_out"]
+    assert record["search"] == TOO_LONG and record["views"] > len(_load(tmp_path)[0].getTrainCameras())
 
 
 def test_saves_before_the_cut_are_read_with_the_bands_they_have(runs, monkeypatch):
@@ -161,18 +203,18 @@ def test_colours_move_by_no_more_than_asked(runs):
     with torch.no_grad():
         gaussians._features_rest *= 0.02
     before = parameters(gaussians)
-    whole = trim(gaussians, cameras, pipeline(), keep_unseen=True, prune_sh=-1.0)
+    whole = trim(gaussians, cameras, pipeline(), keep_unseen=True, prune_sh=-1.0, iterations=1)
     assert whole.gaussians is gaussians and whole.unseen == 0
     for degree in (2, 1, 0):
         bound = whole.cut_bounds[degree]
-        cut = trim(gaussians, cameras, pipeline(), keep_unseen=True, prune_sh=bound)
+        cut = trim(gaussians, cameras, pipeline(), keep_unseen=True, prune_sh=bound, iterations=1)
         assert cut.gaussians.max_sh_degree == cut.gaussians.active_sh_degree == degree
         assert cut.gaussians._features_rest.shape[1] == (degree + 1) ** 2 - 1 and len(cut.gaussians) == 200
         moved = change_on_views(gaussians, cut.gaussians, cameras, ScoredViews(pipeline(), BLACK, False), scored=False)[
             "largest"
         ]
         assert 0.05 * bound < moved <= bound
-        assert trim(gaussians, cameras, pipeline(), True, 0.99 * bound).gaussians.max_sh_degree > degree
+        assert trim(gaussians, cameras, pipeline(), True, 0.99 * bound, 1).gaussians.max_sh_degree > degree
     assert all(torch.equal(values, before[name]) for name, values in parameters(gaussians).items())
 
 
@@ -181,7 +223,106 @@ def test_a_model_that_no_view_sees_is_kept(runs):
     gaussians = model(5)
     with torch.no_grad():
         gaussians._opacity.fill_(-50.0)
-    assert trim(gaussians, cameras, pipeline(), keep_unseen=False, prune_sh=-1.0).gaussians is gaussians
+    assert trim(gaussians, cameras, pipeline(), False, -1.0, iterations=10**6).gaussians is gaussians
+
+
+def test_faint_gaussians_go_without_a_look(runs, monkeypatch):
+    """No pixel takes an alpha below 1/255, so opacities below it are in no image from anywhere."""
+    cameras = _load(runs.whole)[0].getTrainCameras()
+    gaussians = model(200, seed=4)
+    with torch.no_grad():
+        gaussians._opacity[:50] = FAINT - 1e-3
+        gaussians._opacity[50:60] = -math.log(254) + 1e-3
+        gaussians._scaling[:60] += 3
+    monkeypatch.setattr(trimming, "decisive_for", None)  # is not called
+    trimmed = trim(gaussians, cameras, pipeline(), False, -1.0, iterations=10)
+    assert trimmed.search.end == TOO_LONG and trimmed.unseen == trimmed.search.faint == 50
+    for camera in _walked(_load(runs.whole)[0])[::20]:
+        assert torch.equal(_image(camera, gaussians), _image(camera, trimmed.gaussians))
+        assert not decisive_for(camera, gaussians, pipeline())[:50].any()
+        assert decisive_for(camera, gaussians, pipeline())[50:60].any()
+
+
+def test_few_unseen_ones_are_kept_without_looking_further(runs):
+    cameras = _load(runs.whole)[0].getTrainCameras()
+    gaussians = model(200, seed=4)
+    with torch.no_grad():
+        # Just below what a pixel takes, and just above what counts as faint.
+        gaussians._opacity[:1] = FAINT + 5e-5
+    assert not decisive_for_any(cameras, gaussians, pipeline())[0]
+    kept = trim(gaussians, cameras, pipeline(), False, -1.0, iterations=10**6)
+    assert kept.search.end == FEW and kept.gaussians is gaussians and kept.search.views == len(cameras)
+    with torch.no_grad():
+        gaussians._opacity[:2] = FAINT + 5e-5
+    gone = trim(gaussians, cameras, pipeline(), False, -1.0, iterations=10**6)
+    assert gone.search.end == DONE and gone.unseen == 2 and gone.search.faint == 0
+
+
+def test_many_cameras_have_fewer_neighbours(runs):
+    cameras = _load(runs.whole)[0].getTrainCameras()
+    pairs, views = walk(cameras, 10**6)
+    assert pairs == neighbours(cameras, NEAREST) and views == len(cameras) + 4 * len(pairs)
+    fewer, views = walk(cameras, views - 1)
+    assert fewer == neighbours(cameras, NEAREST - 1) and views == len(cameras) + 4 * len(fewer)
+    tree, views = walk(cameras, 5 * len(cameras) - 4)
+    assert len(tree) == len(cameras) - 1 and views == 5 * len(cameras) - 4
+    assert walk(cameras, views - 1) == ([], views)
+
+
+def _standing(centers: np.ndarray, turns: Rotation, **changes: object) -> list[Camera]:
+    """Cameras with no photos, as far as `neighbours` and `views_between` look at them."""
+    made = {"image_width": 40, "image_height": 30, "fx": 50.0, "fy": 60.0, "cx": 22.0, "cy": 14.0, "device": "cpu"}
+    rows = zip(np.asarray(centers, float), turns.as_matrix(), strict=True)
+    return [SimpleNamespace(R=turn, T=-turn.T @ center, **(made | changes)) for center, turn in rows]
+
+
+def test_neighbours_in_a_sequence_in_a_ring_and_in_groups():
+    straight = Rotation.from_rotvec(np.zeros((10, 3)))
+    line = np.arange(10)[:, None] * [1.0, 0, 0]
+    assert {(i, i + 1) for i in range(9)} <= set(neighbours(_standing(line, straight), 2))
+    angles = np.arange(10) * 2 * np.pi / 10
+    ring = np.stack([np.cos(angles), 0 * angles, np.sin(angles)], 1)
+    turned = Rotation.from_rotvec(-angles[:, None] * [0, 1.0, 0])
+    around = {(i, i + 1) for i in range(9)} | {(0, 9)}
+    assert set(neighbours(_standing(ring, turned), 2)) == around
+    groups = np.concatenate([line[:5], line[:5] + [1000.0, 0, 0]])
+    joined = neighbours(_standing(groups, straight), 1)
+    assert (4, 5) in joined  # the groups' nearest members
+    back = Rotation.from_rotvec([[0, 0, 0], [0, np.pi, 0], [0, 0.1, 0]])
+    close = _standing(np.array([[0, 0, 0], [0.1, 0, 0], [0.15, 0, 0.0]]), back)
+    assert (0, 2) in neighbours(close, 1)  # a camera that looks the other way is not near
+    assert neighbours(_standing(line[:1], straight[:1])) == []
+    assert len(neighbours(_standing(line[:4] * 0, straight[:4]), 0)) == 3  # all in one place
+
+
+def test_a_view_between_is_interpolated():
+    turns = Rotation.from_rotvec([[0.1, 0.2, -0.3], [1.0, -2.0, 0.5]])
+    first, second = _standing(np.array([[1.0, 2, 3], [4, 0, -1]]), turns)
+    second.fx, second.fy, second.cx, second.cy, second.image_width = 80.0, 70.0, 33.0, 15.0, 60
+    views = views_between(first, second)
+    assert len(views) == len(FRACTIONS) >= 4
+    for fraction, view in zip(FRACTIONS, views, strict=True):
+        center = (1 - fraction) * np.array([1.0, 2, 3]) + fraction * np.array([4.0, 0, -1])
+        np.testing.assert_allclose(view.camera_center, center, atol=1e-5)
+        turn = Slerp([0, 1], turns)(fraction).as_matrix()
+        np.testing.assert_allclose(view.world_view_transform[:3, :3], turn, atol=1e-6)
+        assert (view.image_width, view.image_height) == (WIDER * 60, WIDER * 30)
+        assert view.image_width / (2 * math.tan(view.FoVx / 2)) == pytest.approx(50 + 30 * fraction)
+        assert view.image_height / (2 * math.tan(view.FoVy / 2)) == pytest.approx(60 + 10 * fraction)
+        ahead = torch.tensor([*(center + turn @ [0, 0, 5.0]), 1.0], dtype=torch.float32)
+        clip = ahead @ view.full_proj_transform
+        # The principal points lie 2 px right of the first image's centre and 3 of the second's.
+        assert (clip[0] / clip[3]).item() * view.image_width / 2 == pytest.approx(2 + fraction, abs=1e-3)
+        assert (clip[1] / clip[3]).item() * view.image_height / 2 == pytest.approx(-1 + fraction, abs=1e-3)
+
+
+def test_a_turn_takes_the_shorter_way():
+    for angle in (1e-9, 3.0, math.pi - 1e-6):
+        turns = Rotation.from_rotvec([[0, 0, 0.1], [0, 0, 0.1 + angle]])
+        first, second = _standing(np.zeros((2, 3)), turns)
+        for fraction, view in zip(FRACTIONS, views_between(first, second), strict=True):
+            wanted = Rotation.from_rotvec([0, 0, 0.1 + fraction * angle]).as_matrix()
+            np.testing.assert_allclose(view.world_view_transform[:3, :3], wanted, atol=1e-6)
 
 
 @pytest.mark.parametrize("value", ["-0.5", "nan"])
@@ -192,8 +333,9 @@ def test_no_such_tolerance(value, tmp_path):
 
 def _left_out(**changes: object) -> LeftOut:
     values = {
-        "gaussians": 1000, "unseen": 50, "keep_unseen": False, "max_sh_degree": 3, "sh_degree": 3,
-        "cut_bounds": [0.3, 0.2, 0.1, 0.0], "ply_bytes": 248_000, "ply_bytes_saved": 12_400, "seconds": 1.25,
+        "gaussians": 1000, "unseen": 50, "faint": 0, "keep_unseen": False, "search": DONE, "views": 99,
+        "iterations": 7000, "max_sh_degree": 3, "sh_degree": 3, "cut_bounds": [0.3, 0.2, 0.1, 0.0],
+        "ply_bytes": 248_000, "ply_bytes_saved": 12_400, "seconds": 1.25,
         "picture_bytes": 3_000_000, "picture_bytes_in_files": 12_000_000,
         "test_change": {"largest": 0.0123, "psnr_before": 30.0, "psnr_after": 29.9},
     }  # fmt: skip
@@ -203,7 +345,8 @@ def _left_out(**changes: object) -> LeftOut:
 def test_the_three_lines():
     said = lines(_left_out())
     assert said == [
-        "Left out 50 of 1000 Gaussians (5.0 %, 0.01 MB of the PLY) that no training view depends on, found in 1.2 s; "
+        "Left out 50 of 1000 Gaussians (5.0 %, 0.01 MB of the PLY) that no training view and no view between two of "
+        "them depends on, found in 1.2 s (99 views); "
         "test views change by at most 0.012 (values 0 to 1), PSNR 30.000 to 29.900 dB",
         "Left out no SH bands; cutting them would move colours by at most 0.3 above degree 0, 0.2 above degree 1, "
         "0.1 above degree 2 (--prune_sh)",
@@ -215,15 +358,42 @@ def test_the_three_lines():
     moved = "colours move by at most 0.2 (values 0 to 1)"
     assert cut[1] == f"Left out the SH bands above degree 1 (0.14 MB of the PLY): {moved}"
     assert cut[0].endswith("; test views change by at most 0 (values 0 to 1)")
+    zero = lines(_left_out(sh_degree=1, cut_bounds=[0.3, 0.0, 0.0, 0.0]))
+    assert zero[1] == "Left out the SH bands above degree 1 (0.14 MB of the PLY): they are zero throughout"
     assert lines(_left_out(keep_unseen=True, unseen=0, test_change={}))[0].startswith("Left out no Gaussians (--keep")
     assert "none above degree 0" in lines(_left_out(max_sh_degree=0, sh_degree=0, cut_bounds=[0.0]))[1]
+    few = lines(_left_out(search=FEW, unseen=20, faint=20, test_change={}))[0]
+    assert few == (
+        "Left out 20 of 1000 Gaussians (2.0 %, 0.00 MB of the PLY), of an opacity that no pixel shows; "
+        "fewer than 1 % are unseen besides, looked for in 1.2 s (99 views)"
+    )
+    long = lines(_left_out(search=TOO_LONG, unseen=0, test_change={}))[0]
+    assert long == (
+        "Left out no Gaussians; no others were looked for: that takes 99 views, more than the training's iterations / "
+        "15"
+    )
+
+
+def test_the_short_line():
+    short = {"iterations": 600, "sh_degree": 0, "ply_bytes_saved": 183_400, "test_change": {}}
+    assert lines(_left_out(**short)) == [
+        "Saved 950 of 1000 Gaussians, SH degree 0: 0.06 MB instead of 0.25",
+    ]
+    nothing = {"iterations": 600, "unseen": 0, "ply_bytes_saved": 0, "test_change": {}}
+    assert lines(_left_out(**nothing)) == ["Saved 1000 of 1000 Gaussians, SH degree 3"]
+    assert lines(_left_out(iterations=600))[0].endswith("; test views change by at most 0.012 (values 0 to 1), "
+                                                        "PSNR 30.000 to 29.900 dB")  # fmt: skip
 
 
 def test_training_says_them(colmap_scene, tmp_path, capfd, monkeypatch):
     monkeypatch.setattr(sys, "stdout", sys.stdout)
-    train.main(["-s", str(colmap_scene), "-m", str(tmp_path), "-r", "24", "--iterations", "2"])
-    said = re.sub(r" \[\d\d/\d\d \d\d:\d\d:\d\d\]$", "", capfd.readouterr().out, flags=re.MULTILINE).splitlines()
-    expected = lines(LeftOut(**json.loads((tmp_path / "model.json").read_text())["left_out"]))
-    assert said[-4:] == [*expected, "Training complete."]
+    for short in (2000, 0):
+        monkeypatch.setattr("training.left_out.SHORT", short)
+        train.main(["-s", str(colmap_scene), "-m", str(tmp_path), "-r", "24", "--iterations", "2"])
+        said = re.sub(r" \[\d\d/\d\d \d\d:\d\d:\d\d\]$", "", capfd.readouterr().out, flags=re.MULTILINE).splitlines()
+        expected = lines(LeftOut(**json.loads((tmp_path / "model.json").read_text())["left_out"]))
+        assert len(expected) == (1 if short else 3)
+        assert said[-1 - len(expected) :] == [*expected, "Training complete."]
+        assert json.loads((tmp_path / "train_log.json").read_text())[-1]["lines"] == expected
     # There are 17 photos of 96 x 64, trained at 24 x 16.
     assert "size: 0.0 MB, 1.2 MB less" in expected[2]

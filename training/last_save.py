@@ -27,10 +27,10 @@ def save_last(
     """
     trained = scene.gaussians
     trained.optimizer.zero_grad(set_to_none=True)  # room for the trimmed copy
-    trimmed = trim(trained, scene.getTrainCameras(), pipe, opt.keep_unseen, opt.prune_sh)
+    trimmed = trim(trained, scene.getTrainCameras(), pipe, opt.keep_unseen, opt.prune_sh, opt.iterations)
     final, test = trimmed.gaussians, scene.getTestCameras()
     change = {}
-    if test and final is not trained:
+    if test and (trimmed.unseen > trimmed.search.faint or trimmed.cut_bounds[final.max_sh_degree] > 0):
         views = ScoredViews(pipe, background, dataset.train_test_exp)
         change = change_on_views(trained, final, test, views, scored)
     scene.save(opt.iterations, final)
@@ -39,7 +39,11 @@ def save_last(
     left_out = LeftOut(
         gaussians=len(trained),
         unseen=trimmed.unseen,
+        faint=trimmed.search.faint,
         keep_unseen=opt.keep_unseen,
+        search=trimmed.search.end,
+        views=trimmed.search.views,
+        iterations=opt.iterations,
         max_sh_degree=trained.max_sh_degree,
         sh_degree=final.max_sh_degree,
         cut_bounds=trimmed.cut_bounds,

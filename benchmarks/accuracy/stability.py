@@ -13,6 +13,8 @@ same float32 values.
 - Rounding alone can decide a pixel within `cut` of a cut-off or with a depth tie. Such pixels are left out of the loss
   and of the comparison.
 - "inf" stands for NaN or Inf.
+- The last line is the verdict: whether our results are finite and within the bounds of every case. CUDA may have three
+  times the CPU's bounds. The exit status is 0 or 1 accordingly.
 - "One rounding" is how much the oracle's own result changes when every parameter is off by 2^-24 of itself and the
   camera is rounded to float32. No float32 arithmetic can promise a smaller error.
 """
@@ -33,8 +35,9 @@ from tqdm import tqdm
 from benchmarks.accuracy.stability_needles import LENGTHS, NeedleError, needle_error
 from benchmarks.harness.environment import describe, print_table
 from benchmarks.workloads import textbook
-from benchmarks.workloads.stability_cases import CASES, Case, Problem
+from benchmarks.workloads.stability_cases import CASES, PLAIN, Case, Problem
 from utils.files.json_files import write_json
+from utils.system_utils import run_cli
 
 PLANES = ("color", "inverse_depth", "transmittance")
 PARTS = ("ordinary", "stiff")
@@ -73,6 +76,7 @@ CPU_FLOAT = Backend("CPU float32", rasterize, torch.float32, "cpu")
 CPU_DOUBLE = Backend("CPU float64", rasterize, torch.float64, "cpu")
 CUDA_FLOAT = Backend("CUDA float32", rasterize, torch.float32, "cuda")
 TEXTBOOK = Backend("textbook float32", textbook.render, torch.float32, "cpu")
+CUDA_FACTOR = 3  # a GPU has a fast exponential and reciprocal, for which the design allows more error
 ORACLE = Backend("oracle", reference.render, torch.float64, "cpu")
 
 
@@ -129,6 +133,25 @@ class Judged:
             _run(self.problem, backend, keep=self.keep)
             times.append(1e3 * (time.perf_counter() - start))
         return min(times)
+
+
+def beyond(case: Case, backend: Backend, judged: Judged, result: Result) -> list[str]:
+    """Return what of our result of a case is not finite, or above the case's bounds; nothing if it is as it should."""
+    found = [] if result.finite else [f"{case.name}: NaN or Inf"]
+    # If all Gaussians are stiff, the pixels that none reaches are next to pixels that one does.
+    ordinary = case.bound.image if judged.problem.stiff.all() else PLAIN.image
+    allowed = {("planes", "ordinary"): ordinary, ("planes", "stiff"): case.bound.image}
+    allowed |= {("gradients", "ordinary"): PLAIN.gradient, ("gradients", "stiff"): case.bound.gradient}
+    for (kind, part), limit in allowed.items():
+        limit = case.double if backend == CPU_DOUBLE else (CUDA_FACTOR if backend == CUDA_FLOAT else 1) * limit
+        for name, error in getattr(result, kind).items():
+            if error[part].largest > limit:  # not if it is NaN: the part is empty
+                found.append(f"{case.name}: {name}, {part}, {error[part].largest:.1e} above {limit:.1e}")
+    if case.bound.median is not None and backend == CPU_FLOAT:
+        median = max(error["stiff"].median for error in result.gradients.values())
+        if not median < case.bound.median:
+            found.append(f"{case.name}: median of the gradients, {median:.1e} above {case.bound.median:.1e}")
+    return found
 
 
 def _nudged(problem: Problem) -> Problem:
@@ -285,6 +308,7 @@ def main() -> None:
     used = backends()
     machine = describe(CUDA_FLOAT.device if CUDA_FLOAT in used else "cpu")
     print(machine)
+    wrong: dict[str, list[str]] = {backend.name: [] for backend in used if backend is not TEXTBOOK}
     left_out: dict[str, int] = {}
     rounding: dict[str, Result] = {}
     results: dict[str, dict[str, Result]] = {backend.name: {} for backend in used}
@@ -296,6 +320,8 @@ def main() -> None:
         for backend in used:
             result = judged.result(backend)
             results[backend.name][case.name] = result._replace(milliseconds=judged.milliseconds(backend))
+            if backend is not TEXTBOOK:
+                wrong[backend.name] += beyond(case, backend, judged, result)
     needles = [needle_error(*length) for length in LENGTHS] if "needles" in args.only or not args.only else []
     for backend in used:
         if backend is not TEXTBOOK:
@@ -314,7 +340,19 @@ def main() -> None:
         }
         report |= {name: {case: _as_json(r) for case, r in by_case.items()} for name, by_case in results.items()}
         write_json(args.json, report)
+    _print_verdict(len(left_out), wrong)
+
+
+def _print_verdict(cases: int, wrong: dict[str, list[str]]) -> None:
+    """Print whether all cases are within their bounds; end with status 1 if not."""
+    failed = [f"{name}: {line}" for name, lines in wrong.items() for line in lines]
+    print("\n".join(["", *failed]))
+    names = ", ".join(wrong)
+    if failed or not cases:
+        print(f"Verdict: NOT STABLE. Of {cases} cases on {names}, {len(failed)} results are beyond their bounds.")
+        raise SystemExit(1)
+    print(f"Verdict: stable. All {cases} cases are finite and within their bounds on {names}.")
 
 
 if __name__ == "__main__":
-    main()
+    run_cli(main)

@@ -24,7 +24,8 @@ from benchmarks.costs.allocations import allocated_bytes
 from benchmarks.costs.paired import Interval, difference, interleaved
 from benchmarks.costs.rows import ROWS, Row, Workload
 from benchmarks.harness.environment import describe, table
-from utils.system_utils import UserError, atomic_write, compute_device, run_cli
+from benchmarks.harness.page import check_marks, write_tables
+from utils.system_utils import UserError, compute_device, run_cli
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -32,7 +33,6 @@ ROOT = Path(__file__).resolve().parents[2]
 WORKLOADS = {"cpu": (50_000, 400, 400, 2.4), "cuda": (1_000_000, 1600, 1060, 1.7)}
 HEADER = ["feature, off", "compared with", "ms", "ms more than that [95 %]", "", "bytes more"]
 HEADER += ["switched on: ms more", "bytes more"]
-BEGIN, END = "<!-- begin {} -->", "<!-- end {} -->"  # marks around a device's tables
 
 
 def measure(row: Row, rounds: int, device: torch.device) -> list[str]:
@@ -130,8 +130,8 @@ def main() -> None:
     add("--write", type=Path, help="page whose tables to replace (default: only print)")
     args = parser.parse_args()
     device = compute_device()
-    if args.write and BEGIN.format(device.type) not in (page := args.write.read_text(encoding="utf-8")):
-        raise UserError(f"{args.write} needs a line {BEGIN.format(device.type)} where the tables go; it has none")
+    if args.write:
+        check_marks(args.write, device.type)
     splats, width, height, sigma = WORKLOADS[device.type]
     splats = args.splats or splats
     work = Workload(splats, width, height, sigma, device)
@@ -141,15 +141,7 @@ def main() -> None:
     lines += ["", *table(["not there when off", "seen", "what that saves"], absent()), ""]
     print("\n".join(lines))
     if args.write:
-        with atomic_write(args.write) as temporary:
-            temporary.write_text(replace_tables(page, device.type, lines), encoding="utf-8")
-
-
-def replace_tables(page: str, device: str, lines: list[str]) -> str:
-    """Return the page with `lines` between the marks of a device type."""
-    begin, end = BEGIN.format(device), END.format(device)
-    before, _, rest = page.partition(begin)
-    return "\n".join([before + begin, *lines, end]) + rest.partition(end)[2]
+        write_tables(args.write, device.type, lines)
 
 
 if __name__ == "__main__":

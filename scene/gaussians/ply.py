@@ -70,13 +70,15 @@ def _degree(names: Iterable[str]) -> int | None:
 
 
 def read_ply(path: str | os.PathLike, sh_degree: int) -> Rows:
-    """Read a Gaussian PLY of exactly this SH degree, of any tool: any order of properties, scalar type and encoding.
+    """Read a Gaussian PLY of any tool: any order of properties, scalar type and encoding.
 
-    UserError when the file is missing or unreadable, lacks properties (the message names them), or has another degree.
+    SH bands that the file lacks are zero: the last save of a training leaves out those that are.
+    UserError when the file is missing or unreadable, lacks properties (the message names them), or has a higher degree.
     """
     vertices = read_vertices(path)
     present = set(vertices.dtype.names or ())
-    table = attributes(sh_degree)
+    degree = _degree(present)
+    table = attributes(sh_degree if degree is None else min(degree, sh_degree))
     wanted = table["f_rest"].columns
     rest = sum(name.startswith("f_rest_") for name in present)
     missing = [name for part, a in table.items() if part != "f_rest" for name in a.columns if name not in present]
@@ -85,7 +87,6 @@ def read_ply(path: str | os.PathLike, sh_degree: int) -> Rows:
             f"{path} is not a Gaussian model: it lacks the properties {', '.join(missing)}; give a trained model"
         )
     if rest != len(wanted) or not present.issuperset(wanted):
-        degree = _degree(present)
         found = "no known SH degree" if degree is None else f"SH degree {degree}"
         raise UserError(
             f"{path} has {rest} f_rest properties, those of {found}, but SH degree {sh_degree} needs {len(wanted)}; "
@@ -99,6 +100,8 @@ def read_ply(path: str | os.PathLike, sh_degree: int) -> Rows:
             bands, channels = attribute.shape
             values = values.reshape(len(vertices), channels, bands).transpose(1, 2).contiguous()
         rows[name] = values
+    absent = attributes(sh_degree)["f_rest"].shape[0] - rows["f_rest"].shape[1]
+    rows["f_rest"] = torch.nn.functional.pad(rows["f_rest"], (0, 0, 0, absent))
     return rows
 
 

@@ -47,7 +47,7 @@ class Saves(Observer):
 
     def ended(self, error: Error) -> None:
         if error is None and self._left_out is not None:
-            print("\n".join(lines(self._left_out)))
+            self._run.log.tell(*lines(self._left_out))
 
 
 class Checkpoints(Observer):
