@@ -25,14 +25,14 @@ import torch
 from PIL import Image
 from tqdm import tqdm
 
-from arguments import ModelParams, OptionParser, PipelineParams, get_combined_args
+from arguments import ModelParams, OptionParser, PipelineParams, get_combined_args, warn_of_background
 from gaussian_renderer.memory_errors import memory_errors_explained
 from gaussian_renderer.scored_views import ScoredViews
 from gaussian_renderer.view_planes import PLANES, view_planes
 from records import render_times
 from scene.cameras import Camera
 from scene.gaussian_model import GaussianModel
-from scene.saved_model import load_saved, warn_of_background
+from scene.saved_model import load_saved
 from utils.files.plane_files import write_plane
 from utils.general_utils import safe_state
 from utils.system_utils import UserError, atomic_write, compute_device, mkdir_p, run_cli

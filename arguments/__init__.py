@@ -10,6 +10,7 @@ from arguments.stored import (
     read_model_json,
     read_stored_options,
     read_training_options,
+    warn_of_background,
     write_cfg_args,
     write_model_json,
 )
@@ -28,6 +29,7 @@ __all__ = [
     "read_model_json",
     "read_stored_options",
     "read_training_options",
+    "warn_of_background",
     "write_cfg_args",
     "write_model_json",
 ]

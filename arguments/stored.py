@@ -3,6 +3,7 @@
 import argparse
 import ast
 import os
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -137,3 +138,13 @@ def get_combined_args(parser: argparse.ArgumentParser, argv: Sequence[str] | Non
         remembered = read_model_json(args.model_path).get("antialiasing", False)
         combined.antialiasing = bool(args.antialiasing) or remembered
     return combined
+
+
+def warn_of_background(options: argparse.Namespace) -> None:
+    """Print a warning to stderr if options ask for a white background, but the model's cfg_args has a black one."""
+    if options.white_background and read_cfg_args(options.model_path).get("white_background") is False:
+        print(
+            f"warning: {options.model_path} has a black background in its cfg_args, but -w asks for white; leave -w "
+            "out to render it as it was trained",
+            file=sys.stderr,
+        )

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 
 from scene.cameras import ZFAR, ZNEAR, Camera, MiniCam
-from utils.graphics_utils import focal2fov, getProjectionMatrix, getWorld2View2
+from utils.graphics_utils import focal2fov, projection, world_to_camera
 
 NEAREST = 3  # neighbours of each camera; in a sequence and in a ring its two sides are among them
 FRACTIONS = (0.2, 0.4, 0.6, 0.8)  # of the way from a camera to its neighbour
@@ -83,9 +83,9 @@ def _between(first: Camera, second: Camera, fraction: float) -> MiniCam:
     # Offsets of the principal point from the image's centre stay what they are in pixels.
     shift_x = mixed(first.cx - first.image_width / 2, second.cx - second.image_width / 2)
     shift_y = mixed(first.cy - first.image_height / 2, second.cy - second.image_height / 2)
-    view = torch.from_numpy(getWorld2View2(turn, -turn.T @ center))
-    projection = getProjectionMatrix(ZNEAR, ZFAR, fovx, fovy, 2 * shift_x / width, 2 * shift_y / height)
-    matrices = [m.T.to(first.device, torch.float32).contiguous() for m in (view, projection @ view)]
+    view = torch.from_numpy(world_to_camera(turn, -turn.T @ center))
+    project = projection(ZNEAR, ZFAR, fovx, fovy, 2 * shift_x / width, 2 * shift_y / height)
+    matrices = [m.T.to(first.device, torch.float32).contiguous() for m in (view, project @ view)]
     return MiniCam(width, height, fovy, fovx, ZNEAR, ZFAR, *matrices)
 
 

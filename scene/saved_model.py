@@ -4,9 +4,7 @@ The SH degree is read from the PLY, not from cfg_args, because --prune_sh change
 """
 
 import argparse
-import sys
 
-from arguments import read_cfg_args
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.ply import stored_sh_degree
 from scene.saved_iterations import find_iteration, saved_ply
@@ -23,13 +21,3 @@ def load_saved(options: argparse.Namespace, iteration: int, sh_degree: int | Non
         sh_degree = stored_sh_degree(saved_ply(options.model_path, iteration))
     gaussians = GaussianModel(options.sh_degree if sh_degree is None else sh_degree)
     return Scene(options, gaussians, load_iteration=iteration, shuffle=False)
-
-
-def warn_of_background(options: argparse.Namespace) -> None:
-    """Print a warning to stderr if options ask for a white background, but the model's cfg_args has a black one."""
-    if options.white_background and read_cfg_args(options.model_path).get("white_background") is False:
-        print(
-            f"warning: {options.model_path} has a black background in its cfg_args, but -w asks for white; leave -w "
-            "out to render it as it was trained",
-            file=sys.stderr,
-        )

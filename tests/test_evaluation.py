@@ -74,7 +74,9 @@ def test_subsets_are_in_no_table_and_no_peak(tmp_path):
     part = [row | {"subset": 2} for row in curve((1, 35, 10), (2, 36, 10))]
     whole = [row | {"iteration": row["iteration"] + 2} for row in curve((3, 20, 10), (4, 20.05, 10))]
     rising = [*curve((2.5, 18, 10)), *whole]
-    runs = [{"scene": "s", "config": name, "failure": None, "curve": part + rising} for name in ("a", "b")]
+    runs = [
+        {"scene": "s", "config": name, "failure": None, "apart": False, "curve": part + rising} for name in ("a", "b")
+    ]
     assert max(row["psnr"] for row in _cheapest(runs)["s"]) == 20.0
     late = [row | {"iteration": 9, "subset": 2, "test_psnr": 1.0} for row in part[:1]]
     assert _peak(part + whole + late, tmp_path) is None
