@@ -65,10 +65,14 @@ def draw_curves(path: Path, scene: str, runs: Sequence[dict[str, Any]], peers: S
     figure.suptitle(f"{printable(scene)}: error against time")
     for axes, (value, label, sign) in zip(figure.subplots(1, len(panels)), panels, strict=True):
         every = _draw_runs(axes, runs, value, several)
-        if several and sign:
+        if several and sign and every:
             _draw_front(axes, every, sign)
-        drawn = every + _draw_peers(axes, peers, value)
-        axes.set(xscale="log", xlabel="seconds of training, without scoring and saving", ylabel=label)
+        theirs = _draw_peers(axes, peers, value)
+        drawn = every + theirs
+        seconds = "seconds of training, without scoring and saving" + (
+            " (other programs: as they count)" if theirs else ""
+        )
+        axes.set(xscale="log", xlabel=seconds, ylabel=label)
         plain_log_axis(axes.xaxis)
         if value is _dissimilarity and all(number > 0 for _, number in drawn):
             axes.set_yscale("log")

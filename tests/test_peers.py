@@ -85,6 +85,8 @@ def test_a_peer_is_drawn_beside_ours_and_is_in_no_front(tmp_path, monkeypatch):
     lines = {line.get_label(): line for line in left.lines}
     assert lines["other (another program)"].get_xydata().tolist() == [[0.5, 40.0]]
     assert [0.5, 40.0] not in lines["Pareto front"].get_xydata().tolist()
+    assert left.get_xlabel().endswith("(other programs: as they count)")
+    assert not right.get_xlabel().endswith("(other programs: as they count)")
     assert "other (another program)" not in [line.get_label() for line in right.lines]  # it has no SSIM
 
 
