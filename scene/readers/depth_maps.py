@@ -10,13 +10,12 @@ from typing import ClassVar
 
 import numpy as np
 import torch
-from PIL import Image
 from torch import Tensor
 
 from scene.pictures.decode import picture_size
 from scene.readers import colmap_model
 from scene.readers.info import CameraInfo, SceneInfo
-from utils.files.image_files import UNREADABLE
+from utils.files.image_files import UNREADABLE, open_image
 from utils.files.listing import some
 from utils.host.cache_folder import cache_folder
 from utils.system_utils import UserError
@@ -74,7 +73,7 @@ def with_depth_maps(info: SceneInfo, scene: Path, depths: str) -> SceneInfo:
 def read_values(path: Path) -> np.ndarray:
     """Values (H, W) float64 of a grey image file of 8 or 16 bits, unscaled. UserError for a file that is not grey."""
     try:
-        with Image.open(path) as image:
+        with open_image(path) as image:
             if image.mode not in ("L", "I;16", "I;16B", "I"):
                 if _is_16_bit_color(path):
                     raise UserError(

@@ -1,4 +1,4 @@
-"""Image files: suffixes, exceptions of reading them, and opening of renders of any size."""
+"""Image files: suffixes and formats, exceptions of reading them, and opening of photos and of renders of any size."""
 
 import warnings
 from pathlib import Path
@@ -14,6 +14,14 @@ UNREADABLE = (
     Image.DecompressionBombError,
 )  # Pillow raises these for broken files, depending on the format
 SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp")
+# What photos come in. Pillow knows more formats, and hands some of them, as PostScript, to other programs, whatever the
+# file's name is.
+FORMATS = ("PNG", "JPEG", "TIFF", "BMP", "WEBP", "GIF", "PPM", "JPEG2000", "TGA")
+
+
+def open_image(path: Path) -> Image.Image:
+    """Open an image file of one of FORMATS; its pixels are read later. Raises one of UNREADABLE if that fails."""
+    return Image.open(path, formats=FORMATS)
 
 
 def open_render(path: Path) -> Image.Image:
@@ -23,7 +31,7 @@ def open_render(path: Path) -> Image.Image:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error", Image.DecompressionBombWarning)
-            return Image.open(path)
+            return open_image(path)
     except Image.DecompressionBombWarning as error:
         raise Image.DecompressionBombError(str(error)) from error
     finally:
