@@ -122,10 +122,11 @@ class GaussianAdam(torch.optim.Adam):
             state["exp_avg_sq"] = torch.zeros_like(param)
         return state
 
-    def take_state(self, state_dict: Any) -> None:
+    def take_state(self, state_dict: Any) -> list[str]:
         """Take Adam's averages and the step counters of a state dict; the groups keep their options.
 
-        ValueError that says what does not fit, unless it is the state dict of the same groups.
+        Returns the names of the groups that the state dict has none for. ValueError that says what does not fit, unless
+        it is the state dict of the same groups.
         """
         own = self.state_dict()["param_groups"]
         try:
@@ -140,6 +141,7 @@ class GaussianAdam(torch.optim.Adam):
             if key in state:
                 taken[mine["params"][0]] = _fitting(state[key], group["params"][0], group["name"])
         super().load_state_dict({"state": taken, "param_groups": own})
+        return [group["name"] for group in self.param_groups if group["params"][0] not in self.state]
 
     def append_rows(self, rows: dict[str, Tensor]) -> dict[str, nn.Parameter]:
         """Append `rows[name]` (n, ...) to each group, with averages of zero. Returns the parameters, without gradient.
