@@ -9,6 +9,7 @@ from plyfile import PlyData, PlyParseError
 from torch import Tensor
 
 from scene.gaussians.attributes import Rows, attributes
+from utils.files.ply_header import check_header
 from utils.system_utils import UserError, atomic_write
 
 _NORMALS = ["nx", "ny", "nz"]  # zeros after the positions, as in the reference's files
@@ -100,6 +101,7 @@ def read_vertices(path: str | os.PathLike) -> np.ndarray:
     if not os.path.isfile(path):
         raise UserError(f"no file {path}; give the point_cloud.ply of a trained model")
     try:
+        check_header(path)
         return PlyData.read(os.fspath(path))["vertex"].data
     except (PlyParseError, ValueError, UnicodeDecodeError) as error:
         raise UserError(f"{path} is not a complete PLY file ({error}); save or download it again") from error

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from plyfile import PlyData, PlyElement, PlyParseError
 
+from utils.files.ply_header import check_header
 from utils.graphics_utils import BasicPointCloud
 from utils.system_utils import UserError, atomic_write
 
@@ -52,6 +53,7 @@ def _begins_with(path: Path, magic: bytes) -> bool:
 
 def _read_ply(path: Path) -> BasicPointCloud:
     try:
+        check_header(path)
         ply = PlyData.read(str(path))
     except (PlyParseError, ValueError, OverflowError, OSError, EOFError, MemoryError) as error:
         raise UserError(f"{path} is not a readable PLY file ({error}); export the point cloud again") from error
