@@ -76,13 +76,15 @@ class GaussianRasterizer(nn.Module):
         (N, 3). scales (N, 3): positive, and rotations (N, 4): w x y z, both used as they are; or cov3D_precomp (N, 6):
         xx, xy, xz, yy, yz, zz.
         Returns colour (3, H, W), radii (N,) int32 in px, and the inverse depth (1, H, W), the sum of alpha T / z.
-        Raises Exception unless exactly one of each pair of alternatives is given.
+        Raises Exception unless exactly one of each pair of alternatives is given, and as `rasterize`.
         """
         if (shs is None) == (colors_precomp is None):
             raise Exception("give exactly one of shs and colors_precomp")
         given = scales is not None or rotations is not None
         if given == (cov3D_precomp is not None) or (given and (scales is None or rotations is None)):
             raise Exception("give exactly one of the pair scales, rotations and cov3D_precomp")
+        if shs is not None and len(getattr(shs, "shape", ())) != 3:
+            raise ValueError(f"shs must be (N, K, 3), got {tuple(getattr(shs, 'shape', ()))}")
         settings = self.raster_settings
         out = rasterize(
             means3D,

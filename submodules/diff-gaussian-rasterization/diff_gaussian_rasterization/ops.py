@@ -4,11 +4,11 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 from torch import Tensor, library
-from torch.autograd.function import once_differentiable
 
 import diff_gaussian_rasterization.fakes  # noqa: F401  (registers the fake kernels)
 from diff_gaussian_rasterization.backend import OPERATORS
 from diff_gaussian_rasterization.checks import check_finite
+from diff_gaussian_rasterization.first_order import first_order
 from diff_gaussian_rasterization.gaussians import Gaussians
 from diff_gaussian_rasterization.schema import GRADIENT_PLACES, INPUTS, SCENE_TENSORS
 
@@ -44,18 +44,22 @@ def rasterize(
     means2d (N, 3): values unused; receives d loss / d mean on the image, per NDC unit.
     raw: opacities are logits, scales are logarithms, and rotations have any length (zero means the identity).
     Gaussians with a NaN or an infinite value are left out and receive zero gradients.
-    Raises TypeError for wrong dtypes and ValueError for wrong shapes. Raises RuntimeError for wrong settings, and if
-    the image needs more than 2^31 tile instances.
+    Second derivatives raise RuntimeError. Raises TypeError for None and wrong dtypes, and ValueError for wrong shapes,
+    degrees and tangents. Raises RuntimeError for wrong sizes, and if the image needs more than 2^31 tile instances.
     """
     gaussians = Gaussians(means, opacities, **others)
     given = [values for values in (*gaussians, means2d) if values is not None]
-    train = torch.is_grad_enabled() and any([values.requires_grad for values in given])
+    try:
+        train = torch.is_grad_enabled() and any([values.requires_grad for values in given])
+    except AttributeError:
+        raise TypeError(f"inputs must be tensors, got {', '.join({type(v).__name__ for v in given})}") from None
     if settings.debug:
         for name, values in gaussians._asdict().items():
             if values is not None:
                 check_finite(name, values)
     arguments = scene_arguments(gaussians, settings, raw)
-    function = _Rasterize.apply if train else OPERATORS.rasterize
+    # torch.compile knows the operator, whose autograd is registered below.
+    function = _Rasterize.apply if train and not torch.compiler.is_compiling() else OPERATORS.rasterize
     out = function(means2d, *arguments, settings.bg, want_inverse_depth, train)
     color, transmittance, inverse_depth, radii = out[:4]
     if settings.debug:
@@ -128,6 +132,7 @@ def _setup_context(ctx, inputs, output):
     ctx.save_for_backward(*scene[:SCENE_TENSORS], *state, tile_counts)
 
 
+@first_order
 def _backward(ctx, grad_color, grad_transmittance, grad_inverse_depth, *_):
     if not ctx.train:
         raise RuntimeError("this image was rasterized with train=False, so it has no backward")
@@ -170,8 +175,4 @@ class _Rasterize(torch.autograd.Function):
             return OPERATORS.rasterize(*inputs)
 
     setup_context = staticmethod(_setup_context)
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx, *gradients):
-        return _backward(ctx, *gradients)
+    backward = staticmethod(_backward)
