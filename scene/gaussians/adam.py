@@ -222,6 +222,8 @@ def _fitting(entry: Any, param: Tensor, name: str) -> dict[str, Tensor]:
         moment = entry[key]
         if not torch.is_tensor(moment) or moment.shape != param.shape or moment.dtype != param.dtype:
             raise ValueError(f"{key} and {name} differ in shape or type")
+        if not moment.isfinite().all():
+            raise ValueError(f"{key} of {name} is not finite")
     try:
         step = float(entry["step"])  # a tensor; a number where an older torch wrote it
     except (TypeError, ValueError, RuntimeError) as error:

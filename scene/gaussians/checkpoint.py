@@ -1,6 +1,5 @@
 """Checkpoints, files chkpntN.pth of (state of the model, N): tensors and numbers, read without running any code."""
 
-import math
 import os
 import zipfile
 from collections.abc import Sequence
@@ -16,6 +15,7 @@ from scene.gaussians.finite import check_finite
 from scene.gaussians.statistics import Statistics
 from utils.system_utils import UserError, atomic_write
 
+_LARGEST = 1e15  # extent; learning rates are multiples of it
 _ENTRIES = 12  # the reference's; the values of further attributes may follow, and a dict of the exposures
 # The reference stores the scene extent as a NumPy scalar, which NumPy 1 and 2 rebuild by functions of other names.
 _SCALAR = np.float64(0).__reduce__()[0]
@@ -195,9 +195,9 @@ def _checked(content: Any) -> tuple[tuple, int]:
     if not isinstance(capture, tuple | list) or len(capture) < _ENTRIES:
         raise ValueError(f"the state has fewer than {_ENTRIES} entries")
     if type(iteration) is not int or not 0 <= iteration < 2**31:
-        raise ValueError(f"the iteration is {iteration!r:.40}")
+        raise ValueError(f"the iteration is {_shown(iteration)}")
     if type(capture[0]) is not int or not 0 <= capture[0] <= 3:
-        raise ValueError(f"the active SH degree is {capture[0]!r:.40}")
+        raise ValueError(f"the active SH degree is {_shown(capture[0])}")
     per_gaussian = (*capture[1:10], *(entry for entry in capture[_ENTRIES:] if not isinstance(entry, dict)))
     if not all(torch.is_tensor(t) and t.dim() > 0 and t.dtype == torch.float32 for t in per_gaussian):
         raise ValueError("a per-Gaussian value is not a float32 tensor")
@@ -209,9 +209,13 @@ def _checked(content: Any) -> tuple[tuple, int]:
     if [tuple(tensor.shape[1:]) for tensor in capture[7:10]] != [(), (1,), (1,)]:
         raise ValueError("the statistics of density control have wrong shapes")
     extent = capture[11]
-    if not isinstance(extent, Real) or isinstance(extent, bool) or not 0 <= extent < math.inf:
-        raise ValueError(f"the extent of the scene is {extent!r:.40}")
+    if not isinstance(extent, Real) or isinstance(extent, bool) or not 0 <= extent < _LARGEST:
+        raise ValueError(f"the extent of the scene is {_shown(extent)}")
     return tuple(capture), iteration
+
+
+def _shown(value: Any) -> str:
+    return " ".join(repr(value).split())[:40]
 
 
 def _refuse_other_kinds(path: str | os.PathLike) -> None:

@@ -31,7 +31,7 @@ def picture_size(path: Path) -> tuple[int, int]:
             _refuse_float(image)
             if not _has_end_mark(path, image.format):
                 image.load()
-    except UNREADABLE as error:
+    except (*UNREADABLE, MemoryError) as error:
         raise _unreadable(path, error) from error
     return size
 
@@ -69,7 +69,9 @@ def decode(path: Path, size: tuple[int, int]) -> Tensor:
 def _unreadable(path: Path, error: Exception) -> UserError:
     if other := not_the_file(path):
         return UserError(f"{path} is {other}; download it again or take it out of the scene")
-    return UserError(f"cannot read {path} ({error}); replace it or take it out of the scene")
+    return UserError(
+        f"cannot read {path} ({str(error) or type(error).__name__}); replace it or take it out of the scene"
+    )
 
 
 def _has_end_mark(path: Path, file_format: str | None) -> bool:

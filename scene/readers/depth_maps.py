@@ -81,8 +81,10 @@ def read_values(path: Path) -> np.ndarray:
                     )
                 image = image.convert("RGB")
             values = np.asarray(image).astype(np.float64)
-    except UNREADABLE as error:
-        raise UserError(f"cannot read the depth map {path} ({error}); make it again") from error
+    except (*UNREADABLE, MemoryError) as error:
+        raise UserError(
+            f"cannot read the depth map {path} ({str(error) or type(error).__name__}); make it again"
+        ) from error
     if values.ndim == 3:
         # Some tools write grey as three equal channels.
         if (values != values[..., :1]).any():

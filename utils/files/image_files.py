@@ -1,5 +1,6 @@
 """Image files: suffixes and formats, exceptions of reading them, and opening of photos and of renders of any size."""
 
+import struct
 import warnings
 from pathlib import Path
 
@@ -7,11 +8,8 @@ from PIL import Image
 
 MOST_PIXELS = 1 << 28  # 16384 a side, the largest training size; Pillow's default limit is lower
 UNREADABLE = (
-    OSError,
-    SyntaxError,
-    ValueError,
-    EOFError,
-    Image.DecompressionBombError,
+    *(OSError, SyntaxError, ValueError, EOFError, Image.DecompressionBombError),
+    *(TypeError, LookupError, ArithmeticError, struct.error),
 )  # Pillow raises these for broken files, depending on the format
 SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp")
 # What photos come in. Pillow knows more formats, and hands some of them, as PostScript, to other programs, whatever the
