@@ -26,7 +26,6 @@ from evaluation import stages
 from evaluation.configs import check_options, read_configs
 from evaluation.document import Table, cheapest_table, result_blocks
 from evaluation.earlier import joined, joined_peers, read_earlier
-from evaluation.lock import locked
 from evaluation.machine import machine
 from evaluation.peers import peers_of
 from evaluation.report import make_report, write_report
@@ -34,6 +33,7 @@ from evaluation.results import read_run
 from evaluation.runs import Run, check_folders, check_nesting, check_outside_scenes, plan_runs
 from evaluation.scenes import SceneEntry, check_names, dataset_scenes, finished_scenes, folder_scenes
 from evaluation.stages import Failure, StageFailed
+from utils.files.lock import locked
 from utils.files.markdown_table import markdown_table
 from utils.system_utils import UserError, mkdir_p, run_cli
 
@@ -184,7 +184,8 @@ def main(argv: Sequence[str] | None = None) -> None:
     output = args.output_path.resolve()
     mkdir_p(output)
     failures: dict[Run, Failure] = {}
-    with locked(output):
+    busy = "full_eval.py (process {process}), or a training that it started,"
+    with locked(output, "full_eval.py", busy, "--output_path", inherited=True):
         try:
             _carry_out(runs, args, failures)
         finally:  # report the finished runs after Ctrl-C too

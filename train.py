@@ -19,6 +19,7 @@ from arguments import ModelParams, OptimizationParams, OptionParser, PipelinePar
 from training.loop import run_training
 from training.observers.report import training_report
 from training.observers.standard import standard_observers
+from training.output_folder import own_folder
 from training.plan import Plan
 from training.run import Run
 from utils.general_utils import safe_state
@@ -54,9 +55,10 @@ def training(
     plan = Plan(testing_iterations, saving_iterations, checkpoint_iterations, checkpoint, debug_from, record_curve)
     run = Run(dataset, opt, pipe, plan)
     # Write nothing before every input check has passed: a mistyped option must not overwrite a finished model.
-    writer = prepare_output_and_logger(dataset, **run.kept)
-    run.begin()
-    run_training(run, standard_observers(run, writer, training_report))
+    with own_folder(dataset.model_path):
+        writer = prepare_output_and_logger(dataset, **run.kept)
+        run.begin()
+        run_training(run, standard_observers(run, writer, training_report))
 
 
 def _new_output_folder() -> str:

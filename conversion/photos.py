@@ -11,7 +11,7 @@ from tqdm import tqdm
 
 from conversion.layout import Layout, picture_names
 from scene.pictures.decode import picture_size
-from utils.files.image_files import UNREADABLE
+from utils.files.image_files import UNREADABLE, open_image
 from utils.host.threads import threads
 from utils.system_utils import UserError
 
@@ -82,7 +82,7 @@ def resize_images(layout: Layout, factor: int) -> None:
     """Fill `images_<factor>` from `images` by Pillow's bicubic filter; sides are divided by the factor and rounded."""
 
     def resize(name: str) -> None:
-        with Image.open(layout.images / name) as image:
+        with open_image(layout.images / name) as image:
             size = tuple(max(1, round(side / factor)) for side in image.size)
             _save(image.resize(size, Image.Resampling.BICUBIC), layout.resized(factor) / name, image)
 
@@ -93,7 +93,7 @@ def _prepare_photo(source: Path, target: Path) -> Path:
     """Write the prepared photo and return its path: `target`, with .png appended if the format had to change."""
     target.parent.mkdir(parents=True, exist_ok=True)
     try:
-        with Image.open(source) as image:
+        with open_image(source) as image:
             webp = image.format == "WEBP"
             if image.getexif().get(_ORIENTATION, 1) in (0, 1) and not webp:
                 _link(source, target)
@@ -109,7 +109,7 @@ def _prepare_photo(source: Path, target: Path) -> Path:
 def _upright_size(photo: Path) -> tuple[int, int]:
     width, height = picture_size(photo)  # UserError for a truncated file or one of another kind
     try:
-        with Image.open(photo) as image:
+        with open_image(photo) as image:
             lies = image.getexif().get(_ORIENTATION, 1) in _LYING
     except UNREADABLE as error:
         raise UserError(f"cannot read the EXIF data of {photo} ({error}); replace or remove the photo") from error
@@ -135,7 +135,7 @@ def _prepare_mask(source: Path | None, target: Path, photo: Path) -> None:
         Image.new("L", picture_size(photo), 255).save(target)
         return
     try:
-        with Image.open(source) as image:
+        with open_image(source) as image:
             mask = image.convert("L")
     except UNREADABLE as error:
         raise UserError(f"cannot read the mask {source} ({error}); replace or remove it") from error

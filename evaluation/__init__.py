@@ -1,7 +1,7 @@
 """The parts of full_eval.py, which trains, renders and scores a table of scenes, and writes one report.
 
 scenes, configs, runs        the plan: scene folders, options, model folders
-child, lock, record, stages  its execution: each stage is a subprocess; the model folder records finished stages
+child, record, stages        its execution: each stage is a subprocess; the model folder records finished stages
 model_folder, results        readers of model folders
 summary, tradeoff, published spread over seeds, error against time, comparison with published tables
 ground_truth, earlier, peers runs that can be compared, those of earlier calls, curves of other programs

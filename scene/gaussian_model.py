@@ -2,6 +2,7 @@
 
 import argparse
 import os
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -192,11 +193,17 @@ class GaussianModel(Exposed, AdaptiveGaussians):
         self.training_setup(training_args)
         try:
             if isinstance(self.optimizer, GaussianAdam):
-                self.optimizer.take_state(state.optimizer)
+                lacking = self.optimizer.take_state(state.optimizer)
             else:  # a subclass has set up another
                 self.optimizer.load_state_dict(state.optimizer)
+                lacking = []
         except ValueError as error:
             raise UserError(f"the optimiser state of the checkpoint does not fit ({error}); use another one") from error
+        if "xyz" in lacking:  # f_rest may lack it, as Gaussians without active bands have no steps
+            print(
+                f"warning: the checkpoint has no averages of Adam for {', '.join(map(str, lacking))}; they begin at zero",
+                file=sys.stderr,
+            )
         if state.exposures is not None:
             self.exposures.restore(state.exposures)
         self.statistics = state.statistics.to(self._xyz.device)

@@ -127,6 +127,20 @@ def _with(change):
     return lambda scene: _edit(scene, change)
 
 
+def _pose(row, values):
+    def change(content):
+        matrix = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 4], [0, 0, 0, 1]]
+        matrix[row] = values
+        content["frames"][0]["transform_matrix"] = matrix
+
+    return _with(change)
+
+
+def test_poses_that_carry_a_scale_are_taken(blender_scene):
+    _edit(blender_scene, lambda content: content["frames"][0].update(transform_matrix=np.diag([5, 5, 5, 1]).tolist()))
+    assert len(read_scene(blender_scene, "images", True).train_cameras) == 4
+
+
 @pytest.mark.parametrize(
     ("change", "said"),
     [
@@ -146,6 +160,12 @@ def _with(change):
         (_with(lambda content: content["frames"][0].update(transform_matrix=[[1, 2], [3, 4]])), "must be 4x4"),
         (_with(lambda content: content["frames"][0].update(transform_matrix=[[0] * 4] * 4)), "Singular matrix"),
         (_with(lambda content: content["frames"][0].update(transform_matrix=[[1e400] * 4] * 4)), "finite"),
+        (_pose(3, [1, 2, 3, 4]), "the last row of transform_matrix must be 0 0 0 1"),
+        (_pose(0, [1e30, 0, 0, 0]), "pose of r_0 has no rotation, but a matrix that stretches"),
+        (_pose(0, [1, 0, 0, 1e30]), "camera of r_0 is more than 1e[+]12 from the origin"),
+        (_pose(1, [0, 9, 0, 0]), "pose of r_0 has no rotation, but a matrix that stretches"),
+        (_with(lambda content: content.update(cx=1e30)), "principal point far outside"),
+        (_with(lambda content: content.update(w=1e9)), "camera of r_0 has no usable size"),
     ],
 )
 def test_bad_scenes_get_one_sentence_and_no_output(blender_scene, tmp_path, change, said):

@@ -243,6 +243,74 @@ def test_parts_that_do_not_fit_end_in_a_sentence(tmp_path):
         model(2, degree=0).restore(_changed(model(4, degree=0).capture(), 0, 3), options())
 
 
+def test_one_flipped_bit_anywhere_is_noticed(tmp_path):
+    """torch compares no checksums: weights that are off by 1e9 would be trained on."""
+    gaussians = model(50)
+    take_steps(gaussians, 1)
+    path = tmp_path / "chkpnt1.pth"
+    save_checkpoint(path, gaussians.capture(), 1)
+    whole = path.read_bytes()
+    with zipfile.ZipFile(path) as archive:
+        parts = [part for part in archive.infolist() if "data/" in part.filename and part.file_size]
+    for part in parts:
+        lengths = whole[part.header_offset + 26 : part.header_offset + 30]  # of name and padding, each in two bytes
+        place = part.header_offset + 30 + lengths[0] + lengths[2] + 256 * lengths[3] + part.file_size // 2
+        path.write_bytes(whole[:place] + bytes([whole[place] ^ 16]) + whole[place + 1 :])
+        with pytest.raises(UserError, match=r"chkpnt1.pth is damaged: its part \.?data/\w+ does not have the checksum"):
+            load_checkpoint(path)
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("chkpnt1/data.pkl", bytes(1 << 20))
+    with pytest.raises(UserError, match="is not a checkpoint of train.py"):
+        load_checkpoint(path)
+
+
+@pytest.mark.parametrize(
+    "unreal",
+    [
+        lambda values: values[:1].expand(len(values) << 20, *values.shape[1:]),
+        lambda values: values.to_sparse(),
+        lambda values: values.to("meta"),
+    ],
+    ids=["expanded", "sparse", "meta"],
+)
+@pytest.mark.parametrize("place", [1, 8, "exp_avg"])
+def test_tensors_that_are_not_in_the_file_are_refused(tmp_path, unreal, place):
+    gaussians = model(5)
+    take_steps(gaussians, 1)
+    content = gaussians.capture()
+    if place == "exp_avg":
+        content = _with_state(content, lambda s: s["state"][0].update(exp_avg=unreal(s["state"][0]["exp_avg"])))
+    else:
+        content = _changed(content, place, unreal(content[place]))
+    torch.save((content, 7), tmp_path / "chkpnt7.pth")
+    with pytest.raises(UserError, match="a tensor is sparse, has no values, or repeats the same ones"):
+        load_checkpoint(tmp_path / "chkpnt7.pth")
+
+
+def test_a_checkpoint_without_averages_of_adam_is_told_of(capsys):
+    gaussians = model(5)
+    take_steps(gaussians, 1)
+    good = gaussians.capture()
+    model(2).restore(good, options())
+    assert capsys.readouterr().err == ""
+    keyed_by_text = _with_state(good, lambda s: s.update(state={str(key): part for key, part in s["state"].items()}))
+    for content in (_with_state(good, lambda s: s.update(state={})), keyed_by_text):
+        model(2).restore(content, options())
+        assert "warning: the checkpoint has no averages of Adam for xyz, f_dc" in capsys.readouterr().err
+
+
+def test_why_a_checkpoint_cannot_be_written_is_the_systems_own_reason(tmp_path, monkeypatch):
+    """torch hides it: a file system that has become read-only is not a full disk."""
+
+    def refuse(_: object, target) -> None:
+        target.mkdir()  # now the file cannot be opened for writing
+        raise RuntimeError("[enforce fail at inline_container.cc] unexpected pos")
+
+    monkeypatch.setattr("scene.gaussians.checkpoint.torch.save", refuse)
+    with pytest.raises(UserError, match=r"cannot write .*chkpnt1.pth \(Is a directory\)"):
+        save_checkpoint(tmp_path / "chkpnt1.pth", model(3).capture(), 1)
+
+
 @pytest.mark.skipif(resource is None, reason="this system has no limits of file sizes")
 def test_a_full_disk_ends_in_a_sentence(tmp_path):
     capture = model(2000).capture()

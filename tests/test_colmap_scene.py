@@ -340,7 +340,7 @@ def _no_views(scene):
     [
         (_no_sparse, r"is not a scene: looked for the folder sparse .* transforms_train.json .*found images; "),
         (_empty_sparse, r"no COLMAP model in .*looked for cameras, images and points3D.*found sparse/0, .*cameras.bin"),
-        (_cut("cameras.bin"), r"cannot read the COLMAP model .*cameras.bin is cut short, 59 of 64 bytes"),
+        (_cut("cameras.bin"), r"cannot read the COLMAP model .*cameras.bin is cut short or damaged: its 59 bytes"),
         (_cut("images.bin"), r"cannot read the COLMAP model in "),
         (_cut("points3D.bin"), r"cannot read the COLMAP model in "),
         (_missing_pictures, r"7 of 17 photos that .* lists are missing: .*Right/V03.png, .* and 2 more; .*-i"),
@@ -355,6 +355,74 @@ def test_bad_scenes_get_one_sentence_and_no_output(colmap_scene, tmp_path, chang
         Scene(_options(colmap_scene, tmp_path / "out"), FakeGaussians())
     assert "\n" not in str(error.value)
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("name", ["images.bin", "points3D.bin", "rigs.bin", "frames.bin"])
+@pytest.mark.parametrize("bit", [9, 40])
+def test_a_count_beyond_the_file_never_reaches_pycolmap(colmap_scene, monkeypatch, name, bit):
+    """It would fill all memory first. The count of records and that of each record's items are changed in turn."""
+    model = colmap_scene / "sparse" / "0"
+    path = model / name
+    whole = path.read_bytes()
+    places = {"images.bin": whole.find(b"png\0") + 4, "points3D.bin": 8 + 43, "rigs.bin": 12, "frames.bin": 8 + 64}
+    monkeypatch.setattr(pycolmap.Reconstruction, "read_binary", lambda *_: pytest.fail("pycolmap was called"))
+    for place, size in ((0, 8), (places[name], 4 if name in ("rigs.bin", "frames.bin") else 8)):
+        number = int.from_bytes(whole[place : place + size], "little") | 1 << min(bit, 8 * size - 1)
+        path.write_bytes(whole[:place] + number.to_bytes(size, "little") + whole[place + size :])
+        with pytest.raises(UserError, match=rf"{name} is cut short or damaged: its [0-9,]+ bytes end in record"):
+            colmap_model.read_model(model)
+
+
+def test_a_points_file_cut_anywhere_is_refused_before_it_is_read(colmap_scene, monkeypatch):
+    path = colmap_scene / "sparse" / "0" / "points3D.bin"
+    whole = path.read_bytes()
+    monkeypatch.setattr(pycolmap.Reconstruction, "read_binary", lambda *_: pytest.fail("pycolmap was called"))
+    for length in (1, 7, 8, 9, 50, 51, 53, 58, 59, 60, 1000, len(whole) - 1):
+        path.write_bytes(whole[:length])
+        with pytest.raises(UserError, match="points3D.bin is cut short or damaged"):
+            colmap_model.read_model(path.parent)
+
+
+@pytest.mark.parametrize(
+    "params",
+    [
+        *((FOCAL, FOCAL, 45.0, 1e300), (FOCAL, FOCAL, -1e300, 34.5), (FOCAL, FOCAL, 1e39, 34.5)),
+        *((FOCAL, FOCAL, 1e20, 34.5), (1e300, FOCAL, 45.0, 34.5), (1e-300, FOCAL, 45.0, 34.5)),
+        (FOCAL, 5e-324, 45.0, 34.5),
+    ],
+)
+@pytest.mark.parametrize("model", ["PINHOLE", "OPENCV"])
+def test_an_absurd_camera_is_refused(colmap_scene, model, params):
+    sparse = colmap_scene / "sparse" / "0"
+    _as_text(colmap_scene)
+    more = " 0.1 0 0 0" if model == "OPENCV" else ""
+    line = f"1 {model} 96 64 {' '.join(map(repr, params))}{more}\n"
+    (sparse / "cameras.txt").write_text(line)
+    with pytest.raises(UserError, match="camera of Right/V03.png has no usable size or focal length, or a principal"):
+        _read(colmap_scene)
+
+
+def test_cameras_for_parts_of_a_large_photo_and_for_a_telescope_are_taken(colmap_scene):
+    _as_text(colmap_scene)
+    (colmap_scene / "sparse" / "0" / "cameras.txt").write_text("1 PINHOLE 96 64 500000 500000 -900 34.5\n")
+    assert len(_read(colmap_scene).train_cameras) == 17
+
+
+@pytest.mark.parametrize(
+    ("translation", "said"),
+    [("1e30 0 0", "more than 1e[+]12 from the origin"), ("0 1e300 0", "more than 1e[+]12 from the origin")],
+)
+def test_an_absurd_pose_is_refused(colmap_scene, translation, said):
+    _as_text(colmap_scene)
+    path = colmap_scene / "sparse" / "0" / "images.txt"
+    for newer in ("rigs.txt", "frames.txt"):  # they have poses, too
+        (path.parent / newer).unlink()
+    lines = path.read_text().splitlines()
+    words = lines[4].split()
+    words[5:8] = translation.split()
+    path.write_text("\n".join([*lines[:4], " ".join(words), *lines[5:]]) + "\n")
+    with pytest.raises(UserError, match=said):
+        _read(colmap_scene)
 
 
 def test_no_such_folder(tmp_path):

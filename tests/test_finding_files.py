@@ -1,5 +1,6 @@
 """The choice of the COLMAP model, the search for photos by name, and photos of every format in a scene."""
 
+import os
 import shutil
 import unicodedata
 from pathlib import Path
@@ -8,7 +9,7 @@ import numpy as np
 import pycolmap
 import pytest
 import torch
-from PIL import Image
+from PIL import EpsImagePlugin, Image
 from synthetic import HEIGHT, WIDTH, FakeGaussians, folder_state, make_colmap_scene
 from test_colmap_scene import _options, _read
 
@@ -166,3 +167,23 @@ def test_pictures_of_any_kind(tmp_path, kind, model):
     # A palette of 256 colours and JPEG lose some levels; a turned photo would be off by 30 or more.
     assert (target - plain).abs().mean() < (6 if kind == "palette" else 1)
     assert folder_state(folder) == before
+
+
+@pytest.mark.parametrize("make", [os.mkfifo, lambda path: path.symlink_to(path), lambda path: path.symlink_to("gone")])
+def test_what_is_no_file_is_no_photo(colmap_scene, make):
+    """Whoever opens a pipe waits for ever."""
+    path = colmap_scene / "images" / "left" / "v02.png"
+    path.unlink()
+    make(path)
+    with pytest.raises(UserError, match=r"photos .*left/v02.png \(it is there, but a link to nothing or no file"):
+        _read(colmap_scene)
+
+
+def test_a_photo_in_postscript_is_never_run(colmap_scene, monkeypatch):
+    path = colmap_scene / "images" / "left" / "v02.png"
+    with Image.open(path) as image:
+        image.convert("RGB").save(path.with_suffix(".eps"))
+    shutil.move(path.with_suffix(".eps"), path)
+    monkeypatch.setattr(EpsImagePlugin, "Ghostscript", lambda *_, **__: pytest.fail("Ghostscript was started"))
+    with pytest.raises(UserError, match="cannot read .*left/v02.png .*cannot identify image file"):
+        _read(colmap_scene)

@@ -417,3 +417,29 @@ def test_the_paddings_have_a_name() -> None:
     assert allowed_padding == ["same", "valid"]
     pair = image_pair("noise")
     assert len({fused_ssim(*pair, padding).item() for padding in allowed_padding}) == 2
+
+
+_LOSSES = {
+    "fused_ssim": lambda one, two: fused_ssim(one, two),
+    "photometric": lambda one, two: fused_photometric_loss(one, two, 0.2)[0],
+    "operator": lambda one, two: torch.ops.fused_ssim.photometric(one, two, 0.2, True)[0],
+}
+
+
+@pytest.mark.parametrize("loss", _LOSSES.values(), ids=_LOSSES)
+def test_a_penalty_on_a_gradient_raises_instead_of_adding_nothing(loss):
+    """The gradient of a mean is constant, where torch's once_differentiable is silent."""
+    one, two = torch.rand(3, 20, 20, requires_grad=True), torch.rand(3, 20, 20)
+    (gradient,) = torch.autograd.grad(loss(one, two), one, create_graph=True)
+    assert gradient.requires_grad
+    with pytest.raises(RuntimeError, match="differentiate twice"):
+        gradient.square().sum().backward()
+
+
+@pytest.mark.parametrize("loss", _LOSSES.values(), ids=_LOSSES)
+def test_torch_compile_gives_the_same_gradients(loss):
+    one, two = torch.rand(3, 20, 20, requires_grad=True), torch.rand(3, 20, 20)
+    (expected,) = torch.autograd.grad(loss(one, two), one)
+    torch._dynamo.reset()
+    (compiled,) = torch.autograd.grad(torch.compile(loss, backend="aot_eager")(one, two), one)
+    assert torch.equal(compiled, expected)

@@ -8,6 +8,7 @@ from plyfile import PlyData, PlyElement
 
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.ply import stored_sh_degree
+from scene.readers.point_cloud import read_point_cloud
 from utils.system_utils import UserError
 
 ORDER = (
@@ -156,3 +157,30 @@ def test_rows_without_columns_are_no_reason_for_a_traceback(tmp_path):
     (tmp_path / "a.ply").write_text(f"ply\nformat ascii 1.0\nelement vertex 1{'0' * 40}\nend_header\n")
     with pytest.raises(UserError):
         _loaded(tmp_path / "a.ply")
+
+
+def test_gaussians_that_are_not_drawn_are_told_of(tmp_path, capsys):
+    gaussians = model(6)
+    with torch.no_grad():
+        gaussians._xyz[1, 2] = torch.nan
+        gaussians._scaling[4, 0] = torch.inf
+        gaussians._opacity[5] = torch.inf  # an opacity of 1
+    gaussians.save_ply(tmp_path / "point_cloud.ply")
+    capsys.readouterr()
+    _loaded(tmp_path / "point_cloud.ply")
+    said = capsys.readouterr().err
+    assert "warning: 2 of 6 Gaussians in" in said and "are not finite, and are not drawn" in said
+    model(6).save_ply(tmp_path / "point_cloud.ply")
+    capsys.readouterr()
+    _loaded(tmp_path / "point_cloud.ply")
+    assert capsys.readouterr().err == ""
+
+
+def test_a_header_without_an_end_is_refused_at_once(tmp_path, monkeypatch):
+    """plyfile would take minutes and a gigabyte."""
+    (tmp_path / "endless.ply").write_bytes(b"ply\nformat ascii 1.0\ncomment " + b"x" * (2 << 20) + b"\nend_header\n")
+    monkeypatch.setattr(PlyData, "read", lambda *_: pytest.fail("plyfile was asked"))
+    with pytest.raises(UserError, match="no end_header in its first MiB"):
+        _loaded(tmp_path / "endless.ply")
+    with pytest.raises(UserError, match="no end_header in its first MiB"):
+        read_point_cloud(tmp_path / "endless.ply")

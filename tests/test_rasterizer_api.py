@@ -447,14 +447,60 @@ def test_raw_scales_are_asked_for_as_logarithms():
         ({"sh_degree": -1}, "sh_degree must be 0 to 3, got -1"),
         ({"image_width": 0}, "image size 0x7 is out of range"),
         ({"image_height": -1}, "image size 18x-1 is out of range"),
-        ({"viewmatrix": torch.eye(3)}, "view must have 16 values"),
-        ({"bg": torch.zeros(1)}, "background must have 3 values"),
+        ({"viewmatrix": torch.eye(3)}, r"view must be \(4, 4\), got \(3, 3\)"),
+        ({"projmatrix": torch.eye(4).bfloat16()}, "projection must be float32 or float64, got torch.bfloat16"),
+        ({"viewmatrix": None}, "view must be a tensor, got None"),
+        ({"campos": torch.zeros(3, dtype=torch.int64)}, "center must be float32 or float64, got torch.int64"),
+        ({"bg": torch.zeros(1)}, r"background must be \(3,\), got \(1,\)"),
+        ({"bg": torch.zeros(3).half()}, "background must be float32 or float64, got torch.float16"),
+        ({"tanfovx": 0.0}, "tan_x must be the tangent of half an angle of view, got 0"),
+        ({"tanfovy": float("nan")}, "tan_y must be the tangent of half an angle of view, got nan"),
+        ({"tanfovx": float("inf")}, "tan_x must be the tangent"),
+        ({"scale_modifier": float("nan")}, "scale_modifier must be finite, got nan"),
     ],
 )
 def test_wrong_settings_are_named(changes, message):
     splats, camera = scene()
-    with pytest.raises((ValueError, RuntimeError), match=message):
+    with pytest.raises((ValueError, TypeError, RuntimeError), match=message):
         render(splats, camera._replace(**changes), raw=False)
+
+
+@pytest.mark.parametrize("shs", [torch.zeros(()), torch.zeros(3), torch.zeros(3, 3)])
+def test_coefficients_of_another_rank_are_named(shs):
+    splats, camera = scene()
+    with pytest.raises(ValueError, match=r"shs must be \(N, K, 3\), got "):
+        call(splats, camera, shs=shs)
+
+
+@pytest.mark.parametrize("backend", ["eager", "aot_eager"])
+def test_torch_compile_gives_the_same_gradients(backend):
+    splats, camera = scene()
+
+    def loss(**inputs: torch.Tensor) -> torch.Tensor:
+        return (call(inputs, camera, means2D=torch.zeros_like(inputs["means"]))[0] ** 2).sum()
+
+    expected, compiled = leaves(splats), leaves(splats)
+    loss(**expected).backward()
+    torch._dynamo.reset()
+    torch.compile(loss, backend=backend, fullgraph=True)(**compiled).backward()
+    for name, values in expected.items():
+        assert torch.equal(compiled[name].grad, values.grad), name
+
+
+def _image_by_operator(inputs, camera):
+    scene = scene_arguments(inputs, camera, raw=False)
+    return ops.rasterize(torch.zeros_like(inputs["means"]), *scene, camera.bg, False, True)[0]
+
+
+@pytest.mark.parametrize("image", [lambda inputs, camera: call(inputs, camera)[0], _image_by_operator])
+def test_a_penalty_on_a_gradient_raises_instead_of_adding_nothing(image):
+    """The gradient of a sum is constant, where torch's once_differentiable is silent."""
+    splats, camera = scene()
+    inputs = leaves(splats)
+    (gradient,) = torch.autograd.grad(image(inputs, camera).sum(), inputs["means"], create_graph=True)
+    assert gradient.requires_grad and gradient.isfinite().all()
+    with pytest.raises(RuntimeError, match="differentiate twice"):
+        gradient.square().sum().backward()
 
 
 @pytest.mark.parametrize("shape", [(2, 3), (3, 2)])

@@ -144,6 +144,23 @@ def test_scales_from_points_to_worlds(scale, camera):
         assert 0 < (reached > 0).sum() < 30
 
 
+@CPU_AND_GPU
+@pytest.mark.parametrize("axes", [(0,), (2,), (0, 1, 2)])
+def test_giants_are_drawn_or_culled_alike_in_both_precisions(axes, camera, device):
+    """Their squares leave float32's range, where float64 went on drawing."""
+    parameters = scene(True)
+    seen = []
+    for exponent in (14, 15, 16, 17, 17.5, 18.5, 19, 20, 30, 38):
+        giant = {name: t.clone() for name, t in parameters.items()}
+        giant["scales"][VICTIM, list(axes)] = math.log(10) * exponent
+        got = gradients(giant, camera, device)
+        exact = gradients({name: t.double() for name, t in giant.items()}, camera)
+        assert (got["color"] - exact["color"]).abs().max() < 1e-5, exponent
+        assert (got["radii"][VICTIM] > 0) == (exact["radii"][VICTIM] > 0)
+        seen.append(bool(got["radii"][VICTIM]))
+    assert seen[0] and not seen[-1] and seen == sorted(seen, reverse=True)
+
+
 def test_bright_coefficients(camera):
     parameters = {k: t.clone() for k, t in scene(True).items()}
     parameters["sh_dc"][VICTIM] = 1e4

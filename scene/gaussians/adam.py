@@ -173,10 +173,11 @@ class GaussianAdam(torch.optim.Adam):
             state["exp_avg_sq"] = torch.zeros_like(param)
         return state
 
-    def take_state(self, state_dict: Any) -> None:
+    def take_state(self, state_dict: Any) -> list[str]:
         """Take Adam's averages and the step counters of a state dict; the groups keep their options.
 
-        ValueError that says what does not fit, unless it is the state dict of the same groups.
+        Returns the names of the groups that the state dict has none for. ValueError that says what does not fit, unless
+        it is the state dict of the same groups.
         """
         own = self.state_dict()["param_groups"]
         try:
@@ -192,6 +193,7 @@ class GaussianAdam(torch.optim.Adam):
                 if key in state:
                     taken[index] = _fitting(state[key], param, name)
         super().load_state_dict({"state": taken, "param_groups": own})
+        return [g.get("name") for g in self.param_groups if any(param not in self.state for param in g["params"])]
 
 
 def _kind(param: Tensor) -> tuple[torch.dtype, torch.device] | None:
@@ -212,6 +214,8 @@ def _fitting(entry: Any, param: Tensor, name: str | None) -> dict[str, Tensor]:
         moment = entry[key]
         if not torch.is_tensor(moment) or moment.shape != param.shape or moment.dtype != param.dtype:
             raise ValueError(f"{key} and {name} differ in shape or type")
+        if not moment.isfinite().all():
+            raise ValueError(f"{key} of {name} is not finite")
     try:
         step = float(entry["step"])  # a tensor; a number where an older torch wrote it
     except (TypeError, ValueError, RuntimeError) as error:

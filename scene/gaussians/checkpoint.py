@@ -1,9 +1,10 @@
 """Checkpoints, files chkpntN.pth of (state of the model, N): tensors and numbers, read without running any code."""
 
-import math
 import os
+import zipfile
 from collections.abc import Sequence
 from numbers import Real
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,6 +15,7 @@ from scene.gaussians.finite import check_finite
 from scene.gaussians.statistics import Statistics
 from utils.system_utils import UserError, atomic_write
 
+_LARGEST = 1e15  # extent; learning rates are multiples of it
 _ENTRIES = 12  # the reference's; the values of further attributes may follow
 EXPOSURES = "exposures"  # key in the optimiser's state dict
 # The reference stores the scene extent as a NumPy scalar, which NumPy 1 and 2 rebuild by functions of other names.
@@ -110,7 +112,17 @@ def save_checkpoint(path: str | os.PathLike, capture: tuple, iteration: int) -> 
             # torch hides the cause when its archive writer fails, but the content is never the cause.
             if "inline_container" not in str(error) and "PytorchStreamWriter" not in str(error):
                 raise
-            raise OSError("no space is left, or the file is larger than allowed") from error
+            raise _reason(temporary) from error
+
+
+def _reason(temporary: Path) -> OSError:
+    """Why no more can be written to a file, found out by writing more."""
+    try:
+        with open(temporary, "ab") as file:
+            file.write(bytes(1 << 20))
+    except OSError as error:
+        return error
+    return OSError("no space is left, or the file is larger than allowed")
 
 
 def load_checkpoint(path: str | os.PathLike, device: torch.device | str = "cpu") -> tuple[tuple, int]:
@@ -118,8 +130,11 @@ def load_checkpoint(path: str | os.PathLike, device: torch.device | str = "cpu")
     _refuse_other_kinds(path)
     try:
         _refuse_other_formats(path)
+        _refuse_damaged(path)
         with torch.serialization.safe_globals(_ALLOWED):
             content = torch.load(path, map_location=device, weights_only=True)
+    except UserError:
+        raise
     except Exception as error:  # a damaged file can raise any exception in the unpickler
         raise UserError(
             f"{path} is not a checkpoint of train.py: it is damaged, or holds objects other than tensors and numbers, "
@@ -140,17 +155,54 @@ def _refuse_other_formats(path: str | os.PathLike) -> None:
             raise ValueError("not a zip archive")
 
 
+def _refuse_damaged(path: str | os.PathLike) -> None:
+    """UserError for an archive with a part that does not have its checksum, which torch does not compare."""
+    with zipfile.ZipFile(path) as archive:
+        # torch stores parts as they are; compressed ones could be larger than any memory.
+        if any(part.compress_type != zipfile.ZIP_STORED for part in archive.infolist()):
+            raise ValueError("compressed")
+        if damaged := archive.testzip():
+            raise UserError(
+                f"{path} is damaged: its part {damaged.partition('/')[2]} does not have the checksum it was saved "
+                "with; copy the file again, or resume from another checkpoint"
+            )
+
+
+def _refuse_unreal_tensors(content: Any) -> None:
+    """ValueError for a tensor, at any depth, that claims more values than are stored, or stores them in another way.
+
+    A file of a few bytes could fill all memory with them.
+    """
+    left, seen = [content], set()
+    while left:
+        part = left.pop()
+        if id(part) in seen:
+            continue
+        seen.add(id(part))
+        if isinstance(part, dict):
+            left += [*part.keys(), *part.values()]
+        elif isinstance(part, tuple | list):
+            left += part
+        elif torch.is_tensor(part) and not (
+            part.layout == torch.strided
+            and part.device.type != "meta"
+            and part.numel() * part.element_size() <= part.untyped_storage().nbytes()
+        ):
+            raise ValueError("a tensor is sparse, has no values, or repeats the same ones")
+
+
 def _checked(content: Any) -> tuple[tuple, int]:
     """Capture and iteration. ValueError says what is wrong; `unpack` checks the shapes of the attributes."""
+    _refuse_unreal_tensors(content)
     if not isinstance(content, tuple | list) or len(content) != 2:
         raise ValueError("it is not a pair of a state and an iteration")
     capture, iteration = content
     if not isinstance(capture, tuple | list) or len(capture) < _ENTRIES:
         raise ValueError(f"the state has fewer than {_ENTRIES} entries")
     if type(iteration) is not int or not 0 <= iteration < 2**31:
-        raise ValueError(f"the iteration is {iteration!r:.40}")
+        raise ValueError(f"the iteration is {_shown(iteration)}")
     if type(capture[0]) is not int or not 0 <= capture[0] <= 3:
-        raise ValueError(f"the active SH degree is {capture[0]!r:.40}")
+        raise ValueError(f"the active SH degree is {_shown(capture[0])}")
     per_gaussian = (*capture[1:10], *(entry for entry in capture[_ENTRIES:] if not isinstance(entry, dict)))
     if not all(torch.is_tensor(t) and t.dim() > 0 and t.dtype == torch.float32 for t in per_gaussian):
         raise ValueError("a per-Gaussian value is not a float32 tensor")
@@ -162,9 +214,13 @@ def _checked(content: Any) -> tuple[tuple, int]:
     if [tuple(tensor.shape[1:]) for tensor in capture[7:10]] != [(), (1,), (1,)]:
         raise ValueError("the statistics of density control have wrong shapes")
     extent = capture[11]
-    if not isinstance(extent, Real) or isinstance(extent, bool) or not 0 <= extent < math.inf:
-        raise ValueError(f"the extent of the scene is {extent!r:.40}")
+    if not isinstance(extent, Real) or isinstance(extent, bool) or not 0 <= extent < _LARGEST:
+        raise ValueError(f"the extent of the scene is {_shown(extent)}")
     return tuple(capture), iteration
+
+
+def _shown(value: Any) -> str:
+    return " ".join(repr(value).split())[:40]
 
 
 def _refuse_other_kinds(path: str | os.PathLike) -> None:

@@ -1,5 +1,7 @@
 """Check that the values of Gaussians are finite."""
 
+import sys
+
 import torch
 
 from scene.gaussians.attributes import Rows
@@ -18,3 +20,23 @@ def check_finite(rows: Rows, where: str, remedy: str) -> None:
                 f"{name} of {len(bad)} of {len(values)} Gaussians in {where} is not finite "
                 f"(the first is Gaussian {int(bad[0])}); {remedy}"
             )
+
+
+def tell_of_undrawn(rows: Rows, source: object) -> None:
+    """Say how many Gaussians of a file the rasterizer leaves out, because a value is not finite.
+
+    Infinite logits are drawn: programs that set the opacities 0 and 1 write them.
+    """
+    drawn = torch.stack(
+        [
+            (~values.isnan() if name == "opacity" else values.isfinite()).flatten(1).all(dim=1)
+            for name, values in rows.items()
+        ]
+    ).all(dim=0)
+    if not drawn.all():
+        undrawn = len(drawn) - int(drawn.sum())
+        print(
+            f"warning: {undrawn} of {len(drawn)} Gaussians in {source} have values that are not finite, and are not "
+            "drawn",
+            file=sys.stderr,
+        )

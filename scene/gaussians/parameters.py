@@ -8,6 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from scene.gaussians.attributes import Attribute, Rows, attributes
+from scene.gaussians.finite import tell_of_undrawn
 from scene.gaussians.ply import column_names, read_ply, row_bytes, write_ply
 from utils.general_utils import build_scaling_rotation, inverse_sigmoid, strip_symmetric
 from utils.host.device import compute_device
@@ -151,7 +152,9 @@ class GaussianParameters:
 
     def load_ply(self, path: str | os.PathLike) -> None:
         """Take all parameters from a PLY of this model's SH degree (else UserError); all SH bands become active."""
-        self.set_rows(read_ply(path, self.max_sh_degree))
+        rows = read_ply(path, self.max_sh_degree)
+        tell_of_undrawn(rows, path)
+        self.set_rows(rows)
         self.active_sh_degree = self.max_sh_degree
 
     def save_ply(self, path: str | os.PathLike) -> None:

@@ -9,6 +9,7 @@ from plyfile import PlyData, PlyParseError
 from torch import Tensor
 
 from scene.gaussians.attributes import Rows, attributes
+from utils.files.ply_header import check_header
 from utils.files.ply_rows import check_rows
 from utils.system_utils import UserError, atomic_write
 
@@ -110,6 +111,7 @@ def read_vertices(path: str | os.PathLike) -> np.ndarray:
     if not os.path.isfile(path):
         raise UserError(f"no file {path}; give the point_cloud.ply of a trained model")
     try:
+        check_header(path)
         check_rows(path)
         return PlyData.read(os.fspath(path))["vertex"].data
     except (PlyParseError, ValueError, OverflowError) as error:

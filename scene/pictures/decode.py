@@ -10,10 +10,11 @@ from PIL import Image
 from torch import Tensor
 
 from utils.files.file_kinds import not_the_file
-from utils.files.image_files import UNREADABLE
+from utils.files.image_files import UNREADABLE, open_image
 from utils.system_utils import UserError
 
 _TAIL = 4096
+_EIGHT_BITS = ((np.arange(1 << 16) + 128) // 257).astype(np.uint8)  # of a 16-bit grey; 255 is 65535
 # Large photos are normal here; Pillow's own limit still refuses absurd sizes. The filter is set once, because filters
 # set for a block apply to all threads.
 warnings.filterwarnings("ignore", category=Image.DecompressionBombWarning)
@@ -25,26 +26,26 @@ def picture_size(path: Path) -> tuple[int, int]:
     A file that lacks its format's end mark is decoded, to find out whether it is complete.
     """
     try:
-        with Image.open(path) as image:
+        with open_image(path) as image:
             size = image.size
             _refuse_float(image)
             if not _has_end_mark(path, image.format):
                 image.load()
-    except UNREADABLE as error:
+    except (*UNREADABLE, MemoryError) as error:
         raise _unreadable(path, error) from error
     return size
 
 
 def may_be_transparent(path: Path) -> bool:
     """Whether a readable image file has an alpha channel or a transparent colour, from its header."""
-    with Image.open(path) as image:
+    with open_image(path) as image:
         return image.has_transparency_data
 
 
 def decode(path: Path, size: tuple[int, int]) -> Tensor:
     """Do as `pixels_of` for a file; EXIF orientation is ignored, as in COLMAP. UserError if it cannot be read."""
     try:
-        with Image.open(path) as image:
+        with open_image(path) as image:
             return pixels_of(image, size)
     except UNREADABLE as error:
         raise _unreadable(path, error) from error
@@ -72,7 +73,9 @@ def pixels_of(image: Image.Image, size: tuple[int, int]) -> Tensor:
 def _unreadable(path: Path, error: Exception) -> UserError:
     if other := not_the_file(path):
         return UserError(f"{path} is {other}; download it again or take it out of the scene")
-    return UserError(f"cannot read {path} ({error}); replace it or take it out of the scene")
+    return UserError(
+        f"cannot read {path} ({str(error) or type(error).__name__}); replace it or take it out of the scene"
+    )
 
 
 def _has_end_mark(path: Path, file_format: str | None) -> bool:
@@ -92,8 +95,9 @@ def _refuse_float(image: Image.Image) -> None:
 def _to_rgb_or_rgba(image: Image.Image) -> Image.Image:
     if image.mode.startswith("I"):
         # Pillow's own conversion of 16-bit grey clips at 255.
-        grey = np.clip(np.asarray(image).astype(np.int64), 0, 65535)
-        return Image.fromarray(((grey + 128) // 257).astype(np.uint8)).convert("RGB")
+        grey = np.asarray(image)
+        grey = grey if grey.dtype == np.uint16 else np.clip(grey, 0, 65535)
+        return Image.fromarray(_EIGHT_BITS[grey]).convert("RGB")
     _refuse_float(image)
     has_alpha = image.has_transparency_data
     return image.convert("RGBA" if has_alpha else "RGB")

@@ -31,7 +31,8 @@ class FileIndex:
         if self._folded_paths is None:
             self._folded_paths = {}
             for folder, _, files in os.walk(self._folder):
-                for path in (Path(folder, file) for file in files):
+                # A pipe is no file, and whoever opens one waits for ever; a link may lead to nothing.
+                for path in (Path(folder, file) for file in files if os.path.isfile(os.path.join(folder, file))):
                     self._folded_paths.setdefault(_folded(str(path.relative_to(self._folder))), []).append(path)
         for name in names:
             alike = self._folded_paths.get(_folded(name), [])
@@ -76,7 +77,10 @@ def find_pictures(
         if suffixes:
             missing = [name if name.lower().endswith(tuple(suffixes)) else name + suffixes[0] for name in missing]
         other = index.with_another_suffix(missing[0])
-        instead = f" ({other.relative_to(folder)} is there instead)" if other else ""
+        if other:
+            instead = f" ({other.relative_to(folder)} is there instead)"
+        else:
+            instead = " (it is there, but a link to nothing or no file)" if os.path.lexists(folder / missing[0]) else ""
         raise UserError(
             f"{len(missing)} of {len(paths)} {kind} that {listed_by} lists are missing: "
             f"{some([str(folder / name) for name in missing])}{instead}; {remedy}"

@@ -6,6 +6,7 @@ has border rays that no pinhole can project; then `WIDEST` decides.
 
 import functools
 import math
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,6 +16,11 @@ from utils.system_utils import UserError
 
 WIDEST = 60.0  # degrees to either side; farther out, a pinhole stretches the photo more than fourfold
 _PINHOLES = {"SIMPLE_PINHOLE": 3, "PINHOLE": 4}  # number of parameters
+# In sizes of the photo. Beyond these bounds lie damaged files and other units, not lenses: fields of view below a
+# thousandth of a degree, or so near 180 degrees that no pinhole shows anything.
+_SHORTEST, _LONGEST = 1e-4, 1e5  # focal length
+_FARTHEST = 100.0  # principal point, from the middle; parts cut out of a large photo have it outside
+_LARGEST = 1 << 20  # pixels a side
 _ROUND_TRIP = 0.5  # pixels: largest error of a usable ray, from a pixel to the ray and back
 
 
@@ -56,7 +62,8 @@ def pinhole_of(lens: Lens, name: str) -> Pinhole | None:
 
     name: of a photo, for the message. UserError for a lens that is unusable or a panorama.
     """
-    if not (np.isfinite(lens.params).all() and min(lens.width, lens.height) > 0):
+    narrow, wide = sorted((lens.width, lens.height))
+    if not (np.isfinite(lens.params).all() and narrow > 0 and wide <= _LARGEST):
         raise _unusable(lens, name)
     if len(lens.params) == _PINHOLES.get(lens.model):  # without pycolmap, which is slow to import
         focal, center = lens.params[:-2], lens.params[-2:]
@@ -71,17 +78,24 @@ def pinhole_of(lens: Lens, name: str) -> Pinhole | None:
         center = tuple(lens.params[index] for index in camera.principal_point_idxs())
         # is_undistorted alone is also true of a fisheye without further parameters.
         straight = camera.is_perspective_pinhole() and camera.is_undistorted()
-        if not straight and min(focal) > 0:
+        if not straight:
+            _check_bounds(lens, focal, center, name)
             return None
-    if min(focal) <= 0:
-        raise _unusable(lens, name)
+    _check_bounds(lens, focal, center, name)
     return Pinhole(focal[0], focal[-1], *center, lens.width, lens.height)
+
+
+def _check_bounds(lens: Lens, focal: Sequence[float], center: Sequence[float], name: str) -> None:
+    size = max(lens.width, lens.height)
+    astray = max(abs(center[0] / lens.width - 0.5), abs(center[1] / lens.height - 0.5))
+    if not (_SHORTEST * size <= min(focal) <= max(focal) <= _LONGEST * size and astray <= _FARTHEST):
+        raise _unusable(lens, name)
 
 
 def _unusable(lens: Lens, name: str) -> UserError:
     return UserError(
-        f"the camera of {name} has no usable size or focal length ({lens.model}, {lens.width} x {lens.height}, "
-        f"{lens.params}); fix it, or export the cameras again"
+        f"the camera of {name} has no usable size or focal length, or a principal point far outside of the photo "
+        f"({lens.model}, {lens.width} x {lens.height}, {lens.params}); fix it, or export the cameras again"
     )
 
 

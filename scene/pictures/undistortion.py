@@ -20,6 +20,8 @@ from scene.pictures.decode import decode, picture_size
 from scene.pictures.lens import Lens, Pinhole, Undistortion, shown_pixels, undistortion
 from scene.pictures.masks import TRANSPARENT, Mask
 from scene.pictures.pycolmap_import import import_pycolmap
+from utils.files.image_files import open_image
+from utils.files.leftovers import remove_leftovers
 from utils.host.cache_folder import cache_folder
 from utils.host.threads import threads
 from utils.system_utils import UserError, atomic_write, mkdir_p
@@ -67,6 +69,7 @@ def undistort(photos: Sequence[Photo]) -> list[Undistorted]:
     paths = [folder / key[:2] / f"{key}.png" for key in keys]
     missing = {path: photo for path, photo in zip(paths, photos, strict=True) if not _kept(path)}
     if missing:
+        remove_leftovers(folder)
         _in_threads(lambda item: _make(item[1], item[0]), list(missing.items()), "Undistorting photos")
         size = sum(path.stat().st_size for path in missing)
         print(
@@ -119,7 +122,7 @@ def _kept(path: Path) -> bool:
         return False
     try:
         picture_size(path)
-        with Image.open(path) as image:
+        with open_image(path) as image:
             has_mask = image.info.get(_HAS_MASK)
         if has_mask == "yes":
             picture_size(_mask_path(path))

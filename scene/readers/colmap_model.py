@@ -9,6 +9,7 @@ import numpy as np
 from scene.pictures.lens import Lens
 from scene.pictures.pycolmap_import import import_pycolmap
 from scene.readers.colmap_faults import NAMES, describe
+from scene.readers.colmap_lengths import check_lengths
 from utils.system_utils import UserError
 
 
@@ -72,9 +73,9 @@ def read_model(folder: Path) -> ColmapModel:
             continue
         model = pycolmap.Reconstruction()
         try:
-            getattr(model, read)(str(folder))
             if suffix == "bin":
-                _check_cameras_whole(folder / "cameras.bin", model)
+                check_lengths(folder)
+            getattr(model, read)(str(folder))
             return _records(model, {} if suffix == "bin" else _spaced_names(folder / "images.txt", model))
         except UnicodeDecodeError:
             errors.append(f".{suffix}: photo names are not UTF-8 (rename the photos in plain letters)")
@@ -106,6 +107,8 @@ def read_sightings(folder: Path, suffix: str) -> list[Sightings]:
         raise UserError(f"no COLMAP model in {folder} as .{suffix}; choose the other kind with --model_type")
     model = import_pycolmap().Reconstruction()
     try:
+        if suffix == "bin":
+            check_lengths(folder)
         (model.read_binary if suffix == "bin" else model.read_text)(str(folder))
     except (ValueError, RuntimeError, IndexError, MemoryError) as error:
         raise _unreadable(folder, [describe(folder, suffix, error)]) from error
@@ -135,13 +138,6 @@ def points_file(folder: Path) -> Path:
 
 def _has_model(folder: Path, suffix: str) -> bool:
     return all((folder / f"{name}.{suffix}").is_file() for name in NAMES)
-
-
-def _check_cameras_whole(path: Path, model) -> None:
-    # pycolmap 4.2.1 fills the missing end of this file with garbage instead of refusing it.
-    wanted = 8 + sum(24 + 8 * len(camera.params) for camera in model.cameras.values())
-    if path.stat().st_size < wanted:
-        raise ValueError(f"cameras.bin is cut short, {path.stat().st_size} of {wanted} bytes")
 
 
 def _spaced_names(path: Path, model) -> dict[int, str]:

@@ -10,13 +10,12 @@ from typing import ClassVar
 
 import numpy as np
 import torch
-from PIL import Image
 from torch import Tensor
 
 from scene.pictures.decode import picture_size
 from scene.readers import colmap_model
 from scene.readers.info import CameraInfo, SceneInfo
-from utils.files.image_files import UNREADABLE
+from utils.files.image_files import UNREADABLE, open_image
 from utils.files.listing import some
 from utils.host.cache_folder import cache_folder
 from utils.system_utils import UserError
@@ -96,7 +95,7 @@ def _with_map(camera: CameraInfo, path: Path, params: dict[str, float] | None, u
 def read_values(path: Path) -> np.ndarray:
     """Values (H, W) float64 of a grey image file of 8 or 16 bits, unscaled. UserError for a file that is not grey."""
     try:
-        with Image.open(path) as image:
+        with open_image(path) as image:
             if image.mode not in ("L", "I;16", "I;16B", "I"):
                 if _is_16_bit_color(path):
                     raise UserError(
@@ -104,8 +103,10 @@ def read_values(path: Path) -> np.ndarray:
                     )
                 image = image.convert("RGB")
             values = np.asarray(image).astype(np.float64)
-    except UNREADABLE as error:
-        raise UserError(f"cannot read the depth map {path} ({error}); make it again") from error
+    except (*UNREADABLE, MemoryError) as error:
+        raise UserError(
+            f"cannot read the depth map {path} ({str(error) or type(error).__name__}); make it again"
+        ) from error
     if values.ndim == 3:
         # Some tools write grey as three equal channels.
         if (values != values[..., :1]).any():

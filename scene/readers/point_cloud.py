@@ -3,14 +3,21 @@
 import os
 import warnings
 import zipfile
+import zlib
 from pathlib import Path
 
 import numpy as np
 from plyfile import PlyData, PlyElement, PlyParseError
 
+from utils.files.ply_header import check_header
 from utils.graphics_utils import BasicPointCloud
 from utils.system_utils import UserError, atomic_write
 
+# What NumPy and the reader of archives raise for damaged files: the last two for compression and encryption.
+_NPZ_FAULTS = (
+    *(ValueError, TypeError, OSError, EOFError, KeyError, MemoryError, zipfile.BadZipFile, zlib.error),
+    *(NotImplementedError, RuntimeError),
+)
 _POSITION = ("x", "y", "z")
 _NORMAL = ("nx", "ny", "nz")
 _COLOR = ("red", "green", "blue")
@@ -75,6 +82,7 @@ def _begins_with(path: Path, magic: bytes) -> bool:
 
 def _read_ply(path: Path) -> BasicPointCloud:
     try:
+        check_header(path)
         ply = PlyData.read(str(path))
     except (PlyParseError, ValueError, OverflowError, OSError, EOFError, MemoryError) as error:
         raise UserError(f"{path} is not a readable PLY file ({error}); export the point cloud again") from error
@@ -106,7 +114,7 @@ def _read_npz(path: Path) -> np.ndarray:
         if points is None or any(part.ndim != 2 or part.shape[1] != 3 for part in parts):
             raise ValueError("it needs an array points (N,3), and may have colors (N,3)")
         return np.concatenate(parts, axis=1)
-    except (ValueError, TypeError, OSError, EOFError, KeyError, MemoryError, zipfile.BadZipFile) as error:
+    except _NPZ_FAULTS as error:
         raise UserError(
             f"{path} is not a readable npz file of points ({error}); save points and colors (N,3)"
         ) from error

@@ -14,6 +14,12 @@ from scene.pictures.undistortion import Photo, undistort
 from scene.readers.info import CameraInfo
 from utils.system_utils import UserError
 
+# Bounds on poses, beyond which lie damaged files. At 1e12 a double has steps of 1e-4. Some programs scale their poses,
+# by one factor for all axes.
+FARTHEST = 1e12
+SCALED = 1e6
+SKEWED = 2.0
+
 
 class SourceView(NamedTuple):
     """A photo as a dataset lists it: file, lens, world-to-camera rotation (3,3) and translation (3,), mask."""
@@ -34,8 +40,7 @@ def make_cameras(views: Sequence[SourceView], ignore_alpha: bool) -> list[Camera
     """
     pinholes = [pinhole_of(view.lens, view.name) for view in views]
     for view in views:
-        if not (np.isfinite(view.rotation).all() and np.isfinite(view.translation).all()):
-            raise UserError(f"the pose of {view.name} is not finite; take the photo out of the scene")
+        _check_pose(view)
     sizes = [picture_size(view.path) for view in views]
     _warn_of_other_shapes(views, sizes)
     for view, size in zip(views, sizes, strict=True):
@@ -79,6 +84,23 @@ def camera_of(
         mask=mask,
         ignore_alpha=ignore_alpha,
     )
+
+
+def _check_pose(view: SourceView) -> None:
+    if not (np.isfinite(view.rotation).all() and np.isfinite(view.translation).all()):
+        raise UserError(f"the pose of {view.name} is not finite; take the photo out of the scene")
+    center = view.rotation.T @ view.translation
+    if np.abs(view.translation).max() > FARTHEST or np.abs(center).max() > FARTHEST:
+        raise UserError(
+            f"the camera of {view.name} is more than {FARTHEST:g} from the origin; take the photo out of the scene, or "
+            "move the scene to its origin"
+        )
+    stretch = np.linalg.svd(view.rotation, compute_uv=False)
+    if not (stretch[0] <= SKEWED * stretch[2] and 1 / SCALED <= stretch[0] <= SCALED):
+        raise UserError(
+            f"the pose of {view.name} has no rotation, but a matrix that stretches by {stretch[2]:.3g} to "
+            f"{stretch[0]:.3g}; export the cameras again, or take the photo out of the scene"
+        )
 
 
 def _check_mask(view: SourceView, size: tuple[int, int]) -> None:

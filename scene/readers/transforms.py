@@ -204,4 +204,7 @@ def _world_to_camera(rows: list[list[float]]) -> np.ndarray:
     if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
         raise ValueError(f"transform_matrix must be 4x4 finite numbers, got shape {matrix.shape}")
     matrix[:3, 1:3] *= -1
-    return np.linalg.inv(matrix)
+    inverse = np.linalg.inv(matrix)
+    if np.abs(matrix[3] - (0, 0, 0, 1)).max() > 1e-3:
+        raise ValueError(f"the last row of transform_matrix must be 0 0 0 1, got {matrix[3]}")
+    return inverse

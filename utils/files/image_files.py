@@ -1,5 +1,6 @@
-"""Image files: suffixes, exceptions of reading them, and opening of renders of any size."""
+"""Image files: suffixes and formats, exceptions of reading them, and opening of photos and of renders of any size."""
 
+import struct
 import warnings
 from pathlib import Path
 
@@ -7,13 +8,18 @@ from PIL import Image
 
 MOST_PIXELS = 1 << 28  # 16384 a side, the largest training size; Pillow's default limit is lower
 UNREADABLE = (
-    OSError,
-    SyntaxError,
-    ValueError,
-    EOFError,
-    Image.DecompressionBombError,
+    *(OSError, SyntaxError, ValueError, EOFError, Image.DecompressionBombError),
+    *(TypeError, LookupError, ArithmeticError, struct.error),
 )  # Pillow raises these for broken files, depending on the format
 SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp")
+# What photos come in. Pillow knows more formats, and hands some of them, as PostScript, to other programs, whatever the
+# file's name is.
+FORMATS = ("PNG", "JPEG", "TIFF", "BMP", "WEBP", "GIF", "PPM", "JPEG2000", "TGA")
+
+
+def open_image(path: Path) -> Image.Image:
+    """Open an image file of one of FORMATS; its pixels are read later. Raises one of UNREADABLE if that fails."""
+    return Image.open(path, formats=FORMATS)
 
 
 def open_render(path: Path) -> Image.Image:
@@ -23,7 +29,7 @@ def open_render(path: Path) -> Image.Image:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error", Image.DecompressionBombWarning)
-            return Image.open(path)
+            return open_image(path)
     except Image.DecompressionBombWarning as error:
         raise Image.DecompressionBombError(str(error)) from error
     finally:

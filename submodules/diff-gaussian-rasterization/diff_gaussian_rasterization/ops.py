@@ -4,11 +4,11 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor, library
-from torch.autograd.function import once_differentiable
 
 import diff_gaussian_rasterization.fakes  # noqa: F401  (registers the fake kernels)
 from diff_gaussian_rasterization.backend import OPERATORS
 from diff_gaussian_rasterization.checks import check_finite, check_tensors
+from diff_gaussian_rasterization.first_order import first_order
 from diff_gaussian_rasterization.gaussians import Gaussians, lists_gaussians
 from diff_gaussian_rasterization.schema import GRADIENT_PLACES, INPUTS, SCENE_TENSORS
 from diff_gaussian_rasterization.settings import GaussianRasterizationSettings
@@ -43,8 +43,9 @@ def rasterize(
     means2d (N, 3): values unused; receives d loss / d mean on the image, per NDC unit.
     raw: opacities are logits, scales are logarithms, and rotations have any length (zero means the identity).
     Gaussians with a NaN or an infinite value are left out and receive zero gradients.
-    Raises TypeError for wrong types and dtypes and ValueError for wrong shapes. Raises RuntimeError for wrong settings,
-    and if the image needs more than 2^31 tile instances.
+    Second derivatives raise RuntimeError. Raises TypeError for None, other wrong types and dtypes, and ValueError for
+    wrong shapes, degrees and tangents. Raises RuntimeError for wrong sizes, and if the image needs more than 2^31 tile
+    instances.
     """
     gaussians = Gaussians(means, opacities, **others)
     try:
@@ -55,7 +56,8 @@ def rasterize(
                 if values is not None:
                     check_finite(name, values)
         arguments = scene_arguments(gaussians, settings, raw)
-        function = _Rasterize.apply if train else OPERATORS.rasterize
+        # torch.compile knows the operator, whose autograd is registered below.
+        function = _Rasterize.apply if train and not torch.compiler.is_compiling() else OPERATORS.rasterize
         out = function(means2d, *arguments, settings.bg, want_inverse_depth, train)
     except (AttributeError, TypeError, RuntimeError):
         _check_types(gaussians, settings, means2d)
@@ -142,6 +144,7 @@ def _setup_context(ctx, inputs, output):
     ctx.save_for_backward(*scene[:SCENE_TENSORS], *state, tile_counts)
 
 
+@first_order
 def _backward(ctx, grad_color, grad_transmittance, grad_inverse_depth, *_):
     if not ctx.train:
         raise RuntimeError("this image was rasterized with train=False, so it has no backward")
@@ -184,8 +187,4 @@ class _Rasterize(torch.autograd.Function):
             return OPERATORS.rasterize(*inputs)
 
     setup_context = staticmethod(_setup_context)
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx, *gradients):
-        return _backward(ctx, *gradients)
+    backward = staticmethod(_backward)

@@ -80,6 +80,8 @@ def rasterize_gaussians(
     optional |= {"cov3Ds_precomp": cov3Ds_precomp}
     check_tensors({"means3D": means3D, "means2D": means2D, "opacities": opacities} | optional)
     sh, dc, colors, scales, rotations, cov3d = map(_or_none, optional.values())
+    if sh is not None and sh.dim() != 3:
+        raise ValueError(f"shs must be (N, K, 3), got {tuple(sh.shape)}")
     if colors is not None:
         sh_dc = sh_rest = None
     elif dc is not None:

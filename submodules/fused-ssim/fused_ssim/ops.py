@@ -9,9 +9,9 @@ from functools import cache
 
 import torch
 from torch import Tensor, library
-from torch.autograd.function import once_differentiable
 
 from fused_ssim.backend import OPERATORS
+from fused_ssim.first_order import first_order
 
 WINDOW = 11  # pixels
 PADDINGS = ("same", "valid")
@@ -49,9 +49,9 @@ def fused_photometric_loss(img1: Tensor, img2: Tensor, lambda_dssim: float) -> t
     """
     _check_inputs(img1, img2, "same")
     train = torch.is_grad_enabled() and img1.requires_grad
-    if train:
+    if train and not torch.compiler.is_compiling():  # torch.compile knows the operator
         return _Photometric.apply(img1, img2, float(lambda_dssim), True)[:2]
-    return OPERATORS.photometric(img1, img2.detach(), float(lambda_dssim), False)[:2]
+    return OPERATORS.photometric(img1, img2.detach(), float(lambda_dssim), train)[:2]
 
 
 def composite(picture: Tensor, background: Tensor) -> Tensor:
@@ -109,7 +109,7 @@ def _setup_context(ctx, inputs: tuple, output: tuple[Tensor, Tensor, Tensor]) ->
     ctx.save_for_backward(img1, img2, output[2])
 
 
-@once_differentiable  # a second derivative would be silently wrong
+@first_order
 def _backward(ctx, grad_l1: Tensor, grad_ssim: Tensor, _) -> tuple[Tensor, None, None, None]:
     img1, img2, ssim_gradient = ctx.saved_tensors
     return OPERATORS.l1_ssim_vjp(img1, img2, ssim_gradient, grad_l1, grad_ssim), None, None, None
@@ -142,7 +142,7 @@ def _setup_photometric(ctx, inputs: tuple, output: tuple[Tensor, Tensor, Tensor]
     ctx.save_for_backward(img1, img2, output[2])
 
 
-@once_differentiable
+@first_order
 def _photometric_backward(ctx, grad_loss: Tensor | None, *_) -> tuple[Tensor | None, None, None, None]:
     if grad_loss is None:
         return None, None, None, None

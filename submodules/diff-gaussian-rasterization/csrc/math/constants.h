@@ -18,6 +18,7 @@ constexpr double kMinRadiusRoot = 0.1;      // px^4, under the root of the large
 constexpr double kMaxLog2Opacity = 64;      // opacities are at most 1; this keeps exp2 finite for others
 constexpr double kBlack = -1e-6;    // colours >= this get a gradient: points that start black are at 0 up to rounding
 constexpr double kMaxColor = 1e15;  // a larger magnitude is culled as Inf is: its gradients overflow
+constexpr double kMaxVariance = 1e36;     // px^2; culled beyond, for any T: in float32 the squares overflow
 constexpr double kMinQuaternion = 1e-30;  // a shorter one counts as zero: its gradient, 1/|q|, overflows
 constexpr double kLn2 = 0.693147180559945309417;
 constexpr double kHalfLog2e = 0.5 / kLn2;  // exp(-q/2) = exp2(-kHalfLog2e q)

@@ -55,7 +55,7 @@ GS_HD Footprint<T> splat_footprint(const Camera<T>& cam, const Perspective<T>& p
 }
 
 // Computes a splat except its colour. Opacity, scales and rotation must be finite. Returns false if it is culled:
-// behind the camera, not finite on the image, or too faint to be seen anywhere.
+// behind the camera, not finite or too large on the image, or too faint to be seen anywhere.
 template <class T>
 GS_HD bool project_splat(const Camera<T>& cam, const Gaussian<T>& gaussian, bool antialiasing, Splat<T>& splat,
                          T& depth, int& radius) {
@@ -69,7 +69,7 @@ GS_HD bool project_splat(const Camera<T>& cam, const Gaussian<T>& gaussian, bool
   splat.l11 = f.l11, splat.l12 = f.l12, splat.l22 = f.l22;
   splat.inverse_depth = p.inverse_z;
   depth = view.z;
-  if (!finite(Vec3<T>{splat.x, splat.y, f.l12}) || !(f.l11 > 0) || !(f.l22 > 0) || !std::isfinite(f.a + f.c))
+  if (!finite(Vec3<T>{splat.x, splat.y, f.l12}) || !(f.l11 > 0) || !(f.l22 > 0) || !(f.a + f.c < T(kMaxVariance)))
     return false;
   radius = footprint_radius(f);
   if (!radius_on_image(splat.x, splat.y, radius, cam.width, cam.height)) radius = 0;

@@ -1,4 +1,5 @@
 // The ops that change parameters and statistics in place: Adam, sparse Adam, and what density control observes.
+#include <utility>
 #include <vector>
 
 #include "tensors.h"
@@ -8,6 +9,9 @@ namespace gs::ops {
 namespace {
 
 void check_moments(const Tensor& value, const Tensor& gradient, const Tensor& exp_avg, const Tensor& exp_avg_sq) {
+  for (const auto& [name, t] : {std::pair("value", &value), std::pair("gradient", &gradient),
+                                std::pair("exp_avg", &exp_avg), std::pair("exp_avg_sq", &exp_avg_sq)})
+    check_given(*t, name);
   for (const Tensor* t : {&gradient, &exp_avg, &exp_avg_sq})
     TORCH_CHECK(t->sizes() == value.sizes() && t->scalar_type() == value.scalar_type() && t->device() == value.device(),
                 "gradient and averages must have the shape, dtype and device of the parameter, ", value.sizes(), " ",
@@ -84,6 +88,7 @@ void sparse_adam_op(Tensor& value, const Tensor& gradient, Tensor& exp_avg, Tens
                     double lr, double beta1, double beta2, double eps, int64_t columns, const MaybeTensor& loss,
                     const MaybeTensor& stopped, int64_t iteration) {
   check_moments(value, gradient, exp_avg, exp_avg_sq);
+  check_given(visible, "visible");
   const int64_t rows = rows_of(value);
   TORCH_CHECK(visible.dim() == 1 && visible.size(0) == rows && visible.scalar_type() == at::kBool &&
                   visible.device() == value.device(),
@@ -100,6 +105,10 @@ void sparse_adam_op(Tensor& value, const Tensor& gradient, Tensor& exp_avg, Tens
 }
 
 void observe_op(Tensor& max_radii, Tensor& gradient_sums, Tensor& views, const Tensor& radii, const Tensor& gradient) {
+  for (const auto& [name, t] :
+       {std::pair("max_radii", &max_radii), std::pair("gradient_sums", &gradient_sums), std::pair("views", &views)})
+    check_given(*t, name);
+  check_given(radii, "radii"), check_given(gradient, "gradient");
   const int64_t n = radii.numel();
   for (const Tensor* t : {&max_radii, &gradient_sums, &views}) {
     TORCH_CHECK(t->numel() == n && t->scalar_type() == at::kFloat && t->device() == radii.device(),

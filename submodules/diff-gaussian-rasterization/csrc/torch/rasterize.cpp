@@ -42,6 +42,37 @@ struct ProjectedTensors {
   }
 };
 
+// What a forward hands to its backward, and the ops of single stages take from their callers. Of values only the ends
+// of lists are checked, and only on the CPU, as reading one from a GPU waits for it. Other indices are the caller's
+// concern.
+void check_splats(const Tensor& splats) {
+  check_given(splats, "splats");
+  const at::ScalarType type = splats.scalar_type();
+  TORCH_CHECK_TYPE(type == at::kFloat || type == at::kDouble, "splats must be float32 or float64, got ",
+                   in_words(type));
+  TORCH_CHECK_VALUE(splats.dim() == 2 && splats.size(1) == kSplatValues, "splats must be (N, ", kSplatValues, "), got ",
+                    in_words(splats.sizes()));
+}
+
+void check_lists(const Tensor& instances, const Tensor& ranges, const Tensor& splats, gs::Image image) {
+  check_tensor(instances, "instances", at::kInt, splats.device(), {-1});
+  check_tensor(ranges, "ranges", at::kLong, splats.device(), {tiles_of(image) + 1});
+  if (!ranges.is_cpu()) return;
+  const int64_t end = ranges.const_data_ptr<int64_t>()[tiles_of(image) * ranges.stride(0)], n = instances.size(0);
+  TORCH_CHECK_VALUE(end <= n && (end <= 0 || splats.size(0) > 0), "ranges end at ", end, ", but there are ", n,
+                    " instances of ", splats.size(0), " splats");
+}
+
+// The size of the image whose `last` this is.
+gs::Image image_of(const Tensor& last, const Tensor& splats) {
+  check_tensor(last, "last", at::kInt, splats.device(), {-1, -1});
+  return checked_image(last.size(0), last.size(1));
+}
+
+void check_counts(const Tensor& tile_counts, int64_t count, at::Device device) {
+  check_tensor(tile_counts, "tile_counts", at::kInt, device, {count});
+}
+
 // rects: whether the caller wants them; with records nothing else needs them.
 ProjectedTensors project(const SceneTensors& in, bool rects) {
   const int64_t n = in.count();
@@ -111,7 +142,7 @@ gs::BlendInput<T> blend_input(const Tensor& splats, const Tensor& instances, con
 }
 
 Tensor background_like(const Tensor& background, const Tensor& splats) {
-  TORCH_CHECK(background.numel() == 3, "background must have 3 values, got ", in_words(background.sizes()));
+  check_precise(background, "background", {3});
   return converted(background, splats);
 }
 
@@ -143,15 +174,15 @@ class BlendBackward {
   BlendBackward(const Tensor& splats, const Tensor& instances, const Tensor& ranges, const Tensor& splat_slots,
                 const Tensor& slots, const Tensor& background, const Tensor& last, const Tensor& transmittance,
                 const Tensor& grad_color, const MaybeTensor& grad_transmittance, const MaybeTensor& grad_inverse_depth)
-      : splats_(splats.contiguous()),
-        instances_(instances),
-        ranges_(ranges),
+      : image_(checked(BACKWARD_ARGUMENTS)),
+        splats_(splats.contiguous()),
+        instances_(instances.contiguous()),
+        ranges_(ranges.contiguous()),
         splat_slots_(splat_slots.contiguous()),
         slot_count_(slots.size(0)),
         background_(background_like(background, splats)),
-        last_(last),
-        transmittance_(transmittance),
-        image_{int(last.size(1)), int(last.size(0))},
+        last_(last.contiguous()),
+        transmittance_(transmittance.contiguous()),
         color_(plane(grad_color, 3)),
         alpha_(plane(grad_transmittance, 1)),
         depth_(plane(grad_inverse_depth, 1)) {}
@@ -177,18 +208,33 @@ class BlendBackward {
   }
 
  private:
+  // Checks all but the planes of gradients; returns the size of the image.
+  static gs::Image checked(BACKWARD_PARAMETERS) {
+    check_splats(splats);
+    const at::Device device = splats.device();
+    const gs::Image image = image_of(last, splats);
+    check_lists(instances, ranges, splats, image);
+    check_tensor(splat_slots, "splat_slots", at::kLong, device, {splats.size(0) + 1, 2});
+    check_tensor(slots, "slots", at::kInt, device, {-1, 0});
+    if (device.is_cpu()) {
+      const int64_t end = splat_slots.const_data_ptr<int64_t>()[splats.size(0) * splat_slots.stride(0)];
+      TORCH_CHECK_VALUE(end == slots.size(0), "splat_slots end at ", end, ", but there are ", slots.size(0), " slots");
+    }
+    check_tensor(transmittance, "transmittance", splats.scalar_type(), device, {1, image.height, image.width});
+    check_given(grad_color, "grad_color");
+    return image;
+  }
+
   Tensor plane(const MaybeTensor& t, int64_t channels) const {
     if (!t.has_value() || !t->defined()) return {};
-    TORCH_CHECK(t->dim() == 3 && t->size(0) == channels && t->size(1) == image_.height && t->size(2) == image_.width,
-                "the gradient of an image must be (", channels, ", ", image_.height, ", ", image_.width, "), got ",
-                in_words(t->sizes()));
+    check_precise(*t, "the gradient of an image", {channels, image_.height, image_.width});
     return converted(*t, splats_);
   }
 
+  gs::Image image_;
   Tensor splats_, instances_, ranges_, splat_slots_;
   int64_t slot_count_;
   Tensor background_, last_, transmittance_;
-  gs::Image image_;
   Tensor color_, alpha_, depth_;
 };
 
@@ -221,24 +267,36 @@ Tensors5 project_op(SCENE_PARAMETERS) {
 
 Tensors4 bin_op(const Tensor& splats, const Tensor& depths, const Tensor& rects, const Tensor& tile_counts,
                 int64_t height, int64_t width, bool train) {
+  check_splats(splats);
+  const at::Device device = splats.device();
+  const int64_t n = splats.size(0);
+  check_tensor(depths, "depths", splats.scalar_type(), device, {n});
+  check_tensor(rects, "rects", at::kInt, device, {n, 4});
+  check_counts(tile_counts, n, device);
   ProjectedTensors p;
   p.splats = splats.contiguous(), p.depths = depths.contiguous(), p.rects = rects.contiguous();
   p.tile_counts = p.radii = tile_counts.contiguous();
-  const BinnedTensors b = bin(p, {int(width), int(height)}, train);
+  const BinnedTensors b = bin(p, checked_image(height, width), train);
   return {b.instances, b.ranges, b.splat_slots, b.slots};
 }
 
 Tensors4 blend_op(const Tensor& splats, const Tensor& instances, const Tensor& ranges, const Tensor& background,
                   int64_t height, int64_t width, bool inverse_depth, bool train) {
+  check_splats(splats);
+  const gs::Image image = checked_image(height, width);
+  check_lists(instances, ranges, splats, image);
   const BlendedTensors b =
-      blend(splats.contiguous(), instances, ranges, background, {int(width), int(height)}, inverse_depth, train);
+      blend(splats.contiguous(), instances.contiguous(), ranges.contiguous(), background, image, inverse_depth, train);
   return {b.color, b.transmittance, b.inverse_depth, b.last};
 }
 
 Tensor blend_vjp_op(BACKWARD_PARAMETERS) { return blend_vjp(BlendBackward(BACKWARD_ARGUMENTS)); }
 
 Gradients project_vjp_op(SCENE_PARAMETERS, const Tensor& tile_counts, const Tensor& moments, Wanted wanted) {
-  return project_vjp(SceneTensors(SCENE_ARGUMENTS), tile_counts.contiguous(), moments.contiguous(), wanted);
+  const SceneTensors scene(SCENE_ARGUMENTS);
+  check_counts(tile_counts, scene.count(), scene.device());
+  check_tensor(moments, "moments", scene.dtype(), scene.device(), {scene.count(), kGradientValues});
+  return project_vjp(scene, tile_counts.contiguous(), moments.contiguous(), wanted);
 }
 
 using Rasterized = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor>;
@@ -256,6 +314,8 @@ Rasterized rasterize_op(const Tensor& means2d, SCENE_PARAMETERS, const Tensor& b
 
 Gradients rasterize_vjp_op(SCENE_PARAMETERS, BACKWARD_PARAMETERS, const Tensor& tile_counts, Wanted wanted) {
   const SceneTensors scene(SCENE_ARGUMENTS);
+  check_tensor(splats, "splats", scene.dtype(), scene.device(), {scene.count(), kSplatValues});
+  check_counts(tile_counts, scene.count(), scene.device());
   const BlendBackward in(BACKWARD_ARGUMENTS);
 #ifdef GS_CUDA
   if (splats.is_cuda()) {
@@ -271,12 +331,13 @@ Gradients rasterize_vjp_op(SCENE_PARAMETERS, BACKWARD_PARAMETERS, const Tensor& 
     return out->all();
   }
 #endif
-  return project_vjp(scene, tile_counts, blend_vjp(in), wanted);
+  return project_vjp(scene, tile_counts.contiguous(), blend_vjp(in), wanted);
 }
 
 Tensor mark_visible_op(const Tensor& means, const Tensor& view) {
-  TORCH_CHECK(means.dim() == 2 && means.size(1) == 3, "positions must be (N, 3), got ", in_words(means.sizes()));
-  TORCH_CHECK(view.numel() == 16, "the view matrix must be 4x4, got ", in_words(view.sizes()));
+  check_given(means, "positions");
+  TORCH_CHECK_VALUE(means.dim() == 2 && means.size(1) == 3, "positions must be (N, 3), got ", in_words(means.sizes()));
+  check_precise(view, "the view matrix", {4, 4});
   const Tensor rows = means.contiguous(), matrix = converted(view, means);
   Tensor visible = at::empty({rows.size(0)}, rows.options().dtype(at::kBool));
   with_scalar(rows.scalar_type(), [&](auto zero) {
@@ -288,13 +349,16 @@ Tensor mark_visible_op(const Tensor& means, const Tensor& view) {
 }
 
 Tensor decisive_op(const Tensor& splats, const Tensor& instances, const Tensor& ranges, const Tensor& last) {
+  check_splats(splats);
+  const gs::Image image = image_of(last, splats);
+  check_lists(instances, ranges, splats, image);
   Tensor decisive = at::zeros({splats.size(0)}, splats.options().dtype(at::kBool));
   const Tensor rows = splats.contiguous(), no_background = at::zeros({3}, splats.options());
-  const gs::Image image{int(last.size(1)), int(last.size(0))};
+  const Tensor lists = instances.contiguous(), bounds = ranges.contiguous(), ends = last.contiguous();
   with_scalar(rows.scalar_type(), [&](auto zero) {
     using T = decltype(zero);
-    GS_RUN(T, rows, mark_decisive, blend_input<T>(rows, instances, ranges, no_background, image),
-           last.const_data_ptr<int32_t>(), decisive.mutable_data_ptr<bool>());
+    GS_RUN(T, rows, mark_decisive, blend_input<T>(rows, lists, bounds, no_background, image),
+           ends.const_data_ptr<int32_t>(), decisive.mutable_data_ptr<bool>());
   });
   return decisive;
 }

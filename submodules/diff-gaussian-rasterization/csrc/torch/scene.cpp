@@ -3,8 +3,10 @@
 #include <ATen/ops/empty.h>
 #include <c10/util/DimVector.h>
 
+#include <cmath>
 #include <iterator>
 #include <limits>
+#include <utility>
 
 #include "math/sh.h"
 #include "math/tiles.h"
@@ -42,6 +44,15 @@ Tensor with_whole_rows(const Tensor& t) {
 
 }  // namespace
 
+gs::Image checked_image(int64_t height, int64_t width) {
+  TORCH_CHECK(height > 0 && width > 0 && height < (1 << 24) && width < (1 << 24), "image size ", width, "x", height,
+              " is out of range");
+  const gs::Image image{int(width), int(height)};
+  TORCH_CHECK(tiles_of(image) <= std::numeric_limits<int32_t>::max(), "image size ", width, "x", height,
+              " has more than 2^31 - 1 tiles of ", kTile, "x", kTile);
+  return image;
+}
+
 SceneTensors::SceneTensors(SCENE_PARAMETERS)
     : tan_x_(tan_x),
       tan_y_(tan_y),
@@ -49,10 +60,10 @@ SceneTensors::SceneTensors(SCENE_PARAMETERS)
       sh_degree_(int(sh_degree)),
       antialiasing_(antialiasing),
       raw_(raw),
-      image_{int(width), int(height)} {
+      image_(checked_image(height, width)) {
+  check_given(means, "means");
   const at::ScalarType type = means.scalar_type();
   TORCH_CHECK_TYPE(type == at::kFloat || type == at::kDouble, "means must be float32 or float64, got ", in_words(type));
-  TORCH_CHECK_TYPE(means.defined(), "means must be a tensor, got None");
   TORCH_CHECK_VALUE(means.dim() == 2 && means.size(1) == 3, "means must be (N, 3), got ", in_words(means.sizes()));
   TORCH_CHECK_VALUE(cov3d.has_value() != (scales.has_value() && rotations.has_value()),
                     "give scales and rotations, or cov3d");
@@ -62,10 +73,11 @@ SceneTensors::SceneTensors(SCENE_PARAMETERS)
   inputs_[kMeans] = means.contiguous();
   const MaybeTensor given[kInputs] = {means, {}, opacities, scales, rotations, cov3d, colors, sh_dc, sh_rest};
   for (int input = kMeans2d; input < kInputs; ++input) inputs_[input] = checked(Input(input), given[input]);
-  view_ = matrix(view, 16, "view");
-  projection_ = matrix(projection, 16, "projection");
-  center_ = matrix(center, 3, "center");
-  check_settings(height, width);
+  check_precise(view, "view", {4, 4});
+  check_precise(projection, "projection", {4, 4});
+  check_precise(center, "center", {3});
+  view_ = converted(view, means), projection_ = converted(projection, means), center_ = converted(center, means);
+  check_settings();
 }
 
 Tensor SceneTensors::checked(Input input, const MaybeTensor& given) const {
@@ -95,16 +107,10 @@ Tensor SceneTensors::checked_rest(const Tensor& t) const {
   return with_whole_rows(t);
 }
 
-Tensor SceneTensors::matrix(const Tensor& t, int64_t values, const char* name) const {
-  TORCH_CHECK(t.numel() == values, name, " must have ", values, " values, got ", in_words(t.sizes()));
-  return converted(t, inputs_[kMeans]);
-}
-
-void SceneTensors::check_settings(int64_t height, int64_t width) const {
-  TORCH_CHECK(height > 0 && width > 0 && height < (1 << 24) && width < (1 << 24), "image size ", width, "x", height,
-              " is out of range");
-  TORCH_CHECK(tiles_of(image_) <= std::numeric_limits<int32_t>::max(), "image size ", width, "x", height,
-              " has more than 2^31 - 1 tiles of ", kTile, "x", kTile);
+void SceneTensors::check_settings() const {
+  for (const auto& [name, tan] : {std::pair("tan_x", tan_x_), std::pair("tan_y", tan_y_)})
+    TORCH_CHECK_VALUE(tan > 0 && std::isfinite(tan), name, " must be the tangent of half an angle of view, got ", tan);
+  TORCH_CHECK_VALUE(std::isfinite(scale_modifier_), "scale_modifier must be finite, got ", scale_modifier_);
   TORCH_CHECK(count() < std::numeric_limits<int32_t>::max(), "more than 2^31 Gaussians");
 }
 

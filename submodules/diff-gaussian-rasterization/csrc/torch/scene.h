@@ -26,6 +26,9 @@
 
 namespace gs::ops {
 
+// Checks the size of an image and of its tiles.
+gs::Image checked_image(int64_t height, int64_t width);
+
 // The inputs that have a gradient, in the order of GRADIENTS_SCHEMA. means2d has nothing else: its values are not read.
 enum Input { kMeans, kMeans2d, kOpacities, kScales, kRotations, kCov3d, kColors, kShDc, kShRest, kInputs };
 
@@ -78,8 +81,7 @@ class SceneTensors {
 
  private:
   Tensor checked_rest(const Tensor& t) const;
-  Tensor matrix(const Tensor& t, int64_t values, const char* name) const;
-  void check_settings(int64_t height, int64_t width) const;
+  void check_settings() const;
 
   InputTensors inputs_;  // means2d stays undefined
   Tensor view_, projection_, center_;

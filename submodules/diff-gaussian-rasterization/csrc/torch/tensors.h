@@ -34,6 +34,30 @@ inline std::string in_words(at::IntArrayRef sizes) {
 }
 inline std::string in_words(at::ScalarType type) { return "torch." + std::string(c10::getDtypeNames(type).first); }
 
+// TypeError for Python's None, which arrives as an undefined tensor where the schema wants one.
+inline void check_given(const Tensor& t, const char* name) {
+  TORCH_CHECK_TYPE(t.defined(), name, " must be a tensor, got None");
+}
+
+// TypeError for None and for another dtype or device, ValueError for other sizes; a size of -1 allows any.
+inline void check_tensor(const Tensor& t, const char* name, at::ScalarType type, at::Device device,
+                         at::IntArrayRef sizes) {
+  check_given(t, name);
+  TORCH_CHECK_TYPE(t.scalar_type() == type && t.device() == device, name, " must be ", in_words(type), " on ", device,
+                   ", got ", in_words(t.scalar_type()), " on ", t.device());
+  bool fits = t.dim() == int64_t(sizes.size());
+  for (size_t axis = 0; fits && axis < sizes.size(); ++axis) fits = sizes[axis] < 0 || t.size(axis) == sizes[axis];
+  TORCH_CHECK_VALUE(fits, name, " must be ", in_words(sizes), ", where -1 is any size, got ", in_words(t.sizes()));
+}
+
+// The same for a tensor that is converted to the dtype and device of others: both precisions are taken.
+inline void check_precise(const Tensor& t, const char* name, at::IntArrayRef sizes) {
+  check_given(t, name);
+  TORCH_CHECK_TYPE(t.scalar_type() == at::kFloat || t.scalar_type() == at::kDouble, name,
+                   " must be float32 or float64, got ", in_words(t.scalar_type()));
+  TORCH_CHECK_VALUE(t.sizes() == sizes, name, " must be ", in_words(sizes), ", got ", in_words(t.sizes()));
+}
+
 // Calls f with a zero of the C++ type behind the dtype.
 template <class F>
 void with_scalar(at::ScalarType type, const F& f) {

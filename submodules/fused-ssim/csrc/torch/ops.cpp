@@ -14,7 +14,13 @@
 
 namespace {
 
+// TypeError for Python's None, which arrives as an undefined tensor where the schema wants one.
+void check_given(const at::Tensor& t, const char* name) {
+  TORCH_CHECK_TYPE(t.defined(), name, " must be a tensor, got None");
+}
+
 void check_images(const at::Tensor& img1, const at::Tensor& img2, bool valid) {
+  check_given(img1, "img1"), check_given(img2, "img2");
   TORCH_CHECK(img1.scalar_type() == at::kFloat || img1.scalar_type() == at::kDouble,
               "img1 must be float32 or float64, got ", img1.scalar_type());
   TORCH_CHECK(img2.scalar_type() == img1.scalar_type() || img2.scalar_type() == at::kByte, "img2 must be ",
@@ -94,9 +100,18 @@ Tensors3 photometric(const at::Tensor& img1_, const at::Tensor& img2_, double la
 }
 
 void check_ssim_gradient(const at::Tensor& ssim_gradient, const at::Tensor& img1) {
+  check_given(ssim_gradient, "ssim_gradient");
   TORCH_CHECK(ssim_gradient.sizes() == img1.sizes() && ssim_gradient.scalar_type() == img1.scalar_type(),
               "ssim_gradient must be like img1, got ", ssim_gradient.sizes(), " and ", img1.sizes(),
               ": it is kept in a forward with train = True only");
+}
+
+// Checks the gradient of a mean.
+void check_scalar(const at::Tensor& grad, const at::Tensor& img1) {
+  check_given(grad, "the gradient of a mean");
+  TORCH_CHECK_TYPE(grad.scalar_type() == img1.scalar_type(), "the gradient of a mean must be ", img1.scalar_type(),
+                   " like img1, got ", grad.scalar_type());
+  TORCH_CHECK_VALUE(grad.numel() == 1, "the gradient of a mean must be a scalar, got ", grad.sizes());
 }
 
 template <class T>
@@ -114,6 +129,7 @@ at::Tensor l1_ssim_vjp(const at::Tensor& img1, const at::Tensor& img2, const at:
                        const at::Tensor& grad_l1, const at::Tensor& grad_ssim) {
   check_images(img1, img2, false);
   check_ssim_gradient(ssim_gradient, img1);
+  check_scalar(grad_l1, img1), check_scalar(grad_ssim, img1);
   return with_scalar(img1, [&](auto zero) {
     using T = decltype(zero);
     return vjp<T>(img1, img2, ssim_gradient, false, grad_l1.item<T>(), grad_ssim.item<T>());
@@ -124,6 +140,7 @@ at::Tensor photometric_vjp(const at::Tensor& img1, const at::Tensor& img2, const
                            double lambda, const at::Tensor& grad_loss) {
   check_images(img1, img2, false);
   check_ssim_gradient(ssim_gradient, img1);
+  check_scalar(grad_loss, img1);
   return with_scalar(img1, [&](auto zero) {
     using T = decltype(zero);
     const T grad = grad_loss.item<T>();
@@ -175,8 +192,8 @@ at::Tensor vjp_on_cuda(const at::Tensor& img1_, const at::Tensor& img2_, const a
   check_ssim_gradient(ssim_gradient_, img1_);
   check_on_cuda(ssim_gradient_, img1_);
   for (const at::Tensor& grad : {grad_l1, grad_ssim}) {
+    check_scalar(grad, img1_);
     check_on_cuda(grad, img1_);
-    TORCH_CHECK(grad.numel() == 1, "the gradient of a mean must be a scalar, got ", grad.sizes());
   }
   gs::TorchQueue queue(img1_.device());
   const at::Tensor img1 = img1_.contiguous(), img2 = img2_.contiguous(), ssim_gradient = ssim_gradient_.contiguous();
@@ -200,6 +217,7 @@ at::Tensor photometric_vjp_on_cuda(const at::Tensor& img1, const at::Tensor& img
 #endif
 
 at::Tensor composite(const at::Tensor& picture_, const at::Tensor& background_) {
+  check_given(picture_, "the picture"), check_given(background_, "the background");
   TORCH_CHECK(picture_.dim() == 3 && picture_.size(0) == 4 && picture_.scalar_type() == at::kByte,
               "the picture must be (4, H, W) uint8, got ", picture_.sizes(), " ", picture_.scalar_type());
   TORCH_CHECK(background_.numel() == 3 && background_.scalar_type() == at::kFloat,

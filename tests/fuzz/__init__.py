@@ -1,0 +1,10 @@
+"""Random damage to everything that a user can give: files, options, and arguments of the rasterizer.
+
+python -m tests.fuzz SECONDS SEED
+
+damage                               changes of bytes and of nested values
+files, pictures, options, rasterizer the kinds of cases
+worker                               a process that runs cases and measures them
+sandbox                              starts workers, and notices when one crashes or hangs
+operators                            changed calls of every operator, for tests/test_operator_arguments.py
+"""

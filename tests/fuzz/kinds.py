@@ -1,0 +1,14 @@
+"""The kinds of cases, by name."""
+
+from fuzz import files, models, options, pictures, rasterizer
+
+KINDS = {
+    "colmap": files.Colmap,
+    "transforms": files.Transforms,
+    "cloud": files.Cloud,
+    "ply": models.Ply,
+    "checkpoint": models.Checkpoint,
+    "picture": pictures.Picture,
+    "options": options.Options,
+    "rasterizer": rasterizer.Rasterizer,
+}

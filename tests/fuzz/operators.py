@@ -1,0 +1,103 @@
+"""Calls of every operator of the three extensions, and changes of one tensor that must end in an error."""
+
+from collections.abc import Iterator
+from typing import Any
+
+import fused_ssim  # noqa: F401  (registers its operators)
+import simple_knn._C  # noqa: F401
+import torch
+from rasterizer_tools import few, ops, scene_arguments
+from torch import Tensor
+
+from benchmarks.workloads.splat_scenes import settings
+
+Call = tuple[Any, list]  # operator, arguments
+
+
+def sound_calls() -> dict[str, Call]:
+    """One call of each operator, by name."""
+    raw, size = few(dtype=torch.float32)
+    camera = settings(**size)
+    height, width, background = camera.image_height, camera.image_width, camera.bg.float()
+    scene = list(scene_arguments(raw, camera))
+    splats, depths, rects, counts, _ = ops.project(*scene)
+    instances, ranges, *slots = ops.bin(splats, depths, rects, counts, height, width, True)
+    image, transmittance, plane, last = ops.blend(splats, instances, ranges, background, height, width, True, True)
+    state = [splats, instances, ranges, *slots, background, last, transmittance]
+    planes = [torch.ones_like(image), torch.ones_like(transmittance), torch.ones_like(plane)]
+    wanted = [True, True, True, True, True, False, False, True, True]
+    lists = [[torch.rand(3, 3), torch.rand(2, 5)] for _ in range(4)]
+    guard = [torch.rand(()), torch.zeros(1, dtype=torch.int64), 3]
+    adam = [*lists, [torch.tensor(1.0), torch.tensor(7.0)], [0.1, 0.2], 0.9, 0.99, 1e-8, [2, -1], *guard]
+    sparse = [*(torch.rand(3, 3) for _ in range(4)), torch.tensor([True, False, True]), 0.1, 0.9, 0.99, 1e-8, -1]
+    statistics = [torch.rand(3), torch.rand(3, 1), torch.rand(3, 1), torch.ones(3, dtype=torch.int32)]
+    one, two = torch.rand(3, 20, 20), torch.rand(3, 20, 20)
+    ssim = torch.ops.fused_ssim
+    kept = ssim.l1_ssim(one, two, False, True)[2]
+    return {
+        "project": (ops.project, scene),
+        "bin": (ops.bin, [splats, depths, rects, counts, height, width, True]),
+        "blend": (ops.blend, [splats, instances, ranges, background, height, width, True, True]),
+        "blend_vjp": (ops.blend_vjp, [*state, *planes]),
+        "project_vjp": (ops.project_vjp, [*scene, counts, ops.blend_vjp(*state, *planes), wanted]),
+        "rasterize": (ops.rasterize, [torch.zeros(3, 3), *scene, background, True, True]),
+        "rasterize_vjp": (ops.rasterize_vjp, [*scene, *state, *planes, counts, wanted]),
+        "mark_visible": (ops.mark_visible, [raw["means"], camera.viewmatrix.float()]),
+        "decisive": (ops.decisive, [splats, instances, ranges, last]),
+        "adam_": (ops.adam_, adam),
+        "sparse_adam_": (ops.sparse_adam_, [*sparse, *guard]),
+        "observe_": (ops.observe_, [*statistics, torch.rand(3, 3)]),
+        "l1_ssim": (ssim.l1_ssim, [one, two, True, True]),
+        "l1_ssim_vjp": (ssim.l1_ssim_vjp, [one, two, kept, torch.ones(()), torch.ones(())]),
+        "photometric": (ssim.photometric, [one, two, 0.2, True]),
+        "photometric_vjp": (ssim.photometric_vjp, [one, two, kept, 0.2, torch.ones(())]),
+        "composite": (ssim.composite, [torch.zeros(4, 5, 6, dtype=torch.uint8), torch.ones(3)]),
+        "mean_distance2": (torch.ops.simple_knn.mean_distance2, [torch.rand(9, 3)]),
+    }
+
+
+def outcomes() -> Iterator[tuple[str, str, str]]:
+    """Make all changed calls; give the operator's name, what was changed, and the error's type or `returned`."""
+    for name, (operator, arguments) in sound_calls().items():
+        for words, changed in changed_tensors(arguments):
+            try:
+                operator(*changed)
+                outcome = "returned"
+            except Exception as error:  # of any type: the test judges
+                outcome = type(error).__name__
+            yield name, words, outcome
+
+
+def changed_tensors(arguments: list) -> Iterator[tuple[str, list]]:
+    """The arguments with one tensor replaced, each time, and words for what it was replaced by."""
+    for place, value in enumerate(arguments):
+        if torch.is_tensor(value):
+            for words, other in _others(value):
+                yield f"argument {place} {words}", [*arguments[:place], other, *arguments[place + 1 :]]
+        elif isinstance(value, list) and value and torch.is_tensor(value[0]):
+            for words, other in _others(value[-1]):
+                inner = [*value[:-1], other]
+                yield f"argument {place}[-1] {words}", [*arguments[:place], inner, *arguments[place + 1 :]]
+            yield f"argument {place} shorter", [*arguments[:place], value[:-1], *arguments[place + 1 :]]
+
+
+def _others(value: Tensor) -> Iterator[tuple[str, Any]]:
+    yield "is None", None
+    yield "is a number", 1.0
+    for dtype in (torch.float16, torch.float64, torch.int64, torch.int32, torch.bool, torch.complex64):
+        if dtype != value.dtype:
+            yield f"is {dtype}", value.to(dtype)
+    yield "has one more axis", value.unsqueeze(0)
+    yield "has all values in a row", value.reshape(-1)
+    yield "is a scalar", value.new_zeros(())
+    yield "is empty", value.new_empty(0)
+    if value.dim():
+        yield "has no rows", value[:0]
+        yield "has one row more", torch.cat([value, value[:1]])
+        yield "has one row less", value[:-1]
+        yield "has no columns", value[..., :0]
+    if value.dim() > 1:
+        yield "has one column more", torch.cat([value, value[..., :1]], dim=-1)
+        yield "is transposed", value.transpose(0, -1)
+    yield "is on no device", value.to("meta")
+    yield "is sparse", value.to_sparse()

@@ -1,0 +1,75 @@
+"""A process that runs the cases whose kinds and numbers it reads, under a limit of memory.
+
+python -m fuzz.worker SEED FOLDER
+"""
+
+import json
+import os
+import random
+import resource
+import sys
+import traceback
+from pathlib import Path
+
+import utils.host.openmp  # noqa: F401  isort: skip  (before torch)
+import torch
+
+import train
+from fuzz.kinds import KINDS
+from utils.system_utils import UserError
+
+MOST = 2 << 30  # bytes that a case may add to the memory in use
+ROOM = 3 << 30  # that it can address: more than it may, so that an excess shows
+
+
+def main() -> None:
+    """Answer every line of stdin with a line of JSON: null, or words about the finding."""
+    seed, folder = sys.argv[1], Path(sys.argv[2])
+    answers = os.fdopen(os.dup(1), "w")
+    log = os.open(folder / "log", os.O_WRONLY | os.O_CREAT | os.O_APPEND)
+    os.dup2(log, 1)
+    os.dup2(log, 2)
+    train.SummaryWriter = None  # its threads would pile up
+    torch.set_num_threads(1)
+    kinds = {name: make(_made(folder / name)) for name, make in KINDS.items()}
+    size = _memory("VmSize") + ROOM
+    resource.setrlimit(resource.RLIMIT_AS, (size, size))
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    print("ready", file=answers, flush=True)
+    for line in sys.stdin:
+        kind, number = line.split()
+        os.truncate(log, 0)
+        finding = _finding(kinds[kind], random.Random(f"{seed} {kind} {number}"))
+        sys.stdout.flush()
+        print(json.dumps(finding), file=answers, flush=True)
+
+
+def _made(folder: Path) -> Path:
+    folder.mkdir()
+    return folder
+
+
+def _finding(kind: object, rng: random.Random) -> str | None:
+    Path("/proc/self/clear_refs").write_text("5")  # the peak begins anew
+    before = _memory("VmRSS")
+    try:
+        kind.run(rng)
+    except UserError as error:
+        if "\n" in str(error):
+            return f"a message of several lines: {error}"
+    except SystemExit as error:  # of argparse
+        if error.code not in (0, 2):
+            return f"exit status {error.code}"
+    except BaseException:
+        return traceback.format_exc()[-3000:]
+    more = _memory("VmHWM") - before
+    return f"took {more >> 20} MiB" if more > MOST else None
+
+
+def _memory(name: str) -> int:
+    (line,) = (line for line in Path("/proc/self/status").read_text().splitlines() if line.startswith(f"{name}:"))
+    return int(line.split()[1]) << 10
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,105 @@
+"""The output folder of a training: one train.py at a time, no leftovers of killed runs, a word about removed files."""
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from training.output_folder import own_folder
+from utils.files.leftovers import remove_leftovers
+from utils.files.lock import locked
+from utils.system_utils import UserError, atomic_write
+
+ROOT = Path(__file__).parents[1]
+HOLD = (
+    "import sys, time; from training.output_folder import own_folder\n"
+    "with own_folder(sys.argv[1]):\n"
+    "    print('held', flush=True); time.sleep(60)"
+)
+
+
+def _holder(folder: Path) -> subprocess.Popen:
+    child = subprocess.Popen([sys.executable, "-c", HOLD, str(folder)], cwd=ROOT, stdout=subprocess.PIPE, text=True)
+    assert child.stdout.readline() == "held\n"
+    return child
+
+
+def test_a_second_training_is_refused_and_a_killed_one_blocks_nothing(tmp_path, capsys):
+    holder = _holder(tmp_path)
+    try:
+        said = rf"another train.py \(process {holder.pid}\) is at work in .*another -m"
+        with pytest.raises(UserError, match=said), own_folder(str(tmp_path)):
+            pass
+    finally:
+        holder.kill()
+        holder.communicate()
+    assert (tmp_path / ".train.lock").exists()
+    with own_folder(str(tmp_path)):
+        pass
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("error", [UserError, KeyboardInterrupt, SystemExit])
+def test_every_ending_releases_the_folder(tmp_path, error):
+    with pytest.raises(error), own_folder(str(tmp_path)):
+        raise error
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_lock_whose_file_was_replaced_is_taken_anew(tmp_path, monkeypatch):
+    """Its owner removes the file at its end, which may be just after we have opened it."""
+    real, removed = os.path.samestat, []
+
+    def remove_once(*stats: os.stat_result) -> bool:
+        if not removed:
+            removed.append(True)
+            (tmp_path / ".x.lock").unlink()
+            return False
+        return real(*stats)
+
+    monkeypatch.setattr("os.path.samestat", remove_once)
+    with locked(tmp_path, "x.py", "another x.py (process {process})", "-m"):
+        assert removed and (tmp_path / ".x.lock").read_text() == f"{os.getpid()}\n"
+
+
+def test_temporary_files_of_dead_processes_are_removed(tmp_path):
+    dead = subprocess.Popen([sys.executable, "-c", ""])
+    dead.wait()
+    living = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"])
+    inner = tmp_path / "point_cloud" / "iteration_7"
+    inner.mkdir(parents=True)
+    gone = [tmp_path / f".chkpnt200.{dead.pid}.tmp.pth", inner / f".point_cloud.{dead.pid}.tmp.ply"]
+    gone.append(tmp_path / f".cfg_args.{dead.pid}.tmp")
+    stay = [tmp_path / f".model.{living.pid}.tmp.json", tmp_path / "chkpnt200.pth", tmp_path / ".a.x.tmp.pth"]
+    try:
+        for path in (*gone, *stay):
+            path.touch()
+        with own_folder(str(tmp_path)):
+            assert not any(path.exists() for path in gone)
+        assert all(path.exists() for path in stay)
+    finally:
+        living.kill()
+        living.wait()
+
+
+@pytest.mark.parametrize("name", ["chkpnt7.pth", "cfg_args", "a.b.png", "point_cloud.ply", ".hidden"])
+def test_the_names_of_temporary_files_are_known(tmp_path, monkeypatch, name):
+    with atomic_write(tmp_path / name) as temporary:
+        temporary.touch()
+        assert not remove_leftovers(tmp_path)  # this process lives
+        monkeypatch.setattr("utils.files.leftovers._runs", lambda process: process != os.getpid())
+        assert remove_leftovers(tmp_path) == [temporary]
+        temporary.touch()
+
+
+def test_a_folder_that_is_removed_while_training_is_told_of(tmp_path, capsys):
+    folder = tmp_path / "out"
+    with own_folder(str(folder)):
+        shutil.rmtree(folder)
+        folder.mkdir()
+        (folder / "cfg_args").touch()
+    assert "warning: model.json, cameras.json, input.ply in" in (said := capsys.readouterr().err)
+    assert "were removed while training" in said

@@ -1,0 +1,33 @@
+"""The output folder of a training while it runs."""
+
+import contextlib
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+from utils.files.leftovers import remove_leftovers
+from utils.files.listing import some
+from utils.files.lock import locked
+from utils.system_utils import mkdir_p
+
+_INPUTS = ("cfg_args", "model.json", "cameras.json", "input.ply")
+
+
+@contextlib.contextmanager
+def own_folder(model_path: str) -> Iterator[None]:
+    """Make the folder and keep it for this training. UserError if another train.py is at work in it.
+
+    Temporary files of killed runs are removed first. A message says if files of the run are missing at the end, as
+    when the folder was removed meanwhile.
+    """
+    folder = Path(model_path)
+    mkdir_p(folder)
+    with locked(folder, "train.py", "another train.py (process {process})", "-m"):
+        remove_leftovers(folder)
+        yield
+        if missing := [name for name in _INPUTS if not (folder / name).exists()]:
+            print(
+                f"warning: {some(missing)} in {folder} were removed while training; the model is saved, but other "
+                "programs may miss them",
+                file=sys.stderr,
+            )
