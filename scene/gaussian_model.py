@@ -105,7 +105,6 @@ class GaussianModel(Exposed, AdaptiveGaussians):
             lr_delay_mult=training_args.position_lr_delay_mult,
             max_steps=training_args.position_lr_max_steps,
         )
-        self._limit_columns()
         self.exposures.training_setup(training_args)
 
     def update_learning_rate(self, iteration: int) -> float:
@@ -155,9 +154,12 @@ class GaussianModel(Exposed, AdaptiveGaussians):
     def oneupSHdegree(self) -> None:
         """Raise the active SH degree by one, up to the maximum."""
         self.active_sh_degree = min(self.active_sh_degree + 1, self.max_sh_degree)
-        self._limit_columns()
 
-    def _limit_columns(self) -> None:
+    def limit_columns(self) -> None:
+        """Promise GaussianAdam that the SH bands above the active degree never had a gradient, so that it skips them.
+
+        train.py calls it whenever it has set the degree. Code that may read or raise other bands leaves it out.
+        """
         if isinstance(self.optimizer, GaussianAdam):
             self.optimizer.set_active_columns("f_rest", 3 * self.active_bands)
 

@@ -17,6 +17,7 @@ from plyfile import PlyData
 import train
 from records.training_log import Stopwatch, TrainingLog
 from scene.gaussian_model import GaussianModel
+from scene.gaussians.adam import GaussianAdam
 from scene.gaussians.checkpoint import load_checkpoint
 from scene.readers.point_cloud import write_point_cloud
 from training import loop
@@ -167,12 +168,21 @@ def test_sh_degree_rises_every_interval_up_to_its_maximum(blender_scene, tmp_pat
     cloud = tmp_path / "cloud.ply"
     write_point_cloud(cloud, np.random.default_rng(0).normal(size=(50, 3)) * 0.3, np.full((50, 3), 100))
     every = [str(t) for t in range(1, 9)]
+    promised = []
+    monkeypatch.setattr(GaussianAdam, "set_active_columns", lambda self, name, columns: promised.append(columns))
     ply = _train(
         blender_scene, tmp_path / "out", "-w", "--sh_degree", degree, "--init_pcd_path", cloud,
         "--checkpoint_iterations", *every, iterations=8,
     )  # fmt: skip
     active = [load_checkpoint(tmp_path / "out" / f"chkpnt{t}.pth")[0][0] for t in every]
     assert active == [min(int(t) // 2, degree) for t in every]
+    columns = [3 * ((min(raises, degree) + 1) ** 2 - 1) for raises in range(5)]
+    assert promised == columns
+    _train(
+        blender_scene, tmp_path / "resumed", "-w", "--sh_degree", degree, "--init_pcd_path", cloud,
+        "--start_checkpoint", tmp_path / "out/chkpnt3.pth", iterations=4,
+    )  # fmt: skip
+    assert promised[5:] == columns[1:3]
     assert _raw(ply, degree)._xyz.isfinite().all()
 
 
