@@ -57,8 +57,8 @@ class Camera(nn.Module):
     All may be assigned, and other attributes added; nothing is computed again from an assigned one. `del` of an
     original_image, alpha_mask, depth_reliable, invdepthmap or depth_mask brings the photo's back.
     A copy shares the store of the decoded photos; what is assigned to it is its own. copy.copy shares tensors,
-    copy.deepcopy does not. A pickle leaves the store out, and the photos are decoded again. Both keep what was assigned,
-    and changes in place of original_image.
+    copy.deepcopy does not. A pickle leaves the store out, and the photos are decoded again. All keep what was assigned
+    and, where the store keeps such images (ImageStore.keeps_floats), changes in place of original_image.
     """
 
     __signature__ = SIGNATURE
@@ -167,8 +167,9 @@ class Camera(nn.Module):
         return self._decoded(self._source)
 
     def _float_pixels(self) -> Tensor:
-        """The pixels (3 or 4,H,W) as float in [0,1] on the data device; kept if the store allows it, because others read
-        them often.
+        """The pixels (3 or 4,H,W) as float in [0,1] on the data device.
+
+        They are kept if the store allows it, because others read them often.
         """
         if "pixels" in self._made:
             return self._made["pixels"]

@@ -22,9 +22,10 @@ def train_on_all(info: SceneInfo) -> SceneInfo:
 
 
 def mark_halves(cameras: Sequence[Camera], views: Sequence[CameraInfo], info: SceneInfo, in_test_list: bool) -> None:
-    """Set the columns that count in the cameras of a scene made by `train_on_all`, and exposure names where names clash.
+    """Set the columns that count in the cameras of a scene made by `train_on_all`.
 
-    views: of these cameras, in their order. in_test_list: they are the test list, else the training list.
+    Where names clash, set exposure names, too. views: of these cameras, in their order. in_test_list: they are the test
+    list, else the training list.
     """
     tested = {view.image_path for view in info.test_cameras}
     paths = [view.image_path for view in info.train_cameras]

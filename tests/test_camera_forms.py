@@ -157,6 +157,8 @@ def test_resized_by_pillow():
         ({"scale": 0.19, "offset": 0.25, "med_scale": 1.0}, (0.19, 0.25), False),
         ({"scale": 5.1, "offset": 0.25, "med_scale": 1.0}, (5.1, 0.25), False),
         ({"scale": 0.0, "offset": 0.25, "med_scale": 1.0}, (1, 0), False),
+        ({"scale": 0.0, "offset": 0.25, "med_scale": 0.0}, (1, 0), False),
+        ({"scale": 2.0, "offset": 0.25}, (2, 0.25), True),
     ],
 )
 def test_inverse_depth_in_memory(params, wanted, reliable):
