@@ -1,5 +1,6 @@
 """train.py on tiny scenes: order of a step, resume, threads, interruption, refusals."""
 
+import argparse
 import json
 import os
 import re
@@ -15,6 +16,7 @@ import torch
 from plyfile import PlyData
 
 import train
+from arguments import read_training_options
 from records.training_log import Stopwatch, TrainingLog
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.adam import GaussianAdam
@@ -313,6 +315,24 @@ def test_a_new_folder_is_said_before_the_training(colmap_scene, tmp_path, monkey
     train.main(["-s", str(colmap_scene), "--iterations", "1", *SMALL])
     assert re.search(r"^Optimizing ./output/job ", capfd.readouterr().out, re.MULTILINE)
     assert (tmp_path / "output" / "job" / "cfg_args").is_file()
+
+
+@pytest.mark.parametrize("options", [{}, {"depths": "", "train_test_exp": False}, {"seed": 3, "antialiasing": True}])
+def test_the_output_folder_is_made_for_other_code_too(tmp_path, monkeypatch, options):
+    """With the options of either release, or with all of them in one record."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("OAR_JOB_ID", "a_long_job_id")
+    monkeypatch.setattr(train, "SummaryWriter", _Writer)
+    args = argparse.Namespace(sh_degree=3, source_path="/s", model_path="", images="images", resolution=-1,
+                              white_background=True, data_device="cuda", eval=True, **options)  # fmt: skip
+    assert train.prepare_output_and_logger(args) is _Writer.last
+    assert args.model_path == "./output/a_long_job"
+    stored = read_training_options(args.model_path)
+    assert stored["white_background"] and stored["source_path"] == "/s" and stored["train_test_exp"] is False
+    assert (stored["seed"], stored["antialiasing"]) == (options.get("seed", 0), options.get("antialiasing", False))
+    args.model_path = "out"
+    train.prepare_output_and_logger(args, seed=7)
+    assert read_training_options("out")["seed"] == 7
 
 
 def test_a_late_reset_is_announced(colmap_scene, tmp_path, capfd):
