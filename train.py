@@ -69,8 +69,9 @@ def _new_output_folder() -> str:
 def prepare_output_and_logger(args: argparse.Namespace, **kept: Any) -> Any | None:
     """Make the output folder, args.model_path, with cfg_args and model.json (kept: as write_model_json takes it).
 
-    Returns a TensorBoard writer, or None if TensorBoard is not installed.
+    An empty model_path becomes that of a new folder. Returns a TensorBoard writer, or None without TensorBoard.
     """
+    args.model_path = args.model_path or _new_output_folder()
     print(f"Output folder: {args.model_path}")
     mkdir_p(args.model_path)
     write_cfg_args(args.model_path, args)

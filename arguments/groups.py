@@ -2,6 +2,7 @@
 
 import argparse
 import os
+from collections.abc import Collection
 
 from arguments.param_group import GroupParams, Option, OptionTable, above, at_least, one_of, within
 from utils.system_utils import UserError
@@ -128,15 +129,18 @@ class ModelParams(OptionTable):
         ),
     )
 
+    def __init__(self, parser: argparse.ArgumentParser, sentinel: bool = False, without: Collection[str] = ()) -> None:
+        self._add_table(parser, sentinel, without)
+
     def extract(self, args: argparse.Namespace) -> GroupParams:
         """Do as OptionTable.extract, and make source_path absolute. UserError for contradictory options."""
         values = super().extract(args)
-        if values.init_pcd_path and values.init_type == "random":
+        if getattr(values, "init_pcd_path", "") and getattr(values, "init_type", "") == "random":
             raise UserError(
                 f"--init_type random and --init_pcd_path {values.init_pcd_path} both name the points to start from; "
                 "leave one out"
             )
-        if values.source_path:
+        if getattr(values, "source_path", ""):
             values.source_path = os.path.abspath(values.source_path)
         return values
 
@@ -156,6 +160,9 @@ class PipelineParams(OptionTable):
             loaded="that of the model",
         ),
     )
+
+    def __init__(self, parser: argparse.ArgumentParser, sentinel: bool = False, without: Collection[str] = ()) -> None:
+        self._add_table(parser, sentinel, without)
 
 
 class OptimizationParams(OptionTable):
@@ -298,3 +305,6 @@ class OptimizationParams(OptionTable):
             check=within(0, 2**63 - 1),
         ),
     )
+
+    def __init__(self, parser: argparse.ArgumentParser, sentinel: bool = False, without: Collection[str] = ()) -> None:
+        self._add_table(parser, sentinel, without)

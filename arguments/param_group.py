@@ -124,26 +124,32 @@ def _of_attribute(name: str, value: Any) -> Option:
 class OptionTable(ParamGroup):
     """A group whose options are records, with help and checks; its attributes hold the defaults.
 
-    Attributes that a subclass sets before it calls this constructor are options, too. One named like an option that we
-    added replaces it. sentinel: as fill_none of ParamGroup.
+    An attribute that other code sets to another value, or without the underscore of a short form, is an option without
+    help and checks. Constructors call `_add_table`, so that `super()` of a table is ParamGroup, as in the reference.
     """
 
     title: ClassVar[str]
     options: ClassVar[tuple[Option, ...]]
 
-    def __init__(self, parser: argparse.ArgumentParser, sentinel: bool = False, without: Collection[str] = ()) -> None:
+    def _add_table(self, parser: argparse.ArgumentParser, sentinel: bool, without: Collection[str]) -> None:
+        """Make the table's options attributes, and add them and the attributes that a subclass has set to the parser.
+
+        One named like an option that we added replaces it.
+        """
         taken = {name.removeprefix("_") for name in vars(self)}
         for option in self.options:
             if not (option.ours and option.name in taken):
                 setattr(self, option.attribute, option.default)
-        super().__init__(parser, self.title, sentinel, without)
+        ParamGroup.__init__(self, parser, self.title, sentinel, without)
 
     def _options(self) -> list[Option]:
-        options = {option.name: option for option in super()._options()}
-        for option in self.options:
-            if not option.ours or options[option.name].default == option.default:
-                options[option.name] = option
-        return list(options.values())
+        table = {option.attribute: option for option in self.options}
+        options = []
+        for name, value in vars(self).items():
+            known = table.get(name)
+            same = known and type(value) is type(known.default) and value == known.default
+            options.append(known if same else _of_attribute(name, value))
+        return options
 
     def extract(self, args: argparse.Namespace) -> GroupParams:
         """Do as ParamGroup.extract. UserError for invalid values."""

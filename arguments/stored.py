@@ -22,8 +22,11 @@ _OF_TRAINING = ("antialiasing", "optimizer_type", "seed")
 
 
 def write_cfg_args(model_path: str | os.PathLike, args: argparse.Namespace) -> None:
-    """Write `cfg_args`: one line, the repr of a Namespace with exactly the ten stored model options."""
-    line = repr(argparse.Namespace(**{name: getattr(args, name) for name in _STORED}))
+    """Write `cfg_args`: one line, the repr of a Namespace with exactly the ten stored model options.
+
+    Those that `args` lacks have their default.
+    """
+    line = repr(argparse.Namespace(**{name: getattr(args, name, default) for name, default in _STORED.items()}))
     with atomic_write(Path(model_path) / "cfg_args") as path:
         path.write_text(line, encoding="utf-8")
 
@@ -65,18 +68,22 @@ def write_model_json(
     model_path: str | os.PathLike,
     args: argparse.Namespace | None = None,
     *,
-    antialiasing: bool,
-    seed: int,
+    antialiasing: bool | None = None,
+    seed: int | None = None,
     optimizer_type: str | None = None,
     world_offset: Sequence[float] = (0.0, 0.0, 0.0),
 ) -> None:
     """Write `model.json`, the options that cfg_args has no place for, with sorted keys.
 
-    args: model options; those that differ from their default are written. optimizer_type: that of the training; None
-    writes no entry. world_offset: world coordinates of the origin of the model's frame
-    (scene/readers/world_offset.py); zero writes no entry.
+    args: model options; those that differ from their default are written. antialiasing, seed: None: those of `args`, or
+    False and 0. optimizer_type: that of the training; None writes no entry. world_offset: world coordinates of the
+    origin of the model's frame (scene/readers/world_offset.py); zero writes no entry.
     """
-    record = {"antialiasing": antialiasing, "seed": seed, "version": VERSION}
+    record = {
+        "antialiasing": getattr(args, "antialiasing", False) if antialiasing is None else antialiasing,
+        "seed": getattr(args, "seed", 0) if seed is None else seed,
+        "version": VERSION,
+    }
     for name, default in _REMEMBERED.items():
         if (value := getattr(args, name, default)) != default:
             record[name] = value

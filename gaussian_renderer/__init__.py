@@ -12,6 +12,7 @@ from torch import Tensor
 from scene.cameras import Camera, MiniCam
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.exposure import apply_exposure
+from scene.gaussians.parameters import GaussianParameters
 from utils.sh_utils import eval_sh
 
 
@@ -127,11 +128,11 @@ def _geometry(pc: GaussianModel, in_python: bool, scaling_modifier: float) -> tu
     """Shapes and opacities, and whether they are raw, so that the kernels activate them.
 
     The kernels are faster and give the same bits for any number of threads. They take activated values of a model that
-    has activations of its own, or is of another class.
+    has activations of its own, or is of another class, even one that hands every other name on to a model of ours.
     """
     if in_python:
         return {"opacities": pc.get_opacity, "cov3d": pc.get_covariance(scaling_modifier)}, False
-    if getattr(pc, "kernels_activate", False):
+    if isinstance(pc, GaussianParameters) and pc.kernels_activate:
         return pc.raw_geometry(), True
     return {"opacities": pc.get_opacity, "scales": pc.get_scaling, "rotations": pc.get_rotation}, False
 
@@ -145,7 +146,7 @@ def _colors(
         direction = torch.nn.functional.normalize(pc.get_xyz - camera.camera_center.to(pc.get_xyz.dtype))
         color = eval_sh(pc.active_sh_degree, pc.get_features.transpose(1, 2), direction)
         return {"colors": (color + 0.5).clamp_min(0.0)}
-    if separate_sh or getattr(pc, "features_are_raw", False):
+    if separate_sh or (isinstance(pc, GaussianParameters) and pc.features_are_raw):
         dc, rest = pc.get_features_dc, pc.get_features_rest
     else:
         features = pc.get_features

@@ -20,10 +20,12 @@ from utils.host.device import compute_device
 ZNEAR = 0.01  # ZNEAR and ZFAR only shape the clip depth and cull nothing
 ZFAR = 100.0
 _OF_TARGET = frozenset(("original_image", "alpha_mask"))
+_OF_EACH_COPY = ("_assigned", "_made", "_parameters", "_buffers", "_modules")
+_EDITED = -1  # stands for the version of a tensor that was changed in place; torch counts from 0
 
 
 def _assignable(compute: Callable[["Camera"], Any]) -> property:
-    """A property that is what was assigned to it, and until then what `compute` returns."""
+    """A property that is what was assigned to it, and until then, or once that is deleted, what `compute` returns."""
     name = compute.__name__
 
     def read(camera: "Camera") -> Any:
@@ -32,7 +34,12 @@ def _assignable(compute: Callable[["Camera"], Any]) -> property:
     def assign(camera: "Camera", value: Any) -> None:
         camera._assigned[name] = value
 
-    return property(read, assign, doc=compute.__doc__)
+    def reset(camera: "Camera") -> None:
+        camera._assigned.pop(name, None)
+        if name in _OF_TARGET:
+            camera._made.clear()
+
+    return property(read, assign, reset, doc=compute.__doc__)
 
 
 class Camera(nn.Module):
@@ -45,9 +52,13 @@ class Camera(nn.Module):
     integer pixel coordinates are half a pixel less). world_view_transform, projection_matrix, full_proj_transform:
     (4,4) float32, transposed; camera_center (3,) float32; all on `device`. trans, scale: moved the camera's centre c to
     (c + trans) * scale in these. columns: the columns that count in loss and scores, None: all (scene/half_images.py).
-    exposure_name: the photo's name among the trained exposures. data_device: where photos in memory lie.
-    All may be assigned, and other attributes added; nothing is computed again from an assigned one. A copy shares the
-    store of the decoded photos. A pickle leaves it out, and the photos are decoded again.
+    exposure_name: the photo's name among the trained exposures where it is not image_name (scene/half_images.py), else
+    None. data_device: where photos in memory lie, and the images and masks below that other code reads.
+    All may be assigned, and other attributes added; nothing is computed again from an assigned one. `del` of an
+    original_image, alpha_mask, depth_reliable, invdepthmap or depth_mask brings the photo's back.
+    A copy shares the store of the decoded photos; what is assigned to it is its own. copy.copy shares tensors,
+    copy.deepcopy does not. A pickle leaves the store out, and the photos are decoded again. All keep what was assigned
+    and, where the store keeps such images (ImageStore.keeps_floats), changes in place of original_image.
     """
 
     __signature__ = SIGNATURE
@@ -58,7 +69,8 @@ class Camera(nn.Module):
         self.uid, self.colmap_id = view.uid, view.colmap_id
         self.R, self.T = view.R, view.T
         self.FoVx, self.FoVy = view.FoVx, view.FoVy
-        self.image_name = self.exposure_name = view.image_name
+        self.image_name = view.image_name
+        self.exposure_name: str | None = None
         self.image_path = view.image_path
         self.columns = view.columns
         self.image_width, self.image_height = self._size = view.size
@@ -67,17 +79,18 @@ class Camera(nn.Module):
         self.znear, self.zfar = ZNEAR, ZFAR
         self.trans, self.scale = view.trans, view.scale
         self.device = compute_device()
-        self.data_device = usable_device(view.data_device, self.device)
+        self.data_device = self._photo_device = usable_device(view.data_device, self.device)
         self._images: ImageStore | None = None
         self._source, self._mask, self._depth = self._placed(view.source), view.mask, self._placed(view.depth)
         self._ignore_alpha = view.ignore_alpha
         self._reliable = view.depth_reliable
         self._assigned: dict[str, Any] = {}
         self._made: dict[str, Tensor] = {}
+        self._made_version = 0
         self._set_matrices(view.offset)
 
     def _placed(self, source: Source | InMemory | None) -> Source | InMemory | None:
-        return InMemory(source.pixels.to(self.data_device)) if isinstance(source, InMemory) else source
+        return InMemory(source.pixels.to(self._photo_device)) if isinstance(source, InMemory) else source
 
     def _set_matrices(self, offset: tuple[float, float]) -> None:
         # Computed in float64, so that product and inverse are rounded only once.
@@ -91,8 +104,31 @@ class Camera(nn.Module):
     def _hand_on(self, matrix: Tensor) -> Tensor:
         return matrix.to(self.device, torch.float32).contiguous()
 
+    def __setattr__(self, name: str, value: Any) -> None:
+        if not isinstance(getattr(type(self), name, None), property):
+            super().__setattr__(name, value)
+            return
+        self._parameters.pop(name, None)
+        object.__setattr__(self, name, value)
+        if isinstance(value, nn.Parameter):
+            self._parameters[name] = value  # torch would refuse the name, since a property has it
+
+    def __delattr__(self, name: str) -> None:
+        if isinstance(getattr(type(self), name, None), property):
+            self._parameters.pop(name, None)
+            object.__delattr__(self, name)
+        else:
+            super().__delattr__(name)
+
     def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_images": None, "_made": {}}
+        state = {**self.__dict__, "_images": None}
+        return state | ({"_made_version": _EDITED} if self._edited else {"_made": {}})
+
+    def __copy__(self) -> "Camera":
+        twin = type(self).__new__(type(self))
+        twin.__dict__.update(self.__dict__)
+        twin.__dict__.update((name, self.__dict__[name].copy()) for name in _OF_EACH_COPY)
+        return twin
 
     def __deepcopy__(self, memo: dict[int, Any]) -> "Camera":
         twin = type(self).__new__(type(self))
@@ -105,7 +141,7 @@ class Camera(nn.Module):
     def images(self) -> ImageStore:
         """Store of the decoded pictures: the scene's, or one of this view's own."""
         if self._images is None:
-            self._images = ImageStore(0, self.data_device, self.device)
+            self._images = ImageStore(0, self._photo_device, self.device)
         return self._images
 
     @images.setter
@@ -121,22 +157,33 @@ class Camera(nn.Module):
         sources = (self._source, self._mask, self._depth)
         return [(s, self._size) for s in sources if s is not None and not isinstance(s, InMemory)]
 
+    def _stored(self, source: Source | InMemory) -> Tensor:
+        return source.pixels if isinstance(source, InMemory) else self.images.get(source, self._size)
+
     def _decoded(self, source: Source | InMemory) -> Tensor:
-        pixels = source.pixels if isinstance(source, InMemory) else self.images.get(source, self._size)
-        return pixels.to(self.device, non_blocking=True)
+        return self._stored(source).to(self.device, non_blocking=True)
 
     def _pixels(self) -> Tensor:
         return self._decoded(self._source)
 
     def _float_pixels(self) -> Tensor:
-        """The pixels (3 or 4,H,W) as float in [0,1]; kept if the store allows it, because others read them often."""
+        """The pixels (3 or 4,H,W) as float in [0,1] on the data device.
+
+        They are kept if the store allows it, because others read them often.
+        """
         if "pixels" in self._made:
             return self._made["pixels"]
-        pixels = self._pixels()
-        pixels = pixels.clone() if pixels.is_floating_point() else pixels.float() / 255
+        with torch.inference_mode(False):  # tensors of that mode count no versions
+            pixels = self._stored(self._source).to(self._photo_device)
+            pixels = pixels.clone() if pixels.is_floating_point() else pixels.float() / 255
         if isinstance(self._source, InMemory) or self.images.keeps_floats:
-            self._made["pixels"] = pixels
+            self._made["pixels"], self._made_version = pixels, pixels._version
         return pixels
+
+    @property
+    def _edited(self) -> bool:
+        """Whether other code changed the kept float pixels in place."""
+        return bool(self._made) and self._made["pixels"]._version != self._made_version
 
     def ground_truth(self, background: Tensor) -> tuple[Tensor, Tensor | None]:
         """`target` and `mask`, with one copy of the image to the device for both."""
@@ -147,12 +194,13 @@ class Camera(nn.Module):
         """Image (3,H,W) that a render of this view over `background` (3,) in [0,1] should equal.
 
         uint8, meaning value / 255, for a photo without alpha, or whose alpha is a mask; else float32, composited over
-        the background. An original_image or alpha_mask that was assigned takes the place of the photo's.
+        the background. An original_image or alpha_mask that was assigned or changed in place takes the place of the
+        photo's.
         """
         return self._target(self._pixels(), background)
 
     def _target(self, pixels: Tensor, background: Tensor) -> Tensor:
-        if not _OF_TARGET.isdisjoint(self._assigned):
+        if self._edited or not _OF_TARGET.isdisjoint(self._assigned):
             return self._assigned_target(pixels, background.to(self.device))
         if pixels.shape[0] == 3 or self._ignore_alpha:
             return pixels[:3] if pixels.dtype == torch.uint8 else pixels[:3].float()
@@ -166,7 +214,9 @@ class Camera(nn.Module):
         if "alpha_mask" in self._assigned:
             alpha = self.alpha_mask.to(self.device, torch.float32)
         elif pixels.shape[0] == 4 and not self._ignore_alpha:
-            alpha = self._float_pixels()[3:].float()
+            alpha = self._float_pixels()[3:].to(self.device, torch.float32)
+            if pixels.is_floating_point():
+                return colors + (1 - alpha) * background[:, None, None]  # multiplied by alpha already
         else:
             return colors
         return colors * alpha + (1 - alpha) * background[:, None, None]
@@ -185,16 +235,19 @@ class Camera(nn.Module):
 
     @_assignable
     def original_image(self) -> Tensor:
-        """The photo's colours (3,H,W) float32 in [0,1]; straight alpha is not applied.
+        """The photo's colours (3,H,W) float32 in [0,1] on the data device; straight alpha is not applied.
 
-        A change in place lasts only where the store keeps such images (ImageStore.keeps_floats), and `target` never
-        sees it; assigning has neither limit.
+        A change in place is a change of `target`, but is lost where the store does not keep such images
+        (ImageStore.keeps_floats), as with a limit (--images_to_load). An assigned image is always kept.
         """
         return self._float_pixels()[:3]
 
     @_assignable
     def alpha_mask(self) -> Tensor:
-        """The photo's alpha (1,H,W) float32 in [0,1], ones without alpha; 0 outside `columns`."""
+        """The photo's alpha (1,H,W) float32 in [0,1] on the data device, ones without alpha; 0 outside `columns`.
+
+        Assign another one rather than change it in place: it is made anew at each reading unless the photo has alpha.
+        """
         pixels = self._float_pixels()
         alpha = pixels[3:] if pixels.shape[0] == 4 else None
         return self._within_columns(alpha) if alpha is None or self.columns is not None else alpha
@@ -206,13 +259,21 @@ class Camera(nn.Module):
 
     @_assignable
     def invdepthmap(self) -> Tensor | None:
-        """Inverse depth (1,H,W) float32, 1 / world units; None without a map."""
+        """Inverse depth (1,H,W) float32 on the data device, 1 / world units; None without a map."""
+        return None if self._depth is None else self._stored(self._depth).to(self._photo_device)
+
+    @property
+    def inverse_depth(self) -> Tensor | None:
+        """`invdepthmap`, on `device`."""
+        if "invdepthmap" in self._assigned:
+            depth = self._assigned["invdepthmap"]
+            return None if depth is None else depth.to(self.device)
         return None if self._depth is None else self._decoded(self._depth)
 
     @_assignable
     def depth_mask(self) -> Tensor | None:
-        """(1,H,W) float32: 1 where the inverse depth counts, 0 outside `columns` and for an unreliable map; None
-        without a map.
+        """(1,H,W) float32 on the data device: 1 where the inverse depth counts, 0 outside `columns` and for an
+        unreliable map; None without a map.
         """
         if self._depth is None:
             return None
@@ -220,7 +281,7 @@ class Camera(nn.Module):
 
     def _within_columns(self, values: Tensor | None = None) -> Tensor:
         """Values (1,H,W), ones by default, in the columns that count; 0 elsewhere."""
-        mask = torch.zeros(1, *self._size[::-1], device=self.device)
+        mask = torch.zeros(1, *self._size[::-1], device=self._photo_device)
         columns = slice(None) if self.columns is None else self.columns
         mask[..., columns] = 1.0 if values is None else values[..., columns]
         return mask

@@ -92,12 +92,24 @@ def read_by_callback(
 ) -> SceneInfo | None:
     """The scene by the reader that other code has put into `sceneLoadTypeCallbacks`; None where ours stand.
 
-    It is called with the reference's arguments. halves: the half-image protocol, train_test_exp.
+    It is called with the reference's arguments, and may return any record with the fields that a release of the
+    reference has. halves: the half-image protocol, train_test_exp.
     """
     kind = kind_of(Path(source_path)) if str(source_path) else None
     read = sceneLoadTypeCallbacks.get(kind)
     if read is _OURS.get(kind):
         return None
     if kind == COLMAP:
-        return read(str(source_path), images, depths, hold_out, halves)
-    return read(str(source_path), white_background, depths, hold_out)
+        info = read(str(source_path), images, depths, hold_out, halves)
+    else:
+        info = read(str(source_path), white_background, depths, hold_out)
+    if isinstance(info, SceneInfo):
+        return info
+    return SceneInfo(
+        info.point_cloud,
+        info.train_cameras,
+        info.test_cameras,
+        info.nerf_normalization,
+        info.ply_path,
+        getattr(info, "is_nerf_synthetic", kind == BLENDER),  # unknown to the release of 2023
+    )

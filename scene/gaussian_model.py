@@ -7,20 +7,24 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import torch
 from torch import Tensor, nn
 
 from scene.gaussians.adam import GaussianAdam, StepGuard
 from scene.gaussians.adaptive import AdaptiveGaussians
+from scene.gaussians.attributes import INITIAL_OPACITY
 from scene.gaussians.checkpoint import State, pack, unpack
 from scene.gaussians.exposed import Exposed
 from scene.gaussians.exposure import Exposures, read_exposures, read_pretrained
 from scene.gaussians.finite import check_finite
+from scene.gaussians.parameters import raw_rows
 from scene.gaussians.sparse_adam import SparseGaussianAdam
 from scene.gaussians.start import start_rows
 from scene.gaussians.trainable import trainable
 from scene.readers.info import exposure_names
-from utils.general_utils import get_expon_lr_func
+from utils.general_utils import get_expon_lr_func, inverse_sigmoid
 from utils.graphics_utils import BasicPointCloud
+from utils.host.device import compute_device
 from utils.system_utils import UserError
 
 _OPTIMIZERS = {"default": GaussianAdam, "sparse_adam": SparseGaussianAdam}
@@ -34,12 +38,14 @@ class GaussianModel(Exposed, AdaptiveGaussians):
     spatial_lr_scale: extent of the scene, world units.
     """
 
+    optimizer_type = "default"
+    spatial_lr_scale = 0.0
+
     def __init__(self, sh_degree: int, optimizer_type: str = "default") -> None:
         if optimizer_type not in _OPTIMIZERS:
             raise UserError(f"optimizer_type must be {' or '.join(_OPTIMIZERS)}, got {optimizer_type!r}")
         super().__init__(sh_degree)
         self.optimizer_type = optimizer_type
-        self.spatial_lr_scale = 0.0
 
     def create_from_pcd(
         self, pcd: BasicPointCloud, cam_infos: Sequence | float = (), spatial_lr_scale: float | None = None
@@ -53,6 +59,9 @@ class GaussianModel(Exposed, AdaptiveGaussians):
         if spatial_lr_scale is None:
             cam_infos, spatial_lr_scale = (), cam_infos
         rows = start_rows(pcd, spatial_lr_scale, self.max_sh_degree)
+        if self.inverse_opacity_activation is not inverse_sigmoid:
+            opacity = torch.full_like(rows["opacity"], INITIAL_OPACITY, device=compute_device())
+            rows["opacity"] = self.inverse_opacity_activation(opacity)
         self.spatial_lr_scale = float(spatial_lr_scale)
         self.active_sh_degree = 0
         self.set_rows(rows)
@@ -92,7 +101,7 @@ class GaussianModel(Exposed, AdaptiveGaussians):
         Parameters become contiguous in place. Plain tensors, which code may have assigned, become parameters.
         """
         self.percent_dense = training_args.percent_dense
-        self._take({name: trainable(self.raw(name)) for name in self._attributes})
+        self._take({name: trainable(getattr(self, a.field)) for name, a in self._attributes.items()})
         self._zero_statistics()
         self.optimizer = _OPTIMIZERS[self.optimizer_type](
             [
@@ -106,7 +115,6 @@ class GaussianModel(Exposed, AdaptiveGaussians):
             lr_delay_mult=training_args.position_lr_delay_mult,
             max_steps=training_args.position_lr_max_steps,
         )
-        self._limit_columns()
         self.exposures.training_setup(training_args)
 
     def update_learning_rate(self, iteration: int) -> float:
@@ -156,9 +164,12 @@ class GaussianModel(Exposed, AdaptiveGaussians):
     def oneupSHdegree(self) -> None:
         """Raise the active SH degree by one, up to the maximum."""
         self.active_sh_degree = min(self.active_sh_degree + 1, self.max_sh_degree)
-        self._limit_columns()
 
-    def _limit_columns(self) -> None:
+    def limit_columns(self) -> None:
+        """Promise GaussianAdam that the SH bands above the active degree never had a gradient, so that it skips them.
+
+        train.py calls it whenever it has set the degree. Code that may read or raise other bands leaves it out.
+        """
         if isinstance(self.optimizer, GaussianAdam):
             self.optimizer.set_active_columns("f_rest", 3 * self.active_bands)
 
@@ -169,7 +180,7 @@ class GaussianModel(Exposed, AdaptiveGaussians):
 
         Values of Gaussians are parameters: the reference trains on with the very tensors that a checkpoint holds.
         """
-        raw = {name: self.raw(name) for name in self._attributes}
+        raw = {name: getattr(self, a.field) for name, a in self._attributes.items()}
         return pack(
             State(
                 self.active_sh_degree,
@@ -184,12 +195,15 @@ class GaussianModel(Exposed, AdaptiveGaussians):
     def restore(self, model_args: Sequence[Any], training_args: argparse.Namespace) -> None:
         """Take the state of `capture()`. Learning rates and densification options come from `training_args`.
 
+        A model without exposures takes those of the state, too; one that has them must have the same photos.
         UserError when the state was made with another maximal SH degree or does not fit together.
         """
         state = unpack(model_args, self._attributes, self.max_sh_degree)
         self.active_sh_degree = state.active_sh_degree
         self.spatial_lr_scale = state.spatial_lr_scale
         self.set_rows(state.rows)
+        if state.exposures is not None and not self.exposures.mapping:  # a model without a scene
+            self.exposures.start_as(state.exposures)
         self.training_setup(training_args)
         try:
             if isinstance(self.optimizer, GaussianAdam):
@@ -211,7 +225,7 @@ class GaussianModel(Exposed, AdaptiveGaussians):
     def check_finite(self, iteration: int) -> None:
         """UserError for a parameter that is not finite; call it before anything of this iteration is saved."""
         remedy = "nothing of this iteration was saved; lower the learning rates, or resume from an earlier checkpoint"
-        check_finite(self.rows(), f"iteration {iteration}", remedy)
+        check_finite(raw_rows(self), f"iteration {iteration}", remedy)
         self.exposures.check_finite(f"iteration {iteration}", remedy)
 
 

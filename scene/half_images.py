@@ -22,15 +22,17 @@ def train_on_all(info: SceneInfo) -> SceneInfo:
 
 
 def mark_halves(cameras: Sequence[Camera], views: Sequence[CameraInfo], info: SceneInfo, in_test_list: bool) -> None:
-    """Set the columns that count and the exposure names in the cameras of a scene made by `train_on_all`.
+    """Set the columns that count in the cameras of a scene made by `train_on_all`.
 
-    views: of these cameras, in their order. in_test_list: they are the test list, else the training list.
+    Where names clash, set exposure names, too. views: of these cameras, in their order. in_test_list: they are the test
+    list, else the training list.
     """
     tested = {view.image_path for view in info.test_cameras}
     paths = [view.image_path for view in info.train_cameras]
     names = dict(zip(paths, exposure_names(info.train_cameras), strict=True))
     for camera, view in zip(cameras, views, strict=False):
         if isinstance(camera, Camera):  # code of others may replace utils.camera_utils.loadCam
-            camera.exposure_name = names.get(view.image_path, view.image_name)
+            if (name := names.get(view.image_path, view.image_name)) != view.image_name:
+                camera.exposure_name = name
             if view.image_path in tested:
                 camera.columns = half(camera.image_width, in_test_list)

@@ -21,6 +21,7 @@ from scene.readers.depth_maps import with_depth_maps
 from scene.readers.info import CameraInfo, SceneInfo
 from scene.readers.point_cloud import write_point_cloud
 from scene.saved_iterations import find_iteration, saved_ply
+from scene.views.of_info import file_size
 from utils.files.model_json import OFFSET, read_model_json
 from utils.graphics_utils import BasicPointCloud
 from utils.host.device import compute_device
@@ -28,9 +29,12 @@ from utils.system_utils import UserError, atomic_write
 
 
 class SceneGaussians(Protocol):
-    """The part of GaussianModel that a scene uses."""
+    """The part of GaussianModel that a scene needs, or the reference's class of that name.
 
-    world_offset: tuple[float, float, float]
+    A scene sets `world_offset`, and calls `load_exposures(folder, cam_infos)` and `save_exposures(folder)` with
+    train_test_exp if there are such methods. Else it calls `load_ply(path, True)`, and writes exposure.json from
+    `exposure_mapping` and `get_exposure_from_name(name)`, as the reference does.
+    """
 
     def create_from_pcd(
         self, pcd: BasicPointCloud, cam_infos: Sequence[CameraInfo], spatial_lr_scale: float
@@ -39,10 +43,6 @@ class SceneGaussians(Protocol):
     def load_ply(self, path: str) -> None: ...
 
     def save_ply(self, path: str) -> None: ...
-
-    def load_exposures(self, folder: str, cam_infos: Sequence[CameraInfo]) -> None: ...
-
-    def save_exposures(self, folder: str) -> None: ...
 
 
 class Scene:
@@ -116,9 +116,14 @@ class Scene:
 
     def _load_gaussians(self) -> None:
         print(f"Loading trained model at iteration {self.loaded_iter}")
-        self.gaussians.load_ply(str(saved_ply(self.model_path, self.loaded_iter)))
+        path = str(saved_ply(self.model_path, self.loaded_iter))
+        load_exposures = getattr(self.gaussians, "load_exposures", None)
+        if self._halves and load_exposures is None:
+            self.gaussians.load_ply(path, True)
+            return
+        self.gaussians.load_ply(path)
         if self._halves:
-            self.gaussians.load_exposures(self.model_path, self.info.train_cameras)
+            load_exposures(self.model_path, self.info.train_cameras)
 
     def getTrainCameras(self, scale: float = 1.0) -> list[Camera]:
         """Training views at a resolution scale that the scene was made with."""
@@ -140,12 +145,21 @@ class Scene:
         """
         (self.gaussians if gaussians is None else gaussians).save_ply(str(saved_ply(self.model_path, iteration)))
         if self._halves:
-            self.gaussians.save_exposures(self.model_path)
+            save_exposures = getattr(self.gaussians, "save_exposures", None)
+            (save_exposures or self._write_exposures)(self.model_path)
+
+    def _write_exposures(self, folder: str) -> None:
+        """Write the exposures of a model that cannot do so itself."""
+        maps = self.gaussians
+        table = {name: maps.get_exposure_from_name(name).tolist() for name in getattr(maps, "exposure_mapping", ())}
+        if table:
+            with atomic_write(Path(folder) / "exposure.json") as path:
+                path.write_text(json.dumps(table, indent=2), encoding="utf-8")
 
     def training_pixels(self) -> tuple[int, int]:
         """Pixels of all training views: at training size, and in the photos."""
         trained = sum(camera.image_width * camera.image_height for camera in self.getTrainCameras())
-        return trained, sum(width * height for width, height in (c.file_size for c in self.info.train_cameras))
+        return trained, sum(width * height for width, height in map(file_size, self.info.train_cameras))
 
     def create_gaussians(self) -> None:
         """Start from the dataset's points."""

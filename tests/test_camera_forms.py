@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from gaussian_renderer import render
 from gaussian_renderer.scored_views import ScoredViews
 from scene.cameras import Camera
+from scene.gaussians.exposure import Exposures
 from scene.pictures.masks import Mask
 from scene.pictures.store import ImageStore
 from scene.readers.info import CameraInfo
@@ -156,6 +157,8 @@ def test_resized_by_pillow():
         ({"scale": 0.19, "offset": 0.25, "med_scale": 1.0}, (0.19, 0.25), False),
         ({"scale": 5.1, "offset": 0.25, "med_scale": 1.0}, (5.1, 0.25), False),
         ({"scale": 0.0, "offset": 0.25, "med_scale": 1.0}, (1, 0), False),
+        ({"scale": 0.0, "offset": 0.25, "med_scale": 0.0}, (1, 0), False),
+        ({"scale": 2.0, "offset": 0.25}, (2, 0.25), True),
     ],
 )
 def test_inverse_depth_in_memory(params, wanted, reliable):
@@ -351,3 +354,109 @@ def test_a_pickle_leaves_the_photos_out(used):
     assert loaded.images is not used.images and len(loaded.images) == 0
     assert torch.equal(loaded.original_image, used.original_image) and torch.equal(loaded.mask, used.mask)
     assert torch.equal(loaded.full_proj_transform, used.full_proj_transform)
+
+
+def test_a_shallow_copy_has_its_own_attributes(used, monkeypatch):
+    monkeypatch.setattr("scene.pictures.store.decode", lambda *_: pytest.fail("decoded again"))
+    twin = copy.copy(used)
+    assert type(twin) is Camera and twin.images is used.images and twin.R is used.R
+    assert twin.original_image.data_ptr() == used.original_image.data_ptr()  # tensors are shared, as by copy.copy
+    twin.original_image, twin.uid = torch.zeros(3, 1, 1), 99
+    twin.alpha_mask = twin.delta = torch.nn.Parameter(torch.ones(1, 1, 1))
+    assert used.original_image.shape == (3, 600, 800) and used.alpha_mask.shape == (1, 600, 800) and used.uid == 0
+    assert not hasattr(used, "delta") and not list(used.parameters()) and len(list(twin.parameters())) == 1
+
+
+@pytest.mark.parametrize("kind", ["rgb", "rgba", "float"])
+def test_a_change_in_place_stays_in_copies_and_in_the_target(kind, tmp_path):
+    background = torch.tensor([0.2, 0.5, 1.0])
+    photo = _photo(4 if kind == "rgba" else 3)
+    photo.save(tmp_path / "a.png")
+    image, alpha = torch.rand(3, HEIGHT, WIDTH), torch.rand(1, HEIGHT, WIDTH)
+    camera = _older(image, alpha) if kind == "float" else _of_file(tmp_path / "a.png")
+    wanted, unchanged = camera.target(background).clone(), camera.original_image.clone()
+    wanted = wanted if wanted.is_floating_point() else wanted.float() / 255
+    assert copy.deepcopy(camera)._made == {}  # unchanged pixels are not copied
+    camera.original_image[:, :10] = 0
+    assert not camera.original_image[:, :10].any()
+    over = (1 - camera.alpha_mask[:, :10]) * background[:, None, None]
+    wanted[:, :10] = over
+    for other in (camera, copy.copy(camera), copy.deepcopy(camera), pickle.loads(pickle.dumps(camera))):
+        assert torch.equal(other.original_image, camera.original_image)
+        for _ in range(2):
+            torch.testing.assert_close(other.target(background), wanted, rtol=0, atol=1e-6)
+            torch.testing.assert_close(other.ground_truth(background)[0], wanted, rtol=0, atol=1e-6)
+            other = copy.deepcopy(other)
+    own = copy.deepcopy(camera)
+    own.original_image[:, 10:] = 1
+    assert torch.equal(camera.original_image[:, 10:], unchanged[:, 10:])
+    del camera.original_image
+    assert torch.equal(camera.original_image, unchanged) and not own.original_image[:, :10].any()
+
+
+def test_pixels_first_read_in_inference_mode_may_be_changed():
+    camera = _newer()
+    with torch.inference_mode():
+        camera.original_image[:, 0] = 0.5
+        assert (camera.target(torch.zeros(3))[:, 0] == 0.5).all()
+    assert (copy.deepcopy(camera).original_image[:, 0] == 0.5).all()
+
+
+@pytest.mark.parametrize("name", ["original_image", "alpha_mask", "invdepthmap", "depth_mask"])
+def test_a_parameter_may_be_assigned_and_anything_deleted(name):
+    camera = _newer(invdepthmap=np.ones((HEIGHT, WIDTH)))
+    photos = getattr(camera, name).clone()
+    parameter = torch.nn.Parameter(torch.full_like(photos, 0.25))
+    setattr(camera, name, parameter)
+    assert getattr(camera, name) is parameter and [n for n, _ in camera.named_parameters()] == [name]
+    for other in (copy.deepcopy(camera), pickle.loads(pickle.dumps(camera))):
+        assert getattr(other, name) is dict(other.named_parameters())[name]
+    if name == "original_image":
+        camera.target(torch.zeros(3)).sum().backward()
+        assert (parameter.grad == 1).all()
+    setattr(camera, name, parameter.detach())
+    assert not list(camera.parameters())
+    setattr(camera, name, parameter)
+    delattr(camera, name)
+    assert torch.equal(getattr(camera, name), photos) and not list(camera.parameters())
+
+
+def test_other_attributes_are_deleted():
+    camera = _newer()
+    camera.delta = torch.nn.Parameter(torch.zeros(1))
+    del camera.delta, camera.zfar
+    assert not list(camera.parameters()) and not hasattr(camera, "zfar")
+
+
+def test_images_for_other_code_lie_on_the_data_device(monkeypatch):
+    computes = torch.device("meta")  # stands for a GPU
+    monkeypatch.setattr("scene.cameras.compute_device", lambda: computes)
+    camera = _newer(_photo(4), invdepthmap=np.ones((HEIGHT, WIDTH)), data_device="cpu")
+    assert camera.data_device == torch.device("cpu") and camera.camera_center.device == computes
+    for name in ("original_image", "alpha_mask", "invdepthmap", "depth_mask"):
+        assert getattr(camera, name).device.type == "cpu" and getattr(camera, name).shape[1:] == (HEIGHT, WIDTH)
+        camera.columns = slice(0, 5)
+        assert getattr(camera, name).device.type == "cpu"
+        camera.columns = None
+    assert camera.inverse_depth.device == computes
+    camera.original_image[:, 0] = 0
+    assert camera.target(torch.zeros(3)).device == computes
+    camera.invdepthmap = torch.zeros(1, 2, 2)
+    assert camera.inverse_depth.device == computes and camera.inverse_depth.shape == (1, 2, 2)
+    camera.invdepthmap = None
+    assert camera.inverse_depth is None
+    camera = _newer(data_device="cpu")
+    assert camera.alpha_mask.device.type == "cpu" and camera.inverse_depth is None
+
+
+def test_the_exposure_follows_a_changed_name():
+    gaussians, black = model(30), torch.zeros(3)
+    gaussians.exposures = Exposures(["a.png", "b.png"])
+    with torch.no_grad():
+        gaussians.exposures.values[1, :, 3] = 0.25
+    camera = _newer()
+    assert camera.exposure_name is None
+    images = []
+    for camera.image_name in ("a.png", "b.png"):
+        images.append(render(camera, gaussians, pipeline(), black, use_trained_exp=True)["render"])
+    torch.testing.assert_close(images[1], (images[0] + 0.25).clamp(0, 1))

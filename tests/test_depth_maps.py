@@ -7,6 +7,7 @@ import sys
 import zlib
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -22,6 +23,7 @@ from gaussian_renderer import render
 from scene import Scene
 from scene.dataset_readers import read_scene
 from scene.gaussian_model import GaussianModel
+from scene.readers import depth_maps
 from scene.readers.colmap_model import Sightings, read_sightings
 from scene.readers.depth_maps import DepthMap, read_values, resize, with_depth_maps
 from scene.readers.depth_scale import fit_line, fit_picture, make_depth_params
@@ -128,6 +130,18 @@ def test_every_picture_has_its_map(scene, capsys):
     for name, depth in depths.items():
         assert depth == DepthMap((scene / "depths" / name).with_suffix(".png"), 65536.0, 1.0, 0.0)
     assert len(_depths(scene, hold_out=True)) == 14
+
+
+@pytest.mark.parametrize("scale", [-1.0, 0.0, 0.19, 0.2, 5.0, 5.1])
+@pytest.mark.parametrize("median", [{}, {"med_scale": 1.0}, {"med_scale": 0.0}])
+def test_readers_and_cameras_have_one_rule_for_scales(scale, median):
+    params = {"scale": scale, "offset": 0.5, **median}
+    info = SimpleNamespace(depth_path="a.png", depth_params=params)
+    named, fit = depth_maps.named_depth_map(info, 1.0), depth_maps.depth_fit(params)
+    reliable = scale > 0 and (not median or (median["med_scale"] == 1 and 0.2 <= scale <= 5))
+    assert (named is not None) == fit.reliable == reliable
+    if named:
+        assert (named.scale, named.offset) == (fit.scale, fit.offset) == (scale, 0.5)
 
 
 def test_unreliable_and_unknown_scales_give_no_loss_and_one_message(scene, capsys):

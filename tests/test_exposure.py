@@ -220,6 +220,22 @@ def test_a_ply_brings_the_exposures_of_its_model_folder(tmp_path, capsys):
 # Checkpoints
 
 
+def test_a_model_without_a_scene_takes_the_checkpoints_photos():
+    gaussians, other = model(6), GaussianModel(3)
+    gaussians.exposures = _trained()
+    take_steps(gaussians, 1)
+    other.restore(gaussians.capture(), options())
+    assert list(other.exposure_mapping) == NAMES and torch.equal(other.get_exposure, gaussians.get_exposure)
+    assert other.exposure_optimizer.state[other._exposure]["step"] == 3
+    renamed = GaussianModel(3)
+    renamed.start_exposures(_infos("d.png"))
+    for names, each in ((NAMES, renamed), ("abc", GaussianModel(3)), ([["a"], "b", "c"], GaussianModel(3))):
+        capture = list(gaussians.capture())
+        capture[10][EXPOSURES]["names"] = names
+        with pytest.raises(UserError, match="exposures are of other photos"):
+            each.restore(capture, options())
+
+
 @pytest.mark.parametrize(
     "last_entry", [False, True], ids=["in the optimiser's state", "as the last entry, as until 0.1.0"]
 )

@@ -109,6 +109,32 @@ def test_any_class_with_the_getters_is_rendered(degree, in_python):
             assert (gradients[0][name] - gradient).abs().max() <= 1e-5 * gradient.abs().max(), name
 
 
+class Wrapped:
+    """Hands every name on to a model of ours, but those that it overrides."""
+
+    def __init__(self, gaussians: GaussianModel) -> None:
+        self._of = gaussians
+
+    def __getattr__(self, name: str) -> object:
+        return getattr(self._of, name)
+
+
+def test_a_wrapper_is_rendered_by_its_own_getters():
+    class Tiny(Wrapped):
+        get_scaling = property(lambda self: torch.full_like(self._scaling, 0.05))
+
+    class Black(Wrapped):
+        get_features = property(lambda self: torch.zeros(len(self._xyz), 16, 3))
+
+    gaussians, tiny, black = model(40), model(40), model(40)
+    with torch.no_grad():
+        tiny._scaling.fill_(math.log(0.05))
+        black._features_dc.zero_()
+        black._features_rest.zero_()
+    for wrapper, wanted in ((Wrapped, gaussians), (Tiny, tiny), (Black, black)):
+        torch.testing.assert_close(_image(wrapper(gaussians)), _image(wanted), **CLOSE)
+
+
 class Opaque(GaussianModel):
     get_opacity = property(lambda self: torch.ones_like(self._opacity))
 
@@ -288,6 +314,36 @@ def test_a_loop_as_the_reference_writes_it(kind, tmp_path):
     assert len(gaussians) > 60 and losses[-1] < losses[0]
     assert not torch.equal(gaussians.get_exposure_from_name("a.png"), torch.eye(3, 4))
     save_checkpoint(tmp_path / "chkpnt30.pth", gaussians.capture(), 30)
+
+
+def _raise_by_hand(gaussians: GaussianModel) -> None:
+    gaussians.oneupSHdegree()
+    gaussians.active_sh_degree = 3
+
+
+def _restore_and_raise(gaussians: GaussianModel) -> None:
+    gaussians.oneupSHdegree()
+    gaussians.restore(gaussians.capture(), options())
+    gaussians.active_sh_degree = 3
+
+
+def _raise_and_lower(gaussians: GaussianModel) -> None:
+    gaussians.oneupSHdegree()
+    gaussians.active_sh_degree = 0
+
+
+@pytest.mark.parametrize("change", [_raise_by_hand, _restore_and_raise, _raise_and_lower, GaussianModel.oneupSHdegree])
+@pytest.mark.parametrize("kind", ["default", "sparse_adam"])
+def test_every_band_with_a_gradient_trains(kind, change):
+    """Whatever set the degree, and whatever reads the coefficients, such as a regulariser."""
+    gaussians = model(20, active=False, optimizer_type=kind)
+    change(gaussians)
+    before = parameters(gaussians)["f_rest"]
+    for _ in range(2):
+        gaussians._features_rest.square().sum().backward()
+        gaussians.optimizer.step(*([torch.ones(20, dtype=torch.bool)] if kind == "sparse_adam" else []))
+        gaussians.optimizer.zero_grad()
+    assert (gaussians._features_rest != before).all()
 
 
 def test_options_of_the_2023_release_are_enough():

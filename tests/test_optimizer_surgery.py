@@ -7,6 +7,7 @@ import pytest
 import torch
 from gaussians import GROUPS, model, options, parameters
 from torch import Tensor, nn
+from torch.optim.optimizer import register_optimizer_step_post_hook
 
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.adam import GaussianAdam
@@ -345,3 +346,56 @@ def test_a_loss_on_inactive_bands_reaches_them():
     before = gaussians._features_rest.detach().clone()
     gaussians.optimizer.step()
     assert (gaussians._features_rest < before).all()
+
+
+def test_groups_that_change_after_a_step_follow_torch():
+    """Options, a parameter of another type, and a group that takes the place of one."""
+    ours, theirs = (torch.nn.ParameterList([nn.Parameter(torch.ones(10, 3)) for _ in range(2)]) for _ in range(2))
+    optimizers = [
+        GaussianAdam([{"params": [value], "lr": 0.1, "name": name} for name, value in zip("ab", ours, strict=True)]),
+        torch.optim.Adam([{"params": [value], "lr": 0.1} for value in theirs], eps=1e-15),
+    ]
+    changes = [
+        lambda groups: groups[0].update(betas=(0.5, 0.9)),
+        lambda groups: groups[1].update(weight_decay=0.1),
+        lambda groups: groups.__setitem__(
+            0, groups[0] | {"params": [nn.Parameter(torch.ones(4, dtype=torch.float64))]}
+        ),
+        lambda groups: groups[0]["params"].append(nn.Parameter(torch.ones(5))),
+        lambda groups: groups[1].update(weight_decay=0, betas=(0.9, 0.999)),
+    ]
+    for step, change in enumerate([lambda groups: None, *changes]):
+        for optimizer in optimizers:
+            change(optimizer.param_groups)
+            for group in optimizer.param_groups:
+                for param in group["params"]:
+                    param.grad = torch.sin(torch.arange(param.numel()) + step).reshape(param.shape).to(param.dtype)
+            optimizer.step()
+        for mine, other in zip(*(optimizer.param_groups for optimizer in optimizers), strict=True):
+            for a, b in zip(mine["params"], other["params"], strict=True):
+                torch.testing.assert_close(a, b, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("make", [GaussianAdam, SparseGaussianAdam, type("Client", (GaussianAdam,), {})])
+@pytest.mark.parametrize("beside", [False, True], ids=["by the kernel", "and by torch"])
+def test_step_hooks_are_called_once(make, beside):
+    torch.optim.Adam([nn.Parameter(torch.ones(1))])  # from now on, torch calls hooks in Adam's own step
+    param, weight = nn.Parameter(torch.ones(10, 3)), nn.Parameter(torch.tensor(1.0))
+    optimizer = make([{"params": [param], "lr": 0.1, "name": "xyz"}])
+    if beside:
+        optimizer.add_param_group({"params": [weight], "lr": 0.1})
+    param.grad, weight.grad = torch.ones(10, 3), torch.tensor(1.0)
+    told = []
+    handles = [
+        optimizer.register_step_pre_hook(lambda o, args, kwargs: told.append(("before", param[0, 0].item()))),
+        optimizer.register_step_post_hook(lambda o, args, kwargs: told.append(("after", param[0, 0].item()))),
+        register_optimizer_step_post_hook(lambda o, args, kwargs: told.append("all")),
+    ]
+    visible = [torch.ones(10, dtype=torch.bool)] if make is SparseGaussianAdam else []
+    optimizer.step(*visible)
+    after = param[0, 0].item()
+    assert told == [("before", 1.0), ("after", after), "all"] and after < 1 and (weight < 1) == beside
+    for handle in handles:
+        handle.remove()
+    optimizer.step(*visible)
+    assert len(told) == 3

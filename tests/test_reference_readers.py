@@ -197,6 +197,8 @@ def test_the_norm_is_the_plain_rule():
     np.testing.assert_allclose(norm["translate"], -centers.mean(axis=0))
     assert norm["radius"] == pytest.approx(1.1 * np.linalg.norm(centers - centers.mean(axis=0), axis=1).max())
     assert getNerfppNorm(infos[:1])["radius"] == 0
+    skewed = SimpleNamespace(R=2 * infos[0].R, T=infos[0].T)  # of a scaled pose, which the matrix's inverse counts in
+    np.testing.assert_allclose(getNerfppNorm([skewed])["translate"], infos[0].R @ infos[0].T / 2)
     assert scene_extent(infos) < norm["radius"] / 10
 
 

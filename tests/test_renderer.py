@@ -84,6 +84,24 @@ def test_scores_are_computed_without_depth(camera, monkeypatch):
     )
 
 
+@pytest.mark.parametrize("more", [(), (1.0, False, None), (1.0, False, None, True)])
+def test_the_report_takes_the_renders_arguments_of_the_2024_release(camera, more):
+    """Whose sixth says that exposures are used, as train_test_exp does."""
+    asked = []
+
+    def spy(*args: object, **options: object) -> dict:
+        asked.append(args[7] if len(args) > 7 else options["use_trained_exp"])
+        return {"render": torch.zeros(3, HEIGHT, WIDTH)}
+
+    scene = argparse.Namespace(gaussians=model(5), getTrainCameras=lambda: [camera], getTestCameras=lambda: [camera])
+    camera.target, camera.mask, camera.image_name = lambda _: torch.ones(3, HEIGHT, WIDTH), None, "a"
+    zero = torch.zeros(())
+    scores = report.training_report(
+        None, 1, zero, zero, l1_loss, 0.0, [1], scene, spy, (pipeline(), BLACK, *more), True
+    )
+    assert asked == [True] * 6 and scores["test_l1"] == 1.0
+
+
 def test_screen_points_are_zeros_with_a_gradient_of_their_own_in_every_render(camera):
     gaussian_renderer._zero.cache_clear()
     gaussians = model(20)

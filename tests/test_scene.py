@@ -1,17 +1,22 @@
 """Scene as other people's code calls it: with their options, their readers, and their own package `arguments`."""
 
 import argparse
+import json
 import os
 import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from typing import NamedTuple
 
+import numpy as np
 import pytest
+import torch
 from synthetic import FakeGaussians
 
 import scene as scene_package
+import train
 from arguments import ModelParams
 from scene import Scene
 from scene.dataset_readers import read_scene, sceneLoadTypeCallbacks
@@ -98,6 +103,88 @@ def test_a_replaced_reader_of_blender_scenes(blender_scene, tmp_path, monkeypatc
     monkeypatch.setitem(sceneLoadTypeCallbacks, "Blender", lambda *given: calls.append(given) or known)
     made = Scene(_args(blender_scene, tmp_path / "out", OF_2023, white_background=True), FakeGaussians(), start=False)
     assert calls == [(str(blender_scene), True, "", True)] and made.info is known
+
+
+class TheirCamera(NamedTuple):
+    """The records of the 2024 release."""
+
+    uid: int
+    R: np.ndarray
+    T: np.ndarray
+    FovY: float
+    FovX: float
+    depth_params: dict | None
+    image_path: str
+    image_name: str
+    depth_path: str
+    width: int
+    height: int
+    is_test: bool
+
+
+class TheirInfo2023(NamedTuple):
+    point_cloud: object
+    train_cameras: list
+    test_cameras: list
+    nerf_normalization: dict
+    ply_path: str
+
+
+class TheirInfo2024(NamedTuple):
+    point_cloud: object
+    train_cameras: list
+    test_cameras: list
+    nerf_normalization: dict
+    ply_path: str
+    is_nerf_synthetic: bool
+
+
+@pytest.mark.parametrize("record", [TheirInfo2023, TheirInfo2024])
+def test_a_replaced_reader_may_return_records_of_its_own(colmap_scene, tmp_path, monkeypatch, record):
+    known = read_scene(colmap_scene, "images", True)
+    lists = [[TheirCamera(*camera) for camera in part] for part in (known.train_cameras, known.test_cameras)]
+    ply = tmp_path / "points.ply"
+    ply.write_bytes(b"ply")
+    theirs = record(*(known.point_cloud, *lists, {"translate": np.zeros(3), "radius": 3.5}, str(ply), False)[
+        : len(record._fields)])  # fmt: skip
+    monkeypatch.setitem(sceneLoadTypeCallbacks, "Colmap", lambda *_: theirs)
+    made = Scene(_args(colmap_scene, tmp_path / "out"), FakeGaussians())
+    assert made.cameras_extent == 3.5 and made.gaussians.world_offset == (0, 0, 0)
+    assert (tmp_path / "out" / "input.ply").read_bytes() == b"ply"
+    ours = Scene(_args(colmap_scene, tmp_path / "o"), FakeGaussians())
+    assert made.training_pixels() == ours.training_pixels()
+    train.main(["-s", str(colmap_scene), "-m", str(tmp_path / "trained"), "--iterations", "2", "-r", "24", "--eval",
+                "--test_iterations", "2"])  # fmt: skip
+    assert (tmp_path / "trained" / "point_cloud" / "iteration_2" / "point_cloud.ply").is_file()
+
+
+class TheirModel:
+    """The reference's class, as a scene with exposures calls it."""
+
+    exposure_mapping = {"a.png": 0}
+
+    def create_from_pcd(self, pcd, cam_infos, spatial_lr_scale) -> None:
+        self.calls = []
+
+    def get_exposure_from_name(self, image_name: str) -> torch.Tensor:
+        return torch.nn.Parameter(torch.eye(3, 4))
+
+    def save_ply(self, path: str) -> None:
+        FakeGaussians().save_ply(path)
+
+    def load_ply(self, path: str, use_train_test_exp: bool = False) -> None:
+        self.calls = [use_train_test_exp]
+
+
+def test_a_foreign_model_is_saved_and_loaded_with_exposures(colmap_scene, tmp_path):
+    for halves in (True, False):
+        args = _args(colmap_scene, tmp_path / str(halves), train_test_exp=halves)
+        Scene(args, TheirModel()).save(1)
+        model = TheirModel()
+        Scene(args, model, load_iteration=1)
+        assert model.calls == [halves] and (tmp_path / str(halves) / "exposure.json").is_file() == halves
+    table = json.loads((tmp_path / "True" / "exposure.json").read_text())
+    assert table == {"a.png": torch.eye(3, 4).tolist()}
 
 
 def _run(code: str, folder: Path) -> None:

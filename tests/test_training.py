@@ -1,5 +1,6 @@
 """train.py on tiny scenes: order of a step, resume, threads, interruption, refusals."""
 
+import argparse
 import json
 import os
 import re
@@ -15,8 +16,10 @@ import torch
 from plyfile import PlyData
 
 import train
+from arguments import read_training_options
 from records.training_log import Stopwatch, TrainingLog
 from scene.gaussian_model import GaussianModel
+from scene.gaussians.adam import GaussianAdam
 from scene.gaussians.checkpoint import load_checkpoint
 from scene.readers.point_cloud import write_point_cloud
 from training import loop
@@ -167,12 +170,21 @@ def test_sh_degree_rises_every_interval_up_to_its_maximum(blender_scene, tmp_pat
     cloud = tmp_path / "cloud.ply"
     write_point_cloud(cloud, np.random.default_rng(0).normal(size=(50, 3)) * 0.3, np.full((50, 3), 100))
     every = [str(t) for t in range(1, 9)]
+    promised = []
+    monkeypatch.setattr(GaussianAdam, "set_active_columns", lambda self, name, columns: promised.append(columns))
     ply = _train(
         blender_scene, tmp_path / "out", "-w", "--sh_degree", degree, "--init_pcd_path", cloud,
         "--checkpoint_iterations", *every, iterations=8,
     )  # fmt: skip
     active = [load_checkpoint(tmp_path / "out" / f"chkpnt{t}.pth")[0][0] for t in every]
     assert active == [min(int(t) // 2, degree) for t in every]
+    columns = [3 * ((min(raises, degree) + 1) ** 2 - 1) for raises in range(5)]
+    assert promised == columns
+    _train(
+        blender_scene, tmp_path / "resumed", "-w", "--sh_degree", degree, "--init_pcd_path", cloud,
+        "--start_checkpoint", tmp_path / "out/chkpnt3.pth", iterations=4,
+    )  # fmt: skip
+    assert promised[5:] == columns[1:3]
     assert _raw(ply, degree)._xyz.isfinite().all()
 
 
@@ -303,6 +315,24 @@ def test_a_new_folder_is_said_before_the_training(colmap_scene, tmp_path, monkey
     train.main(["-s", str(colmap_scene), "--iterations", "1", *SMALL])
     assert re.search(r"^Optimizing ./output/job ", capfd.readouterr().out, re.MULTILINE)
     assert (tmp_path / "output" / "job" / "cfg_args").is_file()
+
+
+@pytest.mark.parametrize("options", [{}, {"depths": "", "train_test_exp": False}, {"seed": 3, "antialiasing": True}])
+def test_the_output_folder_is_made_for_other_code_too(tmp_path, monkeypatch, options):
+    """With the options of either release, or with all of them in one record."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("OAR_JOB_ID", "a_long_job_id")
+    monkeypatch.setattr(train, "SummaryWriter", _Writer)
+    args = argparse.Namespace(sh_degree=3, source_path="/s", model_path="", images="images", resolution=-1,
+                              white_background=True, data_device="cuda", eval=True, **options)  # fmt: skip
+    assert train.prepare_output_and_logger(args) is _Writer.last
+    assert args.model_path == "./output/a_long_job"
+    stored = read_training_options(args.model_path)
+    assert stored["white_background"] and stored["source_path"] == "/s" and stored["train_test_exp"] is False
+    assert (stored["seed"], stored["antialiasing"]) == (options.get("seed", 0), options.get("antialiasing", False))
+    args.model_path = "out"
+    train.prepare_output_and_logger(args, seed=7)
+    assert read_training_options("out")["seed"] == 7
 
 
 def test_a_late_reset_is_announced(colmap_scene, tmp_path, capfd):

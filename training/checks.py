@@ -7,7 +7,7 @@ import numpy as np
 
 from scene.gaussian_model import GaussianModel
 from scene.gaussians import density_rules as rules
-from scene.readers.info import APART, NEAREST, SceneInfo, standing_apart
+from scene.readers.info import APART, NEAREST, SceneInfo, camera_centers, standing_apart
 from utils.files.listing import some
 from utils.system_utils import UserError
 
@@ -42,7 +42,7 @@ def _check_scale(info: SceneInfo) -> None:
 
 def _report_cameras_apart(info: SceneInfo) -> None:
     """Name the training cameras that the extent leaves out."""
-    apart = standing_apart(np.array([camera.center for camera in info.train_cameras]))
+    apart = standing_apart(camera_centers(info.train_cameras))
     if apart.any():
         names = [info.train_cameras[index].image_name for index in apart.nonzero()[0]]
         print(

@@ -31,7 +31,7 @@ class Objective:
         total, l1 = photometric_loss(package["render"], target, self._lambda_dssim, mask, camera.columns)
         depth = None
         if step.depth_weight > 0:
-            error = inverse_depth_loss(package["depth"], camera.invdepthmap, camera.columns, mask)
+            error = inverse_depth_loss(package["depth"], camera.inverse_depth, camera.columns, mask)
             depth = step.depth_weight * error
             total = total + depth
         return Losses(total, l1, depth, mask)

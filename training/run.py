@@ -74,6 +74,7 @@ class Run:
             self.gaussians.start_exposures(self.scene.info.train_cameras)
             self.gaussians.restore(capture, self.opt)
             check_exposures(self.gaussians, self.dataset.train_test_exp, self.plan.start)
+        self.gaussians.limit_columns()
 
     @property
     def _training_options(self) -> dict[str, Any]:
@@ -120,6 +121,7 @@ class Run:
         self.gaussians.update_learning_rate(step.iteration)
         if step.iteration % SH_INTERVAL == 0:
             self.gaussians.oneupSHdegree()
+            self.gaussians.limit_columns()
         if step.iteration - 1 == self.plan.debug_from:
             self.pipe.debug = True
         ahead = min(self.scene.images.ahead, self.opt.iterations - step.iteration + 1)

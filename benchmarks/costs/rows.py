@@ -68,6 +68,7 @@ class Workload:
         model.set_rows(rows)
         model.active_sh_degree = active
         model.training_setup(OptimizationParams(argparse.ArgumentParser()).extract(argparse.Namespace()))
+        model.limit_columns()  # as train.py does
         return model
 
     def image(self, model: GaussianModel, *, pipe: argparse.Namespace | None = None, **options: bool) -> Tensor:

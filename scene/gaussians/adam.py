@@ -2,17 +2,19 @@
 
 import math
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from operator import itemgetter
+from typing import Any
 
 import utils.host.extensions  # noqa: F401  isort: skip  (before the extensions)
 import torch
 from diff_gaussian_rasterization.optim import adam_
 from torch import Tensor
+from torch.optim.optimizer import _global_optimizer_post_hooks, _global_optimizer_pre_hooks
 
 from scene.gaussians.row_surgery import Group
 
 # Options of a group that the kernel takes from the optimiser's defaults, or does not know.
-_COMMON = ("betas", "eps", "weight_decay", "amsgrad", "maximize", "capturable", "differentiable", "fused")
+_common = itemgetter("betas", "eps", "weight_decay", "amsgrad", "maximize", "capturable", "differentiable", "fused")
 
 
 class StepGuard:
@@ -36,24 +38,15 @@ class StepGuard:
         return int(self._stopped)
 
 
-class _Stepped(NamedTuple):
-    """The groups of an optimiser by who steps them."""
-
-    by_kernel: list[Group]  # one contiguous parameter each, all of one kind, with the optimiser's options
-    by_torch: list[Group]
-
-
 class GaussianAdam(torch.optim.Adam):
     """torch.optim.Adam with one parameter (N, ...) per named group, and the same bits for any number of threads.
 
-    State and state dict have torch's form (step, exp_avg, exp_avg_sq), so checkpoints of both can be exchanged. Step
-    hooks are never called: torch's wrapper for them takes as long as the step itself. guard: see StepGuard.
-    Groups that the kernel cannot step are stepped by torch, unguarded: several parameters, or another dtype, device,
-    betas, eps or further option than the optimiser's. That is decided when a group is added.
+    State and state dict have torch's form (step, exp_avg, exp_avg_sq), so checkpoints of both can be exchanged.
+    guard: see StepGuard. Groups that the kernel cannot step are stepped by torch, unguarded: several parameters, or
+    another dtype, device, betas, eps or further option than the optimiser's. Groups may change between any two steps.
     """
 
     guard: StepGuard | None = None
-    _stepped: _Stepped | None = None  # None: to be decided
 
     def __init__(self, groups: list[dict], eps: float = 1e-15) -> None:
         """Take groups: dicts with `params` (a list of one Parameter), `lr` and `name`."""
@@ -64,12 +57,6 @@ class GaussianAdam(torch.optim.Adam):
         """Take a state dict, or become a copy; copies know of no inactive columns."""
         super().__setstate__(state)
         self.__dict__.setdefault("_active_columns", {})
-        self._stepped = None
-
-    def add_param_group(self, param_group: Group) -> None:
-        """Add any group that torch.optim.Adam takes."""
-        super().add_param_group(param_group)
-        self._stepped = None
 
     def set_active_columns(self, name: str, columns: int) -> None:
         """Promise that only the first `columns` values of each row of this group ever had a gradient.
@@ -79,12 +66,24 @@ class GaussianAdam(torch.optim.Adam):
         """
         self._active_columns[name] = columns
 
-    @torch.no_grad()
     def step(self, closure: Callable[[], float] | None = None) -> float | None:
         """Step every parameter that has a gradient; the others keep their values and step counters.
 
         Each group has its own learning rate; betas and eps are the optimiser's.
         """
+        # torch has wrapped the step of a subclass, and calls the hooks there.
+        if self._has_step_hooks() and type(self).step is GaussianAdam.step:
+            return self._hooked_step(closure)
+        return self._step(closure)
+
+    step.hooked = True  # keeps torch from wrapping it: its wrapper takes as long as the step itself
+
+    def _has_step_hooks(self) -> bool:
+        own = self._optimizer_step_pre_hooks or self._optimizer_step_post_hooks
+        return bool(own or _global_optimizer_pre_hooks or _global_optimizer_post_hooks)
+
+    @torch.no_grad()
+    def _step(self, closure: Callable[[], float] | None = None) -> float | None:
         loss = None
         if closure is not None:
             with torch.enable_grad():
@@ -113,27 +112,28 @@ class GaussianAdam(torch.optim.Adam):
             self._step_by_torch(others)
         return loss
 
-    step.hooked = True  # keeps torch from wrapping it
+    _hooked_step = torch.optim.Optimizer.profile_hook_step(_step)
 
-    def _groups(self) -> _Stepped:
-        stepped = self._stepped
-        if stepped is None or len(stepped.by_kernel) + len(stepped.by_torch) != len(self.param_groups):
-            stepped = self._stepped = self._decide()
-        return stepped
+    def _groups(self) -> tuple[list[Group], list[Group]]:
+        """The groups that the kernel steps, each of one contiguous parameter of the same kind, and those left to torch.
 
-    def _decide(self) -> _Stepped:
-        stepped, kind = _Stepped([], []), None
+        Decided anew in every step, in some microseconds, as anyone may change a group.
+        """
+        by_kernel, by_torch, kind, options = [], [], None, _common(self.defaults)
         for group in self.param_groups:
-            common = all(group.get(option) == self.defaults.get(option) for option in _COMMON)
-            own = _kind(group["params"][0]) if common and len(group["params"]) == 1 else None
+            params = group["params"]
+            own = _kind(params[0]) if len(params) == 1 and _common(group) == options else None
             kind = own if kind is None else kind
-            (stepped.by_torch if own is None or own != kind else stepped.by_kernel).append(group)
-        return stepped
+            (by_torch if own is None or own != kind else by_kernel).append(group)
+        return by_kernel, by_torch
 
     def _step_by_torch(self, groups: list[Group]) -> None:
+        step = torch.optim.Adam.step
+        if getattr(step, "hooked", False):  # once there was an Adam, torch's wrapper, which calls the hooks
+            step = step.__wrapped__
         every, self.param_groups = self.param_groups, groups
         try:
-            torch.optim.Adam.step(self)
+            step(self)
         finally:
             self.param_groups = every
 
@@ -148,7 +148,7 @@ class GaussianAdam(torch.optim.Adam):
     def take_marks(self) -> dict[str, Tensor]:
         """Rows (n,), by group, of the values whose step a guard held back; their averages restart at zero."""
         rows = {}
-        for group in self._groups().by_kernel:
+        for group in self._groups()[0]:
             state = self.state.get(group["params"][0])
             if not state:
                 continue
@@ -161,7 +161,7 @@ class GaussianAdam(torch.optim.Adam):
 
     def rewind(self, steps: int) -> None:
         """Reduce the step counters by the steps that a guard held back."""
-        for group in self._groups().by_kernel:
+        for group in self._groups()[0]:
             if state := self.state.get(group["params"][0]):
                 state["step"] = (state["step"] - steps).clamp_min(0)
 

@@ -7,7 +7,7 @@ from torch import Tensor, nn
 
 from scene.gaussians import density_rules as rules
 from scene.gaussians.attributes import Rows
-from scene.gaussians.parameters import GaussianParameters
+from scene.gaussians.parameters import GaussianParameters, raw_rows
 from scene.gaussians.row_surgery import Group, States, append_rows, keep_rows, replace_values, row_groups
 from scene.gaussians.statistics import NAMES, Statistics
 from utils.general_utils import inverse_sigmoid
@@ -31,6 +31,10 @@ class AdaptiveGaussians(GaussianParameters):
     optimizer: torch.optim.Optimizer | None = None
     tmp_radii: Tensor | None = None
     percent_dense = 0.0
+
+    def __init__(self, sh_degree: int) -> None:
+        super().__init__(sh_degree)
+        self._zero_statistics()
 
     @property
     def statistics(self) -> Statistics:
@@ -123,7 +127,7 @@ class AdaptiveGaussians(GaussianParameters):
         """Append an exact copy of each Gaussian with gradient >= threshold and scale <= percent_dense * extent."""
         small = rules.is_small(self._log_scales(), self.percent_dense * scene_extent)
         chosen = ((grads.reshape(-1) >= grad_threshold) & small).nonzero().reshape(-1)
-        self._append({name: values.index_select(0, chosen) for name, values in self.rows().items()}, chosen)
+        self._append({name: values.index_select(0, chosen) for name, values in raw_rows(self).items()}, chosen)
 
     def densify_and_split(
         self,
@@ -148,14 +152,16 @@ class AdaptiveGaussians(GaussianParameters):
         large[len(grads) :] = False
         large[: len(grads)] &= grads >= grad_threshold
         parents = large.nonzero().reshape(-1)
-        rows = {name: values.index_select(0, parents) for name, values in self.rows().items()}
+        rows = {name: values.index_select(0, parents) for name, values in raw_rows(self).items()}
         shapes = rows["xyz"], log_scales.index_select(0, parents), rows["rotation"]
         children = [
             rules.split_children(*shapes, parents, child, count=N, seed=seed, iteration=iteration) for child in range(N)
         ]
         rows = {name: torch.cat([values] * N) for name, values in rows.items()}
         rows["xyz"], scales = (torch.cat(parts) for parts in zip(*children, strict=True))
-        rows["scaling"] = scales if self.kernels_activate else self.scaling_inverse_activation(scales.exp())
+        if not (self.kernels_activate and self.scaling_inverse_activation is torch.log):
+            scales = self.scaling_inverse_activation(scales.exp())
+        rows["scaling"] = scales
         self._append(rows, parents.repeat(N))
         self.prune_points(torch.cat((large, large.new_zeros(len(self) - before))))
 
@@ -190,8 +196,16 @@ class AdaptiveGaussians(GaussianParameters):
         self._zero_statistics()
 
     def prune_points(self, mask: Tensor) -> None:
-        """Remove the Gaussians of a mask (N,) bool, with their optimiser state and statistics."""
-        kept = ~mask.reshape(-1).bool()
+        """Remove the Gaussians of a mask, with their optimiser state and statistics.
+
+        IndexError, before anything changes, unless the mask is (N,) bool.
+        """
+        if mask.dtype != torch.bool or tuple(mask.shape) != (len(self),):
+            raise IndexError(
+                f"prune_points takes a mask of shape ({len(self)},) and type bool, one value for each Gaussian; "
+                f"this one has the shape {tuple(mask.shape)} and type {mask.dtype}"
+            )
+        kept = ~mask
         keep = kept.nonzero().reshape(-1)
         if len(keep) == len(kept):
             return
@@ -203,7 +217,7 @@ class AdaptiveGaussians(GaussianParameters):
 
     def reset_opacity(self) -> None:
         """Lower every opacity to at most 0.01; Adam's averages of it restart at zero."""
-        if self.kernels_activate:
+        if self.kernels_activate and self.inverse_opacity_activation is inverse_sigmoid:
             lowered = self._opacity.detach().clamp_max(rules.logit(rules.RESET_OPACITY))
         else:
             lowered = self.inverse_opacity_activation(self.get_opacity.detach().clamp_max(rules.RESET_OPACITY))

@@ -31,11 +31,21 @@ class Exposures:
     """
 
     def __init__(self, names: Sequence[str] = ()) -> None:
-        self.mapping = {name: index for index, name in enumerate(names)}
-        self.values: Tensor = nn.Parameter(torch.eye(3, 4, device=compute_device()).repeat(len(names), 1, 1))
+        self.start(names)
         self.pretrained: dict[str, Tensor] | None = None
         self.optimizer: torch.optim.Optimizer | None = None
         self.schedule: Callable[[int], float] | None = None
+
+    def start(self, names: Sequence[str]) -> None:
+        """Give each of these photos a map that changes nothing."""
+        self.mapping = {name: index for index, name in enumerate(names)}
+        self.values: Tensor = nn.Parameter(torch.eye(3, 4, device=compute_device()).repeat(len(names), 1, 1))
+
+    def start_as(self, state: dict[str, Any]) -> None:
+        """`start` with the photos of a state of `capture()`; `restore` refuses what is no list of names."""
+        names = state.get("names")
+        if isinstance(names, list) and all(isinstance(name, str) for name in names):
+            self.start(names)
 
     def __getitem__(self, name: str) -> Tensor:
         """Map (3, 4) of a photo, differentiable. UserError for a photo that was not trained on."""

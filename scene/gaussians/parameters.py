@@ -24,26 +24,41 @@ def covariance(scaling: Tensor, scaling_modifier: float, rotation: Tensor) -> Te
     return strip_symmetric(factor @ factor.transpose(1, 2))
 
 
+def raw_rows(gaussians: "GaussianParameters") -> Rows:
+    """Raw values by optimiser group, without gradient; they share the parameters' memory.
+
+    A function, so that it means the same for a subclass that has a method `rows` of its own.
+    """
+    return {name: getattr(gaussians, a.field).detach() for name, a in gaussians._attributes.items()}
+
+
 class GaussianParameters:
     """N Gaussians with raw (unactivated) float32 parameters; `get_*` give the activated ones.
 
     `_xyz` (N,3) world; `_features_dc` (N,1,3), `_features_rest` (N,K,3), K = (D+1)^2 - 1; `_scaling` (N,3) log;
     `_rotation` (N,4) wxyz, any length; `_opacity` (N,1) logit. world_offset: the world's coordinates of the origin
     (scene/readers/world_offset.py), kept in the PLY. Activations are attributes, which `setup_functions` sets.
+    The tensors become parameters when rows are taken; an empty model has plain ones, as in the reference.
     """
 
-    _xyz: nn.Parameter
-    _features_dc: nn.Parameter
-    _features_rest: nn.Parameter
-    _scaling: nn.Parameter
-    _rotation: nn.Parameter
-    _opacity: nn.Parameter
+    # What a subclass need not set whose __init__ sets the reference's attributes and does not call this one.
+    active_sh_degree = 0
+    max_sh_degree = 3
+    world_offset = (0.0, 0.0, 0.0)
+
+    _xyz: Tensor
+    _features_dc: Tensor
+    _features_rest: Tensor
+    _scaling: Tensor
+    _rotation: Tensor
+    _opacity: Tensor
 
     def __init__(self, sh_degree: int) -> None:
         self.active_sh_degree = 0
         self.max_sh_degree = sh_degree
         self.world_offset = (0.0, 0.0, 0.0)
-        self.set_rows({name: torch.empty(0, *attribute.shape) for name, attribute in self._attributes.items()})
+        device = compute_device()
+        self._take({name: torch.empty(0, *a.shape, device=device) for name, a in self._attributes.items()})
         self.setup_functions()
 
     def setup_functions(self) -> None:
@@ -63,6 +78,10 @@ class GaussianParameters:
     def __len__(self) -> int:
         """Number of Gaussians."""
         return self._xyz.shape[0]
+
+    def __bool__(self) -> bool:
+        """True, also for a model without Gaussians: the reference's has no length."""
+        return True
 
     @property
     def get_xyz(self) -> Tensor:
@@ -159,7 +178,7 @@ class GaussianParameters:
 
     def save_ply(self, path: str | os.PathLike) -> None:
         """Write the raw parameters as a PLY in the reference's layout."""
-        write_ply(path, self.rows(), self._degree_of_tensors(), self.world_offset)
+        write_ply(path, raw_rows(self), self._degree_of_tensors(), self.world_offset)
 
     @property
     def ply_bytes(self) -> int:
@@ -168,7 +187,7 @@ class GaussianParameters:
 
     def part(self, keep: Tensor | slice, sh_degree: int) -> "GaussianParameters":
         """A copy of the Gaussians `keep`, (N,) bool or a slice, with the SH bands up to sh_degree."""
-        rows = {name: values[keep] for name, values in self.rows().items()}
+        rows = {name: values[keep] for name, values in raw_rows(self).items()}
         rows["f_rest"] = rows["f_rest"][:, : (sh_degree + 1) ** 2 - 1].contiguous()
         other = copy.copy(self)
         other.max_sh_degree, other.active_sh_degree = sh_degree, min(sh_degree, self.active_sh_degree)
@@ -177,15 +196,15 @@ class GaussianParameters:
 
     def rows(self) -> Rows:
         """Raw values by optimiser group, without gradient; they share the parameters' memory."""
-        return {name: getattr(self, attribute.field).detach() for name, attribute in self._attributes.items()}
+        return raw_rows(self)
 
     def set_rows(self, rows: Rows) -> None:
         """Take raw values of any number of Gaussians by optimiser group; they move to the device that computes."""
         device = compute_device()
         self._take({name: nn.Parameter(rows[name].to(device)) for name in self._attributes})
 
-    def _take(self, params: dict[str, nn.Parameter]) -> None:
-        """Set the tensors of these attributes; parameters of other names are not the table's."""
+    def _take(self, params: dict[str, Tensor]) -> None:
+        """Set the tensors of these attributes; tensors of other names are not the table's."""
         for name, attribute in self._attributes.items():
             if name in params:
                 setattr(self, attribute.field, params[name])

@@ -94,8 +94,8 @@ class ImageStore:
 
     @property
     def keeps_floats(self) -> bool:
-        """Whether images may also be kept as float32 where they are computed with, four times as large."""
-        return not self.limit and self.keep_on.type == self.device.type and self._room_for_floats
+        """Whether images may also be kept as float32, four times as large, on the device of --data_device."""
+        return not self.limit and self._room_for_floats
 
     def get(self, source: Source, size: Size) -> Tensor:
         """Image (3 or 4,H,W) uint8 of a photo, or the tensor that another source decodes to, on the store's device.

@@ -3,10 +3,10 @@
 import json
 import sys
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 import torch
@@ -43,6 +43,29 @@ class DepthMap:
         return torch.from_numpy((values * self.scale + self.offset).astype(np.float32))[None]
 
 
+class DepthFit(NamedTuple):
+    """Inverse depth = value * scale + offset, and whether to train on it."""
+
+    scale: float = 1.0
+    offset: float = 0.0
+    reliable: bool = True
+
+
+def depth_fit(params: Mapping[str, float] | None) -> DepthFit:
+    """The fit that `scale`, `offset` and the scene's median scale `med_scale` tell; None: the map is used as it is.
+
+    A scale that is not positive belongs to a fit that failed: it is not applied, and the map is not reliable. Nor is a
+    map whose scale is far from the median. Without `med_scale` the scale is the median.
+    """
+    if params is None:
+        return DepthFit()
+    scale = params["scale"]
+    median = params.get("med_scale", scale)
+    if scale <= 0:
+        return DepthFit(reliable=False)
+    return DepthFit(scale, params["offset"], median / RELIABLE <= scale <= median * RELIABLE)
+
+
 def with_depth_maps(info: SceneInfo, scene: Path, depths: str) -> SceneInfo:
     """The scene with a DepthMap for each training view that has a reliable one; a message names the others.
 
@@ -73,16 +96,10 @@ def named_depth_map(camera: CameraInfo, unit: float) -> DepthMap | None:
 
     unit: COLMAP_UNIT or BLENDER_UNIT. A map without parameters is taken as it is, as in the reference.
     """
-    if not camera.depth_path:
+    fit = depth_fit(camera.depth_params)
+    if not camera.depth_path or not fit.reliable:
         return None
-    params = camera.depth_params
-    if params is None:
-        return DepthMap(Path(camera.depth_path), unit)
-    scale = params["scale"]
-    median = params.get("med_scale", scale)
-    if not (scale > 0 and median / RELIABLE <= scale <= median * RELIABLE):
-        return None
-    return DepthMap(Path(camera.depth_path), unit, scale, params["offset"])
+    return DepthMap(Path(camera.depth_path), unit, fit.scale, fit.offset)
 
 
 def _with_map(camera: CameraInfo, path: Path, params: dict[str, float] | None, unit: float) -> CameraInfo:

@@ -13,7 +13,7 @@ import numpy as np
 from scene.pictures.decode import picture_size
 from scene.pictures.masks import Mask
 from scene.pictures.store import Decodable
-from utils.graphics_utils import BasicPointCloud, focal2fov, fov2focal
+from utils.graphics_utils import BasicPointCloud, camera_center, focal2fov, fov2focal
 from utils.system_utils import UserError
 
 HOLD = 8  # every 8th photo by name is a test view (Mip-NeRF 360's split)
@@ -143,7 +143,7 @@ class CameraInfo(_LikeNamedTuple):
     @property
     def center(self) -> np.ndarray:
         """Camera centre (3,) in the world."""
-        return -self.R @ self.T
+        return camera_center(self.R, self.T)
 
 
 _SAME_ANGLE = 1e-9  # relative; FovX, turned into fx and back, differs by rounding
@@ -221,7 +221,7 @@ def normalization(cameras: Sequence[CameraInfo], points: np.ndarray | None = Non
 
 def camera_centers(cameras: Sequence[CameraInfo]) -> np.ndarray:
     """Camera centres (N,3) in the world, of any records with R and T."""
-    return np.array([-camera.R @ camera.T for camera in cameras])
+    return np.array([camera_center(camera.R, camera.T) for camera in cameras])
 
 
 def scene_extent(cameras: Sequence[CameraInfo], points: np.ndarray | None = None) -> float:

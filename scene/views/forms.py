@@ -11,8 +11,7 @@ from torch import Tensor
 
 from scene.pictures.decode import pixels_of
 from scene.pictures.in_memory import InMemory
-from scene.readers.depth_maps import resize
-from scene.views.depth_fit import depth_fit
+from scene.readers.depth_maps import depth_fit, resize
 from scene.views.view import View, half
 
 _NOT_MOVED = np.array([0.0, 0.0, 0.0])

@@ -8,9 +8,8 @@ from scene.pictures.decode import picture_size, pixels_of
 from scene.pictures.in_memory import InMemory
 from scene.pictures.masks import TRANSPARENT, Cutout, Mask, add_alpha
 from scene.pictures.store import Size, Source
-from scene.readers.depth_maps import BLENDER_UNIT, COLMAP_UNIT, DepthMap
+from scene.readers.depth_maps import BLENDER_UNIT, COLMAP_UNIT, DepthFit, DepthMap, depth_fit
 from scene.readers.info import CameraInfo
-from scene.views.depth_fit import DepthFit, depth_fit
 from scene.views.view import View
 
 

@@ -65,8 +65,8 @@ def training_report(
 ) -> dict[str, float]:
     """Log every tenth iteration to TensorBoard; in testing iterations, score and print test and five training views.
 
-    elapsed: seconds of this iteration; renderArgs: what follows camera and model in renderFunc, (pipe, background).
-    train_test_exp: render with exposures, and score right halves only.
+    elapsed: seconds of this iteration; renderArgs: what follows camera and model in renderFunc, (pipe, background) or
+    more. train_test_exp: render with exposures (a sixth of renderArgs says so, too), and score right halves only.
     Returns `<set>_l1` and `<set>_psnr` (dB, mean over views and channels) of the sets scored, {} otherwise.
     """
     if tb_writer and iteration % LOG_INTERVAL == 0:
@@ -75,7 +75,7 @@ def training_report(
         tb_writer.add_scalar("iter_time", elapsed * 1000.0, iteration)
     if iteration not in testing_iterations:
         return {}
-    options = {"use_trained_exp": True} if train_test_exp else {}
+    options = {"use_trained_exp": True} if train_test_exp and len(renderArgs) < 6 else {}
     if renderFunc is render:
         options["want_depth"] = False  # our own addition: only images are scored
     views = ScoredViews(
