@@ -56,8 +56,8 @@ def draw_curves(path: Path, scene: str, runs: Sequence[dict[str, Any]]) -> bool:
             axes.plot(*_columns(points), marker=".", label=(run["config"] or "test") if first else None, **style)
             parts = [row for row in run["curve"] if row.get(SUBSET) is not None]
             if part := _points(parts, value, "test"):
-                label = "a subset of the test views" if run is runs[0] else None
-                axes.plot(*_columns(part), marker="o", label=label, **style | HOLLOW)
+                named = "a subset of the test views" if run is runs[0] else None
+                axes.plot(*_columns(part), marker="o", label=named, **style | HOLLOW)
             if len(configs) == 1 and (train := _points(whole_sets(run["curve"]), value, "train")):
                 style |= {"linestyle": "--", "alpha": 0.6}
                 axes.plot(*_columns(train), label="train" if first else None, **style)
