@@ -74,7 +74,7 @@ def draw_curves(path: Path, scene: str, runs: Sequence[dict[str, Any]], peers: S
         )
         axes.set(xscale="log", xlabel=seconds, ylabel=label)
         plain_log_axis(axes.xaxis)
-        if value is _dissimilarity and all(number > 0 for _, number in drawn):
+        if value is _dissimilarity and drawn and all(number > 0 for _, number in drawn):
             axes.set_yscale("log")
             plain_log_axis(axes.yaxis)
         axes.grid(True, which="both", alpha=0.3)

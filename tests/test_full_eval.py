@@ -401,6 +401,7 @@ def test_points_of_subsets_are_hollow_and_in_no_front(tmp_path, monkeypatch):
     ):
         assert draw_curves(tmp_path / "curves.png", "attic", runs)
         lines = figures[-1].axes[0].lines
+        assert figures[-1].axes[0].get_ylabel() == "PSNR of the test views (dB)"
         hollow = [line.get_xydata().tolist() for line in lines if line.get_fillstyle() == "none"]
         assert [[0.3, 35.0], [1.0, 36.0]] in hollow
         assert [[2.0, 20.0]] in [line.get_xydata().tolist() for line in lines if line.get_fillstyle() == "full"]
