@@ -7,8 +7,6 @@ if __name__ == "__main__":
     import utils.host.early  # noqa: F401  (before the other imports, which take a second)
 
 import argparse
-import os
-import uuid
 from collections.abc import Sequence
 from typing import Any
 
@@ -19,7 +17,7 @@ from arguments import ModelParams, OptimizationParams, OptionParser, PipelinePar
 from training.loop import run_training
 from training.observers.report import training_report
 from training.observers.standard import standard_observers
-from training.output_folder import own_folder
+from training.output_folder import new_folder, own_folder
 from training.plan import Plan
 from training.run import Run
 from utils.general_utils import safe_state
@@ -50,7 +48,7 @@ def training(
     checkpoint: a chkpntN.pth to resume, or None. debug_from: switch pipe.debug on after this iteration.
     record_curve: with test views, write error_vs_time.csv during training, and draw it.
     """
-    dataset.model_path = dataset.model_path or _new_output_folder()
+    dataset.model_path = dataset.model_path or new_folder()
     print(f"Optimizing {dataset.model_path}")
     plan = Plan(testing_iterations, saving_iterations, checkpoint_iterations, checkpoint, debug_from, record_curve)
     run = Run(dataset, opt, pipe, plan)
@@ -61,17 +59,12 @@ def training(
         run_training(run, standard_observers(run, writer, training_report))
 
 
-def _new_output_folder() -> str:
-    name = os.environ.get("OAR_JOB_ID") or str(uuid.uuid4())
-    return os.path.join("./output/", name[:10])
-
-
 def prepare_output_and_logger(args: argparse.Namespace, **kept: Any) -> Any | None:
     """Make the output folder, args.model_path, with cfg_args and model.json (kept: as write_model_json takes it).
 
     An empty model_path becomes that of a new folder. Returns a TensorBoard writer, or None without TensorBoard.
     """
-    args.model_path = args.model_path or _new_output_folder()
+    args.model_path = args.model_path or new_folder()
     print(f"Output folder: {args.model_path}")
     mkdir_p(args.model_path)
     write_cfg_args(args.model_path, args)

@@ -214,10 +214,8 @@ class GaussianModel(Exposed, AdaptiveGaussians):
         except ValueError as error:
             raise UserError(f"the optimiser state of the checkpoint does not fit ({error}); use another one") from error
         if "xyz" in lacking:  # f_rest may lack it, as Gaussians without active bands have no steps
-            print(
-                f"warning: the checkpoint has no averages of Adam for {', '.join(map(str, lacking))}; they begin at zero",
-                file=sys.stderr,
-            )
+            names = ", ".join(map(str, lacking))
+            print(f"warning: the checkpoint has no averages of Adam for {names}; they begin at zero", file=sys.stderr)
         if state.exposures is not None:
             self.exposures.restore(state.exposures)
         self.statistics = state.statistics.to(self._xyz.device)

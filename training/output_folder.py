@@ -1,7 +1,9 @@
-"""The output folder of a training while it runs."""
+"""The output folder of a training: its default, and keeping it while the training runs."""
 
 import contextlib
+import os
 import sys
+import uuid
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -11,6 +13,12 @@ from utils.files.lock import locked
 from utils.system_utils import mkdir_p
 
 _INPUTS = ("cfg_args", "model.json", "cameras.json", "input.ply")
+
+
+def new_folder() -> str:
+    """Name of a new folder under ./output, after OAR_JOB_ID or at random, as in the reference."""
+    name = os.environ.get("OAR_JOB_ID") or str(uuid.uuid4())
+    return os.path.join("./output/", name[:10])
 
 
 @contextlib.contextmanager

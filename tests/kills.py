@@ -1,0 +1,211 @@
+"""Kill trainings at random and at aimed moments, resume them, and compare the end with a training that was let be.
+
+python -m tests.kills N [SEED]
+
+Kills are SIGKILL, in turn: after a random time, and before, in or after the n-th write of a file. A trial kills one to
+three times, each time resuming from the newest checkpoint. At its end the PLYs, the tensors of the checkpoints and the
+names of all files must be those of the training that was let be, with no temporary file or lock left over. Processes
+are forked from this one, which has everything imported.
+"""
+
+import argparse
+import hashlib
+import os
+import random
+import shutil
+import signal
+import sys
+import tempfile
+import time
+import traceback
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
+
+import utils.host.openmp  # noqa: F401, E402  isort: skip  (before torch)
+import numpy as np  # noqa: E402
+import torch  # noqa: E402
+from synthetic import make_blender_scene  # noqa: E402
+
+import train  # noqa: E402
+import utils.system_utils  # noqa: E402
+from scene.readers.point_cloud import write_point_cloud  # noqa: E402
+
+OPTIONS = (
+    *("--iterations", "60", "--eval", "--quiet", "--test_iterations", "30", "60", "--save_iterations", "20", "40"),
+    *("--checkpoint_iterations", "10", "20", "30", "40", "50", "60", "--densify_from_iter", "5"),
+    *("--densification_interval", "10", "--opacity_reset_interval", "25", "--train_test_exp"),
+)
+MOMENTS = ("before", "in", "after")
+
+
+def main() -> int:
+    """Return 1 if a trial ended differently."""
+    parser = argparse.ArgumentParser(prog="python -m tests.kills", description=__doc__.partition("\n")[0])
+    parser.add_argument("kills", type=int, help="stop after this number of kills")
+    parser.add_argument("seed", type=int, nargs="?", default=0)
+    args = parser.parse_args()
+    rng, begin = random.Random(args.seed), time.monotonic()
+    counts = {"random": 0, "before": 0, "in": 0, "after": 0}
+    trials, wrong = 0, 0
+    with tempfile.TemporaryDirectory(prefix="kills") as folder:
+        scene, out = Path(folder, "scene"), Path(folder, "out")
+        make_blender_scene(scene)
+        points = np.random.default_rng(0).normal(size=(300, 3))  # a scene without points would start with 100,000
+        write_point_cloud(scene / "points3d.ply", points, np.full((300, 3), 127, np.uint8))
+        wanted, seconds, writes = _undisturbed(scene, Path(folder, "undisturbed"))
+        while sum(counts.values()) < args.kills:
+            shutil.rmtree(out, ignore_errors=True)
+            done = _trial(rng, scene, out, seconds, writes)
+            trials += 1
+            for name in done:
+                counts[name.split()[0]] += 1
+            if differences := _differences(wanted, _state(out)):
+                wrong += 1
+                print(f"WRONG after {', '.join(done)}: {', '.join(differences)}", flush=True)
+    by_moment = ", ".join(f"{count} {name}" for name, count in counts.items())
+    print(
+        f"{sum(counts.values())} kills ({by_moment} a write) in {trials} trials, {time.monotonic() - begin:.0f} s: "
+        f"{wrong} ended differently"
+    )
+    return 1 if wrong else 0
+
+
+def _undisturbed(scene: Path, out: Path) -> tuple[dict[str, str], float, int]:
+    """State of the training that is let be, its seconds, and the number of its writes."""
+    _wait(_start(scene, out, lambda: None), out)  # the first one warms caches up
+    shutil.rmtree(out)
+    begin, counter = time.monotonic(), out.parent / "writes"
+    _wait(_start(scene, out, lambda: _at_write(lambda *_: counter.open("a").write("x"))), out)
+    return _state(out), time.monotonic() - begin, len(counter.read_text()) // len(MOMENTS)
+
+
+def _trial(rng: random.Random, scene: Path, out: Path, seconds: float, writes: int) -> list[str]:
+    """Train with one to three kills and a last run without; return what was done. Fewer if a run ends before."""
+    done = []
+    for _ in range(rng.randint(1, 3)):
+        if rng.random() < 0.5:
+            child, delay = _start(scene, out, lambda: None), rng.uniform(0, seconds)
+            what = f"random {delay:.2f} s"
+            time.sleep(delay)
+            os.kill(child, signal.SIGKILL)
+        else:
+            moment, number = rng.choice(MOMENTS), rng.randrange(writes)
+            what = f"{moment} write {number}"
+            child = _start(scene, out, lambda m=moment, n=number: _at_write(_killer(m, n)))
+        status = os.waitpid(child, 0)[1]
+        if os.WIFSIGNALED(status) and os.WTERMSIG(status) == signal.SIGKILL:
+            done.append(what)
+        elif status == 0:
+            break  # it was faster, or has fewer writes when resumed
+        else:
+            raise RuntimeError(f"a training ended with status {status} after {done}: {_errors(out)}")
+    if _newest(out) != 60 or done:
+        _wait(_start(scene, out, lambda: None), out)
+    return done
+
+
+def _start(scene: Path, out: Path, prepare: Callable[[], Any]) -> int:
+    """Fork a training that resumes from the newest checkpoint, and return its process."""
+    child = os.fork()
+    if child:
+        return child
+    status = 1
+    try:
+        prepare()
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nowhere, 1)
+        errors = os.open(out.parent / "errors", os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
+        os.dup2(errors, 2)
+        words = ["-s", str(scene), "-m", str(out), *OPTIONS]
+        newest = _newest(out)
+        if newest >= 60:  # killed after its last checkpoint
+            newest = 50
+        if newest:
+            words += ["--start_checkpoint", str(out / f"chkpnt{newest}.pth")]
+        train.SummaryWriter = None
+        torch.set_num_threads(1)
+        train.main(words)
+        status = 0
+    except BaseException:
+        traceback.print_exc()
+    finally:
+        sys.stderr.flush()
+        os._exit(status)
+
+
+def _newest(out: Path) -> int:
+    return max((int(path.stem.removeprefix("chkpnt")) for path in out.glob("chkpnt*.pth")), default=0)
+
+
+def _wait(child: int, out: Path) -> None:
+    if status := os.waitpid(child, 0)[1]:
+        raise RuntimeError(f"a training that was let be ended with status {status}: {_errors(out)}")
+
+
+def _errors(out: Path) -> str:
+    return (out.parent / "errors").read_text(errors="replace")[-2000:]
+
+
+def _at_write(act: Callable[[str, int, Path], Any]) -> None:
+    """Let `act` be called before, in and after each renaming of a temporary file, with its number and path."""
+    replace, count = os.replace, [0]
+
+    def watched(source: Path, target: Path) -> None:
+        number = count[0]
+        count[0] += 1
+        act("before", number, source)
+        act("in", number, source)
+        replace(source, target)
+        act("after", number, source)
+
+    utils.system_utils.os.replace = watched
+
+
+def _killer(moment: str, number: int) -> Callable[[str, int, Path], None]:
+    def act(now: str, at: int, source: Path) -> None:
+        if (now, at) == (moment, number):
+            if now == "in":  # as if only half had been written
+                os.truncate(source, os.path.getsize(source) // 2)
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    return act
+
+
+def _state(out: Path) -> dict[str, str]:
+    """A digest of each file that training determines, and the names of the others."""
+    state = {}
+    for path in sorted(out.rglob("*")):
+        name = str(path.relative_to(out))
+        if path.suffix == ".ply" or path.name in ("cameras.json", "exposure.json"):
+            state[name] = hashlib.sha256(path.read_bytes()).hexdigest()
+        elif path.suffix == ".pth":
+            state[name] = _digest(torch.load(path, weights_only=True))
+        elif path.is_file():
+            state[name] = "there"
+    return state
+
+
+def _digest(content: Any) -> str:
+    if torch.is_tensor(content):
+        return hashlib.sha256(content.detach().contiguous().numpy().tobytes()).hexdigest()
+    if isinstance(content, dict):
+        return str([(key, _digest(content[key])) for key in sorted(content, key=str)])
+    if isinstance(content, list | tuple):
+        return str([_digest(part) for part in content])
+    return repr(content)
+
+
+def _differences(wanted: dict[str, str], found: dict[str, str]) -> list[str]:
+    return (
+        [f"{name} is missing" for name in wanted if name not in found]
+        + [f"{name} is left over" for name in found if name not in wanted]
+        + [f"{name} differs" for name in wanted if name in found and wanted[name] != found[name]]
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(main())
