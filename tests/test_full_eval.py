@@ -396,8 +396,8 @@ def test_points_of_subsets_are_hollow_and_in_no_front(tmp_path, monkeypatch):
     curve = [dict(zip(names, row, strict=True)) for row in rows]
     unfinished = curve[:2]
     for runs in (
-        [{"config": None, "curve": curve}],
-        [{"config": "a", "curve": curve}, {"config": "b", "curve": unfinished}],
+        [{"config": None, "apart": False, "curve": curve}],
+        [{"config": name, "apart": False, "curve": rows} for name, rows in (("a", curve), ("b", unfinished))],
     ):
         assert draw_curves(tmp_path / "curves.png", "attic", runs)
         lines = figures[-1].axes[0].lines

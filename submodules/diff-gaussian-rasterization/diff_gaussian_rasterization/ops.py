@@ -105,11 +105,12 @@ def mark_visible(positions: Tensor, view: Tensor) -> Tensor:
 
 def scene_arguments(gaussians: Gaussians, settings: GaussianRasterizationSettings, raw: bool) -> tuple:
     """Puts Gaussians and camera into the order of the operators' arguments (`schema.SCENE`)."""
+    center = settings.campos  # (3,); code of 2023 also gives a row (1, 3)
     return (
         *gaussians,
         settings.viewmatrix,
         settings.projmatrix,
-        settings.campos,
+        center if center.dim() == 1 else center.reshape(-1),
         settings.tanfovx,
         settings.tanfovy,
         settings.image_height,
