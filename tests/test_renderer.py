@@ -89,8 +89,10 @@ def test_the_report_takes_the_renders_arguments_of_the_2024_release(camera, more
     """Whose sixth says that exposures are used, as train_test_exp does."""
     asked = []
 
-    def spy(*args: object, **options: object) -> dict:
-        asked.append(args[7] if len(args) > 7 else options["use_trained_exp"])
+    def spy(
+        camera, gaussians, pipe, background, scale=1.0, separate_sh=False, color=None, use_trained_exp=False
+    ) -> dict:
+        asked.append(use_trained_exp)
         return {"render": torch.zeros(3, HEIGHT, WIDTH)}
 
     scene = argparse.Namespace(gaussians=model(5), getTrainCameras=lambda: [camera], getTestCameras=lambda: [camera])
