@@ -182,7 +182,7 @@ def _state(out: Path) -> dict[str, str]:
         name = str(path.relative_to(out))
         if path.suffix == ".ply" or path.name in ("cameras.json", "exposure.json"):
             state[name] = hashlib.sha256(path.read_bytes()).hexdigest()
-        elif path.suffix == ".pth":
+        elif path.suffix == ".pth" and ".tmp" not in name:
             state[name] = _digest(torch.load(path, weights_only=True))
         elif path.is_file():
             state[name] = "there"

@@ -103,3 +103,10 @@ def test_a_folder_that_is_removed_while_training_is_told_of(tmp_path, capsys):
         (folder / "cfg_args").touch()
     assert "warning: model.json, cameras.json, input.ply in" in (said := capsys.readouterr().err)
     assert "were removed while training" in said
+
+
+def test_points_that_were_missing_before_a_resumed_run_are_no_news(tmp_path, capsys):
+    with own_folder(str(tmp_path)):
+        for name in ("cfg_args", "model.json", "cameras.json"):
+            (tmp_path / name).touch()
+    assert capsys.readouterr().err == ""

@@ -33,7 +33,8 @@ def own_folder(model_path: str) -> Iterator[None]:
     with locked(folder, "train.py", "another train.py (process {process})", "-m"):
         remove_leftovers(folder)
         yield
-        if missing := [name for name in _INPUTS if not (folder / name).exists()]:
+        missing = [name for name in _INPUTS if not (folder / name).exists()]
+        if missing not in ([], ["input.ply"]):  # a run that is resumed may have begun without the latter
             print(
                 f"warning: {some(missing)} in {folder} were removed while training; the model is saved, but other "
                 "programs may miss them",
