@@ -6,8 +6,8 @@
 A model that train.py saved without --keep_unseen has no unseen Gaussians. The bound is that of --prune_sh, the largest
 change of a colour. PSNR is the mean over the views, from unrounded renders.
 
-With --scenes, each scene is trained with --eval --keep_unseen --prune_sh -1, and saved at each iteration N. Options
-that are not known go to train.py. Models are kept in OUT; one that is there already is not trained again. The table
+With --scenes, each scene is trained with --eval --keep_unseen --prune_sh -1, and saved at each iteration N. All other
+options (-r 4) go to train.py. Models are kept in OUT; one that is there already is not trained again. The table
 compares three rules for the Gaussians to leave out: those that no training view depends on, those that no view between
 neighbours depends on either, and what train.py does at its end. A cell has the share left out, the largest change of
 a value of a test view (of 255), and the change of PSNR in dB.
@@ -163,19 +163,24 @@ def compare_scenes(args: argparse.Namespace, rest: list[str]) -> None:
         write_tables(args.write, PART, lines)
 
 
-@torch.no_grad()
-def main() -> None:
-    parser = OptionParser(description=__doc__.splitlines()[0])
-    model_params, pipeline_params = ModelParams(parser, sentinel=True), PipelineParams(parser)
-    parser.add_argument("--iteration", type=int, default=-1, help="saved iteration to load (-1: the highest)")
+def _of_scenes() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     parser.add_argument("--scenes", type=Path, nargs="+", help="scenes to train and compare, instead of a model")
     parser.add_argument("--out", type=Path, help="folder for the models of --scenes")
     parser.add_argument("--at", type=int, nargs="+", default=[600, 2000], help="iterations to compare (600 2000)")
     parser.add_argument("--write", type=Path, help="page whose table of omission to replace (default: only print)")
-    known, rest = parser.parse_known_args()
-    if known.scenes:
-        compare_scenes(known, rest)
+    return parser
+
+
+@torch.no_grad()
+def main() -> None:
+    args, rest = _of_scenes().parse_known_args()
+    if args.scenes:
+        compare_scenes(args, rest)
         return
+    parser = OptionParser(description=__doc__.splitlines()[0], parents=[_of_scenes()])
+    model_params, pipeline_params = ModelParams(parser, sentinel=True), PipelineParams(parser)
+    parser.add_argument("--iteration", type=int, default=-1, help="saved iteration to load (-1: the highest)")
     args = get_combined_args(parser)
     options, pipe = model_params.extract(args), pipeline_params.extract(args)
     print(describe(compute_device()))
