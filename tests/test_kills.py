@@ -5,9 +5,9 @@ import subprocess
 import sys
 from pathlib import Path
 
-import kills
 import pytest
-from kills import _differences, _state
+from kills import trials
+from kills.trials import _differences, _state
 
 ROOT = Path(__file__).parents[1]
 
@@ -34,9 +34,9 @@ def test_aimed_kills_leave_half_a_file_or_a_whole_one(tmp_path, monkeypatch):
     path = tmp_path / "file"
     for moment, size in (("before", 8), ("in", 4), ("after", 8)):
         path.write_bytes(b"12345678")
-        act = kills._killer(moment, 1)
+        act = trials._killer(moment, 1)
         for number in range(3):
-            for now in kills.MOMENTS:
+            for now in trials.MOMENTS:
                 act(now, number, path)
         assert path.stat().st_size == size
     assert len(killed) == 3

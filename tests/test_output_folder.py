@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from training.output_folder import own_folder
-from utils.files.leftovers import remove_leftovers
 from utils.files.lock import locked
+from utils.files.temporary_files import remove_temporary_files
 from utils.system_utils import UserError, atomic_write
 
 ROOT = Path(__file__).parents[1]
@@ -89,9 +89,9 @@ def test_temporary_files_of_dead_processes_are_removed(tmp_path):
 def test_the_names_of_temporary_files_are_known(tmp_path, monkeypatch, name):
     with atomic_write(tmp_path / name) as temporary:
         temporary.touch()
-        assert not remove_leftovers(tmp_path)  # this process lives
-        monkeypatch.setattr("utils.files.leftovers._runs", lambda process: process != os.getpid())
-        assert remove_leftovers(tmp_path) == [temporary]
+        assert not remove_temporary_files(tmp_path)  # this process lives
+        monkeypatch.setattr("utils.files.temporary_files._runs", lambda process: process != os.getpid())
+        assert remove_temporary_files(tmp_path) == [temporary]
         temporary.touch()
 
 

@@ -7,9 +7,9 @@ import uuid
 from collections.abc import Iterator
 from pathlib import Path
 
-from utils.files.leftovers import remove_leftovers
 from utils.files.listing import some
 from utils.files.lock import locked
+from utils.files.temporary_files import remove_temporary_files
 from utils.system_utils import mkdir_p
 
 _INPUTS = ("cfg_args", "model.json", "cameras.json", "input.ply")
@@ -31,7 +31,7 @@ def own_folder(model_path: str) -> Iterator[None]:
     folder = Path(model_path)
     mkdir_p(folder)
     with locked(folder, "train.py", "another train.py (process {process})", "-m"):
-        remove_leftovers(folder)
+        remove_temporary_files(folder)
         yield
         missing = [name for name in _INPUTS if not (folder / name).exists()]
         if missing not in ([], ["input.ply"]):  # a run that is resumed may have begun without the latter

@@ -21,7 +21,7 @@ from scene.pictures.lens import Lens, Pinhole, Undistortion, shown_pixels, undis
 from scene.pictures.masks import TRANSPARENT, Mask
 from scene.pictures.pycolmap_import import import_pycolmap
 from utils.files.image_files import open_image
-from utils.files.leftovers import remove_leftovers
+from utils.files.temporary_files import remove_temporary_files
 from utils.host.cache_folder import cache_folder
 from utils.host.threads import threads
 from utils.system_utils import UserError, atomic_write, mkdir_p
@@ -69,7 +69,7 @@ def undistort(photos: Sequence[Photo]) -> list[Undistorted]:
     paths = [folder / key[:2] / f"{key}.png" for key in keys]
     missing = {path: photo for path, photo in zip(paths, photos, strict=True) if not _kept(path)}
     if missing:
-        remove_leftovers(folder)
+        remove_temporary_files(folder)
         _in_threads(lambda item: _make(item[1], item[0]), list(missing.items()), "Undistorting photos")
         size = sum(path.stat().st_size for path in missing)
         print(

@@ -2,8 +2,10 @@
 
 python -m tests.fuzz SECONDS SEED
 
+command                              the command line
 damage                               changes of bytes and of nested values
-files, pictures, options, rasterizer the kinds of cases
+files, models, pictures, options, rasterizer
+                                     the kinds of cases
 worker                               a process that runs cases and measures them
 sandbox                              starts workers, and notices when one crashes or hangs
 operators                            changed calls of every operator, for tests/test_operator_arguments.py

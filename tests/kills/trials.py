@@ -1,12 +1,4 @@
-"""Kill trainings at random and at aimed moments, resume them, and compare the end with a training that was let be.
-
-python -m tests.kills N [SEED]
-
-Kills are SIGKILL, in turn: after a random time, and before, in or after the n-th write of a file. A trial kills one to
-three times, each time resuming from the newest checkpoint. At its end the PLYs, the tensors of the checkpoints and the
-names of all files must be those of the training that was let be, with no temporary file or lock left over. Processes
-are forked from this one, which has everything imported.
-"""
+"""Trials of killed trainings. Processes are forked from this one, which has everything imported."""
 
 import argparse
 import hashlib
@@ -22,17 +14,16 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-ROOT = Path(__file__).resolve().parents[1]
-sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
+import utils.host.openmp  # noqa: F401  isort: skip  (before torch)
+import matplotlib.pyplot  # noqa: F401  (here and torch._dynamo: otherwise every child would import them)
+import numpy as np
+import torch
+import torch._dynamo
+from synthetic import make_blender_scene
 
-import utils.host.openmp  # noqa: F401, E402  isort: skip  (before torch)
-import numpy as np  # noqa: E402
-import torch  # noqa: E402
-from synthetic import make_blender_scene  # noqa: E402
-
-import train  # noqa: E402
-import utils.system_utils  # noqa: E402
-from scene.readers.point_cloud import write_point_cloud  # noqa: E402
+import train
+import utils.system_utils
+from scene.readers.point_cloud import write_point_cloud
 
 OPTIONS = (
     *("--iterations", "60", "--eval", "--quiet", "--test_iterations", "30", "60", "--save_iterations", "20", "40"),
@@ -44,7 +35,7 @@ MOMENTS = ("before", "in", "after")
 
 def main() -> int:
     """Return 1 if a trial ended differently."""
-    parser = argparse.ArgumentParser(prog="python -m tests.kills", description=__doc__.partition("\n")[0])
+    parser = argparse.ArgumentParser(prog="python -m tests.kills", description="Kill trainings, resume them, compare.")
     parser.add_argument("kills", type=int, help="stop after this number of kills")
     parser.add_argument("seed", type=int, nargs="?", default=0)
     args = parser.parse_args()
@@ -66,6 +57,8 @@ def main() -> int:
             if differences := _differences(wanted, _state(out)):
                 wrong += 1
                 print(f"WRONG after {', '.join(done)}: {', '.join(differences)}", flush=True)
+            if trials % 20 == 0:
+                print(f"{sum(counts.values())} kills, {wrong} of {trials} trials wrong", flush=True)
     by_moment = ", ".join(f"{count} {name}" for name, count in counts.items())
     print(
         f"{sum(counts.values())} kills ({by_moment} a write) in {trials} trials, {time.monotonic() - begin:.0f} s: "
@@ -205,7 +198,3 @@ def _differences(wanted: dict[str, str], found: dict[str, str]) -> list[str]:
         + [f"{name} is left over" for name in found if name not in wanted]
         + [f"{name} differs" for name in wanted if name in found and wanted[name] != found[name]]
     )
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -8,7 +8,7 @@ from pathlib import Path
 _TEMPORARY = re.compile(r"\..*\.(\d+)\.tmp(\.[^.]*)?")  # as `utils.system_utils.atomic_write` names them
 
 
-def remove_leftovers(folder: str | os.PathLike) -> list[Path]:
+def remove_temporary_files(folder: str | os.PathLike) -> list[Path]:
     """Remove the temporary files of `atomic_write` below a folder whose process runs no more; return their paths."""
     removed = []
     for parent, _, names in os.walk(folder):
