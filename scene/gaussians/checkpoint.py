@@ -162,9 +162,10 @@ def _refuse_damaged(path: str | os.PathLike) -> None:
         if any(part.compress_type != zipfile.ZIP_STORED for part in archive.infolist()):
             raise ValueError("compressed")
         if damaged := archive.testzip():
+            part = _shown(damaged.partition("/")[2])
             raise UserError(
-                f"{path} is damaged: its part {damaged.partition('/')[2]} does not have the checksum it was saved "
-                "with; copy the file again, or resume from another checkpoint"
+                f"{path} is damaged: its part {part} does not have the checksum it was saved with; copy the file again, "
+                "or resume from another checkpoint"
             )
 
 

@@ -119,7 +119,7 @@ def read_values(path: Path) -> np.ndarray:
                         f"the depth map {path} has 16-bit colours, which are read as 8 bits; save it as grey"
                     )
                 image = image.convert("RGB")
-            values = np.asarray(image).astype(np.float64)
+            values = np.asarray(image)
     except (*UNREADABLE, MemoryError) as error:
         raise UserError(
             f"cannot read the depth map {path} ({str(error) or type(error).__name__}); make it again"
@@ -129,7 +129,7 @@ def read_values(path: Path) -> np.ndarray:
         if (values != values[..., :1]).any():
             raise UserError(f"the depth map {path} is coloured; save inverse depth as grey, best with 16 bits")
         values = values[..., 0]
-    return values
+    return values.astype(np.float64)
 
 
 def _is_16_bit_color(path: Path) -> bool:
