@@ -164,8 +164,8 @@ def _refuse_damaged(path: str | os.PathLike) -> None:
         if damaged := archive.testzip():
             part = _shown(damaged.partition("/")[2])
             raise UserError(
-                f"{path} is damaged: its part {part} does not have the checksum it was saved with; copy the file again, "
-                "or resume from another checkpoint"
+                f"{path} is damaged: its part {part} does not have the checksum it was saved with; copy the file "
+                "again, or resume from another checkpoint"
             )
 
 
