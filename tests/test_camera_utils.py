@@ -5,12 +5,12 @@ import math
 import sys
 from pathlib import Path
 from types import SimpleNamespace
-from typing import NamedTuple
 
 import numpy as np
 import pytest
 import torch
 from PIL import Image
+from reference_records import CameraOf2024
 from scipy.spatial.transform import Rotation
 from synthetic import FakeGaussians, make_colmap_scene
 
@@ -26,31 +26,14 @@ from utils.system_utils import UserError
 RNG = np.random.default_rng(0)
 
 
-class Record(NamedTuple):
-    """A view as code for the reference describes it, with the reference's fields alone."""
-
-    uid: int
-    R: np.ndarray
-    T: np.ndarray
-    FovY: float
-    FovX: float
-    depth_params: dict | None
-    image_path: str
-    image_name: str
-    depth_path: str
-    width: int
-    height: int
-    is_test: bool
-
-
 @pytest.fixture
-def record(tmp_path: Path) -> Record:
+def record(tmp_path: Path) -> CameraOf2024:
     """A record of a photo of 40x24 pixels, and of a depth map of 20x12."""
     Image.fromarray(RNG.integers(0, 256, (24, 40, 3), dtype=np.uint8)).save(tmp_path / "a.png")
     Image.fromarray(RNG.integers(0, 65536, (12, 20), dtype=np.uint16)).save(tmp_path / "depth.png")
     R = Rotation.from_euler("xyz", [20, -35, 60], degrees=True).as_matrix()
     path = str(tmp_path / "a.png")
-    return Record(5, R, np.array([0.1, 0.2, 3.0]), 0.5, 0.8, None, path, "a.png", "", 80, 48, False)
+    return CameraOf2024(5, R, np.array([0.1, 0.2, 3.0]), 0.5, 0.8, None, path, "a.png", "", 80, 48, False)
 
 
 def _args(**changes: object) -> SimpleNamespace:

@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 import torch
+from reference_records import CameraOf2024
 from synthetic import FakeGaussians
 
 import scene as scene_package
@@ -105,23 +106,6 @@ def test_a_replaced_reader_of_blender_scenes(blender_scene, tmp_path, monkeypatc
     assert calls == [(str(blender_scene), True, "", True)] and made.info is known
 
 
-class TheirCamera(NamedTuple):
-    """The records of the 2024 release."""
-
-    uid: int
-    R: np.ndarray
-    T: np.ndarray
-    FovY: float
-    FovX: float
-    depth_params: dict | None
-    image_path: str
-    image_name: str
-    depth_path: str
-    width: int
-    height: int
-    is_test: bool
-
-
 class TheirInfo2023(NamedTuple):
     point_cloud: object
     train_cameras: list
@@ -142,7 +126,7 @@ class TheirInfo2024(NamedTuple):
 @pytest.mark.parametrize("record", [TheirInfo2023, TheirInfo2024])
 def test_a_replaced_reader_may_return_records_of_its_own(colmap_scene, tmp_path, monkeypatch, record):
     known = read_scene(colmap_scene, "images", True)
-    lists = [[TheirCamera(*camera) for camera in part] for part in (known.train_cameras, known.test_cameras)]
+    lists = [[CameraOf2024(*camera) for camera in part] for part in (known.train_cameras, known.test_cameras)]
     ply = tmp_path / "points.ply"
     ply.write_bytes(b"ply")
     theirs = record(*(known.point_cloud, *lists, {"translate": np.zeros(3), "radius": 3.5}, str(ply), False)[

@@ -7,10 +7,10 @@ Arguments go by place, in the order of the 2024 release. An empty tensor stands 
 import torch
 from torch import Tensor
 
+from diff_gaussian_rasterization.alternatives import chosen, given
 from diff_gaussian_rasterization.backend import OPERATORS
 from diff_gaussian_rasterization.byte_buffers import packed, unpacked
 from diff_gaussian_rasterization.fakes import SPLAT_VALUES, TILE
-from diff_gaussian_rasterization.gaussians import Gaussians
 from diff_gaussian_rasterization.optim import sparse_adam_
 from diff_gaussian_rasterization.schema import GRADIENTS
 
@@ -54,7 +54,7 @@ def rasterize_gaussians(
     """
     of_2023 = debug is None
     camera = viewmatrix, projmatrix, campos, tan_fovx, tan_fovy, image_height, image_width, degree, scale_modifier
-    gaussians = _gaussians(means3D, opacity, scales, rotations, cov3D_precomp, colors, sh)
+    gaussians = chosen(means3D, opacity, scales, rotations, cov3D_precomp, colors, sh)
     smooth = not of_2023 and bool(antialiasing)
     out = OPERATORS.rasterize(None, *gaussians, *camera, smooth, False, background, True, True)
     color, transmittance, inverse_depth, radii, splats, tile_counts, instances, ranges, splat_slots, _, last = out
@@ -95,7 +95,7 @@ def rasterize_gaussians_backward(
     Returns those of the means on the image (N, 3), per NDC unit, then of colors, opacities, means3D, cov3D_precomp, sh,
     scales and rotations; zeros for what was not given.
     """
-    gaussians = _gaussians(means3D, opacities, scales, rotations, cov3D_precomp, colors, sh)
+    gaussians = chosen(means3D, opacities, scales, rotations, cov3D_precomp, colors, sh)
     count, (height, width) = len(means3D), grad_out_color.shape[1:]
     floats, ints, longs = means3D.dtype, torch.int32, torch.int64
     geometry = (longs, (count + 1, 2)), (floats, (count, SPLAT_VALUES)), (ints, (count,))
@@ -108,7 +108,7 @@ def rasterize_gaussians_backward(
 
     camera = viewmatrix, projmatrix, campos, tan_fovx, tan_fovy, height, width, degree, scale_modifier
     state = splats, instances, ranges, splat_slots, slots, background, last, transmittance
-    arguments = *gaussians, *camera, bool(antialiasing), False, *state, grad_out_color, None, _given(grad_out_invdepth)
+    arguments = *gaussians, *camera, bool(antialiasing), False, *state, grad_out_color, None, given(grad_out_invdepth)
     wanted = [name == "means2d" or getattr(gaussians, name) is not None for name in GRADIENTS]
     gradients = dict(zip(GRADIENTS, OPERATORS.rasterize_vjp(*arguments, tile_counts, wanted), strict=True))
     for name, is_wanted in zip(GRADIENTS, wanted, strict=True):
@@ -139,19 +139,3 @@ def adamUpdate(
 ) -> None:
     """Takes one step of sparse Adam in place, see `optim.sparse_adam_`. N rows of M values each are not read."""
     sparse_adam_(param, grad, exp_avg, exp_avg_sq, visibility, lr, b1, b2, eps)
-
-
-def _gaussians(
-    means: Tensor, opacities: Tensor, scales: Tensor, rotations: Tensor, cov3d: Tensor, colors: Tensor, sh: Tensor
-) -> Gaussians:
-    """The operators' inputs; of two alternatives the precomputed one counts."""
-    cov3d, colors = _given(cov3d), _given(colors)
-    scales, rotations = (None, None) if cov3d is not None else (_given(scales), _given(rotations))
-    sh = _given(sh) if colors is None else None
-    bands = (None, None) if sh is None else (sh[:, :1], sh[:, 1:])
-    return Gaussians(means, opacities, scales, rotations, cov3d, colors, *bands)
-
-
-def _given(values: Tensor | None) -> Tensor | None:
-    """None for the empty tensor that stands for it; a tensor of no Gaussians has more axes."""
-    return None if values is None or values.shape == (0,) else values

@@ -3,6 +3,7 @@
 import torch
 from torch import Tensor, nn
 
+from diff_gaussian_rasterization.alternatives import chosen, given
 from diff_gaussian_rasterization.checks import check_tensors
 from diff_gaussian_rasterization.ops import mark_visible, rasterize
 from diff_gaussian_rasterization.settings import GaussianRasterizationSettings
@@ -49,12 +50,12 @@ class GaussianRasterizer(nn.Module):
         tensors.
         """
         shs, dc, colors_precomp, scales, rotations, cov3D_precomp = map(
-            _or_none, (shs, dc, colors_precomp, scales, rotations, cov3D_precomp)
+            given, (shs, dc, colors_precomp, scales, rotations, cov3D_precomp)
         )
         if (shs is None and dc is None) == (colors_precomp is None):
             raise Exception("give exactly one of shs and colors_precomp")
-        given = scales is not None or rotations is not None
-        if given == (cov3D_precomp is not None) or (given and (scales is None or rotations is None)):
+        shaped = scales is not None or rotations is not None
+        if shaped == (cov3D_precomp is not None) or (shaped and (scales is None or rotations is None)):
             raise Exception("give exactly one of the pair scales, rotations and cov3D_precomp")
         shape = scales, rotations, cov3D_precomp
         return rasterize_gaussians(
@@ -79,39 +80,17 @@ def rasterize_gaussians(
     optional = {"sh": sh, "dc": dc, "colors_precomp": colors_precomp, "scales": scales, "rotations": rotations}
     optional |= {"cov3Ds_precomp": cov3Ds_precomp}
     check_tensors({"means3D": means3D, "means2D": means2D, "opacities": opacities} | optional)
-    sh, dc, colors, scales, rotations, cov3d = map(_or_none, optional.values())
-    if sh is not None and sh.dim() != 3:
-        raise ValueError(f"shs must be (N, K, 3), got {tuple(sh.shape)}")
-    if colors is not None:
-        sh_dc = sh_rest = None
-    elif dc is not None:
-        sh_dc, sh_rest = dc, dc[:, :0] if sh is None else sh
-    else:
-        sh_dc, sh_rest = (None, None) if sh is None else (sh[:, :1], sh[:, 1:])
-    if cov3d is not None:
-        scales = rotations = None
+    gaussians = chosen(means3D, opacities, scales, rotations, cov3Ds_precomp, colors_precomp, sh, dc)
     # Only its gradient counts, so what needs none is not looked at.
     means2d = None if means2D is None or not means2D.requires_grad else means2D.to(means3D)
     with_depth = raster_settings.antialiasing is not None
     out = rasterize(
-        means3D,
-        means2d,
-        opacities,
-        raster_settings,
-        scales=scales,
-        rotations=rotations,
-        cov3d=cov3d,
-        colors=colors,
-        sh_dc=sh_dc,
-        sh_rest=sh_rest,
+        means2d=means2d,
+        settings=raster_settings,
         want_inverse_depth=with_depth and raster_settings.inverse_depth,
+        **gaussians._asdict(),
     )
     return (out.color, out.radii, out.inverse_depth) if with_depth else (out.color, out.radii)
-
-
-def _or_none(values: Tensor | None) -> Tensor | None:
-    """None for the empty tensor that stands for it; a tensor of no Gaussians has more axes."""
-    return None if isinstance(values, Tensor) and values.shape == (0,) else values
 
 
 def cpu_deep_copy_tuple(input_tuple: tuple) -> tuple:
