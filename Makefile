@@ -47,7 +47,7 @@ output/demo_scene: | install
 	$(BIN)/python -m demo.make_scene $@
 
 test: install lint cpp-test
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist worksteal
 
 lint: $(VENV)/.requirements
 	$(BIN)/ruff check .
