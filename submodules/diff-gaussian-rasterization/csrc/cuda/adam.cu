@@ -21,7 +21,9 @@ struct Tensors {
   StepGuard<float> guard;
 };
 
-__global__ void __launch_bounds__(kThreads) adam_kernel(const __grid_constant__ Tensors tensors) {
+__global__ void __launch_bounds__(kThreads)
+    adam_kernel(const int32_t* halted, const __grid_constant__ Tensors tensors) {
+  if (is_halted(halted)) return;
   if (!begin_step(tensors.guard)) return;
   int which = 0;
   while (int64_t(blockIdx.x) >= tensors.end[which]) ++which;
@@ -50,7 +52,7 @@ void adam<float>(const Queue& queue, const AdamInput<float>* tensors, int64_t co
       some.end[i] = blocks;
     }
     if (!blocks) continue;
-    adam_kernel<<<unsigned(blocks), kThreads, 0, stream_of(queue)>>>(some);
+    adam_kernel<<<unsigned(blocks), kThreads, 0, stream_of(queue)>>>(queue.halted, some);
     check_launch("adam");
   }
 }

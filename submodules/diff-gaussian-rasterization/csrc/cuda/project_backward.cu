@@ -25,7 +25,8 @@ struct StoredMoments {
 
 template <class Source>
 __global__ void __launch_bounds__(kThreads)
-    project_vjp_kernel(Scene<float> s, Source source, SceneGradient<float> out) {
+    project_vjp_kernel(const int32_t* halted, Scene<float> s, Source source, SceneGradient<float> out) {
+  if (is_halted(halted)) return;
   __shared__ Camera<float> camera;
   __shared__ __align__(16) float rest[kThreads * kRest];
   __shared__ __align__(8) float stage[kThreads / 32 * SlotSums::kStage];
@@ -55,7 +56,7 @@ __global__ void __launch_bounds__(kThreads)
 template <class Source>
 void launch_project_vjp(const Queue& queue, const Scene<float>& s, const Source& source,
                         const SceneGradient<float>& out) {
-  project_vjp_kernel<<<blocks_for(s.count, kThreads), kThreads, 0, stream_of(queue)>>>(s, source, out);
+  project_vjp_kernel<<<blocks_for(s.count, kThreads), kThreads, 0, stream_of(queue)>>>(queue.halted, s, source, out);
   check_launch("project_vjp");
 }
 
