@@ -14,10 +14,10 @@ __device__ inline void judge_lists(const Ahead& ahead, int64_t instances, int64_
 }
 
 // Does the same for the gradient rows, and tells the host. The step's number arrives last.
-__global__ void judge_rows_kernel(Ahead ahead, const int32_t* rows) {
+__device__ inline void judge_rows(const Ahead& ahead, int64_t rows) {
   Room& needed = *ahead.needed;
   if (!is_halted(ahead.halted)) {
-    needed.rows = *rows;
+    needed.rows = rows;
     if (needed.rows > ahead.room.rows) *ahead.halted = ahead.step;
   }
   if (!ahead.report) return;

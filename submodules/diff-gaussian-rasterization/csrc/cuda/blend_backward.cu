@@ -67,6 +67,8 @@ __global__ void __launch_bounds__(kTile* kTile)
   }
 }
 
+__global__ void judge_rows_kernel(Ahead ahead, const int32_t* rows) { judge_rows(ahead, *rows); }
+
 // Sums ten values over a warp in 12 shuffles: each step halves the values that a lane keeps and doubles the lanes that
 // are summed. The lane ends with the sum of `value`, or with none (-1).
 __device__ __forceinline__ float transposed_sum(const float (&v)[kGradientValues], int& value) {

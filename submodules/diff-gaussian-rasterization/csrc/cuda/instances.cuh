@@ -38,10 +38,10 @@ struct alignas(16) Lined {
 __global__ void __launch_bounds__(kEmitThreads)
     line_up_kernel(const int32_t* halted, int64_t n, const int32_t* order, Projected<float> in, int columns,
                    Lined* lined, int32_t* counts) {
-  if (is_halted(halted)) return;
   const int64_t k = int64_t(blockIdx.x) * kEmitThreads + threadIdx.x;
-  if (k == n) counts[n] = 0;
-  if (k >= n) return;
+  const bool empty = is_halted(halted);  // the sum of counts that nobody wrote could overflow
+  if (k == n || (empty && k < n)) counts[k] = 0;
+  if (k >= n || empty) return;
   const Reached reached = reached_by(in, order[k]);
   const TileRect rect = reached.rect;
   counts[k] = reached.count;
