@@ -14,6 +14,9 @@ struct Queue {
   // Allocates page-locked host memory with the same lifetime; the host does not wait for a copy to it.
   int64_t* (*pinned)(void* context, int64_t count);
   void* context;
+  // A word on the device, or null. Once a kernel has found too little room for its results it sets the word, and from
+  // then on no kernel changes anything: the host, which runs ahead, makes room and repeats the work.
+  const int32_t* halted = nullptr;
 
   template <class T>
   T* array(size_t count) const {

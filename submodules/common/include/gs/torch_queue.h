@@ -17,9 +17,9 @@ namespace gs {
 // enough, because torch's allocator reuses memory in stream order.
 class TorchQueue {
  public:
-  explicit TorchQueue(at::Device device) : guard_(device) {}
+  explicit TorchQueue(at::Device device, const int32_t* halted = nullptr) : guard_(device), halted_(halted) {}
 
-  Queue queue() { return {c10::cuda::getCurrentCUDAStream().stream(), &allocate, &release, &pinned, this}; }
+  Queue queue() { return {c10::cuda::getCurrentCUDAStream().stream(), &allocate, &release, &pinned, this, halted_}; }
 
  private:
   static void* allocate(void* context, size_t bytes) {
@@ -42,6 +42,7 @@ class TorchQueue {
   }
 
   c10::cuda::CUDAGuard guard_;
+  const int32_t* halted_;
   std::vector<c10::DataPtr> memory_;
   std::vector<at::Tensor> numbers_;
 };

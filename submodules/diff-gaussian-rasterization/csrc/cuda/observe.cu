@@ -12,7 +12,8 @@ namespace {
 
 constexpr int kThreads = 256;
 
-__global__ void __launch_bounds__(kThreads) observe_kernel(ObserveInput in) {
+__global__ void __launch_bounds__(kThreads) observe_kernel(const int32_t* halted, ObserveInput in) {
+  if (is_halted(halted)) return;
   const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
   if (i >= in.count) return;
   Observed o{in.max_radii[i], in.gradient_sums[i], in.views[i]};
@@ -24,7 +25,7 @@ __global__ void __launch_bounds__(kThreads) observe_kernel(ObserveInput in) {
 
 void observe(const Queue& queue, const ObserveInput& in) {
   if (!in.count) return;
-  observe_kernel<<<blocks_for(in.count, kThreads), kThreads, 0, stream_of(queue)>>>(in);
+  observe_kernel<<<blocks_for(in.count, kThreads), kThreads, 0, stream_of(queue)>>>(queue.halted, in);
   check_launch("observe");
 }
 

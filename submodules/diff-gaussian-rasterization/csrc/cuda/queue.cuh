@@ -12,6 +12,9 @@ constexpr unsigned kWarp = 0xffffffffu;
 
 inline cudaStream_t stream_of(const Queue& queue) { return static_cast<cudaStream_t>(queue.stream); }
 
+// Whether an earlier kernel halted the work (gs/cuda_queue.h).
+__device__ __forceinline__ bool is_halted(const int32_t* halted) { return halted && *halted != 0; }
+
 // The blocks of `threads` that `n` items need, a thread each.
 inline unsigned blocks_for(int64_t n, int threads) { return unsigned((n + threads - 1) / threads); }
 

@@ -13,9 +13,10 @@ namespace {
 
 constexpr int kThreads = 256;
 
-__global__ void __launch_bounds__(kThreads) sparse_adam_kernel(AdamInput<float> in, const bool* visible,
-                                                               baseline::AdamStep<float> step, StepGuard<float> guard) {
-  if (!begin_step(guard)) return;
+__global__ void __launch_bounds__(kThreads)
+    sparse_adam_kernel(const int32_t* halted, AdamInput<float> in, const bool* visible, AdamConstants step,
+                       StepGuard<float> guard) {
+  if (is_halted(halted) || !begin_step(guard)) return;
   const int64_t k = int64_t(blockIdx.x) * kThreads + threadIdx.x;
   if (k >= in.rows * in.columns) return;
   const int64_t r = k / in.columns;
@@ -31,8 +32,9 @@ void sparse_adam<float>(const Queue& queue, const AdamInput<float>& in, const bo
                         const StepGuard<float>& guard) {
   const int64_t n = in.rows * in.columns;
   if (!n) return;
-  const auto step = baseline::make_uncorrected_adam_step<float>(in.lr, in.beta1, in.beta2, in.eps);
-  sparse_adam_kernel<<<blocks_for(n, kThreads), kThreads, 0, stream_of(queue)>>>(in, visible, step, guard);
+  const AdamConstants step = baseline::make_uncorrected_adam_step<float>(in.lr, in.beta1, in.beta2, in.eps);
+  sparse_adam_kernel<<<blocks_for(n, kThreads), kThreads, 0, stream_of(queue)>>>(queue.halted, in, visible, step,
+                                                                                 guard);
   check_launch("sparse_adam");
 }
 
