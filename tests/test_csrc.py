@@ -20,6 +20,10 @@ BACKWARD = (
     "Tensor splats, Tensor instances, Tensor ranges, Tensor splat_slots, Tensor slots, Tensor background, Tensor last, "
     "Tensor transmittance, Tensor grad_color, Tensor? grad_transmittance, Tensor? grad_inverse_depth"
 )
+STEPPED_SCENE = (
+    "Tensor(a!) means, Tensor(b!) opacities, Tensor(c!)? scales, Tensor(d!)? rotations, Tensor? cov3d, Tensor? colors, "
+    "Tensor(e!)? sh_dc, Tensor(f!)? sh_rest" + SCENE[SCENE.index(", Tensor view") :]
+)
 GRADIENTS = (
     "(Tensor means, Tensor means2d, Tensor opacities, Tensor scales, Tensor rotations, Tensor cov3d, Tensor colors, "
     "Tensor sh_dc, Tensor sh_rest)"
@@ -36,6 +40,10 @@ SCHEMAS = [
     "Tensor transmittance, Tensor inverse_depth, Tensor radii, Tensor splats, Tensor tile_counts, Tensor instances, "
     "Tensor ranges, Tensor splat_slots, Tensor slots, Tensor last)",
     f"rasterize_vjp({SCENE}, {BACKWARD}, Tensor tile_counts, bool[9] wanted) -> {GRADIENTS}",
+    f"rasterize_vjp_step_({STEPPED_SCENE}, {BACKWARD}, Tensor tile_counts, Tensor radii, int[] attributes, "
+    "Tensor(g!)[] exp_avg, Tensor(h!)[] exp_avg_sq, Tensor(i!)[] steps, float[] rates, float beta1, float beta2, "
+    "float eps, int[] columns, bool sparse, Tensor(j!)? max_radii=None, Tensor(k!)? gradient_sums=None, "
+    "Tensor(l!)? views=None, Tensor? loss=None, Tensor(m!)? stopped=None, int iteration=0) -> ()",
     "mark_visible(Tensor means, Tensor view) -> Tensor",
     "decisive(Tensor splats, Tensor instances, Tensor ranges, Tensor last) -> Tensor",
     "adam_(Tensor(a!)[] values, Tensor[] gradients, Tensor(b!)[] exp_avg, Tensor(c!)[] exp_avg_sq, Tensor(d!)[] steps, "

@@ -42,6 +42,7 @@ def sound_calls() -> dict[str, Call]:
         "project_vjp": (ops.project_vjp, [*scene, counts, ops.blend_vjp(*state, *planes), wanted]),
         "rasterize": (ops.rasterize, [torch.zeros(3, 3), *scene, background, True, True]),
         "rasterize_vjp": (ops.rasterize_vjp, [*scene, *state, *planes, counts, wanted]),
+        "rasterize_vjp_step_": (ops.rasterize_vjp_step_, [*scene, *state, *planes, counts, *_step(raw), *guard]),
         "mark_visible": (ops.mark_visible, [raw["means"], camera.viewmatrix.float()]),
         "decisive": (ops.decisive, [splats, instances, ranges, last]),
         "adam_": (ops.adam_, adam),
@@ -54,6 +55,16 @@ def sound_calls() -> dict[str, Call]:
         "composite": (ssim.composite, [torch.zeros(4, 5, 6, dtype=torch.uint8), torch.ones(3)]),
         "mean_distance2": (torch.ops.simple_knn.mean_distance2, [torch.rand(9, 3)]),
     }
+
+
+def _step(raw: dict[str, Tensor]) -> list:
+    """The arguments of `rasterize_vjp_step_` from `radii` to the statistics."""
+    count = len(raw["means"])
+    averages = [[torch.rand_like(value) for value in raw.values()] for _ in range(2)]
+    counters = [torch.tensor(float(place)) for place in range(6)]
+    statistics = [torch.rand(count), torch.rand(count, 1), torch.rand(count, 1)]
+    adam = [*averages, counters, [0.1] * 6, 0.9, 0.99, 1e-8, [-1, -1, -1, -1, -1, 9]]
+    return [torch.ones(count, dtype=torch.int32), list(range(6)), *adam, False, *statistics]
 
 
 def outcomes() -> Iterator[tuple[str, str, str]]:

@@ -6,7 +6,7 @@ from training.objective import Losses
 from training.observer import Announcer
 from training.run import Run
 from training.step import Step
-from training.steps.plain import PlainStep
+from training.steps.fused import FusedStep
 from training.steps.run_ahead import RunAhead
 
 _INSTANCES = 8  # of a Gaussian, for the room of the first step
@@ -15,24 +15,23 @@ _LEAST = 1 << 16
 
 
 class AheadStep:
-    """Takes steps without waiting for the GPU, and as `PlainStep` does where something reads the model or changes it.
+    """Takes steps as `FusedStep` does, but does not wait for the GPU unless something reads or changes the model.
 
     An error leaves the model as it was after the last step that was done.
     """
 
     def __init__(self, run: Run) -> None:
         self._run = run
-        self._plain = PlainStep(run)
+        self._fused = FusedStep(run)
         count = len(run.gaussians)
         room = max(_INSTANCES * count, _LEAST)
         self._ahead = RunAhead(run.device, (room, max(_SLOTS * count, _LEAST), room), run.gaussians.rewind)
 
     def take(self, step: Step, tell: Announcer) -> None:
         """Queue a step, unless something is due in it."""
-        if step.due or step.last or self._run.pipe.debug:
+        if step.due or not self._fused.takes(step):
             self._ahead.settle()
-            self._plain.take(step, tell)
-            return
+            return self._fused.take(step, tell)
         done: list[Losses] = []
         self._ahead.take(step.camera.uid, lambda: done.append(self._queue(step)), lambda: self._repeat(step, done[0]))
         tell.measured(step, done[0])
@@ -46,9 +45,9 @@ class AheadStep:
         return self._ahead.give_up()
 
     def _queue(self, step: Step) -> Losses:
-        package, losses = self._plain.backward(step)
+        drawn, losses, gradients = self._fused.measure(step)
         self._run.gaussians.guard_loss(step.iteration, losses.total)
-        self._plain.advance(step, package)
+        self._fused.advance(step, drawn, gradients)
         return losses
 
     @torch.no_grad()

@@ -4,21 +4,20 @@ from typing import TypeAlias
 
 import torch
 
-from training.density import AdaptiveDensityControl
-from training.objective import Objective
 from training.run import Run
 from training.steps.ahead import AheadStep
+from training.steps.fused import FusedStep
 from training.steps.plain import PlainStep
 
-Taker: TypeAlias = PlainStep | AheadStep
+Taker: TypeAlias = PlainStep | FusedStep | AheadStep
 
 
 def step_taker(run: Run) -> Taker:
     """The fastest way to take the steps of this run.
 
     The plain one where the user asks for it (--plain_step, --detect_anomaly), and for an objective or a density control
-    that is not ours: it may wait for values that the GPU has not computed yet.
+    that is not ours: it may want gradients, or wait for values that the GPU has not computed yet.
     """
-    ours = type(run.objective) is Objective and type(run.density) is AdaptiveDensityControl
-    plain = run.plan.plain_step or torch.is_anomaly_enabled() or not ours
-    return PlainStep(run) if plain or run.device.type != "cuda" else AheadStep(run)
+    if run.plan.plain_step or torch.is_anomaly_enabled() or not FusedStep.suits(run):
+        return PlainStep(run)
+    return AheadStep(run) if run.device.type == "cuda" else FusedStep(run)

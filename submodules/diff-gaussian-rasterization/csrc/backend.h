@@ -39,15 +39,23 @@ struct BinMemory {
 
 void observe(const Executor&, const ObserveInput&);  // compiled once: see gs/rounded.h
 
+// What else the CPU offers. project_vjp_step: project_vjp, and every Gaussian's step as soon as its gradients are
+// known.
+#define GS_CPU_BACKEND                                                                                  \
+  GS_BACKEND(Executor)                                                                                  \
+  template <class T>                                                                                    \
+  void project_vjp_step(const Executor&, const Scene<T>&, const int32_t* tile_counts, const T* moments, \
+                        const GaussianStep<T>&);
+
 namespace baseline {
-GS_BACKEND(Executor)
+GS_CPU_BACKEND
 }
 #ifdef GS_X86
 namespace avx2 {
-GS_BACKEND(Executor)
+GS_CPU_BACKEND
 }
 namespace avx512 {
-GS_BACKEND(Executor)
+GS_CPU_BACKEND
 }
 #endif
 namespace cuda {
@@ -61,6 +69,9 @@ struct GradientMemory {
 // blend_vjp and project_vjp in one, without the moments in between (BlendGradient::moments is not written).
 void rasterize_vjp(const Queue&, const Scene<float>&, const BlendInput<float>&, const BlendGradient<float>&,
                    const GradientMemory&);
+// The same, and every Gaussian's step as soon as its gradients are known. No gradient is written.
+void rasterize_vjp_step(const Queue&, const Scene<float>&, const BlendInput<float>&, const BlendGradient<float>&,
+                        const GaussianStep<float>&);
 }  // namespace cuda
 
 }  // namespace gs

@@ -149,4 +149,17 @@ struct ObserveInput {
   const float* gradients;                    // (N, 3) of the means on the screen; the third value is not read
 };
 
+// The parameters of a Gaussian that take steps.
+enum Stepped { kStepMeans, kStepOpacities, kStepScales, kStepRotations, kStepShDc, kStepShRest, kStepped };
+
+// The step that every Gaussian takes as soon as its gradients are known, so that these never reach memory. The values
+// are those of the Scene and change in place: a Gaussian's row is read before it is written, and no other reads it.
+template <class T>
+struct GaussianStep {
+  AdamInput<T> attributes[kStepped];  // the gradients are not read; without columns an attribute takes no step
+  StepGuard<T> guard;
+  bool sparse;            // only Gaussians of observed.radii above 0 take a step, and without bias correction
+  ObserveInput observed;  // the view's gradients are not read; with max_radii null nothing is observed
+};
+
 }  // namespace gs

@@ -102,5 +102,6 @@ def _(splats, *_):
 @_fake("adam_")
 @_fake("sparse_adam_")
 @_fake("observe_")
+@_fake("rasterize_vjp_step_")
 def _(*_args, **_keywords):
     return None

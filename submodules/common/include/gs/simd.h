@@ -1,5 +1,6 @@
 #pragma once
 // Vectors by the vector extension of GCC and Clang: operators and ?: work lane by lane.
+#include <cmath>
 #include <cstdint>
 #include <cstring>
 
@@ -44,6 +45,36 @@ struct Simd {
   }
   static void store(T* to, Vec v) { std::memcpy(to, &v, sizeof v); }
   static Vec all(T value) { return value - Vec{}; }
+
+  // The root of each lane, rounded correctly.
+  static Vec root(Vec v) {
+#if defined(__AVX512F__)
+    if constexpr (sizeof(T) == 4) return (Vec)_mm512_sqrt_ps((__m512)v);
+    return (Vec)_mm512_sqrt_pd((__m512d)v);
+#elif defined(__AVX__)
+    if constexpr (sizeof(T) == 4) return (Vec)_mm256_sqrt_ps((__m256)v);
+    return (Vec)_mm256_sqrt_pd((__m256d)v);
+#elif defined(__SSE2__)
+    if constexpr (sizeof(T) == 4) return (Vec)_mm_sqrt_ps((__m128)v);
+    return (Vec)_mm_sqrt_pd((__m128d)v);
+#else
+    for (int i = 0; i < kLanes; ++i) v[i] = std::sqrt(v[i]);
+    return v;
+#endif
+  }
+
+  // a b + c, fused wherever the instruction set can: a compiler would choose which of two products it fuses.
+  static Vec multiply_add(Vec a, Vec b, Vec c) {
+#if defined(__AVX512F__)
+    if constexpr (sizeof(T) == 4) return (Vec)_mm512_fmadd_ps((__m512)a, (__m512)b, (__m512)c);
+    return (Vec)_mm512_fmadd_pd((__m512d)a, (__m512d)b, (__m512d)c);
+#elif defined(__FMA__)
+    if constexpr (sizeof(T) == 4) return (Vec)_mm256_fmadd_ps((__m256)a, (__m256)b, (__m256)c);
+    return (Vec)_mm256_fmadd_pd((__m256d)a, (__m256d)b, (__m256d)c);
+#else
+    return a * b + c;
+#endif
+  }
 
   static bool any(Mask m) {
 #if defined(__AVX512F__)

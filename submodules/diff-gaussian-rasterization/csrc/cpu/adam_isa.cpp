@@ -1,48 +1,89 @@
 // Adam's steps, dense and sparse, under a guard.
-#include <type_traits>
+#include <algorithm>
 
 #include "../backend.h"
-#include "../math/adam.h"
+#include "adam_rows.h"
+#include "gs/simd.h"
 
 GS_ISA_BEGIN
 
 namespace {
 
-// Steps `count` values of a tensor from `first` on. Returns whether all took their step.
+// Values of one or several tensors that lie side by side.
 template <class T>
-bool adam_values(const AdamStep<T>& step, const AdamInput<T>& in, int64_t first, int64_t count, bool guarded) {
-  T* __restrict value = in.value + first;
-  T* __restrict mean = in.mean + first;
-  T* __restrict square = in.square + first;
-  const T* __restrict gradient = in.gradient + first;
-  std::conditional_t<sizeof(T) == 4, int32_t, int64_t> wrong = 0;  // as wide as T, so that the loop vectorises
-  if (guarded) {
-    for (int64_t i = 0; i < count; ++i)
-      wrong |= adam_if_finite(step, gradient[i], value[i], mean[i], square[i]) ? 0 : 1;
-  } else {
-    for (int64_t i = 0; i < count; ++i) gs::GS_ISA::adam(step, gradient[i], value[i], mean[i], square[i]);
-  }
-  return wrong == 0;
+struct Values {
+  const T* gradient;
+  T *value, *mean, *square;
+};
+
+// Steps a vector of values; `finite` loses the lanes that did not take their step.
+template <class T, bool kGuarded>
+void step_lanes(const AdamStep<T>& step, const Values<T>& at, typename Simd<T>::Mask& finite) {
+  using S = Simd<T>;
+  const typename S::Vec gradient = S::load(at.gradient);
+  typename S::Vec value = S::load(at.value), mean = S::load(at.mean), square = S::load(at.square);
+  if constexpr (kGuarded)
+    finite &= adam_if_finite<S>(step, gradient, value, mean, square);
+  else
+    gs::GS_ISA::adam<S>(step, gradient, value, mean, square);
+  S::store(at.value, value), S::store(at.mean, mean), S::store(at.square, square);
+}
+
+// The last values, fewer than a vector's: copies are stepped, beside lanes that cannot fail.
+template <class T, bool kGuarded>
+void step_tail(const AdamStep<T>& step, const Values<T>& at, int64_t count, typename Simd<T>::Mask& finite) {
+  constexpr int kLanes = Simd<T>::kLanes;
+  T gradient[kLanes] = {}, value[kLanes] = {}, mean[kLanes] = {}, square[kLanes];
+  std::fill_n(square, kLanes, T(1));
+  for (int64_t k = 0; k < count; ++k)
+    gradient[k] = at.gradient[k], value[k] = at.value[k], mean[k] = at.mean[k], square[k] = at.square[k];
+  step_lanes<T, kGuarded>(step, {gradient, value, mean, square}, finite);
+  for (int64_t k = 0; k < count; ++k) at.value[k] = value[k], at.mean[k] = mean[k], at.square[k] = square[k];
+}
+
+template <class T, bool kGuarded>
+bool step_values(const AdamStep<T>& step, const Values<T>& at, int64_t count) {
+  typename Simd<T>::Mask finite = ~typename Simd<T>::Mask{};
+  int64_t i = 0;
+  const auto from = [&] { return Values<T>{at.gradient + i, at.value + i, at.mean + i, at.square + i}; };
+  for (; i + Simd<T>::kLanes <= count; i += Simd<T>::kLanes) step_lanes<T, kGuarded>(step, from(), finite);
+  if (i < count) step_tail<T, kGuarded>(step, from(), count - i, finite);
+  return !Simd<T>::any(~finite);
+}
+
+// Steps `count` values from value `first` of the tensor on; `gradient` has theirs.
+template <class T>
+bool adam_values(const AdamStep<T>& step, const AdamInput<T>& in, const T* gradient, int64_t first, int64_t count,
+                 bool guarded) {
+  const Values<T> at{gradient, in.value + first, in.mean + first, in.square + first};
+  return guarded ? step_values<T, true>(step, at, count) : step_values<T, false>(step, at, count);
 }
 
 template <class T>
 bool adam_tensor(const Executor& executor, const AdamInput<T>& in, bool guarded) {
   if (in.columns == 0) return true;
-  const AdamStep<T> step = make_adam_step<T>(in.lr, in.beta1, in.beta2, in.eps, in.step);
+  const AdamStep<T> step = adam_step_of(in, false);
   const bool dense = in.columns == in.row;
   bool finite = true;
-  // Fixed blocks, not the pool's ranges: the compiler's vector loop and its scalar tail may round differently.
-  const int64_t n = dense ? in.rows * in.row : in.rows;
-  for_dynamic(executor, n, dense ? 32768 : 1024, [&](int64_t begin, int64_t end) {
-    bool mine = true;
-    if (dense) mine = adam_values(step, in, begin, end - begin, guarded);
-    for (int64_t r = begin; r < end && !dense; ++r) mine &= adam_values(step, in, r * in.row, in.columns, guarded);
+  for_dynamic(executor, dense ? in.rows * in.row : in.rows, dense ? 32768 : 1024, [&](int64_t begin, int64_t end) {
+    const bool mine = dense ? adam_values(step, in, in.gradient + begin, begin, end - begin, guarded)
+                            : adam_rows(step, in, in.gradient + begin * in.row, begin, end - begin, guarded);
     if (!mine) __atomic_store_n(&finite, false, __ATOMIC_RELAXED);
   });
   return finite;
 }
 
 }  // namespace
+
+template <class T>
+bool adam_rows(const AdamStep<T>& step, const AdamInput<T>& in, const T* gradient, int64_t first, int64_t count,
+               bool guarded) {
+  if (in.columns == in.row) return adam_values(step, in, gradient, first * in.row, count * in.row, guarded);
+  bool finite = true;
+  for (int64_t r = 0; r < count; ++r)
+    finite &= adam_values(step, in, gradient + r * in.row, (first + r) * in.row, in.columns, guarded);
+  return finite;
+}
 
 template <class T>
 void adam(const Executor& executor, const AdamInput<T>* tensors, int64_t count, const StepGuard<T>& guard) {
@@ -55,20 +96,24 @@ void adam(const Executor& executor, const AdamInput<T>* tensors, int64_t count, 
 
 template <class T>
 void sparse_adam(const Executor& executor, const AdamInput<T>& in, const bool* visible, const StepGuard<T>& guard) {
-  const AdamStep<T> step = make_uncorrected_adam_step<T>(in.lr, in.beta1, in.beta2, in.eps);
+  const AdamStep<T> step = adam_step_of(in, true);
   bool finite = may_step(guard);
-  // Row by row: the end of a vector loop, where its scalar tail begins, must not depend on which rows are visible.
   for_dynamic(executor, finite ? in.rows : 0, 1024, [&](int64_t begin, int64_t end) {
-    for (int64_t r = begin; r < end; ++r)
-      if (visible[r] && !adam_values(step, in, r * in.row, in.columns, guard.stopped != nullptr))
-        __atomic_store_n(&finite, false, __ATOMIC_RELAXED);
+    const bool mine = for_runs(
+        begin, end, [&](int64_t r) { return visible[r]; },
+        [&](int64_t r, int64_t rows) {
+          return adam_rows(step, in, in.gradient + r * in.row, r, rows, guard.stopped != nullptr);
+        });
+    if (!mine) __atomic_store_n(&finite, false, __ATOMIC_RELAXED);
   });
   if (!finite && *guard.stopped == 0) *guard.stopped = guard.iteration;
 }
 
-template void adam<float>(const Executor&, const AdamInput<float>*, int64_t, const StepGuard<float>&);
-template void adam<double>(const Executor&, const AdamInput<double>*, int64_t, const StepGuard<double>&);
-template void sparse_adam<float>(const Executor&, const AdamInput<float>&, const bool*, const StepGuard<float>&);
-template void sparse_adam<double>(const Executor&, const AdamInput<double>&, const bool*, const StepGuard<double>&);
+#define GS_INSTANTIATE(T)                                                                                \
+  template bool adam_rows<T>(const AdamStep<T>&, const AdamInput<T>&, const T*, int64_t, int64_t, bool); \
+  template void adam<T>(const Executor&, const AdamInput<T>*, int64_t, const StepGuard<T>&);             \
+  template void sparse_adam<T>(const Executor&, const AdamInput<T>&, const bool*, const StepGuard<T>&);
+GS_INSTANTIATE(float)
+GS_INSTANTIATE(double)
 
 GS_ISA_END

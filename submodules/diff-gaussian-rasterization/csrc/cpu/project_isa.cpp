@@ -1,4 +1,4 @@
-// Projection and its backward, Gaussian by Gaussian.
+// Projection, Gaussian by Gaussian.
 #include <cstring>
 
 #include "../backend.h"
@@ -28,18 +28,6 @@ void project_one(const Scene<T>& s, const Camera<T>& camera, int64_t i, const Pr
   std::memcpy(out.splats + kSplatValues * i, &splat, sizeof splat);
 }
 
-template <class T>
-void project_vjp_one(const Scene<T>& s, const Camera<T>& camera, bool seen, int64_t i, const T* moments,
-                     const SceneGradient<T>& out) {
-  T* g_rest = out.sh_rest ? out.sh_rest + 3 * s.rest_bands * i : nullptr;
-  if (seen) {
-    project_vjp_row(s, camera, i, moments + kGradientValues * i, s.sh_rest + s.rest_stride * i, g_rest, out);
-  } else {
-    zero_gradient(i, out);
-    if (g_rest) std::memset(g_rest, 0, 3 * s.rest_bands * sizeof(T));
-  }
-}
-
 }  // namespace
 
 template <class T>
@@ -51,15 +39,6 @@ void project(const Executor& executor, const Scene<T>& s, const Projected<T>& ou
 }
 
 template <class T>
-void project_vjp(const Executor& executor, const Scene<T>& s, const int32_t* tile_counts, const T* moments,
-                 const SceneGradient<T>& out) {
-  const Camera<T> camera = camera_of(s);
-  for_dynamic(executor, s.count, kGrain, [&](int64_t begin, int64_t end) {
-    for (int64_t i = begin; i < end; ++i) project_vjp_one(s, camera, tile_counts[i] != 0, i, moments, out);
-  });
-}
-
-template <class T>
 void mark_visible(const Executor& executor, int64_t count, const T* means, const T* view, bool* visible) {
   const Vec3<T> row_z = {view[2], view[6], view[10]};
   for_dynamic(executor, count, kGrain, [&](int64_t begin, int64_t end) {
@@ -67,9 +46,8 @@ void mark_visible(const Executor& executor, int64_t count, const T* means, const
   });
 }
 
-#define GS_INSTANTIATE(T)                                                                                            \
-  template void project<T>(const Executor&, const Scene<T>&, const Projected<T>&);                                   \
-  template void project_vjp<T>(const Executor&, const Scene<T>&, const int32_t*, const T*, const SceneGradient<T>&); \
+#define GS_INSTANTIATE(T)                                                          \
+  template void project<T>(const Executor&, const Scene<T>&, const Projected<T>&); \
   template void mark_visible<T>(const Executor&, int64_t, const T*, const T*, bool*);
 GS_INSTANTIATE(float)
 GS_INSTANTIATE(double)

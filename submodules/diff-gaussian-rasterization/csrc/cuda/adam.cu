@@ -16,15 +16,14 @@ constexpr int kTensors = 16;  // of one launch; each takes 130 bytes of the 4 Ki
 
 struct Tensors {
   AdamInput<float> in[kTensors];
-  baseline::AdamStep<float> step[kTensors];
+  AdamConstants step[kTensors];
   int64_t end[kTensors];  // the first block behind this tensor's
   StepGuard<float> guard;
 };
 
 __global__ void __launch_bounds__(kThreads)
     adam_kernel(const int32_t* halted, const __grid_constant__ Tensors tensors) {
-  if (is_halted(halted)) return;
-  if (!begin_step(tensors.guard)) return;
+  if (is_halted(halted) || !begin_step(tensors.guard)) return;
   int which = 0;
   while (int64_t(blockIdx.x) >= tensors.end[which]) ++which;
   const AdamInput<float>& in = tensors.in[which];

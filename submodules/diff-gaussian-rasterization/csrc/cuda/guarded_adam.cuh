@@ -8,6 +8,8 @@
 namespace gs {
 namespace cuda {
 
+using AdamConstants = baseline::AdamStep<float>;  // of a step
+
 // Tells whether this iteration takes a step, and records a loss that is not finite.
 __device__ inline bool begin_step(const StepGuard<float>& guard) {
   if (baseline::may_step(guard)) return true;
@@ -15,12 +17,20 @@ __device__ inline bool begin_step(const StepGuard<float>& guard) {
   return false;
 }
 
-__device__ inline void step_value(const StepGuard<float>& guard, const baseline::AdamStep<float>& step,
-                                  const AdamInput<float>& in, int64_t i) {
+// Steps a value that is in registers. Returns whether it took the step; without a guard it does not look.
+__device__ inline bool step_value(bool guarded, const AdamConstants& step, float gradient, float& value, float& mean,
+                                  float& square) {
+  using Lanes = baseline::OneLane<float>;
+  if (guarded) return baseline::adam_if_finite<Lanes>(step, gradient, value, mean, square);
+  baseline::adam<Lanes>(step, gradient, value, mean, square);
+  return true;
+}
+
+// Steps value i of a tensor.
+__device__ inline void step_value(const StepGuard<float>& guard, const AdamConstants& step, const AdamInput<float>& in,
+                                  int64_t i) {
   float value = in.value[i], mean = in.mean[i], square = in.square[i];
-  if (!guard.stopped)
-    baseline::adam(step, in.gradient[i], value, mean, square);
-  else if (!baseline::adam_if_finite(step, in.gradient[i], value, mean, square))
+  if (!step_value(guard.stopped != nullptr, step, in.gradient[i], value, mean, square))
     *guard.stopped = guard.iteration;  // every thread writes the same
   in.value[i] = value, in.mean[i] = mean, in.square[i] = square;
 }

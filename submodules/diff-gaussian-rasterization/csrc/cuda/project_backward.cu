@@ -3,6 +3,7 @@
 
 #include "../backend.h"
 #include "../math/scene_row.h"
+#include "gaussian_step.cuh"
 #include "gradient_rows.cuh"
 #include "sh_rows.cuh"
 
@@ -23,40 +24,93 @@ struct StoredMoments {
   }
 };
 
+// A Gaussian's gradients, except those that go to memory or shared memory at once.
+struct RowGradient {
+  float means[3], means2d[3], opacity, scales[3], rotation[4], sh_dc[3];
+
+  // As rows 0 of `out`; the gradients that are not held here go to row i.
+  __device__ SceneGradient<float> pointers(const SceneGradient<float>& out, int64_t i) {
+    return {means,
+            means2d,
+            &opacity,
+            scales,
+            rotation,
+            out.cov3d ? out.cov3d + 6 * i : nullptr,
+            out.colors ? out.colors + 3 * i : nullptr,
+            sh_dc,
+            nullptr};
+  }
+};
+
+__device__ void write_values(const float* values, int count, float* rows, int64_t i) {
+  if (rows)
+    for (int k = 0; k < count; ++k) rows[count * i + k] = values[k];
+}
+
+__device__ void write_gradient(const RowGradient& g, int64_t i, const SceneGradient<float>& out) {
+  write_values(g.means, 3, out.means, i), write_values(g.means2d, 3, out.means2d, i);
+  write_values(&g.opacity, 1, out.opacities, i), write_values(g.scales, 3, out.scales, i);
+  write_values(g.rotation, 4, out.rotations, i), write_values(g.sh_dc, 3, out.sh_dc, i);
+}
+
+__device__ void write_gradient(const RowGradient& g, const WarpGradients& to) {
+  const int lane = threadIdx.x & 31;
+  write_values(g.means, 3, to.means(), lane), write_values(g.scales, 3, to.scales(), lane);
+  write_values(g.sh_dc, 3, to.sh_dc(), lane), write_values(g.rotation, 4, to.rotations(), lane);
+  to.opacities()[lane] = g.opacity;
+}
+
+// Computes gradients, and either writes them or takes the Gaussians' steps. It is one kernel for both, because a
+// compiler may fuse other products in another, and both must go the same way to the last bit.
 template <class Source>
 __global__ void __launch_bounds__(kThreads)
-    project_vjp_kernel(const int32_t* halted, Scene<float> s, Source source, SceneGradient<float> out) {
+    project_vjp_kernel(const int32_t* halted, Scene<float> s, Source source, SceneGradient<float> out,
+                       const __grid_constant__ StepParameters step) {
   if (is_halted(halted)) return;
+  constexpr int kStage = SlotSums::kStage > WarpGradients::kFloats ? SlotSums::kStage : WarpGradients::kFloats;
   __shared__ Camera<float> camera;
   __shared__ __align__(16) float rest[kThreads * kRest];
-  __shared__ __align__(8) float stage[kThreads / 32 * SlotSums::kStage];
+  __shared__ __align__(16) float stage[kThreads / 32 * kStage];
   if (threadIdx.x == 0) camera = camera_of(s);
   __syncthreads();
   const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x, first = i - (threadIdx.x & 31);
   const bool seen = i < s.count && source.seen(i);
   float* row = rest + threadIdx.x * kRest;
   float* warp_rows = rest + (threadIdx.x & ~31) * kRest;
+  float* warp_stage = stage + threadIdx.x / 32 * kStage;
   if (!s.colors)
     fetch_rows(s.sh_rest, first, s.count, s.rest_stride, 3 * (sh_count(s.sh_degree) - 1), __ballot_sync(kWarp, seen), 0,
                warp_rows);
   float m[kGradientValues];
-  source.read(i, seen, m, stage + threadIdx.x / 32 * SlotSums::kStage);
+  source.read(i, seen, m, warp_stage);
   wait_for_rows();
+  RowGradient g = {};
+  const SceneGradient<float> mine = g.pointers(out, i);
   if (seen) {
     // Writes the row even if it is not wanted: a null pointer would be tested for every band.
-    project_vjp_row(s, camera, i, m, row, row, out);
+    project_vjp_row(s, camera, i, m, row, row, mine, 0);
   } else if (i < s.count) {
-    zero_gradient(i, out);
+    zero_row(mine.cov3d, 0, 6), zero_row(mine.colors, 0, 3);
     for (int k = 0; k < 3 * s.rest_bands; ++k) row[k] = 0;
   }
-  if (out.sh_rest && first < s.count)
+  if (first >= s.count) return;
+  if (step.wanted) {
+    if (step.observed.max_radii && i < s.count) observe_one(step.observed, i, g.means2d);
+    const WarpGradients gradients{warp_stage};
+    write_gradient(g, gradients);
+    step_gaussians<kRest>(step, first, s.count, gradients, warp_rows);
+    return;
+  }
+  if (i < s.count) write_gradient(g, i, out);
+  if (out.sh_rest)
     write_rows(warp_rows, first, int(s.count - first < 32 ? s.count - first : 32), 3 * s.rest_bands, out.sh_rest);
 }
 
 template <class Source>
 void launch_project_vjp(const Queue& queue, const Scene<float>& s, const Source& source,
-                        const SceneGradient<float>& out) {
-  project_vjp_kernel<<<blocks_for(s.count, kThreads), kThreads, 0, stream_of(queue)>>>(queue.halted, s, source, out);
+                        const SceneGradient<float>& out, const StepParameters& step) {
+  project_vjp_kernel<<<blocks_for(s.count, kThreads), kThreads, 0, stream_of(queue)>>>(queue.halted, s, source, out,
+                                                                                       step);
   check_launch("project_vjp");
 }
 
@@ -65,14 +119,19 @@ void launch_project_vjp(const Queue& queue, const Scene<float>& s, const Source&
 template <>
 void project_vjp<float>(const Queue& queue, const Scene<float>& s, const int32_t* tile_counts, const float* moments,
                         const SceneGradient<float>& out) {
-  if (s.count) launch_project_vjp(queue, s, StoredMoments{moments, tile_counts}, out);
+  if (s.count) launch_project_vjp(queue, s, StoredMoments{moments, tile_counts}, out, {});
 }
 
 void rasterize_vjp(const Queue& queue, const Scene<float>& s, const BlendInput<float>& in,
                    const BlendGradient<float>& g, const GradientMemory& memory) {
   if (!s.count) return;
   const SlotSums source{blend_rows(queue, in, g), g.slots};
-  launch_project_vjp(queue, s, source, memory.take(memory.context));
+  launch_project_vjp(queue, s, source, memory.take(memory.context), {});
+}
+
+void rasterize_vjp_step(const Queue& queue, const Scene<float>& s, const BlendInput<float>& in,
+                        const BlendGradient<float>& g, const GaussianStep<float>& step) {
+  if (s.count) launch_project_vjp(queue, s, SlotSums{blend_rows(queue, in, g), g.slots}, {}, step_parameters(step));
 }
 
 }  // namespace cuda

@@ -14,10 +14,9 @@ namespace {
 constexpr int kThreads = 256;
 
 __global__ void __launch_bounds__(kThreads)
-    sparse_adam_kernel(const int32_t* halted, AdamInput<float> in, const bool* visible, baseline::AdamStep<float> step,
+    sparse_adam_kernel(const int32_t* halted, AdamInput<float> in, const bool* visible, AdamConstants step,
                        StepGuard<float> guard) {
-  if (is_halted(halted)) return;
-  if (!begin_step(guard)) return;
+  if (is_halted(halted) || !begin_step(guard)) return;
   const int64_t k = int64_t(blockIdx.x) * kThreads + threadIdx.x;
   if (k >= in.rows * in.columns) return;
   const int64_t r = k / in.columns;
@@ -33,7 +32,7 @@ void sparse_adam<float>(const Queue& queue, const AdamInput<float>& in, const bo
                         const StepGuard<float>& guard) {
   const int64_t n = in.rows * in.columns;
   if (!n) return;
-  const auto step = baseline::make_uncorrected_adam_step<float>(in.lr, in.beta1, in.beta2, in.eps);
+  const AdamConstants step = baseline::make_uncorrected_adam_step<float>(in.lr, in.beta1, in.beta2, in.eps);
   sparse_adam_kernel<<<blocks_for(n, kThreads), kThreads, 0, stream_of(queue)>>>(queue.halted, in, visible, step,
                                                                                  guard);
   check_launch("sparse_adam");

@@ -6,6 +6,7 @@
 #include "../data.h"
 #include "gs/hd.h"
 #include "gs/isa.h"
+#include "vec.h"
 
 GS_ISA_BEGIN
 
@@ -38,16 +39,27 @@ GS_HD AdamStep<T> make_uncorrected_adam_step(double lr, double beta1, double bet
   return {T(beta1), T(1 - beta1), T(beta2), T(1 - beta2), T(lr), T(1), T(eps)};
 }
 
+// The operations of a step on a scalar; Simd (gs/simd.h) has them on vectors.
 template <class T>
-GS_HD void adam(const AdamStep<T>& a, T gradient, T& value, T& mean, T& square) {
-  mean = a.keep1 * mean + a.take1 * gradient;
-  square = a.keep2 * square + a.take2 * gradient * gradient;
-  value -= a.rate * (mean / (std::sqrt(square) * a.root_correction + a.eps));
+struct OneLane {
+  static GS_HD T all(T x) { return x; }
+  static GS_HD T root(T x) { return std::sqrt(x); }
+  static GS_HD T multiply_add(T a, T b, T c) { return GS_ISA::multiply_add(a, b, c); }
+};
+
+// V is a scalar or a vector, Lanes has its operations. Which products are fused with a sum is said here and not left to
+// compilers, so a value's step has the same bits wherever it is taken: alone, in a vector, or beside its gradient.
+template <class Lanes, class T, class V>
+GS_HD void adam(const AdamStep<T>& a, V gradient, V& value, V& mean, V& square) {
+  mean = Lanes::multiply_add(Lanes::all(a.keep1), mean, a.take1 * gradient);
+  square = Lanes::multiply_add(Lanes::all(a.keep2), square, a.take2 * gradient * gradient);
+  const V divisor = Lanes::multiply_add(Lanes::root(square), Lanes::all(a.root_correction), Lanes::all(a.eps));
+  value = Lanes::multiply_add(Lanes::all(-a.rate), mean / divisor, value);
 }
 
-template <class T>
-GS_HD bool is_finite(T x) {
-  return x - x == T(0);  // inf - inf is not a number
+template <class V>
+GS_HD auto is_finite(V x) {
+  return x - x == V{};  // inf - inf is not a number
 }
 
 // Tells whether the tensors take their step in this iteration.
@@ -59,14 +71,15 @@ GS_HD bool may_step(const StepGuard<T>& guard) {
   return (stopped == 0 || stopped == guard.iteration) && is_finite(*guard.loss);
 }
 
-// Takes the step if all its results are finite. Otherwise the value stays, and its mean becomes NaN as a mark.
-template <class T>
-GS_HD bool adam_if_finite(const AdamStep<T>& a, T gradient, T& value, T& mean, T& square) {
-  T v = value, m = mean, s = square;
-  adam(a, gradient, v, m, s);
-  const bool finite = is_finite(v) & is_finite(m) & is_finite(s);
+// Takes the step where all its results are finite. Elsewhere the value stays, and its mean becomes NaN as a mark.
+// Returns where it was taken: a truth value, or a mask of lanes.
+template <class Lanes, class T, class V>
+GS_HD auto adam_if_finite(const AdamStep<T>& a, V gradient, V& value, V& mean, V& square) {
+  V v = value, m = mean, s = square;
+  adam<Lanes>(a, gradient, v, m, s);
+  const auto finite = is_finite(v) & is_finite(m) & is_finite(s);
   value = finite ? v : value;
-  mean = finite ? m : T(NAN);
+  mean = finite ? m : Lanes::all(T(NAN));
   square = finite ? s : square;
   return finite;
 }

@@ -107,8 +107,8 @@ GS_HD void zero_gradient(int64_t i, const SceneGradient<T>& out) {
   zero_row(out.colors, i, 3), zero_row(out.sh_dc, i, 3);
 }
 
-// Computes the coefficients' gradients, and returns the mean's through the viewing direction. `rest` and g_rest are the
-// rows of sh_rest and of its gradient (or null). They may be copies, and may be the same memory.
+// Computes the coefficients' gradients, and returns the mean's through the viewing direction. `rest` is the row of
+// sh_rest, g_dc and g_rest are those of the gradients (or null). `rest` and g_rest may be the same memory.
 template <class T>
 GS_HD Vec3<T> color_vjp(const Scene<T>& s, const Camera<T>& camera, int64_t i, Vec3<T> g, const T* rest, T* g_dc,
                         T* g_rest) {
@@ -119,7 +119,7 @@ GS_HD Vec3<T> color_vjp(const Scene<T>& s, const Camera<T>& camera, int64_t i, V
   const Vec3<T> c = sh_color(s.sh_degree, basis, s.sh_dc + s.dc_stride * i, rest);
   const T black = T(kBlack);
   g = {c.x >= black ? g.x : T(0), c.y >= black ? g.y : T(0), c.z >= black ? g.z : T(0)};
-  if (g_dc) store3(g_dc + 3 * i, basis[0] * g);
+  if (g_dc) store3(g_dc, basis[0] * g);
   const int active = sh_count(s.sh_degree);
   // Loops of constant length let a GPU keep the arrays in registers. All of a row is read before it may be written.
   for (int k = 1; k < kCount; ++k)
@@ -134,35 +134,37 @@ GS_HD Vec3<T> color_vjp(const Scene<T>& s, const Camera<T>& camera, int64_t i, V
   return sh_direction_vjp(direction, norm, sh_basis_vjp(s.sh_degree, direction, weight));
 }
 
+// Computes the gradients of Gaussian i from its moments m, and writes them to row `to` of `out`, except that of
+// sh_rest.
 template <class T>
 GS_HD void project_vjp_row(const Scene<T>& s, const Camera<T>& camera, int64_t i, const T* m, const T* rest, T* g_rest,
-                           const SceneGradient<T>& out) {
+                           const SceneGradient<T>& out, int64_t to) {
   const Loaded<T> in = load(s, i);
   const GaussianGradient<T> g =
-      project_splat_vjp(camera, in.gaussian, s.antialiasing, s.raw, out.cov3d ? out.cov3d + 6 * i : nullptr,
+      project_splat_vjp(camera, in.gaussian, s.antialiasing, s.raw, out.cov3d ? out.cov3d + 6 * to : nullptr,
                         Moments<T>{m[0], m[1], m[2], m[3], m[4], m[5]}, m[9]);
   Vec3<T> g_mean = g.mean;
   const Vec3<T> g_color = {m[6], m[7], m[8]};
   if (s.colors) {
-    if (out.colors) store3(out.colors + 3 * i, g_color);
+    if (out.colors) store3(out.colors + 3 * to, g_color);
   } else {
-    g_mean = g_mean + color_vjp(s, camera, i, g_color, rest, out.sh_dc, g_rest);
+    g_mean = g_mean + color_vjp(s, camera, i, g_color, rest, out.sh_dc ? out.sh_dc + 3 * to : nullptr, g_rest);
   }
-  if (out.means) store3(out.means + 3 * i, g_mean);
+  if (out.means) store3(out.means + 3 * to, g_mean);
   if (out.means2d)
-    store3(out.means2d + 3 * i,
+    store3(out.means2d + 3 * to,
            Vec3<T>{g.pixel_x * T(0.5) * T(s.image.width), g.pixel_y * T(0.5) * T(s.image.height), T(0)});
   if (out.opacities)
-    out.opacities[i] = g.log_opacity * (s.raw ? log_sigmoid_slope(s.opacities[i]) : 1 / s.opacities[i]);
+    out.opacities[to] = g.log_opacity * (s.raw ? log_sigmoid_slope(s.opacities[i]) : 1 / s.opacities[i]);
   if (out.scales)
     for (int k = 0; k < 3; ++k) {
       const T scale = s.raw ? T(1) : s.scales[3 * i + k];
-      out.scales[3 * i + k] = scale != 0 ? g.log_scale[k] / scale : T(0);  // the loss is even in the scale
+      out.scales[3 * to + k] = scale != 0 ? g.log_scale[k] / scale : T(0);  // the loss is even in the scale
     }
   if (out.rotations) {
     const Quat<T> q =
         s.raw ? normalise_vjp(in.rotation, in.rotation_norm, g.torque) : rotation_columns_vjp(in.rotation, g.direction);
-    T* row = out.rotations + 4 * i;
+    T* row = out.rotations + 4 * to;
     row[0] = q.w, row[1] = q.x, row[2] = q.y, row[3] = q.z;
   }
 }

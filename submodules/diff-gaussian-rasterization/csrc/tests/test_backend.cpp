@@ -3,6 +3,7 @@
 #include <thread>
 
 #include "backend_run.h"
+#include "step_run.h"
 
 namespace {
 
@@ -113,11 +114,37 @@ void test_poison() {
       }
 }
 
+// Steps taken inside the backward give the bits of steps from gradients in memory: several iterations, the last ones
+// after a step that was not finite.
+void test_gaussian_step() {
+  for (const int64_t count : {0, 1, 130, 700})
+    for (const StepCase& how : kStepCases) {
+      const Stepping start{Parameters<float>(count)};
+      Stepping plain = start, fused = start;
+      for (int64_t iteration = 1; iteration <= 3; ++iteration) {
+        const float gradient = iteration == 2 ? how.gradient : 1;
+        const auto before = render(threads(), plain.values, {40, 24}, count == 130, gradient);
+        blend_vjp(threads(), before->input, before->backward);
+        step_plainly(threads(), plain, how, *before, iteration, [&](const gs::SceneGradient<float>& g) {
+          project_vjp(gs::serial_executor(), before->scene, before->tile_counts.data(), before->moments.data(), g);
+        });
+        const auto r = render(threads(), fused.values, {40, 24}, count == 130, gradient);
+        blend_vjp(threads(), r->input, r->backward);
+        project_vjp_step(threads(), r->scene, r->tile_counts.data(), r->moments.data(),
+                         gaussian_step(fused, how, *r, iteration));
+        CHECK(fused.bytes() == plain.bytes());
+      }
+      CHECK(count < 130 || (fused.stopped == 2) == (how.guarded && std::isnan(how.gradient)));
+      CHECK(count < 130 || fused.values.means != start.values.means);
+    }
+}
+
 }  // namespace
 
 int main() {
   test_threads_and_sizes<float>(), test_threads_and_sizes<double>();
   test_gradient();
   test_poison<float>(), test_poison<double>();
+  test_gaussian_step();
   return gs::finish_tests("rasterizer backend");
 }

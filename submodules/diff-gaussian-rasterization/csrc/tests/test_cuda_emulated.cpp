@@ -5,6 +5,7 @@
 #include "backend_run.h"
 #include "emulated_queue.h"
 #include "schedule.cuh"
+#include "step_run.h"
 
 namespace {
 
@@ -308,6 +309,44 @@ void test_observe() {
   }
 }
 
+// Gradients of the emulated backward, into memory.
+void emulated_gradients(const gs::Queue& queue, const Rendered& r, const gs::SceneGradient<float>& g) {
+  const auto take = [](void* to) { return *static_cast<const gs::SceneGradient<float>*>(to); };
+  gs::SceneGradient<float> copy = g;
+  gs::cuda::rasterize_vjp(queue, r.scene, r.input, r.backward, {take, &copy});
+}
+
+// Steps taken inside the backward give the bits of steps from gradients in memory, in every order of threads. A halted
+// queue changes nothing.
+void test_gaussian_step() {
+  for (const int64_t count : {0, 1, 33, 300})
+    for (const StepCase& how : kStepCases) {
+      const Stepping start{Parameters<float>(count)};
+      Stepping plain = start, fused = start;
+      for (int64_t iteration = 1; iteration <= 3; ++iteration) {
+        gs::emulation::order = gs::emulation::kOrders[iteration % 3];
+        const float gradient = iteration == 2 ? how.gradient : 1;
+        gs::emulation::Memory memory;
+        gs::Queue queue = memory.queue();
+        const auto before = render(queue, plain.values, {40, 24}, count == 33, gradient);
+        step_plainly(queue, plain, how, *before, iteration,
+                     [&](const gs::SceneGradient<float>& g) { emulated_gradients(queue, *before, g); });
+        const auto r = render(queue, fused.values, {40, 24}, count == 33, gradient);
+        const int32_t halted[2] = {1, 0};
+        const std::vector<uint8_t> unchanged = fused.bytes();
+        for (const int32_t& word : halted) {
+          queue.halted = &word;
+          gs::cuda::rasterize_vjp_step(queue, r->scene, r->input, r->backward,
+                                       gaussian_step(fused, how, *r, iteration));
+          CHECK(word == 0 || fused.bytes() == unchanged);
+        }
+        CHECK(fused.bytes() == plain.bytes());
+      }
+      CHECK(count < 300 || (fused.stopped == 2) == (how.guarded && std::isnan(how.gradient)));
+      CHECK(count < 300 || fused.values.means != start.values.means);
+    }
+}
+
 struct Lengths {
   const int64_t* lengths;
   int64_t operator()(int tile) const { return lengths[tile]; }
@@ -359,6 +398,7 @@ int main() {
   test_adam();
   test_step_guard();
   test_observe();
+  test_gaussian_step();
   test_many_tiles();
   test_long_lists();
   test_ahead();

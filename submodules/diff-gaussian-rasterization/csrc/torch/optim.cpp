@@ -1,12 +1,10 @@
 // The ops that change parameters and statistics in place: Adam, sparse Adam, and what density control observes.
+#include "optim.h"
+
 #include <utility>
 #include <vector>
 
-#include "tensors.h"
-
 namespace gs::ops {
-
-namespace {
 
 void check_moments(const Tensor& value, const Tensor& gradient, const Tensor& exp_avg, const Tensor& exp_avg_sq) {
   for (const auto& [name, t] : {std::pair("value", &value), std::pair("gradient", &gradient),
@@ -21,35 +19,29 @@ void check_moments(const Tensor& value, const Tensor& gradient, const Tensor& ex
               "parameter and averages must be contiguous");
 }
 
-// Checks the inputs of a step's guard. `stopped`, one int64, comes with a loss of the parameters' dtype.
-template <class T>
-gs::StepGuard<T> step_guard(const Tensor& value, const MaybeTensor& loss, const MaybeTensor& stopped,
-                            int64_t iteration) {
-  if (!stopped) return {};
-  TORCH_CHECK(
-      loss && loss->numel() == 1 && loss->scalar_type() == value.scalar_type() && loss->device() == value.device(),
-      "a guarded step needs the loss, one ", value.scalar_type(), " on ", value.device());
-  TORCH_CHECK(stopped->numel() == 1 && stopped->scalar_type() == at::kLong && stopped->device() == value.device(),
-              "stopped must be one int64 on ", value.device(), ", got ", stopped->sizes(), " ", stopped->scalar_type(),
-              " on ", stopped->device());
-  TORCH_CHECK(iteration > 0, "iterations of guarded steps count from 1, got ", iteration);
-  return {loss->const_data_ptr<T>(), stopped->mutable_data_ptr<int64_t>(), iteration};
+void check_counter(const Tensor& step) {
+  check_given(step, "step");
+  TORCH_CHECK(step.is_cpu() && step.numel() == 1 && step.scalar_type() == at::kFloat,
+              "a step counter must be one float32 on the CPU, got ", step.sizes(), " ", step.scalar_type(), " on ",
+              step.device());
 }
 
-int64_t rows_of(const Tensor& t) { return t.dim() > 0 ? t.size(0) : 1; }
-
-// The tensors of one parameter as a backend takes them; all of them checked. columns: -1 for whole rows.
-template <class T>
-gs::AdamInput<T> adam_input(const Tensor& value, const Tensor& gradient, const Tensor& exp_avg,
-                            const Tensor& exp_avg_sq, int64_t columns) {
-  const int64_t rows = rows_of(value), row = rows ? value.numel() / rows : 0;
-  TORCH_CHECK(rows == 0 || columns <= row, "columns must be at most ", row, ", got ", columns);
-  gs::AdamInput<T> in{};
-  in.value = value.mutable_data_ptr<T>(), in.gradient = gradient.const_data_ptr<T>();
-  in.mean = exp_avg.mutable_data_ptr<T>(), in.square = exp_avg_sq.mutable_data_ptr<T>();
-  in.rows = rows, in.row = row, in.columns = columns < 0 ? row : columns;
-  return in;
+void check_statistics(const Tensor& max_radii, const Tensor& gradient_sums, const Tensor& views, const Tensor& radii) {
+  for (const auto& [name, t] :
+       {std::pair("max_radii", &max_radii), std::pair("gradient_sums", &gradient_sums), std::pair("views", &views)})
+    check_given(*t, name);
+  check_given(radii, "radii");
+  const int64_t n = radii.numel();
+  for (const Tensor* t : {&max_radii, &gradient_sums, &views}) {
+    TORCH_CHECK(t->numel() == n && t->scalar_type() == at::kFloat && t->device() == radii.device(),
+                "statistics must be ", n, " float32 on ", radii.device(), ", got ", t->sizes(), " ", t->scalar_type(),
+                " on ", t->device());
+    TORCH_CHECK(t->is_contiguous(), "statistics must be contiguous");
+  }
+  TORCH_CHECK(radii.scalar_type() == at::kInt, "radii must be int32, got ", radii.scalar_type());
 }
+
+namespace {
 
 // Takes one step of every parameter, in one launch on a GPU. Advances each counter first, as torch does, even if
 // the guard holds the step back.
@@ -69,14 +61,11 @@ void adam_op(at::TensorList values, at::TensorList gradients, at::TensorList exp
       TORCH_CHECK(values[i].scalar_type() == first.scalar_type() && values[i].device() == first.device(),
                   "all parameters must have one dtype and device");
       check_moments(values[i], gradients[i], exp_avg[i], exp_avg_sq[i]);
-      const Tensor& step = steps[i];
-      TORCH_CHECK(step.is_cpu() && step.numel() == 1 && step.scalar_type() == at::kFloat,
-                  "a step counter must be one float32 on the CPU, got ", step.sizes(), " ", step.scalar_type(), " on ",
-                  step.device());
+      check_counter(steps[i]);
       contiguous.push_back(gradients[i].contiguous());
       gs::AdamInput<T> in = adam_input<T>(values[i], contiguous.back(), exp_avg[i], exp_avg_sq[i], columns[i]);
       in.lr = rates[i], in.beta1 = beta1, in.beta2 = beta2, in.eps = eps;
-      in.step = double(*step.const_data_ptr<float>()) + 1;
+      in.step = double(*steps[i].const_data_ptr<float>()) + 1;
       inputs.push_back(in);
     }
     GS_RUN(T, first, adam, inputs.data(), int64_t(n), step_guard<T>(first, loss, stopped, iteration));
@@ -105,18 +94,9 @@ void sparse_adam_op(Tensor& value, const Tensor& gradient, Tensor& exp_avg, Tens
 }
 
 void observe_op(Tensor& max_radii, Tensor& gradient_sums, Tensor& views, const Tensor& radii, const Tensor& gradient) {
-  for (const auto& [name, t] :
-       {std::pair("max_radii", &max_radii), std::pair("gradient_sums", &gradient_sums), std::pair("views", &views)})
-    check_given(*t, name);
-  check_given(radii, "radii"), check_given(gradient, "gradient");
+  check_statistics(max_radii, gradient_sums, views, radii);
+  check_given(gradient, "gradient");
   const int64_t n = radii.numel();
-  for (const Tensor* t : {&max_radii, &gradient_sums, &views}) {
-    TORCH_CHECK(t->numel() == n && t->scalar_type() == at::kFloat && t->device() == radii.device(),
-                "statistics must be ", n, " float32 on ", radii.device(), ", got ", t->sizes(), " ", t->scalar_type(),
-                " on ", t->device());
-    TORCH_CHECK(t->is_contiguous(), "statistics must be contiguous");
-  }
-  TORCH_CHECK(radii.scalar_type() == at::kInt, "radii must be int32, got ", radii.scalar_type());
   TORCH_CHECK(gradient.dim() == 2 && gradient.size(0) == n && gradient.size(1) == 3 &&
                   gradient.scalar_type() == at::kFloat && gradient.device() == radii.device(),
               "the gradient must be (", n, ", 3) float32 on ", radii.device(), ", got ", gradient.sizes(), " ",

@@ -6,21 +6,10 @@
 #include <algorithm>
 #include <limits>
 
+#include "backward.h"
 #include "math/splat.h"
 #include "math/tiles.h"
 #include "scene.h"
-
-#define BACKWARD_SCHEMA                                                                                   \
-  "Tensor splats, Tensor instances, Tensor ranges, Tensor splat_slots, Tensor slots, "                    \
-  "Tensor background, Tensor last, Tensor transmittance, Tensor grad_color, Tensor? grad_transmittance, " \
-  "Tensor? grad_inverse_depth"
-#define BACKWARD_PARAMETERS                                                                                            \
-  const Tensor &splats, const Tensor &instances, const Tensor &ranges, const Tensor &splat_slots, const Tensor &slots, \
-      const Tensor &background, const Tensor &last, const Tensor &transmittance, const Tensor &grad_color,             \
-      const MaybeTensor &grad_transmittance, const MaybeTensor &grad_inverse_depth
-#define BACKWARD_ARGUMENTS                                                                                        \
-  splats, instances, ranges, splat_slots, slots, background, last, transmittance, grad_color, grad_transmittance, \
-      grad_inverse_depth
 
 namespace gs::ops {
 
@@ -41,37 +30,6 @@ struct ProjectedTensors {
             records.defined() ? static_cast<gs::TileRecord*>(records.mutable_data_ptr()) : nullptr};
   }
 };
-
-// What a forward hands to its backward, and the ops of single stages take from their callers. Of values only the ends
-// of lists are checked, and only on the CPU, as reading one from a GPU waits for it. Other indices are the caller's
-// concern.
-void check_splats(const Tensor& splats) {
-  check_given(splats, "splats");
-  const at::ScalarType type = splats.scalar_type();
-  TORCH_CHECK_TYPE(type == at::kFloat || type == at::kDouble, "splats must be float32 or float64, got ",
-                   in_words(type));
-  TORCH_CHECK_VALUE(splats.dim() == 2 && splats.size(1) == kSplatValues, "splats must be (N, ", kSplatValues, "), got ",
-                    in_words(splats.sizes()));
-}
-
-void check_lists(const Tensor& instances, const Tensor& ranges, const Tensor& splats, gs::Image image) {
-  check_tensor(instances, "instances", at::kInt, splats.device(), {-1});
-  check_tensor(ranges, "ranges", at::kLong, splats.device(), {tiles_of(image) + 1});
-  if (!ranges.is_cpu()) return;
-  const int64_t end = ranges.const_data_ptr<int64_t>()[tiles_of(image) * ranges.stride(0)], n = instances.size(0);
-  TORCH_CHECK_VALUE(end <= n && (end <= 0 || splats.size(0) > 0), "ranges end at ", end, ", but there are ", n,
-                    " instances of ", splats.size(0), " splats");
-}
-
-// The size of the image whose `last` this is.
-gs::Image image_of(const Tensor& last, const Tensor& splats) {
-  check_tensor(last, "last", at::kInt, splats.device(), {-1, -1});
-  return checked_image(last.size(0), last.size(1));
-}
-
-void check_counts(const Tensor& tile_counts, int64_t count, at::Device device) {
-  check_tensor(tile_counts, "tile_counts", at::kInt, device, {count});
-}
 
 // rects: whether the caller wants them; with records nothing else needs them.
 ProjectedTensors project(const SceneTensors& in, bool rects) {
@@ -134,18 +92,6 @@ BinnedTensors bin(ProjectedTensors& in, gs::Image image, bool slots) {
   return out;
 }
 
-template <class T>
-gs::BlendInput<T> blend_input(const Tensor& splats, const Tensor& instances, const Tensor& ranges,
-                              const Tensor& background, gs::Image image) {
-  return {splats.const_data_ptr<T>(), instances.const_data_ptr<int32_t>(), ranges.const_data_ptr<int64_t>(),
-          background.const_data_ptr<T>(), image};
-}
-
-Tensor background_like(const Tensor& background, const Tensor& splats) {
-  check_precise(background, "background", {3});
-  return converted(background, splats);
-}
-
 struct BlendedTensors {
   Tensor color, transmittance, inverse_depth, last;
 };
@@ -166,86 +112,6 @@ BlendedTensors blend(const Tensor& splats, const Tensor& instances, const Tensor
     GS_RUN(T, splats, blend, blend_input<T>(splats, instances, ranges, bg, image), blended);
   });
   return out;
-}
-
-// Owns the tensors that the gs::BlendInput and gs::BlendGradient of a backward point into.
-class BlendBackward {
- public:
-  BlendBackward(const Tensor& splats, const Tensor& instances, const Tensor& ranges, const Tensor& splat_slots,
-                const Tensor& slots, const Tensor& background, const Tensor& last, const Tensor& transmittance,
-                const Tensor& grad_color, const MaybeTensor& grad_transmittance, const MaybeTensor& grad_inverse_depth)
-      : image_(checked(BACKWARD_ARGUMENTS)),
-        splats_(splats.contiguous()),
-        instances_(instances.contiguous()),
-        ranges_(ranges.contiguous()),
-        splat_slots_(splat_slots.contiguous()),
-        slot_count_(slots.size(0)),
-        background_(background_like(background, splats)),
-        last_(last.contiguous()),
-        transmittance_(transmittance.contiguous()),
-        color_(plane(grad_color, 3)),
-        alpha_(plane(grad_transmittance, 1)),
-        depth_(plane(grad_inverse_depth, 1)) {}
-
-  const Tensor& splats() const { return splats_; }
-
-  template <class T>
-  gs::BlendInput<T> input() const {
-    return blend_input<T>(splats_, instances_, ranges_, background_, image_);
-  }
-  template <class T>
-  gs::BlendGradient<T> gradient(T* moments) const {
-    return {splats_.size(0),
-            instances_.size(0),
-            slot_count_,
-            static_cast<const gs::SplatSlots*>(splat_slots_.const_data_ptr()),
-            transmittance_.const_data_ptr<T>(),
-            last_.const_data_ptr<int32_t>(),
-            color_.const_data_ptr<T>(),
-            depth_.defined() ? depth_.const_data_ptr<T>() : nullptr,
-            alpha_.defined() ? alpha_.const_data_ptr<T>() : nullptr,
-            moments,
-            ahead()};
-  }
-
- private:
-  // Checks all but the planes of gradients; returns the size of the image.
-  static gs::Image checked(BACKWARD_PARAMETERS) {
-    check_splats(splats);
-    const at::Device device = splats.device();
-    const gs::Image image = image_of(last, splats);
-    check_lists(instances, ranges, splats, image);
-    check_tensor(splat_slots, "splat_slots", at::kLong, device, {splats.size(0) + 1, 2});
-    check_tensor(slots, "slots", at::kInt, device, {-1, 0});
-    if (device.is_cpu()) {
-      const int64_t end = splat_slots.const_data_ptr<int64_t>()[splats.size(0) * splat_slots.stride(0)];
-      TORCH_CHECK_VALUE(end == slots.size(0), "splat_slots end at ", end, ", but there are ", slots.size(0), " slots");
-    }
-    check_tensor(transmittance, "transmittance", splats.scalar_type(), device, {1, image.height, image.width});
-    check_given(grad_color, "grad_color");
-    return image;
-  }
-
-  Tensor plane(const MaybeTensor& t, int64_t channels) const {
-    if (!t.has_value() || !t->defined()) return {};
-    check_precise(*t, "the gradient of an image", {channels, image_.height, image_.width});
-    return converted(*t, splats_);
-  }
-
-  gs::Image image_;
-  Tensor splats_, instances_, ranges_, splat_slots_;
-  int64_t slot_count_;
-  Tensor background_, last_, transmittance_;
-  Tensor color_, alpha_, depth_;
-};
-
-Tensor blend_vjp(const BlendBackward& in) {
-  Tensor moments = at::empty({in.splats().size(0), kGradientValues}, in.splats().options());
-  with_scalar(moments.scalar_type(), [&](auto zero) {
-    using T = decltype(zero);
-    GS_RUN(T, moments, blend_vjp, in.input<T>(), in.gradient<T>(moments.mutable_data_ptr<T>()));
-  });
-  return moments;
 }
 
 Gradients project_vjp(const SceneTensors& in, const Tensor& tile_counts, const Tensor& moments, const Wanted& wanted) {

@@ -1,0 +1,127 @@
+#pragma once
+// The step that Gaussians take inside the backward of projection, from gradients in shared memory. A warp steps the
+// rows of its own 32 Gaussians, which lie side by side in every tensor, so that it reads and writes whole lines.
+#include <cuda_runtime.h>
+
+#include "../backend.h"
+#include "../math/observe.h"
+#include "guarded_adam.cuh"
+#include "queue.cuh"
+
+namespace gs {
+namespace cuda {
+
+// A tensor's rows. whole: all columns step, and 32 rows begin at a multiple of 16 bytes.
+struct SteppedRows {
+  float *value, *mean, *square;
+  int row, columns;
+  bool whole;
+  AdamConstants constants;
+};
+
+struct StepParameters {
+  bool wanted;
+  bool sparse;
+  SteppedRows rows[kStepped];
+  StepGuard<float> guard;
+  ObserveInput observed;
+};
+
+inline StepParameters step_parameters(const GaussianStep<float>& in) {
+  StepParameters out{};
+  out.wanted = true, out.sparse = in.sparse, out.guard = in.guard, out.observed = in.observed;
+  for (int a = 0; a < kStepped; ++a) {
+    const AdamInput<float>& from = in.attributes[a];
+    bool whole = from.columns == from.row;
+    for (const float* p : {from.value, from.mean, from.square}) whole &= reinterpret_cast<uintptr_t>(p) % 16 == 0;
+    out.rows[a] = {from.value, from.mean, from.square, int(from.row), int(from.columns), whole, {}};
+    if (!from.columns) continue;
+    out.rows[a].constants = in.sparse
+                                ? baseline::make_uncorrected_adam_step<float>(from.lr, from.beta1, from.beta2, from.eps)
+                                : baseline::make_adam_step<float>(from.lr, from.beta1, from.beta2, from.eps, from.step);
+  }
+  return out;
+}
+
+// Steps all 32 rows of a warp, 16 bytes a lane at a time; their gradients lie side by side. Returns whether the lane's
+// values took their step.
+template <int kRow>
+__device__ inline bool step_whole_rows(SteppedRows to, bool guarded, int64_t first, const float* gradient) {
+  bool finite = true;
+  float4 *value = reinterpret_cast<float4*>(to.value + first * kRow),
+         *mean = reinterpret_cast<float4*>(to.mean + first * kRow),
+         *square = reinterpret_cast<float4*>(to.square + first * kRow);
+#pragma unroll 2
+  for (int k = threadIdx.x & 31; k < 8 * kRow; k += 32) {
+    const float4 g = reinterpret_cast<const float4*>(gradient)[k];
+    float4 v = value[k], m = mean[k], s = square[k];
+    finite &= step_value(guarded, to.constants, g.x, v.x, m.x, s.x);
+    finite &= step_value(guarded, to.constants, g.y, v.y, m.y, s.y);
+    finite &= step_value(guarded, to.constants, g.z, v.z, m.z, s.z);
+    finite &= step_value(guarded, to.constants, g.w, v.w, m.w, s.w);
+    value[k] = v, mean[k] = m, square[k] = s;
+  }
+  return finite;
+}
+
+// Steps those of a warp's rows that have a bit in `stepping`. `gradient` has all 32 of them, `stride` floats apart; row
+// `first` of the tensor is the first. kRow: the values of a row, as is usual. Returns whether the lane's values took
+// their step.
+template <int kRow>
+__device__ inline bool step_rows(SteppedRows to, bool guarded, unsigned stepping, int64_t first, const float* gradient,
+                                 int stride) {
+  if (!to.columns) return true;
+  if (to.whole && to.row == kRow && stride == kRow && stepping == kWarp)
+    return step_whole_rows<kRow>(to, guarded, first, gradient);
+  bool finite = true;
+  for (int k = threadIdx.x & 31; k < 32 * to.columns; k += 32) {
+    const int row = k / to.columns, column = k - row * to.columns;
+    if (!(stepping >> row & 1)) continue;
+    const int64_t at = (first + row) * to.row + column;
+    float value = to.value[at], mean = to.mean[at], square = to.square[at];
+    finite &= step_value(guarded, to.constants, gradient[row * stride + column], value, mean, square);
+    to.value[at] = value, to.mean[at] = mean, to.square[at] = square;
+  }
+  return finite;
+}
+
+// The gradients of a warp's Gaussians in shared memory, except those of sh_rest.
+struct WarpGradients {
+  static constexpr int kFloats = 32 * (3 + 1 + 3 + 4 + 3);
+  float* memory;  // kFloats
+  __device__ float* means() const { return memory; }
+  __device__ float* scales() const { return memory + 32 * 3; }
+  __device__ float* sh_dc() const { return memory + 32 * 6; }
+  __device__ float* rotations() const { return memory + 32 * 9; }
+  __device__ float* opacities() const { return memory + 32 * 13; }
+};
+
+// Adds the view to the statistics of Gaussian i, whose gradient on the screen this is.
+__device__ inline void observe_one(const ObserveInput& in, int64_t i, const float* gradient) {
+  Observed o{in.max_radii[i], in.gradient_sums[i], in.views[i]};
+  gs::observe(in.radii[i], gradient[0], gradient[1], o);
+  in.max_radii[i] = o.max_radius, in.gradient_sums[i] = o.gradient_sum, in.views[i] = o.views;
+}
+
+// Takes the step of a warp's Gaussians; all of its lanes call it. `first` is the warp's first Gaussian, `rest` has
+// their gradients of sh_rest, kRest floats apart. Inlined, it would take the whole kernel from 96 to 104 registers,
+// with which one block in five would no longer fit.
+template <int kRest>
+__device__ __noinline__ void step_gaussians(const StepParameters& in, int64_t first, int64_t count,
+                                            const WarpGradients& g, const float* rest) {
+  if (!begin_step(in.guard)) return;
+  const int64_t i = first + (threadIdx.x & 31);
+  const unsigned stepping = __ballot_sync(kWarp, i < count && (!in.sparse || in.observed.radii[i] > 0));
+  __syncwarp();  // all lanes have written their gradients
+  const bool guarded = in.guard.stopped != nullptr;
+  bool finite = step_rows<3>(in.rows[kStepMeans], guarded, stepping, first, g.means(), 3);
+  finite &= step_rows<1>(in.rows[kStepOpacities], guarded, stepping, first, g.opacities(), 1);
+  finite &= step_rows<3>(in.rows[kStepScales], guarded, stepping, first, g.scales(), 3);
+  finite &= step_rows<4>(in.rows[kStepRotations], guarded, stepping, first, g.rotations(), 4);
+  finite &= step_rows<3>(in.rows[kStepShDc], guarded, stepping, first, g.sh_dc(), 3);
+  finite &= step_rows<kRest>(in.rows[kStepShRest], guarded, stepping, first, rest, kRest);
+  if (!finite) *in.guard.stopped = in.guard.iteration;  // every thread writes the same
+}
+
+}  // namespace cuda
+}  // namespace gs

@@ -1,0 +1,169 @@
+#pragma once
+// Gaussians that take a step from a backward: by the backward itself, or from gradients in memory, as a plain optimiser
+// and density control do. Both must give the same bits.
+#include <cstring>
+#include <memory>
+#include <vector>
+
+#include "backend_run.h"
+
+struct StepCase {
+  bool sparse = false, guarded = false, observed = true;
+  int64_t rest_columns = 45;
+  bool opacities_step = true;
+  float gradient = 1;  // dLoss/dcolor of a pixel in the middle; of the others 1
+};
+
+// Everything that a step changes.
+struct Stepping {
+  Parameters<float> values;
+  std::vector<float> mean[6], square[6];
+  std::vector<float> statistics;  // max_radii, gradient_sums, views
+  int64_t stopped = 0;
+  float loss = 0.5f;
+
+  explicit Stepping(const Parameters<float>& p) : values(p) {
+    for (int a = 0; a < 6; ++a) {
+      for (size_t k = 0; k < values.all()[a]->size(); ++k)
+        mean[a].push_back(float(0.1 * normal())), square[a].push_back(float(normal() * normal() + 1e-3));
+    }
+    for (int64_t k = 0; k < 3 * p.count; ++k) statistics.push_back(float(std::abs(normal())));
+  }
+
+  // Adam's inputs in the order of gs::Stepped; `gradients` may be null.
+  void inputs(const StepCase& how, const float* const* gradients, gs::AdamInput<float>* to) {
+    constexpr int64_t kRows[6] = {3, 1, 3, 4, 3, 45};
+    for (int a = 0; a < 6; ++a) {
+      int64_t columns = a == gs::kStepShRest ? how.rest_columns : kRows[a];
+      if (a == gs::kStepOpacities && !how.opacities_step) columns = 0;
+      to[a] = {values.all()[a]->data(),
+               gradients ? gradients[a] : nullptr,
+               mean[a].data(),
+               square[a].data(),
+               values.count,
+               kRows[a],
+               columns,
+               0.01 * (a + 1),
+               0.9,
+               0.999,
+               1e-15,
+               double(a + 3)};
+    }
+  }
+  gs::ObserveInput observe(const StepCase& how, const int32_t* radii, const float* gradients) {
+    const int64_t n = values.count;
+    float* s = how.observed ? statistics.data() : nullptr;
+    return {n, s, s ? s + n : nullptr, s ? s + 2 * n : nullptr, radii, gradients};
+  }
+  gs::StepGuard<float> guard(const StepCase& how, int64_t iteration) {
+    return how.guarded ? gs::StepGuard<float>{&loss, &stopped, iteration} : gs::StepGuard<float>{};
+  }
+
+  std::vector<uint8_t> bytes() {
+    std::vector<uint8_t> all;
+    const auto add = [&](const std::vector<float>& part) {
+      const auto* from = reinterpret_cast<const uint8_t*>(part.data());
+      all.insert(all.end(), from, from + part.size() * sizeof(float));
+    };
+    for (int a = 0; a < 6; ++a) add(*values.all()[a]), add(mean[a]), add(square[a]);
+    add(statistics);
+    all.push_back(uint8_t(stopped));
+    return all;
+  }
+};
+
+// A forward of the values, and what its backward needs.
+struct Rendered {
+  std::vector<float> splats, depths, color, transmittance, inverse_depth, gradient, moments;
+  std::vector<int32_t> rects, tile_counts, radii, last, instances;
+  std::vector<gs::TileRecord> records;
+  std::vector<int64_t> ranges;
+  std::vector<gs::SplatSlots> slots;
+  int64_t slot_count = 0;
+  float background[3] = {0.1f, 0.2f, 0.3f};
+  gs::Scene<float> scene;
+  gs::BlendInput<float> input;
+  gs::BlendGradient<float> backward;
+};
+template <class Where>
+std::unique_ptr<Rendered> render(const Where& where, Parameters<float>& p, gs::Image image, bool antialiasing,
+                                 float gradient) {
+  using gs::cuda::bin, gs::cuda::blend, gs::cuda::project;
+  using gs::GS_ISA::bin, gs::GS_ISA::blend, gs::GS_ISA::project;
+  auto out = std::make_unique<Rendered>();
+  Rendered& r = *out;
+  const size_t n = p.count, pixels = size_t(image.width) * image.height;
+  r.scene = scene_of(p, image, antialiasing);
+  r.splats.resize(kSplatValues * n), r.depths.resize(n), r.rects.resize(4 * n), r.tile_counts.resize(n);
+  r.radii.resize(n), r.records.resize(n), r.slots.resize(n + 1), r.moments.resize(kGradientValues * n);
+  const gs::Projected<float> projected = {r.splats.data(),      r.depths.data(), r.rects.data(),
+                                          r.tile_counts.data(), r.radii.data(),  r.records.data()};
+  project(where, r.scene, projected);
+  r.ranges.resize(size_t((image.width + 15) / 16) * ((image.height + 15) / 16) + 1);
+  const auto take = [](void* context, int64_t count, int64_t slots) {
+    Rendered& to = *static_cast<Rendered*>(context);
+    to.instances.resize(count), to.slot_count = slots;
+    return gs::Binned{to.instances.data(), to.ranges.data()};
+  };
+  bin(where, p.count, projected, image, gs::BinMemory{take, &r, r.slots.data()});
+  r.color.resize(3 * pixels), r.transmittance.resize(pixels), r.inverse_depth.resize(pixels), r.last.resize(pixels);
+  r.input = {r.splats.data(), r.instances.data(), r.ranges.data(), r.background, image};
+  blend(where, r.input, {r.color.data(), r.transmittance.data(), r.inverse_depth.data(), r.last.data()});
+  r.gradient.assign(3 * pixels, 1);
+  r.gradient[pixels / 2 + image.width / 2] = gradient;
+  r.backward = {
+      p.count,       int64_t(r.instances.size()), r.slot_count,      r.slots.data(),    r.transmittance.data(),
+      r.last.data(), r.gradient.data(),           r.gradient.data(), r.gradient.data(), r.moments.data()};
+  return out;
+}
+
+// Gradients in memory: means, means2d, opacities, scales, rotations, sh_dc, sh_rest, one after the other.
+struct GradientRowsInMemory {
+  std::vector<float> memory;
+  gs::SceneGradient<float> pointers;
+  explicit GradientRowsInMemory(int64_t n) : memory(n * 62, -77.0f) {
+    float* g = memory.data();
+    pointers = {g, g + 3 * n, g + 6 * n, g + 7 * n, g + 10 * n, nullptr, nullptr, g + 14 * n, g + 17 * n};
+  }
+};
+
+// Takes an iteration's step from gradients in memory. fill writes them, from the render.
+template <class Where, class Fill>
+void step_plainly(const Where& where, Stepping& s, const StepCase& how, const Rendered& r, int64_t iteration,
+                  const Fill& fill) {
+  using gs::observe, gs::cuda::observe, gs::cuda::adam, gs::cuda::sparse_adam;
+  using gs::GS_ISA::adam, gs::GS_ISA::sparse_adam;
+  GradientRowsInMemory gradient(s.values.count);
+  const gs::SceneGradient<float>& g = gradient.pointers;
+  fill(g);
+  if (how.observed) observe(where, s.observe(how, r.radii.data(), g.means2d));
+  const float* const by_attribute[6] = {g.means, g.opacities, g.scales, g.rotations, g.sh_dc, g.sh_rest};
+  gs::AdamInput<float> inputs[6];
+  s.inputs(how, by_attribute, inputs);
+  const auto visible = std::make_unique<bool[]>(s.values.count);
+  for (int64_t i = 0; i < s.values.count; ++i) visible[i] = r.radii[i] > 0;
+  if (!how.sparse) return adam(where, inputs, 6, s.guard(how, iteration));
+  for (const gs::AdamInput<float>& in : inputs) sparse_adam(where, in, visible.get(), s.guard(how, iteration));
+}
+
+inline gs::GaussianStep<float> gaussian_step(Stepping& s, const StepCase& how, const Rendered& r, int64_t iteration) {
+  gs::GaussianStep<float> step{};
+  s.inputs(how, nullptr, step.attributes);
+  step.guard = s.guard(how, iteration);
+  step.sparse = how.sparse;
+  step.observed = s.observe(how, r.radii.data(), nullptr);
+  return step;
+}
+
+inline const StepCase kStepCases[] = {
+    {},
+    {true},
+    {false, true},
+    {true, true},
+    {false, true, false, 45, true, NAN},
+    {true, true, true, 45, true, NAN},
+    {false, false, true, 45, true, NAN},
+    {false, false, true, 9, true},
+    {true, false, true, 24, true},
+    {false, true, false, 0, false},
+};

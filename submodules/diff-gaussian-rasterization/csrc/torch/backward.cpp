@@ -1,0 +1,79 @@
+// The checks of a backward's tensors, and the backward of blending.
+#include "backward.h"
+
+#include <ATen/ops/empty.h>
+
+#include "math/splat.h"
+#include "math/tiles.h"
+#include "scene.h"
+
+namespace gs::ops {
+
+using gs::baseline::kGradientValues, gs::baseline::kSplatValues, gs::baseline::tiles_of;
+
+void check_splats(const Tensor& splats) {
+  check_given(splats, "splats");
+  const at::ScalarType type = splats.scalar_type();
+  TORCH_CHECK_TYPE(type == at::kFloat || type == at::kDouble, "splats must be float32 or float64, got ",
+                   in_words(type));
+  TORCH_CHECK_VALUE(splats.dim() == 2 && splats.size(1) == kSplatValues, "splats must be (N, ", kSplatValues, "), got ",
+                    in_words(splats.sizes()));
+}
+
+void check_lists(const Tensor& instances, const Tensor& ranges, const Tensor& splats, gs::Image image) {
+  check_tensor(instances, "instances", at::kInt, splats.device(), {-1});
+  check_tensor(ranges, "ranges", at::kLong, splats.device(), {tiles_of(image) + 1});
+  if (!ranges.is_cpu()) return;
+  const int64_t end = ranges.const_data_ptr<int64_t>()[tiles_of(image) * ranges.stride(0)], n = instances.size(0);
+  TORCH_CHECK_VALUE(end <= n && (end <= 0 || splats.size(0) > 0), "ranges end at ", end, ", but there are ", n,
+                    " instances of ", splats.size(0), " splats");
+}
+
+gs::Image image_of(const Tensor& last, const Tensor& splats) {
+  check_tensor(last, "last", at::kInt, splats.device(), {-1, -1});
+  return checked_image(last.size(0), last.size(1));
+}
+
+void check_counts(const Tensor& tile_counts, int64_t count, at::Device device) {
+  check_tensor(tile_counts, "tile_counts", at::kInt, device, {count});
+}
+
+Tensor background_like(const Tensor& background, const Tensor& splats) {
+  check_precise(background, "background", {3});
+  return converted(background, splats);
+}
+
+gs::Image BlendBackward::checked(const Tensor& splats, const Tensor& instances, const Tensor& ranges,
+                                 const Tensor& splat_slots, const Tensor& slots, const Tensor& last,
+                                 const Tensor& transmittance, const Tensor& grad_color) {
+  check_splats(splats);
+  const at::Device device = splats.device();
+  const gs::Image image = image_of(last, splats);
+  check_lists(instances, ranges, splats, image);
+  check_tensor(splat_slots, "splat_slots", at::kLong, device, {splats.size(0) + 1, 2});
+  check_tensor(slots, "slots", at::kInt, device, {-1, 0});
+  if (device.is_cpu()) {
+    const int64_t end = splat_slots.const_data_ptr<int64_t>()[splats.size(0) * splat_slots.stride(0)];
+    TORCH_CHECK_VALUE(end == slots.size(0), "splat_slots end at ", end, ", but there are ", slots.size(0), " slots");
+  }
+  check_tensor(transmittance, "transmittance", splats.scalar_type(), device, {1, image.height, image.width});
+  check_given(grad_color, "grad_color");
+  return image;
+}
+
+Tensor BlendBackward::plane(const MaybeTensor& t, int64_t channels) const {
+  if (!t.has_value() || !t->defined()) return {};
+  check_precise(*t, "the gradient of an image", {channels, image_.height, image_.width});
+  return converted(*t, splats_);
+}
+
+Tensor blend_vjp(const BlendBackward& in) {
+  Tensor moments = at::empty({in.splats().size(0), kGradientValues}, in.splats().options());
+  with_scalar(moments.scalar_type(), [&](auto zero) {
+    using T = decltype(zero);
+    GS_RUN(T, moments, blend_vjp, in.input<T>(), in.gradient<T>(moments.mutable_data_ptr<T>()));
+  });
+  return moments;
+}
+
+}  // namespace gs::ops

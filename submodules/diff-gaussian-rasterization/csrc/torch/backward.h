@@ -1,0 +1,91 @@
+#pragma once
+// What a forward hands to its backward, as tensors.
+#include "tensors.h"
+
+#define BACKWARD_SCHEMA                                                                                   \
+  "Tensor splats, Tensor instances, Tensor ranges, Tensor splat_slots, Tensor slots, "                    \
+  "Tensor background, Tensor last, Tensor transmittance, Tensor grad_color, Tensor? grad_transmittance, " \
+  "Tensor? grad_inverse_depth"
+#define BACKWARD_PARAMETERS                                                                                            \
+  const Tensor &splats, const Tensor &instances, const Tensor &ranges, const Tensor &splat_slots, const Tensor &slots, \
+      const Tensor &background, const Tensor &last, const Tensor &transmittance, const Tensor &grad_color,             \
+      const MaybeTensor &grad_transmittance, const MaybeTensor &grad_inverse_depth
+#define BACKWARD_ARGUMENTS                                                                                        \
+  splats, instances, ranges, splat_slots, slots, background, last, transmittance, grad_color, grad_transmittance, \
+      grad_inverse_depth
+
+namespace gs::ops {
+
+// The ops of single stages take these from their callers. Of values only the ends of lists are checked, and only on the
+// CPU, as reading one from a GPU waits for it. Other indices are the caller's concern.
+void check_splats(const Tensor& splats);
+void check_lists(const Tensor& instances, const Tensor& ranges, const Tensor& splats, gs::Image image);
+void check_counts(const Tensor& tile_counts, int64_t count, at::Device device);
+// The size of the image whose `last` this is.
+gs::Image image_of(const Tensor& last, const Tensor& splats);
+Tensor background_like(const Tensor& background, const Tensor& splats);
+
+template <class T>
+gs::BlendInput<T> blend_input(const Tensor& splats, const Tensor& instances, const Tensor& ranges,
+                              const Tensor& background, gs::Image image) {
+  return {splats.const_data_ptr<T>(), instances.const_data_ptr<int32_t>(), ranges.const_data_ptr<int64_t>(),
+          background.const_data_ptr<T>(), image};
+}
+
+// Owns the tensors that the gs::BlendInput and gs::BlendGradient of a backward point into.
+class BlendBackward {
+ public:
+  BlendBackward(const Tensor& splats, const Tensor& instances, const Tensor& ranges, const Tensor& splat_slots,
+                const Tensor& slots, const Tensor& background, const Tensor& last, const Tensor& transmittance,
+                const Tensor& grad_color, const MaybeTensor& grad_transmittance, const MaybeTensor& grad_inverse_depth)
+      : image_(checked(splats, instances, ranges, splat_slots, slots, last, transmittance, grad_color)),
+        splats_(splats.contiguous()),
+        instances_(instances.contiguous()),
+        ranges_(ranges.contiguous()),
+        splat_slots_(splat_slots.contiguous()),
+        slot_count_(slots.size(0)),
+        background_(background_like(background, splats)),
+        last_(last.contiguous()),
+        transmittance_(transmittance.contiguous()),
+        color_(plane(grad_color, 3)),
+        alpha_(plane(grad_transmittance, 1)),
+        depth_(plane(grad_inverse_depth, 1)) {}
+
+  const Tensor& splats() const { return splats_; }
+
+  template <class T>
+  gs::BlendInput<T> input() const {
+    return blend_input<T>(splats_, instances_, ranges_, background_, image_);
+  }
+  template <class T>
+  gs::BlendGradient<T> gradient(T* moments) const {
+    return {splats_.size(0),
+            instances_.size(0),
+            slot_count_,
+            static_cast<const gs::SplatSlots*>(splat_slots_.const_data_ptr()),
+            transmittance_.const_data_ptr<T>(),
+            last_.const_data_ptr<int32_t>(),
+            color_.const_data_ptr<T>(),
+            depth_.defined() ? depth_.const_data_ptr<T>() : nullptr,
+            alpha_.defined() ? alpha_.const_data_ptr<T>() : nullptr,
+            moments,
+            ahead()};
+  }
+
+ private:
+  // Checks all but the planes of gradients; returns the size of the image.
+  static gs::Image checked(const Tensor& splats, const Tensor& instances, const Tensor& ranges,
+                           const Tensor& splat_slots, const Tensor& slots, const Tensor& last,
+                           const Tensor& transmittance, const Tensor& grad_color);
+  Tensor plane(const MaybeTensor& t, int64_t channels) const;
+
+  gs::Image image_;
+  Tensor splats_, instances_, ranges_, splat_slots_;
+  int64_t slot_count_;
+  Tensor background_, last_, transmittance_;
+  Tensor color_, alpha_, depth_;
+};
+
+Tensor blend_vjp(const BlendBackward& in);
+
+}  // namespace gs::ops

@@ -1,0 +1,42 @@
+#pragma once
+// Checks of what changes in place: parameters with Adam's averages and counters, a guard, statistics.
+#include "tensors.h"
+
+namespace gs::ops {
+
+// Every tensor is given and fits the parameter; parameter and averages are contiguous.
+void check_moments(const Tensor& value, const Tensor& gradient, const Tensor& exp_avg, const Tensor& exp_avg_sq);
+void check_counter(const Tensor& step);
+void check_statistics(const Tensor& max_radii, const Tensor& gradient_sums, const Tensor& views, const Tensor& radii);
+
+// Checks the inputs of a step's guard. `stopped`, one int64, comes with a loss of the parameters' dtype.
+template <class T>
+gs::StepGuard<T> step_guard(const Tensor& value, const MaybeTensor& loss, const MaybeTensor& stopped,
+                            int64_t iteration) {
+  if (!stopped) return {};
+  TORCH_CHECK(
+      loss && loss->numel() == 1 && loss->scalar_type() == value.scalar_type() && loss->device() == value.device(),
+      "a guarded step needs the loss, one ", value.scalar_type(), " on ", value.device());
+  TORCH_CHECK(stopped->numel() == 1 && stopped->scalar_type() == at::kLong && stopped->device() == value.device(),
+              "stopped must be one int64 on ", value.device(), ", got ", stopped->sizes(), " ", stopped->scalar_type(),
+              " on ", stopped->device());
+  TORCH_CHECK(iteration > 0, "iterations of guarded steps count from 1, got ", iteration);
+  return {loss->const_data_ptr<T>(), stopped->mutable_data_ptr<int64_t>(), iteration};
+}
+
+inline int64_t rows_of(const Tensor& t) { return t.dim() > 0 ? t.size(0) : 1; }
+
+// The tensors of one parameter as a backend takes them; all of them checked. columns: -1 for whole rows.
+template <class T>
+gs::AdamInput<T> adam_input(const Tensor& value, const Tensor& gradient, const Tensor& exp_avg,
+                            const Tensor& exp_avg_sq, int64_t columns) {
+  const int64_t rows = rows_of(value), row = rows ? value.numel() / rows : 0;
+  TORCH_CHECK(rows == 0 || columns <= row, "columns must be at most ", row, ", got ", columns);
+  gs::AdamInput<T> in{};
+  in.value = value.mutable_data_ptr<T>(), in.gradient = gradient.const_data_ptr<T>();
+  in.mean = exp_avg.mutable_data_ptr<T>(), in.square = exp_avg_sq.mutable_data_ptr<T>();
+  in.rows = rows, in.row = row, in.columns = columns < 0 ? row : columns;
+  return in;
+}
+
+}  // namespace gs::ops

@@ -1,0 +1,267 @@
+"""The backward that steps the Gaussians itself, against gradients in memory, `adam_` and `observe_`: equal bytes."""
+
+import math
+from dataclasses import dataclass, field, replace
+
+import pytest
+import torch
+from diff_gaussian_rasterization import GaussianRasterizationSettings, schema
+from rasterizer_tools import BOTH_AND_GPU, activated, ops, scene_arguments
+from torch import Tensor, library
+
+from benchmarks.workloads.splat_scenes import PARAMETERS, frustum
+
+BETAS, EPS = (0.9, 0.999), 1e-15
+RATES = [1e-4, 0.05, 0.005, 0.001, 0.0025, 0.000125]
+
+
+@dataclass
+class State:
+    """What a step changes: values and averages by attribute, counters, statistics, the guard's flag."""
+
+    values: dict[str, Tensor]
+    averages: list[list[Tensor]] = field(default_factory=list)
+    counters: list[Tensor] = field(default_factory=list)
+    statistics: list[Tensor] = field(default_factory=list)
+    stopped: Tensor | None = None
+
+    @classmethod
+    def start(cls, values: dict[str, Tensor]) -> "State":
+        generator = torch.Generator().manual_seed(1)
+
+        def random(like: Tensor) -> Tensor:
+            return torch.randn(like.shape, generator=generator, dtype=torch.float64).to(like)
+
+        averages = [[1e-4 * random(v) for v in values.values()], [1e-6 * random(v) ** 2 for v in values.values()]]
+        counters = [torch.tensor(float(3 + place)) for place in range(6)]
+        means = values["means"]
+        statistics = [random(means[:, :1]).float().abs() for _ in range(3)]
+        return cls(values, averages, counters, statistics, torch.zeros(1, dtype=torch.int64, device=means.device))
+
+    def tensors(self) -> list[Tensor]:
+        averages = [t for tensors in self.averages for t in tensors]
+        return [*self.values.values(), *averages, *self.counters, *self.statistics, self.stopped]
+
+    def copy(self) -> "State":
+        return State(
+            {name: t.clone() for name, t in self.values.items()},
+            [[t.clone() for t in tensors] for tensors in self.averages],
+            [t.clone() for t in self.counters],
+            [t.clone() for t in self.statistics],
+            self.stopped.clone(),
+        )
+
+
+@dataclass
+class Case:
+    """How a step is taken. attributes: those that take one; columns: of sh_rest."""
+
+    sparse: bool = False
+    guarded: bool = False
+    observed: bool = True
+    attributes: tuple[int, ...] = (0, 1, 2, 3, 4, 5)
+    columns: int = -1
+    degree: int = 3
+    antialiasing: bool = False
+    raw: bool = True
+    depth: bool = False
+    broken: float = 1.0  # the factor of a pixel's gradient in the second iteration
+    loss: float = 0.5
+
+    def lists(self, state: State) -> tuple:
+        """Adam's arguments from the first averages on, of the attributes that take a step."""
+        columns = [*[-1] * 5, self.columns]
+        every = *state.averages, state.counters, RATES
+        return (
+            *([of[place] for place in self.attributes] for of in every),
+            *BETAS,
+            EPS,
+            [columns[place] for place in self.attributes],
+        )
+
+    def guard(self, state: State, iteration: int) -> tuple:
+        loss = torch.tensor(self.loss).to(state.values["means"])
+        return (loss, state.stopped, iteration) if self.guarded else ()
+
+
+def rendered(state: State, camera: GaussianRasterizationSettings, case: Case, iteration: int) -> tuple:
+    """Arguments that both backwards have in common, then the radii."""
+    scene = scene_arguments(state.values, camera, case.raw)
+    out = ops.rasterize(None, *scene, camera.bg, True, True)
+    color, transmittance, inverse_depth, radii, splats, counts, *lists, last = out
+    generator = torch.Generator().manual_seed(iteration)
+    planes = [torch.randn(t.shape, generator=generator).to(t) for t in (color, transmittance, inverse_depth)]
+    if iteration == 2:
+        planes[0][0, color.shape[1] // 2, color.shape[2] // 2] *= case.broken
+    if not case.depth:
+        planes[1:] = None, None
+    return (*scene, splats, *lists, camera.bg, last, transmittance, *planes, counts), radii
+
+
+def step_plainly(state: State, camera: GaussianRasterizationSettings, case: Case, iteration: int) -> None:
+    """Take one iteration's step from gradients in memory."""
+    arguments, radii = rendered(state, camera, case, iteration)
+    wanted = [name in ("means2d", *PARAMETERS) for name in schema.GRADIENTS]
+    gradients = dict(zip(schema.GRADIENTS, ops.rasterize_vjp(*arguments, wanted), strict=True))
+    if case.observed:
+        ops.observe_(*state.statistics, radii, gradients["means2d"])
+    names = [PARAMETERS[place] for place in case.attributes]
+    values, gradients = [state.values[name] for name in names], [gradients[name] for name in names]
+    guard = case.guard(state, iteration)
+    if not names:
+        return
+    if not case.sparse:
+        ops.adam_(values, gradients, *case.lists(state), *guard)
+        return
+    *lists, beta1, beta2, eps, columns = case.lists(state)
+    for value, gradient, mean, square, counter, rate, count in zip(values, gradients, *lists, columns, strict=True):
+        counter += 1
+        ops.sparse_adam_(value, gradient, mean, square, radii > 0, rate, beta1, beta2, eps, count, *guard)
+
+
+def step_fused(state: State, camera: GaussianRasterizationSettings, case: Case, iteration: int) -> None:
+    """Take the same step inside the backward."""
+    arguments, radii = rendered(state, camera, case, iteration)
+    statistics = state.statistics if case.observed else (None, None, None)
+    lists = case.attributes, *case.lists(state)
+    ops.rasterize_vjp_step_(*arguments, radii, *lists, case.sparse, *statistics, *case.guard(state, iteration))
+
+
+def same_bytes(one: Tensor, other: Tensor) -> bool:
+    return one.cpu().numpy().tobytes() == other.cpu().numpy().tobytes()
+
+
+CASES = {
+    "dense": Case(),
+    "sparse": Case(sparse=True),
+    "unobserved": Case(observed=False),
+    "guarded": Case(guarded=True),
+    "guarded sparse": Case(guarded=True, sparse=True),
+    "NaN": Case(guarded=True, broken=math.nan),
+    "sparse NaN": Case(guarded=True, sparse=True, broken=math.inf),
+    "unguarded NaN": Case(broken=math.nan),
+    "huge gradient": Case(guarded=True, broken=1e200),
+    "NaN loss": Case(guarded=True, loss=math.nan),
+    "no bands": Case(degree=0, columns=0),
+    "one band": Case(degree=1, columns=9),
+    "sparse, two bands": Case(degree=2, columns=24, sparse=True),
+    "inactive bands step": Case(degree=1),
+    "one band, guarded": Case(degree=1, columns=9, guarded=True, broken=math.nan),
+    "after a reset": Case(attributes=(0, 2, 3, 4, 5)),
+    "only statistics": Case(attributes=()),
+    "antialiased": Case(antialiasing=True),
+    "activated": Case(raw=False),
+    "depth": Case(depth=True, guarded=True),
+}
+
+
+def start_and_camera(
+    case: Case, n: int, device: str, dtype: torch.dtype
+) -> tuple[State, GaussianRasterizationSettings]:
+    scene = frustum(n, 77, 51, 4.0, seed=7)
+    values = {name: scene.parameters[name].float() for name in PARAMETERS}
+    values["means"] = values["means"] * torch.tensor([1.6, 1.6, 1.0])  # some are not seen
+    values = values if case.raw else activated(values)
+    state = State.start({name: t.to(device, dtype).contiguous() for name, t in values.items()})
+    camera = scene.to(device).settings(dtype, sh_degree=case.degree, antialiasing=case.antialiasing)
+    return state, camera
+
+
+@BOTH_AND_GPU
+@pytest.mark.parametrize("case", CASES.values(), ids=CASES)
+def test_it_has_the_bytes_of_the_plain_step(case, device, dtype):
+    if dtype == torch.float64:
+        case = replace(case, observed=False)
+    start, camera = start_and_camera(case, 700, device, dtype)
+    plain, fused = start.copy(), start.copy()
+    for iteration in (1, 2, 3):
+        step_plainly(plain, camera, case, iteration)
+        step_fused(fused, camera, case, iteration)
+        for one, other in zip(fused.tensors(), plain.tensors(), strict=True):
+            assert same_bytes(one, other)
+    if case.attributes and math.isfinite(case.loss):
+        assert not torch.equal(fused.values["means"], start.values["means"])
+    if case.guarded:
+        assert int(fused.stopped) == (1 if math.isnan(case.loss) else 0 if case.broken == 1 else 2)
+
+
+@BOTH_AND_GPU
+@pytest.mark.parametrize("n", [0, 1, 31, 129])
+@pytest.mark.parametrize("bands", [0, 3, 15])
+def test_sizes(n, bands, device, dtype):
+    case = Case(degree={0: 0, 3: 1, 15: 2}[bands], observed=dtype == torch.float32)
+    state, camera = start_and_camera(case, n, device, dtype)
+    rest = state.values["sh_rest"][:, :bands].contiguous()
+    start = State.start(state.values | {"sh_rest": rest})
+    plain, fused = start.copy(), start.copy()
+    step_plainly(plain, camera, case, 1)
+    step_fused(fused, camera, case, 1)
+    assert all(same_bytes(one, other) for one, other in zip(fused.tensors(), plain.tensors(), strict=True))
+
+
+def test_any_number_of_threads_gives_the_same_bytes():
+    case, before, results = Case(sparse=True, guarded=True), torch.get_num_threads(), []
+    start, camera = start_and_camera(case, 5000, "cpu", torch.float32)
+    try:
+        for threads in (1, 2, 3):
+            torch.set_num_threads(threads)
+            state = start.copy()
+            step_fused(state, camera, case, 1)
+            results.append(state.tensors())
+    finally:
+        torch.set_num_threads(before)
+    for tensors in results[1:]:
+        assert all(same_bytes(one, other) for one, other in zip(tensors, results[0], strict=True))
+
+
+@BOTH_AND_GPU
+def test_opcheck(device, dtype):
+    case = Case(guarded=True, observed=dtype == torch.float32)
+    state, camera = start_and_camera(case, 5, device, dtype)
+    arguments, radii = rendered(state, camera, case, 1)
+    statistics = state.statistics if case.observed else (None, None, None)
+    rest = *case.lists(state), False, *statistics, *case.guard(state, 1)
+    library.opcheck(ops.rasterize_vjp_step_, (*arguments, radii, list(case.attributes), *rest))
+
+
+def _refused(match: str, case: Case | None = None, error: type = RuntimeError, **changes) -> None:
+    """Assert that the step with changed arguments, by name, is refused and changes nothing."""
+    case = case or Case(guarded=True)
+    state, camera = start_and_camera(case, 8, "cpu", torch.float32)
+    arguments, radii = rendered(state, camera, case, 1)
+    rest = list(case.attributes), *case.lists(state), False, *state.statistics, *case.guard(state, 1)
+    names = [argument.name for argument in ops.rasterize_vjp_step_.default._schema.arguments]
+    named = dict(zip(names, (*arguments, radii, *rest), strict=True))
+    changes = {name: change(named[name]) if callable(change) else change for name, change in changes.items()}
+    before = [t.clone() for t in state.tensors()]
+    with pytest.raises(error, match=match):
+        ops.rasterize_vjp_step_(**(named | changes))
+    assert all(same_bytes(one, other) for one, other in zip(state.tensors(), before, strict=True))
+
+
+def test_wrong_arguments_are_named():
+    _refused("for each of the 6 attributes, got 5", rates=[0.1] * 5)
+    _refused("different numbers from 0 to 5", attributes=[0, 1, 2, 3, 4, 4])
+    _refused("different numbers from 0 to 5", attributes=[0, 1, 2, 3, 4, 6])
+    _refused("columns must be at most 45, got 46", columns=[-1] * 5 + [46])
+    _refused("shape, dtype and device of the parameter", exp_avg=lambda tensors: [*tensors[:5], tensors[0]])
+    _refused("shape, dtype and device of the parameter", exp_avg_sq=lambda t: [*t[:5], t[5].double()])
+    _refused("must be contiguous", means=lambda t: t.T.contiguous().T)
+    _refused("must be contiguous", exp_avg=lambda t: [t[0].T.contiguous().T, *t[1:]])
+    _refused("step counter must be one float32 on the CPU", steps=lambda t: [*t[:5], torch.ones(2)])
+    _refused("statistics must be 8 float32", views=torch.ones(7))
+    _refused("statistics must be contiguous", views=torch.ones(16)[::2])
+    _refused("max_radii, gradient_sums and views, or none", views=None)
+    _refused("a guarded step needs the loss", loss=None)
+    _refused("stopped must be one int64", stopped=torch.zeros(1))
+    _refused("count from 1", iteration=0)
+    _refused("radii must be", radii=torch.ones(8), error=TypeError)
+    _refused("radii must be", radii=torch.ones(7, dtype=torch.int32), error=ValueError)
+    _refused("tile_counts must be", tile_counts=torch.ones(7, dtype=torch.int32), error=ValueError)
+    _refused("not cov3d or colors", sh_dc=None, sh_rest=None, colors=torch.rand(8, 3), error=ValueError)
+
+
+def test_statistics_of_float64_are_refused():
+    state, camera = start_and_camera(Case(), 4, "cpu", torch.float64)
+    with pytest.raises(RuntimeError, match="statistics are of float32 Gaussians"):
+        step_fused(state, camera, Case(), 1)
