@@ -25,7 +25,7 @@ struct Stepping {
   explicit Stepping(const Parameters<float>& p) : values(p) {
     for (int a = 0; a < 6; ++a) {
       for (size_t k = 0; k < values.all()[a]->size(); ++k)
-        mean[a].push_back(float(0.1 * normal())), square[a].push_back(float(normal() * normal() + 1e-3));
+        mean[a].push_back(float(0.1 * normal())), square[a].push_back(float(std::abs(normal()) + 1e-3));
     }
     for (int64_t k = 0; k < 3 * p.count; ++k) statistics.push_back(float(std::abs(normal())));
   }

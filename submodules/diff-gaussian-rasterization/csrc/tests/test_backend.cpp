@@ -123,13 +123,12 @@ void test_gaussian_step() {
       Stepping plain = start, fused = start;
       for (int64_t iteration = 1; iteration <= 3; ++iteration) {
         const float gradient = iteration == 2 ? how.gradient : 1;
-        const auto before = render(threads(), plain.values, {40, 24}, count == 130, gradient);
-        blend_vjp(threads(), before->input, before->backward);
-        step_plainly(threads(), plain, how, *before, iteration, [&](const gs::SceneGradient<float>& g) {
-          project_vjp(gs::serial_executor(), before->scene, before->tile_counts.data(), before->moments.data(), g);
-        });
-        const auto r = render(threads(), fused.values, {40, 24}, count == 130, gradient);
+        const auto r = render(threads(), plain.values, {40, 24}, count == 130, gradient);
         blend_vjp(threads(), r->input, r->backward);
+        step_plainly(threads(), plain, how, *r, iteration, [&](const gs::SceneGradient<float>& g) {
+          project_vjp(gs::serial_executor(), r->scene, r->tile_counts.data(), r->moments.data(), g);
+        });
+        r->scene = scene_of(fused.values, r->scene.image, r->scene.antialiasing);  // has the values of before that step
         project_vjp_step(threads(), r->scene, r->tile_counts.data(), r->moments.data(),
                          gaussian_step(fused, how, *r, iteration));
         CHECK(fused.bytes() == plain.bytes());
