@@ -39,7 +39,7 @@ class CurveRecorder:
 
     rows: those of the runs that this one resumes; `log` has their seconds. iterations: the last one; always: those
     that score all views, as the last one does; the others score a fixed part of each set (`subset_size`, `drawn`).
-    views: those to score, by set, "test" and "train". load(view) decodes a view's photo; scores(views) gives their mean
+    views: those to score, by set, "test" and "train". load(views) decodes their photos; scores(views) gives their mean
     scores by name. If the file cannot be written, one warning says so and the next point
     tries again: a training is worth more than its curve.
     """
@@ -52,7 +52,7 @@ class CurveRecorder:
         iterations: int,
         always: Sequence[int],
         views: dict[str, Sequence[View]],
-        load: Callable[[View], None],
+        load: Callable[[Sequence[View]], None],
         scores: Callable[[Sequence[View]], dict[str, float]],
         device: torch.device,
     ) -> None:
@@ -108,9 +108,7 @@ class CurveRecorder:
         return time.perf_counter() - start
 
     def _load_all(self) -> None:
-        for views in self._views.values():
-            for view in views:
-                self._load(view)
+        self._load([view for of_set in self._views.values() for view in of_set])
 
     def _score(self, row: Row, views: dict[str, Sequence[View]]) -> None:
         for name, of_set in views.items():

@@ -37,7 +37,9 @@ class Report(Observer):
 
     def measured(self, step: Step, losses: Losses) -> None:
         run, seconds = self._run, self._run.clock.seconds
-        with run.clock.paused():
+        with run.clock.paused("scoring"):
+            if step.iteration in run.plan.test:
+                run.scene.prefetch(run.scene.getTestCameras())
             scores = self._report(
                 self._writer, step.iteration, losses.l1, losses.total, l1_loss, seconds - step.started, run.plan.test,
                 run.scene, render, (run.pipe, run.background), run.dataset.train_test_exp,
