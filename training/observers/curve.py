@@ -53,6 +53,7 @@ class Curve(Observer):
 
     def ended(self, error: Error) -> None:
         if error is not None:
+            self._recorder.abandon()
             return
         run = self._run
         saved = {*run.plan.save} & {*saved_iterations(Path(run.scene.model_path) / "point_cloud")}
