@@ -5,6 +5,7 @@ and prints what went wrong. If its input ends before, it draws nothing.
 """
 
 import contextlib
+import gc
 import json
 import subprocess
 import sys
@@ -76,6 +77,7 @@ def _failure(path: Path, rows: list[Row], title: str) -> str | None:
 
 
 def main() -> None:
+    gc.disable()  # for the second that this takes
     with contextlib.suppress(Exception):  # drawing reports it
         import matplotlib.backends.backend_agg
         import matplotlib.figure  # noqa: F401
