@@ -1,6 +1,7 @@
 """TensorBoard's event files, written without TensorBoard."""
 
 import io
+import json
 import struct
 import sys
 import types
@@ -11,6 +12,7 @@ import pytest
 import torch
 from PIL import Image
 
+import train
 from evaluation.tensorboard_scalars import _fields, _records, read_scalars
 from records import event_file
 from records.event_writer import EventWriter
@@ -151,6 +153,19 @@ def test_everything_else_is_done_by_tensorboards_own(tmp_path, monkeypatch):
     assert calls[:3] == [str(tmp_path), ("a", "b", 1), ("a", "c", 2)]
     assert [words[::2] for words in calls[3:5]] == [("grey", 3), ("numbers", 4)]
     assert calls[5:] == [("then", 1.0, 5, 1e9), "flushed", "closed"]
+
+
+def test_a_training_tells_tensorboard_where_it_is_installed(colmap_scene, tmp_path, monkeypatch):
+    monkeypatch.setattr(sys, "stdout", sys.stdout)
+    monkeypatch.setattr(train, "SummaryWriter", EventWriter)
+    words = ["-s", colmap_scene, "-m", tmp_path / "out", "-r", "24", "--iterations", "10", "--eval", "--no_curve"]
+    train.main([*map(str, words), "--test_iterations", "10"])
+    scalars = read_scalars(tmp_path / "out")
+    assert [scalars[tag][0].step for tag in ("iter_time", "total_points", "test/loss_viewpoint - psnr")] == [10] * 3
+    scores = json.loads((tmp_path / "out" / "train_log.json").read_text())[-1]
+    assert scalars["test/loss_viewpoint - psnr"][0].value == pytest.approx(scores["test_psnr"], rel=1e-6)
+    images = [value for value in _values(tmp_path / "out").values() if 4 in value]
+    assert len(images) == 2 * (3 + 5)  # renders and photos of three test views and five training views
 
 
 def test_tensorboard_reads_them(tmp_path):

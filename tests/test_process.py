@@ -13,6 +13,7 @@ import torch
 import train
 from scene.gaussians.adam import GaussianAdam
 from scene.gaussians.undecorated import undecorated
+from scene.pictures import store
 from training import run as training_run
 from utils.host import cuda_start
 
@@ -124,6 +125,23 @@ def test_pictures_are_decoded_while_the_model_is_made(colmap_scene, tmp_path, mo
     monkeypatch.setattr(training_run.Run, "_start", start)
     _train(colmap_scene, tmp_path / "out", iterations=2)
     assert kept == [(2, kept[0][1])] and kept[0][1] >= 2  # as many as there are iterations
+
+
+@pytest.mark.parametrize("options", [["--test_iterations", -1], ["--test_iterations", 1, "--no_curve"]])
+def test_views_that_are_scored_are_decoded_side_by_side(colmap_scene, tmp_path, monkeypatch, options):
+    decoded = {}
+    plain = store.decode
+
+    def decode(path: Path, size: tuple[int, int]) -> torch.Tensor:
+        decoded[path] = threading.current_thread().name
+        return plain(path, size)
+
+    monkeypatch.setattr(store, "decode", decode)
+    _train(colmap_scene, tmp_path / "out", "--eval", *options, iterations=1)
+    photos = sorted(path for path in (colmap_scene / "images").rglob("*") if path.is_file())
+    tested = set(photos[::8])
+    assert len(tested) == 3 and tested <= decoded.keys()
+    assert all(decoded[name].startswith("decode") for name in tested), decoded  # every 8th photo
 
 
 class _Driver:
