@@ -57,7 +57,7 @@ def test_a_training_imports_nothing_that_it_does_not_use(blender_scene, tmp_path
     """A checkpoint takes the optimiser's state; the twelve iterations pass one that TensorBoard is told of."""
     out = tmp_path / "out"
     assert _loaded(blender_scene, out, "--eval", "--no_curve", "--checkpoint_iterations", "6") == []
-    resumed = ["--start_checkpoint", str(out / "chkpnt6.pth"), "--optimizer_type", "default"]
+    resumed = ["--start_checkpoint", str(out / "chkpnt6.pth"), "--optimizer_type", "sparse_adam"]
     assert _loaded(blender_scene, out, "--eval", "--no_curve", *resumed) == []
 
 
