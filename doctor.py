@@ -78,6 +78,8 @@ def main(argv: Sequence[str] | None = None) -> None:
 
 if __name__ == "__main__":
     try:
+        import torch  # noqa: F401  (here, where Ctrl-C ends the program at once)
+
         from utils.system_utils import run_cli
     except ImportError:  # torch is missing, which main reports
         main()

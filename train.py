@@ -5,6 +5,7 @@ python train.py -s SCENE -m OUT --eval
 
 if __name__ == "__main__":
     import utils.host.early  # noqa: F401  (before the other imports, which take a second)
+    import utils.host.early_cuda  # noqa: F401  (while the others are imported)
 
 import argparse
 from collections.abc import Sequence
@@ -14,6 +15,7 @@ import utils.host.openmp  # noqa: F401  isort: skip  (before torch)
 import torch
 
 from arguments import ModelParams, OptimizationParams, OptionParser, PipelineParams, write_cfg_args, write_model_json
+from records.event_writer import EventWriter, tensorboard_is_installed
 from training.loop import run_training
 from training.observers.report import training_report
 from training.observers.standard import standard_observers
@@ -23,11 +25,7 @@ from training.run import Run
 from utils.general_utils import safe_state
 from utils.system_utils import UserError, mkdir_p, run_cli
 
-try:
-    from torch.utils.tensorboard import SummaryWriter
-except ImportError:
-    SummaryWriter = None
-
+SummaryWriter = EventWriter if tensorboard_is_installed() else None
 __all__ = ["main", "parse", "prepare_output_and_logger", "training", "training_report"]
 
 

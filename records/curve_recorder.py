@@ -10,14 +10,16 @@ from typing import TypeVar
 import torch
 from tqdm import tqdm
 
-from records.curve_figure import draw_curve
+from records.curve_drawer import CurveDrawer
 from records.curve_peak import peak_advice
 from records.curve_schedule import CurveSchedule, subset_size
 from records.error_curve import COLUMNS, FIGURE, NAME, SUBSET, Row, write_curve
 from records.training_log import SHORT, TrainingLog
 from utils.host.process import wall_seconds
+from utils.host.threads import cores
 from utils.system_utils import UserError
 
+AHEAD, MANY_CORES = 2.0, 4  # seconds before the end at which drawing gets ready, where that takes no core from training
 View = TypeVar("View")
 
 
@@ -39,7 +41,7 @@ class CurveRecorder:
 
     rows: those of the runs that this one resumes; `log` has their seconds. iterations: the last one; always: those
     that score all views, as the last one does; the others score a fixed part of each set (`subset_size`, `drawn`).
-    views: those to score, by set, "test" and "train". load(view) decodes a view's photo; scores(views) gives their mean
+    views: those to score, by set, "test" and "train". load(views) decodes their photos; scores(views) gives their mean
     scores by name. If the file cannot be written, one warning says so and the next point
     tries again: a training is worth more than its curve.
     """
@@ -52,7 +54,7 @@ class CurveRecorder:
         iterations: int,
         always: Sequence[int],
         views: dict[str, Sequence[View]],
-        load: Callable[[View], None],
+        load: Callable[[Sequence[View]], None],
         scores: Callable[[Sequence[View]], dict[str, float]],
         device: torch.device,
     ) -> None:
@@ -73,16 +75,24 @@ class CurveRecorder:
         self._loading = 0.0  # seconds of decoding photos that were not needed before
         self._writing = 0.0  # seconds of writing the file
         self._warned = False
+        self._drawer = CurveDrawer()
+        self._ahead = AHEAD if cores() >= MANY_CORES else 0.0
 
     def due(self, iteration: int, seconds: float) -> bool:
         """Whether to `add` a point after `seconds` of training in this run; if so, it waits for the GPU."""
+        pace = seconds / max(iteration - self._log.first_iteration, 1)
+        if pace * (self._iterations - iteration) <= self._ahead:
+            self._drawer.begin()
         due = self._schedule.due(iteration, seconds)
         if due and self._device.type == "cuda":
             torch.cuda.synchronize(self._device)
         return due
 
     def add(self, iteration: int, seconds: float, gaussians: int) -> None:
-        """Score after `seconds` of training in this run, and write the curve with the new point."""
+        """Score after `seconds` of training in this run, and write the curve with the new point.
+
+        With the last one, it is being drawn from then on until `finish`.
+        """
         # The peaks of log and curve, because after a rescue the curve has rows beyond the log's last record.
         peaks = [self._log.peak_memory_mib(), *(row["peak_memory_mib"] for row in self.rows[-1:])]
         row = dict.fromkeys(COLUMNS) | {
@@ -100,6 +110,8 @@ class CurveRecorder:
         self._schedule.scored(iteration, self._seconds(lambda: self._score(row, views)))
         self.rows.append(row)
         self._writing += self._seconds(self._write)
+        if iteration == self._iterations:
+            self._drawer.draw(self._folder / FIGURE, self.rows, self._folder.resolve().name)
 
     @staticmethod
     def _seconds(call: Callable[[], object]) -> float:
@@ -108,9 +120,7 @@ class CurveRecorder:
         return time.perf_counter() - start
 
     def _load_all(self) -> None:
-        for views in self._views.values():
-            for view in views:
-                self._load(view)
+        self._load([view for of_set in self._views.values() for view in of_set])
 
     def _score(self, row: Row, views: dict[str, Sequence[View]]) -> None:
         for name, of_set in views.items():
@@ -125,10 +135,10 @@ class CurveRecorder:
             self._warned = True
 
     def finish(self, seconds: float, saved: Container[int], position_lr_max_steps: int, follows_length: bool) -> None:
-        """Draw the curve, print its cost beside `seconds` of training in this run, and give advice (`peak_advice`).
+        """Wait for the figure, print the curve's cost beside `seconds` of training in this run, and give `peak_advice`.
 
         The log's last record gets the costs: `curve_scoring_seconds`, `curve_writing_seconds` (of the file),
-        `curve_drawing_seconds`, and `curve_loading_seconds` (of photos, before the first scoring).
+        `curve_drawing_seconds` (of waiting), and `curve_loading_seconds` (of photos, before the first scoring).
         """
         drawing = self._seconds(self._draw)
         scoring, writing = self._schedule.spent, self._writing
@@ -155,8 +165,10 @@ class CurveRecorder:
             f"drew it in {drawing:.1f} s"
         )
 
+    def abandon(self) -> None:
+        """Draw nothing: the training did not reach its end."""
+        self._drawer.abandon()
+
     def _draw(self) -> None:
-        try:
-            draw_curve(self._folder / FIGURE, self.rows, self._folder.resolve().name)
-        except Exception as error:  # a broken matplotlib may raise anything, and the model is trained
-            print(f"warning: no {FIGURE}: {type(error).__name__}: {error}", file=sys.stderr)
+        if failure := self._drawer.finish():
+            print(f"warning: no {FIGURE}: {failure}", file=sys.stderr)

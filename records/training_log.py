@@ -18,22 +18,25 @@ _FINITE = ("loss", "peak_memory_mib", "wall_seconds")  # if present
 
 
 class Stopwatch:
-    """Seconds since its construction, without those inside `paused()`."""
+    """Seconds since its construction, without those inside `paused()`. spent: those, by their purpose."""
 
     def __init__(self) -> None:
         self._start = time.perf_counter()
+        self.spent: dict[str, float] = {}
 
     @property
     def seconds(self) -> float:
         return time.perf_counter() - self._start
 
     @contextmanager
-    def paused(self) -> Iterator[None]:
+    def paused(self, purpose: str) -> Iterator[None]:
         before = time.perf_counter()
         try:
             yield
         finally:
-            self._start += time.perf_counter() - before
+            taken = time.perf_counter() - before
+            self._start += taken
+            self.spent[purpose] = self.spent.get(purpose, 0.0) + taken
 
 
 class TrainingLog:
@@ -42,8 +45,9 @@ class TrainingLog:
     A record has `iteration`; `seconds` of training, without evaluation and saving; `wall_seconds` since the process
     started; `peak_memory_mib`, the most so far; `gaussians`; `loss`, a running mean; and for each set tested
     `<set>_l1`, `<set>_psnr`. Seconds and memory include the runs that were resumed. The last record also has
-    `gaussians_left_out`, those that the last save does not have, the costs of the curve (curve_recorder.py), and
-    `lines`, what training said at its end.
+    `gaussians_left_out`, those that the last save does not have, the costs of the curve (curve_recorder.py), the
+    seconds of this process by what they were spent on (training/observers/records.py), and `lines`, what training said
+    at its end.
 
     first_iteration, seconds_before, wall_seconds_before: done by the runs that this one resumes.
     """
@@ -98,6 +102,12 @@ class TrainingLog:
             record = before | record | {"seconds": max(before["seconds"], record["seconds"])}
         self.records.append(record)
         write_json(self._path, self.records)
+
+    def note(self, **values: float | None) -> None:
+        """Add values to the last record as it is."""
+        if self.records:
+            self.records[-1] |= values
+            write_json(self._path, self.records)
 
     def tell(self, *lines: str) -> None:
         """Print lines about the finished training, and keep them as `lines` of the last record, for reports."""

@@ -309,4 +309,6 @@ class MiniCam:
         self.zfar = zfar
         self.world_view_transform = world_view_transform
         self.full_proj_transform = full_proj_transform
-        self.camera_center = torch.inverse(world_view_transform)[3, :3]
+        # On the CPU: for 16 numbers, a GPU would have to load a library of solvers, which takes a second.
+        center = torch.inverse(world_view_transform.cpu())[3, :3]
+        self.camera_center = center.to(world_view_transform.device)

@@ -185,6 +185,18 @@ def test_mini_camera_finds_its_centre():
     assert (mini.image_width, mini.image_height, mini.FoVy) == (160, 120, camera.FoVy)
 
 
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU")
+def test_a_mini_camera_on_a_gpu_needs_no_library_of_solvers(monkeypatch):
+    inverted = []
+    plain = torch.inverse
+    monkeypatch.setattr(torch, "inverse", lambda matrix: (inverted.append(matrix.device.type), plain(matrix))[1])
+    view = torch.eye(4, device="cuda")
+    view[3, :3] = torch.tensor([1.0, 2.0, 3.0])
+    mini = MiniCam(160, 120, 0.6, 0.9, 0.01, 100.0, view, view)
+    assert inverted == ["cpu"] and mini.camera_center.tolist() == [-1, -2, -3] and mini.camera_center.is_cuda
+
+
 def test_json_entry_has_the_known_keys_and_full_size_values():
     info = _info()
     entry = camera_to_JSON(4, info)

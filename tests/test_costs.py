@@ -84,8 +84,7 @@ def test_the_probe_makes_nothing_when_it_is_asked_for_help(tmp_path):
 
 
 def test_training_and_rendering_load_nothing_they_do_not_use(probed):
-    installed = {"torch.utils.tensorboard", "tensorboard"}  # train.py tries to import it
-    assert set(probed["modules"]) <= installed
+    assert probed["modules"] == []
     assert probed["binds"] == []
     assert "point_cloud/iteration_3/point_cloud.ply" in probed["files"]
     assert not [name for name in probed["files"] if "error_vs_time" in name]

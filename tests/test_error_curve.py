@@ -234,8 +234,8 @@ class TestScores:
     def test_pictures_and_masks_are_loaded_before_a_scoring_is_timed(self, tmp_path):
         seen = []
 
-        def load(view: str) -> None:
-            seen.append(("load", view))
+        def load(views: list[str]) -> None:
+            seen.append(("load", *views))
 
         def scores(views: list[str]) -> dict[str, float]:
             seen.append(("scores", *views))
@@ -244,9 +244,9 @@ class TestScores:
         views, log = {"test": ["a"], "train": ["b"]}, TrainingLog(tmp_path, 0)
         recorder = CurveRecorder(tmp_path, [], log, 2, [], views, load, scores, torch.device("cpu"))
         recorder.add(1, 1.0, 5)
-        assert seen == [("load", "a"), ("load", "b"), ("scores", "a"), ("scores", "b")]
+        assert seen == [("load", "a", "b"), ("scores", "a"), ("scores", "b")]
         recorder.add(2, 2.0, 5)
-        assert seen[4:] == [("scores", "a"), ("scores", "b")]  # loaded once
+        assert seen[3:] == [("scores", "a"), ("scores", "b")]  # loaded once
         assert recorder.rows[0]["test_psnr"] == recorder.rows[1]["train_psnr"] == 20.0
 
     def test_a_set_is_scored_by_render_target_and_mask_of_each_view(self):

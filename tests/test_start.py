@@ -47,6 +47,24 @@ def test_ctrl_c_while_modules_are_imported_is_no_traceback(tmp_path, command):
     assert process.returncode == -signal.SIGINT
 
 
+@pytest.mark.parametrize("prepared", [True, False])
+def test_what_is_imported_is_no_garbage(prepared):
+    """Where a command prepares its imports; other code that uses the same function keeps its collector."""
+    code = f"""
+import gc
+from utils.host import start
+if {prepared}:
+    start.prepare()
+before = gc.isenabled()
+start.imported()
+frozen = gc.get_freeze_count()
+start.imported()
+print(before, gc.isenabled(), frozen > 1000, gc.get_freeze_count() == frozen)
+"""
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert done.stdout.split() == [str(not prepared), "True", str(prepared), "True"]
+
+
 def _run(script: str, redirection: str, tmp_path: Path) -> subprocess.CompletedProcess:
     program = tmp_path / "program.py"
     program.write_text(

@@ -302,11 +302,14 @@ def test_a_stopwatch_pauses_also_when_something_fails(monkeypatch):
     monkeypatch.setattr(time, "perf_counter", lambda: now[0])
     clock = Stopwatch()
     now[0] += 2
-    with pytest.raises(ZeroDivisionError), clock.paused():
+    with pytest.raises(ZeroDivisionError), clock.paused("saving"):
         now[0] += 30
         _ = 1 / 0
     now[0] += 3
-    assert clock.seconds == 5
+    for purpose in ("saving", "scoring"):
+        with clock.paused(purpose):
+            now[0] += 4
+    assert clock.seconds == 5 and clock.spent == {"saving": 34, "scoring": 4}
 
 
 def test_a_new_folder_is_said_before_the_training(colmap_scene, tmp_path, monkeypatch, capfd):

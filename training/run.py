@@ -23,6 +23,7 @@ from training.step import Step
 from training.view_order import ViewOrder
 from utils.exact.counter_rng import Stream, uniform
 from utils.general_utils import get_expon_lr_func
+from utils.host.process import seconds_since_start
 from utils.system_utils import UserError, compute_device
 
 SH_INTERVAL = 1000  # iterations between raises of the active SH degree
@@ -33,8 +34,11 @@ class Run:
 
     scene, gaussians, views (by iteration), objective, density; dataset, opt, pipe: the options; background: (3,) of the
     scene; first_iteration: done before this run. From `begin` on: log, rows (of the curve so far), losses
-    (running mean of the total) and clock (seconds of training). lost: steps that an error has taken back.
+    (running mean of the total) and clock (seconds of training). lost: steps that an error has taken back. first_done:
+    seconds from the process's start to the end of its first iteration, None if the system does not say.
     """
+
+    first_done: float | None = None
 
     def __init__(
         self, dataset: argparse.Namespace, opt: argparse.Namespace, pipe: argparse.Namespace, plan: Plan
@@ -53,8 +57,9 @@ class Run:
         self.gaussians = GaussianModel(dataset.sh_degree, opt.optimizer_type)
         self.scene = Scene(dataset, self.gaussians, shuffle=False, start=False)
         check_scene(self.scene.info)
-        self._start(capture)
         self.views = ViewOrder(self.scene.getTrainCameras(), opt.seed)
+        self._decode_ahead(self.first_iteration + 1)
+        self._start(capture)
         saves = [iteration for iteration in plan.save if iteration <= opt.iterations]
         check_folder(dataset.model_path, dataset.source_path, saves, plan.start, self.first_iteration)
         if plan.start:
@@ -110,6 +115,8 @@ class Run:
                 changes=self.density.changes(iteration) or iteration % SH_INTERVAL == 0,
                 started=self.clock.seconds,
             )
+            if iteration == self.first_iteration + 1:
+                self.first_done = seconds_since_start()
 
     def _background(self, iteration: int) -> Tensor:
         if not self.opt.random_background:
@@ -125,8 +132,11 @@ class Run:
             self.gaussians.limit_columns()
         if step.iteration - 1 == self.plan.debug_from:
             self.pipe.debug = True
-        ahead = min(self.scene.images.ahead, self.opt.iterations - step.iteration + 1)
-        self.scene.prefetch(self.views.coming(step.iteration, ahead))
+        self._decode_ahead(step.iteration)
+
+    def _decode_ahead(self, iteration: int) -> None:
+        ahead = min(self.scene.images.ahead, self.opt.iterations - iteration + 1)
+        self.scene.prefetch(self.views.coming(iteration, ahead))
 
     def render_options(self, step: Step) -> dict[str, bool]:
         """Options of `render` that make it compute what this step's loss needs, and no more."""

@@ -16,7 +16,11 @@ import numpy as np
 import torch
 from PIL import Image, ImageFile
 
-MODULES = ("pycolmap", "matplotlib", "tensorboard", "torch.utils.tensorboard", "socketserver", "lpips", "skimage")
+MODULES = (
+    *("pycolmap", "matplotlib", "tensorboard", "torch.utils.tensorboard", "socketserver", "lpips", "skimage", "scipy"),
+    *("torch._dynamo", "torch.onnx", "torchvision", "sympy", "networkx", "triton", "pandas", "IPython"),
+)
+BEFORE = frozenset(sys.modules)  # by torch itself, NumPy and Pillow
 SIZE = 32
 
 
@@ -42,8 +46,9 @@ def make_scene(folder: Path) -> None:
 def probe(folder: Path) -> dict:
     """Train and render in `folder`; return what was seen.
 
-    Keys: `modules`, those of MODULES that were loaded; `binds`, the sockets bound; `files`, those written; `decoded`,
-    the paths of decoded photos; `picture_bytes`, the memory of each training image, and `values`, its colour values.
+    Keys: `modules`, those of MODULES that were loaded besides BEFORE; `binds`, the sockets bound; `files`, those
+    written; `decoded`, the paths of decoded photos; `picture_bytes`, the memory of each training image, and `values`,
+    its colour values.
     """
     scene, model = folder / "scene", folder / "model"
     make_scene(scene)
@@ -77,7 +82,7 @@ def probe(folder: Path) -> dict:
     render.main()
     pictures = [camera.target(torch.zeros(3)) for camera in made[0].getTrainCameras()]
     return {
-        "modules": [name for name in MODULES if name in sys.modules],
+        "modules": [name for name in MODULES if name in sys.modules and name not in BEFORE],
         "binds": binds,
         "files": sorted(str(file.relative_to(model)) for file in model.rglob("*") if file.is_file()),
         "decoded": decoded_in_training,

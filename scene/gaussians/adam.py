@@ -12,6 +12,7 @@ from torch import Tensor
 from torch.optim.optimizer import _global_optimizer_post_hooks, _global_optimizer_pre_hooks
 
 from scene.gaussians.row_surgery import Group
+from scene.gaussians.undecorated import undecorated
 
 # Options of a group that the kernel takes from the optimiser's defaults, or does not know.
 _common = itemgetter("betas", "eps", "weight_decay", "amsgrad", "maximize", "capturable", "differentiable", "fused")
@@ -57,6 +58,18 @@ class GaussianAdam(torch.optim.Adam):
         """Take a state dict, or become a copy; copies know of no inactive columns."""
         super().__setstate__(state)
         self.__dict__.setdefault("_active_columns", {})
+
+    def add_param_group(self, param_group: Group) -> None:
+        """Add a group, as torch does."""
+        undecorated(torch.optim.Adam.add_param_group)(self, param_group)
+
+    def state_dict(self) -> dict[str, Any]:
+        """The state in torch's form."""
+        return undecorated(torch.optim.Adam.state_dict)(self)
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Take a state dict, as torch does."""
+        undecorated(torch.optim.Adam.load_state_dict)(self, state_dict)
 
     def set_active_columns(self, name: str, columns: int) -> None:
         """Promise that only the first `columns` values of each row of this group ever had a gradient.
@@ -140,7 +153,7 @@ class GaussianAdam(torch.optim.Adam):
     def zero_grad(self, set_to_none: bool = True) -> None:
         """Drop the gradients, or zero them."""
         if not set_to_none:
-            return super().zero_grad(set_to_none=False)
+            return undecorated(torch.optim.Adam.zero_grad)(self, set_to_none=False)
         for group in self.param_groups:
             for param in group["params"]:
                 param.grad = None
@@ -201,7 +214,7 @@ class GaussianAdam(torch.optim.Adam):
             for param, index, key in zip(group["params"], mine["params"], keys, strict=True):
                 if key in state:
                     taken[index] = _fitting(state[key], param, name)
-        super().load_state_dict({"state": taken, "param_groups": own})
+        undecorated(torch.optim.Adam.load_state_dict)(self, {"state": taken, "param_groups": own})
         return [g.get("name") for g in self.param_groups if any(param not in self.state for param in g["params"])]
 
 

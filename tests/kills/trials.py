@@ -15,10 +15,9 @@ from pathlib import Path
 from typing import Any
 
 import utils.host.openmp  # noqa: F401  isort: skip  (before torch)
-import matplotlib.pyplot  # noqa: F401  (here and torch._dynamo: otherwise every child would import them)
+import matplotlib.pyplot  # noqa: F401  (here: otherwise every child would start a process that imports it)
 import numpy as np
 import torch
-import torch._dynamo
 from synthetic import make_blender_scene
 
 import train

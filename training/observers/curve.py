@@ -1,10 +1,12 @@
 """The curve of error against run time, recorded while the model trains."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from gaussian_renderer.scored_views import ScoredViews
 from records.curve_peak import schedules_follow_length
 from records.curve_recorder import CurveRecorder, evenly_spread
+from scene.cameras import Camera
 from training.objective import Losses
 from training.observer import Error, Observer
 from training.run import Run
@@ -27,12 +29,17 @@ class Curve(Observer):
             run.opt.iterations,
             run.plan.test,
             {"test": test, "train": evenly_spread(trained, len(test))},
-            views.load,
+            lambda cameras: self._load(cameras, views),
             lambda cameras: views.scores(cameras, run.gaussians),
             run.device,
         )
         self._due = False
         self._seconds = 0.0
+
+    def _load(self, cameras: Sequence[Camera], views: ScoredViews) -> None:
+        self._run.scene.prefetch(cameras)
+        for camera in cameras:
+            views.load(camera)
 
     def due(self, step: Step) -> bool:
         self._due = self._recorder.due(step.iteration, self._run.clock.seconds)
@@ -41,11 +48,12 @@ class Curve(Observer):
     def measured(self, step: Step, losses: Losses) -> None:
         if self._due:
             self._seconds = self._run.clock.seconds
-            with self._run.clock.paused():
+            with self._run.clock.paused("scoring"):
                 self._recorder.add(step.iteration, self._seconds, len(self._run.gaussians))
 
     def ended(self, error: Error) -> None:
         if error is not None:
+            self._recorder.abandon()
             return
         run = self._run
         saved = {*run.plan.save} & {*saved_iterations(Path(run.scene.model_path) / "point_cloud")}

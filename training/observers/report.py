@@ -41,7 +41,9 @@ class Report(Observer):
         if step.due or (self._writer and step.iteration % LOG_INTERVAL == 0):
             self._later.append((step, losses, seconds))
         if step.due:
-            with self._run.clock.paused():
+            with self._run.clock.paused("scoring"):
+                if step.iteration in self._run.plan.test:
+                    self._run.scene.prefetch(self._run.scene.getTestCameras())
                 for one in self._later:
                     self._tell(*one)
             self._later.clear()

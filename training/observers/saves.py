@@ -34,7 +34,7 @@ class Saves(Observer):
             return
         run = self._run
         step.record = step.record or {}
-        with run.clock.paused():
+        with run.clock.paused("saving"):
             run.gaussians.check_finite(step.iteration)
             tqdm.write(f"[ITER {step.iteration}] Saving Gaussians", file=sys.stdout)
             if step.last:
@@ -66,7 +66,7 @@ class Checkpoints(Observer):
         run = self._run
         self._watch.look(step.iteration, stepped=not step.last)
         seconds = run.clock.seconds
-        with run.clock.paused():
+        with run.clock.paused("saving"):
             run.gaussians.check_finite(step.iteration)
             tqdm.write(f"[ITER {step.iteration}] Saving Checkpoint", file=sys.stdout)
             path = Path(run.scene.model_path) / f"chkpnt{step.iteration}.pth"

@@ -1,10 +1,17 @@
-"""The choice of the device that computes."""
+"""The choice of the device that computes. torch is imported on first use: not every program needs it."""
 
-import torch
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    import torch
 
 
 def compute_device() -> torch.device:
     """`cuda` when a GPU is visible and the rasterizer was built with its CUDA kernels, else `cpu`."""
+    import torch
+
     return torch.device("cuda" if torch.cuda.is_available() and _has_cuda_kernels() else "cpu")
 
 

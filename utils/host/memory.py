@@ -1,10 +1,17 @@
-"""Free memory, and recognition of errors that mean there is too little of it."""
+"""Free memory, and recognition of errors that mean there is too little of it.
+
+torch is imported on first use: not every program needs it.
+"""
+
+from __future__ import annotations
 
 import contextlib
 import re
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-import torch
+if TYPE_CHECKING:
+    import torch
 
 try:
     import resource
@@ -29,6 +36,8 @@ def is_out_of_memory(error: BaseException | None) -> bool:
 
 def shortage(error: BaseException, device: torch.device | str) -> str:
     """Description of such an error: the bytes asked for, or its own words, and the free bytes if known."""
+    import torch
+
     asked, free = _ASKED.search(str(error)), free_memory(device)
     if asked:
         parts = [f"{gib(float(asked[1]) * _UNITS[asked[2]])} asked for"]
@@ -50,6 +59,8 @@ def free_memory(device: torch.device | str) -> int | None:
     CPU: the kernel's available memory, or less if the container (control group) or a limit of the process (ulimit -v)
     allows less. GPU: the driver's free memory, and memory that torch holds unused.
     """
+    import torch
+
     device = torch.device(device)
     if device.type == "cuda":
         held = torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)

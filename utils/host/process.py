@@ -9,16 +9,21 @@ import torch
 _IMPORTED = time.perf_counter()
 
 
-def wall_seconds() -> float:
-    """Seconds since the process started, or since the import of this module if the system does not say."""
-    since_import = time.perf_counter() - _IMPORTED
+def seconds_since_start() -> float | None:
+    """Seconds since the process started, to a clock tick; None if the system does not say."""
     try:
         # The command's name, in brackets, may have spaces. Field 22 of proc(5) is the start in clock ticks since boot.
         fields = Path("/proc/self/stat").read_text().rpartition(")")[2].split()
         started = int(fields[22 - 3]) / os.sysconf("SC_CLK_TCK")
-        return max(time.clock_gettime(time.CLOCK_BOOTTIME) - started, since_import)
+        return max(time.clock_gettime(time.CLOCK_BOOTTIME) - started, time.perf_counter() - _IMPORTED)
     except (OSError, ValueError, IndexError, AttributeError):
-        return since_import
+        return None
+
+
+def wall_seconds() -> float:
+    """Seconds since the process started, or since the import of this module if the system does not say."""
+    known = seconds_since_start()
+    return time.perf_counter() - _IMPORTED if known is None else known
 
 
 def peak_memory_mib(device: torch.device) -> float | None:

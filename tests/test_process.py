@@ -1,0 +1,198 @@
+"""Start and end of train.py's process: what it imports, what it begins early, and the seconds that it notes."""
+
+import copy
+import json
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import pytest
+import torch
+
+import train
+from scene.gaussians.adam import GaussianAdam
+from scene.gaussians.undecorated import undecorated
+from scene.pictures import store
+from training import run as training_run
+from utils.host import cuda_start
+
+ROOT = Path(__file__).parents[1]
+UNUSED = ("torch._dynamo", "torch._inductor", "torch.onnx", "tensorboard", "torch.utils.tensorboard", "matplotlib")
+UNUSED += ("pycolmap", "scipy", "skimage", "torchvision", "lpips", "sympy", "networkx", "pandas", "triton")
+LOADED = """
+import sys
+import utils.host.openmp
+import torch, numpy, PIL.Image
+before = set(sys.modules)
+import train
+train.main(sys.argv[2:])
+print("loaded:", *sorted(set(sys.argv[1].split(",")) & (set(sys.modules) - before)), file=sys.__stdout__)
+"""
+
+
+@pytest.fixture(autouse=True)
+def _stdout(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Restore stdout, which training stamps and may silence."""
+    monkeypatch.setattr(sys, "stdout", sys.stdout)
+
+
+def _train(scene: Path, out: Path, *more: object, iterations: int = 3) -> dict:
+    """The last record of the log of a training."""
+    train.main(["-s", str(scene), "-m", str(out), "-r", "24", "--iterations", str(iterations), *map(str, more)])
+    return json.loads((out / "train_log.json").read_text())[-1]
+
+
+def _loaded(scene: Path, out: Path, *more: str) -> list[str]:
+    """Modules of UNUSED that a training loads in a process of its own, besides those of torch itself."""
+    words = [",".join(UNUSED), "-s", scene, "-m", out, "-r", "24", "--iterations", "12", *more]
+    done = subprocess.run(
+        [sys.executable, "-c", LOADED, *map(str, words)], cwd=ROOT, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout.splitlines()[-1].split()[1:]
+
+
+def test_a_training_imports_nothing_that_it_does_not_use(blender_scene, tmp_path):
+    """A checkpoint takes the optimiser's state; the twelve iterations pass one that TensorBoard is told of."""
+    out = tmp_path / "out"
+    assert _loaded(blender_scene, out, "--eval", "--no_curve", "--checkpoint_iterations", "6") == []
+    resumed = ["--start_checkpoint", str(out / "chkpnt6.pth"), "--optimizer_type", "sparse_adam"]
+    assert _loaded(blender_scene, out, "--eval", "--no_curve", *resumed) == []
+
+
+def test_a_training_imports_what_it_does_use(colmap_scene, tmp_path):
+    """Another process draws the curve."""
+    assert _loaded(colmap_scene, tmp_path, "--eval") == ["pycolmap"]
+    assert (tmp_path / "error_vs_time.png").is_file()
+
+
+def _decorated(name: str) -> bool:
+    return undecorated(getattr(torch.optim.Adam, name)) is not getattr(torch.optim.Adam, name)
+
+
+def test_methods_keep_torchs_decorator_once_its_compiler_is_there(monkeypatch):
+    monkeypatch.delitem(sys.modules, "torch._dynamo", raising=False)
+    assert _decorated("add_param_group") and _decorated("state_dict") and _decorated("load_state_dict")
+    assert not _decorated("step")
+    monkeypatch.setitem(sys.modules, "torch._dynamo", torch)
+    assert not _decorated("add_param_group")
+
+
+def test_what_others_put_in_place_of_torchs_method_is_called(monkeypatch):
+    called = []
+    plain = torch.optim.Optimizer.add_param_group
+
+    def wrapped(optimizer: torch.optim.Optimizer, group: dict) -> None:
+        called.append(group["name"])
+        plain(optimizer, group)
+
+    wrapped.__wrapped__ = None
+    monkeypatch.setattr(torch.optim.Optimizer, "add_param_group", wrapped)
+    optimizer = GaussianAdam([{"params": [torch.nn.Parameter(torch.ones(2, 3))], "lr": 0.1, "name": "xyz"}])
+    assert called == ["xyz"] and optimizer.param_groups[0]["betas"] == (0.9, 0.999)
+    assert copy.deepcopy(optimizer).state_dict()["param_groups"] == optimizer.state_dict()["param_groups"]
+
+
+def test_the_last_record_says_where_the_time_went(colmap_scene, tmp_path):
+    record = _train(colmap_scene, tmp_path / "out", "--eval", "--test_iterations", 2, "--checkpoint_iterations", 2)
+    parts = [record[f"{name}_seconds"] for name in ("training", "scoring", "saving")]
+    assert all(part > 0 for part in parts)
+    assert record["training_seconds"] == record["seconds"]
+    assert record["first_iteration_seconds"] + sum(parts[1:]) <= record["wall_seconds"]
+    log = json.loads((tmp_path / "out" / "train_log.json").read_text())
+    assert not any("training_seconds" in earlier for earlier in log[:-1])
+    resumed = ["--start_checkpoint", tmp_path / "out" / "chkpnt2.pth"]
+    record = _train(colmap_scene, tmp_path / "out", "--eval", "--test_iterations", -1, *resumed)
+    assert record["training_seconds"] < record["seconds"]  # the former are of this process alone
+
+
+def test_a_system_that_does_not_tell_when_a_process_started(colmap_scene, tmp_path, monkeypatch):
+    monkeypatch.setattr(training_run, "seconds_since_start", lambda: None)
+    record = _train(colmap_scene, tmp_path / "out", iterations=1)
+    assert record["first_iteration_seconds"] is None and record["wall_seconds"] > 0
+    assert record["scoring_seconds"] >= 0 and record["saving_seconds"] > 0
+
+
+def test_pictures_are_decoded_while_the_model_is_made(colmap_scene, tmp_path, monkeypatch):
+    kept = []
+    plain = training_run.Run._start
+
+    def start(run: training_run.Run, capture: tuple | None) -> None:
+        kept.append((len(run.scene.images), run.scene.images.ahead))
+        plain(run, capture)
+
+    monkeypatch.setattr(training_run.Run, "_start", start)
+    _train(colmap_scene, tmp_path / "out", iterations=2)
+    assert kept == [(2, kept[0][1])] and kept[0][1] >= 2  # as many as there are iterations
+
+
+@pytest.mark.parametrize("options", [["--test_iterations", -1], ["--test_iterations", 1, "--no_curve"]])
+def test_views_that_are_scored_are_decoded_side_by_side(colmap_scene, tmp_path, monkeypatch, options):
+    decoded = {}
+    plain = store.decode
+
+    def decode(path: Path, size: tuple[int, int]) -> torch.Tensor:
+        decoded[path] = threading.current_thread().name
+        return plain(path, size)
+
+    monkeypatch.setattr(store, "decode", decode)
+    _train(colmap_scene, tmp_path / "out", "--eval", *options, iterations=1)
+    photos = sorted(path for path in (colmap_scene / "images").rglob("*") if path.is_file())
+    tested = set(photos[::8])
+    assert len(tested) == 3 and tested <= decoded.keys()
+    assert all(decoded[name].startswith("decode") for name in tested), decoded  # every 8th photo
+
+
+class _Driver:
+    """A stand-in for libcuda."""
+
+    def __init__(self, initialised: int = 0) -> None:
+        self.calls: list[str] = []
+        self._initialised = initialised
+
+    def cuInit(self, flags: int) -> int:
+        self.calls.append("init")
+        return self._initialised
+
+    def cuDeviceGet(self, device: object, number: int) -> int:
+        self.calls.append(f"device {number}")
+        return 0
+
+    def cuDevicePrimaryCtxRetain(self, context: object, device: object) -> int:
+        self.calls.append("context")
+        return 0
+
+
+@pytest.mark.parametrize(
+    ("driver", "calls"), [(_Driver(), ["init", "device 0", "context"]), (_Driver(100), ["init"]), (None, [])]
+)
+def test_the_gpus_context_is_made_in_a_thread(monkeypatch, driver, calls):
+    def load(name: str) -> _Driver:
+        assert name == "libcuda.so.1" and threading.current_thread().name == "cuda start"
+        if driver is None:
+            raise OSError("no such library")
+        return driver
+
+    monkeypatch.setattr(cuda_start.ctypes, "CDLL", load)
+    monkeypatch.setattr(cuda_start, "_computes_on_a_gpu", lambda: True)
+    thread = cuda_start.begin()
+    thread.join()
+    assert driver is None or driver.calls == calls
+    assert not thread.daemon  # the driver must not be left in the middle of it
+
+
+def test_an_installation_for_the_cpu_leaves_the_driver_alone(monkeypatch):
+    monkeypatch.setattr(cuda_start, "_computes_on_a_gpu", lambda: False)
+    assert cuda_start.begin() is None
+
+
+def test_what_was_built_with_cuda_is_known_before_torch_is_there(tmp_path):
+    """In a fresh process, as the extension is found without being imported."""
+    code = (
+        "import sys\nfrom utils.host import cuda_start\nprint(cuda_start._computes_on_a_gpu(), 'torch' in sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    from diff_gaussian_rasterization import has_cuda_kernels
+
+    assert done.stdout.split() == [str(has_cuda_kernels()), "False"]
