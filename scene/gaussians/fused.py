@@ -44,10 +44,11 @@ class FusedAdam:
         groups = {group["name"]: group for group in optimizer.param_groups}
         attributes, averages, squares, steps, rates, columns = [], [], [], [], [], []
         for place, name in enumerate(_STEPPED):
+            (param,) = groups[name]["params"]
             active = optimizer.active_columns(name)
-            if active == 0 and sparse:
-                continue  # it has no gradient, so the sparse optimiser would pass it over
-            state = optimizer.state_of(groups[name]["params"][0])
+            if not param.numel() or (active == 0 and sparse):
+                continue  # it has no gradient, and the optimiser would pass it over
+            state = optimizer.state_of(param)
             attributes.append(place)
             averages.append(state["exp_avg"])
             squares.append(state["exp_avg_sq"])

@@ -1,0 +1,124 @@
+"""The ways to take a step of training: the fast ones give the bytes of the plain one."""
+
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from rasterizer_tools import GPU_MARKS
+
+import train
+from training import run
+from training.objective import Objective
+from training.steps import ahead, run_ahead
+from training.steps.ahead import AheadStep
+from training.steps.choose import step_taker
+from training.steps.fused import FusedStep
+from training.steps.plain import PlainStep
+
+ITERATIONS = 60
+DENSITY = ("--densify_from_iter", 10, "--densification_interval", 20, "--opacity_reset_interval", 30)
+OPTIONS = {
+    "default": (),
+    "sparse": ("--optimizer_type", "sparse_adam", "--random_background"),
+    "exposure": ("--train_test_exp", "--antialiasing"),
+    "depth": ("-d", "depths", "--depth_l1_weight_init", 1.0),
+    "masks": ("--masks", "masks"),
+    "degree 0": ("--sh_degree", 0),
+}
+
+
+@pytest.fixture(autouse=True)
+def _stdout(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "stdout", sys.stdout)  # training stamps it
+
+
+@pytest.fixture
+def scene(colmap_scene: Path) -> Path:
+    """The COLMAP scene with a mask and an inverse depth map for each photo."""
+    images = colmap_scene / "images"
+    photos = [photo.relative_to(images) for photo in images.rglob("*") if photo.is_file()]
+    mask = np.full((64, 96), 255, np.uint8)
+    mask[:, :20] = 0
+    depth = np.linspace(0, 2**15, 64 * 96).astype(np.uint16).reshape(64, 96)
+    for photo in photos:
+        for pixels, path in ((mask, f"masks/{photo}.png"), (depth, f"depths/{photo.with_suffix('.png')}")):
+            (colmap_scene / path).parent.mkdir(parents=True, exist_ok=True)
+            Image.fromarray(pixels).save(colmap_scene / path)
+    scales = {str(photo.with_suffix("")): {"scale": 1.0, "offset": 0.0} for photo in photos}
+    (colmap_scene / "sparse/0/depth_params.json").write_text(json.dumps(scales))
+    return colmap_scene
+
+
+def trained(scene: Path, out: Path, *options: object) -> dict[str, bytes | list]:
+    """Train; the bytes of the PLY, and the tensors and numbers of the checkpoint."""
+    words = ["-s", scene, "-m", out, "--eval", "-r", 48, "--iterations", ITERATIONS, *DENSITY, "--no_curve", "--quiet"]
+    train.main(list(map(str, [*words, "--test_iterations", -1, "--checkpoint_iterations", ITERATIONS, *options])))
+    leaves = []
+
+    def collect(value: object) -> None:
+        if torch.is_tensor(value):
+            leaves.append((value.shape, value.detach().cpu().numpy().tobytes()))
+        elif isinstance(value, dict):
+            for key, item in value.items():
+                leaves.append(key)
+                collect(item)
+        elif isinstance(value, list | tuple):
+            for item in value:
+                collect(item)
+        else:
+            leaves.append(value)
+
+    collect(torch.load(out / f"chkpnt{ITERATIONS}.pth", weights_only=False))
+    return {"ply": (out / f"point_cloud/iteration_{ITERATIONS}/point_cloud.ply").read_bytes(), "checkpoint": leaves}
+
+
+@pytest.mark.parametrize("options", OPTIONS.values(), ids=OPTIONS.keys())
+def test_the_fused_step_gives_the_bytes_of_the_plain_one(scene, tmp_path, monkeypatch, options):
+    plain = trained(scene, tmp_path / "plain", "--plain_step", *options)
+    fused, advance = [], FusedStep.advance
+    monkeypatch.setattr(FusedStep, "advance", lambda self, at, *x: (fused.append(at.iteration), advance(self, at, *x)))
+    assert trained(scene, tmp_path / "fused", *options) == plain
+    # Densification, the resets of opacities and the last iteration change rows, or take no step.
+    assert fused == [t for t in range(1, ITERATIONS) if t not in (20, 30, 40)]
+
+
+def test_what_may_want_gradients_takes_the_plain_step(scene, tmp_path, monkeypatch):
+    taken = []
+    monkeypatch.setattr("training.loop.step_taker", lambda run: (taken.append(step_taker(run)), taken[-1])[1])
+
+    class WithFurtherTerm(Objective):
+        pass
+
+    trained(scene, tmp_path / "a")
+    trained(scene, tmp_path / "b", "--detect_anomaly")
+    torch.autograd.set_detect_anomaly(False)
+    monkeypatch.setattr(run, "Objective", WithFurtherTerm)
+    trained(scene, tmp_path / "c")
+    fast = AheadStep if torch.cuda.is_available() else FusedStep
+    assert [type(one) for one in taken] == [fast, PlainStep, PlainStep]
+
+
+@pytest.mark.parametrize("pipe", ["--compute_cov3D_python", "--convert_SHs_python", "--debug"])
+def test_options_that_the_operator_does_not_know_take_the_plain_step(scene, tmp_path, monkeypatch, pipe):
+    monkeypatch.setattr(FusedStep, "advance", lambda *_: pytest.fail("fused"))
+    trained(scene, tmp_path / "a", pipe)
+
+
+@pytest.mark.parametrize("options", OPTIONS.values(), ids=OPTIONS.keys())
+@pytest.mark.parametrize("_", [pytest.param(None, marks=GPU_MARKS)])
+def test_a_host_that_runs_ahead_without_room_gives_the_same_bytes(scene, tmp_path, monkeypatch, options, _):
+    """Room for one instance at first, and never for more than the last visit needed: many steps halt."""
+    plain = trained(scene, tmp_path / "plain", "--plain_step", *options)
+    assert trained(scene, tmp_path / "ahead", *options) == plain
+    halts, repeat = [], run_ahead.RunAhead._repeat
+    monkeypatch.setattr(run_ahead.RunAhead, "_repeat", lambda *x: (halts.append(1), repeat(*x)))
+    monkeypatch.setattr(run_ahead, "_with_spare", lambda count: count)
+    for name in ("_INSTANCES", "_SLOTS"):
+        monkeypatch.setattr(ahead, name, 0)
+    monkeypatch.setattr(ahead, "_LEAST", 1)
+    assert trained(scene, tmp_path / "halting", *options) == plain
+    assert len(halts) > 5
