@@ -17,8 +17,8 @@ from torch import Tensor
 
 from gaussian_renderer import rasterizer_settings
 from scene.cameras import Camera
+from scene.fused_adam import FusedAdam
 from scene.gaussian_model import GaussianModel
-from scene.gaussians.fused import FusedAdam
 
 
 @dataclass(slots=True)
@@ -38,8 +38,8 @@ def draw(
     camera: Camera, gaussians: GaussianModel, pipe: argparse.Namespace, background: Tensor, want_depth: bool
 ) -> Drawn:
     """Render a view for `step`. The Gaussians must be ones that `FusedAdam` takes."""
-    colors = {"sh_dc": gaussians._features_dc, "sh_rest": gaussians._features_rest}
-    rows = Gaussians(gaussians._xyz, **gaussians.raw_geometry(), **colors)
+    colors = {"sh_dc": gaussians.get_features_dc, "sh_rest": gaussians.get_features_rest}
+    rows = Gaussians(gaussians.get_xyz, **gaussians.raw_geometry(), **colors)
     scene = scene_arguments(rows, rasterizer_settings(camera, gaussians, pipe, background), True)
     color, transmittance, depth, radii, splats, tile_counts, *lists, last = OPERATORS.rasterize(
         rows.means, *scene, background, want_depth, True

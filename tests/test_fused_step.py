@@ -59,11 +59,12 @@ def test_fused_and_plain_steps_go_the_same_way(blender_scene, tmp_path, monkeypa
     models = []
     for fused in (True, False):
         if not fused:
-            monkeypatch.setattr("training.loop.render", _render)
+            monkeypatch.setattr("training.steps.plain.render", _render)
             monkeypatch.setattr("training.objective.photometric_loss", _loss)
             monkeypatch.setattr(Camera, "target", _target)
             monkeypatch.setattr(GaussianModel, "observe", _observe)
             monkeypatch.setattr(adam, "adam_", _adam)
+            options.append("--plain_step")
         out = tmp_path / str(fused)
         train.main(["-s", str(blender_scene), "-m", str(out), "--iterations", str(ITERATIONS), *options])
         models.append((out / f"point_cloud/iteration_{ITERATIONS}/point_cloud.ply").read_bytes())

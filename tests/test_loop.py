@@ -68,7 +68,7 @@ def test_every_hook_is_called_once_an_iteration_and_in_order(colmap_scene, tmp_p
     for t in range(1, ITERATIONS + 1):
         # The observer writes in 7; density control changes the Gaussians in 10 and 20.
         due = " due" if t in (7, 10, 20) else ""
-        expected += [("begins", t), ("due", t), ("measured" + due, t), ("stepped", t)]
+        expected += [("due", t), ("begins", t), ("measured" + due, t), ("stepped", t)]
     assert told == [*expected, ("ended", 0)]
 
 
@@ -85,7 +85,7 @@ def test_observers_are_told_in_the_order_of_the_list_and_of_the_error(colmap_sce
 
     with pytest.raises(RuntimeError, match="broken"):
         _train(colmap_scene, tmp_path, monkeypatch, observers)
-    hooks = ("begins", "due", "measured", "stepped")
+    hooks = ("due", "begins", "measured", "stepped")
     first = [(f"{name} {hook}", 1) for hook in hooks for name in "ab"]
     second = [(f"{name} {hook}", 2) for hook in hooks for name in "ab"][:-1]  # b is not told that 2 has stepped
     assert told == [*first, *second, ("a RuntimeError", 0), ("b RuntimeError", 0)]

@@ -102,6 +102,25 @@ def test_what_may_want_gradients_takes_the_plain_step(scene, tmp_path, monkeypat
     assert [type(one) for one in taken] == [fast, PlainStep, PlainStep]
 
 
+def test_a_term_that_was_added_to_our_objective_is_not_lost(scene, tmp_path, monkeypatch):
+    """Its gradients go past the image, so the steps from there on are plain."""
+    call, fused, advance = Objective.__call__, [], FusedStep.advance
+    models = []
+
+    def with_term(self, package, step):
+        losses = call(self, package, step)
+        return losses if step.iteration < 15 else losses._replace(total=losses.total + models[-1]._scaling.exp().mean())
+
+    make = run.GaussianModel
+    monkeypatch.setattr(run, "GaussianModel", lambda *x: (models.append(make(*x)), models[-1])[1])
+    plain = trained(scene, tmp_path / "without")
+    monkeypatch.setattr(Objective, "__call__", with_term)
+    wanted = trained(scene, tmp_path / "plain", "--plain_step")
+    monkeypatch.setattr(FusedStep, "advance", lambda self, at, *x: (fused.append(at.iteration), advance(self, at, *x)))
+    assert trained(scene, tmp_path / "fused") == wanted != plain
+    assert fused == list(range(1, 15))
+
+
 @pytest.mark.parametrize("pipe", ["--compute_cov3D_python", "--convert_SHs_python", "--debug"])
 def test_options_that_the_operator_does_not_know_take_the_plain_step(scene, tmp_path, monkeypatch, pipe):
     monkeypatch.setattr(FusedStep, "advance", lambda *_: pytest.fail("fused"))

@@ -46,8 +46,13 @@ class AheadStep:
 
     def _queue(self, step: Step) -> Losses:
         drawn, losses, gradients = self._fused.measure(step)
+        if self._fused.finds_further_terms():
+            package, losses = self._fused.plain.backward(step)
         self._run.gaussians.guard_loss(step.iteration, losses.total)
-        self._fused.advance(step, drawn, gradients)
+        if self._fused.takes(step):
+            self._fused.advance(step, drawn, gradients)
+        else:
+            self._fused.plain.advance(step, package)
         return losses
 
     @torch.no_grad()

@@ -4,8 +4,8 @@ import torch
 from torch import Tensor
 
 from gaussian_renderer.view_step import Drawn, draw, step
+from scene.fused_adam import FusedAdam
 from scene.gaussians.exposure import apply_exposure
-from scene.gaussians.fused import FusedAdam
 from training.density import AdaptiveDensityControl
 from training.objective import Losses, Objective
 from training.observer import Announcer
@@ -22,8 +22,9 @@ class FusedStep:
 
     def __init__(self, run: Run) -> None:
         self._run = run
-        self._plain = PlainStep(run)
+        self.plain = PlainStep(run)
         self._adam = FusedAdam(run.gaussians)
+        self._further_terms = False
 
     @staticmethod
     def suits(run: Run) -> bool:
@@ -34,15 +35,17 @@ class FusedStep:
         """Whether this step can be fused. The last one, and one that changes the Gaussians' rows, use the gradients."""
         run, pipe = self._run, self._run.pipe
         in_python = pipe.compute_cov3D_python or pipe.convert_SHs_python or pipe.debug
-        return not (step.changes or step.last or in_python) and FusedAdam.takes(run.gaussians)
+        able = not (step.changes or step.last or in_python or self._further_terms)
+        return able and FusedAdam.takes(run.gaussians)
 
     def take(self, step: Step, tell: Announcer) -> None:
         """Take a step; the observers are told once the loss is known."""
-        if not self.takes(step):
-            return self._plain.take(step, tell)
-        drawn, losses, gradients = self.measure(step)
-        tell.measured(step, losses)
-        self.advance(step, drawn, gradients)
+        if self.takes(step):
+            drawn, losses, gradients = self.measure(step)
+            if not self.finds_further_terms():
+                tell.measured(step, losses)
+                return self.advance(step, drawn, gradients)
+        self.plain.take(step, tell)
 
     def settle(self) -> None:
         """Nothing is ever pending."""
@@ -65,6 +68,18 @@ class FusedStep:
             losses = run.objective({"render": rendered, "depth": depth}, step)
             losses.total.backward()
         return drawn, losses, (image.grad, None if depth is None else depth.grad)
+
+    def finds_further_terms(self) -> bool:
+        """Whether the loss of the last `measure` depends on a parameter by another way than the image.
+
+        Somebody has added a term to it. Its gradients are dropped, and from now on no step can be fused.
+        """
+        params = [self._run.gaussians.raw(name) for name in self._run.gaussians._attributes]
+        self._further_terms = any([param.grad is not None for param in params])
+        if self._further_terms:
+            for param in params:
+                param.grad = None
+        return self._further_terms
 
     def advance(self, at: Step, drawn: Drawn, gradients: tuple[Tensor, Tensor | None]) -> None:
         """Take the step of the Gaussians, and that of the exposures."""
