@@ -41,16 +41,18 @@ def training(
     checkpoint: str | None,
     debug_from: int = -1,
     record_curve: bool = True,
+    plain_step: bool = False,
 ) -> None:
     """Train from the options of the three groups; write model, checkpoints and log to dataset.model_path.
 
     testing_iterations, saving_iterations, checkpoint_iterations: when to score, save the PLY, save a checkpoint.
-    checkpoint: a chkpntN.pth to resume, or None. debug_from: switch pipe.debug on after this iteration.
-    record_curve: with test views, write error_vs_time.csv during training, and draw it.
+    checkpoint: a chkpntN.pth to resume, or None. debug_from: switch pipe.debug on after this iteration. plain_step: no
+    fast steps. record_curve: with test views, write error_vs_time.csv during training, and draw it.
     """
     dataset.model_path = dataset.model_path or new_folder()
     print(f"Optimizing {dataset.model_path}")
-    plan = Plan(testing_iterations, saving_iterations, checkpoint_iterations, checkpoint, debug_from, record_curve)
+    iterations = testing_iterations, saving_iterations, checkpoint_iterations
+    plan = Plan(*iterations, checkpoint, debug_from, record_curve, plain_step)
     run = Run(dataset, opt, pipe, plan)
     # Write nothing before every input check has passed: a mistyped option must not overwrite a finished model.
     with own_folder(dataset.model_path):
@@ -94,6 +96,8 @@ def _parser() -> tuple[argparse.ArgumentParser, ModelParams, OptimizationParams,
     add("--no_curve", action="store_true",
         help="write no error_vs_time.csv and .png, which cost up to 5 %% of the time, more in short runs "
         "(default: write them with --eval)")  # fmt: skip
+    add("--plain_step", action="store_true",
+        help="take every step by autograd, slower and with the same result (default: the fast step)")  # fmt: skip
     add("--quiet", action="store_true", help="print nothing but the progress bar and errors")
     return parser, *groups
 
@@ -118,6 +122,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     args, dataset, opt, pipe = parse(argv)
     safe_state(args.quiet, opt.seed)
     torch.autograd.set_detect_anomaly(args.detect_anomaly)
+    further = args.start_checkpoint, args.debug_from, not args.no_curve, args.plain_step
     training(
         dataset,
         opt,
@@ -125,9 +130,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         args.test_iterations,
         [*args.save_iterations, opt.iterations],
         args.checkpoint_iterations,
-        args.start_checkpoint,
-        args.debug_from,
-        not args.no_curve,
+        *further,
     )
     print("Training complete.")
 

@@ -60,7 +60,7 @@ def render(
     result = rasterize(
         xyz,
         viewspace_points,
-        settings=_settings(viewpoint_camera, pc.active_sh_degree, pipe, bg_color, scaling_modifier),
+        settings=rasterizer_settings(viewpoint_camera, pc, pipe, bg_color, scaling_modifier),
         want_inverse_depth=want_depth,
         raw=raw,
         **geometry,
@@ -91,26 +91,27 @@ def decisive_for(camera: Camera | MiniCam, pc: GaussianModel, pipe: argparse.Nam
     geometry, raw = _geometry(pc, pipe.compute_cov3D_python, 1.0)
     return decisive(
         pc.get_xyz,
-        settings=_settings(camera, pc.active_sh_degree, pipe, background, 1.0),
+        settings=rasterizer_settings(camera, pc, pipe, background),
         raw=raw,
         **geometry,
         **_colors(pc, pipe.convert_SHs_python, camera, False, None),
     )
 
 
-def _settings(
-    camera: Camera | MiniCam, sh_degree: int, pipe: argparse.Namespace, background: Tensor, scaling_modifier: float
+def rasterizer_settings(
+    camera: Camera | MiniCam, pc: GaussianModel, pipe: argparse.Namespace, background: Tensor, scaling: float = 1.0
 ) -> GaussianRasterizationSettings:
+    """The rasterizer's settings for a view of a model; arguments as for `render`."""
     return GaussianRasterizationSettings(
         image_height=int(camera.image_height),
         image_width=int(camera.image_width),
         tanfovx=math.tan(camera.FoVx / 2),
         tanfovy=math.tan(camera.FoVy / 2),
         bg=background,
-        scale_modifier=scaling_modifier,
+        scale_modifier=scaling,
         viewmatrix=camera.world_view_transform,
         projmatrix=camera.full_proj_transform,
-        sh_degree=sh_degree,
+        sh_degree=pc.active_sh_degree,
         campos=camera.camera_center,
         prefiltered=False,
         debug=pipe.debug,

@@ -143,6 +143,11 @@ class GaussianModel(Exposed, AdaptiveGaussians):
         """Let a guard hold back the steps of all optimisers; training_setup makes unguarded ones."""
         self.optimizer.guard = self.exposures.optimizer.guard = guard
 
+    def guard_loss(self, iteration: int, loss: Tensor) -> None:
+        """Give the guard, if there is one, the scalar loss of an iteration before its step."""
+        if guard := getattr(self.optimizer, "guard", None):
+            guard.watch(iteration, loss)
+
     def check_steps(self) -> None:
         """UserError if a guard has held steps back, so that the model is older than its iteration number."""
         guard = getattr(self.optimizer, "guard", None)

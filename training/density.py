@@ -45,6 +45,10 @@ class AdaptiveDensityControl(DensityControl):
         todo = self._actions(iteration)
         return todo.densify or todo.reset_opacity
 
+    def observes(self, iteration: int) -> bool:
+        """Whether the view of this iteration counts in the statistics."""
+        return self._actions(iteration).observe
+
     def after_backward(self, step: Step, package: dict[str, Tensor]) -> None:
         todo = self._actions(step.iteration)
         if todo.observe:

@@ -5,38 +5,43 @@ from contextlib import contextmanager
 
 import torch
 
-from gaussian_renderer import render
 from training.observer import Announcer, Observer
 from training.run import Run
+from training.steps.choose import Taker, step_taker
 from utils.host.interrupt import DeferredInterrupt
 
 
 def run_training(run: Run, observers: Sequence[Observer]) -> None:
-    """Render a view, compare it with its photo, follow the gradient, control density, step.
+    """Take the steps (training/steps/plain.py): render a view, follow the gradient of its loss, control density.
 
     Whatever else happens is an observer's business, in the order of the list (training/observers/standard.py).
     Raises KeyboardInterrupt or Terminated, after a complete step, if a signal asked for it.
     """
-    tell = Announcer(observers)
-    with DeferredInterrupt() as interrupt, tell, _backward_on_this_thread():
+    tell, taker = Announcer(observers), step_taker(run)
+    with DeferredInterrupt() as interrupt, tell, _backward_on_this_thread(), _whole_steps(run, taker):
         for step in run.steps():
             tell.begins(step)
+            if step.due:
+                taker.settle()
             run.prepare(step)  # learning rates, SH degree, photos of the next views
-
-            package = render(step.camera, run.gaussians, run.pipe, step.background, **run.render_options(step))
-            losses = run.objective(package, step)
-            losses.total.backward()
-            tell.measured(step, losses)
-
-            run.density.after_backward(step, package)
-            if not step.last:  # as in the reference, the last iteration takes no step
-                run.gaussians.step(package["radii"])
-                run.density.after_step(step)
+            taker.take(step, tell)
             step.stopping = interrupt.requested  # read once: a signal may come at any moment
+            if step.stopping:
+                taker.settle()
             tell.stepped(step)
             if step.stopping:
                 raise step.stopping
     tell.ended()  # out here a signal stops at once what is only drawn and printed
+
+
+@contextmanager
+def _whole_steps(run: Run, taker: Taker) -> Iterator[None]:
+    """After an error, leave the model as it was between two steps."""
+    try:
+        yield
+    except BaseException:
+        run.lost = taker.give_up()
+        raise
 
 
 @contextmanager

@@ -14,14 +14,18 @@ class Observer:
     """Base of all observers. A hook that a class does not override costs nothing."""
 
     def due(self, step: Step) -> bool:
-        """Whether this iteration writes something. If so, every loss so far is checked first in `measured`."""
+        """Whether this iteration reads the model or a loss, or writes something. Asked once, when it begins.
+
+        If so, all steps before it are done by then, and every loss so far is checked first in `measured`. Otherwise the
+        GPU may be some steps behind in `measured` and `stepped`, so what these get must not be read, only noted.
+        """
         raise NotImplementedError
 
     def begins(self, step: Step) -> None:
         """The iteration begins, with its view."""
 
     def measured(self, step: Step, losses: Losses) -> None:
-        """The gradients are computed; the model is still the one that was rendered."""
+        """The losses are computed. If the iteration is due, the model is still the one that was rendered."""
 
     def stepped(self, step: Step) -> None:
         """Density control and optimiser are done; the model is that of the next iteration."""
@@ -43,12 +47,12 @@ class Announcer:
         )
 
     def begins(self, step: Step) -> None:
+        # A list, so that each observer is asked in every iteration, whatever the others answer.
+        step.due = any([step.changes, *[due(step) for due in self._due]])
         for tell in self._begins:
             tell(step)
 
     def measured(self, step: Step, losses: Losses) -> None:
-        # A list, so that each observer is asked in every iteration, whatever the others answer.
-        step.due = any([step.changes, *[due(step) for due in self._due]])
         for tell in self._measured:
             tell(step, losses)
 

@@ -13,3 +13,4 @@ class Plan(NamedTuple):
     start: str | None  # a chkpntN.pth to resume, None: the dataset's points
     debug_from: int  # pipe.debug is switched on after this iteration; -1: never
     record_curve: bool  # error_vs_time.csv, if there are test views
+    plain_step: bool = False  # take every step by autograd, and wait for the GPU in it

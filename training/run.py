@@ -33,7 +33,7 @@ class Run:
 
     scene, gaussians, views (by iteration), objective, density; dataset, opt, pipe: the options; background: (3,) of the
     scene; first_iteration: done before this run. From `begin` on: log, rows (of the curve so far), losses
-    (running mean of the total) and clock (seconds of training).
+    (running mean of the total) and clock (seconds of training). lost: steps that an error has taken back.
     """
 
     def __init__(
@@ -41,6 +41,7 @@ class Run:
     ) -> None:
         """Read and check everything that can be refused; nothing is written. UserError for what is refused."""
         self.dataset, self.opt, self.pipe, self.plan = dataset, opt, pipe, plan
+        self.lost = 0
         self.device = compute_device()
         capture, self.first_iteration = load_checkpoint(plan.start, self.device) if plan.start else (None, 0)
         if self.first_iteration >= opt.iterations:
@@ -106,7 +107,7 @@ class Run:
                 camera=camera,
                 background=self._background(iteration),
                 depth_weight=self._depth_weight(iteration) if camera.depth_reliable else 0.0,
-                changes=self.density.changes(iteration),
+                changes=self.density.changes(iteration) or iteration % SH_INTERVAL == 0,
                 started=self.clock.seconds,
             )
 

@@ -101,7 +101,7 @@ class GaussianAdam(torch.optim.Adam):
                     # gradient.
                     gradient = param
             if gradient is not None:
-                state = self._state_of(param)
+                state = self.state_of(param)
                 tensors.append((param, gradient, state["exp_avg"], state["exp_avg_sq"], state["step"]))
                 rates.append(group["lr"])
                 columns.append(active)
@@ -165,7 +165,16 @@ class GaussianAdam(torch.optim.Adam):
             if state := self.state.get(group["params"][0]):
                 state["step"] = (state["step"] - steps).clamp_min(0)
 
-    def _state_of(self, param: Tensor) -> dict[str, Tensor]:
+    def active_columns(self, name: str) -> int:
+        """The number of columns that step (`set_active_columns`), -1: all of them."""
+        return self._active_columns.get(name, -1)
+
+    def steps_all_by_kernel(self) -> bool:
+        """Whether the kernel steps every group, and no hook waits for a step."""
+        return not self._has_step_hooks() and not self._groups()[1]
+
+    def state_of(self, param: Tensor) -> dict[str, Tensor]:
+        """Step counter and averages of a parameter, zero before its first step."""
         state = self.state[param]
         if not state:
             state["step"] = torch.zeros((), dtype=torch.float32)

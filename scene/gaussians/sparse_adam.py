@@ -28,7 +28,7 @@ class SparseGaussianAdam(GaussianAdam):
             if len(param) != len(visible):
                 others = [*others, group]
                 continue
-            state = self._state_of(param)
+            state = self.state_of(param)
             state["step"] += 1
             moments = state["exp_avg"], state["exp_avg_sq"]
             beta1, beta2 = group["betas"]

@@ -23,6 +23,7 @@ class MemoryGuard(Observer):
     """
 
     def __init__(self, run: Run) -> None:
+        self._run = run
         self._gaussians = run.gaussians
         self._folder = Path(run.scene.model_path)
         self._first = run.first_iteration
@@ -44,6 +45,7 @@ class MemoryGuard(Observer):
         self._reached(step.iteration)
 
     def ended(self, error: Error) -> None:
+        self._iteration -= self._run.lost
         if is_out_of_memory(error):
             what = situation(error, self._gaussians, [self._camera] if self._camera else [])
             traceback.clear_frames(error.__traceback__)  # their tensors take memory that saving may need

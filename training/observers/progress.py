@@ -1,5 +1,8 @@
 """The progress bar: losses and the number of Gaussians."""
 
+import math
+import time
+
 from tqdm import tqdm
 
 from training.loss_watch import LossWatch
@@ -9,6 +12,7 @@ from training.run import Run
 from training.step import Step
 
 BAR_INTERVAL = 10  # iterations between updates, each of which reads the losses and so waits for the GPU
+BAR_SECONDS = 0.2  # between them at least, as each waits for the GPU
 
 
 class ProgressBar(Observer):
@@ -18,12 +22,14 @@ class ProgressBar(Observer):
         self._run = run
         self._depth = LossWatch()
         self._shown = {"Loss": run.losses} | ({"Depth Loss": self._depth} if run.dataset.depths else {})
+        self._updated = -math.inf
         self._bar = tqdm(
             initial=run.first_iteration, total=run.opt.iterations, desc="Training progress", dynamic_ncols=True
         )
 
     def due(self, step: Step) -> bool:
-        return step.last or step.iteration % BAR_INTERVAL == 0
+        shown = step.iteration % BAR_INTERVAL == 0 and time.monotonic() - self._updated >= BAR_SECONDS
+        return step.last or shown
 
     def measured(self, step: Step, losses: Losses) -> None:
         if losses.depth is not None:
@@ -36,6 +42,7 @@ class ProgressBar(Observer):
         # As text: tqdm would round the number to three digits.
         self._bar.set_postfix(means, Gaussians=f"{len(self._run.gaussians):,}", refresh=False)
         self._bar.update(step.iteration - self._bar.n)
+        self._updated = time.monotonic()
 
     def ended(self, error: Error) -> None:
         self._bar.close()

@@ -31,17 +31,27 @@ class Report(Observer):
         self._run = run
         self._writer = writer
         self._report = report
+        self._later: list[tuple[Step, Losses, float]] = []
 
     def due(self, step: Step) -> bool:
-        return step.iteration in self._run.plan.test
+        return self._report is not training_report or step.iteration in self._run.plan.test
 
     def measured(self, step: Step, losses: Losses) -> None:
-        run, seconds = self._run, self._run.clock.seconds
-        with run.clock.paused():
-            scores = self._report(
-                self._writer, step.iteration, losses.l1, losses.total, l1_loss, seconds - step.started, run.plan.test,
-                run.scene, render, (run.pipe, run.background), run.dataset.train_test_exp,
-            )  # fmt: skip
+        seconds = self._run.clock.seconds - step.started
+        if step.due or (self._writer and step.iteration % LOG_INTERVAL == 0):
+            self._later.append((step, losses, seconds))
+        if step.due:
+            with self._run.clock.paused():
+                for one in self._later:
+                    self._tell(*one)
+            self._later.clear()
+
+    def _tell(self, step: Step, losses: Losses, seconds: float) -> None:
+        run = self._run
+        scores = self._report(
+            self._writer, step.iteration, losses.l1, losses.total, l1_loss, seconds, run.plan.test,
+            run.scene, render, (run.pipe, run.background), run.dataset.train_test_exp,
+        )  # fmt: skip
         if scores:
             step.record = scores
 

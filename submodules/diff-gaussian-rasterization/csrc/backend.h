@@ -10,7 +10,8 @@ namespace gs {
 struct BinMemory {
   Binned (*take)(void* context, int64_t instances, int64_t slots);
   void* context;
-  SplatSlots* slots;  // (N + 1), filled by binning, or null if not wanted
+  SplatSlots* slots;             // (N + 1), filled by binning, or null if not wanted
+  const Ahead* ahead = nullptr;  // on a GPU: take room for lists, and do not wait for their lengths
 };
 
 // Every backend's functions. `Where` says how they run: an Executor on the CPU, a Queue on a GPU.

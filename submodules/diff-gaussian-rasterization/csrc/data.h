@@ -72,6 +72,21 @@ struct alignas(16) SplatSlots {
   int32_t wide;     // the rectangle's width
 };
 
+// What lists may hold, or what they need: instances, slots, and gradient rows (a processed instance has one).
+struct Room {
+  int64_t instances, slots, rows;
+};
+
+// How far a host may run ahead of a GPU: it gives room for lists whose lengths it does not know. If one is too long,
+// the step halts, and all later ones do nothing until the host has made room (Queue::halted).
+struct Ahead {
+  int32_t* halted;  // on the device: the step that lacked room, else 0
+  Room* needed;     // on the device: of the last step that was not halted before
+  Room room;
+  int32_t step;     // counts from 1
+  int64_t* report;  // page-locked: instances, slots, rows, halted, step of the last step; or null
+};
+
 struct Binned {
   int32_t* instances;  // (I) the splat; sorted by tile, then by depth, then by index
   int64_t* ranges;     // (tiles + 1) into instances
@@ -104,6 +119,7 @@ struct BlendGradient {
   const T* inverse_depth;           // dLoss/dinverse_depth, or null
   const T* transmittance_gradient;  // or null
   T* moments;                       // out: (N, 10), Moments in math/footprint.h, then colour and inverse depth
+  const Ahead* ahead = nullptr;     // on a GPU: take room for gradient rows, and do not wait for their number
 };
 
 // A tensor that takes a step of Adam in place, in the `columns` leading values of each row.

@@ -5,9 +5,11 @@
 #include <thrust/iterator/transform_iterator.h>
 
 #include <cub/cub.cuh>
+#include <optional>
 
 #include "../backend.h"
 #include "../math/slots.h"
+#include "ahead.cuh"
 #include "host_numbers.cuh"
 #include "instances.cuh"
 
@@ -22,7 +24,8 @@ constexpr int kCounted = 4;  // splats of a thread; their loads do not wait for 
 
 // Adds the instances and slots of all splats to `totals`, and numbers the splats for the depth sort.
 __global__ void __launch_bounds__(kThreads)
-    count_kernel(int64_t n, Projected<float> in, int32_t* index, unsigned long long* totals) {
+    count_kernel(const int32_t* halted, int64_t n, Projected<float> in, int32_t* index, unsigned long long* totals) {
+  if (is_halted(halted)) return;
   __shared__ unsigned long long of_block[2];
   if (threadIdx.x < 2) of_block[threadIdx.x] = 0;
   __syncthreads();
@@ -48,10 +51,13 @@ __global__ void __launch_bounds__(kThreads)
 const int64_t* count_all(const Queue& queue, int64_t n, const Projected<float>& in, int32_t* index) {
   auto* totals = queue.array<unsigned long long>(2);
   GS_CUDA_CHECK(cudaMemsetAsync(totals, 0, 2 * sizeof *totals, stream_of(queue)));
-  count_kernel<<<blocks_for(n, kCounted * kThreads), kThreads, 0, stream_of(queue)>>>(n, in, index, totals);
+  count_kernel<<<blocks_for(n, kCounted * kThreads), kThreads, 0, stream_of(queue)>>>(queue.halted, n, in, index,
+                                                                                      totals);
   check_launch("count");
   return reinterpret_cast<const int64_t*>(totals);
 }
+
+__global__ void judge_lists_kernel(Ahead ahead, const int64_t* totals) { judge_lists(ahead, totals[0], totals[1]); }
 
 // The rectangle of a splat, empty behind the last one.
 struct Rects {
@@ -92,9 +98,12 @@ struct alignas(16) Keys {
 };
 
 // Finds where each tile's list begins. An instance begins the lists of all tiles after the previous instance's tile, up
-// to its own. The memory of `sorted` has room for whole loads.
+// to its own. The memory of `sorted` has room for whole loads. What stands behind the last instance belongs to the tile
+// behind the last one.
 template <class Key>
-__global__ void ranges_kernel(int64_t instances, int64_t tiles, const Key* sorted, int64_t* ranges) {
+__global__ void ranges_kernel(const int32_t* halted, int64_t instances, int64_t tiles, const Key* sorted,
+                              int64_t* ranges) {
+  if (is_halted(halted)) return;
   constexpr int kCount = Keys<Key>::kCount;
   const int64_t first = (int64_t(blockIdx.x) * kThreads + threadIdx.x) * kCount;
   if (first > instances) return;
@@ -137,37 +146,39 @@ void find_slots(const Queue& queue, int64_t n, const Projected<float>& in, Splat
   });
 }
 
-// Emits the instances and sorts them by tile. order: the splats by depth.
+// Emits the instances and sorts them by tile. order: the splats by depth. room: for at least all instances.
 template <class Key>
 void bin_with(const Queue& queue, int64_t n, const Projected<float>& in, const int32_t* order, Image image,
-              int64_t instances, const Binned& out) {
+              int64_t room, const Binned& out) {
   const int64_t tiles = tiles_of(image);
   const cudaStream_t stream = stream_of(queue);
-  const int64_t blocks = (instances + kEmitted - 1) / kEmitted;
+  const int64_t blocks = (room + kEmitted - 1) / kEmitted;
   Key *keys = queue.array<Key>(blocks * kEmitted), *sorted_keys = queue.array<Key>(blocks * kEmitted);
-  if (instances) {
+  if (room) {
     Lined* lined = queue.array<Lined>(n);
     int32_t *counts = queue.array<int32_t>(n + 1), *offsets = queue.array<int32_t>(n + 1);
     int32_t* first = queue.array<int32_t>(blocks + 1);
     const unsigned splat_blocks = unsigned(n / kEmitThreads + 1);
-    line_up_kernel<<<splat_blocks, kEmitThreads, 0, stream>>>(n, order, in, tile_count(image.width), lined, counts);
+    line_up_kernel<<<splat_blocks, kEmitThreads, 0, stream>>>(queue.halted, n, order, in, tile_count(image.width),
+                                                              lined, counts);
     check_launch("line_up");
     with_memory(queue, [&](void* memory, size_t& bytes) {
       return cub::DeviceScan::ExclusiveSum(memory, bytes, counts, offsets, n + 1, stream);
     });
-    share_kernel<<<splat_blocks, kEmitThreads, 0, stream>>>(n, offsets, first);
+    share_kernel<<<splat_blocks, kEmitThreads, 0, stream>>>(queue.halted, n, offsets, first);
     check_launch("share");
     int32_t* owners = queue.array<int32_t>(blocks * kEmitted);
-    emit_kernel<Key><<<unsigned(blocks), kEmitThreads, 0, stream>>>(instances, order, lined, offsets, first, in, image,
-                                                                    keys, owners);
+    emit_kernel<Key><<<unsigned(blocks), kEmitThreads, 0, stream>>>(queue.halted, n, order, lined, offsets, first, in,
+                                                                    image, keys, owners);
     check_launch("emit");
     with_memory(queue, [&](void* memory, size_t& bytes) {
-      return cub::DeviceRadixSort::SortPairs(memory, bytes, keys, sorted_keys, owners, out.instances, instances, 0,
-                                             bits_for(tiles), stream);
+      return cub::DeviceRadixSort::SortPairs(memory, bytes, keys, sorted_keys, owners, out.instances, room, 0,
+                                             bits_for(tiles + 1), stream);
     });
   }
-  const int64_t loads = instances / Keys<Key>::kCount + 1;
-  ranges_kernel<Key><<<blocks_for(loads, kThreads), kThreads, 0, stream>>>(instances, tiles, sorted_keys, out.ranges);
+  const int64_t loads = room / Keys<Key>::kCount + 1;
+  ranges_kernel<Key>
+      <<<blocks_for(loads, kThreads), kThreads, 0, stream>>>(queue.halted, room, tiles, sorted_keys, out.ranges);
   check_launch("bin");
 }
 
@@ -179,18 +190,25 @@ void bin<float>(const Queue& queue, int64_t count, const Projected<float>& in, I
   const int32_t* order = nullptr;
   if (count) {
     int32_t* index = queue.array<int32_t>(count);
-    const HostNumbers<int64_t> totals(queue, count_all(queue, count, in, index), 2);
-    // While the host waits for the numbers, the GPU does the work that needs no list.
+    const int64_t* counted = count_all(queue, count, in, index);
+    std::optional<HostNumbers<int64_t>> totals;
+    if (memory.ahead) {
+      judge_lists_kernel<<<1, 1, 0, stream_of(queue)>>>(*memory.ahead, counted);
+      check_launch("judge_lists");
+    } else {
+      totals.emplace(queue, counted, 2);
+    }
+    // If the host waits for the numbers, the GPU does the work that needs no list.
     order = sort_by_depth(queue, count, in.depths, index);
     if (memory.slots) find_slots(queue, count, in, memory.slots);
-    instances = totals.wait()[0];
-    if (memory.slots) slots = totals.wait()[1];
+    instances = totals ? totals->wait()[0] : memory.ahead->room.instances;
+    if (memory.slots) slots = totals ? totals->wait()[1] : memory.ahead->room.slots;
   } else if (memory.slots) {
     GS_CUDA_CHECK(cudaMemsetAsync(memory.slots, 0, sizeof *memory.slots, stream_of(queue)));
   }
   const Binned out = memory.take(memory.context, instances, slots);
   const int64_t tiles = tiles_of(image);
-  const auto run = tiles <= 1 << 16 ? bin_with<uint16_t> : bin_with<uint32_t>;
+  const auto run = tiles < 1 << 16 ? bin_with<uint16_t> : bin_with<uint32_t>;
   run(queue, count, in, order, image, instances, out);
 }
 

@@ -8,6 +8,7 @@
 
 #include "../backend.h"
 #include "../math/slots.h"
+#include "ahead.cuh"
 #include "blend_layout.cuh"
 #include "gradient_rows.cuh"
 #include "host_numbers.cuh"
@@ -47,8 +48,9 @@ struct CountBits {
 
 // Finds how far each tile's backward has to go, and marks the slots of the instances up to there.
 __global__ void __launch_bounds__(kTile* kTile)
-    mark_kernel(BlendInput<float> in, const int32_t* last, const SplatSlots* slots, int32_t* processed,
-                uint32_t* bits) {
+    mark_kernel(const int32_t* halted, BlendInput<float> in, const int32_t* last, const SplatSlots* slots,
+                int32_t* processed, uint32_t* bits) {
+  if (is_halted(halted)) return;
   __shared__ int32_t most;
   if (threadIdx.x == 0) most = 0;
   __syncthreads();
@@ -64,6 +66,8 @@ __global__ void __launch_bounds__(kTile* kTile)
     atomicOr(bits + (slot >> 5), 1u << (slot & 31));
   }
 }
+
+__global__ void judge_rows_kernel(Ahead ahead, const int32_t* rows) { judge_rows(ahead, *rows); }
 
 // Sums ten values over a warp in 12 shuffles: each step halves the values that a lane keeps and doubles the lanes that
 // are summed. The lane ends with the sum of `value`, or with none (-1).
@@ -133,7 +137,9 @@ struct Pixels {
 // Computes the layers of all chunks but the first of each tile, a block each.
 template <class L, bool kDepth>
 __global__ void __launch_bounds__(L::kThreads)
-    layers_kernel(BlendInput<float> in, BlendGradient<float> g, const Chunk* chunks, Layer* layers) {
+    layers_kernel(const int32_t* halted, BlendInput<float> in, BlendGradient<float> g, const Chunk* chunks,
+                  Layer* layers) {
+  if (is_halted(halted)) return;
   constexpr int kBatch = L::kThreads, kRun = L::kRun;
   __shared__ Batch<kBatch> batch;
   const Chunk chunk = chunks[blockIdx.x];
@@ -228,8 +234,9 @@ __device__ __forceinline__ void splat_gradient(const Batch<kBatch>& batch, const
 // longer.
 template <bool kDepth>
 __global__ void GS_MAX_REGISTERS(kDepth ? 96 : 80)
-    blend_vjp_kernel(BlendInput<float> in, BlendGradient<float> g, const int32_t* processed, const Chunk* chunks,
-                     int chunk_size, const Layer* layers, GradientRows rows) {
+    blend_vjp_kernel(const int32_t* halted, BlendInput<float> in, BlendGradient<float> g, const int32_t* processed,
+                     const Chunk* chunks, int chunk_size, const Layer* layers, GradientRows rows) {
+  if (is_halted(halted)) return;
   using L = Backward;
   constexpr int kBatch = 64;
   __shared__ Batch<kBatch> batch;
@@ -273,7 +280,9 @@ __global__ void GS_MAX_REGISTERS(kDepth ? 96 : 80)
   }
 }
 
-__global__ void __launch_bounds__(256) moments_kernel(int64_t count, SlotSums sums, float* moments) {
+__global__ void __launch_bounds__(256)
+    moments_kernel(const int32_t* halted, int64_t count, SlotSums sums, float* moments) {
+  if (is_halted(halted)) return;
   const int64_t i = int64_t(blockIdx.x) * 256 + threadIdx.x;
   __shared__ __align__(8) float stage[256 / 32 * SlotSums::kStage];
   float values[kGradientValues];
@@ -286,7 +295,7 @@ template <class L>
 void find_layers(const Queue& queue, const BlendInput<float>& in, const BlendGradient<float>& g,
                  const Schedule& schedule, Layer* layers) {
   const auto kernel = g.inverse_depth ? layers_kernel<L, true> : layers_kernel<L, false>;
-  kernel<<<schedule.blocks, L::kThreads, 0, stream_of(queue)>>>(in, g, schedule.chunks, layers);
+  kernel<<<schedule.blocks, L::kThreads, 0, stream_of(queue)>>>(queue.halted, in, g, schedule.chunks, layers);
   check_launch("layers");
 }
 
@@ -299,16 +308,20 @@ GradientRows blend_rows(const Queue& queue, const BlendInput<float>& in, const B
   uint32_t* bits = queue.array<uint32_t>(words + 1);
   int32_t *before = queue.array<int32_t>(words + 1), *processed = queue.array<int32_t>(tiles);
   GS_CUDA_CHECK(cudaMemsetAsync(bits, 0, (words + 1) * sizeof *bits, stream));
-  mark_kernel<<<tiles, kTile * kTile, 0, stream>>>(in, g.last, g.slots, processed, bits);
+  mark_kernel<<<tiles, kTile * kTile, 0, stream>>>(queue.halted, in, g.last, g.slots, processed, bits);
   check_launch("mark");
   const auto counts = thrust::make_transform_iterator(thrust::counting_iterator<int64_t>(0), CountBits{bits, words});
   with_memory(queue, [&](void* memory, size_t& bytes) {
     return cub::DeviceScan::ExclusiveSum(memory, bytes, counts, before, words + 1, stream);
   });
   const int chunk_size = tiles <= kFewTiles ? kChunkOfFew : kChunkOfMany;
-  int64_t rows = g.instance_count;  // an upper bound
+  int64_t rows = g.ahead ? g.ahead->room.rows : g.instance_count;  // an upper bound
   std::optional<HostNumbers<int32_t>> processed_count;
-  if (rows > kRowsUnasked) processed_count.emplace(queue, before + words, 1);
+  if (g.ahead) {
+    judge_rows_kernel<<<1, 1, 0, stream>>>(*g.ahead, before + words);
+    check_launch("judge_rows");
+  } else if (rows > kRowsUnasked)
+    processed_count.emplace(queue, before + words, 1);
   Schedule schedule = longest_first(queue, tiles, ProcessedLength{processed}, chunk_size, rows);
   if (processed_count) rows = *processed_count->wait(), schedule = schedule.shortened(rows);
   const GradientRows gradients{bits, before, queue.array<float>(size_t(rows) * kGradientValues)};
@@ -316,8 +329,8 @@ GradientRows blend_rows(const Queue& queue, const BlendInput<float>& in, const B
   if (schedule.places)
     (tiles <= kFewTiles ? find_layers<Layout<1>> : find_layers<Layout<2>>)(queue, in, g, schedule, layers);
   const auto kernel = g.inverse_depth ? blend_vjp_kernel<true> : blend_vjp_kernel<false>;
-  kernel<<<schedule.blocks, Backward::kThreads, 0, stream>>>(in, g, processed, schedule.chunks, chunk_size, layers,
-                                                             gradients);
+  kernel<<<schedule.blocks, Backward::kThreads, 0, stream>>>(queue.halted, in, g, processed, schedule.chunks,
+                                                             chunk_size, layers, gradients);
   check_launch("blend_vjp");
   for (const void* done : {static_cast<const void*>(layers), static_cast<const void*>(schedule.chunks)})
     queue.release(queue.context, done);  // the gradients come next, and take most of a step's memory
@@ -328,7 +341,7 @@ template <>
 void blend_vjp<float>(const Queue& queue, const BlendInput<float>& in, const BlendGradient<float>& g) {
   if (!g.count) return;
   const SlotSums sums{blend_rows(queue, in, g), g.slots};
-  moments_kernel<<<blocks_for(g.count, 256), 256, 0, stream_of(queue)>>>(g.count, sums, g.moments);
+  moments_kernel<<<blocks_for(g.count, 256), 256, 0, stream_of(queue)>>>(queue.halted, g.count, sums, g.moments);
   check_launch("moments");
 }
 

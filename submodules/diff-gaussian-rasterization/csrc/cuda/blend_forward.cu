@@ -17,7 +17,8 @@ struct ListLength {
 // sm_90.
 template <class L, bool kDepth, bool kLast>
 __global__ void __launch_bounds__(L::kThreads, L::kRun == 1 ? 5 : 9)
-    blend_kernel(BlendInput<float> in, const Chunk* order, Blended<float> out) {
+    blend_kernel(const int32_t* halted, BlendInput<float> in, const Chunk* order, Blended<float> out) {
+  if (is_halted(halted)) return;
   constexpr int kBatch = L::kThreads, kRun = L::kRun;
   __shared__ Batch<kBatch> batch;
   const L at;
@@ -80,7 +81,7 @@ void blend_as(const Queue& queue, const BlendInput<float>& in, const Blended<flo
   const int64_t tiles = tiles_of(in.image);
   // Many tiles balance without a schedule.
   const Chunk* order = tiles <= kFewTiles ? longest_first(queue, tiles, ListLength{in.ranges}).chunks : nullptr;
-  kernel<<<unsigned(tiles), L::kThreads, 0, stream_of(queue)>>>(in, order, out);
+  kernel<<<unsigned(tiles), L::kThreads, 0, stream_of(queue)>>>(queue.halted, in, order, out);
   check_launch("blend");
 }
 

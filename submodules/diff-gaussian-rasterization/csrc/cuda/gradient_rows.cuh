@@ -23,7 +23,8 @@ struct GradientRows {
   }
 };
 
-// Runs the backward of blending up to the rows. Waits for the number of rows if there may be many.
+// Runs the backward of blending up to the rows. Waits for the number of rows if there may be many and the host does not
+// run ahead.
 GradientRows blend_rows(const Queue& queue, const BlendInput<float>& in, const BlendGradient<float>& g);
 
 // Sums a splat's rows, in an order that depends on their number alone. The rows of a warp's splats lie side by side, so

@@ -36,10 +36,12 @@ struct alignas(16) Lined {
 // Copies this data of the splats into depth order, so that scattered memory is read only once. counts:
 // (n + 1), the last 0.
 __global__ void __launch_bounds__(kEmitThreads)
-    line_up_kernel(int64_t n, const int32_t* order, Projected<float> in, int columns, Lined* lined, int32_t* counts) {
+    line_up_kernel(const int32_t* halted, int64_t n, const int32_t* order, Projected<float> in, int columns,
+                   Lined* lined, int32_t* counts) {
   const int64_t k = int64_t(blockIdx.x) * kEmitThreads + threadIdx.x;
-  if (k == n) counts[n] = 0;
-  if (k >= n) return;
+  const bool empty = is_halted(halted);  // the sum of counts that nobody wrote could overflow
+  if (k == n || (empty && k < n)) counts[k] = 0;
+  if (k >= n || empty) return;
   const Reached reached = reached_by(in, order[k]);
   const TileRect rect = reached.rect;
   counts[k] = reached.count;
@@ -48,7 +50,9 @@ __global__ void __launch_bounds__(kEmitThreads)
 
 // Finds for each block the splat of its first instance; the entry after the last block gets the last splat with an
 // instance. Splats count in depth order. offsets: (n + 1), the first instance of each splat.
-__global__ void __launch_bounds__(kEmitThreads) share_kernel(int64_t n, const int32_t* offsets, int32_t* first) {
+__global__ void __launch_bounds__(kEmitThreads)
+    share_kernel(const int32_t* halted, int64_t n, const int32_t* offsets, int32_t* first) {
+  if (is_halted(halted)) return;
   const int64_t k = int64_t(blockIdx.x) * kEmitThreads + threadIdx.x;
   if (k >= n) return;
   const int64_t begin = offsets[k], end = offsets[k + 1], instances = offsets[n];
@@ -119,10 +123,11 @@ __device__ __forceinline__ int find_owner(EmittedSplats& splats, const EmitRun<i
   return k;
 }
 
-// Writes the thread's instances by the masks of their splats; any tile for a splat without a mask.
+// Writes the thread's instances by the masks of their splats; any tile for a splat without a mask. Behind the last
+// instance come any splats in the tile `behind`.
 template <class Key>
-__device__ __forceinline__ void emit_masked(EmittedSplats& splats, int64_t base, int columns, int warp, int lane,
-                                            Key* tiles, int32_t* owners) {
+__device__ __forceinline__ void emit_masked(EmittedSplats& splats, int64_t base, int emitted, int columns, Key behind,
+                                            int warp, int lane, Key* tiles, int32_t* owners) {
   const EmitRun<int32_t> starting = reinterpret_cast<const EmitRun<int32_t>*>(splats.starting)[threadIdx.x];
   int k = find_owner(splats, starting, warp, lane);
   const int at = kEmitRun * threadIdx.x;
@@ -133,7 +138,7 @@ __device__ __forceinline__ void emit_masked(EmittedSplats& splats, int64_t base,
 #pragma unroll
   for (int r = 0; r < kEmitRun; ++r) {
     if (starting.of[r]) k = starting.of[r], line = splats.line[k];
-    run_tiles.of[r] = Key(tile_at(line, (__ffsll(line.mask) - 1) & 63, columns));
+    run_tiles.of[r] = at + r < emitted ? Key(tile_at(line, (__ffsll(line.mask) - 1) & 63, columns)) : behind;
     run_owners.of[r] = splats.index[k];
     line.mask &= line.mask - 1;
   }
@@ -176,20 +181,26 @@ __device__ __forceinline__ void emit_unmasked(const EmittedSplats& splats, WarpH
   }
 }
 
-// Writes the tile and the splat of every instance, in depth order. order: the splats by depth; tiles and owners have
-// room for whole blocks.
+// Writes the tile and the splat of every instance, in depth order. order: the n splats by depth; tiles and owners have
+// room for whole blocks. What is left of that room gets the tile behind the last one, so that it is sorted last.
 template <class Key>
 __global__ void __launch_bounds__(kEmitThreads)
-    emit_kernel(int64_t instances, const int32_t* order, const Lined* lined, const int32_t* offsets,
+    emit_kernel(const int32_t* halted, int64_t n, const int32_t* order, const Lined* lined, const int32_t* offsets,
                 const int32_t* first_splat, Projected<float> in, Image image, Key* tiles, int32_t* owners) {
+  if (is_halted(halted)) return;
   __shared__ EmittedSplats splats;
   __shared__ WarpHits warp_hits;
   const int columns = tile_count(image.width), warp = threadIdx.x / 32, lane = threadIdx.x & 31;
-  const int64_t base = int64_t(blockIdx.x) * kEmitted;
+  const int64_t base = int64_t(blockIdx.x) * kEmitted, instances = offsets[n];
+  const Key behind = Key(tiles_of(image));
+  if (base >= instances) {
+    for (int j = threadIdx.x; j < kEmitted; j += kEmitThreads) tiles[base + j] = behind;
+    return;
+  }
   const int emitted = int(instances - base < kEmitted ? instances - base : kEmitted);
   const int32_t first = first_splat[blockIdx.x], last = first_splat[blockIdx.x + 1];
   gather_splats(splats, base, emitted, first, last, order, lined, offsets);
-  emit_masked(splats, base, columns, warp, lane, tiles, owners);
+  emit_masked(splats, base, emitted, columns, behind, warp, lane, tiles, owners);
   emit_unmasked(splats, warp_hits, in, image, columns, base, emitted, warp, lane, tiles, owners);
 }
 

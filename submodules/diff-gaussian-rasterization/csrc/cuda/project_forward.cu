@@ -22,7 +22,9 @@ __device__ bool near_view(const Camera<float>& cam, Vec3<float> view) {
          y < cam.height * view.z + spare_y;
 }
 
-__global__ void __launch_bounds__(kThreads) project_kernel(Scene<float> s, Projected<float> out) {
+__global__ void __launch_bounds__(kThreads)
+    project_kernel(const int32_t* halted, Scene<float> s, Projected<float> out) {
+  if (is_halted(halted)) return;
   __shared__ Camera<float> camera;
   __shared__ __align__(16) float rest[kThreads * kRest];
   if (threadIdx.x == 0) camera = camera_of(s);
@@ -72,7 +74,7 @@ __global__ void mark_visible_kernel(int64_t count, const float* means, const flo
 template <>
 void project<float>(const Queue& queue, const Scene<float>& s, const Projected<float>& out) {
   if (!s.count) return;
-  project_kernel<<<blocks_for(s.count, kThreads), kThreads, 0, stream_of(queue)>>>(s, out);
+  project_kernel<<<blocks_for(s.count, kThreads), kThreads, 0, stream_of(queue)>>>(queue.halted, s, out);
   check_launch("project");
 }
 

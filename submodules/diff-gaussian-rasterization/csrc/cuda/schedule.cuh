@@ -47,7 +47,8 @@ __device__ inline int32_t full_chunks(int32_t length, int32_t size) { return len
 // depends on them.
 template <class Length>
 __global__ void __launch_bounds__(kOrderThreads)
-    order_chunks_kernel(int tiles, Length length, int32_t size, int blocks, Chunk* chunks) {
+    order_chunks_kernel(const int32_t* halted, int tiles, Length length, int32_t size, int blocks, Chunk* chunks) {
+  if (is_halted(halted)) return;
   __shared__ int32_t next[kLengthClasses], total, places;
   for (int c = threadIdx.x; c < kLengthClasses; c += kOrderThreads) next[c] = 0;
   if (threadIdx.x == 0) places = 0;
@@ -91,7 +92,9 @@ __global__ void __launch_bounds__(kOrderThreads)
 }
 
 template <class Length>
-__global__ void __launch_bounds__(kOrderThreads) keep_tiles_kernel(int tiles, Length length, Chunk* chunks) {
+__global__ void __launch_bounds__(kOrderThreads)
+    keep_tiles_kernel(const int32_t* halted, int tiles, Length length, Chunk* chunks) {
+  if (is_halted(halted)) return;
   const int t = blockIdx.x * kOrderThreads + threadIdx.x;
   if (t < tiles) chunks[t] = {t, 0, int32_t(length(t)), 0};
 }
@@ -106,9 +109,11 @@ Schedule longest_first(const Queue& queue, int64_t tiles, const Length& length, 
   const int64_t places = ordered ? total / size : 0;
   Chunk* chunks = queue.array<Chunk>(tiles + places);
   if (ordered)
-    order_chunks_kernel<<<1, kOrderThreads, 0, stream>>>(int(tiles), length, size, int(tiles + places), chunks);
+    order_chunks_kernel<<<1, kOrderThreads, 0, stream>>>(queue.halted, int(tiles), length, size, int(tiles + places),
+                                                         chunks);
   else
-    keep_tiles_kernel<<<blocks_for(tiles, kOrderThreads), kOrderThreads, 0, stream>>>(int(tiles), length, chunks);
+    keep_tiles_kernel<<<blocks_for(tiles, kOrderThreads), kOrderThreads, 0, stream>>>(queue.halted, int(tiles), length,
+                                                                                      chunks);
   check_launch("order_chunks");
   return {chunks, unsigned(tiles + places), unsigned(places), size};
 }

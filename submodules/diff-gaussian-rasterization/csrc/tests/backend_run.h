@@ -92,9 +92,11 @@ Bins<T> bin_scene(const Where& where, const gs::Scene<T>& scene, bool rects, boo
 
 // Forward and backward of the sum of all pixels of all planes, on an Executor or a Queue. Allocations are exact, so
 // that a sanitizer sees an access outside. The gradient holds means, means2d, opacities, scales, rotations, dc, rest,
-// one after the other. records: projection gives binning a record of each splat besides its rectangle.
+// one after the other. records: projection gives binning a record of each splat besides its rectangle. ahead: as a host
+// that runs ahead gives it; a gradient of a halted run is -77.
 template <class T, class Where>
-Result<T> run(const Where& where, Parameters<T>& p, gs::Image image, bool antialiasing, bool records = false) {
+Result<T> run(const Where& where, Parameters<T>& p, gs::Image image, bool antialiasing, bool records = false,
+              const gs::Ahead* ahead = nullptr) {
   using gs::cuda::bin, gs::cuda::blend, gs::cuda::blend_vjp, gs::cuda::project, gs::cuda::project_vjp;
   using gs::cuda::mark_decisive, gs::GS_ISA::mark_decisive;
   using gs::GS_ISA::bin, gs::GS_ISA::blend, gs::GS_ISA::blend_vjp, gs::GS_ISA::project, gs::GS_ISA::project_vjp;
@@ -122,14 +124,16 @@ Result<T> run(const Where& where, Parameters<T>& p, gs::Image image, bool antial
     l.instances.resize(count), l.slot_count = slots;
     return gs::Binned{l.instances.data(), l.ranges.data()};
   };
-  bin(where, p.count, projected, image, gs::BinMemory{take, &lists, slots.data()});
+  bin(where, p.count, projected, image, gs::BinMemory{take, &lists, slots.data(), ahead});
   auto& [instances, ranges, slot_count] = lists;
-  CHECK(slot_count == slots.back().first && slot_count >= int64_t(instances.size()));
+  const bool halted = ahead && *ahead->halted;
   std::vector<int32_t> last(pixels);
-  out.instances = int64_t(instances.size());
-  CHECK(out.instances == std::accumulate(out.tile_counts.begin(), out.tile_counts.end(), int64_t(0)));
-  CHECK(ranges.front() == 0 && ranges.back() == out.instances);
-  for (size_t t = 0; t < tiles; ++t)
+  out.instances = ahead ? ranges.back() : int64_t(instances.size());
+  CHECK(halted || slot_count >= slots.back().first);
+  CHECK(ahead || slot_count == slots.back().first);
+  CHECK(halted || out.instances == std::accumulate(out.tile_counts.begin(), out.tile_counts.end(), int64_t(0)));
+  CHECK(halted || (ranges.front() == 0 && ranges.back() == out.instances));
+  for (size_t t = 0; t < tiles && !halted; ++t)
     for (int64_t k = ranges[t] + 1; k < ranges[t + 1]; ++k) {
       const int32_t a = instances[k - 1], b = instances[k];
       CHECK(depths[a] < depths[b] || (depths[a] == depths[b] && a < b));
@@ -141,13 +145,13 @@ Result<T> run(const Where& where, Parameters<T>& p, gs::Image image, bool antial
 
   static_assert(sizeof(bool) == 1);
   out.decisive.resize(n);
-  mark_decisive(where, input, last.data(), reinterpret_cast<bool*>(out.decisive.data()));
+  if (!halted) mark_decisive(where, input, last.data(), reinterpret_cast<bool*>(out.decisive.data()));
 
   const std::vector<T> ones(3 * pixels, T(1));
   std::vector<T> moments(kGradientValues * n);
   blend_vjp(where, input,
             gs::BlendGradient<T>{p.count, out.instances, slot_count, slots.data(), out.transmittance.data(),
-                                 last.data(), ones.data(), ones.data(), ones.data(), moments.data()});
+                                 last.data(), ones.data(), ones.data(), ones.data(), moments.data(), ahead});
   out.gradient.assign(n * (3 + 3 + 1 + 3 + 4 + 3 + 45), T(-77));
   T* g = out.gradient.data();
   const gs::SceneGradient<T> gradient = {g,       g + 3 * n, g + 6 * n,  g + 7 * n, g + 10 * n,

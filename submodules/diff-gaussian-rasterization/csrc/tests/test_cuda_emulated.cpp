@@ -89,6 +89,53 @@ void test_long_lists() {
   check_scene(p, gs::Image{25, 16}, false);
 }
 
+// A host that runs ahead: with enough room, exactly or more, the bits are those of a host that waits. With less room in
+// one of the lists, the step halts, says what it needs and leaves the gradients alone, and so does every later step.
+void test_ahead() {
+  constexpr gs::Image image{330, 70};
+  Parameters<float> p(300);
+  for (int k = 0; k < 3; ++k) p.scales[3 * 17 + k] = 1;
+  const Result<float> wanted = run_emulated(p, image, false, true, gs::emulation::Order::forward);
+  int32_t halted = 0, step = 0;
+  gs::Room needed{};
+  int64_t report[5];
+  const auto go = [&](gs::Room room) {
+    gs::emulation::order = gs::emulation::Order::shuffled;
+    gs::emulation::Memory memory;
+    gs::Queue queue = memory.queue();
+    queue.halted = &halted;
+    const gs::Ahead ahead{&halted, &needed, room, ++step, report};
+    return run(queue, p, image, false, true, &ahead);
+  };
+  constexpr int64_t plenty = 20000;
+  go({plenty, plenty, plenty});
+  const gs::Room exact = needed;
+  CHECK(exact.instances == wanted.instances && exact.slots >= exact.instances && exact.rows <= exact.instances);
+  CHECK(exact.rows > 0);
+  for (const int64_t more : {0, 1, 1000, 20000}) {
+    const Result<float> got = go({exact.instances + more, exact.slots + more, exact.rows + more});
+    CHECK(got.color == wanted.color && got.gradient == wanted.gradient && got.instances == wanted.instances);
+    CHECK(halted == 0 && report[0] == exact.instances && report[1] == exact.slots && report[2] == exact.rows);
+    CHECK(report[3] == 0 && report[4] == step);
+  }
+  const std::vector<float> untouched(wanted.gradient.size(), -77.0f);
+  for (const int lacking : {0, 1, 2})
+    for (const int64_t of : {int64_t(0), int64_t(1),
+                             (lacking == 0   ? exact.instances
+                              : lacking == 1 ? exact.slots
+                                             : exact.rows) -
+                                 1}) {
+      gs::Room room = exact;
+      (lacking == 0 ? room.instances : lacking == 1 ? room.slots : room.rows) = of;
+      CHECK(go(room).gradient == untouched);
+      CHECK(halted == step && report[3] == step && report[4] == step);
+      CHECK(report[0] == exact.instances && report[1] == exact.slots && report[2] == (lacking == 2 ? exact.rows : 0));
+      CHECK(go({plenty, plenty, plenty}).gradient == untouched);
+      CHECK(halted == step - 1 && report[3] == step - 1 && report[4] == step);
+      halted = 0;
+    }
+}
+
 bool same_slots(const gs::SplatSlots& a, const gs::SplatSlots& b) {
   return a.first == b.first && a.skipped == b.skipped && a.wide == b.wide;
 }
@@ -354,6 +401,7 @@ int main() {
   test_gaussian_step();
   test_many_tiles();
   test_long_lists();
+  test_ahead();
   test_lists();
   test_longest_first();
   return gs::finish_tests("CUDA kernels, emulated");

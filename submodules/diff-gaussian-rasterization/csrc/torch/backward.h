@@ -68,7 +68,8 @@ class BlendBackward {
             color_.const_data_ptr<T>(),
             depth_.defined() ? depth_.const_data_ptr<T>() : nullptr,
             alpha_.defined() ? alpha_.const_data_ptr<T>() : nullptr,
-            moments};
+            moments,
+            ahead()};
   }
 
  private:

@@ -78,7 +78,7 @@ void run(const SceneTensors& scene, const BlendBackward& in, const Tensor& tile_
          const gs::GaussianStep<float>& step) {
 #ifdef GS_CUDA
   if (in.splats().is_cuda()) {
-    gs::TorchQueue queue(in.splats().device());
+    gs::TorchQueue queue(in.splats().device(), halted());
     return gs::cuda::rasterize_vjp_step(queue.queue(), scene.scene<float>(), in.input<float>(),
                                         in.gradient<float>(nullptr), step);
   }

@@ -110,7 +110,7 @@ void observe_op(Tensor& max_radii, Tensor& gradient_sums, Tensor& views, const T
                             rows.const_data_ptr<float>()};
 #ifdef GS_CUDA
   if (radii.is_cuda()) {
-    gs::TorchQueue queue(radii.device());
+    gs::TorchQueue queue(radii.device(), halted());
     return gs::cuda::observe(queue.queue(), in);
   }
 #endif

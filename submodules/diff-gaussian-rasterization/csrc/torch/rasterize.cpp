@@ -84,7 +84,7 @@ BinnedTensors bin(ProjectedTensors& in, gs::Image image, bool slots) {
   using Allocate = decltype(allocate);
   const gs::BinMemory memory{
       [](void* context, int64_t total, int64_t slots) { return (*static_cast<Allocate*>(context))(total, slots); },
-      &allocate, slots ? static_cast<gs::SplatSlots*>(out.splat_slots.mutable_data_ptr()) : nullptr};
+      &allocate, slots ? static_cast<gs::SplatSlots*>(out.splat_slots.mutable_data_ptr()) : nullptr, ahead()};
   with_scalar(in.depths.scalar_type(), [&](auto zero) {
     using T = decltype(zero);
     GS_RUN(T, in.depths, bin, in.depths.size(0), in.pointers<T>(), image, memory);
@@ -186,7 +186,7 @@ Gradients rasterize_vjp_op(SCENE_PARAMETERS, BACKWARD_PARAMETERS, const Tensor& 
   const BlendBackward in(BACKWARD_ARGUMENTS);
 #ifdef GS_CUDA
   if (splats.is_cuda()) {
-    gs::TorchQueue queue(splats.device());
+    gs::TorchQueue queue(splats.device(), halted());
     std::optional<SceneGradients> out;
     auto allocate = [&] { return out.emplace(scene, wanted).pointers<float>(); };
     using Allocate = decltype(allocate);

@@ -7,6 +7,7 @@
 #include <string>
 #include <type_traits>
 
+#include "ahead.h"
 #include "backend.h"
 #include "gs/isa.h"
 #include "gs/torch_executor.h"
@@ -87,7 +88,7 @@ void define(torch::Library& library, const std::string& schema, Function* functi
   if (!(like).is_cuda()) {                                                                                  \
     GS_DISPATCH(fn, gs::torch_executor(), __VA_ARGS__);                                                     \
   } else if constexpr (std::is_same_v<T, float>) {                                                          \
-    gs::TorchQueue queue((like).device());                                                                  \
+    gs::TorchQueue queue((like).device(), gs::ops::halted());                                               \
     gs::cuda::fn(queue.queue(), __VA_ARGS__);                                                               \
   } else {                                                                                                  \
     TORCH_CHECK(false, "the CUDA backend computes in float32, got float64: pass .float(), or use the CPU"); \

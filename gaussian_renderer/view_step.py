@@ -1,0 +1,57 @@
+"""A view's image and the Gaussians' step that follows from it, without gradients of parameters in between.
+
+For a training loop that needs no autograd through the Gaussians: `draw` renders a view, any function of the image is
+differentiated by it, and `step` takes the optimiser's step inside the rasterizer's backward. Values, averages and
+statistics get the same bits as by `render`, backward, `observe` and the optimiser's own step.
+"""
+
+import argparse
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from diff_gaussian_rasterization.backend import OPERATORS
+from diff_gaussian_rasterization.gaussians import Gaussians
+from diff_gaussian_rasterization.ops import scene_arguments
+from torch import Tensor
+
+from gaussian_renderer import rasterizer_settings
+from scene.cameras import Camera
+from scene.gaussian_model import GaussianModel
+from scene.gaussians.fused import FusedAdam
+
+
+@dataclass(slots=True)
+class Drawn:
+    """A view's image (3, H, W) and, if wanted, inverse depth (1, H, W); both may be given `requires_grad`."""
+
+    image: Tensor
+    depth: Tensor | None
+    radii: Tensor  # (N,) int32 pixels
+    scene: tuple[Any, ...]  # arguments of the operators
+    state: tuple[Tensor, ...]
+    tile_counts: Tensor
+
+
+@torch.no_grad()
+def draw(
+    camera: Camera, gaussians: GaussianModel, pipe: argparse.Namespace, background: Tensor, want_depth: bool
+) -> Drawn:
+    """Render a view for `step`. The Gaussians must be ones that `FusedAdam` takes."""
+    colors = {"sh_dc": gaussians._features_dc, "sh_rest": gaussians._features_rest}
+    rows = Gaussians(gaussians._xyz, **gaussians.raw_geometry(), **colors)
+    scene = scene_arguments(rows, rasterizer_settings(camera, gaussians, pipe, background), True)
+    color, transmittance, depth, radii, splats, tile_counts, *lists, last = OPERATORS.rasterize(
+        rows.means, *scene, background, want_depth, True
+    )
+    state = (splats, *lists, background, last, transmittance)
+    return Drawn(color, depth if want_depth else None, radii, scene, state, tile_counts)
+
+
+@torch.no_grad()
+def step(drawn: Drawn, adam: FusedAdam, image_gradient: Tensor, depth_gradient: Tensor | None, observe: bool) -> None:
+    """Take the step of every Gaussian. observe: add the view to the statistics of density control."""
+    OPERATORS.rasterize_vjp_step_(
+        *drawn.scene, *drawn.state, image_gradient, None, depth_gradient, drawn.tile_counts, drawn.radii,
+        *adam.arguments(observe),
+    )  # fmt: skip

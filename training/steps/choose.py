@@ -1,0 +1,23 @@
+"""The choice of how steps are taken."""
+
+from typing import TypeAlias
+
+import torch
+
+from training.run import Run
+from training.steps.ahead import AheadStep
+from training.steps.fused import FusedStep
+from training.steps.plain import PlainStep
+
+Taker: TypeAlias = PlainStep | FusedStep | AheadStep
+
+
+def step_taker(run: Run) -> Taker:
+    """The fastest way to take the steps of this run.
+
+    The plain one where the user asks for it (--plain_step, --detect_anomaly), and for an objective or a density control
+    that is not ours: it may want gradients, or wait for values that the GPU has not computed yet.
+    """
+    if run.plan.plain_step or torch.is_anomaly_enabled() or not FusedStep.suits(run):
+        return PlainStep(run)
+    return AheadStep(run) if run.device.type == "cuda" else FusedStep(run)

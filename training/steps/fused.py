@@ -1,0 +1,74 @@
+"""The fused step: no gradient of a parameter is written, because the rasterizer's backward steps the Gaussians."""
+
+import torch
+from torch import Tensor
+
+from gaussian_renderer.view_step import Drawn, draw, step
+from scene.gaussians.exposure import apply_exposure
+from scene.gaussians.fused import FusedAdam
+from training.density import AdaptiveDensityControl
+from training.objective import Losses, Objective
+from training.observer import Announcer
+from training.run import Run
+from training.step import Step
+from training.steps.plain import PlainStep
+
+
+class FusedStep:
+    """Takes steps in which nothing but the optimiser uses the gradients, with the bytes of `PlainStep`.
+
+    Autograd differentiates the loss by the image only, so any loss of image and depth will do, and exposures.
+    """
+
+    def __init__(self, run: Run) -> None:
+        self._run = run
+        self._plain = PlainStep(run)
+        self._adam = FusedAdam(run.gaussians)
+
+    @staticmethod
+    def suits(run: Run) -> bool:
+        """Whether the run's objective and density control are ours, which use no gradient of a parameter."""
+        return type(run.objective) is Objective and type(run.density) is AdaptiveDensityControl
+
+    def takes(self, step: Step) -> bool:
+        """Whether this step can be fused. The last one, and one that changes the Gaussians' rows, use the gradients."""
+        run, pipe = self._run, self._run.pipe
+        in_python = pipe.compute_cov3D_python or pipe.convert_SHs_python or pipe.debug
+        return not (step.changes or step.last or in_python) and FusedAdam.takes(run.gaussians)
+
+    def take(self, step: Step, tell: Announcer) -> None:
+        """Take a step; the observers are told once the loss is known."""
+        if not self.takes(step):
+            return self._plain.take(step, tell)
+        drawn, losses, gradients = self.measure(step)
+        tell.measured(step, losses)
+        self.advance(step, drawn, gradients)
+
+    def settle(self) -> None:
+        """Nothing is ever pending."""
+
+    def give_up(self) -> int:
+        """Nothing is ever pending, so no step has to be taken back: 0."""
+        return 0
+
+    def measure(self, step: Step) -> tuple[Drawn, Losses, tuple[Tensor, Tensor | None]]:
+        """Render: what was drawn, the losses, and their gradients of image and depth."""
+        run = self._run
+        drawn = draw(step.camera, run.gaussians, run.pipe, step.background, step.depth_weight > 0)
+        with torch.enable_grad():
+            image, depth = drawn.image.requires_grad_(), drawn.depth
+            if depth is not None:
+                depth.requires_grad_()
+            rendered = image
+            if run.dataset.train_test_exp and (name := step.camera.exposure_name or step.camera.image_name) is not None:
+                rendered = apply_exposure(image, run.gaussians.get_exposure_from_name(name))
+            losses = run.objective({"render": rendered, "depth": depth}, step)
+            losses.total.backward()
+        return drawn, losses, (image.grad, None if depth is None else depth.grad)
+
+    def advance(self, at: Step, drawn: Drawn, gradients: tuple[Tensor, Tensor | None]) -> None:
+        """Take the step of the Gaussians, and that of the exposures."""
+        run = self._run
+        step(drawn, self._adam, *gradients, run.density.observes(at.iteration))
+        run.gaussians.exposures.step()
+        run.density.after_step(at)

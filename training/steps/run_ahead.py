@@ -1,0 +1,138 @@
+"""The host runs ahead of a GPU: it gives lists room by guess, and repeats what lacked room.
+
+A step needs memory for lists whose lengths only the GPU knows. To wait for them in every step would leave the GPU idle
+while the host prepares the next launches. So the host guesses from what the view needed before, and does not wait. A
+kernel that finds too little room halts: neither it nor any later kernel changes anything (gs::Queue::halted in
+submodules/common/include/gs/cuda_queue.h). Some steps later the host reads that in a report which the GPU writes into
+the host's memory. It then makes room, and repeats the steps from the halted one on, in their order. So no value depends
+on the guesses, only the time does.
+"""
+
+import time
+from collections import deque
+from collections.abc import Callable, Hashable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import torch
+from diff_gaussian_rasterization.backend import OPERATORS
+
+AHEAD = 8  # steps; enough to hide a pause of the host, and few to repeat
+_REPORTS = 2 * AHEAD
+_SPARE = 1.25  # of room for what a view needed before: Gaussians move and multiply until its next visit
+_LEAST = 1024
+_MOST = 2**31 - 1
+_NAP = 1e-4  # seconds; steps of less than this are queued in numbers anyway
+
+Room = tuple[int, int, int]  # of instances, slots and gradient rows (gs::Room)
+
+
+@dataclass
+class _Pending:
+    number: int
+    view: Hashable
+    repeat: Callable[[], None]
+
+
+class RunAhead:
+    """Runs steps ahead of a GPU.
+
+    first: the room of the first step. rewind: called with a number of steps before these are repeated, to take back
+    what the host counted for them.
+    """
+
+    def __init__(self, device: torch.device, first: Room, rewind: Callable[[int], None]) -> None:
+        self._words = torch.zeros(4, dtype=torch.int64, device=device)
+        self._reports = list(torch.zeros(_REPORTS, 5, dtype=torch.int64, pin_memory=True))
+        self._numbers = [report.numpy() for report in self._reports]  # the same memory
+        self._stream = torch.cuda.current_stream(device)
+        self._first, self._needed = first, {}
+        self._pending: deque[_Pending] = deque()
+        self._rewind = rewind
+        self._number = 0
+        self.halts = 0  # so far
+
+    def take(self, view: Hashable, step: Callable[[], None], repeat: Callable[[], None]) -> None:
+        """Queue a step that renders a view. `repeat` queues it once more, with the same values as before."""
+        number = self._queue(view, step)
+        self._pending.append(_Pending(number, view, repeat))
+        self._collect(AHEAD)
+
+    def settle(self) -> None:
+        """Wait until all steps are done."""
+        self._collect(0)
+
+    def give_up(self) -> int:
+        """Drop the steps that lack room, after an error. Returns their number; they changed nothing."""
+        self._stream.synchronize()
+        while self._pending and self._done(self._pending[0]):
+            self._pending.popleft()
+        lost = len(self._pending)
+        self._pending.clear()
+        self._rewind(lost)
+        return lost
+
+    def _queue(self, view: Hashable, step: Callable[[], None]) -> int:
+        self._number += 1
+        with self._running(self._room_of(view)):
+            step()
+        return self._number
+
+    @contextmanager
+    def _running(self, room: Room) -> Iterator[None]:
+        OPERATORS.run_ahead_(self._words, room, self._number, self._reports[self._number % _REPORTS])
+        try:
+            yield
+        finally:
+            OPERATORS.run_ahead_(None, [], 0, None)
+
+    def _room_of(self, view: Hashable) -> Room:
+        """Room for what a view needed before; a new view gets room for the largest."""
+        if not self._needed:
+            return self._first
+        needed = self._needed.get(view) or tuple(map(max, zip(*self._needed.values(), strict=True)))
+        instances, slots, rows = map(_with_spare, needed)
+        return min(instances, _MOST), slots, min(rows, _MOST)
+
+    def _report(self, pending: _Pending) -> list[int] | None:
+        """Instances, slots, rows, halted; None until the GPU has written them."""
+        numbers = self._numbers[pending.number % _REPORTS]
+        return numbers[:4].tolist() if numbers[4] == pending.number else None
+
+    def _done(self, pending: _Pending) -> bool:
+        report = self._report(pending)
+        return report is not None and report[3] == 0
+
+    def _collect(self, most: int) -> None:
+        """Take back the reports that are there, and wait until at most so many steps are pending."""
+        while self._pending:
+            report = self._report(self._pending[0])
+            if report is None:
+                if len(self._pending) <= most:
+                    return
+                time.sleep(_NAP)
+            elif report[3]:
+                self._repeat(report)
+            else:
+                self._needed[self._pending.popleft().view] = tuple(report[:3])
+
+    def _repeat(self, report: list[int]) -> None:
+        """Make room for the step that was halted, and repeat it and all later ones."""
+        self.halts += 1
+        self._stream.synchronize()
+        self._words.zero_()
+        self._rewind(len(self._pending))
+        instances, slots, rows, _ = report
+        if instances > _MOST:
+            self._pending[0].repeat()  # a host that waits raises an error with the reason
+        # A step without room for instances did not count its rows, of which there are no more.
+        self._needed[self._pending[0].view] = instances, slots, rows or instances
+        for pending in self._pending:
+            pending.number = self._queue(pending.view, pending.repeat)
+
+
+def _with_spare(count: int) -> int:
+    """Room for a little more, in few different sizes, so that torch's allocator finds them again."""
+    wanted = max(int(_SPARE * count), _LEAST)
+    unit = 1 << max(wanted.bit_length() - 4, 0)
+    return -(-wanted // unit) * unit
