@@ -44,22 +44,31 @@ inline StepParameters step_parameters(const GaussianStep<float>& in) {
 }
 
 // Steps all 32 rows of a warp, 16 bytes a lane at a time; their gradients lie side by side. Returns whether the lane's
-// values took their step.
+// values took their step. Several loads are under way before the first store, behind which a compiler moves none.
 template <int kRow>
 __device__ inline bool step_whole_rows(SteppedRows to, bool guarded, int64_t first, const float* gradient) {
+  constexpr int kCount = 8 * kRow, kAhead = kCount > 64 ? 3 : 1;
   bool finite = true;
   float4 *value = reinterpret_cast<float4*>(to.value + first * kRow),
          *mean = reinterpret_cast<float4*>(to.mean + first * kRow),
          *square = reinterpret_cast<float4*>(to.square + first * kRow);
-#pragma unroll 2
-  for (int k = threadIdx.x & 31; k < 8 * kRow; k += 32) {
-    const float4 g = reinterpret_cast<const float4*>(gradient)[k];
-    float4 v = value[k], m = mean[k], s = square[k];
-    finite &= step_value(guarded, to.constants, g.x, v.x, m.x, s.x);
-    finite &= step_value(guarded, to.constants, g.y, v.y, m.y, s.y);
-    finite &= step_value(guarded, to.constants, g.z, v.z, m.z, s.z);
-    finite &= step_value(guarded, to.constants, g.w, v.w, m.w, s.w);
-    value[k] = v, mean[k] = m, square[k] = s;
+#pragma unroll 1
+  for (int k = threadIdx.x & 31; k < kCount; k += 32 * kAhead) {
+    float4 v[kAhead], m[kAhead], s[kAhead];
+#pragma unroll
+    for (int j = 0; j < kAhead; ++j)
+      if (k + 32 * j < kCount) v[j] = value[k + 32 * j], m[j] = mean[k + 32 * j], s[j] = square[k + 32 * j];
+#pragma unroll
+    for (int j = 0; j < kAhead; ++j) {
+      const int at = k + 32 * j;
+      if (at >= kCount) continue;
+      const float4 g = reinterpret_cast<const float4*>(gradient)[at];
+      finite &= step_value(guarded, to.constants, g.x, v[j].x, m[j].x, s[j].x);
+      finite &= step_value(guarded, to.constants, g.y, v[j].y, m[j].y, s[j].y);
+      finite &= step_value(guarded, to.constants, g.z, v[j].z, m[j].z, s[j].z);
+      finite &= step_value(guarded, to.constants, g.w, v[j].w, m[j].w, s[j].w);
+      value[at] = v[j], mean[at] = m[j], square[at] = s[j];
+    }
   }
   return finite;
 }

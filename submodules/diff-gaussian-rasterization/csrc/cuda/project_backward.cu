@@ -28,14 +28,14 @@ struct StoredMoments {
 struct RowGradient {
   float means[3], means2d[3], opacity, scales[3], rotation[4], sh_dc[3];
 
-  // As rows 0 of `out`; the gradients that are not held here go to row i. Those of tensors that the scene lacks go
-  // nowhere, because their formulas read these tensors.
-  __device__ SceneGradient<float> pointers(const Scene<float>& s, const SceneGradient<float>& out, int64_t i) {
+  // As rows 0 of `out`; the gradients that are not held here go to row i. No pointer to a member depends on a
+  // condition, or the members would lie in memory.
+  __device__ SceneGradient<float> pointers(const SceneGradient<float>& out, int64_t i) {
     return {means,
             means2d,
             &opacity,
-            s.scales ? scales : nullptr,
-            s.rotations ? rotation : nullptr,
+            scales,
+            rotation,
             out.cov3d ? out.cov3d + 6 * i : nullptr,
             out.colors ? out.colors + 3 * i : nullptr,
             sh_dc,
@@ -86,7 +86,7 @@ __global__ void __launch_bounds__(kThreads)
   source.read(i, seen, m, warp_stage);
   wait_for_rows();
   RowGradient g = {};
-  const SceneGradient<float> mine = g.pointers(s, out, i);
+  const SceneGradient<float> mine = g.pointers(out, i);
   if (seen) {
     // Writes the row even if it is not wanted: a null pointer would be tested for every band.
     project_vjp_row(s, camera, i, m, row, row, mine, 0);

@@ -135,7 +135,7 @@ GS_HD Vec3<T> color_vjp(const Scene<T>& s, const Camera<T>& camera, int64_t i, V
 }
 
 // Computes the gradients of Gaussian i from its moments m, and writes them to row `to` of `out`, except that of
-// sh_rest.
+// sh_rest. Those of tensors that the scene lacks are not written.
 template <class T>
 GS_HD void project_vjp_row(const Scene<T>& s, const Camera<T>& camera, int64_t i, const T* m, const T* rest, T* g_rest,
                            const SceneGradient<T>& out, int64_t to) {
@@ -156,12 +156,12 @@ GS_HD void project_vjp_row(const Scene<T>& s, const Camera<T>& camera, int64_t i
            Vec3<T>{g.pixel_x * T(0.5) * T(s.image.width), g.pixel_y * T(0.5) * T(s.image.height), T(0)});
   if (out.opacities)
     out.opacities[to] = g.log_opacity * (s.raw ? log_sigmoid_slope(s.opacities[i]) : 1 / s.opacities[i]);
-  if (out.scales)
+  if (out.scales && s.scales)
     for (int k = 0; k < 3; ++k) {
       const T scale = s.raw ? T(1) : s.scales[3 * i + k];
       out.scales[3 * to + k] = scale != 0 ? g.log_scale[k] / scale : T(0);  // the loss is even in the scale
     }
-  if (out.rotations) {
+  if (out.rotations && s.rotations) {
     const Quat<T> q =
         s.raw ? normalise_vjp(in.rotation, in.rotation_norm, g.torque) : rotation_columns_vjp(in.rotation, g.direction);
     T* row = out.rotations + 4 * to;

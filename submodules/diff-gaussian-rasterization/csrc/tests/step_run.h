@@ -86,14 +86,14 @@ struct Rendered {
   gs::BlendGradient<float> backward;
 };
 template <class Where>
-std::unique_ptr<Rendered> render(const Where& where, Parameters<float>& p, gs::Image image, bool antialiasing,
-                                 float gradient) {
+std::unique_ptr<Rendered> render(const Where& where, const gs::Scene<float>& scene, float gradient) {
   using gs::cuda::bin, gs::cuda::blend, gs::cuda::project;
   using gs::GS_ISA::bin, gs::GS_ISA::blend, gs::GS_ISA::project;
   auto out = std::make_unique<Rendered>();
   Rendered& r = *out;
-  const size_t n = p.count, pixels = size_t(image.width) * image.height;
-  r.scene = scene_of(p, image, antialiasing);
+  const gs::Image image = scene.image;
+  const size_t n = scene.count, pixels = size_t(image.width) * image.height;
+  r.scene = scene;
   r.splats.resize(kSplatValues * n), r.depths.resize(n), r.rects.resize(4 * n), r.tile_counts.resize(n);
   r.radii.resize(n), r.records.resize(n), r.slots.resize(n + 1), r.moments.resize(kGradientValues * n);
   const gs::Projected<float> projected = {r.splats.data(),      r.depths.data(), r.rects.data(),
@@ -105,14 +105,14 @@ std::unique_ptr<Rendered> render(const Where& where, Parameters<float>& p, gs::I
     to.instances.resize(count), to.slot_count = slots;
     return gs::Binned{to.instances.data(), to.ranges.data()};
   };
-  bin(where, p.count, projected, image, gs::BinMemory{take, &r, r.slots.data()});
+  bin(where, scene.count, projected, image, gs::BinMemory{take, &r, r.slots.data()});
   r.color.resize(3 * pixels), r.transmittance.resize(pixels), r.inverse_depth.resize(pixels), r.last.resize(pixels);
   r.input = {r.splats.data(), r.instances.data(), r.ranges.data(), r.background, image};
   blend(where, r.input, {r.color.data(), r.transmittance.data(), r.inverse_depth.data(), r.last.data()});
   r.gradient.assign(3 * pixels, 1);
   r.gradient[pixels / 2 + image.width / 2] = gradient;
   r.backward = {
-      p.count,       int64_t(r.instances.size()), r.slot_count,      r.slots.data(),    r.transmittance.data(),
+      scene.count,   int64_t(r.instances.size()), r.slot_count,      r.slots.data(),    r.transmittance.data(),
       r.last.data(), r.gradient.data(),           r.gradient.data(), r.gradient.data(), r.moments.data()};
   return out;
 }

@@ -123,7 +123,7 @@ void test_gaussian_step() {
       Stepping plain = start, fused = start;
       for (int64_t iteration = 1; iteration <= 3; ++iteration) {
         const float gradient = iteration == 2 ? how.gradient : 1;
-        const auto r = render(threads(), plain.values, {40, 24}, count == 130, gradient);
+        const auto r = render(threads(), scene_of(plain.values, {40, 24}, count == 130), gradient);
         blend_vjp(threads(), r->input, r->backward);
         step_plainly(threads(), plain, how, *r, iteration, [&](const gs::SceneGradient<float>& g) {
           project_vjp(gs::serial_executor(), r->scene, r->tile_counts.data(), r->moments.data(), g);

@@ -328,7 +328,7 @@ void test_gaussian_step() {
         const float gradient = iteration == 2 ? how.gradient : 1;
         gs::emulation::Memory memory;
         gs::Queue queue = memory.queue();
-        const auto r = render(queue, plain.values, {40, 24}, count == 33, gradient);
+        const auto r = render(queue, scene_of(plain.values, {40, 24}, count == 33), gradient);
         step_plainly(queue, plain, how, *r, iteration,
                      [&](const gs::SceneGradient<float>& g) { emulated_gradients(queue, *r, g); });
         r->scene = scene_of(fused.values, r->scene.image, r->scene.antialiasing);  // has the values of before that step
@@ -345,6 +345,32 @@ void test_gaussian_step() {
       CHECK(count < 200 || (fused.stopped == 2) == (how.guarded && std::isnan(how.gradient)));
       CHECK(count < 200 || fused.values.means != start.values.means);
     }
+}
+
+// Covariances and colours that are given, whose scene has no scales, rotations and coefficients to read.
+void test_given_covariances_and_colors() {
+  Parameters<float> p(50);
+  std::vector<float> covariances, colors, got(50 * 9), wanted(50 * 9);
+  for (int64_t i = 0; i < p.count; ++i) {
+    p.opacities[i] = 0.5f;
+    for (int k = 0; k < 3; ++k) colors.push_back(float(std::abs(normal())));
+    for (const bool diagonal : {true, false, false, true, false, true})
+      covariances.push_back(diagonal ? std::exp(2 * p.scales[i]) : 0);
+  }
+  gs::Scene<float> scene = scene_of(p, {40, 24}, false);
+  scene.raw = false;
+  scene.scales = scene.rotations = scene.sh_dc = scene.sh_rest = nullptr, scene.rest_bands = 0;
+  scene.cov3d = covariances.data(), scene.colors = colors.data();
+  gs::SceneGradient<float> g{};
+  gs::emulation::Memory memory;
+  const auto r = render(memory.queue(), scene, 1);
+  g.cov3d = got.data(), g.colors = got.data() + 50 * 6;
+  emulated_gradients(memory.queue(), *r, g);
+  const auto cpu = render(gs::serial_executor(), scene, 1);
+  gs::GS_ISA::blend_vjp(gs::serial_executor(), cpu->input, cpu->backward);
+  g.cov3d = wanted.data(), g.colors = wanted.data() + 50 * 6;
+  gs::GS_ISA::project_vjp(gs::serial_executor(), scene, cpu->tile_counts.data(), cpu->moments.data(), g);
+  check_near(got, wanted, 2e-5);
 }
 
 struct Lengths {
@@ -399,6 +425,7 @@ int main() {
   test_step_guard();
   test_observe();
   test_gaussian_step();
+  test_given_covariances_and_colors();
   test_many_tiles();
   test_long_lists();
   test_ahead();
