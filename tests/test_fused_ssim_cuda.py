@@ -21,8 +21,8 @@ pytestmark = [
     pytest.mark.skipif(not torch.cuda.is_available(), reason="torch finds no NVIDIA GPU"),
 ]
 eps = EPS[torch.float32]
-# Parts of a plane are 70, 38 or 22 rows by 108 columns (csrc/cuda/ssim_strip.h), by the number of pixels.
-CUTS = [(3, 22, 108), (3, 23, 109), (1, 45, 217), (3, 800, 800), (3, 1060, 1600), (600, 39, 3)]
+# Tiles of a plane are 8 or 16 rows by 116 columns (csrc/cuda/ssim_tile.h), by the number of pixels.
+CUTS = [(3, 16, 116), (3, 17, 117), (1, 45, 233), (3, 800, 800), (3, 1060, 1600), (600, 39, 3)]
 
 
 def paddings(shape: tuple[int, ...]) -> list[str]:
@@ -106,7 +106,8 @@ def test_opcheck(train: bool) -> None:
     img1, img2 = (image.cuda() for image in image_pair("noise", (2, 12, 13), torch.float32))
     library.opcheck(torch.ops.fused_ssim.l1_ssim, (img1.clone().requires_grad_(train), img2, True, train))
     one = torch.ones((), device="cuda")
-    library.opcheck(torch.ops.fused_ssim.l1_ssim_vjp, (img1, img2, torch.rand_like(img2), one, one))
+    kept = torch.ops.fused_ssim.l1_ssim(img1, img2, False, True)[2]
+    library.opcheck(torch.ops.fused_ssim.l1_ssim_vjp, (img1, img2, kept, one, one))
 
 
 @pytest.mark.parametrize("as_bytes", [False, True], ids=["float", "bytes"])
@@ -131,7 +132,8 @@ def test_photometric_loss_agrees_with_the_cpu_and_its_parts(as_bytes: bool) -> N
 def test_opcheck_photometric(train: bool) -> None:
     image, target = (image.cuda() for image in image_pair("noise", (2, 12, 13), torch.float32))
     library.opcheck(torch.ops.fused_ssim.photometric, (image.requires_grad_(train), target, 0.2, train))
-    arguments = (image.detach(), target, torch.rand_like(target), 0.2, torch.ones((), device="cuda"))
+    kept = torch.ops.fused_ssim.photometric(image.detach(), target, 0.2, True)[2]
+    arguments = (image.detach(), target, kept, 0.2, torch.ones((), device="cuda"))
     library.opcheck(torch.ops.fused_ssim.photometric_vjp, arguments)
 
 
@@ -161,6 +163,15 @@ def test_strides_and_alignment_change_no_bit() -> None:
     for name, view in views.items():
         for got, bits in zip(all_bits(view(img1), view(img2)), wanted, strict=True):
             assert torch.equal(got, bits), name
+
+
+def test_what_is_kept_may_be_a_view() -> None:
+    img1, img2 = (image.cuda() for image in image_pair("noise", (4, 20, 21), torch.float32))
+    one = torch.ones((), device="cuda")
+    kept = torch.ops.fused_ssim.l1_ssim(img1, img2, False, True)[2]
+    view = torch.cat([kept.new_zeros(1), kept.reshape(-1)])[1:].view(kept.shape)
+    wanted, got = (torch.ops.fused_ssim.l1_ssim_vjp(img1, img2, k, one, one) for k in (kept, view))
+    assert torch.equal(got, wanted)
 
 
 def test_runs_on_the_current_stream() -> None:
@@ -205,5 +216,8 @@ def test_messages() -> None:
     # The operator itself checks inputs that bypass the Python function.
     with pytest.raises(RuntimeError, match="img1 must be float32 on a GPU"):
         torch.ops.fused_ssim.l1_ssim(image.double(), image.double(), False, False)
-    with pytest.raises(RuntimeError, match="gradients must be float32"):
+    with pytest.raises(RuntimeError, match=r"kept must be \[3, 1, 20, 408\]"):
         torch.ops.fused_ssim.l1_ssim_vjp(image, image, image, torch.ones(()), torch.ones(()))
+    kept = torch.ops.fused_ssim.l1_ssim(image, image, False, True)[2]
+    with pytest.raises(RuntimeError, match="gradients must be float32"):
+        torch.ops.fused_ssim.l1_ssim_vjp(image, image, kept, torch.ones(()), torch.ones(()))

@@ -31,22 +31,28 @@ struct L1SsimVjp {
   T* grad_img1;  // out
 };
 
+// L1SsimCuda::maps are (planes, strips, height, kMapRow) floats. Each strip has kMapColumns columns of a plane.
+constexpr int kMapColumns = 116, kMapRow = 408;
+constexpr int64_t map_strips(int64_t width) { return (width + kMapColumns - 1) / kMapColumns; }
+
 // As L1Ssim<float>, with every pointer to the device.
 struct L1SsimCuda {
   ImagePair<float> images;
   bool valid;
-  float *l1, *ssim;  // ssim null if not wanted
-  float* gradient;
+  float *l1, *ssim;       // ssim null if not wanted
+  float* maps;            // out: what the gradient needs; null if not wanted
   float* loss = nullptr;  // out: l1_weight l1 + dssim_weight (1 - ssim); null if not wanted
   float l1_weight = 0, dssim_weight = 0;
+  const int32_t* halted = nullptr;  // while this is not 0, nothing is done; null: never
 };
 
 // As L1SsimVjp<float>, with every pointer to the device.
 struct L1SsimVjpCuda {
   ImagePair<float> images;
-  const float *ssim_gradient, *grad_l1, *grad_ssim;
+  const float *maps, *grad_l1, *grad_ssim;  // L1SsimCuda::maps
   float* grad_img1;
   float l1_weight = 1, ssim_weight = 1;  // of grad_l1 and grad_ssim
+  const int32_t* halted = nullptr;       // as in L1SsimCuda
 };
 
 // An image with alpha, to be composited on a background.
@@ -54,7 +60,8 @@ struct Composite {
   const uint8_t* picture;   // (4, pixels): red, green, blue, straight alpha
   const float* background;  // 3
   int64_t pixels;
-  float* out;  // (3, pixels)
+  float* out;                       // (3, pixels)
+  const int32_t* halted = nullptr;  // of the device, as in L1SsimCuda
 };
 
 }  // namespace gs

@@ -5,6 +5,7 @@ Padding "same" takes pixels beyond the border as 0; "valid" leaves a rim of 5 pi
 a gradient.
 """
 
+import math
 from functools import cache
 
 import torch
@@ -14,6 +15,7 @@ from fused_ssim.backend import OPERATORS
 from fused_ssim.first_order import first_order
 
 WINDOW = 11  # pixels
+MAP_COLUMNS, MAP_ROW = 116, 408  # as in csrc/data.h
 PADDINGS = ("same", "valid")
 
 
@@ -95,11 +97,19 @@ def has_backend(device: str) -> bool:
 
 @library.register_fake("fused_ssim::l1_ssim")
 def _l1_ssim_fake(img1: Tensor, img2: Tensor, valid: bool, train: bool) -> tuple[Tensor, Tensor, Tensor]:
-    return img1.new_empty(()), img1.new_empty(()), img1.new_empty(img1.shape if train else (0,))
+    return img1.new_empty(()), img1.new_empty(()), img1.new_empty(_kept_shape(img1) if train else (0,))
+
+
+def _kept_shape(img1: Tensor) -> tuple[int, ...]:
+    """Return the shape of what a forward keeps: on the CPU the gradient of SSIM, on a GPU three maps of its windows."""
+    if img1.device.type != "cuda":
+        return tuple(img1.shape)
+    height, width = img1.shape[-2:]
+    return math.prod(img1.shape[:-2]), (width + MAP_COLUMNS - 1) // MAP_COLUMNS, height, MAP_ROW
 
 
 @library.register_fake("fused_ssim::l1_ssim_vjp")
-def _l1_ssim_vjp_fake(img1: Tensor, img2: Tensor, ssim_gradient: Tensor, grad_l1: Tensor, grad_ssim: Tensor) -> Tensor:
+def _l1_ssim_vjp_fake(img1: Tensor, img2: Tensor, kept: Tensor, grad_l1: Tensor, grad_ssim: Tensor) -> Tensor:
     return img1.new_empty(img1.shape)
 
 
@@ -111,8 +121,8 @@ def _setup_context(ctx, inputs: tuple, output: tuple[Tensor, Tensor, Tensor]) ->
 
 @first_order
 def _backward(ctx, grad_l1: Tensor, grad_ssim: Tensor, _) -> tuple[Tensor, None, None, None]:
-    img1, img2, ssim_gradient = ctx.saved_tensors
-    return OPERATORS.l1_ssim_vjp(img1, img2, ssim_gradient, grad_l1, grad_ssim), None, None, None
+    img1, img2, kept = ctx.saved_tensors
+    return OPERATORS.l1_ssim_vjp(img1, img2, kept, grad_l1, grad_ssim), None, None, None
 
 
 library.register_autograd("fused_ssim::l1_ssim", _backward, setup_context=_setup_context)
@@ -124,9 +134,7 @@ def _photometric_fake(img1: Tensor, img2: Tensor, lambda_dssim: float, train: bo
 
 
 @library.register_fake("fused_ssim::photometric_vjp")
-def _photometric_vjp_fake(
-    img1: Tensor, img2: Tensor, ssim_gradient: Tensor, lambda_dssim: float, grad_loss: Tensor
-) -> Tensor:
+def _photometric_vjp_fake(img1: Tensor, img2: Tensor, kept: Tensor, lambda_dssim: float, grad_loss: Tensor) -> Tensor:
     return img1.new_empty(img1.shape)
 
 

@@ -11,6 +11,7 @@ namespace {
 constexpr int kThreads = 256;
 
 __global__ void __launch_bounds__(kThreads) composite_kernel(Composite args) {
+  if (args.halted && *args.halted) return;
   const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
   if (i >= args.pixels) return;
   const uint8_t alpha = args.picture[3 * args.pixels + i];

@@ -1,7 +1,13 @@
-// L1 and SSIM with the gradient of SSIM, in one walk over the images. A block walks down a strip (ssim_strip.h) and
-// sums in double. A last block adds the blocks' sums in order, so the same images give the same bits.
+// L1 and SSIM, and their gradient. The forward leaves the derivative of SSIM by each window's statistics in maps, which
+// stay in the L2 cache, and the backward gathers them: a kernel for both would compute the windows around each tile
+// twice. A block takes a tile. A last block adds the blocks' sums in order, so the same images give the same bits.
+#include <cuda_runtime.h>
+
+#include <stdexcept>
+
 #include "backend.h"
-#include "cuda/ssim_strip.h"
+#include "cuda/ssim_backward.h"
+#include "cuda/ssim_forward.h"
 #include "gs/cuda_check.h"
 
 namespace gs {
@@ -9,134 +15,163 @@ namespace {
 
 using namespace GS_ISA;
 
-// Sums over the block in a fixed tree; thread 0 gets the sum. All threads call this once.
-template <int kBlock>
-__device__ Sums block_sum(Sums own) {
-  __shared__ Sums warps[kBlock / 32];
-  for (int offset = 16; offset > 0; offset /= 2) {
-    own.l1 += __shfl_down_sync(~0u, own.l1, offset);
-    own.ssim += __shfl_down_sync(~0u, own.ssim, offset);
-  }
+struct BlockSums {
+  double l1, unlike;
+};
+
+// The sum over a warp in a fixed tree; lane 0 gets it.
+template <class T>
+__device__ T warp_sum(T own) {
+  for (int offset = 16; offset > 0; offset /= 2) own += __shfl_down_sync(~0u, own, offset);
+  return own;
+}
+
+// Sums over the block; thread 0 gets the sum. All threads call this once.
+template <int kBlock, class T>
+__device__ BlockSums block_sum(T l1, T unlike) {
+  __shared__ BlockSums warps[kBlock / 32];
+  const BlockSums own{double(warp_sum(l1)), double(warp_sum(unlike))};
   if (threadIdx.x % 32 == 0) warps[threadIdx.x / 32] = own;
   __syncthreads();
-  Sums all{};
+  BlockSums all{};
   if (threadIdx.x == 0)
-    for (const Sums& warp : warps) {
+    for (const BlockSums& warp : warps) {
       all.l1 += warp.l1;
-      all.ssim += warp.ssim;
+      all.unlike += warp.unlike;
     }
   return all;
 }
 
-template <class Source, bool kGradient>
-__global__ void __launch_bounds__(kThreads, 3)
-    l1_ssim_kernel(ImagePair<float> images, Cut cut, bool valid, float gradient_scale, float* gradient, Sums* sums) {
-  extern __shared__ Four memory[];
-  Strip& strip = *reinterpret_cast<Strip*>(memory);
-  const int thread = threadIdx.x;
-  const Part part = part_of(cut, images.height, images.width, valid, blockIdx.x);
-  const int64_t plane = blockIdx.x / (cut.across * cut.down(images.height)) * images.height * images.width;
-  const float* img1 = images.img1 + plane;
-  const Source* img2 = static_cast<const Source*>(images.img2) + plane;
+template <class Source>
+__device__ Plane<Source> plane_of(const ImagePair<float>& images, const Tile& tile) {
+  const int64_t first = tile.plane * (images.height * images.width);
+  return {images.img1 + first, static_cast<const Source*>(images.img2) + first, int(images.height), int(images.width),
+          images.clamp};
+}
 
+template <class Source, bool kGradient>
+__global__ void __launch_bounds__(kColumns, 7) l1_ssim_kernel(ImagePair<float> images, Tiles tiles, Maps maps,
+                                                              Frame frame, BlockSums* sums, const int32_t* halted) {
+  if (halted && *halted) return;
+  __shared__ ForwardTile shared;
+  Tile tile = tile_of(tiles, blockIdx.x);
+  const Plane<Source> plane = plane_of<Source>(images, tile);
+  const int thread = threadIdx.x;
   Sums own{};
-  for (int first = 0; first < kRing; first += kStep)
-    put(strip, part, load(part, img1, img2, images.clamp, first, thread), first, kRing, thread, own);
-  __syncthreads();
-  const int steps = step_count(part.rows);
-  for (int step = 0; step < steps; ++step) {
-    column_stats(strip, step, thread);
+  for (const int end = tile.row + tiles.rows; tile.row < end && tile.row < plane.height; tile.row += kForwardRows) {
+    column_stats(shared, tile, plane, thread, own);
     __syncthreads();
-    window_row<kGradient>(strip, part, step, thread, own);
+    window_rows<kGradient>(shared, tile, frame, maps, thread, own);
     __syncthreads();
-    if constexpr (kGradient) {
-      gather_down(strip, step, thread);
-      __syncthreads();
-    }
-    const int next = step * kStep + kRing;
-    const Rows rows = load(part, img1, img2, images.clamp, next, thread);  // they arrive while the gradient is computed
-    if constexpr (kGradient) gather_across(strip, thread);
-    put(strip, part, rows, next, next + kStep, thread, own);
-    __syncthreads();
-    if constexpr (kGradient) write_gradient(strip, part, step, gradient_scale, gradient + plane, thread);
   }
-  const Sums all = block_sum<kThreads>(own);
+  const BlockSums all = block_sum<kColumns>(own.l1, own.unlike);
   if (thread == 0) sums[blockIdx.x] = all;
 }
 
-constexpr int kSumThreads = 256;
+constexpr int kSumThreads = 512;
 
-__global__ void mean_kernel(const Sums* sums, int64_t n, double l1_count, double ssim_count, L1SsimCuda out) {
-  Sums own{};
+__global__ void __launch_bounds__(kSumThreads)
+    mean_kernel(const BlockSums* sums, int64_t n, double l1_count, double ssim_count, L1SsimCuda out) {
+  if (out.halted && *out.halted) return;
+  BlockSums own{};
   for (int64_t i = threadIdx.x; i < n; i += kSumThreads) {
     own.l1 += sums[i].l1;
-    own.ssim += sums[i].ssim;
+    own.unlike += sums[i].unlike;
   }
-  const Sums all = block_sum<kSumThreads>(own);
+  const BlockSums all = block_sum<kSumThreads>(own.l1, own.unlike);
   if (threadIdx.x == 0) {
-    const float l1 = float(all.l1 / l1_count), ssim = float(all.ssim / ssim_count);
+    const float l1 = float(all.l1 / l1_count);
+    const double unlike = all.unlike / ssim_count;
     *out.l1 = l1;
-    if (out.ssim) *out.ssim = ssim;
-    if (out.loss) *out.loss = out.l1_weight * l1 + out.dssim_weight * (1 - ssim);
+    if (out.ssim) *out.ssim = float(1 - unlike);
+    if (out.loss) *out.loss = out.l1_weight * l1 + out.dssim_weight * float(unlike);
   }
+}
+
+void check_size(const ImagePair<float>& images, int64_t tiles) {
+  if (images.height > INT32_MAX / 2 || images.width > INT32_MAX / 2)
+    throw std::runtime_error("an image has more than 2^30 rows or columns: cut it");
+  if (tiles > INT32_MAX) throw std::runtime_error("the images have too many planes for one call: pass fewer");
+}
+
+Maps maps_of(const ImagePair<float>& images, float* maps) {
+  return {maps, int(images.height), int(map_strips(images.width))};
+}
+
+constexpr int64_t kManyTiles = 1024;  // enough for every processor of a large GPU to have several at once
+
+// Two tiles a block halve what a block costs beside its pixels.
+Tiles forward_tiles(const ImagePair<float>& images) {
+  const Tiles tiles = Tiles::of(kForwardRows, images.planes, images.height, images.width);
+  check_size(images, tiles.count);
+  return tiles.count < kManyTiles ? tiles : Tiles::of(2 * kForwardRows, images.planes, images.height, images.width);
 }
 
 template <class Source, bool kGradient>
 void l1_ssim(const L1SsimCuda& args, const Queue& queue) {
   const auto& images = args.images;
   const auto stream = static_cast<cudaStream_t>(queue.stream);
-  const Cut cut = Cut::of(images.planes, images.height, images.width);
-  if (cut.parts > INT32_MAX) throw std::runtime_error("the images have too many planes for one call: pass fewer");
+  const Tiles tiles = forward_tiles(images);
   const int64_t rim = args.valid ? kReach : 0;
   const double l1_count = double(images.planes) * double(images.height) * double(images.width);
   const double ssim_count = double(images.planes) * double(images.height - rim) * double(images.width - rim);
-  Sums* sums = queue.array<Sums>(cut.parts);
-  const auto kernel = l1_ssim_kernel<Source, kGradient>;
-  GS_CUDA_CHECK(cudaFuncSetAttribute(kernel, cudaFuncAttributeMaxDynamicSharedMemorySize, int(sizeof(Strip))));
-  kernel<<<unsigned(cut.parts), kThreads, sizeof(Strip), stream>>>(images, cut, args.valid, float(1 / ssim_count),
-                                                                   args.gradient, sums);
+  const Frame frame{int(images.width), int(rim / 2), float(1 / ssim_count)};
+  BlockSums* sums = queue.array<BlockSums>(tiles.count);
+  l1_ssim_kernel<Source, kGradient><<<unsigned(tiles.count), kColumns, 0, stream>>>(
+      images, tiles, maps_of(images, args.maps), frame, sums, args.halted);
   check_launch("l1_ssim_kernel");
-  mean_kernel<<<1, kSumThreads, 0, stream>>>(sums, cut.parts, l1_count, ssim_count, args);
+  mean_kernel<<<1, kSumThreads, 0, stream>>>(sums, tiles.count, l1_count, ssim_count, args);
   check_launch("mean_kernel");
 }
 
-constexpr int kVjpThreads = 256;
-constexpr int kVjpPixels = 4;  // of a thread, kVjpThreads apart: their loads overlap, whatever the alignment
-
-template <class Source>
-__global__ void __launch_bounds__(kVjpThreads) l1_ssim_vjp_kernel(L1SsimVjpCuda args, int64_t n, double mean) {
-  const float by_l1 = float(double(*args.grad_l1 * args.l1_weight) * mean);
-  const float by_ssim = *args.grad_ssim * args.ssim_weight;
-  const Source* img2 = static_cast<const Source*>(args.images.img2);
-  const int64_t first = int64_t(blockIdx.x) * (kVjpThreads * kVjpPixels) + threadIdx.x;
-  GS_UNROLL
-  for (int i = 0; i < kVjpPixels; ++i) {
-    const int64_t at = first + i * kVjpThreads;
-    if (at < n) {
-      const float x1 = args.images.img1[at];
-      const float sum = by_ssim * args.ssim_gradient[at] + by_l1 * abs_difference_vjp(x1, to_float(img2[at]));
-      args.grad_img1[at] = args.images.clamp && !in_unit(x1) ? 0 : sum;
-    }
-  }
+template <int kRows, class Source>
+__global__ void __launch_bounds__(kColumns, 7)
+    l1_ssim_vjp_kernel(L1SsimVjpCuda args, Tiles tiles, Maps maps, double mean, bool quads) {
+  if (args.halted && *args.halted) return;
+  __shared__ BackwardTile<kRows> shared;
+  const Tile tile = tile_of(tiles, blockIdx.x);
+  const Plane<Source> plane = plane_of<Source>(args.images, tile);
+  const int thread = threadIdx.x;
+  WindowColumn<kRows> windows = load_windows(shared, tile, maps, plane.width, thread);
+  __syncthreads();
+  gather_down(shared, tile, maps, plane.width, windows, thread);
+  __syncthreads();
+  const Chain chain{float(double(*args.grad_l1 * args.l1_weight) * mean), *args.grad_ssim * args.ssim_weight,
+                    args.grad_img1 + (plane.img1 - args.images.img1), quads};
+  gather_across(shared, tile, plane, chain, thread);
 }
 
+bool is_multiple(const void* pointer, size_t bytes) { return reinterpret_cast<uintptr_t>(pointer) % bytes == 0; }
+
+template <int kRows, class Source>
+void l1_ssim_vjp(const L1SsimVjpCuda& args, const Queue& queue) {
+  const auto& images = args.images;
+  const Tiles tiles = Tiles::of(kRows, images.planes, images.height, images.width);
+  check_size(images, tiles.count);
+  const bool quads = images.width % 4 == 0 && is_multiple(images.img1, sizeof(Four)) &&
+                     is_multiple(images.img2, sizeof(Quad<Source>)) && is_multiple(args.grad_img1, sizeof(Four));
+  const double mean = 1 / double(images.planes * images.height * images.width);
+  const Maps maps = maps_of(images, const_cast<float*>(args.maps));
+  l1_ssim_vjp_kernel<kRows, Source>
+      <<<unsigned(tiles.count), kColumns, 0, static_cast<cudaStream_t>(queue.stream)>>>(args, tiles, maps, mean, quads);
+  check_launch("l1_ssim_vjp_kernel");
+}
+
+// Lower tiles read more rows for each of theirs, but a small image needs them to fill a large GPU.
 template <class Source>
 void l1_ssim_vjp(const L1SsimVjpCuda& args, const Queue& queue) {
-  const int64_t n = args.images.planes * args.images.height * args.images.width;
-  const int64_t blocks = (n + kVjpThreads * kVjpPixels - 1) / (kVjpThreads * kVjpPixels);
-  if (blocks > INT32_MAX) throw std::runtime_error("the images have too many pixels for one call: pass fewer planes");
-  l1_ssim_vjp_kernel<Source>
-      <<<unsigned(blocks), kVjpThreads, 0, static_cast<cudaStream_t>(queue.stream)>>>(args, n, 1 / double(n));
-  check_launch("l1_ssim_vjp_kernel");
+  const auto& images = args.images;
+  const int64_t tiles = Tiles::of(16, images.planes, images.height, images.width).count;
+  tiles < kManyTiles / 2 ? l1_ssim_vjp<8, Source>(args, queue) : l1_ssim_vjp<16, Source>(args, queue);
 }
 
 }  // namespace
 
 void l1_ssim_cuda(const L1SsimCuda& args, const Queue& queue) {
   if (args.images.img2_is_bytes)
-    args.gradient ? l1_ssim<uint8_t, true>(args, queue) : l1_ssim<uint8_t, false>(args, queue);
+    args.maps ? l1_ssim<uint8_t, true>(args, queue) : l1_ssim<uint8_t, false>(args, queue);
   else
-    args.gradient ? l1_ssim<float, true>(args, queue) : l1_ssim<float, false>(args, queue);
+    args.maps ? l1_ssim<float, true>(args, queue) : l1_ssim<float, false>(args, queue);
 }
 
 void l1_ssim_vjp_cuda(const L1SsimVjpCuda& args, const Queue& queue) {

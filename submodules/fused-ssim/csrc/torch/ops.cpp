@@ -43,9 +43,16 @@ gs::ImagePair<T> image_pair(const at::Tensor& img1, const at::Tensor& img2, bool
           clamp};
 }
 
-// Memory for the gradient that the backward will need, if there will be one.
-at::Tensor kept_gradient(const at::Tensor& img1, bool train) {
-  return train ? at::empty(img1.sizes(), img1.options()) : at::empty({0}, img1.options());
+// The shape of what a forward keeps for the backward: on the CPU the gradient of SSIM, on a GPU L1SsimCuda::maps.
+at::DimVector kept_shape(const at::Tensor& img1) {
+  if (!img1.is_cuda()) return at::DimVector(img1.sizes());
+  const int64_t height = img1.size(-2), width = img1.size(-1);
+  return {img1.numel() / (height * width), gs::map_strips(width), height, gs::kMapRow};
+}
+
+// Memory for it, if there will be a backward.
+at::Tensor empty_kept(const at::Tensor& img1, bool train) {
+  return at::empty(train ? kept_shape(img1) : at::DimVector{0}, img1.options());
 }
 
 template <class T>
@@ -79,7 +86,7 @@ using Tensors3 = std::tuple<at::Tensor, at::Tensor, at::Tensor>;
 Tensors3 l1_ssim(const at::Tensor& img1_, const at::Tensor& img2_, bool valid, bool train) {
   check_images(img1_, img2_, valid);
   const at::Tensor img1 = img1_.contiguous(), img2 = img2_.contiguous();
-  at::Tensor gradient = kept_gradient(img1, train);
+  at::Tensor gradient = empty_kept(img1, train);
   return with_scalar(img1, [&](auto zero) {
     using T = decltype(zero);
     const Means means = means_of(image_pair<T>(img1, img2, false), valid, gradient);
@@ -90,7 +97,7 @@ Tensors3 l1_ssim(const at::Tensor& img1_, const at::Tensor& img2_, bool valid, b
 Tensors3 photometric(const at::Tensor& img1_, const at::Tensor& img2_, double lambda, bool train) {
   check_images(img1_, img2_, false);
   const at::Tensor img1 = img1_.contiguous(), img2 = img2_.contiguous();
-  at::Tensor gradient = kept_gradient(img1, train);
+  at::Tensor gradient = empty_kept(img1, train);
   return with_scalar(img1, [&](auto zero) {
     using T = decltype(zero);
     const Means means = means_of(image_pair<T>(img1, img2, true), false, gradient);
@@ -99,11 +106,12 @@ Tensors3 photometric(const at::Tensor& img1_, const at::Tensor& img2_, double la
   });
 }
 
-void check_ssim_gradient(const at::Tensor& ssim_gradient, const at::Tensor& img1) {
-  check_given(ssim_gradient, "ssim_gradient");
-  TORCH_CHECK(ssim_gradient.sizes() == img1.sizes() && ssim_gradient.scalar_type() == img1.scalar_type(),
-              "ssim_gradient must be like img1, got ", ssim_gradient.sizes(), " and ", img1.sizes(),
-              ": it is kept in a forward with train = True only");
+void check_kept(const at::Tensor& kept, const at::Tensor& img1) {
+  check_given(kept, "kept");
+  const at::DimVector wanted = kept_shape(img1);
+  TORCH_CHECK(kept.sizes() == at::IntArrayRef(wanted) && kept.scalar_type() == img1.scalar_type(), "kept must be ",
+              at::IntArrayRef(wanted), " of ", img1.scalar_type(), ", as a forward with train = True gives it, got ",
+              kept.sizes(), " of ", kept.scalar_type());
 }
 
 // Checks the gradient of a mean.
@@ -115,36 +123,36 @@ void check_scalar(const at::Tensor& grad, const at::Tensor& img1) {
 }
 
 template <class T>
-at::Tensor vjp(const at::Tensor& img1_, const at::Tensor& img2_, const at::Tensor& ssim_gradient_, bool clamp,
-               T grad_l1, T grad_ssim) {
-  const at::Tensor img1 = img1_.contiguous(), img2 = img2_.contiguous(), ssim_gradient = ssim_gradient_.contiguous();
+at::Tensor vjp(const at::Tensor& img1_, const at::Tensor& img2_, const at::Tensor& kept_, bool clamp, T grad_l1,
+               T grad_ssim) {
+  const at::Tensor img1 = img1_.contiguous(), img2 = img2_.contiguous(), kept = kept_.contiguous();
   at::Tensor grad_img1 = at::empty(img1.sizes(), img1.options());
-  const gs::L1SsimVjp<T> args{image_pair<T>(img1, img2, clamp), ssim_gradient.const_data_ptr<T>(), double(grad_l1),
+  const gs::L1SsimVjp<T> args{image_pair<T>(img1, img2, clamp), kept.const_data_ptr<T>(), double(grad_l1),
                               double(grad_ssim), grad_img1.mutable_data_ptr<T>()};
   GS_DISPATCH(l1_ssim_vjp_cpu, args, gs::torch_executor());
   return grad_img1;
 }
 
-at::Tensor l1_ssim_vjp(const at::Tensor& img1, const at::Tensor& img2, const at::Tensor& ssim_gradient,
+at::Tensor l1_ssim_vjp(const at::Tensor& img1, const at::Tensor& img2, const at::Tensor& kept,
                        const at::Tensor& grad_l1, const at::Tensor& grad_ssim) {
   check_images(img1, img2, false);
-  check_ssim_gradient(ssim_gradient, img1);
+  check_kept(kept, img1);
   check_scalar(grad_l1, img1), check_scalar(grad_ssim, img1);
   return with_scalar(img1, [&](auto zero) {
     using T = decltype(zero);
-    return vjp<T>(img1, img2, ssim_gradient, false, grad_l1.item<T>(), grad_ssim.item<T>());
+    return vjp<T>(img1, img2, kept, false, grad_l1.item<T>(), grad_ssim.item<T>());
   });
 }
 
-at::Tensor photometric_vjp(const at::Tensor& img1, const at::Tensor& img2, const at::Tensor& ssim_gradient,
-                           double lambda, const at::Tensor& grad_loss) {
+at::Tensor photometric_vjp(const at::Tensor& img1, const at::Tensor& img2, const at::Tensor& kept, double lambda,
+                           const at::Tensor& grad_loss) {
   check_images(img1, img2, false);
-  check_ssim_gradient(ssim_gradient, img1);
+  check_kept(kept, img1);
   check_scalar(grad_loss, img1);
   return with_scalar(img1, [&](auto zero) {
     using T = decltype(zero);
     const T grad = grad_loss.item<T>();
-    return vjp<T>(img1, img2, ssim_gradient, true, grad * T(1 - lambda), grad * -T(lambda));
+    return vjp<T>(img1, img2, kept, true, grad * T(1 - lambda), grad * -T(lambda));
   });
 }
 
@@ -160,11 +168,11 @@ Tensors3 l1_ssim_on_cuda(const at::Tensor& img1_, const at::Tensor& img2_, bool 
   gs::TorchQueue queue(img1_.device());
   const at::Tensor img1 = img1_.contiguous(), img2 = img2_.contiguous();
   at::Tensor l1 = at::empty({}, img1.options()), ssim = at::empty({}, img1.options());
-  at::Tensor gradient = kept_gradient(img1, train);
+  at::Tensor kept = empty_kept(img1, train);
   gs::l1_ssim_cuda({image_pair<float>(img1, img2, false), valid, l1.mutable_data_ptr<float>(),
-                    ssim.mutable_data_ptr<float>(), train ? gradient.mutable_data_ptr<float>() : nullptr},
+                    ssim.mutable_data_ptr<float>(), train ? kept.mutable_data_ptr<float>() : nullptr},
                    queue.queue());
-  return {l1, ssim, gradient};
+  return {l1, ssim, kept};
 }
 
 Tensors3 photometric_on_cuda(const at::Tensor& img1_, const at::Tensor& img2_, double lambda, bool train) {
@@ -172,12 +180,12 @@ Tensors3 photometric_on_cuda(const at::Tensor& img1_, const at::Tensor& img2_, d
   gs::TorchQueue queue(img1_.device());
   const at::Tensor img1 = img1_.contiguous(), img2 = img2_.contiguous();
   at::Tensor loss = at::empty({}, img1.options()), l1 = at::empty({}, img1.options());
-  at::Tensor gradient = kept_gradient(img1, train);
+  at::Tensor kept = empty_kept(img1, train);
   gs::l1_ssim_cuda({image_pair<float>(img1, img2, true), false, l1.mutable_data_ptr<float>(), nullptr,
-                    train ? gradient.mutable_data_ptr<float>() : nullptr, loss.mutable_data_ptr<float>(),
-                    float(1 - lambda), float(lambda)},
+                    train ? kept.mutable_data_ptr<float>() : nullptr, loss.mutable_data_ptr<float>(), float(1 - lambda),
+                    float(lambda)},
                    queue.queue());
-  return {loss, l1, gradient};
+  return {loss, l1, kept};
 }
 
 void check_on_cuda(const at::Tensor& gradient, const at::Tensor& img1) {
@@ -186,33 +194,35 @@ void check_on_cuda(const at::Tensor& gradient, const at::Tensor& img1) {
               gradient.device());
 }
 
-at::Tensor vjp_on_cuda(const at::Tensor& img1_, const at::Tensor& img2_, const at::Tensor& ssim_gradient_, bool clamp,
+at::Tensor vjp_on_cuda(const at::Tensor& img1_, const at::Tensor& img2_, const at::Tensor& kept_, bool clamp,
                        const at::Tensor& grad_l1, float l1_weight, const at::Tensor& grad_ssim, float ssim_weight) {
   check_images_cuda(img1_, img2_, false);
-  check_ssim_gradient(ssim_gradient_, img1_);
-  check_on_cuda(ssim_gradient_, img1_);
+  check_kept(kept_, img1_);
+  check_on_cuda(kept_, img1_);
   for (const at::Tensor& grad : {grad_l1, grad_ssim}) {
     check_scalar(grad, img1_);
     check_on_cuda(grad, img1_);
   }
   gs::TorchQueue queue(img1_.device());
-  const at::Tensor img1 = img1_.contiguous(), img2 = img2_.contiguous(), ssim_gradient = ssim_gradient_.contiguous();
+  const at::Tensor img1 = img1_.contiguous(), img2 = img2_.contiguous();
+  const bool aligned = reinterpret_cast<uintptr_t>(kept_.const_data_ptr()) % 16 == 0;  // else a view of the caller's
+  const at::Tensor kept = aligned ? kept_.contiguous() : kept_.clone(at::MemoryFormat::Contiguous);
   at::Tensor grad_img1 = at::empty(img1.sizes(), img1.options());
   gs::l1_ssim_vjp_cuda(
-      {image_pair<float>(img1, img2, clamp), ssim_gradient.const_data_ptr<float>(), grad_l1.const_data_ptr<float>(),
+      {image_pair<float>(img1, img2, clamp), kept.const_data_ptr<float>(), grad_l1.const_data_ptr<float>(),
        grad_ssim.const_data_ptr<float>(), grad_img1.mutable_data_ptr<float>(), l1_weight, ssim_weight},
       queue.queue());
   return grad_img1;
 }
 
-at::Tensor l1_ssim_vjp_on_cuda(const at::Tensor& img1, const at::Tensor& img2, const at::Tensor& ssim_gradient,
+at::Tensor l1_ssim_vjp_on_cuda(const at::Tensor& img1, const at::Tensor& img2, const at::Tensor& kept,
                                const at::Tensor& grad_l1, const at::Tensor& grad_ssim) {
-  return vjp_on_cuda(img1, img2, ssim_gradient, false, grad_l1, 1, grad_ssim, 1);
+  return vjp_on_cuda(img1, img2, kept, false, grad_l1, 1, grad_ssim, 1);
 }
 
-at::Tensor photometric_vjp_on_cuda(const at::Tensor& img1, const at::Tensor& img2, const at::Tensor& ssim_gradient,
+at::Tensor photometric_vjp_on_cuda(const at::Tensor& img1, const at::Tensor& img2, const at::Tensor& kept,
                                    double lambda, const at::Tensor& grad_loss) {
-  return vjp_on_cuda(img1, img2, ssim_gradient, true, grad_loss, float(1 - lambda), grad_loss, -float(lambda));
+  return vjp_on_cuda(img1, img2, kept, true, grad_loss, float(1 - lambda), grad_loss, -float(lambda));
 }
 #endif
 
@@ -242,15 +252,15 @@ at::Tensor composite(const at::Tensor& picture_, const at::Tensor& background_) 
 }  // namespace
 
 TORCH_LIBRARY(fused_ssim, m) {
-  m.def("l1_ssim(Tensor img1, Tensor img2, bool valid, bool train) -> (Tensor l1, Tensor ssim, Tensor ssim_gradient)");
+  m.def("l1_ssim(Tensor img1, Tensor img2, bool valid, bool train) -> (Tensor l1, Tensor ssim, Tensor kept)");
   m.def(
-      "l1_ssim_vjp(Tensor img1, Tensor img2, Tensor ssim_gradient, Tensor grad_l1, Tensor grad_ssim)"
+      "l1_ssim_vjp(Tensor img1, Tensor img2, Tensor kept, Tensor grad_l1, Tensor grad_ssim)"
       " -> Tensor grad_img1");
   m.def(
       "photometric(Tensor image, Tensor target, float lambda_dssim, bool train)"
-      " -> (Tensor loss, Tensor l1, Tensor ssim_gradient)");
+      " -> (Tensor loss, Tensor l1, Tensor kept)");
   m.def(
-      "photometric_vjp(Tensor image, Tensor target, Tensor ssim_gradient, float lambda_dssim, Tensor grad_loss)"
+      "photometric_vjp(Tensor image, Tensor target, Tensor kept, float lambda_dssim, Tensor grad_loss)"
       " -> Tensor grad_image");
   m.def("composite(Tensor picture, Tensor background) -> Tensor");
 }
