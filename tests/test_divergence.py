@@ -252,7 +252,7 @@ def test_gaussians_without_a_finite_step_are_named(colmap_scene, tmp_path, monke
     monkeypatch.setattr(GaussianModel, "step", poisoned)
     said = r"xyz of 1 of 300 \(5\) and opacity of 1 of 300 \(17\) had no finite step in iteration 4 \(view .*4.pth"
     with pytest.raises(UserError, match=said):
-        _train(colmap_scene, tmp_path, "--optimizer_type", optimizer, iterations=30)
+        _train(colmap_scene, tmp_path, "--optimizer_type", optimizer, "--plain_step", iterations=30)
     capture, iteration = load_checkpoint(tmp_path / "chkpnt4.pth")
     assert iteration == 4 and not (tmp_path / "point_cloud").exists()
     assert all(state["step"] == 4 for state in capture[10]["state"].values())
@@ -274,7 +274,7 @@ def test_exposures_without_a_finite_step_are_named(colmap_scene, tmp_path, monke
 
     monkeypatch.setattr(GaussianModel, "step", poisoned)
     with pytest.raises(UserError, match=r"exposure of 1 of 17 \(Right/V15.png\) had no finite step in iteration 4"):
-        _train(colmap_scene, tmp_path, "--eval", "--train_test_exp", iterations=30)
+        _train(colmap_scene, tmp_path, "--eval", "--train_test_exp", "--plain_step", iterations=30)
     load_checkpoint(tmp_path / "chkpnt4.pth")
 
 

@@ -18,8 +18,9 @@ from gaussian_renderer import scored_views
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.checkpoint import load_checkpoint
 from scene.pictures import decode
-from training import loop, memory_estimate
+from training import memory_estimate
 from training.memory_estimate import training_bytes
+from training.steps import fused, plain
 from utils.host import memory
 from utils.host.memory import free_memory, gib, is_out_of_memory, shortage
 from utils.system_utils import UserError, run_cli
@@ -140,7 +141,7 @@ def _failing(function, call: int, error: Exception):
 def test_the_state_before_is_saved_and_goes_on_to_the_same_end(colmap_scene, tmp_path, monkeypatch, error, said):
     monkeypatch.setattr("training.run.SH_INTERVAL", 5)  # so that the failing iteration is one that raises the degree
     with monkeypatch.context() as patch:
-        patch.setattr(loop, "render", _failing(loop.render, 5, error))
+        patch.setattr(plain, "render", _failing(plain.render, 2, error))  # densification, and the raise of the degree
         with pytest.raises(UserError, match="training ran out of memory in iteration 5") as caught:
             _train(colmap_scene, tmp_path / "cut")
     text = str(caught.value)
@@ -184,14 +185,14 @@ def test_a_densification_cut_short_is_saved_whole(colmap_scene, tmp_path, monkey
 
 
 def test_nothing_trained_saves_nothing(colmap_scene, tmp_path, monkeypatch):
-    monkeypatch.setattr(loop, "render", _failing(loop.render, 1, ON_A_GPU))
+    monkeypatch.setattr(fused, "draw", _failing(fused.draw, 1, ON_A_GPU))
     with pytest.raises(UserError, match="in iteration 1 .*nothing was trained yet"):
         _train(colmap_scene, tmp_path)
     assert not list(tmp_path.glob("*.pth"))
 
 
 def test_other_errors_pass(colmap_scene, tmp_path, monkeypatch):
-    monkeypatch.setattr(loop, "render", _failing(loop.render, 3, RuntimeError("shapes differ")))
+    monkeypatch.setattr(fused, "draw", _failing(fused.draw, 3, RuntimeError("shapes differ")))
     with pytest.raises(RuntimeError, match="shapes differ"):
         _train(colmap_scene, tmp_path)
     assert not list(tmp_path.glob("*.pth"))
@@ -300,15 +301,15 @@ def test_threads_end_with_an_interrupted_run(colmap_scene, tmp_path):
 @pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no NVIDIA GPU")
 def test_a_full_gpu_saves_the_model(colmap_scene, tmp_path, monkeypatch):
-    plain, calls = loop.render, []
+    draw, calls = fused.draw, []
 
     def greedy(*args: object, **kwargs: object) -> dict:
         calls.append(1)
         if len(calls) == 3:
             torch.empty(1 << 50, dtype=torch.uint8, device="cuda")
-        return plain(*args, **kwargs)
+        return draw(*args, **kwargs)
 
-    monkeypatch.setattr(loop, "render", greedy)
+    monkeypatch.setattr(fused, "draw", greedy)
     with pytest.raises(UserError, match="GiB asked for, .* GiB free on the GPU.*chkpnt2.pth"):
         _train(colmap_scene, tmp_path)
     assert load_checkpoint(tmp_path / "chkpnt2.pth")[1] == 2

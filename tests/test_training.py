@@ -22,9 +22,9 @@ from scene.gaussian_model import GaussianModel
 from scene.gaussians.adam import GaussianAdam
 from scene.gaussians.checkpoint import load_checkpoint
 from scene.readers.point_cloud import write_point_cloud
-from training import loop
 from training import run as training_run
 from training.observers import report
+from training.steps import fused
 from training.view_order import ViewOrder
 from utils.system_utils import UserError
 
@@ -190,7 +190,7 @@ def test_sh_degree_rises_every_interval_up_to_its_maximum(blender_scene, tmp_pat
 
 def test_interrupt_saves_a_checkpoint_that_goes_on_to_the_same_end(colmap_scene, tmp_path, monkeypatch):
     whole = _train(colmap_scene, tmp_path / "whole", iterations=9)
-    plain, calls = loop.render, []
+    plain, calls = fused.draw, []
 
     def interrupted(*args: object, **kwargs: object) -> dict:
         calls.append(1)
@@ -199,7 +199,7 @@ def test_interrupt_saves_a_checkpoint_that_goes_on_to_the_same_end(colmap_scene,
         return plain(*args, **kwargs)
 
     with monkeypatch.context() as patch:
-        patch.setattr(loop, "render", interrupted)
+        patch.setattr(fused, "draw", interrupted)
         with pytest.raises(KeyboardInterrupt):
             _train(colmap_scene, tmp_path / "cut", iterations=9)
     resumed = _train(

@@ -47,6 +47,10 @@ def sound_calls() -> dict[str, Call]:
         "decisive": (ops.decisive, [splats, instances, ranges, last]),
         "adam_": (ops.adam_, adam),
         "sparse_adam_": (ops.sparse_adam_, [*sparse, *guard]),
+        "run_ahead_": (
+            ops.run_ahead_,
+            [torch.zeros(4, dtype=torch.int64), [1, 1, 1], 1, None],
+        ),  # refused: not on a GPU
         "observe_": (ops.observe_, [*statistics, torch.rand(3, 3)]),
         "l1_ssim": (ssim.l1_ssim, [one, two, True, True]),
         "l1_ssim_vjp": (ssim.l1_ssim_vjp, [one, two, kept, torch.ones(()), torch.ones(())]),
