@@ -24,18 +24,24 @@ def processed_per_tile(last: Tensor) -> Tensor:
     return _by_tile(last).amax((1, 2)).long()
 
 
-def fragments(splats: Tensor, instances: Tensor, ranges: Tensor, last: Tensor) -> dict[str, float]:
+def fragments(
+    splats: Tensor,
+    instances: Tensor,
+    ranges: Tensor,
+    last: Tensor,
+    sub_tiles: tuple[tuple[int, int], ...] = SUB_TILES,
+) -> dict[str, float]:
     """Count fragments per pixel, from the outputs of the operators project, bin and blend.
 
-    Keys: "blended", and "8x4" and so on for the fragments evaluated with sub-tiles of that size.
+    Keys: "blended", and "8x4" and so on for the fragments evaluated with sub-tiles of that width and height.
     """
     across = -(-last.shape[1] // TILE)
     last_by_tile = _by_tile(last)
-    limits = {(w, h): last_by_tile.unflatten(2, (-1, w)).unflatten(1, (-1, h)).amax((2, 4)) for w, h in SUB_TILES}
+    limits = {(w, h): last_by_tile.unflatten(2, (-1, w)).unflatten(1, (-1, h)).amax((2, 4)) for w, h in sub_tiles}
     processed = processed_per_tile(last)
     tile_of = torch.repeat_interleave(torch.arange(len(processed), device=last.device), processed)
     position = torch.arange(len(tile_of), device=last.device) - (processed.cumsum(0) - processed)[tile_of]
-    pairs = dict.fromkeys(("blended", *SUB_TILES), 0)
+    pairs = dict.fromkeys(("blended", *sub_tiles), 0)
     local = torch.arange(TILE, device=last.device)
     for tile, place in zip(tile_of.split(_CHUNK), position.split(_CHUNK), strict=True):
         mean_x, mean_y, l11, l12, l22, log2_opacity = splats[instances[ranges[tile] + place].long(), :6].double().T

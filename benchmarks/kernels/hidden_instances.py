@@ -7,17 +7,15 @@ to the last one that a pixel of the tile blends are processed. The rest is the m
 save. Prints medians over the views.
 """
 
-import math
 from statistics import median
 
 import torch
-from diff_gaussian_rasterization import GaussianRasterizationSettings, Gaussians
-from diff_gaussian_rasterization.ops import scene_arguments
 from tqdm import tqdm
 
 from arguments import ModelParams, OptionParser, get_combined_args
 from benchmarks.harness.environment import describe, print_table
 from benchmarks.kernels.fragments import processed_per_tile
+from benchmarks.kernels.views import view_arguments
 from scene.cameras import Camera
 from scene.gaussian_model import GaussianModel
 from scene.saved_model import load_saved
@@ -26,25 +24,9 @@ from utils.system_utils import compute_device, run_cli
 
 def counts(camera: Camera, model: GaussianModel) -> dict[str, int]:
     """Count the splats and instances that one view lists, and those of them that are processed."""
-    colors = {"sh_dc": model.get_features_dc, "sh_rest": model.get_features_rest}
-    gaussians = Gaussians(model.get_xyz, **model.raw_geometry(), **colors)
-    settings = GaussianRasterizationSettings(
-        image_height=camera.image_height,
-        image_width=camera.image_width,
-        tanfovx=math.tan(camera.FoVx / 2),
-        tanfovy=math.tan(camera.FoVy / 2),
-        bg=model.get_xyz.new_zeros(3),
-        scale_modifier=1.0,
-        viewmatrix=camera.world_view_transform,
-        projmatrix=camera.full_proj_transform,
-        sh_degree=model.active_sh_degree,
-        campos=camera.camera_center,
-        prefiltered=False,
-        debug=False,
-        antialiasing=False,
-    )
-    arguments = scene_arguments(gaussians, settings, raw=True)
-    out = torch.ops.diff_gaussian_rasterization.rasterize(model.get_xyz, *arguments, settings.bg, False, True)
+    means, background = model.get_xyz, model.get_xyz.new_zeros(3)
+    arguments = view_arguments(camera, model)
+    out = torch.ops.diff_gaussian_rasterization.rasterize(means, *arguments, background, False, True)
     _, _, _, _, _, tile_counts, instances, ranges, _, _, last = out
     processed = processed_per_tile(last)
     tile = torch.repeat_interleave(torch.arange(len(processed), device=ranges.device), ranges.diff())

@@ -31,12 +31,12 @@ constexpr int kVectorBytes = 32;
 constexpr int kVectorBytes = 16;
 #endif
 
-template <class T>
+template <class T, int kBytes = kVectorBytes>
 struct Simd {
-  static constexpr int kLanes = kVectorBytes / sizeof(T);
+  static constexpr int kLanes = kBytes / sizeof(T);
   using Int = typename IntOf<T>::type;
-  typedef T Vec __attribute__((vector_size(kVectorBytes)));
-  typedef Int Mask __attribute__((vector_size(kVectorBytes)));  // each lane 0 or -1
+  typedef T Vec __attribute__((vector_size(kBytes)));
+  typedef Int Mask __attribute__((vector_size(kBytes)));  // each lane 0 or -1
 
   static Vec load(const T* from) {
     Vec v;
@@ -78,48 +78,34 @@ struct Simd {
 
   static bool any(Mask m) {
 #if defined(__AVX512F__)
-    return _mm512_test_epi64_mask((__m512i)m, (__m512i)m) != 0;
-#elif defined(__AVX__)
-    return !_mm256_testz_si256((__m256i)m, (__m256i)m);
-#elif defined(__SSE2__)
-    return _mm_movemask_epi8((__m128i)m) != 0;
-#else
-    bool found = false;
-    for (int i = 0; i < kLanes; ++i) found |= m[i] != 0;
-    return found;
+    if constexpr (kBytes == 64) return _mm512_test_epi64_mask((__m512i)m, (__m512i)m) != 0;
 #endif
+#if defined(__AVX__)
+    if constexpr (kBytes == 32) return !_mm256_testz_si256((__m256i)m, (__m256i)m);
+#endif
+#if defined(__SSE2__)
+    if constexpr (kBytes == 16) return _mm_movemask_epi8((__m128i)m) != 0;
+#endif
+    return bits(m) != 0;
   }
 
   // A bit for each lane.
   static uint32_t bits(Mask m) {
 #if defined(__AVX512DQ__)
-    if constexpr (sizeof(T) == 4) return _mm512_movepi32_mask((__m512i)m);
-    return _mm512_movepi64_mask((__m512i)m);
-#elif defined(__AVX__)
-    if constexpr (sizeof(T) == 4) return uint32_t(_mm256_movemask_ps((__m256)m));
-    return uint32_t(_mm256_movemask_pd((__m256d)m));
-#else
+    if constexpr (kBytes == 64 && sizeof(T) == 4) return _mm512_movepi32_mask((__m512i)m);
+    if constexpr (kBytes == 64 && sizeof(T) == 8) return _mm512_movepi64_mask((__m512i)m);
+#endif
+#if defined(__AVX__)
+    if constexpr (kBytes == 32 && sizeof(T) == 4) return uint32_t(_mm256_movemask_ps((__m256)m));
+    if constexpr (kBytes == 32 && sizeof(T) == 8) return uint32_t(_mm256_movemask_pd((__m256d)m));
+#endif
+#if defined(__SSE2__)
+    if constexpr (kBytes == 16 && sizeof(T) == 4) return uint32_t(_mm_movemask_ps((__m128)m));
+    if constexpr (kBytes == 16 && sizeof(T) == 8) return uint32_t(_mm_movemask_pd((__m128d)m));
+#endif
     uint32_t found = 0;
     for (int i = 0; i < kLanes; ++i) found |= uint32_t(m[i] != 0) << i;
     return found;
-#endif
-  }
-
-  // Sums the lanes by halves: one fixed tree for an instruction set.
-  static T sum(Vec v) { return halves<kLanes>(v); }
-
- private:
-  template <int kCount, class Part>
-  static T halves(Part v) {
-    if constexpr (kCount == 1) {
-      return v[0];
-    } else {
-      typedef T Half __attribute__((vector_size(kCount / 2 * sizeof(T))));
-      Half low, high;
-      std::memcpy(&low, &v, sizeof low);
-      std::memcpy(&high, reinterpret_cast<const char*>(&v) + sizeof low, sizeof high);
-      return halves<kCount / 2>(Half(low + high));
-    }
   }
 };
 

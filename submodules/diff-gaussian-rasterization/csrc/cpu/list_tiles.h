@@ -1,13 +1,18 @@
 #pragma once
-// The list of the tiles that a splat reaches.
+// The tiles that a splat reaches.
 #include "../data.h"
 #include "../math/tiles.h"
 
 GS_ISA_BEGIN
 
-// Writes the tiles that a splat reaches to `tiles`, unless that is null, and returns their number. Counting and
-// emission call one compiled function: inlined twice, it could round in two ways, and the two must agree.
+constexpr int kMasked = 64;  // a rectangle of at most this many tiles has a bit for each
+
+inline bool masked(TileRect rect) { return int64_t(rect.x1 - rect.x0) * (rect.y1 - rect.y0) <= kMasked; }
+
+// Returns the number of tiles of its rectangle that a splat reaches, and in `mask` a bit for each of them, row by row,
+// or 0 if there are too many. Writes their numbers to `tiles`, unless that is null. Counting and emission call one
+// compiled function: inlined twice, it could round in two ways, and the two must agree.
 template <class T>
-int32_t list_tiles(const Splat<T>& splat, TileRect rect, Image image, int32_t* tiles);
+int32_t list_tiles(const Splat<T>& splat, TileRect rect, Image image, uint64_t& mask, int32_t* tiles);
 
 GS_ISA_END

@@ -34,19 +34,35 @@ struct RowTerms {
   T top, l11, u0, v;
 };
 
-template <class T>
-GS_HD RowTerms<T> row_terms(const LocalSplat<T>& s, T y) {
-  const T v = s.l22 * (y - s.y);
-  return {s.log2_opacity - v * v, s.l11, s.l12 * (y - T(kTileCentre)) + s.u, v};
+// V may be a vector of splats in one row y, or of one splat in rows y.
+template <class V, class Y>
+GS_HD RowTerms<V> row_terms(const LocalSplat<V>& s, Y y) {
+  const V v = s.l22 * (y - s.y);
+  return {s.log2_opacity - v * v, s.l11, s.l12 * (y - float(kTileCentre)) + s.u, v};
 }
 
 template <class V, class T>
 GS_HD V row_u(const RowTerms<T>& row, V x) {
-  return (x - T(kTileCentre)) * row.l11 + row.u0;
+  const V along = x - T(kTileCentre);
+  if constexpr (std::is_same_v<V, T>)
+    return along * row.l11 + row.u0;
+  else  // fused by name: where l11 is constant in a loop, a compiler would hoist the product and round it
+    return multiply_add(along, row.l11 - V{}, row.u0 - V{});
 }
 template <class V, class T>
 GS_HD V row_exponent(const RowTerms<T>& row, V u) {
   return row.top - u * u;
+}
+
+// Whether a splat may reach a pixel from `first` to `last` of a row; V may be a vector of splats or of rows. In
+// between, u takes all values between those at the ends. Its least magnitude is rounded down by 60 units in the last
+// place of its terms, so this never denies a pixel that row_exponent reaches, in whatever way u is rounded.
+template <class V, class T>
+GS_HD auto row_reached(const RowTerms<V>& row, T first, T last) {
+  const T half = (last - first) / 2, centre = (last + first) / 2 - T(kTileCentre), margin = T(4e-6);
+  const V u = row.l11 * centre + row.u0, slope = larger(row.l11, V(-row.l11)), start = larger(row.u0, V(-row.u0));
+  const V least = larger(u, V(-u)) - (slope * (half + margin * T(kTileCentre)) + start * margin);
+  return row_exponent(row, larger(least, V{})) >= T(kLog2MinAlpha);
 }
 
 template <class V, class T>

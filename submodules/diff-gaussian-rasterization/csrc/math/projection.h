@@ -78,6 +78,23 @@ GS_HD bool project_splat(const Camera<T>& cam, const Gaussian<T>& gaussian, bool
   return splat.log2_opacity >= T(kLog2MinAlpha) - T(1e-3);  // the margin of tile_rect
 }
 
+// Whether a splat certainly has no tile and no radius, for a Gaussian with perpendicular axes and an opacity of at most
+// 1. largest_scale() is asked for its largest scale only if its mean is off the image: its covariance on the image has
+// at most the trace of a ball's of that scale. 3.34 standard deviations reach alpha 1/255, and `radii` count 3. The
+// rest is for rounding.
+template <class T, class Scale>
+GS_HD bool surely_outside(const Camera<T>& cam, Vec3<T> mean, const Scale& largest_scale) {
+  const Vec3<T> view = to_view(cam, mean);
+  if (!in_front(view.z)) return true;
+  const Perspective<T> p = perspective(cam, view);
+  const T x = cam.mean_focal_x * p.ray_x + cam.axis_x, y = cam.mean_focal_y * p.ray_y + cam.axis_y;
+  const T away = larger(larger(-x, x - T(cam.width + kTile)), larger(-y, y - T(cam.height + kTile)));
+  const T deviations = (away - 3) / T(3.5);
+  if (!(deviations > 1)) return false;
+  const T scale = largest_scale();
+  return scale * scale * (dot(p.p1, p.p1) + dot(p.p2, p.p2)) + 1 < deviations * deviations;
+}
+
 // The gradients of project_splat's inputs; the opacity's is d/d ln(opacity).
 template <class T>
 struct GaussianGradient {

@@ -2,6 +2,7 @@
 // Vectors of three, and scalar helpers.
 #include <cmath>
 
+#include "gs/fused_lanes.h"
 #include "gs/hd.h"
 #include "gs/isa.h"
 
@@ -41,11 +42,17 @@ template <class T>
 GS_HD T clamp(T value, T low, T high) {
   return value < low ? low : value > high ? high : value;
 }
-// a b + c, rounded in one way wherever it is compiled: counting and emission must not differ by what a compiler fuses.
+// a b + c, rounded in one way wherever it is compiled: counting and emission must not differ by what a compiler fuses,
+// nor forward and backward. T may be a vector.
 template <class T>
 GS_HD T multiply_add(T a, T b, T c) {
-#if defined(__CUDA_ARCH__) || defined(__FMA__)
+#if defined(__CUDA_ARCH__)
   return std::fma(a, b, c);
+#elif defined(__FMA__)
+  if constexpr (std::is_floating_point_v<T>)
+    return std::fma(a, b, c);
+  else
+    return fused_lanes(a, b, c);
 #else
   return a * b + c;  // nothing to fuse it with
 #endif

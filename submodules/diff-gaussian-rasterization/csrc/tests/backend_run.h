@@ -58,8 +58,8 @@ gs::Scene<T> scene_of(Parameters<T>& p, gs::Image image, bool antialiasing) {
   return scene;
 }
 
-// Binning's results for a scene, on an Executor or a Queue. rects, records: whether projection gives them to binning (a
-// GPU needs one of the two, the CPU needs rects). slots: whether binning fills them.
+// Binning's results for a scene, on an Executor or a Queue. rects, records: whether projection gives them to binning,
+// which needs one of the two. slots: whether binning fills them.
 template <class T>
 struct Bins {
   std::vector<int32_t> instances;

@@ -31,6 +31,8 @@ void test_threads_and_sizes() {
       CHECK(serial.depth == parallel.depth && serial.gradient == parallel.gradient);
       CHECK(serial.radii == parallel.radii && serial.instances == parallel.instances);
       CHECK(serial.decisive == parallel.decisive);
+      const Result<T> recorded = run(threads(), p, image, true, true);
+      CHECK(serial.color == recorded.color && serial.gradient == recorded.gradient);
       for (int64_t i = 0; i < count; ++i) CHECK(!serial.decisive[i] || serial.tile_counts[i] > 0);
       check_finite(serial.color), check_finite(serial.gradient);
       if (count == 0) CHECK(serial.color.back() == T(0.3) && serial.transmittance.back() == 1);

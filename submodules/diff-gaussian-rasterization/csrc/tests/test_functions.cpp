@@ -3,6 +3,7 @@
 #include <random>
 
 #include "gs/check.h"
+#include "gs/lane_sums.h"
 #include "gs/simd.h"
 #include "math/covariance.h"
 #include "math/exp2.h"
@@ -34,6 +35,28 @@ void test_exp2() {
   // Rounding of the polynomial's steps: a bound of twice the unit in the last place, 1.2e-7 and 2.2e-16, has room.
   CHECK(exp2_error<float>() < 2.4e-7);
   CHECK(exp2_error<double>() < 4.5e-16);
+}
+
+// The sums of several vectors are those of the same tree on one vector, and turning the lanes changes none.
+template <class T>
+void test_lane_sums() {
+  using S = Simd<T>;
+  constexpr int kCount = 10;
+  typename S::Vec v[kCount], turned[kCount];
+  T got[kCount], got_turned[kCount];
+  for (int turn = 0; turn < S::kLanes; ++turn) {
+    for (int k = 0; k < kCount; ++k)
+      for (int i = 0; i < S::kLanes; ++i) v[k][i] = turned[k][(i + turn) % S::kLanes] = T(normal());
+    LaneSums<T, kVectorBytes>::store(v, got);
+    LaneSums<T, kVectorBytes>::store(turned, got_turned);
+    for (int k = 0; k < kCount; ++k) {
+      T tree[S::kLanes];
+      S::store(tree, v[k]);
+      for (int half = S::kLanes / 2; half; half /= 2)
+        for (int i = 0; i < half; ++i) tree[i] += tree[i + half];
+      CHECK(got[k] == tree[0] && got_turned[k] == tree[0]);
+    }
+  }
 }
 
 template <class T>
@@ -202,6 +225,7 @@ void test_direction() {
 
 int main() {
   test_exp2();
+  test_lane_sums<float>(), test_lane_sums<double>();
   test_sigmoid<float>(), test_sigmoid<double>();
   test_rotation();
   test_degenerate_quaternions<float>(), test_degenerate_quaternions<double>();

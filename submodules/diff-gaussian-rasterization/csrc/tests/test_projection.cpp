@@ -258,6 +258,31 @@ void test_footprint_identities() {
   CHECK(footprint_radius(point) == 3);
 }
 
+// What is surely outside has neither tile nor radius, at full opacity; and most of what has none is found.
+void test_surely_outside() {
+  const Camera<double> cam = camera(0.05, -0.1);
+  int outside = 0, empty = 0;
+  for (int trial = 0; trial < 20000; ++trial) {
+    Gaussian<double> g;
+    g.mean = {4 * normal(), 4 * normal(), 4 * normal()};
+    double norm, largest = 0;
+    rotation_columns(normalise(Quat<double>{normal(), normal(), normal(), normal()}, norm), g.axes.direction);
+    for (double& scale : g.axes.scale) scale = std::exp(uniform(-7, 2)), largest = larger(largest, scale);
+    g.log2_opacity = 0;
+    Splat<double> splat;
+    double depth;
+    int radius;
+    const bool visible = project_splat(cam, g, false, splat, depth, radius);
+    const TileRect rect = visible ? tile_rect(splat, kWidth, kHeight) : TileRect{0, 0, 0, 0};
+    const bool nothing = radius == 0 && rect.x1 == rect.x0,
+               found = surely_outside(cam, g.mean, [&] { return largest; });
+    CHECK(nothing || !found);
+    empty += nothing, outside += found;
+  }
+  CHECK(outside > 0.8 * empty);
+  CHECK(empty < 19000);
+}
+
 }  // namespace
 
 int main() {
@@ -266,5 +291,6 @@ int main() {
   test_narrow_camera();
   test_needles();
   test_footprint_identities();
+  test_surely_outside();
   return gs::finish_tests("rasterizer projection");
 }

@@ -4,6 +4,7 @@
 
 #include "cpu/list_tiles.h"
 #include "gs/check.h"
+#include "gs/simd.h"
 #include "math/blend.h"
 #include "math/footprint.h"
 
@@ -53,8 +54,14 @@ std::vector<bool> listed(const Splat<T>& splat) {
   int previous = -1;
   std::vector<int32_t> tiles(out.size());
   const TileRect rect = tile_rect(splat, kWidth, kHeight);
-  tiles.resize(list_tiles(splat, rect, gs::Image{kWidth, kHeight}, tiles.data()));
-  CHECK(list_tiles(splat, rect, gs::Image{kWidth, kHeight}, nullptr) == int(tiles.size()));
+  uint64_t mask, same;
+  tiles.resize(list_tiles(splat, rect, gs::Image{kWidth, kHeight}, mask, tiles.data()));
+  CHECK(list_tiles(splat, rect, gs::Image{kWidth, kHeight}, same, nullptr) == int(tiles.size()) && mask == same);
+  CHECK(__builtin_popcountll(mask) == int(tiles.size()));
+  for (int tile : tiles) {
+    const int x = tile % tile_count(kWidth) - rect.x0, y = tile / tile_count(kWidth) - rect.y0;
+    CHECK(mask >> (y * (rect.x1 - rect.x0) + x) & 1);
+  }
   const TileTest<T> test = make_tile_test(splat, rect, kWidth, kHeight);
   for (int tile : tiles) {
     CHECK(tile > previous);  // row by row, each tile once
@@ -91,6 +98,33 @@ void test_random() {
   CHECK(total > 2000);
   // Needles pass between the pixel centres of a tile's box. Measured: 4 of 2,595.
   CHECK(spare < 10);
+}
+
+// row_reached never denies a pixel that the exponent reaches, alone and in vectors, also where opacity just suffices.
+template <class T>
+void test_rows() {
+  using S = Simd<T>;
+  int reached = 0, spare = 0;
+  for (int trial = 0; trial < 4000; ++trial) {
+    Splat<T> splat = random_splat<T>(trial % 2 ? 30 : 3000);
+    const LocalSplat<T> local = localise(splat, T(16), T(16));
+    for (int y = 0; y < kTile; ++y)
+      for (int first = 0; first < kTile; first += 8) {
+        RowTerms<T> terms = row_terms(local, T(y));
+        T best = -INFINITY;
+        for (int x = first; x < first + 8; ++x) best = larger(best, row_exponent(terms, row_u(terms, T(x))));
+        if (trial % 3 == 0) terms.top += T(kLog2MinAlpha) - best;  // up to rounding
+        best = -INFINITY;
+        for (int x = first; x < first + 8; ++x) best = larger(best, row_exponent(terms, row_u(terms, T(x))));
+        const bool kept = row_reached(terms, T(first), T(first + 7));
+        const RowTerms<typename S::Vec> all = {S::all(terms.top), S::all(terms.l11), S::all(terms.u0), {}};
+        CHECK(S::bits(row_reached(all, T(first), T(first + 7))) == (kept ? (1u << S::kLanes) - 1 : 0));
+        CHECK(kept || !(best >= T(kLog2MinAlpha)));
+        reached += best >= T(kLog2MinAlpha), spare += kept && !(best >= T(kLog2MinAlpha)) && trial % 3;
+      }
+  }
+  CHECK(reached > 5000);
+  CHECK(spare < reached / 20);  // thin splats that pass between pixel centres
 }
 
 // Opacities within a few units in the last place of the one that just reaches 1/255 in a tile.
@@ -168,6 +202,7 @@ void test_local_coordinates() {
 
 int main() {
   test_random<float>(), test_random<double>();
+  test_rows<float>(), test_rows<double>();
   test_borderline<float>(), test_borderline<double>();
   test_extremes<float>(), test_extremes<double>();
   test_radius();

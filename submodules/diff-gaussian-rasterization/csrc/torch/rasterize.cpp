@@ -19,7 +19,7 @@ using gs::baseline::kGradientValues, gs::baseline::kSplatValues, gs::baseline::t
 
 struct ProjectedTensors {
   Tensor splats, depths, rects, tile_counts, radii;
-  Tensor records;  // undefined on the CPU
+  Tensor records;  // undefined where an image has too many tiles
   template <class T>
   gs::Projected<T> pointers() {
     return {splats.mutable_data_ptr<T>(),
@@ -41,7 +41,7 @@ ProjectedTensors project(const SceneTensors& in, bool rects) {
   out.tile_counts = at::empty({n}, ints);
   out.radii = at::empty({n}, ints);
   const int most_tiles = tile_count(std::max(in.image().width, in.image().height));
-  const bool records = in.device().is_cuda() && most_tiles <= std::numeric_limits<uint16_t>::max();
+  const bool records = most_tiles <= std::numeric_limits<uint16_t>::max();
   if (rects || !records) out.rects = at::empty({n, 4}, ints);
   if (records) out.records = at::empty({n, int64_t(sizeof(gs::TileRecord))}, in.options().dtype(at::kByte));
   with_scalar(in.dtype(), [&](auto zero) {

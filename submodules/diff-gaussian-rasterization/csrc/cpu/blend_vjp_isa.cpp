@@ -1,0 +1,283 @@
+// The backward of blending. A thread takes a tile, a vector takes pixels of one of its rows.
+#include <memory>
+#include <vector>
+
+#include "../backend.h"
+#include "../math/exp2.h"
+#include "../math/slots.h"
+#include "gs/lane_sums.h"
+#include "tile_chunk.h"
+
+GS_ISA_BEGIN
+
+namespace {
+
+constexpr int kBatch = 64;  // splats held at once, some 3 KB of floats, and 12 KB of their terms
+
+template <class T>
+struct BackwardState {
+  alignas(64) T transmittance[kPixels], behind[kPixels];
+  alignas(64) T color[3][kPixels], depth[kPixels];  // the image's gradient
+  alignas(64) typename IntOf<T>::type last[kPixels];
+  alignas(64) typename IntOf<T>::type row_last[kTile];  // the largest in a row
+};
+
+// The columns that each splat of a chunk can reach, first <= column <= last; the exact test follows. As in tile_rect,
+// with its margins.
+template <class T>
+struct ColumnRanges {
+  int32_t first[kBatch], last[kBatch];
+
+  void find(const Chunk<T, kBatch>& chunk, int64_t count) {
+    const T end = T(kTile - 1);
+    for (int64_t k = 0; k < count; ++k) {
+      const T slope = chunk.l12[k] / chunk.l22[k];
+      const T level = larger(chunk.log2_opacity[k] - T(kLog2MinAlpha), T(0));
+      const T reach = std::sqrt(level) * T(1.0001) + T(0.01);
+      const T dx = reach * std::sqrt(1 + slope * slope) / chunk.l11[k] + T(0.01);
+      const T left = chunk.x[k] - dx, right = chunk.x[k] + dx;
+      first[k] = int32_t(left > 0 ? (left < end ? left : end) : T(0));  // what is not a number reaches all columns
+      last[k] = int32_t(right < end ? (right > 0 ? right : T(0)) : end);
+    }
+  }
+};
+
+// Pixels go in vectors of at most 32 bytes: many splats reach fewer of a row, and sums of 64 bytes do not all fit the
+// registers.
+template <class T>
+using Pixels = Simd<T, (kVectorBytes < 32 ? kVectorBytes : 32)>;
+
+// Sums come out as those of whole vectors do: narrower vectors beside each other have sums of their own until the end.
+template <class T>
+constexpr int kBeside = Simd<T>::kLanes / Pixels<T>::kLanes;
+
+// The terms of a batch's splats in all rows, and the rows with pixels that each may reach.
+template <class T>
+struct RowTable {
+  static constexpr int kParts = Simd<T>::kLanes == kTile ? kBeside<T> : 1;  // of a row
+  alignas(64) T top[kTile][kBatch], u0[kTile][kBatch], v[kTile][kBatch];
+  alignas(64) typename IntOf<T>::type reached[kParts][kBatch];  // a bit for each row
+
+  // position: of the first splat in the tile's list.
+  void fill(const Chunk<T, kBatch>& chunk, int64_t count, int64_t position, const BackwardState<T>& state) {
+    using S = Simd<T>;
+    using Int = typename S::Int;
+    const typename S::Mask lanes = __builtin_convertvector(lane_numbers<T>(0), typename S::Mask);
+    for (int64_t k = 0; k < count; k += S::kLanes) {
+      const LocalSplat<typename S::Vec> splats = chunk.shapes(k);
+      const typename S::Mask positions = lanes + Int(position + k);
+      typename S::Mask bits[kParts] = {};
+      for (int row = 0; row < kTile; ++row) {
+        const RowTerms<typename S::Vec> terms = row_terms(splats, T(row));
+        S::store(top[row] + k, terms.top), S::store(u0[row] + k, terms.u0), S::store(v[row] + k, terms.v);
+        const typename S::Mask wanted = (positions < state.row_last[row]) & Int(1 << row);
+        for (int p = 0; p < kParts; ++p) {
+          constexpr int kPart = kTile / kParts;
+          bits[p] |= row_reached(terms, T(p * kPart), T((p + 1) * kPart - 1)) & wanted;
+        }
+      }
+      for (int p = 0; p < kParts; ++p) std::memcpy(reached[p] + k, &bits[p], sizeof bits[p]);
+    }
+  }
+
+  uint32_t rows(int k) const {
+    uint32_t bits = 0;
+    for (int p = 0; p < kParts; ++p) bits |= uint32_t(reached[p][k]);
+    return bits;
+  }
+};
+
+template <class T>
+using Sums = typename Pixels<T>::Vec[kGradientValues];
+
+// A batch of splats in a tile, to be taken back to front.
+template <class T>
+struct Batch {
+  Chunk<T, kBatch> chunk;
+  ColumnRanges<T> columns;
+  RowTable<T> table;
+};
+
+// Sums one splat's kGradientValues, lane by lane, over the rows with a bit, in vectors from column `first` on, until
+// `end`. k: the splat in its batch.
+template <class T, bool kDepth>
+__attribute__((always_inline)) inline void sum_rows(const Batch<T>& batch, int k, int64_t position, uint32_t bits,
+                                                    int first, int end, BackwardState<T>& state, Sums<T>& sums) {
+  using S = Pixels<T>;
+  using V = typename S::Vec;
+  using M = typename S::Mask;
+  const Chunk<T, kBatch>& chunk = batch.chunk;
+  const V zero = {};
+  V q0 = zero, qu = zero, qv = zero, quu = zero, quv = zero, qvv = zero;
+  V red = zero, green = zero, blue = zero, depth = zero;
+  for (; bits; bits &= bits - 1) {
+    const int row = __builtin_ctz(bits);
+    const RowTerms<T> terms = {batch.table.top[row][k], chunk.l11[k], batch.table.u0[row][k], batch.table.v[row][k]};
+    int column = first;
+    do {
+      const int at = row * kTile + column;
+      M last;
+      std::memcpy(&last, state.last + at, sizeof last);
+      const V u = row_u(terms, lane_numbers<T, S>(0) + T(column));
+      const V t = row_exponent(terms, u);
+      const M reached = (t >= T(kLog2MinAlpha)) & (last > typename S::Int(position));
+      if (!S::any(reached)) continue;
+      const V uncapped = reached ? exp2_lanes<V, M>(reached ? t : zero, T()) : zero;
+      const V alpha = capped<V, T>(uncapped);
+      V left = S::load(state.transmittance + at), behind = S::load(state.behind + at);
+      const V gr = S::load(state.color[0] + at), gg = S::load(state.color[1] + at), gb = S::load(state.color[2] + at);
+      V gd = zero;
+      V value = chunk.r[k] * gr + chunk.g[k] * gg + chunk.b[k] * gb;
+      if (kDepth) gd = S::load(state.depth + at), value += chunk.inverse_depth[k] * gd;
+      const V q = uncapped * alpha_gradient<T, V>(alpha, value, left, behind);
+      const V weight = alpha * left;
+      S::store(state.transmittance + at, left), S::store(state.behind + at, behind);
+      const V qu_here = q * u, qv_here = q * terms.v;
+      q0 += q, qu += qu_here, qv += qv_here;
+      quu += qu_here * u, quv += qu_here * terms.v, qvv += qv_here * terms.v;
+      red += weight * gr, green += weight * gg, blue += weight * gb;
+      if (kDepth) depth += weight * gd;
+    } while ((column += Simd<T>::kLanes) < end && Simd<T>::kLanes < kTile);
+  }
+  const V all[kGradientValues] = {q0, qu, qv, quu, quv, qvv, red, green, blue, depth};
+  std::copy_n(all, kGradientValues, sums);
+}
+
+// Sums one splat's kGradientValues over the pixels that it reaches, all of them from column `first` to `last`.
+template <class T, bool kDepth>
+void splat_gradient(const Batch<T>& batch, int k, int64_t position, BackwardState<T>& state, T* out) {
+  constexpr int kLanes = Pixels<T>::kLanes, kWhole = Simd<T>::kLanes;
+  const int first = batch.columns.first[k], wide = batch.columns.last[k] - first;
+  Sums<T> sums;
+  if (wide < kLanes) {  // one vector a row, which may begin at any column: that changes no sum
+    const int begin = std::min(first, kTile - kLanes);
+    sum_rows<T, kDepth>(batch, k, position, batch.table.rows(k), begin, begin + 1, state, sums);
+  } else {
+    const int wholes = wide / kWhole + 1, begin = std::min(first, kTile - wholes * kWhole);
+    Sums<T> beside[kBeside<T>];
+    for (int b = 0; b < kBeside<T>; ++b) {
+      const uint32_t rows = RowTable<T>::kParts > 1 ? batch.table.reached[b][k] : batch.table.rows(k);
+      sum_rows<T, kDepth>(batch, k, position, rows, begin + b * kLanes, begin + wholes * kWhole, state, beside[b]);
+    }
+    for (int i = 0; i < kGradientValues; ++i) {
+      sums[i] = beside[0][i];
+      for (int b = 1; b < kBeside<T>; ++b) sums[i] += beside[b][i];
+    }
+  }
+  LaneSums<T, int(sizeof sums[0])>::store(sums, out);
+}
+
+// Sums of the processed instances, a row of kGradientValues each, in the order of slots: those of a splat lie side by
+// side, whatever tiles they come from. A mark per slot tells which instances were processed, and a prefix sum over the
+// marks tells where a row is. So memory is for these rows only, and nothing is added concurrently.
+template <class T>
+class GradientRows {
+ public:
+  explicit GradientRows(int64_t slots) : marks_((slots + 63) / 64 * 64, 0), bits_(marks_.size() / 64) {}
+
+  void mark(int64_t slot) { marks_[slot] = 1; }
+
+  void allocate() {
+    before_.resize(bits_.size() + 1);
+    before_[0] = 0;
+    for (size_t w = 0; w < bits_.size(); ++w) {
+      uint64_t bits = 0;
+      for (int i = 0; i < 8; ++i) {
+        uint64_t marks;  // of 8 slots, the first in the lowest byte
+        std::memcpy(&marks, &marks_[64 * w + 8 * i], sizeof marks);
+        bits |= (marks * 0x0102040810204080 >> 56) << 8 * i;
+      }
+      bits_[w] = bits;
+      before_[w + 1] = before_[w] + __builtin_popcountll(bits);
+    }
+    rows_.reset(new T[kGradientValues * before_.back()]);  // not zeroed: every row is written
+  }
+
+  // The row of a slot; for a slot without one, the next row.
+  T* row(int64_t slot) {
+    const uint64_t lower = (uint64_t(1) << (slot & 63)) - 1;
+    const int64_t rank = before_[slot >> 6] + (slot & 63 ? __builtin_popcountll(bits_[slot >> 6] & lower) : 0);
+    return rows_.get() + kGradientValues * rank;
+  }
+
+ private:
+  std::vector<uint8_t> marks_;
+  std::vector<uint64_t> bits_;
+  std::vector<int64_t> before_;
+  std::unique_ptr<T[]> rows_;
+};
+
+template <class T>
+void read_state(const BlendInput<T>& in, const BlendGradient<T>& g, const Tile& tile, BackwardState<T>& state) {
+  const int64_t plane = int64_t(in.image.width) * in.image.height;
+  std::fill_n(state.last, kPixels, 0);
+  std::fill_n(state.transmittance, kPixels, T(1));
+  std::fill_n(state.behind, kPixels, T(0));
+  std::fill_n(state.color[0], 3 * kPixels, T(0));
+  std::fill_n(state.depth, kPixels, T(0));
+  read_tile(g.last, in.image, tile, state.last);
+  read_tile(g.transmittance, in.image, tile, state.transmittance);
+  for (int c = 0; c < 3; ++c) read_tile(g.color + c * plane, in.image, tile, state.color[c]);
+  if (g.inverse_depth) read_tile(g.inverse_depth, in.image, tile, state.depth);
+  if (g.transmittance_gradient) read_tile(g.transmittance_gradient, in.image, tile, state.behind);
+  for (int p = 0; p < kPixels; ++p)
+    for (int c = 0; c < 3; ++c) state.behind[p] += in.background[c] * state.color[c][p];
+  for (int row = 0; row < kTile; ++row)
+    state.row_last[row] = *std::max_element(state.last + row * kTile, state.last + (row + 1) * kTile);
+}
+
+template <class T, bool kDepth>
+void blend_tile_vjp(const BlendInput<T>& in, const BlendGradient<T>& g, int64_t index, int64_t processed,
+                    GradientRows<T>& rows) {
+  const Tile tile(index, in.image);
+  const int64_t begin = in.ranges[index];
+  BackwardState<T> state;
+  read_state(in, g, tile, state);
+  Batch<T> batch;
+  for (int64_t to = processed; to > 0; to -= std::min<int64_t>(kBatch, to)) {
+    const int64_t from = std::max<int64_t>(0, to - kBatch), count = to - from;
+    batch.chunk.gather(in, tile, begin + from, count);
+    batch.columns.find(batch.chunk, count);
+    batch.table.fill(batch.chunk, count, from, state);
+    for (int64_t position = to - 1; position >= from; --position) {
+      T* sums = rows.row(slot_of(g.slots, in.instances[begin + position], tile.x / kTile, tile.y / kTile));
+      splat_gradient<T, kDepth>(batch, int(position - from), position, state, sums);
+    }
+  }
+}
+
+}  // namespace
+
+template <class T>
+void blend_vjp(const Executor& executor, const BlendInput<T>& in, const BlendGradient<T>& g) {
+  const int64_t tiles = tiles_of(in.image);
+  GradientRows<T> rows(g.slot_count);
+  std::vector<int32_t> processed(tiles);
+  for_dynamic(executor, tiles, 4, [&](int64_t begin, int64_t end) {
+    for (int64_t index = begin; index < end; ++index) {
+      const Tile tile(index, in.image);
+      int32_t last[kPixels] = {};
+      read_tile(g.last, in.image, tile, last);
+      processed[index] = *std::max_element(last, last + kPixels);
+      for (int64_t k = 0; k < processed[index]; ++k)
+        rows.mark(slot_of(g.slots, in.instances[in.ranges[index] + k], tile.x / kTile, tile.y / kTile));
+    }
+  });
+  rows.allocate();
+  const auto run = g.inverse_depth ? blend_tile_vjp<T, true> : blend_tile_vjp<T, false>;
+  for_dynamic(executor, tiles, 1, [&](int64_t tile, int64_t) { run(in, g, tile, processed[tile], rows); });
+  for_dynamic(executor, g.count, 1024, [&](int64_t begin, int64_t end) {
+    for (int64_t i = begin; i < end; ++i) {
+      double sums[kGradientValues] = {};  // a splat may have thousands of tiles
+      const T* stop = rows.row(g.slots[i + 1].first);
+      for (const T* row = rows.row(g.slots[i].first); row < stop; row += kGradientValues)
+        for (int v = 0; v < kGradientValues; ++v) sums[v] += row[v];
+      std::copy_n(sums, kGradientValues, g.moments + kGradientValues * i);
+    }
+  });
+}
+
+template void blend_vjp<float>(const Executor&, const BlendInput<float>&, const BlendGradient<float>&);
+template void blend_vjp<double>(const Executor&, const BlendInput<double>&, const BlendGradient<double>&);
+
+GS_ISA_END

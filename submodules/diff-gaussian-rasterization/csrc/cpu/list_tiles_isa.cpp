@@ -1,0 +1,43 @@
+// The tiles that a splat reaches.
+#include "gs/simd.h"
+#include "list_tiles.h"
+
+GS_ISA_BEGIN
+
+// Tests the rectangle's tiles row by row, a vector at a time.
+template <class T>
+__attribute__((noinline)) int32_t list_tiles(const Splat<T>& splat, TileRect rect, Image image, uint64_t& mask,
+                                             int32_t* tiles) {
+  using S = Simd<T>;
+  using V = typename S::Vec;
+  using M = typename S::Mask;
+  T lanes[S::kLanes];
+  for (int i = 0; i < S::kLanes; ++i) lanes[i] = T(i);
+  const V lane = S::load(lanes);
+  const TileTest<T> test = make_tile_test(splat, rect, image.width, image.height);
+  const int wide = rect.x1 - rect.x0, columns = tile_count(image.width), total = wide * (rect.y1 - rect.y0);
+  int32_t count = 0;
+  mask = 0;
+  int row = rect.y0, column = 0;
+  for (int done = 0; done < total; done += S::kLanes) {
+    const V along = lane + T(column);
+    const M down = __builtin_convertvector((along + T(0.5)) / T(wide), M);
+    const V x = along - __builtin_convertvector(down, V) * T(wide) + T(rect.x0);
+    const V y = __builtin_convertvector(down, V) + T(row);
+    uint32_t reached = S::bits(tile_reached(test, x, y));
+    if (total - done < S::kLanes) reached &= (1u << (total - done)) - 1;
+    if (total <= kMasked) mask |= uint64_t(reached) << done;
+    if (tiles) {
+      const M tile = (down + row) * columns + __builtin_convertvector(x, M);
+      for (uint32_t bits = reached; bits; bits &= bits - 1) *tiles++ = int32_t(tile[__builtin_ctz(bits)]);
+    }
+    count += __builtin_popcount(reached);
+    column += S::kLanes;
+    row += column / wide, column %= wide;
+  }
+  return count;
+}
+template int32_t list_tiles<float>(const Splat<float>&, TileRect, Image, uint64_t&, int32_t*);
+template int32_t list_tiles<double>(const Splat<double>&, TileRect, Image, uint64_t&, int32_t*);
+
+GS_ISA_END
