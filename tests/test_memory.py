@@ -310,6 +310,6 @@ def test_a_full_gpu_saves_the_model(colmap_scene, tmp_path, monkeypatch):
         return draw(*args, **kwargs)
 
     monkeypatch.setattr(fused, "draw", greedy)
-    with pytest.raises(UserError, match="GiB asked for, .* GiB free on the GPU.*chkpnt2.pth"):
+    with pytest.raises(UserError, match="GiB asked for, .* GiB free on the GPU.*chkpnt3.pth"):
         _train(colmap_scene, tmp_path)
-    assert load_checkpoint(tmp_path / "chkpnt2.pth")[1] == 2
+    assert load_checkpoint(tmp_path / "chkpnt3.pth")[1] == 3

@@ -14,7 +14,7 @@
 // a window that is anchored at its own centre (4.8, see ssim.h).
 #include <cmath>
 
-#include "math/ssim.h"
+#include "ssim.h"
 
 #ifndef GS_UNROLL
 #ifdef __CUDACC__
