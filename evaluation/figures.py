@@ -50,7 +50,7 @@ def draw_curves(path: Path, scene: str, runs: Sequence[dict[str, Any]], peers: S
     Each option set has a colour and each seed a line. With several option sets, the Pareto front of all points is
     marked, without runs that stand apart, and a third panel has the gap between training and test views. With one, the
     training views are drawn too, dashed. Points that score a subset of the views are hollow, on a thin line of their
-    own, and in no front. peers: curves of other programs, in grey; they are no part of the front.
+    own, and in no front. They are not in the third panel, as the gap between two subsets is mostly chance. peers: curves of other programs, in grey; they are no part of the front.
     """
     from matplotlib.figure import Figure  # imported here because only a report needs it
 
@@ -100,7 +100,7 @@ def _draw_runs(axes: Axes, runs: Sequence[dict[str, Any]], value: Value, several
         else:
             every += points
         axes.plot(*_columns(points), marker=".", label=name if first else None, **style)
-        if few := _points(part, value, "test"):
+        if value is not _gap and (few := _points(part, value, "test")):
             label = "a subset of the test views" if run is runs[0] else None
             axes.plot(*_columns(few), marker="o", label=label, **style | HOLLOW)
         if not several and (train := _points(whole, value, "train")):

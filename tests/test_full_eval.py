@@ -409,6 +409,8 @@ def test_points_of_subsets_are_hollow_and_in_no_front(tmp_path, monkeypatch):
             assert [[0.3, 36.0], [1.0, 37.0]] in hollow  # the training views
     (front,) = (line for line in lines if line.get_label() == "Pareto front")
     assert front.get_xydata().tolist() == [[2.0, 20.0]]
+    gap = figures[-1].axes[2].lines  # the difference of two subsets is mostly chance
+    assert [line.get_xydata().tolist() for line in gap] == [[[2.0, 1.0]], []]
 
 
 def test_the_report_repeats_what_training_said_at_its_end(scenes, tmp_path):
@@ -584,7 +586,7 @@ def test_the_gap_to_the_training_views_is_a_panel_of_option_sets(figures, scenes
     run("--scenes", scenes / "attic", "--output_path", tmp_path / "out", "--iterations", 40, "--configs", configs)
     panel = drawn[0].axes[2]
     assert panel.get_ylabel() == "PSNR of the training views above the test views (dB)"
-    base, small = panel.lines
+    base, small = panel.lines  # and no line of points that score a subset of the views
     assert base.get_ydata().tolist() == pytest.approx([14.5, 12.0, 7.0])  # 30 dB on training views, 23 on test views
     assert small.get_ydata().tolist() == pytest.approx([16.5, 14.0, 9.0])
 
