@@ -14,6 +14,7 @@ DOCS_VENV := .venv-docs
 CHECK_PYTHON := import sys; sys.exit(sys.version_info < (3, 10) and "Python 3.10 or newer is needed: make PYTHON=...")
 EXTENSIONS := simple-knn fused-ssim diff-gaussian-rasterization
 CXX_TESTS := $(patsubst submodules/%.cpp,build/%,$(wildcard submodules/*/csrc/tests/*.cpp))
+CORES := $(shell getconf _NPROCESSORS_ONLN)
 CXX_TEST_FLAGS := -std=c++17 -O1 -g -Wall -Wextra -Werror -fsanitize=address,undefined -fno-sanitize-recover=all -pthread
 
 CXX_SOURCES := $(shell find submodules benchmarks -name build -prune -o \( -name '*.cpp' -o -name '*.cu*' -o -name '*.h' \) -print)
@@ -59,8 +60,9 @@ format: $(VENV)/.requirements
 	$(BIN)/ruff format .
 	$(BIN)/clang-format -i $(CXX_SOURCES)
 
-cpp-test: $(CXX_TESTS)
-	@for test in $^; do $$test || exit 1; done
+# A process a core builds a test and runs it; the longest take minutes.
+cpp-test:
+	@printf '%s\n' $(CXX_TESTS) | xargs -P $(CORES) -I TEST sh -c '$(MAKE) --no-print-directory TEST && TEST'
 
 build/%: submodules/%.cpp $$(call sources,$$(firstword $$(subst /, ,$$*))) $$(wildcard submodules/$$(dir $$*)*.h)
 	@mkdir -p $(@D)

@@ -50,7 +50,8 @@ def draw_curves(path: Path, scene: str, runs: Sequence[dict[str, Any]], peers: S
     Each option set has a colour and each seed a line. With several option sets, the Pareto front of all points is
     marked, without runs that stand apart, and a third panel has the gap between training and test views. With one, the
     training views are drawn too, dashed. Points that score a subset of the views are hollow, on a thin line of their
-    own, and in no front. They are not in the third panel, as the gap between two subsets is mostly chance. peers: curves of other programs, in grey; they are no part of the front.
+    own, and in no front. They are not in the third panel, as the gap between two subsets is mostly chance.
+    peers: curves of other programs, in grey; they are no part of the front.
     """
     from matplotlib.figure import Figure  # imported here because only a report needs it
 
