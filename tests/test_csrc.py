@@ -34,8 +34,8 @@ SCHEMAS = [
     f"project_vjp({SCENE}, Tensor tile_counts, Tensor moments, bool[9] wanted) -> {GRADIENTS}",
     f"rasterize(Tensor means2d, {SCENE}, Tensor background, bool inverse_depth, bool train) -> (Tensor color, "
     "Tensor transmittance, Tensor inverse_depth, Tensor radii, Tensor splats, Tensor tile_counts, Tensor instances, "
-    "Tensor ranges, Tensor splat_slots, Tensor slots, Tensor last)",
-    f"rasterize_vjp({SCENE}, {BACKWARD}, Tensor tile_counts, bool[9] wanted) -> {GRADIENTS}",
+    "Tensor ranges, Tensor splat_slots, Tensor slots, Tensor last, Tensor layers)",
+    f"rasterize_vjp({SCENE}, {BACKWARD}, Tensor tile_counts, Tensor layers, bool[9] wanted) -> {GRADIENTS}",
     "mark_visible(Tensor means, Tensor view) -> Tensor",
     "decisive(Tensor splats, Tensor instances, Tensor ranges, Tensor last) -> Tensor",
     "adam_(Tensor(a!)[] values, Tensor[] gradients, Tensor(b!)[] exp_avg, Tensor(c!)[] exp_avg_sq, Tensor(d!)[] steps, "

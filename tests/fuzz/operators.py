@@ -41,7 +41,7 @@ def sound_calls() -> dict[str, Call]:
         "blend_vjp": (ops.blend_vjp, [*state, *planes]),
         "project_vjp": (ops.project_vjp, [*scene, counts, ops.blend_vjp(*state, *planes), wanted]),
         "rasterize": (ops.rasterize, [torch.zeros(3, 3), *scene, background, True, True]),
-        "rasterize_vjp": (ops.rasterize_vjp, [*scene, *state, *planes, counts, wanted]),
+        "rasterize_vjp": (ops.rasterize_vjp, [*scene, *state, *planes, counts, torch.zeros(0), wanted]),
         "mark_visible": (ops.mark_visible, [raw["means"], camera.viewmatrix.float()]),
         "decisive": (ops.decisive, [splats, instances, ranges, last]),
         "adam_": (ops.adam_, adam),

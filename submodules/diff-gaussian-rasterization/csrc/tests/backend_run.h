@@ -136,8 +136,9 @@ Result<T> run(const Where& where, Parameters<T>& p, gs::Image image, bool antial
     }
 
   out.color.resize(3 * pixels), out.transmittance.resize(pixels), out.depth.resize(pixels);
-  const gs::BlendInput<T> input = {splats.data(), instances.data(), ranges.data(), background, image};
-  blend(where, input, gs::Blended<T>{out.color.data(), out.transmittance.data(), out.depth.data(), last.data()});
+  const gs::BlendInput<T> input = {splats.data(), instances.data(), ranges.data(), background, image, out.instances};
+  blend(where, input,
+        gs::Blended<T>{out.color.data(), out.transmittance.data(), out.depth.data(), last.data(), nullptr});
 
   static_assert(sizeof(bool) == 1);
   out.decisive.resize(n);
@@ -147,7 +148,7 @@ Result<T> run(const Where& where, Parameters<T>& p, gs::Image image, bool antial
   std::vector<T> moments(kGradientValues * n);
   blend_vjp(where, input,
             gs::BlendGradient<T>{p.count, out.instances, slot_count, slots.data(), out.transmittance.data(),
-                                 last.data(), ones.data(), ones.data(), ones.data(), moments.data()});
+                                 last.data(), ones.data(), ones.data(), ones.data(), moments.data(), nullptr});
   out.gradient.assign(n * (3 + 3 + 1 + 3 + 4 + 3 + 45), T(-77));
   T* g = out.gradient.data();
   const gs::SceneGradient<T> gradient = {g,       g + 3 * n, g + 6 * n,  g + 7 * n, g + 10 * n,

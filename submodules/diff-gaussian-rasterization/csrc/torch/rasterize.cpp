@@ -6,6 +6,7 @@
 #include <algorithm>
 #include <limits>
 
+#include "math/layers.h"
 #include "math/splat.h"
 #include "math/tiles.h"
 #include "scene.h"
@@ -26,7 +27,8 @@ namespace gs::ops {
 
 namespace {
 
-using gs::baseline::kGradientValues, gs::baseline::kSplatValues, gs::baseline::tile_count, gs::baseline::tiles_of;
+using gs::baseline::kGradientValues, gs::baseline::kSplatValues, gs::baseline::layer_values;
+using gs::baseline::tile_count, gs::baseline::tiles_of;
 
 struct ProjectedTensors {
   Tensor splats, depths, rects, tile_counts, radii;
@@ -137,8 +139,12 @@ BinnedTensors bin(ProjectedTensors& in, gs::Image image, bool slots) {
 template <class T>
 gs::BlendInput<T> blend_input(const Tensor& splats, const Tensor& instances, const Tensor& ranges,
                               const Tensor& background, gs::Image image) {
-  return {splats.const_data_ptr<T>(), instances.const_data_ptr<int32_t>(), ranges.const_data_ptr<int64_t>(),
-          background.const_data_ptr<T>(), image};
+  return {splats.const_data_ptr<T>(),
+          instances.const_data_ptr<int32_t>(),
+          ranges.const_data_ptr<int64_t>(),
+          background.const_data_ptr<T>(),
+          image,
+          instances.size(0)};
 }
 
 Tensor background_like(const Tensor& background, const Tensor& splats) {
@@ -148,21 +154,25 @@ Tensor background_like(const Tensor& background, const Tensor& splats) {
 
 struct BlendedTensors {
   Tensor color, transmittance, inverse_depth, last;
+  Tensor layers;  // (V): gs::Blended::layers, of no values on the CPU
 };
 
-// last: whether the backward will need it.
+// last: whether the backward will need it. layers: whether it gets them.
 BlendedTensors blend(const Tensor& splats, const Tensor& instances, const Tensor& ranges, const Tensor& background,
-                     gs::Image image, bool inverse_depth, bool last) {
+                     gs::Image image, bool inverse_depth, bool last, bool layers) {
   const int64_t h = image.height, w = image.width;
+  const bool made = layers && splats.is_cuda();
   BlendedTensors out{at::empty({3, h, w}, splats.options()), at::empty({1, h, w}, splats.options()),
                      at::empty({inverse_depth ? 1 : 0, h, w}, splats.options()),
-                     at::empty({last ? h : 0, w}, splats.options().dtype(at::kInt))};
+                     at::empty({last ? h : 0, w}, splats.options().dtype(at::kInt)),
+                     at::empty({made ? layer_values(image, instances.size(0), inverse_depth) : 0}, splats.options())};
   const Tensor bg = background_like(background, splats);
   with_scalar(splats.scalar_type(), [&](auto zero) {
     using T = decltype(zero);
     const gs::Blended<T> blended{out.color.mutable_data_ptr<T>(), out.transmittance.mutable_data_ptr<T>(),
                                  inverse_depth ? out.inverse_depth.mutable_data_ptr<T>() : nullptr,
-                                 last ? out.last.mutable_data_ptr<int32_t>() : nullptr};
+                                 last ? out.last.mutable_data_ptr<int32_t>() : nullptr,
+                                 out.layers.numel() ? out.layers.mutable_data_ptr<T>() : nullptr};
     GS_RUN(T, splats, blend, blend_input<T>(splats, instances, ranges, bg, image), blended);
   });
   return out;
@@ -189,6 +199,15 @@ class BlendBackward {
 
   const Tensor& splats() const { return splats_; }
 
+  // Takes the forward's layers. Without them, the backward makes its own.
+  void take_layers(const Tensor& layers) {
+    check_tensor(layers, "layers", splats_.scalar_type(), splats_.device(), {-1});
+    const int64_t wanted = layer_values(image_, instances_.size(0), depth_.defined());
+    TORCH_CHECK_VALUE(!layers.size(0) || layers.size(0) >= wanted, "layers must have ", wanted, " values, got ",
+                      layers.size(0));
+    layers_ = layers.contiguous();
+  }
+
   template <class T>
   gs::BlendInput<T> input() const {
     return blend_input<T>(splats_, instances_, ranges_, background_, image_);
@@ -204,7 +223,8 @@ class BlendBackward {
             color_.const_data_ptr<T>(),
             depth_.defined() ? depth_.const_data_ptr<T>() : nullptr,
             alpha_.defined() ? alpha_.const_data_ptr<T>() : nullptr,
-            moments};
+            moments,
+            layers_.defined() && layers_.numel() ? layers_.const_data_ptr<T>() : nullptr};
   }
 
  private:
@@ -235,7 +255,7 @@ class BlendBackward {
   Tensor splats_, instances_, ranges_, splat_slots_;
   int64_t slot_count_;
   Tensor background_, last_, transmittance_;
-  Tensor color_, alpha_, depth_;
+  Tensor color_, alpha_, depth_, layers_;
 };
 
 Tensor blend_vjp(const BlendBackward& in) {
@@ -285,8 +305,8 @@ Tensors4 blend_op(const Tensor& splats, const Tensor& instances, const Tensor& r
   check_splats(splats);
   const gs::Image image = checked_image(height, width);
   check_lists(instances, ranges, splats, image);
-  const BlendedTensors b =
-      blend(splats.contiguous(), instances.contiguous(), ranges.contiguous(), background, image, inverse_depth, train);
+  const BlendedTensors b = blend(splats.contiguous(), instances.contiguous(), ranges.contiguous(), background, image,
+                                 inverse_depth, train, false);
   return {b.color, b.transmittance, b.inverse_depth, b.last};
 }
 
@@ -299,7 +319,8 @@ Gradients project_vjp_op(SCENE_PARAMETERS, const Tensor& tile_counts, const Tens
   return project_vjp(scene, tile_counts.contiguous(), moments.contiguous(), wanted);
 }
 
-using Rasterized = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor>;
+using Rasterized =
+    std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor>;
 
 Rasterized rasterize_op(const Tensor& means2d, SCENE_PARAMETERS, const Tensor& background, bool inverse_depth,
                         bool train) {
@@ -307,16 +328,18 @@ Rasterized rasterize_op(const Tensor& means2d, SCENE_PARAMETERS, const Tensor& b
   scene.checked(kMeans2d, means2d);  // it only receives a gradient
   ProjectedTensors p = project(scene, false);
   BinnedTensors b = bin(p, scene.image(), train);
-  BlendedTensors o = blend(p.splats, b.instances, b.ranges, background, scene.image(), inverse_depth, train);
+  BlendedTensors o = blend(p.splats, b.instances, b.ranges, background, scene.image(), inverse_depth, train, train);
   return {o.color,     o.transmittance, o.inverse_depth, p.radii, p.splats, p.tile_counts,
-          b.instances, b.ranges,        b.splat_slots,   b.slots, o.last};
+          b.instances, b.ranges,        b.splat_slots,   b.slots, o.last,   o.layers};
 }
 
-Gradients rasterize_vjp_op(SCENE_PARAMETERS, BACKWARD_PARAMETERS, const Tensor& tile_counts, Wanted wanted) {
+Gradients rasterize_vjp_op(SCENE_PARAMETERS, BACKWARD_PARAMETERS, const Tensor& tile_counts, const Tensor& layers,
+                           Wanted wanted) {
   const SceneTensors scene(SCENE_ARGUMENTS);
   check_tensor(splats, "splats", scene.dtype(), scene.device(), {scene.count(), kSplatValues});
   check_counts(tile_counts, scene.count(), scene.device());
-  const BlendBackward in(BACKWARD_ARGUMENTS);
+  BlendBackward in(BACKWARD_ARGUMENTS);
+  in.take_layers(layers);
 #ifdef GS_CUDA
   if (splats.is_cuda()) {
     gs::TorchQueue queue(splats.device());
@@ -384,11 +407,11 @@ TORCH_LIBRARY_FRAGMENT(diff_gaussian_rasterization, m) {
          "rasterize(Tensor means2d, " SCENE_SCHEMA
          ", Tensor background, bool inverse_depth, bool train) -> (Tensor color, Tensor transmittance, "
          "Tensor inverse_depth, Tensor radii, Tensor splats, Tensor tile_counts, Tensor instances, "
-         "Tensor ranges, Tensor splat_slots, Tensor slots, Tensor last)",
+         "Tensor ranges, Tensor splat_slots, Tensor slots, Tensor last, Tensor layers)",
          &rasterize_op);
   define(m,
          "rasterize_vjp(" SCENE_SCHEMA ", " BACKWARD_SCHEMA
-         ", Tensor tile_counts, bool[9] wanted) -> " GRADIENTS_SCHEMA,
+         ", Tensor tile_counts, Tensor layers, bool[9] wanted) -> " GRADIENTS_SCHEMA,
          &rasterize_vjp_op);
   define(m, "mark_visible(Tensor means, Tensor view) -> Tensor", &mark_visible_op);
   define(m, "decisive(Tensor splats, Tensor instances, Tensor ranges, Tensor last) -> Tensor", &decisive_op);
