@@ -86,6 +86,20 @@ def test_the_fused_step_gives_the_bytes_of_the_plain_one(scene, tmp_path, monkey
     assert fused == [t for t in range(1, ITERATIONS) if t not in (20, 30, 40)]
 
 
+def test_losses_that_are_kept_keep_no_image(scene, tmp_path, monkeypatch):
+    """Observers note them until something is due; a graph would keep the image and its gradient that long."""
+    measure, told = FusedStep.measure, []
+
+    def noted(self, step):
+        measured = measure(self, step)
+        told.extend(value for value in measured[1] if value is not None)
+        return measured
+
+    monkeypatch.setattr(FusedStep, "measure", noted)
+    trained(scene, tmp_path / "a", *OPTIONS["depth"])
+    assert len(told) > 100 and not any(value.requires_grad for value in told)
+
+
 def test_what_may_want_gradients_takes_the_plain_step(scene, tmp_path, monkeypatch):
     taken = []
     monkeypatch.setattr("training.loop.step_taker", lambda run: (taken.append(step_taker(run)), taken[-1])[1])

@@ -67,6 +67,10 @@ class FusedStep:
                 rendered = apply_exposure(image, run.gaussians.get_exposure_from_name(name))
             losses = run.objective({"render": rendered, "depth": depth}, step)
             losses.total.backward()
+        # Observers keep losses for a while, which must not keep the image and its gradient.
+        losses = losses._replace(
+            **{name: value.detach() for name, value in losses._asdict().items() if value is not None}
+        )
         return drawn, losses, (image.grad, None if depth is None else depth.grad)
 
     def finds_further_terms(self) -> bool:
