@@ -6,6 +6,11 @@ kernel that finds too little room halts: neither it nor any later kernel changes
 submodules/common/include/gs/cuda_queue.h). Some steps later the host reads that in a report which the GPU writes into
 the host's memory. It then makes room, and repeats the steps from the halted one on, in their order. So no value depends
 on the guesses, only the time does.
+
+Streams: everything that a step computes is queued on torch's current stream, in the order of the calls. Photos that the
+CPU keeps are copied on a stream of their own, and the current stream waits for the event of the one it needs
+(scene/pictures/device_copies.py). The reports go straight into page-locked memory. The host reads them without a call
+to the GPU, and waits for the whole stream before it repeats steps or lets anybody read the model.
 """
 
 import time
