@@ -135,6 +135,37 @@ def test_a_term_that_was_added_to_our_objective_is_not_lost(scene, tmp_path, mon
     assert fused == list(range(1, 15))
 
 
+class Immediate:
+    """Stands for RunAhead where there is no GPU: every step is done at once."""
+
+    def __init__(self, *_: object) -> None:
+        self.settle = lambda: None
+        self.give_up = lambda: 0
+
+    def take(self, view: int, step, repeat) -> None:
+        step()
+
+
+@pytest.mark.parametrize("term", [False, True], ids=["ours", "with a further term"])
+def test_steps_that_are_queued_give_the_same_bytes(scene, tmp_path, monkeypatch, term):
+    call, models, make = Objective.__call__, [], run.GaussianModel
+
+    def with_term(self, package, step):
+        losses = call(self, package, step)
+        return losses._replace(total=losses.total + models[-1]._scaling.exp().mean()) if step.iteration > 14 else losses
+
+    monkeypatch.setattr(run, "GaussianModel", lambda *x: (models.append(make(*x)), models[-1])[1])
+    if term:
+        monkeypatch.setattr(Objective, "__call__", with_term)
+    plain = trained(scene, tmp_path / "plain", "--plain_step")
+    monkeypatch.setattr(ahead, "RunAhead", Immediate)
+    monkeypatch.setattr("training.loop.step_taker", AheadStep)
+    queued, queue = [], AheadStep._queue
+    monkeypatch.setattr(AheadStep, "_queue", lambda self, step: (queued.append(step.iteration), queue(self, step))[1])
+    assert trained(scene, tmp_path / "ahead", *OPTIONS["default"]) == plain
+    assert len(queued) > (10 if term else 40)
+
+
 @pytest.mark.parametrize("pipe", ["--compute_cov3D_python", "--convert_SHs_python", "--debug"])
 def test_options_that_the_operator_does_not_know_take_the_plain_step(scene, tmp_path, monkeypatch, pipe):
     monkeypatch.setattr(FusedStep, "advance", lambda *_: pytest.fail("fused"))

@@ -11,8 +11,8 @@ from training.observer import Error, Observer
 from training.run import Run
 from training.step import Step
 
-BAR_INTERVAL = 10  # iterations between updates, each of which reads the losses and so waits for the GPU
-BAR_SECONDS = 0.2  # between them at least, as each waits for the GPU
+BAR_INTERVAL = 10  # iterations between updates, at least
+BAR_SECONDS = 0.2  # between updates, at least: each reads the losses, and so waits for the GPU
 
 
 class ProgressBar(Observer):

@@ -46,10 +46,11 @@ class AheadStep:
 
     def _queue(self, step: Step) -> Losses:
         drawn, losses, gradients = self._fused.measure(step)
-        if self._fused.finds_further_terms():
+        fused = not self._fused.finds_further_terms()
+        if not fused:
             package, losses = self._fused.plain.backward(step)
         self._run.gaussians.guard_loss(step.iteration, losses.total)
-        if self._fused.takes(step):
+        if fused:
             self._fused.advance(step, drawn, gradients)
         else:
             self._fused.plain.advance(step, package)
