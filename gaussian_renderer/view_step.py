@@ -49,9 +49,19 @@ def draw(
 
 
 @torch.no_grad()
-def step(drawn: Drawn, adam: FusedAdam, image_gradient: Tensor, depth_gradient: Tensor | None, observe: bool) -> None:
-    """Take the step of every Gaussian. observe: add the view to the statistics of density control."""
+def step(
+    drawn: Drawn,
+    adam: FusedAdam,
+    image_gradient: Tensor,
+    depth_gradient: Tensor | None,
+    observe: bool,
+    now: Tensor | None = None,
+) -> None:
+    """Take the step of every Gaussian. observe: add the view to the statistics of density control.
+
+    now: on a GPU, (NOW_WORDS,) int64 of `FusedAdam.write_now`, for a step that is recorded.
+    """
     OPERATORS.rasterize_vjp_step_(
         *drawn.scene, *drawn.state, image_gradient, None, depth_gradient, drawn.tile_counts, drawn.radii,
-        *adam.arguments(observe),
+        *adam.arguments(observe), now=now,
     )  # fmt: skip

@@ -1,8 +1,10 @@
 """Adam's tensors as the rasterizer's backward takes them, so that it steps the Gaussians itself."""
 
-from typing import Any
+from collections.abc import Iterator
+from typing import Any, NamedTuple
 
 import utils.host.extensions  # noqa: F401  isort: skip  (before the extensions)
+from diff_gaussian_rasterization.backend import OPERATORS
 from torch import Tensor
 
 from scene.gaussian_model import GaussianModel
@@ -11,6 +13,8 @@ from scene.gaussians.sparse_adam import SparseGaussianAdam
 
 # In the operator's order (gs::Stepped).
 _STEPPED = ("xyz", "opacity", "scaling", "rotation", "f_dc", "f_rest")
+
+NOW_WORDS = 22  # int64: what changes from step to step (gs::StepNow)
 
 
 class FusedAdam:
@@ -39,28 +43,61 @@ class FusedAdam:
 
     def arguments(self, observe: bool) -> tuple[Any, ...]:
         """Arguments of the operator from `attributes` on, for the next step. observe: with the statistics."""
-        gaussians, optimizer = self._gaussians, self._gaussians.optimizer
-        sparse = isinstance(optimizer, SparseGaussianAdam)
+        optimizer = self._gaussians.optimizer
+        stepping = list(self._stepping())
+        attributes = [one.attribute for one in stepping]
+        averages = [one.state["exp_avg"] for one in stepping], [one.state["exp_avg_sq"] for one in stepping]
+        steps = [one.state["step"] for one in stepping]
+        rates, columns = [one.rate for one in stepping], [one.columns for one in stepping]
+        statistics = self._statistics() if observe else (None, None, None)
+        guard = optimizer.guard.arguments if optimizer.guard else ()
+        return (attributes, *averages, steps, rates, *self._constants(), columns, self._sparse, *statistics, *guard)
+
+    def write_now(self, now: Tensor, iteration: int) -> None:
+        """Write what the next step stands for, (NOW_WORDS,) int64 on the CPU, and advance the step counters.
+
+        A step that was recorded with a copy of it on the GPU (`view_step.step`) then takes the step of `iteration`.
+        """
+        stepping = list(self._stepping())
+        attributes, steps = [one.attribute for one in stepping], [one.state["step"] for one in stepping]
+        rates = [one.rate for one in stepping]
+        OPERATORS.step_now_(now, attributes, steps, rates, *self._constants(), self._sparse, iteration)
+
+    def places(self) -> tuple[int, ...]:
+        """Where all tensors of a step lie, to see whether one was replaced."""
+        tensors = [t for one in self._stepping() for t in (one.param, one.state["exp_avg"], one.state["exp_avg_sq"])]
+        return tuple(tensor.data_ptr() for tensor in (*tensors, *self._statistics()))
+
+    @property
+    def _sparse(self) -> bool:
+        return isinstance(self._gaussians.optimizer, SparseGaussianAdam)
+
+    def _constants(self) -> tuple[float, float, float]:
+        defaults = self._gaussians.optimizer.defaults
+        return (*defaults["betas"], defaults["eps"])
+
+    def _statistics(self) -> tuple[Tensor, Tensor, Tensor]:
+        seen = self._gaussians.statistics
+        return seen.max_radii2D, seen.xyz_gradient_accum, seen.denom
+
+    def _stepping(self) -> Iterator["_Stepping"]:
+        """The attributes that step, in the operator's order."""
+        optimizer, sparse = self._gaussians.optimizer, self._sparse
         groups = {group["name"]: group for group in optimizer.param_groups}
-        attributes, averages, squares, steps, rates, columns = [], [], [], [], [], []
         for place, name in enumerate(_STEPPED):
             (param,) = groups[name]["params"]
             active = optimizer.active_columns(name)
             if not param.numel() or (active == 0 and sparse):
                 continue  # it has no gradient, and the optimiser would pass it over
-            state = optimizer.state_of(param)
-            attributes.append(place)
-            averages.append(state["exp_avg"])
-            squares.append(state["exp_avg_sq"])
-            steps.append(state["step"])
-            rates.append(groups[name]["lr"])
-            columns.append(active)
-        defaults = optimizer.defaults
-        seen = gaussians.statistics
-        statistics = (seen.max_radii2D, seen.xyz_gradient_accum, seen.denom) if observe else (None, None, None)
-        guard = optimizer.guard.arguments if optimizer.guard else ()
-        lists = attributes, averages, squares, steps, rates
-        return (*lists, *defaults["betas"], defaults["eps"], columns, sparse, *statistics, *guard)
+            yield _Stepping(place, param, optimizer.state_of(param), groups[name]["lr"], active)
+
+
+class _Stepping(NamedTuple):
+    attribute: int  # its place in gs::Stepped
+    param: Tensor
+    state: dict[str, Tensor]
+    rate: float
+    columns: int
 
 
 def _is_plain(param: Tensor) -> bool:

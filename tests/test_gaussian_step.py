@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 import pytest
 import torch
 from diff_gaussian_rasterization import GaussianRasterizationSettings, schema
-from rasterizer_tools import BOTH_AND_GPU, activated, ops, scene_arguments
+from rasterizer_tools import BOTH_AND_GPU, GPU_MARKS, activated, ops, scene_arguments
 from torch import Tensor, library
 
 from benchmarks.workloads.splat_scenes import PARAMETERS, frustum
@@ -127,6 +127,23 @@ def step_fused(state: State, camera: GaussianRasterizationSettings, case: Case, 
     ops.rasterize_vjp_step_(*arguments, radii, *lists, case.sparse, *statistics, *case.guard(state, iteration))
 
 
+def step_recorded(state: State, camera: GaussianRasterizationSettings, case: Case, iteration: int) -> None:
+    """Take the same step by numbers that the GPU's memory holds; those of the call are wrong."""
+    _, _, steps, rates, *constants, columns = case.lists(state)
+    host = torch.zeros(22, dtype=torch.int64)
+    arguments, radii = rendered(state, camera, case, iteration)
+    ops.step_now_(host, case.attributes, steps, rates, *constants, case.sparse, iteration)
+    statistics = state.statistics if case.observed else (None, None, None)
+    guard = case.guard(state, iteration)
+    averages = case.lists(state)[:2]
+    wrong = [t + 5 for t in steps], [2.0 * rate for rate in rates], 0.5, 0.5, 1.0
+    last = (*guard[:2], 77) if guard else (None, None, 77)
+    ops.rasterize_vjp_step_(
+        *arguments, radii, case.attributes, *averages, *wrong, columns, case.sparse, *statistics, *last,
+        host.to(radii.device),
+    )  # fmt: skip
+
+
 def same_bytes(one: Tensor, other: Tensor) -> bool:
     return one.cpu().numpy().tobytes() == other.cpu().numpy().tobytes()
 
@@ -185,6 +202,18 @@ def test_it_has_the_bytes_of_the_plain_step(case, device, dtype):
         assert int(fused.stopped) == (1 if math.isnan(case.loss) else 0 if case.broken == 1 else 2)
 
 
+@pytest.mark.parametrize("_", [pytest.param(None, marks=GPU_MARKS)])
+@pytest.mark.parametrize("case", CASES.values(), ids=CASES)
+def test_a_step_by_numbers_in_memory_has_the_same_bytes(case, _):
+    start, camera = start_and_camera(case, 700, "cuda", torch.float32)
+    fused, recorded = start.copy(), start.copy()
+    for iteration in (1, 2, 3):
+        step_fused(fused, camera, case, iteration)
+        step_recorded(recorded, camera, case, iteration)
+        for one, other in zip(recorded.tensors(), fused.tensors(), strict=True):
+            assert same_bytes(one, other)
+
+
 @BOTH_AND_GPU
 @pytest.mark.parametrize("n", [0, 1, 31, 129])
 @pytest.mark.parametrize("bands", [0, 3, 15])
@@ -229,7 +258,7 @@ def _refused(match: str, case: Case | None = None, error: type = RuntimeError, *
     case = case or Case(guarded=True)
     state, camera = start_and_camera(case, 8, "cpu", torch.float32)
     arguments, radii = rendered(state, camera, case, 1)
-    rest = list(case.attributes), *case.lists(state), False, *state.statistics, *case.guard(state, 1)
+    rest = list(case.attributes), *case.lists(state), False, *state.statistics, *case.guard(state, 1), None
     names = [argument.name for argument in ops.rasterize_vjp_step_.default._schema.arguments]
     named = dict(zip(names, (*arguments, radii, *rest), strict=True))
     changes = {name: change(named[name]) if callable(change) else change for name, change in changes.items()}
@@ -258,6 +287,7 @@ def test_wrong_arguments_are_named():
     _refused("radii must be", radii=torch.ones(8), error=TypeError)
     _refused("radii must be", radii=torch.ones(7, dtype=torch.int32), error=ValueError)
     _refused("tile_counts must be", tile_counts=torch.ones(7, dtype=torch.int32), error=ValueError)
+    _refused("now must be contiguous, and on a GPU", now=torch.zeros(22, dtype=torch.int64), error=ValueError)
     _refused("not cov3d or colors", sh_dc=None, sh_rest=None, colors=torch.rand(8, 3), error=ValueError)
 
 

@@ -47,10 +47,8 @@ def sound_calls() -> dict[str, Call]:
         "decisive": (ops.decisive, [splats, instances, ranges, last]),
         "adam_": (ops.adam_, adam),
         "sparse_adam_": (ops.sparse_adam_, [*sparse, *guard]),
-        "run_ahead_": (
-            ops.run_ahead_,
-            [torch.zeros(4, dtype=torch.int64), [1, 1, 1], 1, None],
-        ),  # refused: not on a GPU
+        "run_ahead_": (ops.run_ahead_, [torch.zeros(5, dtype=torch.int64), [1, 1, 1], None]),  # refused: not on a GPU
+        "step_now_": (ops.step_now_, _step_now()),
         "observe_": (ops.observe_, [*statistics, torch.rand(3, 3)]),
         "l1_ssim": (ssim.l1_ssim, [one, two, True, True]),
         "l1_ssim_vjp": (ssim.l1_ssim_vjp, [one, two, kept, torch.ones(()), torch.ones(())]),
@@ -69,6 +67,12 @@ def _step(raw: dict[str, Tensor]) -> list:
     statistics = [torch.rand(count), torch.rand(count, 1), torch.rand(count, 1)]
     adam = [*averages, counters, [0.1] * 6, 0.9, 0.99, 1e-8, [-1, -1, -1, -1, -1, 9]]
     return [torch.ones(count, dtype=torch.int32), list(range(6)), *adam, False, *statistics]
+
+
+def _step_now() -> list:
+    """The arguments of `step_now_`."""
+    counters = [torch.tensor(float(place)) for place in range(6)]
+    return [torch.zeros(22, dtype=torch.int64), list(range(6)), counters, [0.1] * 6, 0.9, 0.99, 1e-8, False, 7]
 
 
 def outcomes() -> Iterator[tuple[str, str, str]]:

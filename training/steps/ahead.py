@@ -7,6 +7,7 @@ from training.observer import Announcer
 from training.run import Run
 from training.step import Step
 from training.steps.fused import FusedStep
+from training.steps.recorded import RecordedStep
 from training.steps.run_ahead import RunAhead
 
 _INSTANCES = 8  # of a Gaussian, for the room of the first step
@@ -25,11 +26,14 @@ class AheadStep:
         self._fused = FusedStep(run)
         count = len(run.gaussians)
         room = max(_INSTANCES * count, _LEAST)
-        self._ahead = RunAhead(run.device, (room, max(_SLOTS * count, _LEAST), room), run.gaussians.rewind)
+        self._ahead = RunAhead(run.device, (room, max(_SLOTS * count, _LEAST), room), self._rewind)
+        self._recorded = RecordedStep(run, self._ahead.room)
+        self._unknown = True  # whether somebody may have changed the model's tensors or hooks
 
     def take(self, step: Step, tell: Announcer) -> None:
         """Queue a step, unless something is due in it."""
-        if step.due or not self._fused.takes(step):
+        if step.due or not self._able(step):
+            self._unknown = True
             self._ahead.settle()
             return self._fused.take(step, tell)
         done: list[Losses] = []
@@ -44,7 +48,30 @@ class AheadStep:
         """Take back the steps that cannot be done, after an error. Returns their number."""
         return self._ahead.give_up()
 
+    def _able(self, step: Step) -> bool:
+        """Whether the step can be queued. The model is asked after each step in which somebody may have changed it."""
+        if not self._unknown:
+            return not step.last
+        able = self._fused.takes(step)
+        if able:
+            self._recorded.check()
+        self._unknown = not able
+        return able
+
+    def _rewind(self, steps: int) -> None:
+        self._run.gaussians.rewind(steps)
+        self._recorded.drop()
+
     def _queue(self, step: Step) -> Losses:
+        losses = self._recorded.take(step)
+        if losses is None:
+            with self._ahead.room(step.camera.uid):
+                losses = self._queue_calls(step)
+        else:
+            self._run.density.after_step(step)
+        return losses
+
+    def _queue_calls(self, step: Step) -> Losses:
         drawn, losses, gradients = self._fused.measure(step)
         fused = not self._fused.finds_further_terms()
         if not fused:
@@ -53,6 +80,7 @@ class AheadStep:
         if fused:
             self._fused.advance(step, drawn, gradients)
         else:
+            self._unknown = True
             self._fused.plain.advance(step, package)
         return losses
 

@@ -5,7 +5,8 @@ while the host prepares the next launches. So the host guesses from what the vie
 kernel that finds too little room halts: neither it nor any later kernel changes anything (gs::Queue::halted in
 submodules/common/include/gs/cuda_queue.h). Some steps later the host reads that in a report which the GPU writes into
 the host's memory. It then makes room, and repeats the steps from the halted one on, in their order. So no value depends
-on the guesses, only the time does.
+on the guesses, only the time does. The GPU counts the steps itself, so that a step can be recorded
+(training/steps/recorded.py).
 
 Streams: everything that a step computes is queued on torch's current stream, in the order of the calls. Photos that the
 CPU keeps are copied on a stream of their own, and the current stream waits for the event of the one it needs
@@ -34,7 +35,6 @@ Room = tuple[int, int, int]  # of instances, slots and gradient rows (gs::Room)
 
 @dataclass
 class _Pending:
-    number: int
     view: Hashable
     repeat: Callable[[], None]
 
@@ -47,20 +47,20 @@ class RunAhead:
     """
 
     def __init__(self, device: torch.device, first: Room, rewind: Callable[[int], None]) -> None:
-        self._words = torch.zeros(4, dtype=torch.int64, device=device)
-        self._reports = list(torch.zeros(_REPORTS, 5, dtype=torch.int64, pin_memory=True))
-        self._numbers = [report.numpy() for report in self._reports]  # the same memory
+        self._words = torch.zeros(5, dtype=torch.int64, device=device)
+        self._reports = torch.zeros(_REPORTS, 5, dtype=torch.int64, pin_memory=True)
+        self._numbers = list(self._reports.numpy())  # the same memory
         self._stream = torch.cuda.current_stream(device)
         self._first, self._needed = first, {}
         self._pending: deque[_Pending] = deque()
         self._rewind = rewind
-        self._number = 0
+        self._done = 0  # steps, as far as the host knows
         self.halts = 0  # so far
 
     def take(self, view: Hashable, step: Callable[[], None], repeat: Callable[[], None]) -> None:
-        """Queue a step that renders a view. `repeat` queues it once more, with the same values as before."""
-        number = self._queue(view, step)
-        self._pending.append(_Pending(number, view, repeat))
+        """Queue a step that renders a view, inside `room`. `repeat` queues it once more, with the same values."""
+        step()
+        self._pending.append(_Pending(view, repeat))
         self._collect(AHEAD)
 
     def settle(self) -> None:
@@ -70,28 +70,23 @@ class RunAhead:
     def give_up(self) -> int:
         """Drop the steps that lack room, after an error. Returns their number; they changed nothing."""
         self._stream.synchronize()
-        while self._pending and self._done(self._pending[0]):
-            self._pending.popleft()
+        while self._pending and (report := self._report()) and not report[3]:
+            self._finish(report)
         lost = len(self._pending)
         self._pending.clear()
         self._rewind(lost)
         return lost
 
-    def _queue(self, view: Hashable, step: Callable[[], None]) -> int:
-        self._number += 1
-        with self._running(self._room_of(view)):
-            step()
-        return self._number
-
     @contextmanager
-    def _running(self, room: Room) -> Iterator[None]:
-        OPERATORS.run_ahead_(self._words, room, self._number, self._reports[self._number % _REPORTS])
+    def room(self, view: Hashable | None) -> Iterator[None]:
+        """Within it, operators take room for what a view needed before, or with None for what any view needed."""
+        OPERATORS.run_ahead_(self._words, self._room_of(view), self._reports)
         try:
             yield
         finally:
-            OPERATORS.run_ahead_(None, [], 0, None)
+            OPERATORS.run_ahead_(None, [], None)
 
-    def _room_of(self, view: Hashable) -> Room:
+    def _room_of(self, view: Hashable | None) -> Room:
         """Room for what a view needed before; a new view gets room for the largest."""
         if not self._needed:
             return self._first
@@ -99,19 +94,21 @@ class RunAhead:
         instances, slots, rows = map(_with_spare, needed)
         return min(instances, _MOST), slots, min(rows, _MOST)
 
-    def _report(self, pending: _Pending) -> list[int] | None:
-        """Instances, slots, rows, halted; None until the GPU has written them."""
-        numbers = self._numbers[pending.number % _REPORTS]
-        return numbers[:4].tolist() if numbers[4] == pending.number else None
+    def _report(self) -> list[int] | None:
+        """Of the first pending step: instances, slots, rows, halted; None until the GPU has written them."""
+        number = self._done + 1
+        numbers = self._numbers[number % _REPORTS]
+        return numbers[:4].tolist() if numbers[4] == number else None
 
-    def _done(self, pending: _Pending) -> bool:
-        report = self._report(pending)
-        return report is not None and report[3] == 0
+    def _finish(self, report: list[int]) -> None:
+        """Strike the first pending step off."""
+        self._needed[self._pending.popleft().view] = tuple(report[:3])
+        self._done += 1
 
     def _collect(self, most: int) -> None:
         """Take back the reports that are there, and wait until at most so many steps are pending."""
         while self._pending:
-            report = self._report(self._pending[0])
+            report = self._report()
             if report is None:
                 if len(self._pending) <= most:
                     return
@@ -119,13 +116,14 @@ class RunAhead:
             elif report[3]:
                 self._repeat(report)
             else:
-                self._needed[self._pending.popleft().view] = tuple(report[:3])
+                self._finish(report)
 
     def _repeat(self, report: list[int]) -> None:
         """Make room for the step that was halted, and repeat it and all later ones."""
         self.halts += 1
         self._stream.synchronize()
-        self._words.zero_()
+        self._words[0] = 0
+        self._numbers[(self._done + 1) % _REPORTS][4] = 0  # the halted step's report will come once more
         self._rewind(len(self._pending))
         instances, slots, rows, _ = report
         if instances > _MOST:
@@ -133,7 +131,7 @@ class RunAhead:
         # A step without room for instances did not count its rows, of which there are no more.
         self._needed[self._pending[0].view] = instances, slots, rows or instances
         for pending in self._pending:
-            pending.number = self._queue(pending.view, pending.repeat)
+            pending.repeat()
 
 
 def _with_spare(count: int) -> int:

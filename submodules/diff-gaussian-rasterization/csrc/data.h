@@ -82,9 +82,10 @@ struct Room {
 struct Ahead {
   int32_t* halted;  // on the device: the step that lacked room, else 0
   Room* needed;     // on the device: of the last step that was not halted before
+  int64_t* done;    // on the device: the number of steps that were done
   Room room;
-  int32_t step;     // counts from 1
-  int64_t* report;  // page-locked: instances, slots, rows, halted, step of the last step; or null
+  int64_t* reports;  // (report_count, 5) page-locked: of a step, instances, slots, rows, halted, its number; or null
+  int report_count;  // step n, counted from 1, writes report n % report_count
 };
 
 struct Binned {
@@ -152,11 +153,14 @@ struct ObserveInput {
 // The parameters of a Gaussian that take steps.
 enum Stepped { kStepMeans, kStepOpacities, kStepScales, kStepRotations, kStepShDc, kStepShRest, kStepped };
 
+struct StepNow;  // math/step_now.h
+
 // The step that every Gaussian takes as soon as its gradients are known, so that these never reach memory. The values
 // are those of the Scene and change in place: a Gaussian's row is read before it is written, and no other reads it.
 template <class T>
 struct GaussianStep {
   AdamInput<T> attributes[kStepped];  // the gradients are not read; without columns an attribute takes no step
+  const StepNow* now;                 // on a GPU: stands in for rates, steps and the guard's iteration; or null
   StepGuard<T> guard;
   bool sparse;            // only Gaussians of observed.radii above 0 take a step, and without bias correction
   ObserveInput observed;  // the view's gradients are not read; with max_radii null nothing is observed

@@ -103,5 +103,6 @@ def _(splats, *_):
 @_fake("sparse_adam_")
 @_fake("observe_")
 @_fake("rasterize_vjp_step_")
+@_fake("step_now_")
 def _(*_args, **_keywords):
     return None

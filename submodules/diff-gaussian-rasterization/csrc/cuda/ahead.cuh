@@ -10,21 +10,26 @@ namespace cuda {
 __device__ inline void judge_lists(const Ahead& ahead, int64_t instances, int64_t slots) {
   if (is_halted(ahead.halted)) return;
   *ahead.needed = {instances, slots, 0};
-  if (instances > ahead.room.instances || slots > ahead.room.slots) *ahead.halted = ahead.step;
+  if (instances > ahead.room.instances || slots > ahead.room.slots) *ahead.halted = int32_t(*ahead.done + 1);
 }
 
-// Does the same for the gradient rows, and tells the host. The step's number arrives last.
+// Does the same for the gradient rows, and tells the host. The step's number arrives last. The steps that follow a
+// halted one write its report once more.
 __device__ inline void judge_rows(const Ahead& ahead, int64_t rows) {
   Room& needed = *ahead.needed;
+  const int64_t step = *ahead.done + 1;
   if (!is_halted(ahead.halted)) {
     needed.rows = rows;
-    if (needed.rows > ahead.room.rows) *ahead.halted = ahead.step;
+    if (rows > ahead.room.rows)
+      *ahead.halted = int32_t(step);
+    else
+      *ahead.done = step;
   }
-  if (!ahead.report) return;
-  volatile int64_t* to = ahead.report;
+  if (!ahead.reports) return;
+  volatile int64_t* to = ahead.reports + 5 * (step % ahead.report_count);
   to[0] = needed.instances, to[1] = needed.slots, to[2] = needed.rows, to[3] = *ahead.halted;
   __threadfence_system();
-  to[4] = ahead.step;
+  to[4] = step;
 }
 
 }  // namespace cuda

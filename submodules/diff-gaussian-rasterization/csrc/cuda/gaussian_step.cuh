@@ -5,6 +5,7 @@
 
 #include "../backend.h"
 #include "../math/observe.h"
+#include "../math/step_now.h"
 #include "guarded_adam.cuh"
 #include "queue.cuh"
 
@@ -21,6 +22,7 @@ struct SteppedRows {
 
 struct StepParameters {
   bool wanted;
+  const StepNow* now;  // what stands in for the rows' constants and the guard's iteration, or null
   bool sparse;
   SteppedRows rows[kStepped];
   StepGuard<float> guard;
@@ -29,16 +31,14 @@ struct StepParameters {
 
 inline StepParameters step_parameters(const GaussianStep<float>& in) {
   StepParameters out{};
-  out.wanted = true, out.sparse = in.sparse, out.guard = in.guard, out.observed = in.observed;
+  out.wanted = true, out.now = in.now, out.sparse = in.sparse, out.guard = in.guard, out.observed = in.observed;
   for (int a = 0; a < kStepped; ++a) {
     const AdamInput<float>& from = in.attributes[a];
     bool whole = from.columns == from.row;
     for (const float* p : {from.value, from.mean, from.square}) whole &= reinterpret_cast<uintptr_t>(p) % 16 == 0;
     out.rows[a] = {from.value, from.mean, from.square, int(from.row), int(from.columns), whole, {}};
-    if (!from.columns) continue;
-    out.rows[a].constants = in.sparse
-                                ? baseline::make_uncorrected_adam_step<float>(from.lr, from.beta1, from.beta2, from.eps)
-                                : baseline::make_adam_step<float>(from.lr, from.beta1, from.beta2, from.eps, from.step);
+    if (from.columns && !in.now)
+      out.rows[a].constants = step_constants(in.sparse, from.lr, from.beta1, from.beta2, from.eps, from.step);
   }
   return out;
 }
@@ -118,18 +118,25 @@ __device__ inline void observe_one(const ObserveInput& in, int64_t i, const floa
 template <int kRest>
 __device__ __noinline__ void step_gaussians(const StepParameters& in, int64_t first, int64_t count,
                                             const WarpGradients& g, const float* rest) {
-  if (!begin_step(in.guard)) return;
+  StepGuard<float> guard = in.guard;
+  if (in.now) guard.iteration = in.now->iteration;
+  if (!begin_step(guard)) return;
+  const auto rows = [&](Stepped attribute) {
+    SteppedRows to = in.rows[attribute];
+    if (in.now) to.constants = in.now->constants[attribute];
+    return to;
+  };
   const int64_t i = first + (threadIdx.x & 31);
   const unsigned stepping = __ballot_sync(kWarp, i < count && (!in.sparse || in.observed.radii[i] > 0));
   __syncwarp();  // all lanes have written their gradients
-  const bool guarded = in.guard.stopped != nullptr;
-  bool finite = step_rows<3>(in.rows[kStepMeans], guarded, stepping, first, g.means(), 3);
-  finite &= step_rows<1>(in.rows[kStepOpacities], guarded, stepping, first, g.opacities(), 1);
-  finite &= step_rows<3>(in.rows[kStepScales], guarded, stepping, first, g.scales(), 3);
-  finite &= step_rows<4>(in.rows[kStepRotations], guarded, stepping, first, g.rotations(), 4);
-  finite &= step_rows<3>(in.rows[kStepShDc], guarded, stepping, first, g.sh_dc(), 3);
-  finite &= step_rows<kRest>(in.rows[kStepShRest], guarded, stepping, first, rest, kRest);
-  if (!finite) *in.guard.stopped = in.guard.iteration;  // every thread writes the same
+  const bool guarded = guard.stopped != nullptr;
+  bool finite = step_rows<3>(rows(kStepMeans), guarded, stepping, first, g.means(), 3);
+  finite &= step_rows<1>(rows(kStepOpacities), guarded, stepping, first, g.opacities(), 1);
+  finite &= step_rows<3>(rows(kStepScales), guarded, stepping, first, g.scales(), 3);
+  finite &= step_rows<4>(rows(kStepRotations), guarded, stepping, first, g.rotations(), 4);
+  finite &= step_rows<3>(rows(kStepShDc), guarded, stepping, first, g.sh_dc(), 3);
+  finite &= step_rows<kRest>(rows(kStepShRest), guarded, stepping, first, rest, kRest);
+  if (!finite) *guard.stopped = guard.iteration;  // every thread writes the same
 }
 
 }  // namespace cuda

@@ -4,6 +4,7 @@
 
 #include "backend_run.h"
 #include "emulated_queue.h"
+#include "math/step_now.h"
 #include "schedule.cuh"
 #include "step_run.h"
 
@@ -96,15 +97,18 @@ void test_ahead() {
   Parameters<float> p(300);
   for (int k = 0; k < 3; ++k) p.scales[3 * 17 + k] = 1;
   const Result<float> wanted = run_emulated(p, image, false, true, gs::emulation::Order::forward);
-  int32_t halted = 0, step = 0;
+  constexpr int kReports = 4;
+  int32_t halted = 0;
+  int64_t done = 0, reports[5 * kReports], *report = nullptr;
   gs::Room needed{};
-  int64_t report[5];
   const auto go = [&](gs::Room room) {
     gs::emulation::order = gs::emulation::Order::shuffled;
     gs::emulation::Memory memory;
     gs::Queue queue = memory.queue();
     queue.halted = &halted;
-    const gs::Ahead ahead{&halted, &needed, room, ++step, report};
+    const gs::Ahead ahead{&halted, &needed, &done, room, reports, kReports};
+    report = reports + 5 * ((done + 1) % kReports);
+    std::fill_n(report, 5, -1);
     return run(queue, p, image, false, true, &ahead);
   };
   constexpr int64_t plenty = 20000;
@@ -116,7 +120,7 @@ void test_ahead() {
     const Result<float> got = go({exact.instances + more, exact.slots + more, exact.rows + more});
     CHECK(got.color == wanted.color && got.gradient == wanted.gradient && got.instances == wanted.instances);
     CHECK(halted == 0 && report[0] == exact.instances && report[1] == exact.slots && report[2] == exact.rows);
-    CHECK(report[3] == 0 && report[4] == step);
+    CHECK(report[3] == 0 && report[4] == done);
   }
   const std::vector<float> untouched(wanted.gradient.size(), -77.0f);
   for (const int lacking : {0, 1, 2})
@@ -128,10 +132,10 @@ void test_ahead() {
       gs::Room room = exact;
       (lacking == 0 ? room.instances : lacking == 1 ? room.slots : room.rows) = of;
       CHECK(go(room).gradient == untouched);
-      CHECK(halted == step && report[3] == step && report[4] == step);
+      CHECK(halted == done + 1 && report[3] == done + 1 && report[4] == done + 1);
       CHECK(report[0] == exact.instances && report[1] == exact.slots && report[2] == (lacking == 2 ? exact.rows : 0));
       CHECK(go({plenty, plenty, plenty}).gradient == untouched);
-      CHECK(halted == step - 1 && report[3] == step - 1 && report[4] == step);
+      CHECK(halted == done + 1 && report[3] == done + 1 && report[4] == done + 1);
       halted = 0;
     }
 }
@@ -316,8 +320,19 @@ void emulated_gradients(const gs::Queue& queue, const Rendered& r, const gs::Sce
   gs::cuda::rasterize_vjp(queue, r.scene, r.input, r.backward, {take, &copy});
 }
 
-// Steps taken inside the backward give the bits of steps from gradients in memory, in every order of threads. A halted
-// queue changes nothing.
+// Moves what changes from step to step to `now`.
+void put_off(gs::GaussianStep<float>& step, gs::StepNow& now) {
+  for (int a = 0; a < gs::kStepped; ++a) {
+    gs::AdamInput<float>& in = step.attributes[a];
+    now.constants[a] = gs::step_constants(step.sparse, in.lr, in.beta1, in.beta2, in.eps, in.step);
+    in.lr = in.beta1 = in.beta2 = in.eps = in.step = NAN;
+  }
+  now.iteration = step.guard.iteration;
+  step.guard.iteration = 77, step.now = &now;
+}
+
+// Steps taken inside the backward give the bits of steps from gradients in memory, in every order of threads, and with
+// their constants in memory. A halted queue changes nothing.
 void test_gaussian_step() {
   for (const int64_t count : {0, 1, 33, 200})
     for (const StepCase& how : kStepCases) {
@@ -336,8 +351,10 @@ void test_gaussian_step() {
         const std::vector<uint8_t> unchanged = fused.bytes();
         for (const int32_t& word : halted) {
           queue.halted = &word;
-          gs::cuda::rasterize_vjp_step(queue, r->scene, r->input, r->backward,
-                                       gaussian_step(fused, how, *r, iteration));
+          gs::GaussianStep<float> step = gaussian_step(fused, how, *r, iteration);
+          gs::StepNow now;
+          if (count == 33 || iteration == 3) put_off(step, now);
+          gs::cuda::rasterize_vjp_step(queue, r->scene, r->input, r->backward, step);
           CHECK(word == 0 || fused.bytes() == unchanged);
         }
         CHECK(fused.bytes() == plain.bytes());

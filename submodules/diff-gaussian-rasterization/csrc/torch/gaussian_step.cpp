@@ -3,6 +3,7 @@
 
 #include "backward.h"
 #include "math/splat.h"
+#include "math/step_now.h"
 #include "optim.h"
 #include "scene.h"
 
@@ -11,6 +12,27 @@ namespace gs::ops {
 namespace {
 
 using gs::baseline::kSplatValues;
+
+// Checks the attributes that step, their counters, and the lengths of the lists with an entry for each.
+void check_steps(at::IntArrayRef attributes, at::TensorList steps, std::initializer_list<size_t> lengths) {
+  const size_t n = attributes.size();
+  TORCH_CHECK(steps.size() == n, "every list must have an entry for each of the ", n, " attributes, got ",
+              steps.size());
+  for (size_t length : lengths)
+    TORCH_CHECK(length == n, "every list must have an entry for each of the ", n, " attributes, got ", length);
+  std::array<bool, gs::kStepped> named{};
+  for (int64_t a : attributes) {
+    TORCH_CHECK(a >= 0 && a < gs::kStepped && !named[a], "attributes must be different numbers from 0 to ",
+                gs::kStepped - 1, ", got ", attributes);
+    named[a] = true;
+  }
+  for (const Tensor& step : steps) check_counter(step);
+}
+
+// Advances the counters of steps.
+void advance(at::TensorList steps) {
+  for (const Tensor& step : steps) *step.mutable_data_ptr<float>() += 1;
+}
 
 // Adam's lists, with an entry for each attribute that `attributes` names by its place in gs::Stepped.
 struct StepLists {
@@ -21,16 +43,7 @@ struct StepLists {
   double beta1, beta2, eps;
 
   void check() const {
-    const size_t n = attributes.size();
-    for (size_t size : {exp_avg.size(), exp_avg_sq.size(), steps.size(), rates.size(), columns.size()})
-      TORCH_CHECK(size == n, "every list must have an entry for each of the ", n, " attributes, got ", size);
-    std::array<bool, gs::kStepped> named{};
-    for (int64_t a : attributes) {
-      TORCH_CHECK(a >= 0 && a < gs::kStepped && !named[a], "attributes must be different numbers from 0 to ",
-                  gs::kStepped - 1, ", got ", attributes);
-      named[a] = true;
-    }
-    for (const Tensor& step : steps) check_counter(step);
+    check_steps(attributes, steps, {exp_avg.size(), exp_avg_sq.size(), rates.size(), columns.size()});
   }
 };
 
@@ -67,6 +80,14 @@ void observe_in(gs::GaussianStep<T>& step, const Tensor& radii, const MaybeTenso
   step.observed.views = views->mutable_data_ptr<float>();
 }
 
+// The numbers of a step that was recorded before; null for those of the call.
+const gs::StepNow* step_now(const MaybeTensor& now, const SceneTensors& scene) {
+  if (!now) return nullptr;
+  check_tensor(*now, "now", at::kLong, scene.device(), {gs::kStepNowWords});
+  TORCH_CHECK_VALUE(now->is_cuda() && now->is_contiguous(), "now must be contiguous, and on a GPU");
+  return reinterpret_cast<const gs::StepNow*>(now->const_data_ptr<int64_t>());
+}
+
 void run(const SceneTensors& scene, const BlendBackward& in, const Tensor& tile_counts,
          const gs::GaussianStep<double>& step) {
   const Tensor moments = blend_vjp(in);
@@ -90,13 +111,14 @@ void run(const SceneTensors& scene, const BlendBackward& in, const Tensor& tile_
 
 // rasterize_vjp, then adam_ (or sparse_adam_ on the Gaussians of a radius above 0) of the attributes that are named,
 // and observe_ if statistics are given: the same bits, without gradients in memory. Advances the counters as adam_
-// does.
+// does. now: on a GPU, what `step_now_` wrote, which stands in for steps, rates and iteration, and has advanced the
+// counters.
 void rasterize_vjp_step_op(SCENE_PARAMETERS, BACKWARD_PARAMETERS, const Tensor& tile_counts, const Tensor& radii,
                            at::IntArrayRef attributes, at::TensorList exp_avg, at::TensorList exp_avg_sq,
                            at::TensorList steps, at::ArrayRef<double> rates, double beta1, double beta2, double eps,
                            at::IntArrayRef columns, bool sparse, const MaybeTensor& max_radii,
                            const MaybeTensor& gradient_sums, const MaybeTensor& views, const MaybeTensor& loss,
-                           const MaybeTensor& stopped, int64_t iteration) {
+                           const MaybeTensor& stopped, int64_t iteration, const MaybeTensor& now) {
   const SceneTensors scene(SCENE_ARGUMENTS);
   TORCH_CHECK_VALUE(!cov3d && !colors, "a step needs scales, rotations, sh_dc and sh_rest, not cov3d or colors");
   check_tensor(splats, "splats", scene.dtype(), scene.device(), {scene.count(), kSplatValues});
@@ -111,9 +133,24 @@ void rasterize_vjp_step_op(SCENE_PARAMETERS, BACKWARD_PARAMETERS, const Tensor& 
     auto step = gaussian_step<T>({means, opacities, *scales, *rotations, *sh_dc, *sh_rest}, lists, sparse);
     step.guard = step_guard<T>(means, loss, stopped, iteration);
     observe_in(step, pixels, max_radii, gradient_sums, views);
+    step.now = step_now(now, scene);
     run(scene, in, counts, step);
   });
-  for (const Tensor& step : steps) *step.mutable_data_ptr<float>() += 1;
+  if (!now) advance(steps);
+}
+
+// Writes what the next step stands for, and advances the counters.
+void step_now_op(Tensor& now, at::IntArrayRef attributes, at::TensorList steps, at::ArrayRef<double> rates,
+                 double beta1, double beta2, double eps, bool sparse, int64_t iteration) {
+  check_tensor(now, "now", at::kLong, at::kCPU, {gs::kStepNowWords});
+  TORCH_CHECK_VALUE(now.is_contiguous(), "now must be contiguous");
+  check_steps(attributes, steps, {rates.size()});
+  auto* to = reinterpret_cast<gs::StepNow*>(now.mutable_data_ptr<int64_t>());
+  for (size_t k = 0; k < attributes.size(); ++k)
+    to->constants[attributes[k]] =
+        gs::step_constants(sparse, rates[k], beta1, beta2, eps, double(*steps[k].const_data_ptr<float>()) + 1);
+  to->iteration = iteration;
+  advance(steps);
 }
 
 }  // namespace
@@ -132,8 +169,12 @@ TORCH_LIBRARY_FRAGMENT(diff_gaussian_rasterization, m) {
              ", Tensor tile_counts, Tensor radii, int[] attributes, Tensor(g!)[] exp_avg, Tensor(h!)[] exp_avg_sq, "
              "Tensor(i!)[] steps, float[] rates, float beta1, float beta2, float eps, int[] columns, bool sparse, "
              "Tensor(j!)? max_radii=None, Tensor(k!)? gradient_sums=None, Tensor(l!)? views=None, Tensor? loss=None, "
-             "Tensor(m!)? stopped=None, int iteration=0) -> ()",
+             "Tensor(m!)? stopped=None, int iteration=0, Tensor? now=None) -> ()",
          &rasterize_vjp_step_op);
+  define(m,
+         "step_now_(Tensor(a!) now, int[] attributes, Tensor(b!)[] steps, float[] rates, float beta1, float beta2, "
+         "float eps, bool sparse, int iteration) -> ()",
+         &step_now_op);
 }
 
 }  // namespace gs::ops

@@ -1,0 +1,115 @@
+"""Where an iteration's time goes on a GPU in the middle of a training: clock, kernels, host, launches, waits.
+
+    python -m benchmarks.scenes.step_profile SCENE [--checkouts . OLDER] [--first 6400] [options of train.py]
+
+The checkouts take turns, each with its own .venv if it has one, or its own build/device/site. `clock` is without a
+profiler, over the iterations before those that are profiled. `host` is the processor's time of the training's thread.
+`waits` are calls that wait for the GPU. A second table has the kernels.
+"""
+
+import argparse
+import json
+import os
+import re
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from statistics import median
+
+from benchmarks.harness.environment import describe, print_table
+from utils.system_utils import UserError, compute_device, run_cli
+
+PROGRAM = Path(__file__).with_name("step_profile_program.py")
+HEADER = ["code", "Gaussians", "clock, us", "kernels, us", "clock / kernels", "host, us", "launches", "waits", "MiB"]
+NOT_KERNELS = ("Memcpy HtoD", "Memcpy DtoH")  # they run beside the kernels
+SHOWN = 0.005  # of the kernels' time
+
+
+def profiled(checkout: Path, scene: Path, first: int, count: int, options: list[str]) -> dict:
+    """One training of a checkout, up to the end of its profile."""
+    own = checkout / ".venv" / "bin" / "python"
+    site = checkout / "build" / "device" / "site"
+    paths = [str(path) for path in (checkout, site) if path.exists()]
+    with tempfile.TemporaryDirectory() as folder:
+        result = Path(folder, "profile.json")
+        words = ["-s", str(scene), "-m", str(Path(folder, "out")), "--test_iterations", "-1", "--quiet", *options]
+        done = subprocess.run(
+            [str(own) if own.exists() else sys.executable, "-c", PROGRAM.read_text() + "\n\nmain()\n",
+             str(first), str(count), str(result), *words],
+            cwd=checkout, env=os.environ | {"PYTHONPATH": os.pathsep.join(paths)}, capture_output=True, text=True,
+        )  # fmt: skip
+        if not result.exists():
+            raise UserError(f"the training in {checkout} ended with status {done.returncode}:\n{done.stderr[-2000:]}")
+        return json.loads(result.read_text())
+
+
+def _kernels(run: dict) -> float:
+    return sum(us for name, us in run["kernels"].items() if not name.startswith(NOT_KERNELS))
+
+
+def _row(name: str, runs: list[dict]) -> list[str]:
+    def middle(value) -> float:
+        return median([value(run) for run in runs])
+
+    clock, kernels = middle(lambda run: 1e6 * run["clock"]), middle(_kernels)
+    cells = [clock, kernels, clock / kernels, middle(lambda run: 1e6 * run["host"])]
+    counts = [middle(lambda run: run["launches"]), middle(lambda run: run["waits"])]
+    shown = [f"{cells[0]:.0f}", f"{cells[1]:.0f}", f"{cells[2]:.2f}", f"{cells[3]:.0f}"]
+    memory = middle(lambda run: run["memory"] / 2**20)
+    return [name, str(runs[0]["gaussians"]), *shown, *[f"{count:.1f}" for count in counts], f"{memory:.0f}"]
+
+
+def _short(kernel: str) -> str:
+    """A kernel's name without return type, namespaces, template arguments and parameters."""
+    name = kernel.replace("(anonymous namespace)::", "").removeprefix("void ")
+    return re.split(r"[<(]", name)[0].split("::")[-1]
+
+
+def _by_name(run: dict) -> dict[str, tuple[float, float]]:
+    """Microseconds and launches of each short name."""
+    sums: dict[str, tuple[float, float]] = {}
+    for kernel, us in run["kernels"].items():
+        before = sums.get(_short(kernel), (0.0, 0.0))
+        sums[_short(kernel)] = before[0] + us, before[1] + run["counts"][kernel]
+    return sums
+
+
+def print_kernels(names: list[str], runs: list[dict]) -> None:
+    """Microseconds (launches) of an iteration by kernel, for the last run of each checkout."""
+    columns = [_by_name(run) for run in runs]
+    most = {name: max(column.get(name, (0, 0))[0] for column in columns) for column in columns for name in column}
+    least = SHOWN * max(map(_kernels, runs))
+    shown = sorted((name for name in most if most[name] >= least), key=lambda name: -most[name])
+    rows = [[name, *[_cell(column.get(name)) for column in columns]] for name in shown]
+    rest = [[column[name] for name in column if name not in shown] for column in columns]
+    rows.append(["others", *[_cell((sum(us for us, _ in r), sum(n for _, n in r))) for r in rest]])
+    print_table(["us (launches)", *names], rows)
+
+
+def _cell(sums: tuple[float, float] | None) -> str:
+    return "" if sums is None else f"{sums[0]:.1f} ({sums[1]:.1f})"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0], allow_abbrev=False)
+    parser.add_argument("scene", type=Path, help="a scene that train.py takes")
+    parser.add_argument("--checkouts", type=Path, nargs="+", default=[Path()], help="folders of the code (default: .)")
+    parser.add_argument("--first", type=int, default=6200, help="iteration that the clock starts at (default: 6200)")
+    parser.add_argument("--count", type=int, default=200, help="iterations by the clock, and profiled (default: 200)")
+    parser.add_argument("--rounds", type=int, default=1, help="turns of each checkout (default: 1)")
+    args, options = parser.parse_known_args()
+    if compute_device().type != "cuda":
+        raise UserError("the profile is of a GPU, and none is here")
+    print(describe("cuda"))
+    runs: list[list[dict]] = [[] for _ in args.checkouts]
+    for _ in range(args.rounds):
+        for mine, folder in zip(runs, args.checkouts, strict=True):
+            mine.append(profiled(folder.resolve(), args.scene.resolve(), args.first, args.count, options))
+    names = [str(folder) for folder in args.checkouts]
+    print_table(HEADER, [_row(name, mine) for name, mine in zip(names, runs, strict=True)])
+    print_kernels(names, [mine[-1] for mine in runs])
+
+
+if __name__ == "__main__":
+    run_cli(main)
