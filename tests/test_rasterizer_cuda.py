@@ -4,10 +4,9 @@ import math
 
 import pytest
 import torch
-from diff_gaussian_rasterization.schema import GRADIENTS
-from rasterizer_tools import GPU_MARKS, gradients, loss_of, scene_arguments
+from rasterizer_tools import GPU_MARKS, gradients, loss_of
 
-from benchmarks.workloads.splat_scenes import KINDS, PARAMETERS, SplatScene, frustum, heap, on_device, settings
+from benchmarks.workloads.splat_scenes import KINDS, SplatScene, frustum, settings
 
 pytestmark = [*GPU_MARKS]
 OPS = torch.ops.diff_gaussian_rasterization
@@ -160,44 +159,6 @@ def test_culling_changes_no_bit_in_short_lists_and_only_rounding_in_long_ones(n,
     exact = OPS.blend(splats, instances, ranges, background, 117, 203, True, True)
     full = OPS.blend(splats, every.repeat(tiles), all_ranges, background, 117, 203, True, True)
     assert all((a - b).abs().max() <= largest for a, b in zip(exact[:3], full[:3], strict=True))
-
-
-@pytest.mark.parametrize("inverse_depth", [False, True])
-def test_lists_of_thousands(inverse_depth):
-    """Several blocks share a list: each pixel ends where the CPU ends it, and every call gives the same bits."""
-    scene = heap(30_000, 90, 75).to("cuda")
-    camera = on_device(settings(90, 75, torch.float32), "cuda")
-    arguments = scene_arguments(scene.parameters, camera)
-    projected = OPS.project(*arguments)
-    instances, ranges, *_ = OPS.bin(*projected[:4], 75, 90, False)
-    assert ranges.diff().max() > 4000 and ranges.diff().min() < 256
-    lists = projected[0], instances, ranges
-    planes = OPS.blend(*lists, camera.bg, 75, 90, inverse_depth, True)
-    cpu = OPS.blend(*(t.cpu() for t in (*lists, camera.bg)), 75, 90, inverse_depth, True)
-    ends = planes[3].cpu() == cpu[3]
-    assert ends.float().mean() > 0.98  # rounding decides the others
-    for got, wanted in zip(planes[:3], cpu[:3], strict=True):
-        off = ((got.cpu() - wanted).abs() > 1e-5).any(0)  # the CPU's error is 3e-6
-        assert (off & ends).float().mean() <= 0.002  # pixels at a cut-off
-    for train in (True, False):
-        again = OPS.blend(*lists, camera.bg, 75, 90, inverse_depth, train)
-        assert all(torch.equal(a, b) for a, b in zip(again[:3], planes[:3], strict=True))
-    # The backward from the forward's layers, and from its own.
-    color = torch.randn(3, 75, 90, generator=torch.Generator().manual_seed(3)).cuda()
-    depth = color[:1] if inverse_depth else None
-    out = OPS.rasterize(projected[0][:, :3], *arguments, camera.bg, inverse_depth, True)
-    state = (out[4], *out[6:10], camera.bg, out[10], out[1])
-    assert out[11].numel() > 0
-    wanted = [name in (*PARAMETERS, "means2d") for name in GRADIENTS]
-    rest = (color, None, depth, out[5])
-    made, own = (
-        OPS.rasterize_vjp(*arguments, *state, *rest, layers, wanted) for layers in (out[11], color.new_empty(0))
-    )
-    again = OPS.rasterize_vjp(*arguments, *state, *rest, out[11], wanted)
-    for a, b, c in zip(made, own, again, strict=True):
-        assert torch.equal(a, c)
-        # Either is within 9e-6 of double on ordinary scenes; see docs/results/accuracy.md.
-        assert not a.numel() or largest_error(a, b) < 2e-5
 
 
 def test_adam_is_the_cpus_to_rounding():
