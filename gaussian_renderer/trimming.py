@@ -108,7 +108,7 @@ def trim(
 
     keep_unseen: leave no Gaussian out. prune_sh: by how much cut SH bands may change a colour (in [0, 1]); -1 cuts
     none, 0 those that are zero. iterations: of the training. Unless bands that are not zero are cut, the renders of
-    `cameras` keep every bit.
+    `cameras` keep every bit, or on a GPU change by rounding (see `decisive`).
     """
     start = time.perf_counter()
     every = torch.ones(len(gaussians), dtype=torch.bool, device=gaussians.get_xyz.device)

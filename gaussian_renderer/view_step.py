@@ -30,7 +30,7 @@ class Drawn:
     radii: Tensor  # (N,) int32 pixels
     scene: tuple[Any, ...]  # arguments of the operators
     state: tuple[Tensor, ...]
-    tile_counts: Tensor
+    more: tuple[Tensor, ...]  # what the backward wants after the image's gradients
 
 
 @torch.no_grad()
@@ -41,11 +41,11 @@ def draw(
     colors = {"sh_dc": gaussians.get_features_dc, "sh_rest": gaussians.get_features_rest}
     rows = Gaussians(gaussians.get_xyz, **gaussians.raw_geometry(), **colors)
     scene = scene_arguments(rows, rasterizer_settings(camera, gaussians, pipe, background), True)
-    color, transmittance, depth, radii, splats, tile_counts, *lists, last = OPERATORS.rasterize(
+    color, transmittance, depth, radii, splats, tile_counts, *lists, last, layers = OPERATORS.rasterize(
         rows.means, *scene, background, want_depth, True
     )
     state = (splats, *lists, background, last, transmittance)
-    return Drawn(color, depth if want_depth else None, radii, scene, state, tile_counts)
+    return Drawn(color, depth if want_depth else None, radii, scene, state, (tile_counts, layers))
 
 
 @torch.no_grad()
@@ -62,6 +62,6 @@ def step(
     now: on a GPU, (NOW_WORDS,) int64 of `FusedAdam.write_now`, for a step that is recorded.
     """
     OPERATORS.rasterize_vjp_step_(
-        *drawn.scene, *drawn.state, image_gradient, None, depth_gradient, drawn.tile_counts, drawn.radii,
+        *drawn.scene, *drawn.state, image_gradient, None, depth_gradient, *drawn.more, drawn.radii,
         *adam.arguments(observe), now=now,
     )  # fmt: skip

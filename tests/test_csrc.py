@@ -38,12 +38,13 @@ SCHEMAS = [
     f"project_vjp({SCENE}, Tensor tile_counts, Tensor moments, bool[9] wanted) -> {GRADIENTS}",
     f"rasterize(Tensor means2d, {SCENE}, Tensor background, bool inverse_depth, bool train) -> (Tensor color, "
     "Tensor transmittance, Tensor inverse_depth, Tensor radii, Tensor splats, Tensor tile_counts, Tensor instances, "
-    "Tensor ranges, Tensor splat_slots, Tensor slots, Tensor last)",
-    f"rasterize_vjp({SCENE}, {BACKWARD}, Tensor tile_counts, bool[9] wanted) -> {GRADIENTS}",
-    f"rasterize_vjp_step_({STEPPED_SCENE}, {BACKWARD}, Tensor tile_counts, Tensor radii, int[] attributes, "
-    "Tensor(g!)[] exp_avg, Tensor(h!)[] exp_avg_sq, Tensor(i!)[] steps, float[] rates, float beta1, float beta2, "
-    "float eps, int[] columns, bool sparse, Tensor(j!)? max_radii=None, Tensor(k!)? gradient_sums=None, "
-    "Tensor(l!)? views=None, Tensor? loss=None, Tensor(m!)? stopped=None, int iteration=0) -> ()",
+    "Tensor ranges, Tensor splat_slots, Tensor slots, Tensor last, Tensor layers)",
+    f"rasterize_vjp({SCENE}, {BACKWARD}, Tensor tile_counts, Tensor layers, bool[9] wanted) -> {GRADIENTS}",
+    f"rasterize_vjp_step_({STEPPED_SCENE}, {BACKWARD}, Tensor tile_counts, Tensor layers, Tensor radii, "
+    "int[] attributes, Tensor(g!)[] exp_avg, Tensor(h!)[] exp_avg_sq, Tensor(i!)[] steps, float[] rates, float beta1, "
+    "float beta2, float eps, int[] columns, bool sparse, Tensor(j!)? max_radii=None, "
+    "Tensor(k!)? gradient_sums=None, Tensor(l!)? views=None, Tensor? loss=None, Tensor(m!)? stopped=None, "
+    "int iteration=0) -> ()",
     "mark_visible(Tensor means, Tensor view) -> Tensor",
     "decisive(Tensor splats, Tensor instances, Tensor ranges, Tensor last) -> Tensor",
     "adam_(Tensor(a!)[] values, Tensor[] gradients, Tensor(b!)[] exp_avg, Tensor(c!)[] exp_avg_sq, Tensor(d!)[] steps, "

@@ -88,14 +88,14 @@ def rendered(state: State, camera: GaussianRasterizationSettings, case: Case, it
     """Arguments that both backwards have in common, then the radii."""
     scene = scene_arguments(state.values, camera, case.raw)
     out = ops.rasterize(None, *scene, camera.bg, True, True)
-    color, transmittance, inverse_depth, radii, splats, counts, *lists, last = out
+    color, transmittance, inverse_depth, radii, splats, counts, *lists, last, layers = out
     generator = torch.Generator().manual_seed(iteration)
     planes = [torch.randn(t.shape, generator=generator).to(t) for t in (color, transmittance, inverse_depth)]
     if iteration == 2:
         planes[0][0, color.shape[1] // 2, color.shape[2] // 2] *= case.broken
     if not case.depth:
         planes[1:] = None, None
-    return (*scene, splats, *lists, camera.bg, last, transmittance, *planes, counts), radii
+    return (*scene, splats, *lists, camera.bg, last, transmittance, *planes, counts, layers), radii
 
 
 def step_plainly(state: State, camera: GaussianRasterizationSettings, case: Case, iteration: int) -> None:

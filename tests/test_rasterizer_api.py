@@ -369,9 +369,10 @@ def test_nothing_is_kept_without_gradients():
         "splat_slots",
         "slots",
         "last",
+        "layers",
     ]
     rendering = dict(zip(names, _outputs(splats, camera, False, False), strict=True))
-    for name in ("splat_slots", "last", "inverse_depth"):
+    for name in ("splat_slots", "last", "inverse_depth", "layers"):
         assert rendering[name].numel() == 0, name
     assert len(rendering["slots"]) == 0
     training = dict(zip(names, _outputs(splats, camera, True), strict=True))

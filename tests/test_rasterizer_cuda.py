@@ -140,8 +140,10 @@ def test_several_blocks_share_a_long_list():
         assert all(torch.equal(gpu[name], again[name]) for name in gpu)
 
 
-def test_culling_changes_no_bit():
-    scene = frustum(2_000, 203, 117, 4.0, seed=8)
+@pytest.mark.parametrize(("n", "sigma", "largest"), [(250, 11.0, 0.0), (2_000, 4.0, 1e-6)])
+def test_culling_changes_no_bit_in_short_lists_and_only_rounding_in_long_ones(n, sigma, largest):
+    """Lists are summed by chunks of 256 splats, and culling shifts the chunks."""
+    scene = frustum(n, 203, 117, sigma, seed=8)
     camera = settings(203, 117, torch.float32)
     p = {name: v.cuda() for name, v in scene.parameters.items()}
     matrices = [t.cuda() for t in (camera.viewmatrix, camera.projmatrix, camera.campos)]
@@ -156,7 +158,7 @@ def test_culling_changes_no_bit():
     background = camera.bg.cuda()
     exact = OPS.blend(splats, instances, ranges, background, 117, 203, True, True)
     full = OPS.blend(splats, every.repeat(tiles), all_ranges, background, 117, 203, True, True)
-    assert all(torch.equal(a, b) for a, b in zip(exact[:3], full[:3], strict=True))
+    assert all((a - b).abs().max() <= largest for a, b in zip(exact[:3], full[:3], strict=True))
 
 
 def test_adam_is_the_cpus_to_rounding():

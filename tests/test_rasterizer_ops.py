@@ -49,7 +49,7 @@ def test_opcheck_every_other_op(device):
     moments = ops.blend_vjp(*state, *gradients)
     wanted = [True, True, True, True, True, False, False, True, True]
     _check(ops.project_vjp, *arguments, counts, moments, wanted)
-    _check(ops.rasterize_vjp, *arguments, *state, *gradients, counts, wanted)
+    _check(ops.rasterize_vjp, *arguments, *state, *gradients, counts, image.new_empty(0), wanted)
     _check(ops.mark_visible, raw["means"], camera.viewmatrix.float())
     lists = [[torch.rand(3, 3, device=device), torch.rand(2, 5, device=device)] for _ in range(4)]
     counters = [torch.tensor(1.0), torch.tensor(7.0)]

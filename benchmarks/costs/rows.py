@@ -132,7 +132,7 @@ def gradient_buffers(work: Workload) -> Row:
     model = work.model()
     with torch.no_grad():
         out = _operator(work, model, train=False)
-    _, _, _, _, _, _, instances, ranges, _, _, _ = out
+    _, _, _, _, _, _, instances, ranges, _, _, _, _ = out
     a_splat = 40 + 4 + 16 + 8
     pixels = work.camera.image_width * work.camera.image_height
     needed = a_splat * len(model) + 4 * len(instances) + 8 * len(ranges) + 16 * pixels

@@ -64,7 +64,8 @@ class Iteration:
         means = self.arguments[0]
         out = self.call("forward", OPS.rasterize, means, *self.arguments, self.background, False, True)
         state = (*out[4:5], *out[6:10], self.background, out[10], out[1], gradient, None, None)
-        self.call("backward", OPS.rasterize_vjp, *self.arguments, *state, out[5], self.wanted)
+        more = (out[5], *out[11:])  # older versions have no layers
+        self.call("backward", OPS.rasterize_vjp, *self.arguments, *state, *more, self.wanted)
         return self.took
 
 

@@ -36,7 +36,7 @@ class Steps:
         self.values = {name: values[name].detach().float().clone() for name in PARAMETERS}
         scene = scene_arguments(Gaussians(**self.values), camera, True)
         out = OPS.rasterize(None, *scene, camera.bg, False, True)
-        color, transmittance, _, self.radii, splats, counts, instances, ranges, splat_slots, slots, last = out
+        color, transmittance, _, self.radii, splats, counts, instances, ranges, splat_slots, slots, last, layers = out
         generator = torch.Generator().manual_seed(0)
         gradient = torch.randn(color.shape, generator=generator).to(color)
         if not blended:
@@ -44,7 +44,7 @@ class Steps:
             for positions in (ranges, splat_slots, last):
                 positions.zero_()
         lists = instances, ranges, splat_slots, slots
-        self.backward = *scene, splats, *lists, camera.bg, last, transmittance, gradient, None, None, counts
+        self.backward = *scene, splats, *lists, camera.bg, last, transmittance, gradient, None, None, counts, layers
         averages = [[torch.full_like(value, 1e-6) for value in self.values.values()] for _ in range(2)]
         self.adam = *averages, [torch.zeros(()) for _ in range(6)], [0.0] * 6, 0.9, 0.999, 1e-15, [-1] * 6
         self.statistics = [torch.zeros(len(self.radii), device=color.device) for _ in range(3)]

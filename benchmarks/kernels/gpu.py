@@ -13,8 +13,9 @@ from benchmarks.peers.gsplat_calls import GsplatCalls, version
 from benchmarks.workloads.splat_scenes import SplatScene, frustum
 
 # Kernels that separate the stages of a step: those of _BEGINS begin the named stage; it begins after those of _NEXT.
-_BEGINS = {"blend_kernel": "blend", "adam_kernel": "adam"}
-_NEXT = {"project_kernel": "bin", "blend_kernel": "blend_vjp", "blend_vjp_kernel": "project_vjp"}
+_BEGINS = {"blend_kernel": "blend", "blend_chunks_kernel": "blend", "adam_kernel": "adam"}
+_NEXT = {"project_kernel": "bin", "blend_vjp_kernel": "project_vjp"}
+_NEXT |= dict.fromkeys(("blend_kernel", "blend_chunks_kernel"), "blend_vjp")
 
 
 @dataclass

@@ -27,7 +27,7 @@ def counts(camera: Camera, model: GaussianModel) -> dict[str, int]:
     means, background = model.get_xyz, model.get_xyz.new_zeros(3)
     arguments = view_arguments(camera, model)
     out = torch.ops.diff_gaussian_rasterization.rasterize(means, *arguments, background, False, True)
-    _, _, _, _, _, tile_counts, instances, ranges, _, _, last = out
+    _, _, _, _, _, tile_counts, instances, ranges, _, _, last, _ = out
     processed = processed_per_tile(last)
     tile = torch.repeat_interleave(torch.arange(len(processed), device=ranges.device), ranges.diff())
     behind = torch.arange(len(instances), device=ranges.device) - ranges[tile] >= processed[tile]

@@ -121,6 +121,30 @@ def frustum(
     return SplatScene(parameters, width, height)
 
 
+def heap(
+    n: int = 200_000, width: int = 400, height: int = 400, seed: int = 0, device: torch.device | str = "cpu"
+) -> SplatScene:
+    """Draw small Gaussians in a cube that covers the middle of the image, densest at its centre, as of an object.
+
+    Some tiles have lists of thousands, most have few or none. With the default numbers, the longest has some 7,100, of
+    which half are processed; of all instances 92 % are. The median size is 1.2 px.
+    """
+    g = torch.Generator().manual_seed(seed)  # the same on every device
+    uniform = 2 * torch.rand(n, 3, generator=g) - 1
+    means = 1.2 * uniform.sign() * uniform.abs() ** 1.3 + torch.tensor([0.0, 0.0, 4.2])
+    focal = width / (2 * math.tan(FOV / 2))
+    size = torch.log(1.2 * means[:, 2] / focal) + 0.6 * torch.randn(n, generator=g)
+    parameters = {
+        "means": means,
+        "opacities": 1.2 * torch.randn(n, 1, generator=g) - 3,
+        "scales": size[:, None] + (torch.rand(n, 3, generator=g) - 0.5) * math.log(5.0),
+        "rotations": torch.randn(n, 4, generator=g),
+        "sh_dc": 0.8 * torch.randn(n, 1, 3, generator=g),
+        "sh_rest": 0.1 * torch.randn(n, 15, 3, generator=g),
+    }
+    return SplatScene(parameters, width, height).to(device)
+
+
 def ordinary(n: int = 2000, width: int = 203, height: int = 117) -> SplatScene:
     """Make Gaussians as in a trained scene; the image size is no multiple of the tile."""
     return frustum(n, width, height, sigma_px=3.0, seed=1)

@@ -24,6 +24,7 @@ def sound_calls() -> dict[str, Call]:
     instances, ranges, *slots = ops.bin(splats, depths, rects, counts, height, width, True)
     image, transmittance, plane, last = ops.blend(splats, instances, ranges, background, height, width, True, True)
     state = [splats, instances, ranges, *slots, background, last, transmittance]
+    layers = torch.zeros(5 * 256)  # as a GPU makes them of few instances
     planes = [torch.ones_like(image), torch.ones_like(transmittance), torch.ones_like(plane)]
     wanted = [True, True, True, True, True, False, False, True, True]
     lists = [[torch.rand(3, 3), torch.rand(2, 5)] for _ in range(4)]
@@ -41,8 +42,11 @@ def sound_calls() -> dict[str, Call]:
         "blend_vjp": (ops.blend_vjp, [*state, *planes]),
         "project_vjp": (ops.project_vjp, [*scene, counts, ops.blend_vjp(*state, *planes), wanted]),
         "rasterize": (ops.rasterize, [torch.zeros(3, 3), *scene, background, True, True]),
-        "rasterize_vjp": (ops.rasterize_vjp, [*scene, *state, *planes, counts, wanted]),
-        "rasterize_vjp_step_": (ops.rasterize_vjp_step_, [*scene, *state, *planes, counts, *_step(raw), *guard]),
+        "rasterize_vjp": (ops.rasterize_vjp, [*scene, *state, *planes, counts, layers, wanted]),
+        "rasterize_vjp_step_": (
+            ops.rasterize_vjp_step_,
+            [*scene, *state, *planes, counts, layers, *_step(raw), *guard],
+        ),
         "mark_visible": (ops.mark_visible, [raw["means"], camera.viewmatrix.float()]),
         "decisive": (ops.decisive, [splats, instances, ranges, last]),
         "adam_": (ops.adam_, adam),

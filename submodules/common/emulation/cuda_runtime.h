@@ -84,6 +84,10 @@ inline unsigned __float_as_uint(float a) {
   std::memcpy(&bits, &a, sizeof bits);
   return bits;
 }
+template <class T>
+T __ldcg(const T* at) {
+  return *at;
+}
 inline float __fdividef(float a, float b) { return a / b; }
 inline float __frcp_rn(float a) { return 1 / a; }
 inline float __saturatef(float a) { return a > 1 ? 1.0f : a > 0 ? a : 0.0f; }

@@ -100,6 +100,7 @@ struct BlendInput {
   const int64_t* ranges;
   const T* background;  // 3
   Image image;
+  int64_t instance_count;  // where the ranges end, or more
 };
 
 template <class T>
@@ -108,6 +109,7 @@ struct Blended {
   T* transmittance;  // (H, W)
   T* inverse_depth;  // (H, W), or null
   int32_t* last;     // (H, W) 1 + position in the tile's list of the last splat blended, or null
+  T* layers;         // math/layers.h, for the backward; null allowed, and on the CPU
 };
 
 template <class T>
@@ -120,6 +122,7 @@ struct BlendGradient {
   const T* inverse_depth;           // dLoss/dinverse_depth, or null
   const T* transmittance_gradient;  // or null
   T* moments;                       // out: (N, 10), Moments in math/footprint.h, then colour and inverse depth
+  const T* layers = nullptr;        // Blended::layers, or null: then blend_vjp makes its own
   const Ahead* ahead = nullptr;     // on a GPU: take room for gradient rows, and do not wait for their number
 };
 

@@ -57,7 +57,7 @@ def rasterize_gaussians(
     gaussians = chosen(means3D, opacity, scales, rotations, cov3D_precomp, colors, sh)
     smooth = not of_2023 and bool(antialiasing)
     out = OPERATORS.rasterize(None, *gaussians, *camera, smooth, False, background, True, True)
-    color, transmittance, inverse_depth, radii, splats, tile_counts, instances, ranges, splat_slots, _, last = out
+    color, transmittance, inverse_depth, radii, splats, tile_counts, instances, ranges, splat_slots, _, last, _ = out
     buffers = packed(splat_slots, splats, tile_counts), packed(instances), packed(ranges, transmittance, last)
     rendered = len(instances), color, radii, *buffers
     return rendered if of_2023 else (*rendered, inverse_depth)
@@ -109,8 +109,9 @@ def rasterize_gaussians_backward(
     camera = viewmatrix, projmatrix, campos, tan_fovx, tan_fovy, height, width, degree, scale_modifier
     state = splats, instances, ranges, splat_slots, slots, background, last, transmittance
     arguments = *gaussians, *camera, bool(antialiasing), False, *state, grad_out_color, None, given(grad_out_invdepth)
+    no_layers = splats.new_empty(0)  # the backward makes its own
     wanted = [name == "means2d" or getattr(gaussians, name) is not None for name in GRADIENTS]
-    gradients = dict(zip(GRADIENTS, OPERATORS.rasterize_vjp(*arguments, tile_counts, wanted), strict=True))
+    gradients = dict(zip(GRADIENTS, OPERATORS.rasterize_vjp(*arguments, tile_counts, no_layers, wanted), strict=True))
     for name, is_wanted in zip(GRADIENTS, wanted, strict=True):
         if not is_wanted:
             gradients[name] = means3D.new_zeros(count, *gradients[name].shape[1:])

@@ -86,7 +86,9 @@ def _(means2d, *arguments):
     color, transmittance, depth, last = _blended(means, height, width, inverse_depth, train)
     radii, tile_counts = (means.new_empty((count,), dtype=torch.int32) for _ in range(2))
     projected = radii, means.new_empty((count, SPLAT_VALUES)), tile_counts
-    return color, transmittance, depth, *projected, *_binned(means, count, height, width, train), last
+    values = library.get_ctx().new_dynamic_size() if means.is_cuda and train else 0
+    lists = _binned(means, count, height, width, train)
+    return color, transmittance, depth, *projected, *lists, last, means.new_empty((values,))
 
 
 @_fake("mark_visible")

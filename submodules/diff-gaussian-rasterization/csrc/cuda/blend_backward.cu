@@ -1,5 +1,6 @@
 // The backward of blending. A tile's list is cut into chunks, a block each, because one long list would outlast all
-// others together. First every chunk becomes a layer, which tells the chunks in front of it what lies behind them.
+// others together. Layers tell a chunk what lies behind it. In images of few tiles the forward has made them; else they
+// are made first, one of every chunk.
 #include <thrust/iterator/counting_iterator.h>
 #include <thrust/iterator/transform_iterator.h>
 
@@ -9,6 +10,7 @@
 #include "../backend.h"
 #include "../math/slots.h"
 #include "ahead.cuh"
+#include "blend_layers.cuh"
 #include "blend_layout.cuh"
 #include "gradient_rows.cuh"
 #include "host_numbers.cuh"
@@ -20,7 +22,7 @@ namespace cuda {
 namespace {
 
 // Splats of a chunk, in an image of few tiles and of many. Shorter chunks fill a GPU better, but each costs a layer.
-constexpr int kChunkOfFew = 256, kChunkOfMany = 512;
+constexpr int kChunkOfFew = kLayerChunk, kChunkOfMany = 512;
 
 // Going back to front, a splat costs a warp as much as several pixels. So a lane takes 4, even if few warps run.
 using Backward = Layout<4>;
@@ -197,6 +199,22 @@ __device__ __forceinline__ void start_behind(const Pixels<Backward, kDepth>& pix
   for (int p = 0; p < kRun; ++p) transmittance[p] = pixels.transmittance[p] / through[p];
 }
 
+// The same from the forward's layers, of which one stands for all that lies behind the chunk. length: the chunk's.
+template <bool kDepth>
+__device__ __forceinline__ void start_before(const Pixels<Backward, kDepth>& pixels, const Backward& at,
+                                             const MadeLayers& layers, int64_t layer, int length,
+                                             OfPixels& transmittance, OfPixels& behind) {
+  for (int p = 0; p < Backward::kRun; ++p) {
+    transmittance[p] = pixels.transmittance[p], behind[p] = pixels.background[p];
+    if (pixels.last[p] <= length) continue;  // the layer is not there, or shows nothing at this pixel
+    const int64_t pixel = layer + at.y * kTile + at.x + at.column(p);
+    const float4 color = layers.color[pixel];
+    const float value = pixels.value(p, color, kDepth ? layers.depth[pixel] : 0);
+    behind[p] = (value + pixels.transmittance[p] * pixels.background[p]) / color.w;
+    transmittance[p] = color.w;
+  }
+}
+
 // Steps the lanes over splat k of the batch, whose first splat is the chunk's splat `first`, and leaves the sums over
 // the warp's pixels in `sums`. A splat that reaches none of them changes nothing.
 template <bool kDepth, int kBatch>
@@ -232,10 +250,10 @@ __device__ __forceinline__ void splat_gradient(const Batch<kBatch>& batch, const
 // Walks each chunk back to front, a block each, and writes its gradient rows. Within these registers ptxas compiles the
 // loop over splats without spills on sm_90. If blocks per multiprocessor are bounded instead, it makes the loop a tenth
 // longer.
-template <bool kDepth>
+template <bool kDepth, bool kMade>
 __global__ void GS_MAX_REGISTERS(kDepth ? 96 : 80)
     blend_vjp_kernel(const int32_t* halted, BlendInput<float> in, BlendGradient<float> g, const int32_t* processed,
-                     const Chunk* chunks, int chunk_size, const Layer* layers, GradientRows rows) {
+                     const Chunk* chunks, int chunk_size, const Layer* layers, MadeLayers made, GradientRows rows) {
   if (is_halted(halted)) return;
   using L = Backward;
   constexpr int kBatch = 64;
@@ -249,9 +267,15 @@ __global__ void GS_MAX_REGISTERS(kDepth ? 96 : 80)
   const int left = chunk.tile % across * kTile, top = chunk.tile / across * kTile;
   const Pixels<L, kDepth> pixels(in, g, at, left, top, chunk.first);
   OfPixels transmittance, behind, through;
-  const int layers_behind = (processed[chunk.tile] - chunk.end + chunk_size - 1) / chunk_size;
-  start_behind(pixels, at, layers, chunk.behind, layers_behind, transmittance, behind, through);
-  const int64_t begin = in.ranges[chunk.tile] + chunk.first;
+  int64_t begin = in.ranges[chunk.tile];
+  if (kMade) {
+    const int64_t layer = layer_pixel(begin, chunk.first / kLayerChunk + 1);
+    start_before(pixels, at, made, layer, chunk.end - chunk.first, transmittance, behind);
+  } else {
+    const int layers_behind = (processed[chunk.tile] - chunk.end + chunk_size - 1) / chunk_size;
+    start_behind(pixels, at, layers, chunk.behind, layers_behind, transmittance, behind, through);
+  }
+  begin += chunk.first;
   for (int end = chunk.end - chunk.first; end > 0; end -= kBatch) {
     const int count = end < kBatch ? end : kBatch, first = end - count;
     __syncthreads();
@@ -325,12 +349,15 @@ GradientRows blend_rows(const Queue& queue, const BlendInput<float>& in, const B
   Schedule schedule = longest_first(queue, tiles, ProcessedLength{processed}, chunk_size, rows);
   if (processed_count) rows = *processed_count->wait(), schedule = schedule.shortened(rows);
   const GradientRows gradients{bits, before, queue.array<float>(size_t(rows) * kGradientValues)};
-  Layer* layers = queue.array<Layer>(size_t(schedule.places) * kTile * kTile);
-  if (schedule.places)
+  const bool made = g.layers && makes_layers(in.image);
+  Layer* layers = queue.array<Layer>(made ? 0 : size_t(schedule.places) * kTile * kTile);
+  if (schedule.places && !made)
     (tiles <= kFewTiles ? find_layers<Layout<1>> : find_layers<Layout<2>>)(queue, in, g, schedule, layers);
-  const auto kernel = g.inverse_depth ? blend_vjp_kernel<true> : blend_vjp_kernel<false>;
+  const auto kernel = g.inverse_depth ? (made ? blend_vjp_kernel<true, true> : blend_vjp_kernel<true, false>)
+                                      : (made ? blend_vjp_kernel<false, true> : blend_vjp_kernel<false, false>);
   kernel<<<schedule.blocks, Backward::kThreads, 0, stream>>>(queue.halted, in, g, processed, schedule.chunks,
-                                                             chunk_size, layers, gradients);
+                                                             chunk_size, layers, layers_at(g.layers, in.instance_count),
+                                                             gradients);
   check_launch("blend_vjp");
   for (const void* done : {static_cast<const void*>(layers), static_cast<const void*>(schedule.chunks)})
     queue.release(queue.context, done);  // the gradients come next, and take most of a step's memory

@@ -1,28 +1,24 @@
-// Blends each tile's list front to back, a block per tile.
+// Blends each tile's list front to back, a block per tile. Images of few tiles go another way.
 #include "../backend.h"
+#include "blend_chunks.cuh"
 #include "blend_layout.cuh"
-#include "schedule.cuh"
 
 namespace gs {
 namespace cuda {
 
 namespace {
 
-struct ListLength {
-  const int64_t* ranges;
-  __device__ int64_t operator()(int tile) const { return ranges[tile + 1] - ranges[tile]; }
-};
+using L = Layout<2>;
 
-// Bounding blocks per multiprocessor limits the kernel to 56 registers, or 48 with one pixel a lane, without spills on
-// sm_90.
-template <class L, bool kDepth, bool kLast>
-__global__ void __launch_bounds__(L::kThreads, L::kRun == 1 ? 5 : 9)
-    blend_kernel(const int32_t* halted, BlendInput<float> in, const Chunk* order, Blended<float> out) {
+// Bounding blocks per multiprocessor limits the kernel to 56 registers without spills on sm_90.
+template <bool kDepth, bool kLast>
+__global__ void __launch_bounds__(L::kThreads, 9)
+    blend_kernel(const int32_t* halted, BlendInput<float> in, Blended<float> out) {
   if (is_halted(halted)) return;
   constexpr int kBatch = L::kThreads, kRun = L::kRun;
   __shared__ Batch<kBatch> batch;
   const L at;
-  const int across = tile_count(in.image.width), tile = order ? order[blockIdx.x].tile : int(blockIdx.x);
+  const int across = tile_count(in.image.width), tile = blockIdx.x;
   const int left = tile % across * kTile, top = tile / across * kTile;
   float transmittance[kRun], red[kRun], green[kRun], blue[kRun], depth[kRun], threshold[kRun];
   int last[kRun];
@@ -42,7 +38,7 @@ __global__ void __launch_bounds__(L::kThreads, L::kRun == 1 ? 5 : 9)
     for (int from = 0; open && from < count; from += 32) {
       front_to_back(batch, at, from, count, [&](int k, int p, float t) {
         const bool reached = t >= threshold[p];
-        if (kTogether<L> == 1 && !reached) return;  // no branch where splats are taken together
+        if (!reached) return;
         const float alpha = capped<float, float>(exp2_device(t));
         const float after = transmittance[p] - alpha * transmittance[p];
         const bool ends = reached && after < float(kMinTransmittance), blended = reached && !ends;
@@ -74,22 +70,15 @@ __global__ void __launch_bounds__(L::kThreads, L::kRun == 1 ? 5 : 9)
   }
 }
 
-template <class L>
-void blend_as(const Queue& queue, const BlendInput<float>& in, const Blended<float>& out) {
-  const auto kernel = out.inverse_depth ? (out.last ? blend_kernel<L, true, true> : blend_kernel<L, true, false>)
-                                        : (out.last ? blend_kernel<L, false, true> : blend_kernel<L, false, false>);
-  const int64_t tiles = tiles_of(in.image);
-  // Many tiles balance without a schedule.
-  const Chunk* order = tiles <= kFewTiles ? longest_first(queue, tiles, ListLength{in.ranges}).chunks : nullptr;
-  kernel<<<unsigned(tiles), L::kThreads, 0, stream_of(queue)>>>(queue.halted, in, order, out);
-  check_launch("blend");
-}
-
 }  // namespace
 
 template <>
 void blend<float>(const Queue& queue, const BlendInput<float>& in, const Blended<float>& out) {
-  (tiles_of(in.image) <= kFewTiles ? blend_as<Layout<1>> : blend_as<Layout<2>>)(queue, in, out);
+  if (makes_layers(in.image)) return blend_chunks(queue, in, out);
+  const auto kernel = out.inverse_depth ? (out.last ? blend_kernel<true, true> : blend_kernel<true, false>)
+                                        : (out.last ? blend_kernel<false, true> : blend_kernel<false, false>);
+  kernel<<<unsigned(tiles_of(in.image)), L::kThreads, 0, stream_of(queue)>>>(queue.halted, in, out);
+  check_launch("blend");
 }
 
 }  // namespace cuda

@@ -8,6 +8,7 @@
 #include "../math/blend.h"
 #include "../math/exp2.h"
 #include "../math/footprint.h"
+#include "../math/layers.h"
 #include "../math/tiles.h"
 #include "queue.cuh"
 #include "splat_row.cuh"
@@ -18,10 +19,6 @@ namespace cuda {
 using namespace baseline;
 
 constexpr float kLeast = float(kLog2MinAlpha);
-
-// Images of up to this many tiles do not fill a GPU with blocks and wait for their longest lists, so more warps share a
-// tile.
-constexpr int64_t kFewTiles = 3000;
 
 // The share of a lane is kRun pixels of one row, 4 columns apart.
 template <int kRun_>

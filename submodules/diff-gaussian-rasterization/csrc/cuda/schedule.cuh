@@ -43,52 +43,84 @@ __device__ inline int length_class(int64_t length) {
 // The number of chunks of a list before its last one, which has the rest.
 __device__ inline int32_t full_chunks(int32_t length, int32_t size) { return length ? (length - 1) / size : 0; }
 
-// Sorts chunks by class, in one block. The order within a class and the order of places are arbitrary; no result
-// depends on them.
+struct CutList {
+  int32_t length, size;  // size: of its chunks
+};
+
+// The plan that serves the longest chunks first. A plan cuts lists, and puts chunks into classes, which are served in
+// ascending order.
 template <class Length>
+struct LongestFirst {
+  static constexpr int kClasses = kLengthClasses;  // a multiple of 32
+  Length length;
+  int32_t size;
+
+  __device__ CutList list(int tile) const { return {int32_t(length(tile)), size}; }
+
+  // Calls run(class, first chunk, count) for consecutive chunks of a class.
+  template <class Run>
+  __device__ void runs(const CutList& list, const Run& run) const {
+    const int32_t full = full_chunks(list.length, list.size);
+    if (full) run(length_class(list.size), 0, full);
+    run(length_class(list.length - full * list.size), full, 1);
+  }
+};
+
+// Turns the lengths of classes into the positions where they begin. Returns the sum. Only the first warp calls this.
+template <int kClasses>
+__device__ inline int32_t begin_classes(int32_t (&next)[kClasses]) {
+  static_assert(kClasses % 32 == 0);
+  constexpr int kOwn = kClasses / 32;
+  const int lane = threadIdx.x, own = kOwn * lane;
+  int32_t end = 0;
+  for (int c = 0; c < kOwn; ++c) end += next[own + c];
+  const int32_t sum = end;
+  for (int step = 1; step < 32; step *= 2) {
+    const int32_t before = __shfl_up_sync(kWarp, end, step);
+    if (lane >= step) end += before;
+  }
+  const int32_t total = __shfl_sync(kWarp, end, 31);
+  int32_t begin = end - sum;
+  for (int c = 0; c < kOwn; ++c) {
+    const int32_t count = next[own + c];
+    next[own + c] = begin;
+    begin += count;
+  }
+  return total;
+}
+
+// Sorts chunks by class, in one block. The order within a class and the order of places are arbitrary, but that chunks
+// of one run stay together; no result depends on them. Also sets `count` numbers at `zeros` to 0.
+template <class Plan>
 __global__ void __launch_bounds__(kOrderThreads)
-    order_chunks_kernel(const int32_t* halted, int tiles, Length length, int32_t size, int blocks, Chunk* chunks) {
+    order_chunks_kernel(const int32_t* halted, int tiles, Plan plan, int blocks, Chunk* chunks, int32_t* zeros,
+                        int64_t count) {
   if (is_halted(halted)) return;
-  __shared__ int32_t next[kLengthClasses], total, places;
-  for (int c = threadIdx.x; c < kLengthClasses; c += kOrderThreads) next[c] = 0;
+  __shared__ int32_t next[Plan::kClasses], total, places;
+  for (int c = threadIdx.x; c < Plan::kClasses; c += kOrderThreads) next[c] = 0;
   if (threadIdx.x == 0) places = 0;
   __syncthreads();
-  for (int t = threadIdx.x; t < tiles; t += kOrderThreads) {
-    const int32_t whole = int32_t(length(t)), full = full_chunks(whole, size);
-    if (full) atomicAdd(&next[length_class(size)], full);
-    atomicAdd(&next[length_class(whole - full * size)], 1);
-  }
+  for (int t = threadIdx.x; t < tiles; t += kOrderThreads)
+    plan.runs(plan.list(t), [&](int kind, int32_t, int32_t run) { atomicAdd(&next[kind], run); });
   __syncthreads();
-  if (threadIdx.x < 32) {  // where each class begins
-    constexpr int kOwn = kLengthClasses / 32;
-    const int lane = threadIdx.x, own = kOwn * lane;
-    int32_t end = 0;
-    for (int c = 0; c < kOwn; ++c) end += next[own + c];
-    const int32_t sum = end;
-    for (int step = 1; step < 32; step *= 2) {
-      const int32_t before = __shfl_up_sync(kWarp, end, step);
-      if (lane >= step) end += before;
-    }
-    if (lane == 31) total = end;
-    int32_t begin = end - sum;
-    for (int c = 0; c < kOwn; ++c) {
-      const int32_t count = next[own + c];
-      next[own + c] = begin;
-      begin += count;
-    }
+  if (threadIdx.x < 32) {
+    const int32_t sum = begin_classes(next);
+    if (threadIdx.x == 0) total = sum;
   }
   __syncthreads();
   for (int t = threadIdx.x; t < tiles; t += kOrderThreads) {
-    const int32_t whole = int32_t(length(t)), full = full_chunks(whole, size);
-    int32_t behind = 0;
-    if (full) {
-      behind = atomicAdd(&places, full);
-      const int32_t to = atomicAdd(&next[length_class(size)], full);
-      for (int c = 0; c < full; ++c) chunks[to + c] = {t, c * size, (c + 1) * size, behind + c};
-    }
-    chunks[atomicAdd(&next[length_class(whole - full * size)], 1)] = {t, full * size, whole, behind + full};
+    const CutList list = plan.list(t);
+    const int32_t full = full_chunks(list.length, list.size), behind = full ? atomicAdd(&places, full) : 0;
+    plan.runs(list, [&](int kind, int32_t first, int32_t run) {
+      const int32_t to = atomicAdd(&next[kind], run);
+      for (int32_t i = 0; i < run; ++i) {
+        const int32_t c = first + i, begin = c * list.size;
+        chunks[to + i] = {t, begin, c < full ? begin + list.size : list.length, behind + c};
+      }
+    });
   }
   for (int k = total + int(threadIdx.x); k < blocks; k += kOrderThreads) chunks[k] = {-1, 0, 0, 0};
+  for (int64_t k = threadIdx.x; k < count; k += kOrderThreads) zeros[k] = 0;
 }
 
 template <class Length>
@@ -109,8 +141,8 @@ Schedule longest_first(const Queue& queue, int64_t tiles, const Length& length, 
   const int64_t places = ordered ? total / size : 0;
   Chunk* chunks = queue.array<Chunk>(tiles + places);
   if (ordered)
-    order_chunks_kernel<<<1, kOrderThreads, 0, stream>>>(queue.halted, int(tiles), length, size, int(tiles + places),
-                                                         chunks);
+    order_chunks_kernel<<<1, kOrderThreads, 0, stream>>>(queue.halted, int(tiles), LongestFirst<Length>{length, size},
+                                                         int(tiles + places), chunks, nullptr, 0);
   else
     keep_tiles_kernel<<<blocks_for(tiles, kOrderThreads), kOrderThreads, 0, stream>>>(queue.halted, int(tiles), length,
                                                                                       chunks);

@@ -7,6 +7,7 @@
 
 #include "backend.h"
 #include "gs/check.h"
+#include "math/layers.h"
 #include "math/splat.h"
 
 using namespace gs::GS_ISA;
@@ -90,10 +91,17 @@ Bins<T> bin_scene(const Where& where, const gs::Scene<T>& scene, bool rects, boo
   return out;
 }
 
+// A forward's layers, with inverse depth. They are made on a Queue alone.
+template <class T, class Where>
+std::vector<T> memory_for_layers(const Where&, gs::Image image, int64_t instances) {
+  return std::vector<T>(std::is_same_v<Where, gs::Queue> ? layer_values(image, instances, true) : 0, T(NAN));
+}
+
 // Forward and backward of the sum of all pixels of all planes, on an Executor or a Queue. Allocations are exact, so
-// that a sanitizer sees an access outside. The gradient holds means, means2d, opacities, scales, rotations, dc, rest,
-// one after the other. records: projection gives binning a record of each splat besides its rectangle. ahead: as a host
-// that runs ahead gives it; a gradient of a halted run is -77.
+// that a sanitizer sees an access outside. On a Queue the forward gives its layers to the backward. The gradient holds
+// means, means2d, opacities, scales, rotations, dc, rest, one after the other. records: projection gives binning a
+// record of each splat besides its rectangle. ahead: as a host that runs ahead gives it; a gradient of a halted run is
+// -77.
 template <class T, class Where>
 Result<T> run(const Where& where, Parameters<T>& p, gs::Image image, bool antialiasing, bool records = false,
               const gs::Ahead* ahead = nullptr) {
@@ -140,8 +148,12 @@ Result<T> run(const Where& where, Parameters<T>& p, gs::Image image, bool antial
     }
 
   out.color.resize(3 * pixels), out.transmittance.resize(pixels), out.depth.resize(pixels);
-  const gs::BlendInput<T> input = {splats.data(), instances.data(), ranges.data(), background, image};
-  blend(where, input, gs::Blended<T>{out.color.data(), out.transmittance.data(), out.depth.data(), last.data()});
+  const int64_t room = int64_t(instances.size());
+  const gs::BlendInput<T> input = {splats.data(), instances.data(), ranges.data(), background, image, room};
+  std::vector<T> layers = memory_for_layers<T>(where, image, room);
+  blend(where, input,
+        gs::Blended<T>{out.color.data(), out.transmittance.data(), out.depth.data(), last.data(),
+                       layers.empty() ? nullptr : layers.data()});
 
   static_assert(sizeof(bool) == 1);
   out.decisive.resize(n);
@@ -149,9 +161,10 @@ Result<T> run(const Where& where, Parameters<T>& p, gs::Image image, bool antial
 
   const std::vector<T> ones(3 * pixels, T(1));
   std::vector<T> moments(kGradientValues * n);
-  blend_vjp(where, input,
-            gs::BlendGradient<T>{p.count, out.instances, slot_count, slots.data(), out.transmittance.data(),
-                                 last.data(), ones.data(), ones.data(), ones.data(), moments.data(), ahead});
+  blend_vjp(
+      where, input,
+      gs::BlendGradient<T>{p.count, room, slot_count, slots.data(), out.transmittance.data(), last.data(), ones.data(),
+                           ones.data(), ones.data(), moments.data(), layers.empty() ? nullptr : layers.data(), ahead});
   out.gradient.assign(n * (3 + 3 + 1 + 3 + 4 + 3 + 45), T(-77));
   T* g = out.gradient.data();
   const gs::SceneGradient<T> gradient = {g,       g + 3 * n, g + 6 * n,  g + 7 * n, g + 10 * n,

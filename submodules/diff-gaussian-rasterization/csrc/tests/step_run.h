@@ -74,7 +74,7 @@ struct Stepping {
 
 // A forward of the values, and what its backward needs.
 struct Rendered {
-  std::vector<float> splats, depths, color, transmittance, inverse_depth, gradient, moments;
+  std::vector<float> splats, depths, color, transmittance, inverse_depth, gradient, moments, layers;
   std::vector<int32_t> rects, tile_counts, radii, last, instances;
   std::vector<gs::TileRecord> records;
   std::vector<int64_t> ranges;
@@ -107,13 +107,16 @@ std::unique_ptr<Rendered> render(const Where& where, const gs::Scene<float>& sce
   };
   bin(where, scene.count, projected, image, gs::BinMemory{take, &r, r.slots.data()});
   r.color.resize(3 * pixels), r.transmittance.resize(pixels), r.inverse_depth.resize(pixels), r.last.resize(pixels);
-  r.input = {r.splats.data(), r.instances.data(), r.ranges.data(), r.background, image};
-  blend(where, r.input, {r.color.data(), r.transmittance.data(), r.inverse_depth.data(), r.last.data()});
+  r.input = {r.splats.data(), r.instances.data(), r.ranges.data(), r.background, image, int64_t(r.instances.size())};
+  r.layers = memory_for_layers<float>(where, image, int64_t(r.instances.size()));
+  float* const layers = r.layers.empty() ? nullptr : r.layers.data();
+  blend(where, r.input, {r.color.data(), r.transmittance.data(), r.inverse_depth.data(), r.last.data(), layers});
   r.gradient.assign(3 * pixels, 1);
   r.gradient[pixels / 2 + image.width / 2] = gradient;
   r.backward = {
       scene.count,   int64_t(r.instances.size()), r.slot_count,      r.slots.data(),    r.transmittance.data(),
-      r.last.data(), r.gradient.data(),           r.gradient.data(), r.gradient.data(), r.moments.data()};
+      r.last.data(), r.gradient.data(),           r.gradient.data(), r.gradient.data(), r.moments.data(),
+      layers};
   return out;
 }
 

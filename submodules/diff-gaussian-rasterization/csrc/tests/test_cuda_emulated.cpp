@@ -4,8 +4,9 @@
 
 #include "backend_run.h"
 #include "emulated_queue.h"
+#include "front_first.cuh"
+#include "long_lists.h"
 #include "math/step_now.h"
-#include "schedule.cuh"
 #include "step_run.h"
 
 namespace {
@@ -73,10 +74,10 @@ void test_many_tiles() {
                 run(gs::serial_executor(), p, image, false));
 }
 
-// Two tiles whose lists the backward cuts into several chunks. The splats are wide. Some pixels end in the middle of
-// the list, at opaque splats, and the others stay open to its end.
-void test_long_lists() {
-  constexpr int64_t count = 2100;
+// Two tiles whose lists several blocks share. The splats are wide. Some pixels end in the middle of the list, at opaque
+// splats, and the others stay open to its end.
+constexpr gs::Image kTwoTiles{25, 16};
+Parameters<float> two_long_lists(int64_t count) {
   Parameters<float> p(count);
   for (int64_t i = 0; i < count; ++i) {
     const float depth = 2 + 2 * float(i) / count;
@@ -87,15 +88,17 @@ void test_long_lists() {
     for (int k = 0; k < 3; ++k) p.scales[3 * i + k] = std::log((closing ? 0.1f : 0.6f) * depth);
     if (closing) p.means[3 * i] = -0.3f * depth;
   }
-  check_scene(p, gs::Image{25, 16}, false);
+  return p;
+}
+
+void test_long_lists() {
+  Parameters<float> p = two_long_lists(2100);
+  check_scene(p, kTwoTiles, false);
 }
 
 // A host that runs ahead: with enough room, exactly or more, the bits are those of a host that waits. With less room in
 // one of the lists, the step halts, says what it needs and leaves the gradients alone, and so does every later step.
-void test_ahead() {
-  constexpr gs::Image image{330, 70};
-  Parameters<float> p(300);
-  for (int k = 0; k < 3; ++k) p.scales[3 * 17 + k] = 1;
+void check_ahead(Parameters<float>& p, gs::Image image) {
   const Result<float> wanted = run_emulated(p, image, false, true, gs::emulation::Order::forward);
   constexpr int kReports = 4;
   int32_t halted = 0;
@@ -138,6 +141,128 @@ void test_ahead() {
       CHECK(halted == done + 1 && report[3] == done + 1 && report[4] == done + 1);
       halted = 0;
     }
+}
+
+void test_ahead() {
+  Parameters<float> p(300);
+  for (int k = 0; k < 3; ++k) p.scales[3 * 17 + k] = 1;
+  check_ahead(p, gs::Image{330, 70});
+  p = two_long_lists(900);
+  check_ahead(p, kTwoTiles);
+}
+
+// Checks that several orders give the same bits, and these bits against the rule and against the CPU. Every output may
+// be left out.
+void check_lists(const LongLists& lists) {
+  const Blending exact = blend_exactly(lists);
+  const auto emulated = [&](gs::emulation::Order order, bool depth, bool last, bool layers) {
+    gs::emulation::order = order;
+    gs::emulation::Memory memory;
+    return blend_lists(memory.queue(), lists, depth, last, layers);
+  };
+  const Blending got = emulated(gs::emulation::Order::forward, true, true, true);
+  const std::vector<double>* const wanted[] = {&exact.exact_color, &exact.exact_transmittance, &exact.exact_depth};
+  const std::vector<float>* const planes[] = {&got.color, &got.transmittance, &got.depth};
+  const size_t pixels = got.last.size();
+  double error = 0;
+  size_t decided = 0;
+  for (size_t pixel = 0; pixel < pixels; ++pixel) {
+    if (!exact.decided[pixel]) continue;
+    ++decided;
+    CHECK(got.last[pixel] == exact.last[pixel]);
+    for (int plane = 0; plane < 3; ++plane)
+      for (size_t i = pixel; i < planes[plane]->size(); i += pixels)
+        error = std::max(error, std::abs((*planes[plane])[i] - (*wanted[plane])[i]));
+  }
+  CHECK(decided > 0.9 * double(pixels));
+  CHECK_NEAR(error, 0, 2e-6);  // a pixel's 600 blends in float
+  if (std::getenv("GS_SHOW")) std::cerr << "largest error " << error << ", " << decided << " of " << pixels << '\n';
+  const Blending cpu = blend_lists(gs::serial_executor(), lists, true, true, false);
+  check_near(got.moments, cpu.moments, 2e-5);
+  check_near(emulated(gs::emulation::Order::forward, true, true, false).moments, cpu.moments, 2e-5);
+  for (const gs::emulation::Order order : gs::emulation::kOrders) {
+    const Blending again = emulated(order, true, true, true);
+    CHECK(again.color == got.color && again.transmittance == got.transmittance && again.depth == got.depth);
+    CHECK(again.last == got.last && again.moments == got.moments);
+    for (const auto& [depth, last] : {std::pair{false, true}, std::pair{true, false}, std::pair{false, false}}) {
+      const Blending fewer = emulated(order, depth, last, true);
+      CHECK(fewer.color == got.color && fewer.transmittance == got.transmittance);
+      CHECK((!depth || fewer.depth == got.depth) && (!last || fewer.last == got.last));
+    }
+  }
+}
+
+// A list of twelve chunks. Up to 240 pixels end, one every eleven splats, so that some end in each chunk; the others
+// stay open. An end takes up to three opaque splats at the pixel alone.
+void add_ending_list(LongLists& lists, int faint, int ending) {
+  for (int i = 0; i < faint; ++i) {
+    lists.add_faint(-7.6f);
+    const int pixel = i / 8 * 37 % 256;
+    for (int k = 0; k < 3 && i % 8 == 0 && i / 8 < ending; ++k) lists.add(float(pixel % 16), float(pixel / 16), 4, 0);
+  }
+  lists.end_tile();
+}
+
+void test_pixels_that_end_in_every_chunk() {
+  LongLists lists(gs::Image{16, 16});
+  add_ending_list(lists, 2100, 240);
+  check_lists(lists);
+}
+
+// Lists of none, few and many splats: for one block, for one block in two chunks, for several blocks. All pixels of one
+// long list end early, and the tiles are cut off by the image.
+void test_lists_of_all_lengths() {
+  LongLists lists(gs::Image{6 * 16 + 7, 11});
+  lists.end_tile();
+  for (const int faint : {1, 250, 460}) add_ending_list(lists, faint, 6);
+  for (int k = 0; k < 5; ++k) lists.add(8, 8, 0.001f, -0.1f);
+  add_ending_list(lists, 1100, 0);
+  for (const int faint : {513, 700}) add_ending_list(lists, faint, 90);
+  check_lists(lists);
+}
+
+// Whether blocks share a list depends on the other lists; the image must not.
+void test_shared_lists_are_blended_as_whole_ones() {
+  LongLists lists(gs::Image{32, 16});
+  add_ending_list(lists, 500, 60);
+  for (int k = 0; k < 5; ++k) lists.add(8, 8, 0.001f, -0.1f);  // all pixels of the second tile end
+  LongLists more = lists;
+  lists.end_tile();
+  more.instances.resize(more.instances.size() + gs::cuda::kShares * 800, more.instances.back());
+  more.end_tile();
+  const int64_t share = int64_t(more.instances.size()) / gs::cuda::kShares;
+  CHECK(lists.ranges[1] > gs::cuda::kAlwaysWhole && lists.ranges[1] < share);
+  gs::emulation::order = gs::emulation::Order::forward;
+  gs::emulation::Memory memory;
+  const Blending shared = blend_lists(memory.queue(), lists, true, true, true);
+  const Blending whole = blend_lists(memory.queue(), more, true, true, true);
+  CHECK(shared.color == whole.color && shared.transmittance == whole.transmittance && shared.depth == whole.depth);
+  CHECK(shared.last == whole.last && shared.moments == whole.moments);
+}
+
+// Chunks come after those in front of them in their list, and cover every list.
+void test_front_first() {
+  for (const int tiles : {1, 2500}) {
+    std::vector<int64_t> ranges(1);
+    for (int t = 0; t < tiles; ++t) ranges.push_back(ranges.back() + int64_t(std::exp(4 + 2 * normal())));
+    for (int t = tiles / 2; t < tiles; ++t) ranges[t + 1] += 100 * kLayerChunk + 1;
+    std::vector<int32_t> zeros(5000, 7);
+    gs::emulation::Memory memory;
+    const gs::cuda::Schedule schedule =
+        gs::cuda::front_first(memory.queue(), tiles, ranges.data(), ranges.back(), zeros.data(), zeros.size() - 1);
+    CHECK(std::count(zeros.begin(), zeros.end(), 0) == 4999 && zeros.back() == 7);
+    std::vector<int64_t> covered(tiles);
+    size_t longest = 0;
+    for (unsigned i = 0; i < schedule.blocks; ++i) {
+      const gs::cuda::Chunk& chunk = schedule.chunks[i];
+      if (chunk.tile < 0) continue;
+      CHECK(chunk.first == covered[chunk.tile]);
+      covered[chunk.tile] = chunk.end;
+      longest = std::max<size_t>(longest, chunk.end - chunk.first);
+    }
+    for (int t = 0; t < tiles; ++t) CHECK(covered[t] == ranges[t + 1] - ranges[t]);
+    CHECK(longest <= size_t(std::max<int64_t>(gs::cuda::kAlwaysWhole, ranges.back() / gs::cuda::kShares)));
+  }
 }
 
 bool same_slots(const gs::SplatSlots& a, const gs::SplatSlots& b) {
@@ -446,6 +571,10 @@ int main() {
   test_many_tiles();
   test_long_lists();
   test_ahead();
+  test_pixels_that_end_in_every_chunk();
+  test_lists_of_all_lengths();
+  test_shared_lists_are_blended_as_whole_ones();
+  test_front_first();
   test_lists();
   test_longest_first();
   return gs::finish_tests("CUDA kernels, emulated");

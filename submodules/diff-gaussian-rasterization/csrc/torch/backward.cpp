@@ -3,13 +3,14 @@
 
 #include <ATen/ops/empty.h>
 
+#include "math/layers.h"
 #include "math/splat.h"
 #include "math/tiles.h"
 #include "scene.h"
 
 namespace gs::ops {
 
-using gs::baseline::kGradientValues, gs::baseline::kSplatValues, gs::baseline::tiles_of;
+using gs::baseline::kGradientValues, gs::baseline::kSplatValues, gs::baseline::layer_values, gs::baseline::tiles_of;
 
 void check_splats(const Tensor& splats) {
   check_given(splats, "splats");
@@ -59,6 +60,14 @@ gs::Image BlendBackward::checked(const Tensor& splats, const Tensor& instances, 
   check_tensor(transmittance, "transmittance", splats.scalar_type(), device, {1, image.height, image.width});
   check_given(grad_color, "grad_color");
   return image;
+}
+
+void BlendBackward::take_layers(const Tensor& layers) {
+  check_tensor(layers, "layers", splats_.scalar_type(), splats_.device(), {-1});
+  const int64_t wanted = layer_values(image_, instances_.size(0), depth_.defined());
+  TORCH_CHECK_VALUE(!layers.size(0) || layers.size(0) >= wanted, "layers must have ", wanted, " values, got ",
+                    layers.size(0));
+  layers_ = layers.contiguous();
 }
 
 Tensor BlendBackward::plane(const MaybeTensor& t, int64_t channels) const {

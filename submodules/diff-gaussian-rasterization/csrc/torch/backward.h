@@ -28,8 +28,12 @@ Tensor background_like(const Tensor& background, const Tensor& splats);
 template <class T>
 gs::BlendInput<T> blend_input(const Tensor& splats, const Tensor& instances, const Tensor& ranges,
                               const Tensor& background, gs::Image image) {
-  return {splats.const_data_ptr<T>(), instances.const_data_ptr<int32_t>(), ranges.const_data_ptr<int64_t>(),
-          background.const_data_ptr<T>(), image};
+  return {splats.const_data_ptr<T>(),
+          instances.const_data_ptr<int32_t>(),
+          ranges.const_data_ptr<int64_t>(),
+          background.const_data_ptr<T>(),
+          image,
+          instances.size(0)};
 }
 
 // Owns the tensors that the gs::BlendInput and gs::BlendGradient of a backward point into.
@@ -53,6 +57,9 @@ class BlendBackward {
 
   const Tensor& splats() const { return splats_; }
 
+  // Takes the forward's layers. Without them, the backward makes its own.
+  void take_layers(const Tensor& layers);
+
   template <class T>
   gs::BlendInput<T> input() const {
     return blend_input<T>(splats_, instances_, ranges_, background_, image_);
@@ -69,6 +76,7 @@ class BlendBackward {
             depth_.defined() ? depth_.const_data_ptr<T>() : nullptr,
             alpha_.defined() ? alpha_.const_data_ptr<T>() : nullptr,
             moments,
+            layers_.defined() && layers_.numel() ? layers_.const_data_ptr<T>() : nullptr,
             ahead()};
   }
 
@@ -83,7 +91,7 @@ class BlendBackward {
   Tensor splats_, instances_, ranges_, splat_slots_;
   int64_t slot_count_;
   Tensor background_, last_, transmittance_;
-  Tensor color_, alpha_, depth_;
+  Tensor color_, alpha_, depth_, layers_;
 };
 
 Tensor blend_vjp(const BlendBackward& in);

@@ -113,10 +113,10 @@ void run(const SceneTensors& scene, const BlendBackward& in, const Tensor& tile_
 // and observe_ if statistics are given: the same bits, without gradients in memory. Advances the counters as adam_
 // does. now: on a GPU, what `step_now_` wrote, which stands in for steps, rates and iteration, and has advanced the
 // counters.
-void rasterize_vjp_step_op(SCENE_PARAMETERS, BACKWARD_PARAMETERS, const Tensor& tile_counts, const Tensor& radii,
-                           at::IntArrayRef attributes, at::TensorList exp_avg, at::TensorList exp_avg_sq,
-                           at::TensorList steps, at::ArrayRef<double> rates, double beta1, double beta2, double eps,
-                           at::IntArrayRef columns, bool sparse, const MaybeTensor& max_radii,
+void rasterize_vjp_step_op(SCENE_PARAMETERS, BACKWARD_PARAMETERS, const Tensor& tile_counts, const Tensor& layers,
+                           const Tensor& radii, at::IntArrayRef attributes, at::TensorList exp_avg,
+                           at::TensorList exp_avg_sq, at::TensorList steps, at::ArrayRef<double> rates, double beta1,
+                           double beta2, double eps, at::IntArrayRef columns, bool sparse, const MaybeTensor& max_radii,
                            const MaybeTensor& gradient_sums, const MaybeTensor& views, const MaybeTensor& loss,
                            const MaybeTensor& stopped, int64_t iteration, const MaybeTensor& now) {
   const SceneTensors scene(SCENE_ARGUMENTS);
@@ -124,7 +124,8 @@ void rasterize_vjp_step_op(SCENE_PARAMETERS, BACKWARD_PARAMETERS, const Tensor& 
   check_tensor(splats, "splats", scene.dtype(), scene.device(), {scene.count(), kSplatValues});
   check_counts(tile_counts, scene.count(), scene.device());
   check_tensor(radii, "radii", at::kInt, scene.device(), {scene.count()});
-  const BlendBackward in(BACKWARD_ARGUMENTS);
+  BlendBackward in(BACKWARD_ARGUMENTS);
+  in.take_layers(layers);
   const StepLists lists{attributes, exp_avg, exp_avg_sq, steps, rates, columns, beta1, beta2, eps};
   lists.check();
   const Tensor counts = tile_counts.contiguous(), pixels = radii.contiguous();
@@ -166,7 +167,8 @@ TORCH_LIBRARY_FRAGMENT(diff_gaussian_rasterization, m) {
   define(m,
          "rasterize_vjp_step_(" + scene +
              ", " BACKWARD_SCHEMA
-             ", Tensor tile_counts, Tensor radii, int[] attributes, Tensor(g!)[] exp_avg, Tensor(h!)[] exp_avg_sq, "
+             ", Tensor tile_counts, Tensor layers, Tensor radii, int[] attributes, Tensor(g!)[] exp_avg, Tensor(h!)[] "
+             "exp_avg_sq, "
              "Tensor(i!)[] steps, float[] rates, float beta1, float beta2, float eps, int[] columns, bool sparse, "
              "Tensor(j!)? max_radii=None, Tensor(k!)? gradient_sums=None, Tensor(l!)? views=None, Tensor? loss=None, "
              "Tensor(m!)? stopped=None, int iteration=0, Tensor? now=None) -> ()",

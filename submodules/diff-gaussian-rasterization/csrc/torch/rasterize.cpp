@@ -7,6 +7,7 @@
 #include <limits>
 
 #include "backward.h"
+#include "math/layers.h"
 #include "math/splat.h"
 #include "math/tiles.h"
 #include "scene.h"
@@ -15,7 +16,8 @@ namespace gs::ops {
 
 namespace {
 
-using gs::baseline::kGradientValues, gs::baseline::kSplatValues, gs::baseline::tile_count, gs::baseline::tiles_of;
+using gs::baseline::kGradientValues, gs::baseline::kSplatValues, gs::baseline::layer_values;
+using gs::baseline::tile_count, gs::baseline::tiles_of;
 
 struct ProjectedTensors {
   Tensor splats, depths, rects, tile_counts, radii;
@@ -94,21 +96,25 @@ BinnedTensors bin(ProjectedTensors& in, gs::Image image, bool slots) {
 
 struct BlendedTensors {
   Tensor color, transmittance, inverse_depth, last;
+  Tensor layers;  // (V): gs::Blended::layers, of no values on the CPU
 };
 
-// last: whether the backward will need it.
+// last: whether the backward will need it. layers: whether it gets them.
 BlendedTensors blend(const Tensor& splats, const Tensor& instances, const Tensor& ranges, const Tensor& background,
-                     gs::Image image, bool inverse_depth, bool last) {
+                     gs::Image image, bool inverse_depth, bool last, bool layers) {
   const int64_t h = image.height, w = image.width;
+  const bool made = layers && splats.is_cuda();
   BlendedTensors out{at::empty({3, h, w}, splats.options()), at::empty({1, h, w}, splats.options()),
                      at::empty({inverse_depth ? 1 : 0, h, w}, splats.options()),
-                     at::empty({last ? h : 0, w}, splats.options().dtype(at::kInt))};
+                     at::empty({last ? h : 0, w}, splats.options().dtype(at::kInt)),
+                     at::empty({made ? layer_values(image, instances.size(0), inverse_depth) : 0}, splats.options())};
   const Tensor bg = background_like(background, splats);
   with_scalar(splats.scalar_type(), [&](auto zero) {
     using T = decltype(zero);
     const gs::Blended<T> blended{out.color.mutable_data_ptr<T>(), out.transmittance.mutable_data_ptr<T>(),
                                  inverse_depth ? out.inverse_depth.mutable_data_ptr<T>() : nullptr,
-                                 last ? out.last.mutable_data_ptr<int32_t>() : nullptr};
+                                 last ? out.last.mutable_data_ptr<int32_t>() : nullptr,
+                                 out.layers.numel() ? out.layers.mutable_data_ptr<T>() : nullptr};
     GS_RUN(T, splats, blend, blend_input<T>(splats, instances, ranges, bg, image), blended);
   });
   return out;
@@ -152,8 +158,8 @@ Tensors4 blend_op(const Tensor& splats, const Tensor& instances, const Tensor& r
   check_splats(splats);
   const gs::Image image = checked_image(height, width);
   check_lists(instances, ranges, splats, image);
-  const BlendedTensors b =
-      blend(splats.contiguous(), instances.contiguous(), ranges.contiguous(), background, image, inverse_depth, train);
+  const BlendedTensors b = blend(splats.contiguous(), instances.contiguous(), ranges.contiguous(), background, image,
+                                 inverse_depth, train, false);
   return {b.color, b.transmittance, b.inverse_depth, b.last};
 }
 
@@ -166,7 +172,8 @@ Gradients project_vjp_op(SCENE_PARAMETERS, const Tensor& tile_counts, const Tens
   return project_vjp(scene, tile_counts.contiguous(), moments.contiguous(), wanted);
 }
 
-using Rasterized = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor>;
+using Rasterized =
+    std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor>;
 
 Rasterized rasterize_op(const Tensor& means2d, SCENE_PARAMETERS, const Tensor& background, bool inverse_depth,
                         bool train) {
@@ -174,16 +181,18 @@ Rasterized rasterize_op(const Tensor& means2d, SCENE_PARAMETERS, const Tensor& b
   scene.checked(kMeans2d, means2d);  // it only receives a gradient
   ProjectedTensors p = project(scene, false);
   BinnedTensors b = bin(p, scene.image(), train);
-  BlendedTensors o = blend(p.splats, b.instances, b.ranges, background, scene.image(), inverse_depth, train);
+  BlendedTensors o = blend(p.splats, b.instances, b.ranges, background, scene.image(), inverse_depth, train, train);
   return {o.color,     o.transmittance, o.inverse_depth, p.radii, p.splats, p.tile_counts,
-          b.instances, b.ranges,        b.splat_slots,   b.slots, o.last};
+          b.instances, b.ranges,        b.splat_slots,   b.slots, o.last,   o.layers};
 }
 
-Gradients rasterize_vjp_op(SCENE_PARAMETERS, BACKWARD_PARAMETERS, const Tensor& tile_counts, Wanted wanted) {
+Gradients rasterize_vjp_op(SCENE_PARAMETERS, BACKWARD_PARAMETERS, const Tensor& tile_counts, const Tensor& layers,
+                           Wanted wanted) {
   const SceneTensors scene(SCENE_ARGUMENTS);
   check_tensor(splats, "splats", scene.dtype(), scene.device(), {scene.count(), kSplatValues});
   check_counts(tile_counts, scene.count(), scene.device());
-  const BlendBackward in(BACKWARD_ARGUMENTS);
+  BlendBackward in(BACKWARD_ARGUMENTS);
+  in.take_layers(layers);
 #ifdef GS_CUDA
   if (splats.is_cuda()) {
     gs::TorchQueue queue(splats.device(), halted());
@@ -251,11 +260,11 @@ TORCH_LIBRARY_FRAGMENT(diff_gaussian_rasterization, m) {
          "rasterize(Tensor means2d, " SCENE_SCHEMA
          ", Tensor background, bool inverse_depth, bool train) -> (Tensor color, Tensor transmittance, "
          "Tensor inverse_depth, Tensor radii, Tensor splats, Tensor tile_counts, Tensor instances, "
-         "Tensor ranges, Tensor splat_slots, Tensor slots, Tensor last)",
+         "Tensor ranges, Tensor splat_slots, Tensor slots, Tensor last, Tensor layers)",
          &rasterize_op);
   define(m,
          "rasterize_vjp(" SCENE_SCHEMA ", " BACKWARD_SCHEMA
-         ", Tensor tile_counts, bool[9] wanted) -> " GRADIENTS_SCHEMA,
+         ", Tensor tile_counts, Tensor layers, bool[9] wanted) -> " GRADIENTS_SCHEMA,
          &rasterize_vjp_op);
   define(m, "mark_visible(Tensor means, Tensor view) -> Tensor", &mark_visible_op);
   define(m, "decisive(Tensor splats, Tensor instances, Tensor ranges, Tensor last) -> Tensor", &decisive_op);

@@ -1,0 +1,104 @@
+#pragma once
+// Hand-made lists of splats for a row of tiles, blended by a backend, and by the rule itself in double.
+#include <algorithm>
+#include <cmath>
+#include <random>
+#include <vector>
+
+#include "backend_run.h"
+#include "math/layers.h"
+#include "math/slots.h"
+
+// A row of tiles. Each splat lies in one list.
+struct LongLists {
+  gs::Image image;
+  std::vector<float> splats;
+  std::vector<int32_t> instances;
+  std::vector<int64_t> ranges{0};
+  std::vector<gs::SplatSlots> slots;
+
+  explicit LongLists(gs::Image of) : image(of) {}
+  int64_t count() const { return int64_t(splats.size()) / kSplatValues; }
+  int tile() const { return int(ranges.size()) - 1; }  // the one that is being filled
+
+  // x, y: in the tile.
+  void add(float x, float y, float inverse_width, float log2_opacity) {
+    instances.push_back(int32_t(count()));
+    slots.push_back(gs::SplatSlots{count(), tile(), 1});
+    const auto color = [] { return float(std::uniform_real_distribution<>()(generator)); };
+    for (const float value : {x + float(kTile * tile()), y, inverse_width, 0.1f * inverse_width, inverse_width,
+                              log2_opacity, color(), color(), color(), color()})
+      splats.push_back(value);
+  }
+  void add_faint(float log2_opacity) {
+    const auto at = [] { return float(std::uniform_real_distribution<>(0, kTile)(generator)); };
+    add(at(), at(), 0.05f, log2_opacity + 0.3f * float(normal()));
+  }
+  void end_tile() { ranges.push_back(int64_t(instances.size())); }
+};
+
+struct Blending {
+  std::vector<float> color, transmittance, depth, moments;
+  std::vector<int32_t> last;
+  std::vector<double> exact_color, exact_transmittance, exact_depth;  // of blend_exactly alone
+  std::vector<bool> decided;                                          // whether rounding cannot move the end
+};
+
+// depth, last: whether these outputs are asked for. layers: whether the forward gives its layers to the backward.
+template <class Where>
+Blending blend_lists(const Where& where, const LongLists& lists, bool depth, bool last, bool layers) {
+  using gs::cuda::blend, gs::cuda::blend_vjp, gs::GS_ISA::blend, gs::GS_ISA::blend_vjp;
+  const float background[3] = {0.1f, 0.2f, 0.3f};
+  const size_t pixels = size_t(lists.image.width) * lists.image.height;
+  const int64_t total = int64_t(lists.instances.size());
+  Blending out;
+  out.color.resize(3 * pixels), out.transmittance.resize(pixels);
+  out.depth.resize(depth ? pixels : 0), out.last.resize(last ? pixels : 0);
+  std::vector<float> made(layers ? layer_values(lists.image, total, depth) : 0, NAN);
+  float* const to = layers ? made.data() : nullptr;
+  const gs::BlendInput<float> in = {
+      lists.splats.data(), lists.instances.data(), lists.ranges.data(), background, lists.image, total};
+  blend(where, in,
+        gs::Blended<float>{out.color.data(), out.transmittance.data(), depth ? out.depth.data() : nullptr,
+                           last ? out.last.data() : nullptr, to});
+  if (!last) return out;
+  std::vector<gs::SplatSlots> slots = lists.slots;
+  slots.push_back({lists.count(), 0, 0});
+  std::vector<float> gradients;
+  std::mt19937 numbers(8);
+  for (size_t i = 0; i < 5 * pixels; ++i) gradients.push_back(float(std::normal_distribution<>()(numbers)));
+  const float* g = gradients.data();
+  out.moments.resize(kGradientValues * lists.count());
+  blend_vjp(where, in,
+            gs::BlendGradient<float>{lists.count(), total, lists.count(), slots.data(), out.transmittance.data(),
+                                     out.last.data(), g, depth ? g + 3 * pixels : nullptr, g + 4 * pixels,
+                                     out.moments.data(), to});
+  return out;
+}
+
+// The rule, a pixel at a time.
+inline Blending blend_exactly(const LongLists& lists) {
+  const int width = lists.image.width, height = lists.image.height;
+  const size_t pixels = size_t(width) * height;
+  Blending out;
+  out.exact_color.resize(3 * pixels), out.exact_transmittance.resize(pixels), out.exact_depth.resize(pixels);
+  out.last.resize(pixels), out.decided.resize(pixels, true);
+  for (size_t pixel = 0; pixel < pixels; ++pixel) {
+    const int x = int(pixel) % width, y = int(pixel) / width, tile = x / kTile;
+    double left = 1, sum[4] = {0, 0, 0, 0};
+    for (int64_t k = lists.ranges[tile]; k < lists.ranges[tile + 1]; ++k) {
+      const float* s = &lists.splats[kSplatValues * lists.instances[k]];
+      const double u = s[2] * (double(x) - s[0]) + s[3] * (double(y) - s[1]), v = s[4] * (double(y) - s[1]);
+      const double power = s[5] - u * u - v * v, alpha = std::min(0.99, std::exp2(power));
+      if (std::abs(power + std::log2(255.0)) < 2e-5) out.decided[pixel] = false;
+      if (alpha < 1 / 255.0) continue;
+      if (std::abs(left * (1 - alpha) - 1e-4) < 1e-8) out.decided[pixel] = false;
+      if (left * (1 - alpha) < 1e-4) break;
+      for (int c = 0; c < 4; ++c) sum[c] += left * alpha * s[6 + c];
+      left *= 1 - alpha, out.last[pixel] = int32_t(k - lists.ranges[tile]) + 1;
+    }
+    for (int c = 0; c < 3; ++c) out.exact_color[c * pixels + pixel] = sum[c] + left * float(0.1f * float(c + 1));
+    out.exact_transmittance[pixel] = left, out.exact_depth[pixel] = sum[3];
+  }
+  return out;
+}
