@@ -54,6 +54,8 @@ SCHEMAS = [
     "float lr, float beta1, float beta2, float eps, int columns=-1, Tensor? loss=None, Tensor(d!)? stopped=None, "
     "int iteration=0) -> ()",
     "observe_(Tensor(a!) max_radii, Tensor(b!) gradient_sums, Tensor(c!) views, Tensor radii, Tensor gradient) -> ()",
+    "split_positions(Tensor means, Tensor log_scales, Tensor rotations, Tensor items, int seed, int stream, "
+    "int iteration, int draw) -> Tensor",
 ]
 
 

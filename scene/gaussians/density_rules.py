@@ -7,11 +7,12 @@ import argparse
 import math
 from typing import NamedTuple
 
+import utils.host.extensions  # noqa: F401  isort: skip  (before the extensions)
 import torch
+from diff_gaussian_rasterization.density import split_positions
 from torch import Tensor
 
-from utils.exact import portable_math
-from utils.exact.counter_rng import Stream, normal
+from utils.exact.counter_rng import Stream
 
 SHRINK = 0.8  # N children of a split have 1 / (0.8 N) of the parent's scale: 1 / 1.6 for two (paper, section 5.2)
 PRUNE_EXTENT = 0.1  # a Gaussian wider than this part of the scene's extent is removed, once sizes are limited
@@ -99,20 +100,6 @@ def split_children(
     scales (n, 3), quaternions (n, 4) wxyz. Their indices `items` (n,), seed, iteration and child decide the random
     numbers.
     """
-    noise = normal(seed, Stream.SPLIT, iteration, items, child)[:, :3] * portable_math.exp(scaling)
-    return (xyz.double() + _rotate(rotation.double(), noise)).float(), scaling - math.log(SHRINK * count)
-
-
-def _rotate(quaternion: Tensor, vector: Tensor) -> Tensor:
-    """v + 2 w (u x v) + 2 u x (u x v), unit quaternion (w, u). Elementwise, so that no kernel can reorder sums."""
-    square = quaternion * quaternion
-    length = (((square[:, 0] + square[:, 1]) + square[:, 2]) + square[:, 3]).sqrt().clamp_min(1e-12)
-    unit = quaternion / length[:, None]
-    w, u = unit[:, :1], unit[:, 1:]
-    twice = _cross(u, vector) * 2.0
-    return (vector + w * twice) + _cross(u, twice)
-
-
-def _cross(a: Tensor, b: Tensor) -> Tensor:
-    (ax, ay, az), (bx, by, bz) = a.unbind(1), b.unbind(1)
-    return torch.stack((ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx), dim=1)
+    shapes = xyz.float(), scaling.float(), rotation.float()
+    draw = {"seed": seed, "stream": Stream.SPLIT, "iteration": iteration, "draw": child}
+    return split_positions(*shapes, items, **draw), scaling - math.log(SHRINK * count)

@@ -54,6 +54,10 @@ def sound_calls() -> dict[str, Call]:
         "run_ahead_": (ops.run_ahead_, [torch.zeros(5, dtype=torch.int64), [1, 1, 1], None]),  # refused: not on a GPU
         "step_now_": (ops.step_now_, _step_now()),
         "observe_": (ops.observe_, [*statistics, torch.rand(3, 3)]),
+        "split_positions": (
+            ops.split_positions,
+            [torch.rand(3, 3), torch.rand(3, 3), torch.rand(3, 4), torch.arange(3), 1, 2, 600, 0],
+        ),
         "l1_ssim": (ssim.l1_ssim, [one, two, True, True]),
         "l1_ssim_vjp": (ssim.l1_ssim_vjp, [one, two, kept, torch.ones(()), torch.ones(())]),
         "photometric": (ssim.photometric, [one, two, 0.2, True]),

@@ -37,7 +37,9 @@ struct BinMemory {
   template <class T>                                                                            \
   void sparse_adam(const Where&, const AdamInput<T>&, const bool* visible, const StepGuard<T>&);
 
-void observe(const Executor&, const ObserveInput&);  // compiled once: see gs/rounded.h
+// Compiled once: see gs/rounded.h.
+void observe(const Executor&, const ObserveInput&);
+void split_positions(const Executor&, const SplitInput&);
 
 // What else the CPU offers. project_vjp_step: project_vjp, and every Gaussian's step as soon as its gradients are
 // known.
@@ -61,6 +63,7 @@ GS_CPU_BACKEND
 namespace cuda {
 GS_BACKEND(Queue)
 void observe(const Queue&, const ObserveInput&);
+void split_positions(const Queue&, const SplitInput&);
 // Allocates the gradients; called while the GPU is busy, so that the host's work costs no time.
 struct GradientMemory {
   SceneGradient<float> (*take)(void* context);

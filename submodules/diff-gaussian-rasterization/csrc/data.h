@@ -153,6 +153,16 @@ struct ObserveInput {
   const float* gradients;                    // (N, 3) of the means on the screen; the third value is not read
 };
 
+// Gaussians that density control splits, of each the child number `draw` (math/split.h).
+struct SplitInput {
+  int64_t count;
+  const float *means, *log_scales, *rotations;  // (N, 3), (N, 3) and (N, 4) wxyz
+  const int64_t* items;                         // (N) indices in the model; with what follows they decide the numbers
+  uint64_t seed;
+  uint32_t draw, iteration, stream;
+  float* positions;  // (N, 3), written
+};
+
 // The parameters of a Gaussian that take steps.
 enum Stepped { kStepMeans, kStepOpacities, kStepScales, kStepRotations, kStepShDc, kStepShRest, kStepped };
 

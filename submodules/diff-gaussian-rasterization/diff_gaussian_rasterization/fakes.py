@@ -101,6 +101,11 @@ def _(splats, *_):
     return splats.new_empty((splats.shape[0],), dtype=torch.bool)
 
 
+@_fake("split_positions")
+def _(means, *_):
+    return means.new_empty((means.shape[0], 3))
+
+
 @_fake("adam_")
 @_fake("sparse_adam_")
 @_fake("observe_")

@@ -14,5 +14,12 @@ GS_HD float rounded_product(float a, float b) {
   return a * b;
 #endif
 }
+GS_HD double rounded_product(double a, double b) {
+#ifdef __CUDA_ARCH__
+  return __dmul_rn(a, b);
+#else
+  return a * b;
+#endif
+}
 
 }  // namespace gs

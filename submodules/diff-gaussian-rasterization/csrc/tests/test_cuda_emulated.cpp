@@ -438,6 +438,25 @@ void test_observe() {
   }
 }
 
+void test_split_positions() {
+  for (const int64_t n : {0, 1, 255, 700}) {
+    std::vector<float> values;
+    std::vector<int64_t> items;
+    for (int64_t i = 0; i < 10 * n; ++i) values.push_back(float(3 * normal()));
+    for (int64_t i = 0; i < n; ++i) items.push_back(i * 6700417);
+    std::vector<float> wanted(3 * n), got(3 * n);
+    const auto input = [&](std::vector<float>& positions) {
+      const float* v = values.data();
+      return gs::SplitInput{n, v, v + 3 * n, v + 6 * n, items.data(), 1ull << 40, 1, 600, 2, positions.data()};
+    };
+    gs::split_positions(gs::serial_executor(), input(wanted));
+    gs::emulation::Memory memory;
+    gs::cuda::split_positions(memory.queue(), input(got));
+    CHECK(got == wanted);
+    for (int64_t i = 0; i < 3 * n; ++i) CHECK(got[i] != values[i]);
+  }
+}
+
 // Gradients of the emulated backward, into memory.
 void emulated_gradients(const gs::Queue& queue, const Rendered& r, const gs::SceneGradient<float>& g) {
   const auto take = [](void* to) { return *static_cast<const gs::SceneGradient<float>*>(to); };
@@ -566,6 +585,7 @@ int main() {
   test_adam();
   test_step_guard();
   test_observe();
+  test_split_positions();
   test_gaussian_step();
   test_given_covariances_and_colors();
   test_many_tiles();

@@ -1,0 +1,119 @@
+"""The operator that places the children of a split: the bits of the same formulas written in torch."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from diff_gaussian_rasterization.density import split_positions
+from rasterizer_tools import CPU_AND_GPU, ops
+from torch import Tensor, library
+
+from utils.exact import portable_math
+from utils.exact.counter_rng import Stream, random_bits
+
+WHERE = {"seed": 3, "stream": Stream.SPLIT, "iteration": 600, "draw": 1}
+
+
+def _parents(count: int, seed: int = 0) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Parents of all sizes, some with a quaternion of zero, and their indices."""
+    generator = torch.Generator().manual_seed(seed)
+    means, scales, rotations = (torch.randn(count, width, generator=generator) for width in (3, 3, 4))
+    rotations[::7] = 0
+    items = torch.randint(0, 2**32, (count,), generator=generator)
+    return 100 * means, 12 * scales - 4, rotations, items
+
+
+def _normal(seed: int, stream: Stream, iteration: int, items: Tensor, draw: int) -> Tensor:
+    """counter_rng.normal, with NumPy's square root: torch's is sometimes off by a unit in the last place."""
+    bits = random_bits(seed, stream, iteration, items, draw)
+    square = portable_math.log((bits[:, 0::2] + 1).to(torch.float64) * 2.0**-32) * -2.0
+    radius = torch.from_numpy(np.sqrt(square.numpy()))
+    cos, sin = portable_math.cos_sin_turns(bits[:, 1::2])
+    return torch.cat((radius * cos, radius * sin), dim=1)
+
+
+def _cross(a: Tensor, b: Tensor) -> Tensor:
+    (ax, ay, az), (bx, by, bz) = a.unbind(1), b.unbind(1)
+    return torch.stack((ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx), dim=1)
+
+
+def _in_torch(means: Tensor, log_scales: Tensor, rotations: Tensor, items: Tensor, **where: int) -> Tensor:
+    """mu + e + 2 w (u x e) + 2 u x (u x e), for the unit quaternion (w, u): every product rounded, in this order."""
+    vector = _normal(where["seed"], where["stream"], where["iteration"], items, where["draw"])[:, :3]
+    vector = vector * portable_math.exp(log_scales)
+    square = (rotations * rotations.double()).unbind(1)
+    length = np.sqrt((((square[0] + square[1]) + square[2]) + square[3]).numpy())
+    unit = rotations.double() / torch.from_numpy(length).clamp_min(1e-12)[:, None]
+    w, u = unit[:, :1], unit[:, 1:]
+    twice = _cross(u, vector) * 2.0
+    return (means.double() + ((vector + w * twice) + _cross(u, twice))).float()
+
+
+@CPU_AND_GPU
+@pytest.mark.parametrize("count", [0, 1, 1023, 40_000])
+def test_the_bits_are_those_of_torch(count, device):
+    parents = _parents(count)
+    for where in (WHERE, WHERE | {"seed": 2**63 + 5, "stream": 0, "iteration": 2**32 - 1, "draw": 0}):
+        wanted = _in_torch(*parents, **where)
+        got = split_positions(*(t.to(device) for t in parents), **where)
+        assert got.shape == (count, 3) and torch.equal(got.cpu(), wanted)
+
+
+def test_unturned_and_round_the_offsets_are_the_normal_numbers():
+    items = torch.arange(5000)
+    zero, rotations = torch.zeros(5000, 3), torch.tensor([1.0, 0, 0, 0]).expand(5000, 4)
+    wanted = _normal(3, Stream.SPLIT, 600, items, 1)[:, :3].float()
+    assert torch.equal(split_positions(zero, zero, rotations, items, **WHERE), wanted)
+
+
+def test_every_argument_matters():
+    means, _, rotations, items = _parents(50)
+    parents = means, torch.zeros(50, 3), rotations, items
+    base = split_positions(*parents, **WHERE)
+    for name in WHERE:
+        assert not (base == split_positions(*parents, **WHERE | {name: WHERE[name] + 1})).all(dim=1).any(), name
+    assert torch.equal(base, split_positions(*parents, **WHERE | {"seed": 3 + 2**64}))
+    assert not torch.equal(base, split_positions(*parents, **WHERE | {"seed": 3 + 2**32}))
+
+
+@CPU_AND_GPU
+def test_broken_parents_harm_nobody_else(device):
+    parents = [t.to(device) for t in _parents(6)]
+    wanted = split_positions(*parents, **WHERE)
+    parents[0][1, 2], parents[1][2, 0], parents[2][3, 1] = math.nan, math.nan, math.nan
+    parents[1][4] = torch.tensor([math.inf, -math.inf, 0.0], device=device)
+    got = split_positions(*parents, **WHERE)
+    assert torch.equal(got[[0, 5]], wanted[[0, 5]]) and torch.equal(got[1, :2], wanted[1, :2])
+    assert got[1, 2].isnan() and got[2].isnan().any() and got[3].isnan().all() and not got[4].isnan().any()
+
+
+def test_any_number_of_threads_gives_the_same():
+    parents, before = _parents(20_001), torch.get_num_threads()
+    try:
+        results = []
+        for threads in (1, 2, 3):
+            torch.set_num_threads(threads)
+            results.append(split_positions(*parents, **WHERE))
+    finally:
+        torch.set_num_threads(before)
+    assert torch.equal(results[0], results[1]) and torch.equal(results[0], results[2])
+
+
+@CPU_AND_GPU
+def test_opcheck(device):
+    library.opcheck(ops.split_positions, (*(t.to(device) for t in _parents(5)), 1, 2, 600, 0))
+
+
+def test_what_does_not_fit_is_named():
+    means, scales, rotations, items = _parents(4)
+    for parents, message in (
+        ((means, scales, rotations, items.int()), "items must be torch.int64 on cpu, got torch.int32"),
+        ((means.double(), scales, rotations, items), "means must be torch.float32 on cpu, got torch.float64"),
+    ):
+        with pytest.raises(TypeError, match=message):
+            split_positions(*parents, **WHERE)
+    with pytest.raises(ValueError, match=r"rotations must be \(4, 4\).*got \(4, 3\)"):
+        split_positions(means, scales, means, items, **WHERE)
+    with pytest.raises(ValueError, match=r"items must be \(4,\).*got \(2, 2\)"):
+        split_positions(means, scales, rotations, items.reshape(2, 2), **WHERE)
