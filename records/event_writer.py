@@ -5,10 +5,12 @@ import itertools
 import socket
 import sys
 import time
+from collections import deque
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from os import getpid
 from pathlib import Path
+from threading import Event
 from typing import Any
 
 import numpy as np
@@ -18,6 +20,7 @@ from tqdm import tqdm
 
 from records import event_file
 
+_PAUSE = 0.05  # seconds from a record until it is made
 _NUMBERS = itertools.count()  # of the files of this process
 
 
@@ -41,6 +44,9 @@ class EventWriter:
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="events")
         self._complete: Any = None
         self._failed = False
+        self._records: deque[Callable[[], bytes]] = deque()
+        self._is_told = False  # the thread, that there are records
+        self._hurry = Event()
         self._write(lambda: event_file.first_record(time.time()))
 
     def add_scalar(
@@ -74,12 +80,14 @@ class EventWriter:
 
     def flush(self) -> None:
         """Return when everything so far is written."""
-        self._thread.submit(lambda: None).result()
+        self._hurry.set()
+        self._thread.submit(self._hurry.clear).result()
         if self._complete is not None:
             self._complete.flush()
 
     def close(self) -> None:
         """Write everything so far; nothing may be added afterwards."""
+        self._hurry.set()
         self._thread.shutdown()
         if self._complete is not None:
             self._complete.close()
@@ -99,14 +107,21 @@ class EventWriter:
 
     def _write(self, record: Callable[[], bytes]) -> None:
         """Append a record, which the thread makes."""
-        self._thread.submit(self._append, record)
+        self._records.append(record)
+        if not self._is_told:
+            self._is_told = True
+            self._thread.submit(self._append)
 
-    def _append(self, record: Callable[[], bytes]) -> None:
+    def _append(self) -> None:
+        # Records come in bursts, while training waits: its thread would have to share the interpreter with this one.
+        self._hurry.wait(_PAUSE)
+        self._is_told = False  # before the records are taken, so that none is left behind
+        records = [self._records.popleft() for _ in range(len(self._records))]
         if self._failed:
             return
         try:
             with self._path.open("ab") as file:
-                file.write(record())
+                file.writelines(record() for record in records)
         except Exception as error:  # whatever it is, the training goes on
             self._failed = True
             message = f"warning: cannot write {self._path} ({error}); training continues without TensorBoard's events"

@@ -14,7 +14,7 @@ from PIL import Image
 
 import train
 from evaluation.tensorboard_scalars import _fields, _records, read_scalars
-from records import event_file
+from records import event_file, event_writer
 from records.event_writer import EventWriter
 from utils.files import crc32c as checksums
 from utils.files.crc32c import crc32c
@@ -72,6 +72,22 @@ def test_scalars_are_read_back(tmp_path):
     assert [(scalar.step, scalar.value) for scalar in found["loss"]] == [(10, 1.25), (20, 2.5), (300, 37.5)]
     assert found["huge"][0].value == float("inf") and found["loss"][0].wall <= found["loss"][2].wall
     writer.close()
+
+
+def test_a_burst_is_written_at_once(tmp_path, monkeypatch):
+    """The file is opened for all of it, not for every number, and who flushes or closes does not wait for more."""
+    writer, opened, plain = EventWriter(str(tmp_path)), [], Path.open
+    writer.flush()
+    monkeypatch.setattr(event_writer, "_PAUSE", 3600.0)
+    monkeypatch.setattr(Path, "open", lambda path, mode="r": opened.append(mode) or plain(path, mode))
+    for step in range(100):
+        writer.add_scalar("loss", step, step)
+    assert not opened
+    writer.flush()
+    assert opened == ["ab"] and [scalar.step for scalar in read_scalars(tmp_path)["loss"]] == list(range(100))
+    writer.add_scalar("loss", 7.0, 100)
+    writer.close()
+    assert len(read_scalars(tmp_path)["loss"]) == 101
 
 
 def test_an_image_is_a_png_of_eight_bits(tmp_path):

@@ -44,14 +44,20 @@ class Report(Observer):
             with self._run.clock.paused("scoring"):
                 if step.iteration in self._run.plan.test:
                     self._run.scene.prefetch(self._run.scene.getTestCameras())
-                for one in self._later:
+                for one in self._read():
                     self._tell(*one)
-            self._later.clear()
 
-    def _tell(self, step: Step, losses: Losses, seconds: float) -> None:
+    def _read(self) -> list[tuple[Step, Tensor, Tensor, float]]:
+        """Take what is kept, its L1 and total losses on the host: one wait for a GPU instead of two for each."""
+        kept, self._later = self._later, []
+        values = torch.stack([loss.detach() for _, losses, _ in kept for loss in (losses.l1, losses.total)]).cpu()
+        pairs = values.view(-1, 2)
+        return [(step, l1, total, seconds) for (step, _, seconds), (l1, total) in zip(kept, pairs, strict=True)]
+
+    def _tell(self, step: Step, l1: Tensor, total: Tensor, seconds: float) -> None:
         run = self._run
         scores = self._report(
-            self._writer, step.iteration, losses.l1, losses.total, l1_loss, seconds, run.plan.test,
+            self._writer, step.iteration, l1, total, l1_loss, seconds, run.plan.test,
             run.scene, render, (run.pipe, run.background), run.dataset.train_test_exp,
         )  # fmt: skip
         if scores:
