@@ -78,6 +78,34 @@ def test_clones_and_children_inherit_from_their_own_parent():
         assert torch.equal(value, expected), name
 
 
+@pytest.mark.parametrize("screen", [None, 20])
+def test_clones_and_splits_at_once_give_the_bytes_of_one_after_the_other(screen):
+    """A client that replaces a step gets its own call; all the rest is as without."""
+
+    class Client(GaussianModel):
+        def densify_and_clone(self, *args: object) -> None:
+            before = len(self)
+            super().densify_and_clone(*args)
+            cloned.append(len(self) - before)
+
+    generator, cloned, models = torch.Generator().manual_seed(7), [], []
+    scales = (LIMIT * 20 ** (2 * torch.rand(300, generator=generator) - 1)).tolist()  # up to twice what is pruned
+    gradients = (2 * THRESHOLD * torch.rand(300, generator=generator)).tolist()
+    for kind in (GaussianModel, Client):
+        gaussians = _toy(scales, gradients)
+        gaussians.__class__ = kind
+        with torch.no_grad():
+            gaussians._opacity[::7] = -6.0
+        _densify(gaussians, screen=screen, seed=3, iteration=700)
+        models.append(gaussians)
+    ours, theirs = models
+    assert cloned[0] > 20 and len(ours) == len(theirs) != 300
+    for name, value in parameters(ours).items():
+        assert torch.equal(value, parameters(theirs)[name]), name
+        for key, average in moments(ours)[name].items():
+            assert torch.equal(average, moments(theirs)[name][key]), (name, key)
+
+
 def test_statistics_start_again_and_moments_follow_their_rows():
     gaussians = _toy([LIMIT / 2, LIMIT * 3, LIMIT], [1.0, 1.0, 0.0])
     state = moments(gaussians)

@@ -162,13 +162,21 @@ def test_a_picture_that_does_not_fit_saves_too(colmap_scene, tmp_path, monkeypat
 
 
 @pytest.mark.parametrize(
-    ("of", "name", "call", "count"),
-    [(torch, "cat", 4, 300), (torch, "cat", 18 + 1 + 6 + 2 + 3, 304), (torch.Tensor, "index_select", 12 + 5, 600)],
-    ids=["cloning", "splitting", "pruning"],
+    ("by_steps", "of", "name", "call", "count"),
+    [
+        (False, torch, "cat", 3 + 4, 300),
+        (False, torch.Tensor, "index_select", 6 + 1 + 5, 600),
+        (True, torch, "cat", 4, 300),
+        (True, torch, "cat", 18 + 2 + 3, 304),
+        (True, torch.Tensor, "index_select", 12 + 1 + 5, 600),
+    ],
+    ids=["growing", "pruning", "cloning", "splitting", "pruning by steps"],
 )
-def test_a_densification_cut_short_is_saved_whole(colmap_scene, tmp_path, monkeypatch, of, name, call, count):
-    """Clone 4 of 300 Gaussians and split 296 in two."""
-    plain = GaussianModel.densify_and_prune
+def test_a_densification_cut_short_is_saved_whole(colmap_scene, tmp_path, monkeypatch, by_steps, of, name, call, count):
+    """Clone 4 of 300 Gaussians and split 296 in two, at once or by steps of which a client has replaced one."""
+    plain, split = GaussianModel.densify_and_prune, GaussianModel.densify_and_split
+    if by_steps:
+        monkeypatch.setattr(GaussianModel, "densify_and_split", lambda *args, **kwargs: split(*args, **kwargs))
 
     def densify(*args: object, **kwargs: object) -> None:
         with monkeypatch.context() as patch:

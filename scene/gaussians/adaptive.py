@@ -112,9 +112,15 @@ class AdaptiveGaussians(GaussianParameters):
         if max_splats > 0:
             gradient = rules.limit_growth(gradient, max_grad, max_splats - len(self))
         draws = {} if seed is None else {"seed": seed, "iteration": iteration}
-        self.densify_and_clone(gradient, max_grad, extent)
-        self.densify_and_split(gradient, max_grad, extent, **draws)
+        split = None
+        if self._grows_by_own_steps():
+            split = self._clone_and_split(gradient, max_grad, extent, **draws)
+        else:
+            self.densify_and_clone(gradient, max_grad, extent)
+            self.densify_and_split(gradient, max_grad, extent, **draws)
         remove = rules.is_useless(self._opacity_logits(), min_opacity)
+        if split is not None:
+            remove[: len(split)] |= split
         if max_screen_size:
             # Appending has just zeroed max_radii2D, so the first test never fires, as in the reference.
             remove |= self.max_radii2D > max_screen_size
@@ -122,6 +128,28 @@ class AdaptiveGaussians(GaussianParameters):
         self.prune_points(remove)
         if radii is not None:
             self.tmp_radii = None
+
+    def _grows_by_own_steps(self) -> bool:
+        """Whether nobody has replaced a step of density control, so that they may be taken together."""
+        steps = self.densify_and_clone, self.densify_and_split, self.densification_postfix, self.prune_points
+        return tuple(getattr(step, "__func__", None) for step in steps) == _OWN_STEPS
+
+    def _clone_and_split(
+        self, grads: Tensor, grad_threshold: float, scene_extent: float, seed: int | None = None, iteration: int = 0
+    ) -> Tensor:
+        """Append what densify_and_clone and densify_and_split append, in their order, with one copy of all tensors.
+
+        Returns the mask (N,) of those that were split; they are left to be removed.
+        """
+        high = grads >= grad_threshold
+        small = rules.is_small(self._log_scales(), self.percent_dense * scene_extent)
+        split = high & ~small
+        clones, parents = (mask.nonzero().reshape(-1) for mask in (high & small, split))
+        origins = torch.cat((clones, parents, parents))
+        rows = {name: values.index_select(0, origins) for name, values in raw_rows(self).items()}
+        self._make_children(rows, parents, 2, seed, iteration)
+        self._append(rows, origins)
+        return split
 
     def densify_and_clone(self, grads: Tensor, grad_threshold: float, scene_extent: float) -> None:
         """Append an exact copy of each Gaussian with gradient >= threshold and scale <= percent_dense * extent."""
@@ -144,26 +172,33 @@ class AdaptiveGaussians(GaussianParameters):
         grads: (n,) or (n, 1) for the first n Gaussians; those appended since (fresh clones) have gradient 0. seed,
         iteration: as in densify_and_prune.
         """
-        if seed is None:
-            seed = int(torch.randint(2**62, ()))
-        before, log_scales = len(self), self._log_scales()
-        large = ~rules.is_small(log_scales, self.percent_dense * scene_extent)
+        before = len(self)
+        large = ~rules.is_small(self._log_scales(), self.percent_dense * scene_extent)
         grads = grads.reshape(-1)
         large[len(grads) :] = False
         large[: len(grads)] &= grads >= grad_threshold
         parents = large.nonzero().reshape(-1)
-        rows = {name: values.index_select(0, parents) for name, values in raw_rows(self).items()}
-        shapes = rows["xyz"], log_scales.index_select(0, parents), rows["rotation"]
+        origins = parents.repeat(N)
+        rows = {name: values.index_select(0, origins) for name, values in raw_rows(self).items()}
+        self._make_children(rows, parents, N, seed, iteration)
+        self._append(rows, origins)
+        self.prune_points(torch.cat((large, large.new_zeros(len(self) - before))))
+
+    def _make_children(self, rows: Rows, parents: Tensor, count: int, seed: int | None, iteration: int) -> None:
+        """Move and shrink the last rows, which are `count` copies of those of the `parents` (n,), one after another."""
+        if seed is None:
+            seed = int(torch.randint(2**62, ()))
+        first = len(rows["xyz"]) - count * len(parents)
+        xyz, rotation = (rows[name][first : first + len(parents)] for name in ("xyz", "rotation"))
+        shapes = xyz, self._log_scales().index_select(0, parents), rotation
         children = [
-            rules.split_children(*shapes, parents, child, count=N, seed=seed, iteration=iteration) for child in range(N)
+            rules.split_children(*shapes, parents, child, count=count, seed=seed, iteration=iteration)
+            for child in range(count)
         ]
-        rows = {name: torch.cat([values] * N) for name, values in rows.items()}
-        rows["xyz"], scales = (torch.cat(parts) for parts in zip(*children, strict=True))
+        positions, scales = (torch.cat(parts) for parts in zip(*children, strict=True))
         if not (self.kernels_activate and self.scaling_inverse_activation is torch.log):
             scales = self.scaling_inverse_activation(scales.exp())
-        rows["scaling"] = scales
-        self._append(rows, parents.repeat(N))
-        self.prune_points(torch.cat((large, large.new_zeros(len(self) - before))))
+        rows["xyz"][first:], rows["scaling"][first:] = positions, scales
 
     def _append(self, rows: Rows, origins: Tensor) -> None:
         """Append rows by `densification_postfix`, or what overrides it, with the radii of their origins (n,) if set."""
@@ -268,3 +303,12 @@ class AdaptiveGaussians(GaussianParameters):
             if name not in names
         ]
         return optimised, others, {} if self.optimizer is None else self.optimizer.state
+
+
+# Read once, so that a step is told from one that replaces it, in a subclass or in this class.
+_OWN_STEPS = (
+    AdaptiveGaussians.densify_and_clone,
+    AdaptiveGaussians.densify_and_split,
+    AdaptiveGaussians.densification_postfix,
+    AdaptiveGaussians.prune_points,
+)
