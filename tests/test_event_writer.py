@@ -2,6 +2,7 @@
 
 import io
 import json
+import math
 import struct
 import sys
 import types
@@ -16,6 +17,10 @@ import train
 from evaluation.tensorboard_scalars import _fields, _records, read_scalars
 from records import event_file, event_writer
 from records.event_writer import EventWriter
+from training.objective import Losses
+from training.observers import progress
+from training.observers.report import Report
+from training.step import Step
 from utils.files import crc32c as checksums
 from utils.files.crc32c import crc32c
 
@@ -182,6 +187,27 @@ def test_a_training_tells_tensorboard_where_it_is_installed(colmap_scene, tmp_pa
     assert scalars["test/loss_viewpoint - psnr"][0].value == pytest.approx(scores["test_psnr"], rel=1e-6)
     images = [value for value in _values(tmp_path / "out").values() if 4 in value]
     assert len(images) == 2 * (3 + 5)  # renders and photos of three test views and five training views
+
+
+def test_every_tenth_iteration_has_its_own_losses(colmap_scene, tmp_path, monkeypatch):
+    """They are kept until something is due, and read together."""
+    measured, plain = {}, Report.measured
+
+    def measure(self: Report, step: Step, losses: Losses) -> None:
+        measured[step.iteration] = losses.l1.item(), losses.total.item()
+        plain(self, step, losses)
+
+    monkeypatch.setattr(sys, "stdout", sys.stdout)
+    monkeypatch.setattr(train, "SummaryWriter", EventWriter)
+    monkeypatch.setattr(Report, "measured", measure)
+    monkeypatch.setattr(progress, "BAR_SECONDS", math.inf)  # nothing but the tests is due
+    words = ["-s", colmap_scene, "-m", tmp_path, "-r", "24", "--iterations", "40", "--eval", "--no_curve"]
+    train.main([*map(str, words), "--test_iterations", "30"])
+    scalars = read_scalars(tmp_path)
+    for place, name in enumerate(("l1_loss", "total_loss")):
+        told = {scalar.step: scalar.value for scalar in scalars[f"train_loss_patches/{name}"]}
+        assert told == {t: measured[t][place] for t in (10, 20, 30, 40)}
+    assert len({loss for pair in measured.values() for loss in pair}) == 80  # a mistaken place would show
 
 
 def test_tensorboard_reads_them(tmp_path):
