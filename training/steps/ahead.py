@@ -50,13 +50,14 @@ class AheadStep:
 
     def _able(self, step: Step) -> bool:
         """Whether the step can be queued. The model is asked after each step in which somebody may have changed it."""
-        if not self._unknown:
-            return not step.last
-        able = self._fused.takes(step)
-        if able:
+        if not self._fused.is_usual(step):
+            return False
+        if self._unknown:
+            if not self._fused.takes(step):
+                return False
             self._recorded.check()
-        self._unknown = not able
-        return able
+            self._unknown = False
+        return True
 
     def _rewind(self, steps: int) -> None:
         self._run.gaussians.rewind(steps)
@@ -80,7 +81,6 @@ class AheadStep:
         if fused:
             self._fused.advance(step, drawn, gradients)
         else:
-            self._unknown = True
             self._fused.plain.advance(step, package)
         return losses
 
