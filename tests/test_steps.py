@@ -153,7 +153,7 @@ class Immediate:
     """Stands for RunAhead where there is no GPU: every step is done at once."""
 
     def __init__(self, *_: object) -> None:
-        self.settle = lambda: None
+        self.settle = self.make_way = lambda: None
         self.give_up = lambda: 0
 
     def take(self, view: int, step, repeat) -> None:

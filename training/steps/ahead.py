@@ -34,11 +34,19 @@ class AheadStep:
         """Queue a step, unless something is due in it."""
         if step.due or not self._able(step):
             self._unknown = True
-            self._ahead.settle()
+            self._ahead.settle()  # nothing is pending, unless --debug_from has just come into force
+            self._run.gaussians.update_learning_rate(step.iteration)
             return self._fused.take(step, tell)
         done: list[Losses] = []
         self._ahead.take(step.camera.uid, lambda: done.append(self._queue(step)), lambda: self._repeat(step, done[0]))
         tell.measured(step, done[0])
+
+    def make_ready(self, step: Step) -> None:
+        """Wait until few steps are pending, or none if this one cannot be queued."""
+        if step.due or not self._able(step):
+            self._ahead.settle()
+        else:
+            self._ahead.make_way()
 
     def settle(self) -> None:
         """Wait until all steps are done."""

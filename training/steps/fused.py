@@ -53,6 +53,9 @@ class FusedStep:
                 return self.advance(step, drawn, gradients)
         self.plain.take(step, tell)
 
+    def make_ready(self, step: Step) -> None:
+        """Nothing is ever pending."""
+
     def settle(self) -> None:
         """Nothing is ever pending."""
 

@@ -61,9 +61,12 @@ class RunAhead:
 
     def take(self, view: Hashable, step: Callable[[], None], repeat: Callable[[], None]) -> None:
         """Queue a step that renders a view, inside `room`. `repeat` queues it once more, with the same values."""
-        self._collect(AHEAD - 1)  # before the step: an error in a repetition must not find it half counted
         step()
         self._pending.append(_Pending(view, repeat))
+
+    def make_way(self) -> None:
+        """Wait until another step can be queued."""
+        self._collect(AHEAD - 1)
 
     def settle(self) -> None:
         """Wait until all steps are done."""
