@@ -8,7 +8,6 @@ from torch import library
 
 from benchmarks.workloads.splat_scenes import on_device, settings
 
-
 UNCOMPARED = ("test_schema", "test_autograd_registration", "test_faketensor")
 
 
