@@ -49,13 +49,13 @@ class View:
         out = self.forward(True)
         return [*out[:3], out[10], *self.backward(out, True, out[11])]
 
-    def ahead(self, words: Tensor, room: list[int], step: int) -> list[Tensor]:
+    def ahead(self, words: Tensor, room: list[int]) -> list[Tensor]:
         """Does the same without waiting for the GPU: `run_ahead_` has the arguments."""
-        OPS.run_ahead_(words, room, step, None)
+        OPS.run_ahead_(words, room, None)
         try:
             return self.both()
         finally:
-            OPS.run_ahead_(None, [], 0, None)
+            OPS.run_ahead_(None, [], None)
 
 
 def same_bits(one: list[Tensor], other: list[Tensor]) -> bool:
@@ -91,14 +91,14 @@ def beside_other_work() -> None:
     view = View(60_000, 300, 200)
     wanted, product = view.both(), torch.randn(2048, 2048, device="cuda")
     streams = [torch.cuda.Stream() for _ in range(4)]
-    words = [torch.zeros(4, dtype=torch.int64, device="cuda") for _ in streams]
+    words = [torch.zeros(5, dtype=torch.int64, device="cuda") for _ in streams]
     torch.cuda.synchronize()
     results = []
-    for step in range(1, 26):
+    for _ in range(25):
         for stream, own in zip(streams, words, strict=True):
             with torch.cuda.stream(stream):
                 product @ product
-                results.append(view.ahead(own, view.room, step))
+                results.append(view.ahead(own, view.room))
     torch.cuda.synchronize()
     assert not torch.stack(words)[:, 0].any()
     assert all(same_bits(result, wanted) for result in results)
@@ -107,17 +107,17 @@ def beside_other_work() -> None:
 def any_room() -> None:
     """More room changes no bit. With less, the step halts, and the next one that has enough is as if nothing was."""
     view = View(30_000, 90, 75)
-    wanted, words = view.both(), torch.zeros(4, dtype=torch.int64, device="cuda")
+    wanted, words = view.both(), torch.zeros(5, dtype=torch.int64, device="cuda")
     for step, more in enumerate((0, 1, 255, 256, 100_000, 3_000_000), 1):
-        got = view.ahead(words, [room + more for room in view.room], step)
+        got = view.ahead(words, [room + more for room in view.room])
         assert words[0] == 0 and same_bits(got, wanted), more
         for place in range(2):
             less = list(view.room)
             less[place] -= 1
-            view.ahead(words, less, 100 + step)
-            view.ahead(words, view.room, 200 + step)
-            assert words[0] == 100 + step
-            words.zero_()
+            view.ahead(words, less)
+            view.ahead(words, view.room)
+            assert words[0] == step + 1 and words[4] == step
+            words[0] = 0
 
 
 CASES = {

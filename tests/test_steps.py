@@ -1,6 +1,9 @@
 """The ways to take a step of training: the fast ones give the bytes of the plain one."""
 
 import json
+import re
+import signal
+import subprocess
 import sys
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
@@ -21,6 +24,7 @@ from training.steps.choose import step_taker
 from training.steps.fused import FusedStep
 from training.steps.plain import PlainStep
 from training.steps.recorded import RecordedStep
+from utils.system_utils import UserError
 
 ITERATIONS = 60
 DENSITY = ("--densify_from_iter", 10, "--densification_interval", 20, "--opacity_reset_interval", 30)
@@ -77,6 +81,13 @@ def trained(scene: Path, out: Path, *options: object) -> dict[str, bytes | list]
 
     collect(torch.load(out / f"chkpnt{ITERATIONS}.pth", weights_only=False))
     return {"ply": (out / f"point_cloud/iteration_{ITERATIONS}/point_cloud.ply").read_bytes(), "checkpoint": leaves}
+
+
+def differences(one: dict[str, bytes | list], other: dict[str, bytes | list]) -> list[str]:
+    """What differs between two results of `trained`, in few words."""
+    leaves = zip(one["checkpoint"], other["checkpoint"], strict=True)
+    found = [f"leaf {n}: {str(a)[:60]} and {str(b)[:60]}" for n, (a, b) in enumerate(leaves) if a != b]
+    return found + (["ply"] if one["ply"] != other["ply"] else [])
 
 
 @pytest.mark.parametrize("options", OPTIONS.values(), ids=OPTIONS.keys())
@@ -149,7 +160,7 @@ class Immediate:
     """Stands for RunAhead where there is no GPU: every step is done at once."""
 
     def __init__(self, *_: object) -> None:
-        self.settle = lambda: None
+        self.settle = self.make_way = lambda: None
         self.give_up = lambda: 0
 
     def take(self, view: int, step, repeat) -> None:
@@ -200,3 +211,81 @@ def test_a_host_that_runs_ahead_without_room_gives_the_same_bytes(scene, tmp_pat
     monkeypatch.setattr(ahead, "_LEAST", 1)
     assert trained(scene, tmp_path / "halting", *options) == plain
     assert len(halts) > 5
+
+
+@pytest.mark.parametrize("_", [pytest.param(None, marks=GPU_MARKS)])
+@pytest.mark.parametrize("fails", [1, 99])
+def test_without_memory_for_a_record_steps_are_queued_one_call_after_the_other(scene, tmp_path, monkeypatch, fails, _):
+    wanted = trained(scene, tmp_path / "recorded")
+    body, asked, taken = RecordedStep._body, [], []
+
+    def lacking(self, at, target):
+        asked.append(at.iteration)
+        losses = body(self, at, target)
+        if len(asked) <= fails:
+            raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 20.00 GiB.")
+        return losses
+
+    take = RecordedStep.take
+    monkeypatch.setattr(RecordedStep, "_body", lacking)
+    monkeypatch.setattr(RecordedStep, "take", lambda self, at: (taken.append(take(self, at)), taken[-1])[1])
+    assert trained(scene, tmp_path / "queued") == wanted
+    assert len(asked) == 2 if fails == 99 else len(asked) > 2
+    assert any(taken) == (fails == 1)
+
+
+def _exact_room(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Room for what the last visit of a view needed, and no more, so that many steps halt."""
+    monkeypatch.setattr(run_ahead, "_with_spare", lambda count: count)
+
+
+@pytest.mark.parametrize("_", [pytest.param(None, marks=GPU_MARKS)])
+@pytest.mark.parametrize("repeated", [0, 1, 3])
+def test_memory_that_runs_out_while_room_is_made_leaves_the_last_whole_step(scene, tmp_path, monkeypatch, repeated, _):
+    """After so many steps of a halted queue were repeated."""
+    wanted = trained(scene, tmp_path / "whole")
+    again, left = AheadStep._repeat, [repeated]
+
+    def repeat(self, step, first):
+        if step.iteration > 40 and left[0] == 0:
+            raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 20.00 GiB.")
+        left[0] -= step.iteration > 40
+        again(self, step, first)
+
+    with monkeypatch.context() as patch:
+        _exact_room(patch)
+        patch.setattr(AheadStep, "_repeat", repeat)
+        with pytest.raises(UserError, match="the model after iteration .* is saved") as caught:
+            trained(scene, tmp_path / "out")
+    saved = int(re.search(r"after iteration (\d+) is saved", str(caught.value))[1])
+    assert 40 <= saved < ITERATIONS
+    start = "--start_checkpoint", tmp_path / f"out/chkpnt{saved}.pth"
+    assert not differences(trained(scene, tmp_path / "out", *start), wanted)
+
+
+@pytest.mark.parametrize("_", [pytest.param(None, marks=GPU_MARKS)])
+def test_a_run_that_is_killed_right_after_a_halt_resumes_to_the_same_bytes(scene, tmp_path, monkeypatch, _):
+    wanted = trained(scene, tmp_path / "whole")
+    program = """
+import os, signal, sys
+sys.path[:0] = ["tests", "."]
+import utils.host.openmp
+from pathlib import Path
+import test_steps
+from training.steps import run_ahead
+repeat = run_ahead.RunAhead._repeat
+
+def repeat_and_die(self, report):
+    repeat(self, report)
+    if self._done > 30:
+        os.kill(os.getpid(), signal.SIGKILL)
+
+run_ahead._with_spare = lambda count: count
+run_ahead.RunAhead._repeat = repeat_and_die
+test_steps.trained(Path(sys.argv[1]), Path(sys.argv[2]), "--checkpoint_iterations", 25)
+"""
+    words = [sys.executable, "-c", program, scene, tmp_path / "out"]
+    done = subprocess.run(list(map(str, words)), cwd=Path(__file__).parents[1], capture_output=True, text=True)
+    assert done.returncode == -signal.SIGKILL, done.stderr
+    start = "--start_checkpoint", tmp_path / "out/chkpnt25.pth"
+    assert not differences(trained(scene, tmp_path / "out", *start), wanted)

@@ -21,8 +21,7 @@ def run_training(run: Run, observers: Sequence[Observer]) -> None:
     with DeferredInterrupt() as interrupt, tell, _backward_on_this_thread(), _whole_steps(run, taker):
         for step in run.steps():
             tell.begins(step)
-            if step.due:
-                taker.settle()
+            taker.make_ready(step)  # before the learning rates are set, which a repeated step changes
             run.prepare(step)  # learning rates, SH degree, photos of the next views
             taker.take(step, tell)
             step.stopping = interrupt.requested  # read once: a signal may come at any moment

@@ -74,7 +74,6 @@ def main() -> None:
         return announce(self, iteration)
 
     GaussianModel.update_learning_rate = update
-    sys.path.insert(0, os.getcwd())
     import train
 
     train.main(options)

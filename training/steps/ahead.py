@@ -34,11 +34,19 @@ class AheadStep:
         """Queue a step, unless something is due in it."""
         if step.due or not self._able(step):
             self._unknown = True
-            self._ahead.settle()
+            self._ahead.settle()  # nothing is pending, unless --debug_from has just come into force
+            self._run.gaussians.update_learning_rate(step.iteration)
             return self._fused.take(step, tell)
         done: list[Losses] = []
         self._ahead.take(step.camera.uid, lambda: done.append(self._queue(step)), lambda: self._repeat(step, done[0]))
         tell.measured(step, done[0])
+
+    def make_ready(self, step: Step) -> None:
+        """Wait until few steps are pending, or none if this one cannot be queued."""
+        if step.due or not self._able(step):
+            self._ahead.settle()
+        else:
+            self._ahead.make_way()
 
     def settle(self) -> None:
         """Wait until all steps are done."""
@@ -50,13 +58,14 @@ class AheadStep:
 
     def _able(self, step: Step) -> bool:
         """Whether the step can be queued. The model is asked after each step in which somebody may have changed it."""
-        if not self._unknown:
-            return not step.last
-        able = self._fused.takes(step)
-        if able:
+        if not self._fused.is_usual(step):
+            return False
+        if self._unknown:
+            if not self._fused.takes(step):
+                return False
             self._recorded.check()
-        self._unknown = not able
-        return able
+            self._unknown = False
+        return True
 
     def _rewind(self, steps: int) -> None:
         self._run.gaussians.rewind(steps)
@@ -80,7 +89,6 @@ class AheadStep:
         if fused:
             self._fused.advance(step, drawn, gradients)
         else:
-            self._unknown = True
             self._fused.plain.advance(step, package)
         return losses
 

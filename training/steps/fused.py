@@ -32,11 +32,17 @@ class FusedStep:
         return type(run.objective) is Objective and type(run.density) is AdaptiveDensityControl
 
     def takes(self, step: Step) -> bool:
-        """Whether this step can be fused. The last one, and one that changes the Gaussians' rows, use the gradients."""
-        run, pipe = self._run, self._run.pipe
+        """Whether this step can be fused."""
+        return self.is_usual(step) and FusedAdam.takes(self._run.gaussians)
+
+    def is_usual(self, step: Step) -> bool:
+        """Whether it can be as far as the model does not matter.
+
+        The last step, and one that changes the Gaussians' rows, use the gradients.
+        """
+        pipe = self._run.pipe
         in_python = pipe.compute_cov3D_python or pipe.convert_SHs_python or pipe.debug
-        able = not (step.changes or step.last or in_python or self._further_terms)
-        return able and FusedAdam.takes(run.gaussians)
+        return not (step.changes or step.last or in_python or self._further_terms)
 
     def take(self, step: Step, tell: Announcer) -> None:
         """Take a step; the observers are told once the loss is known."""
@@ -46,6 +52,9 @@ class FusedStep:
                 tell.measured(step, losses)
                 return self.advance(step, drawn, gradients)
         self.plain.take(step, tell)
+
+    def make_ready(self, step: Step) -> None:
+        """Nothing is ever pending."""
 
     def settle(self) -> None:
         """Nothing is ever pending."""

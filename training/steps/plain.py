@@ -21,6 +21,9 @@ class PlainStep:
         tell.measured(step, losses)
         self.advance(step, package)
 
+    def make_ready(self, step: Step) -> None:
+        """Nothing is ever pending."""
+
     def settle(self) -> None:
         """Nothing is ever pending."""
 

@@ -10,7 +10,7 @@ tensors are replaced, as density control does, or their lists outgrow its room.
 """
 
 from collections.abc import Callable, Hashable
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -71,20 +71,16 @@ class RecordedStep:
         self._stream, self._memory = torch.cuda.Stream(run.device), torch.cuda.graph_pool_handle()
         # Torch gives a pool's memory back once no graph uses it; the next record would wait for it to be allocated.
         self._keeps_memory = self._graph_of(self._background.zero_)[0]
+        self._fits = True  # whether there is memory for records
         self._taken = 0
 
     def take(self, at: Step) -> Losses | None:
         """Take a step of the run, or do nothing and return None where it has to be taken in another way."""
         target = self._target(at)
-        if target is None:
-            return None
-        kind = self._kind(at, target)
-        record = self._records.get(kind)
-        if record is None and not self._worth(kind):
+        record = None if target is None else self._record(at, target)
+        if record is None:
             return None
         self._fill(at)
-        if record is None:
-            record = self._records[kind] = self._recorded(at, target)
         record.target.copy_(target, non_blocking=True)
         if at.background is not self._run.background:
             self._background.copy_(at.background, non_blocking=True)
@@ -117,12 +113,32 @@ class RecordedStep:
         random = at.background is not run.background
         return (*view, target.dtype, run.density.observes(at.iteration), run.gaussians.active_sh_degree, random)
 
-    def _worth(self, kind: Kind) -> bool:
-        """Whether to record this kind. The first step of a kind is not, as it may load kernels."""
-        known = kind in self._kinds
-        if len(self._kinds) <= _MOST_KINDS * 8:
+    def _record(self, at: Step, target: Tensor) -> _Record | None:
+        """The record for a step, made if it is worth it. The first step of a kind is not, as it may load kernels."""
+        kind = self._kind(at, target)
+        record = self._records.get(kind)
+        if record is not None or kind not in self._kinds or len(self._records) == _MOST_KINDS or not self._fits:
             self._kinds.add(kind)
-        return known and len(self._records) < _MOST_KINDS
+            return record
+        try:
+            record = self._recorded(at, target)
+        except torch.OutOfMemoryError:
+            # While it records, torch cannot give back memory that it keeps for later, which may be enough.
+            torch.cuda.empty_cache()
+            record = self._recorded_if_it_fits(at, target)
+        if record is not None:
+            self._records[kind] = record
+        return record
+
+    def _recorded_if_it_fits(self, at: Step, target: Tensor) -> _Record | None:
+        try:
+            return self._recorded(at, target)
+        except torch.OutOfMemoryError:
+            self._fits = False
+            self._records.clear()
+            self._keeps_memory.reset()
+            torch.cuda.empty_cache()
+            return None
 
     def _fill(self, at: Step) -> None:
         """Send the camera and Adam's numbers to the GPU, and advance the optimiser's counters."""
@@ -156,8 +172,11 @@ class RecordedStep:
             graph.capture_begin(pool=self._memory, capture_error_mode="thread_local")
             try:
                 result = body()
-            finally:
-                graph.capture_end()
+            except BaseException:
+                with suppress(RuntimeError):  # which tells of the record, not of its cause
+                    graph.capture_end()
+                raise
+            graph.capture_end()
         return graph, result
 
     def _body(self, at: Step, target: Tensor) -> Tensor:

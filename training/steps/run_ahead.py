@@ -8,10 +8,11 @@ the host's memory. It then makes room, and repeats the steps from the halted one
 on the guesses, only the time does. The GPU counts the steps itself, so that a step can be recorded
 (training/steps/recorded.py).
 
-Streams: everything that a step computes is queued on torch's current stream, in the order of the calls. Photos that the
-CPU keeps are copied on a stream of their own, and the current stream waits for the event of the one it needs
-(scene/pictures/device_copies.py). The reports go straight into page-locked memory. The host reads them without a call
-to the GPU, and waits for the whole stream before it repeats steps or lets anybody read the model.
+Streams: everything that a step computes is queued on torch's current stream, in the order of the calls. Photos that
+the CPU keeps are copied on a stream of their own, and the current stream waits for the event of the one it needs
+(scene/pictures/device_copies.py). A step is recorded on a third stream, on which nothing ever runs; its launch is
+queued on the current stream like any other. The reports go straight into page-locked memory. The host reads them
+without a call to the GPU, and waits for the whole stream before it repeats steps or lets anybody read the model.
 """
 
 import time
@@ -37,6 +38,7 @@ Room = tuple[int, int, int]  # of instances, slots and gradient rows (gs::Room)
 class _Pending:
     view: Hashable
     repeat: Callable[[], None]
+    counted: bool = True  # whether the host counts the step among those that it has queued
 
 
 class RunAhead:
@@ -61,7 +63,10 @@ class RunAhead:
         """Queue a step that renders a view, inside `room`. `repeat` queues it once more, with the same values."""
         step()
         self._pending.append(_Pending(view, repeat))
-        self._collect(AHEAD)
+
+    def make_way(self) -> None:
+        """Wait until another step can be queued."""
+        self._collect(AHEAD - 1)
 
     def settle(self) -> None:
         """Wait until all steps are done."""
@@ -73,8 +78,8 @@ class RunAhead:
         while self._pending and (report := self._report()) and not report[3]:
             self._finish(report)
         lost = len(self._pending)
+        self._rewind(sum(pending.counted for pending in self._pending))
         self._pending.clear()
-        self._rewind(lost)
         return lost
 
     @contextmanager
@@ -125,6 +130,8 @@ class RunAhead:
         self._words[0] = 0
         self._numbers[(self._done + 1) % _REPORTS][4] = 0  # the halted step's report will come once more
         self._rewind(len(self._pending))
+        for pending in self._pending:
+            pending.counted = False
         instances, slots, rows, _ = report
         if instances > _MOST:
             self._pending[0].repeat()  # a host that waits raises an error with the reason
@@ -132,6 +139,7 @@ class RunAhead:
         self._needed[self._pending[0].view] = instances, slots, rows or instances
         for pending in self._pending:
             pending.repeat()
+            pending.counted = True
 
 
 def _with_spare(count: int) -> int:

@@ -88,6 +88,14 @@ template <class T>
 T __ldcg(const T* at) {
   return *at;
 }
+template <class T>
+T __ldcs(const T* at) {
+  return *at;
+}
+template <class T>
+void __stcs(T* at, T value) {
+  *at = value;
+}
 inline float __fdividef(float a, float b) { return a / b; }
 inline float __frcp_rn(float a) { return 1 / a; }
 inline float __saturatef(float a) { return a > 1 ? 1.0f : a > 0 ? a : 0.0f; }

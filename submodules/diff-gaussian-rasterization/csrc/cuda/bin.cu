@@ -98,8 +98,7 @@ struct alignas(16) Keys {
 };
 
 // Finds where each tile's list begins. An instance begins the lists of all tiles after the previous instance's tile, up
-// to its own. The memory of `sorted` has room for whole loads. What stands behind the last instance belongs to the tile
-// behind the last one.
+// to its own. What stands behind the last instance belongs to the tile behind the last one.
 template <class Key>
 __global__ void ranges_kernel(const int32_t* halted, int64_t instances, int64_t tiles, const Key* sorted,
                               int64_t* ranges) {
@@ -108,7 +107,11 @@ __global__ void ranges_kernel(const int32_t* halted, int64_t instances, int64_t 
   const int64_t first = (int64_t(blockIdx.x) * kThreads + threadIdx.x) * kCount;
   if (first > instances) return;
   int64_t tile = first == 0 ? 0 : int64_t(sorted[first - 1]) + 1;
-  const Keys<Key> keys = first < instances ? *reinterpret_cast<const Keys<Key>*>(sorted + first) : Keys<Key>{};
+  Keys<Key> keys{};
+  if (first + kCount <= instances)
+    keys = *reinterpret_cast<const Keys<Key>*>(sorted + first);
+  else
+    for (int r = 0; first + r < instances; ++r) keys.of[r] = sorted[first + r];
 #pragma unroll
   for (int r = 0; r < kCount; ++r) {
     const int64_t i = first + r;

@@ -216,8 +216,10 @@ struct Blender {
     const Place at = place();
     if (chunk > 0) {
       const int64_t pixel = layer_pixel(item.begin, chunk) + at.in_tile;
-      layers.color[pixel] = make_float4(front * seen.red, front * seen.green, front * seen.blue, front);
-      if (kDepth) layers.depth[pixel] = front * seen.depth;
+      const bool lit = front > 0;  // what is not must not show, not even a product of 0 and infinity
+      layers.color[pixel] =
+          make_float4(lit ? front * seen.red : 0, lit ? front * seen.green : 0, lit ? front * seen.blue : 0, front);
+      if (kDepth) layers.depth[pixel] = lit ? front * seen.depth : 0;
       if (kLast && front > 0 && seen.last) atomicMax(out.last + at.pixel, chunk * kLayerChunk + seen.last);
     } else if (at.inside) {
       put(at, seen.red, seen.green, seen.blue, seen.depth);

@@ -37,13 +37,12 @@ __global__ void __launch_bounds__(L::kThreads, 9)
     __syncthreads();
     for (int from = 0; open && from < count; from += 32) {
       front_to_back(batch, at, from, count, [&](int k, int p, float t) {
-        const bool reached = t >= threshold[p];
-        if (!reached) return;
+        if (!(t >= threshold[p])) return;
         const float alpha = capped<float, float>(exp2_device(t));
         const float after = transmittance[p] - alpha * transmittance[p];
-        const bool ends = reached && after < float(kMinTransmittance), blended = reached && !ends;
+        const bool ends = after < float(kMinTransmittance);
         const float4 c = batch.color[k];
-        if (blended) {
+        if (!ends) {
           const float weight = alpha * transmittance[p];
           red[p] += weight * c.x, green[p] += weight * c.y, blue[p] += weight * c.z;
           if (kDepth) depth[p] += weight * batch.rest[k].w;

@@ -44,7 +44,8 @@ inline StepParameters step_parameters(const GaussianStep<float>& in) {
 }
 
 // Steps all 32 rows of a warp, 16 bytes a lane at a time; their gradients lie side by side. Returns whether the lane's
-// values took their step. Several loads are under way before the first store, behind which a compiler moves none.
+// values took their step. Several loads are under way before the first store, behind which a compiler moves none. No
+// value is read again soon, so none should stay in the caches.
 template <int kRow>
 __device__ inline bool step_whole_rows(SteppedRows to, bool guarded, int64_t first, const float* gradient) {
   constexpr int kCount = 8 * kRow, kAhead = kCount > 64 ? 3 : 1;
@@ -57,7 +58,8 @@ __device__ inline bool step_whole_rows(SteppedRows to, bool guarded, int64_t fir
     float4 v[kAhead], m[kAhead], s[kAhead];
 #pragma unroll
     for (int j = 0; j < kAhead; ++j)
-      if (k + 32 * j < kCount) v[j] = value[k + 32 * j], m[j] = mean[k + 32 * j], s[j] = square[k + 32 * j];
+      if (k + 32 * j < kCount)
+        v[j] = __ldcs(value + k + 32 * j), m[j] = __ldcs(mean + k + 32 * j), s[j] = __ldcs(square + k + 32 * j);
 #pragma unroll
     for (int j = 0; j < kAhead; ++j) {
       const int at = k + 32 * j;
@@ -67,7 +69,7 @@ __device__ inline bool step_whole_rows(SteppedRows to, bool guarded, int64_t fir
       finite &= step_value(guarded, to.constants, g.y, v[j].y, m[j].y, s[j].y);
       finite &= step_value(guarded, to.constants, g.z, v[j].z, m[j].z, s[j].z);
       finite &= step_value(guarded, to.constants, g.w, v[j].w, m[j].w, s[j].w);
-      value[at] = v[j], mean[at] = m[j], square[at] = s[j];
+      __stcs(value + at, v[j]), __stcs(mean + at, m[j]), __stcs(square + at, s[j]);
     }
   }
   return finite;
