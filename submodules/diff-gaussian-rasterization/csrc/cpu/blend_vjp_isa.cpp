@@ -280,6 +280,8 @@ void blend_tile_vjp(const BlendInput<T>& in, const BlendGradient<T>& g, int64_t 
   for (int64_t to = processed; to > 0; to -= std::min<int64_t>(kBatch, to)) {
     const int64_t from = std::max<int64_t>(0, to - kBatch), count = to - from;
     batch.chunk.gather(in, tile, begin + from, count);
+    for (int64_t k = begin + from; k < begin + to; ++k) __builtin_prefetch(g.slots + in.instances[k]);
+    prefetch_splats(in, begin + std::max<int64_t>(0, from - kBatch), begin + from);
     batch.columns.find(batch.chunk, count);
     batch.table.fill(batch.chunk, count, from, state);
     for (int64_t position = to - 1; position >= from; --position) {
