@@ -3,6 +3,7 @@
 #include <cmath>
 #include <cstdint>
 #include <cstring>
+#include <limits>
 
 #include "gs/isa.h"
 
@@ -49,8 +50,8 @@ struct Simd {
   // The root of each lane, rounded correctly.
   static Vec root(Vec v) {
 #if defined(__AVX512F__)
-    if constexpr (sizeof(T) == 4) return (Vec)_mm512_sqrt_ps((__m512)v);
-    return (Vec)_mm512_sqrt_pd((__m512d)v);
+    if constexpr (sizeof(T) == 4) return (Vec)_mm512_maskz_sqrt_ps(-1, (__m512)v);
+    return (Vec)_mm512_maskz_sqrt_pd(-1, (__m512d)v);
 #elif defined(__AVX__)
     if constexpr (sizeof(T) == 4) return (Vec)_mm256_sqrt_ps((__m256)v);
     return (Vec)_mm256_sqrt_pd((__m256d)v);
@@ -59,6 +60,22 @@ struct Simd {
     return (Vec)_mm_sqrt_pd((__m128d)v);
 #else
     for (int i = 0; i < kLanes; ++i) v[i] = std::sqrt(v[i]);
+    return v;
+#endif
+  }
+
+  static Vec magnitude(Vec v) { return (Vec)((Mask)v & std::numeric_limits<Int>::max()); }
+
+  // The least whole number that is not below it, of each lane.
+  static Vec rounded_up(Vec v) {
+#if defined(__AVX512F__)
+    if constexpr (sizeof(T) == 4) return (Vec)_mm512_ceil_ps((__m512)v);
+    return (Vec)_mm512_ceil_pd((__m512d)v);
+#elif defined(__AVX__)
+    if constexpr (sizeof(T) == 4) return (Vec)_mm256_ceil_ps((__m256)v);
+    return (Vec)_mm256_ceil_pd((__m256d)v);
+#else
+    for (int i = 0; i < kLanes; ++i) v[i] = std::ceil(v[i]);
     return v;
 #endif
   }

@@ -112,6 +112,7 @@ void through_tile(const BlendInput<T>& in, const Tile& tile, int64_t index, T* t
   for (int64_t from = begin; any && from < end; from += kChunk) {
     const int64_t count = std::min<int64_t>(kChunk, end - from);
     chunk.gather(in, tile, from, count);
+    prefetch_splats(in, from + count, std::min(end, from + count + kChunk));
     any = false;
     for (int s = 0; s < tile.rows * kStrips; ++s) {
       if (!open[s]) continue;

@@ -1,4 +1,4 @@
-// The backward of blending. A thread takes a tile, a vector takes pixels of one of its rows.
+// The backward of blending. A thread takes a tile, a vector takes pixels of one or two of its rows.
 #include <memory>
 #include <vector>
 
@@ -13,6 +13,47 @@ GS_ISA_BEGIN
 namespace {
 
 constexpr int kBatch = 64;  // splats held at once, some 3 KB of floats, and 12 KB of their terms
+
+// A vector has kColumns of a row, or of two rows in turn: most splats reach few columns. Pixels lie in that order.
+template <class T>
+constexpr int kRows = Simd<T>::kLanes > 8 ? 2 : 1;
+template <class T>
+constexpr int kColumns = Simd<T>::kLanes / kRows<T>;
+
+// The place of a pixel, whose row is a multiple of kRows.
+template <class T>
+int place(int row, int column) {
+  return row * kTile + column * kRows<T>;
+}
+
+// Puts a tile's pixels from rows to their places.
+template <class T, class Value>
+void interleave(Value* pixels) {
+  if constexpr (kRows<T> == 2)
+    for (Value* pair = pixels; pair < pixels + kPixels; pair += 2 * kTile) {
+      Value rows[2 * kTile];
+      std::copy_n(pair, 2 * kTile, rows);
+      for (int c = 0; c < kTile; ++c) pair[2 * c] = rows[c], pair[2 * c + 1] = rows[kTile + c];
+    }
+}
+
+// The vector of a row's value, or of two rows' in turn.
+template <class T>
+typename Simd<T>::Vec by_rows(const T (&values)[kTile][kBatch], int row, int k) {
+  using S = Simd<T>;
+  if constexpr (kRows<T> == 1) return S::all(values[row][k]);
+  typename S::Mask odd;
+  for (int i = 0; i < S::kLanes; ++i) odd[i] = -(i % 2);
+  return odd ? S::all(values[row + kRows<T> - 1][k]) : S::all(values[row][k]);
+}
+
+// The columns of a vector's pixels.
+template <class T>
+typename Simd<T>::Vec columns_from(int first) {
+  T x[Simd<T>::kLanes];
+  for (int i = 0; i < Simd<T>::kLanes; ++i) x[i] = T(first + i / kRows<T>);
+  return Simd<T>::load(x);
+}
 
 template <class T>
 struct BackwardState {
@@ -42,19 +83,10 @@ struct ColumnRanges {
   }
 };
 
-// Pixels go in vectors of at most 32 bytes: many splats reach fewer of a row, and sums of 64 bytes do not all fit the
-// registers.
-template <class T>
-using Pixels = Simd<T, (kVectorBytes < 32 ? kVectorBytes : 32)>;
-
-// Sums come out as those of whole vectors do: narrower vectors beside each other have sums of their own until the end.
-template <class T>
-constexpr int kBeside = Simd<T>::kLanes / Pixels<T>::kLanes;
-
 // The terms of a batch's splats in all rows, and the rows with pixels that each may reach.
 template <class T>
 struct RowTable {
-  static constexpr int kParts = Simd<T>::kLanes == kTile ? kBeside<T> : 1;  // of a row
+  static constexpr int kParts = kRows<T> == 1 ? 1 : kTile / kColumns<T>;  // of a row
   alignas(64) T top[kTile][kBatch], u0[kTile][kBatch], v[kTile][kBatch];
   alignas(64) typename IntOf<T>::type reached[kParts][kBatch];  // a bit for each row
 
@@ -80,15 +112,20 @@ struct RowTable {
     }
   }
 
+  // A bit for each row with which vectors begin: those of which the splat may reach one of theirs, in any part.
   uint32_t rows(int k) const {
     uint32_t bits = 0;
-    for (int p = 0; p < kParts; ++p) bits |= uint32_t(reached[p][k]);
+    for (int p = 0; p < kParts; ++p) bits |= rows(k, p);
     return bits;
+  }
+  uint32_t rows(int k, int part) const {
+    const uint32_t bits = uint32_t(reached[part][k]);
+    return kRows<T> == 1 ? bits : (bits | bits >> 1) & 0x5555;
   }
 };
 
 template <class T>
-using Sums = typename Pixels<T>::Vec[kGradientValues];
+using Sums = typename Simd<T>::Vec[kGradientValues];
 
 // A batch of splats in a tile, to be taken back to front.
 template <class T>
@@ -103,22 +140,24 @@ struct Batch {
 template <class T, bool kDepth>
 __attribute__((always_inline)) inline void sum_rows(const Batch<T>& batch, int k, int64_t position, uint32_t bits,
                                                     int first, int end, BackwardState<T>& state, Sums<T>& sums) {
-  using S = Pixels<T>;
+  using S = Simd<T>;
   using V = typename S::Vec;
   using M = typename S::Mask;
   const Chunk<T, kBatch>& chunk = batch.chunk;
+  const RowTable<T>& table = batch.table;
   const V zero = {};
   V q0 = zero, qu = zero, qv = zero, quu = zero, quv = zero, qvv = zero;
   V red = zero, green = zero, blue = zero, depth = zero;
   for (; bits; bits &= bits - 1) {
     const int row = __builtin_ctz(bits);
-    const RowTerms<T> terms = {batch.table.top[row][k], chunk.l11[k], batch.table.u0[row][k], batch.table.v[row][k]};
+    const RowTerms<V> terms = {by_rows<T>(table.top, row, k), S::all(chunk.l11[k]), by_rows<T>(table.u0, row, k),
+                               by_rows<T>(table.v, row, k)};
     int column = first;
     do {
-      const int at = row * kTile + column;
+      const int at = place<T>(row, column);
       M last;
       std::memcpy(&last, state.last + at, sizeof last);
-      const V u = row_u(terms, lane_numbers<T, S>(0) + T(column));
+      const V u = row_u(terms, columns_from<T>(0) + T(column));
       const V t = row_exponent(terms, u);
       const M reached = (t >= T(kLog2MinAlpha)) & (last > typename S::Int(position));
       if (!S::any(reached)) continue;
@@ -137,7 +176,7 @@ __attribute__((always_inline)) inline void sum_rows(const Batch<T>& batch, int k
       quu += qu_here * u, quv += qu_here * terms.v, qvv += qv_here * terms.v;
       red += weight * gr, green += weight * gg, blue += weight * gb;
       if (kDepth) depth += weight * gd;
-    } while ((column += Simd<T>::kLanes) < end && Simd<T>::kLanes < kTile);
+    } while ((column += kColumns<T>) < end && RowTable<T>::kParts == 1);
   }
   const V all[kGradientValues] = {q0, qu, qv, quu, quv, qvv, red, green, blue, depth};
   std::copy_n(all, kGradientValues, sums);
@@ -146,22 +185,23 @@ __attribute__((always_inline)) inline void sum_rows(const Batch<T>& batch, int k
 // Sums one splat's kGradientValues over the pixels that it reaches, all of them from column `first` to `last`.
 template <class T, bool kDepth>
 void splat_gradient(const Batch<T>& batch, int k, int64_t position, BackwardState<T>& state, T* out) {
-  constexpr int kLanes = Pixels<T>::kLanes, kWhole = Simd<T>::kLanes;
+  constexpr int kParts = RowTable<T>::kParts;
   const int first = batch.columns.first[k], wide = batch.columns.last[k] - first;
   Sums<T> sums;
-  if (wide < kLanes) {  // one vector a row, which may begin at any column: that changes no sum
-    const int begin = std::min(first, kTile - kLanes);
+  if (wide < kColumns<T>) {  // one vector a row, which may begin at any column: that changes no sum
+    const int begin = std::min(first, kTile - kColumns<T>);
     sum_rows<T, kDepth>(batch, k, position, batch.table.rows(k), begin, begin + 1, state, sums);
   } else {
-    const int wholes = wide / kWhole + 1, begin = std::min(first, kTile - wholes * kWhole);
-    Sums<T> beside[kBeside<T>];
-    for (int b = 0; b < kBeside<T>; ++b) {
-      const uint32_t rows = RowTable<T>::kParts > 1 ? batch.table.reached[b][k] : batch.table.rows(k);
-      sum_rows<T, kDepth>(batch, k, position, rows, begin + b * kLanes, begin + wholes * kWhole, state, beside[b]);
+    const int vectors = wide / kColumns<T> + 1, begin = std::min(first, kTile - vectors * kColumns<T>);
+    Sums<T> parts[kParts];
+    for (int p = 0; p < kParts; ++p) {
+      const int from = kParts > 1 ? p * kColumns<T> : begin;
+      sum_rows<T, kDepth>(batch, k, position, batch.table.rows(k, p), from, begin + vectors * kColumns<T>, state,
+                          parts[p]);
     }
     for (int i = 0; i < kGradientValues; ++i) {
-      sums[i] = beside[0][i];
-      for (int b = 1; b < kBeside<T>; ++b) sums[i] += beside[b][i];
+      sums[i] = parts[0][i];
+      for (int p = 1; p < kParts; ++p) sums[i] += parts[p][i];
     }
   }
   LaneSums<T, int(sizeof sums[0])>::store(sums, out);
@@ -224,6 +264,9 @@ void read_state(const BlendInput<T>& in, const BlendGradient<T>& g, const Tile& 
     for (int c = 0; c < 3; ++c) state.behind[p] += in.background[c] * state.color[c][p];
   for (int row = 0; row < kTile; ++row)
     state.row_last[row] = *std::max_element(state.last + row * kTile, state.last + (row + 1) * kTile);
+  interleave<T>(state.last);
+  for (T* pixels : {state.transmittance, state.behind, state.color[0], state.color[1], state.color[2], state.depth})
+    interleave<T>(pixels);
 }
 
 template <class T, bool kDepth>
@@ -237,6 +280,8 @@ void blend_tile_vjp(const BlendInput<T>& in, const BlendGradient<T>& g, int64_t 
   for (int64_t to = processed; to > 0; to -= std::min<int64_t>(kBatch, to)) {
     const int64_t from = std::max<int64_t>(0, to - kBatch), count = to - from;
     batch.chunk.gather(in, tile, begin + from, count);
+    for (int64_t k = begin + from; k < begin + to; ++k) __builtin_prefetch(g.slots + in.instances[k]);
+    prefetch_splats(in, begin + std::max<int64_t>(0, from - kBatch), begin + from);
     batch.columns.find(batch.chunk, count);
     batch.table.fill(batch.chunk, count, from, state);
     for (int64_t position = to - 1; position >= from; --position) {

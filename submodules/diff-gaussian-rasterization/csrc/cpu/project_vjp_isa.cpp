@@ -3,31 +3,15 @@
 #include <type_traits>
 
 #include "../backend.h"
-#include "../math/scene_row.h"
 #include "adam_rows.h"
+#include "scene_lanes.h"
 
 GS_ISA_BEGIN
 
 namespace {
 
 constexpr int64_t kBlock = 128;  // Gaussians whose gradients, some 30 KB of floats, stay in a core's cache
-constexpr int kRestValues = 3 * (sh_count(kMaxShDegree) - 1);
 
-template <class T>
-T* from_row(T* rows, int64_t first, int64_t row) {
-  return rows ? rows + first * row : nullptr;
-}
-
-// The Gaussians [first, first + count) of a scene, and their gradients.
-template <class T>
-Scene<T> part_of(Scene<T> s, int64_t first, int64_t count) {
-  s.count = count;
-  s.means = from_row(s.means, first, 3), s.opacities = from_row(s.opacities, first, 1);
-  s.scales = from_row(s.scales, first, 3), s.rotations = from_row(s.rotations, first, 4);
-  s.cov3d = from_row(s.cov3d, first, 6), s.colors = from_row(s.colors, first, 3);
-  s.sh_dc = from_row(s.sh_dc, first, s.dc_stride), s.sh_rest = from_row(s.sh_rest, first, s.rest_stride);
-  return s;
-}
 template <class T>
 SceneGradient<T> part_of(const SceneGradient<T>& g, int64_t first, int rest_bands) {
   return {from_row(g.means, first, 3),  from_row(g.means2d, first, 3),   from_row(g.opacities, first, 1),
@@ -43,25 +27,64 @@ SceneGradient<T> part_of(const SceneGradient<T>& g, int64_t first, int rest_band
 #define GS_ONE_COPY __attribute__((noipa))
 #endif
 
+// Zeroes the gradients of the Gaussians that were not seen, and lists the others.
+template <class T>
+int64_t list_seen(const Scene<T>& s, const int32_t* tile_counts, const SceneGradient<T>& out, int32_t* seen) {
+  int64_t found = 0;
+  for (int64_t i = 0; i < s.count; ++i) {
+    if (tile_counts[i]) {
+      seen[found++] = int32_t(i);
+    } else {
+      zero_gradient(i, out);
+      if (out.sh_rest) std::memset(out.sh_rest + 3 * s.rest_bands * i, 0, 3 * s.rest_bands * sizeof(T));
+    }
+  }
+  return found;
+}
+
+// The gradients of a vector of Gaussians.
+template <class T>
+struct PackGradient {
+  using V = typename Simd<T>::Vec;
+  V means[3], means2d[3], opacities[1], scales[3], rotations[4], cov3d[6], colors[3], sh_dc[3];
+
+  SceneGradient<V> pointers(const Scene<T>& s) {
+    return {means, means2d, opacities, scales, rotations, s.cov3d ? cov3d : nullptr, colors, sh_dc, nullptr};
+  }
+
+  void write(const Pack<T>& pack, const SceneGradient<T>& out) const {
+    const auto write = [&](const V* values, int row, T* to) {
+      if (to) write_rows(values, row, row, pack, to);
+    };
+    write(means, 3, out.means), write(means2d, 3, out.means2d), write(opacities, 1, out.opacities);
+    write(scales, 3, out.scales), write(rotations, 4, out.rotations), write(cov3d, 6, out.cov3d);
+    write(colors, 3, out.colors), write(sh_dc, 3, out.sh_dc);
+  }
+};
+
+// At most kBlock Gaussians.
 template <class T>
 GS_ONE_COPY void project_vjp_rows(const Scene<T>& s, const Camera<T>& camera, const int32_t* tile_counts,
                                   const T* moments, const SceneGradient<T>& out) {
-  for (int64_t i = 0; i < s.count; ++i) {
-    T* g_rest = out.sh_rest ? out.sh_rest + 3 * s.rest_bands * i : nullptr;
-    if (tile_counts[i]) {
-      project_vjp_row(s, camera, i, moments + kGradientValues * i, s.sh_rest + s.rest_stride * i, g_rest, out, i);
-    } else {
-      zero_gradient(i, out);
-      if (g_rest) std::memset(g_rest, 0, 3 * s.rest_bands * sizeof(T));
-    }
-  }
+  using V = typename Simd<T>::Vec;
+  int32_t seen[kBlock];
+  for_packs<T>(seen, list_seen(s, tile_counts, out, seen), [&](const Pack<T>& pack) {
+    V m[kGradientValues], rest[kMostRest];
+    read_rows(moments, kGradientValues, s.count, kGradientValues, pack, m);
+    SceneLanes<T> row(s, pack);
+    row.read_colors(s, pack, rest);
+    PackGradient<T> gradient{};
+    project_vjp_row(s, camera, row, m, rest, rest, gradient.pointers(s), 0);
+    gradient.write(pack, out);
+    if (out.sh_rest) write_rows(rest, 3 * s.rest_bands, 3 * s.rest_bands, pack, out.sh_rest);
+  });
 }
 
 // The gradients of a block's Gaussians.
 template <class T>
 struct BlockGradient {
   T means[3 * kBlock], means2d[3 * kBlock], opacities[kBlock], scales[3 * kBlock], rotations[4 * kBlock];
-  T sh_dc[3 * kBlock], sh_rest[kRestValues * kBlock];
+  T sh_dc[3 * kBlock], sh_rest[kMostRest * kBlock];
 
   SceneGradient<T> pointers() {
     return {means, means2d, opacities, scales, rotations, nullptr, nullptr, sh_dc, sh_rest};
@@ -106,7 +129,7 @@ template <class T>
 void project_vjp(const Executor& executor, const Scene<T>& s, const int32_t* tile_counts, const T* moments,
                  const SceneGradient<T>& out) {
   const Camera<T> camera = camera_of(s);
-  for_dynamic(executor, s.count, 4 * kBlock, [&](int64_t begin, int64_t end) {
+  for_dynamic(executor, s.count, kBlock, [&](int64_t begin, int64_t end) {
     project_vjp_rows(part_of(s, begin, end - begin), camera, tile_counts + begin, moments + kGradientValues * begin,
                      part_of(out, begin, s.rest_bands));
   });

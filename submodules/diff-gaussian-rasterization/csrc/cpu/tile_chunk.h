@@ -36,6 +36,15 @@ void write_tile(const From* pixels, Image image, const Tile& tile, To* plane) {
     std::copy_n(pixels + r * kTile, tile.columns, plane + int64_t(tile.y + r) * image.width + tile.x);
 }
 
+// Has the splats of instances fetched into the cache, for a chunk that is gathered later: they lie anywhere.
+template <class T>
+void prefetch_splats(const BlendInput<T>& in, int64_t begin, int64_t end) {
+  for (int64_t k = begin; k < end; ++k) {
+    const T* splat = in.splats + kSplatValues * int64_t(in.instances[k]);
+    __builtin_prefetch(splat), __builtin_prefetch(splat + kSplatValues - 1);
+  }
+}
+
 // The values of at most kChunk splats, an array each, as LocalSplat has them.
 template <class T, int kChunk>
 struct Chunk {

@@ -89,7 +89,7 @@ __global__ void __launch_bounds__(kThreads)
   const SceneGradient<float> mine = g.pointers(out, i);
   if (seen) {
     // Writes the row even if it is not wanted: a null pointer would be tested for every band.
-    project_vjp_row(s, camera, i, m, row, row, mine, 0);
+    project_vjp_row(s, camera, SceneRow<float>{s, i}, m, row, row, mine, 0);
   } else if (i < s.count) {
     zero_row(mine.cov3d, 0, 6), zero_row(mine.colors, 0, 3);
     for (int k = 0; k < 3 * s.rest_bands; ++k) row[k] = 0;

@@ -42,14 +42,14 @@ __global__ void __launch_bounds__(kThreads)
   // The coefficients of Gaussians that are likely seen arrive while the warp computes shapes.
   const bool likely = i < s.count && near_view(camera, to_view(camera, load3(s.means + 3 * i)));
   fetch(likely);
-  const bool visible = i < s.count && project_shape(s, camera, i, splat, depth, radius);
+  const bool visible = i < s.count && project_shape(s, camera, SceneRow<float>{s, i}, splat, depth, radius);
   TileRect rect = {0, 0, 0, 0};
   if (visible) rect = tile_rect(splat, s.image.width, s.image.height);
   fetch(rect.x1 > rect.x0);
   uint64_t mask;
   int32_t count = warp_count_tiles(splat, rect, s.image, mask);
   wait_for_rows();
-  if (count && !project_color(s, camera, i, rest + threadIdx.x * kRest, splat)) count = 0;
+  if (count && !project_color(s, camera, SceneRow<float>{s, i}, rest + threadIdx.x * kRest, splat)) count = 0;
   if (i >= s.count) return;
   out.radii[i] = radius;
   out.tile_counts[i] = count;

@@ -2,6 +2,7 @@
 // Activations, from the optimised parameters (log scale, logit, free quaternion) to the rendered ones, with
 // derivatives.
 #include "constants.h"
+#include "exponential.h"
 #include "vec.h"
 
 GS_ISA_BEGIN
@@ -9,15 +10,15 @@ GS_ISA_BEGIN
 // log2 of the logistic function sigmoid(x) = 1/(1+e^-x), accurate for any logit.
 template <class T>
 GS_HD T log2_sigmoid(T logit) {
-  const T away = std::log1p(std::exp(-std::abs(logit)));
-  return (logit > 0 ? -away : logit - away) * T(1.44269504088896340736);
+  const T away = log_one_plus(exponential(-magnitude(logit)));
+  return (logit > 0 ? -away : logit - away) * Scalar<T>(1.44269504088896340736);
 }
 
 // d ln sigmoid(x) / dx = sigmoid(-x).
 template <class T>
 GS_HD T log_sigmoid_slope(T logit) {
-  const T e = std::exp(-std::abs(logit));
-  return (logit > 0 ? e : T(1)) / (1 + e);
+  const T e = exponential(-magnitude(logit));
+  return (logit > 0 ? e : all<T>(1)) / (1 + e);
 }
 
 template <class T>
@@ -30,24 +31,23 @@ struct Quat {
 template <class T>
 GS_HD Quat<T> normalise(Quat<T> q, T& norm) {
   // Divides by the largest entry first: squares of 1e-20 and 1e20 leave the range of float.
-  const T m = larger(larger(std::abs(q.w), std::abs(q.x)), larger(std::abs(q.y), std::abs(q.z)));
-  norm = 0;
-  if (m < T(kMinQuaternion)) return {1, 0, 0, 0};
+  const T m = larger(larger(magnitude(q.w), magnitude(q.x)), larger(magnitude(q.y), magnitude(q.z)));
+  const Truth<T> none = m < Scalar<T>(kMinQuaternion);
   const Quat<T> s = {q.w / m, q.x / m, q.y / m, q.z / m};
-  const T r = std::sqrt(s.w * s.w + s.x * s.x + s.y * s.y + s.z * s.z);
-  norm = m * r;
-  return {s.w / r, s.x / r, s.y / r, s.z / r};
+  const T r = root(s.w * s.w + s.x * s.x + s.y * s.y + s.z * s.z), zero = {};
+  norm = none ? zero : m * r;
+  return {none ? all<T>(1) : s.w / r, none ? zero : s.x / r, none ? zero : s.y / r, none ? zero : s.z / r};
 }
 
 // The gradient of q from the torque about the rotation's own axes: small angles a about them turn n = q / |q| into
 // n (1, a/2).
 template <class T>
 GS_HD Quat<T> normalise_vjp(Quat<T> n, T norm, Vec3<T> torque) {
-  if (!(norm > 0)) return {0, 0, 0, 0};
-  const T k = 2 / norm;
+  const Truth<T> some = norm > 0;
+  const T k = 2 / norm, zero = {};
   const Vec3<T> t = torque;
-  return {k * (-n.x * t.x - n.y * t.y - n.z * t.z), k * (n.w * t.x + n.y * t.z - n.z * t.y),
-          k * (n.w * t.y + n.z * t.x - n.x * t.z), k * (n.w * t.z + n.x * t.y - n.y * t.x)};
+  return {some ? k * (-n.x * t.x - n.y * t.y - n.z * t.z) : zero, some ? k * (n.w * t.x + n.y * t.z - n.z * t.y) : zero,
+          some ? k * (n.w * t.y + n.z * t.x - n.x * t.z) : zero, some ? k * (n.w * t.z + n.x * t.y - n.y * t.x) : zero};
 }
 
 GS_ISA_END

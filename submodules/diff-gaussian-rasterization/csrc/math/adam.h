@@ -57,11 +57,6 @@ GS_HD void adam(const AdamStep<T>& a, V gradient, V& value, V& mean, V& square) 
   value = Lanes::multiply_add(Lanes::all(-a.rate), mean / divisor, value);
 }
 
-template <class V>
-GS_HD auto is_finite(V x) {
-  return x - x == V{};  // inf - inf is not a number
-}
-
 // Tells whether the tensors take their step in this iteration.
 template <class T>
 GS_HD bool may_step(const StepGuard<T>& guard) {

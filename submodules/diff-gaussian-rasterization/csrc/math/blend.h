@@ -41,10 +41,11 @@ GS_HD RowTerms<V> row_terms(const LocalSplat<V>& s, Y y) {
   return {s.log2_opacity - v * v, s.l11, s.l12 * (y - float(kTileCentre)) + s.u, v};
 }
 
+// T: V or its scalar.
 template <class V, class T>
 GS_HD V row_u(const RowTerms<T>& row, V x) {
-  const V along = x - T(kTileCentre);
-  if constexpr (std::is_same_v<V, T>)
+  const V along = x - Scalar<V>(kTileCentre);
+  if constexpr (kIsScalar<V>)
     return along * row.l11 + row.u0;
   else  // fused by name: where l11 is constant in a loop, a compiler would hoist the product and round it
     return multiply_add(along, row.l11 - V{}, row.u0 - V{});

@@ -46,15 +46,15 @@ GS_HD Camera<T> make_camera(const T* view, const T* full, const T* center, doubl
   return cam;
 }
 
-template <class T>
-GS_HD Vec3<T> to_view(const Camera<T>& cam, Vec3<T> p) {
-  return Vec3<T>{dot(cam.row_x, p), dot(cam.row_y, p), dot(cam.row_z, p)} + cam.translation;
+template <class T, class V>
+GS_HD Vec3<V> to_view(const Camera<T>& cam, Vec3<V> p) {
+  return Vec3<V>{dot(cam.row_x, p), dot(cam.row_y, p), dot(cam.row_z, p)} + cam.translation;
 }
 
 // The near rule of the reference; false for NaN.
 template <class T>
-GS_HD bool in_front(T view_z) {
-  return view_z > T(kNear);
+GS_HD Truth<T> in_front(T view_z) {
+  return view_z > Scalar<T>(kNear);
 }
 
 GS_ISA_END

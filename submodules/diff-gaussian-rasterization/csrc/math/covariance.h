@@ -32,12 +32,13 @@ GS_HD Quat<T> rotation_columns_vjp(Quat<T> q, const Vec3<T> g[3]) {
 // Axes of a given covariance (xx, xy, xz, yy, yz, zz) by Cholesky. A pivot that rounding made negative counts as zero.
 template <class T>
 GS_HD Axes<T> axes_of_covariance(const T* c) {
-  const T a = std::sqrt(larger(c[0], T(0)));
-  const T b = a > 0 ? c[1] / a : T(0), d = a > 0 ? c[2] / a : T(0);
-  const T e = std::sqrt(larger(c[3] - b * b, T(0)));
-  const T f = e > 0 ? (c[4] - b * d) / e : T(0);
-  const T g = std::sqrt(larger(c[5] - d * d - f * f, T(0)));
-  return {{{a, b, d}, {0, e, f}, {0, 0, g}}, {1, 1, 1}};
+  const T zero = {}, one = all<T>(1);
+  const T a = root(larger(c[0], zero));
+  const T b = a > 0 ? c[1] / a : zero, d = a > 0 ? c[2] / a : zero;
+  const T e = root(larger(c[3] - b * b, zero));
+  const T f = e > 0 ? (c[4] - b * d) / e : zero;
+  const T g = root(larger(c[5] - d * d - f * f, zero));
+  return {{{a, b, d}, {zero, e, f}, {zero, zero, g}}, {one, one, one}};
 }
 
 GS_ISA_END

@@ -17,7 +17,7 @@ struct Footprint {
   T excess;        // (det - det undilated) / c
   T l11, l12, l22;
   T compensation;  // sqrt(det undilated / det), floored: the antialiasing factor
-  bool floored;
+  Truth<T> floored;
 };
 
 // det = |m1 x m2|^2 + h (|m1|^2 + |m2|^2) + h^2 (Cauchy-Binet) has only non-negative terms, so nothing cancels. All is
@@ -25,22 +25,22 @@ struct Footprint {
 // l22 = sqrt(k/c), l11 = sqrt(k c/det), l12 = -(b/c) l11.
 template <class T>
 GS_HD Footprint<T> make_footprint(Vec3<T> m1, Vec3<T> m2, Vec3<T> minors) {
-  const T h = T(kDilation), k = T(kHalfLog2e);
+  const Scalar<T> h = Scalar<T>(kDilation), k = Scalar<T>(kHalfLog2e);
   Footprint<T> f;
   f.m1 = m1, f.m2 = m2, f.minors = minors;
   f.a0 = dot(m1, m1), f.c0 = dot(m2, m2);
   f.a = f.a0 + h, f.b = dot(m1, m2), f.c = f.c0 + h;
-  const T root = std::sqrt(f.c);
-  const Vec3<T> n = {minors.x / root, minors.y / root, minors.z / root};
+  const T width = root(f.c);
+  const Vec3<T> n = {minors.x / width, minors.y / width, minors.z / width};
   const T det0 = dot(n, n);
   f.excess = h * ((f.a0 + f.c0 + h) / f.c);
   f.schur = det0 + f.excess;
-  f.l22 = std::sqrt(k / f.c);
-  f.l11 = std::sqrt(k / f.schur);
+  f.l22 = root(k / f.c);
+  f.l11 = root(k / f.schur);
   f.l12 = -(f.b / f.c) * f.l11;
   const T ratio = det0 / f.schur;
-  f.floored = !(ratio > T(kMinAntialias));
-  f.compensation = std::sqrt(f.floored ? T(kMinAntialias) : ratio);
+  f.floored = !(ratio > Scalar<T>(kMinAntialias));
+  f.compensation = root(f.floored ? all<T>(kMinAntialias) : ratio);
   return f;
 }
 
@@ -53,7 +53,7 @@ struct Moments {
 // d log2(alpha)/dmean = 2 L^T w, w = (u, v).
 template <class T>
 GS_HD void mean_vjp(const Footprint<T>& f, const Moments<T>& s, T& gx, T& gy) {
-  const T two_ln2 = T(2 * kLn2);
+  const Scalar<T> two_ln2 = Scalar<T>(2 * kLn2);
   gx = two_ln2 * f.l11 * s.qu;
   gy = two_ln2 * (f.l12 * s.qu + f.l22 * s.qv);
 }
@@ -79,17 +79,17 @@ struct ShapeGradient {
 // out with det0 = a0 c0 - b^2, its terms in b and c cancel on paper.
 template <class T>
 GS_HD ShapeGradient<T> footprint_vjp(const Footprint<T>& f, const Moments<T>& s, bool antialiasing) {
-  const T h = T(kDilation), four_ln2_sq = T(4 * kLn2 * kLn2);
+  const Scalar<T> h = Scalar<T>(kDilation), four_ln2_sq = Scalar<T>(4 * kLn2 * kLn2);
   T uu = four_ln2_sq * s.quu, uv = four_ln2_sq * s.quv, vv = four_ln2_sq * s.qvv;
-  if (antialiasing && !f.floored) {
+  if (antialiasing && any(!f.floored)) {
     const T inverse_ratio = 1 / (f.compensation * f.compensation), slope = f.b / f.c;
-    const T k = T(kDilation / kHalfLog2e) * s.q * inverse_ratio;
-    uu += k * ((slope / f.schur) * slope + f.c0 / f.c / f.schur);
-    uv -= k * (slope / std::sqrt(f.schur) / std::sqrt(f.c));
-    vv += k * ((f.compensation * f.compensation + h * (f.a0 / f.c / f.schur)) / f.c);
+    const T k = Scalar<T>(kDilation / kHalfLog2e) * s.q * inverse_ratio;
+    uu = f.floored ? uu : uu + k * ((slope / f.schur) * slope + f.c0 / f.c / f.schur);
+    uv = f.floored ? uv : uv - k * (slope / root(f.schur) / root(f.c));
+    vv = f.floored ? vv : vv + k * ((f.compensation * f.compensation + h * (f.a0 / f.c / f.schur)) / f.c);
   }
-  const T root = 1 / std::sqrt(f.c);  // scales both factors, because their product overflows
-  const Vec3<T> lm_u = f.l11 * (cross(root * f.m2, root * f.minors) + (h / f.c) * f.m1), lm_v = f.l22 * f.m2;
+  const T part = 1 / root(f.c);  // scales both factors, because their product overflows
+  const Vec3<T> lm_u = f.l11 * (cross(part * f.m2, part * f.minors) + (h / f.c) * f.m1), lm_v = f.l22 * f.m2;
   const Vec3<T> wu = uu * lm_u + uv * lm_v, wv = uv * lm_u + vv * lm_v;
   return {f.l11 * wu,
           f.l12 * wu + f.l22 * wv,
@@ -100,25 +100,27 @@ GS_HD ShapeGradient<T> footprint_vjp(const Footprint<T>& f, const Moments<T>& s,
 // The gradient of the 2D covariance (xx, xy, yy; xy once, of the symmetric matrix), for Gaussians given by cov3d.
 template <class T>
 GS_HD void covariance2d_vjp(const Footprint<T>& f, const Moments<T>& s, bool antialiasing, T g[3]) {
-  const T two_ln2_sq = T(2 * kLn2 * kLn2);
+  const Scalar<T> two_ln2_sq = Scalar<T>(2 * kLn2 * kLn2);
   const T uu = s.quu * f.l11, uv = s.quv * f.l11;
   const T vu = s.quu * f.l12 + s.quv * f.l22, vv = s.quv * f.l12 + s.qvv * f.l22;
   g[0] = two_ln2_sq * f.l11 * uu;
   g[1] = two_ln2_sq * (f.l12 * uu + f.l22 * uv);
   g[2] = two_ln2_sq * (f.l12 * vu + f.l22 * vv);
-  if (!antialiasing || f.floored) return;
-  const T h = T(kDilation), excess = compensation_excess(f), half_per_det = T(0.5) * s.q / f.schur / f.c;
-  g[0] += half_per_det * (excess * f.c0 - h);
-  g[1] -= half_per_det * (excess * f.b);
-  g[2] += half_per_det * (excess * f.a0 - h);
+  if (!antialiasing || !any(!f.floored)) return;
+  const Scalar<T> h = Scalar<T>(kDilation);
+  const T excess = compensation_excess(f), half_per_det = Scalar<T>(0.5) * s.q / f.schur / f.c;
+  g[0] = f.floored ? g[0] : g[0] + half_per_det * (excess * f.c0 - h);
+  g[1] = f.floored ? g[1] : g[1] - half_per_det * (excess * f.b);
+  g[2] = f.floored ? g[2] : g[2] + half_per_det * (excess * f.a0 - h);
 }
 
 // ceil(3 sigma) of the larger axis, the reference's rule; at most 2^30.
 template <class T>
-GS_HD int footprint_radius(const Footprint<T>& f) {
-  const T root = larger(std::sqrt(T(kMinRadiusRoot)), length(T(0.5) * (f.a - f.c), f.b));
-  const T radius = std::ceil(T(kRadiusSigmas) * std::sqrt(T(0.5) * (f.a + f.c) + root));
-  return radius < T(1 << 30) ? int(radius) : 1 << 30;
+GS_HD Integer<T> footprint_radius(const Footprint<T>& f) {
+  const Scalar<T> half = Scalar<T>(0.5);
+  const T apart = larger(root(all<T>(kMinRadiusRoot)), length<T>(half * (f.a - f.c), f.b));
+  const T radius = rounded_up(Scalar<T>(kRadiusSigmas) * root(half * (f.a + f.c) + apart));
+  return integer(radius < Scalar<T>(1 << 30) ? radius : all<T>(1 << 30));
 }
 
 GS_ISA_END

@@ -26,13 +26,13 @@ struct Perspective {
   Vec3<T> p1, p2;
 };
 
-template <class T>
-GS_HD Perspective<T> perspective(const Camera<T>& cam, Vec3<T> view) {
-  Perspective<T> p;
+template <class T, class V>
+GS_HD Perspective<V> perspective(const Camera<T>& cam, Vec3<V> view) {
+  Perspective<V> p;
   p.inverse_z = 1 / view.z;
   p.ray_x = view.x * p.inverse_z, p.ray_y = view.y * p.inverse_z;
-  p.clamped_x = clamp(p.ray_x, cam.ray_min_x, cam.ray_max_x);
-  p.clamped_y = clamp(p.ray_y, cam.ray_min_y, cam.ray_max_y);
+  p.clamped_x = clamp(p.ray_x, all<V>(cam.ray_min_x), all<V>(cam.ray_max_x));
+  p.clamped_y = clamp(p.ray_y, all<V>(cam.ray_min_y), all<V>(cam.ray_max_y));
   p.p1 = (cam.focal_x * p.inverse_z) * (cam.row_x - p.clamped_x * cam.row_z);
   p.p2 = (cam.focal_y * p.inverse_z) * (cam.row_y - p.clamped_y * cam.row_z);
   return p;
@@ -40,15 +40,15 @@ GS_HD Perspective<T> perspective(const Camera<T>& cam, Vec3<T> view) {
 
 // M = J W R S and its minors. p1 x p2 = fx fy / z^2 (W^T (clamped ray, 1)), and the minor of columns i, j is its dot
 // product with axis_i x axis_j: no difference of large products, however thin the splat.
-template <class T>
-GS_HD Footprint<T> splat_footprint(const Camera<T>& cam, const Perspective<T>& p, const Axes<T>& axes) {
+template <class T, class V>
+GS_HD Footprint<V> splat_footprint(const Camera<T>& cam, const Perspective<V>& p, const Axes<V>& axes) {
   const auto& d = axes.direction;
   const auto& s = axes.scale;
-  const Vec3<T> ray = cam.row_z + p.clamped_x * cam.row_x + p.clamped_y * cam.row_y;
-  const T fx = cam.focal_x * p.inverse_z, fy = cam.focal_y * p.inverse_z;
-  const Vec3<T> m1 = {s[0] * dot(p.p1, d[0]), s[1] * dot(p.p1, d[1]), s[2] * dot(p.p1, d[2])};
-  const Vec3<T> m2 = {s[0] * dot(p.p2, d[0]), s[1] * dot(p.p2, d[1]), s[2] * dot(p.p2, d[2])};
-  const Vec3<T> minors = {(fx * s[1]) * (fy * s[2]) * dot(ray, cross(d[1], d[2])),
+  const Vec3<V> ray = cam.row_z + p.clamped_x * cam.row_x + p.clamped_y * cam.row_y;
+  const V fx = cam.focal_x * p.inverse_z, fy = cam.focal_y * p.inverse_z;
+  const Vec3<V> m1 = {s[0] * dot(p.p1, d[0]), s[1] * dot(p.p1, d[1]), s[2] * dot(p.p1, d[2])};
+  const Vec3<V> m2 = {s[0] * dot(p.p2, d[0]), s[1] * dot(p.p2, d[1]), s[2] * dot(p.p2, d[2])};
+  const Vec3<V> minors = {(fx * s[1]) * (fy * s[2]) * dot(ray, cross(d[1], d[2])),
                           (fx * s[2]) * (fy * s[0]) * dot(ray, cross(d[2], d[0])),
                           (fx * s[0]) * (fy * s[1]) * dot(ray, cross(d[0], d[1]))};
   return make_footprint(m1, m2, minors);
@@ -56,43 +56,46 @@ GS_HD Footprint<T> splat_footprint(const Camera<T>& cam, const Perspective<T>& p
 
 // Computes a splat except its colour. Opacity, scales and rotation must be finite. Returns false if it is culled:
 // behind the camera, not finite or too large on the image, or too faint to be seen anywhere.
-template <class T>
-GS_HD bool project_splat(const Camera<T>& cam, const Gaussian<T>& gaussian, bool antialiasing, Splat<T>& splat,
-                         T& depth, int& radius) {
-  radius = 0;
-  const Vec3<T> view = to_view(cam, gaussian.mean);
-  if (!in_front(view.z) || !finite(view)) return false;
-  const Perspective<T> p = perspective(cam, view);
-  const Footprint<T> f = splat_footprint(cam, p, gaussian.axes);
+template <class T, class V>
+GS_HD Truth<V> project_splat(const Camera<T>& cam, const Gaussian<V>& gaussian, bool antialiasing, Splat<V>& splat,
+                             V& depth, Integer<V>& radius) {
+  radius = Integer<V>{};
+  const Vec3<V> view = to_view(cam, gaussian.mean);
+  Truth<V> visible = in_front(view.z) & finite(view);
+  if (!any(visible)) return visible;
+  const Perspective<V> p = perspective(cam, view);
+  const Footprint<V> f = splat_footprint(cam, p, gaussian.axes);
   splat.x = cam.mean_focal_x * p.ray_x + cam.axis_x;
   splat.y = cam.mean_focal_y * p.ray_y + cam.axis_y;
   splat.l11 = f.l11, splat.l12 = f.l12, splat.l22 = f.l22;
   splat.inverse_depth = p.inverse_z;
   depth = view.z;
-  if (!finite(Vec3<T>{splat.x, splat.y, f.l12}) || !(f.l11 > 0) || !(f.l22 > 0) || !(f.a + f.c < T(kMaxVariance)))
-    return false;
-  radius = footprint_radius(f);
-  if (!radius_on_image(splat.x, splat.y, radius, cam.width, cam.height)) radius = 0;
-  const T log2_opacity = gaussian.log2_opacity + (antialiasing ? std::log2(f.compensation) : T(0));
-  splat.log2_opacity = log2_opacity < T(kMaxLog2Opacity) ? log2_opacity : T(kMaxLog2Opacity);
-  return splat.log2_opacity >= T(kLog2MinAlpha) - T(1e-3);  // the margin of tile_rect
+  visible &= finite(Vec3<V>{splat.x, splat.y, f.l12}) & (f.l11 > 0) & (f.l22 > 0) & (f.a + f.c < T(kMaxVariance));
+  if (!any(visible)) return visible;
+  const Integer<V> wide = footprint_radius(f);
+  radius = visible & radius_on_image(splat.x, splat.y, wide, cam.width, cam.height) ? wide : radius;
+  const V log2_opacity = gaussian.log2_opacity + (antialiasing ? binary_log(f.compensation) : V{});
+  splat.log2_opacity = log2_opacity < T(kMaxLog2Opacity) ? log2_opacity : all<V>(kMaxLog2Opacity);
+  return visible & (splat.log2_opacity >= T(kLog2MinAlpha) - T(1e-3));  // the margin of tile_rect
 }
 
 // Whether a splat certainly has no tile and no radius, for a Gaussian with perpendicular axes and an opacity of at most
 // 1. largest_scale() is asked for its largest scale only if its mean is off the image: its covariance on the image has
 // at most the trace of a ball's of that scale. 3.34 standard deviations reach alpha 1/255, and `radii` count 3. The
 // rest is for rounding.
-template <class T, class Scale>
-GS_HD bool surely_outside(const Camera<T>& cam, Vec3<T> mean, const Scale& largest_scale) {
-  const Vec3<T> view = to_view(cam, mean);
-  if (!in_front(view.z)) return true;
-  const Perspective<T> p = perspective(cam, view);
-  const T x = cam.mean_focal_x * p.ray_x + cam.axis_x, y = cam.mean_focal_y * p.ray_y + cam.axis_y;
-  const T away = larger(larger(-x, x - T(cam.width + kTile)), larger(-y, y - T(cam.height + kTile)));
-  const T deviations = (away - 3) / T(3.5);
-  if (!(deviations > 1)) return false;
-  const T scale = largest_scale();
-  return scale * scale * (dot(p.p1, p.p1) + dot(p.p2, p.p2)) + 1 < deviations * deviations;
+template <class T, class V, class Scale>
+GS_HD Truth<V> surely_outside(const Camera<T>& cam, Vec3<V> mean, const Scale& largest_scale) {
+  const Vec3<V> view = to_view(cam, mean);
+  const Truth<V> front = in_front(view.z);
+  const Perspective<V> p = perspective(cam, view);
+  const V x = cam.mean_focal_x * p.ray_x + cam.axis_x, y = cam.mean_focal_y * p.ray_y + cam.axis_y;
+  const V away = larger<V>(larger<V>(-x, x - T(cam.width + kTile)), larger<V>(-y, y - T(cam.height + kTile)));
+  const V deviations = (away - 3) / T(3.5);
+  const Truth<V> off = front & (deviations > 1);
+  if (!any(off)) return !front;
+  const V scale = largest_scale();
+  const Truth<V> out = scale * scale * (dot(p.p1, p.p1) + dot(p.p2, p.p2)) + 1 < deviations * deviations;
+  return (!front) | (off & out);
 }
 
 // The gradients of project_splat's inputs; the opacity's is d/d ln(opacity).
@@ -111,28 +114,28 @@ struct GaussianGradient {
 template <class T>
 GS_HD T torque(T off, T a, T b) {
   const T low = a < b ? a : b, high = larger(a, b);
-  return low > 0 ? off / low * (a + b) * ((a - b) / high) : T(0);
+  return low > 0 ? off / low * (a + b) * ((a - b) / high) : T{};
 }
 
 // perpendicular: whether the axes are. g_covariance (6, or null): the gradient of the covariance that gave the axes.
-template <class T>
-GS_HD GaussianGradient<T> project_splat_vjp(const Camera<T>& cam, const Gaussian<T>& gaussian, bool antialiasing,
-                                            bool perpendicular, T* g_covariance, const Moments<T>& s,
-                                            T g_inverse_depth) {
-  GaussianGradient<T> g;
-  const Vec3<T> view = to_view(cam, gaussian.mean);
-  const Perspective<T> p = perspective(cam, view);
-  const Footprint<T> f = splat_footprint(cam, p, gaussian.axes);
+template <class V, class T>
+GS_HD GaussianGradient<V> project_splat_vjp(const Camera<T>& cam, const Gaussian<V>& gaussian, bool antialiasing,
+                                            bool perpendicular, V* g_covariance, const Moments<V>& s,
+                                            V g_inverse_depth) {
+  GaussianGradient<V> g;
+  const Vec3<V> view = to_view(cam, gaussian.mean);
+  const Perspective<V> p = perspective(cam, view);
+  const Footprint<V> f = splat_footprint(cam, p, gaussian.axes);
   g.log_opacity = s.q;
   mean_vjp(f, s, g.pixel_x, g.pixel_y);
 
-  const ShapeGradient<T> shape = footprint_vjp(f, s, antialiasing);
+  const ShapeGradient<V> shape = footprint_vjp(f, s, antialiasing);
   const auto& d = gaussian.axes.direction;
   const auto& c = gaussian.axes.scale;
-  const T row1[3] = {shape.m1.x, shape.m1.y, shape.m1.z}, row2[3] = {shape.m2.x, shape.m2.y, shape.m2.z};
-  T along1 = 0, along2 = 0;  // dP's rows on the optical axis
+  const V row1[3] = {shape.m1.x, shape.m1.y, shape.m1.z}, row2[3] = {shape.m2.x, shape.m2.y, shape.m2.z};
+  V along1 = {}, along2 = {};  // dP's rows on the optical axis
   for (int k = 0; k < 3; ++k) {
-    const T depth = c[k] * dot(cam.row_z, d[k]);
+    const V depth = c[k] * dot(cam.row_z, d[k]);
     along1 += row1[k] * depth, along2 += row2[k] * depth;
   }
   g.log_scale[0] = shape.diagonal.x, g.log_scale[1] = shape.diagonal.y, g.log_scale[2] = shape.diagonal.z;
@@ -141,9 +144,9 @@ GS_HD GaussianGradient<T> project_splat_vjp(const Camera<T>& cam, const Gaussian
   else
     for (int k = 0; k < 3; ++k) g.direction[k] = c[k] * (row1[k] * p.p1 + row2[k] * p.p2);
   if (g_covariance) {  // d cov3d = P^T G P; off-diagonal entries stand for two
-    T c2[3];
+    V c2[3];
     covariance2d_vjp(f, s, antialiasing, c2);
-    const Vec3<T> a = c2[0] * p.p1 + c2[1] * p.p2, b = c2[1] * p.p1 + c2[2] * p.p2;
+    const Vec3<V> a = c2[0] * p.p1 + c2[1] * p.p2, b = c2[1] * p.p1 + c2[2] * p.p2;
     g_covariance[0] = p.p1.x * a.x + p.p2.x * b.x;
     g_covariance[1] = p.p1.x * a.y + p.p2.x * b.y + p.p1.y * a.x + p.p2.y * b.x;
     g_covariance[2] = p.p1.x * a.z + p.p2.x * b.z + p.p1.z * a.x + p.p2.z * b.x;
@@ -153,10 +156,10 @@ GS_HD GaussianGradient<T> project_splat_vjp(const Camera<T>& cam, const Gaussian
   }
 
   // A clamped ray is constant: its coordinate gets no gradient through J, and z only through the factor 1/z.
-  T g_ray_x = cam.mean_focal_x * g.pixel_x, g_ray_y = cam.mean_focal_y * g.pixel_y;
-  if (p.clamped_x == p.ray_x) g_ray_x -= cam.focal_x * p.inverse_z * along1;
-  if (p.clamped_y == p.ray_y) g_ray_y -= cam.focal_y * p.inverse_z * along2;
-  const T g_z = -(shape.diagonal.x + shape.diagonal.y + shape.diagonal.z + p.ray_x * g_ray_x + p.ray_y * g_ray_y +
+  V g_ray_x = cam.mean_focal_x * g.pixel_x, g_ray_y = cam.mean_focal_y * g.pixel_y;
+  g_ray_x = p.clamped_x == p.ray_x ? g_ray_x - cam.focal_x * p.inverse_z * along1 : g_ray_x;
+  g_ray_y = p.clamped_y == p.ray_y ? g_ray_y - cam.focal_y * p.inverse_z * along2 : g_ray_y;
+  const V g_z = -(shape.diagonal.x + shape.diagonal.y + shape.diagonal.z + p.ray_x * g_ray_x + p.ray_y * g_ray_y +
                   p.inverse_z * g_inverse_depth);
   g.mean = p.inverse_z * (g_ray_x * cam.row_x + g_ray_y * cam.row_y + g_z * cam.row_z);
   return g;

@@ -10,40 +10,51 @@
 GS_ISA_BEGIN
 
 // Tiles x0 <= x < x1, y0 <= y < y1.
-struct TileRect {
-  int32_t x0, y0, x1, y1;
+template <class I>
+struct Rect {
+  I x0, y0, x1, y1;
 };
+using TileRect = Rect<int32_t>;
 
 GS_HD int tile_count(int pixels) { return (pixels + kTile - 1) / kTile; }
 GS_HD int64_t tiles_of(Image image) { return int64_t(tile_count(image.width)) * tile_count(image.height); }
 
 template <class T>
-GS_HD int clamped_floor(T value, int limit) {
-  return value > 0 ? (value < T(limit) ? int(value) : limit) : 0;
+GS_HD Integer<T> clamped_floor(T value, int limit) {
+  const T below = value < Scalar<T>(limit) ? value : all<T>(limit);
+  return integer(value > 0 ? below : T{});
 }
 
 // Tells whether the square of 3-sigma radius meets the image: the reference's rule for `radii`, by whole tiles.
 template <class T>
-GS_HD bool radius_on_image(T x, T y, int radius, int width, int height) {
-  const T r = T(radius), tile = T(kTile);
+GS_HD Truth<T> radius_on_image(T x, T y, Integer<T> radius, int width, int height) {
+  const T r = number<T>(radius);
+  const Scalar<T> tile = Scalar<T>(kTile);
   const int nx = tile_count(width), ny = tile_count(height);
-  return clamped_floor((x + r + tile - 1) / tile, nx) > clamped_floor((x - r) / tile, nx) &&
-         clamped_floor((y + r + tile - 1) / tile, ny) > clamped_floor((y - r) / tile, ny);
+  return (clamped_floor((x + r + tile - 1) / tile, nx) > clamped_floor((x - r) / tile, nx)) &
+         (clamped_floor((y + r + tile - 1) / tile, ny) > clamped_floor((y - r) / tile, ny));
 }
 
 // The box of tiles that the splat can reach. |dx| is at most sqrt(reach) / |column of L^-1|, with
 // L^-1 = (1/l11, -l12/(l11 l22); 0, 1/l22).
 template <class T>
-GS_HD TileRect tile_rect(const Splat<T>& s, int width, int height) {
-  const T level = s.log2_opacity - T(kLog2MinAlpha);
-  if (!(level > T(-1e-3))) return {0, 0, 0, 0};
-  const T reach = std::sqrt(larger(level, T(0))) * T(1.0001) + T(0.01);
-  const T dx = reach * length(T(1), s.l12 / s.l22) / s.l11 + T(0.01), dy = reach / s.l22 + T(0.01);
-  const T tile = T(kTile);
-  if (!(s.x + dx >= 0 && s.y + dy >= 0 && s.x - dx <= T(width - 1) && s.y - dy <= T(height - 1))) return {0, 0, 0, 0};
+GS_HD Rect<Integer<T>> tile_rect(const Splat<T>& s, int width, int height) {
+  using Number = Scalar<T>;
+  const T level = s.log2_opacity - Number(kLog2MinAlpha);
+  const Integer<T> none = {};
+  const Rect<Integer<T>> nothing = {none, none, none, none};
+  Truth<T> some = level > Number(-1e-3);
+  if (!any(some)) return nothing;
+  const T reach = root(larger(level, T{})) * Number(1.0001) + Number(0.01);
+  const T dx = reach * length<T>(all<T>(1), s.l12 / s.l22) / s.l11 + Number(0.01), dy = reach / s.l22 + Number(0.01);
+  some &= (s.x + dx >= 0) & (s.y + dy >= 0) & (s.x - dx <= Number(width - 1)) & (s.y - dy <= Number(height - 1));
+  if (!any(some)) return nothing;
+  const Number tile = Number(kTile);
   const int nx = tile_count(width), ny = tile_count(height);
-  return {clamped_floor((s.x - dx) / tile, nx - 1), clamped_floor((s.y - dy) / tile, ny - 1),
-          clamped_floor((s.x + dx) / tile, nx - 1) + 1, clamped_floor((s.y + dy) / tile, ny - 1) + 1};
+  return {some ? clamped_floor<T>((s.x - dx) / tile, nx - 1) : none,
+          some ? clamped_floor<T>((s.y - dy) / tile, ny - 1) : none,
+          some ? clamped_floor<T>((s.x + dx) / tile, nx - 1) + 1 : none,
+          some ? clamped_floor<T>((s.y + dy) / tile, ny - 1) + 1 : none};
 }
 
 // The part of one splat's tile tests that does not depend on the tile. l11 and l22 are above 0, because projection
@@ -63,9 +74,9 @@ struct TileTest {
 template <class T>
 GS_HD TileTest<T> make_tile_test(const Splat<T>& s, TileRect rect, int width, int height) {
   const T unit = sizeof(T) == 4 ? T(5.9604644775390625e-8) : T(1.1102230246251565e-16);
-  const T far_x = larger(std::abs(T(rect.x0 * kTile) - s.x), std::abs(T(rect.x1 * kTile) - s.x));
-  const T far_y = larger(std::abs(T(rect.y0 * kTile) - s.y), std::abs(T(rect.y1 * kTile) - s.y));
-  const T terms = multiply_add(std::abs(s.l11), far_x, multiply_add(std::abs(s.l12), far_y, T(2)));
+  const T far_x = larger(magnitude(T(rect.x0 * kTile) - s.x), magnitude(T(rect.x1 * kTile) - s.x));
+  const T far_y = larger(magnitude(T(rect.y0 * kTile) - s.y), magnitude(T(rect.y1 * kTile) - s.y));
+  const T terms = multiply_add(magnitude(s.l11), far_x, multiply_add(magnitude(s.l12), far_y, T(2)));
   return {s,
           T(width - 1),
           T(height - 1),

@@ -1,10 +1,7 @@
 #pragma once
-// Vectors of three, and scalar helpers.
-#include <cmath>
-
+// Vectors of three, and helpers for numbers.
 #include "gs/fused_lanes.h"
-#include "gs/hd.h"
-#include "gs/isa.h"
+#include "gs/number.h"
 
 GS_ISA_BEGIN
 
@@ -13,20 +10,21 @@ struct Vec3 {
   T x, y, z;
 };
 
-template <class T>
-GS_HD Vec3<T> operator+(Vec3<T> a, Vec3<T> b) {
+// A and B: the same, or a vector type and its scalar.
+template <class A, class B>
+GS_HD auto operator+(Vec3<A> a, Vec3<B> b) -> Vec3<decltype(a.x + b.x)> {
   return {a.x + b.x, a.y + b.y, a.z + b.z};
 }
-template <class T>
-GS_HD Vec3<T> operator-(Vec3<T> a, Vec3<T> b) {
+template <class A, class B>
+GS_HD auto operator-(Vec3<A> a, Vec3<B> b) -> Vec3<decltype(a.x - b.x)> {
   return {a.x - b.x, a.y - b.y, a.z - b.z};
 }
-template <class T>
-GS_HD Vec3<T> operator*(T s, Vec3<T> a) {
+template <class A, class B>
+GS_HD auto operator*(A s, Vec3<B> a) -> Vec3<decltype(s * a.x)> {
   return {s * a.x, s * a.y, s * a.z};
 }
-template <class T>
-GS_HD T dot(Vec3<T> a, Vec3<T> b) {
+template <class A, class B>
+GS_HD auto dot(Vec3<A> a, Vec3<B> b) {
   return a.x * b.x + a.y * b.y + a.z * b.z;
 }
 template <class T>
@@ -34,9 +32,8 @@ GS_HD Vec3<T> cross(Vec3<T> a, Vec3<T> b) {
   return {a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x};
 }
 template <class T>
-GS_HD bool finite(Vec3<T> a) {
-  return std::isfinite(a.x) & std::isfinite(a.y) &
-         std::isfinite(a.z);  // & instead of &&: no load waits for another's test
+GS_HD Truth<T> finite(Vec3<T> a) {
+  return is_finite(a.x) & is_finite(a.y) & is_finite(a.z);  // & instead of &&: no load waits for another's test
 }
 template <class T>
 GS_HD T clamp(T value, T low, T high) {
@@ -58,10 +55,6 @@ GS_HD T multiply_add(T a, T b, T c) {
 #endif
 }
 template <class T>
-GS_HD T larger(T a, T b) {
-  return a < b ? b : a;
-}
-template <class T>
 GS_HD Vec3<T> load3(const T* p) {
   return {p[0], p[1], p[2]};
 }
@@ -73,17 +66,15 @@ GS_HD void store3(T* p, Vec3<T> v) {
 // Length without overflow or underflow of the squares.
 template <class T>
 GS_HD T length(Vec3<T> a) {
-  const T m = larger(larger(std::abs(a.x), std::abs(a.y)), std::abs(a.z));
-  if (!(m > 0)) return m;
+  const T m = larger(larger(magnitude(a.x), magnitude(a.y)), magnitude(a.z));
   const T x = a.x / m, y = a.y / m, z = a.z / m;
-  return m * std::sqrt(x * x + y * y + z * z);
+  return m > 0 ? m * root(x * x + y * y + z * z) : m;
 }
 template <class T>
 GS_HD T length(T x, T y) {
-  const T m = larger(std::abs(x), std::abs(y));
-  if (!(m > 0)) return m;
+  const T m = larger(magnitude(x), magnitude(y));
   const T a = x / m, b = y / m;
-  return m * std::sqrt(a * a + b * b);
+  return m > 0 ? m * root(a * a + b * b) : m;
 }
 
 GS_ISA_END

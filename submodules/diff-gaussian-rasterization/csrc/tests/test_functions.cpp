@@ -1,10 +1,11 @@
 // The small functions: exp2, activations, quaternions, spherical harmonics; derivatives by central differences.
 #include <limits>
 #include <random>
+#include <vector>
 
+#include "cpu/row_lanes.h"
 #include "gs/check.h"
 #include "gs/lane_sums.h"
-#include "gs/simd.h"
 #include "math/covariance.h"
 #include "math/exp2.h"
 #include "math/sh.h"
@@ -72,6 +73,75 @@ void test_sigmoid() {
   CHECK(log2_sigmoid(std::numeric_limits<T>::infinity()) == 0);
   CHECK(log2_sigmoid(-std::numeric_limits<T>::infinity()) == -std::numeric_limits<T>::infinity());
   CHECK(std::isnan(log2_sigmoid(std::numeric_limits<T>::quiet_NaN())));
+}
+
+// A function on a step over [first, last], alone and in a vector: the same bits, and within `units` of the last place.
+template <class T, class Function, class Exact>
+void check_function(double first, double last, double step, double units, const Function& function,
+                    const Exact& exact) {
+  using S = Simd<T>;
+  T x[S::kLanes], got[S::kLanes];
+  double worst = 0;
+  for (double at = first; at <= last; at += step * S::kLanes) {
+    for (int i = 0; i < S::kLanes; ++i) x[i] = T(std::min(at + step * i, last));
+    S::store(got, function(S::load(x)));
+    for (int i = 0; i < S::kLanes; ++i) {
+      const T alone = function(x[i]);
+      CHECK(alone == got[i]);
+      const long double wanted = exact((long double)x[i]);
+      const double unit = std::max<double>(std::numeric_limits<T>::denorm_min(),
+                                           std::abs(double(wanted)) * std::numeric_limits<T>::epsilon());
+      worst = std::max(worst, std::abs(double(got[i] - wanted)) / unit);
+    }
+  }
+  CHECK(worst < units);
+}
+
+template <class T>
+void test_exponential() {
+  using V = typename Simd<T>::Vec;
+  const auto exact_exp = [](long double x) { return std::exp(x); };
+  const auto exact_log = [](long double x) { return std::log1p(x); };
+  const auto power = [](auto x) { return exponential(x); };
+  const auto log = [](auto x) { return log_one_plus(x); };
+  check_function<T>(-103, 88, 0.00137, 1, power, exact_exp);  // below -87.4, floats are not normal
+  check_function<T>(-1e-3, 1e-3, 1e-7, 1, power, exact_exp);
+  check_function<T>(0, 1, 1.7e-5, 1, log, exact_log);
+  check_function<T>(0, 1e-6, 1.7e-10, 1, log, exact_log);
+  const T infinity = std::numeric_limits<T>::infinity();
+  for (const T far : {T(1000), infinity, std::numeric_limits<T>::max()}) {
+    CHECK(exponential(far) == infinity && exponential(V{} + far)[0] == infinity);
+    CHECK(exponential(-far) == 0 && exponential(V{} - far)[0] == 0);
+  }
+  const T nan = std::numeric_limits<T>::quiet_NaN();
+  CHECK(std::isnan(exponential(nan)) && std::isnan(exponential(V{} + nan)[0]));
+  CHECK(std::isnan(log_one_plus(nan)) && std::isnan(log_one_plus(V{} + nan)[0]));
+}
+
+// Rows become vectors and rows again, whole packs and the last, from rows that do not follow each other. The tensors
+// have no room behind their last row, and the sanitizers watch.
+template <class T>
+void test_row_lanes() {
+  constexpr int kLanes = Simd<T>::kLanes;
+  for (const int columns : {1, 3, 4, 9, 10, 24, 45})
+    for (const int stride : {columns, columns + 7})
+      for (const int count : {1, kLanes, kLanes + 3}) {
+        std::vector<int32_t> rows;
+        for (int i = 0; i < count; ++i) rows.push_back(2 * i);
+        const int64_t n = 2 * count - 1;
+        std::vector<T> from((n - 1) * stride + columns), to(from.size(), T(-1)), wanted = to;
+        for (size_t i = 0; i < from.size(); ++i) from[i] = T(i);
+        for (const int32_t row : rows)
+          for (int k = 0; k < columns; ++k) wanted[row * stride + k] = from[row * stride + k];
+        for_packs<T>(rows.data(), count, [&](const Pack<T>& pack) {
+          typename Simd<T>::Vec values[45];
+          read_rows(from.data(), stride, n, columns, pack, values);
+          for (int k = 0; k < columns; ++k)
+            for (int i = 0; i < pack.count; ++i) CHECK(values[k][i] == from[pack.row[i] * stride + k]);
+          write_rows(values, stride, columns, pack, to.data());
+        });
+        CHECK(to == wanted);
+      }
 }
 
 double& entry(Quat<double>& q, int k) { return k == 0 ? q.w : k == 1 ? q.x : k == 2 ? q.y : q.z; }
@@ -226,6 +296,8 @@ void test_direction() {
 int main() {
   test_exp2();
   test_lane_sums<float>(), test_lane_sums<double>();
+  test_exponential<float>(), test_exponential<double>();
+  test_row_lanes<float>(), test_row_lanes<double>();
   test_sigmoid<float>(), test_sigmoid<double>();
   test_rotation();
   test_degenerate_quaternions<float>(), test_degenerate_quaternions<double>();
