@@ -13,6 +13,7 @@ from benchmarks.harness.timing import short_name
 from benchmarks.kernels.fragments import TILE, fragments, processed_per_tile
 from benchmarks.kernels.host_ops import NODE, calls_per_iteration, operator_calls
 from benchmarks.kernels.seen_share import SHARES, Ring, measure
+from benchmarks.scenes import step_profile
 from benchmarks.workloads.splat_scenes import frustum
 
 BENCHMARKS = Path(__file__).resolve().parents[1] / "benchmarks"
@@ -90,3 +91,16 @@ def test_every_command_answers_h(path, monkeypatch, capsys):
 @pytest.mark.parametrize("path", COMMANDS, ids=_name)
 def test_every_command_shows_how_it_is_run(path):
     assert f"python -m {_name(path)} " in ast.get_docstring(ast.parse(path.read_text()))
+
+
+def test_the_profile_of_a_step_adds_up_kernels_by_name():
+    kernels = {
+        "void gs::cuda::(anonymous namespace)::blend_kernel<true>(int const*, gs::BlendInput<float>)": 3.0,
+        "void gs::cuda::(anonymous namespace)::blend_kernel<false>(int const*, gs::BlendInput<float>)": 2.0,
+        "void at::native::vectorized_elementwise_kernel<4, at::native::FillFunctor<float>>(int)": 1.0,
+        "Memcpy HtoD (Pinned -> Device)": 4.0,
+    }
+    run = {"kernels": kernels, "counts": dict.fromkeys(kernels, 1.5)}
+    sums = step_profile._by_name(run)
+    assert sums["blend_kernel"] == (5.0, 3.0) and sums["vectorized_elementwise_kernel"] == (1.0, 1.5)
+    assert step_profile._kernels(run) == 6.0  # a copy from the host runs beside the kernels

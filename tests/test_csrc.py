@@ -44,7 +44,9 @@ SCHEMAS = [
     "int[] attributes, Tensor(g!)[] exp_avg, Tensor(h!)[] exp_avg_sq, Tensor(i!)[] steps, float[] rates, float beta1, "
     "float beta2, float eps, int[] columns, bool sparse, Tensor(j!)? max_radii=None, "
     "Tensor(k!)? gradient_sums=None, Tensor(l!)? views=None, Tensor? loss=None, Tensor(m!)? stopped=None, "
-    "int iteration=0) -> ()",
+    "int iteration=0, Tensor? now=None) -> ()",
+    "step_now_(Tensor(a!) now, int[] attributes, Tensor(b!)[] steps, float[] rates, float beta1, float beta2, "
+    "float eps, bool sparse, int iteration) -> ()",
     "mark_visible(Tensor means, Tensor view) -> Tensor",
     "decisive(Tensor splats, Tensor instances, Tensor ranges, Tensor last) -> Tensor",
     "adam_(Tensor(a!)[] values, Tensor[] gradients, Tensor(b!)[] exp_avg, Tensor(c!)[] exp_avg_sq, Tensor(d!)[] steps, "

@@ -58,10 +58,10 @@ class Ring:
         """Take the step of a view. Returns the tiles of each Gaussian."""
         scene = scene_arguments(Gaussians(**self.values), camera, True)
         out = OPS.rasterize(None, *scene, camera.bg, False, True)
-        color, transmittance, _, radii, splats, tiles, *lists, last = out
+        color, transmittance, _, radii, splats, tiles, *lists, last, layers = out
         _, _, kept = torch.ops.fused_ssim.photometric(color, self.target, 0.2, True)
         gradient = torch.ops.fused_ssim.photometric_vjp(color, self.target, kept, 0.2, self._one)
-        state = splats, *lists, camera.bg, last, transmittance, gradient, None, None, tiles, radii
+        state = splats, *lists, camera.bg, last, transmittance, gradient, None, None, tiles, layers, radii
         OPS.rasterize_vjp_step_(*scene, *state, list(range(6)), *self._adam, False, *self._statistics)
         return tiles
 

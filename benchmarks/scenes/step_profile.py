@@ -1,4 +1,4 @@
-"""Where an iteration's time goes on a GPU in the middle of a training: clock, kernels, host, launches, waits.
+"""Profile of the iterations in the middle of a training on a GPU: clock, kernels, host, launches, waits.
 
     python -m benchmarks.scenes.step_profile SCENE [--checkouts . OLDER] [--first 6400] [options of train.py]
 
@@ -10,7 +10,6 @@ profiler, over the iterations before those that are profiled. `host` is the proc
 import argparse
 import json
 import os
-import re
 import subprocess
 import sys
 import tempfile
@@ -18,6 +17,7 @@ from pathlib import Path
 from statistics import median
 
 from benchmarks.harness.environment import describe, print_table
+from benchmarks.harness.timing import short_name
 from utils.system_utils import UserError, compute_device, run_cli
 
 PROGRAM = Path(__file__).with_name("step_profile_program.py")
@@ -60,18 +60,12 @@ def _row(name: str, runs: list[dict]) -> list[str]:
     return [name, str(runs[0]["gaussians"]), *shown, *[f"{count:.1f}" for count in counts], f"{memory:.0f}"]
 
 
-def _short(kernel: str) -> str:
-    """A kernel's name without return type, namespaces, template arguments and parameters."""
-    name = kernel.replace("(anonymous namespace)::", "").removeprefix("void ")
-    return re.split(r"[<(]", name)[0].split("::")[-1]
-
-
 def _by_name(run: dict) -> dict[str, tuple[float, float]]:
     """Microseconds and launches of each short name."""
     sums: dict[str, tuple[float, float]] = {}
     for kernel, us in run["kernels"].items():
-        before = sums.get(_short(kernel), (0.0, 0.0))
-        sums[_short(kernel)] = before[0] + us, before[1] + run["counts"][kernel]
+        before = sums.get(short_name(kernel), (0.0, 0.0))
+        sums[short_name(kernel)] = before[0] + us, before[1] + run["counts"][kernel]
     return sums
 
 

@@ -245,4 +245,4 @@ def _fitting(entry: Any, param: Tensor, name: str | None) -> dict[str, Tensor]:
     if not (math.isfinite(step) and step >= 0):
         raise ValueError(f"step of {name} is {step}")
     averages = {key: value for key, value in entry.items() if torch.is_tensor(value) and value.shape == param.shape}
-    return averages | {"step": torch.tensor(step, dtype=torch.float32)}
+    return {"step": torch.tensor(step, dtype=torch.float32), **averages}
