@@ -5,6 +5,9 @@
 
 The two take turns. Milliseconds are medians, without blend_vjp, which both have: on the CPU it finds no instances, and
 on a GPU its kernels are left out. Peaks are MiB above the inputs.
+
+On a GPU a second table has the whole step, forward to statistics: calls from an idle GPU, with the host in them, and
+the sum of their kernels.
 """
 
 import argparse
@@ -23,6 +26,7 @@ from benchmarks.harness.timing import gpu_time, peak_mib
 from benchmarks.kernels.rasterizer import CPU_WORKLOADS
 from benchmarks.peers.published import WORKLOADS
 from benchmarks.workloads.splat_scenes import PARAMETERS, frustum
+from utils.loss_utils import photometric_gradient
 from utils.system_utils import UserError, compute_device, run_cli
 
 OPS = torch.ops.diff_gaussian_rasterization
@@ -39,6 +43,7 @@ class Steps:
         color, transmittance, _, self.radii, splats, counts, instances, ranges, splat_slots, slots, last, layers = out
         generator = torch.Generator().manual_seed(0)
         gradient = torch.randn(color.shape, generator=generator).to(color)
+        self.camera, self.scene, self.target = camera, scene, torch.rand_like(color)
         if not blended:
             instances, slots = instances[:0], slots[:0]
             for positions in (ranges, splat_slots, last):
@@ -57,6 +62,17 @@ class Steps:
 
     def fused(self) -> None:
         OPS.rasterize_vjp_step_(*self.backward, self.radii, list(range(6)), *self.adam, False, *self.statistics)
+
+    def forward(self) -> tuple[Tensor, ...]:
+        return OPS.rasterize(None, *self.scene, self.camera.bg, False, True)
+
+    @torch.no_grad()
+    def whole(self) -> None:
+        color, transmittance, _, radii, splats, counts, *lists, last, layers = self.forward()
+        _, _, gradient = photometric_gradient(color, self.target, 0.2)
+        backward = splats, *lists, self.camera.bg, last, transmittance, gradient, None, None, counts, layers
+        rest = radii, list(range(6)), *self.adam, False, *self.statistics
+        OPS.rasterize_vjp_step_(*self.scene, *backward, *rest)
 
 
 def by_turns(calls: list[Callable[[], None]], repeats: int) -> list[float]:
@@ -82,10 +98,11 @@ def measure_on_cpu(repeats: int) -> None:
 
 
 def measure_on_gpu() -> None:
-    rows = []
+    rows, whole = [], []
     for name, workload in WORKLOADS.items():
         scene = frustum(*workload, device="cuda")
         steps = Steps(scene.parameters, scene.settings(torch.float32), blended=True)
+        whole.append([name, *_whole(steps)])
         calls = steps.in_parts, steps.fused
         peaks = [f"{peak_mib(call, lambda: None):.0f}" for call in calls]
         parts, fused = (min(_after_blending(call) for _ in range(2)) for call in calls)
@@ -93,6 +110,15 @@ def measure_on_gpu() -> None:
         del steps, calls, scene
         torch.cuda.empty_cache()
     print_table(["", "project_vjp, observe, adam", "fused", "fused / in parts", "peak in parts", "fused"], rows)
+    print()
+    print_table(["", "forward", "its kernels", "step", "its kernels", "peak MiB"], whole)
+
+
+def _whole(steps: Steps) -> list[str]:
+    """Cells for the whole step and its forward."""
+    forward, step = gpu_time(steps.forward), gpu_time(steps.whole)
+    times = forward.wall, forward.kernels, step.wall, step.kernels
+    return [*[f"{milliseconds:.3f}" for milliseconds in times], f"{peak_mib(steps.whole, lambda: None):.0f}"]
 
 
 def _after_blending(call: Callable[[], None]) -> float:
