@@ -33,7 +33,17 @@ def profiled(checkout: Path, scene: Path, first: int, count: int, options: list[
     paths = [str(path) for path in (checkout, site) if path.exists()]
     with tempfile.TemporaryDirectory() as folder:
         result = Path(folder, "profile.json")
-        words = ["-s", str(scene), "-m", str(Path(folder, "out")), "--test_iterations", "-1", "--quiet", *options]
+        words = [
+            "-s",
+            str(scene),
+            "-m",
+            str(Path(folder, "out")),
+            "--test_iterations",
+            "-1",
+            "--no_curve",
+            "--quiet",
+            *options,
+        ]
         done = subprocess.run(
             [str(own) if own.exists() else sys.executable, "-c", PROGRAM.read_text() + "\n\nmain()\n",
              str(first), str(count), str(result), *words],
