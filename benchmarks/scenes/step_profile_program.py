@@ -28,8 +28,12 @@ class Probe:
         self._first, self._count, self._result = first, count, result
         self._profile = profile(activities=[ProfilerActivity.CPU, ProfilerActivity.CUDA])
         self._out: dict = {}
+        self._latest = 0
 
     def at(self, iteration: int, gaussians: GaussianModel) -> None:
+        if iteration <= self._latest:
+            return  # a step that is repeated
+        self._latest = iteration
         if iteration == self._first:
             torch.cuda.synchronize()
             self._clock, self._host = time.perf_counter(), time.thread_time()
