@@ -12,6 +12,7 @@ from benchmarks.harness.calls import Stages
 from benchmarks.harness.timing import short_name
 from benchmarks.kernels.fragments import TILE, fragments, processed_per_tile
 from benchmarks.kernels.host_ops import NODE, calls_per_iteration, operator_calls
+from benchmarks.kernels.seen_share import SHARES, Ring, measure
 from benchmarks.workloads.splat_scenes import frustum
 
 BENCHMARKS = Path(__file__).resolve().parents[1] / "benchmarks"
@@ -63,6 +64,18 @@ def test_an_iteration_makes_few_calls(colmap_scene):
     assert calls["fused_ssim::photometric"] == calls["fused_ssim::photometric_vjp"] == 1
     assert calls[NODE] <= 2  # the loss, and the image that it is differentiated by
     assert operator_calls(calls) <= 70  # and some 20 for the order of the views, drawn once an epoch of 17
+
+
+@pytest.mark.parametrize("share", SHARES)
+def test_views_of_the_ring_see_the_share_that_was_asked_for(share):
+    ring = Ring(20_000, 400, 265, "cpu")
+    assert ring.seen(ring.views(share, 5)) == pytest.approx(share, rel=0.15, abs=0.015)
+
+
+def test_a_row_for_each_share():
+    rows = measure("cpu", (300, 40, 27), 2)
+    assert [len(row) for row in rows] == [2] * len(SHARES)
+    assert all(float(row[1]) > 0 for row in rows)
 
 
 @pytest.mark.parametrize("path", COMMANDS, ids=_name)

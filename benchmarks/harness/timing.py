@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import torch
 from torch.autograd import DeviceType
+from torch.autograd.profiler_util import FunctionEvent
 from torch.profiler import ProfilerActivity, profile
 
 WARM_UPS, REPEATS = 20, 50  # on a GPU
@@ -71,15 +72,13 @@ def gpu_time(run: Callable[[], object]) -> GpuTime:
 
 def _profile(run: Callable[[], object], calls: int) -> tuple[list[Kernel], int] | None:
     """Return kernels, with mean times, and waits of a call; None if the calls launched different kernels."""
-    torch.cuda.synchronize()
-    with profile(activities=[ProfilerActivity.CPU, ProfilerActivity.CUDA]) as trace:
+
+    def several() -> None:
         for _ in range(calls):
             run()
-        torch.cuda.synchronize()
-    events = sorted(trace.events(), key=lambda e: e.time_range.start)
-    launched = [
-        (short_name(e.name), e.time_range.elapsed_us() / 1e3) for e in events if e.device_type == DeviceType.CUDA
-    ]
+
+    events = _events(several)
+    launched = _launched(events)
     per_call = len(launched) // calls
     names = [name for name, _ in launched[:per_call]]
     if [name for name, _ in launched] != names * calls:
@@ -93,6 +92,25 @@ def _profile(run: Callable[[], object], calls: int) -> tuple[list[Kernel], int] 
         else:
             result.append(Kernel(name, 1, milliseconds))
     return result, sum(e.name in _WAITS for e in events) // calls
+
+
+def launches(run: Callable[[], object]) -> list[tuple[str, float]]:
+    """Return name and milliseconds of each kernel that a call runs on the device, in order."""
+    return _launched(_events(run))
+
+
+def _events(run: Callable[[], object]) -> list[FunctionEvent]:
+    """Return the profiler's events of a call, in order."""
+    torch.cuda.synchronize()
+    with profile(activities=[ProfilerActivity.CPU, ProfilerActivity.CUDA]) as trace:
+        run()
+        torch.cuda.synchronize()
+    return sorted(trace.events(), key=lambda e: e.time_range.start)
+
+
+def _launched(events: list[FunctionEvent]) -> list[tuple[str, float]]:
+    on_device = (e for e in events if e.device_type == DeviceType.CUDA)
+    return [(short_name(e.name), e.time_range.elapsed_us() / 1e3) for e in on_device]
 
 
 def peak_mib(run: Callable[[], object], clear: Callable[[], None]) -> float:

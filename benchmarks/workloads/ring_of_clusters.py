@@ -1,0 +1,82 @@
+"""A scene whose views see a part of it: clusters of Gaussians in a ring, and cameras that see a wanted share."""
+
+import math
+
+import torch
+from diff_gaussian_rasterization import GaussianRasterizationSettings
+from torch import Tensor
+
+from benchmarks.workloads.splat_scenes import FOV, SplatScene, on_device, settings
+
+RADIUS = 10.0
+CLUSTERS = 60
+SIGMA_PX = 1.4  # median size from the ring's middle
+_FARTHEST = 4 * RADIUS  # from where a view has the whole ring in front of it
+_STEPS = 40  # of the bisection
+
+
+def ring_of_clusters(n: int, width: int, height: int, seed: int = 0, device: torch.device | str = "cpu") -> SplatScene:
+    """Draw Gaussians in clusters that stand in a ring around the origin, in the plane of x and z.
+
+    Rows are in random order, as in a model that has been densified many times. Sizes and opacities are those of
+    `splat_scenes.frustum`. Numbers are drawn on `device`; a GPU's differ from the CPU's.
+    """
+    g = torch.Generator(device).manual_seed(seed)
+
+    def uniform(*shape: int) -> Tensor:
+        return torch.rand(*shape, generator=g, device=device)
+
+    def normal(*shape: int) -> Tensor:
+        return torch.randn(*shape, generator=g, device=device)
+
+    cluster = torch.randint(CLUSTERS, (n,), generator=g, device=device)
+    angles = 2 * math.pi * (torch.arange(CLUSTERS, device=device) + uniform(CLUSTERS)) / CLUSTERS
+    heights = 4 * uniform(CLUSTERS) - 2
+    centers = torch.stack([RADIUS * angles.sin(), heights, RADIUS * angles.cos()], -1)
+    focal = width / (2 * math.tan(FOV / 2))
+    size = math.log(SIGMA_PX * RADIUS / focal) + 0.8 * normal(n, 1)
+    parameters = {
+        "means": centers[cluster] + 0.5 * normal(n, 3),
+        "opacities": 1.5 * normal(n, 1),
+        "scales": size + (uniform(n, 3) - 0.5) * math.log(5.0),
+        "rotations": normal(n, 4),
+        "sh_dc": 0.8 * normal(n, 1, 3),
+        "sh_rest": 0.1 * normal(n, 15, 3),
+    }
+    return SplatScene(parameters, width, height)
+
+
+def view_of_share(
+    scene: SplatScene, share: float, turn: float, dtype: torch.dtype = torch.float32, **changes
+) -> GaussianRasterizationSettings:
+    """Return a camera that looks away from the ring's axis, `turn` radians from +z, and sees a share of the means.
+
+    A camera that moves backwards along its axis sees more and more, from a few Gaussians behind the ring on its far
+    side to all of them. `changes` replace fields of the settings.
+    """
+    means = scene.parameters["means"][:: max(1, len(scene.parameters["means"]) // 100_000)].double()
+    nearest, farthest = -1.2 * RADIUS, _FARTHEST
+    for _ in range(_STEPS):
+        back = (nearest + farthest) / 2
+        seen = _share(means, scene, _view(turn, back))
+        nearest, farthest = (back, farthest) if seen < share else (nearest, back)
+    camera = settings(scene.width, scene.height, dtype, view=_view(turn, farthest), **changes)
+    return on_device(camera, scene.parameters["means"].device)
+
+
+def _view(turn: float, back: float) -> Tensor:
+    """World to view, of a camera that stands `back` behind the origin."""
+    view = torch.eye(4, dtype=torch.float64)
+    sine, cosine = math.sin(turn), math.cos(turn)
+    view[0, 0], view[0, 2], view[2, 0], view[2, 2] = cosine, -sine, sine, cosine
+    view[2, 3] = back
+    return view
+
+
+def _share(means: Tensor, scene: SplatScene, view: Tensor) -> float:
+    """The share of the means that lie on the image."""
+    view = view.to(means.device)
+    x, y, z = (means @ view[:3, :3].T + view[:3, 3]).T
+    wide = math.tan(FOV / 2)
+    high = wide * scene.height / scene.width
+    return float(((z > 0.2) & (x.abs() < wide * z) & (y.abs() < high * z)).double().mean())
