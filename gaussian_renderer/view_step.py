@@ -19,6 +19,7 @@ from gaussian_renderer import rasterizer_settings
 from scene.cameras import Camera
 from scene.fused_adam import FusedAdam
 from scene.gaussian_model import GaussianModel
+from scene.lazy_rows import LazyRows
 
 
 @dataclass(slots=True)
@@ -35,12 +36,19 @@ class Drawn:
 
 @torch.no_grad()
 def draw(
-    camera: Camera, gaussians: GaussianModel, pipe: argparse.Namespace, background: Tensor, want_depth: bool
+    camera: Camera,
+    gaussians: GaussianModel,
+    pipe: argparse.Namespace,
+    background: Tensor,
+    want_depth: bool,
+    lazy: LazyRows | None = None,
 ) -> Drawn:
-    """Render a view for `step`. The Gaussians must be ones that `FusedAdam` takes."""
+    """Render a view for `step`. The Gaussians must be ones that `FusedAdam` takes. lazy: their rows, if some wait."""
     colors = {"sh_dc": gaussians.get_features_dc, "sh_rest": gaussians.get_features_rest}
     rows = Gaussians(gaussians.get_xyz, **gaussians.raw_geometry(), **colors)
     scene = scene_arguments(rows, rasterizer_settings(camera, gaussians, pipe, background), True)
+    if lazy is not None:
+        lazy.catch_up_seen(scene)
     color, transmittance, depth, radii, splats, tile_counts, *lists, last = OPERATORS.rasterize(
         rows.means, *scene, background, want_depth, True
     )
@@ -49,9 +57,16 @@ def draw(
 
 
 @torch.no_grad()
-def step(drawn: Drawn, adam: FusedAdam, image_gradient: Tensor, depth_gradient: Tensor | None, observe: bool) -> None:
-    """Take the step of every Gaussian. observe: add the view to the statistics of density control."""
+def step(
+    drawn: Drawn,
+    adam: FusedAdam,
+    image_gradient: Tensor,
+    depth_gradient: Tensor | None,
+    observe: bool,
+    lazy: LazyRows | None = None,
+) -> None:
+    """Take the step of every Gaussian. observe: add the view to the statistics of density control. lazy: as `draw`."""
     OPERATORS.rasterize_vjp_step_(
         *drawn.scene, *drawn.state, image_gradient, None, depth_gradient, drawn.tile_counts, drawn.radii,
-        *adam.arguments(observe),
+        *adam.arguments(observe), **(lazy.arguments() if lazy is not None else {}),
     )  # fmt: skip

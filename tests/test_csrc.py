@@ -24,6 +24,8 @@ STEPPED_SCENE = (
     "Tensor(a!) means, Tensor(b!) opacities, Tensor(c!)? scales, Tensor(d!)? rotations, Tensor? cov3d, Tensor? colors, "
     "Tensor(e!)? sh_dc, Tensor(f!)? sh_rest" + SCENE[SCENE.index(", Tensor view") :]
 )
+LAZY = "Tensor(c!)[] exp_avg, Tensor(d!)[] exp_avg_sq, int[] columns, Tensor(e!) last, Tensor ring, Tensor taken) -> ()"
+LAZY_SCENE = SCENE.replace("Tensor? sh_dc, Tensor? sh_rest", "Tensor(a!)? sh_dc, Tensor(b!)? sh_rest")
 GRADIENTS = (
     "(Tensor means, Tensor means2d, Tensor opacities, Tensor scales, Tensor rotations, Tensor cov3d, Tensor colors, "
     "Tensor sh_dc, Tensor sh_rest)"
@@ -43,7 +45,10 @@ SCHEMAS = [
     f"rasterize_vjp_step_({STEPPED_SCENE}, {BACKWARD}, Tensor tile_counts, Tensor radii, int[] attributes, "
     "Tensor(g!)[] exp_avg, Tensor(h!)[] exp_avg_sq, Tensor(i!)[] steps, float[] rates, float beta1, float beta2, "
     "float eps, int[] columns, bool sparse, Tensor(j!)? max_radii=None, Tensor(k!)? gradient_sums=None, "
-    "Tensor(l!)? views=None, Tensor? loss=None, Tensor(m!)? stopped=None, int iteration=0) -> ()",
+    "Tensor(l!)? views=None, Tensor? loss=None, Tensor(m!)? stopped=None, int iteration=0, "
+    "Tensor(n!)? last_steps=None, Tensor(o!)? ring=None, Tensor(p!)? taken=None, int number=0) -> ()",
+    f"catch_up_(Tensor(a!) sh_dc, Tensor(b!) sh_rest, {LAZY}",
+    f"catch_up_seen_({LAZY_SCENE}, {LAZY}",
     "mark_visible(Tensor means, Tensor view) -> Tensor",
     "decisive(Tensor splats, Tensor instances, Tensor ranges, Tensor last) -> Tensor",
     "adam_(Tensor(a!)[] values, Tensor[] gradients, Tensor(b!)[] exp_avg, Tensor(c!)[] exp_avg_sq, Tensor(d!)[] steps, "

@@ -9,7 +9,7 @@ from diff_gaussian_rasterization import GaussianRasterizationSettings, schema
 from rasterizer_tools import BOTH_AND_GPU, activated, ops, scene_arguments
 from torch import Tensor, library
 
-from benchmarks.workloads.splat_scenes import PARAMETERS, frustum
+from benchmarks.workloads.splat_scenes import PARAMETERS, frustum, on_device, settings
 
 BETAS, EPS = (0.9, 0.999), 1e-15
 RATES = [1e-4, 0.05, 0.005, 0.001, 0.0025, 0.000125]
@@ -119,12 +119,12 @@ def step_plainly(state: State, camera: GaussianRasterizationSettings, case: Case
         ops.sparse_adam_(value, gradient, mean, square, radii > 0, rate, beta1, beta2, eps, count, *guard)
 
 
-def step_fused(state: State, camera: GaussianRasterizationSettings, case: Case, iteration: int) -> None:
-    """Take the same step inside the backward."""
+def step_fused(state: State, camera: GaussianRasterizationSettings, case: Case, iteration: int, **lazy) -> None:
+    """Take the same step inside the backward. lazy: arguments for rows that wait."""
     arguments, radii = rendered(state, camera, case, iteration)
     statistics = state.statistics if case.observed else (None, None, None)
     lists = case.attributes, *case.lists(state)
-    ops.rasterize_vjp_step_(*arguments, radii, *lists, case.sparse, *statistics, *case.guard(state, iteration))
+    ops.rasterize_vjp_step_(*arguments, radii, *lists, case.sparse, *statistics, *case.guard(state, iteration), **lazy)
 
 
 def same_bytes(one: Tensor, other: Tensor) -> bool:
@@ -224,6 +224,45 @@ def test_opcheck(device, dtype):
     library.opcheck(ops.rasterize_vjp_step_, (*arguments, radii, list(case.attributes), *rest))
 
 
+def _lazy_tensors(values: dict[str, Tensor]) -> dict[str, Tensor]:
+    like = values["means"]
+    last = torch.full((len(like),), -1, dtype=torch.int32, device=like.device)
+    return {"last_steps": last, "ring": like.new_zeros(256, 2, 8), "taken": last.new_zeros(1)}
+
+
+def _catch_up(state: State, columns: int, lazy: dict[str, Tensor], scene: tuple | None) -> None:
+    """Let all rows catch up, or those that a view may see."""
+    averages = [tensors[4:] for tensors in state.averages]
+    rest = *averages, [-1, columns], lazy["last_steps"], lazy["ring"], lazy["taken"]
+    if scene is None:
+        ops.catch_up_(state.values["sh_dc"], state.values["sh_rest"], *rest)
+    else:
+        ops.catch_up_seen_(*scene, *rest)
+
+
+@BOTH_AND_GPU
+@pytest.mark.parametrize("name", ["dense", "guarded", "NaN", "NaN loss", "no bands", "one band", "activated"])
+def test_rows_that_wait_have_the_bytes_of_those_that_do_not(name, device, dtype):
+    case = replace(CASES[name], observed=dtype == torch.float32)
+    start, camera = start_and_camera(case, 700, device, dtype)
+    dense, late, lazy = start.copy(), start.copy(), _lazy_tensors(start.values)
+    waited = 0
+    for iteration in range(1, 11):
+        view = torch.eye(4, dtype=torch.float64)
+        view[0, 3] = (0.0, 2.5, -2.5, 0.0, 60.0)[iteration % 5]
+        turned = settings(camera.image_width, camera.image_height, dtype, view=view, sh_degree=case.degree)
+        turned = on_device(turned, device)
+        step_fused(dense, turned, case, iteration)
+        _catch_up(late, case.columns, lazy, scene_arguments(late.values, turned, case.raw))
+        step_fused(late, turned, case, iteration, **lazy, number=iteration)
+        waited += int(((lazy["last_steps"] >= 0) & (lazy["last_steps"] < lazy["taken"])).sum())
+        if iteration in (6, 10):
+            _catch_up(late, case.columns, lazy, None)
+            assert all(same_bytes(one, other) for one, other in zip(late.tensors(), dense.tensors(), strict=True))
+    assert (waited > 100) == (name != "NaN loss")
+    assert int(lazy["taken"]) == {"NaN": 2, "NaN loss": 0}.get(name, 10)
+
+
 def _refused(match: str, case: Case | None = None, error: type = RuntimeError, **changes) -> None:
     """Assert that the step with changed arguments, by name, is refused and changes nothing."""
     case = case or Case(guarded=True)
@@ -231,7 +270,7 @@ def _refused(match: str, case: Case | None = None, error: type = RuntimeError, *
     arguments, radii = rendered(state, camera, case, 1)
     rest = list(case.attributes), *case.lists(state), False, *state.statistics, *case.guard(state, 1)
     names = [argument.name for argument in ops.rasterize_vjp_step_.default._schema.arguments]
-    named = dict(zip(names, (*arguments, radii, *rest), strict=True))
+    named = dict(zip(names, (*arguments, radii, *rest), strict=False))
     changes = {name: change(named[name]) if callable(change) else change for name, change in changes.items()}
     before = [t.clone() for t in state.tensors()]
     with pytest.raises(error, match=match):
@@ -257,6 +296,16 @@ def test_wrong_arguments_are_named():
     _refused("count from 1", iteration=0)
     _refused("radii must be", radii=torch.ones(8), error=TypeError)
     _refused("radii must be", radii=torch.ones(7, dtype=torch.int32), error=ValueError)
+    lazy = _lazy_tensors({"means": torch.zeros(8, 3)}) | {"number": 1}
+    _refused("last, ring and taken, or none", last_steps=lazy["last_steps"])
+    _refused("steps count from 1", **lazy | {"number": 0})
+    _refused("rows cannot wait with the rate -0.1", **lazy, rates=[-0.1] * 6)
+    _refused("rows cannot wait with .* eps 0", **lazy, eps=0.0)
+    _refused("for the dense optimiser", **lazy, sparse=True)
+    _refused("last must be", **lazy | {"last_steps": torch.zeros(7, dtype=torch.int32)}, error=ValueError)
+    _refused("ring must be", **lazy | {"ring": torch.zeros(255, 2, 8)}, error=ValueError)
+    _refused("taken must be", **lazy | {"taken": torch.zeros(1)}, error=TypeError)
+    _refused("steps of sh_dc", case=Case(guarded=True, attributes=(0,)), **lazy)
     _refused("tile_counts must be", tile_counts=torch.ones(7, dtype=torch.int32), error=ValueError)
     _refused("not cov3d or colors", sh_dc=None, sh_rest=None, colors=torch.rand(8, 3), error=ValueError)
 

@@ -11,6 +11,9 @@ from PIL import Image
 from rasterizer_tools import GPU_MARKS
 
 import train
+from scene import lazy_rows
+from scene.lazy_rows import LazyRows
+from scene.readers.point_cloud import write_point_cloud
 from training import run
 from training.objective import Objective
 from training.steps import ahead, run_ahead
@@ -51,6 +54,29 @@ def scene(colmap_scene: Path) -> Path:
     scales = {str(photo.with_suffix("")): {"scale": 1.0, "offset": 0.0} for photo in photos}
     (colmap_scene / "sparse/0/depth_params.json").write_text(json.dumps(scales))
     return colmap_scene
+
+
+@pytest.fixture
+def lazy(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Rows wait in every step that lets them, and all of them catch up often. Gets the rows that lack some, by step."""
+    lacking, arguments = [], LazyRows.arguments
+
+    def noted(self: LazyRows) -> dict:
+        lacking.append(int(((self._last >= 0) & (self._last < self._taken)).sum()))
+        return arguments(self)
+
+    monkeypatch.setattr(LazyRows, "_pays", lambda self: True)
+    monkeypatch.setattr(lazy_rows, "_SPAN", 7)
+    monkeypatch.setattr(LazyRows, "arguments", noted)
+    return lacking
+
+
+@pytest.fixture
+def wide_scene(scene: Path) -> Path:
+    """The scene with points all around, of which each view sees a part."""
+    random = np.random.default_rng(0)
+    write_point_cloud(scene / "sparse/0/points3D.ply", random.uniform(-4, 4, (600, 3)), random.random((600, 3)))
+    return scene
 
 
 def trained(scene: Path, out: Path, *options: object) -> dict[str, bytes | list]:
@@ -166,6 +192,102 @@ def test_steps_that_are_queued_give_the_same_bytes(scene, tmp_path, monkeypatch,
     assert len(queued) > (10 if term else 40)
 
 
+@pytest.mark.parametrize("options", OPTIONS.values(), ids=OPTIONS.keys())
+def test_rows_that_wait_give_the_same_bytes(wide_scene, tmp_path, monkeypatch, lazy, options):
+    monkeypatch.setattr(run, "SH_INTERVAL", 12)
+    options = (*options, "--save_iterations", 25)
+    plain = trained(wide_scene, tmp_path / "plain", "--plain_step", *options)
+    assert trained(wide_scene, tmp_path / "lazy", *options) == plain
+    saved = [tmp_path / name / "point_cloud/iteration_25/point_cloud.ply" for name in ("plain", "lazy")]
+    assert saved[0].read_bytes() == saved[1].read_bytes()
+    if "sparse_adam" in options:
+        assert not lazy
+    else:
+        assert len(lazy) > 40 and sum(count > 0 for count in lazy) > 20
+
+
+class Halting:
+    """Stands for RunAhead where there is no GPU: groups of steps change nothing, and are then repeated."""
+
+    models: list[LazyRows]
+
+    def __init__(self, _device: torch.device, _first: tuple, rewind) -> None:
+        self._rewind, self._gaussians, self._pending, self.repeated = rewind, rewind.__self__, [], 0
+
+    def _tensors(self) -> list[torch.Tensor]:
+        gaussians = self._gaussians
+        values = [gaussians.raw(name) for name in gaussians._attributes]
+        states = [gaussians.optimizer.state_of(value)[key] for value in values for key in ("exp_avg", "exp_avg_sq")]
+        lazy = [[rows._last, rows._ring, rows._taken] for rows in self.models if rows.active]
+        statistics = gaussians.max_radii2D, gaussians.xyz_gradient_accum, gaussians.denom
+        return [t.detach() for t in (*values, *states, *statistics, *sum(lazy, []))]
+
+    def take(self, view: int, step, repeat) -> None:
+        before = [(tensor, tensor.clone()) for tensor in self._tensors()]
+        step()
+        for tensor, old in before:
+            tensor.copy_(old)
+        self._pending.append(repeat)
+        if len(self._pending) == 4:
+            self.settle()
+
+    def settle(self) -> None:
+        pending, self._pending = self._pending, []
+        self._rewind(len(pending))
+        for repeat in pending:
+            repeat()
+
+    def give_up(self) -> int:
+        return 0
+
+
+@pytest.mark.parametrize("term", [False, True], ids=["ours", "with a further term"])
+def test_rows_wait_through_halts(wide_scene, tmp_path, monkeypatch, lazy, term):
+    call, models, make = Objective.__call__, [], run.GaussianModel
+
+    def with_term(self, package, step):
+        losses = call(self, package, step)
+        further = models[-1]._features_rest.square().mean()
+        return losses._replace(total=losses.total + further) if step.iteration > 34 else losses
+
+    monkeypatch.setattr(run, "GaussianModel", lambda *x: (models.append(make(*x)), models[-1])[1])
+    monkeypatch.setattr(run, "SH_INTERVAL", 12)
+    if term:
+        monkeypatch.setattr(Objective, "__call__", with_term)
+    plain = trained(wide_scene, tmp_path / "plain", "--plain_step")
+    rows, start = [], LazyRows.__init__
+    monkeypatch.setattr(LazyRows, "__init__", lambda self, model: (rows.append(self), start(self, model))[1])
+    monkeypatch.setattr(Halting, "models", rows, raising=False)
+    monkeypatch.setattr(ahead, "RunAhead", Halting)
+    monkeypatch.setattr("training.loop.step_taker", AheadStep)
+    assert trained(wide_scene, tmp_path / "ahead") == plain
+    assert len(lazy) > (50 if term else 80)  # each once more when it is repeated
+
+
+def test_a_training_that_fails_leaves_no_row_behind(wide_scene, tmp_path, monkeypatch, lazy):
+    """The model is that of the step before the one that failed."""
+    models, make, advance = [], run.GaussianModel, FusedStep.advance
+    monkeypatch.setattr(run, "GaussianModel", lambda *x: (models.append(make(*x)), models[-1])[1])
+
+    def failing(self: FusedStep, at, *rest) -> None:
+        if at.iteration == 28:
+            raise ZeroDivisionError
+        advance(self, at, *rest)
+
+    monkeypatch.setattr(FusedStep, "advance", failing)
+    values = []
+    for name, pays in (("dense", False), ("lazy", True)):
+        monkeypatch.setattr(LazyRows, "_pays", lambda self, pays=pays: pays)
+        with pytest.raises(ZeroDivisionError):
+            trained(wide_scene, tmp_path / name)
+        assert bool(lazy) == pays
+        states = [models[-1].optimizer.state[models[-1].raw(name)] for name in ("f_dc", "f_rest")]
+        averages = [state[key] for state in states for key in ("exp_avg", "exp_avg_sq")]
+        values.append([models[-1].raw("f_dc"), models[-1].raw("f_rest"), *averages])
+    for one, other in zip(*values, strict=True):
+        assert one.detach().cpu().numpy().tobytes() == other.detach().cpu().numpy().tobytes()
+
+
 @pytest.mark.parametrize("pipe", ["--compute_cov3D_python", "--convert_SHs_python", "--debug"])
 def test_options_that_the_operator_does_not_know_take_the_plain_step(scene, tmp_path, monkeypatch, pipe):
     monkeypatch.setattr(FusedStep, "advance", lambda *_: pytest.fail("fused"))
@@ -173,16 +295,20 @@ def test_options_that_the_operator_does_not_know_take_the_plain_step(scene, tmp_
 
 
 @pytest.mark.parametrize("options", OPTIONS.values(), ids=OPTIONS.keys())
+@pytest.mark.parametrize("pays", [False, True], ids=["dense", "lazy"])
 @pytest.mark.parametrize("_", [pytest.param(None, marks=GPU_MARKS)])
-def test_a_host_that_runs_ahead_without_room_gives_the_same_bytes(scene, tmp_path, monkeypatch, options, _):
+def test_a_host_that_runs_ahead_without_room_gives_the_same_bytes(
+    wide_scene, tmp_path, monkeypatch, lazy, options, pays, _
+):
     """Room for one instance at first, and never for more than the last visit needed: many steps halt."""
-    plain = trained(scene, tmp_path / "plain", "--plain_step", *options)
-    assert trained(scene, tmp_path / "ahead", *options) == plain
+    monkeypatch.setattr(LazyRows, "_pays", lambda self: pays)
+    plain = trained(wide_scene, tmp_path / "plain", "--plain_step", *options)
+    assert trained(wide_scene, tmp_path / "ahead", *options) == plain
     halts, repeat = [], run_ahead.RunAhead._repeat
     monkeypatch.setattr(run_ahead.RunAhead, "_repeat", lambda *x: (halts.append(1), repeat(*x)))
     monkeypatch.setattr(run_ahead, "_with_spare", lambda count: count)
     for name in ("_INSTANCES", "_SLOTS"):
         monkeypatch.setattr(ahead, name, 0)
     monkeypatch.setattr(ahead, "_LEAST", 1)
-    assert trained(scene, tmp_path / "halting", *options) == plain
-    assert len(halts) > 5
+    assert trained(wide_scene, tmp_path / "halting", *options) == plain
+    assert len(halts) > 5 and bool(lazy) == (pays and "sparse_adam" not in options)

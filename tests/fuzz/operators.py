@@ -28,6 +28,7 @@ def sound_calls() -> dict[str, Call]:
     wanted = [True, True, True, True, True, False, False, True, True]
     lists = [[torch.rand(3, 3), torch.rand(2, 5)] for _ in range(4)]
     guard = [torch.rand(()), torch.zeros(1, dtype=torch.int64), 3]
+    lazy = [*_lazy(raw)[-3:], 8]
     adam = [*lists, [torch.tensor(1.0), torch.tensor(7.0)], [0.1, 0.2], 0.9, 0.99, 1e-8, [2, -1], *guard]
     sparse = [*(torch.rand(3, 3) for _ in range(4)), torch.tensor([True, False, True]), 0.1, 0.9, 0.99, 1e-8, -1]
     statistics = [torch.rand(3), torch.rand(3, 1), torch.rand(3, 1), torch.ones(3, dtype=torch.int32)]
@@ -42,7 +43,9 @@ def sound_calls() -> dict[str, Call]:
         "project_vjp": (ops.project_vjp, [*scene, counts, ops.blend_vjp(*state, *planes), wanted]),
         "rasterize": (ops.rasterize, [torch.zeros(3, 3), *scene, background, True, True]),
         "rasterize_vjp": (ops.rasterize_vjp, [*scene, *state, *planes, counts, wanted]),
-        "rasterize_vjp_step_": (ops.rasterize_vjp_step_, [*scene, *state, *planes, counts, *_step(raw), *guard]),
+        "rasterize_vjp_step_": (ops.rasterize_vjp_step_, [*scene, *state, *planes, counts, *_step(raw), *guard, *lazy]),
+        "catch_up_": (ops.catch_up_, [raw["sh_dc"], raw["sh_rest"], *_lazy(raw)]),
+        "catch_up_seen_": (ops.catch_up_seen_, [*scene, *_lazy(raw)]),
         "mark_visible": (ops.mark_visible, [raw["means"], camera.viewmatrix.float()]),
         "decisive": (ops.decisive, [splats, instances, ranges, last]),
         "adam_": (ops.adam_, adam),
@@ -69,6 +72,13 @@ def _step(raw: dict[str, Tensor]) -> list:
     statistics = [torch.rand(count), torch.rand(count, 1), torch.rand(count, 1)]
     adam = [*averages, counters, [0.1] * 6, 0.9, 0.99, 1e-8, [-1, -1, -1, -1, -1, 9]]
     return [torch.ones(count, dtype=torch.int32), list(range(6)), *adam, False, *statistics]
+
+
+def _lazy(raw: dict[str, Tensor]) -> list:
+    """The arguments of `catch_up_` from the averages on."""
+    averages = [[torch.rand_like(raw[name]) for name in ("sh_dc", "sh_rest")] for _ in range(2)]
+    last = torch.full((len(raw["means"]),), 5, dtype=torch.int32)
+    return [*averages, [-1, 9], last, torch.rand(256, 2, 8), torch.tensor([7], dtype=torch.int32)]
 
 
 def outcomes() -> Iterator[tuple[str, str, str]]:

@@ -30,24 +30,31 @@ class AheadStep:
     def take(self, step: Step, tell: Announcer) -> None:
         """Queue a step, unless something is due in it."""
         if step.due or not self._fused.takes(step):
-            self._ahead.settle()
+            self.settle()
             return self._fused.take(step, tell)
+        if not self._fused.lazy.able():
+            self.settle()
+        self._fused.let_rows_wait(step)
         done: list[Losses] = []
         self._ahead.take(step.camera.uid, lambda: done.append(self._queue(step)), lambda: self._repeat(step, done[0]))
         tell.measured(step, done[0])
 
     def settle(self) -> None:
-        """Wait until all steps are done."""
+        """Wait until all steps are done, and let all rows take those that they lack."""
         self._ahead.settle()
+        self._fused.settle()
 
     def give_up(self) -> int:
         """Take back the steps that cannot be done, after an error. Returns their number."""
-        return self._ahead.give_up()
+        lost = self._ahead.give_up()
+        self._fused.settle()
+        return lost
 
     def _queue(self, step: Step) -> Losses:
         drawn, losses, gradients = self._fused.measure(step)
         fused = not self._fused.finds_further_terms()
         if not fused:
+            self._fused.lazy.catch_up()  # the rows stay lazy: a step before may be halted, and will be repeated
             package, losses = self._fused.plain.backward(step)
         self._run.gaussians.guard_loss(step.iteration, losses.total)
         if fused:

@@ -6,6 +6,7 @@ from torch import Tensor
 from gaussian_renderer.view_step import Drawn, draw, step
 from scene.fused_adam import FusedAdam
 from scene.gaussians.exposure import apply_exposure
+from scene.lazy_rows import LazyRows
 from training.density import AdaptiveDensityControl
 from training.objective import Losses, Objective
 from training.observer import Announcer
@@ -24,6 +25,7 @@ class FusedStep:
         self._run = run
         self.plain = PlainStep(run)
         self._adam = FusedAdam(run.gaussians)
+        self.lazy = LazyRows(run.gaussians)
         self._further_terms = False
 
     @staticmethod
@@ -41,23 +43,37 @@ class FusedStep:
     def take(self, step: Step, tell: Announcer) -> None:
         """Take a step; the observers are told once the loss is known."""
         if self.takes(step):
+            self.let_rows_wait(step)
             drawn, losses, gradients = self.measure(step)
+            if step.due:
+                self.lazy.observe(drawn.tile_counts)
             if not self.finds_further_terms():
                 tell.measured(step, losses)
                 return self.advance(step, drawn, gradients)
+        self.settle()
         self.plain.take(step, tell)
 
+    def let_rows_wait(self, step: Step) -> None:
+        """Decide whether rows may lack steps after this one. They must not where somebody reads the model."""
+        if step.due or not self.lazy.able():
+            self.settle()
+        else:
+            self.lazy.begin()
+
     def settle(self) -> None:
-        """Nothing is ever pending."""
+        """Let all rows take the steps that they lack; no step is ever pending."""
+        self.lazy.settle()
 
     def give_up(self) -> int:
-        """Nothing is ever pending, so no step has to be taken back: 0."""
+        """Settle, after an error. No step has to be taken back: 0."""
+        self.settle()
         return 0
 
     def measure(self, step: Step) -> tuple[Drawn, Losses, tuple[Tensor, Tensor | None]]:
         """Render: what was drawn, the losses, and their gradients of image and depth."""
         run = self._run
-        drawn = draw(step.camera, run.gaussians, run.pipe, step.background, step.depth_weight > 0)
+        wanted = run.pipe, step.background, step.depth_weight > 0, self._waiting
+        drawn = draw(step.camera, run.gaussians, *wanted)
         with torch.enable_grad():
             image, depth = drawn.image.requires_grad_(), drawn.depth
             if depth is not None:
@@ -72,6 +88,10 @@ class FusedStep:
             **{name: value.detach() for name, value in losses._asdict().items() if value is not None}
         )
         return drawn, losses, (image.grad, None if depth is None else depth.grad)
+
+    @property
+    def _waiting(self) -> LazyRows | None:
+        return self.lazy if self.lazy.active else None
 
     def finds_further_terms(self) -> bool:
         """Whether the loss of the last `measure` depends on a parameter by another way than the image.
@@ -88,6 +108,6 @@ class FusedStep:
     def advance(self, at: Step, drawn: Drawn, gradients: tuple[Tensor, Tensor | None]) -> None:
         """Take the step of the Gaussians, and that of the exposures."""
         run = self._run
-        step(drawn, self._adam, *gradients, run.density.observes(at.iteration))
+        step(drawn, self._adam, *gradients, run.density.observes(at.iteration), self._waiting)
         run.gaussians.exposures.step()
         run.density.after_step(at)

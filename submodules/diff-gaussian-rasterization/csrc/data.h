@@ -152,6 +152,28 @@ struct ObserveInput {
 // The parameters of a Gaussian that take steps.
 enum Stepped { kStepMeans, kStepOpacities, kStepScales, kStepRotations, kStepShDc, kStepShRest, kStepped };
 
+// The attributes whose steps may wait until a view sees a row (math/lazy_rows.h): those from sh_dc on.
+constexpr int kFirstLazy = kStepShDc, kLazy = kStepped - kFirstLazy;
+constexpr int kLazySteps = 256;     // the most that a row may lack
+constexpr int kLazyConstants = 8;   // of a step and an attribute, the last of them unused
+constexpr int32_t kEveryStep = -1;  // in place of a row's last step: it takes every step
+
+// What is known of rows that wait. Steps are numbered from 1, one after the other.
+template <class T>
+struct LazyRows {
+  int32_t* last;   // (N) the last step that the row took, or kEveryStep; null: no row waits
+  T* ring;         // (kLazySteps, kLazy, kLazyConstants), aligned to 16 bytes: step n is n % kLazySteps
+  int32_t* taken;  // the last step that was taken: neither halted nor held back by a guard
+};
+
+// Rows that take the steps they lack: all of them, or those that a view may see.
+template <class T>
+struct CatchUp {
+  LazyRows<T> rows;
+  AdamInput<T> attributes[kLazy];  // values and averages; the rest is not read
+  bool all;                        // then only the number of Gaussians is read of the Scene
+};
+
 // The step that every Gaussian takes as soon as its gradients are known, so that these never reach memory. The values
 // are those of the Scene and change in place: a Gaussian's row is read before it is written, and no other reads it.
 template <class T>
@@ -160,6 +182,8 @@ struct GaussianStep {
   StepGuard<T> guard;
   bool sparse;            // only Gaussians of observed.radii above 0 take a step, and without bias correction
   ObserveInput observed;  // the view's gradients are not read; with max_radii null nothing is observed
+  LazyRows<T> lazy;       // all rows that the view sees have caught up; null where sparse
+  int32_t number;         // of this step among those of the lazy rows
 };
 
 }  // namespace gs

@@ -103,5 +103,7 @@ def _(splats, *_):
 @_fake("sparse_adam_")
 @_fake("observe_")
 @_fake("rasterize_vjp_step_")
+@_fake("catch_up_")
+@_fake("catch_up_seen_")
 def _(*_args, **_keywords):
     return None

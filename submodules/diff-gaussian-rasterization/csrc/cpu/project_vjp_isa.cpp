@@ -5,6 +5,7 @@
 #include "../backend.h"
 #include "../math/scene_row.h"
 #include "adam_rows.h"
+#include "lazy_rows.h"
 
 GS_ISA_BEGIN
 
@@ -83,8 +84,8 @@ void observe_block(const ObserveInput& in, int64_t first, int64_t count, const B
 
 // Takes the steps of a block's Gaussians. Returns whether all values took theirs.
 template <class T>
-bool step_block(const GaussianStep<T>& in, const AdamStep<T>* steps, int64_t first, int64_t count,
-                const BlockGradient<T>& gradient) {
+bool step_block(const GaussianStep<T>& in, const AdamStep<T>* steps, const int32_t* tile_counts, int64_t first,
+                int64_t count, const BlockGradient<T>& gradient) {
   bool finite = true;
   for (int a = 0; a < kStepped; ++a) {
     const AdamInput<T>& to = in.attributes[a];
@@ -93,10 +94,13 @@ bool step_block(const GaussianStep<T>& in, const AdamStep<T>* steps, int64_t fir
       const T* from = gradient.of(a) + (begin - first) * to.row;
       return adam_rows(steps[a], to, from, begin, rows, in.guard.stopped != nullptr);
     };
-    finite &= in.sparse ? for_runs(
-                              first, first + count, [&](int64_t i) { return in.observed.radii[i] > 0; }, take)
-                        : take(first, count);
+    const bool lazy = in.lazy.last && a >= kFirstLazy;
+    const auto steps_too = [&](int64_t i) {
+      return lazy ? steps_now(in.lazy, i, tile_counts[i]) : in.observed.radii[i] > 0;
+    };
+    finite &= in.sparse || lazy ? for_runs(first, first + count, steps_too, take) : take(first, count);
   }
+  if (in.lazy.last) note_rows(in, tile_counts, first, count);
   return finite;
 }
 
@@ -127,8 +131,10 @@ void project_vjp_step(const Executor& executor, const Scene<T>& s, const int32_t
     if (!step.attributes[kStepShRest].columns) wanted.sh_rest = nullptr;
     project_vjp_rows(part_of(s, begin, count), camera, tile_counts + begin, moments + kGradientValues * begin, wanted);
     observe_block(step.observed, begin, count, gradient);
-    if (may && !step_block(step, steps, begin, count, gradient)) __atomic_store_n(&finite, false, __ATOMIC_RELAXED);
+    if (may && !step_block(step, steps, tile_counts, begin, count, gradient))
+      __atomic_store_n(&finite, false, __ATOMIC_RELAXED);
   });
+  if (may && step.lazy.last) note_step(step, steps);
   if (!finite && *step.guard.stopped == 0) *step.guard.stopped = step.guard.iteration;
 }
 

@@ -6,6 +6,7 @@
 #include "../backend.h"
 #include "../math/observe.h"
 #include "guarded_adam.cuh"
+#include "lazy_rows.cuh"
 #include "queue.cuh"
 
 namespace gs {
@@ -25,11 +26,14 @@ struct StepParameters {
   SteppedRows rows[kStepped];
   StepGuard<float> guard;
   ObserveInput observed;
+  LazyRows<float> lazy;
+  int32_t number;
 };
 
 inline StepParameters step_parameters(const GaussianStep<float>& in) {
   StepParameters out{};
   out.wanted = true, out.sparse = in.sparse, out.guard = in.guard, out.observed = in.observed;
+  out.lazy = in.lazy, out.number = in.number;
   for (int a = 0; a < kStepped; ++a) {
     const AdamInput<float>& from = in.attributes[a];
     bool whole = from.columns == from.row;
@@ -73,25 +77,47 @@ __device__ inline bool step_whole_rows(SteppedRows to, bool guarded, int64_t fir
   return finite;
 }
 
+// Steps some of a warp's rows, value by value. Several loads are under way before the first store here, too. waiting:
+// whether the lane's values may wait (math/lazy_rows.h).
+__device__ inline bool step_some_rows(const SteppedRows& to, bool guarded, unsigned stepping, int64_t first,
+                                      const float* gradient, int stride, bool& waiting) {
+  constexpr int kAhead = 3;
+  const int lane = threadIdx.x & 31, mine = nth_bit(stepping, lane), count = __popc(stepping) * to.columns;
+  bool finite = true;
+#pragma unroll 1
+  for (int begin = 0; begin < count; begin += 32 * kAhead) {
+    int64_t at[kAhead];
+    float g[kAhead], v[kAhead], m[kAhead], s[kAhead];
+#pragma unroll
+    for (int j = 0; j < kAhead; ++j) {
+      const int k = begin + 32 * j + lane, nth = k / to.columns, column = k - nth * to.columns;
+      const int row = __shfl_sync(kWarp, mine, nth & 31);
+      at[j] = k < count ? (first + row) * to.row + column : -1;
+      if (k < count)
+        g[j] = gradient[row * stride + column], v[j] = to.value[at[j]], m[j] = to.mean[at[j]], s[j] = to.square[at[j]];
+    }
+#pragma unroll
+    for (int j = 0; j < kAhead; ++j) {
+      if (at[j] < 0) continue;
+      finite &= step_value(guarded, to.constants, g[j], v[j], m[j], s[j]);
+      waiting &= baseline::may_wait(v[j], m[j], s[j]);
+      to.value[at[j]] = v[j], to.mean[at[j]] = m[j], to.square[at[j]] = s[j];
+    }
+  }
+  return finite;
+}
+
 // Steps those of a warp's rows that have a bit in `stepping`. `gradient` has all 32 of them, `stride` floats apart; row
 // `first` of the tensor is the first. kRow: the values of a row, as is usual. Returns whether the lane's values took
 // their step.
 template <int kRow>
-__device__ inline bool step_rows(SteppedRows to, bool guarded, unsigned stepping, int64_t first, const float* gradient,
-                                 int stride) {
+__device__ inline bool step_rows(const SteppedRows& to, bool guarded, unsigned stepping, int64_t first,
+                                 const float* gradient, int stride) {
   if (!to.columns) return true;
   if (to.whole && to.row == kRow && stride == kRow && stepping == kWarp)
     return step_whole_rows<kRow>(to, guarded, first, gradient);
-  bool finite = true;
-  for (int k = threadIdx.x & 31; k < 32 * to.columns; k += 32) {
-    const int row = k / to.columns, column = k - row * to.columns;
-    if (!(stepping >> row & 1)) continue;
-    const int64_t at = (first + row) * to.row + column;
-    float value = to.value[at], mean = to.mean[at], square = to.square[at];
-    finite &= step_value(guarded, to.constants, gradient[row * stride + column], value, mean, square);
-    to.value[at] = value, to.mean[at] = mean, to.square[at] = square;
-  }
-  return finite;
+  bool waiting = true;
+  return step_some_rows(to, guarded, stepping, first, gradient, stride, waiting);
 }
 
 // The gradients of a warp's Gaussians in shared memory, except those of sh_rest.
@@ -112,12 +138,29 @@ __device__ inline void observe_one(const ObserveInput& in, int64_t i, const floa
   in.max_radii[i] = o.max_radius, in.gradient_sums[i] = o.gradient_sum, in.views[i] = o.views;
 }
 
+// Steps the SH coefficients of those Gaussians that the view sees, and of those that take every step.
+template <int kRest>
+__device__ inline bool step_lazy_rows(const StepParameters& in, unsigned stepping, int64_t first, const float* dc,
+                                      const float* rest) {
+  const bool guarded = in.guard.stopped != nullptr;
+  bool waiting = true;
+  bool finite = step_some_rows(in.rows[kStepShDc], guarded, stepping, first, dc, 3, waiting);
+  finite &= step_some_rows(in.rows[kStepShRest], guarded, stepping, first, rest, kRest, waiting);
+  note_rows(in.lazy, in.number, first, stepping, waiting);
+  if (blockIdx.x == 0 && threadIdx.x == 0) {
+    for (int a = 0; a < kLazy; ++a)
+      baseline::store_step(in.rows[kFirstLazy + a].constants, in.lazy.ring + baseline::ring_place(in.number, a));
+    *in.lazy.taken = in.number;
+  }
+  return finite;
+}
+
 // Takes the step of a warp's Gaussians; all of its lanes call it. `first` is the warp's first Gaussian, `rest` has
-// their gradients of sh_rest, kRest floats apart. Inlined, it would take the whole kernel from 96 to 104 registers,
-// with which one block in five would no longer fit.
+// their gradients of sh_rest, kRest floats apart; seen: whether the view sees the lane's Gaussian. Inlined, it would
+// take the whole kernel from 96 to 104 registers, with which one block in five would no longer fit.
 template <int kRest>
 __device__ __noinline__ void step_gaussians(const StepParameters& in, int64_t first, int64_t count,
-                                            const WarpGradients& g, const float* rest) {
+                                            const WarpGradients& g, const float* rest, bool seen) {
   if (!begin_step(in.guard)) return;
   const int64_t i = first + (threadIdx.x & 31);
   const unsigned stepping = __ballot_sync(kWarp, i < count && (!in.sparse || in.observed.radii[i] > 0));
@@ -127,8 +170,13 @@ __device__ __noinline__ void step_gaussians(const StepParameters& in, int64_t fi
   finite &= step_rows<1>(in.rows[kStepOpacities], guarded, stepping, first, g.opacities(), 1);
   finite &= step_rows<3>(in.rows[kStepScales], guarded, stepping, first, g.scales(), 3);
   finite &= step_rows<4>(in.rows[kStepRotations], guarded, stepping, first, g.rotations(), 4);
-  finite &= step_rows<3>(in.rows[kStepShDc], guarded, stepping, first, g.sh_dc(), 3);
-  finite &= step_rows<kRest>(in.rows[kStepShRest], guarded, stepping, first, rest, kRest);
+  if (in.lazy.last) {
+    const unsigned now = __ballot_sync(kWarp, i < count && (seen || in.lazy.last[i] == kEveryStep));
+    finite &= step_lazy_rows<kRest>(in, now, first, g.sh_dc(), rest);
+  } else {
+    finite &= step_rows<3>(in.rows[kStepShDc], guarded, stepping, first, g.sh_dc(), 3);
+    finite &= step_rows<kRest>(in.rows[kStepShRest], guarded, stepping, first, rest, kRest);
+  }
   if (!finite) *in.guard.stopped = in.guard.iteration;  // every thread writes the same
 }
 

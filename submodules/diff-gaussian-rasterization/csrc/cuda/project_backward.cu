@@ -99,7 +99,7 @@ __global__ void __launch_bounds__(kThreads)
     if (step.observed.max_radii && i < s.count) observe_one(step.observed, i, g.means2d);
     const WarpGradients gradients{warp_stage};
     write_gradient(g, gradients);
-    step_gaussians<kRest>(step, first, s.count, gradients, warp_rows);
+    step_gaussians<kRest>(step, first, s.count, gradients, warp_rows, seen);
     return;
   }
   if (i < s.count) write_gradient(g, i, out);

@@ -30,8 +30,8 @@ struct Stepping {
     for (int64_t k = 0; k < 3 * p.count; ++k) statistics.push_back(float(std::abs(normal())));
   }
 
-  // Adam's inputs in the order of gs::Stepped; `gradients` may be null.
-  void inputs(const StepCase& how, const float* const* gradients, gs::AdamInput<float>* to) {
+  // Adam's inputs in the order of gs::Stepped; `gradients` may be null. number: added to the counters.
+  void inputs(const StepCase& how, const float* const* gradients, gs::AdamInput<float>* to, int number = 0) {
     constexpr int64_t kRows[6] = {3, 1, 3, 4, 3, 45};
     for (int a = 0; a < 6; ++a) {
       int64_t columns = a == gs::kStepShRest ? how.rest_columns : kRows[a];
@@ -47,7 +47,7 @@ struct Stepping {
                0.9,
                0.999,
                1e-15,
-               double(a + 3)};
+               double(a + 3 + number)};
     }
   }
   gs::ObserveInput observe(const StepCase& how, const int32_t* radii, const float* gradients) {
@@ -146,9 +146,11 @@ void step_plainly(const Where& where, Stepping& s, const StepCase& how, const Re
   for (const gs::AdamInput<float>& in : inputs) sparse_adam(where, in, visible.get(), s.guard(how, iteration));
 }
 
-inline gs::GaussianStep<float> gaussian_step(Stepping& s, const StepCase& how, const Rendered& r, int64_t iteration) {
+// number: added to the counters of Adam.
+inline gs::GaussianStep<float> gaussian_step(Stepping& s, const StepCase& how, const Rendered& r, int64_t iteration,
+                                             int number = 0) {
   gs::GaussianStep<float> step{};
-  s.inputs(how, nullptr, step.attributes);
+  s.inputs(how, nullptr, step.attributes, number);
   step.guard = s.guard(how, iteration);
   step.sparse = how.sparse;
   step.observed = s.observe(how, r.radii.data(), nullptr);

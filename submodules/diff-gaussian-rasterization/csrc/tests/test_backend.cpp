@@ -3,7 +3,7 @@
 #include <thread>
 
 #include "backend_run.h"
-#include "step_run.h"
+#include "lazy_run.h"
 
 namespace {
 
@@ -140,6 +140,14 @@ void test_gaussian_step() {
     }
 }
 
+void test_lazy_rows() {
+  check_late_steps<float>(threads()), check_late_steps<double>(threads());
+  check_lazy_steps(threads(), [](const Rendered& r, const gs::GaussianStep<float>& step) {
+    blend_vjp(threads(), r.input, r.backward);
+    project_vjp_step(threads(), r.scene, r.tile_counts.data(), r.moments.data(), step);
+  });
+}
+
 }  // namespace
 
 int main() {
@@ -147,5 +155,6 @@ int main() {
   test_gradient();
   test_poison<float>(), test_poison<double>();
   test_gaussian_step();
+  test_lazy_rows();
   return gs::finish_tests("rasterizer backend");
 }

@@ -1,9 +1,11 @@
 // The op that runs the rasterizer's backward and takes the Gaussians' steps in one.
 #include <array>
+#include <limits>
 
 #include "backward.h"
+#include "lazy_rows.h"
+#include "math/lazy_rows.h"
 #include "math/splat.h"
-#include "optim.h"
 #include "scene.h"
 
 namespace gs::ops {
@@ -67,6 +69,25 @@ void observe_in(gs::GaussianStep<T>& step, const Tensor& radii, const MaybeTenso
   step.observed.views = views->mutable_data_ptr<float>();
 }
 
+// Lets the rows of SH coefficients that the view does not see wait, if tensors for that are given.
+template <class T>
+void let_wait(gs::GaussianStep<T>& step, const SceneTensors& scene, const Tensor& like, const MaybeTensor& last,
+              const MaybeTensor& ring, const MaybeTensor& taken, int64_t number) {
+  TORCH_CHECK(ring.has_value() == last.has_value() && taken.has_value() == last.has_value(),
+              "give last, ring and taken, or none of them");
+  if (!last) return;
+  TORCH_CHECK(!step.sparse, "rows wait only for the dense optimiser");
+  TORCH_CHECK(0 < number && number < std::numeric_limits<int32_t>::max(), "steps count from 1, got ", number);
+  for (int a = gs::kFirstLazy; a < gs::kStepped; ++a) {
+    const gs::AdamInput<T>& in = step.attributes[a];
+    TORCH_CHECK(a == gs::kStepShRest || in.columns == 3 || !scene.count(), "rows that wait need steps of sh_dc");
+    TORCH_CHECK(!in.columns || gs::baseline::may_wait(in.lr, in.beta1, in.beta2, in.eps),
+                "rows cannot wait with the rate ", in.lr, ", betas ", in.beta1, " and ", in.beta2, ", eps ", in.eps);
+  }
+  step.lazy = lazy_rows<T>(scene.count(), like, *last, *ring, *taken);
+  step.number = int32_t(number);
+}
+
 void run(const SceneTensors& scene, const BlendBackward& in, const Tensor& tile_counts,
          const gs::GaussianStep<double>& step) {
   const Tensor moments = blend_vjp(in);
@@ -90,13 +111,14 @@ void run(const SceneTensors& scene, const BlendBackward& in, const Tensor& tile_
 
 // rasterize_vjp, then adam_ (or sparse_adam_ on the Gaussians of a radius above 0) of the attributes that are named,
 // and observe_ if statistics are given: the same bits, without gradients in memory. Advances the counters as adam_
-// does.
+// does. With last_steps, SH coefficients that the view does not see take their steps later, in catch_up_.
 void rasterize_vjp_step_op(SCENE_PARAMETERS, BACKWARD_PARAMETERS, const Tensor& tile_counts, const Tensor& radii,
                            at::IntArrayRef attributes, at::TensorList exp_avg, at::TensorList exp_avg_sq,
                            at::TensorList steps, at::ArrayRef<double> rates, double beta1, double beta2, double eps,
                            at::IntArrayRef columns, bool sparse, const MaybeTensor& max_radii,
                            const MaybeTensor& gradient_sums, const MaybeTensor& views, const MaybeTensor& loss,
-                           const MaybeTensor& stopped, int64_t iteration) {
+                           const MaybeTensor& stopped, int64_t iteration, const MaybeTensor& last_steps,
+                           const MaybeTensor& ring, const MaybeTensor& taken, int64_t number) {
   const SceneTensors scene(SCENE_ARGUMENTS);
   TORCH_CHECK_VALUE(!cov3d && !colors, "a step needs scales, rotations, sh_dc and sh_rest, not cov3d or colors");
   check_tensor(splats, "splats", scene.dtype(), scene.device(), {scene.count(), kSplatValues});
@@ -111,6 +133,7 @@ void rasterize_vjp_step_op(SCENE_PARAMETERS, BACKWARD_PARAMETERS, const Tensor& 
     auto step = gaussian_step<T>({means, opacities, *scales, *rotations, *sh_dc, *sh_rest}, lists, sparse);
     step.guard = step_guard<T>(means, loss, stopped, iteration);
     observe_in(step, pixels, max_radii, gradient_sums, views);
+    let_wait(step, scene, means, last_steps, ring, taken, number);
     run(scene, in, counts, step);
   });
   for (const Tensor& step : steps) *step.mutable_data_ptr<float>() += 1;
@@ -132,7 +155,8 @@ TORCH_LIBRARY_FRAGMENT(diff_gaussian_rasterization, m) {
              ", Tensor tile_counts, Tensor radii, int[] attributes, Tensor(g!)[] exp_avg, Tensor(h!)[] exp_avg_sq, "
              "Tensor(i!)[] steps, float[] rates, float beta1, float beta2, float eps, int[] columns, bool sparse, "
              "Tensor(j!)? max_radii=None, Tensor(k!)? gradient_sums=None, Tensor(l!)? views=None, Tensor? loss=None, "
-             "Tensor(m!)? stopped=None, int iteration=0) -> ()",
+             "Tensor(m!)? stopped=None, int iteration=0, Tensor(n!)? last_steps=None, Tensor(o!)? ring=None, "
+             "Tensor(p!)? taken=None, int number=0) -> ()",
          &rasterize_vjp_step_op);
 }
 
