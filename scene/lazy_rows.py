@@ -2,8 +2,8 @@
 
 A Gaussian that a view does not see has no gradient, but dense Adam moves its 59 values on, of which 48 are SH
 coefficients. Nobody looks at these before a view sees the Gaussian, or something reads the whole model. So they wait,
-and take the steps that they lack in one go, with the same bits (csrc/math/lazy_rows.h). It costs as many bytes as a
-step, so it pays where a view sees less than a half.
+and take the steps that they lack in one go, with the same bits (csrc/math/lazy_rows.h). That costs as many bytes as
+a step, so it pays on a GPU where views see a minority.
 """
 
 from collections import deque
@@ -20,9 +20,9 @@ from scene.gaussians.adam import GaussianAdam
 _LAZY = ("f_dc", "f_rest")  # gs::kFirstLazy and on
 _STEPS, _CONSTANTS = 256, 8  # gs::kLazySteps and gs::kLazyConstants
 _SPAN = 240  # steps until all rows catch up: fewer than the ring has, by more than a host runs ahead
-_PAYS = 0.35  # the largest share seen that lets rows wait
+_PAYS = 0.4  # the largest share seen that lets rows wait
 _VIEWS = 8  # whose shares are averaged
-_FEWEST = {"cuda": 1 << 18, "cpu": 1 << 12}  # rows; fewer are stepped sooner than a kernel is launched
+_FEWEST = 1 << 18  # rows; fewer are stepped sooner than a kernel is launched
 
 
 class LazyRows:
@@ -45,7 +45,7 @@ class LazyRows:
     @torch.no_grad()
     def begin(self) -> None:
         """Let rows wait from the next step on, if that pays. Whatever the answer, values get the same bits."""
-        if self.active or not self._pays() or not self.able():
+        if self.active or not self._pays() or not self._able():
             return
         like = self._gaussians.get_xyz
         self._last = torch.full((len(like),), -1, dtype=torch.int32, device=like.device)  # each row takes its next step
@@ -53,18 +53,10 @@ class LazyRows:
         self._taken = torch.zeros(1, dtype=torch.int32, device=like.device)
         self.active = True
 
-    def able(self) -> bool:
-        """Whether the optimiser's present options let rows wait: the dense one, with sound rates, betas and eps."""
-        optimizer = self._gaussians.optimizer
-        (beta1, beta2), eps = optimizer.defaults["betas"], optimizer.defaults["eps"]
-        rates = [group["lr"] for group in optimizer.param_groups if group["name"] in _LAZY]
-        return (
-            type(optimizer) is GaussianAdam
-            and all(0 <= r <= 1 for r in [*rates, eps])
-            and (
-                0 <= beta1 <= 0.99 and 0 <= beta2 <= 0.9999999 and eps >= 1e-16  # as gs::may_wait has it
-            )
-        )
+    @property
+    def must_settle(self) -> bool:
+        """Whether rows wait that may not wait any more, since somebody has changed the optimiser's options."""
+        return self.active and not self._able()
 
     def catch_up_seen(self, scene: tuple[Any, ...]) -> None:
         """Let the rows that a view may see catch up, or all before the ring is full. scene: as `rasterize` takes it."""
@@ -106,4 +98,18 @@ class LazyRows:
 
     def _pays(self) -> bool:
         rows, shares = self._gaussians.get_xyz, self._shares
-        return len(rows) >= _FEWEST[rows.device.type] and len(shares) > 0 and sum(shares) / len(shares) <= _PAYS
+        # On two cores of a CPU, late steps take as long to compute as the memory traffic that they save.
+        return rows.is_cuda and len(rows) >= _FEWEST and len(shares) > 0 and sum(shares) / len(shares) <= _PAYS
+
+    def _able(self) -> bool:
+        """Whether the optimiser's present options let rows wait: the dense one, with sound rates, betas and eps."""
+        optimizer = self._gaussians.optimizer
+        (beta1, beta2), eps = optimizer.defaults["betas"], optimizer.defaults["eps"]
+        rates = [group["lr"] for group in optimizer.param_groups if group["name"] in _LAZY]
+        return (
+            type(optimizer) is GaussianAdam
+            and all(0 <= r <= 1 for r in [*rates, eps])
+            and (
+                0 <= beta1 <= 0.99 and 0 <= beta2 <= 0.9999999 and eps >= 1e-16  # as gs::may_wait has it
+            )
+        )

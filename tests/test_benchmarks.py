@@ -72,10 +72,10 @@ def test_views_of_the_ring_see_the_share_that_was_asked_for(share):
     assert ring.seen(ring.views(share, 5)) == pytest.approx(share, rel=0.15, abs=0.015)
 
 
-def test_a_row_for_each_share():
+def test_two_rows_for_each_share():
     rows = measure("cpu", (300, 40, 27), 2)
-    assert [len(row) for row in rows] == [2] * len(SHARES)
-    assert all(float(row[1]) > 0 for row in rows)
+    assert [(len(row), row[1]) for row in rows] == [(4, "dense"), (4, "lazy")] * len(SHARES)
+    assert all(float(row[2]) > 0 and (row[3] != "") == (row[1] == "lazy") for row in rows)
 
 
 @pytest.mark.parametrize("path", COMMANDS, ids=_name)

@@ -206,6 +206,22 @@ def test_rows_that_wait_give_the_same_bytes(wide_scene, tmp_path, monkeypatch, l
         assert len(lazy) > 40 and sum(count > 0 for count in lazy) > 20
 
 
+def test_rows_settle_when_the_rates_change_to_what_they_cannot_wait_with(wide_scene, tmp_path, monkeypatch, lazy):
+    """Late steps are right for rates from 0 to 1 only. Other rates that change on the way belong to their steps."""
+    prepare = run.Run.prepare
+
+    def changing(self: run.Run, step) -> None:
+        prepare(self, step)
+        for group in self.gaussians.optimizer.param_groups:
+            if group["name"] in ("f_dc", "f_rest"):
+                group["lr"] = -1e-5 if 12 <= step.iteration < 18 else 1e-3 / (1 + step.iteration % 3)
+
+    monkeypatch.setattr(run.Run, "prepare", changing)
+    plain = trained(wide_scene, tmp_path / "plain", "--plain_step")
+    assert trained(wide_scene, tmp_path / "lazy") == plain
+    assert 30 < len(lazy) < 50
+
+
 class Halting:
     """Stands for RunAhead where there is no GPU: groups of steps change nothing, and are then repeated."""
 

@@ -32,7 +32,7 @@ class AheadStep:
         if step.due or not self._fused.takes(step):
             self.settle()
             return self._fused.take(step, tell)
-        if not self._fused.lazy.able():
+        if self._fused.lazy.must_settle:
             self.settle()
         self._fused.let_rows_wait(step)
         done: list[Losses] = []

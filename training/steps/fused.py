@@ -55,7 +55,7 @@ class FusedStep:
 
     def let_rows_wait(self, step: Step) -> None:
         """Decide whether rows may lack steps after this one. They must not where somebody reads the model."""
-        if step.due or not self.lazy.able():
+        if step.due or self.lazy.must_settle:
             self.settle()
         else:
             self.lazy.begin()

@@ -29,8 +29,8 @@ inline bool may_wait(double lr, double beta1, double beta2, double eps) {
 }
 
 // The place of a step's constants in LazyRows::ring.
-GS_HD int64_t ring_place(int32_t number, int lazy) {
-  return (int64_t(number % kLazySteps) * kLazy + lazy) * kLazyConstants;
+GS_HD uint32_t ring_place(int32_t number, int lazy) {
+  return (uint32_t(number) % kLazySteps * kLazy + lazy) * kLazyConstants;
 }
 
 template <class T>

@@ -349,22 +349,22 @@ void test_gaussian_step() {
 
 // Rows that wait, in every order of threads. A halted queue changes nothing.
 void test_lazy_rows() {
+  gs::emulation::Memory memory;
+  gs::Queue queue = memory.queue();
   for (const gs::emulation::Order order : gs::emulation::kOrders) {
     gs::emulation::order = order;
-    gs::emulation::Memory memory;
-    const gs::Queue queue = memory.queue();
     check_late_steps<float>(queue);
-    check_lazy_steps(queue, [&](const Rendered& r, const gs::GaussianStep<float>& step) {
-      gs::cuda::rasterize_vjp_step(queue, r.scene, r.input, r.backward, step);
-    });
   }
+  int turn = 0;
+  check_lazy_steps(queue, [&](const Rendered& r, const gs::GaussianStep<float>& step) {
+    gs::emulation::order = gs::emulation::kOrders[turn++ % 3];
+    gs::cuda::rasterize_vjp_step(queue, r.scene, r.input, r.backward, step);
+  });
   Stepping s{Parameters<float>(33)};
   Waiting<float> waiting(33);
   std::fill(waiting.last.begin(), waiting.last.end(), 1), waiting.taken = 9;
   const std::vector<uint8_t> unchanged = s.bytes();
   const int32_t halted = 1;
-  gs::emulation::Memory memory;
-  gs::Queue queue = memory.queue();
   queue.halted = &halted;
   gs::cuda::catch_up(queue, Place(0).scene(s.values), catch_up_of(gaussian_step(s, {}, Rendered{}, 1), waiting, true));
   CHECK(s.bytes() == unchanged && waiting.last == std::vector<int32_t>(33, 1));
