@@ -59,7 +59,7 @@ def step(
 ) -> None:
     """Take the step of every Gaussian. observe: add the view to the statistics of density control.
 
-    now: on a GPU, (NOW_WORDS,) int64 of `FusedAdam.write_now`, for a step that is recorded.
+    now: (NOW_WORDS,) int64 on the Gaussians' device of `FusedAdam.write_now`, for a step that is recorded.
     """
     OPERATORS.rasterize_vjp_step_(
         *drawn.scene, *drawn.state, image_gradient, None, depth_gradient, *drawn.more, drawn.radii,

@@ -222,6 +222,11 @@ class Camera(nn.Module):
         return colors * alpha + (1 - alpha) * background[:, None, None]
 
     @property
+    def counts_all(self) -> bool:
+        """Whether `mask` is None for a reason that is known without the photo."""
+        return self._mask is None and not self._ignore_alpha
+
+    @property
     def mask(self) -> Tensor | None:
         """Pixels that count in loss and scores, (1,H,W) bool; None if all count."""
         return self._counting(self._pixels() if self._ignore_alpha else None)

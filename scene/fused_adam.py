@@ -64,9 +64,9 @@ class FusedAdam:
         OPERATORS.step_now_(now, attributes, steps, rates, *self._constants(), self._sparse, iteration)
 
     def places(self) -> tuple[int, ...]:
-        """Where all tensors of a step lie, to see whether one was replaced."""
+        """Number of Gaussians, and where all tensors of a step lie, to see whether one was replaced."""
         tensors = [t for one in self._stepping() for t in (one.param, one.state["exp_avg"], one.state["exp_avg_sq"])]
-        return tuple(tensor.data_ptr() for tensor in (*tensors, *self._statistics()))
+        return len(self._gaussians), *[tensor.data_ptr() for tensor in (*tensors, *self._statistics())]
 
     @property
     def _sparse(self) -> bool:

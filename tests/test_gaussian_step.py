@@ -128,7 +128,7 @@ def step_fused(state: State, camera: GaussianRasterizationSettings, case: Case, 
 
 
 def step_recorded(state: State, camera: GaussianRasterizationSettings, case: Case, iteration: int) -> None:
-    """Take the same step by numbers that the GPU's memory holds; those of the call are wrong."""
+    """Take the same step by numbers that the device's memory holds; those of the call are wrong."""
     _, _, steps, rates, *constants, columns = case.lists(state)
     host = torch.zeros(22, dtype=torch.int64)
     arguments, radii = rendered(state, camera, case, iteration)
@@ -202,10 +202,10 @@ def test_it_has_the_bytes_of_the_plain_step(case, device, dtype):
         assert int(fused.stopped) == (1 if math.isnan(case.loss) else 0 if case.broken == 1 else 2)
 
 
-@pytest.mark.parametrize("_", [pytest.param(None, marks=GPU_MARKS)])
+@pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=GPU_MARKS)])
 @pytest.mark.parametrize("case", CASES.values(), ids=CASES)
-def test_a_step_by_numbers_in_memory_has_the_same_bytes(case, _):
-    start, camera = start_and_camera(case, 700, "cuda", torch.float32)
+def test_a_step_by_numbers_in_memory_has_the_same_bytes(case, device):
+    start, camera = start_and_camera(case, 700, device, torch.float32)
     fused, recorded = start.copy(), start.copy()
     for iteration in (1, 2, 3):
         step_fused(fused, camera, case, iteration)
@@ -287,7 +287,8 @@ def test_wrong_arguments_are_named():
     _refused("radii must be", radii=torch.ones(8), error=TypeError)
     _refused("radii must be", radii=torch.ones(7, dtype=torch.int32), error=ValueError)
     _refused("tile_counts must be", tile_counts=torch.ones(7, dtype=torch.int32), error=ValueError)
-    _refused("now must be contiguous, and on a GPU", now=torch.zeros(22, dtype=torch.int64), error=ValueError)
+    _refused("now must be contiguous", now=torch.zeros(44, dtype=torch.int64)[::2], error=ValueError)
+    _refused("now must be", now=torch.zeros(21, dtype=torch.int64), error=ValueError)
     _refused("not cov3d or colors", sh_dc=None, sh_rest=None, colors=torch.rand(8, 3), error=ValueError)
 
 

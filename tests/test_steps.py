@@ -5,9 +5,9 @@ import re
 import signal
 import subprocess
 import sys
+from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -18,7 +18,7 @@ from rasterizer_tools import GPU_MARKS
 import train
 from training import run
 from training.objective import Objective
-from training.steps import ahead, run_ahead
+from training.steps import ahead, recorded, run_ahead
 from training.steps.ahead import AheadStep
 from training.steps.choose import step_taker
 from training.steps.fused import FusedStep
@@ -163,11 +163,101 @@ class Immediate:
         self.settle = self.make_way = lambda: None
         self.give_up = lambda: 0
 
-    def take(self, view: int, step, repeat) -> None:
-        step()
+    def take(self, view: int, step: Callable[[], bool], *_: object) -> bool:
+        return step()
 
-    def room(self, view: int) -> AbstractContextManager:
+    def room(self, view: int | None) -> AbstractContextManager:
         return nullcontext()
+
+
+class Rerun:
+    """Stands for Recorder where there is no GPU: a launch runs the function once more, which reads what lies there."""
+
+    def __init__(self, *_: object) -> None:
+        self.launches = self.records = self.released = 0
+        MADE.append(self)
+
+    def record(self, body: Callable[[], torch.Tensor]) -> tuple[Callable[[], None], torch.Tensor]:
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(recorded, "step", lambda *_: None)  # to record a step does not take it
+            result = body()
+        self.records += 1
+
+        def launch() -> None:
+            self.launches += 1
+            result.copy_(body())
+
+        return launch, result
+
+    def is_tight(self) -> bool:
+        return False
+
+    def release(self) -> None:
+        self.released += 1
+
+
+MADE: list[Rerun] = []
+
+
+@pytest.fixture
+def queued(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Steps are taken as on a GPU."""
+    MADE.clear()
+    monkeypatch.setattr(ahead, "RunAhead", Immediate)
+    monkeypatch.setattr(recorded, "Recorder", Rerun)
+    monkeypatch.setattr("training.loop.step_taker", AheadStep)
+
+
+ENDS_EARLY = ("--densify_until_iter", 30)  # so that two phases have steps to record
+
+
+@pytest.mark.parametrize(
+    "options",
+    [(), OPTIONS["sparse"], ("-w", "--antialiasing"), ENDS_EARLY, OPTIONS["degree 0"]],
+    ids=["default", "sparse", "white", "two phases", "degree 0"],
+)
+def test_steps_that_are_recorded_give_the_same_bytes(scene, tmp_path, queued, monkeypatch, options):
+    record, kinds = RecordedStep._record, []
+    monkeypatch.setattr(RecordedStep, "_record", lambda self, at: (record(self, at), kinds.append({*self._records}))[0])
+    taken = trained(scene, tmp_path / "recorded", *options)
+    assert MADE[0].launches > 40
+    assert MADE[0].records >= 3  # tensors that density control has replaced are recorded anew
+    assert all(len({kind[-2:] for kind in known}) <= 1 for known in kinds)  # records of another phase go
+    assert len(set().union(*kinds)) == (2 if options == ENDS_EARLY else 1)
+    monkeypatch.setattr("training.loop.step_taker", PlainStep)
+    assert not differences(taken, trained(scene, tmp_path / "plain", *options))
+
+
+def test_records_give_their_memory_back_where_it_is_short(scene, tmp_path, queued, monkeypatch):
+    taken = trained(scene, tmp_path / "plenty")
+    monkeypatch.setattr(Rerun, "is_tight", lambda self: True)
+    assert not differences(taken, trained(scene, tmp_path / "short"))
+    assert MADE[0].released == 0 and MADE[1].released > 2
+
+
+OWN_TERMS = {
+    "of the image": (True, lambda losses, package, step: losses.total + 0.1 * package["render"].square().mean()),
+    "of the iteration": (False, lambda losses, package, step: losses.total * (1 + step.iteration / 100)),
+    "of the photo's name": (False, lambda losses, package, step: losses.total * (1 + len(step.camera.image_name))),
+}
+
+
+@pytest.mark.parametrize("own", OWN_TERMS.values(), ids=OWN_TERMS.keys())
+def test_a_loss_that_was_changed_is_recorded_only_if_it_is_the_same_in_every_step(
+    scene, tmp_path, queued, monkeypatch, own
+):
+    recordable, term = own
+    call = Objective.__call__
+
+    def changed(self, package, step):
+        losses = call(self, package, step)
+        return losses._replace(total=term(losses, package, step))
+
+    monkeypatch.setattr(Objective, "__call__", changed)
+    taken = trained(scene, tmp_path / "queued")
+    assert (MADE[0].launches > 40) == recordable and (MADE[0].launches == 0) != recordable
+    monkeypatch.setattr("training.loop.step_taker", PlainStep)
+    assert not differences(taken, trained(scene, tmp_path / "plain"))
 
 
 @pytest.mark.parametrize("term", [False, True], ids=["ours", "with a further term"])
@@ -183,12 +273,29 @@ def test_steps_that_are_queued_give_the_same_bytes(scene, tmp_path, monkeypatch,
         monkeypatch.setattr(Objective, "__call__", with_term)
     plain = trained(scene, tmp_path / "plain", "--plain_step")
     monkeypatch.setattr(ahead, "RunAhead", Immediate)
-    monkeypatch.setattr(ahead, "RecordedStep", lambda *_: SimpleNamespace(take=lambda _: None, check=lambda: None))
+    monkeypatch.setattr(recorded, "Recorder", Rerun)
+    monkeypatch.setattr(RecordedStep, "take", lambda *_: None)
     monkeypatch.setattr("training.loop.step_taker", AheadStep)
-    queued, queue = [], AheadStep._queue
-    monkeypatch.setattr(AheadStep, "_queue", lambda self, step: (queued.append(step.iteration), queue(self, step))[1])
+    taken, queue = [], AheadStep._queue
+    monkeypatch.setattr(AheadStep, "_queue", lambda self, step, x: (taken.append(queue(self, step, x)), taken[-1])[1])
     assert trained(scene, tmp_path / "ahead", *OPTIONS["default"]) == plain
-    assert len(queued) > (10 if term else 40)
+    assert sum(taken) > (10 if term else 40)
+
+
+def test_a_term_that_appears_when_a_step_is_recorded_is_not_lost(scene, tmp_path, queued, monkeypatch):
+    call, make, models, calls = Objective.__call__, run.GaussianModel, [], []
+
+    def with_term(self, package, step):
+        calls.append(1)
+        losses = call(self, package, step)
+        return losses if len(calls) == 1 else losses._replace(total=losses.total + models[-1]._scaling.exp().mean())
+
+    monkeypatch.setattr(run, "GaussianModel", lambda *x: (models.append(make(*x)), calls.clear(), models[-1])[2])
+    monkeypatch.setattr(Objective, "__call__", with_term)
+    taken = trained(scene, tmp_path / "queued")
+    assert MADE[0].launches == 0
+    monkeypatch.setattr("training.loop.step_taker", PlainStep)
+    assert not differences(taken, trained(scene, tmp_path / "plain"))
 
 
 @pytest.mark.parametrize("pipe", ["--compute_cov3D_python", "--convert_SHs_python", "--debug"])
@@ -219,9 +326,9 @@ def test_without_memory_for_a_record_steps_are_queued_one_call_after_the_other(s
     wanted = trained(scene, tmp_path / "recorded")
     body, asked, taken = RecordedStep._body, [], []
 
-    def lacking(self, at, target):
-        asked.append(at.iteration)
-        losses = body(self, at, target)
+    def lacking(self, iteration, still):
+        asked.append(iteration)
+        losses = body(self, iteration, still)
         if len(asked) <= fails:
             raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 20.00 GiB.")
         return losses
@@ -261,6 +368,23 @@ def test_memory_that_runs_out_while_room_is_made_leaves_the_last_whole_step(scen
     assert 40 <= saved < ITERATIONS
     start = "--start_checkpoint", tmp_path / f"out/chkpnt{saved}.pth"
     assert not differences(trained(scene, tmp_path / "out", *start), wanted)
+
+
+@pytest.mark.parametrize("_", [pytest.param(None, marks=GPU_MARKS)])
+def test_lists_that_are_too_long_for_any_room_end_the_run_with_the_reason(scene, tmp_path, monkeypatch, _):
+    """The step is rendered by a host that waits, whose operator says so. 10 stands for 2^31."""
+    repeat, measure, halted = run_ahead.RunAhead._repeat, FusedStep.measure, []
+
+    def refusing(self, step):
+        if halted:
+            raise RuntimeError("more than 10 instances")
+        return measure(self, step)
+
+    monkeypatch.setattr(run_ahead.RunAhead, "_repeat", lambda *x: (halted.append(1), repeat(*x)))
+    monkeypatch.setattr(FusedStep, "measure", refusing)
+    monkeypatch.setattr(run_ahead, "_MOST", 10)
+    with pytest.raises(RuntimeError, match="more than 10 instances"):
+        trained(scene, tmp_path / "a")
 
 
 @pytest.mark.parametrize("_", [pytest.param(None, marks=GPU_MARKS)])

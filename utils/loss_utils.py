@@ -1,12 +1,9 @@
 """Losses between a render and its target: by fused kernels where they can, in plain PyTorch elsewhere."""
 
-from functools import cache
-
 import utils.host.extensions  # noqa: F401  isort: skip  (before the extensions)
 import torch
 import torch.nn.functional as F
 from fused_ssim import FusedSSIMMap, fused_l1_ssim, fused_photometric_loss, has_backend
-from fused_ssim.backend import OPERATORS
 from fused_ssim.maps import gaussian_taps, separable_blur, similarity
 from torch import Tensor
 
@@ -19,7 +16,6 @@ __all__ = [
     "l1_and_ssim",
     "l1_loss",
     "l2_loss",
-    "photometric_gradient",
     "photometric_loss",
     "ssim",
 ]
@@ -116,19 +112,6 @@ def photometric_loss(
         return fused_photometric_loss(image, target, lambda_dssim)
     l1, similarity = l1_and_ssim(image.clamp(0, 1), target, mask)
     return (1.0 - lambda_dssim) * l1 + lambda_dssim * (1.0 - similarity), l1
-
-
-@torch.no_grad()
-def photometric_gradient(image: Tensor, target: Tensor, lambda_dssim: float) -> tuple[Tensor, Tensor, Tensor]:
-    """`photometric_loss`, its L1 part, and its gradient by the image: the bits of autograd without its cost."""
-    total, l1, kept = OPERATORS.photometric(image, target, lambda_dssim, True)
-    return total, l1, OPERATORS.photometric_vjp(image, target, kept, lambda_dssim, _one(image.device, image.dtype))
-
-
-@cache
-def _one(device: torch.device, dtype: torch.dtype) -> Tensor:
-    with torch.inference_mode(False):  # so that training can use it after a render in inference mode
-        return torch.ones((), device=device, dtype=dtype)
 
 
 def l1_and_ssim(image: Tensor, target: Tensor, mask: Tensor | None = None) -> tuple[Tensor, Tensor]:

@@ -15,6 +15,7 @@ import time
 from collections.abc import Callable
 from statistics import median
 
+import fused_ssim  # noqa: F401  (registers its operators)
 import torch
 from diff_gaussian_rasterization import GaussianRasterizationSettings, Gaussians
 from diff_gaussian_rasterization.ops import scene_arguments
@@ -26,7 +27,6 @@ from benchmarks.harness.timing import gpu_time, peak_mib
 from benchmarks.kernels.rasterizer import CPU_WORKLOADS
 from benchmarks.peers.published import WORKLOADS
 from benchmarks.workloads.splat_scenes import PARAMETERS, frustum
-from utils.loss_utils import photometric_gradient
 from utils.system_utils import UserError, compute_device, run_cli
 
 OPS = torch.ops.diff_gaussian_rasterization
@@ -43,7 +43,7 @@ class Steps:
         color, transmittance, _, self.radii, splats, counts, instances, ranges, splat_slots, slots, last, layers = out
         generator = torch.Generator().manual_seed(0)
         gradient = torch.randn(color.shape, generator=generator).to(color)
-        self.camera, self.scene, self.target = camera, scene, torch.rand_like(color)
+        self.camera, self.scene, self.target, self.one = camera, scene, torch.rand_like(color), color.new_ones(())
         if not blended:
             instances, slots = instances[:0], slots[:0]
             for positions in (ranges, splat_slots, last):
@@ -69,7 +69,8 @@ class Steps:
     @torch.no_grad()
     def whole(self) -> None:
         color, transmittance, _, radii, splats, counts, *lists, last, layers = self.forward()
-        _, _, gradient = photometric_gradient(color, self.target, 0.2)
+        _, _, kept = torch.ops.fused_ssim.photometric(color, self.target, 0.2, True)
+        gradient = torch.ops.fused_ssim.photometric_vjp(color, self.target, kept, 0.2, self.one)
         backward = splats, *lists, self.camera.bg, last, transmittance, gradient, None, None, counts, layers
         rest = radii, list(range(6)), *self.adam, False, *self.statistics
         OPS.rasterize_vjp_step_(*self.scene, *backward, *rest)

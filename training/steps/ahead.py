@@ -27,7 +27,7 @@ class AheadStep:
         count = len(run.gaussians)
         room = max(_INSTANCES * count, _LEAST)
         self._ahead = RunAhead(run.device, (room, max(_SLOTS * count, _LEAST), room), self._rewind)
-        self._recorded = RecordedStep(run, self._ahead.room)
+        self._recorded = RecordedStep(run, self._fused, self._ahead.room)
         self._unknown = True  # whether somebody may have changed the model's tensors or hooks
 
     def take(self, step: Step, tell: Announcer) -> None:
@@ -37,14 +37,23 @@ class AheadStep:
             self._ahead.settle()  # nothing is pending, unless --debug_from has just come into force
             self._run.gaussians.update_learning_rate(step.iteration)
             return self._fused.take(step, tell)
-        done: list[Losses] = []
-        self._ahead.take(step.camera.uid, lambda: done.append(self._queue(step)), lambda: self._repeat(step, done[0]))
-        tell.measured(step, done[0])
+        losses: list[Losses] = []
+        queued = self._ahead.take(
+            step.camera.uid,
+            lambda: self._queue(step, losses),
+            lambda: self._repeat(step, losses[0]),
+            lambda: self._fused.measure(step),
+        )
+        if queued:
+            return tell.measured(step, losses[0])
+        self._run.gaussians.update_learning_rate(step.iteration)
+        self._fused.plain.take(step, tell)
 
     def make_ready(self, step: Step) -> None:
         """Wait until few steps are pending, or none if this one cannot be queued."""
         if step.due or not self._able(step):
             self._ahead.settle()
+            self._recorded.make_room()
         else:
             self._ahead.make_way()
 
@@ -57,7 +66,11 @@ class AheadStep:
         return self._ahead.give_up()
 
     def _able(self, step: Step) -> bool:
-        """Whether the step can be queued. The model is asked after each step in which somebody may have changed it."""
+        """Whether the step can be queued.
+
+        The model is asked after each step in which something was due: only there may somebody replace its tensors, or
+        wait for gradients.
+        """
         if not self._fused.is_usual(step):
             return False
         if self._unknown:
@@ -71,25 +84,24 @@ class AheadStep:
         self._run.gaussians.rewind(steps)
         self._recorded.drop()
 
-    def _queue(self, step: Step) -> Losses:
-        losses = self._recorded.take(step)
-        if losses is None:
+    def _queue(self, step: Step, losses: list[Losses]) -> bool:
+        """Queue a step and append its losses, unless its loss has further terms."""
+        taken = self._recorded.take(step)
+        if taken is None:
             with self._ahead.room(step.camera.uid):
-                losses = self._queue_calls(step)
+                taken = self._queue_calls(step)
         else:
             self._run.density.after_step(step)
-        return losses
+        if taken is not None:
+            losses.append(taken)
+        return taken is not None
 
-    def _queue_calls(self, step: Step) -> Losses:
+    def _queue_calls(self, step: Step) -> Losses | None:
         drawn, losses, gradients = self._fused.measure(step)
-        fused = not self._fused.finds_further_terms()
-        if not fused:
-            package, losses = self._fused.plain.backward(step)
+        if self._fused.finds_further_terms():
+            return None
         self._run.gaussians.guard_loss(step.iteration, losses.total)
-        if fused:
-            self._fused.advance(step, drawn, gradients)
-        else:
-            self._fused.plain.advance(step, package)
+        self._fused.advance(step, drawn, gradients)
         return losses
 
     @torch.no_grad()
@@ -101,4 +113,6 @@ class AheadStep:
     def _repeat(self, step: Step, first: Losses) -> None:
         """Queue a step once more; the losses that the observers hold get its values."""
         self._run.gaussians.update_learning_rate(step.iteration)
-        self._copy(self._queue(step), first)
+        losses: list[Losses] = []
+        self._queue(step, losses)
+        self._copy(losses[0], first)

@@ -38,6 +38,7 @@ Room = tuple[int, int, int]  # of instances, slots and gradient rows (gs::Room)
 class _Pending:
     view: Hashable
     repeat: Callable[[], None]
+    refuse: Callable[[], None]
     counted: bool = True  # whether the host counts the step among those that it has queued
 
 
@@ -59,10 +60,22 @@ class RunAhead:
         self._done = 0  # steps, as far as the host knows
         self.halts = 0  # so far
 
-    def take(self, view: Hashable, step: Callable[[], None], repeat: Callable[[], None]) -> None:
-        """Queue a step that renders a view, inside `room`. `repeat` queues it once more, with the same values."""
-        step()
-        self._pending.append(_Pending(view, repeat))
+    def take(
+        self, view: Hashable, step: Callable[[], bool], repeat: Callable[[], None], refuse: Callable[[], None]
+    ) -> bool:
+        """Take note of a step that `step` queues, with what `room` gives. Returns whether it did queue it, as it says.
+
+        repeat: queues it once more, with the same values. refuse: renders the view so that the host waits, which raises
+        an error if its lists are too long for any room.
+        """
+        if step():
+            self._pending.append(_Pending(view, repeat, refuse))
+            return True
+        self._collect(0)
+        self._stream.synchronize()
+        self._words[0] = 0  # what was queued in vain may have lacked room
+        self._done = int(self._words[4])
+        return False
 
     def make_way(self) -> None:
         """Wait until another step can be queued."""
@@ -134,7 +147,7 @@ class RunAhead:
             pending.counted = False
         instances, slots, rows, _ = report
         if instances > _MOST:
-            self._pending[0].repeat()  # a host that waits raises an error with the reason
+            self._pending[0].refuse()
         # A step without room for instances did not count its rows, of which there are no more.
         self._needed[self._pending[0].view] = instances, slots, rows or instances
         for pending in self._pending:

@@ -166,14 +166,18 @@ struct SplitInput {
 // The parameters of a Gaussian that take steps.
 enum Stepped { kStepMeans, kStepOpacities, kStepScales, kStepRotations, kStepShDc, kStepShRest, kStepped };
 
-struct StepNow;  // math/step_now.h
+// What changes from step to step, in the device's memory, so that a step can be recorded once and taken often.
+struct StepNow {
+  float constants[kStepped][7];  // AdamStep in math/adam.h of each attribute
+  int64_t iteration;             // of the guard
+};
 
 // The step that every Gaussian takes as soon as its gradients are known, so that these never reach memory. The values
 // are those of the Scene and change in place: a Gaussian's row is read before it is written, and no other reads it.
 template <class T>
 struct GaussianStep {
   AdamInput<T> attributes[kStepped];  // the gradients are not read; without columns an attribute takes no step
-  const StepNow* now;                 // on a GPU: stands in for rates, steps and the guard's iteration; or null
+  const StepNow* now;                 // stands in for rates, steps and the guard's iteration; or null
   StepGuard<T> guard;
   bool sparse;            // only Gaussians of observed.radii above 0 take a step, and without bias correction
   ObserveInput observed;  // the view's gradients are not read; with max_radii null nothing is observed

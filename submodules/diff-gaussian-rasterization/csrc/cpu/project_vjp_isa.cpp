@@ -141,7 +141,14 @@ void project_vjp_step(const Executor& executor, const Scene<T>& s, const int32_t
   const Camera<T> camera = camera_of(s);
   AdamStep<T> steps[kStepped];
   for (int a = 0; a < kStepped; ++a) steps[a] = adam_step_of(step.attributes[a], step.sparse);
-  const bool may = may_step(step.guard);
+  StepGuard<T> guard = step.guard;
+  if constexpr (std::is_same_v<T, float>)
+    if (step.now) {
+      static_assert(sizeof steps == sizeof step.now->constants, "AdamStep has seven numbers");
+      std::memcpy(steps, step.now->constants, sizeof steps);
+      guard.iteration = step.now->iteration;
+    }
+  const bool may = may_step(guard);
   bool finite = may;
   for_dynamic(executor, s.count, kBlock, [&](int64_t begin, int64_t end) {
     const int64_t count = end - begin;
@@ -152,7 +159,7 @@ void project_vjp_step(const Executor& executor, const Scene<T>& s, const int32_t
     observe_block(step.observed, begin, count, gradient);
     if (may && !step_block(step, steps, begin, count, gradient)) __atomic_store_n(&finite, false, __ATOMIC_RELAXED);
   });
-  if (!finite && *step.guard.stopped == 0) *step.guard.stopped = step.guard.iteration;
+  if (!finite && *guard.stopped == 0) *guard.stopped = guard.iteration;
 }
 
 #define GS_INSTANTIATE(T)                                                                                            \

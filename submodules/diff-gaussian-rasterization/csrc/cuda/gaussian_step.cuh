@@ -125,7 +125,10 @@ __device__ __noinline__ void step_gaussians(const StepParameters& in, int64_t fi
   if (!begin_step(guard)) return;
   const auto rows = [&](Stepped attribute) {
     SteppedRows to = in.rows[attribute];
-    if (in.now) to.constants = in.now->constants[attribute];
+    if (in.now) {
+      const float* c = in.now->constants[attribute];
+      to.constants = {c[0], c[1], c[2], c[3], c[4], c[5], c[6]};
+    }
     return to;
   };
   const int64_t i = first + (threadIdx.x & 31);

@@ -1,17 +1,12 @@
 #pragma once
-// What changes from step to step, for steps that are recorded once and taken often.
-#include <cstdint>
+// The numbers of a step (gs::StepNow), made on the host for every backend.
+#include <cstring>
 
 #include "adam.h"
 
 namespace gs {
 
-struct StepNow {
-  baseline::AdamStep<float> constants[kStepped];
-  int64_t iteration;  // of the guard
-};
-
-// The operators carry it as a tensor of int64.
+// The operators carry them as a tensor of int64.
 constexpr int64_t kStepNowWords = sizeof(StepNow) / sizeof(int64_t);
 static_assert(sizeof(StepNow) % sizeof(int64_t) == 0, "whole words");
 
@@ -20,6 +15,11 @@ inline baseline::AdamStep<float> step_constants(bool sparse, double lr, double b
                                                 double step) {
   if (sparse) return baseline::make_uncorrected_adam_step<float>(lr, beta1, beta2, eps);
   return baseline::make_adam_step<float>(lr, beta1, beta2, eps, step);
+}
+
+inline void set_constants(StepNow& now, int64_t attribute, const baseline::AdamStep<float>& constants) {
+  static_assert(sizeof now.constants[0] == sizeof constants, "AdamStep has seven numbers");
+  std::memcpy(now.constants[attribute], &constants, sizeof constants);
 }
 
 }  // namespace gs

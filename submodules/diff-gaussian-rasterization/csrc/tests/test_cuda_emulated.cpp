@@ -468,7 +468,7 @@ void emulated_gradients(const gs::Queue& queue, const Rendered& r, const gs::Sce
 void put_off(gs::GaussianStep<float>& step, gs::StepNow& now) {
   for (int a = 0; a < gs::kStepped; ++a) {
     gs::AdamInput<float>& in = step.attributes[a];
-    now.constants[a] = gs::step_constants(step.sparse, in.lr, in.beta1, in.beta2, in.eps, in.step);
+    gs::set_constants(now, a, gs::step_constants(step.sparse, in.lr, in.beta1, in.beta2, in.eps, in.step));
     in.lr = in.beta1 = in.beta2 = in.eps = in.step = NAN;
   }
   now.iteration = step.guard.iteration;

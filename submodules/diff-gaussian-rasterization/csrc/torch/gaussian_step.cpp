@@ -84,7 +84,8 @@ void observe_in(gs::GaussianStep<T>& step, const Tensor& radii, const MaybeTenso
 const gs::StepNow* step_now(const MaybeTensor& now, const SceneTensors& scene) {
   if (!now) return nullptr;
   check_tensor(*now, "now", at::kLong, scene.device(), {gs::kStepNowWords});
-  TORCH_CHECK_VALUE(now->is_cuda() && now->is_contiguous(), "now must be contiguous, and on a GPU");
+  TORCH_CHECK_VALUE(now->is_contiguous(), "now must be contiguous");
+  TORCH_CHECK(scene.dtype() == at::kFloat, "now is of float32 Gaussians, got float64");
   return reinterpret_cast<const gs::StepNow*>(now->const_data_ptr<int64_t>());
 }
 
@@ -111,7 +112,7 @@ void run(const SceneTensors& scene, const BlendBackward& in, const Tensor& tile_
 
 // rasterize_vjp, then adam_ (or sparse_adam_ on the Gaussians of a radius above 0) of the attributes that are named,
 // and observe_ if statistics are given: the same bits, without gradients in memory. Advances the counters as adam_
-// does. now: on a GPU, what `step_now_` wrote, which stands in for steps, rates and iteration, and has advanced the
+// does. now: what `step_now_` wrote, which stands in for steps, rates and iteration, and has advanced the
 // counters.
 void rasterize_vjp_step_op(SCENE_PARAMETERS, BACKWARD_PARAMETERS, const Tensor& tile_counts, const Tensor& layers,
                            const Tensor& radii, at::IntArrayRef attributes, at::TensorList exp_avg,
@@ -148,8 +149,9 @@ void step_now_op(Tensor& now, at::IntArrayRef attributes, at::TensorList steps, 
   check_steps(attributes, steps, {rates.size()});
   auto* to = reinterpret_cast<gs::StepNow*>(now.mutable_data_ptr<int64_t>());
   for (size_t k = 0; k < attributes.size(); ++k)
-    to->constants[attributes[k]] =
-        gs::step_constants(sparse, rates[k], beta1, beta2, eps, double(*steps[k].const_data_ptr<float>()) + 1);
+    gs::set_constants(
+        *to, attributes[k],
+        gs::step_constants(sparse, rates[k], beta1, beta2, eps, double(*steps[k].const_data_ptr<float>()) + 1));
   to->iteration = iteration;
   advance(steps);
 }
