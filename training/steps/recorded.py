@@ -78,7 +78,7 @@ class RecordedStep:
         self._host = torch.zeros(_SLOTS, words, dtype=torch.int64, pin_memory=run.device.type == "cuda")
         self._host_cameras = [row.numpy() for row in self._host[:, NOW_WORDS:].view(torch.float32)[:, :_CAMERA]]
         self._inputs = torch.zeros(words, dtype=torch.int64, device=run.device)
-        self._background = torch.empty_like(run.background)
+        self._background, self._copied = torch.empty_like(run.background), None
         self._cameras: dict[Camera, tuple] = {}
         self._kinds: set[Kind] = set()
         self._records: dict[Kind, _Record] = {}
@@ -97,7 +97,9 @@ class RecordedStep:
         # Nothing below asks for memory or may fail in another way once the optimiser's counters are advanced.
         numbers, losses = self._numbers_of(at.camera), torch.empty_like(record.losses)  # observers keep them
         record.target.copy_(target, non_blocking=True)
-        self._background.copy_(at.background, non_blocking=True)
+        if at.background is not self._copied:
+            self._copied = at.background
+            self._background.copy_(at.background, non_blocking=True)
         slot = self._taken % _SLOTS
         self._taken += 1
         self._host_cameras[slot][:] = numbers
