@@ -15,7 +15,12 @@ from doc_pages import PAGES, ROOT, commands, name_of, prose
 COMMANDS = sorted({command for page in PAGES for command in commands(page)})
 PROGRAMS = sorted({command.program for command in COMMANDS})
 # Programs that hand words which they do not know to train.py.
-FORWARDING = ("benchmarks.kernels.host_ops", "benchmarks.scenes.camera_models", "benchmarks.scenes.training")
+FORWARDING = (
+    "benchmarks.kernels.host_ops",
+    "benchmarks.scenes.camera_models",
+    "benchmarks.scenes.step_profile",
+    "benchmarks.scenes.training",
+)
 # Flags of other programs.
 FOREIGN = {"--peers", "--eval_steps", "--save_steps"}
 
