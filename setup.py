@@ -36,6 +36,10 @@ setup(
     python_requires=">=3.10",
     packages=[],
     py_modules=[],
-    extras_require={"video": ["imageio-ffmpeg==0.8.1"]},  # convert.py --video
+    extras_require={
+        "export": ["usd-core==26.11", "zstandard==0.25.0"],  # .usdz and .spz
+        "video": ["imageio-ffmpeg==0.8.1"],  # convert.py --video, render.py --path
+        "viewer": ["viser==1.1.1"],  # view.py, train.py --viewer
+    },
     install_requires=requirements() + [f"{name} @ {extension_url(name)}" for name in EXTENSIONS],
 )

@@ -1,0 +1,1 @@
+"""Paths of a camera through a scene, for videos and viewers."""
