@@ -1,5 +1,6 @@
 # make demo   a scene made, trained, rendered and scored
 # make test   lint, format check, C++ tests, pytest
+# make test-browser   the tests that need Chromium, which is installed first where Debian's package manager may be used
 # make format rewrites what the format check would complain about
 # make docs   the site, build/site/index.html; a dead link or a page outside of the navigation fails
 # All set up .venv first: pinned requirements and the three extensions, again only when their sources have changed.
@@ -22,7 +23,7 @@ CXX_SOURCES := $(shell find submodules benchmarks -name build -prune -o \( -name
 sources = $(shell find submodules/common submodules/$(1) \( -name build -o -name tests -o -name emulation \) -prune -o \
             \( -name '*.cpp' -o -name '*.cu*' -o -name '*.h' -o -name '*.py' -o -name '*.toml' \) -print)
 
-.PHONY: install demo test lint format cpp-test docs clean
+.PHONY: install demo test test-browser lint format cpp-test docs clean
 .NOTPARALLEL:
 
 install: $(EXTENSIONS:%=$(VENV)/.built-%)
@@ -48,7 +49,11 @@ output/demo_scene: | install
 	$(BIN)/python -m demo.make_scene $@
 
 test: install lint cpp-test
-	$(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist worksteal
+	$(BIN)/python -m pytest -m 'not browser' --numprocesses auto --maxprocesses 4 --dist worksteal
+
+test-browser: install
+	tests/browser/install.sh
+	$(BIN)/python -m pytest -m browser tests/browser
 
 lint: $(VENV)/.requirements
 	$(BIN)/ruff check .
