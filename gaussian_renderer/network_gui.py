@@ -63,10 +63,10 @@ def init(wish_host: str, wish_port: int) -> None:
         listener = socket.create_server((host, port), family=family)
         listener.setblocking(False)
     except (OSError, OverflowError) as error:
-        reason = getattr(error, "strerror", None) or error
+        reason = str(getattr(error, "strerror", None) or error).partition(" (")[0]  # it would name the address again
         print(
-            f"warning: no viewer can connect to this training, since {host}:{port} cannot be listened at ({reason}); "
-            "give another --port, 0 for any free one, or --disable_viewer",
+            f"warning: cannot listen for the remote viewer at {host}:{port} ({reason}); choose another --port (0: any "
+            "free one), or --disable_viewer",
             file=sys.stderr,
         )
         return

@@ -74,7 +74,7 @@ def _receive(conn: socket.socket, count: int, end: float) -> bytes:
         try:
             part = conn.recv(count - len(received))
         except OSError as error:
-            raise ViewerLost(_reason(error)) from error
+            raise ViewerLost(_reason(error, end)) from error
         if not part:
             break
         received += part
@@ -88,17 +88,23 @@ def _send(conn: socket.socket, data: bytes | memoryview, end: float) -> None:
         try:
             rest = rest[conn.send(rest[:_PART]) :]
         except OSError as error:
-            raise ViewerLost(_reason(error)) from error
+            raise ViewerLost(_reason(error, end)) from error
 
 
 def _limit(conn: socket.socket, end: float) -> None:
     left = end - time.monotonic()
     if left <= 0:
-        raise ViewerLost(f"its message took more than {LONGEST:g} s")
+        raise ViewerLost(_too_long())
     conn.settimeout(min(SILENCE, left))
 
 
-def _reason(error: OSError) -> str:
-    if isinstance(error, TimeoutError):
-        return f"it was silent for {SILENCE:g} s in the middle of a message"
-    return error.strerror or str(error)
+def _too_long() -> str:
+    return f"its message took more than {LONGEST:g} s"
+
+
+def _reason(error: OSError, end: float) -> str:
+    if not isinstance(error, TimeoutError):
+        return error.strerror or str(error)
+    if time.monotonic() >= end:
+        return _too_long()
+    return f"it was silent for {SILENCE:g} s in the middle of a message"

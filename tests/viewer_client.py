@@ -10,7 +10,6 @@ import torch
 
 from scene.cameras import MiniCam
 
-SWITCHES = ("train", "keep_alive", "shs_python", "rot_scale_python")
 FIELDS = (
     *("resolution_x", "resolution_y", "train", "fov_y", "fov_x", "z_near", "z_far", "shs_python", "rot_scale_python"),
     *("keep_alive", "scaling_modifier", "view_matrix", "view_projection_matrix"),
@@ -23,10 +22,9 @@ def request(camera: MiniCam, **changes: object) -> dict[str, object]:
     full = camera.full_proj_transform.cpu().double().numpy().copy()
     for matrix, column in ((view, 1), (view, 2), (full, 1)):
         matrix[:, column] = -matrix[:, column]
-    values = (
-        *(camera.image_width, camera.image_height, 0, camera.FoVy, camera.FoVx, camera.znear, camera.zfar, 0, 0, 0, 1.0),
-        *(view.flatten().tolist(), full.flatten().tolist()),
-    )
+    size = camera.image_width, camera.image_height
+    lens = camera.FoVy, camera.FoVx, camera.znear, camera.zfar
+    values = (*size, 0, *lens, 0, 0, 0, 1.0, view.flatten().tolist(), full.flatten().tolist())
     return dict(zip(FIELDS, values, strict=True)) | changes
 
 
