@@ -110,7 +110,7 @@ class Watched(Observer):
                 result = trained(*words, "--port", 0)
             finally:
                 self._started.set()
-            done.result(30)
+                done.result(30)
         return result
 
     def _play(self) -> None:
@@ -325,6 +325,19 @@ def test_a_viewer_that_asks_for_nothing_holds_nothing(monkeypatch, capfd):
     assert line.endswith("it has not asked for anything for 0.4 s")
 
 
+def test_no_message_takes_longer_than_its_limit_though_bytes_keep_coming(monkeypatch):
+    monkeypatch.setattr(network_transfer, "LONGEST", 0.0)
+    ours, theirs = socket.socketpair()
+    with ours, theirs:
+        theirs.sendall(packed(valid()))
+        for act in (
+            lambda: network_transfer.receive_message(ours),
+            lambda: network_transfer.send_message(ours, b"1", b""),
+        ):
+            with pytest.raises(network_transfer.ViewerLost, match="took more than 0 s"):
+                act()
+
+
 def test_a_viewer_whose_messages_come_in_pieces_is_served():
     with Endless():
         viewer = Viewer(network_gui.port)
@@ -387,8 +400,11 @@ def test_keep_alive_holds_a_finished_training(colmap_scene, tmp_path, capsys, en
 
     def script(watched: Watched, viewer: Viewer) -> None:
         viewer.ask(request(watched.camera(0), train=1, keep_alive=1))
-        saved = out / f"chkpnt{ITERATIONS}.pth"
-        wait_for(saved.exists)
+        watched.reaches(ITERATIONS - 1)
+        viewer.say(valid(train=1, keep_alive=1))  # there in the last iteration, and answered after it
+        watched.go()
+        assert viewer.take(3 * 24 * 16) and viewer.path()
+        assert (out / f"chkpnt{ITERATIONS}.pth").exists()
         for number in range(3):
             watched.check(viewer, number, train=1, keep_alive=1)
         time.sleep(0.3)
@@ -402,7 +418,7 @@ def test_keep_alive_holds_a_finished_training(colmap_scene, tmp_path, capsys, en
             os.kill(os.getpid(), signal.SIGINT)
             assert viewer.is_let_go()
 
-    watched = Watched(script)
+    watched = Watched(script, stops=(ITERATIONS - 1,))
     if end == "Ctrl-C":
         with pytest.raises(KeyboardInterrupt):
             watched(colmap_scene, out)

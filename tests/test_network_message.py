@@ -71,6 +71,7 @@ def test_every_field_is_needed_and_has_its_type(name):
         {"view_matrix": [*VALID["view_matrix"][:15], [1.0]]},
         {"view_projection_matrix": [*VALID["view_projection_matrix"], 1.0]},
         {"view_projection_matrix": [-INF] * 16},
+        {"view_projection_matrix": [*VALID["view_projection_matrix"][:15], 1e300]},
     ],
     ids=lambda changes: " ".join(changes),
 )
