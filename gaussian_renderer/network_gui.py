@@ -5,6 +5,7 @@ nobody is connected; a loop may set it to None to drop the viewer. The protocol 
 """
 
 import contextlib
+import os
 import socket
 import sys
 import time
@@ -168,7 +169,7 @@ def receive() -> tuple[MiniCam | None, bool | None, bool | None, bool | None, bo
 def send(message_bytes: bytes | memoryview | None, verify: str) -> None:
     """Answer a request: the frame's bytes (H, W, 3), None without one, and the dataset's path. Errors as in `read`."""
     with _connection():
-        send_message(conn, b"" if message_bytes is None else message_bytes, verify.encode("utf-8"))
+        send_message(conn, b"" if message_bytes is None else message_bytes, os.fsencode(verify))
 
 
 def disconnect(fault: str | None = None) -> None:

@@ -475,9 +475,9 @@ def test_a_loop_of_its_own_receives_and_sends(monkeypatch, capfd):
     viewer.say(valid(train=1, shs_python=1, scaling_modifier=0.25))
     camera, *rest = network_gui.receive()
     assert rest == [True, True, False, False, 0.25] and (camera.image_width, camera.image_height) == (24, 16)
-    network_gui.send(memoryview(bytes(3 * 24 * 16)), "/scène")
+    network_gui.send(memoryview(bytes(3 * 24 * 16)), "/scène\udcff")  # a name that is not UTF-8
     assert viewer.take(3 * 24 * 16) == bytes(3 * 24 * 16)
-    assert viewer.take(11) == struct.pack("<I", 7) + "/scène".encode()
+    assert viewer.take(12) == struct.pack("<I", 8) + "/scène".encode() + b"\xff"
     viewer.say({"resolution_x": 0, "resolution_y": 0})
     assert network_gui.receive() == (None,) * 6
     network_gui.send(None, "/scene")
