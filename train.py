@@ -15,6 +15,7 @@ import utils.host.openmp  # noqa: F401  isort: skip  (before torch)
 import torch
 
 from arguments import ModelParams, OptimizationParams, OptionParser, PipelineParams, write_cfg_args, write_model_json
+from gaussian_renderer import network_gui
 from records.event_writer import EventWriter, tensorboard_is_installed
 from training.loop import run_training
 from training.observers.report import training_report
@@ -40,12 +41,14 @@ def training(
     debug_from: int = -1,
     record_curve: bool = True,
     plain_step: bool = False,
+    viewer_address: tuple[str, int] | None = None,
 ) -> None:
     """Train from the options of the three groups; write model, checkpoints and log to dataset.model_path.
 
     testing_iterations, saving_iterations, checkpoint_iterations: when to score, save the PLY, save a checkpoint.
     checkpoint: a chkpntN.pth to resume, or None. debug_from: switch pipe.debug on after this iteration. plain_step: no
-    fast steps. record_curve: with test views, write error_vs_time.csv during training, and draw it.
+    fast steps. record_curve: with test views, write error_vs_time.csv during training, and draw it. viewer_address:
+    listen there for the remote viewer; None: nowhere, unless network_gui listens already.
     """
     dataset.model_path = dataset.model_path or new_folder()
     print(f"Optimizing {dataset.model_path}")
@@ -53,7 +56,7 @@ def training(
     plan = Plan(*iterations, checkpoint, debug_from, record_curve, plain_step)
     run = Run(dataset, opt, pipe, plan)
     # Write nothing before every input check has passed: a mistyped option must not overwrite a finished model.
-    with own_folder(dataset.model_path):
+    with own_folder(dataset.model_path), network_gui.listening(viewer_address):
         writer = prepare_output_and_logger(dataset, **run.kept)
         run.begin()
         run_training(run, standard_observers(run, writer, training_report))
@@ -79,9 +82,9 @@ def _parser() -> tuple[argparse.ArgumentParser, ModelParams, OptimizationParams,
     parser = OptionParser(description="Train a Gaussian model from photos with known cameras.")
     groups = ModelParams(parser), OptimizationParams(parser), PipelineParams(parser)
     add = parser.add_argument
-    add("--ip", type=str, default="127.0.0.1", help="address of the viewer (no viewer in this version; no effect)")
-    add("--port", type=int, default=6009, help="port of the viewer (no effect)")
-    add("--disable_viewer", action="store_true", help="open no port for the viewer (none is opened anyway)")
+    add("--ip", type=str, default="127.0.0.1", help="address to listen at for the remote viewer (default: 127.0.0.1)")
+    add("--port", type=int, default=6009, help="port for the remote viewer, 0: any free one (default: 6009)")
+    add("--disable_viewer", action="store_true", help="open no port for the remote viewer")
     add("--debug_from", type=int, default=-1, metavar="N", help="switch --debug on after iteration N (default: never)")
     add("--detect_anomaly", action="store_true", help="let autograd name the operation that produced a NaN; slow")
     listed = {"type": int, "nargs": "+", "metavar": "N"}
@@ -120,16 +123,10 @@ def main(argv: Sequence[str] | None = None) -> None:
     args, dataset, opt, pipe = parse(argv)
     safe_state(args.quiet, opt.seed)
     torch.autograd.set_detect_anomaly(args.detect_anomaly)
-    further = args.start_checkpoint, args.debug_from, not args.no_curve, args.plain_step
-    training(
-        dataset,
-        opt,
-        pipe,
-        args.test_iterations,
-        [*args.save_iterations, opt.iterations],
-        args.checkpoint_iterations,
-        *further,
-    )
+    iterations = args.test_iterations, [*args.save_iterations, opt.iterations], args.checkpoint_iterations
+    viewer_address = None if args.disable_viewer else (args.ip, args.port)
+    further = args.start_checkpoint, args.debug_from, not args.no_curve, args.plain_step, viewer_address
+    training(dataset, opt, pipe, *iterations, *further)
     print("Training complete.")
 
 

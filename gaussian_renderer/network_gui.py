@@ -1,38 +1,208 @@
-"""The reference's names for a viewer that watches a training. This version has no viewer yet."""
+"""The remote viewer's side of a training: a socket that listens, one viewer, its requests and their answers.
 
+The names are the reference's, so that training loops written for it work. `conn` is the viewer's socket, None while
+nobody is connected; a loop may set it to None to drop the viewer. The protocol has no password.
+"""
+
+import contextlib
+import os
+import socket
 import sys
-from typing import Any, NoReturn
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
 
+from tqdm import tqdm
+
+from gaussian_renderer.network_message import BadMessage, Request, decode, parse
+from gaussian_renderer.network_transfer import (
+    ViewerLeft,
+    ViewerLost,
+    readable,
+    receive_message,
+    send_message,
+    set_up,
+)
+from scene.cameras import MiniCam
+from utils.host.device import compute_device
 from utils.system_utils import UserError
 
-conn: Any = None  # always None, so that training loops never serve anybody
+PATIENCE = 30.0  # seconds that `read` waits for a viewer that lets training go on, or has not asked for anything yet
+FIRST = 10.0  # seconds after which `is_asked` ends a connection that has not asked for anything
+
+conn: socket.socket | None = None
 addr: Any = None
-listener: Any = None
+listener: socket.socket | None = None
 host = "127.0.0.1"
 port = 6009
 
 
+@dataclass
+class _Viewer:
+    """What the connected viewer has said so far."""
+
+    since: float = 0.0
+    has_asked: bool = False
+    train: bool = True
+    keep_alive: bool = False
+
+
+_viewer = _Viewer()
+
+
 def init(wish_host: str, wish_port: int) -> None:
-    """Say that nobody is served. wish_host, wish_port: kept in `host` and `port`."""
-    global host, port
+    """Listen at an address; port 0: any free one, which is printed. What cannot be had is one warning on stderr.
+
+    `host` and `port` become the wish, and `port` the one that was found.
+    """
+    global host, port, listener
+    close()
     host, port = wish_host, wish_port
-    print("this version has no viewer: nothing listens at --ip and --port", file=sys.stderr)
+    try:
+        family = socket.AF_INET6 if ":" in host else socket.AF_INET
+        listener = socket.create_server((host, port), family=family)
+        listener.setblocking(False)
+    except (OSError, OverflowError) as error:
+        reason = str(getattr(error, "strerror", None) or error).partition(" (")[0]  # it would name the address again
+        print(
+            f"warning: cannot listen for the remote viewer at {host}:{port} ({reason}); choose another --port (0: any "
+            "free one), or --disable_viewer",
+            file=sys.stderr,
+        )
+        return
+    port = listener.getsockname()[1]
+    if wish_port == 0:
+        print(f"A viewer can connect to {host}:{port}")
+
+
+def close() -> None:
+    """Let the viewer go, and listen no longer."""
+    global listener
+    disconnect()
+    if listener is not None:
+        listener.close()
+        listener = None
+
+
+@contextlib.contextmanager
+def listening(address: tuple[str, int] | None) -> Iterator[None]:
+    """Within it, listen at an address (`init`); None: leave things as they are."""
+    if address is None:
+        yield
+        return
+    init(*address)
+    try:
+        yield
+    finally:
+        close()
 
 
 def try_connect() -> None:
-    """Do nothing: there is nobody to accept."""
+    """Accept a viewer if one is waiting. Costs about a microsecond if none is."""
+    global conn, addr, _viewer
+    if listener is None or not readable(listener):
+        return
+    try:
+        accepted, addr = listener.accept()
+        set_up(accepted)
+    except OSError:  # it has gone already
+        return
+    conn = accepted
+    _viewer = _Viewer(since=time.monotonic())
+    tqdm.write(f"viewer {_name()} connected", file=sys.stdout)
 
 
-def read() -> NoReturn:
-    """UserError: nobody is connected."""
-    raise UserError("no viewer is connected, and this version has none; leave network_gui out while `conn` is None")
+def is_asked(seconds: float = 0.0) -> bool:
+    """Whether the viewer sends something, or leaves, within so many seconds; False while nobody is connected.
+
+    A viewer that has not asked for anything after FIRST seconds is let go.
+    """
+    if conn is None:
+        return False
+    if readable(conn, seconds):
+        return True
+    if not _viewer.has_asked and time.monotonic() - _viewer.since > FIRST:
+        disconnect(f"it has not asked for anything for {FIRST:g} s")
+    return False
 
 
-def send(message_bytes: bytes | memoryview | None, verify: str) -> NoReturn:
-    """UserError: nobody is connected."""
-    read()
+def holds(last: bool) -> bool:
+    """Whether the viewer wants training to wait. last: in the last iteration, where keep_alive does so, too."""
+    return conn is not None and not (_viewer.train and not (last and _viewer.keep_alive))
 
 
-def receive() -> NoReturn:
-    """UserError: nobody is connected."""
-    read()
+def read() -> dict[str, Any]:
+    """Wait for the viewer's next message; its JSON object, unchecked.
+
+    ViewerLost, with a line on stderr, once the connection has ended; UserError while nobody is connected.
+    """
+    with _connection():
+        if not readable(conn, None if holds(last=False) else PATIENCE):
+            raise ViewerLost(f"it has sent nothing for {PATIENCE:g} s")
+        return decode(receive_message(conn))
+
+
+def receive_request() -> Request | None:
+    """Wait for the viewer's next request; None for one without a frame. Errors as in `read`."""
+    message = read()
+    with _connection():
+        request = parse(message)
+    _viewer.has_asked = True
+    if request is not None:
+        _viewer.train, _viewer.keep_alive = request.train, request.keep_alive
+    return request
+
+
+def receive() -> tuple[MiniCam | None, bool | None, bool | None, bool | None, bool | None, float | None]:
+    """The next request as camera, train, shs_python, rot_scale_python, keep_alive and scaling_modifier.
+
+    All are None in a request without a frame. Errors as in `read`.
+    """
+    request = receive_request()
+    if request is None:
+        return None, None, None, None, None, None
+    flags = request.train, request.shs_python, request.rot_scale_python, request.keep_alive
+    return request.camera(compute_device()), *flags, request.scaling_modifier
+
+
+def send(message_bytes: bytes | memoryview | None, verify: str) -> None:
+    """Answer a request: the frame's bytes (H, W, 3), None without one, and the dataset's path. Errors as in `read`."""
+    with _connection():
+        send_message(conn, b"" if message_bytes is None else message_bytes, os.fsencode(verify))
+
+
+def disconnect(fault: str | None = None) -> None:
+    """Let the viewer go, with a line. fault: why, if it is the viewer's fault."""
+    global conn, addr
+    if conn is None:
+        return
+    name = _name()
+    conn.close()
+    conn = addr = None
+    if fault is None:
+        tqdm.write(f"viewer {name} disconnected", file=sys.stdout)
+    else:
+        tqdm.write(f"viewer {name} is disconnected: {fault}", file=sys.stderr)
+
+
+@contextlib.contextmanager
+def _connection() -> Iterator[None]:
+    """Within it, a fault of the viewer ends the connection."""
+    if conn is None:
+        raise UserError("no viewer is connected; call network_gui.try_connect() until `conn` is not None")
+    try:
+        yield
+    except ViewerLeft:
+        disconnect()
+        raise
+    except ViewerLost as error:
+        disconnect(str(error))
+        raise
+    except BadMessage as error:
+        disconnect(str(error))
+        raise ViewerLost(str(error)) from error
+
+
+def _name() -> str:
+    return ":".join(map(str, addr[:2])) if addr else "without an address"

@@ -5,14 +5,12 @@ import math
 import types
 from collections.abc import Callable
 
-import numpy as np
 import pytest
 import torch
 from gaussians import GROUPS, cloud, model, options, parameters, pipeline
 from torch import Tensor, nn
 
-import gaussian_renderer
-from gaussian_renderer import GaussianModel, network_gui, render
+from gaussian_renderer import GaussianModel, render
 from scene.cameras import MiniCam
 from scene.gaussians.checkpoint import save_checkpoint
 from utils.general_utils import inverse_sigmoid
@@ -500,17 +498,3 @@ def test_three_children_are_smaller_than_two():
     scaling = gaussians._scaling.detach().clone()
     gaussians.densify_and_split(torch.ones(2, 1), 0.5, 0.0, N=3)
     assert torch.equal(gaussians._scaling, torch.cat([scaling] * 3) - math.log(0.8 * 3))
-
-
-# The viewer
-
-
-def test_nobody_is_served(capfd):
-    network_gui.init("127.0.0.2", 7)
-    assert capfd.readouterr().err.count("\n") == 1 and (network_gui.host, network_gui.port) == ("127.0.0.2", 7)
-    network_gui.try_connect()
-    assert network_gui.conn is None and network_gui.addr is None and network_gui.listener is None
-    for call in (network_gui.read, network_gui.receive, lambda: network_gui.send(b"", "/scene")):
-        with pytest.raises(UserError, match="no viewer is connected"):
-            call()
-    assert gaussian_renderer.GaussianModel is GaussianModel and np.isfinite(network_gui.port)

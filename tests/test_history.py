@@ -31,6 +31,7 @@ def _stdout(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def _train(scene: Path, out: Path, *more: object, iterations: int) -> bytes:
     words = ["-s", scene, "-m", out, "-r", 24, "--iterations", iterations, "--test_iterations", -1, *more]
+    words.append("--disable_viewer")  # its port may be in use, which is a warning
     train.main(list(map(str, words)))
     return (out / "point_cloud" / f"iteration_{iterations}" / "point_cloud.ply").read_bytes()
 

@@ -166,7 +166,6 @@ def test_the_loop_of_2024_takes_the_options_of_its_release(world, client, option
         assert result["exposures"] == [VIEWS, 3, 4] and result["exposure_moved"] > 1e-3
 
 
-@pytest.mark.xfail(strict=True, reason="this version has no viewer")
 def test_the_loop_of_2024_serves_a_viewer(world, client):
     port, replies, over = free_port(), [], threading.Event()
     viewer = threading.Thread(target=watch, args=(port, replies, over), daemon=True)

@@ -3,11 +3,13 @@
 from collections.abc import Callable
 from typing import Any
 
+from gaussian_renderer import network_gui
 from training.observer import Observer
 from training.observers.curve import Curve
 from training.observers.divergence import DivergenceWatch
 from training.observers.masks import MaskWatch
 from training.observers.memory import MemoryGuard
+from training.observers.network_viewer import NetworkViewer
 from training.observers.progress import ProgressBar
 from training.observers.records import Records
 from training.observers.report import Report
@@ -28,6 +30,7 @@ def standard_observers(run: Run, writer: Any | None, report: Callable[..., dict[
         Report(run, writer, report),
         Saves(run, test_in_memory),  # before the model changes
         Records(run),  # after all that add to the iteration's record
+        *([NetworkViewer(run)] if network_gui.listener else []),  # after all that write: it may make training wait
         MemoryGuard(run),  # from `measured` to `stepped` the model changes; otherwise it is whole
         Checkpoints(run, watch),  # last: writes the whole state after the step
     ]

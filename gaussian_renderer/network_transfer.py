@@ -1,0 +1,110 @@
+"""Messages over a viewer's connection, with limits of time and length so that no viewer can hold training for good."""
+
+import select
+import socket
+import struct
+import time
+
+SILENCE = 1.0  # seconds without a byte, within a message either way
+LONGEST = 10.0  # seconds of a message in all
+LARGEST = 1 << 16  # bytes of a request; the viewer's have about 1,000
+_PART = 1 << 20  # bytes handed to the system at once
+
+
+# The system asks a silent viewer for a sign of life, so that one whose machine is gone does not hold a paused training.
+_KEEP_ALIVE = {"TCP_KEEPIDLE": 10, "TCP_KEEPINTVL": 5, "TCP_KEEPCNT": 4}  # seconds, seconds, times; not on all systems
+
+
+class ViewerLost(Exception):
+    """A connection that cannot go on. Its text says why."""
+
+
+class ViewerLeft(ViewerLost):
+    """A connection that the viewer has closed between two messages."""
+
+
+def set_up(conn: socket.socket) -> None:
+    """Set a new connection's options: short messages go out at once, and one whose other end is gone ends."""
+    conn.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    conn.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+    for name, value in _KEEP_ALIVE.items():
+        if hasattr(socket, name):
+            conn.setsockopt(socket.IPPROTO_TCP, getattr(socket, name), value)
+
+
+def readable(sock: socket.socket, seconds: float | None = 0.0) -> bool:
+    """Whether bytes, the end of the connection or, of a listener, a connection are there within so many seconds.
+
+    None: wait without end. Takes less than a microsecond if it need not wait.
+    """
+    if hasattr(select, "poll"):
+        poll = select.poll()
+        poll.register(sock, select.POLLIN)
+        return bool(poll.poll(None if seconds is None else 1000 * seconds))
+    return bool(select.select([sock], [], [], seconds)[0])
+
+
+def receive_message(conn: socket.socket) -> bytes:
+    """The bytes of a message after its length. ViewerLeft if none comes any more, ViewerLost if half of it does."""
+    end = time.monotonic() + LONGEST
+    head = _receive(conn, 4, end)
+    if not head:
+        raise ViewerLeft("it left")
+    length = struct.unpack("<I", head)[0] if len(head) == 4 else 0
+    if length > LARGEST:
+        raise ViewerLost(f"it announced a message of {length:,} bytes, and a request has at most {LARGEST:,}")
+    text = _receive(conn, length, end)
+    if len(head) < 4 or len(text) < length:
+        raise ViewerLost("it left in the middle of a message")
+    return text
+
+
+def send_message(conn: socket.socket, frame: bytes | memoryview, text: bytes) -> None:
+    """Send a frame as it is, then a text after its length. ViewerLost if the viewer does not take them."""
+    end = time.monotonic() + LONGEST
+    _send(conn, frame, end)
+    _send(conn, struct.pack("<I", len(text)) + text, end)
+
+
+def _receive(conn: socket.socket, count: int, end: float) -> bytes:
+    """So many bytes, or fewer if the connection ends before."""
+    received = bytearray()
+    while len(received) < count:
+        _limit(conn, end)
+        try:
+            part = conn.recv(count - len(received))
+        except OSError as error:
+            raise ViewerLost(_reason(error, end)) from error
+        if not part:
+            break
+        received += part
+    return bytes(received)
+
+
+def _send(conn: socket.socket, data: bytes | memoryview, end: float) -> None:
+    rest = memoryview(data).cast("B")
+    while rest:
+        _limit(conn, end)
+        try:
+            rest = rest[conn.send(rest[:_PART]) :]
+        except OSError as error:
+            raise ViewerLost(_reason(error, end)) from error
+
+
+def _limit(conn: socket.socket, end: float) -> None:
+    left = end - time.monotonic()
+    if left <= 0:
+        raise ViewerLost(_too_long())
+    conn.settimeout(min(SILENCE, left))
+
+
+def _too_long() -> str:
+    return f"its message took more than {LONGEST:g} s"
+
+
+def _reason(error: OSError, end: float) -> str:
+    if not isinstance(error, TimeoutError):
+        return error.strerror or str(error)
+    if time.monotonic() >= end:
+        return _too_long()
+    return f"it was silent for {SILENCE:g} s in the middle of a message"

@@ -1,0 +1,502 @@
+"""The remote viewer of a training: a client written from the protocol watches, pauses, misbehaves; nothing changes."""
+
+import os
+import random
+import re
+import signal
+import socket
+import struct
+import sys
+import threading
+import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+import torch
+from gaussians import model, pipeline
+from test_network_message import mutated
+from viewer_client import Viewer, as_bytes, packed, request, wait_for
+
+import train
+from gaussian_renderer import network_gui, network_transfer, render
+from gaussian_renderer.free_view import free_view
+from scene.cameras import MiniCam
+from training.observer import Observer
+from training.observers.network_viewer import NetworkViewer
+from utils.system_utils import UserError
+
+ITERATIONS = 60
+OPTIONS = {
+    "default": (),
+    "exposure": ("--train_test_exp", "--antialiasing"),
+    "sparse": ("--optimizer_type", "sparse_adam", "-w", "--random_background"),
+    "python": ("--convert_SHs_python",),
+}
+RESET = struct.pack("ii", 1, 0)  # of SO_LINGER: closing drops what is on its way
+
+
+@pytest.fixture(autouse=True)
+def _tidy(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "stdout", sys.stdout)  # training stamps it
+    monkeypatch.setattr(network_transfer, "SILENCE", 0.3)
+    yield
+    network_gui.close()
+
+
+def trained(scene: Path, out: Path, *options: object) -> tuple[bytes, list]:
+    """Train; the bytes of the PLY, and the numbers of the checkpoint."""
+    words = ["-s", scene, "-m", out, "--eval", "-r", 48, "--iterations", ITERATIONS, "--test_iterations", -1]
+    words += ["--densify_from_iter", 10, "--densification_interval", 20, "--opacity_reset_interval", 30]
+    words += ["--no_curve", "--checkpoint_iterations", ITERATIONS, *options]
+    train.main([*map(str, words)])
+    values = torch.load(out / f"chkpnt{ITERATIONS}.pth", weights_only=False)
+    ply = (out / f"point_cloud/iteration_{ITERATIONS}/point_cloud.ply").read_bytes()
+    return ply, flat(values)
+
+
+def flat(value: object) -> list:
+    if torch.is_tensor(value):
+        return [value.shape, value.detach().cpu().numpy().tobytes()]
+    if isinstance(value, dict):
+        return [leaf for pair in value.items() for leaf in (pair[0], *flat(pair[1]))]
+    if isinstance(value, list | tuple):
+        return [leaf for item in value for leaf in flat(item)]
+    return [value]
+
+
+def valid(**changes: object) -> dict[str, object]:
+    return request(free_view(24, 16, 0.8, (0.0, 0.0, -3.0), (1.0, 0.0, 0.0, 0.0), "cpu"), **changes)
+
+
+class Watched(Observer):
+    """A training that a viewer has paused in its first iteration. script: called with that in a thread of its own.
+
+    stops: iterations in which training waits for `go`, so that the script does not have to hurry.
+    """
+
+    def __init__(self, script: Callable[["Watched", Viewer], object], stops: tuple[int, ...] = ()) -> None:
+        self.script, self.stops = script, stops
+        self.iteration = 0
+        self._go = threading.Event()
+        self._started, self._connected, self._run_training = threading.Event(), threading.Event(), train.run_training
+
+    def _train(self, run: object, observers: list[Observer]) -> None:
+        self.run = run
+        self._started.set()
+        assert self._connected.wait(20)
+        self._run_training(run, [*observers, self])
+
+    def begins(self, step: object) -> None:
+        self.iteration = step.iteration
+        if step.iteration in self.stops:
+            assert self._go.wait(20)
+            self._go.clear()
+
+    def reaches(self, iteration: int) -> None:
+        wait_for(lambda: self.iteration == iteration)
+
+    def go(self) -> None:
+        self._go.set()
+
+    def __call__(self, *words: object) -> tuple[bytes, list]:
+        """Train with words as `trained`, at a free port; the errors of the script are raised."""
+        with ThreadPoolExecutor(1) as pool, pytest.MonkeyPatch.context() as patch:
+            patch.setattr(train, "run_training", self._train)
+            done = pool.submit(self._play)
+            try:
+                result = trained(*words, "--port", 0)
+            finally:
+                self._started.set()
+                done.result(30)
+        return result
+
+    def _play(self) -> None:
+        assert self._started.wait(20)
+        viewer = Viewer(network_gui.port)
+        viewer.say(valid())
+        self._connected.set()
+        try:
+            assert len(viewer.take(3 * 24 * 16)) == 3 * 24 * 16
+            assert viewer.path() == self.run.dataset.source_path
+            self.script(self, viewer)
+        finally:
+            viewer.leave()
+
+    def camera(self, number: int, width: int = 48, height: int = 32) -> MiniCam:
+        """A view beside that of a photo."""
+        views = self.run.scene.getTrainCameras()
+        near = views[number % len(views)]
+        view = near.world_view_transform.clone()
+        view[3, :3] += 0.003 * number * torch.tensor([1.0, -2.0, 0.5], device=view.device)
+        full = view @ near.projection_matrix
+        return MiniCam(width, height, near.FoVy, near.FoVx, near.znear, near.zfar, view, full)
+
+    def wanted(self, camera: MiniCam, scaling: float = 1.0) -> bytes:
+        """What `render` shows of the model now."""
+        with torch.no_grad():
+            return as_bytes(
+                render(camera, self.run.gaussians, self.run.pipe, self.run.background, scaling)["render"]
+            ).tobytes()
+
+    def check(self, viewer: Viewer, number: int, **changes: object) -> bytes:
+        """Ask for a frame, training being paused; it must be the model's."""
+        camera = self.camera(number)
+        switches = {"shs_python": int(self.run.pipe.convert_SHs_python)} | changes
+        frame, path = viewer.ask(request(camera, **switches))
+        assert path == str(self.run.dataset.source_path)
+        assert frame.tobytes() == self.wanted(camera, changes.get("scaling_modifier", 1.0))
+        return frame.tobytes()
+
+
+@pytest.mark.parametrize("options", OPTIONS.values(), ids=OPTIONS.keys())
+def test_frames_are_those_of_render_and_training_is_the_same(colmap_scene, tmp_path, options):
+    count = 100 if not options else 5
+
+    def script(watched: Watched, viewer: Viewer) -> None:
+        first = [watched.check(viewer, number) for number in range(count)]  # paused
+        assert len({*first}) == count and watched.iteration == 1
+        small = watched.check(viewer, 0, scaling_modifier=0.3)
+        assert small != first[0]
+        viewer.ask(request(watched.camera(0), train=1))
+        watched.reaches(25)  # nothing is asked for: training does not wait
+        viewer.say(valid())
+        watched.go()
+        assert viewer.take(3 * 24 * 16) and viewer.path()
+        later = watched.check(viewer, 0)
+        assert later != first[0] and watched.iteration == 26
+        viewer.leave()
+        watched.reaches(45)
+        again = Viewer(network_gui.port)
+        again.say({"resolution_x": 0, "resolution_y": 5})
+        again.say(valid())
+        watched.go()
+        assert again.path() == str(colmap_scene)  # no frame, and no word on training
+        assert again.take(3 * 24 * 16) and again.path()
+        watched.check(again, 1)
+        assert 45 < watched.iteration < 50
+        again.ask(request(watched.camera(1), train=1, shs_python=1, rot_scale_python=1))
+        again.leave()
+
+    watched = Watched(script, stops=(25, 45))
+    result = watched(colmap_scene, tmp_path / "watched", *options)
+    assert watched.iteration == ITERATIONS
+    assert result == trained(colmap_scene, tmp_path / "alone", "--disable_viewer", *options)
+    record = (tmp_path / "watched/train_log.json").read_text()
+    assert '"viewing_seconds"' in record and '"viewing_seconds"' not in (tmp_path / "alone/train_log.json").read_text()
+
+
+def half(viewer: Viewer) -> None:
+    viewer.socket.sendall(packed(valid())[:200])
+
+
+def dribble(viewer: Viewer) -> None:
+    for byte in packed(valid()):
+        viewer.socket.sendall(bytes([byte]))
+        time.sleep(0.02)
+
+
+def leave_amid(viewer: Viewer) -> None:
+    """Ask for a large frame, take a piece of it, and go."""
+    viewer.say(valid(resolution_x=1600, resolution_y=1600))
+    viewer.take(1000)
+    viewer.socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, RESET)
+    viewer.leave()
+
+
+def take_nothing(viewer: Viewer) -> None:
+    viewer.say(valid(resolution_x=1600, resolution_y=1600))
+    time.sleep(0.5)
+    viewer.leave()
+
+
+# What a viewer does once it has paused training, and why it is let go.
+HOSTILE: dict[str, tuple[Callable[[Viewer], None] | bytes, str]] = {
+    "2 GB": (struct.pack("<i", 2**31 - 1), "announced a message of 2,147,483,647 bytes"),
+    "negative length": (struct.pack("<i", -1), "announced"),
+    "length alone": (struct.pack("<i", 100), "silent"),
+    "length too short": (struct.pack("<i", 30) + packed(valid())[4:], "not JSON"),
+    "length too long": (struct.pack("<i", 60_000) + packed(valid())[4:], "silent"),
+    "no length": (struct.pack("<i", 0), "not JSON"),
+    "not JSON": (packed(b"GET / HTTP/1.1\r\n\r\n"), "not JSON"),
+    "HTTP": (b"GET / HTTP/1.1\r\n\r\n", "announced"),
+    "binary": (packed(bytes(range(256))), "not JSON"),
+    "wrong types": (packed(valid(fov_x="1", view_matrix={"a": 1})), "fov_x is not a number"),
+    "a list": (packed([1, 2, 3]), "not a JSON object"),
+    "huge": (packed(valid(resolution_x=10**6, resolution_y=10**6)), "resolution"),
+    "negative size": (packed(valid(resolution_x=-4)), "resolution"),
+    "NaN matrix": (packed(valid(view_matrix=[float("nan")] * 16)), "view_matrix is not finite"),
+    "singular": (packed(valid(view_matrix=[0.0] * 16)), "singular"),
+    "half a message": (half, "silent"),
+    "left in a frame": (leave_amid, "reset|pipe"),
+    "takes nothing": (take_nothing, "silent|reset|pipe"),
+    "dribble": (dribble, "took more than"),
+}
+
+
+def test_no_message_ends_the_training(colmap_scene, tmp_path, monkeypatch, capfd):
+    """Each viewer is connected before the one before it is let go, so that each meets a training."""
+    monkeypatch.setattr(network_transfer, "LONGEST", 1.0)
+
+    def script(watched: Watched, viewer: Viewer) -> None:
+        for act, _ in HOSTILE.values():
+            following = Viewer(network_gui.port, buffer=4096)
+            following.say(valid())
+            if isinstance(act, bytes):
+                viewer.socket.sendall(act)
+            else:
+                try:
+                    act(viewer)
+                except OSError:
+                    assert act is dribble  # let go in the middle of it
+            assert viewer.socket.fileno() < 0 or viewer.is_let_go()
+            viewer.leave()
+            viewer = following
+            assert len(viewer.take(3 * 24 * 16)) == 3 * 24 * 16 and viewer.path() == str(colmap_scene)
+        assert watched.iteration < ITERATIONS
+        viewer.ask(valid(train=1))
+        viewer.leave()
+
+    watched = Watched(script)
+    result = watched(colmap_scene, tmp_path / "watched")
+    said = [line for line in capfd.readouterr().err.splitlines() if "is disconnected" in line]
+    assert len(said) == len(HOSTILE)
+    for line, (name, (_, why)) in zip(said, HOSTILE.items(), strict=True):
+        assert re.search(rf"viewer 127.0.0.1:\d+ is disconnected: .*({why})", line), name
+    assert result == trained(colmap_scene, tmp_path / "alone", "--disable_viewer")
+
+
+class Endless:
+    """A training that only serves viewers: its observer is asked and told as the loop does it, in a thread."""
+
+    def __init__(self) -> None:
+        network_gui.init("127.0.0.1", 0)
+        gaussians = model(40)
+        self.run = SimpleNamespace(
+            gaussians=gaussians,
+            pipe=pipeline(),
+            background=gaussians.get_xyz.new_zeros(3),
+            dataset=SimpleNamespace(source_path="/scene"),
+            clock=SimpleNamespace(paused=lambda purpose: threading.Lock()),
+            interrupt=SimpleNamespace(requested=None),
+        )
+        self.iterations = self.due = 0
+        self.longest = 0.0
+        self._over = threading.Event()
+        self._thread = threading.Thread(target=self._serve)
+
+    def _serve(self) -> None:
+        viewer, step = NetworkViewer(self.run), SimpleNamespace(last=False)
+        while not self._over.wait(0.0005):
+            begun = time.monotonic()
+            self.due += viewer.due(step)
+            viewer.measured(step, None)
+            self.longest = max(self.longest, time.monotonic() - begun)
+            self.iterations += 1
+
+    def __enter__(self) -> "Endless":
+        self._thread.start()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.run.interrupt.requested = KeyboardInterrupt
+        self._over.set()
+        self._thread.join(20)
+        assert not self._thread.is_alive()
+
+
+def test_a_viewer_that_asks_for_nothing_holds_nothing(monkeypatch, capfd):
+    monkeypatch.setattr(network_gui, "FIRST", 0.4)
+    with Endless() as training:
+        idle, waiting = Viewer(network_gui.port), Viewer(network_gui.port)
+        waiting.say(valid(train=1))
+        assert idle.is_let_go()
+        assert training.due == 0 and training.longest < 0.3 and training.iterations > 50
+        assert waiting.take(3 * 24 * 16) and waiting.path() == "/scene"
+        before = training.iterations
+        time.sleep(1)  # it lets training go on, so it may be silent for as long as it likes
+        assert training.iterations > before + 100 and training.due == 1
+        assert waiting.ask(valid(train=1))[1] == "/scene"
+        waiting.leave()
+        idle.leave()
+    (line,) = re.findall("^.*is disconnected.*$", capfd.readouterr().err, re.MULTILINE)
+    assert line.endswith("it has not asked for anything for 0.4 s")
+
+
+def test_no_message_takes_longer_than_its_limit_though_bytes_keep_coming(monkeypatch):
+    monkeypatch.setattr(network_transfer, "LONGEST", 0.0)
+    ours, theirs = socket.socketpair()
+    with ours, theirs:
+        theirs.sendall(packed(valid()))
+        for act in (
+            lambda: network_transfer.receive_message(ours),
+            lambda: network_transfer.send_message(ours, b"1", b""),
+        ):
+            with pytest.raises(network_transfer.ViewerLost, match="took more than 0 s"):
+                act()
+
+
+def test_a_viewer_whose_messages_come_in_pieces_is_served():
+    with Endless():
+        viewer = Viewer(network_gui.port)
+        text = packed(valid())
+        for start in range(0, len(text), 100):
+            viewer.socket.sendall(text[start : start + 100])
+            time.sleep(0.01)
+        assert len(viewer.take(3 * 24 * 16)) == 3 * 24 * 16 and viewer.path() == "/scene"
+        viewer.socket.sendall(packed(valid(train=1)) + packed(valid()))  # two at once
+        assert len(viewer.take(3 * 24 * 16)) == 3 * 24 * 16 and viewer.path() == "/scene"
+        assert len(viewer.take(3 * 24 * 16)) == 3 * 24 * 16 and viewer.path() == "/scene"
+        viewer.leave()
+
+
+def test_random_messages_over_the_wire(monkeypatch):
+    monkeypatch.setattr(network_transfer, "SILENCE", 0.02)
+    rng = random.Random(7)
+    with Endless() as training:
+        for _ in range(150):
+            viewer = Viewer(network_gui.port)
+            text = mutated(rng)
+            length = rng.choice([len(text)] * 8 + [len(text) + 5, rng.randrange(2**32)])
+            viewer.socket.sendall(struct.pack("<I", length) + text)
+            viewer.leave()
+        viewer = Viewer(network_gui.port)
+        assert viewer.ask(valid(train=1))[1] == "/scene"
+        viewer.leave()
+        assert training._thread.is_alive()
+
+
+def test_a_frame_that_cannot_be_rendered_ends_the_connection(monkeypatch, capfd):
+    def fail(*arguments: object) -> None:
+        raise MemoryError("no room for\nthis")
+
+    monkeypatch.setattr("training.observers.network_viewer.frame_bytes", fail)
+    with Endless():
+        viewer = Viewer(network_gui.port)
+        viewer.say(valid())
+        assert viewer.is_let_go()
+        viewer.leave()
+    assert re.search(r"its frame cannot be rendered \(no room for\)\n", capfd.readouterr().err)
+
+
+def test_ctrl_c_stops_a_training_that_waits_for_its_viewer(colmap_scene, tmp_path):
+    def script(watched: Watched, viewer: Viewer) -> None:
+        watched.check(viewer, 0)
+        os.kill(os.getpid(), signal.SIGINT)
+        assert viewer.is_let_go()
+
+    watched = Watched(script)
+    with pytest.raises(KeyboardInterrupt):
+        watched(colmap_scene, tmp_path / "out")
+    assert (tmp_path / f"out/chkpnt{watched.iteration}.pth").exists() and watched.iteration < ITERATIONS
+    assert network_gui.listener is None and network_gui.conn is None
+
+
+@pytest.mark.parametrize("end", ["leaves", "lets go", "Ctrl-C"])
+def test_keep_alive_holds_a_finished_training(colmap_scene, tmp_path, capsys, end):
+    out = tmp_path / "out"
+
+    def script(watched: Watched, viewer: Viewer) -> None:
+        viewer.ask(request(watched.camera(0), train=1, keep_alive=1))
+        watched.reaches(ITERATIONS - 1)
+        viewer.say(valid(train=1, keep_alive=1))  # there in the last iteration, and answered after it
+        watched.go()
+        assert viewer.take(3 * 24 * 16) and viewer.path()
+        assert (out / f"chkpnt{ITERATIONS}.pth").exists()
+        for number in range(3):
+            watched.check(viewer, number, train=1, keep_alive=1)
+        time.sleep(0.3)
+        assert (out / f"point_cloud/iteration_{ITERATIONS}/point_cloud.ply").exists()
+        watched.check(viewer, 3, train=0, keep_alive=0)
+        watched.check(viewer, 4, train=1, keep_alive=1)
+        if end == "lets go":
+            watched.check(viewer, 5, train=1, keep_alive=0)
+            assert viewer.is_let_go()
+        elif end == "Ctrl-C":
+            os.kill(os.getpid(), signal.SIGINT)
+            assert viewer.is_let_go()
+
+    watched = Watched(script, stops=(ITERATIONS - 1,))
+    if end == "Ctrl-C":
+        with pytest.raises(KeyboardInterrupt):
+            watched(colmap_scene, out)
+    else:
+        watched(colmap_scene, out)
+        assert "Training complete." in capsys.readouterr().out
+
+
+def test_a_port_in_use_is_one_warning(colmap_scene, tmp_path, capfd):
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        trained(colmap_scene, tmp_path / "out", "--port", taken.getsockname()[1], "--quiet")
+    (warning,) = re.findall("^warning: .*$", capfd.readouterr().err, re.MULTILINE)
+    assert "cannot listen for the remote viewer at 127.0.0.1:" in warning and "--disable_viewer" in warning
+
+
+@pytest.mark.parametrize("address", [("127.0.0.1", 70_000), ("::no", 0), ("203.0.113.1", 0)])
+def test_an_address_that_cannot_be_had_is_one_warning(address, capfd):
+    network_gui.init(*address)
+    assert network_gui.listener is None and (network_gui.host, network_gui.port) == address
+    assert capfd.readouterr().err.count("\n") == 1
+    network_gui.try_connect()
+    assert network_gui.conn is None
+
+
+def test_disable_viewer_opens_nothing(colmap_scene, tmp_path, monkeypatch):
+    opened = []
+    monkeypatch.setattr(socket, "create_server", lambda *x, **y: opened.append(x))
+    trained(colmap_scene, tmp_path / "out", "--disable_viewer", "--quiet")
+    assert opened == []
+
+
+def test_the_default_address_is_the_reference_s():
+    args = train.parse(["-s", "."])[0]
+    assert (args.ip, args.port, args.disable_viewer) == ("127.0.0.1", 6009, False)
+
+
+# Loops that call the names of the reference themselves
+
+
+def test_calls_without_a_viewer_say_so():
+    assert network_gui.conn is None
+    for call in (network_gui.read, network_gui.receive, lambda: network_gui.send(b"", "/scene")):
+        with pytest.raises(UserError, match="no viewer is connected"):
+            call()
+
+
+def test_a_loop_of_its_own_receives_and_sends(monkeypatch, capfd):
+    monkeypatch.setattr(network_gui, "PATIENCE", 0.3)
+    network_gui.init("127.0.0.1", 0)
+    network_gui.try_connect()
+    assert network_gui.conn is None
+    viewer = Viewer(network_gui.port)
+    wait_for(lambda: network_gui.try_connect() or network_gui.conn)
+    viewer.say(valid(train=1, shs_python=1, scaling_modifier=0.25))
+    camera, *rest = network_gui.receive()
+    assert rest == [True, True, False, False, 0.25] and (camera.image_width, camera.image_height) == (24, 16)
+    network_gui.send(memoryview(bytes(3 * 24 * 16)), "/scène\udcff")  # a name that is not UTF-8
+    assert viewer.take(3 * 24 * 16) == bytes(3 * 24 * 16)
+    assert viewer.take(12) == struct.pack("<I", 8) + "/scène".encode() + b"\xff"
+    viewer.say({"resolution_x": 0, "resolution_y": 0})
+    assert network_gui.receive() == (None,) * 6
+    network_gui.send(None, "/scene")
+    assert viewer.path() == "/scene"
+    viewer.say(valid())
+    assert network_gui.read() == valid()
+    with pytest.raises(Exception, match="sent nothing for 0.3 s"):
+        network_gui.receive()
+    assert network_gui.conn is None and viewer.is_let_go()
+    assert capfd.readouterr().err.count("\n") == 1
+
+
+def test_a_loop_may_drop_the_viewer_and_take_the_next():
+    network_gui.init("127.0.0.1", 0)
+    for _ in range(2):
+        viewer = Viewer(network_gui.port)
+        wait_for(lambda: network_gui.try_connect() or network_gui.conn)
+        viewer.say(valid())
+        network_gui.receive()
+        network_gui.conn = None
+        assert viewer.is_let_go()
+        viewer.leave()
