@@ -239,6 +239,48 @@ def test_interpolate_passes_each_camera_smoothly_at_constant_speed():
     assert fov.min() >= poses.fov.min() and fov.max() <= poses.fov.max()
 
 
+def test_interpolate_is_a_centripetal_catmull_rom_spline():
+    """Points by the pyramid of Barry and Goldman (SIGGRAPH 1988, figure 2), with square roots of chords as knots."""
+    points = np.array([[0, 0, 0], [1, 0, 0], [1.2, 0.1, 0], [1, 3, 1], [5, 3, 0.0]])
+    poses = Poses(points, np.broadcast_to(np.eye(3), (5, 3, 3)), np.full(5, 40.0))
+    places, _, _ = sampled(Interpolated(poses, 5.0), 8000)
+    knots = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1) ** 0.5)])
+    for first in (0, 1):
+        for at in np.linspace(knots[first + 1], knots[first + 2], 9):
+            level = list(points[first : first + 4])
+            for spans in ([(0, 1), (1, 2), (2, 3)], [(0, 2), (1, 3)], [(1, 2)]):
+                level = [
+                    ((knots[first + j] - at) * level[k] + (at - knots[first + i]) * level[k + 1])
+                    / (knots[first + j] - knots[first + i])
+                    for k, (i, j) in enumerate(spans)
+                ]
+            assert np.linalg.norm(places - level[0], axis=1).min() < 0.002
+
+
+def test_interpolate_turns_the_short_way_around_a_full_circle():
+    """Quaternions change their sign on the way."""
+    degrees = np.arange(0, 360, 40)
+    poses = Poses(np.zeros((9, 3)), about_y(*degrees).as_matrix(), np.full(9, 40.0))
+    places, turns, _ = sampled(Interpolated(poses, 8.0), 321)
+    np.testing.assert_allclose(turns[::40], poses.turns, rtol=0, atol=1e-3)
+    assert steps(places, turns)[1] == pytest.approx(math.radians(1), rel=0.02)
+
+
+def test_no_part_of_a_tour_is_shorter_when_reversed():
+    poses = Poses(np.random.default_rng(3).normal(size=(40, 3)), np.tile(np.eye(3), (40, 1, 1)), np.ones(40))
+    order = visiting_order(poses)
+
+    def length(places: np.ndarray) -> float:
+        return np.linalg.norm(np.diff(places, axis=0), axis=1).sum()
+
+    places = poses.positions[order]
+    assert order[0] == 0 and sorted(order) == list(range(40)) and length(places) < length(poses.positions) / 2
+    for start in range(1, 39):
+        for end in range(start + 1, 40):
+            other = np.concatenate([places[:start], places[start : end + 1][::-1], places[end + 1 :]])
+            assert length(other) > length(places) - 1e-6
+
+
 def test_a_walk_is_kept_and_photos_in_no_order_are_not_criss_crossed():
     walk = on_ring(30)
     assert visiting_order(walk).tolist() == list(range(30))
@@ -345,12 +387,13 @@ def test_the_arc_that_angles_cover():
 
 
 def test_cameras_overhead_do_not_make_the_ellipse_spin():
-    """Seen from above, up is a direction of the ground, along which the way about it would pass."""
-    rng = np.random.default_rng(0)
-    positions = np.column_stack([rng.uniform(-1, 1, 30), np.full(30, -5.0), rng.uniform(-1, 1, 30)])
-    poses = looking_at(positions, np.zeros(3), up=np.array([0, 0, 1.0]))
-    places, turns, _ = sampled(Ellipse(poses, 5.0))
-    assert steps(places, turns)[1].max() < 0.05 and (-turns[:, :, 1] @ [0, 0, 1]).min() > 0.5
+    """A ring that passes over the focus, seen along the cameras' mean up."""
+    angles = np.arange(24) * 2 * math.pi / 24
+    ring = np.column_stack([np.sin(0.61) * np.cos(angles), np.full(24, -np.cos(0.61)), np.sin(0.61) * np.sin(angles)])
+    poses = looking_at(4 * ring, np.zeros(3), up=Rotation.from_euler("x", 20, degrees=True).apply(UP))
+    path = Ellipse(poses, 5.0)
+    places, turns, _ = sampled(path)
+    assert steps(places, turns)[1].max() < 0.05 and (-turns[:, :, 1] @ path.up).min() > 0
 
 
 def test_the_spiral_turns_twice_before_the_scene():

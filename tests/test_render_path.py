@@ -141,7 +141,7 @@ def by_bt709(planes: np.ndarray, width: int, height: int) -> np.ndarray:
 
 
 def test_neither_levels_nor_colours_are_shifted(tmp_path, monkeypatch):
-    """H.264 has a value of colour where the left one of two pixels is, in the middle of two rows (H.264, figure 6-1)."""
+    """H.264 has a value of colour on the left one of two pixels, in the middle of two rows (its figure 6-1)."""
     av = pytest.importorskip("av", reason="PyAV, a second decoder, is not installed")
     monkeypatch.setattr(video, "CRF", 1)
     columns, rows = np.meshgrid(np.arange(96), np.arange(64))
@@ -282,7 +282,7 @@ def test_memory_does_not_grow_with_the_length(run, monkeypatch, decoder):
         (("--path", "ellipse", "--seconds", "4000"), "^--seconds must be 0.1 to 3600, got 4000$"),
         (
             ("--path", "elipse"),
-            "^--path must be interpolate, ellipse, spiral or a file of keyframes; there is no file el",
+            "^--path must be interpolate, ellipse, spiral or a file of keyframes; there is no file",
         ),
         (("--path", "spiral"), "^--path spiral needs training cameras that face one way"),
     ],
@@ -360,6 +360,21 @@ def test_an_ffmpeg_that_cannot_be_started_is_named(run, tmp_path, monkeypatch):
     monkeypatch.setattr(video, "find_ffmpeg", lambda: str(tmp_path / "none"))
     with pytest.raises(UserError, match=r"^cannot start .*none \(No such file or directory\); `pip install "):
         run("--path", "ellipse")
+
+
+def test_a_lack_of_memory_names_a_smaller_size(run, out, monkeypatch):
+    from camera_paths import render_path
+
+    def fail(*_, **__):
+        raise MemoryError
+
+    monkeypatch.setattr(render_path, "render", fail)
+    for words, remedy in (([], r"lower --resolution \(-r\), or pass"), (["--size", "64", "48"], "pass")):
+        with pytest.raises(
+            UserError, match=f"images of {'64 x 48' if words else '96 x 64'}.; {remedy} a smaller --siz"
+        ):
+            run("--path", "ellipse", *words)
+    assert written(out / "videos") == []
 
 
 def test_a_video_that_cannot_be_placed_is_refused(run, out):
