@@ -9,7 +9,7 @@ _PASSES = 50
 
 
 def distances(one: Poses, other: Poses, radius: float) -> np.ndarray:
-    """How far poses (N or 1) are from others (N): metres walked plus radius x radians turned, in world units."""
+    """How far poses are from others, pairwise: distance moved plus radius x radians turned (N,), in world units."""
     moved = np.linalg.norm(one.positions - other.positions, axis=1)
     cosine = np.abs((one.quaternions * other.quaternions).sum(axis=1))
     return moved + radius * 2 * np.arccos(np.minimum(cosine, 1.0))

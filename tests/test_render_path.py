@@ -16,9 +16,10 @@ from PIL import Image
 
 from camera_paths import video
 from camera_paths.keyframes import CameraPath, Keyframe
-from camera_paths.video import find_ffmpeg, video_writer
+from camera_paths.video import video_writer
 from utils.system_utils import UserError
 
+imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg", reason="no imageio-ffmpeg: pip install '.[video]'")
 render = pytest.importorskip("render", reason="the extensions are not built: make test")
 ROOT = Path(__file__).resolve().parents[1]
 PATH = CameraPath(tuple(Keyframe(at, (0.2 * at, 0.0, -3.0), (1.0, 0.0, 0.0, 0.0), 45.0 + at) for at in (0.0, 0.4, 1.0)))
@@ -26,13 +27,12 @@ PATH = CameraPath(tuple(Keyframe(at, (0.2 * at, 0.0, -3.0), (1.0, 0.0, 0.0, 0.0)
 
 @pytest.fixture(scope="session")
 def decoder() -> Callable[[Path], tuple[dict, list[np.ndarray]]]:
-    """Reads a video by ffmpeg: what is known of it, and its frames. Skips without imageio-ffmpeg."""
-    package = pytest.importorskip("imageio_ffmpeg", reason="no imageio-ffmpeg: pip install '.[video]'")
+    """Reads a video by ffmpeg: what is known of it, and its frames."""
 
     def decoded(path: Path) -> tuple[dict, list[np.ndarray]]:
         # ffmpeg's default conversion rounds down, and makes every picture a level darker.
         exact = ["-vf", "scale=flags=bicubic+accurate_rnd+full_chroma_int+full_chroma_inp,format=rgb24"]
-        frames = package.read_frames(str(path), output_params=exact)
+        frames = imageio_ffmpeg.read_frames(str(path), output_params=exact)
         known = next(frames)
         width, height = known["size"]
         return known, [np.frombuffer(data, np.uint8).reshape(height, width, 3) for data in frames]
@@ -314,13 +314,12 @@ def test_a_wrong_file_is_refused(run, out, tmp_path):
 
 
 def test_a_missing_ffmpeg_is_said_before_the_model_is_read(run, out, monkeypatch):
-    package = pytest.importorskip("imageio_ffmpeg", reason="no imageio-ffmpeg: pip install '.[video]'")
 
     def none() -> str:
         raise RuntimeError("No ffmpeg exe could be found.")
 
     (out / "point_cloud").unlink()
-    monkeypatch.setattr(package, "get_ffmpeg_exe", none)
+    monkeypatch.setattr(imageio_ffmpeg, "get_ffmpeg_exe", none)
     with pytest.raises(UserError, match="has no ffmpeg program for this machine; install ffmpeg, and name it in"):
         run("--path", "ellipse")
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
@@ -369,10 +368,11 @@ def test_a_lack_of_memory_names_a_smaller_size(run, out, monkeypatch):
         raise MemoryError
 
     monkeypatch.setattr(render_path, "render", fail)
-    for words, remedy in (([], r"lower --resolution \(-r\), or pass"), (["--size", "64", "48"], "pass")):
-        with pytest.raises(
-            UserError, match=f"images of {'64 x 48' if words else '96 x 64'}.; {remedy} a smaller --siz"
-        ):
+    for words, size, remedy in (
+        ([], "96 x 64", r"lower --resolution \(-r\), or pass a smaller --size"),
+        (["--size", "64", "48"], "64 x 48", "pass a smaller --size"),
+    ):
+        with pytest.raises(UserError, match=rf"images of {size}\); {remedy}, or free memory that other programs use$"):
             run("--path", "ellipse", *words)
     assert written(out / "videos") == []
 
@@ -386,7 +386,6 @@ def test_a_video_that_cannot_be_placed_is_refused(run, out):
 
 
 def test_an_interrupted_video_leaves_nothing(tmp_path):
-    find_ffmpeg()
     started: list[subprocess.Popen] = []
     with pytest.raises(KeyboardInterrupt), video_writer(tmp_path / "a.mp4", 64, 48, 30) as writer:
         started.append(writer._process)
