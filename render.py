@@ -1,11 +1,14 @@
 """Render a trained model's train and test views as PNG beside the ground truth, and time the renders.
 
 python render.py -m MODEL [--iteration N] [--skip_train] [--skip_test] [--depth] [--alpha]
+python render.py -m MODEL --path {interpolate,ellipse,spiral,FILE.json} [--fps N] [--size W H] [--seconds S] [--frames]
 
 Writes MODEL/{train,test}/ours_N/{renders,gt}/00000.png ..., numbered by the views' sorted order, masks/ for views of
 which not every pixel counts, and render_times.json beside these folders: the time of each view without I/O. The device
 is idle before the clock starts, and done when it stops. --depth and --alpha write inverse depth and alpha into folders
 of these names, 16-bit PNGs with their scale in a text chunk (utils/files/plane_files.py).
+
+With --path, writes MODEL/videos/ours_N/NAME.mp4 instead (camera_paths/render_path.py).
 """
 
 from __future__ import annotations
@@ -15,7 +18,6 @@ if __name__ == "__main__":
 
 import argparse
 import copy
-import re
 import time
 from collections.abc import Collection
 from pathlib import Path
@@ -26,6 +28,7 @@ from PIL import Image
 from tqdm import tqdm
 
 from arguments import ModelParams, OptionParser, PipelineParams, get_combined_args, warn_of_background
+from camera_paths.options import add_path_options, wants_path
 from gaussian_renderer.memory_errors import memory_errors_explained
 from gaussian_renderer.scored_views import ScoredViews
 from gaussian_renderer.view_planes import PLANES, view_planes
@@ -33,22 +36,11 @@ from records import render_times
 from scene.cameras import Camera
 from scene.gaussian_model import GaussianModel
 from scene.saved_model import load_saved
+from scene.scene import Scene
+from utils.files.numbered_pngs import remove_leftovers, save_png
 from utils.files.plane_files import write_plane
 from utils.general_utils import safe_state
 from utils.system_utils import UserError, atomic_write, compute_device, mkdir_p, run_cli
-
-
-def to_bytes(image: torch.Tensor) -> torch.Tensor:
-    """An image (3, H, W), float in [0, 1] or already uint8, as (H, W, 3) uint8, halves rounded up."""
-    if image.dtype != torch.uint8:
-        image = (image.clamp(0, 1) * 255 + 0.5).to(torch.uint8)
-    return image.permute(1, 2, 0).contiguous().cpu()
-
-
-def save_png(image: torch.Tensor, path: Path) -> None:
-    """Write an image as `to_bytes` takes it; the file is written whole or not at all."""
-    with atomic_write(path) as temporary:
-        Image.fromarray(to_bytes(image).numpy()).save(temporary)
 
 
 def save_mask(mask: torch.Tensor, path: Path) -> None:
@@ -60,13 +52,6 @@ def save_mask(mask: torch.Tensor, path: Path) -> None:
 def save_plane(values: torch.Tensor, path: Path, plane: str) -> None:
     """Write a plane (1, H, W) of PLANES. White is 1 for alpha, and the nearest value of the view for depth."""
     write_plane(path, values[0].cpu().numpy(), 1.0 if plane == "alpha" else None)
-
-
-def remove_leftovers(folder: Path, count: int) -> None:
-    """Delete numbered PNGs beyond the first `count`, which an earlier run with more views has left."""
-    for file in folder.glob("*.png"):
-        if re.fullmatch(r"\d{5,}", file.stem) and int(file.stem) >= count:
-            file.unlink()
 
 
 def write_views(
@@ -168,23 +153,27 @@ def render_sets(
     dataset: the model options. sh_degree: degree that the PLY must have, None: any. planes: those of PLANES to write,
     too. UserError if nothing can be loaded.
     """
-    options = copy.copy(dataset)
-    options.images_to_load = 1  # each photo is used once
-    scene = load_saved(options, iteration, sh_degree)
-    gaussians = scene.gaussians
-    if len(gaussians) == 0:
-        raise UserError(f"iteration {scene.loaded_iter} of {scene.model_path} has no Gaussians; train it again")
-    background = torch.full((3,), 1.0 if options.white_background else 0.0, device=compute_device())
-    halves = getattr(options, "train_test_exp", False)  # options of 2023 lack it
-    drawn = gaussians, pipeline, background, halves, separate_sh
+    scene, background = _loaded(dataset, iteration, sh_degree)
+    halves = getattr(dataset, "train_test_exp", False)  # options of 2023 lack it
+    drawn = scene.gaussians, pipeline, background, halves, separate_sh
     if not skip_train:
         render_set(scene.model_path, "train", scene.loaded_iter, scene.getTrainCameras(), *drawn, planes=planes)
     if not skip_test:
         render_set(scene.model_path, "test", scene.loaded_iter, scene.getTestCameras(), *drawn, planes=planes)
 
 
+def _loaded(dataset: argparse.Namespace, iteration: int, sh_degree: int | None) -> tuple[Scene, torch.Tensor]:
+    """The scene with the model of a saved iteration, and the background (3,) of the options."""
+    options = copy.copy(dataset)
+    options.images_to_load = 1  # each photo is used once
+    scene = load_saved(options, iteration, sh_degree)
+    if len(scene.gaussians) == 0:
+        raise UserError(f"iteration {scene.loaded_iter} of {scene.model_path} has no Gaussians; train it again")
+    return scene, torch.full((3,), 1.0 if options.white_background else 0.0, device=compute_device())
+
+
 def main() -> None:
-    parser = OptionParser(description="Render the train and test views of a trained model.")
+    parser = OptionParser(description="Render the train and test views of a trained model, or a video of it.")
     # Each photo is used once, so one is kept in memory.
     model_params = ModelParams(parser, sentinel=True, without=("images_to_load",))
     pipeline_params = PipelineParams(parser, sentinel=True)
@@ -193,11 +182,20 @@ def main() -> None:
     parser.add_argument("--skip_test", action="store_true", help="leave the test views out (default: off)")
     for plane, what in (("depth", "inverse depth"), ("alpha", "alpha")):
         parser.add_argument(f"--{plane}", action="store_true", help=f"also write {what}, 16-bit PNGs (default: off)")
+    add_path_options(parser)
     parser.add_argument("--quiet", action="store_true", help="print nothing to stdout (default: off)")
     args = get_combined_args(parser)
     options, pipeline = model_params.extract(args), pipeline_params.extract(args)
     safe_state(args.quiet)
     warn_of_background(options)
+    if wants_path(args):
+        from camera_paths.render_path import render_path  # SciPy takes a while to import
+        from camera_paths.request import path_request
+
+        request = path_request(args)
+        scene, background = _loaded(options, args.iteration, args.typed_sh_degree)
+        render_path(scene, pipeline, background, request)
+        return
     chosen = {"sh_degree": args.typed_sh_degree, "planes": [plane for plane in PLANES if getattr(args, plane)]}
     render_sets(options, args.iteration, pipeline, args.skip_train, args.skip_test, **chosen)
 

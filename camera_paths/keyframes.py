@@ -1,6 +1,7 @@
 """A camera path as keyframes, and its JSON file, which the viewer writes and render.py reads."""
 
 import math
+import sys
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -9,6 +10,8 @@ from utils.files.json_files import read_json, write_json
 from utils.system_utils import UserError
 
 EASINGS = ("linear", "smooth")
+_FOV = 0.001, 179.9  # degrees; outside, the numbers of a projection have no meaning in float32
+_FARTHEST = 1e12  # as for the cameras of a scene
 
 
 @dataclass(frozen=True)
@@ -44,7 +47,7 @@ class CameraPath:
 
 def read_camera_path(path: Path) -> CameraPath:
     """Read a file of `CameraPath.write`, or one written by hand. UserError, naming the keyframe, for a wrong one."""
-    content = read_json(path)
+    content = _content(path)
     if not isinstance(content, dict) or not isinstance(content.get("keyframes"), list):
         raise UserError(f"{path} is no camera path: it needs a list called keyframes")
     keyframes = tuple(_keyframe(entry, f"{path}: keyframe {n}") for n, entry in enumerate(content["keyframes"], 1))
@@ -61,14 +64,28 @@ def read_camera_path(path: Path) -> CameraPath:
     return CameraPath(keyframes, easing)
 
 
+def _content(path: Path) -> Any:
+    try:
+        return read_json(path)
+    except OSError as error:
+        raise UserError(
+            f"cannot read the camera path {path} ({error.strerror}); pass another file, or fix its permissions"
+        ) from error
+    except (ValueError, RecursionError) as error:
+        reason = "nested too deep" if isinstance(error, RecursionError) else error
+        raise UserError(f"the camera path {path} is not JSON ({reason}); save it again from the viewer") from error
+
+
 def _keyframe(entry: Any, where: str) -> Keyframe:
     if not isinstance(entry, dict):
         raise UserError(f"{where} must be an object with seconds, position, wxyz and fov")
     seconds, fov = _numbers(entry, "seconds", None, where)[0], _numbers(entry, "fov", None, where)[0]
     position, wxyz = _numbers(entry, "position", 3, where), _numbers(entry, "wxyz", 4, where)
     length = math.hypot(*wxyz)
-    if not 0 < fov < 180:
-        raise UserError(f"{where}: fov must be between 0 and 180 degrees, got {fov}")
+    if not _FOV[0] <= fov <= _FOV[1]:
+        raise UserError(f"{where}: fov must be {_FOV[0]} to {_FOV[1]} degrees, got {fov}")
+    if max(map(abs, position)) > _FARTHEST:
+        raise UserError(f"{where}: position must be at most {_FARTHEST:g} from the origin, got {list(position)}")
     if not 1e-6 < length < 1e6:
         raise UserError(f"{where}: wxyz must be a unit quaternion, got {list(wxyz)}")
     return Keyframe(seconds, position, tuple(value / length for value in wxyz), fov)
@@ -80,9 +97,10 @@ def _numbers(entry: dict, name: str, count: int | None, where: str) -> tuple[flo
     values = value if count else [value]
     what = f"{count} numbers" if count else "a number"
     if not isinstance(values, list) or len(values) != (count or 1) or not all(map(_is_number, values)):
-        raise UserError(f"{where}: {name} must be {what}, got {value!r}")
+        raise UserError(f"{where}: {name} must be {what}, got {repr(value)[:80]}")
     return tuple(float(number) for number in values)
 
 
 def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    # Comparisons, as an integer of JSON may be too large for a float.
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= sys.float_info.max

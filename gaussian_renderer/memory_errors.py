@@ -3,27 +3,29 @@
 import contextlib
 from collections.abc import Iterator, Sequence
 
-from scene.cameras import Camera
+from scene.cameras import Camera, MiniCam
 from scene.gaussian_model import GaussianModel
 from utils.host.memory import is_out_of_memory, shortage
 from utils.system_utils import UserError
 
 
 @contextlib.contextmanager
-def memory_errors_explained(gaussians: GaussianModel, cameras: Sequence[Camera]) -> Iterator[None]:
-    """Replace an out-of-memory error by a UserError while these views are rendered."""
+def memory_errors_explained(
+    gaussians: GaussianModel, cameras: Sequence[Camera | MiniCam], remedy: str = "lower --resolution (-r)"
+) -> Iterator[None]:
+    """Replace an out-of-memory error by a UserError while these views are rendered. remedy: what makes them smaller."""
     try:
         yield
     except Exception as error:
         if not is_out_of_memory(error):
             raise
         raise UserError(
-            f"rendering ran out of memory ({situation(error, gaussians, cameras)}); lower --resolution (-r), "
-            "or free memory that other programs use"
+            f"rendering ran out of memory ({situation(error, gaussians, cameras)}); {remedy}, or free memory "
+            "that other programs use"
         ) from error
 
 
-def situation(error: BaseException, gaussians: GaussianModel, cameras: Sequence[Camera]) -> str:
+def situation(error: BaseException, gaussians: GaussianModel, cameras: Sequence[Camera | MiniCam]) -> str:
     """The memory asked for and free, the number of Gaussians, and the size of the largest view."""
     parts = [shortage(error, gaussians.get_xyz.device), f"{len(gaussians):,} Gaussians"]
     if cameras:

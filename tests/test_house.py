@@ -14,7 +14,7 @@ ROOT = Path(__file__).resolve().parents[1]
 COMMANDS = ("train", "render", "metrics", "full_eval", "convert", "doctor", "setup")
 ROOMS = (
     *("arguments", "benchmarks", "conversion", "demo", "diagnosis", "evaluation", "gaussian_renderer", "records"),
-    *("lpipsPyTorch", "scene", "training", "utils"),
+    *("camera_paths", "lpipsPyTorch", "scene", "training", "utils"),
 )
 CSRC = ROOT / "submodules"
 LONGEST = 60  # lines of a function
@@ -40,6 +40,7 @@ MAY_IMPORT = {
     "scene.cameras": ("scene.views", "scene.pictures", "utils"),
     "scene": ("utils",),  # not arguments: a client's own package of that name may be found first
     "gaussian_renderer": ("scene", "utils"),
+    "camera_paths": ("gaussian_renderer", "scene", "utils"),
     "training": ("gaussian_renderer", "scene", "records", "arguments", "utils"),
     "training.observers": ("training", "gaussian_renderer", "scene", "records", "arguments", "utils"),
     "diagnosis": ("gaussian_renderer", "scene", "arguments", "utils"),

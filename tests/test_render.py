@@ -22,6 +22,7 @@ from scene.gaussian_model import GaussianModel
 from scene.gaussians.attributes import attributes
 from scene.gaussians.ply import write_ply
 from scene.saved_model import load_saved
+from utils.files.numbered_pngs import to_bytes
 from utils.files.plane_files import read_plane, write_plane
 from utils.system_utils import UserError
 
@@ -53,13 +54,13 @@ def test_bytes_are_rounded_half_up_and_clamped():
     )
     expected = [0, 0, 0, 1, 2, 3, 255, 255, 255]
     image = values.repeat(3, 2, 1)
-    assert render.to_bytes(image)[1, :, 2].tolist() == expected
-    assert render.to_bytes(image).shape == (2, 9, 3)
+    assert to_bytes(image)[1, :, 2].tolist() == expected
+    assert to_bytes(image).shape == (2, 9, 3)
 
 
 def test_every_8_bit_value_survives_float32():
     levels = torch.arange(256, dtype=torch.float32).repeat(3, 1, 1) / 255
-    assert torch.equal(render.to_bytes(levels)[0, :, 0], torch.arange(256, dtype=torch.uint8))
+    assert torch.equal(to_bytes(levels)[0, :, 0], torch.arange(256, dtype=torch.uint8))
 
 
 def test_renders_and_ground_truth_side_by_side(tmp_path, rendered):
@@ -124,12 +125,12 @@ def test_views_by_the_references_arguments(tmp_path, rendered, capsys):
     files = sorted(file.relative_to(folder).as_posix() for file in folder.rglob("*.*"))
     assert files == ["gt/00000.png", "render_times.json", "renders/00000.png"]
     assert json.loads((folder / "render_times.json").read_text())["gaussians"] == 7
-    assert np.array_equal(read(folder / "renders" / "00000.png"), render.to_bytes(image).numpy())
+    assert np.array_equal(read(folder / "renders" / "00000.png"), to_bytes(image).numpy())
     assert "test: 1 views, median" in capsys.readouterr().out
     # Half images, and the two arguments that 2023 did not have; its options lack antialiasing.
     render.render_set(str(tmp_path), "train", 30, [one], range(7), Namespace(), background, True, True)
     half = read(tmp_path / "train" / "ours_30" / "renders" / "00000.png")
-    assert np.array_equal(half, render.to_bytes(image[..., 2:]).numpy())
+    assert np.array_equal(half, to_bytes(image[..., 2:]).numpy())
 
 
 def test_sets_by_the_references_arguments(tmp_path, colmap_scene):

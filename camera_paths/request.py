@@ -1,0 +1,77 @@
+"""Request for a video along a path, made from the options of render.py and checked before a model is loaded."""
+
+import argparse
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from camera_paths.generated import GENERATED, SECONDS
+from camera_paths.keyframes import read_camera_path
+from camera_paths.moments import KeyframePath, TimedPath
+from camera_paths.poses import Poses
+from camera_paths.video import find_ffmpeg
+from utils.system_utils import UserError
+
+FPS = 30
+MOST_FPS = 240
+LARGEST_SIDE = 16384  # of x264
+MOST_SECONDS = 3600
+
+
+@dataclass(frozen=True)
+class PathRequest:
+    """A video to make.
+
+    name: of its files. make: the path of the training cameras' poses. fps: frames a second. size: width and height,
+    even, None: those of the first training camera, made even. frames: whether to write PNGs, too.
+    """
+
+    name: str
+    make: Callable[[Poses], TimedPath]
+    fps: int = FPS
+    size: tuple[int, int] | None = None
+    frames: bool = False
+
+
+def path_request(args: argparse.Namespace) -> PathRequest:
+    """The request of a command line with --path and the other options of `add_path_options`.
+
+    Reads the keyframe file and looks for ffmpeg. UserError for a wrong value, a wrong file or a missing ffmpeg.
+    """
+    fps = FPS if args.fps is None else args.fps
+    if not 1 <= fps <= MOST_FPS:
+        raise UserError(f"--fps must be 1 to {MOST_FPS}, got {fps}")
+    size = None if args.size is None else _checked_size(*args.size)
+    make = _maker(args.path, args.seconds)
+    find_ffmpeg()
+    return PathRequest(args.path if args.path in GENERATED else Path(args.path).stem, make, fps, size, args.frames)
+
+
+def _checked_size(width: int, height: int) -> tuple[int, int]:
+    if not (2 <= width <= LARGEST_SIDE and 2 <= height <= LARGEST_SIDE):
+        raise UserError(f"--size must be two even numbers of 2 to {LARGEST_SIDE} pixels, got {width} {height}")
+    if width % 2 or height % 2:
+        raise UserError(
+            f"--size {width} {height} has an odd side, which players of H.264 do not take; "
+            f"use --size {width - width % 2} {height - height % 2}"
+        )
+    return width, height
+
+
+def _maker(path: str, seconds: float | None) -> Callable[[Poses], TimedPath]:
+    if path in GENERATED:
+        seconds = SECONDS if seconds is None else seconds
+        if not 0.1 <= seconds <= MOST_SECONDS:
+            raise UserError(f"--seconds must be 0.1 to {MOST_SECONDS}, got {seconds:g}")
+        return lambda poses: GENERATED[path](poses, seconds)
+    if seconds is not None:
+        raise UserError(f"--seconds is for {', '.join(GENERATED)}; the times of {path} stand in it")
+    if not Path(path).exists():
+        raise UserError(f"--path must be {', '.join(GENERATED)} or a file of keyframes; there is no file {path}")
+    keyframes = KeyframePath(read_camera_path(Path(path)))
+    if keyframes.seconds > MOST_SECONDS:
+        raise UserError(
+            f"{path} lasts {keyframes.seconds:g} s, and a video lasts at most {MOST_SECONDS}; "
+            "give the keyframes' times in seconds"
+        )
+    return lambda _: keyframes
