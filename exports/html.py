@@ -1,0 +1,87 @@
+"""A model as one HTML file, with a viewer: it opens from disk, without network and without other programs."""
+
+import base64
+import gzip
+import json
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import jinja2
+
+from camera_paths.moments import TimedPath
+from camera_paths.poses import poses_of
+from exports.compressed_ply import write_compressed_ply
+from exports.splats import Splats
+from exports.upright import turn_upright, turned, up_of
+from exports.vendor import FOLDER, RECORD
+from exports.viewer_settings import settings
+from scene.cameras import Camera
+from utils.files.json_files import read_json
+from utils.system_utils import UserError, atomic_write
+
+_NAME = "scene.compressed.ply"  # its ending tells the viewer the format
+
+
+def write_html(
+    path: str | os.PathLike,
+    splats: Splats,
+    cameras: Sequence[Camera],
+    camera_path: TimedPath | None = None,
+    title: str = "3D Gaussian Splatting",
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+) -> None:
+    """Write the page, whole or not at all.
+
+    cameras: the training views, the first of which is where the page begins; up to 25 of them become bookmarks.
+    camera_path: the animation, None: once around the model. background: RGB in [0,1]. UserError without a camera.
+    """
+    if not cameras:
+        raise UserError("a page needs at least one training camera, from which it shows the model; the scene has none")
+    poses = poses_of(cameras)
+    turn = turn_upright(up_of(poses))
+    names = [str(camera.image_name) for camera in cameras]
+    page = {
+        "antialiasing": splats.antialiasing,
+        "name": _NAME,
+        "settings": settings(poses, names, turn, camera_path, background),
+    }
+    content = _template().render(
+        background=", ".join(f"{255 * value:.0f}" for value in background),
+        css=(FOLDER / "viewer.css").read_text(encoding="utf-8"),
+        licence=(FOLDER / "LICENSE").read_text(encoding="utf-8"),
+        model=_packed(_model(turned(splats, turn))),
+        page=_embedded(page),
+        record=read_json(RECORD),
+        title=title,
+        viewer=_packed((FOLDER / "viewer.js").read_bytes()),
+    )
+    with atomic_write(path) as temporary:
+        # Names that are not UTF-8 have surrogates, which appear as numbers.
+        temporary.write_text(content, encoding="utf-8", errors="backslashreplace")
+
+
+def _template() -> jinja2.Template:
+    loader = jinja2.FileSystemLoader(Path(__file__).parent)
+    environment = jinja2.Environment(
+        loader=loader, autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )
+    return environment.get_template("page.html.jinja")
+
+
+def _packed(content: bytes) -> str:
+    return base64.b64encode(gzip.compress(content, mtime=0)).decode()
+
+
+def _embedded(content: Any) -> str:
+    """JSON that cannot end the script element it stands in."""
+    return json.dumps(content, allow_nan=False).replace("<", "\\u003c")
+
+
+def _model(splats: Splats) -> bytes:
+    with TemporaryDirectory() as folder:
+        file = Path(folder) / _NAME
+        write_compressed_ply(file, splats)
+        return file.read_bytes()
