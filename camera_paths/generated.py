@@ -143,6 +143,7 @@ def ring(poses: Poses, focus: np.ndarray, normal: np.ndarray) -> Callable[[float
     _, _, axes = np.linalg.svd(flat - flat.mean(axis=0))
     across = axes - np.outer(axes @ normal, normal)  # axes[0], but where the cameras are in one place of the plane
     first = unit(across[np.linalg.norm(across, axis=1).argmax()])
+    first *= math.copysign(1.0, first @ flat[0])  # it begins on the side of the first camera
     plane = np.column_stack([first, np.cross(normal, first)])
     places = flat @ plane
     middle, half = covered_arc(np.arctan2(places[:, 1], places[:, 0]))

@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+import re
 import subprocess
 import tempfile
 from collections.abc import Iterator
@@ -61,7 +62,8 @@ class VideoWriter:
             self._process.wait(_WAIT)
         self._said.seek(0)
         lines = self._said.read().decode("utf-8", "replace").strip().splitlines()
-        reason = lines[-1].strip() if lines else f"exit status {self._process.returncode}"
+        # Without the part of ffmpeg that says it, "[out#0/mp4 @ 0x5609]".
+        reason = re.sub(r"^\[[^\]]*\] ", "", lines[-1]) if lines else f"it ended with {self._process.returncode}"
         return UserError(
             f"ffmpeg could not write {self._path}, after {self._frames} frames ({reason}); free space there, or "
             "choose another --size or place"
