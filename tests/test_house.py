@@ -11,10 +11,10 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
-COMMANDS = ("train", "render", "metrics", "full_eval", "convert", "doctor", "setup")
+COMMANDS = ("train", "render", "metrics", "full_eval", "convert", "doctor", "export", "setup")
 ROOMS = (
-    *("arguments", "benchmarks", "conversion", "demo", "diagnosis", "evaluation", "gaussian_renderer", "records"),
-    *("lpipsPyTorch", "scene", "training", "utils"),
+    *("arguments", "benchmarks", "conversion", "demo", "diagnosis", "evaluation", "exports", "gaussian_renderer"),
+    *("lpipsPyTorch", "records", "scene", "training", "utils"),
 )
 CSRC = ROOT / "submodules"
 LONGEST = 60  # lines of a function
@@ -40,7 +40,8 @@ MAY_IMPORT = {
     "scene.cameras": ("scene.views", "scene.pictures", "utils"),
     "scene": ("utils",),  # not arguments: a client's own package of that name may be found first
     "gaussian_renderer": ("scene", "utils"),
-    "training": ("gaussian_renderer", "scene", "records", "arguments", "utils"),
+    "exports": ("scene", "utils"),
+    "training": ("exports", "gaussian_renderer", "scene", "records", "arguments", "utils"),
     "training.observers": ("training", "gaussian_renderer", "scene", "records", "arguments", "utils"),
     "diagnosis": ("gaussian_renderer", "scene", "arguments", "utils"),
     "conversion": ("scene.readers", "scene.pictures", "utils"),
