@@ -4,7 +4,7 @@ import base64
 import gzip
 import json
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -12,13 +12,14 @@ from typing import Any
 import jinja2
 
 from camera_paths.moments import TimedPath
-from camera_paths.poses import poses_of
+from camera_paths.poses import Poses, poses_of
 from exports.compressed_ply import write_compressed_ply
 from exports.splats import Splats
 from exports.upright import turn_upright, turned, up_of
 from exports.vendor import FOLDER, RECORD
 from exports.viewer_settings import settings
 from scene.cameras import Camera
+from scene.scene import Scene
 from utils.files.json_files import read_json
 from utils.system_utils import UserError, atomic_write
 
@@ -30,13 +31,14 @@ def write_html(
     splats: Splats,
     cameras: Sequence[Camera],
     camera_path: TimedPath | None = None,
-    title: str = "3D Gaussian Splatting",
+    title: str | None = None,
     background: tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> None:
     """Write the page, whole or not at all.
 
     cameras: the training views, the first of which is where the page begins; up to 25 of them become bookmarks.
-    camera_path: the animation, None: once around the model. background: RGB in [0,1]. UserError without a camera.
+    camera_path: the animation, None: once around the model. title: None: the file's name. background: RGB in [0,1].
+    UserError without a camera.
     """
     if not cameras:
         raise UserError("a page needs at least one training camera, from which it shows the model; the scene has none")
@@ -55,12 +57,30 @@ def write_html(
         model=_packed(_model(turned(splats, turn))),
         page=_embedded(page),
         record=read_json(RECORD),
-        title=title,
+        title=Path(path).stem if title is None else title,
         viewer=_packed((FOLDER / "viewer.js").read_bytes()),
     )
     with atomic_write(path) as temporary:
         # Names that are not UTF-8 have surrogates, which appear as numbers.
         temporary.write_text(content, encoding="utf-8", errors="backslashreplace")
+
+
+def write_scene_html(
+    path: str | os.PathLike,
+    splats: Splats,
+    scene: Scene,
+    white_background: bool = False,
+    make_path: Callable[[Poses], TimedPath] | None = None,
+) -> None:
+    """Write the page of splats from a scene's model, with its training views, as `write_html` does.
+
+    white_background: whether it was trained with -w. make_path: the animation from the training views' poses, as of
+    camera_paths/request.py.
+    """
+    cameras = scene.getTrainCameras()
+    camera_path = make_path(poses_of(cameras)) if make_path and cameras else None
+    background = (1.0, 1.0, 1.0) if white_background else (0.0, 0.0, 0.0)
+    write_html(path, splats, cameras, camera_path, background=background)
 
 
 def _template() -> jinja2.Template:

@@ -45,7 +45,7 @@ const leaning = (viewer, annotations) => {
 try {
   const { antialiasing, name, settings } = JSON.parse(document.getElementById('page').textContent);
   const cameras = [...settings.cameras, ...settings.annotations.map((annotation) => annotation.camera)];
-  for (const pose of new Set(cameras.map(({ initial }) => initial))) pose.fov = fit(pose.fov);
+  for (const { initial } of cameras) initial.fov = fit(initial.fov);
   for (const { keyframes: { values } } of settings.animTracks) values.fov = values.fov.map(fit);
   const code = new Blob([await unpacked('viewer').text()], { type: 'text/javascript' });
   const { createViewer } = await import(URL.createObjectURL(code));

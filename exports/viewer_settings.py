@@ -7,11 +7,11 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from camera_paths.focus import focus_point
 from camera_paths.moments import TimedPath
 from camera_paths.poses import Poses
-from gaussian_renderer.free_view import rotation_matrix
 
 BOOKMARKS = 25  # the viewer's own limit of annotations
 _TITLE = 60  # and of letters in their titles
@@ -83,7 +83,8 @@ def _track(path: TimedPath, axes: np.ndarray, depth: float) -> dict[str, Any]:
     count = max(2, min(_MOST_KEYS, round(path.seconds * _KEYS_A_SECOND) + 1))
     times = np.linspace(0, path.seconds, count)[: count - path.closed]
     keys = [path.at(float(second)) for second in times]
-    looks = [_look(axes, np.array(k.position), rotation_matrix(k.wxyz), depth, k.fov) for k in keys]
+    turns = Rotation.from_quat([np.roll(key.wxyz, -1) for key in keys]).as_matrix()
+    looks = [_look(axes, np.array(k.position), turn, depth, k.fov) for k, turn in zip(keys, turns, strict=True)]
     return {
         "name": "camera path",
         "duration": path.seconds,
