@@ -4,8 +4,8 @@ python full_eval.py -m360 DIR -tat DIR -db DIR [--output_path DIR]
 python full_eval.py --scenes FOLDER ... [--iterations N] [--seeds 0 1 2] [--configs FILE] [-- more options of train.py]
 
 Writes report.md, report.json, report.html, figures/ and timing.txt into the output folder, and a model folder for every
-run: <scene>[/<option set>][/seed_N]; with --html_models also models/, each model as one HTML file. After an interruption, the same command resumes. Another command with the same
-output folder adds its runs to the report.
+run: <scene>[/<option set>][/seed_N]; with --html_models also models/, each model as one HTML file. After an
+interruption, the same command resumes. Another command with the same output folder adds its runs to the report.
 """
 
 from __future__ import annotations

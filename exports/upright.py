@@ -16,8 +16,8 @@ _DIRECTIONS = 64  # more than the 25 coefficients that they determine
 def up_of(poses: Poses) -> np.ndarray:
     """The direction (3,), of length 1, that is up for most cameras: the one in which their rolls are least.
 
-    A level camera has its x axis at right angles to up, however far it looks down. So up is the eigenvector of the least
-    eigenvalue of the mean of x x^T; where cameras face one way and leave it open, their mean up decides.
+    A level camera has its x axis at right angles to up, however far it looks down. So up is the eigenvector of the
+    least eigenvalue of the mean of x x^T; where cameras face one way and leave it open, their mean up decides.
     """
     mean, across = poses.up, poses.turns[:, :, 0]
     mean = mean / max(float(np.linalg.norm(mean)), 1e-9)
@@ -50,6 +50,7 @@ def turned(splats: Splats, turn: np.ndarray) -> Splats:
 
 def _sh_turn(degree: int, turn: np.ndarray) -> np.ndarray:
     """The matrix (K,K) of SH coefficients: the new function at a direction d is the old one at turn^T d."""
-    directions = torch.nn.functional.normalize(torch.randn(_DIRECTIONS, 3, generator=torch.Generator().manual_seed(0)))
-    new, old = (sh_basis(degree, d).numpy() for d in (directions.double(), directions.double() @ torch.from_numpy(turn)))
-    return np.linalg.lstsq(new, old, rcond=None)[0]
+    directions = torch.randn(_DIRECTIONS, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    directions = torch.nn.functional.normalize(directions)
+    new, old = sh_basis(degree, directions), sh_basis(degree, directions @ torch.from_numpy(turn))
+    return torch.linalg.lstsq(new, old).solution.numpy()

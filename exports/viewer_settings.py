@@ -76,7 +76,13 @@ def _look(axes: np.ndarray, position: np.ndarray, turn: np.ndarray, depth: float
 def _bookmark(name: str, camera: dict[str, Any], degrees: float) -> dict[str, Any]:
     """An annotation at the camera's own place. The viewer's cameras are level, so our page adds the lean."""
     title = name if len(name) <= _TITLE else "…" + name[1 - _TITLE :]
-    return {"position": camera["position"], "title": title, "text": "", "camera": {"initial": camera}, "extras": {"lean": degrees}}
+    return {
+        "position": camera["position"],
+        "title": title,
+        "text": "",
+        "camera": {"initial": camera},
+        "extras": {"lean": degrees},
+    }
 
 
 def _track(path: TimedPath, axes: np.ndarray, depth: float) -> dict[str, Any]:

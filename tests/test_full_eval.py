@@ -722,7 +722,11 @@ def test_each_test_view_has_photo_render_and_error_in_the_page(scenes, tmp_path)
     run("--scenes", scenes / "attic", "--output_path", out, "--iterations", 40)
     (page,) = re.findall(r"<h2>attic</h2>(.*)<h2>", (out / "report.html").read_text(), re.DOTALL)
     figures = re.findall(r'<figure class="comparison">.*?</figure>', page, re.DOTALL)
-    assert ["photo_0.jpg: 24.00 dB" in figures[0], "photo_1.jpg: 22.00 dB" in figures[1], len(figures)] == [True, True, 2]
+    assert ["photo_0.jpg: 24.00 dB" in figures[0], "photo_1.jpg: 22.00 dB" in figures[1], len(figures)] == [
+        True,
+        True,
+        2,
+    ]
     for figure in figures:
         pictures = re.findall(r'src="data:image/jpeg;base64,([^"]+)" alt="(\w+)"', figure)
         assert [alt for _, alt in pictures] == ["photo", "render", "error"]
