@@ -23,6 +23,7 @@ from scene.scene import Scene
 from utils.files.json_files import read_json
 from utils.system_utils import UserError, atomic_write
 
+LONGEST = 500_000_000  # letters of a page's text; Chromium's strings end at 2^29
 _NAME = "scene.compressed.ply"  # its ending tells the viewer the format
 
 
@@ -54,7 +55,7 @@ def write_html(
         background=", ".join(f"{255 * value:.0f}" for value in background),
         css=(FOLDER / "viewer.css").read_text(encoding="utf-8"),
         licence=(FOLDER / "LICENSE").read_text(encoding="utf-8"),
-        model=_packed(_model(turned(splats, turn))),
+        model=_packed_model(turned(splats, turn)),
         page=_embedded(page),
         record=read_json(RECORD),
         title=Path(path).stem if title is None else title,
@@ -100,8 +101,14 @@ def _embedded(content: Any) -> str:
     return json.dumps(content, allow_nan=False).replace("<", "\\u003c")
 
 
-def _model(splats: Splats) -> bytes:
+def _packed_model(splats: Splats) -> str:
     with TemporaryDirectory() as folder:
         file = Path(folder) / _NAME
         write_compressed_ply(file, splats)
-        return file.read_bytes()
+        packed = _packed(file.read_bytes())
+    if len(packed) > LONGEST:
+        raise UserError(
+            f"a page of {len(splats):,} Gaussians of SH degree {splats.sh_degree} would have {len(packed) / 1e6:.0f} "
+            f"MB, and browsers read at most {LONGEST / 1e6:.0f}; export fewer by --max_splats or --sh_degree"
+        )
+    return packed

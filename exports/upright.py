@@ -37,13 +37,13 @@ def turn_upright(up: np.ndarray) -> np.ndarray:
 def turned(splats: Splats, turn: np.ndarray) -> Splats:
     """The same Gaussians in a world turned by a rotation (3,3)."""
     rotation = Rotation.from_matrix(turn) * Rotation.from_quat(np.roll(splats.rotations, -1, axis=1))
-    sh = np.einsum("jk,nkc->njc", _sh_turn(splats.sh_degree, turn), splats.sh)
+    sh = np.einsum("jk,nkc->njc", _sh_turn(splats.sh_degree, turn).astype(np.float32), splats.sh)
     return Splats(
         (splats.means @ turn.T).astype(np.float32),
         splats.log_scales,
         np.roll(rotation.as_quat(), 1, axis=1).astype(np.float32),
         splats.opacity_logits,
-        sh.astype(np.float32),
+        sh,
         splats.antialiasing,
     )
 

@@ -14,17 +14,22 @@ import shutil
 import subprocess
 import tarfile
 import tempfile
+from argparse import ArgumentParser
+from collections.abc import Sequence
 from pathlib import Path
 
 from utils.system_utils import UserError, atomic_write, run_cli
 
-FOLDER = Path(__file__).resolve().parent / "viewer"
+ROOT = Path(__file__).resolve().parents[1]
+FOLDER = ROOT / "exports" / "viewer"
 RECORD = FOLDER / "vendored.json"
 _SOURCES = {"viewer.js": "public/index.js", "viewer.css": "public/index.css"}  # our name: the package's, to be minified
 
 
-def main() -> None:
+def main(argv: Sequence[str] | None = None) -> None:
     """Make the files anew."""
+    description = f"Make {FOLDER.relative_to(ROOT)}/ from the npm package and minifier that its vendored.json names."
+    ArgumentParser(prog="python -m exports.vendor", description=description).parse_args(argv)
     record = json.loads(RECORD.read_text(encoding="utf-8"))
     if not shutil.which("npm"):
         raise UserError("npm is not installed; install Node 20 or later, which brings it")

@@ -21,7 +21,7 @@ from camera_paths.generated import Ellipse
 from camera_paths.keyframes import CameraPath, Keyframe
 from camera_paths.moments import KeyframePath
 from camera_paths.poses import Poses, facing, poses_of
-from exports import vendor
+from exports import html, vendor
 from exports.compressed_ply import read_compressed_ply
 from exports.html import write_html, write_scene_html
 from exports.of_model import model_of
@@ -92,6 +92,7 @@ def test_vendor_writes_nothing_that_differs_from_the_record(tmp_path, monkeypatc
     package = tmp_path / "package"
     package.mkdir()
     (package / "LICENSE").write_text("other")
+    monkeypatch.setattr(vendor, "ROOT", tmp_path)
     monkeypatch.setattr(vendor, "FOLDER", tmp_path / "viewer")
     monkeypatch.setattr(vendor.shutil, "which", lambda _: "npm")
     monkeypatch.setattr(vendor, "_unpacked", lambda *_: package)
@@ -99,7 +100,7 @@ def test_vendor_writes_nothing_that_differs_from_the_record(tmp_path, monkeypatc
     monkeypatch.setattr(vendor, "_output", lambda *_: b"code")
     digest = hashlib.sha256(b"other").hexdigest()
     with pytest.raises(UserError, match=f'the files differ from those of .*"LICENSE": "{digest}"'):
-        vendor.main()
+        vendor.main([])
     assert not (tmp_path / "viewer").exists()
 
 
@@ -258,6 +259,15 @@ def test_the_page_of_a_scene(tmp_path):
     write_scene_html(tmp_path / "scene.html", balls(each=2), scene, white_background=True, make_path=Ellipse)
     content = json.loads(Page(tmp_path / "scene.html").texts["page"])["settings"]
     assert content["background"]["color"] == [1.0, 1.0, 1.0] and content["startMode"] == "animTrack"
+
+
+def test_a_page_that_no_browser_could_read_is_not_written(tmp_path, monkeypatch):
+    monkeypatch.setattr(html, "LONGEST", 1000)
+    with pytest.raises(
+        UserError, match="a page of 600 Gaussians of SH degree 1 would have .* --max_splats or --sh_deg"
+    ):
+        write_html(tmp_path / "page.html", balls(), cameras())
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_page_needs_a_camera(tmp_path):

@@ -1,5 +1,6 @@
 """One-file HTML of a model, and the report's sliders, in a real browser, opened from disk."""
 
+import dataclasses
 import io
 import math
 import shutil
@@ -145,6 +146,14 @@ def test_the_animation_goes_along_the_path(tab, splats, tmp_path):
     opposite = tab.evaluate(place)
     across = np.linalg.norm(np.subtract(path.at(2.0).position, path.at(6.0).position))
     assert math.dist(quarter, opposite) == pytest.approx(across, rel=0.01)
+
+
+def test_antialiasing_is_that_of_the_model(tab, splats, tmp_path):
+    small = dataclasses.replace(splats, log_scales=splats.log_scales - 3.2, antialiasing=True)
+    write_html(tmp_path / "page.html", small, cameras(), background=BACKGROUND)
+    show(tab, tmp_path / "page.html")
+    shown, other = settled(tab), dataclasses.replace(small, antialiasing=False)
+    assert psnr(shown, wanted(small, cameras()[0])) > psnr(shown, wanted(other, cameras()[0])) + 5
 
 
 def test_a_damaged_page_says_so(browser, page, tmp_path):
