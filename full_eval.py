@@ -4,8 +4,8 @@ python full_eval.py -m360 DIR -tat DIR -db DIR [--output_path DIR]
 python full_eval.py --scenes FOLDER ... [--iterations N] [--seeds 0 1 2] [--configs FILE] [-- more options of train.py]
 
 Writes report.md, report.json, report.html, figures/ and timing.txt into the output folder, and a model folder for every
-run: <scene>[/<option set>][/seed_N]. After an interruption, the same command resumes. Another command with the same
-output folder adds its runs to the report.
+run: <scene>[/<option set>][/seed_N]; with --html_models also models/, each model as one HTML file. After an
+interruption, the same command resumes. Another command with the same output folder adds its runs to the report.
 """
 
 from __future__ import annotations
@@ -72,6 +72,8 @@ def _parser() -> ArgumentParser:
         help="draw another program's error against time beside ours, from a CSV file with the columns seconds and "
         "test_psnr (`python -m evaluation.peer_curve` makes it); with several scenes NAME is SCENE/NAME; may be given "
         "again (default: none)")  # fmt: skip
+    add("--html_models", **flag,
+        help="write each model into models/ beside the report, as one HTML file with a viewer")  # fmt: skip
     add("--use_depth", **flag, help="supervise with inverse depth maps: train.py -d depths2/")
     add("--use_expcomp", **flag, help="exposure compensation: train.py --train_test_exp and its learning rates")
     add("--fast", **flag, help="train.py --optimizer_type sparse_adam")
@@ -127,7 +129,7 @@ def _parse_for_training(words: Sequence[str]) -> None:
 def _carry_out(runs: Sequence[Run], args: Namespace, failures: dict[Run, Failure]) -> None:
     """Carry out every run; note and print a failure, and continue with the next run."""
     facts = {} if args.skip_training else machine()
-    render_options = ("--antialiasing",) if args.aa else ()
+    options = ("--antialiasing",) if args.aa else ()
     download = True
     for number, run in enumerate(runs, 1):
         print(f"[{number}/{len(runs)}] {run.title}", flush=True)
@@ -135,9 +137,11 @@ def _carry_out(runs: Sequence[Run], args: Namespace, failures: dict[Run, Failure
             if not args.skip_training:
                 stages.train(run, facts)
             if not args.skip_rendering:
-                stages.render(run, render_options)
+                stages.render(run, options)
             if not args.skip_metrics:
                 download = stages.score(run, download)
+            if args.html_models:
+                stages.page(run, args.output_path.resolve(), options)
         except StageFailed as failed:
             failures[run] = failed.failure
             print(f"  FAILED ({failed.failure.stage}): {failed}", flush=True)

@@ -26,7 +26,7 @@ def contact_sheet(views: Sequence[tuple[str, Image.Image, Image.Image]], widest:
     widest: shrink wider images to this width in pixels, after computing the error.
     """
     cells = [
-        (label, [_shrunk(image, widest) for image in (truth, render, error_image(truth, render))])
+        (label, [shrunk(image, widest) for image in (truth, render, error_image(truth, render))])
         for label, truth, render in views
     ]
     cell_width = max(images[0].width for _, images in cells)
@@ -45,7 +45,8 @@ def contact_sheet(views: Sequence[tuple[str, Image.Image, Image.Image]], widest:
     return sheet
 
 
-def _shrunk(image: Image.Image, widest: int | None) -> Image.Image:
+def shrunk(image: Image.Image, widest: int | None) -> Image.Image:
+    """Return the image at no more than a width in pixels, None: as it is."""
     if widest is None or image.width <= widest:
         return image
     return image.convert("RGB").resize((widest, max(round(image.height * widest / image.width), 1)))

@@ -35,7 +35,25 @@ class Quote:
     lines: list[str]
 
 
-Block = str | Table | Picture | Quote
+@dataclass(frozen=True)
+class Link:
+    """A file beside the report. target: its path relative to the report's folder."""
+
+    text: str
+    target: str
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """A test view, each picture as the bytes of a JPEG: photo, render, and their amplified difference."""
+
+    caption: str
+    photo: bytes
+    render: bytes
+    error: bytes
+
+
+Block = str | Table | Picture | Quote | Link | Comparison
 
 
 @dataclass(frozen=True)
@@ -92,8 +110,8 @@ def results_table(rows: Sequence[Mapping[str, Any]]) -> Table:
     return Table(header, cells)
 
 
-def document(report: Mapping[str, Any], figures: Mapping[str, Sequence[Picture]]) -> list[Section]:
-    """Return the sections of the report. figures: those of each scene, by scene."""
+def document(report: Mapping[str, Any], figures: Mapping[str, Sequence[Block]]) -> list[Section]:
+    """Return the sections of the report. figures: those of each scene and its comparisons, by scene."""
     return [
         *_failures(report),
         _results(report),
@@ -241,7 +259,7 @@ def _peers(report: Mapping[str, Any]) -> list[Section]:
     return [Section("Other programs", [Table(header, cells), note])]
 
 
-def _scenes(report: Mapping[str, Any], figures: Mapping[str, Sequence[Picture]]) -> list[Section]:
+def _scenes(report: Mapping[str, Any], figures: Mapping[str, Sequence[Block]]) -> list[Section]:
     sections = []
     for scene in dict.fromkeys(run["scene"] for run in report["runs"]):
         blocks: list[Block] = []
@@ -252,6 +270,11 @@ def _scenes(report: Mapping[str, Any], figures: Mapping[str, Sequence[Picture]])
                     f"{run_title(run)}: the test views were best at iteration {peak['iteration']:,} "
                     f"({peak['test_psnr']:.2f} dB) and lost {peak['lost']:.2f} dB until the end{advice}."
                 )
+        blocks += [
+            Link(f"{run_title(run)}: the model in 3D", run["page"])
+            for run in report["runs"]
+            if run["scene"] == scene and run["page"]
+        ]
         blocks += figures.get(scene, ())
         if blocks:
             sections.append(Section(scene, blocks))

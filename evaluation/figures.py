@@ -6,11 +6,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-from PIL import Image
-
 from evaluation.contact_sheet import contact_sheet
-from evaluation.model_folder import mask_of, picture
+from evaluation.model_folder import counted_picture
 from evaluation.printable import printable
 from evaluation.tradeoff import pareto_front
 from records.error_curve import SUBSET, Row, whole_sets
@@ -150,13 +147,6 @@ def _stairs(points: Sequence[Point]) -> list[Point]:
     return [point for pair in zip(points, corners, strict=False) for point in pair] + list(points[-1:])
 
 
-def _what_counts(method: Path, side: str, name: str) -> Image.Image:
-    image, mask = picture(method / side / name), mask_of(method, name)
-    if mask is None:
-        return image
-    return Image.fromarray(np.where(mask[..., None], np.asarray(image), np.uint8(255)))
-
-
 def draw_worst_views(path: Path, run: dict[str, Any], output: Path) -> bool:
     """Draw a run's worst test views with ground truth, render and amplified error; return False if it has none.
 
@@ -168,7 +158,7 @@ def draw_worst_views(path: Path, run: dict[str, Any], output: Path) -> bool:
     rows = [
         (
             f"{view['picture']}: {view['PSNR']:.2f} dB",
-            *(_what_counts(folder, side, view["file"]) for side in ("gt", "renders")),
+            *(counted_picture(folder, side, view["file"]) for side in ("gt", "renders")),
         )
         for view in run["worst_views"]
     ]

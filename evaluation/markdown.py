@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from urllib.parse import quote
 
-from evaluation.document import Block, Picture, Quote, Section, Table
+from evaluation.document import Block, Comparison, Link, Picture, Quote, Section, Table
 from utils.files.markdown_table import markdown_table
 
 _MEANT = re.compile(r"[\\`*\[\]<>&]")  # characters that begin or end links, emphasis, code and HTML
@@ -31,6 +31,8 @@ def _block(block: Block, folder: Path) -> str:
         return table_text(block)
     if isinstance(block, Picture):
         return f"![{plain(block.caption)}]({quote(os.fsencode(os.path.relpath(block.path, folder)))})"
+    if isinstance(block, Link):
+        return f"[{plain(block.text)}]({quote(os.fsencode(block.target))})"
     if isinstance(block, Quote):
         return "\n".join(f"    {line}" for text in block.lines for line in text.splitlines())
     return re.sub(r"^\s*([#+=~-])", r"\\\1", plain(block))  # no heading, no list
@@ -40,5 +42,7 @@ def to_markdown(title: str, sections: Sequence[Section], folder: Path) -> str:
     """Render the whole page; links to figures are relative to `folder`, the folder of the page."""
     parts = [f"# {title}"]
     for section in sections:
-        parts += [f"## {plain(section.title)}", *(_block(block, folder) for block in section.blocks)]
+        parts += [f"## {plain(section.title)}"]
+        # Comparisons are for the page alone: their pictures are in no file.
+        parts += [_block(block, folder) for block in section.blocks if not isinstance(block, Comparison)]
     return "\n\n".join(parts) + "\n"

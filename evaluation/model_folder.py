@@ -6,6 +6,7 @@ import hashlib
 import re
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from PIL import Image
@@ -117,6 +118,22 @@ def mask_of(method: Path, name: str) -> np.ndarray | None:
     """Read which pixels of a view count for metrics.py, (H, W) bool; None: all. method: the folder `ours_N`."""
     file = method / "masks" / name
     return np.asarray(picture(file))[..., 0] > 0 if file.is_file() else None
+
+
+def counted_picture(method: Path, side: str, name: str) -> Image.Image:
+    """Read a view's `gt` or `renders`, RGB, white where pixels do not count. method: the folder `ours_N`."""
+    image, mask = picture(method / side / name), mask_of(method, name)
+    if mask is None:
+        return image
+    return Image.fromarray(np.where(mask[..., None], np.asarray(image), np.uint8(255)))
+
+
+def picture_name(cameras: Any, file: str) -> str:
+    """Return the photo's name of a rendered test view. cameras: content of cameras.json, which has test views first."""
+    try:
+        return str(cameras[int(Path(file).stem)]["img_name"])
+    except (ValueError, IndexError, KeyError, TypeError):
+        return file
 
 
 def ground_truth_digest(model: Path, method: str) -> str:

@@ -7,7 +7,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from evaluation.document import Picture, document, run_title
+from evaluation.comparisons import OF_A_REPORT, OF_A_RUN, comparisons
+from evaluation.document import Block, Picture, document, run_title
 from evaluation.figures import draw_curves, draw_worst_views
 from evaluation.ground_truth import stand_apart
 from evaluation.html import to_html
@@ -109,12 +110,15 @@ def _load_warning(scene: str, runs: Sequence[dict[str, Any]]) -> list[str]:
 
 def write_report(report: Mapping[str, Any], output: Path) -> None:
     """Write all files of the report into `output`."""
+    shown = len({(run["scene"], run["config"]) for run in report["runs"]})
+    each = max(1, min(OF_A_RUN, OF_A_REPORT // max(1, shown)))
     pictures = {
         scene: _draw(
             output,
             scene,
             [run for run in report["runs"] if run["scene"] == scene],
             [peer for peer in report["peers"] if peer["scene"] == scene],
+            each,
         )
         for scene in dict.fromkeys(run["scene"] for run in report["runs"])
     }
@@ -131,10 +135,15 @@ def write_report(report: Mapping[str, Any], output: Path) -> None:
             temporary.write_text(text, encoding="utf-8", errors="backslashreplace")
 
 
-def _draw(output: Path, scene: str, runs: Sequence[dict[str, Any]], peers: Sequence[dict[str, Any]]) -> list[Picture]:
-    """Draw the figures of a scene: its curves, and the worst views of each option set's first run that succeeded."""
+def _draw(
+    output: Path, scene: str, runs: Sequence[dict[str, Any]], peers: Sequence[dict[str, Any]], each: int
+) -> list[Block]:
+    """Draw the figures of a scene: its curves, and views of each option set's first run that succeeded.
+
+    These are its worst views, and as comparisons up to `each` views.
+    """
     folder = output / "figures"
-    pictures = []
+    pictures: list[Block] = []
     path = folder / f"{scene}_curves.png"
     try:
         if draw_curves(path, scene, runs, peers):
@@ -148,12 +157,13 @@ def _draw(output: Path, scene: str, runs: Sequence[dict[str, Any]], peers: Seque
         path = folder / f"{scene}{'_' + run['config'] if run['config'] else ''}_worst_views.png"
         try:
             drawn = draw_worst_views(path, run, output)
+            views = comparisons(run, output, each) if drawn else []
         except UserError as error:
-            print(f"warning: no figure of the worst views of {run_title(run)}: {error}", file=sys.stderr)
+            print(f"warning: no pictures of the test views of {run_title(run)}: {error}", file=sys.stderr)
             continue
         if drawn:
             seen.add(run["config"])
-            pictures.append(Picture(path, f"{run_title(run)}: the test views with the lowest PSNR"))
+            pictures += [Picture(path, f"{run_title(run)}: the test views with the lowest PSNR"), *views]
     return pictures
 
 

@@ -12,6 +12,7 @@ from evaluation.model_folder import (
     closing_lines,
     count_gaussians,
     load_scores,
+    picture_name,
     picture_size,
     shorter_ends_there,
     trained_gaussians,
@@ -20,7 +21,7 @@ from evaluation.model_folder import (
 )
 from evaluation.record import Record
 from evaluation.runs import Run
-from evaluation.stages import Failure
+from evaluation.stages import Failure, page_file
 from records.curve_peak import CLEAR
 from records.error_curve import NAME as CURVE
 from records.error_curve import Row, best_test, read_curve, whole_sets
@@ -56,6 +57,7 @@ def read_run(run: Run, output: Path, failure: Failure | None) -> dict[str, Any]:
         "machine": trained.get("machine") or {},
         "model": os.path.relpath(run.model, output),
         "options": known and known["options"],
+        "page": _page(run, output),
         "peak": _peak(curve, run.model),
         "scene": run.scene.name,
         "seed": run.seed,
@@ -86,6 +88,12 @@ def read_run(run: Run, output: Path, failure: Failure | None) -> dict[str, Any]:
     result["failure"] = dataclasses.asdict(failure) if failure else None
     result["finished"] = not failure and bool(saved) and result["final_iteration"] == saved[-1]
     return result
+
+
+def _page(run: Run, output: Path) -> str | None:
+    """Return the path of the model's HTML file, relative to the report, if full_eval.py --html_models has made it."""
+    page = page_file(run.model, output)
+    return os.path.relpath(page, output) if Record(run.model).stage("html") and page.is_file() else None
 
 
 def _curve(model: Path) -> list[Row]:
@@ -192,11 +200,4 @@ def _worst(model: Path, iteration: int) -> list[dict[str, Any]]:
     scores = load_scores(model, f"ours_{iteration}")[1]["PSNR"]
     worst = sorted((value, name) for name, value in scores.items() if value is not None)[:WORST]
     cameras = _json(model / "cameras.json")
-    return [{"PSNR": value, "file": name, "picture": _picture_name(cameras, name)} for value, name in worst]
-
-
-def _picture_name(cameras: Any, file: str) -> str:
-    try:
-        return str(cameras[int(Path(file).stem)]["img_name"])
-    except (ValueError, IndexError, KeyError, TypeError):
-        return file
+    return [{"PSNR": value, "file": name, "picture": picture_name(cameras, name)} for value, name in worst]

@@ -1,4 +1,4 @@
-"""The stages train, render and score. Each is a subprocess, and is skipped silently if it is finished."""
+"""The stages train, render, score and page. Each is a subprocess, and is skipped silently if it is finished."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from evaluation.model_folder import ground_truth_digest, load_scores, ply_file, 
 from evaluation.record import Record
 from evaluation.runs import Run
 from records import render_times
-from utils.system_utils import UserError, saved_iterations
+from utils.system_utils import UserError, mkdir_p, saved_iterations
 
 _ROOT = Path(__file__).resolve().parents[1]
 
@@ -189,6 +189,35 @@ def score(run: Run, download: bool = True) -> bool:
     record.note("metrics", ground_truth_sha256=truth, renders=renders, wall_seconds=round(finished.seconds, 3))
     _stop_if_asked(finished)
     return download and load_scores(run.model, methods[-1])[0].get("LPIPS") is not None
+
+
+def page_file(model: Path, output: Path) -> Path:
+    """Return the path of a model's HTML file, beside the report in the folder `output`."""
+    return output / "models" / f"{model.relative_to(output)}.html"
+
+
+def page(run: Run, output: Path, options: Sequence[str]) -> None:
+    """Write the last saved iteration as one HTML file, unless it was made of the same model.
+
+    options: more words for export.py.
+    """
+    record = Record(run.model)
+    iterations = saved_iterations(run.model / "point_cloud")
+    if not iterations:
+        raise StageFailed(Failure("html", [], [f"{run.model} has no saved iteration; train it first"]))
+    file = page_file(run.model, output)
+    wanted = {"model": _stamp(ply_file(run.model, iterations[-1])), "options": list(options)}
+    done = record.stage("html")
+    if done and {key: done[key] for key in wanted} == wanted and file.is_file():
+        return
+    source = ("-s", str(run.scene.source)) if run.scene.source else ()
+    mkdir_p(file.parent)
+    command = _script("export.py", "-m", str(run.model), *source, "--to", str(file), *options)
+    _say("writing the model as a page")
+    finished = run_child(command)
+    _expect_success("html", command, finished)
+    record.note("html", **wanted, wall_seconds=round(finished.seconds, 3))
+    _stop_if_asked(finished)
 
 
 def _times_stamp(model: Path, method: str) -> list[int] | None:

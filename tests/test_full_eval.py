@@ -1,9 +1,12 @@
 """full_eval.py: its runs, resumes, refusals and reports, with stand-ins for its programs and once with real ones."""
 
+import base64
 import contextlib
 import dataclasses
+import io
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -11,6 +14,7 @@ import sys
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 from matplotlib.figure import Figure
 from PIL import Image
@@ -19,7 +23,8 @@ from synthetic import folder_state
 import full_eval
 from evaluation import report as report_module
 from evaluation import results_page, stages
-from evaluation.contact_sheet import GAP, HEADER
+from evaluation.comparisons import comparisons
+from evaluation.contact_sheet import GAIN, GAP, HEADER
 from evaluation.figures import draw_curves, draw_worst_views
 from evaluation.results_page import BEGIN, END
 from evaluation.scenes import DATASETS
@@ -542,7 +547,7 @@ def test_damaged_files_do_not_cost_the_report(scenes, tmp_path, capsys):
     assert [run["finished"] for run in report["runs"]] == [False, True, True, True, False]
     assert report["runs"][0]["failure"]["stage"] == "report"
     warnings = capsys.readouterr().err
-    assert "error_vs_time.csv cannot be read" in warnings and "no figure of the worst views of picture" in warnings
+    assert "error_vs_time.csv cannot be read" in warnings and "no pictures of the test views of picture" in warnings
     assert (out / "report.html").exists()
 
 
@@ -668,7 +673,8 @@ def test_names_stay_names_in_the_report(figures, scenes, tmp_path, name):
     report = run("--scenes", scenes / name, "--output_path", out, "--iterations", 40)
     assert report["runs"][0]["finished"]
     for file in ("report.md", "report.html"):
-        assert "<script" not in (out / file).read_text(encoding="utf-8")
+        text = (out / file).read_text(encoding="utf-8")
+        assert text.count("<script") == (file == "report.html") and "<script>alert" not in text
     assert "[x](" not in (out / "report.md").read_text(encoding="utf-8")
     tables = [line for line in (out / "report.md").read_text(encoding="utf-8").splitlines() if line.startswith("|")]
     assert len(tables) == 6 and len({line.count("|") for line in tables[:3]}) == 1  # header, rule and row of two tables
@@ -681,7 +687,7 @@ def _browser() -> str | None:
     return next((path for name in names if (path := shutil.which(name))), None)
 
 
-# Append the script to a copy: the report itself has none.
+# Appended to a copy of the report.
 PROBE = """<script>addEventListener("load", () => {
   const images = [...document.images];
   document.body.dataset.probe = images.length + " images, " +
@@ -695,7 +701,7 @@ def test_html_opens_in_a_browser_and_needs_nothing_else(figures, scenes, tmp_pat
     with pytest.raises(SystemExit):
         run("--scenes", scenes / "attic", scenes / "brick", "--output_path", out, "--iterations", 40)
     html = (out / "report.html").read_text()
-    assert "<script" not in html and "http:" not in html and "https:" not in html
+    assert "http:" not in html and "https:" not in html
     assert all(part.startswith("data:image/") for part in html.split('src="')[1:])
     browser = _browser()
     if browser is None:
@@ -707,8 +713,59 @@ def test_html_opens_in_a_browser_and_needs_nothing_else(figures, scenes, tmp_pat
         f"--user-data-dir={tmp_path / 'profile'}", "--enable-logging=stderr", "--v=0", "--dump-dom", probed.as_uri(),
     ]  # fmt: skip
     done = subprocess.run(command, capture_output=True, text=True, timeout=120)
-    assert 'data-probe="2 images, 2 loaded"' in done.stdout, done.stderr
+    assert 'data-probe="8 images, 8 loaded"' in done.stdout, done.stderr
     assert "CONSOLE" not in done.stderr
+
+
+def test_each_test_view_has_photo_render_and_error_in_the_page(scenes, tmp_path):
+    out = tmp_path / "out"
+    run("--scenes", scenes / "attic", "--output_path", out, "--iterations", 40)
+    (page,) = re.findall(r"<h2>attic</h2>(.*)<h2>", (out / "report.html").read_text(), re.DOTALL)
+    figures = re.findall(r'<figure class="comparison">.*?</figure>', page, re.DOTALL)
+    assert ["photo_0.jpg: 24.00 dB" in figures[0], "photo_1.jpg: 22.00 dB" in figures[1], len(figures)] == [
+        True,
+        True,
+        2,
+    ]
+    for figure in figures:
+        pictures = re.findall(r'src="data:image/jpeg;base64,([^"]+)" alt="(\w+)"', figure)
+        assert [alt for _, alt in pictures] == ["photo", "render", "error"]
+        images = [Image.open(io.BytesIO(base64.b64decode(text))) for text, _ in pictures]
+        pixels = [[image.getpixel(place) for place in ((60, 8), (60, 60))] for image in images]
+        wanted = [[(90, 90, 90)] * 2, [(110, 90, 90), (90, 90, 90)], [(20 * GAIN, 0, 0), (0, 0, 0)]]
+        assert np.abs(np.subtract(pixels, wanted)).max() <= 6  # of JPEG
+        assert figure.count('<input type="range"') == 1
+    assert "data:image" not in (out / "report.md").read_text()
+
+
+def test_the_report_has_a_bounded_number_of_views(scenes, tmp_path, monkeypatch):
+    out = tmp_path / "out"
+    (attic,) = run("--scenes", scenes / "attic", "--output_path", out, "--iterations", 40)["runs"]
+    assert [view.caption[:11] for view in comparisons(attic, out, 1)] == ["photo_0.jpg"]
+    monkeypatch.setattr(report_module, "OF_A_REPORT", 2)
+    run("--scenes", scenes / "attic", scenes / "brick", "--output_path", out, "--iterations", 40)
+    assert (out / "report.html").read_text().count('<figure class="comparison">') == 2
+
+
+def test_each_model_becomes_a_page_that_the_report_links(scenes, tmp_path):
+    out = tmp_path / "out"
+    command = ("--scenes", scenes / "attic", "--output_path", out, "--iterations", 40, "--html_models", "--aa")
+    command += ("--seeds", 0, 1)
+    report = run(*command)
+    pages = ["models/attic/seed_0.html", "models/attic/seed_1.html"]
+    assert [entry["page"] for entry in report["runs"]] == pages
+    made = [words for words in calls(scenes) if words[0] == "export"]
+    assert made[0] == ["export", "-m", str(out / "attic/seed_0"), "-s", str(scenes / "attic"), "--to",
+                       str(out / pages[0]), "--antialiasing"]  # fmt: skip
+    html, markdown = ((out / f"report.{kind}").read_text() for kind in ("html", "md"))
+    for page in pages:
+        assert f'<a href="{page}">' in html and f"]({page})" in markdown and (out / page).is_file()
+    run(*command)
+    assert [words for words in calls(scenes) if words[0] == "export"] == made, "a page was made twice"
+    (out / pages[0]).unlink()
+    assert run(*command[:6], *command[7:])["runs"][0]["page"] is None, "the link of a page that is gone"
+    run(*command)
+    assert len([words for words in calls(scenes) if words[0] == "export"]) == 3
 
 
 def test_for_real(colmap_scene, tmp_path):

@@ -11,10 +11,10 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
-COMMANDS = ("train", "render", "metrics", "full_eval", "convert", "doctor", "setup")
+COMMANDS = ("train", "render", "metrics", "full_eval", "convert", "doctor", "export", "setup")
 ROOMS = (
-    *("arguments", "benchmarks", "conversion", "demo", "diagnosis", "evaluation", "gaussian_renderer", "records"),
-    *("camera_paths", "lpipsPyTorch", "scene", "training", "utils"),
+    *("arguments", "benchmarks", "camera_paths", "conversion", "demo", "diagnosis", "evaluation", "exports"),
+    *("gaussian_renderer", "lpipsPyTorch", "records", "scene", "training", "utils"),
 )
 CSRC = ROOT / "submodules"
 LONGEST = 60  # lines of a function
@@ -41,7 +41,8 @@ MAY_IMPORT = {
     "scene": ("utils",),  # not arguments: a client's own package of that name may be found first
     "gaussian_renderer": ("scene", "utils"),
     "camera_paths": ("gaussian_renderer", "scene", "utils"),
-    "training": ("gaussian_renderer", "scene", "records", "arguments", "utils"),
+    "exports": ("camera_paths", "scene", "utils"),
+    "training": ("exports", "gaussian_renderer", "scene", "records", "arguments", "utils"),
     "training.observers": ("training", "gaussian_renderer", "scene", "records", "arguments", "utils"),
     "diagnosis": ("gaussian_renderer", "scene", "arguments", "utils"),
     "conversion": ("scene.readers", "scene.pictures", "utils"),

@@ -1,7 +1,7 @@
 """PLY files of trained models, with the columns of the reference in its order, as other tools read them."""
 
 import os
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 
 import numpy as np
 import torch
@@ -17,11 +17,15 @@ _NORMALS = ["nx", "ny", "nz"]  # zeros after the positions, as in the reference'
 
 
 def write_ply(
-    path: str | os.PathLike, rows: Rows, sh_degree: int, world_offset: Sequence[float] = (0.0, 0.0, 0.0)
+    path: str | os.PathLike,
+    rows: Rows,
+    sh_degree: int,
+    world_offset: Sequence[float] = (0.0, 0.0, 0.0),
+    comments: Sequence[str] = (),
 ) -> None:
     """Write a binary little-endian PLY, float32, SH bands channel by channel; the whole file or none.
 
-    world_offset: world coordinates of the origin, written as a comment unless they are zero.
+    world_offset: world coordinates of the origin, written as a comment unless they are zero. comments: further ones.
     """
     count = len(rows["xyz"])
     parts = [(attribute.columns, rows[name]) for name, attribute in attributes(sh_degree).items()]
@@ -35,7 +39,8 @@ def write_ply(
         stop = start + len(columns)
         matrix[:, start:stop] = values.reshape(count, len(columns)).cpu().numpy()
         start = stop
-    header = ["ply", "format binary_little_endian 1.0", *_comments(world_offset), f"element vertex {count}"]
+    header = ["ply", "format binary_little_endian 1.0", *_comments(world_offset)]
+    header += [*(f"comment {comment}" for comment in comments), f"element vertex {count}"]
     header += [f"property float {name}" for name in names]
     with atomic_write(path) as temporary, open(temporary, "wb") as file:
         file.write("\n".join([*header, "end_header\n"]).encode("ascii"))
@@ -70,23 +75,24 @@ def _degree(names: Iterable[str]) -> int | None:
     return next((degree for degree in range(4) if 3 * ((degree + 1) ** 2 - 1) == rest), None)
 
 
-def read_ply(path: str | os.PathLike, sh_degree: int) -> Rows:
+def read_ply(path: str | os.PathLike, sh_degree: int | None) -> Rows:
     """Read a Gaussian PLY of any tool: any order of properties, scalar type and encoding.
 
-    SH bands that the file lacks are zero: the last save of a training leaves out those that are.
-    UserError when the file is missing or unreadable, lacks properties (the message names them), or has a higher degree.
+    SH bands that the file lacks are zero: the last save of a training leaves out those that are. sh_degree: None: that
+    of the file. UserError when the file is missing or unreadable, lacks properties (the message names them), or has a
+    higher degree.
     """
     vertices = read_vertices(path)
     present = set(vertices.dtype.names or ())
     degree = _degree(present)
+    if sh_degree is None:
+        sh_degree = 3 if degree is None else degree
     table = attributes(sh_degree if degree is None else min(degree, sh_degree))
     wanted = table["f_rest"].columns
     rest = sum(name.startswith("f_rest_") for name in present)
     missing = [name for part, a in table.items() if part != "f_rest" for name in a.columns if name not in present]
     if missing:
-        raise UserError(
-            f"{path} is not a Gaussian model: it lacks the properties {', '.join(missing)}; give a trained model"
-        )
+        raise UserError(_why_no_model(path, missing, present))
     if rest != len(wanted) or not present.issuperset(wanted):
         found = "no known SH degree" if degree is None else f"SH degree {degree}"
         raise UserError(
@@ -104,6 +110,17 @@ def read_ply(path: str | os.PathLike, sh_degree: int) -> Rows:
     absent = attributes(sh_degree)["f_rest"].shape[0] - rows["f_rest"].shape[1]
     rows["f_rest"] = torch.nn.functional.pad(rows["f_rest"], (0, 0, 0, absent))
     return rows
+
+
+def _why_no_model(path: str | os.PathLike, missing: Sequence[str], present: Collection[str]) -> str:
+    if list(missing) == ["scale_2"]:
+        return f"{path} has flat Gaussians of two scales (2DGS), which this rasterizer cannot draw; give a 3DGS model"
+    if "packed_position" in present:
+        return f"{path} is a compressed PLY; unpack it with export.py --ply {path} --to FILE.ply, and give FILE.ply"
+    remedy = "give a trained model"
+    if {"x", "y", "z"} <= set(present) and not any(name.startswith(("f_dc", "opacity", "scale")) for name in present):
+        remedy += ", or start a training from this point cloud with train.py --init_pcd_path"
+    return f"{path} is not a Gaussian model: it lacks the properties {', '.join(missing)}; {remedy}"
 
 
 def read_vertices(path: str | os.PathLike) -> np.ndarray:

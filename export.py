@@ -1,0 +1,157 @@
+"""Write a trained model in the file format of another program.
+
+python export.py -m MODEL --to FILE [--iteration N] [--sh_degree D] [--crop X0 Y0 Z0 X1 Y1 Z1] [--max_splats N]
+python export.py --ply MODEL_OF_ANY_TOOL --to FILE
+
+The ending of FILE names the format; exports/formats.py has the table.
+"""
+
+from __future__ import annotations
+
+if __name__ == "__main__":
+    import utils.host.early  # noqa: F401  (before the other imports, which take a second)
+
+import argparse
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import utils.host.openmp  # noqa: F401  isort: skip  (before torch)
+import numpy as np
+import torch
+
+from arguments import ModelParams, OptionParser, PipelineParams, get_combined_args
+from exports.formats import FORMATS, Format, format_of
+from exports.of_model import splats_of
+from exports.read import READABLE, read_splats
+from exports.selection import drawable, opacities, selected, tidy, with_sh_degree, within_box
+from exports.splats import Splats
+from gaussian_renderer.importance import blending_weights, most_important
+from gaussian_renderer.scored_views import ScoredViews
+from gaussian_renderer.trimming import change_on_views
+from scene.gaussian_model import GaussianModel
+from scene.gaussians.ply import stored_sh_degree
+from scene.saved_iterations import find_iteration, saved_ply
+from scene.saved_model import load_saved
+from scene.scene import Scene
+from utils.general_utils import safe_state
+from utils.system_utils import UserError, compute_device, run_cli
+
+
+def load(args: argparse.Namespace, options: argparse.Namespace, want_views: bool) -> tuple[Splats, Scene | None]:
+    """The splats that the command line names, and the scene if views are wanted.
+
+    options: the model options. UserError if there is nothing to load, or views are wanted of a model without a scene.
+    """
+    if args.ply:
+        if want_views:
+            raise UserError(f"--max_splats and pages need training views, which {args.ply} has not; give a model by -m")
+        splats = read_splats(args.ply)
+        return (Splats(**{**vars(splats), "antialiasing": True}) if args.antialiasing else splats), None
+    if want_views:
+        options.images_to_load = 1  # each photo is used once or twice
+        scene = load_saved(options, args.iteration)
+        return splats_of(scene.gaussians, args.antialiasing), scene
+    path = saved_ply(options.model_path, find_iteration(options.model_path, args.iteration))
+    degree = stored_sh_degree(path)
+    gaussians = GaussianModel(options.sh_degree if degree is None else degree)
+    gaussians.load_ply(path)
+    return splats_of(gaussians, args.antialiasing), None
+
+
+def choose(splats: Splats, crop: Sequence[float] | None, min_opacity: float) -> np.ndarray:
+    """(N,) bool: the splats that are drawn, lie in the box, and have at least this opacity. UserError if none do."""
+    keep = drawable(splats) & (opacities(splats) >= min_opacity)
+    if crop is not None:
+        keep &= within_box(splats, crop)
+    if len(splats) and not keep.any():
+        raise UserError("no Gaussian is left; give a larger --crop or a smaller --min_opacity")
+    return keep
+
+
+@torch.no_grad()
+def thin_out(
+    scene: Scene, keep: np.ndarray, sh_degree: int, count: int, pipe: argparse.Namespace, options: argparse.Namespace
+) -> np.ndarray:
+    """The mask `keep` without what matters least to the training views, with `count` Gaussians left; print the loss.
+
+    What matters is the sum of blending weights over all pixels of the training views.
+    """
+    every, cameras = scene.gaussians, scene.getTrainCameras()
+    kept = np.flatnonzero(keep)
+    if len(kept) <= count:
+        return keep
+    before = every.part(torch.from_numpy(keep).to(every.get_xyz.device), sh_degree)
+    with torch.enable_grad():
+        weights = blending_weights(before, cameras, pipe)
+    chosen = most_important(weights, count)
+    background = torch.full((3,), 1.0 if options.white_background else 0.0, device=compute_device())
+    views = ScoredViews(pipe, background, options.train_test_exp)
+    change = change_on_views(before, before.part(chosen, sh_degree), cameras, views, scored=True)
+    one, other = change["psnr_before"], change["psnr_after"]
+    print(f"{len(kept)} -> {count} Gaussians: training views {one:.2f} -> {other:.2f} dB ({other - one:+.2f} dB)")
+    thinned = np.zeros_like(keep)
+    thinned[kept[chosen.cpu().numpy()]] = True
+    return thinned
+
+
+def export(args: argparse.Namespace, options: argparse.Namespace, pipe: argparse.Namespace, entry: Format) -> None:
+    """Write the file that the command line asks for. UserError if there is nothing to load or to write."""
+    splats, scene = load(args, options, want_views=bool(args.max_splats) or entry.wants_cameras)
+    degree = splats.sh_degree if args.typed_sh_degree is None else min(args.typed_sh_degree, splats.sh_degree)
+    keep = choose(splats, args.crop, args.min_opacity)
+    if scene is not None and args.max_splats:
+        keep = thin_out(scene, keep, degree, args.max_splats, pipe, options)
+    chosen = tidy(with_sh_degree(selected(splats, keep), degree))
+    start = time.perf_counter()
+    entry.write(args.to, chosen, scene.getTrainCameras() if scene is not None else ())
+    size, seconds = Path(args.to).stat().st_size, time.perf_counter() - start
+    what = f"{len(chosen)} of {len(splats)} Gaussians, SH degree {degree}"
+    print(
+        f"Wrote {args.to}: {what}, {size / 1e6:.2f} MB ({size / max(len(chosen), 1):.0f} bytes each), {seconds:.1f} s"
+    )
+
+
+def main() -> None:
+    parser = OptionParser(description="Write a trained model in the file format of another program.")
+    without = ("images_to_load", "sh_degree")
+    model_params = ModelParams(parser, sentinel=True, without=without)
+    pipeline_params = PipelineParams(parser, sentinel=True)
+    add = parser.add_argument
+    endings = "; ".join(f"{entry.ending}: {entry.what}" for entry in FORMATS)
+    add("--to", required=True, metavar="FILE", help=f"file to write; its ending is the format. {endings}")
+    add("--iteration", type=int, default=-1, help="saved iteration to write (default: -1, the last)")
+    add(
+        "--ply", metavar="FILE", help=f"write this model, of any tool, instead of one of -m: {READABLE} (default: none)"
+    )
+    add("--sh_degree", type=int, choices=range(4), metavar="D", help="leave SH bands above D out (default: keep all)")
+    add("--crop", type=float, nargs=6, metavar=("X0", "Y0", "Z0", "X1", "Y1", "Z1"),
+        help="keep the Gaussians with a centre in this box of world coordinates (default: keep all)")  # fmt: skip
+    add("--min_opacity", type=float, default=0.0, help="leave fainter Gaussians out, 0 to 1 (default: 0)")
+    add("--max_splats", type=int, default=0, metavar="N",
+        help="keep N Gaussians; what adds least to the training views goes first (default: 0, no limit)")  # fmt: skip
+    add("--quiet", action="store_true", help="print nothing to stdout (default: off)")
+    args = parse(parser)
+    safe_state(args.quiet)
+    export(args, model_params.extract(args), pipeline_params.extract(args), format_of(args.to))
+
+
+def parse(parser: argparse.ArgumentParser, argv: Sequence[str] | None = None) -> argparse.Namespace:
+    """Parse the command line; with --ply, no model folder is read. UserError for values out of range."""
+    args = parser.parse_args(argv)
+    if args.ply and args.model_path:
+        raise UserError(f"--ply {args.ply} and -m {args.model_path} both name the model to write; leave one out")
+    if not 0 <= args.min_opacity <= 1:
+        raise UserError(f"--min_opacity must be from 0 to 1, got {args.min_opacity}")
+    if args.max_splats < 0:
+        raise UserError(f"--max_splats must be 0, no limit, or above, got {args.max_splats}")
+    if args.crop and not all(low < high for low, high in zip(args.crop[:3], args.crop[3:], strict=True)):
+        raise UserError(f"--crop takes the smaller corner first, x0 y0 z0 x1 y1 z1, got {args.crop}")
+    if not args.ply:
+        return get_combined_args(parser, argv)
+    args.typed_sh_degree = args.sh_degree
+    return args
+
+
+if __name__ == "__main__":
+    run_cli(main)

@@ -1,0 +1,62 @@
+"""Numbers in few bits: what the compressed formats share."""
+
+import numpy as np
+
+_MORTON_BITS = 21  # a coordinate
+
+
+def to_bits(values: np.ndarray, bits: int) -> np.ndarray:
+    """Values in [0, 1] as unsigned integers of so many bits, uint32, rounded to the nearest; others are clamped."""
+    most = (1 << bits) - 1
+    return np.clip(np.floor(np.asarray(values, np.float64) * most + 0.5), 0, most).astype(np.uint32)
+
+
+def from_bits(codes: np.ndarray, bits: int) -> np.ndarray:
+    """The values in [0, 1] of the lowest `bits` bits of integers."""
+    most = (1 << bits) - 1
+    return (codes & np.uint32(most)) / most
+
+
+def morton_order(points: np.ndarray) -> np.ndarray:
+    """Indices (N,) that put points (N, 3) along a Z-order curve, so that neighbours in a file are near each other."""
+    if not len(points):
+        return np.zeros(0, dtype=np.int64)
+    points = points.astype(np.float64)
+    low, size = points.min(axis=0), np.ptp(points, axis=0)
+    cells = ((points - low) / np.where(size > 0, size, 1) * ((1 << _MORTON_BITS) - 1)).astype(np.uint64)
+    codes = np.zeros(len(points), dtype=np.uint64)
+    for axis in range(3):
+        codes |= _spread(cells[:, axis]) << np.uint64(axis)
+    return np.argsort(codes, kind="stable")
+
+
+def _spread(x: np.ndarray) -> np.ndarray:
+    """21 bits with two zeros between each and the next."""
+    for shift, mask in (
+        (32, 0x1F00000000FFFF),
+        (16, 0x1F0000FF0000FF),
+        (8, 0x100F00F00F00F00F),
+        (4, 0x10C30C30C30C30C3),
+        (2, 0x1249249249249249),
+    ):
+        x = (x | (x << np.uint64(shift))) & np.uint64(mask)
+    return x
+
+
+def smallest_three(quaternions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Index (N,) of the largest component of unit quaternions (N, 4), and the other three, in order, float64.
+
+    The quaternion's sign is such that the largest is positive. The others are then within sqrt(1/2) of zero.
+    """
+    q = quaternions.astype(np.float64)
+    largest = np.abs(q).argmax(axis=1)
+    q = q * np.where(np.take_along_axis(q, largest[:, None], 1) < 0, -1.0, 1.0)
+    return largest, q[np.arange(4) != largest[:, None]].reshape(-1, 3)
+
+
+def whole_quaternions(largest: np.ndarray, three: np.ndarray) -> np.ndarray:
+    """Unit quaternions (N, 4) of `smallest_three`."""
+    q = np.empty((len(three), 4))
+    q[np.arange(4) != largest[:, None]] = three.ravel()
+    q[np.arange(len(q)), largest] = np.sqrt(np.clip(1 - (three**2).sum(axis=1), 0, 1))
+    return q / np.linalg.norm(q, axis=1, keepdims=True)

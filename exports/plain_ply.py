@@ -1,0 +1,52 @@
+"""PLY with float32 properties: the reference's columns, and comments that say what they mean."""
+
+import os
+
+import torch
+
+from exports.splats import Splats
+from scene.gaussians.ply import read_ply, write_ply
+from utils.files.ply_header import header_lines
+
+AXES = "axes x right, y down, z forward (COLMAP)"
+
+
+def comments(splats: Splats) -> list[str]:
+    """Comments of our PLY files. Brush writes SplatRenderMode, and Postshot antialiased; viewers know both."""
+    return [
+        AXES,
+        f"SplatRenderMode: {'mip' if splats.antialiasing else 'default'}",
+        f"antialiased {splats.antialiasing:d}",
+    ]
+
+
+def says_antialiasing(path: str | os.PathLike) -> bool:
+    """Whether the comments of a PLY say that its splats were trained with antialiasing; the last one counts."""
+    found = False
+    for line in header_lines(path):
+        words = line.lower().replace(":", " ").split()
+        if words[:2] in (["comment", "splatrendermode"], ["comment", "antialiased"]):
+            found = words[2:3] in (["mip"], ["1"])
+    return found
+
+
+def write_plain_ply(path: str | os.PathLike, splats: Splats) -> None:
+    """Write the file, whole or not at all."""
+    sh = torch.from_numpy(splats.sh)
+    rows = {
+        "xyz": torch.from_numpy(splats.means),
+        "f_dc": sh[:, :1],
+        "f_rest": sh[:, 1:],
+        "opacity": torch.from_numpy(splats.opacity_logits)[:, None],
+        "scaling": torch.from_numpy(splats.log_scales),
+        "rotation": torch.from_numpy(splats.rotations),
+    }
+    write_ply(path, rows, splats.sh_degree, comments=comments(splats))
+
+
+def read_plain_ply(path: str | os.PathLike) -> Splats:
+    """Read a Gaussian PLY of any tool. UserError as from scene/gaussians/ply.py."""
+    rows = {name: values.numpy() for name, values in read_ply(path, None).items()}
+    sh = torch.cat([torch.from_numpy(rows["f_dc"]), torch.from_numpy(rows["f_rest"])], dim=1).numpy()
+    values = (rows["xyz"], rows["scaling"], rows["rotation"], rows["opacity"][:, 0], sh)
+    return Splats(*values, antialiasing=says_antialiasing(path))

@@ -1,0 +1,57 @@
+"""Selection of splats: those of a mask, those that are worth a place in a file, and fewer SH bands."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from exports.splats import Splats
+
+_LARGEST = 80.0  # of a logarithm of a scale; exp(89) is infinite in float32
+
+
+def selected(splats: Splats, which: np.ndarray) -> Splats:
+    """The splats of a mask (N,) bool, or of indices in their order."""
+    names = ("means", "log_scales", "rotations", "opacity_logits", "sh")
+    return replace(splats, **{name: np.ascontiguousarray(getattr(splats, name)[which]) for name in names})
+
+
+def with_sh_degree(splats: Splats, degree: int) -> Splats:
+    """The splats without SH bands above a degree; they never get more bands than they have."""
+    return replace(splats, sh=np.ascontiguousarray(splats.sh[:, : (degree + 1) ** 2]))
+
+
+def drawable(splats: Splats) -> np.ndarray:
+    """(N,) bool: the splats that the rasterizer draws. Infinite logits are opacities 0 and 1, all else is finite."""
+    finite = [np.isfinite(x).reshape(len(splats), -1).all(axis=1) for x in (splats.means, splats.log_scales, splats.sh)]
+    turned = np.isfinite(splats.rotations).all(axis=1)
+    return np.logical_and.reduce([*finite, turned, ~np.isnan(splats.opacity_logits)])
+
+
+def within_box(splats: Splats, box: Sequence[float]) -> np.ndarray:
+    """(N,) bool: the splats whose centre lies in a box of world coordinates x0 y0 z0 x1 y1 z1."""
+    low, high = np.asarray(box[:3]), np.asarray(box[3:])
+    return ((splats.means >= low) & (splats.means <= high)).all(axis=1)
+
+
+def tidy(splats: Splats) -> Splats:
+    """The splats with values that every format can hold: rotations of length 1, logs of scales of at most 80."""
+    lengths = np.linalg.norm(splats.rotations, axis=1, keepdims=True)
+    known = lengths > 1e-12
+    rotations = np.where(known, splats.rotations / np.where(known, lengths, 1), np.float32([1, 0, 0, 0]))
+    scales = np.clip(splats.log_scales, -_LARGEST, _LARGEST)
+    return replace(splats, rotations=rotations.astype(np.float32), log_scales=scales.astype(np.float32))
+
+
+def opacities(splats: Splats) -> np.ndarray:
+    """Opacities (N,) float64 in [0, 1]."""
+    return 1 / (1 + np.exp(-np.clip(splats.opacity_logits.astype(np.float64), -700, 700)))
+
+
+def logits(values: np.ndarray, step: float) -> np.ndarray:
+    """Logits (float32) of opacities in [0, 1] that were rounded to multiples of `step`.
+
+    0 and 1 become a quarter of a step away, so that they are finite.
+    """
+    inner = np.clip(np.asarray(values, np.float64), step / 4, 1 - step / 4)
+    return np.log(inner / (1 - inner)).astype(np.float32)

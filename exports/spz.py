@@ -1,0 +1,155 @@
+"""SPZ, the format of Niantic and Adobe: version 4 is written, versions 1 to 4 are read.
+
+Published in the README of github.com/nianticlabs/spz. Version 4 is a header of 32 bytes, a table of streams, and a zstd
+stream for each attribute: positions (24-bit fixed point), opacities, colours, logarithms of scales (steps of 1/16 from
+-10), rotations (the index of the largest component in 2 bits, the others in 10: sign and size) and SH coefficients
+(range +-1, all 8 bits used), one splat after the other. Axes are those of OpenGL: x right, y up, z back.
+"""
+
+import gzip
+import os
+import struct
+import sys
+import zlib
+from types import ModuleType
+
+import numpy as np
+
+from exports.half_turn import half_turned
+from exports.packing import morton_order, smallest_three, whole_quaternions
+from exports.selection import logits, opacities, selected
+from exports.splats import Splats
+from utils.system_utils import UserError, atomic_write
+
+MAGIC = 0x5053474E
+_HEADER = struct.Struct("<IIIBBBBI12x")
+_HEADER_GZIP = struct.Struct("<IIIBBBB")
+_ANTIALIASED = 1
+_COLOR = 0.15  # colours are 0.5 + 0.15 SH0, so that those beyond [0, 1] fit
+_MOST_BITS = 20  # of a position's fraction
+_LARGEST_POSITION = (1 << 23) - 1
+_LEVEL = 19  # of zstd; the best of those that need little memory to read
+_SIZES = (9, 1, 3, 3, 4)  # bytes a splat of each stream, before SH
+
+
+def write_spz(path: str | os.PathLike, splats: Splats) -> None:
+    """Write version 4, whole or not at all. UserError without the package zstandard."""
+    zstandard = _zstandard(path)
+    splats = half_turned(selected(splats, morton_order(splats.means)))
+    farthest = float(np.abs(splats.means).max(initial=0))
+    bits = int(np.clip(np.floor(np.log2(_LARGEST_POSITION / max(farthest, 1e-30))), 0, _MOST_BITS))
+    compressor = zstandard.ZstdCompressor(level=_LEVEL)
+    streams = [s.tobytes() for s in (_positions(splats.means, bits), *_bytes(splats), _rotations(splats.rotations))]
+    if splats.sh_degree:  # readers refuse an empty stream
+        streams.append(_byte(splats.sh[:, 1:].astype(np.float64) * 128 + 128).tobytes())
+    packed = [compressor.compress(stream) for stream in streams]
+    table = b"".join(struct.pack("<QQ", len(p), len(s)) for p, s in zip(packed, streams, strict=True))
+    flags = _ANTIALIASED if splats.antialiasing else 0
+    header = _HEADER.pack(MAGIC, 4, len(splats), splats.sh_degree, bits, flags, len(streams), _HEADER.size)
+    with atomic_write(path) as temporary:
+        temporary.write_bytes(header + table + b"".join(packed))
+
+
+def _zstandard(path: str | os.PathLike) -> ModuleType:
+    try:
+        import zstandard
+    except ImportError as error:
+        raise UserError(f"{path} needs the package zstandard; install it with pip install '.[export]'") from error
+    return zstandard
+
+
+def _positions(means: np.ndarray, bits: int) -> np.ndarray:
+    fixed = np.clip(np.round(means.astype(np.float64) * 2**bits), -_LARGEST_POSITION, _LARGEST_POSITION)
+    return fixed.astype("<i4").view(np.uint8).reshape(-1, 3, 4)[:, :, :3]
+
+
+def _bytes(splats: Splats) -> tuple[np.ndarray, ...]:
+    """Opacities, colours and scales."""
+    color = (splats.sh[:, 0].astype(np.float64) * _COLOR + 0.5) * 255
+    return _byte(opacities(splats) * 255), _byte(color), _byte((splats.log_scales.astype(np.float64) + 10) * 16)
+
+
+def _byte(values: np.ndarray) -> np.ndarray:
+    return np.clip(np.floor(values + 0.5), 0, 255).astype(np.uint8)
+
+
+def _rotations(wxyz: np.ndarray) -> np.ndarray:
+    largest, three = smallest_three(np.roll(wxyz, -1, axis=1))
+    size = np.floor(np.abs(three) * np.sqrt(2) * 511 + 0.5).clip(0, 511).astype(np.uint32)
+    first, second, third = (size | (three < 0).astype(np.uint32) << 9).T
+    return (largest.astype(np.uint32) << 30 | first << 20 | second << 10 | third).astype("<u4")
+
+
+def read_spz(path: str | os.PathLike) -> Splats:
+    """Read a file of this format; SH bands above degree 3 are left out, with a warning. UserError if it is damaged."""
+    with open(path, "rb") as file:
+        content = file.read()
+    try:
+        return _read_gzip(content) if content[:2] == b"\x1f\x8b" else _read_zstd(content, path)
+    except (ValueError, struct.error, EOFError, OSError, zlib.error, IndexError, MemoryError) as error:
+        raise UserError(f"{path} is not a complete SPZ file ({error}); save or download it again") from error
+
+
+def _read_zstd(content: bytes, path: str | os.PathLike) -> Splats:
+    magic, version, count, degree, bits, flags, streams, table = _HEADER.unpack_from(content)
+    if magic != MAGIC or version != 4:
+        raise ValueError(f"no version that this program knows: {version}" if magic == MAGIC else "no magic number")
+    zstandard = _zstandard(path)
+    sizes = [size * count for size in (*_SIZES, 3 * ((degree + 1) ** 2 - 1))]
+    begin, parts = table + 16 * streams, []
+    for index, size in enumerate(sizes):
+        packed, whole = struct.unpack_from("<QQ", content, table + 16 * index) if index < streams else (0, 0)
+        if whole != size:
+            raise ValueError(f"stream {index} promises {whole} bytes instead of {size}")
+        try:
+            part = content[begin : begin + packed]
+            parts.append(zstandard.ZstdDecompressor().decompress(part, max_output_size=size) if size else b"")
+        except zstandard.ZstdError as error:
+            raise ValueError(f"stream {index}: {error}") from error
+        begin += packed
+    return _splats(parts, count, degree, bits, flags, version)
+
+
+def _read_gzip(content: bytes) -> Splats:
+    content = gzip.decompress(content)
+    magic, version, count, degree, bits, flags, _ = _HEADER_GZIP.unpack_from(content)
+    if magic != MAGIC or version not in (1, 2, 3):
+        raise ValueError(f"no version that this program knows: {version}" if magic == MAGIC else "no magic number")
+    sizes = [6 if version == 1 else 9, *_SIZES[1:4], 3 if version < 3 else 4, 3 * ((degree + 1) ** 2 - 1)]
+    begin, parts = _HEADER_GZIP.size, []
+    for size in sizes:
+        parts.append(content[begin : begin + size * count])
+        begin += size * count
+    return _splats(parts, count, degree, bits, flags, version)
+
+
+def _splats(parts: list[bytes], count: int, degree: int, bits: int, flags: int, version: int) -> Splats:
+    sizes = (6 if version == 1 else 9, *_SIZES[1:4], 3 if version < 3 else 4)
+    table = [np.frombuffer(part, np.uint8).reshape(count, size) for part, size in zip(parts, sizes, strict=False)]
+    coefficients = (degree + 1) ** 2 - 1
+    rest = np.frombuffer(parts[5], np.uint8).reshape(count, coefficients, 3).astype(np.float64) / 128 - 1
+    if degree > 3:
+        print(f"warning: SH bands of degree {degree} are left out; models have at most degree 3", file=sys.stderr)
+    if version == 1:
+        means = np.ascontiguousarray(table[0]).view("<f2").astype(np.float64)
+    else:
+        wide = np.zeros((count, 3, 4), np.uint8)
+        wide[:, :, 1:] = table[0].reshape(count, 3, 3)
+        means = (wide.view("<i4")[:, :, 0] >> 8) / 2.0**bits
+    base = (table[2] / 255.0 - 0.5) / _COLOR
+    sh = np.concatenate([base[:, None], rest[:, :15]], axis=1)
+    alpha = logits(table[1].reshape(count) / 255.0, 1 / 255)
+    values = (means, table[3] / 16.0 - 10, _read_rotations(table[4]), alpha, sh)
+    means, scales, rotations, alpha, sh = (x.astype(np.float32) for x in values)
+    return half_turned(Splats(means, scales, rotations, alpha, sh, bool(flags & _ANTIALIASED)))
+
+
+def _read_rotations(table: np.ndarray) -> np.ndarray:
+    """Quaternions wxyz of 4 bytes each, or of 3: x, y and z of the version before 3."""
+    if table.shape[1] == 3:
+        three = table / 127.5 - 1
+        return np.concatenate([np.sqrt(np.clip(1 - (three**2).sum(axis=1, keepdims=True), 0, 1)), three], axis=1)
+    codes = np.ascontiguousarray(table).view("<u4").reshape(-1)
+    each = np.stack([codes >> np.uint32(20), codes >> np.uint32(10), codes], axis=1) & np.uint32(1023)
+    three = np.where(each & 512, -1.0, 1.0) * (each & 511) / 511 / np.sqrt(2)
+    return np.roll(whole_quaternions((codes >> np.uint32(30)).astype(np.int64), three), 1, axis=1)

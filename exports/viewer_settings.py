@@ -1,0 +1,121 @@
+"""Settings of the vendored viewer: cameras, bookmarks and animation, in its axes (x right, y up, z backwards).
+
+The form is that of its settings.json, version 2 (docs/api.md and dist/settings.d.ts of the npm package).
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from camera_paths.focus import focus_point
+from camera_paths.moments import TimedPath
+from camera_paths.poses import Poses
+
+BOOKMARKS = 25  # the viewer's own limit of annotations
+_TITLE = 60  # and of letters in their titles
+_KEYS_A_SECOND = 10
+_MOST_KEYS = 1000
+_VIEWER_AXES = np.diag([-1.0, -1.0, 1.0])  # the viewer turns each model by half a turn about z
+
+
+def settings(
+    poses: Poses,
+    names: Sequence[str],
+    turn: np.ndarray,
+    path: TimedPath | None,
+    background: tuple[float, float, float],
+) -> dict[str, Any]:
+    """The settings of a model that was turned by `turn` (3,3).
+
+    poses, names: of the training cameras before that, the first of which is where the viewer begins. path: the
+    animation, in the same frame. background: RGB in [0,1]. Opening angles are vertical, in degrees.
+    """
+    axes = _VIEWER_AXES @ turn
+    focus = focus_point(poses)
+    depths = _depths(poses, focus)
+    cameras = [_look(axes, *camera) for camera in zip(poses.positions, poses.turns, depths, poses.fov, strict=True)]
+    marked = np.unique(np.linspace(0, len(cameras) - 1, BOOKMARKS).round().astype(int)).tolist()
+    return {
+        "version": 2,
+        "tonemapping": "none",
+        "highPrecisionRendering": False,
+        "background": {"color": list(background)},
+        "postEffectSettings": _no_effects(),
+        "animTracks": [] if path is None else [_track(path, axes, float(np.median(depths)))],
+        "cameras": [{"initial": cameras[0]}],
+        "annotations": [_bookmark(names[n], cameras[n], lean(axes @ poses.turns[n])) for n in marked],
+        "startMode": "default" if path is None else "animTrack",
+    }
+
+
+def _depths(poses: Poses, focus: np.ndarray | None) -> np.ndarray:
+    """How far along each axis the point about which that camera turns lies: at the focus, or near it."""
+    if focus is None:
+        return np.full(len(poses), max(poses.spread, 1e-3))
+    ahead = ((focus - poses.positions) * poses.forward).sum(axis=1)
+    return np.where(ahead > 0, ahead, np.median(ahead))
+
+
+def lean(turn: np.ndarray) -> float:
+    """Degrees by which a camera with axes `turn` (3,3) in the viewer's world must be rolled from a level one.
+
+    About its backward axis, and level as the viewer's cameras are: turned about y, then about their own x.
+    """
+    yaw = np.arctan2(-turn[0, 2], -turn[2, 2])
+    level = np.array([np.cos(yaw), 0, -np.sin(yaw)])
+    return float(np.degrees(np.arctan2(turn[:, 1] @ level, turn[:, 0] @ level)))
+
+
+def _look(axes: np.ndarray, position: np.ndarray, turn: np.ndarray, depth: float, fov: float) -> dict[str, Any]:
+    target = position + depth * turn[:, 2]
+    return {"position": (axes @ position).tolist(), "target": (axes @ target).tolist(), "fov": float(fov)}
+
+
+def _bookmark(name: str, camera: dict[str, Any], degrees: float) -> dict[str, Any]:
+    """An annotation at the camera's own place. The viewer's cameras are level, so our page adds the lean."""
+    title = name if len(name) <= _TITLE else "…" + name[1 - _TITLE :]
+    return {
+        "position": camera["position"],
+        "title": title,
+        "text": "",
+        "camera": {"initial": camera},
+        "extras": {"lean": degrees},
+    }
+
+
+def _track(path: TimedPath, axes: np.ndarray, depth: float) -> dict[str, Any]:
+    count = max(2, min(_MOST_KEYS, round(path.seconds * _KEYS_A_SECOND) + 1))
+    times = np.linspace(0, path.seconds, count)[: count - path.closed]
+    keys = [path.at(float(second)) for second in times]
+    turns = Rotation.from_quat([np.roll(key.wxyz, -1) for key in keys]).as_matrix()
+    looks = [_look(axes, np.array(k.position), turn, depth, k.fov) for k, turn in zip(keys, turns, strict=True)]
+    return {
+        "name": "camera path",
+        "duration": path.seconds,
+        "frameRate": 1,
+        "loopMode": "repeat" if path.closed else "none",
+        "interpolation": "spline",
+        "smoothness": 1,
+        "keyframes": {
+            "times": times.tolist(),
+            "values": {
+                "position": [value for look in looks for value in look["position"]],
+                "target": [value for look in looks for value in look["target"]],
+                "fov": [look["fov"] for look in looks],
+            },
+        },
+    }
+
+
+def _no_effects() -> dict[str, Any]:
+    """The viewer's post effects, all off."""
+    off = {"enabled": False}
+    return {
+        "sharpness": {**off, "amount": 0},
+        "bloom": {**off, "intensity": 0.1, "blurLevel": 2},
+        "grading": {**off, "brightness": 1, "contrast": 1, "saturation": 1, "tint": [1, 1, 1]},
+        "vignette": {**off, "intensity": 0.5, "inner": 0.3, "outer": 0.75, "curvature": 1},
+        "fringing": {**off, "intensity": 0.5},
+    }

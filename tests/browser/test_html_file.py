@@ -1,0 +1,213 @@
+"""One-file HTML of a model, and the report's sliders, in a real browser, opened from disk."""
+
+import dataclasses
+import io
+import math
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+import torch
+from gaussians import pipeline
+from html_scene import SIZE, balls, cameras
+from PIL import Image
+
+from camera_paths.generated import Ellipse
+from camera_paths.poses import poses_of
+from evaluation.document import Comparison, Section
+from evaluation.html import to_html
+from exports.html import write_html
+from exports.of_model import model_of
+from gaussian_renderer import render
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Browser, Page
+
+pytestmark = pytest.mark.browser
+SECONDS = 20  # until something must have happened
+BARE = ".sse-viewer > :not(canvas) { display: none !important }"  # the picture without buttons
+BACKGROUND = (0.2, 0.4, 0.3)
+
+
+@pytest.fixture(scope="module")
+def browser() -> "Iterator[Browser]":
+    api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed: pip install playwright")
+    program = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+    if program is None:
+        pytest.skip("no Chromium is on PATH: apt-get install chromium")
+    with api.sync_playwright() as playwright:
+        options = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+        launched = playwright.chromium.launch(executable_path=program, args=options)
+        yield launched
+        launched.close()
+
+
+@pytest.fixture
+def tab(browser: "Browser") -> "Iterator[Page]":
+    """A tab of the size of the test cameras' pictures. Its test fails for an error or a request to elsewhere."""
+    context = browser.new_context(viewport={"width": SIZE[0], "height": SIZE[1]})
+    page, errors, asked = context.new_page(), [], []
+    page.on("console", lambda message: errors.append(message.text) if message.type == "error" else None)
+    page.on("pageerror", lambda error: errors.append(str(error)))
+    context.on("request", lambda request: asked.append(request.url))
+    yield page
+    context.close()
+    assert not errors
+    assert [url for url in asked if not url.startswith(("file:", "blob:", "data:"))] == []
+    assert sum(url.startswith("file:") for url in asked) == 1
+
+
+def picture(tab: "Page") -> np.ndarray:
+    return np.asarray(Image.open(io.BytesIO(tab.screenshot())).convert("RGB"), np.float64)
+
+
+def wanted(splats, camera) -> np.ndarray:
+    """Our render, in 0 to 255."""
+    with torch.no_grad():
+        image = render(camera, model_of(splats), pipeline(antialiasing=splats.antialiasing), torch.tensor(BACKGROUND))
+    return image["render"].clamp(0, 1).permute(1, 2, 0).numpy() * 255.0
+
+
+def psnr(one: np.ndarray, other: np.ndarray) -> float:
+    return 10 * math.log10(255**2 / np.square(one - other).mean())
+
+
+def show(tab: "Page", path: Path) -> None:
+    """Open a page and wait for its first picture. Polls, as the page's policy forbids playwright's own way."""
+    tab.goto(path.as_uri())
+    for _ in range(10 * SECONDS):
+        if tab.evaluate("window.viewer?.state.loaded ?? false"):
+            break
+        tab.wait_for_timeout(100)
+    else:
+        pytest.fail(f"no picture after {SECONDS} s: {tab.locator('body').inner_text()}")
+    tab.add_style_tag(content=BARE)
+
+
+def settled(tab: "Page") -> np.ndarray:
+    """The picture, once the camera is at rest."""
+    before = picture(tab)
+    for _ in range(4 * SECONDS):
+        tab.wait_for_timeout(250)
+        now = picture(tab)
+        if np.array_equal(now, before):
+            return now
+        before = now
+    pytest.fail(f"the picture is not at rest after {SECONDS} s")
+
+
+@pytest.fixture(scope="module")
+def splats():
+    return balls()
+
+
+@pytest.fixture(scope="module")
+def page(splats, tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("page") / "a model's page.html"
+    write_html(path, splats, cameras(), background=BACKGROUND)
+    return path
+
+
+def test_the_page_begins_with_the_picture_of_its_first_camera(tab, page, splats):
+    show(tab, page)
+    shown = settled(tab)
+    assert psnr(shown, wanted(splats, cameras()[0])) > 33
+    level = psnr(shown, wanted(splats, cameras(rolls=())[0]))
+    assert level < 27, "a camera that leans by 12 degrees makes no difference"
+
+
+def test_a_bookmark_shows_the_picture_of_its_camera_and_the_model_is_upright(tab, page, splats):
+    show(tab, page)
+    tab.evaluate("viewer.selectAnnotation(3)")
+    assert psnr(settled(tab), wanted(splats, cameras()[3])) > 33
+    tab.evaluate("viewer.frameScene()")  # from the viewer's own side, level
+    shown = settled(tab)
+    rows = np.arange(SIZE[1])[:, None]
+    red, blue = (np.maximum(shown[..., one] - shown[..., other] - 60, 0) for one, other in ((0, 2), (2, 0)))
+    assert red.sum() > 1000 < blue.sum()
+    assert (rows * red).sum() / red.sum() < (rows * blue).sum() / blue.sum() - 20
+
+
+def test_the_animation_goes_along_the_path(tab, splats, tmp_path):
+    views = cameras(rolls=())
+    path = Ellipse(poses_of(views), 8.0)
+    write_html(tmp_path / "page.html", splats, views, path, background=BACKGROUND)
+    show(tab, tmp_path / "page.html")
+    assert psnr(settled(tab), wanted(splats, views[0])) > 33
+    place = "(({ x, y, z }) => [x, y, z])(viewer.app.root.findByName('camera').getPosition())"
+    tab.evaluate("viewer.state.animationPaused = true; viewer.seek(2)")
+    settled(tab)
+    quarter = tab.evaluate(place)
+    tab.evaluate("viewer.seek(6)")
+    settled(tab)
+    opposite = tab.evaluate(place)
+    across = np.linalg.norm(np.subtract(path.at(2.0).position, path.at(6.0).position))
+    assert math.dist(quarter, opposite) == pytest.approx(across, rel=0.01)
+
+
+def test_antialiasing_is_that_of_the_model(tab, splats, tmp_path):
+    small = dataclasses.replace(splats, log_scales=splats.log_scales - 3.2, antialiasing=True)
+    write_html(tmp_path / "page.html", small, cameras(), background=BACKGROUND)
+    show(tab, tmp_path / "page.html")
+    shown, other = settled(tab), dataclasses.replace(small, antialiasing=False)
+    assert psnr(shown, wanted(small, cameras()[0])) > psnr(shown, wanted(other, cameras()[0])) + 5
+
+
+def test_a_damaged_page_says_so(browser, page, tmp_path):
+    text = page.read_text()
+    start = text.index('id="viewer">') + len('id="viewer">')
+    (tmp_path / "page.html").write_text(text[:start] + text[start + 1000 :])
+    tab = browser.new_page()
+    tab.goto((tmp_path / "page.html").as_uri())
+    tab.get_by_text("The model cannot be shown").wait_for(timeout=1000 * SECONDS)
+    tab.close()
+
+
+def flat(*colour: int) -> bytes:
+    buffer = io.BytesIO()
+    Image.new("RGB", (120, 80), colour).save(buffer, "JPEG")
+    return buffer.getvalue()
+
+
+@pytest.fixture
+def report(tmp_path) -> Path:
+    view = Comparison("a view", flat(200, 0, 0), flat(0, 0, 200), flat(0, 200, 0))
+    (tmp_path / "report.html").write_text(to_html("Report", [Section("scene", [view])]))
+    return tmp_path / "report.html"
+
+
+def shares(tab: "Page") -> list[float]:
+    """Parts of the window, in pixels, that show photo, render and error."""
+    shown = picture(tab)
+    return [float((shown[..., channel] > 150)[shown.min(axis=2) < 50].sum()) for channel in range(3)]
+
+
+def test_the_reports_slider_moves_between_photo_and_render(tab, report):
+    tab.goto(report.as_uri())
+    slider = tab.locator("input[type=range]")
+    photo, error, render = shares(tab)
+    assert photo == pytest.approx(render, abs=400) and error == pytest.approx(photo + render, abs=600)
+    box = slider.bounding_box()
+    tab.mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+    tab.mouse.down()
+    tab.mouse.move(box["x"] + 0.9 * box["width"], box["y"] + box["height"] / 2)
+    tab.mouse.up()
+    photo, _, render = shares(tab)
+    assert photo / (photo + render) == pytest.approx(0.9, abs=0.07)
+    slider.press("Home")
+    assert shares(tab)[0] < 400
+
+
+def test_without_script_and_on_paper_the_pictures_lie_side_by_side(browser, tab, report):
+    context = browser.new_context(java_script_enabled=False, viewport={"width": SIZE[0], "height": SIZE[1]})
+    plain = context.new_page()
+    plain.goto(report.as_uri())
+    tab.goto(report.as_uri())
+    tab.emulate_media(media="print")
+    for page in (plain, tab):
+        parts = shares(page)
+        assert min(parts) > 3000 and max(parts) < 1.2 * min(parts)
+    context.close()

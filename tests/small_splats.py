@@ -1,0 +1,31 @@
+"""Splats for tests of exports: random ones, few ones, and such with extreme values."""
+
+import numpy as np
+
+from exports.selection import tidy
+from exports.splats import Splats
+
+
+def splats(count: int, degree: int = 3, seed: int = 0, antialiasing: bool = False) -> Splats:
+    """Random splats: positions within some units, scales about 0.02, SH coefficients above band 0 about 0.1."""
+    random = np.random.default_rng(seed)
+
+    def normal(*shape: int, mean: float = 0.0, size: float = 1.0) -> np.ndarray:
+        return random.normal(mean, size, shape).astype(np.float32)
+
+    sh = normal(count, (degree + 1) ** 2, 3, size=0.1)
+    sh[:, 0] *= 5
+    means, scales, rotations = normal(count, 3), normal(count, 3, mean=-4), normal(count, 4)
+    return tidy(Splats(means, scales, rotations, normal(count, size=2), sh, antialiasing))
+
+
+def extreme_splats(degree: int = 3) -> Splats:
+    """Splats at the ends of what a float32 model may hold."""
+    some = splats(8, degree)
+    some.log_scales[:] = np.float32([-80, -40, -20, -1, 0, 20, 40, 80])[:, None]
+    some.opacity_logits[:] = np.float32([-np.inf, -200, -10, 0, 10, 200, np.inf, 1])
+    some.means[:] *= np.float32([0, 1e-20, 1, 1, 1, 1e3, 1e5, 1e30])[:, None]
+    some.sh[:] *= np.float32([0, 1e-20, 1, 1, 1, 100, 1e5, 1])[:, None, None]
+    some.rotations[:4] = np.eye(4, dtype=np.float32)
+    some.rotations[4:] = -np.eye(4, dtype=np.float32)
+    return tidy(some)

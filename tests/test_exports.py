@@ -1,0 +1,294 @@
+"""Exported files: read back by our own readers, byte stability, ends of the ranges, and export.py."""
+
+import json
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from gaussians import model, pipeline
+from plyfile import PlyData
+from small_splats import extreme_splats, splats
+
+from exports.formats import FORMATS, format_of
+from exports.half_turn import half_turned
+from exports.of_model import model_of, splats_of
+from exports.packing import morton_order, smallest_three, whole_quaternions
+from exports.read import read_splats
+from exports.selection import drawable, logits, opacities, selected, tidy, with_sh_degree, within_box
+from exports.splats import Splats
+from gaussian_renderer.free_view import rotation_matrix
+from gaussian_renderer.importance import blending_weights, most_important
+from scene.cameras import MiniCam
+from utils.graphics_utils import getProjectionMatrix
+from utils.sh_utils import C0, sh_basis
+from utils.system_utils import UserError
+
+READABLE = (".ply", ".compressed.ply", ".splat", ".spz")
+OURS = (*READABLE, ".glb", ".usdz")  # not those that other programs write
+PACKAGES = {".spz": "zstandard", ".usdz": "pxr"}
+
+
+def _write(folder: Path, ending: str, some: Splats, name: str = "model") -> Path:
+    if ending in PACKAGES:
+        pytest.importorskip(PACKAGES[ending], reason="the extra [export] is not installed")
+    path = folder / (name + ending)
+    format_of(path).write(path, some)
+    return path
+
+
+def _matched(some: Splats, read: Splats) -> Splats:
+    """The splats of `read` in the order of `some`: each is the nearest to its position."""
+    distance = np.linalg.norm(some.means[:, None] - read.means[None], axis=2)
+    found = distance.argmin(axis=1)
+    assert len(set(found.tolist())) == len(some) == len(read)
+    return selected(read, found)
+
+
+def _angles(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """Angles, radians, between orientations."""
+    return 2 * np.arccos(np.clip(np.abs((one.astype(np.float64) * other).sum(axis=1)), 0, 1))
+
+
+# What a format loses, by its definition half a step of its rounding: position, log scale, angle, opacity, SH0, SH.
+BYTE = 0.5 / 255
+LOSSES = {
+    ".ply": (0, 0, 1e-3, 0, 0, 0),
+    ".splat": (0, 1e-6, 0.03, BYTE, BYTE / C0, 0),
+    ".compressed.ply": (8 / 1023 / 2, 8 / 1023 / 2, 4e-3, BYTE, 4 * BYTE, 8 / 256 / 2),
+    ".spz": (2**-20, 1 / 32, 6e-3, BYTE, BYTE / 0.15, 1 / 256),
+}
+
+
+@pytest.mark.parametrize("degree", range(4))
+@pytest.mark.parametrize("ending", READABLE)
+def test_round_trips_lose_what_the_format_rounds(tmp_path, ending, degree):
+    some = splats(300, degree, antialiasing=True)
+    read = read_splats(_write(tmp_path, ending, some))
+    assert read.antialiasing == (ending != ".splat")
+    assert read.sh_degree == (0 if ending == ".splat" else degree)
+    some = with_sh_degree(some, read.sh_degree)
+    read = _matched(some, read)
+    differences = (
+        np.abs(some.means - read.means),
+        np.abs(some.log_scales - read.log_scales),
+        _angles(some.rotations, read.rotations),
+        np.abs(opacities(some) - opacities(read)),
+        np.abs(some.sh[:, 0] - read.sh[:, 0]),
+        np.abs(some.sh[:, 1:] - read.sh[:, 1:]),
+    )
+    if ending == ".splat":  # colours outside [0, 1] are cut off
+        inside = np.abs(some.sh[:, 0] * C0) < 0.5
+        differences = (*differences[:4], differences[4][inside], differences[5])
+    for difference, loss in zip(differences, LOSSES[ending], strict=True):
+        assert difference.max(initial=0) <= loss * 1.001 + 1e-6
+
+
+@pytest.mark.parametrize("count", [0, 1, 257])
+@pytest.mark.parametrize("ending", OURS)
+def test_the_same_splats_give_the_same_bytes(tmp_path, ending, count):
+    one, other = (_write(tmp_path, ending, splats(count, 2), name) for name in ("one", "other"))
+    assert one.read_bytes() == other.read_bytes()
+    if ending in READABLE:
+        assert len(read_splats(one)) == count
+
+
+@pytest.mark.parametrize("ending", READABLE)
+def test_extreme_values_stay_finite_and_in_their_place(tmp_path, ending):
+    some = extreme_splats()
+    read = read_splats(_write(tmp_path, ending, some))
+    assert len(read) == len(some) and drawable(read).all()
+    assert (np.abs(np.linalg.norm(read.rotations, axis=1) - 1) < 1e-5).all()
+    if ending == ".ply":
+        np.testing.assert_array_equal(read.means, some.means)
+    np.testing.assert_allclose(np.sort(opacities(read)), np.sort(opacities(some)), atol=BYTE)
+
+
+def test_glb_says_what_its_numbers_mean(tmp_path):
+    """A reader of the file by the specification of glTF and its extension alone."""
+    some = splats(50, 2, antialiasing=True)
+    content = _write(tmp_path, ".glb", some).read_bytes()
+    magic, version, length = struct.unpack_from("<4sII", content)
+    assert (magic, version, length) == (b"glTF", 2, len(content))
+    size = struct.unpack_from("<I", content, 12)[0]
+    document, binary = json.loads(content[20 : 20 + size]), content[28 + size :]
+    (primitive,) = document["meshes"][0]["primitives"]
+    assert document["extensionsUsed"] == ["KHR_gaussian_splatting"] and primitive["mode"] == 0
+    assert set(primitive["extensions"]["KHR_gaussian_splatting"]) == {"kernel", "colorSpace"}
+
+    def values(name: str) -> np.ndarray:
+        accessor = document["accessors"][primitive["attributes"][name]]
+        view = document["bufferViews"][accessor["bufferView"]]
+        assert accessor["componentType"] == 5126 and accessor["count"] == 50 and view["byteOffset"] % 4 == 0
+        return np.frombuffer(binary, "<f4", view["byteLength"] // 4, view["byteOffset"]).reshape(50, -1)
+
+    prefix = "KHR_gaussian_splatting:"
+    np.testing.assert_array_equal(values("POSITION"), some.means)
+    np.testing.assert_array_equal(values(prefix + "ROTATION"), some.rotations[:, [1, 2, 3, 0]])
+    np.testing.assert_allclose(values(prefix + "SCALE"), np.exp(some.log_scales), rtol=1e-6)
+    np.testing.assert_allclose(values(prefix + "OPACITY")[:, 0], opacities(some), rtol=1e-6)
+    names = [f"{prefix}SH_DEGREE_{d}_COEF_{n}" for d in range(3) for n in range(2 * d + 1)]
+    np.testing.assert_array_equal(np.stack([values(name) for name in names], axis=1), some.sh)
+    assert f"{prefix}SH_DEGREE_3_COEF_0" not in primitive["attributes"]
+    # A camera's up, -y of COLMAP, is glTF's +y once the node has turned it.
+    x, y, z, w = document["nodes"][0]["rotation"]
+    np.testing.assert_allclose(rotation_matrix((w, x, y, z)) @ [0, -1, 0], [0, 1, 0], atol=1e-12)
+
+
+def test_usdz_has_the_schema_and_stands_upright(tmp_path):
+    path = _write(tmp_path, ".usdz", some := splats(20, 1))
+    from pxr import Gf, Usd, UsdGeom
+
+    stage = Usd.Stage.Open(str(path))
+    (prim,) = [prim for prim in stage.Traverse() if prim.GetTypeName() == "ParticleField3DGaussianSplat"]
+    assert UsdGeom.GetStageUpAxis(stage) == "Y"
+    world = UsdGeom.Xformable(prim).ComputeLocalToWorldTransform(Usd.TimeCode.Default())
+    assert Gf.IsClose(world.TransformDir(Gf.Vec3d(0, -1, 0)), Gf.Vec3d(0, 1, 0), 1e-9)
+
+    def value(name: str) -> np.ndarray:
+        return np.asarray(prim.GetAttribute(name).Get())
+
+    np.testing.assert_array_equal(value("positions"), some.means)
+    np.testing.assert_allclose(value("scales"), np.exp(some.log_scales), rtol=1e-6)
+    np.testing.assert_allclose(value("opacities"), opacities(some), rtol=1e-6)
+    turn = prim.GetAttribute("orientations").Get()[3]
+    np.testing.assert_array_equal([turn.GetReal(), *turn.GetImaginary()], some.rotations[3])
+    assert value("radiance:sphericalHarmonicsDegree") == 1
+    np.testing.assert_array_equal(value("radiance:sphericalHarmonicsCoefficients").reshape(20, 4, 3), some.sh)
+
+
+def test_a_half_turn_moves_splats_and_keeps_their_colours():
+    some = splats(30)
+    turned = half_turned(some)
+    turn = np.diag([1.0, -1.0, -1.0])
+    np.testing.assert_allclose(turned.means, some.means @ turn.T)
+    for before, after in zip(some.rotations, turned.rotations, strict=True):
+        np.testing.assert_allclose(rotation_matrix(after), turn @ rotation_matrix(before) @ turn.T, atol=1e-6)
+    directions = torch.nn.functional.normalize(torch.randn(30, 3, generator=torch.Generator().manual_seed(0)))
+    seen = torch.einsum("nk,nkc->nc", sh_basis(3, directions), torch.from_numpy(some.sh))
+    turned_directions = directions * torch.tensor([1.0, -1.0, -1.0])
+    torch.testing.assert_close(
+        torch.einsum("nk,nkc->nc", sh_basis(3, turned_directions), torch.from_numpy(turned.sh)), seen
+    )
+    np.testing.assert_array_equal(half_turned(turned).sh, some.sh)
+
+
+def test_a_camera_is_upright_in_spz(tmp_path):
+    """SPZ has y up: what is above in COLMAP (-y) has a positive y in the file."""
+    some = selected(splats(1), [0])
+    some.means[:] = [[0.0, -2.0, 0.0]]
+    content = _write(tmp_path, ".spz", some).read_bytes()
+    import zstandard
+
+    packed, whole = struct.unpack_from("<QQ", content, 32)
+    begin = 32 + 16 * content[15]
+    positions = zstandard.ZstdDecompressor().decompress(content[begin : begin + packed], max_output_size=whole)
+    y = int.from_bytes(positions[3:6], "little", signed=True) / 2 ** content[13]
+    assert y == 2.0
+
+
+def test_splat_begins_with_what_matters_most(tmp_path):
+    some = splats(100)
+    read = read_splats(_write(tmp_path, ".splat", some))
+    worth = read.log_scales.sum(axis=1) + np.log(opacities(read))
+    assert np.corrcoef(worth, -np.arange(100))[0, 1] > 0.9 and worth.argmax() == 0
+
+
+def test_ply_says_axes_and_render_mode(tmp_path):
+    for antialiasing, mode in ((True, "mip"), (False, "default")):
+        path = _write(tmp_path, ".ply", splats(3, antialiasing=antialiasing))
+        comments = PlyData.read(path).comments
+        assert comments[0] == "axes x right, y down, z forward (COLMAP)"
+        assert comments[1:] == [f"SplatRenderMode: {mode}", f"antialiased {antialiasing:d}"]
+
+
+def test_neighbours_in_space_are_neighbours_in_the_order():
+    some = splats(2000).means
+    order = morton_order(some)
+    assert sorted(order) == list(range(2000))
+    steps = [np.linalg.norm(np.diff(points, axis=0), axis=1).mean() for points in (some, some[order])]
+    assert steps[1] < steps[0] / 4
+
+
+def test_smallest_three_and_back():
+    some = splats(200).rotations
+    back = whole_quaternions(*smallest_three(some))
+    np.testing.assert_allclose(np.abs((back * some).sum(axis=1)), 1, atol=1e-6)
+    _, three = smallest_three(some)
+    assert np.abs(three).max() <= np.sqrt(0.5) + 1e-9
+
+
+def test_models_and_splats_are_the_same_gaussians():
+    gaussians = model(12, degree=2)
+    back = splats_of(model_of(splats_of(gaussians)))
+    for name, value in vars(splats_of(gaussians)).items():
+        np.testing.assert_allclose(getattr(back, name), value, atol=1e-7 if name == "rotations" else 0)
+    gaussians.scaling_activation = torch.nn.functional.softplus  # another activation: files still hold logarithms
+    np.testing.assert_allclose(
+        np.exp(splats_of(gaussians).log_scales), gaussians.get_scaling.detach().numpy(), rtol=1e-5
+    )
+    assert model_of(splats(4, 1), 3).active_sh_degree == 1 and model_of(splats(4, 3), 1).max_sh_degree == 1
+
+
+def test_selection():
+    some = splats(50)
+    inside = within_box(some, (-1, -1, -1, 1, 0, 1))
+    assert 0 < inside.sum() < 50 and (some.means[inside][:, 1] <= 0).all()
+    some.means[3, 1] = np.nan
+    some.opacity_logits[4] = np.inf
+    assert (~drawable(some)).nonzero()[0].tolist() == [3]
+    some.rotations[5] = 0
+    np.testing.assert_array_equal(tidy(some).rotations[5], [1, 0, 0, 0])
+    np.testing.assert_allclose(1 / (1 + np.exp(-logits(np.float32([0, 0.5, 1]), 0.1))), [0.025, 0.5, 0.975], atol=1e-6)
+
+
+def test_weights_are_those_of_blending():
+    """Over a black background, with all colours 1, a pixel is the sum of its weights."""
+    gaussians = model(40)
+    view = torch.eye(4)
+    view[2, 3] = 3.0
+    projection = torch.as_tensor(getProjectionMatrix(0.01, 100.0, 0.9, 0.6)).float()
+    camera = MiniCam(41, 27, 0.6, 0.9, 0.01, 100.0, view.T.contiguous(), (projection @ view).T.contiguous())
+    from gaussian_renderer import render
+
+    pipe, white = pipeline(), torch.ones(40, 3)
+    weights = blending_weights(gaussians, [camera, camera], pipe)
+    image = render(camera, gaussians, pipe, torch.zeros(3), override_color=white, clamp=False)["render"]
+    torch.testing.assert_close(weights.sum(), 2 * image[0].sum().double().detach(), rtol=1e-5, atol=0)
+    assert (weights >= 0).all() and (weights > 0).sum() > 10
+    kept = most_important(weights, 7)
+    assert kept.sum() == 7 and weights[kept].min() >= weights[~kept].max()
+
+
+def test_unknown_endings_and_files_are_refused(tmp_path):
+    with pytest.raises(UserError, match=r"format of a.obj is unknown; end its name with one of .compressed.ply, .ply"):
+        format_of("a.obj")
+    assert format_of("A.Compressed.PLY").ending == ".compressed.ply" and format_of("b.ply").ending == ".ply"
+    assert len({entry.ending for entry in FORMATS}) == len(FORMATS)
+    with pytest.raises(UserError, match="no file"):
+        read_splats(tmp_path / "absent.spz")
+    (tmp_path / "a.bin").write_bytes(b"hello")
+    with pytest.raises(UserError, match="no model that this program reads; give PLY"):
+        read_splats(tmp_path / "a.bin")
+
+
+@pytest.mark.parametrize("ending", READABLE)
+def test_damaged_files_end_in_a_sentence(tmp_path, ending):
+    """Cut and altered at many places; whatever is read besides must be splats."""
+    whole = _write(tmp_path, ending, splats(20, 1)).read_bytes()
+    random = np.random.default_rng(0)
+    path = tmp_path / f"damaged{ending}"
+    for trial in range(60):
+        content = bytearray(whole)
+        if trial % 2:
+            del content[int(random.integers(len(whole))) :]
+        else:
+            for place in random.integers(min(len(whole), 200), size=3):
+                content[place] = int(random.integers(256))
+        path.write_bytes(content)
+        try:
+            read = read_splats(path)
+        except UserError:
+            continue
+        assert len(read.means) == len(read.sh) == len(read.rotations)

@@ -1,0 +1,276 @@
+"""One-file HTML of a model: what is in the file, where its cameras stand, and what is vendored."""
+
+import base64
+import gzip
+import hashlib
+import json
+import math
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from gaussians import pipeline
+from html_scene import CENTRE, FOV, SIZE, UP, balls, cameras
+from scipy.spatial.transform import Rotation
+
+from camera_paths.generated import Ellipse
+from camera_paths.keyframes import CameraPath, Keyframe
+from camera_paths.moments import KeyframePath
+from camera_paths.poses import Poses, facing, poses_of
+from exports import html, vendor
+from exports.compressed_ply import read_compressed_ply
+from exports.html import write_html, write_scene_html
+from exports.of_model import model_of
+from exports.upright import turn_upright, turned, up_of
+from exports.viewer_settings import BOOKMARKS, lean, settings
+from gaussian_renderer import render
+from gaussian_renderer.free_view import free_view
+from utils.system_utils import UserError
+
+# Addresses in the viewer's code. It asks for none of them here: those of PlayCanvas and Khronos are in texts, SVG is a
+# name, and jsDelivr would have models of the hand-held controllers of a VR headset, which the page's policy refuses.
+ADDRESSES = {
+    "http://www.w3.org/2000/svg",
+    "https://cdn.jsdelivr.net/npm/@webxr-input-profiles/assets/dist/profiles",
+    "https://github.com/playcanvas/engine",
+    "https://github.com/playcanvas/supersplat-viewer",
+}
+
+
+class Page(HTMLParser):
+    """Elements of a page: their attributes, and the text of those with an id and of title and style."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__()
+        self.tags: list[tuple[str, dict]] = []
+        self.texts: dict[str, str] = {}
+        self._open = ""
+        self.feed(path.read_text(encoding="utf-8"))
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append((tag, dict(attrs)))
+        self._open = dict(attrs).get("id", tag)
+
+    def handle_endtag(self, tag):
+        self._open = ""
+
+    def handle_data(self, data):
+        self.texts[self._open] = self.texts.get(self._open, "") + data
+
+    def unpacked(self, name: str) -> bytes:
+        return gzip.decompress(base64.b64decode(self.texts[name]))
+
+
+@pytest.fixture(scope="module")
+def page(tmp_path_factory) -> Page:
+    path = tmp_path_factory.mktemp("page") / "balls.html"
+    write_html(path, balls(), cameras(), background=(1.0, 0.5, 0.0))
+    return Page(path)
+
+
+def rendered(splats, camera) -> np.ndarray:
+    with torch.no_grad():
+        return render(camera, model_of(splats), pipeline(), torch.zeros(3))["render"].numpy()
+
+
+def test_vendored_files_are_those_of_the_record():
+    record = json.loads(vendor.RECORD.read_text())
+    files = {path.name for path in vendor.FOLDER.iterdir()} - {vendor.RECORD.name}
+    assert files == set(record["sha256"])
+    for name, digest in record["sha256"].items():
+        assert hashlib.sha256((vendor.FOLDER / name).read_bytes()).hexdigest() == digest, name
+    assert record["license"] == "MIT" and (vendor.FOLDER / "LICENSE").read_text().startswith("MIT License")
+    for name in ("viewer.js", "viewer.css"):
+        assert f"{record['package']} {record['version']}, MIT" in (vendor.FOLDER / name).read_text()[:100]
+
+
+def test_vendor_writes_nothing_that_differs_from_the_record(tmp_path, monkeypatch):
+    package = tmp_path / "package"
+    package.mkdir()
+    (package / "LICENSE").write_text("other")
+    monkeypatch.setattr(vendor, "ROOT", tmp_path)
+    monkeypatch.setattr(vendor, "FOLDER", tmp_path / "viewer")
+    monkeypatch.setattr(vendor.shutil, "which", lambda _: "npm")
+    monkeypatch.setattr(vendor, "_unpacked", lambda *_: package)
+    monkeypatch.setattr(vendor, "_minifier", lambda *_: Path("esbuild"))
+    monkeypatch.setattr(vendor, "_output", lambda *_: b"code")
+    digest = hashlib.sha256(b"other").hexdigest()
+    with pytest.raises(UserError, match=f'the files differ from those of .*"LICENSE": "{digest}"'):
+        vendor.main([])
+    assert not (tmp_path / "viewer").exists()
+
+
+def test_the_viewer_names_no_other_addresses():
+    code = (vendor.FOLDER / "viewer.js").read_text() + (vendor.FOLDER / "viewer.css").read_text()
+    assert set(re.findall(r"""(?:https?|wss?)://[^"'`\s<>)\\]+""", code)) == ADDRESSES
+    assert "@import" not in code and "new Function" not in code
+
+
+def test_the_page_refers_to_nothing_outside(page):
+    for tag, attributes in page.tags:
+        for name in ("src", "href", "action", "data", "poster", "srcset"):
+            assert attributes.get(name, "data:").startswith("data:"), (tag, attributes)
+    for name, text in page.texts.items():
+        without_comments = re.sub(r"(^|\s)// .*$", "", text, flags=re.MULTILINE)
+        assert "//" not in without_comments or name in ("model", "viewer"), name
+    assert page.unpacked("viewer") == (vendor.FOLDER / "viewer.js").read_bytes()
+    policy = next(a["content"] for _, a in page.tags if a.get("http-equiv") == "Content-Security-Policy")
+    allowed = {words.split()[0]: words.split()[1:] for words in policy.split(";")}
+    assert allowed["default-src"] == ["'none'"]
+    assert {source for sources in allowed.values() for source in sources} == {
+        "'none'", "'unsafe-inline'", "blob:", "data:",
+    }  # fmt: skip
+
+
+def test_the_page_carries_the_viewers_licence(tmp_path):
+    path = tmp_path / "balls.html"
+    write_html(path, balls(each=2), cameras())
+    assert (vendor.FOLDER / "LICENSE").read_text() in path.read_text()
+
+
+@pytest.mark.parametrize("name", ["</script><script>alert(1)</script>", "<!--<script>", "a & b ' \" ü", "caf\udce9"])
+def test_names_stay_names(tmp_path, name):
+    views = cameras()
+    for camera in views:
+        camera.image_name = name
+    write_html(tmp_path / "page.html", balls(each=2), views, title=name)
+    page = Page(tmp_path / "page.html")
+    assert [tag for tag, _ in page.tags].count("script") == 4
+    shown = name.encode("utf-8", "backslashreplace").decode()
+    content = json.loads(page.texts["page"])
+    assert page.texts["title"] == shown and content["settings"]["annotations"][0]["title"] == name
+
+
+def test_a_page_is_named_by_its_file_and_has_its_background(page):
+    assert page.texts["title"] == "balls"
+    content = json.loads(page.texts["page"])
+    assert content["settings"]["background"]["color"] == [1.0, 0.5, 0.0] and content["antialiasing"] is False
+    assert "rgb(255, 128, 0)" in page.texts["style"]
+
+
+def test_the_model_in_the_page_is_upright(page, tmp_path):
+    content = json.loads(page.texts["page"])
+    (tmp_path / content["name"]).write_bytes(page.unpacked("model"))
+    splats = read_compressed_ply(tmp_path / content["name"])
+    red = splats.sh[:, 0, 0] > splats.sh[:, 0, 2]
+    assert len(splats) == 600 and red.sum() == 300
+    apart = splats.means[red].mean(axis=0) - splats.means[~red].mean(axis=0)
+    assert apart / np.linalg.norm(apart) == pytest.approx([0, -1, 0], abs=0.05)  # up, in COLMAP's axes
+
+
+def test_a_turned_model_looks_the_same_from_a_turned_camera():
+    """By our renderer: colours that depend on the direction (SH degree 3) turn with the world."""
+    splats, turn = balls(degree=3), Rotation.from_rotvec([1.0, -2.0, 0.5]).as_matrix()
+    camera = cameras()[0]
+    pose = poses_of([camera])
+    wxyz = np.roll(Rotation.from_matrix(turn @ pose.turns[0]).as_quat(), 1)
+    other = free_view(*SIZE, math.radians(FOV), turn @ pose.positions[0], wxyz, "cpu")
+    before, after = rendered(splats, camera), rendered(turned(splats, turn), other)
+    assert before.max() > 0.5 and 10 * math.log10(1 / np.square(before - after).mean()) > 80
+    unturned = turned(splats, turn).sh * 0 + splats.sh
+    wrong = rendered(type(splats)(**{**vars(turned(splats, turn)), "sh": unturned}), other)
+    assert 10 * math.log10(1 / np.square(before - wrong).mean()) < 40
+
+
+def test_up_is_where_the_horizons_are_level():
+    ring = poses_of(cameras(rolls=()))
+    assert up_of(ring) == pytest.approx(UP, abs=1e-6)
+    side = ring[np.arange(3)]  # all look down from one side, so that their mean up leans to it
+    assert math.degrees(math.acos(side.up @ UP / np.linalg.norm(side.up))) > 8
+    assert up_of(side) == pytest.approx(UP, abs=1e-2)
+    one = ring[np.zeros(4, int)]
+    assert up_of(one) == pytest.approx(one.up, abs=1e-6)
+
+
+@pytest.mark.parametrize("up", [UP, [0, 1, 0], [0, -1, 0], [1, 0, 0]])
+def test_the_turn_upright_is_a_rotation(up):
+    turn = turn_upright(np.array(up, float))
+    assert turn @ up == pytest.approx([0, -1, 0], abs=1e-9)
+    assert np.linalg.det(turn) == pytest.approx(1) and turn @ turn.T == pytest.approx(np.eye(3), abs=1e-9)
+
+
+def test_lean_completes_the_viewers_angles():
+    """The viewer's camera has its axes turned by yaw about y, pitch about x; it looks along -z."""
+    for turn in Rotation.random(50, random_state=0).as_matrix():
+        forward = turn[:, 2]
+        yaw, pitch = math.atan2(-forward[0], -forward[2]), math.asin(forward[1])
+        camera = Rotation.from_euler("YXZ", [yaw, pitch, math.radians(lean(turn))]).as_matrix()
+        assert camera == pytest.approx(turn * [1, -1, -1], abs=1e-9)
+
+
+def test_the_first_camera_is_where_the_page_begins(page):
+    content = json.loads(page.texts["page"])["settings"]
+    first = content["cameras"][0]["initial"]
+    pose = poses_of(cameras())
+    axes = np.diag([-1.0, -1.0, 1.0]) @ turn_upright(up_of(pose))
+    assert first["position"] == pytest.approx(axes @ pose.positions[0], abs=1e-6)
+    assert first["target"] == pytest.approx(axes @ CENTRE, abs=1e-4) and first["fov"] == pytest.approx(FOV, abs=1e-4)
+    marks = content["annotations"]
+    assert [mark["title"] for mark in marks] == [f"photo_{n}.jpg" for n in range(8)]
+    assert marks[0]["camera"]["initial"] == first
+    leans = [mark["extras"]["lean"] for mark in marks]
+    assert leans[0] == pytest.approx(-12, abs=4) and np.abs(leans[1:]).max() < 3  # that camera also moves `up_of`
+
+
+def test_bookmarks_are_few_and_spread():
+    views = cameras(60, rolls=())
+    names = [f"{number:0100d}" for number in range(60)]
+    content = settings(poses_of(views), names, np.eye(3), None, (0, 0, 0))
+    titles = [mark["title"] for mark in content["annotations"]]
+    assert len(titles) == BOOKMARKS and max(map(len, titles)) == 60
+    numbers = [int(title[-3:]) for title in titles]
+    assert numbers[0] == 0 and numbers[-1] == 59 and np.diff(numbers).max() == 3
+
+
+def test_the_animation_follows_the_camera_path():
+    poses = poses_of(cameras())
+    names = [""] * len(poses)
+    keys = [Keyframe(s, (s, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), 40 + s) for s in (0.0, 2.0, 4.0)]
+    content = settings(poses, names, np.eye(3), KeyframePath(CameraPath(tuple(keys))), (0, 0, 0))
+    (track,) = content["animTracks"]
+    values = track["keyframes"]["values"]
+    assert content["startMode"] == "animTrack" and track["loopMode"] == "none" and track["duration"] == 4
+    assert track["keyframes"]["times"] == pytest.approx(np.arange(41) / 10)
+    assert np.reshape(values["position"], (-1, 3))[20] == pytest.approx([-2, 0, 0])
+    towards = np.reshape(values["target"], (-1, 3)) - np.reshape(values["position"], (-1, 3))
+    assert (towards[:, 2] > 1).all() and np.abs(towards[:, :2]).max() < 1e-9
+    assert values["fov"][30] == pytest.approx(43)
+    (closed,) = settings(poses, names, np.eye(3), Ellipse(poses, 600.0), (0, 0, 0))["animTracks"]
+    times = closed["keyframes"]["times"]
+    assert closed["loopMode"] == "repeat" and len(times) == 999 and times[-1] < 600 == closed["duration"]
+
+
+def test_cameras_that_look_past_each_other_have_targets_ahead():
+    turns = np.stack([facing(np.array([math.sin(a), 0.0, math.cos(a)]), np.array([0.0, -1.0, 0.0])) for a in range(6)])
+    outwards = Poses(turns[:, :, 2] * 2, turns, np.full(6, 60.0))
+    content = settings(outwards, [""] * 6, np.eye(3), None, (0, 0, 0))
+    for mark, turn in zip(content["annotations"], turns, strict=True):
+        pose = mark["camera"]["initial"]
+        towards = np.subtract(pose["target"], pose["position"])
+        assert towards / np.linalg.norm(towards) == pytest.approx(turn[:, 2] * [-1, -1, 1])
+
+
+def test_the_page_of_a_scene(tmp_path):
+    scene = SimpleNamespace(getTrainCameras=cameras)
+    write_scene_html(tmp_path / "scene.html", balls(each=2), scene, white_background=True, make_path=Ellipse)
+    content = json.loads(Page(tmp_path / "scene.html").texts["page"])["settings"]
+    assert content["background"]["color"] == [1.0, 1.0, 1.0] and content["startMode"] == "animTrack"
+
+
+def test_a_page_that_no_browser_could_read_is_not_written(tmp_path, monkeypatch):
+    monkeypatch.setattr(html, "LONGEST", 1000)
+    with pytest.raises(
+        UserError, match="a page of 600 Gaussians of SH degree 1 would have .* --max_splats or --sh_deg"
+    ):
+        write_html(tmp_path / "page.html", balls(), cameras())
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_page_needs_a_camera(tmp_path):
+    with pytest.raises(UserError, match="a page needs at least one training camera"):
+        write_html(tmp_path / "page.html", balls(each=2), [])
+    assert not list(tmp_path.iterdir())
