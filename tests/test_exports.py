@@ -158,6 +158,19 @@ def test_usdz_has_the_schema_and_stands_upright(tmp_path):
     np.testing.assert_array_equal(value("radiance:sphericalHarmonicsCoefficients").reshape(20, 4, 3), some.sh)
 
 
+def test_openusd_finds_no_fault_in_usdz(tmp_path):
+    path = _write(tmp_path, ".usdz", splats(30, 3))
+    from pxr import Usd, UsdGeom, UsdValidation
+
+    context = UsdValidation.ValidationContext(UsdValidation.ValidationRegistry().GetOrLoadAllValidators())
+    stage = Usd.Stage.Open(str(path))
+    assert [error.GetMessage() for error in context.Validate(stage)] == []
+    (prim,) = [prim for prim in stage.Traverse() if prim.GetTypeName() == "ParticleField3DGaussianSplat"]
+    positions = np.asarray(prim.GetAttribute("positions").Get())
+    low, high = np.asarray(UsdGeom.Boundable(prim).GetExtentAttr().Get())
+    assert (low < positions).all() and (positions < high).all()
+
+
 def test_a_half_turn_moves_splats_and_keeps_their_colours():
     some = splats(30)
     turned = half_turned(some)
