@@ -1,6 +1,7 @@
 """Render a trained model's train and test views as PNG beside the ground truth, and time the renders.
 
 python render.py -m MODEL [--iteration N] [--skip_train] [--skip_test] [--depth] [--alpha]
+python render.py -s SCENE -m OUT --ply FILE
 
 Writes MODEL/{train,test}/ours_N/{renders,gt}/00000.png ..., numbered by the views' sorted order, masks/ for views of
 which not every pixel counts, and render_times.json beside these folders: the time of each view without I/O. The device
@@ -26,10 +27,13 @@ from PIL import Image
 from tqdm import tqdm
 
 from arguments import ModelParams, OptionParser, PipelineParams, get_combined_args, warn_of_background
+from exports.in_scene import scene_with
+from exports.of_model import model_of
 from gaussian_renderer.memory_errors import memory_errors_explained
 from gaussian_renderer.scored_views import ScoredViews
 from gaussian_renderer.view_planes import PLANES, view_planes
 from records import render_times
+from scene import Scene
 from scene.cameras import Camera
 from scene.gaussian_model import GaussianModel
 from scene.saved_model import load_saved
@@ -162,15 +166,16 @@ def render_sets(
     *,
     sh_degree: int | None = None,
     planes: Collection[str] = (),
+    ply: str = "",
 ) -> None:
     """Render the views of a saved iteration, -1: the last one, by `render_set`.
 
     dataset: the model options. sh_degree: degree that the PLY must have, None: any. planes: those of PLANES to write,
-    too. UserError if nothing can be loaded.
+    too. ply: model of any tool to render instead, into folders that have its name. UserError if nothing can be loaded.
     """
     options = copy.copy(dataset)
     options.images_to_load = 1  # each photo is used once
-    scene = load_saved(options, iteration, sh_degree)
+    scene = load_file(options, ply, pipeline) if ply else load_saved(options, iteration, sh_degree)
     gaussians = scene.gaussians
     if len(gaussians) == 0:
         raise UserError(f"iteration {scene.loaded_iter} of {scene.model_path} has no Gaussians; train it again")
@@ -183,12 +188,25 @@ def render_sets(
         render_set(scene.model_path, "test", scene.loaded_iter, scene.getTestCameras(), *drawn, planes=planes)
 
 
+def load_file(options: argparse.Namespace, ply: str, pipeline: argparse.Namespace) -> Scene:
+    """Scene of the model options with the Gaussians of a file; `pipeline` takes its render mode."""
+    scene, splats = scene_with(ply, options, GaussianModel(0))
+    if splats is None:
+        raise UserError(f"{ply} is a point cloud; start a training from it with train.py --init_pcd_path {ply}")
+    scene.gaussians, scene.loaded_iter = model_of(splats), Path(ply).name.split(".")[0]
+    scene.gaussians.start_exposures(scene.info.train_cameras)
+    pipeline.antialiasing = pipeline.antialiasing or splats.antialiasing
+    return scene
+
+
 def main() -> None:
     parser = OptionParser(description="Render the train and test views of a trained model.")
     # Each photo is used once, so one is kept in memory.
     model_params = ModelParams(parser, sentinel=True, without=("images_to_load",))
     pipeline_params = PipelineParams(parser, sentinel=True)
     parser.add_argument("--iteration", type=int, default=-1, help="saved iteration to render (default: -1, the last)")
+    parser.add_argument("--ply", default="", metavar="FILE",
+        help="render this model of any tool in the views of -s, as -m has none of its own (default: none)")  # fmt: skip
     parser.add_argument("--skip_train", action="store_true", help="leave the training views out (default: off)")
     parser.add_argument("--skip_test", action="store_true", help="leave the test views out (default: off)")
     for plane, what in (("depth", "inverse depth"), ("alpha", "alpha")):
@@ -198,7 +216,11 @@ def main() -> None:
     options, pipeline = model_params.extract(args), pipeline_params.extract(args)
     safe_state(args.quiet)
     warn_of_background(options)
-    chosen = {"sh_degree": args.typed_sh_degree, "planes": [plane for plane in PLANES if getattr(args, plane)]}
+    chosen = {
+        "sh_degree": args.typed_sh_degree,
+        "ply": args.ply,
+        "planes": [plane for plane in PLANES if getattr(args, plane)],
+    }
     render_sets(options, args.iteration, pipeline, args.skip_train, args.skip_test, **chosen)
 
 
