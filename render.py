@@ -27,13 +27,11 @@ from PIL import Image
 from tqdm import tqdm
 
 from arguments import ModelParams, OptionParser, PipelineParams, get_combined_args, warn_of_background
-from exports.in_scene import scene_with
-from exports.of_model import model_of
+from exports.in_scene import load_file
 from gaussian_renderer.memory_errors import memory_errors_explained
 from gaussian_renderer.scored_views import ScoredViews
 from gaussian_renderer.view_planes import PLANES, view_planes
 from records import render_times
-from scene import Scene
 from scene.cameras import Camera
 from scene.gaussian_model import GaussianModel
 from scene.saved_model import load_saved
@@ -186,17 +184,6 @@ def render_sets(
         render_set(scene.model_path, "train", scene.loaded_iter, scene.getTrainCameras(), *drawn, planes=planes)
     if not skip_test:
         render_set(scene.model_path, "test", scene.loaded_iter, scene.getTestCameras(), *drawn, planes=planes)
-
-
-def load_file(options: argparse.Namespace, ply: str, pipeline: argparse.Namespace) -> Scene:
-    """Scene of the model options with the Gaussians of a file; `pipeline` takes its render mode."""
-    scene, splats = scene_with(ply, options, GaussianModel(0))
-    if splats is None:
-        raise UserError(f"{ply} is a point cloud; start a training from it with train.py --init_pcd_path {ply}")
-    scene.gaussians, scene.loaded_iter = model_of(splats), Path(ply).name.split(".")[0]
-    scene.gaussians.start_exposures(scene.info.train_cameras)
-    pipeline.antialiasing = pipeline.antialiasing or splats.antialiasing
-    return scene
 
 
 def main() -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from exports.of_model import fill_model
+from exports.of_model import fill_model, model_of
 from exports.plain_ply import stored_offset
 from exports.read import is_point_cloud, read_splats
 from exports.selection import drawable, selected
@@ -43,6 +43,21 @@ def scene_with(
         scene = Scene(options, gaussians, shuffle=shuffle, start=False)
     means = np.ascontiguousarray(scene.info.point_cloud.points, dtype=np.float32)
     return scene, replace(splats, means=means)
+
+
+def load_file(options: argparse.Namespace, path: str, pipeline: argparse.Namespace) -> Scene:
+    """Scene of the model options with a file's Gaussians, in the place of `load_saved`.
+
+    Its loaded_iter is the name of the file, without endings. `pipeline` gets antialiasing if the file says so.
+    UserError for a point cloud, and as from `scene_with`.
+    """
+    scene, splats = scene_with(path, options, GaussianModel(0))
+    if splats is None:
+        raise UserError(f"{path} is a point cloud; start a training from it with train.py --init_pcd_path {path}")
+    scene.gaussians, scene.loaded_iter = model_of(splats), Path(path).name.split(".")[0]
+    scene.gaussians.start_exposures(scene.info.train_cameras)
+    pipeline.antialiasing = pipeline.antialiasing or splats.antialiasing
+    return scene
 
 
 def start_from(splats: Splats, scene: Scene, gaussians: GaussianModel) -> None:

@@ -31,6 +31,7 @@ ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs" / "inside" / "extending.md"
 CODE = (
     "arguments",
+    "exports",
     "gaussian_renderer",
     "records",
     "scene",

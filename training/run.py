@@ -13,6 +13,7 @@ from records.training_log import Stopwatch
 from scene import Scene
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.checkpoint import load_checkpoint
+from scene.options import option
 from training.checks import check_exposures, check_scene, warn_of_late_reset
 from training.density import AdaptiveDensityControl
 from training.history import check_folder, continue_records, report_changes
@@ -56,8 +57,9 @@ class Run:
             )
         warn_of_late_reset(opt, dataset.white_background)
         self.gaussians = GaussianModel(dataset.sh_degree, opt.optimizer_type)
-        if getattr(dataset, "init_ply", "") and not plan.start:  # options of others lack it
-            self.scene, self._first = scene_with(dataset.init_ply, dataset, self.gaussians)
+        init_ply = option(dataset, "init_ply")
+        if init_ply and not plan.start:
+            self.scene, self._first = scene_with(init_ply, dataset, self.gaussians)
         else:
             self.scene, self._first = Scene(dataset, self.gaussians, shuffle=False, start=False), None
         check_scene(self.scene.info)
