@@ -103,11 +103,13 @@ def test_adobes_spz_reads_what_we_wrote(tmp_path, degree):
     np.testing.assert_allclose(np.abs((ours.rotations * theirs.rotations).sum(axis=1)), 1, atol=1e-5)
 
 
-@pytest.mark.parametrize("ending", [".spz", ".compressed.ply"])
-def test_we_read_what_splat_transform_writes(tmp_path, ending):
+@pytest.mark.parametrize(
+    ("ending", "options"), [(".spz", []), (".spz", ["--spz-version", "3"]), (".compressed.ply", [])]
+)
+def test_we_read_what_splat_transform_writes(tmp_path, ending, options):
     some = _scene(2, antialiasing=True)
     plain, packed = _written(tmp_path, ".ply", some), tmp_path / f"theirs{ending}"
-    subprocess.run(["splat-transform", "--quiet", plain, packed], check=True, capture_output=True)
+    subprocess.run(["splat-transform", "--quiet", *options, plain, packed], check=True, capture_output=True)
     read = read_back(packed)
     assert read.antialiasing and read.sh_degree == 2
     assert _loss(some, half_turned(read) if ending == ".spz" else read) >= COMPRESSED
