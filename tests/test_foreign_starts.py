@@ -16,9 +16,11 @@ from exports.formats import format_of
 from exports.of_model import model_of
 from exports.read import is_point_cloud, read_splats
 from exports.selection import with_sh_degree
+from gaussian_renderer.importance import blending_weights, most_important
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.ply import read_ply
 from scene.readers.point_cloud import read_point_cloud
+from scene.saved_model import load_saved
 from utils.system_utils import UserError
 
 
@@ -153,10 +155,17 @@ def test_export_chooses_what_it_writes(tmp_path, colmap_scene, capsys):
     np.testing.assert_allclose(read.means, every.means[wanted], atol=1e-6)
     assert read.sh_degree == 1 and 10 < len(read) < 200
     assert re.search(rf"Wrote .*few.ply: {len(read)} of 300 Gaussians, SH degree 1, 0.0\d MB", capsys.readouterr().out)
-    export.export(*_export_options("-m", out, "--to", target, "--max_splats", 100))
+    args = _export_options("-m", out, "--to", target, "--max_splats", 100, "--min_opacity", 0.3)
+    export.export(*args)
     said = capsys.readouterr().out
-    assert len(read_splats(target)) == 100
-    before, after = map(float, re.search(r"300 -> 100 Gaussians: training views (\S+) -> (\S+) dB", said).groups())
+    count, *decibels = re.search(r"(\d+) -> 100 Gaussians: training views (\S+) -> (\S+) dB", said).groups()
+    before, after = map(float, decibels)
+    opaque = 1 / (1 + np.exp(-every.opacity_logits)) >= 0.3
+    assert int(count) == opaque.sum() > 100
+    scene = load_saved(args[1], -1)
+    part = scene.gaussians.part(torch.from_numpy(opaque), 3)
+    best = part.part(most_important(blending_weights(part, scene.getTrainCameras(), args[2]), 100), 3)
+    np.testing.assert_allclose(read_splats(target).means, best.get_xyz.detach().numpy())
     assert after > 0 and abs(before - after) < 20
 
 
