@@ -112,7 +112,8 @@ def export(args: argparse.Namespace, options: argparse.Namespace, pipe: argparse
     )
 
 
-def main() -> None:
+def options() -> tuple[argparse.ArgumentParser, ModelParams, PipelineParams]:
+    """The parser of the command line, and its groups of options."""
     parser = OptionParser(description="Write a trained model in the file format of another program.")
     without = ("images_to_load", "sh_degree")
     model_params = ModelParams(parser, sentinel=True, without=without)
@@ -131,9 +132,7 @@ def main() -> None:
     add("--max_splats", type=int, default=0, metavar="N",
         help="keep N Gaussians; what adds least to the training views goes first (default: 0, no limit)")  # fmt: skip
     add("--quiet", action="store_true", help="print nothing to stdout (default: off)")
-    args = parse(parser)
-    safe_state(args.quiet)
-    export(args, model_params.extract(args), pipeline_params.extract(args), format_of(args.to))
+    return parser, model_params, pipeline_params
 
 
 def parse(parser: argparse.ArgumentParser, argv: Sequence[str] | None = None) -> argparse.Namespace:
@@ -151,6 +150,13 @@ def parse(parser: argparse.ArgumentParser, argv: Sequence[str] | None = None) ->
         return get_combined_args(parser, argv)
     args.typed_sh_degree = args.sh_degree
     return args
+
+
+def main() -> None:
+    parser, model_params, pipeline_params = options()
+    args = parse(parser)
+    safe_state(args.quiet)
+    export(args, model_params.extract(args), pipeline_params.extract(args), format_of(args.to))
 
 
 if __name__ == "__main__":

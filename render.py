@@ -2,6 +2,7 @@
 
 python render.py -m MODEL [--iteration N] [--skip_train] [--skip_test] [--depth] [--alpha]
 python render.py -m MODEL --path {interpolate,ellipse,spiral,FILE.json} [--fps N] [--size W H] [--seconds S] [--frames]
+python render.py -s SCENE -m OUT --ply FILE
 
 Writes MODEL/{train,test}/ours_N/{renders,gt}/00000.png ..., numbered by the views' sorted order, masks/ for views of
 which not every pixel counts, and render_times.json beside these folders: the time of each view without I/O. The device
@@ -29,6 +30,7 @@ from tqdm import tqdm
 
 from arguments import ModelParams, OptionParser, PipelineParams, get_combined_args, warn_of_background
 from camera_paths.options import add_path_options, wants_path
+from exports.in_scene import load_file
 from gaussian_renderer.memory_errors import memory_errors_explained
 from gaussian_renderer.scored_views import ScoredViews
 from gaussian_renderer.view_planes import PLANES, view_planes
@@ -147,13 +149,14 @@ def render_sets(
     *,
     sh_degree: int | None = None,
     planes: Collection[str] = (),
+    ply: str = "",
 ) -> None:
     """Render the views of a saved iteration, -1: the last one, by `render_set`.
 
     dataset: the model options. sh_degree: degree that the PLY must have, None: any. planes: those of PLANES to write,
-    too. UserError if nothing can be loaded.
+    too. ply: model of any tool to render instead, into folders that have its name. UserError if nothing can be loaded.
     """
-    scene, background = _loaded(dataset, iteration, sh_degree)
+    scene, background = _loaded(dataset, iteration, sh_degree, ply, pipeline)
     halves = getattr(dataset, "train_test_exp", False)  # options of 2023 lack it
     drawn = scene.gaussians, pipeline, background, halves, separate_sh
     if not skip_train:
@@ -162,11 +165,13 @@ def render_sets(
         render_set(scene.model_path, "test", scene.loaded_iter, scene.getTestCameras(), *drawn, planes=planes)
 
 
-def _loaded(dataset: argparse.Namespace, iteration: int, sh_degree: int | None) -> tuple[Scene, torch.Tensor]:
-    """The scene with the model of a saved iteration, and the background (3,) of the options."""
+def _loaded(
+    dataset: argparse.Namespace, iteration: int, sh_degree: int | None, ply: str, pipeline: argparse.Namespace
+) -> tuple[Scene, torch.Tensor]:
+    """The scene with the model of a saved iteration, or that of the file `ply`, and the background (3,)."""
     options = copy.copy(dataset)
     options.images_to_load = 1  # each photo is used once
-    scene = load_saved(options, iteration, sh_degree)
+    scene = load_file(options, ply, pipeline) if ply else load_saved(options, iteration, sh_degree)
     if len(scene.gaussians) == 0:
         raise UserError(f"iteration {scene.loaded_iter} of {scene.model_path} has no Gaussians; train it again")
     return scene, torch.full((3,), 1.0 if options.white_background else 0.0, device=compute_device())
@@ -178,6 +183,8 @@ def main() -> None:
     model_params = ModelParams(parser, sentinel=True, without=("images_to_load",))
     pipeline_params = PipelineParams(parser, sentinel=True)
     parser.add_argument("--iteration", type=int, default=-1, help="saved iteration to render (default: -1, the last)")
+    parser.add_argument("--ply", default="", metavar="FILE",
+        help="render this model of any tool in the views of -s, as -m has none of its own (default: none)")  # fmt: skip
     parser.add_argument("--skip_train", action="store_true", help="leave the training views out (default: off)")
     parser.add_argument("--skip_test", action="store_true", help="leave the test views out (default: off)")
     for plane, what in (("depth", "inverse depth"), ("alpha", "alpha")):
@@ -193,10 +200,14 @@ def main() -> None:
         from camera_paths.request import path_request
 
         request = path_request(args)
-        scene, background = _loaded(options, args.iteration, args.typed_sh_degree)
+        scene, background = _loaded(options, args.iteration, args.typed_sh_degree, args.ply, pipeline)
         render_path(scene, pipeline, background, request)
         return
-    chosen = {"sh_degree": args.typed_sh_degree, "planes": [plane for plane in PLANES if getattr(args, plane)]}
+    chosen = {
+        "sh_degree": args.typed_sh_degree,
+        "ply": args.ply,
+        "planes": [plane for plane in PLANES if getattr(args, plane)],
+    }
     render_sets(options, args.iteration, pipeline, args.skip_train, args.skip_test, **chosen)
 
 

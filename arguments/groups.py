@@ -93,10 +93,17 @@ class ModelParams(OptionTable):
             "ours",
         ),
         Option(
+            "init_ply",
+            "",
+            "model to start from, with its Gaussians' shapes and colours: PLY or compressed PLY of any tool, SPZ or "
+            ".splat; a point cloud is taken as by --init_pcd_path",
+            "ours",
+        ),
+        Option(
             "init_type",
             "sfm",
-            "points to start from without --init_pcd_path. sfm: the scene's own; random: grey points in the cameras' "
-            "frusta, or in the reference's cube for Blender scenes",
+            "points to start from without --init_pcd_path and --init_ply. sfm: the scene's own; random: grey points in "
+            "the cameras' frusta, or in the reference's cube for Blender scenes",
             "ours",
             check=one_of("sfm", "random"),
         ),
@@ -135,11 +142,12 @@ class ModelParams(OptionTable):
     def extract(self, args: argparse.Namespace) -> GroupParams:
         """Do as OptionTable.extract, and make source_path absolute. UserError for contradictory options."""
         values = super().extract(args)
-        if getattr(values, "init_pcd_path", "") and getattr(values, "init_type", "") == "random":
-            raise UserError(
-                f"--init_type random and --init_pcd_path {values.init_pcd_path} both name the points to start from; "
-                "leave one out"
-            )
+        names = [name for name in ("init_pcd_path", "init_ply") if getattr(values, name, "")]
+        starts = [f"--{name} {getattr(values, name)}" for name in names]
+        if getattr(values, "init_type", "") == "random":
+            starts.insert(0, "--init_type random")
+        if len(starts) > 1:
+            raise UserError(f"{' and '.join(starts[:2])} both name the points to start from; leave one out")
         if getattr(values, "source_path", ""):
             values.source_path = os.path.abspath(values.source_path)
         return values

@@ -133,13 +133,16 @@ def get_combined_args(parser: argparse.ArgumentParser, argv: Sequence[str] | Non
 
     Typed options win; flags can only be switched on. The parser's model options must default to None
     (`ModelParams(parser, sentinel=True)`). `typed_sh_degree` is the degree that was typed, or None, since a saved PLY
-    may have another degree than cfg_args. UserError without -m or without a readable cfg_args.
+    may have another degree than cfg_args. With --ply, the folder may be a new one. UserError without -m or without a
+    readable cfg_args.
     """
     args = parser.parse_args(argv)
     if not getattr(args, "model_path", None):
         raise UserError("no model folder given; pass it as -m")
     typed = {name: value for name, value in vars(args).items() if value is not None}
-    combined = argparse.Namespace(**{**vars(args), **read_stored_options(args.model_path), **typed})
+    is_new = getattr(args, "ply", None) and not (Path(args.model_path) / "cfg_args").is_file()
+    stored = {} if is_new else read_stored_options(args.model_path)
+    combined = argparse.Namespace(**{**vars(args), **stored, **typed})
     combined.typed_sh_degree = typed.get("sh_degree")
     if hasattr(args, "antialiasing"):
         remembered = read_model_json(args.model_path).get("antialiasing", False)

@@ -4,6 +4,7 @@ import torch
 
 from exports.splats import Splats
 from scene.gaussian_model import GaussianModel
+from scene.gaussians.attributes import attributes
 from utils.general_utils import inverse_sigmoid
 
 
@@ -32,18 +33,22 @@ def model_of(splats: Splats, sh_degree: int | None = None) -> GaussianModel:
 
 
 def fill_model(gaussians: GaussianModel, splats: Splats) -> None:
-    """Give a model these Gaussians, with the bands that it has. The splats' bands become active."""
+    """Give a model these Gaussians, with the bands that it has. The splats' bands become active.
+
+    Attributes that splats do not have get the values of new Gaussians.
+    """
     bands = (gaussians.max_sh_degree + 1) ** 2
     sh = torch.from_numpy(splats.sh[:, :bands])
     sh = torch.nn.functional.pad(sh, (0, 0, 0, bands - sh.shape[1]))
-    gaussians.set_rows(
-        {
-            "xyz": torch.from_numpy(splats.means),
-            "f_dc": sh[:, :1].contiguous(),
-            "f_rest": sh[:, 1:].contiguous(),
-            "opacity": torch.from_numpy(splats.opacity_logits)[:, None],
-            "scaling": torch.from_numpy(splats.log_scales),
-            "rotation": torch.from_numpy(splats.rotations),
-        }
-    )
+    rows = {
+        "xyz": torch.from_numpy(splats.means),
+        "f_dc": sh[:, :1].contiguous(),
+        "f_rest": sh[:, 1:].contiguous(),
+        "opacity": torch.from_numpy(splats.opacity_logits)[:, None],
+        "scaling": torch.from_numpy(splats.log_scales),
+        "rotation": torch.from_numpy(splats.rotations),
+    }
+    started = attributes(gaussians.max_sh_degree).items()
+    further = {name: torch.full((len(splats), *a.shape), a.start) for name, a in started if name not in rows}
+    gaussians.set_rows(rows | further)
     gaussians.active_sh_degree = min(gaussians.max_sh_degree, splats.sh_degree)

@@ -1,7 +1,9 @@
 """PLY with float32 properties: the reference's columns, and comments that say what they mean."""
 
+import contextlib
 import os
 
+import numpy as np
 import torch
 
 from exports.splats import Splats
@@ -28,6 +30,16 @@ def says_antialiasing(path: str | os.PathLike) -> bool:
         if words[:2] in (["comment", "splatrendermode"], ["comment", "antialiased"]):
             found = words[2:3] in (["mip"], ["1"])
     return found
+
+
+def stored_offset(path: str | os.PathLike) -> np.ndarray:
+    """World coordinates (3,) float64 of a PLY's origin: those of our comment world_offset, zero without one."""
+    for line in header_lines(path):
+        words = line.split()
+        if words[:2] == ["comment", "world_offset"] and len(words) == 5:
+            with contextlib.suppress(ValueError):
+                return np.array([float(word) for word in words[2:]])
+    return np.zeros(3)
 
 
 def write_plain_ply(path: str | os.PathLike, splats: Splats) -> None:

@@ -9,9 +9,22 @@ from exports.selection import tidy
 from exports.splat import read_splat
 from exports.splats import Splats
 from exports.spz import read_spz
+from utils.files.ply_header import header_lines
 from utils.system_utils import UserError
 
 READABLE = "PLY, compressed PLY, SPZ or .splat"
+
+
+def is_point_cloud(path: str | os.PathLike) -> bool:
+    """Whether a file has points instead of splats: a PLY without their properties, or a file of another kind."""
+    if not os.path.isfile(path) or Path(path).suffix.lower() in (".splat", ".spz"):
+        return False
+    lines = header_lines(path)
+    if not lines:
+        with open(path, "rb") as file:
+            return not file.read(4).startswith((b"NGSP", b"\x1f\x8b"))
+    names = {line.split()[-1] for line in lines if line.startswith("property")}
+    return not names & {"f_dc_0", "opacity", "scale_0", "rot_0", "packed_position"}
 
 
 def read_splats(path: str | os.PathLike) -> Splats:

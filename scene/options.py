@@ -9,6 +9,7 @@ DEFAULTS = {
     "depths": "",  # this and the next: unknown to the reference's release of 2023
     "train_test_exp": False,
     "init_pcd_path": "",
+    "init_ply": "",
     "init_type": "sfm",
     "masks": "",
     "invert_masks": False,

@@ -63,6 +63,7 @@ OPTIMISATION = {
 }
 OURS = {
     "init_pcd_path": "",
+    "init_ply": "",
     "init_type": "sfm",
     "masks": "",
     "invert_masks": False,

@@ -1,5 +1,6 @@
 """Exported files: read back by our own readers, byte stability, ends of the ranges, and export.py."""
 
+import gzip
 import json
 import struct
 from pathlib import Path
@@ -158,6 +159,19 @@ def test_usdz_has_the_schema_and_stands_upright(tmp_path):
     np.testing.assert_array_equal(value("radiance:sphericalHarmonicsCoefficients").reshape(20, 4, 3), some.sh)
 
 
+def test_openusd_finds_no_fault_in_usdz(tmp_path):
+    path = _write(tmp_path, ".usdz", splats(30, 3))
+    from pxr import Usd, UsdGeom, UsdValidation
+
+    context = UsdValidation.ValidationContext(UsdValidation.ValidationRegistry().GetOrLoadAllValidators())
+    stage = Usd.Stage.Open(str(path))
+    assert [error.GetMessage() for error in context.Validate(stage)] == []
+    (prim,) = [prim for prim in stage.Traverse() if prim.GetTypeName() == "ParticleField3DGaussianSplat"]
+    positions = np.asarray(prim.GetAttribute("positions").Get())
+    low, high = np.asarray(UsdGeom.Boundable(prim).GetExtentAttr().Get())
+    assert (low < positions).all() and (positions < high).all()
+
+
 def test_a_half_turn_moves_splats_and_keeps_their_colours():
     some = splats(30)
     turned = half_turned(some)
@@ -186,6 +200,21 @@ def test_a_camera_is_upright_in_spz(tmp_path):
     positions = zstandard.ZstdDecompressor().decompress(content[begin : begin + packed], max_output_size=whole)
     y = int.from_bytes(positions[3:6], "little", signed=True) / 2 ** content[13]
     assert y == 2.0
+
+
+def test_spz_of_version_2_is_read(tmp_path):
+    """Bytes by hand, of one splat: gzip, the real part of the quaternion left out, y up."""
+    header = struct.pack("<IIIBBBB", 0x5053474E, 2, 1, 0, 12, 1, 0)
+    position = b"".join((int(value * 4096) & 0xFFFFFF).to_bytes(3, "little") for value in (1.5, 2.0, -3.0))
+    turn = bytes([round(127.5 + 127.5 * value) for value in (0.6, 0.0, 0.0)])
+    body = position + bytes([128]) + bytes([255, 127, 0]) + bytes([160, 80, 0]) + turn
+    (tmp_path / "a.spz").write_bytes(gzip.compress(header + body))
+    read = read_splats(tmp_path / "a.spz")
+    np.testing.assert_allclose(read.means, [[1.5, -2.0, 3.0]])
+    np.testing.assert_allclose(read.log_scales, [[0.0, -5.0, -10.0]])
+    np.testing.assert_allclose(read.rotations, [[0.8, 0.6, 0, 0]], atol=0.005)
+    np.testing.assert_allclose(read.sh[0, 0], [0.5 / 0.15, 0, -0.5 / 0.15], atol=0.02)
+    assert read.antialiasing and abs(opacities(read)[0] - 128 / 255) < 1e-6
 
 
 def test_splat_begins_with_what_matters_most(tmp_path):

@@ -32,6 +32,7 @@ PAGE = ROOT / "docs" / "inside" / "extending.md"
 CODE = (
     "arguments",
     "camera_paths",
+    "exports",
     "gaussian_renderer",
     "records",
     "scene",

@@ -8,10 +8,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from exports.in_scene import scene_with, start_from
 from records.training_log import Stopwatch
 from scene import Scene
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.checkpoint import load_checkpoint
+from scene.options import option
 from training.checks import check_exposures, check_scene, warn_of_late_reset
 from training.density import AdaptiveDensityControl
 from training.history import check_folder, continue_records, report_changes
@@ -58,7 +60,11 @@ class Run:
             )
         warn_of_late_reset(opt, dataset.white_background)
         self.gaussians = GaussianModel(dataset.sh_degree, opt.optimizer_type)
-        self.scene = Scene(dataset, self.gaussians, shuffle=False, start=False)
+        init_ply = option(dataset, "init_ply")
+        if init_ply and not plan.start:
+            self.scene, self._first = scene_with(init_ply, dataset, self.gaussians)
+        else:
+            self.scene, self._first = Scene(dataset, self.gaussians, shuffle=False, start=False), None
         check_scene(self.scene.info)
         self.views = ViewOrder(self.scene.getTrainCameras(), opt.seed)
         self._decode_ahead(self.first_iteration + 1)
@@ -75,9 +81,13 @@ class Run:
         )
 
     def _start(self, capture: tuple | None) -> None:
-        """Start the model from the dataset's points, or from the state of a checkpoint."""
+        """Start the model from the dataset's points, from a file's Gaussians, or from the state of a checkpoint."""
         if capture is None:
-            self.scene.create_gaussians()
+            if self._first is None:
+                self.scene.create_gaussians()
+            else:
+                start_from(self._first, self.scene, self.gaussians)
+                self._first = None
             self.gaussians.training_setup(self.opt)
         else:
             self.gaussians.start_exposures(self.scene.info.train_cameras)

@@ -1,0 +1,1 @@
+"""Benchmarks of the file formats that export.py writes."""

@@ -1,0 +1,69 @@
+"""Splats of a file in a scene: the start of a training, or other people's models in our views."""
+
+import argparse
+import copy
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from exports.of_model import fill_model, model_of
+from exports.plain_ply import stored_offset
+from exports.read import is_point_cloud, read_splats
+from exports.selection import drawable, selected
+from exports.splats import Splats
+from scene import Scene
+from scene.gaussian_model import GaussianModel
+from utils.sh_utils import C0
+from utils.system_utils import UserError
+
+
+def scene_with(
+    path: str, options: argparse.Namespace, gaussians: GaussianModel, shuffle: bool = False
+) -> tuple[Scene, Splats | None]:
+    """A scene whose points are a file's, and the file's splats in the scene's frame; None for a point cloud.
+
+    The model stays empty. options: the model options. Positions in the file are those of the world, unless our comment
+    world_offset tells their origin. UserError for a file without splats that are drawn, and as from Scene.
+    """
+    options = copy.copy(options)
+    if is_point_cloud(path):
+        options.init_pcd_path = path
+        return Scene(options, gaussians, shuffle=shuffle, start=False), None
+    splats = read_splats(path)
+    splats = selected(splats, drawable(splats))
+    if not len(splats):
+        raise UserError(f"{path} has no Gaussians that are drawn; give another model")
+    with tempfile.TemporaryDirectory() as folder:  # so that the scene moves the points into its frame, as it does any
+        points = Path(folder) / "points.npz"
+        colors = np.clip(splats.sh[:, 0] * C0 + 0.5, 0, 1)
+        np.savez(points, points=splats.means.astype(np.float64) + stored_offset(path), colors=colors)
+        options.init_pcd_path = str(points)
+        scene = Scene(options, gaussians, shuffle=shuffle, start=False)
+    means = np.ascontiguousarray(scene.info.point_cloud.points, dtype=np.float32)
+    return scene, replace(splats, means=means)
+
+
+def load_file(options: argparse.Namespace, path: str, pipeline: argparse.Namespace) -> Scene:
+    """Scene of the model options with a file's Gaussians, in the place of `load_saved`.
+
+    Its loaded_iter is the name of the file, without endings. `pipeline` gets antialiasing if the file says so.
+    UserError for a point cloud, and as from `scene_with`.
+    """
+    scene, splats = scene_with(path, options, GaussianModel(0))
+    if splats is None:
+        raise UserError(f"{path} is a point cloud; start a training from it with train.py --init_pcd_path {path}")
+    scene.gaussians, scene.loaded_iter = model_of(splats), Path(path).name.split(".")[0]
+    scene.gaussians.start_exposures(scene.info.train_cameras)
+    pipeline.antialiasing = pipeline.antialiasing or splats.antialiasing
+    return scene
+
+
+def start_from(splats: Splats, scene: Scene, gaussians: GaussianModel) -> None:
+    """Give a model these Gaussians as the start of a training: the SH degree is theirs, up to the model's."""
+    gaussians.spatial_lr_scale = float(scene.cameras_extent)
+    fill_model(gaussians, splats)
+    gaussians.start_exposures(scene.info.train_cameras)
+    bands = "all SH bands" if splats.sh_degree <= gaussians.max_sh_degree else f"SH bands to {gaussians.max_sh_degree}"
+    print(f"Number of Gaussians at initialisation :  {len(gaussians)}, with {bands}")

@@ -1,0 +1,148 @@
+"""Exported files as programs read them that are not ours: PlayCanvas' splat-transform, Adobe's SPZ, Khronos' validator.
+
+They come from npm: `npm ci --ignore-scripts` in tests/foreign installs the versions of its lock file.
+"""
+
+import json
+import shutil
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from small_splats import splats
+from test_exports import PACKAGES
+
+from benchmarks.exports.read_back import read_back, read_by_splat_transform
+from benchmarks.exports.sizes import decibels, renders
+from benchmarks.workloads.orbit import orbit
+from exports.formats import format_of
+from exports.half_turn import half_turned
+from exports.selection import with_sh_degree
+from exports.splats import Splats
+
+FOREIGN = Path(__file__).parent / "foreign"
+FLOAT, COMPRESSED = 60, 35  # dB that a format keeps at least
+COUNT = 600
+
+
+@pytest.fixture(autouse=True)
+def foreign_programs(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Programs of tests/foreign on PATH; skips without them."""
+    if shutil.which("node") is None:
+        pytest.skip("Node is not installed")
+    if not (FOREIGN / "node_modules").is_dir():
+        pytest.skip("no programs to read exports with; run npm ci --ignore-scripts in tests/foreign")
+    monkeypatch.setenv("PATH", str(FOREIGN / "node_modules/.bin"), prepend=":")
+
+
+def _scene(degree: int, antialiasing: bool = False) -> Splats:
+    """Splats that fill the views, half of them opaque."""
+    some = splats(COUNT, degree, antialiasing=antialiasing)
+    some.log_scales[:] += 1.5
+    return some
+
+
+def _written(folder: Path, ending: str, some: Splats) -> Path:
+    if ending in PACKAGES:
+        pytest.importorskip(PACKAGES[ending], reason="the extra [export] is not installed")
+    path = folder / f"model{ending}"
+    format_of(path).write(path, some)
+    return path
+
+
+def _loss(some: Splats, read: Splats) -> float:
+    """PSNR of the renders from 5 views, of which none may be empty."""
+    cameras = orbit(some.means, 5, 64)
+    wanted = renders(some, cameras)
+    assert wanted.flatten(1).std(dim=1).min() > 0.05
+    return decibels(renders(Splats(**{**vars(read), "antialiasing": some.antialiasing}), cameras), wanted)
+
+
+@pytest.mark.parametrize("degree", range(4))
+@pytest.mark.parametrize("ending", [".ply", ".compressed.ply", ".splat", ".spz", ".sog"])
+def test_splat_transform_reads_what_we_wrote(tmp_path, ending, degree):
+    some = _scene(degree, antialiasing=degree == 2)
+    path = _written(tmp_path, ending, some)
+    read = read_by_splat_transform(path)
+    if ending == ".spz":
+        read = half_turned(read)  # this program does not convert between the axes of SPZ and PLY
+    if ending == ".splat":
+        some = with_sh_degree(some, 0)
+    else:
+        assert read.antialiasing == some.antialiasing
+    assert len(read) == COUNT and read.sh_degree == some.sh_degree
+    least = FLOAT if ending == ".ply" else COMPRESSED
+    assert _loss(some, read) >= least
+    if ending != ".sog":
+        assert _loss(some, read_back(path)) >= least
+
+
+@pytest.mark.parametrize("degree", [0, 1, 3])
+def test_adobes_spz_reads_what_we_wrote(tmp_path, degree):
+    some = _scene(degree, antialiasing=True)
+    path = _written(tmp_path, ".spz", some)
+    target = tmp_path / "read.json"
+    subprocess.run(["node", FOREIGN / "read_spz.mjs", path, target], check=True, capture_output=True)
+    read = json.loads(target.read_text())
+    assert (read["count"], read["degree"], read["antialiased"]) == (COUNT, degree, True)
+
+    def values(name: str, *shape: int) -> np.ndarray:
+        numbers = [np.inf if x is None else x for x in read[name]]  # JSON has no infinity, the logit of 1
+        return np.array(numbers, dtype=np.float32).reshape(COUNT, *shape)
+
+    sh = np.concatenate([values("colors", 1, 3), values("sh", (degree + 1) ** 2 - 1, 3)], axis=1)
+    rotations = np.roll(values("rotations", 4), 1, axis=1)
+    theirs = Splats(values("positions", 3), values("scales", 3), rotations, values("alphas"), sh, True)
+    assert _loss(some, theirs) >= COMPRESSED
+    ours = read_back(path)
+    np.testing.assert_allclose(ours.means, theirs.means, atol=1e-6)
+    np.testing.assert_allclose(ours.log_scales, theirs.log_scales, atol=1e-6)
+    np.testing.assert_allclose(ours.sh, theirs.sh, atol=1e-5)
+    np.testing.assert_allclose(np.abs((ours.rotations * theirs.rotations).sum(axis=1)), 1, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("ending", "options"), [(".spz", []), (".spz", ["--spz-version", "3"]), (".compressed.ply", [])]
+)
+def test_we_read_what_splat_transform_writes(tmp_path, ending, options):
+    some = _scene(2, antialiasing=True)
+    plain, packed = _written(tmp_path, ".ply", some), tmp_path / f"theirs{ending}"
+    subprocess.run(["splat-transform", "--quiet", *options, plain, packed], check=True, capture_output=True)
+    read = read_back(packed)
+    assert read.antialiasing and read.sh_degree == 2
+    assert _loss(some, half_turned(read) if ending == ".spz" else read) >= COMPRESSED
+
+
+@pytest.mark.parametrize("ending", [".glb", ".usdz"])
+def test_float_formats_lose_nothing(tmp_path, ending):
+    some = _scene(3)
+    assert _loss(some, read_back(_written(tmp_path, ending, some))) >= FLOAT
+
+
+@pytest.mark.parametrize("count", [0, 1, 50])
+def test_khronos_validator_accepts_glb(tmp_path, count):
+    """The validator knows no attributes of the extension, and names each an invalid one; nothing else may be wrong."""
+    path = _written(tmp_path, ".glb", splats(count, 1))
+    done = subprocess.run(["node", FOREIGN / "check_gltf.mjs", path], check=True, capture_output=True, text=True)
+    report = json.loads(done.stdout)
+    of_extension = "/meshes/0/primitives/0/attributes/KHR_gaussian_splatting:"
+    wrong = [
+        message
+        for message in report["issues"]["messages"]
+        if message["severity"] < 2  # errors and warnings
+        and not (message["code"] == "MESH_PRIMITIVE_INVALID_ATTRIBUTE" and message["pointer"].startswith(of_extension))
+    ]
+    assert wrong == [] and not report["issues"]["truncated"]
+    assert report["info"]["totalVertexCount"] == count
+
+
+def test_a_wrong_turn_would_be_seen():
+    """The measure of these tests: splats turned half around an axis, or without their SH bands, are not close."""
+    some = _scene(3)
+    assert _loss(some, half_turned(some)) < 25
+    assert _loss(some, with_sh_degree(some, 0)) < COMPRESSED
+    turned = Splats(**{**vars(half_turned(some)), "sh": some.sh})
+    assert _loss(some, half_turned(turned)) < COMPRESSED
+    assert torch.isfinite(renders(some, orbit(some.means, 1, 16))).all()

@@ -1,0 +1,186 @@
+"""Models of other tools: PLYs of any form, as the start of a training and in render.py; what is refused."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from plyfile import PlyData, PlyElement
+from small_splats import splats
+
+import export
+import render
+import train
+from exports.formats import format_of
+from exports.of_model import model_of
+from exports.read import is_point_cloud, read_splats
+from exports.selection import with_sh_degree
+from gaussian_renderer.importance import blending_weights, most_important
+from scene.gaussian_model import GaussianModel
+from scene.gaussians.ply import read_ply
+from scene.readers.point_cloud import read_point_cloud
+from scene.saved_model import load_saved
+from utils.system_utils import UserError
+
+
+def _foreign_ply(path: Path, count: int, kind: str) -> Path:
+    """A PLY as another program might write it, of splats(count, 1)."""
+    format_of("a.ply").write(path, splats(count, 1))
+    data = PlyData.read(path, mmap=False)["vertex"].data
+    names = [name for name in data.dtype.names if name not in ("nx", "ny", "nz")]
+    names = list(np.random.default_rng(0).permutation(names))
+    if kind == "2DGS":
+        names.remove("scale_2")
+    if kind == "points":
+        names = ["x", "y", "z"]
+    form = [(name, "f8" if kind == "double" else "f4") for name in names]
+    more = [("red", "u1"), ("green", "u1"), ("blue", "u1")] if kind == "points" else [("segment", "i4")]
+    foreign = np.zeros(count, dtype=[*more, *form])
+    for name in names:
+        foreign[name] = data[name]
+    PlyData([PlyElement.describe(foreign, "vertex")], text=kind == "text").write(str(path))
+    return path
+
+
+@pytest.mark.parametrize("kind", ["float", "double", "text"])
+def test_plys_of_any_form_are_read(tmp_path, kind):
+    read, wanted = read_splats(_foreign_ply(tmp_path / "a.ply", 20, kind)), splats(20, 1)
+    for name in ("means", "log_scales", "rotations", "opacity_logits", "sh"):
+        np.testing.assert_allclose(getattr(read, name), getattr(wanted, name), rtol=1e-6, atol=1e-6)
+
+
+def test_what_is_no_3dgs_model_is_refused_by_name(tmp_path):
+    flat, points = (_foreign_ply(tmp_path / f"{kind}.ply", 5, kind) for kind in ("2DGS", "points"))
+    with pytest.raises(UserError, match=r"flat Gaussians of two scales \(2DGS\).*give a 3DGS model"):
+        read_splats(flat)
+    with pytest.raises(UserError, match="start a training from this point cloud with train.py --init_pcd_path"):
+        read_splats(points)
+    assert is_point_cloud(points) and not is_point_cloud(flat)
+    packed = tmp_path / "b.compressed.ply"
+    format_of(packed).write(packed, splats(5))
+    assert not is_point_cloud(packed)
+    with pytest.raises(UserError, match=r"is a compressed PLY; unpack it with export.py --ply .*b.compressed.ply"):
+        read_ply(packed, 3)
+    plain = tmp_path / "c.ply"
+    export.export(*_export_options("--ply", packed, "--to", plain))
+    assert read_ply(plain, 3)["xyz"].shape == (5, 3)
+
+
+def _export_options(*argv: object) -> tuple:
+    parser, model_params, pipeline_params = export.options()
+    args = export.parse(parser, [str(word) for word in argv])
+    return args, model_params.extract(args), pipeline_params.extract(args), format_of(args.to)
+
+
+def _train(scene: Path, out: Path, *argv: object) -> GaussianModel:
+    train.main(["-s", str(scene), "-m", str(out), "--iterations", "1", "--no_curve", "--keep_unseen",
+                "--prune_sh", "-1", *map(str, argv)])  # fmt: skip
+    gaussians = GaussianModel(3)
+    gaussians.load_ply(out / "point_cloud/iteration_1/point_cloud.ply")
+    return gaussians
+
+
+@pytest.mark.parametrize("ending", [".ply", ".compressed.ply", ".splat", ".spz"])
+def test_training_starts_from_the_gaussians_of_a_file(tmp_path, colmap_scene, ending):
+    """The last iteration takes no step, so one iteration saves the start."""
+    if ending == ".spz":
+        pytest.importorskip("zstandard", reason="the extra [export] is not installed")
+    path = tmp_path / f"start{ending}"
+    format_of(path).write(path, splats(30, 2))
+    gaussians = _train(colmap_scene, tmp_path / "out", "--init_ply", path)
+    wanted = model_of(read_splats(path), 3)
+    for name in ("xyz", "f_dc", "f_rest", "opacity", "scaling", "rotation"):
+        torch.testing.assert_close(gaussians.raw(name), wanted.raw(name), rtol=0, atol=1e-6)
+    assert len(read_point_cloud(tmp_path / "out/input.ply").points) == 30
+
+
+def test_a_start_of_more_bands_than_the_model_loses_them(tmp_path, colmap_scene):
+    path = tmp_path / "start.ply"
+    format_of(path).write(path, splats(30, 3))
+    _train(colmap_scene, tmp_path / "out", "--init_ply", path, "--sh_degree", 1)
+    saved = read_splats(tmp_path / "out/point_cloud/iteration_1/point_cloud.ply")
+    np.testing.assert_allclose(saved.sh, with_sh_degree(splats(30, 3), 1).sh)
+
+
+def test_a_point_cloud_is_one_by_either_option(tmp_path, colmap_scene):
+    path = _foreign_ply(tmp_path / "points.ply", 40, "points")
+    one = _train(colmap_scene, tmp_path / "one", "--init_ply", path)
+    other = _train(colmap_scene, tmp_path / "other", "--init_pcd_path", path)
+    for name in ("xyz", "f_dc", "opacity", "scaling"):
+        assert torch.equal(one.raw(name), other.raw(name))
+
+
+def test_a_start_relative_to_a_world_offset_is_moved_back(tmp_path, colmap_scene):
+    gaussians = model_of(splats(30, 0))
+    gaussians.world_offset = (1.0, -2.0, 3.0)
+    gaussians.save_ply(tmp_path / "start.ply")
+    started = _train(colmap_scene, tmp_path / "out", "--init_ply", tmp_path / "start.ply")
+    moved = gaussians.get_xyz + torch.tensor([1.0, -2.0, 3.0])
+    torch.testing.assert_close(started.get_xyz, moved, rtol=0, atol=1e-6)
+
+
+def test_two_starts_contradict_each_other(tmp_path):
+    for argv, said in (
+        (["--init_ply", "a.ply", "--init_pcd_path", "b.ply"], "--init_pcd_path b.ply and --init_ply a.ply both name"),
+        (["--init_ply", "a.ply", "--init_type", "random"], "--init_type random and --init_ply a.ply both name"),
+    ):
+        with pytest.raises(UserError, match=said):
+            train.parse(["-s", "x", *argv])
+
+
+def test_render_draws_a_file_in_the_views_of_a_scene(tmp_path, colmap_scene, monkeypatch):
+    path = tmp_path / "theirs.compressed.ply"
+    format_of(path).write(path, splats(200, 1, antialiasing=True))
+    out = tmp_path / "out"
+    argv = ["render.py", "-s", colmap_scene, "-m", out, "--eval", "--ply", path, "--skip_train"]
+    monkeypatch.setattr("sys.argv", [str(word) for word in argv])
+    render.main()
+    pictures = sorted((out / "test/ours_theirs/renders").iterdir())
+    assert len(pictures) == 3 and not (out / "train").exists()
+    assert '"antialiasing": true' in (out / "test/ours_theirs/render_times.json").read_text()
+
+
+def test_export_chooses_what_it_writes(tmp_path, colmap_scene, capsys):
+    out = tmp_path / "out"
+    start = tmp_path / "start.ply"
+    format_of(start).write(start, splats(300, 3))
+    _train(colmap_scene, out, "--init_ply", start)
+    capsys.readouterr()
+    target = tmp_path / "few.ply"
+    box = ["--crop", -1, -1, -1, 1, 1, 1]
+    export.export(*_export_options("-m", out, "--to", target, *box, "--min_opacity", 0.3, "--sh_degree", 1))
+    read, every = read_splats(target), splats(300, 3)
+    wanted = (np.abs(every.means) <= 1).all(axis=1) & (1 / (1 + np.exp(-every.opacity_logits)) >= 0.3)
+    np.testing.assert_allclose(read.means, every.means[wanted], atol=1e-6)
+    assert read.sh_degree == 1 and 10 < len(read) < 200
+    assert re.search(rf"Wrote .*few.ply: {len(read)} of 300 Gaussians, SH degree 1, 0.0\d MB", capsys.readouterr().out)
+    args = _export_options("-m", out, "--to", target, "--max_splats", 100, "--min_opacity", 0.3)
+    export.export(*args)
+    said = capsys.readouterr().out
+    count, *decibels = re.search(r"(\d+) -> 100 Gaussians: training views (\S+) -> (\S+) dB", said).groups()
+    before, after = map(float, decibels)
+    opaque = 1 / (1 + np.exp(-every.opacity_logits)) >= 0.3
+    assert int(count) == opaque.sum() > 100
+    scene = load_saved(args[1], -1)
+    part = scene.gaussians.part(torch.from_numpy(opaque), 3)
+    best = part.part(most_important(blending_weights(part, scene.getTrainCameras(), args[2]), 100), 3)
+    np.testing.assert_allclose(read_splats(target).means, best.get_xyz.detach().numpy())
+    assert after > 0 and abs(before - after) < 20
+
+
+@pytest.mark.parametrize(
+    ("argv", "said"),
+    [
+        (["--ply", "a.ply", "-m", "out"], "both name the model to write"),
+        (["--ply", "a.ply", "--min_opacity", "2"], "--min_opacity must be from 0 to 1, got 2.0"),
+        (["--ply", "a.ply", "--max_splats", "-1"], "--max_splats must be 0"),
+        (["--ply", "a.ply", "--crop", "1", "0", "0", "0", "1", "1"], "--crop takes the smaller corner first"),
+        (["--ply", "a.ply", "--max_splats", "5"], "need training views"),
+        (["--ply", "absent.ply"], "no file absent.ply; give a model as PLY"),
+        ([], "no model folder given"),
+    ],
+)
+def test_export_refuses(argv, said):
+    with pytest.raises(UserError, match=said):
+        export.export(*_export_options(*argv, "--to", "b.ply"))
