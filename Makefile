@@ -1,6 +1,7 @@
 # make demo   a scene made, trained, rendered and scored
 # make test   lint, format check, C++ tests, pytest
 # make test-browser   the tests that need Chromium, which is installed first where Debian's package manager may be used
+# make test-foreign   the tests by programs of npm that read our exports; they skip without npm
 # make format rewrites what the format check would complain about
 # make docs   the site, build/site/index.html; a dead link or a page outside of the navigation fails
 # All set up .venv first: pinned requirements and the three extensions, again only when their sources have changed.
@@ -23,7 +24,7 @@ CXX_SOURCES := $(shell find submodules benchmarks -name build -prune -o \( -name
 sources = $(shell find submodules/common submodules/$(1) \( -name build -o -name tests -o -name emulation \) -prune -o \
             \( -name '*.cpp' -o -name '*.cu*' -o -name '*.h' -o -name '*.py' -o -name '*.toml' \) -print)
 
-.PHONY: install demo test test-browser lint format cpp-test docs clean
+.PHONY: install demo test test-browser test-foreign lint format cpp-test docs clean
 .NOTPARALLEL:
 
 install: $(EXTENSIONS:%=$(VENV)/.built-%)
@@ -54,6 +55,10 @@ test: install lint cpp-test
 test-browser: install
 	tests/browser/install.sh
 	$(BIN)/python -m pytest -m browser tests/browser
+
+test-foreign: install
+	@if command -v npm > /dev/null; then cd tests/foreign && npm ci --ignore-scripts --no-audit --no-fund --silent; fi
+	$(BIN)/python -m pytest tests/test_exports_foreign.py
 
 lint: $(VENV)/.requirements
 	$(BIN)/ruff check .

@@ -37,7 +37,11 @@ setup(
     packages=[],
     py_modules=[],
     extras_require={
-        "export": ["usd-core==26.11", "zstandard==0.25.0"],  # .usdz and .spz
+        "export": [  # .usdz and .spz
+            'usd-core==26.8; python_version < "3.11"',
+            'usd-core==26.11; python_version >= "3.11"',
+            "zstandard==0.25.0",
+        ],
         "video": ["imageio-ffmpeg==0.8.1"],  # convert.py --video, render.py --path
         "viewer": ["viser==1.1.1"],  # view.py, train.py --viewer
     },
