@@ -87,19 +87,20 @@ def _bookmark(name: str, camera: dict[str, Any], degrees: float) -> dict[str, An
 
 def _track(path: TimedPath, axes: np.ndarray, depth: float) -> dict[str, Any]:
     count = max(2, min(_MOST_KEYS, round(path.seconds * _KEYS_A_SECOND) + 1))
-    times = np.linspace(0, path.seconds, count)[: count - path.closed]
-    keys = [path.at(float(second)) for second in times]
+    rate = (count - 1) / path.seconds
+    frames = range(count - path.closed)  # the end of a closed path is its beginning
+    keys = [path.at(min(frame / rate, path.seconds)) for frame in frames]
     turns = Rotation.from_quat([np.roll(key.wxyz, -1) for key in keys]).as_matrix()
     looks = [_look(axes, np.array(k.position), turn, depth, k.fov) for k, turn in zip(keys, turns, strict=True)]
     return {
         "name": "camera path",
         "duration": path.seconds,
-        "frameRate": 1,
+        "frameRate": rate,
         "loopMode": "repeat" if path.closed else "none",
         "interpolation": "spline",
         "smoothness": 1,
         "keyframes": {
-            "times": times.tolist(),
+            "times": list(frames),
             "values": {
                 "position": [value for look in looks for value in look["position"]],
                 "target": [value for look in looks for value in look["target"]],
