@@ -13,8 +13,9 @@ if __name__ == "__main__":
 
 import argparse
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import utils.host.openmp  # noqa: F401  isort: skip  (before torch)
 import numpy as np
@@ -36,6 +37,10 @@ from scene.saved_model import load_saved
 from scene.scene import Scene
 from utils.general_utils import safe_state
 from utils.system_utils import UserError, compute_device, run_cli
+
+if TYPE_CHECKING:  # SciPy takes a while to import
+    from camera_paths.moments import TimedPath
+    from camera_paths.poses import Poses
 
 
 def load(args: argparse.Namespace, options: argparse.Namespace, want_views: bool) -> tuple[Splats, Scene | None]:
@@ -97,19 +102,31 @@ def thin_out(
 
 def export(args: argparse.Namespace, options: argparse.Namespace, pipe: argparse.Namespace, entry: Format) -> None:
     """Write the file that the command line asks for. UserError if there is nothing to load or to write."""
-    splats, scene = load(args, options, want_views=bool(args.max_splats) or entry.wants_cameras)
+    make_path = _path_maker(args.path, entry)
+    splats, scene = load(args, options, want_views=bool(args.max_splats) or entry.of_scene)
     degree = splats.sh_degree if args.typed_sh_degree is None else min(args.typed_sh_degree, splats.sh_degree)
     keep = choose(splats, args.crop, args.min_opacity)
     if scene is not None and args.max_splats:
         keep = thin_out(scene, keep, degree, args.max_splats, pipe, options)
     chosen = tidy(with_sh_degree(selected(splats, keep), degree))
     start = time.perf_counter()
-    entry.write(args.to, chosen, scene.getTrainCameras() if scene is not None else ())
+    entry.write(args.to, chosen, *((scene, options.white_background, make_path) if entry.of_scene else ()))
     size, seconds = Path(args.to).stat().st_size, time.perf_counter() - start
     what = f"{len(chosen)} of {len(splats)} Gaussians, SH degree {degree}"
     print(
         f"Wrote {args.to}: {what}, {size / 1e6:.2f} MB ({size / max(len(chosen), 1):.0f} bytes each), {seconds:.1f} s"
     )
+
+
+def _path_maker(path: str | None, entry: Format) -> Callable[[Poses], TimedPath] | None:
+    """What makes the animation of a page; None: the page's own."""
+    if path is None:
+        return None
+    if not entry.of_scene:
+        raise UserError(f"--path is the animation of a page; leave it out for {entry.ending}, or end --to with .html")
+    from camera_paths.request import path_maker
+
+    return path_maker(path)
 
 
 def options() -> tuple[argparse.ArgumentParser, ModelParams, PipelineParams]:
@@ -131,6 +148,9 @@ def options() -> tuple[argparse.ArgumentParser, ModelParams, PipelineParams]:
     add("--min_opacity", type=float, default=0.0, help="leave fainter Gaussians out, 0 to 1 (default: 0)")
     add("--max_splats", type=int, default=0, metavar="N",
         help="keep N Gaussians; what adds least to the training views goes first (default: 0, no limit)")  # fmt: skip
+    add("--path", metavar="PATH",
+        help="animation of an .html: interpolate, ellipse, spiral, or a JSON file of keyframes "
+        "(default: once around the model)")  # fmt: skip
     add("--quiet", action="store_true", help="print nothing to stdout (default: off)")
     return parser, model_params, pipeline_params
 

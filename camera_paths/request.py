@@ -42,7 +42,7 @@ def path_request(args: argparse.Namespace) -> PathRequest:
     if not 1 <= fps <= MOST_FPS:
         raise UserError(f"--fps must be 1 to {MOST_FPS}, got {fps}")
     size = None if args.size is None else _checked_size(*args.size)
-    make = _maker(args.path, args.seconds)
+    make = path_maker(args.path, args.seconds)
     find_ffmpeg()
     return PathRequest(args.path if args.path in GENERATED else Path(args.path).stem, make, fps, size, args.frames)
 
@@ -58,7 +58,11 @@ def _checked_size(width: int, height: int) -> tuple[int, int]:
     return width, height
 
 
-def _maker(path: str, seconds: float | None) -> Callable[[Poses], TimedPath]:
+def path_maker(path: str, seconds: float | None = None) -> Callable[[Poses], TimedPath]:
+    """What makes the path that --path names, from the training cameras' poses. UserError for a wrong one.
+
+    seconds: how long a generated path takes; None: 10.
+    """
     if path in GENERATED:
         seconds = SECONDS if seconds is None else seconds
         if not 0.1 <= seconds <= MOST_SECONDS:

@@ -57,7 +57,7 @@ def measure(model: Path) -> list[list[str]]:
     plain = 4 * (17 + 3 * (splats.sh.shape[1] - 1))
     with tempfile.TemporaryDirectory() as folder:
         for entry in FORMATS:
-            if entry.wants_cameras:
+            if entry.of_scene:
                 continue
             path = Path(folder) / f"model{entry.ending}"
             start = time.perf_counter()
