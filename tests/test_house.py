@@ -11,10 +11,10 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
-COMMANDS = ("train", "render", "metrics", "full_eval", "convert", "doctor", "setup")
+COMMANDS = ("train", "render", "metrics", "full_eval", "convert", "doctor", "setup", "view")
 ROOMS = (
     *("arguments", "benchmarks", "conversion", "demo", "diagnosis", "evaluation", "gaussian_renderer", "records"),
-    *("lpipsPyTorch", "scene", "training", "utils"),
+    *("lpipsPyTorch", "scene", "training", "utils", "viewing"),
 )
 CSRC = ROOT / "submodules"
 LONGEST = 60  # lines of a function
@@ -41,7 +41,8 @@ MAY_IMPORT = {
     "scene": ("utils",),  # not arguments: a client's own package of that name may be found first
     "gaussian_renderer": ("scene", "utils"),
     "training": ("gaussian_renderer", "scene", "records", "arguments", "utils"),
-    "training.observers": ("training", "gaussian_renderer", "scene", "records", "arguments", "utils"),
+    "viewing": ("camera_paths", "gaussian_renderer", "scene", "utils"),
+    "training.observers": ("training", "viewing", "gaussian_renderer", "scene", "records", "arguments", "utils"),
     "diagnosis": ("gaussian_renderer", "scene", "arguments", "utils"),
     "conversion": ("scene.readers", "scene.pictures", "utils"),
     "evaluation": ("records", "arguments", "scene.saved_iterations", "scene.readers.info", "utils"),
