@@ -24,6 +24,8 @@ from training.plan import Plan
 from training.run import Run
 from utils.general_utils import safe_state
 from utils.system_utils import UserError, mkdir_p, run_cli
+from viewing.options import Address, add_viewer_options
+from viewing.server import checked_address
 
 SummaryWriter = EventWriter if tensorboard_is_installed() else None
 __all__ = ["main", "parse", "prepare_output_and_logger", "training", "training_report"]
@@ -40,17 +42,19 @@ def training(
     debug_from: int = -1,
     record_curve: bool = True,
     plain_step: bool = False,
+    viewer: Address | None = None,
 ) -> None:
     """Train from the options of the three groups; write model, checkpoints and log to dataset.model_path.
 
     testing_iterations, saving_iterations, checkpoint_iterations: when to score, save the PLY, save a checkpoint.
     checkpoint: a chkpntN.pth to resume, or None. debug_from: switch pipe.debug on after this iteration. plain_step: no
-    fast steps. record_curve: with test views, write error_vs_time.csv during training, and draw it.
+    fast steps. record_curve: with test views, write error_vs_time.csv during training, and draw it. viewer: where the
+    web page listens, None: no page.
     """
     dataset.model_path = dataset.model_path or new_folder()
     print(f"Optimizing {dataset.model_path}")
     iterations = testing_iterations, saving_iterations, checkpoint_iterations
-    plan = Plan(*iterations, checkpoint, debug_from, record_curve, plain_step)
+    plan = Plan(*iterations, checkpoint, debug_from, record_curve, plain_step, viewer)
     run = Run(dataset, opt, pipe, plan)
     # Write nothing before every input check has passed: a mistyped option must not overwrite a finished model.
     with own_folder(dataset.model_path):
@@ -82,6 +86,7 @@ def _parser() -> tuple[argparse.ArgumentParser, ModelParams, OptimizationParams,
     add("--ip", type=str, default="127.0.0.1", help="address of the viewer (no viewer in this version; no effect)")
     add("--port", type=int, default=6009, help="port of the viewer (no effect)")
     add("--disable_viewer", action="store_true", help="open no port for the viewer (none is opened anyway)")
+    add_viewer_options(parser)
     add("--debug_from", type=int, default=-1, metavar="N", help="switch --debug on after iteration N (default: never)")
     add("--detect_anomaly", action="store_true", help="let autograd name the operation that produced a NaN; slow")
     listed = {"type": int, "nargs": "+", "metavar": "N"}
@@ -119,17 +124,11 @@ def main(argv: Sequence[str] | None = None) -> None:
     """Train as the command line says."""
     args, dataset, opt, pipe = parse(argv)
     safe_state(args.quiet, opt.seed)
+    viewer = checked_address(args.viewer_host, args.viewer)
     torch.autograd.set_detect_anomaly(args.detect_anomaly)
-    further = args.start_checkpoint, args.debug_from, not args.no_curve, args.plain_step
-    training(
-        dataset,
-        opt,
-        pipe,
-        args.test_iterations,
-        [*args.save_iterations, opt.iterations],
-        args.checkpoint_iterations,
-        *further,
-    )
+    further = args.start_checkpoint, args.debug_from, not args.no_curve, args.plain_step, viewer
+    iterations = args.test_iterations, [*args.save_iterations, opt.iterations], args.checkpoint_iterations
+    training(dataset, opt, pipe, *iterations, *further)
     print("Training complete.")
 
 

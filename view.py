@@ -14,8 +14,9 @@ from arguments import ModelParams, OptionParser, PipelineParams, get_combined_ar
 from scene.saved_model import load_saved
 from utils.general_utils import safe_state
 from utils.system_utils import UserError, run_cli
-from viewing.options import PORT, add_host_option, address
+from viewing.options import PORT, add_host_option
 from viewing.saved import serve_saved
+from viewing.server import checked_address
 
 
 def main() -> None:
@@ -28,7 +29,7 @@ def main() -> None:
     parser.add_argument("--quiet", action="store_true", help="print nothing to stdout (default: off)")
     args = get_combined_args(parser)
     options, pipeline = model_params.extract(args), pipeline_params.extract(args)
-    place = address(args.viewer_host, args.port)
+    place = checked_address(args.viewer_host, args.port)
     safe_state(args.quiet)
     warn_of_background(options)
     scene = load_saved(options, args.iteration, args.typed_sh_degree)

@@ -8,7 +8,6 @@ import torch
 from training.observer import Announcer, Observer
 from training.run import Run
 from training.steps.choose import Taker, step_taker
-from utils.host.interrupt import DeferredInterrupt
 
 
 def run_training(run: Run, observers: Sequence[Observer]) -> None:
@@ -18,7 +17,7 @@ def run_training(run: Run, observers: Sequence[Observer]) -> None:
     Raises KeyboardInterrupt or Terminated, after a complete step, if a signal asked for it.
     """
     tell, taker = Announcer(observers), step_taker(run)
-    with DeferredInterrupt() as interrupt, tell, _backward_on_this_thread(), _whole_steps(run, taker):
+    with run.interrupt as interrupt, tell, _backward_on_this_thread(), _whole_steps(run, taker):
         for step in run.steps():
             tell.begins(step)
             taker.make_ready(step)  # before the learning rates are set, which a repeated step changes

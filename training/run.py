@@ -23,6 +23,7 @@ from training.step import Step
 from training.view_order import ViewOrder
 from utils.exact.counter_rng import Stream, uniform
 from utils.general_utils import get_expon_lr_func
+from utils.host.interrupt import DeferredInterrupt
 from utils.host.process import seconds_since_start
 from utils.system_utils import UserError, compute_device
 
@@ -34,8 +35,9 @@ class Run:
 
     scene, gaussians, views (by iteration), objective, density; dataset, opt, pipe: the options; background: (3,) of the
     scene; first_iteration: done before this run. From `begin` on: log, rows (of the curve so far), losses
-    (running mean of the total) and clock (seconds of training). lost: steps that an error has taken back. first_done:
-    seconds from the process's start to the end of its first iteration, None if the system does not say.
+    (running mean of the total) and clock (seconds of training). lost: steps that an error has taken back. interrupt:
+    notes a signal that asks the loop to stop. first_done: seconds from the process's start to the end of its first
+    iteration, None if the system does not say.
     """
 
     first_done: float | None = None
@@ -46,6 +48,7 @@ class Run:
         """Read and check everything that can be refused; nothing is written. UserError for what is refused."""
         self.dataset, self.opt, self.pipe, self.plan = dataset, opt, pipe, plan
         self.lost = 0
+        self.interrupt = DeferredInterrupt()
         self.device = compute_device()
         capture, self.first_iteration = load_checkpoint(plan.start, self.device) if plan.start else (None, 0)
         if self.first_iteration >= opt.iterations:

@@ -3,8 +3,6 @@
 import argparse
 from typing import NamedTuple
 
-from utils.system_utils import UserError
-
 HOST, PORT = "127.0.0.1", 8080
 
 
@@ -31,12 +29,3 @@ def add_viewer_options(parser: argparse.ArgumentParser) -> None:
         help=f"serve a web page that shows the training and controls it, at this port or {PORT} (default: no page)",
     )  # fmt: skip
     add_host_option(parser)
-
-
-def address(host: str, port: int | None) -> Address | None:
-    """The address that the options name, None without a port. UserError for a port that does not exist."""
-    if port is None:
-        return None
-    if not 0 <= port <= 65535:
-        raise UserError(f"the page's port must be between 0 (any) and 65535, got {port}")
-    return Address(host, port)

@@ -22,6 +22,7 @@ from viewing.watchers import Watchers, Wish
 if TYPE_CHECKING:
     import viser
 
+_SENT = 0.1  # seconds in which a message is sent
 _COARSE_QUALITY, _FULL_QUALITY = 70, 92  # of the JPEG
 
 
@@ -103,6 +104,15 @@ class Page:
     def show_numbers(self, iteration: int, gaussians: int) -> None:
         """Show the iteration and the number of Gaussians."""
         self.iteration.value, self.count.value = f"{iteration:,}", f"{gaussians:,}"
+
+    def tell(self, title: str, body: str) -> None:
+        """Show a notification to all, and wait until it has probably been sent."""
+        clients = self.server.get_clients().values()
+        for client in clients:
+            client.add_notification(title, body)
+            client.flush()
+        if clients:
+            time.sleep(_SENT)
 
     def stop(self) -> None:
         """Stop to listen."""

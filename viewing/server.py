@@ -5,6 +5,7 @@ import errno
 import io
 import socket
 import sys
+from types import ModuleType
 from typing import TYPE_CHECKING, NamedTuple
 
 from utils.system_utils import UserError
@@ -24,17 +25,24 @@ class Served(NamedTuple):
     url: str
 
 
+def checked_address(host: str, port: int | None) -> Address | None:
+    """The address that the options name, None without a port. UserError if no page can be served there."""
+    if port is None:
+        return None
+    if not 0 <= port <= 65535:
+        raise UserError(f"the page's port must be between 0 (any) and 65535, got {port}")
+    _import_viser()
+    _free_port(Address(host, port))
+    return Address(host, port)
+
+
 def serve(address: Address, label: str) -> Served:
     """Start a server, at the next free port if the wanted one is taken, and say on stderr where it listens.
 
     UserError without viser, and for an address that cannot be listened at.
     """
-    try:
-        import viser
-
-        from viewing.gate import Gate
-    except ImportError as error:
-        raise UserError(f"the page needs a package ({error}); install it with pip install '.[viewer]'") from None
+    viser = _import_viser()
+    from viewing.gate import Gate
 
     class Server(viser.ViserServer):
         def request_share_url(self, verbose: bool = True) -> None:
@@ -55,6 +63,14 @@ def stop(server: "viser.ViserServer") -> None:
     """Stop a server; browsers are told that the connection is lost."""
     with contextlib.redirect_stdout(io.StringIO()):
         server.stop()
+
+
+def _import_viser() -> ModuleType:
+    try:
+        import viser
+    except ImportError as error:
+        raise UserError(f"the page needs a package ({error}); install it with pip install '.[viewer]'") from None
+    return viser
 
 
 def _free_port(address: Address) -> int:
