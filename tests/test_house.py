@@ -40,7 +40,7 @@ MAY_IMPORT = {
     "scene.cameras": ("scene.views", "scene.pictures", "utils"),
     "scene": ("utils",),  # not arguments: a client's own package of that name may be found first
     "gaussian_renderer": ("scene", "utils"),
-    "training": ("gaussian_renderer", "scene", "records", "arguments", "utils"),
+    "training": ("viewing.options", "gaussian_renderer", "scene", "records", "arguments", "utils"),
     "viewing": ("camera_paths", "gaussian_renderer", "scene", "utils"),
     "training.observers": ("training", "viewing", "gaussian_renderer", "scene", "records", "arguments", "utils"),
     "diagnosis": ("gaussian_renderer", "scene", "arguments", "utils"),
