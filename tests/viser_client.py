@@ -20,7 +20,8 @@ class Client:
         protocol = f"viser-v{viser.__version__}"
         self._socket = connect(
             url.replace("http:", "ws:").split("?")[0],
-            subprotocols=[protocol], origin=origin, additional_headers=headers, max_size=None, compression=None, close_timeout=0.2,
+            subprotocols=[protocol], origin=origin, additional_headers=headers, max_size=None, compression=None,
+            close_timeout=0.2,
         )  # fmt: skip
 
     def __enter__(self) -> "Client":

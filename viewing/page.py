@@ -9,7 +9,7 @@ import numpy as np
 
 from scene.scene import Scene
 from viewing import server as servers
-from viewing.frames import Frames
+from viewing.frames import LONGEST, Frames
 from viewing.options import Address
 from viewing.path_tab import PathTab
 from viewing.photos_tab import PhotosTab
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     import viser
 
 _SENT = 0.1  # seconds in which a message is sent
-_COARSE_QUALITY, _FULL_QUALITY = 70, 92  # of the JPEG
+_COARSE_QUALITY, _FULL_QUALITY = 70, 95  # of the JPEG
 
 
 class Page:
@@ -96,6 +96,8 @@ class Page:
         client = self.server.get_clients().get(wish.client)
         if client is None:
             return
+        if not wish.coarse and max(image.shape) <= LONGEST // 2:
+            image = image.repeat(2, axis=0).repeat(2, axis=1)  # JPEG halves the resolution of colours
         quality = _COARSE_QUALITY if wish.coarse else _FULL_QUALITY
         client.scene.set_background_image(image, "jpeg", jpeg_quality=quality)
         if wish.asked is not None:

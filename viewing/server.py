@@ -8,6 +8,8 @@ import sys
 from types import ModuleType
 from typing import TYPE_CHECKING, NamedTuple
 
+from tqdm import tqdm
+
 from utils.system_utils import UserError
 from viewing.options import Address
 
@@ -100,9 +102,9 @@ def _announce(address: Address, port: int, token: str | None) -> str:
     shown = socket.gethostname() if host in ("0.0.0.0", "::", "") else f"[{host}]" if ":" in host else host
     url = f"http://{shown}:{port}/" + ("" if token is None else f"?token={token}")
     taken = f" (port {wanted} is taken)" if wanted not in (0, port) else ""
-    print(f"viewer: {url}{taken}", file=sys.stderr)
+    tqdm.write(f"viewer: {url}{taken}", file=sys.stderr)  # a progress bar may be there
     if token is not None:
-        print(
+        tqdm.write(
             f"warning: every machine that reaches {host} by the network can ask for this page; whoever has the address "
             "with its token sees the scene and its photos and controls the process, and nothing is encrypted",
             file=sys.stderr,
