@@ -58,6 +58,7 @@ for room, below in {
     "accuracy": ("benchmarks.harness", "benchmarks.workloads"),
     "costs": ("benchmarks.harness", "benchmarks.workloads"),
     "scenes": ("benchmarks.harness", "benchmarks.workloads"),
+    "viewing": ("benchmarks.harness", "benchmarks.workloads"),
 }.items():
     MAY_IMPORT[f"benchmarks.{room}"] = (*below, *MEASURED)
 

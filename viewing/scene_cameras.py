@@ -11,7 +11,7 @@ from viewing.settings import Pose, Vector
 
 _NEAR = 1e-3  # of the scene's size: a page's camera that close stands at the scene's camera
 _TURNED = 2e-3  # radians
-_MARGIN = 1.1  # of the scene's size, to that of one camera's distance where there is only one
+_MARGIN = 1.1  # of the scene's size, to the distance of the outermost camera
 
 
 class SceneCameras:
