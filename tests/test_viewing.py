@@ -181,8 +181,9 @@ def test_a_photo_is_shown_only_where_it_was_taken(gaussians, scene_cameras):
     asked = replace(PLAIN, camera=name, comparison=names.SLIDER)
     assert frames.compared(asked, pose) is camera
     moved = np.asarray(pose.position) + [0.02 * scene_cameras.size, 0, 0]
-    turn = np.array([math.cos(0.005), 0, math.sin(0.005), 0])
-    for other in (replace(pose, position=tuple(moved)), replace(FRONT, wxyz=tuple(turn))):
+    turn = Rotation.from_matrix(camera.R) * Rotation.from_rotvec([0, 0.005, 0])
+    turned = tuple(np.roll(turn.as_quat(), 1))
+    for other in (replace(pose, position=tuple(moved)), replace(pose, wxyz=turned)):
         assert frames.compared(asked, other) is None
     assert frames.compared(replace(asked, camera="no such"), pose) is None
     assert frames.compared(replace(asked, comparison=names.ALONE), pose) is None
