@@ -25,6 +25,8 @@ from training.plan import Plan
 from training.run import Run
 from utils.general_utils import safe_state
 from utils.system_utils import UserError, mkdir_p, run_cli
+from viewing.options import Address, add_viewer_options
+from viewing.server import checked_address
 
 SummaryWriter = EventWriter if tensorboard_is_installed() else None
 __all__ = ["main", "parse", "prepare_output_and_logger", "training", "training_report"]
@@ -41,22 +43,24 @@ def training(
     debug_from: int = -1,
     record_curve: bool = True,
     plain_step: bool = False,
-    viewer_address: tuple[str, int] | None = None,
+    remote_viewer: tuple[str, int] | None = None,
+    viewer: Address | None = None,
 ) -> None:
     """Train from the options of the three groups; write model, checkpoints and log to dataset.model_path.
 
     testing_iterations, saving_iterations, checkpoint_iterations: when to score, save the PLY, save a checkpoint.
     checkpoint: a chkpntN.pth to resume, or None. debug_from: switch pipe.debug on after this iteration. plain_step: no
-    fast steps. record_curve: with test views, write error_vs_time.csv during training, and draw it. viewer_address:
-    listen there for the remote viewer; None: nowhere, unless network_gui listens already.
+    fast steps. record_curve: with test views, write error_vs_time.csv during training, and draw it. remote_viewer:
+    where to listen for it, None: nowhere, unless network_gui listens already. viewer: where the web page listens, None:
+    no page.
     """
     dataset.model_path = dataset.model_path or new_folder()
     print(f"Optimizing {dataset.model_path}")
     iterations = testing_iterations, saving_iterations, checkpoint_iterations
-    plan = Plan(*iterations, checkpoint, debug_from, record_curve, plain_step)
+    plan = Plan(*iterations, checkpoint, debug_from, record_curve, plain_step, viewer)
     run = Run(dataset, opt, pipe, plan)
     # Write nothing before every input check has passed: a mistyped option must not overwrite a finished model.
-    with own_folder(dataset.model_path), network_gui.listening(viewer_address):
+    with own_folder(dataset.model_path), network_gui.listening(remote_viewer):
         writer = prepare_output_and_logger(dataset, **run.kept)
         run.begin()
         run_training(run, standard_observers(run, writer, training_report))
@@ -85,6 +89,7 @@ def _parser() -> tuple[argparse.ArgumentParser, ModelParams, OptimizationParams,
     add("--ip", type=str, default="127.0.0.1", help="address to listen at for the remote viewer (default: 127.0.0.1)")
     add("--port", type=int, default=6009, help="port for the remote viewer, 0: any free one (default: 6009)")
     add("--disable_viewer", action="store_true", help="open no port for the remote viewer")
+    add_viewer_options(parser)
     add("--debug_from", type=int, default=-1, metavar="N", help="switch --debug on after iteration N (default: never)")
     add("--detect_anomaly", action="store_true", help="let autograd name the operation that produced a NaN; slow")
     listed = {"type": int, "nargs": "+", "metavar": "N"}
@@ -122,10 +127,11 @@ def main(argv: Sequence[str] | None = None) -> None:
     """Train as the command line says."""
     args, dataset, opt, pipe = parse(argv)
     safe_state(args.quiet, opt.seed)
+    viewer = checked_address(args.viewer_host, args.viewer)
     torch.autograd.set_detect_anomaly(args.detect_anomaly)
+    remote_viewer = None if args.disable_viewer else (args.ip, args.port)
+    further = args.start_checkpoint, args.debug_from, not args.no_curve, args.plain_step, remote_viewer, viewer
     iterations = args.test_iterations, [*args.save_iterations, opt.iterations], args.checkpoint_iterations
-    viewer_address = None if args.disable_viewer else (args.ip, args.port)
-    further = args.start_checkpoint, args.debug_from, not args.no_curve, args.plain_step, viewer_address
     training(dataset, opt, pipe, *iterations, *further)
     print("Training complete.")
 

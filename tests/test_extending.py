@@ -36,6 +36,8 @@ CODE = (
     "gaussian_renderer",
     "records",
     "scene",
+    "viewing",
+    "camera_paths",
     "training",
     "utils",
     "train.py",

@@ -11,10 +11,10 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
-COMMANDS = ("train", "render", "metrics", "full_eval", "convert", "doctor", "export", "setup")
+COMMANDS = ("train", "render", "metrics", "full_eval", "convert", "doctor", "export", "setup", "view")
 ROOMS = (
     *("arguments", "benchmarks", "camera_paths", "conversion", "demo", "diagnosis", "evaluation", "exports"),
-    *("gaussian_renderer", "lpipsPyTorch", "records", "scene", "training", "utils"),
+    *("gaussian_renderer", "lpipsPyTorch", "records", "scene", "training", "utils", "viewing"),
 )
 CSRC = ROOT / "submodules"
 LONGEST = 60  # lines of a function
@@ -42,8 +42,9 @@ MAY_IMPORT = {
     "gaussian_renderer": ("scene", "utils"),
     "camera_paths": ("gaussian_renderer", "scene", "utils"),
     "exports": ("camera_paths", "scene", "utils"),
-    "training": ("exports", "gaussian_renderer", "scene", "records", "arguments", "utils"),
-    "training.observers": ("training", "gaussian_renderer", "scene", "records", "arguments", "utils"),
+    "training": ("exports", "viewing.options", "gaussian_renderer", "scene", "records", "arguments", "utils"),
+    "viewing": ("camera_paths", "gaussian_renderer", "scene", "utils"),
+    "training.observers": ("training", "viewing", "gaussian_renderer", "scene", "records", "arguments", "utils"),
     "diagnosis": ("gaussian_renderer", "scene", "arguments", "utils"),
     "conversion": ("scene.readers", "scene.pictures", "utils"),
     "evaluation": ("records", "arguments", "scene.saved_iterations", "scene.readers.info", "utils"),
@@ -60,6 +61,7 @@ for room, below in {
     "costs": ("benchmarks.harness", "benchmarks.workloads"),
     "scenes": ("benchmarks.harness", "benchmarks.workloads"),
     "exports": ("benchmarks.harness", "benchmarks.workloads"),
+    "viewing": ("benchmarks.harness", "benchmarks.workloads"),
 }.items():
     MAY_IMPORT[f"benchmarks.{room}"] = (*below, *MEASURED)
 

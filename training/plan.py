@@ -3,6 +3,8 @@
 from collections.abc import Sequence
 from typing import NamedTuple
 
+from viewing.options import Address
+
 
 class Plan(NamedTuple):
     """The user's requests for a run, besides training itself."""
@@ -14,3 +16,4 @@ class Plan(NamedTuple):
     debug_from: int  # pipe.debug is switched on after this iteration; -1: never
     record_curve: bool  # error_vs_time.csv, if there are test views
     plain_step: bool = False  # take every step by autograd, and wait for the GPU in it
+    viewer: Address | None = None  # of the web page; None: no page

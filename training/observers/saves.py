@@ -61,8 +61,11 @@ class Checkpoints(Observer):
         return step.iteration in self._run.plan.checkpoint
 
     def stepped(self, step: Step) -> None:
-        if not step.stopping and step.iteration not in self._run.plan.checkpoint:
-            return
+        if step.stopping or step.iteration in self._run.plan.checkpoint:
+            self.save(step)
+
+    def save(self, step: Step) -> None:
+        """Write a checkpoint after an iteration that is due, and say how to resume if the training stops."""
         run = self._run
         self._watch.look(step.iteration, stepped=not step.last)
         seconds = run.clock.seconds

@@ -10,6 +10,7 @@ from training.observers.divergence import DivergenceWatch
 from training.observers.masks import MaskWatch
 from training.observers.memory import MemoryGuard
 from training.observers.network_viewer import NetworkViewer
+from training.observers.page import PageObserver
 from training.observers.progress import ProgressBar
 from training.observers.records import Records
 from training.observers.report import Report
@@ -22,6 +23,7 @@ def standard_observers(run: Run, writer: Any | None, report: Callable[..., dict[
     with_curve = run.plan.record_curve and bool(run.scene.getTestCameras())
     test_in_memory = with_curve or run.opt.iterations in run.plan.test
     watch = DivergenceWatch(run)
+    checkpoints = Checkpoints(run, watch)
     return [
         watch,  # first: observers that write rely on all losses so far being finite
         ProgressBar(run),  # reads the losses that the watch has checked
@@ -32,5 +34,6 @@ def standard_observers(run: Run, writer: Any | None, report: Callable[..., dict[
         Records(run),  # after all that add to the iteration's record
         *([NetworkViewer(run)] if network_gui.listener else []),  # after all that write: it may make training wait
         MemoryGuard(run),  # from `measured` to `stepped` the model changes; otherwise it is whole
-        Checkpoints(run, watch),  # last: writes the whole state after the step
+        checkpoints,  # writes the whole state after the step
+        *([PageObserver(run, checkpoints)] if run.plan.viewer else []),  # last: may let the training wait
     ]

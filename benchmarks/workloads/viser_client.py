@@ -1,0 +1,66 @@
+"""A client of a viser server without a browser, written from what viser's server sends and takes."""
+
+import io
+from typing import Any
+
+import msgspec.msgpack
+import numpy as np
+import viser
+import zstandard
+from PIL import Image
+from websockets.sync.client import connect
+
+_HEAD = 16  # bytes: two lengths before the compressed messages
+
+
+class Client:
+    """Connects to http://HOST:PORT/ as the page's client does. headers: further ones of the handshake."""
+
+    def __init__(self, url: str, origin: str | None = None, headers: dict[str, str] | None = None) -> None:
+        protocol = f"viser-v{viser.__version__}"
+        self._socket = connect(
+            url.replace("http:", "ws:").split("?")[0],
+            subprotocols=[protocol], origin=origin, additional_headers=headers, max_size=None, compression=None,
+            close_timeout=0.2,
+        )  # fmt: skip
+
+    def __enter__(self) -> "Client":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._socket.close()
+
+    def send(self, kind: str, **fields: Any) -> None:
+        """Send a message."""
+        self._socket.send(msgspec.msgpack.encode({"type": kind, **fields}))
+
+    def look(self, position=(0.0, 0.0, -4.0), wxyz=(1.0, 0.0, 0.0, 0.0), fov=0.8, size=(96, 64)) -> None:
+        """Send the camera's pose; the first one makes the client known."""
+        self.send(
+            "ViewerCameraMessage",
+            wxyz=list(map(float, wxyz)), position=list(map(float, position)), fov=fov, near=0.01, far=100.0,
+            image_width=size[0], image_height=size[1], look_at=[0.0, 0.0, 0.0], up_direction=[0.0, -1.0, 0.0],
+        )  # fmt: skip
+
+    def messages(self, timeout: float = 10.0) -> list[dict[str, Any]]:
+        """The messages of the next packet. TimeoutError without one."""
+        packet = self._socket.recv(timeout)
+        length = int.from_bytes(packet[8:_HEAD], "little")
+        return msgspec.msgpack.decode(zstandard.ZstdDecompressor().decompress(packet[_HEAD : _HEAD + length]))[
+            "messages"
+        ]
+
+    def until(self, kind: str, timeout: float = 10.0) -> dict[str, Any]:
+        """The next message of a kind."""
+        while True:
+            for message in self.messages(timeout):
+                if message["type"] == kind:
+                    return message
+
+    def picture(self, timeout: float = 10.0) -> np.ndarray:
+        """The next picture (H, W, 3) uint8."""
+        message = {"rgb_data": None}  # as a server sends it that has been reset
+        while message["rgb_data"] is None:
+            message = self.until("BackgroundImageMessage", timeout)
+        with Image.open(io.BytesIO(message["rgb_data"])) as image:
+            return np.asarray(image.convert("RGB"))

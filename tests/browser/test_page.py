@@ -1,0 +1,146 @@
+"""The viewer's page in a real browser, while a training runs on the CPU in another process."""
+
+import io
+import os
+import re
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from urllib.parse import urlsplit
+
+import numpy as np
+import pytest
+from conftest import outside
+from PIL import Image
+from synthetic import make_colmap_scene
+
+pytest.importorskip("viser", reason="viser is not installed: pip install '.[viewer]'")
+pytestmark = pytest.mark.browser
+ROOT = Path(__file__).resolve().parents[2]
+SECONDS = 20  # until something must have happened
+
+
+@pytest.fixture(scope="module")
+def training(tmp_path_factory) -> Iterator[tuple[str, Path]]:
+    """A training in another process: the address of its page, and its scene."""
+    folder = tmp_path_factory.mktemp("page")
+    make_colmap_scene(folder / "scene")
+    words = ["train.py", "-s", folder / "scene", "-m", folder / "out", "--eval", "--iterations", 30_000, "--viewer", 0]
+    command = [sys.executable, *map(str, words)]
+    environment = os.environ | {"OMP_NUM_THREADS": "1"}  # the browser needs a core, too
+    process = subprocess.Popen(
+        command, cwd=ROOT, env=environment, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True
+    )
+    try:
+        said = ""
+        for line in process.stderr:
+            said += line
+            if found := re.search(r"viewer: (http://\S+)", line):
+                break
+        else:
+            pytest.fail(said)
+        # Read on, so that the progress bar never waits for a reader.
+        threading.Thread(target=process.stderr.read, daemon=True).start()
+        yield found[1], folder / "scene"
+    finally:
+        process.kill()
+        process.wait()
+
+
+def _field(tab, label: str):
+    return tab.locator(f'label:text-is("{label}")').locator("xpath=following::input[not(@type='hidden')][1]")
+
+
+def _number(tab, label: str) -> float:
+    return float(_field(tab, label).input_value().replace(",", "") or "nan")
+
+
+def _until(holds: Callable[[], bool], what: str) -> None:
+    deadline = time.monotonic() + SECONDS
+    while not holds():
+        assert time.monotonic() < deadline, what
+        time.sleep(0.1)
+
+
+def _picture(tab) -> np.ndarray:
+    """What the tab shows left of the controls, (600, 525, 3)."""
+    shot = tab.screenshot(clip={"x": 0, "y": 0, "width": 525, "height": 600})
+    return np.asarray(Image.open(io.BytesIO(shot)).convert("RGB")).astype(float)
+
+
+def _open(tab, address: str) -> None:
+    tab.goto(address)
+    tab.get_by_role("tab", name="View").wait_for()
+    notice = tab.get_by_role("alert").get_by_role("button")  # that WebGL is slow here
+    notice.first.click()
+    _until(lambda: _picture(tab)[150:].std() > 15, "the page shows no picture")
+
+
+def test_the_page_loads_moves_and_asks_nobody_else(tab, page_errors, requests, training):
+    address, _ = training
+    _open(tab, address)
+    before = _picture(tab)
+    tab.mouse.move(300, 400)
+    tab.mouse.down()
+    for step in range(1, 6):
+        tab.mouse.move(300 + 40 * step, 400)
+    tab.mouse.up()
+    _until(lambda: abs(_picture(tab) - before).mean() > 8, "the picture does not follow the mouse")
+    own = urlsplit(address).netloc
+    assert address in requests and any(asked.startswith("ws://") for asked in requests)
+    assert not outside(requests, own) and not page_errors
+
+
+def test_the_training_pauses_steps_and_its_curve_grows(tab, page_errors, requests, training):
+    _open(tab, training[0])
+    tab.get_by_role("tab", name="Training").click()
+    curve = tab.locator(".uplot canvas")
+    curve.wait_for(timeout=1000 * SECONDS)
+    drawn = curve.screenshot()
+    _until(lambda: curve.screenshot() != drawn, "the curve does not grow")
+    before = _number(tab, "Iteration")
+    _until(lambda: _number(tab, "Iteration") > before, "the training does not go on")
+    tab.get_by_role("button", name="Pause").click()
+    tab.get_by_role("button", name="Resume").wait_for()
+    time.sleep(1.0)
+    paused = _number(tab, "Iteration")
+    time.sleep(1.0)
+    assert _number(tab, "Iteration") == paused
+    for taken in (1, 2):
+        tab.get_by_role("button", name="One step").click()
+        _until(lambda taken=taken: _number(tab, "Iteration") == paused + taken, "no step was taken")
+    tab.get_by_role("button", name="Resume").click()
+    _until(lambda: _number(tab, "Iteration") > paused + 2, "the training does not resume")
+    assert _number(tab, "Loss") > 0 and _number(tab, "Gaussians") > 0
+    assert not page_errors
+
+
+def test_the_slider_shows_the_photo(tab, page_errors, requests, training):
+    address, scene = training
+    _open(tab, address)
+    tab.get_by_role("combobox", name="Show").click()
+    tab.get_by_role("option", name="Opacity").click()  # which no photo looks like
+    tab.get_by_role("tab", name="Photos").click()
+    name = tab.get_by_role("combobox", name="Camera").input_value().split(": ")[1]
+    tab.get_by_role("combobox", name="Compare").click()
+    tab.get_by_role("option", name="Slider").click()
+    # The photo, 96 x 64, fills the window, which has its aspect.
+    photo = np.asarray(Image.open(next(scene.rglob(f"{Path(name).stem}.*"))).convert("RGB")).astype(float)
+
+    def error() -> float:
+        shown = Image.fromarray(_picture(tab).astype(np.uint8))
+        columns = shown.width * 96 // 900
+        small = np.asarray(shown.resize((columns, 64), Image.Resampling.BOX)).astype(float)
+        return abs(small - photo[:, :columns])[2:-2, 2:-2].mean()
+
+    field = _field(tab, "Photo's share")
+    field.fill("1")
+    field.press("Enter")
+    _until(lambda: error() < 10, "the photo is not shown")
+    field.fill("0")
+    field.press("Enter")
+    _until(lambda: error() > 30, "the render's opacity is not shown")
+    assert not page_errors and not outside(requests, urlsplit(address).netloc)

@@ -1,0 +1,360 @@
+"""The viewer's frames, and when they are drawn: no server, no browser."""
+
+import math
+from argparse import ArgumentParser, Namespace
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from gaussians import model, parameters, pipeline
+from scipy.spatial.transform import Rotation
+from synthetic import make_colmap_scene
+
+from arguments import ModelParams
+from camera_paths.keyframes import read_camera_path
+from gaussian_renderer import render
+from gaussian_renderer.free_view import free_view
+from gaussian_renderer.walked import gaussians_walked
+from scene import Scene
+from scene.gaussian_model import GaussianModel
+from utils.system_utils import UserError
+from viewing import settings as names
+from viewing.budget import MOVING, STILL, Budget
+from viewing.frames import LONGEST, Frames
+from viewing.model_part import inside, shown_part
+from viewing.path_tab import PathTab
+from viewing.poses import pose_of
+from viewing.scene_cameras import SceneCameras, canvas, center, fov_of_canvas
+from viewing.settings import Pose, Settings
+from viewing.view_tab import first_box
+from viewing.watchers import STILL_AFTER, Watchers
+
+FRONT = Pose((0.0, 0.0, -4.0), (1.0, 0.0, 0.0, 0.0), 0.8, 96, 64)
+PLAIN = Settings()
+
+
+class Clock:
+    """A clock that stands still until it is moved."""
+
+    def __init__(self) -> None:
+        self.now = 100.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+@pytest.fixture
+def gaussians():
+    return model(200)
+
+
+@pytest.fixture(scope="module")
+def scene_cameras(tmp_path_factory) -> SceneCameras:
+    folder = tmp_path_factory.mktemp("cameras")
+    make_colmap_scene(folder / "scene")
+    given = Namespace(source_path=str(folder / "scene"), model_path=str(folder / "out"), eval=True)
+    options = ModelParams(ArgumentParser()).extract(given)
+    scene = Scene(options, GaussianModel(0), shuffle=False, start=False)
+    return SceneCameras(scene.getTrainCameras(), scene.getTestCameras())
+
+
+def _frames(gaussians, cameras=None) -> Frames:
+    return Frames(gaussians, cameras or SceneCameras([], []), pipeline(), False)
+
+
+def _render(gaussians, pose, scaling=1.0, background=(0.0, 0.0, 0.0)) -> np.ndarray:
+    view = free_view(pose.width, pose.height, pose.fov, pose.position, pose.wxyz, "cpu")
+    image = render(view, gaussians, pipeline(), torch.tensor(background), scaling)["render"].detach()
+    return (image * 255 + 0.5).to(torch.uint8).permute(1, 2, 0).numpy()
+
+
+def _pose_at(camera, width=300, height=100) -> Pose:
+    fov = fov_of_canvas(camera, width / height)
+    return Pose(tuple(center(camera)), tuple(np.roll(Rotation.from_matrix(camera.R).as_quat(), 1)), fov, width, height)
+
+
+def test_a_frame_is_the_render_of_its_pose(gaussians):
+    drawn = _frames(gaussians).draw(PLAIN, FRONT, coarse=False)
+    assert drawn.shape == (64, 96, 3) and drawn.std() > 10
+    np.testing.assert_array_equal(drawn, _render(gaussians, FRONT))
+    red = replace(PLAIN, background=(1.0, 0.0, 0.0), scaling=0.5)
+    drawn = _frames(gaussians).draw(red, FRONT, coarse=False)
+    np.testing.assert_array_equal(drawn, _render(gaussians, FRONT, 0.5, (1.0, 0.0, 0.0)))
+
+
+def test_a_moving_camera_gets_a_quarter_of_the_pixels_and_a_large_window_not_all(gaussians):
+    frames = _frames(gaussians)
+    assert frames.draw(PLAIN, FRONT, coarse=True).shape == (32, 48, 3)
+    assert frames.draw(PLAIN, replace(FRONT, width=8000, height=40), coarse=False).shape == (8, LONGEST, 3)
+
+
+def test_modes_show_what_they_say(gaussians):
+    frames = _frames(gaussians)
+    view = free_view(96, 64, FRONT.fov, FRONT.position, FRONT.wxyz, "cpu")
+    with torch.no_grad():
+        white = render(view, gaussians, pipeline(), torch.zeros(3), override_color=torch.ones(200, 3))["render"]
+    opacity = frames.draw(replace(PLAIN, mode=names.OPACITY), FRONT, coarse=False)
+    np.testing.assert_array_equal(opacity, (white * 255 + 0.5).byte().permute(1, 2, 0).numpy())
+    depth = frames.draw(replace(PLAIN, mode=names.DEPTH), FRONT, coarse=False)
+    assert not depth[white[0].numpy() < 0.5].any() and depth[white[0].numpy() >= 0.5].any(axis=1).all()
+    # Without a photo there is no error to show.
+    np.testing.assert_array_equal(
+        frames.draw(replace(PLAIN, mode=names.ERROR), FRONT, coarse=False), _render(gaussians, FRONT)
+    )
+
+
+def test_the_count_of_a_pixel_is_that_of_its_tiles_list_up_to_the_last_one_blended(gaussians):
+    view = free_view(96, 64, FRONT.fov, FRONT.position, FRONT.wxyz, "cpu")
+    walked = gaussians_walked(view, gaussians, pipeline())
+    with torch.no_grad():
+        drawn = render(view, gaussians, pipeline(), torch.zeros(3), override_color=torch.ones(200, 3))
+    assert walked.shape == (64, 96) and walked.dtype == torch.int32
+    assert torch.equal(walked > 0, drawn["render"][0] > 0)
+    assert 0 < walked.max() <= 200
+    one = model(1)
+    assert gaussians_walked(view, one, pipeline()).max() == 1
+
+
+def test_the_crop_box_leaves_gaussians_out_and_the_model_alone(gaussians):
+    before = {name: values.clone() for name, values in parameters(gaussians).items()}
+    box = (1.0, 1.0, 0.0), (-1.0, -0.2, -1.0)  # opposite corners in any order
+    drawn = _frames(gaussians).draw(replace(PLAIN, crop=box), FRONT, coarse=False)
+    keep = inside(gaussians.get_xyz, *box)
+    xyz = gaussians.get_xyz
+    assert torch.equal(
+        keep,
+        (xyz[:, 0].abs() <= 1) & (xyz[:, 1] >= -0.2) & (xyz[:, 1] <= 1) & (xyz[:, 2].abs() <= 1) & (xyz[:, 2] <= 0),
+    )
+    assert 0 < keep.sum() < 200
+    np.testing.assert_array_equal(drawn, _render(gaussians.part(keep, 3), FRONT))
+    assert len(gaussians) == 200 and gaussians.optimizer is not None
+    for name, values in parameters(gaussians).items():
+        assert torch.equal(values, before[name]), name
+    nothing = _frames(gaussians).draw(replace(PLAIN, crop=((9.0,) * 3, (8.0,) * 3)), FRONT, coarse=False)
+    assert not nothing.any()
+
+
+def test_the_sh_degree_of_a_frame_is_not_that_of_the_model(gaussians):
+    low = shown_part(gaussians, replace(PLAIN, sh_degree=1))
+    assert low.active_sh_degree == 1 and gaussians.active_sh_degree == 3
+    assert shown_part(gaussians, replace(PLAIN, sh_degree=9)) is gaussians
+    drawn = _frames(gaussians).draw(replace(PLAIN, sh_degree=0), FRONT, coarse=False)
+    gaussians.active_sh_degree = 0
+    np.testing.assert_array_equal(drawn, _render(gaussians, FRONT))
+
+
+@pytest.mark.parametrize("size", [(300, 100), (96, 64), (60, 200)])
+def test_left_of_the_slider_is_the_photo_and_right_of_it_the_render(gaussians, scene_cameras, size):
+    name, camera = next(iter(scene_cameras.by_name.items()))
+    asked = replace(PLAIN, camera=name, comparison=names.SLIDER, slider=0.25)
+    drawn = _frames(gaussians, scene_cameras).draw(asked, _pose_at(camera, *size), coarse=False)
+    wide, high = canvas(96, 64, size[0] / size[1])
+    assert drawn.shape == (high, wide, 3)
+    top, left = (high - 64) // 2, (wide - 96) // 2
+    inner = drawn[top : top + 64, left : left + 96]
+    photo = camera.target(torch.zeros(3))
+    np.testing.assert_array_equal(inner[:, :23], photo.permute(1, 2, 0).numpy()[:, :23])
+    with torch.no_grad():
+        image = render(camera, gaussians, pipeline(), torch.zeros(3))["render"]
+    np.testing.assert_array_equal(inner[:, 26:], (image * 255 + 0.5).byte().permute(1, 2, 0).numpy()[:, 26:])
+    assert (inner[:, 23:25] == 255).all()  # the slider's line
+
+
+def test_side_by_side_are_photo_render_and_error(gaussians, scene_cameras):
+    name, camera = next(iter(scene_cameras.by_name.items()))
+    frames, pose = _frames(gaussians, scene_cameras), _pose_at(camera)
+    asked = replace(PLAIN, camera=name, comparison=names.BESIDE)
+    drawn = frames.draw(asked, pose, coarse=False).astype(int)
+    left = (drawn.shape[1] - 3 * 96) // 2
+    top = (drawn.shape[0] - 64) // 2
+    photo, image, error = (drawn[top : top + 64, left + 96 * n : left + 96 * (n + 1)] for n in range(3))
+    assert abs(error - np.minimum(abs(photo - image) * 5, 255)).max() <= 4  # rounded before the difference
+    alone = frames.draw(replace(asked, comparison=names.ALONE, mode=names.ERROR), pose, coarse=False)
+    assert abs(alone[:64, (alone.shape[1] - 96) // 2 :][:, :96].astype(int) - error).max() <= 1
+
+
+def test_a_photo_is_shown_only_where_it_was_taken(gaussians, scene_cameras):
+    name, camera = list(scene_cameras.by_name.items())[3]
+    frames, pose = _frames(gaussians, scene_cameras), _pose_at(camera)
+    asked = replace(PLAIN, camera=name, comparison=names.SLIDER)
+    assert frames.compared(asked, pose) is camera
+    moved = np.asarray(pose.position) + [0.02 * scene_cameras.size, 0, 0]
+    turn = Rotation.from_matrix(camera.R) * Rotation.from_rotvec([0, 0.005, 0])
+    turned = tuple(np.roll(turn.as_quat(), 1))
+    for other in (replace(pose, position=tuple(moved)), replace(pose, wxyz=turned)):
+        assert frames.compared(asked, other) is None
+    assert frames.compared(replace(asked, camera="no such"), pose) is None
+    assert frames.compared(replace(asked, comparison=names.ALONE), pose) is None
+
+
+def test_a_slider_draws_nothing_again_until_the_model_changes(gaussians, scene_cameras, monkeypatch):
+    name, camera = next(iter(scene_cameras.by_name.items()))
+    frames, asked = _frames(gaussians, scene_cameras), replace(PLAIN, camera=name, comparison=names.SLIDER)
+    drawn = []
+    monkeypatch.setattr("viewing.frames.render", lambda *a, **k: (drawn.append(1), render(*a, **k))[1])
+    for slider, version in ((0.1, 1), (0.2, 1), (0.9, 1), (0.9, 2)):
+        frames.draw(replace(asked, slider=slider), _pose_at(camera), False, version)
+    assert len(drawn) == 2
+
+
+@pytest.mark.parametrize("share", [STILL, MOVING])
+@pytest.mark.parametrize("cost", [0.001, 0.05, 2.0])
+def test_frames_take_no_more_than_their_share_of_the_time(share, cost):
+    clock, spent, count = Clock(), 0.0, 0
+    budget, step = Budget(clock), 0.004
+    end = clock.now + 60
+    while clock.now < end:
+        clock.now += step
+        if budget.allows(share):
+            began = clock.now
+            clock.now += cost
+            budget.spent(began, cost)
+            spent, count = spent + cost, count + 1
+    assert spent <= share * 60 + cost
+    assert count <= 30 * 60 + 1
+    assert spent >= 0.8 * min(share * 60, 25 * 60 * cost)  # nor much less than may be taken
+
+
+def test_a_browser_that_moves_gets_coarse_frames_and_then_a_sharp_one():
+    clock = Clock()
+    watchers = Watchers(clock)
+    assert not watchers.any and watchers.next() is None
+    watchers.moved(7, FRONT)
+    first = watchers.next()
+    assert watchers.any and not first.coarse and first.urgent and first.asked == clock.now
+    watchers.drew(first)
+    assert watchers.next() is None
+    clock.now += 1
+    watchers.moved(7, replace(FRONT, fov=0.7))
+    moving = watchers.next()
+    assert moving.coarse and moving.urgent and moving.pose.fov == 0.7
+    watchers.drew(moving)
+    assert watchers.next() is None
+    clock.now += STILL_AFTER + 0.01
+    still = watchers.next()
+    assert not still.coarse and still.urgent
+    watchers.drew(still)
+    assert watchers.next() is None
+    watchers.left(7)
+    assert not watchers.any
+
+
+def test_a_model_that_changes_is_shown_to_all_who_look_and_nobody_waits_for_it():
+    clock = Clock()
+    watchers = Watchers(clock)
+    for client in (1, 2):
+        watchers.moved(client, FRONT)
+        watchers.drew(watchers.next(5), 5)
+        clock.now += 1
+    assert watchers.next(5) is None
+    wish = watchers.next(6)
+    assert wish.client == 1 and not wish.urgent and not wish.coarse
+    watchers.drew(wish, 6)
+    assert watchers.next(6).client == 2
+    watchers.moved(1, replace(FRONT, fov=0.1))
+    assert watchers.next(6).client == 1  # who waits comes first
+    watchers.drew(watchers.next(6), 6)
+    watchers.changed()
+    assert watchers.next(6).urgent
+
+
+def test_a_movement_while_a_frame_is_drawn_asks_for_another():
+    watchers = Watchers(Clock())
+    watchers.moved(1, FRONT)
+    wish = watchers.next()
+    watchers.moved(1, replace(FRONT, fov=0.5))
+    watchers.drew(wish)
+    assert watchers.next().pose.fov == 0.5
+
+
+def test_what_a_browser_sends_is_checked():
+    sound = {"position": [1, 2, 3], "wxyz": [2, 0, 0, 0], "fov": 1.0, "image_width": 800, "image_height": 600}
+    pose = pose_of(SimpleNamespace(**sound))
+    assert pose == Pose((1.0, 2.0, 3.0), (1.0, 0.0, 0.0, 0.0), 1.0, 800, 600)
+    for wrong in (
+        {"position": [math.nan, 0, 0]}, {"position": [math.inf, 0, 0]}, {"wxyz": [0, 0, 0, 0]}, {"fov": 0.0},
+        {"wxyz": [1e300, 0, 0, 0]}, {"fov": math.pi}, {"fov": math.nan}, {"fov": -1.0},
+    ):  # fmt: skip
+        assert pose_of(SimpleNamespace(**sound | wrong)) is None, wrong
+    for width, height in ((10**9, 10**9), (10**9, 1), (0, 0), (-5, 10**6)):
+        pose = pose_of(SimpleNamespace(**sound | {"image_width": width, "image_height": height}))
+        assert 1 <= pose.width <= 8192 and 1 <= pose.height <= 8192
+        assert 0.09 < pose.width / pose.height < 11
+
+
+def test_cameras_are_named_and_the_view_begins_upright(scene_cameras):
+    assert len(scene_cameras.by_name) == 17
+    assert {name.split()[0] for name in scene_cameras.by_name} == {"train", "test"}
+    assert math.isclose(np.linalg.norm(scene_cameras.up()), 1)
+    for camera in scene_cameras.by_name.values():
+        up = np.asarray(scene_cameras.up_at(camera))
+        assert up @ -camera.R[:, 1] > 0 and abs(up @ camera.R[:, 0]) < 1e-9
+        assert scene_cameras.depth(camera) > 0
+
+
+def test_the_crop_box_begins_around_most_gaussians():
+    positions = torch.randn(5000, 3, generator=torch.Generator().manual_seed(0)) * torch.tensor([1.0, 5.0, 0.1])
+    positions[0], positions[1] = 1e6, math.nan
+    low, high = (torch.tensor(corner) for corner in first_box(positions))
+    share = inside(positions, low.tolist(), high.tolist()).float().mean()
+    assert 0.85 < share < 0.95 and high.max() < 15
+    assert first_box(torch.zeros(0, 3)) == ((-1.0,) * 3, (1.0,) * 3)
+
+
+class Control(SimpleNamespace):
+    """A stand-in for any control of viser."""
+
+    def on_click(self, call) -> None:
+        self.click = call
+
+
+class Gui:
+    """A stand-in for viser's controls."""
+
+    def __getattr__(self, name: str):
+        def add(label: str, *values: object, **_: object) -> Control:
+            return Control(label=label, value=values[0] if values else None)
+
+        return add
+
+
+@pytest.fixture
+def path_tab(tmp_path) -> PathTab:
+    tab = PathTab(SimpleNamespace(gui=Gui()), tmp_path)
+    tab.easing.value = "smooth"
+    return tab
+
+
+def _client(**changes: object) -> SimpleNamespace:
+    camera = {"position": [1, 2, 3], "wxyz": [0, 1, 0, 0], "fov": 1.0, "image_width": 4, "image_height": 3}
+    return SimpleNamespace(camera=SimpleNamespace(**camera | changes))
+
+
+def test_a_recorded_path_is_read_by_what_renders_it(path_tab, tmp_path):
+    path_tab.add(_client())
+    path_tab.seconds.value = 1.5
+    path_tab.add(_client(position=[4, 5, 6]))
+    path_tab.add(_client(position=[math.nan] * 3))  # cannot be drawn, so is no keyframe
+    path = read_camera_path(path_tab.save("fly_1-a"))
+    assert path.seconds == 1.5 and path.easing == "smooth"
+    assert [frame.position for frame in path.keyframes] == [(1.0, 2.0, 3.0), (4.0, 5.0, 6.0)]
+    assert math.isclose(path.keyframes[0].fov, math.degrees(1.0)) and path.keyframes[0].wxyz == (0.0, 1.0, 0.0, 0.0)
+    assert [file.name for file in tmp_path.rglob("*.json")] == ["fly_1-a.json"]
+    assert PathTab(SimpleNamespace(gui=Gui()), tmp_path).name.value == "path1"
+
+
+@pytest.mark.parametrize("name", ["", "..", "../a", "a/b", "a\\b", "/etc/x", "a.json", "a\0b", "ä", "a\n", "x" * 65])
+def test_no_name_leads_out_of_the_folder(path_tab, tmp_path, name):
+    for _ in range(2):
+        path_tab.add(_client())
+    with pytest.raises(UserError, match="the name of a path"):
+        path_tab.save(name)
+    assert not list(tmp_path.rglob("*"))
+
+
+def test_a_path_needs_two_views(path_tab):
+    path_tab.add(_client())
+    with pytest.raises(UserError, match="at least 2 keyframes"):
+        path_tab.save("short")

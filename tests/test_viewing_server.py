@@ -1,0 +1,300 @@
+"""The viewer's server: who may connect, what a request can reach, and the page over a websocket."""
+
+import argparse
+import http.client
+import re
+import socket
+import sys
+import threading
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+from gaussians import model, pipeline
+from synthetic import make_colmap_scene
+
+viser = pytest.importorskip("viser", reason="viser is not installed: pip install '.[viewer]'")
+
+from websockets.exceptions import InvalidStatus  # noqa: E402
+
+from arguments import ModelParams  # noqa: E402
+from benchmarks.workloads.viser_client import Client  # noqa: E402
+from scene import Scene  # noqa: E402
+from utils.system_utils import UserError  # noqa: E402
+from viewing import server as servers  # noqa: E402
+from viewing.gate import is_loopback  # noqa: E402
+from viewing.options import Address  # noqa: E402
+from viewing.page import Page  # noqa: E402
+from viewing.saved import answer  # noqa: E402
+
+ANY = Address("127.0.0.1", 0)
+
+
+@pytest.fixture(scope="module")
+def local():
+    served = servers.serve(ANY, "test")
+    yield served
+    servers.stop(served.server)
+
+
+@pytest.fixture(scope="module")
+def public():
+    """A server on all addresses, which needs a token."""
+    served = servers.serve(Address("0.0.0.0", 0), "test")
+    yield served
+    servers.stop(served.server)
+
+
+def _get(port: int, path: str, **headers: str) -> tuple[int, str, bytes]:
+    """Status, cookie and body of a request whose path and headers are sent as they are."""
+    given = {"Host": f"127.0.0.1:{port}"} | {name.replace("_", "-"): value for name, value in headers.items()}
+    lines = [f"GET {path} HTTP/1.1", *(f"{name}: {value}" for name, value in given.items())]
+    with socket.create_connection(("127.0.0.1", port), 10) as asked:
+        asked.sendall("\r\n".join([*lines, "", ""]).encode("latin-1"))
+        answered = http.client.HTTPResponse(asked)
+        answered.begin()
+        return answered.status, answered.headers, answered.read()
+
+
+def test_the_page_is_served_and_may_ask_nobody_else(local):
+    status, headers, body = _get(local.server.get_port(), "/")
+    assert status == 200 and b"<html" in body
+    policy = headers["Content-Security-Policy"]
+    own = rf"(ws|wss)://127\.0\.0\.1:{local.server.get_port()}"
+    sources = {word for part in policy.split(";") for word in part.split()[1:]}
+    outside = {word for word in sources if not re.fullmatch(rf"'[a-z-]+'|data:|blob:|{own}", word)}
+    assert "default-src 'self'" in policy and not outside
+    assert headers["Referrer-Policy"] == "no-referrer"
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "/../../etc/passwd", "/..%2f..%2f..%2f..%2f..%2f..%2fetc/passwd", "/%2e%2e/%2e%2e/%2e%2e/%2e%2e/etc/passwd",
+        "//etc/passwd", "/%2fetc%2fpasswd", "/..\\..\\etc\\passwd", "/%2e%2e%5c%2e%2e%5cetc%5cpasswd",
+        "/....//....//etc/passwd", "/%252e%252e/etc/passwd", "/./.././../etc/passwd", "/etc/passwd%00", "/\x00",
+        "http://127.0.0.1/../../etc/passwd", "/index.html/../../../_viser.py", "/assets/../../../_viser.py",
+        "/index.html%00.png", "/?../../etc/passwd=1",
+    ],
+)  # fmt: skip
+def test_no_request_reads_a_file_but_the_page(local, path):
+    try:
+        status, _, body = _get(local.server.get_port(), path)
+    except (http.client.HTTPException, OSError):
+        return  # the connection was closed without an answer
+    page = _get(local.server.get_port(), "/")[2]
+    assert status != 200 or body == page
+    assert b"root:" not in body and b"import " not in body[:2000]
+
+
+def test_nobody_else_than_this_machine_is_served_on_loopback(local):
+    port = local.server.get_port()
+    for host, status in (
+        (f"127.0.0.1:{port}", 200), ("localhost:9999", 200), ("[::1]:1", 200), ("evil.example", 403),
+        (f"evil.example:{port}", 403), ("127.0.0.1.evil.example", 403), ("", 403), ("[", 403),
+    ):  # fmt: skip
+        assert _get(port, "/", Host=host)[0] == status, host
+
+
+@pytest.mark.parametrize(
+    ("origin", "welcome"),
+    [("own", True), (None, True), ("http://evil.example", False), ("null", False), ("http://127.0.0.1:1", False)],
+)
+def test_pages_of_other_origins_open_no_websocket(local, origin, welcome):
+    if origin == "own":
+        origin = local.url.rstrip("/")
+    if welcome:
+        with Client(local.url, origin) as client:
+            assert client.messages()
+    else:
+        with pytest.raises(InvalidStatus, match="403"):
+            Client(local.url, origin)
+
+
+def test_other_addresses_need_the_token(public, capfd):
+    port, token = public.server.get_port(), public.url.split("token=")[1]
+    url = f"http://127.0.0.1:{port}/"
+    for path in ("/", "/?token=", f"/?token={token[:-1]}", f"/?token={token}x", f"/{token}", "/index.html?token=1"):
+        status, headers, body = _get(port, path)
+        assert status == 403 and token.encode() not in body and headers["Set-Cookie"] is None, path
+    for cookie in ("", f"viewer_token_{port}=no", f"viewer_token_1={token}", f"other={token}", "a;b=;;"):
+        with pytest.raises(InvalidStatus, match="403"):
+            Client(url, headers={"Cookie": cookie})
+    status, headers, _ = _get(port, f"/?token={token}")
+    assert status == 200
+    cookie = headers["Set-Cookie"]
+    assert "HttpOnly" in cookie and "SameSite=Strict" in cookie
+    with Client(url, headers={"Cookie": cookie.split(";")[0]}) as client:
+        assert client.messages()
+
+
+def test_the_token_is_new_each_time_and_printed_with_a_warning(capfd):
+    urls = []
+    for _ in range(2):
+        served = servers.serve(Address("0.0.0.0", 0), "test")
+        servers.stop(served.server)
+        said = capfd.readouterr()
+        assert f"viewer: {served.url}\n" in said.err and "every machine that reaches 0.0.0.0" in said.err
+        assert not said.out
+        urls.append(served.url)
+    assert len({url.split("token=")[1] for url in urls}) == 2 and all(len(url) > 60 for url in urls)
+
+
+def test_one_line_says_where_a_page_on_loopback_is(capfd):
+    served = servers.serve(ANY, "test")
+    servers.stop(served.server)
+    said = capfd.readouterr()
+    assert said.err == f"viewer: http://127.0.0.1:{served.server.get_port()}/\n" and not said.out
+
+
+def test_loopback_is_told_from_other_addresses():
+    assert all(map(is_loopback, ("127.0.0.1", "127.3.2.1", "::1", "localhost")))
+    assert not any(map(is_loopback, ("0.0.0.0", "::", "", "192.168.0.1", "localhost.evil.example", "127.0.0.1.evil")))
+
+
+def test_a_taken_port_is_passed_over_and_told(capfd):
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        served = servers.serve(Address("127.0.0.1", port), "test")
+        servers.stop(served.server)
+    assert served.server.get_port() > port
+    assert f":{served.server.get_port()}/ (port {port} is taken)" in capfd.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("host", "port", "reason"),
+    [
+        ("no.such.host.invalid", 8080, "cannot listen at no.such.host.invalid"),
+        ("198.51.100.7", 8080, "cannot listen at 198.51.100.7"),
+        ("a" * 80, 8080, "cannot listen"),
+        ("127.0.0.1", 70000, "between 0 .any. and 65535, got 70000"),
+        ("127.0.0.1", -1, "between 0"),
+    ],
+)
+def test_an_address_that_cannot_be_listened_at_is_refused_at_once(host, port, reason):
+    with pytest.raises(UserError, match=reason):
+        servers.checked_address(host, port)
+
+
+def test_the_last_port_may_be_taken():
+    with socket.create_server(("127.0.0.1", 65535)), pytest.raises(UserError, match="port 65535 .* taken"):
+        servers.checked_address("127.0.0.1", 65535)
+
+
+def test_without_viser_a_sentence_says_what_to_install(monkeypatch):
+    monkeypatch.setitem(sys.modules, "viser", None)
+    with pytest.raises(UserError, match=re.escape("pip install '.[viewer]'")):
+        servers.checked_address("127.0.0.1", 8080)
+    assert servers.checked_address("127.0.0.1", None) is None
+
+
+def test_a_server_that_asks_no_gate_does_not_stay(monkeypatch):
+    stopped = []
+    monkeypatch.setattr("viewing.gate.Gate.in_front_of_viser", lambda self: threading.Lock())
+    monkeypatch.setattr(servers, "stop", lambda server, stop=servers.stop: (stopped.append(server), stop(server)))
+    with pytest.raises(UserError, match="cannot be guarded"):
+        servers.serve(ANY, "test")
+    assert len(stopped) == 1
+
+
+def test_a_browser_that_asks_for_a_tunnel_gets_none(local, monkeypatch):
+    opened = []
+    monkeypatch.setattr(viser._viser, "ViserTunnel", lambda *_: opened.append(1))
+    with Client(local.url) as client:
+        client.look()
+        client.send("ShareUrlRequest")
+        client.send("GuiFormSubmitMessage", uuid="none")  # an answer to it says that the other has been read
+        client.look()
+        local.server.gui.add_text("heard", "")
+        assert client.until("GuiTextMessage")
+    assert not opened and local.server._share_tunnel is None
+
+
+@pytest.fixture(scope="module")
+def page(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("page")
+    make_colmap_scene(folder / "scene")
+    given = argparse.Namespace(source_path=str(folder / "scene"), model_path=str(folder / "out"), eval=True)
+    options = ModelParams(argparse.ArgumentParser()).extract(given)
+    scene = Scene(options, model(200), shuffle=False, start=False)
+    shown = Page(ANY, scene, pipeline(), False, False)
+    yield shown
+    shown.stop()
+
+
+def _answered(page: Page, client: Client):
+    """The picture that a client gets when it is the page's turn."""
+    deadline = 100
+    while not answer(page) and deadline:
+        deadline -= 1
+    return client.picture()
+
+
+def test_pictures_follow_the_camera_of_each_browser(page):
+    with Client(page.url) as one, Client(page.url) as other:
+        one.look(size=(120, 80))
+        first = _answered(page, one)
+        assert first.shape == (160, 240, 3) and first.std() > 5
+        other.look((0.5, 0.0, -4.0), size=(60, 60))
+        assert _answered(page, other).shape == (120, 120, 3)
+        one.look((1.5, 0.0, -4.0), size=(120, 80))
+        coarse = _answered(page, one)
+        assert coarse.shape == (40, 60, 3)
+        sharp = _answered(page, one)
+        assert sharp.shape == (160, 240, 3) and abs(sharp.astype(int) - first).mean() > 3
+        assert len(page.latency) == 3 and all(0 < seconds < 5 for seconds in page.latency)
+    deadline = 200
+    while page.watchers.any and deadline:
+        deadline -= 1
+        page.watchers.wait(0.05)
+    assert not page.watchers.any
+
+
+def test_hostile_messages_neither_stop_the_page_nor_make_large_pictures(page):
+    with Client(page.url) as client:
+        client.look(size=(10**6, 10**6))
+        assert max(_answered(page, client).shape) <= 1600
+        for wrong in ({"position": [float("nan")] * 3}, {"fov": 0.0}, {"wxyz": [0.0] * 4}):
+            client.look(**wrong)
+        client.look((0.0, 0.0, -5.0), size=(64, 64))
+        assert _answered(page, client).shape[0] in (32, 128)
+    page.view.scaling.value = float("nan")
+    page.view.background.value = (999, -5, 0)
+    page.view.mode.value = "no such mode"
+    settings = page.settings()
+    assert settings.scaling == 1.0 and settings.background == (1.0, 0.0, 0.0)
+    page.view.scaling.value, page.view.mode.value, page.view.background.value = 1.0, "Colour", (0, 0, 0)
+
+
+def test_no_request_writes_outside_of_the_models_folder(page, tmp_path):
+    """A browser names the path; the file that is written lies in the model's folder, or there is none."""
+    before = set(tmp_path.parent.rglob("*.json"))
+    page.path.keyframes.clear()
+    with Client(page.url) as client:
+        client.look()
+        _answered(page, client)
+        handle = next(iter(page.server.get_clients().values()))
+        page.path.add(handle)
+        page.path.add(handle)
+    page.path.name.value = "../../../escaped"
+    page.path._save(None)
+    page.path.name.value = "inside"
+    page.path._save(None)
+    assert not list(Path(page.path._folder).parents[2].rglob("*escaped*"))
+    assert (page.path._folder / "inside.json").is_file()
+    assert set(tmp_path.parent.rglob("*.json")) - before <= {page.path._folder / "inside.json"}
+
+
+def test_addresses_of_ipv6_are_written_in_brackets(capfd):
+    try:
+        socket.create_server(("::1", 0), family=socket.AF_INET6).close()
+    except OSError:
+        pytest.skip("this machine has no IPv6")
+    served = servers.serve(Address("::1", 0), "test")
+    servers.stop(served.server)
+    assert served.url == f"http://[::1]:{served.server.get_port()}/"
+
+
+def test_clients_of_a_stopped_page_do_not_matter():
+    stood_in = SimpleNamespace(get_clients=dict)
+    Page.send(SimpleNamespace(server=stood_in), SimpleNamespace(client=3), None)

@@ -1,0 +1,42 @@
+"""Show a trained model on a web page that this process serves.
+
+python view.py -m MODEL [--iteration N] [--port PORT]
+"""
+
+from __future__ import annotations
+
+if __name__ == "__main__":
+    import utils.host.early  # noqa: F401  (before the other imports, which take a second)
+
+import utils.host.openmp  # noqa: F401  isort: skip  (before torch)
+
+from arguments import ModelParams, OptionParser, PipelineParams, get_combined_args, warn_of_background
+from scene.saved_model import load_saved
+from utils.general_utils import safe_state
+from utils.system_utils import UserError, run_cli
+from viewing.options import PORT, add_host_option
+from viewing.saved import serve_saved
+from viewing.server import checked_address
+
+
+def main() -> None:
+    parser = OptionParser(description="Show a trained model on a web page, until Ctrl-C.")
+    model_params = ModelParams(parser, sentinel=True)
+    pipeline_params = PipelineParams(parser, sentinel=True)
+    parser.add_argument("--iteration", type=int, default=-1, help="saved iteration to show (default: -1, the last)")
+    parser.add_argument("--port", type=int, default=PORT, help=f"port of the page, 0: any (default: {PORT})")
+    add_host_option(parser)
+    parser.add_argument("--quiet", action="store_true", help="print nothing to stdout (default: off)")
+    args = get_combined_args(parser)
+    options, pipeline = model_params.extract(args), pipeline_params.extract(args)
+    place = checked_address(args.viewer_host, args.port)
+    safe_state(args.quiet)
+    warn_of_background(options)
+    scene = load_saved(options, args.iteration, args.typed_sh_degree)
+    if len(scene.gaussians) == 0:
+        raise UserError(f"iteration {scene.loaded_iter} of {scene.model_path} has no Gaussians; train it again")
+    serve_saved(place, scene, pipeline, options.white_background, options.train_test_exp)
+
+
+if __name__ == "__main__":
+    run_cli(main)

@@ -1,0 +1,9 @@
+"""The web page that shows a model, during its training or from its folder.
+
+settings, frames, tints     a frame: what the controls ask for, and the picture for it
+model_part                  the part of a model that a frame shows
+budget, watchers            when to draw: share of time, cameras of the browsers
+gate, server, options       who may connect, and where
+page, view_tab, path_tab, training_tab, scene_cameras     the controls
+saved                       the page of a saved model
+"""

@@ -1,0 +1,123 @@
+"""The picture of a frame: what the settings ask for, from a pose."""
+
+import argparse
+from dataclasses import replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gaussian_renderer import render
+from gaussian_renderer.free_view import free_view
+from gaussian_renderer.walked import gaussians_walked
+from scene.cameras import Camera, MiniCam
+from scene.gaussian_model import GaussianModel
+from utils.image_utils import as_float
+from viewing import tints
+from viewing.model_part import shown_part
+from viewing.scene_cameras import SceneCameras, canvas
+from viewing.settings import ALONE, BESIDE, COLOUR, COUNT, DEPTH, ERROR, OPACITY, Pose, Settings
+
+LONGEST = 1600  # pixels of a frame's longer side, at most
+COARSE = 2  # a frame of a moving camera has a quarter of the pixels
+_BORDER = 0.15  # grey around a photo that does not fill the window
+_LINE = 2  # pixels of the slider's line
+
+
+class Frames:
+    """Draws frames of a model. with_exposures: as `use_trained_exp` of `render`, for a picture beside its photo.
+
+    Used by one thread. Nothing of the model changes.
+    """
+
+    def __init__(
+        self, gaussians: GaussianModel, cameras: SceneCameras, pipe: argparse.Namespace, with_exposures: bool
+    ) -> None:
+        self._gaussians = gaussians
+        self._cameras = cameras
+        self._pipe = pipe
+        self._with_exposures = with_exposures
+        self._compared: tuple[object, tuple[Tensor, Tensor]] = (None, ())
+
+    @torch.no_grad()
+    def draw(self, settings: Settings, pose: Pose, coarse: bool, version: int = 0) -> np.ndarray:
+        """A frame (H, W, 3) uint8, of the window's aspect.
+
+        version: changes with the model, because a photo and its render are kept while a slider moves.
+        """
+        camera = self.compared(settings, pose)
+        if camera is None:
+            return _bytes(self._free(settings, pose, coarse))
+        key = replace(settings, slider=0, comparison=ALONE), version
+        if self._compared[0] != key:
+            self._compared = key, self._pair(settings, camera)
+        return _bytes(_fitted(_composed(settings, *self._compared[1]), pose))
+
+    def compared(self, settings: Settings, pose: Pose) -> Camera | None:
+        """The scene's camera whose photo this frame shows, None: no photo."""
+        camera = self._cameras.by_name.get(settings.camera)
+        wanted = camera is not None and (settings.comparison != ALONE or settings.mode == ERROR)
+        return camera if wanted and self._cameras.stands_at(pose, camera) else None
+
+    def _free(self, settings: Settings, pose: Pose, coarse: bool) -> Tensor:
+        scale = min(1.0, LONGEST / max(pose.width, pose.height)) / (COARSE if coarse else 1)
+        width, height = (max(1, round(side * scale)) for side in (pose.width, pose.height))
+        view = free_view(width, height, pose.fov, pose.position, pose.wxyz, self._gaussians.get_xyz.device)
+        return self._picture(settings, view)
+
+    def _pair(self, settings: Settings, camera: Camera) -> tuple[Tensor, Tensor]:
+        """The photo and the picture beside it, (3, H, W) in [0, 1]."""
+        photo = as_float(camera.target(self._background(settings)))
+        return photo, self._picture(settings, camera, photo)
+
+    def _background(self, settings: Settings) -> Tensor:
+        return self._gaussians.get_xyz.new_tensor(settings.background)
+
+    def _picture(self, settings: Settings, view: Camera | MiniCam, photo: Tensor | None = None) -> Tensor:
+        """The mode's picture (3, H, W) in [0, 1]. Without a photo there is no error, and the colour is drawn."""
+        part = shown_part(self._gaussians, settings)
+        if settings.mode == COUNT:
+            return tints.tinted_counts(gaussians_walked(view, part, self._pipe, settings.scaling))
+        options = {"scaling_modifier": settings.scaling, "want_visibility": False}
+        if settings.mode in (DEPTH, OPACITY):
+            black, white = part.get_xyz.new_zeros(3), part.get_xyz.new_ones(len(part), 3)
+            drawn = render(view, part, self._pipe, black, override_color=white, **options)
+            alpha = drawn["render"][:1]
+            return tints.tinted_depth(drawn["depth"], alpha) if settings.mode == DEPTH else alpha.expand(3, -1, -1)
+        options |= {"want_depth": False, "use_trained_exp": self._with_exposures and photo is not None}
+        colour = render(view, part, self._pipe, self._background(settings), **options)["render"]
+        return tints.error_of(photo, colour) if settings.mode == ERROR and photo is not None else colour
+
+
+def _composed(settings: Settings, photo: Tensor, picture: Tensor) -> Tensor:
+    if settings.comparison == ALONE:
+        return picture
+    if settings.comparison == BESIDE:
+        panels = [photo, picture]
+        if settings.mode == COLOUR:
+            panels.append(tints.error_of(photo, picture))
+        return torch.cat(panels, dim=2)
+    width = photo.shape[2]
+    column = round(min(max(settings.slider, 0.0), 1.0) * width)
+    composed = torch.cat([photo[:, :, :column], picture[:, :, column:]], dim=2)
+    if 0 < column < width:
+        composed[:, :, max(0, column - _LINE // 2) : column + _LINE // 2] = 1.0
+    return composed
+
+
+def _fitted(picture: Tensor, pose: Pose) -> Tensor:
+    """The picture in the middle of a canvas of the window's aspect, not larger than LONGEST."""
+    shrink = max(picture.shape[1:]) / LONGEST
+    if shrink > 1:
+        size = [max(1, round(side / shrink)) for side in picture.shape[1:]]
+        picture = torch.nn.functional.interpolate(picture[None], size, mode="area")[0]
+    height, width = picture.shape[1:]
+    wide, high = canvas(width, height, pose.width / pose.height)
+    fitted = picture.new_full((3, high, wide), _BORDER)
+    top, left = (high - height) // 2, (wide - width) // 2
+    fitted[:, top : top + height, left : left + width] = picture
+    return fitted
+
+
+def _bytes(picture: Tensor) -> np.ndarray:
+    return (picture.clamp(0, 1) * 255 + 0.5).to(torch.uint8).permute(1, 2, 0).contiguous().cpu().numpy()

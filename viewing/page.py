@@ -1,0 +1,121 @@
+"""The page: its server, its tabs, and the browsers that watch."""
+
+import argparse
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from scene.scene import Scene
+from viewing import server as servers
+from viewing.frames import LONGEST, Frames
+from viewing.options import Address
+from viewing.path_tab import PathTab
+from viewing.photos_tab import PhotosTab
+from viewing.poses import pose_of
+from viewing.scene_cameras import SceneCameras, center
+from viewing.settings import Settings
+from viewing.view_tab import ViewTab
+from viewing.watchers import Watchers, Wish
+
+if TYPE_CHECKING:
+    import viser
+
+_SENT = 0.1  # seconds in which a message is sent
+_COARSE_QUALITY, _FULL_QUALITY = 70, 95  # of the JPEG
+
+
+class Page:
+    """A web page that shows the model of a scene. watchers: who looks, and which frame comes next.
+
+    tabs: the group of tabs, to which others can be added. latency: seconds from a change to the sent picture, of the
+    last frames.
+    """
+
+    def __init__(
+        self, address: Address, scene: Scene, pipe: argparse.Namespace, white: bool, with_exposures: bool
+    ) -> None:
+        """Start to listen. UserError if that cannot be done. white: the background at first, else black."""
+        gaussians = scene.gaussians
+        self._cameras = SceneCameras(scene.getTrainCameras(), scene.getTestCameras())
+        self._frames = Frames(gaussians, self._cameras, pipe, with_exposures)
+        self.watchers = Watchers()
+        self.latency: list[float] = []
+        self.server, self.url = servers.serve(address, Path(scene.model_path).resolve().name)
+        gui = self.server.gui
+        self.iteration = gui.add_text("Iteration", str(scene.loaded_iter or 0), disabled=True)
+        self.count = gui.add_text("Gaussians", f"{len(gaussians):,}", disabled=True)
+        self.tabs = gui.add_tab_group()
+        positions, degree = gaussians.get_xyz, gaussians.max_sh_degree
+        with self.tabs.add_tab("View"):
+            background = (1.0, 1.0, 1.0) if white else (0.0, 0.0, 0.0)
+            self.view = ViewTab(self.server, self.watchers.changed, positions, degree, background)
+        with self.tabs.add_tab("Photos"):
+            self.photos = PhotosTab(self.server, self.watchers.changed, self._cameras)
+        with self.tabs.add_tab("Path"):
+            self.path = PathTab(self.server, Path(scene.model_path))
+        self._begin_at_first_camera()
+        self.server.on_client_connect(self._came)
+        self.server.on_client_disconnect(self._left)
+
+    def _begin_at_first_camera(self) -> None:
+        self.server.scene.set_up_direction(self._cameras.up())
+        camera, initial = self._cameras.first, self.server.initial_camera
+        if camera is not None:
+            initial.position = center(camera)
+            initial.look_at = center(camera) + camera.R[:, 2] * self._cameras.depth(camera)
+            initial.up = self._cameras.up_at(camera)
+            initial.fov = camera.FoVy
+        initial.near, initial.far = 1e-3 * self._cameras.size, 1e3 * self._cameras.size
+
+    # Coroutines, so that viser calls them one after the other: a browser that has left stays away.
+    async def _came(self, client: "viser.ClientHandle") -> None:
+        async def moved(camera: "viser.CameraHandle") -> None:
+            pose = pose_of(camera)
+            if pose is not None:
+                self.watchers.moved(client.client_id, pose)
+
+        await moved(client.camera)
+        client.camera.on_update(moved)
+
+    async def _left(self, client: "viser.ClientHandle") -> None:
+        self.watchers.left(client.client_id)
+
+    def settings(self) -> Settings:
+        """What the controls say now."""
+        return self.photos.read(self.view.read())
+
+    def draw(self, wish: Wish, version: int = 0) -> np.ndarray:
+        """The frame (H, W, 3) uint8 of a wish, which then is fulfilled. version: of the model."""
+        self.watchers.drew(wish, version)
+        return self._frames.draw(self.settings(), wish.pose, wish.coarse, version)
+
+    def send(self, wish: Wish, image: np.ndarray) -> None:
+        """Send a drawn frame to its browser, if that has not left."""
+        client = self.server.get_clients().get(wish.client)
+        if client is None:
+            return
+        if not wish.coarse and max(image.shape) <= LONGEST // 2:
+            image = image.repeat(2, axis=0).repeat(2, axis=1)  # JPEG halves the resolution of colours
+        quality = _COARSE_QUALITY if wish.coarse else _FULL_QUALITY
+        client.scene.set_background_image(image, "jpeg", jpeg_quality=quality)
+        if wish.asked is not None:
+            self.latency = [*self.latency[-999:], time.perf_counter() - wish.asked]
+
+    def show_numbers(self, iteration: int, gaussians: int) -> None:
+        """Show the iteration and the number of Gaussians."""
+        self.iteration.value, self.count.value = f"{iteration:,}", f"{gaussians:,}"
+
+    def tell(self, title: str, body: str) -> None:
+        """Show a notification to all, and wait until it has probably been sent."""
+        clients = self.server.get_clients().values()
+        for client in clients:
+            client.add_notification(title, body)
+            client.flush()
+        if clients:
+            time.sleep(_SENT)
+
+    def stop(self) -> None:
+        """Stop to listen."""
+        servers.stop(self.server)
