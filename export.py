@@ -39,8 +39,8 @@ from utils.general_utils import safe_state
 from utils.system_utils import UserError, compute_device, run_cli
 
 if TYPE_CHECKING:  # SciPy takes a while to import
-    from camera_paths.moments import TimedPath
-    from camera_paths.poses import Poses
+    from moving_cameras.moments import TimedPath
+    from moving_cameras.poses import Poses
 
 
 def load(args: argparse.Namespace, options: argparse.Namespace, want_views: bool) -> tuple[Splats, Scene | None]:
@@ -124,7 +124,7 @@ def _path_maker(path: str | None, entry: Format) -> Callable[[Poses], TimedPath]
         return None
     if not entry.of_scene:
         raise UserError(f"--path is the animation of a page; leave it out for {entry.ending}, or end --to with .html")
-    from camera_paths.request import path_maker
+    from moving_cameras.request import path_maker
 
     return path_maker(path)
 

@@ -9,7 +9,7 @@ which not every pixel counts, and render_times.json beside these folders: the ti
 is idle before the clock starts, and done when it stops. --depth and --alpha write inverse depth and alpha into folders
 of these names, 16-bit PNGs with their scale in a text chunk (utils/files/plane_files.py).
 
-With --path, writes MODEL/videos/ours_N/NAME.mp4 instead (camera_paths/render_path.py).
+With --path, writes MODEL/videos/ours_N/NAME.mp4 instead (moving_cameras/render_path.py).
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ from PIL import Image
 from tqdm import tqdm
 
 from arguments import ModelParams, OptionParser, PipelineParams, get_combined_args, warn_of_background
-from camera_paths.options import add_path_options, wants_path
 from exports.in_scene import load_file
 from gaussian_renderer.memory_errors import memory_errors_explained
 from gaussian_renderer.scored_views import ScoredViews
 from gaussian_renderer.view_planes import PLANES, view_planes
+from moving_cameras.options import add_path_options, wants_path
 from records import render_times
 from scene.cameras import Camera
 from scene.gaussian_model import GaussianModel
@@ -196,8 +196,8 @@ def main() -> None:
     safe_state(args.quiet)
     warn_of_background(options)
     if wants_path(args):
-        from camera_paths.render_path import render_path  # SciPy takes a while to import
-        from camera_paths.request import path_request
+        from moving_cameras.render_path import render_path  # SciPy takes a while to import
+        from moving_cameras.request import path_request
 
         request = path_request(args)
         scene, background = _loaded(options, args.iteration, args.typed_sh_degree, args.ply, pipeline)

@@ -11,13 +11,13 @@ from typing import Any
 
 import jinja2
 
-from camera_paths.moments import TimedPath
-from camera_paths.poses import Poses, poses_of
 from exports.compressed_ply import write_compressed_ply
 from exports.splats import Splats
 from exports.upright import turn_upright, turned, up_of
 from exports.vendor import FOLDER, RECORD
 from exports.viewer_settings import settings
+from moving_cameras.moments import TimedPath
+from moving_cameras.poses import Poses, poses_of
 from scene.cameras import Camera
 from scene.scene import Scene
 from utils.files.json_files import read_json
@@ -76,7 +76,7 @@ def write_scene_html(
     """Write the page of splats from a scene's model, with its training views, as `write_html` does.
 
     white_background: whether it was trained with -w. make_path: the animation from the training views' poses, as of
-    camera_paths/request.py.
+    moving_cameras/request.py.
     """
     cameras = scene.getTrainCameras()
     camera_path = make_path(poses_of(cameras)) if make_path and cameras else None

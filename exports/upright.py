@@ -4,8 +4,8 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from camera_paths.poses import Poses
 from exports.splats import Splats
+from moving_cameras.poses import Poses
 from utils.sh_utils import sh_basis
 
 UP = np.array([0.0, -1.0, 0.0])  # of the turned model, as in a usual capture

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from camera_paths.focus import focus_point
-from camera_paths.moments import TimedPath
-from camera_paths.poses import Poses
+from moving_cameras.focus import focus_point
+from moving_cameras.moments import TimedPath
+from moving_cameras.poses import Poses
 
 BOOKMARKS = 25  # the viewer's own limit of annotations
 _TITLE = 60  # and of letters in their titles

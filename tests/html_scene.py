@@ -5,9 +5,9 @@ import math
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from camera_paths.poses import facing, to_wxyz
 from exports.splats import Splats
 from gaussian_renderer.free_view import free_view
+from moving_cameras.poses import facing, to_wxyz
 from scene.cameras import MiniCam
 from utils.sh_utils import C0
 

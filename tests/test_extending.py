@@ -31,15 +31,14 @@ ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs" / "inside" / "extending.md"
 CODE = (
     "arguments",
-    "camera_paths",
     "exports",
     "gaussian_renderer",
+    "moving_cameras",
     "records",
     "scene",
-    "viewing",
-    "camera_paths",
     "training",
     "utils",
+    "viewing",
     "train.py",
     "render.py",
     "pyproject.toml",

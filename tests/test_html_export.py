@@ -17,10 +17,6 @@ from gaussians import pipeline
 from html_scene import CENTRE, FOV, SIZE, UP, balls, cameras
 from scipy.spatial.transform import Rotation
 
-from camera_paths.generated import Ellipse
-from camera_paths.keyframes import CameraPath, Keyframe
-from camera_paths.moments import KeyframePath
-from camera_paths.poses import Poses, facing, poses_of
 from exports import html, vendor
 from exports.compressed_ply import read_compressed_ply
 from exports.html import write_html, write_scene_html
@@ -29,6 +25,10 @@ from exports.upright import turn_upright, turned, up_of
 from exports.viewer_settings import BOOKMARKS, lean, settings
 from gaussian_renderer import render
 from gaussian_renderer.free_view import free_view
+from moving_cameras.generated import Ellipse
+from moving_cameras.keyframes import CameraPath, Keyframe
+from moving_cameras.moments import KeyframePath
+from moving_cameras.poses import Poses, facing, poses_of
 from utils.system_utils import UserError
 
 # Addresses in the viewer's code. It asks for none of them here: those of PlayCanvas and Khronos are in texts, SVG is a

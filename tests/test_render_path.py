@@ -14,9 +14,9 @@ import torch
 from gaussians import model, pipeline
 from PIL import Image
 
-from camera_paths import video
-from camera_paths.keyframes import CameraPath, Keyframe
-from camera_paths.video import video_writer
+from moving_cameras import video
+from moving_cameras.keyframes import CameraPath, Keyframe
+from moving_cameras.video import video_writer
 from utils.system_utils import UserError
 
 imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg", reason="no imageio-ffmpeg: pip install '.[video]'")
@@ -172,7 +172,7 @@ def test_each_generated_path_has_its_name_size_and_length(run, decoder):
 
 
 def test_the_size_of_odd_photos_is_made_even():
-    from camera_paths.render_path import even_size
+    from moving_cameras.render_path import even_size
 
     cases = {(97, 64): (96, 64), (96, 65): (96, 64), (1, 1): (2, 2)}
     for (width, height), size in cases.items():
@@ -195,7 +195,7 @@ def test_the_background_is_the_models_and_exposures_are_not_applied(run, out, tm
 
 def test_the_lens_of_a_photo_is_ignored(run, out, tmp_path):
     """The scene's photos have principal points off centre. A path through a camera shows it centred."""
-    from camera_paths.poses import poses_of
+    from moving_cameras.poses import poses_of
 
     folder = run("--path", "interpolate", "--seconds", "0.5", "--fps", "4", "--frames")
     options = render.ModelParams(render.argparse.ArgumentParser()).extract(
@@ -243,7 +243,7 @@ def _resident() -> int:
 def test_memory_does_not_grow_with_the_length(run, monkeypatch, decoder):
     if not Path("/proc/self/task").is_dir() or not list(Path("/proc/self/task").glob("*/children")):
         pytest.skip("this system does not tell the memory of processes in /proc")
-    from camera_paths import render_path
+    from moving_cameras import render_path
 
     drawn, sizes = render_path.render, []
 
@@ -362,7 +362,7 @@ def test_an_ffmpeg_that_cannot_be_started_is_named(run, tmp_path, monkeypatch):
 
 
 def test_a_lack_of_memory_names_a_smaller_size(run, out, monkeypatch):
-    from camera_paths import render_path
+    from moving_cameras import render_path
 
     def fail(*_, **__):
         raise MemoryError

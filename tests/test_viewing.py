@@ -13,10 +13,10 @@ from scipy.spatial.transform import Rotation
 from synthetic import make_colmap_scene
 
 from arguments import ModelParams
-from camera_paths.keyframes import read_camera_path
 from gaussian_renderer import render
 from gaussian_renderer.free_view import free_view
 from gaussian_renderer.walked import gaussians_walked
+from moving_cameras.keyframes import read_camera_path
 from scene import Scene
 from scene.gaussian_model import GaussianModel
 from utils.system_utils import UserError

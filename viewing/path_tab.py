@@ -5,7 +5,7 @@ import re
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from camera_paths.keyframes import EASINGS, CameraPath, Keyframe
+from moving_cameras.keyframes import EASINGS, CameraPath, Keyframe
 from utils.system_utils import UserError
 from viewing.poses import pose_of
 

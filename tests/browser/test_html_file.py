@@ -3,7 +3,6 @@
 import dataclasses
 import io
 import math
-import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -15,13 +14,13 @@ from gaussians import pipeline
 from html_scene import SIZE, balls, cameras
 from PIL import Image
 
-from camera_paths.generated import Ellipse
-from camera_paths.poses import poses_of
 from evaluation.document import Comparison, Section
 from evaluation.html import to_html
 from exports.html import write_html
 from exports.of_model import model_of
 from gaussian_renderer import render
+from moving_cameras.generated import Ellipse
+from moving_cameras.poses import poses_of
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page
@@ -30,19 +29,6 @@ pytestmark = pytest.mark.browser
 SECONDS = 20  # until something must have happened
 BARE = ".sse-viewer > :not(canvas) { display: none !important }"  # the picture without buttons
 BACKGROUND = (0.2, 0.4, 0.3)
-
-
-@pytest.fixture(scope="module")
-def browser() -> "Iterator[Browser]":
-    api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed: pip install playwright")
-    program = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
-    if program is None:
-        pytest.skip("no Chromium is on PATH: apt-get install chromium")
-    with api.sync_playwright() as playwright:
-        options = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
-        launched = playwright.chromium.launch(executable_path=program, args=options)
-        yield launched
-        launched.close()
 
 
 @pytest.fixture

@@ -1,6 +1,6 @@
 """Options of render.py for a camera path.
 
-camera_paths/request.py, which is loaded only for a path, checks their values: it imports SciPy, which takes a while.
+moving_cameras/request.py, which is loaded only for a path, checks their values: it imports SciPy, which takes a while.
 """
 
 import argparse

@@ -11,14 +11,14 @@ import torch
 from gaussians import model, pipeline
 from scipy.spatial.transform import Rotation, Slerp
 
-from camera_paths import generated
-from camera_paths.focus import focus_point
-from camera_paths.generated import GENERATED, Ellipse, Interpolated, Spiral, covered_arc
-from camera_paths.keyframes import CameraPath, Keyframe, read_camera_path
-from camera_paths.moments import KeyframePath, TimedPath, frame_count, frame_moment
-from camera_paths.order import visiting_order
-from camera_paths.poses import Poses, facing, poses_of
 from gaussian_renderer.free_view import free_view, rotation_matrix
+from moving_cameras import generated
+from moving_cameras.focus import focus_point
+from moving_cameras.generated import GENERATED, Ellipse, Interpolated, Spiral, covered_arc
+from moving_cameras.keyframes import CameraPath, Keyframe, read_camera_path
+from moving_cameras.moments import KeyframePath, TimedPath, frame_count, frame_moment
+from moving_cameras.order import visiting_order
+from moving_cameras.poses import Poses, facing, poses_of
 from scene.cameras import Camera
 from utils.system_utils import UserError
 

@@ -5,8 +5,8 @@ from typing import Protocol
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
-from camera_paths.keyframes import CameraPath, Keyframe
-from camera_paths.poses import to_wxyz
+from moving_cameras.keyframes import CameraPath, Keyframe
+from moving_cameras.poses import to_wxyz
 
 
 class TimedPath(Protocol):

@@ -5,11 +5,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from camera_paths.generated import GENERATED, SECONDS
-from camera_paths.keyframes import read_camera_path
-from camera_paths.moments import KeyframePath, TimedPath
-from camera_paths.poses import Poses
-from camera_paths.video import find_ffmpeg
+from moving_cameras.generated import GENERATED, SECONDS
+from moving_cameras.keyframes import read_camera_path
+from moving_cameras.moments import KeyframePath, TimedPath
+from moving_cameras.poses import Poses
+from moving_cameras.video import find_ffmpeg
 from utils.system_utils import UserError
 
 FPS = 30

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from camera_paths.keyframes import Keyframe
+from moving_cameras.keyframes import Keyframe
 from scene.cameras import Camera
 
 SAME_PLACE = 1e-6  # of the distance from the origin, or of 1: float32 tells no smaller distances apart

@@ -6,12 +6,12 @@ from collections.abc import Callable
 import numpy as np
 from scipy.interpolate import PchipInterpolator
 
-from camera_paths.focus import focus_point
-from camera_paths.keyframes import Keyframe
-from camera_paths.moments import TimedPath
-from camera_paths.order import spread_along, visiting_order
-from camera_paths.poses import Poses, facing, keyframe, unit
-from camera_paths.spline import PoseSpline, without_repeats
+from moving_cameras.focus import focus_point
+from moving_cameras.keyframes import Keyframe
+from moving_cameras.moments import TimedPath
+from moving_cameras.order import spread_along, visiting_order
+from moving_cameras.poses import Poses, facing, keyframe, unit
+from moving_cameras.spline import PoseSpline, without_repeats
 from utils.system_utils import UserError
 
 SECONDS = 10.0  # of a path for which no other time is asked

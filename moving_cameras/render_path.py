@@ -9,14 +9,14 @@ from pathlib import Path
 import torch
 from tqdm import tqdm
 
-from camera_paths.keyframes import Keyframe
-from camera_paths.moments import frame_count, frame_moment
-from camera_paths.poses import poses_of
-from camera_paths.request import PathRequest
-from camera_paths.video import video_writer
 from gaussian_renderer import render
 from gaussian_renderer.free_view import free_view
 from gaussian_renderer.memory_errors import memory_errors_explained
+from moving_cameras.keyframes import Keyframe
+from moving_cameras.moments import frame_count, frame_moment
+from moving_cameras.poses import poses_of
+from moving_cameras.request import PathRequest
+from moving_cameras.video import video_writer
 from scene.cameras import Camera, MiniCam
 from scene.scene import Scene
 from utils.files.numbered_pngs import remove_leftovers, save_png, to_bytes

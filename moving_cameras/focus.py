@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from camera_paths.poses import Poses
+from moving_cameras.poses import Poses
 
 # Mean squared sine of the angles between the axes, about, below which no point is found: 1.8 degrees.
 PARALLEL = 1e-3

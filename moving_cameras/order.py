@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from camera_paths.poses import Poses
+from moving_cameras.poses import Poses
 
 MOST = 1000  # cameras that are looked at: the distances of all pairs take 8 MB
 _PASSES = 50

@@ -3,8 +3,8 @@
 import numpy as np
 from scipy.interpolate import CubicHermiteSpline, PchipInterpolator
 
-from camera_paths.order import turning_radius
-from camera_paths.poses import Poses
+from moving_cameras.order import turning_radius
+from moving_cameras.poses import Poses
 
 _SAMPLES = 32  # of each segment, to measure its length
 _STEP = 1e-9  # of the whole way: poses closer than this are one
