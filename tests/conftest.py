@@ -21,6 +21,16 @@ def shared_dir() -> Path:
     return folder
 
 
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
+    """Tests without the mark `gpu` are of the CPU: also on a machine that has a GPU, their trainings see none."""
+    with pytest.MonkeyPatch.context() as patch:
+        if item.get_closest_marker("gpu") is None:
+            patch.setenv("CUDA_VISIBLE_DEVICES", "")  # for programs that the test starts
+            patch.setattr(torch.cuda, "is_available", lambda: False)
+        return (yield)
+
+
 @pytest.fixture(scope="session", autouse=True)
 def cache_folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """A separate cache folder for the tests, used by subprocesses too."""

@@ -17,6 +17,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 from gaussians import model, pipeline
+from rasterizer_tools import CPU_AND_GPU
 from test_network_message import mutated
 from viewer_client import Viewer, as_bytes, packed, request, wait_for
 
@@ -151,8 +152,9 @@ class Watched(Observer):
         return frame.tobytes()
 
 
+@CPU_AND_GPU
 @pytest.mark.parametrize("options", OPTIONS.values(), ids=OPTIONS.keys())
-def test_frames_are_those_of_render_and_training_is_the_same(colmap_scene, tmp_path, options):
+def test_frames_are_those_of_render_and_training_is_the_same(colmap_scene, tmp_path, options, device):
     count = 100 if not options else 5
 
     def script(watched: Watched, viewer: Viewer) -> None:

@@ -13,6 +13,8 @@ import pytest
 
 pytest.importorskip("viser", reason="viser is not installed: pip install '.[viewer]'")
 
+from rasterizer_tools import CPU_AND_GPU  # noqa: E402
+
 import train  # noqa: E402
 from benchmarks.workloads.viser_client import Client  # noqa: E402
 from scene.gaussians.checkpoint import load_checkpoint  # noqa: E402
@@ -78,8 +80,9 @@ def _later(call: Callable[[], None], seconds: float) -> threading.Timer:
     return timer
 
 
+@CPU_AND_GPU
 @pytest.mark.parametrize("plain", [[], ["--plain_step"]])
-def test_watching_changes_no_byte_of_the_model(colmap_scene, tmp_path, monkeypatch, plain):
+def test_watching_changes_no_byte_of_the_model(colmap_scene, tmp_path, monkeypatch, plain, device):
     expected = _train(colmap_scene, tmp_path / "alone", *plain, viewer=False).read_bytes()
 
     def pause(watched: Watched) -> None:
