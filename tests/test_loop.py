@@ -12,10 +12,12 @@ import torch
 
 import train
 from records.training_log import TrainingLog
-from training import loop, run
-from training.density import AdaptiveDensityControl, DensityControl
+from training import loop
+from training.density import DensityControl
 from training.observer import Announcer, Observer
 from training.observers.standard import standard_observers
+from training.strategies import choose
+from training.strategies.adc import AdaptiveDensityControl
 
 ITERATIONS = 24
 
@@ -141,7 +143,7 @@ def test_another_strategy_is_another_object(colmap_scene, tmp_path, monkeypatch)
             assert self._gaussians.get_xyz.grad is None
             calls.append(("after_step", step.iteration))
 
-    monkeypatch.setattr(run, "AdaptiveDensityControl", Strategy)
+    monkeypatch.setattr(choose, "AdaptiveDensityControl", Strategy)
     told = []
     _train(colmap_scene, tmp_path, monkeypatch, lambda *_: [Recorder(told)])
     steps = range(1, ITERATIONS + 1)

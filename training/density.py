@@ -1,17 +1,21 @@
-"""Density control: the hooks that the training loop calls, and the method's rules (clone, split, prune, reset)."""
+"""The hooks by which a strategy of density control acts on a training (strategies: training/strategies)."""
 
-import argparse
+from typing import ClassVar
 
 from torch import Tensor
 
-from scene.gaussian_model import GaussianModel
-from scene.gaussians import density_rules as rules
 from training.step import Step
-from utils.system_utils import UserError
 
 
 class DensityControl:
-    """Decides how many Gaussians there are. Another strategy overrides these hooks, in a file of its own."""
+    """Decides how many Gaussians there are. A strategy overrides these hooks, in a file of its own.
+
+    fusable: whether it reads gradients only in iterations that `changes` names. All others are then taken by
+    training/steps/fused.py, which calls `observes` and `after_step` alone. It counts only where the class itself says
+    so: a subclass may want more.
+    """
+
+    fusable: ClassVar[bool] = False
 
     def changes(self, iteration: int) -> bool:
         """Whether this iteration will change rows of the Gaussians besides their optimiser step.
@@ -20,60 +24,12 @@ class DensityControl:
         """
         return False
 
+    def observes(self, iteration: int) -> bool:
+        """Whether the view of this iteration counts in the Gaussians' statistics, where the step is fused."""
+        return False
+
     def after_backward(self, step: Step, package: dict[str, Tensor]) -> None:
         """Called with the gradients computed, before the optimiser's step. package: the result of `render`."""
 
     def after_step(self, step: Step) -> None:
         """Called after the optimiser's step, so not in the last iteration, which takes none."""
-
-
-class AdaptiveDensityControl(DensityControl):
-    """Adaptive density control (Kerbl et al. 2023, Section 5.2), with the rules of scene/gaussians/density_rules.py.
-
-    extent: of the scene, world units; sizes are judged by it.
-    """
-
-    def __init__(
-        self, gaussians: GaussianModel, opt: argparse.Namespace, white_background: bool, extent: float
-    ) -> None:
-        self._gaussians = gaussians
-        self._opt = opt
-        self._white_background = white_background
-        self._extent = extent
-
-    def changes(self, iteration: int) -> bool:
-        todo = self._actions(iteration)
-        return todo.densify or todo.reset_opacity
-
-    def observes(self, iteration: int) -> bool:
-        """Whether the view of this iteration counts in the statistics."""
-        return self._actions(iteration).observe
-
-    def after_backward(self, step: Step, package: dict[str, Tensor]) -> None:
-        todo = self._actions(step.iteration)
-        if todo.observe:
-            self._gaussians.observe(package["viewspace_points"], package["radii"])
-        if todo.densify:
-            self._densify(step.iteration, todo.limit_size)
-        if todo.reset_opacity:
-            self._gaussians.reset_opacity()
-
-    def _actions(self, iteration: int) -> rules.Actions:
-        return rules.actions(iteration, self._opt, self._white_background)
-
-    def _densify(self, iteration: int, limit_size: bool) -> None:
-        self._gaussians.densify_and_prune(
-            self._opt.densify_grad_threshold,
-            rules.MIN_OPACITY,
-            self._extent,
-            rules.MAX_SCREEN_SIZE if limit_size else None,
-            seed=self._opt.seed,
-            iteration=iteration,
-            max_splats=self._opt.max_num_splats,
-        )
-        if len(self._gaussians) == 0:
-            raise UserError(
-                f"no Gaussian was left after the densification of iteration {iteration}: the views do not agree "
-                "with the points, or show nothing but the background; check the scene, or raise "
-                "--opacity_reset_interval"
-            )

@@ -15,13 +15,13 @@ from scene.gaussian_model import GaussianModel
 from scene.gaussians.checkpoint import load_checkpoint
 from scene.options import option
 from training.checks import check_exposures, check_scene, warn_of_late_reset
-from training.density import AdaptiveDensityControl
 from training.history import check_folder, continue_records, report_changes
 from training.loss_watch import LossWatch
 from training.memory_estimate import announce_memory
 from training.objective import Objective
 from training.plan import Plan
 from training.step import Step
+from training.strategies.choose import density_control
 from training.view_order import ViewOrder
 from utils.exact.counter_rng import Stream, uniform
 from utils.general_utils import get_expon_lr_func
@@ -75,7 +75,7 @@ class Run:
             report_changes(plan.start, argparse.Namespace(**vars(dataset), **self._training_options))
         self.background = torch.full((3,), 1.0 if dataset.white_background else 0.0, device=self.device)
         self.objective = Objective(opt)
-        self.density = AdaptiveDensityControl(self.gaussians, opt, dataset.white_background, self.scene.cameras_extent)
+        self.density = density_control(self)
         self._depth_weight = get_expon_lr_func(
             opt.depth_l1_weight_init, opt.depth_l1_weight_final, max_steps=opt.iterations
         )

@@ -6,7 +6,6 @@ from torch import Tensor
 from gaussian_renderer.view_step import Drawn, draw, step
 from scene.fused_adam import FusedAdam
 from scene.gaussians.exposure import apply_exposure
-from training.density import AdaptiveDensityControl
 from training.objective import Losses, Objective
 from training.observer import Announcer
 from training.run import Run
@@ -28,8 +27,8 @@ class FusedStep:
 
     @staticmethod
     def suits(run: Run) -> bool:
-        """Whether the run's objective and density control are ours, which use no gradient of a parameter."""
-        return type(run.objective) is Objective and type(run.density) is AdaptiveDensityControl
+        """Whether the run's objective is ours, and its density control wants no gradient of a parameter."""
+        return type(run.objective) is Objective and vars(type(run.density)).get("fusable", False)
 
     def takes(self, step: Step) -> bool:
         """Whether this step can be fused."""

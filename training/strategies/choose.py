@@ -1,0 +1,15 @@
+"""The choice of a strategy."""
+
+from typing import TYPE_CHECKING
+
+from training.density import DensityControl
+from training.strategies.adc import AdaptiveDensityControl
+
+if TYPE_CHECKING:
+    from training.run import Run
+
+
+def density_control(run: "Run") -> DensityControl:
+    """The strategy that --strategy names, for the model and the scene of a run."""
+    parts = run.gaussians, run.opt, run.dataset.white_background, run.scene.cameras_extent
+    return AdaptiveDensityControl(*parts)
