@@ -5,6 +5,7 @@ import os
 from collections.abc import Collection
 
 from arguments.param_group import GroupParams, Option, OptionTable, above, at_least, one_of, within
+from arguments.strategies import STRATEGY_OPTIONS
 from utils.system_utils import UserError
 
 
@@ -312,6 +313,7 @@ class OptimizationParams(OptionTable):
             "ours, and the reference's fixed seed",
             check=within(0, 2**63 - 1),
         ),
+        *STRATEGY_OPTIONS,
     )
 
     def __init__(self, parser: argparse.ArgumentParser, sentinel: bool = False, without: Collection[str] = ()) -> None:
