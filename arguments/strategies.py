@@ -1,6 +1,6 @@
 """Options of the strategies: how many Gaussians there are, and where, and how a run is paced."""
 
-from arguments.param_group import Option
+from arguments.param_group import Option, one_of
 
 ADC_OPTIONS: tuple[Option, ...] = ()
 
@@ -10,4 +10,12 @@ BUDGET_OPTIONS: tuple[Option, ...] = ()
 
 PACE_OPTIONS: tuple[Option, ...] = ()
 
-STRATEGY_OPTIONS = (*ADC_OPTIONS, *MCMC_OPTIONS, *BUDGET_OPTIONS, *PACE_OPTIONS)
+_STRATEGY = Option(
+    "strategy",
+    "adc",
+    "how many Gaussians there are, and where. adc: adaptive density control, the method's own",
+    "ours",
+    check=one_of("adc"),
+)
+
+STRATEGY_OPTIONS = (_STRATEGY, *ADC_OPTIONS, *MCMC_OPTIONS, *BUDGET_OPTIONS, *PACE_OPTIONS)

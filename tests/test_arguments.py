@@ -73,6 +73,7 @@ OURS = {
     "keep_unseen": False,
     "prune_sh": 0.0,
     "seed": 0,
+    "strategy": "adc",
 }
 
 
@@ -138,6 +139,7 @@ def test_short_forms_and_unique_prefixes():
         ("max_num_splats", "-1"),
         ("seed", "-1"),
         ("optimizer_type", "sgd"),
+        ("strategy", "mine"),
         ("exposure_lr_init", "-0.1"),
         ("exposure_lr_delay_steps", "-1"),
         ("exposure_lr_delay_mult", "1.5"),
