@@ -73,8 +73,8 @@ def test_which_errors_mean_too_little_memory():
 
 def test_numbers_of_an_error():
     free = r"[\d.]+ GiB free on the CPU"
-    refused = _raised(lambda: torch.empty(3 << 40, dtype=torch.uint8))
-    assert re.fullmatch(f"3072.0 GiB asked for, {free}", shortage(refused, "cpu"))
+    refused = _raised(lambda: torch.empty(3 << 50, dtype=torch.uint8))
+    assert re.fullmatch(f"3145728.0 GiB asked for, {free}", shortage(refused, "cpu"))
     assert shortage(ON_A_GPU, "cpu").startswith("20.0 GiB asked for, ")
     counted = shortage(_raised(_instances_beyond_counting), "cpu")
     assert re.fullmatch(rf"5 Gaussians cover 3000000000 tile instances, more than 2\^31 - 1, {free}", counted)
