@@ -13,7 +13,7 @@ import numpy as np
 from plyfile import PlyData, PlyElement, PlyParseError
 
 from exports.packing import from_bits, morton_order, smallest_three, to_bits, whole_quaternions
-from exports.plain_ply import comments, says_antialiasing
+from exports.plain_ply import comments, says_antialiasing, stored_offset
 from exports.selection import logits, opacities, selected
 from exports.splats import Splats
 from utils.files.ply_header import header_lines
@@ -116,7 +116,7 @@ def read_compressed_ply(path: str | os.PathLike) -> Splats:
     sh = np.concatenate([((color - 0.5) / C0)[:, None], rest], axis=1)
     alpha = logits(from_bits(packed[3], 8), 1 / 255)
     values = (x.astype(np.float32) for x in (position, log_scales, rotations, alpha, sh))
-    return Splats(*values, antialiasing=says_antialiasing(path))
+    return Splats(*values, antialiasing=says_antialiasing(path), world_offset=stored_offset(path))
 
 
 def _parts(codes: np.ndarray) -> np.ndarray:

@@ -1,13 +1,13 @@
 """PLY with float32 properties: the reference's columns, and comments that say what they mean."""
 
 import contextlib
+import math
 import os
 
-import numpy as np
 import torch
 
 from exports.splats import Splats
-from scene.gaussians.ply import read_ply, write_ply
+from scene.gaussians.ply import offset_comments, read_ply, write_ply
 from utils.files.ply_header import header_lines
 
 AXES = "axes x right, y down, z forward (COLMAP)"
@@ -19,6 +19,7 @@ def comments(splats: Splats) -> list[str]:
         AXES,
         f"SplatRenderMode: {'mip' if splats.antialiasing else 'default'}",
         f"antialiased {splats.antialiasing:d}",
+        *offset_comments(splats.world_offset),
     ]
 
 
@@ -32,14 +33,16 @@ def says_antialiasing(path: str | os.PathLike) -> bool:
     return found
 
 
-def stored_offset(path: str | os.PathLike) -> np.ndarray:
-    """World coordinates (3,) float64 of a PLY's origin: those of our comment world_offset, zero without one."""
+def stored_offset(path: str | os.PathLike) -> tuple[float, float, float]:
+    """World coordinates of a PLY's origin: those of our comment world_offset, zero without a finite one."""
     for line in header_lines(path):
         words = line.split()
         if words[:2] == ["comment", "world_offset"] and len(words) == 5:
             with contextlib.suppress(ValueError):
-                return np.array([float(word) for word in words[2:]])
-    return np.zeros(3)
+                offset = tuple(float(word) for word in words[2:])
+                if all(map(math.isfinite, offset)):
+                    return offset
+    return 0.0, 0.0, 0.0
 
 
 def write_plain_ply(path: str | os.PathLike, splats: Splats) -> None:
@@ -61,4 +64,4 @@ def read_plain_ply(path: str | os.PathLike) -> Splats:
     rows = {name: values.numpy() for name, values in read_ply(path, None).items()}
     sh = torch.cat([torch.from_numpy(rows["f_dc"]), torch.from_numpy(rows["f_rest"])], dim=1).numpy()
     values = (rows["xyz"], rows["scaling"], rows["rotation"], rows["opacity"][:, 0], sh)
-    return Splats(*values, antialiasing=says_antialiasing(path))
+    return Splats(*values, antialiasing=says_antialiasing(path), world_offset=stored_offset(path))

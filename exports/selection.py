@@ -29,7 +29,7 @@ def drawable(splats: Splats) -> np.ndarray:
 
 
 def within_box(splats: Splats, box: Sequence[float]) -> np.ndarray:
-    """(N,) bool: the splats whose centre lies in a box of world coordinates x0 y0 z0 x1 y1 z1."""
+    """(N,) bool: the splats whose centre lies in a box x0 y0 z0 x1 y1 z1 of the means' frame."""
     low, high = np.asarray(box[:3]), np.asarray(box[3:])
     return ((splats.means >= low) & (splats.means <= high)).all(axis=1)
 

@@ -3,6 +3,7 @@
 import gzip
 import json
 import struct
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -84,6 +85,15 @@ def test_round_trips_lose_what_the_format_rounds(tmp_path, ending, degree):
         differences = (*differences[:4], differences[4][inside], differences[5])
     for difference, loss in zip(differences, LOSSES[ending], strict=True):
         assert difference.max(initial=0) <= loss * 1.001 + 1e-6
+
+
+@pytest.mark.parametrize("ending", [".ply", ".compressed.ply"])
+def test_plys_keep_the_origin_of_a_scene_far_away(tmp_path, ending):
+    far = (500_000.25, 5_400_000.0, -7.0)
+    path = _write(tmp_path, ending, replace(splats(20, 1), world_offset=far))
+    assert read_splats(path).world_offset == far
+    path.write_bytes(path.read_bytes().replace(b"500000.25", b"nan", 1))
+    assert read_splats(path).world_offset == (0.0, 0.0, 0.0)
 
 
 @pytest.mark.parametrize("count", [0, 1, 257])

@@ -1,5 +1,6 @@
 """Models of other tools: PLYs of any form, as the start of a training and in render.py; what is refused."""
 
+import json
 import re
 from pathlib import Path
 
@@ -118,6 +119,20 @@ def test_a_start_relative_to_a_world_offset_is_moved_back(tmp_path, colmap_scene
     started = _train(colmap_scene, tmp_path / "out", "--init_ply", tmp_path / "start.ply")
     moved = gaussians.get_xyz + torch.tensor([1.0, -2.0, 3.0])
     torch.testing.assert_close(started.get_xyz, moved, rtol=0, atol=1e-6)
+
+
+def test_an_exported_model_keeps_its_world_offset(tmp_path, colmap_scene):
+    gaussians = _train(colmap_scene, tmp_path / "out")
+    gaussians.world_offset = (1.0, -2.0, 3.0)
+    gaussians.save_ply(tmp_path / "out/point_cloud/iteration_1/point_cloud.ply")
+    remembered = json.loads((tmp_path / "out/model.json").read_text()) | {"world_offset": [1.0, -2.0, 3.0]}
+    (tmp_path / "out/model.json").write_text(json.dumps(remembered))
+    for number, words in enumerate(([], ["--max_splats", 10**6])):  # without its scene, and with it
+        path = tmp_path / f"{number}.compressed.ply"
+        export.export(*_export_options("-m", tmp_path / "out", "--to", path, *words))
+        assert read_splats(path).world_offset == (1.0, -2.0, 3.0)
+        export.export(*_export_options("--ply", path, "--to", tmp_path / "again.ply"))
+        assert read_splats(tmp_path / "again.ply").world_offset == (1.0, -2.0, 3.0)
 
 
 def test_two_starts_contradict_each_other(tmp_path):
