@@ -148,6 +148,24 @@ def test_glb_says_what_its_numbers_mean(tmp_path):
     np.testing.assert_allclose(rotation_matrix((w, x, y, z)) @ [0, -1, 0], [0, 1, 0], atol=1e-12)
 
 
+@pytest.mark.parametrize("ending", OURS)
+@pytest.mark.parametrize("share", [0.5, 0.999])
+def test_a_full_disk_is_said_and_leaves_nothing(tmp_path, ending, share):
+    """A limit on the size of files stands for a full disk, in the middle and at the end."""
+    resource = pytest.importorskip("resource", reason="there are no limits on this system")
+    whole = _write(tmp_path, ending, some := splats(3000, 1))
+    size = whole.stat().st_size
+    whole.unlink()
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (int(share * size), before[1]))
+    try:
+        with pytest.raises(UserError, match=f"cannot write .*model{ending}.*free space"):
+            _write(tmp_path, ending, some)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert not list(tmp_path.iterdir())
+
+
 def test_usdz_has_the_schema_and_stands_upright(tmp_path):
     path = _write(tmp_path, ".usdz", some := splats(20, 1))
     from pxr import Gf, Usd, UsdGeom

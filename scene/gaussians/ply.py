@@ -45,7 +45,7 @@ def write_ply(
     header += [f"property float {name}" for name in names]
     with atomic_write(path) as temporary, open(temporary, "wb") as file:
         file.write("\n".join([*header, "end_header\n"]).encode("ascii"))
-        matrix.tofile(file)
+        file.write(matrix)  # not tofile, which loses the last bytes on a full disk without an error
 
 
 def column_names(sh_degree: int) -> list[str]:
