@@ -18,6 +18,7 @@ from exports.of_model import model_of
 from exports.read import is_point_cloud, read_splats
 from exports.selection import with_sh_degree
 from gaussian_renderer.importance import blending_weights, most_important
+from moving_cameras.keyframes import CameraPath, Keyframe
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.ply import read_ply
 from scene.readers.point_cloud import read_point_cloud
@@ -194,8 +195,42 @@ def test_export_chooses_what_it_writes(tmp_path, colmap_scene, capsys):
         (["--ply", "a.ply", "--max_splats", "5"], "need training views"),
         (["--ply", "absent.ply"], "no file absent.ply; give a model as PLY"),
         ([], "no model folder given"),
+        (
+            ["--ply", "a.ply", "--to", "b.splat", "--path", "ellipse"],
+            "--path is the animation of a page; leave it out for .sp",
+        ),
+        (
+            ["--ply", "a.ply", "--to", "b.html", "--path", "elipse"],
+            "--path must be interpolate, ellipse, spiral or a file",
+        ),
+        (["--ply", "a.ply", "--to", "b.html"], "pages need training views, which a.ply has not"),
+        (
+            ["--ply", "a.ply", "--to", "b.obj"],
+            "the format of b.obj is unknown; end its name with one of .compressed.ply",
+        ),
     ],
 )
 def test_export_refuses(argv, said):
     with pytest.raises(UserError, match=said):
-        export.export(*_export_options(*argv, "--to", "b.ply"))
+        export.export(*_export_options("--to", "b.ply", *argv))
+
+
+@pytest.mark.parametrize("name", ["interpolate", "tour.json"])
+def test_a_page_plays_the_camera_path(tmp_path, colmap_scene, name):
+    _train(colmap_scene, tmp_path / "out")
+    keys = (
+        Keyframe(0.0, (0.0, 0.0, -3.0), (1.0, 0.0, 0.0, 0.0), 40.0),
+        Keyframe(7.0, (1.0, 0.0, -3.0), (1.0, 0, 0, 0), 50.0),
+    )
+    CameraPath(keys).write(tmp_path / "tour.json")
+    path = str(tmp_path / name) if name.endswith("json") else name
+    export.export(*_export_options("-m", tmp_path / "out", "--to", tmp_path / "page.HTML", "--path", path))
+    text = re.search(r'id="page">(.*?)</script>', (tmp_path / "page.HTML").read_text(encoding="utf-8"))[1]
+    (track,) = json.loads(text)["settings"]["animTracks"]
+    values = track["keyframes"]["values"]
+    first, last = np.array(values["position"]).reshape(-1, 3)[[0, -1]]
+    if name == "interpolate":
+        assert track["duration"] == 10 and len(values["fov"]) == 101
+    else:  # the page's world is a turned one
+        assert track["duration"] == 7 and (values["fov"][0], values["fov"][-1]) == (40, 50)
+        assert np.linalg.norm(first) == pytest.approx(3) and np.linalg.norm(first - last) == pytest.approx(1)
