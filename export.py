@@ -152,7 +152,7 @@ def options() -> tuple[argparse.ArgumentParser, ModelParams, PipelineParams]:
         help="keep N Gaussians; what adds least to the training views goes first (default: 0, no limit)")  # fmt: skip
     add("--path", metavar="PATH",
         help="animation of an .html: interpolate, ellipse, spiral, or a JSON file of keyframes "
-        "(default: once around the model)")  # fmt: skip
+        "(default: around the model, or a sway if the first camera is within it)")  # fmt: skip
     add("--quiet", action="store_true", help="print nothing to stdout (default: off)")
     return parser, model_params, pipeline_params
 

@@ -38,7 +38,8 @@ def write_html(
     """Write the page, whole or not at all.
 
     cameras: the training views, the first of which is where the page begins; up to 25 of them become bookmarks.
-    camera_path: the animation, None: once around the model. title: None: the file's name. background: RGB in [0,1].
+    camera_path: the animation, None: the viewer's own, which goes around the model, or sways where the first camera is
+    in the model's box. title: None: the file's name. background: RGB in [0,1].
     UserError without a camera.
     """
     if not cameras:
