@@ -30,9 +30,8 @@ def write_glb(path: str | os.PathLike, splats: Splats) -> None:
     """
     attributes = _attributes(splats) if len(splats) else {}
     sizes = [values.nbytes for values in attributes.values()]
-    text = json.dumps(
-        _document(attributes, sizes, splats.antialiasing), separators=(",", ":"), allow_nan=False
-    ).encode()
+    document = _document(attributes, sizes, splats.antialiasing)
+    text = json.dumps(document, separators=(",", ":"), allow_nan=False).encode()
     text += b" " * (-len(text) % 4)
     chunks = struct.pack("<I4s", len(text), b"JSON") + text
     length = 12 + len(chunks) + (8 + sum(sizes) if attributes else 0)
