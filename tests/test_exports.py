@@ -26,6 +26,7 @@ from exports.splats import Splats
 from gaussian_renderer.free_view import rotation_matrix
 from gaussian_renderer.importance import blending_weights, most_important
 from scene.cameras import MiniCam
+from scene.export_world import export_world
 from utils.graphics_utils import getProjectionMatrix
 from utils.sh_utils import C0, sh_basis
 from utils.system_utils import UserError
@@ -97,6 +98,21 @@ def test_plys_keep_the_origin_of_a_scene_far_away(tmp_path, ending):
     assert read_splats(path).world_offset == far
     path.write_bytes(path.read_bytes().replace(b"500000.25", b"nan", 1))
     assert read_splats(path).world_offset == (0.0, 0.0, 0.0)
+
+
+@pytest.mark.parametrize("count", [0, 1, 300])
+def test_a_ply_in_the_worlds_coordinates_keeps_its_decimals(tmp_path, count):
+    some, far = splats(count, 1), np.array([500_000.0, 5_400_000.0, 200.0])
+    export_world(_write(tmp_path, ".ply", some), far, tmp_path / "world.ply")
+    read = read_splats(tmp_path / "world.ply")
+    if count < 2:  # without an extent nothing is far
+        assert len(read) == count and read.world_offset == (0.0, 0.0, 0.0)
+        return
+    assert any(read.world_offset) and all(value % 10 == 0 for value in read.world_offset)
+    places = read.means.astype(np.float64) + read.world_offset
+    np.testing.assert_allclose(places, some.means + far, rtol=0, atol=1e-5)
+    export_world(_write(tmp_path, ".ply", some), np.ones(3), tmp_path / "near.ply")
+    np.testing.assert_array_equal(read_splats(tmp_path / "near.ply").means, (some.means + 1.0).astype(np.float32))
 
 
 @pytest.mark.parametrize("count", [0, 1, 257])
