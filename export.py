@@ -105,6 +105,7 @@ def thin_out(
 def export(args: argparse.Namespace, options: argparse.Namespace, pipe: argparse.Namespace, entry: Format) -> None:
     """Write the file that the command line asks for. UserError if there is nothing to load or to write."""
     make_path = _path_maker(args.path, entry)
+    entry.check(args.to)
     splats, scene = load(args, options, want_views=bool(args.max_splats) or entry.of_scene)
     degree = splats.sh_degree if args.typed_sh_degree is None else min(args.typed_sh_degree, splats.sh_degree)
     keep = choose(splats, args.crop, args.min_opacity)

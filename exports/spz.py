@@ -35,7 +35,7 @@ _SIZES = (9, 1, 3, 3, 4)  # bytes a splat of each stream, before SH
 
 def write_spz(path: str | os.PathLike, splats: Splats) -> None:
     """Write version 4, whole or not at all. UserError without the package zstandard."""
-    zstandard = _zstandard(path)
+    zstandard = find_zstandard(path)
     splats = half_turned(selected(splats, morton_order(splats.means)))
     farthest = float(np.abs(splats.means).max(initial=0))
     bits = int(np.clip(np.floor(np.log2(_LARGEST_POSITION / max(farthest, 1e-30))), 0, _MOST_BITS))
@@ -51,7 +51,8 @@ def write_spz(path: str | os.PathLike, splats: Splats) -> None:
         temporary.write_bytes(header + table + b"".join(packed))
 
 
-def _zstandard(path: str | os.PathLike) -> ModuleType:
+def find_zstandard(path: str | os.PathLike) -> ModuleType:
+    """The package that a file of this name needs. UserError without it."""
     try:
         import zstandard
     except ImportError as error:
@@ -95,7 +96,7 @@ def _read_zstd(content: bytes, path: str | os.PathLike) -> Splats:
     magic, version, count, degree, bits, flags, streams, table = _HEADER.unpack_from(content)
     if magic != MAGIC or version != 4:
         raise ValueError(f"no version that this program knows: {version}" if magic == MAGIC else "no magic number")
-    zstandard = _zstandard(path)
+    zstandard = find_zstandard(path)
     sizes = [size * count for size in (*_SIZES, 3 * ((degree + 1) ** 2 - 1))]
     begin, parts = table + 16 * streams, []
     for index, size in enumerate(sizes):

@@ -21,7 +21,7 @@ PRIM = "/World/Splats"
 
 def write_usdz(path: str | os.PathLike, splats: Splats) -> None:
     """Write the file, whole or not at all. UserError without a usd-core that has the schema."""
-    usd = _pxr(path)
+    usd = find_pxr(path)
     with tempfile.TemporaryDirectory() as folder, atomic_write(path) as temporary:
         layer = Path(folder) / "splats.usdc"
         try:
@@ -45,7 +45,8 @@ def _is_whole(package: Path) -> bool:
         return False
 
 
-def _pxr(path: str | os.PathLike) -> ModuleType:
+def find_pxr(path: str | os.PathLike) -> ModuleType:
+    """The package that a file of this name needs. UserError without it."""
     try:
         import pxr
         from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdUtils, UsdVol, Vt  # noqa: F401  (so that pxr has them)

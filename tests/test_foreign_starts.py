@@ -2,6 +2,7 @@
 
 import json
 import re
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -234,3 +235,13 @@ def test_a_page_plays_the_camera_path(tmp_path, colmap_scene, name):
     else:  # the page's world is a turned one
         assert track["duration"] == 7 and (values["fov"][0], values["fov"][-1]) == (40, 50)
         assert np.linalg.norm(first) == pytest.approx(3) and np.linalg.norm(first - last) == pytest.approx(1)
+
+
+@pytest.mark.parametrize(("ending", "module"), [(".spz", "zstandard"), (".usdz", "pxr"), (".sog", None)])
+def test_what_a_format_needs_is_looked_for_before_the_model_is_loaded(tmp_path, monkeypatch, ending, module):
+    if module:
+        monkeypatch.setitem(sys.modules, module, None)
+    monkeypatch.setattr("shutil.which", lambda *_, **__: None)
+    monkeypatch.setattr(export, "load", lambda *_, **__: pytest.fail("the model was loaded"))
+    with pytest.raises(UserError, match="needs .*; install"):
+        export.export(*_export_options("--ply", tmp_path / "a.ply", "--to", tmp_path / f"model{ending}"))
