@@ -200,13 +200,13 @@ def test_a_server_that_asks_no_gate_does_not_stay(monkeypatch):
 def test_a_browser_that_asks_for_a_tunnel_gets_none(local, monkeypatch):
     opened = []
     monkeypatch.setattr(viser._viser, "ViserTunnel", lambda *_: opened.append(1))
+    heard, read = threading.Event(), local.server.gui.add_checkbox("read", False)
+    read.on_update(lambda _: heard.set())
     with Client(local.url) as client:
         client.look()
         client.send("ShareUrlRequest")
-        client.send("GuiFormSubmitMessage", uuid="none")  # an answer to it says that the other has been read
-        client.look()
-        local.server.gui.add_text("heard", "")
-        assert client.until("GuiTextMessage")
+        client.send("GuiUpdateMessage", uuid=read._impl.uuid, updates={"value": True})
+        assert heard.wait(10)
     assert not opened and local.server._share_tunnel is None
 
 

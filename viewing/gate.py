@@ -13,6 +13,8 @@ import websockets.asyncio.server as websocket_server
 from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
 
+from viewing.connections import Connections
+
 _LOCAL_NAME = "localhost"
 _HEADERS = {
     "Referrer-Policy": "no-referrer",  # the address may hold the token
@@ -39,6 +41,7 @@ class Gate:
 
     def __init__(self, host: str) -> None:
         self.token = None if is_loopback(host) else secrets.token_urlsafe(32)
+        self.connections = Connections()
         self.stands = False  # whether viser has asked for requests to be checked
 
     def refusal(self, request: Request) -> str | None:
@@ -87,11 +90,8 @@ class Gate:
 
         def serve(*arguments: Any, process_request: Callable, **options: Any) -> Any:
             self.stands = True
-            return plain(
-                *arguments,
-                process_request=lambda connection, request: self.answer(connection, request, process_request),
-                **options,
-            )
+            own = {"process_request": lambda connection, request: self.answer(connection, request, process_request)}
+            return plain(*arguments, **options | self.connections.options() | own)
 
         websocket_server.serve = serve
         try:
