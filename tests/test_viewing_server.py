@@ -230,6 +230,11 @@ def _answered(page: Page, client: Client):
     return client.picture()
 
 
+def _turns(page: Page, count: int) -> None:
+    for _ in range(count):
+        answer(page)
+
+
 def test_pictures_follow_the_camera_of_each_browser(page):
     with Client(page.url) as one, Client(page.url) as other:
         one.look(size=(120, 80))
@@ -283,6 +288,39 @@ def test_no_request_writes_outside_of_the_models_folder(page, tmp_path):
     assert not list(Path(page.path._folder).parents[2].rglob("*escaped*"))
     assert (page.path._folder / "inside.json").is_file()
     assert set(tmp_path.parent.rglob("*.json")) - before <= {page.path._folder / "inside.json"}
+
+
+def test_a_frame_that_cannot_be_drawn_is_told_once_and_ends_nothing(page, monkeypatch, capfd):
+    with Client(page.url) as client:
+        with monkeypatch.context() as broken:
+            broken.setattr(page._frames, "draw", lambda *_: (_ for _ in ()).throw(OSError("no file a\udcff.png")))
+            client.look(size=(60, 60))
+            client.until("BackgroundImageMessage")  # of a server that has been reset
+            for step in (1.0, 2.0):
+                client.look((step, 0.0, -4.0), size=(60, 60))
+                _turns(page, 3)
+        assert "no file a\\udcff.png" in client.until("NotificationShowMessage")["props"]["body"]
+        client.look((0.0, 0.0, -4.0), size=(60, 60))
+        assert _answered(page, client).shape[2] == 3
+    assert capfd.readouterr().err.count("could not draw a frame (no file") == 1
+
+
+def test_names_that_are_not_utf8_are_shown(tmp_path):
+    make_colmap_scene(tmp_path / "scene")
+    given = argparse.Namespace(source_path=str(tmp_path / "scene"), model_path=str(tmp_path / "a\udcff"), eval=True)
+    scene = Scene(ModelParams(argparse.ArgumentParser()).extract(given), model(20), shuffle=False, start=False)
+    first = scene.getTrainCameras()[0]
+    first.image_name = "b\udcff.png"
+    shown = Page(ANY, scene, pipeline(), False, False)
+    try:
+        with Client(shown.url) as client:
+            sent, texts = "", (r"a\udcff", r"train 0: b\udcff.png")
+            while not all(repr(text) in sent for text in texts):
+                sent += repr(client.messages())
+            client.look()
+            assert _answered(shown, client).size
+    finally:
+        shown.stop()
 
 
 def test_addresses_of_ipv6_are_written_in_brackets(capfd):

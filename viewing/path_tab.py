@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from moving_cameras.keyframes import EASINGS, CameraPath, Keyframe
 from utils.system_utils import UserError
 from viewing.poses import pose_of
+from viewing.texts import as_utf8
 
 if TYPE_CHECKING:
     import viser
@@ -61,11 +62,11 @@ class PathTab:
 
     def _save(self, client: "viser.ClientHandle | None") -> None:
         try:
-            title, body = "Saved", f"render.py --path {self.save(self.name.value)}"
+            title, body = "Saved", f"render.py -m {self._folder.parent} --path {self.save(self.name.value)}"
         except UserError as error:
             title, body = "Not saved", str(error)
         if client is not None:
-            client.add_notification(title, body)
+            client.add_notification(title, as_utf8(body))
 
     def _free_name(self) -> str:
         number = 1

@@ -8,6 +8,7 @@ import numpy as np
 from gaussian_renderer.free_view import rotation_matrix
 from scene.cameras import Camera
 from viewing.settings import Pose, Vector
+from viewing.texts import as_utf8
 
 _NEAR = 1e-3  # of the scene's size: a page's camera that close stands at the scene's camera
 _TURNED = 2e-3  # radians
@@ -20,7 +21,7 @@ class SceneCameras:
     def __init__(self, train: Sequence[Camera], test: Sequence[Camera]) -> None:
         sets = {"train": train, "test": test}
         self.by_name: dict[str, Camera] = {
-            f"{of_set} {index}: {camera.image_name}": camera
+            as_utf8(f"{of_set} {index}: {camera.image_name}"): camera
             for of_set, cameras in sets.items()
             for index, camera in enumerate(cameras)
         }
