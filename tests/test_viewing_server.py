@@ -6,9 +6,12 @@ import re
 import socket
 import sys
 import threading
+import time
+import warnings
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 from gaussians import model, pipeline
 from synthetic import make_colmap_scene
@@ -91,7 +94,9 @@ def test_nobody_else_than_this_machine_is_served_on_loopback(local):
     port = local.server.get_port()
     for host, status in (
         (f"127.0.0.1:{port}", 200), ("localhost:9999", 200), ("[::1]:1", 200), ("evil.example", 403),
-        (f"evil.example:{port}", 403), ("127.0.0.1.evil.example", 403), ("", 403), ("[", 403),
+        (f"evil.example:{port}", 403), ("127.0.0.1.evil.example", 403), ("", 403), ("[", 403), (":80", 403),
+        ("127.0.0.1:x", 403), ("127.0.0.1:99999", 403), ("localhost@evil.example", 403),
+        ("127.0.0.1 evil.example", 403),
     ):  # fmt: skip
         assert _get(port, "/", Host=host)[0] == status, host
 
@@ -126,6 +131,9 @@ def test_other_addresses_need_the_token(public, capfd):
     assert "HttpOnly" in cookie and "SameSite=Strict" in cookie
     with Client(url, headers={"Cookie": cookie.split(";")[0]}) as client:
         assert client.messages()
+    # Browsers send a cookie of this host to all its ports, whichever port the page that asks comes from.
+    with pytest.raises(InvalidStatus, match="403"):
+        Client(url, "http://127.0.0.1:1", headers={"Cookie": cookie.split(";")[0]})
 
 
 def test_the_token_is_new_each_time_and_printed_with_a_warning(capfd):
@@ -303,6 +311,28 @@ def test_a_frame_that_cannot_be_drawn_is_told_once_and_ends_nothing(page, monkey
         client.look((0.0, 0.0, -4.0), size=(60, 60))
         assert _answered(page, client).shape[2] == 3
     assert capfd.readouterr().err.count("could not draw a frame (no file") == 1
+
+
+def test_a_browser_that_leaves_while_its_frame_is_drawn_is_not_worth_a_word():
+    with warnings.catch_warnings(record=True) as heard:
+        warnings.simplefilter("always")
+        served = servers.serve(ANY, "test")
+        handles = served.server.get_clients
+        with Client(served.url) as client:
+            client.look()
+            _until(handles)
+            handle = next(iter(handles().values()))
+        _until(lambda: not handles())
+        handle.scene.set_background_image(np.zeros((2, 2, 3), np.uint8))
+        servers.stop(served.server)
+    assert not heard
+
+
+def _until(holds) -> None:
+    deadline = time.monotonic() + 10
+    while not holds():
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
 
 
 def test_names_that_are_not_utf8_are_shown(tmp_path):

@@ -5,6 +5,7 @@ import errno
 import io
 import socket
 import sys
+import warnings
 from types import ModuleType
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -46,6 +47,8 @@ def serve(address: Address, label: str) -> Served:
     viser = _import_viser()
     from viewing.gate import Gate
 
+    # A browser may leave at any moment, also while a frame is drawn for it.
+    warnings.filterwarnings("ignore", r"Queued a \w+ on a closed connection", UserWarning)
     port = _free_port(address)
     gate = Gate(address.host)
     with gate.in_front_of_viser(), contextlib.redirect_stdout(io.StringIO()):
