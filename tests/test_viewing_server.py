@@ -279,6 +279,23 @@ def test_hostile_messages_neither_stop_the_page_nor_make_large_pictures(page):
     page.view.scaling.value, page.view.mode.value, page.view.background.value = 1.0, "Colour", (0, 0, 0)
 
 
+def test_a_crop_box_that_many_drag_is_drawn_once(page, capfd):
+    crop, corner = page.view.crop._impl.uuid, page.view.corners[0]._impl.uuid
+    with Client(page.url) as one, Client(page.url) as other:
+        for client in (one, other):
+            client.look()
+        for step in range(200):
+            one.send("GuiUpdateMessage", uuid=crop, updates={"value": step % 2 == 0})
+            other.send("GuiUpdateMessage", uuid=corner, updates={"value": [-float(step + 1), -1.0, -1.0]})
+        _until(lambda: page.view.corners[0].value[0] == -200.0 and not page.view.crop.value)
+        one.send("GuiUpdateMessage", uuid=crop, updates={"value": True})
+        _until(lambda: page.view._box is not None)
+        one.send("GuiUpdateMessage", uuid=crop, updates={"value": False})
+        _until(lambda: page.view._box is None)
+    assert "/crop box" not in page.server.scene._handle_from_node_name
+    assert "rror" not in capfd.readouterr().err
+
+
 def test_no_request_writes_outside_of_the_models_folder(page, tmp_path):
     """A browser names the path; the file that is written lies in the model's folder, or there is none."""
     before = set(tmp_path.parent.rglob("*.json"))
