@@ -10,6 +10,7 @@ from moving_cameras.focus import focus_point
 from moving_cameras.poses import poses_of
 from scene.cameras import Camera
 from viewing.settings import Pose, Vector
+from viewing.texts import as_utf8
 
 _NEAR = 1e-3  # of the scene's size: a page's camera that close stands at the scene's camera
 _TURNED = 2e-3  # radians
@@ -22,7 +23,7 @@ class SceneCameras:
     def __init__(self, train: Sequence[Camera], test: Sequence[Camera]) -> None:
         sets = {"train": train, "test": test}
         self.by_name: dict[str, Camera] = {
-            f"{of_set} {index}: {camera.image_name}": camera
+            as_utf8(f"{of_set} {index}: {camera.image_name}"): camera
             for of_set, cameras in sets.items()
             for index, camera in enumerate(cameras)
         }

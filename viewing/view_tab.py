@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from viewing.in_turn import in_turn
 from viewing.settings import MODES, Settings, Vector
 
 if TYPE_CHECKING:
@@ -44,7 +45,7 @@ class ViewTab:
         for handle in (self.mode, self.scaling, self.degree, self.background):
             handle.on_update(lambda _: changed())
         for handle in (self.crop, *self.corners):
-            handle.on_update(lambda _: (self._show_box(), changed()))
+            handle.on_update(in_turn(lambda _: (self._show_box(), changed())))
 
     def _show_box(self) -> None:
         """Draw the edges of the crop box into the scene."""

@@ -1,9 +1,6 @@
 """The web page that shows a training and controls it."""
 
-import sys
 import time
-
-from tqdm import tqdm
 
 from training.observer import Error, Observer
 from training.observers.saves import Checkpoints
@@ -37,7 +34,6 @@ class PageObserver(Observer):
             self._tab = TrainingTab(self._page.server, self._requests)
         self.budget = Budget()
         self._wish: Wish | None = None
-        self._warned = False
         self._numbers = (0.0, 0, 0.0)  # when they were shown, the iteration, and its seconds of training
 
     def due(self, step: Step) -> bool:
@@ -63,12 +59,7 @@ class PageObserver(Observer):
 
     def _draw(self, wish: Wish, version: int) -> None:
         began = time.perf_counter()
-        try:
-            self._page.send(wish, self._page.draw(wish, version))
-        except Exception as error:  # memory, a photo that is gone: no frame is worth a training
-            if not self._warned:
-                tqdm.write(f"warning: the viewer could not draw a frame ({error})", file=sys.stderr)
-            self._warned = True
+        self._page.fulfil(wish, version)
         self.budget.spent(began, time.perf_counter() - began)
 
     def _obey(self, step: Step) -> None:
