@@ -151,6 +151,21 @@ def test_stop_saves_a_checkpoint_that_can_be_resumed(colmap_scene, tmp_path, mon
     assert resumed.read_bytes() == _train(colmap_scene, tmp_path / "alone", viewer=False).read_bytes()
 
 
+def test_a_pause_before_the_stop_is_no_time_of_training(colmap_scene, tmp_path, monkeypatch):
+    before: list[float] = []
+
+    def pause(watched: Watched) -> None:
+        before.append(watched.observer._run.clock.seconds)
+        watched.requests.pause()
+        _later(watched.requests.stop, 1.5)
+
+    Watched(monkeypatch, {12: pause})
+    with pytest.raises(KeyboardInterrupt):
+        _train(colmap_scene, tmp_path / "out", "--no_curve")
+    log = json.loads((tmp_path / "out/train_log.json").read_text())
+    assert before[0] < log[-1]["seconds"] < before[0] + 1.0
+
+
 def test_a_signal_ends_a_paused_training_and_saves_it(colmap_scene, tmp_path, monkeypatch):
     def pause(watched: Watched) -> None:
         watched.requests.pause()
