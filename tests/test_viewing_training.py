@@ -177,6 +177,22 @@ def test_a_signal_ends_a_paused_training_and_saves_it(colmap_scene, tmp_path, mo
     assert (tmp_path / "out/chkpnt12.pth").exists()
 
 
+def test_a_checkpoint_that_cannot_be_written_ends_no_training(colmap_scene, tmp_path, monkeypatch, capfd):
+    told = []
+
+    def save(watched: Watched) -> None:
+        watched.page.tell = lambda title, body: told.append((title, body))
+        watched.requests.save()
+
+    Watched(monkeypatch, {10: save, 20: lambda watched: watched.requests.save()})
+    (tmp_path / "out/chkpnt10.pth").mkdir(parents=True)
+    expected = _train(colmap_scene, tmp_path / "alone", "--no_curve", viewer=False).read_bytes()
+    assert _train(colmap_scene, tmp_path / "out", "--no_curve").read_bytes() == expected
+    assert (tmp_path / "out/chkpnt20.pth").is_file()
+    assert [title for title, _ in told] == ["Not saved", "Saved", "The training is done"]
+    assert "warning: cannot write" in capfd.readouterr().err
+
+
 def test_a_frame_that_cannot_be_drawn_ends_no_training(colmap_scene, tmp_path, monkeypatch, capfd):
     watched = Watched(monkeypatch, {5: Watched.connect})
 
