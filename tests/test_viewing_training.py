@@ -139,6 +139,22 @@ def test_a_paused_training_waits_takes_single_steps_and_goes_on(colmap_scene, tm
     assert reached == [30, 31, 32]
 
 
+def test_a_pause_does_not_make_the_training_look_slow(colmap_scene, tmp_path, monkeypatch):
+    monkeypatch.setattr(observed, "_NUMBERS_EVERY", 0.0)
+    seen: list[float] = []
+
+    def pause(watched: Watched) -> None:
+        watched.requests.pause()
+        _later(watched.requests.resume, 0.8)
+
+    def note(watched: Watched) -> None:
+        seen.append(float(watched.observer._tab.speed.value))
+
+    Watched(monkeypatch, {2: Watched.connect, 29: note, 30: pause, 31: note, 32: note})
+    _train(colmap_scene, tmp_path / "out", "--no_curve")
+    assert len(seen) == 3 and min(seen) > 0
+
+
 def test_stop_saves_a_checkpoint_that_can_be_resumed(colmap_scene, tmp_path, monkeypatch, capfd):
     Watched(monkeypatch, {33: lambda w: w.requests.stop()})
     with pytest.raises(KeyboardInterrupt):

@@ -101,6 +101,8 @@ class PageObserver(Observer):
     def _show_numbers(self, iteration: int) -> None:
         run, now = self._run, time.perf_counter()
         _, before, seconds = self._numbers
+        if iteration == before:  # a pause has shown it
+            return
         self._numbers = now, iteration, run.clock.seconds
         took = run.clock.seconds - seconds
         speed = (iteration - before) / took if before and took > 0 else None
