@@ -72,10 +72,10 @@ class ViewTab:
 
 def first_box(positions: Tensor) -> tuple[Vector, Vector]:
     """A box around most positions (N, 3), rounded to thousandths of its size: its lowest and highest corner."""
-    if not len(positions):
-        return (-1.0, -1.0, -1.0), (1.0, 1.0, 1.0)
     some = positions.detach()[:: max(1, len(positions) // 100_000)].double().cpu()
     some = some[some.isfinite().all(1)]
+    if not len(some):
+        return (-1.0, -1.0, -1.0), (1.0, 1.0, 1.0)
     low, high = (torch.quantile(some, q, dim=0) for q in (_OUTLIERS, 1 - _OUTLIERS))
     digits = 3 - math.floor(math.log10(max(float((high - low).max()), 1e-9)))
     return tuple(tuple(round(x, digits) for x in corner.tolist()) for corner in (low, high))

@@ -1,11 +1,15 @@
 """The web page that shows a training and controls it."""
 
+import sys
 import time
+
+from tqdm import tqdm
 
 from training.observer import Error, Observer
 from training.observers.saves import Checkpoints
 from training.run import Run
 from training.step import Step
+from utils.system_utils import UserError
 from viewing.budget import MOVING, STILL, Budget
 from viewing.page import Page
 from viewing.requests import Requests
@@ -73,7 +77,7 @@ class PageObserver(Observer):
                 self._checkpoints.save(step)
                 return
             if requests.take_checkpoint():
-                self._checkpoints.save(step)
+                self._save(step)
             if not requests.paused or requests.take_step():
                 return
             wish = self._page.watchers.next(step.iteration)
@@ -82,9 +86,23 @@ class PageObserver(Observer):
             else:
                 self._draw(wish, step.iteration)
 
+    def _save(self, step: Step) -> None:
+        """Save a checkpoint. A disk that is full is told, and ends nothing."""
+        try:
+            self._checkpoints.save(step)
+        except UserError as error:
+            if not isinstance(error.__cause__, OSError):  # such as a loss that is not finite
+                raise
+            tqdm.write(f"warning: {error}", file=sys.stderr)
+            self._page.tell("Not saved", str(error))
+        else:
+            self._page.tell("Saved", f"chkpnt{step.iteration}.pth")
+
     def _show_numbers(self, iteration: int) -> None:
         run, now = self._run, time.perf_counter()
         _, before, seconds = self._numbers
+        if iteration == before:  # a pause has shown it
+            return
         self._numbers = now, iteration, run.clock.seconds
         took = run.clock.seconds - seconds
         speed = (iteration - before) / took if before and took > 0 else None
@@ -92,6 +110,8 @@ class PageObserver(Observer):
         self._tab.show(speed, run.losses.mean, run.rows)
 
     def ended(self, error: Error) -> None:
-        what = "is done" if error is None else "has stopped"
-        self._page.tell(f"The training {what}", f"See it by python view.py -m {self._run.scene.model_path}")
+        if error is None:
+            self._page.tell("The training is done", f"See it by python view.py -m {self._run.scene.model_path}")
+        else:
+            self._page.tell("The training has stopped", "Its terminal says why, and how to resume it")
         self._page.stop()
