@@ -6,8 +6,6 @@ from collections.abc import Sequence
 import numpy as np
 
 from gaussian_renderer.free_view import rotation_matrix
-from moving_cameras.focus import focus_point
-from moving_cameras.poses import poses_of
 from scene.cameras import Camera
 from viewing.settings import Pose, Vector
 from viewing.texts import as_utf8
@@ -21,6 +19,9 @@ class SceneCameras:
     """by_name: the cameras, training ones first, with names such as `train 3: IMG_0007`."""
 
     def __init__(self, train: Sequence[Camera], test: Sequence[Camera]) -> None:
+        from moving_cameras.focus import focus_point  # SciPy takes a while to import
+        from moving_cameras.poses import poses_of
+
         sets = {"train": train, "test": test}
         self.by_name: dict[str, Camera] = {
             as_utf8(f"{of_set} {index}: {camera.image_name}"): camera
