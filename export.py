@@ -24,6 +24,7 @@ import torch
 from arguments import ModelParams, OptionParser, PipelineParams, get_combined_args
 from exports.formats import FORMATS, Format, format_of
 from exports.of_model import splats_of
+from exports.plain_ply import stored_offset
 from exports.read import READABLE, read_splats
 from exports.selection import drawable, opacities, selected, tidy, with_sh_degree, within_box
 from exports.splats import Splats
@@ -61,6 +62,7 @@ def load(args: argparse.Namespace, options: argparse.Namespace, want_views: bool
     degree = stored_sh_degree(path)
     gaussians = GaussianModel(options.sh_degree if degree is None else degree)
     gaussians.load_ply(path)
+    gaussians.world_offset = stored_offset(path)
     return splats_of(gaussians, args.antialiasing), None
 
 
@@ -103,6 +105,7 @@ def thin_out(
 def export(args: argparse.Namespace, options: argparse.Namespace, pipe: argparse.Namespace, entry: Format) -> None:
     """Write the file that the command line asks for. UserError if there is nothing to load or to write."""
     make_path = _path_maker(args.path, entry)
+    entry.check(args.to)
     splats, scene = load(args, options, want_views=bool(args.max_splats) or entry.of_scene)
     degree = splats.sh_degree if args.typed_sh_degree is None else min(args.typed_sh_degree, splats.sh_degree)
     keep = choose(splats, args.crop, args.min_opacity)
@@ -144,13 +147,13 @@ def options() -> tuple[argparse.ArgumentParser, ModelParams, PipelineParams]:
     )
     add("--sh_degree", type=int, choices=range(4), metavar="D", help="leave SH bands above D out (default: keep all)")
     add("--crop", type=float, nargs=6, metavar=("X0", "Y0", "Z0", "X1", "Y1", "Z1"),
-        help="keep the Gaussians with a centre in this box of world coordinates (default: keep all)")  # fmt: skip
+        help="keep the Gaussians with a centre in this box, in the frame of the model (default: keep all)")  # fmt: skip
     add("--min_opacity", type=float, default=0.0, help="leave fainter Gaussians out, 0 to 1 (default: 0)")
     add("--max_splats", type=int, default=0, metavar="N",
         help="keep N Gaussians; what adds least to the training views goes first (default: 0, no limit)")  # fmt: skip
     add("--path", metavar="PATH",
         help="animation of an .html: interpolate, ellipse, spiral, or a JSON file of keyframes "
-        "(default: once around the model)")  # fmt: skip
+        "(default: around the model, or a sway if the first camera is within it)")  # fmt: skip
     add("--quiet", action="store_true", help="print nothing to stdout (default: off)")
     return parser, model_params, pipeline_params
 

@@ -13,7 +13,7 @@ import numpy as np
 from plyfile import PlyData, PlyElement, PlyParseError
 
 from exports.packing import from_bits, morton_order, smallest_three, to_bits, whole_quaternions
-from exports.plain_ply import comments, says_antialiasing
+from exports.plain_ply import comments, says_antialiasing, stored_offset
 from exports.selection import logits, opacities, selected
 from exports.splats import Splats
 from utils.files.ply_header import header_lines
@@ -53,9 +53,9 @@ def write_compressed_ply(path: str | os.PathLike, splats: Splats) -> None:
     vertex["packed_color"] = red << 24 | green << 16 | blue << 8 | to_bits(opacities(splats), 8)
     elements = [_table("chunk", ranges, "<f4"), PlyElement.describe(vertex, "vertex")]
     if splats.sh_degree:
-        rest = splats.sh[:, 1:].transpose(0, 2, 1).reshape(count, 3 * (splats.sh.shape[1] - 1)).astype(np.float64)
-        codes = np.clip(np.floor((rest / SH_RANGE + 0.5) * 256), 0, 255)
-        elements.append(_table("sh", [([f"f_rest_{i}" for i in range(rest.shape[1])], codes)], "u1"))
+        codes = np.floor((splats.sh[:, 1:] / np.float32(SH_RANGE) + np.float32(0.5)) * 256)  # float64 would take GBs
+        codes = codes.clip(0, 255).astype(np.uint8).transpose(0, 2, 1).reshape(count, 3 * (splats.sh.shape[1] - 1))
+        elements.append(_table("sh", [([f"f_rest_{i}" for i in range(codes.shape[1])], codes)], "u1"))
     with atomic_write(path) as temporary:
         PlyData(elements, byte_order="<", comments=comments(splats)).write(str(temporary))
 
@@ -113,10 +113,10 @@ def read_compressed_ply(path: str | os.PathLike) -> Splats:
         raise UserError(f"{path} is not a complete compressed PLY ({error}); save or download it again") from error
     shifted = np.stack([from_bits(packed[1] >> np.uint32(shift), 10) for shift in (20, 10, 0)], axis=1)
     rotations = whole_quaternions((packed[1] >> np.uint32(30)).astype(np.int64), (shifted - 0.5) * np.sqrt(2))
-    sh = np.concatenate([((color - 0.5) / C0)[:, None], rest], axis=1)
+    sh = np.concatenate([((color - 0.5) / C0).astype(np.float32)[:, None], rest], axis=1)
     alpha = logits(from_bits(packed[3], 8), 1 / 255)
     values = (x.astype(np.float32) for x in (position, log_scales, rotations, alpha, sh))
-    return Splats(*values, antialiasing=says_antialiasing(path))
+    return Splats(*values, antialiasing=says_antialiasing(path), world_offset=stored_offset(path))
 
 
 def _parts(codes: np.ndarray) -> np.ndarray:
@@ -134,12 +134,13 @@ def _between(chunks: np.ndarray, group: str, chunk_of: np.ndarray, parts: np.nda
 def _read_rest(ply: PlyData, count: int) -> np.ndarray:
     """SH coefficients above band 0, (N, K, 3)."""
     if "sh" not in ply:
-        return np.zeros((count, 0, 3))
+        return np.zeros((count, 0, 3), np.float32)
     table = ply["sh"].data
     names = [f"f_rest_{i}" for i in range(len(table.dtype.names))]
-    codes = np.stack([np.asarray(table[name], np.float64) for name in names], axis=1)
+    codes = np.stack([np.asarray(table[name]).astype(np.uint8) for name in names], axis=1)
     if len(table) != count or len(names) not in (9, 24, 45):
         raise ValueError(f"{len(names)} SH values for each of {len(table)} splats")
     # The middle of each step, but the whole range at its ends.
-    value = np.where(codes == 0, 0, np.where(codes == 255, 1, (codes + 0.5) / 256))
-    return ((value - 0.5) * SH_RANGE).reshape(count, 3, len(names) // 3).transpose(0, 2, 1)
+    steps = np.concatenate([[0], (np.arange(1, 255) + 0.5) / 256, [1]])
+    values = ((steps - 0.5) * SH_RANGE).astype(np.float32)
+    return values[codes].reshape(count, 3, len(names) // 3).transpose(0, 2, 1)

@@ -11,29 +11,41 @@ import struct
 
 import numpy as np
 
+from exports.packing import to_bytes
 from exports.selection import opacities
 from exports.splats import Splats
 from utils.sh_utils import C0
-from utils.system_utils import atomic_write
+from utils.system_utils import UserError, atomic_write
 
 EXTENSION = "KHR_gaussian_splatting"
+LARGEST = 2**32 - 1  # bytes: the header has 32 bits for them
 _FLOAT, _UNSIGNED_BYTE, _ARRAY_BUFFER, _POINTS = 5126, 5121, 34962, 0
 _KINDS = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
 
 
 def write_glb(path: str | os.PathLike, splats: Splats) -> None:
-    """Write the file, whole or not at all. Without splats it has a node without a mesh, as glTF has no empty one."""
+    """Write the file, whole or not at all. UserError if it is too large.
+
+    Without splats it has a node without a mesh, as glTF has no empty one.
+    """
     attributes = _attributes(splats) if len(splats) else {}
-    blocks = [values.tobytes() for values in attributes.values()]
-    binary = b"".join(blocks)
-    document = _document(attributes, [len(block) for block in blocks], splats.antialiasing)
+    sizes = [values.nbytes for values in attributes.values()]
+    document = _document(attributes, sizes, splats.antialiasing)
     text = json.dumps(document, separators=(",", ":"), allow_nan=False).encode()
     text += b" " * (-len(text) % 4)
     chunks = struct.pack("<I4s", len(text), b"JSON") + text
-    if binary:
-        chunks += struct.pack("<I4s", len(binary), b"BIN\0") + binary
-    with atomic_write(path) as temporary:
-        temporary.write_bytes(struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks)
+    length = 12 + len(chunks) + (8 + sum(sizes) if attributes else 0)
+    if length > LARGEST:
+        raise UserError(
+            f"{path} would have {length / 1e9:.1f} GB, and a GLB has at most {LARGEST / 1e9:.1f}; leave Gaussians out "
+            "by --max_splats, or bands by --sh_degree"
+        )
+    with atomic_write(path) as temporary, open(temporary, "wb") as file:
+        file.write(struct.pack("<4sII", b"glTF", 2, length) + chunks)
+        if attributes:
+            file.write(struct.pack("<I4s", sum(sizes), b"BIN\0"))
+        for values in attributes.values():  # one by one, as all of them together take much memory
+            file.write(np.ascontiguousarray(values))
 
 
 def _attributes(splats: Splats) -> dict[str, np.ndarray]:
@@ -41,7 +53,7 @@ def _attributes(splats: Splats) -> dict[str, np.ndarray]:
     color = np.concatenate([splats.sh[:, 0] * C0 + 0.5, alpha[:, None]], axis=1)
     values = {
         "POSITION": splats.means,
-        "COLOR_0": np.floor(np.clip(color, 0, 1) * 255 + 0.5).astype(np.uint8),
+        "COLOR_0": to_bytes(255 * color),
         f"{EXTENSION}:ROTATION": np.roll(splats.rotations, -1, axis=1),
         f"{EXTENSION}:SCALE": np.exp(splats.log_scales),
         f"{EXTENSION}:OPACITY": alpha[:, None],

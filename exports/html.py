@@ -10,6 +10,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import jinja2
+import numpy as np
 
 from exports.compressed_ply import write_compressed_ply
 from exports.splats import Splats
@@ -38,7 +39,8 @@ def write_html(
     """Write the page, whole or not at all.
 
     cameras: the training views, the first of which is where the page begins; up to 25 of them become bookmarks.
-    camera_path: the animation, None: once around the model. title: None: the file's name. background: RGB in [0,1].
+    camera_path: the animation, None: the viewer's own, which goes around the model, or sways where the first camera is
+    in the model's box. title: None: the file's name. background: RGB in [0,1].
     UserError without a camera.
     """
     if not cameras:
@@ -49,7 +51,7 @@ def write_html(
     page = {
         "antialiasing": splats.antialiasing,
         "name": _NAME,
-        "settings": settings(poses, names, turn, camera_path, background),
+        "settings": settings(poses, names, turn, camera_path, background, _distance(splats, poses)),
     }
     content = _template().render(
         background=", ".join(f"{255 * value:.0f}" for value in background),
@@ -82,6 +84,11 @@ def write_scene_html(
     camera_path = make_path(poses_of(cameras)) if make_path and cameras else None
     background = (1.0, 1.0, 1.0) if white_background else (0.0, 0.0, 0.0)
     write_html(path, splats, cameras, camera_path, background=background)
+
+
+def _distance(splats: Splats, poses: Poses) -> float:
+    """Median distance of the Gaussians from the first camera."""
+    return float(np.median(np.linalg.norm(splats.means - poses.positions[0], axis=1))) if len(splats) else 1.0
 
 
 def _template() -> jinja2.Template:

@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 
 from exports.of_model import fill_model, model_of
-from exports.plain_ply import stored_offset
 from exports.read import is_point_cloud, read_splats
 from exports.selection import drawable, selected
 from exports.splats import Splats
@@ -38,11 +37,11 @@ def scene_with(
     with tempfile.TemporaryDirectory() as folder:  # so that the scene moves the points into its frame, as it does any
         points = Path(folder) / "points.npz"
         colors = np.clip(splats.sh[:, 0] * C0 + 0.5, 0, 1)
-        np.savez(points, points=splats.means.astype(np.float64) + stored_offset(path), colors=colors)
+        np.savez(points, points=splats.means.astype(np.float64) + splats.world_offset, colors=colors)
         options.init_pcd_path = str(points)
         scene = Scene(options, gaussians, shuffle=shuffle, start=False)
     means = np.ascontiguousarray(scene.info.point_cloud.points, dtype=np.float32)
-    return scene, replace(splats, means=means)
+    return scene, replace(splats, means=means, world_offset=tuple(scene.info.offset.tolist()))
 
 
 def load_file(options: argparse.Namespace, path: str, pipeline: argparse.Namespace) -> Scene:

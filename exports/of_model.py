@@ -18,7 +18,7 @@ def splats_of(gaussians: GaussianModel, antialiasing: bool = False) -> Splats:
         scales, logits = gaussians.get_scaling.log(), inverse_sigmoid(gaussians.get_opacity)
     values = (gaussians.get_xyz, scales, gaussians.get_rotation, logits[:, 0], gaussians.get_features)
     means, scales, rotations, logits, sh = (x.detach().float().cpu().contiguous().numpy() for x in values)
-    return Splats(means, scales, rotations, logits, sh, antialiasing)
+    return Splats(means, scales, rotations, logits, sh, antialiasing, gaussians.world_offset)
 
 
 def model_of(splats: Splats, sh_degree: int | None = None) -> GaussianModel:

@@ -11,6 +11,13 @@ def to_bits(values: np.ndarray, bits: int) -> np.ndarray:
     return np.clip(np.floor(np.asarray(values, np.float64) * most + 0.5), 0, most).astype(np.uint32)
 
 
+def to_bytes(values: np.ndarray) -> np.ndarray:
+    """Values in [0, 255] as uint8, rounded to the nearest; others are clamped."""
+    rounded = values + 0.5
+    np.floor(rounded, out=rounded)
+    return np.clip(rounded, 0, 255, out=rounded).astype(np.uint8)
+
+
 def from_bits(codes: np.ndarray, bits: int) -> np.ndarray:
     """The values in [0, 1] of the lowest `bits` bits of integers."""
     most = (1 << bits) - 1

@@ -1,13 +1,15 @@
 """PLY with float32 properties: the reference's columns, and comments that say what they mean."""
 
 import contextlib
+import math
 import os
 
 import numpy as np
 import torch
 
 from exports.splats import Splats
-from scene.gaussians.ply import read_ply, write_ply
+from scene.gaussians.ply import offset_comments, read_ply, read_vertices, write_ply
+from scene.readers.world_offset import origin_near
 from utils.files.ply_header import header_lines
 
 AXES = "axes x right, y down, z forward (COLMAP)"
@@ -19,6 +21,7 @@ def comments(splats: Splats) -> list[str]:
         AXES,
         f"SplatRenderMode: {'mip' if splats.antialiasing else 'default'}",
         f"antialiased {splats.antialiasing:d}",
+        *offset_comments(splats.world_offset),
     ]
 
 
@@ -32,14 +35,16 @@ def says_antialiasing(path: str | os.PathLike) -> bool:
     return found
 
 
-def stored_offset(path: str | os.PathLike) -> np.ndarray:
-    """World coordinates (3,) float64 of a PLY's origin: those of our comment world_offset, zero without one."""
+def stored_offset(path: str | os.PathLike) -> tuple[float, float, float]:
+    """World coordinates of a PLY's origin: those of our comment world_offset, zero without a finite one."""
     for line in header_lines(path):
         words = line.split()
         if words[:2] == ["comment", "world_offset"] and len(words) == 5:
             with contextlib.suppress(ValueError):
-                return np.array([float(word) for word in words[2:]])
-    return np.zeros(3)
+                offset = tuple(float(word) for word in words[2:])
+                if all(map(math.isfinite, offset)):
+                    return offset
+    return 0.0, 0.0, 0.0
 
 
 def write_plain_ply(path: str | os.PathLike, splats: Splats) -> None:
@@ -57,8 +62,29 @@ def write_plain_ply(path: str | os.PathLike, splats: Splats) -> None:
 
 
 def read_plain_ply(path: str | os.PathLike) -> Splats:
-    """Read a Gaussian PLY of any tool. UserError as from scene/gaussians/ply.py."""
+    """Read a Gaussian PLY of any tool. UserError as from scene/gaussians/ply.py.
+
+    Doubles far from their origin, as of scene/export_world.py, become relative to one that is near them.
+    """
     rows = {name: values.numpy() for name, values in read_ply(path, None).items()}
+    offset = stored_offset(path)
+    if any(line.split() in (["property", "double", "x"], ["property", "float64", "x"]) for line in header_lines(path)):
+        rows["xyz"], origin = _near_origin(path, rows["xyz"])
+        offset = tuple((origin + offset).tolist())
     sh = torch.cat([torch.from_numpy(rows["f_dc"]), torch.from_numpy(rows["f_rest"])], dim=1).numpy()
     values = (rows["xyz"], rows["scaling"], rows["rotation"], rows["opacity"][:, 0], sh)
-    return Splats(*values, antialiasing=says_antialiasing(path))
+    return Splats(*values, antialiasing=says_antialiasing(path), world_offset=offset)
+
+
+def _near_origin(path: str | os.PathLike, means: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The positions (N,3) of a PLY of doubles as float32, and their origin (3,), which is zero unless they are far."""
+    vertices = read_vertices(path)
+    places = np.stack([np.asarray(vertices[axis], np.float64) for axis in "xyz"], axis=1)
+    finite = places[np.isfinite(places).all(axis=1)]
+    middle = np.median(finite, axis=0) if len(finite) else np.zeros(3)
+    extent = float(np.median(np.linalg.norm(finite - middle, axis=1))) if len(finite) else 0.0
+    origin = origin_near(middle, extent) if extent else np.zeros(3)
+    if not origin.any():
+        return means, origin
+    print(f"{path}: positions are taken relative to {' '.join(map(repr, origin.tolist()))}, for float32's sake")
+    return (places - origin).astype(np.float32), origin

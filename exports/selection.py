@@ -23,13 +23,13 @@ def with_sh_degree(splats: Splats, degree: int) -> Splats:
 
 def drawable(splats: Splats) -> np.ndarray:
     """(N,) bool: the splats that the rasterizer draws. Infinite logits are opacities 0 and 1, all else is finite."""
-    finite = [np.isfinite(x).reshape(len(splats), -1).all(axis=1) for x in (splats.means, splats.log_scales, splats.sh)]
-    turned = np.isfinite(splats.rotations).all(axis=1)
-    return np.logical_and.reduce([*finite, turned, ~np.isnan(splats.opacity_logits)])
+    tables = splats.means, splats.log_scales, splats.rotations, splats.sh.reshape(len(splats), 3 * splats.sh.shape[1])
+    finite = [np.isfinite(table).all(axis=1) for table in tables]
+    return np.logical_and.reduce([*finite, ~np.isnan(splats.opacity_logits)])
 
 
 def within_box(splats: Splats, box: Sequence[float]) -> np.ndarray:
-    """(N,) bool: the splats whose centre lies in a box of world coordinates x0 y0 z0 x1 y1 z1."""
+    """(N,) bool: the splats whose centre lies in a box x0 y0 z0 x1 y1 z1 of the means' frame."""
     low, high = np.asarray(box[:3]), np.asarray(box[3:])
     return ((splats.means >= low) & (splats.means <= high)).all(axis=1)
 

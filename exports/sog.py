@@ -13,11 +13,17 @@ from utils.system_utils import UserError, atomic_write
 PROGRAM = "splat-transform"
 
 
-def write_sog(path: str | os.PathLike, splats: Splats) -> None:
-    """Write the file, whole or not at all. UserError without splat-transform, on PATH or in ./node_modules."""
+def find_program(path: str | os.PathLike) -> str:
+    """The program that a file of this name needs. UserError without it."""
     program = shutil.which(PROGRAM) or shutil.which(PROGRAM, path="node_modules/.bin")
     if program is None:
         raise UserError(f"{path} needs {PROGRAM}; install Node, then run npm install -g @playcanvas/splat-transform")
+    return program
+
+
+def write_sog(path: str | os.PathLike, splats: Splats) -> None:
+    """Write the file, whole or not at all. UserError without splat-transform, on PATH or in ./node_modules."""
+    program = find_program(path)
     if not len(splats):
         raise UserError(f"{path} would have no splats, which {PROGRAM} does not write; choose another format")
     with tempfile.TemporaryDirectory() as folder, atomic_write(path) as temporary:

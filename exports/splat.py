@@ -8,6 +8,7 @@ import os
 
 import numpy as np
 
+from exports.packing import to_bytes
 from exports.selection import logits, opacities
 from exports.splats import Splats
 from utils.sh_utils import C0
@@ -25,8 +26,8 @@ def write_splat(path: str | os.PathLike, splats: Splats) -> None:
     records["position"] = splats.means[order]
     records["scale"] = np.exp(splats.log_scales[order])
     color = np.concatenate([splats.sh[:, 0] * C0 + 0.5, alpha[:, None]], axis=1)
-    records["color"] = _byte(255 * color[order])
-    records["rotation"] = _byte(128 + 128 * splats.rotations[order])
+    records["color"] = to_bytes(255 * color[order])
+    records["rotation"] = to_bytes(128 + 128 * splats.rotations[order])
     with atomic_write(path) as temporary:
         temporary.write_bytes(records.tobytes())
 
@@ -45,7 +46,3 @@ def read_splat(path: str | os.PathLike) -> Splats:
     log_scales = np.log(np.maximum(records["scale"], np.float32(1e-35)))
     sh = ((color[:, None, :3] - 0.5) / C0).astype(np.float32)
     return Splats(records["position"].copy(), log_scales, rotations, logits(color[:, 3], 1 / 255), sh)
-
-
-def _byte(values: np.ndarray) -> np.ndarray:
-    return np.clip(np.floor(values + 0.5), 0, 255).astype(np.uint8)

@@ -11,7 +11,8 @@ class Splats:
 
     means (N,3); log_scales (N,3), natural logarithms; rotations (N,4), wxyz, of length 1; opacity_logits (N,);
     sh (N,K,3), the bands in the reference's order, K = (degree + 1)^2. Axes are those of COLMAP's world: of a usual
-    capture x is right, y down, z forward. antialiasing: whether they were trained with --antialiasing.
+    capture x is right, y down, z forward. antialiasing: whether they were trained with --antialiasing. world_offset:
+    the world's coordinates of the origin of the means.
     """
 
     means: np.ndarray
@@ -20,6 +21,7 @@ class Splats:
     opacity_logits: np.ndarray
     sh: np.ndarray
     antialiasing: bool = False
+    world_offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def __len__(self) -> int:
         return len(self.means)

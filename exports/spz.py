@@ -7,6 +7,7 @@ stream for each attribute: positions (24-bit fixed point), opacities, colours, l
 """
 
 import gzip
+import io
 import os
 import struct
 import sys
@@ -16,7 +17,7 @@ from types import ModuleType
 import numpy as np
 
 from exports.half_turn import half_turned
-from exports.packing import morton_order, smallest_three, whole_quaternions
+from exports.packing import morton_order, smallest_three, to_bytes, whole_quaternions
 from exports.selection import logits, opacities, selected
 from exports.splats import Splats
 from utils.system_utils import UserError, atomic_write
@@ -34,14 +35,14 @@ _SIZES = (9, 1, 3, 3, 4)  # bytes a splat of each stream, before SH
 
 def write_spz(path: str | os.PathLike, splats: Splats) -> None:
     """Write version 4, whole or not at all. UserError without the package zstandard."""
-    zstandard = _zstandard(path)
+    zstandard = find_zstandard(path)
     splats = half_turned(selected(splats, morton_order(splats.means)))
     farthest = float(np.abs(splats.means).max(initial=0))
     bits = int(np.clip(np.floor(np.log2(_LARGEST_POSITION / max(farthest, 1e-30))), 0, _MOST_BITS))
     compressor = zstandard.ZstdCompressor(level=_LEVEL)
     streams = [s.tobytes() for s in (_positions(splats.means, bits), *_bytes(splats), _rotations(splats.rotations))]
     if splats.sh_degree:  # readers refuse an empty stream
-        streams.append(_byte(splats.sh[:, 1:].astype(np.float64) * 128 + 128).tobytes())
+        streams.append(to_bytes(splats.sh[:, 1:] * 128 + 128).tobytes())
     packed = [compressor.compress(stream) for stream in streams]
     table = b"".join(struct.pack("<QQ", len(p), len(s)) for p, s in zip(packed, streams, strict=True))
     flags = _ANTIALIASED if splats.antialiasing else 0
@@ -50,7 +51,8 @@ def write_spz(path: str | os.PathLike, splats: Splats) -> None:
         temporary.write_bytes(header + table + b"".join(packed))
 
 
-def _zstandard(path: str | os.PathLike) -> ModuleType:
+def find_zstandard(path: str | os.PathLike) -> ModuleType:
+    """The package that a file of this name needs. UserError without it."""
     try:
         import zstandard
     except ImportError as error:
@@ -66,11 +68,11 @@ def _positions(means: np.ndarray, bits: int) -> np.ndarray:
 def _bytes(splats: Splats) -> tuple[np.ndarray, ...]:
     """Opacities, colours and scales."""
     color = (splats.sh[:, 0].astype(np.float64) * _COLOR + 0.5) * 255
-    return _byte(opacities(splats) * 255), _byte(color), _byte((splats.log_scales.astype(np.float64) + 10) * 16)
-
-
-def _byte(values: np.ndarray) -> np.ndarray:
-    return np.clip(np.floor(values + 0.5), 0, 255).astype(np.uint8)
+    return (
+        to_bytes(opacities(splats) * 255),
+        to_bytes(color),
+        to_bytes((splats.log_scales.astype(np.float64) + 10) * 16),
+    )
 
 
 def _rotations(wxyz: np.ndarray) -> np.ndarray:
@@ -94,7 +96,7 @@ def _read_zstd(content: bytes, path: str | os.PathLike) -> Splats:
     magic, version, count, degree, bits, flags, streams, table = _HEADER.unpack_from(content)
     if magic != MAGIC or version != 4:
         raise ValueError(f"no version that this program knows: {version}" if magic == MAGIC else "no magic number")
-    zstandard = _zstandard(path)
+    zstandard = find_zstandard(path)
     sizes = [size * count for size in (*_SIZES, 3 * ((degree + 1) ** 2 - 1))]
     begin, parts = table + 16 * streams, []
     for index, size in enumerate(sizes):
@@ -103,6 +105,8 @@ def _read_zstd(content: bytes, path: str | os.PathLike) -> Splats:
             raise ValueError(f"stream {index} promises {whole} bytes instead of {size}")
         try:
             part = content[begin : begin + packed]
+            if size and zstandard.frame_content_size(part) not in (-1, size):  # memory is taken for what it says
+                raise ValueError(f"stream {index} does not have its {size} bytes")
             parts.append(zstandard.ZstdDecompressor().decompress(part, max_output_size=size) if size else b"")
         except zstandard.ZstdError as error:
             raise ValueError(f"stream {index}: {error}") from error
@@ -111,15 +115,13 @@ def _read_zstd(content: bytes, path: str | os.PathLike) -> Splats:
 
 
 def _read_gzip(content: bytes) -> Splats:
-    content = gzip.decompress(content)
-    magic, version, count, degree, bits, flags, _ = _HEADER_GZIP.unpack_from(content)
+    stream = gzip.GzipFile(fileobj=io.BytesIO(content))
+    magic, version, count, degree, bits, flags, _ = _HEADER_GZIP.unpack(stream.read(_HEADER_GZIP.size))
     if magic != MAGIC or version not in (2, 3):
         raise ValueError(f"no version that this program knows: {version}" if magic == MAGIC else "no magic number")
     sizes = [*_SIZES[:4], 3 if version == 2 else 4, 3 * ((degree + 1) ** 2 - 1)]
-    begin, parts = _HEADER_GZIP.size, []
-    for size in sizes:
-        parts.append(content[begin : begin + size * count])
-        begin += size * count
+    parts = [stream.read(size * count) for size in sizes]  # no more than that, however much is packed
+    stream.read(1)  # at the end it checks the sum
     return _splats(parts, count, degree, bits, flags, version)
 
 
@@ -127,14 +129,14 @@ def _splats(parts: list[bytes], count: int, degree: int, bits: int, flags: int, 
     sizes = (*_SIZES[:4], 3 if version == 2 else 4)
     table = [np.frombuffer(part, np.uint8).reshape(count, size) for part, size in zip(parts, sizes, strict=False)]
     coefficients = (degree + 1) ** 2 - 1
-    rest = np.frombuffer(parts[5], np.uint8).reshape(count, coefficients, 3).astype(np.float64) / 128 - 1
+    rest = np.frombuffer(parts[5], np.uint8).reshape(count, coefficients, 3)[:, :15].astype(np.float32) / 128 - 1
     if degree > 3:
         print(f"warning: SH bands of degree {degree} are left out; models have at most degree 3", file=sys.stderr)
     wide = np.zeros((count, 3, 4), np.uint8)
     wide[:, :, 1:] = table[0].reshape(count, 3, 3)
     means = (wide.view("<i4")[:, :, 0] >> 8) / 2.0**bits
     base = (table[2] / 255.0 - 0.5) / _COLOR
-    sh = np.concatenate([base[:, None], rest[:, :15]], axis=1)
+    sh = np.concatenate([base.astype(np.float32)[:, None], rest], axis=1)
     alpha = logits(table[1].reshape(count) / 255.0, 1 / 255)
     values = (means, table[3] / 16.0 - 10, _read_rotations(table[4]), alpha, sh)
     means, scales, rotations, alpha, sh = (x.astype(np.float32) for x in values)

@@ -35,7 +35,7 @@ def turn_upright(up: np.ndarray) -> np.ndarray:
 
 
 def turned(splats: Splats, turn: np.ndarray) -> Splats:
-    """The same Gaussians in a world turned by a rotation (3,3)."""
+    """The same Gaussians in a world turned by a rotation (3,3); its offset is not kept."""
     rotation = Rotation.from_matrix(turn) * Rotation.from_quat(np.roll(splats.rotations, -1, axis=1))
     sh = np.einsum("jk,nkc->njc", _sh_turn(splats.sh_degree, turn).astype(np.float32), splats.sh)
     return Splats(

@@ -6,6 +6,7 @@ of the model, in COLMAP's axes, and the prim turns them half around x.
 
 import os
 import tempfile
+import zipfile
 from pathlib import Path
 from types import ModuleType
 
@@ -20,18 +21,35 @@ PRIM = "/World/Splats"
 
 def write_usdz(path: str | os.PathLike, splats: Splats) -> None:
     """Write the file, whole or not at all. UserError without a usd-core that has the schema."""
-    usd = _pxr(path)
+    usd = find_pxr(path)
     with tempfile.TemporaryDirectory() as folder, atomic_write(path) as temporary:
         layer = Path(folder) / "splats.usdc"
-        _write_stage(usd, str(layer), splats)
-        if not usd.UsdUtils.CreateNewUsdzPackage(usd.Sdf.AssetPath(str(layer)), str(temporary)):
-            raise UserError(f"cannot write {path}; free space, fix the permissions, or choose another place")
+        try:
+            _write_stage(usd, str(layer), splats)
+            done = usd.UsdUtils.CreateNewUsdzPackage(usd.Sdf.AssetPath(str(layer)), str(temporary))
+        except usd.Tf.ErrorException:
+            done = False
+        if not done or not _is_whole(temporary):
+            raise UserError(
+                f"cannot write {path}; free space there and in {tempfile.gettempdir()}, fix the permissions, or choose "
+                "another place"
+            )
 
 
-def _pxr(path: str | os.PathLike) -> ModuleType:
+def _is_whole(package: Path) -> bool:
+    """Whether a package has all of its bytes: OpenUSD does not tell of a disk that was full."""
+    try:
+        with zipfile.ZipFile(package) as archive:
+            return archive.testzip() is None
+    except zipfile.BadZipFile:
+        return False
+
+
+def find_pxr(path: str | os.PathLike) -> ModuleType:
+    """The package that a file of this name needs. UserError without it."""
     try:
         import pxr
-        from pxr import Gf, Sdf, Usd, UsdGeom, UsdUtils, UsdVol, Vt  # noqa: F401  (so that pxr has them)
+        from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdUtils, UsdVol, Vt  # noqa: F401  (so that pxr has them)
 
         UsdVol.ParticleField3DGaussianSplat  # noqa: B018
     except (ImportError, AttributeError) as error:

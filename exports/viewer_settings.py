@@ -26,15 +26,17 @@ def settings(
     turn: np.ndarray,
     path: TimedPath | None,
     background: tuple[float, float, float],
+    distance: float = 1.0,
 ) -> dict[str, Any]:
     """The settings of a model that was turned by `turn` (3,3).
 
     poses, names: of the training cameras before that, the first of which is where the viewer begins. path: the
-    animation, in the same frame. background: RGB in [0,1]. Opening angles are vertical, in degrees.
+    animation, in the same frame. background: RGB in [0,1]. distance: of the model, about which cameras that are all in
+    one place turn. Opening angles are vertical, in degrees.
     """
     axes = _VIEWER_AXES @ turn
     focus = focus_point(poses)
-    depths = _depths(poses, focus)
+    depths = _depths(poses, focus, distance)
     cameras = [_look(axes, *camera) for camera in zip(poses.positions, poses.turns, depths, poses.fov, strict=True)]
     marked = np.unique(np.linspace(0, len(cameras) - 1, BOOKMARKS).round().astype(int)).tolist()
     return {
@@ -50,10 +52,10 @@ def settings(
     }
 
 
-def _depths(poses: Poses, focus: np.ndarray | None) -> np.ndarray:
+def _depths(poses: Poses, focus: np.ndarray | None, distance: float) -> np.ndarray:
     """How far along each axis the point about which that camera turns lies: at the focus, or near it."""
     if focus is None:
-        return np.full(len(poses), max(poses.spread, 1e-3))
+        return np.full(len(poses), max(poses.spread or distance, 1e-3))
     ahead = ((focus - poses.positions) * poses.forward).sum(axis=1)
     return np.where(ahead > 0, ahead, np.median(ahead))
 

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
+from gaussian_renderer.free_view import rotation_matrix
 from scene.cameras import ZFAR, ZNEAR, Camera, MiniCam
 from utils.graphics_utils import focal2fov, projection, world_to_camera
 
@@ -103,7 +104,7 @@ def _slerp(first: np.ndarray, second: np.ndarray, fraction: float) -> np.ndarray
         mixed = (1 - fraction) * one + fraction * other
     else:
         mixed = math.sin((1 - fraction) * angle) * one + math.sin(fraction * angle) * other
-    return _matrix(mixed / np.linalg.norm(mixed))
+    return rotation_matrix(mixed / np.linalg.norm(mixed))
 
 
 def _quaternion(turn: np.ndarray) -> np.ndarray:
@@ -118,14 +119,3 @@ def _quaternion(turn: np.ndarray) -> np.ndarray:
         ]
     )
     return np.linalg.eigh(k)[1][:, -1]
-
-
-def _matrix(quaternion: np.ndarray) -> np.ndarray:
-    w, x, y, z = quaternion
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )

@@ -1,6 +1,7 @@
 """Request for a video along a path, made from the options of render.py and checked before a model is loaded."""
 
 import argparse
+import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +16,7 @@ from utils.system_utils import UserError
 FPS = 30
 MOST_FPS = 240
 LARGEST_SIDE = 16384  # of x264
-MOST_SECONDS = 3600
+LEAST_SECONDS, MOST_SECONDS = 0.1, 3600
 
 
 @dataclass(frozen=True)
@@ -65,17 +66,17 @@ def path_maker(path: str, seconds: float | None = None) -> Callable[[Poses], Tim
     """
     if path in GENERATED:
         seconds = SECONDS if seconds is None else seconds
-        if not 0.1 <= seconds <= MOST_SECONDS:
-            raise UserError(f"--seconds must be 0.1 to {MOST_SECONDS}, got {seconds:g}")
+        if not LEAST_SECONDS <= seconds <= MOST_SECONDS:
+            raise UserError(f"--seconds must be {LEAST_SECONDS} to {MOST_SECONDS}, got {seconds:g}")
         return lambda poses: GENERATED[path](poses, seconds)
     if seconds is not None:
         raise UserError(f"--seconds is for {', '.join(GENERATED)}; the times of {path} stand in it")
-    if not Path(path).exists():
+    if not os.path.exists(path):  # unlike Path.exists, it knows that no file has an empty or an endless name
         raise UserError(f"--path must be {', '.join(GENERATED)} or a file of keyframes; there is no file {path}")
     keyframes = KeyframePath(read_camera_path(Path(path)))
-    if keyframes.seconds > MOST_SECONDS:
+    if not LEAST_SECONDS <= keyframes.seconds <= MOST_SECONDS:
         raise UserError(
-            f"{path} lasts {keyframes.seconds:g} s, and a video lasts at most {MOST_SECONDS}; "
+            f"{path} lasts {keyframes.seconds:g} s, and a path lasts {LEAST_SECONDS} to {MOST_SECONDS}; "
             "give the keyframes' times in seconds"
         )
     return lambda _: keyframes

@@ -18,25 +18,33 @@ _FINITE = ("loss", "peak_memory_mib", "wall_seconds")  # if present
 
 
 class Stopwatch:
-    """Seconds since its construction, without those inside `paused()`. spent: those, by their purpose."""
+    """Seconds since its construction, without those inside `paused()`, where it stands still.
+
+    spent: the seconds inside, by their purpose. Of a pause in another one, they count for the inner purpose.
+    """
 
     def __init__(self) -> None:
         self._start = time.perf_counter()
+        self._stopped: float | None = None  # when the outermost pause began
         self.spent: dict[str, float] = {}
 
     @property
     def seconds(self) -> float:
-        return time.perf_counter() - self._start
+        return (time.perf_counter() if self._stopped is None else self._stopped) - self._start
 
     @contextmanager
     def paused(self, purpose: str) -> Iterator[None]:
-        before = time.perf_counter()
+        before, outer, others = time.perf_counter(), self._stopped, sum(self.spent.values())
+        self._stopped = before if outer is None else outer
         try:
             yield
         finally:
             taken = time.perf_counter() - before
-            self._start += taken
-            self.spent[purpose] = self.spent.get(purpose, 0.0) + taken
+            inner = sum(self.spent.values()) - others
+            self.spent[purpose] = self.spent.get(purpose, 0.0) + taken - inner
+            self._stopped = outer
+            if outer is None:
+                self._start += taken
 
 
 class TrainingLog:

@@ -20,6 +20,7 @@ FORWARDING = (
     "benchmarks.scenes.camera_models",
     "benchmarks.scenes.step_profile",
     "benchmarks.scenes.training",
+    "benchmarks.viewing.share",
 )
 # Flags of other programs.
 FOREIGN = {"--peers", "--eval_steps", "--save_steps"}

@@ -1,8 +1,11 @@
 """Exported files: read back by our own readers, byte stability, ends of the ranges, and export.py."""
 
+import contextlib
 import gzip
 import json
 import struct
+import tracemalloc
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +15,7 @@ from gaussians import model, pipeline
 from plyfile import PlyData
 from small_splats import extreme_splats, splats
 
+from exports import glb
 from exports.formats import FORMATS, format_of
 from exports.half_turn import half_turned
 from exports.of_model import model_of, splats_of
@@ -22,6 +26,7 @@ from exports.splats import Splats
 from gaussian_renderer.free_view import rotation_matrix
 from gaussian_renderer.importance import blending_weights, most_important
 from scene.cameras import MiniCam
+from scene.export_world import export_world
 from utils.graphics_utils import getProjectionMatrix
 from utils.sh_utils import C0, sh_basis
 from utils.system_utils import UserError
@@ -86,13 +91,38 @@ def test_round_trips_lose_what_the_format_rounds(tmp_path, ending, degree):
         assert difference.max(initial=0) <= loss * 1.001 + 1e-6
 
 
+@pytest.mark.parametrize("ending", [".ply", ".compressed.ply"])
+def test_plys_keep_the_origin_of_a_scene_far_away(tmp_path, ending):
+    far = (500_000.25, 5_400_000.0, -7.0)
+    path = _write(tmp_path, ending, replace(splats(20, 1), world_offset=far))
+    assert read_splats(path).world_offset == far
+    path.write_bytes(path.read_bytes().replace(b"500000.25", b"nan", 1))
+    assert read_splats(path).world_offset == (0.0, 0.0, 0.0)
+
+
+@pytest.mark.parametrize("count", [0, 1, 300])
+def test_a_ply_in_the_worlds_coordinates_keeps_its_decimals(tmp_path, count):
+    some, far = splats(count, 1), np.array([500_000.0, 5_400_000.0, 200.0])
+    export_world(_write(tmp_path, ".ply", some), far, tmp_path / "world.ply")
+    read = read_splats(tmp_path / "world.ply")
+    if count < 2:  # without an extent nothing is far
+        assert len(read) == count and read.world_offset == (0.0, 0.0, 0.0)
+        return
+    assert any(read.world_offset) and all(value % 10 == 0 for value in read.world_offset)
+    places = read.means.astype(np.float64) + read.world_offset
+    np.testing.assert_allclose(places, some.means + far, rtol=0, atol=1e-5)
+    export_world(_write(tmp_path, ".ply", some), np.ones(3), tmp_path / "near.ply")
+    np.testing.assert_array_equal(read_splats(tmp_path / "near.ply").means, (some.means + 1.0).astype(np.float32))
+
+
 @pytest.mark.parametrize("count", [0, 1, 257])
 @pytest.mark.parametrize("ending", OURS)
 def test_the_same_splats_give_the_same_bytes(tmp_path, ending, count):
     one, other = (_write(tmp_path, ending, splats(count, 2), name) for name in ("one", "other"))
     assert one.read_bytes() == other.read_bytes()
     if ending in READABLE:
-        assert len(read_splats(one)) == count
+        read = read_splats(one)
+        assert drawable(read).shape == (count,) and drawable(read).all()
 
 
 @pytest.mark.parametrize("ending", READABLE)
@@ -135,6 +165,24 @@ def test_glb_says_what_its_numbers_mean(tmp_path):
     # A camera's up, -y of COLMAP, is glTF's +y once the node has turned it.
     x, y, z, w = document["nodes"][0]["rotation"]
     np.testing.assert_allclose(rotation_matrix((w, x, y, z)) @ [0, -1, 0], [0, 1, 0], atol=1e-12)
+
+
+@pytest.mark.parametrize("ending", OURS)
+@pytest.mark.parametrize("share", [0.5, 0.999])
+def test_a_full_disk_is_said_and_leaves_nothing(tmp_path, ending, share):
+    """A limit on the size of files stands for a full disk, in the middle and at the end."""
+    resource = pytest.importorskip("resource", reason="there are no limits on this system")
+    whole = _write(tmp_path, ending, some := splats(3000, 1))
+    size = whole.stat().st_size
+    whole.unlink()
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (int(share * size), before[1]))
+    try:
+        with pytest.raises(UserError, match=f"cannot write .*model{ending}.*free space"):
+            _write(tmp_path, ending, some)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert not list(tmp_path.iterdir())
 
 
 def test_usdz_has_the_schema_and_stands_upright(tmp_path):
@@ -215,6 +263,34 @@ def test_spz_of_version_2_is_read(tmp_path):
     np.testing.assert_allclose(read.rotations, [[0.8, 0.6, 0, 0]], atol=0.005)
     np.testing.assert_allclose(read.sh[0, 0], [0.5 / 0.15, 0, -0.5 / 0.15], atol=0.02)
     assert read.antialiasing and abs(opacities(read)[0] - 128 / 255) < 1e-6
+
+
+@pytest.mark.parametrize("version", [3, 4])
+def test_spz_unpacks_no_more_than_its_header_promises(tmp_path, version):
+    path, bomb = tmp_path / "a.spz", bytes(50_000_000)
+    if version == 3:
+        path.write_bytes(gzip.compress(struct.pack("<IIIBBBB", 0x5053474E, 3, 1, 0, 12, 0, 0) + bomb))
+    else:
+        zstandard = pytest.importorskip("zstandard", reason="the extra [export] is not installed")
+        content = bytearray(_write(tmp_path, ".spz", splats(1, 0)).read_bytes())
+        stream = zstandard.ZstdCompressor().compress(bomb)
+        struct.pack_into("<Q", content, 32, len(stream))
+        path.write_bytes(content[: 32 + 16 * 5] + stream)
+    tracemalloc.start()
+    with (
+        contextlib.nullcontext() if version == 3 else pytest.raises(UserError, match="stream 0 does not have its 9 by")
+    ):
+        read_splats(path)
+    most = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert most < 5_000_000
+
+
+def test_a_glb_of_more_bytes_than_its_header_can_say_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr(glb, "LARGEST", 1000)
+    with pytest.raises(UserError, match="model.glb would have .* GB, .* leave Gaussians out by --max_splats"):
+        _write(tmp_path, ".glb", splats(50))
+    assert not list(tmp_path.iterdir())
 
 
 def test_splat_begins_with_what_matters_most(tmp_path):

@@ -1,6 +1,8 @@
 """Models of other tools: PLYs of any form, as the start of a training and in render.py; what is refused."""
 
+import json
 import re
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +19,7 @@ from exports.of_model import model_of
 from exports.read import is_point_cloud, read_splats
 from exports.selection import with_sh_degree
 from gaussian_renderer.importance import blending_weights, most_important
+from moving_cameras.keyframes import CameraPath, Keyframe
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.ply import read_ply
 from scene.readers.point_cloud import read_point_cloud
@@ -120,6 +123,20 @@ def test_a_start_relative_to_a_world_offset_is_moved_back(tmp_path, colmap_scene
     torch.testing.assert_close(started.get_xyz, moved, rtol=0, atol=1e-6)
 
 
+def test_an_exported_model_keeps_its_world_offset(tmp_path, colmap_scene):
+    gaussians = _train(colmap_scene, tmp_path / "out")
+    gaussians.world_offset = (1.0, -2.0, 3.0)
+    gaussians.save_ply(tmp_path / "out/point_cloud/iteration_1/point_cloud.ply")
+    remembered = json.loads((tmp_path / "out/model.json").read_text()) | {"world_offset": [1.0, -2.0, 3.0]}
+    (tmp_path / "out/model.json").write_text(json.dumps(remembered))
+    for number, words in enumerate(([], ["--max_splats", 10**6])):  # without its scene, and with it
+        path = tmp_path / f"{number}.compressed.ply"
+        export.export(*_export_options("-m", tmp_path / "out", "--to", path, *words))
+        assert read_splats(path).world_offset == (1.0, -2.0, 3.0)
+        export.export(*_export_options("--ply", path, "--to", tmp_path / "again.ply"))
+        assert read_splats(tmp_path / "again.ply").world_offset == (1.0, -2.0, 3.0)
+
+
 def test_two_starts_contradict_each_other(tmp_path):
     for argv, said in (
         (["--init_ply", "a.ply", "--init_pcd_path", "b.ply"], "--init_pcd_path b.ply and --init_ply a.ply both name"),
@@ -179,8 +196,52 @@ def test_export_chooses_what_it_writes(tmp_path, colmap_scene, capsys):
         (["--ply", "a.ply", "--max_splats", "5"], "need training views"),
         (["--ply", "absent.ply"], "no file absent.ply; give a model as PLY"),
         ([], "no model folder given"),
+        (
+            ["--ply", "a.ply", "--to", "b.splat", "--path", "ellipse"],
+            "--path is the animation of a page; leave it out for .sp",
+        ),
+        (
+            ["--ply", "a.ply", "--to", "b.html", "--path", "elipse"],
+            "--path must be interpolate, ellipse, spiral or a file",
+        ),
+        (["--ply", "a.ply", "--to", "b.html"], "pages need training views, which a.ply has not"),
+        (
+            ["--ply", "a.ply", "--to", "b.obj"],
+            "the format of b.obj is unknown; end its name with one of .compressed.ply",
+        ),
     ],
 )
 def test_export_refuses(argv, said):
     with pytest.raises(UserError, match=said):
-        export.export(*_export_options(*argv, "--to", "b.ply"))
+        export.export(*_export_options("--to", "b.ply", *argv))
+
+
+@pytest.mark.parametrize("name", ["interpolate", "tour.json"])
+def test_a_page_plays_the_camera_path(tmp_path, colmap_scene, name):
+    _train(colmap_scene, tmp_path / "out")
+    keys = (
+        Keyframe(0.0, (0.0, 0.0, -3.0), (1.0, 0.0, 0.0, 0.0), 40.0),
+        Keyframe(7.0, (1.0, 0.0, -3.0), (1.0, 0, 0, 0), 50.0),
+    )
+    CameraPath(keys).write(tmp_path / "tour.json")
+    path = str(tmp_path / name) if name.endswith("json") else name
+    export.export(*_export_options("-m", tmp_path / "out", "--to", tmp_path / "page.HTML", "--path", path))
+    text = re.search(r'id="page">(.*?)</script>', (tmp_path / "page.HTML").read_text(encoding="utf-8"))[1]
+    (track,) = json.loads(text)["settings"]["animTracks"]
+    values = track["keyframes"]["values"]
+    first, last = np.array(values["position"]).reshape(-1, 3)[[0, -1]]
+    if name == "interpolate":
+        assert track["duration"] == 10 and len(values["fov"]) == 101
+    else:  # the page's world is a turned one
+        assert track["duration"] == 7 and (values["fov"][0], values["fov"][-1]) == (40, 50)
+        assert np.linalg.norm(first) == pytest.approx(3) and np.linalg.norm(first - last) == pytest.approx(1)
+
+
+@pytest.mark.parametrize(("ending", "module"), [(".spz", "zstandard"), (".usdz", "pxr"), (".sog", None)])
+def test_what_a_format_needs_is_looked_for_before_the_model_is_loaded(tmp_path, monkeypatch, ending, module):
+    if module:
+        monkeypatch.setitem(sys.modules, module, None)
+    monkeypatch.setattr("shutil.which", lambda *_, **__: None)
+    monkeypatch.setattr(export, "load", lambda *_, **__: pytest.fail("the model was loaded"))
+    with pytest.raises(UserError, match="needs .*; install"):
+        export.export(*_export_options("--ply", tmp_path / "a.ply", "--to", tmp_path / f"model{ending}"))

@@ -255,6 +255,15 @@ def test_cameras_that_look_past_each_other_have_targets_ahead():
         assert towards / np.linalg.norm(towards) == pytest.approx(turn[:, 2] * [-1, -1, 1])
 
 
+def test_a_lone_camera_turns_about_the_model(tmp_path):
+    """Not about a point before its lens, from where a viewer's user gets nowhere."""
+    splats, views = balls(each=50), cameras(1)
+    write_html(tmp_path / "page.html", splats, views)
+    content = json.loads(Page(tmp_path / "page.html").texts["page"])["settings"]["cameras"][0]["initial"]
+    wanted = np.median(np.linalg.norm(splats.means - poses_of(views).positions[0], axis=1))
+    assert math.dist(content["position"], content["target"]) == pytest.approx(wanted)
+
+
 def test_the_page_of_a_scene(tmp_path):
     scene = SimpleNamespace(getTrainCameras=cameras)
     write_scene_html(tmp_path / "scene.html", balls(each=2), scene, white_background=True, make_path=Ellipse)

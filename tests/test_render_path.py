@@ -284,9 +284,11 @@ def test_memory_does_not_grow_with_the_length(run, monkeypatch, decoder):
             ("--path", "elipse"),
             "^--path must be interpolate, ellipse, spiral or a file of keyframes; there is no file",
         ),
+        (("--path", ""), "^--path must be .*there is no file $"),
+        (("--path", "x" * 5000), "^--path must be .*there is no file xxx"),
         (("--path", "spiral"), "^--path spiral needs training cameras that face one way"),
     ],
-    ids=" ".join,
+    ids=lambda value: " ".join(value)[:40] if isinstance(value, tuple) else "",
 )
 def test_a_wrong_option_is_refused(run, out, words, sentence):
     before = written(out)
@@ -306,10 +308,12 @@ def test_a_wrong_file_is_refused(run, out, tmp_path):
     with pytest.raises(UserError, match="^--seconds is for interpolate, ellipse, spiral; the times of .* stand in it$"):
         run("--path", file, "--seconds", 3)
     keys = json.loads(file.read_text())
-    keys["keyframes"][-1]["seconds"] = 4000
-    file.write_text(json.dumps(keys))
-    with pytest.raises(UserError, match="lasts 4000 s, and a video lasts at most 3600; give the keyframes' times in s"):
-        run("--path", file)
+    keys["keyframes"] = keys["keyframes"][:1] + keys["keyframes"][-1:]
+    for seconds, said in ((4000, "4000"), (5e-324, "4.94066e-324")):
+        keys["keyframes"][-1]["seconds"] = seconds
+        file.write_text(json.dumps(keys))
+        with pytest.raises(UserError, match=f"lasts {said} s, and a path lasts 0.1 to 3600; give the keyframes' times"):
+            run("--path", file)
     assert not (out / "videos").exists()
 
 

@@ -312,6 +312,22 @@ def test_a_stopwatch_pauses_also_when_something_fails(monkeypatch):
     assert clock.seconds == 5 and clock.spent == {"saving": 34, "scoring": 4}
 
 
+def test_a_stopwatch_stands_still_in_a_pause_and_counts_one_in_another_once(monkeypatch):
+    now = [100.0]
+    monkeypatch.setattr(time, "perf_counter", lambda: now[0])
+    clock = Stopwatch()
+    now[0] += 2
+    with clock.paused("viewing"):
+        now[0] += 600
+        assert clock.seconds == 2
+        with clock.paused("saving"):
+            now[0] += 4
+            assert clock.seconds == 2
+        now[0] += 10
+    now[0] += 3
+    assert clock.seconds == 5 and clock.spent == {"viewing": 610, "saving": 4}
+
+
 def test_a_new_folder_is_said_before_the_training(colmap_scene, tmp_path, monkeypatch, capfd):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("OAR_JOB_ID", "job")

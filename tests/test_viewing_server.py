@@ -6,9 +6,12 @@ import re
 import socket
 import sys
 import threading
+import time
+import warnings
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 from gaussians import model, pipeline
 from synthetic import make_colmap_scene
@@ -91,7 +94,9 @@ def test_nobody_else_than_this_machine_is_served_on_loopback(local):
     port = local.server.get_port()
     for host, status in (
         (f"127.0.0.1:{port}", 200), ("localhost:9999", 200), ("[::1]:1", 200), ("evil.example", 403),
-        (f"evil.example:{port}", 403), ("127.0.0.1.evil.example", 403), ("", 403), ("[", 403),
+        (f"evil.example:{port}", 403), ("127.0.0.1.evil.example", 403), ("", 403), ("[", 403), (":80", 403),
+        ("127.0.0.1:x", 403), ("127.0.0.1:99999", 403), ("localhost@evil.example", 403),
+        ("127.0.0.1 evil.example", 403),
     ):  # fmt: skip
         assert _get(port, "/", Host=host)[0] == status, host
 
@@ -126,6 +131,9 @@ def test_other_addresses_need_the_token(public, capfd):
     assert "HttpOnly" in cookie and "SameSite=Strict" in cookie
     with Client(url, headers={"Cookie": cookie.split(";")[0]}) as client:
         assert client.messages()
+    # Browsers send a cookie of this host to all its ports, whichever port the page that asks comes from.
+    with pytest.raises(InvalidStatus, match="403"):
+        Client(url, "http://127.0.0.1:1", headers={"Cookie": cookie.split(";")[0]})
 
 
 def test_the_token_is_new_each_time_and_printed_with_a_warning(capfd):
@@ -200,13 +208,13 @@ def test_a_server_that_asks_no_gate_does_not_stay(monkeypatch):
 def test_a_browser_that_asks_for_a_tunnel_gets_none(local, monkeypatch):
     opened = []
     monkeypatch.setattr(viser._viser, "ViserTunnel", lambda *_: opened.append(1))
+    heard, read = threading.Event(), local.server.gui.add_checkbox("read", False)
+    read.on_update(lambda _: heard.set())
     with Client(local.url) as client:
         client.look()
         client.send("ShareUrlRequest")
-        client.send("GuiFormSubmitMessage", uuid="none")  # an answer to it says that the other has been read
-        client.look()
-        local.server.gui.add_text("heard", "")
-        assert client.until("GuiTextMessage")
+        client.send("GuiUpdateMessage", uuid=read._impl.uuid, updates={"value": True})
+        assert heard.wait(10)
     assert not opened and local.server._share_tunnel is None
 
 
@@ -228,6 +236,11 @@ def _answered(page: Page, client: Client):
     while not answer(page) and deadline:
         deadline -= 1
     return client.picture()
+
+
+def _turns(page: Page, count: int) -> None:
+    for _ in range(count):
+        answer(page)
 
 
 def test_pictures_follow_the_camera_of_each_browser(page):
@@ -266,6 +279,23 @@ def test_hostile_messages_neither_stop_the_page_nor_make_large_pictures(page):
     page.view.scaling.value, page.view.mode.value, page.view.background.value = 1.0, "Colour", (0, 0, 0)
 
 
+def test_a_crop_box_that_many_drag_is_drawn_once(page, capfd):
+    crop, corner = page.view.crop._impl.uuid, page.view.corners[0]._impl.uuid
+    with Client(page.url) as one, Client(page.url) as other:
+        for client in (one, other):
+            client.look()
+        for step in range(200):
+            one.send("GuiUpdateMessage", uuid=crop, updates={"value": step % 2 == 0})
+            other.send("GuiUpdateMessage", uuid=corner, updates={"value": [-float(step + 1), -1.0, -1.0]})
+        _until(lambda: page.view.corners[0].value[0] == -200.0 and not page.view.crop.value)
+        one.send("GuiUpdateMessage", uuid=crop, updates={"value": True})
+        _until(lambda: page.view._box is not None)
+        one.send("GuiUpdateMessage", uuid=crop, updates={"value": False})
+        _until(lambda: page.view._box is None)
+    assert "/crop box" not in page.server.scene._handle_from_node_name
+    assert "rror" not in capfd.readouterr().err
+
+
 def test_no_request_writes_outside_of_the_models_folder(page, tmp_path):
     """A browser names the path; the file that is written lies in the model's folder, or there is none."""
     before = set(tmp_path.parent.rglob("*.json"))
@@ -283,6 +313,61 @@ def test_no_request_writes_outside_of_the_models_folder(page, tmp_path):
     assert not list(Path(page.path._folder).parents[2].rglob("*escaped*"))
     assert (page.path._folder / "inside.json").is_file()
     assert set(tmp_path.parent.rglob("*.json")) - before <= {page.path._folder / "inside.json"}
+
+
+def test_a_frame_that_cannot_be_drawn_is_told_once_and_ends_nothing(page, monkeypatch, capfd):
+    with Client(page.url) as client:
+        with monkeypatch.context() as broken:
+            broken.setattr(page._frames, "draw", lambda *_: (_ for _ in ()).throw(OSError("no file a\udcff.png")))
+            client.look(size=(60, 60))
+            client.until("BackgroundImageMessage")  # of a server that has been reset
+            for step in (1.0, 2.0):
+                client.look((step, 0.0, -4.0), size=(60, 60))
+                _turns(page, 3)
+        assert "no file a\\udcff.png" in client.until("NotificationShowMessage")["props"]["body"]
+        client.look((0.0, 0.0, -4.0), size=(60, 60))
+        assert _answered(page, client).shape[2] == 3
+    assert capfd.readouterr().err.count("could not draw a frame (no file") == 1
+
+
+def test_a_browser_that_leaves_while_its_frame_is_drawn_is_not_worth_a_word():
+    with warnings.catch_warnings(record=True) as heard:
+        warnings.simplefilter("always")
+        served = servers.serve(ANY, "test")
+        handles = served.server.get_clients
+        with Client(served.url) as client:
+            client.look()
+            _until(handles)
+            handle = next(iter(handles().values()))
+        _until(lambda: not handles())
+        handle.scene.set_background_image(np.zeros((2, 2, 3), np.uint8))
+        servers.stop(served.server)
+    assert not heard
+
+
+def _until(holds) -> None:
+    deadline = time.monotonic() + 10
+    while not holds():
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+
+
+def test_names_that_are_not_utf8_are_shown(tmp_path):
+    make_colmap_scene(tmp_path / "scene")
+    given = argparse.Namespace(source_path=str(tmp_path / "scene"), model_path=str(tmp_path / "a\udcff"), eval=True)
+    scene = Scene(ModelParams(argparse.ArgumentParser()).extract(given), model(20), shuffle=False, start=False)
+    first = scene.getTrainCameras()[0]
+    first.image_name = "b\udcff.png"
+    shown = Page(ANY, scene, pipeline(), False, False)
+    try:
+        with Client(shown.url) as client:
+            sent, texts = "", (r"a\udcff", r"train 0: b\udcff.png")
+            while not all(repr(text) in sent for text in texts):
+                sent += repr(client.messages())
+            client.look()
+            assert _answered(shown, client).size
+    finally:
+        shown.stop()
 
 
 def test_addresses_of_ipv6_are_written_in_brackets(capfd):

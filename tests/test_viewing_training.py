@@ -142,6 +142,22 @@ def test_a_paused_training_waits_takes_single_steps_and_goes_on(colmap_scene, tm
     assert reached == [30, 31, 32]
 
 
+def test_a_pause_does_not_make_the_training_look_slow(colmap_scene, tmp_path, monkeypatch):
+    monkeypatch.setattr(observed, "_NUMBERS_EVERY", 0.0)
+    seen: list[float] = []
+
+    def pause(watched: Watched) -> None:
+        watched.requests.pause()
+        _later(watched.requests.resume, 0.8)
+
+    def note(watched: Watched) -> None:
+        seen.append(float(watched.observer._tab.speed.value))
+
+    Watched(monkeypatch, {2: Watched.connect, 29: note, 30: pause, 31: note, 32: note})
+    _train(colmap_scene, tmp_path / "out", "--no_curve")
+    assert len(seen) == 3 and min(seen) > 0
+
+
 def test_stop_saves_a_checkpoint_that_can_be_resumed(colmap_scene, tmp_path, monkeypatch, capfd):
     Watched(monkeypatch, {33: lambda w: w.requests.stop()})
     with pytest.raises(KeyboardInterrupt):
@@ -154,6 +170,21 @@ def test_stop_saves_a_checkpoint_that_can_be_resumed(colmap_scene, tmp_path, mon
     assert resumed.read_bytes() == _train(colmap_scene, tmp_path / "alone", viewer=False).read_bytes()
 
 
+def test_a_pause_before_the_stop_is_no_time_of_training(colmap_scene, tmp_path, monkeypatch):
+    before: list[float] = []
+
+    def pause(watched: Watched) -> None:
+        before.append(watched.observer._run.clock.seconds)
+        watched.requests.pause()
+        _later(watched.requests.stop, 1.5)
+
+    Watched(monkeypatch, {12: pause})
+    with pytest.raises(KeyboardInterrupt):
+        _train(colmap_scene, tmp_path / "out", "--no_curve")
+    log = json.loads((tmp_path / "out/train_log.json").read_text())
+    assert before[0] < log[-1]["seconds"] < before[0] + 1.0
+
+
 def test_a_signal_ends_a_paused_training_and_saves_it(colmap_scene, tmp_path, monkeypatch):
     def pause(watched: Watched) -> None:
         watched.requests.pause()
@@ -163,6 +194,22 @@ def test_a_signal_ends_a_paused_training_and_saves_it(colmap_scene, tmp_path, mo
     with pytest.raises(KeyboardInterrupt):
         _train(colmap_scene, tmp_path / "out", "--no_curve")
     assert (tmp_path / "out/chkpnt12.pth").exists()
+
+
+def test_a_checkpoint_that_cannot_be_written_ends_no_training(colmap_scene, tmp_path, monkeypatch, capfd):
+    told = []
+
+    def save(watched: Watched) -> None:
+        watched.page.tell = lambda title, body: told.append((title, body))
+        watched.requests.save()
+
+    Watched(monkeypatch, {10: save, 20: lambda watched: watched.requests.save()})
+    (tmp_path / "out/chkpnt10.pth").mkdir(parents=True)
+    expected = _train(colmap_scene, tmp_path / "alone", "--no_curve", viewer=False).read_bytes()
+    assert _train(colmap_scene, tmp_path / "out", "--no_curve").read_bytes() == expected
+    assert (tmp_path / "out/chkpnt20.pth").is_file()
+    assert [title for title, _ in told] == ["Not saved", "Saved", "The training is done"]
+    assert "warning: cannot write" in capfd.readouterr().err
 
 
 def test_a_frame_that_cannot_be_drawn_ends_no_training(colmap_scene, tmp_path, monkeypatch, capfd):

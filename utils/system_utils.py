@@ -17,6 +17,7 @@ __all__ = [
     "UserError",
     "atomic_write",
     "compute_device",
+    "first_line",
     "mkdir_p",
     "run_cli",
     "saved_iterations",
@@ -28,6 +29,11 @@ _ITERATION_FOLDER = re.compile(r"iteration_(\d+)")
 
 class UserError(Exception):
     """An error that the user can fix. Its text is one sentence that names the fault and the remedy."""
+
+
+def first_line(error: BaseException) -> str:
+    """What an error says, in one line of at most 200 characters; its type if it says nothing."""
+    return next(iter(str(error).splitlines()), "")[:200] or type(error).__name__
 
 
 def run_cli(main: Callable[[], object]) -> None:

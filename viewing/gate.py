@@ -13,6 +13,8 @@ import websockets.asyncio.server as websocket_server
 from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
 
+from viewing.connections import Connections
+
 _LOCAL_NAME = "localhost"
 _HEADERS = {
     "Referrer-Policy": "no-referrer",  # the address may hold the token
@@ -32,13 +34,14 @@ def is_loopback(host: str) -> bool:
 class Gate:
     """Refuses every request, for a file or for a websocket, that may not come in.
 
-    On a loopback address, the request must name a loopback host, and a page of another origin may not ask. So no page
-    that is open in the user's browser reaches this one, not even through a name that it leads to 127.0.0.1. On other
+    A page of another origin may not ask. On a loopback address, the request must name a loopback host. So no page that
+    is open in the user's browser reaches this one, not even through a name that it leads to 127.0.0.1. On other
     addresses, a random `token` is needed: in the address (?token=), or in the cookie that is set by the first answer.
     """
 
     def __init__(self, host: str) -> None:
         self.token = None if is_loopback(host) else secrets.token_urlsafe(32)
+        self.connections = Connections()
         self.stands = False  # whether viser has asked for requests to be checked
 
     def refusal(self, request: Request) -> str | None:
@@ -46,13 +49,11 @@ class Gate:
         hosts, origins = request.headers.get_all("Host"), request.headers.get_all("Origin")
         if len(hosts) != 1 or len(origins) > 1:
             return "the request must name one host"
-        if self.token is not None:
-            return None if self._has_token(request, hosts[0]) else "the address needs the token that was printed"
-        if not is_loopback(urlsplit(f"//{hosts[0]}").hostname or ""):
-            return "this page is served to this machine alone"
         if origins and urlsplit(origins[0]).netloc != hosts[0]:
             return "pages of other origins may not ask"
-        return None
+        if self.token is not None:
+            return None if self._has_token(request, hosts[0]) else "the address needs the token that was printed"
+        return None if is_loopback(_place(hosts[0])[0]) else "this page is served to this machine alone"
 
     def _has_token(self, request: Request, host: str) -> bool:
         given = parse_qs(urlsplit(request.path).query).get("token", [])
@@ -87,11 +88,8 @@ class Gate:
 
         def serve(*arguments: Any, process_request: Callable, **options: Any) -> Any:
             self.stands = True
-            return plain(
-                *arguments,
-                process_request=lambda connection, request: self.answer(connection, request, process_request),
-                **options,
-            )
+            own = {"process_request": lambda connection, request: self.answer(connection, request, process_request)}
+            return plain(*arguments, **options | self.connections.options() | own)
 
         websocket_server.serve = serve
         try:
@@ -102,13 +100,19 @@ class Gate:
 
 def _cookie(host: str) -> str:
     """A name for each port, because browsers send a cookie to all ports of a host."""
-    return f"viewer_token_{urlsplit(f'//{host}').port or 80}"
+    return f"viewer_token_{_place(host)[1]}"
+
+
+def _place(host: str) -> tuple[str, int]:
+    """Name and port of a Host header. ValueError if it is malformed."""
+    parts = urlsplit(f"//{host}")
+    return parts.hostname or "", parts.port or 80
 
 
 def _policy(host: str) -> str:
     """The browser itself keeps the page from asking anybody else: Content Security Policy, level 3."""
-    name, port = urlsplit(f"//{host}").hostname, urlsplit(f"//{host}").port
-    place = f"{f'[{name}]' if ':' in name else name}:{port or 80}"
+    name, port = _place(host)
+    place = f"{f'[{name}]' if ':' in name else name}:{port}"
     return (
         "default-src 'self' data: blob: 'unsafe-inline' 'unsafe-eval'; "
         f"connect-src 'self' data: blob: ws://{place} wss://{place}; "

@@ -1,13 +1,16 @@
 """The page: its server, its tabs, and the browsers that watch."""
 
 import argparse
+import sys
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from tqdm import tqdm
 
 from scene.scene import Scene
+from utils.system_utils import first_line
 from viewing import server as servers
 from viewing.frames import LONGEST, Frames
 from viewing.options import Address
@@ -16,6 +19,7 @@ from viewing.photos_tab import PhotosTab
 from viewing.poses import pose_of
 from viewing.scene_cameras import SceneCameras, center
 from viewing.settings import Settings
+from viewing.texts import as_utf8
 from viewing.view_tab import ViewTab
 from viewing.watchers import Watchers, Wish
 
@@ -42,7 +46,8 @@ class Page:
         self._frames = Frames(gaussians, self._cameras, pipe, with_exposures)
         self.watchers = Watchers()
         self.latency: list[float] = []
-        self.server, self.url = servers.serve(address, Path(scene.model_path).resolve().name)
+        self._fault = ""  # the last one that was told
+        self.server, self.url = servers.serve(address, as_utf8(Path(scene.model_path).resolve().name))
         gui = self.server.gui
         self.iteration = gui.add_text("Iteration", str(scene.loaded_iter or 0), disabled=True)
         self.count = gui.add_text("Gaussians", f"{len(gaussians):,}", disabled=True)
@@ -86,6 +91,22 @@ class Page:
         """What the controls say now."""
         return self.photos.read(self.view.read())
 
+    def fulfil(self, wish: Wish, version: int = 0) -> None:
+        """Draw and send the frame of a wish. One that cannot be drawn ends nothing. version: of the model."""
+        try:
+            self.send(wish, self.draw(wish, version))
+        except Exception as error:  # memory, a photo that is gone
+            self._tell_fault(wish, first_line(error))
+
+    def _tell_fault(self, wish: Wish, fault: str) -> None:
+        if fault == self._fault:
+            return
+        self._fault = fault
+        tqdm.write(f"warning: the viewer could not draw a frame ({fault})", file=sys.stderr)
+        client = self.server.get_clients().get(wish.client)
+        if client is not None:
+            client.add_notification("No picture", as_utf8(fault), color="red")
+
     def draw(self, wish: Wish, version: int = 0) -> np.ndarray:
         """The frame (H, W, 3) uint8 of a wish, which then is fulfilled. version: of the model."""
         self.watchers.drew(wish, version)
@@ -111,7 +132,7 @@ class Page:
         """Show a notification to all, and wait until it has probably been sent."""
         clients = self.server.get_clients().values()
         for client in clients:
-            client.add_notification(title, body)
+            client.add_notification(title, as_utf8(body))
             client.flush()
         if clients:
             time.sleep(_SENT)

@@ -7,7 +7,9 @@ from typing import TYPE_CHECKING
 
 from moving_cameras.keyframes import EASINGS, CameraPath, Keyframe
 from utils.system_utils import UserError
+from viewing.in_turn import in_turn
 from viewing.poses import pose_of
+from viewing.texts import as_utf8
 
 if TYPE_CHECKING:
     import viser
@@ -29,9 +31,9 @@ class PathTab:
         self.easing = gui.add_dropdown("Easing", EASINGS)
         self.name = gui.add_text("Name", self._free_name(), hint="letters, digits, - and _")
         save = gui.add_button("Save path")
-        add.on_click(lambda event: self.add(event.client))
-        remove.on_click(lambda _: self.remove())
-        save.on_click(lambda event: self._save(event.client))
+        add.on_click(in_turn(lambda event: self.add(event.client)))
+        remove.on_click(in_turn(lambda _: self.remove()))
+        save.on_click(in_turn(lambda event: self._save(event.client)))
 
     def add(self, client: "viser.ClientHandle") -> None:
         """Append the view of a browser, with what its window shows from top to bottom."""
@@ -61,11 +63,11 @@ class PathTab:
 
     def _save(self, client: "viser.ClientHandle | None") -> None:
         try:
-            title, body = "Saved", f"render.py --path {self.save(self.name.value)}"
+            title, body = "Saved", f"render.py -m {self._folder.parent} --path {self.save(self.name.value)}"
         except UserError as error:
             title, body = "Not saved", str(error)
         if client is not None:
-            client.add_notification(title, body)
+            client.add_notification(title, as_utf8(body))
 
     def _free_name(self) -> str:
         number = 1

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from viewing.in_turn import in_turn
 from viewing.scene_cameras import SceneCameras, center, fov_of_canvas
 from viewing.settings import COMPARISONS, Settings
 
@@ -32,9 +33,10 @@ class PhotosTab:
         shown = gui.add_checkbox("Draw cameras", False, hint="a click on one jumps there")
         self._drawn = server.scene.add_frame("/cameras", show_axes=False, visible=False)
         self._draw()
-        self.camera.on_update(lambda event: self.go(event.client, self.camera.value))
-        again.on_click(lambda event: self.go(event.client, self.camera.value))
-        self.comparison.on_update(lambda event: (self.go(event.client, self.camera.value), changed(False)))
+        # In turn, so that the view does not get its place from one camera and its direction from the next.
+        self.camera.on_update(in_turn(lambda event: self.go(event.client, self.camera.value)))
+        again.on_click(in_turn(lambda event: self.go(event.client, self.camera.value)))
+        self.comparison.on_update(in_turn(lambda event: (self.go(event.client, self.camera.value), changed(False))))
         self.slider.on_update(lambda _: changed(True))
         shown.on_update(lambda _: setattr(self._drawn, "visible", shown.value))
 
@@ -71,7 +73,7 @@ class PhotosTab:
                 cast_shadow=False,
                 receive_shadow=False,
             )
-            frustum.on_click(lambda event, name=name: self._choose(event.client, name))
+            frustum.on_click(in_turn(lambda event, name=name: self._choose(event.client, name)))
 
     def _choose(self, client: "viser.ClientHandle", name: str) -> None:
         self.camera.value = name

@@ -3,7 +3,6 @@
 import argparse
 import time
 
-from gaussian_renderer.memory_errors import memory_errors_explained
 from scene.scene import Scene
 from utils.host.interrupt import DeferredInterrupt
 from viewing.options import Address
@@ -17,7 +16,7 @@ def serve_saved(address: Address, scene: Scene, pipe: argparse.Namespace, white:
     """Serve the page until a signal comes, and raise that. white, with_exposures: as for `Page`."""
     page = Page(address, scene, pipe, white, with_exposures)
     try:
-        with DeferredInterrupt() as interrupt, memory_errors_explained(scene.gaussians, []):
+        with DeferredInterrupt() as interrupt:
             while not interrupt.requested:
                 answer(page)
         raise interrupt.requested
@@ -32,6 +31,6 @@ def answer(page: Page) -> bool:
         page.watchers.wait(_WAIT if not page.watchers.any else _BETWEEN)
         return False
     began = time.perf_counter()
-    page.send(wish, page.draw(wish))
+    page.fulfil(wish)
     time.sleep(max(0.0, began + _BETWEEN - time.perf_counter()))
     return True

@@ -8,6 +8,7 @@ import numpy as np
 from gaussian_renderer.free_view import rotation_matrix
 from scene.cameras import Camera
 from viewing.settings import Pose, Vector
+from viewing.texts import as_utf8
 
 _NEAR = 1e-3  # of the scene's size: a page's camera that close stands at the scene's camera
 _TURNED = 2e-3  # radians
@@ -18,16 +19,19 @@ class SceneCameras:
     """by_name: the cameras, training ones first, with names such as `train 3: IMG_0007`."""
 
     def __init__(self, train: Sequence[Camera], test: Sequence[Camera]) -> None:
+        from moving_cameras.focus import focus_point  # SciPy takes a while to import
+        from moving_cameras.poses import poses_of
+
         sets = {"train": train, "test": test}
         self.by_name: dict[str, Camera] = {
-            f"{of_set} {index}: {camera.image_name}": camera
+            as_utf8(f"{of_set} {index}: {camera.image_name}"): camera
             for of_set, cameras in sets.items()
             for index, camera in enumerate(cameras)
         }
         self._all = [*train, *test]
         centers = np.array([center(camera) for camera in self._all]).reshape(-1, 3)
         middle = centers.mean(0) if len(centers) else np.zeros(3)
-        self._target, self._up = _nearest_to_axes(self._all), self.up()
+        self._target, self._up = focus_point(poses_of(self._all)) if self._all else None, self.up()
         self.size = float(np.linalg.norm(centers - middle, axis=1).max(initial=0.0)) * _MARGIN or 1.0
 
     @property
@@ -52,7 +56,7 @@ class SceneCameras:
 
     def depth(self, camera: Camera) -> float:
         """Distance of what a camera looks at: of the point nearest to all optical axes, if that is in front of it."""
-        depth = float((self._target - center(camera)) @ camera.R[:, 2])
+        depth = 0.0 if self._target is None else float((self._target - center(camera)) @ camera.R[:, 2])
         return depth if depth > 0.1 * self.size else self.size
 
     def stands_at(self, pose: Pose, camera: Camera) -> bool:
@@ -65,15 +69,6 @@ class SceneCameras:
 def center(camera: Camera) -> np.ndarray:
     """Position (3,) float64 in the world."""
     return -camera.R @ camera.T
-
-
-def _nearest_to_axes(cameras: Sequence[Camera]) -> np.ndarray:
-    """The point (3,) nearest to the optical axes of cameras, by least squares."""
-    if not cameras:
-        return np.zeros(3)
-    places, axes = (np.array(rows) for rows in zip(*[(center(c), c.R[:, 2]) for c in cameras], strict=True))
-    across = np.eye(3) - axes[:, :, None] * axes[:, None]
-    return np.linalg.lstsq(across.sum(0), (across @ places[:, :, None]).sum(0)[:, 0], rcond=1e-6)[0]
 
 
 def canvas(width: int, height: int, aspect: float) -> tuple[int, int]:

@@ -5,6 +5,7 @@ import errno
 import io
 import socket
 import sys
+import warnings
 from types import ModuleType
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -46,17 +47,16 @@ def serve(address: Address, label: str) -> Served:
     viser = _import_viser()
     from viewing.gate import Gate
 
-    class Server(viser.ViserServer):
-        def request_share_url(self, verbose: bool = True) -> None:
-            """Open no tunnel, though a browser asks for one: nothing of this process leaves it by another way."""
-
+    # A browser may leave at any moment, also while a frame is drawn for it.
+    warnings.filterwarnings("ignore", r"Queued a \w+ on a closed connection", UserWarning)
     port = _free_port(address)
     gate = Gate(address.host)
     with gate.in_front_of_viser(), contextlib.redirect_stdout(io.StringIO()):
-        server = Server(address.host, port, label=label, verbose=False)
+        server = viser.ViserServer(address.host, port, label=label, verbose=False)
     if not gate.stands:
         stop(server)
         raise UserError("this release of viser cannot be guarded; install the one that setup.py names: '.[viewer]'")
+    gate.connections.control = server.gui._gui_input_handle_from_uuid.get
     server.gui.configure_theme(show_logo=False, show_share_button=False)
     return Served(server, _announce(address, server.get_port(), gate.token))
 

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from viewing.in_turn import in_turn
 from viewing.requests import Requests
 
 if TYPE_CHECKING:
@@ -35,8 +36,8 @@ class TrainingTab:
             visible=False,
         )
         self._rows = 0
-        self.pause.on_click(lambda _: self._turn())
-        step.on_click(lambda _: (requests.step(), self._label()))
+        self.pause.on_click(in_turn(lambda _: self._turn()))
+        step.on_click(in_turn(lambda _: (requests.step(), self._label())))
         save.on_click(lambda _: requests.save())
         stop.on_click(lambda _: requests.stop())
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from viewing.in_turn import in_turn
 from viewing.settings import MODES, Settings, Vector
 
 if TYPE_CHECKING:
@@ -44,7 +45,7 @@ class ViewTab:
         for handle in (self.mode, self.scaling, self.degree, self.background):
             handle.on_update(lambda _: changed())
         for handle in (self.crop, *self.corners):
-            handle.on_update(lambda _: (self._show_box(), changed()))
+            handle.on_update(in_turn(lambda _: (self._show_box(), changed())))
 
     def _show_box(self) -> None:
         """Draw the edges of the crop box into the scene."""
@@ -71,10 +72,10 @@ class ViewTab:
 
 def first_box(positions: Tensor) -> tuple[Vector, Vector]:
     """A box around most positions (N, 3), rounded to thousandths of its size: its lowest and highest corner."""
-    if not len(positions):
-        return (-1.0, -1.0, -1.0), (1.0, 1.0, 1.0)
     some = positions.detach()[:: max(1, len(positions) // 100_000)].double().cpu()
     some = some[some.isfinite().all(1)]
+    if not len(some):
+        return (-1.0, -1.0, -1.0), (1.0, 1.0, 1.0)
     low, high = (torch.quantile(some, q, dim=0) for q in (_OUTLIERS, 1 - _OUTLIERS))
     digits = 3 - math.floor(math.log10(max(float((high - low).max()), 1e-9)))
     return tuple(tuple(round(x, digits) for x in corner.tolist()) for corner in (low, high))

@@ -39,12 +39,13 @@ def write_ply(
         stop = start + len(columns)
         matrix[:, start:stop] = values.reshape(count, len(columns)).cpu().numpy()
         start = stop
-    header = ["ply", "format binary_little_endian 1.0", *_comments(world_offset)]
-    header += [*(f"comment {comment}" for comment in comments), f"element vertex {count}"]
+    header = ["ply", "format binary_little_endian 1.0"]
+    header += [f"comment {comment}" for comment in (*offset_comments(world_offset), *comments)]
+    header += [f"element vertex {count}"]
     header += [f"property float {name}" for name in names]
     with atomic_write(path) as temporary, open(temporary, "wb") as file:
         file.write("\n".join([*header, "end_header\n"]).encode("ascii"))
-        matrix.tofile(file)
+        file.write(matrix)  # not tofile, which loses the last bytes on a full disk without an error
 
 
 def column_names(sh_degree: int) -> list[str]:
@@ -58,8 +59,9 @@ def row_bytes(sh_degree: int) -> int:
     return 4 * len(column_names(sh_degree))
 
 
-def _comments(world_offset: Sequence[float]) -> list[str]:
-    return [f"comment world_offset {' '.join(map(repr, world_offset))}"] if any(world_offset) else []
+def offset_comments(world_offset: Sequence[float]) -> list[str]:
+    """The comment that keeps the world coordinates (3,) of a PLY's origin, [] for zero."""
+    return [f"world_offset {' '.join(map(repr, world_offset))}"] if any(world_offset) else []
 
 
 def stored_sh_degree(path: str | os.PathLike) -> int | None:

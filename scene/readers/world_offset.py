@@ -19,7 +19,11 @@ def world_offset(info: SceneInfo) -> np.ndarray:
     """Offset (3,) float64: round decimal numbers near a scene that is far from its origin, else zero."""
     cameras = info.train_cameras + info.test_cameras
     middle = np.median([camera.center for camera in cameras], axis=0)
-    extent = scene_extent(cameras, None if info.point_cloud is None else info.point_cloud.points)
+    return origin_near(middle, scene_extent(cameras, None if info.point_cloud is None else info.point_cloud.points))
+
+
+def origin_near(middle: np.ndarray, extent: float) -> np.ndarray:
+    """Round decimal numbers (3,) near the middle of something of an extent, zero if that is not far away."""
     if np.abs(middle).max() <= FARTHEST * extent:
         return np.zeros(3)
     step = 10.0 ** np.ceil(np.log10(10 * extent))

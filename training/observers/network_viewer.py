@@ -8,6 +8,7 @@ from training.objective import Losses
 from training.observer import Error, Observer
 from training.run import Run
 from training.step import Step
+from utils.system_utils import first_line
 
 _TICK = 0.1  # seconds between looks whether a signal asks to stop
 _LAST = 1.0  # seconds that a finished training waits for one more request
@@ -72,6 +73,6 @@ class NetworkViewer(Observer):
         try:
             return frame_bytes(request, run.gaussians, run.pipe, run.background)
         except Exception as error:  # such as a frame that memory does not suffice for: no reason to end a training
-            fault = f"its frame cannot be rendered ({str(error).splitlines()[0][:200] if str(error) else type(error)})"
+            fault = f"its frame cannot be rendered ({first_line(error)})"
             network_gui.disconnect(fault)
             raise ViewerLost(fault) from error

@@ -9,6 +9,7 @@ from training.observer import Error, Observer
 from training.observers.saves import Checkpoints
 from training.run import Run
 from training.step import Step
+from utils.system_utils import UserError
 from viewing.budget import MOVING, STILL, Budget
 from viewing.page import Page
 from viewing.requests import Requests
@@ -37,7 +38,6 @@ class PageObserver(Observer):
             self._tab = TrainingTab(self._page.server, self._requests)
         self.budget = Budget()
         self._wish: Wish | None = None
-        self._warned = False
         self._numbers = (0.0, 0, 0.0)  # when they were shown, the iteration, and its seconds of training
 
     def due(self, step: Step) -> bool:
@@ -63,12 +63,7 @@ class PageObserver(Observer):
 
     def _draw(self, wish: Wish, version: int) -> None:
         began = time.perf_counter()
-        try:
-            self._page.send(wish, self._page.draw(wish, version))
-        except Exception as error:  # memory, a photo that is gone: no frame is worth a training
-            if not self._warned:
-                tqdm.write(f"warning: the viewer could not draw a frame ({error})", file=sys.stderr)
-            self._warned = True
+        self._page.fulfil(wish, version)
         self.budget.spent(began, time.perf_counter() - began)
 
     def _obey(self, step: Step) -> None:
@@ -82,7 +77,7 @@ class PageObserver(Observer):
                 self._checkpoints.save(step)
                 return
             if requests.take_checkpoint():
-                self._checkpoints.save(step)
+                self._save(step)
             if not requests.paused or requests.take_step():
                 return
             wish = self._page.watchers.next(step.iteration)
@@ -91,9 +86,23 @@ class PageObserver(Observer):
             else:
                 self._draw(wish, step.iteration)
 
+    def _save(self, step: Step) -> None:
+        """Save a checkpoint. A disk that is full is told, and ends nothing."""
+        try:
+            self._checkpoints.save(step)
+        except UserError as error:
+            if not isinstance(error.__cause__, OSError):  # such as a loss that is not finite
+                raise
+            tqdm.write(f"warning: {error}", file=sys.stderr)
+            self._page.tell("Not saved", str(error))
+        else:
+            self._page.tell("Saved", f"chkpnt{step.iteration}.pth")
+
     def _show_numbers(self, iteration: int) -> None:
         run, now = self._run, time.perf_counter()
         _, before, seconds = self._numbers
+        if iteration == before:  # a pause has shown it
+            return
         self._numbers = now, iteration, run.clock.seconds
         took = run.clock.seconds - seconds
         speed = (iteration - before) / took if before and took > 0 else None
@@ -101,6 +110,8 @@ class PageObserver(Observer):
         self._tab.show(speed, run.losses.mean, run.rows)
 
     def ended(self, error: Error) -> None:
-        what = "is done" if error is None else "has stopped"
-        self._page.tell(f"The training {what}", f"See it by python view.py -m {self._run.scene.model_path}")
+        if error is None:
+            self._page.tell("The training is done", f"See it by python view.py -m {self._run.scene.model_path}")
+        else:
+            self._page.tell("The training has stopped", "Its terminal says why, and how to resume it")
         self._page.stop()
