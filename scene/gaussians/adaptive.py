@@ -61,15 +61,17 @@ class AdaptiveGaussians(GaussianParameters):
     def _zero_statistics(self) -> None:
         self.statistics = Statistics.zero(len(self), self._xyz.device)
 
-    def observe(self, viewspace_points: Tensor, radii: Tensor, absolute: bool = False) -> None:
+    def observe(self, viewspace_points: Tensor, radii: Tensor) -> None:
         """Add a view to the statistics: largest radius, gradient length and count of the Gaussians it saw.
 
         viewspace_points: (N, 3) with `.grad` per NDC unit; radii: (N,) int32 pixels, 0 where not seen. One pass updates
-        max_radii2D and does the work of add_densification_stats for radii > 0. absolute: take the lengths of absolute
-        gradients, which `render` then puts into the third column.
+        max_radii2D and does the work of add_densification_stats for radii > 0.
         """
-        gradient = viewspace_points.grad
-        self.statistics.observe(gradient[:, 2] if absolute else gradient, radii)
+        self.statistics.observe(viewspace_points.grad, radii)
+
+    def observe_absolute(self, viewspace_points: Tensor, radii: Tensor) -> None:
+        """Do as observe with the lengths of absolute gradients, of a `render` with want_absolute_gradient."""
+        self.statistics.observe(viewspace_points.grad[:, 2], radii)
 
     def add_densification_stats(self, viewspace_point_tensor: Tensor, update_filter: Tensor) -> None:
         """Add this view's screen-space gradient lengths and count it, for the Gaussians it saw.

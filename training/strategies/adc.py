@@ -43,7 +43,8 @@ class AdaptiveDensityControl(DensityControl):
     def after_backward(self, step: Step, package: dict[str, Tensor]) -> None:
         todo = self._actions(step.iteration)
         if todo.observe:
-            self._gaussians.observe(package["viewspace_points"], package["radii"], self.absolute_gradients)
+            observe = self._gaussians.observe_absolute if self.absolute_gradients else self._gaussians.observe
+            observe(package["viewspace_points"], package["radii"])
         if todo.densify:
             self._densify(step.iteration, todo.limit_size)
         if todo.reset_opacity:
