@@ -29,6 +29,7 @@ def render(
     want_depth: bool = True,
     want_visibility: bool = True,
     want_inactive_bands: bool = True,
+    want_absolute_gradient: bool = False,
     clamp: bool = True,
 ) -> dict[str, Tensor | None]:
     """Render one view.
@@ -42,9 +43,10 @@ def render(
 
     Returns
     `render` (3, H, W), clamped to [0, 1] so that values outside get no gradient; unclamped if clamp is False;
-    `viewspace_points` (N, 3), whose gradient is that of the screen means, per NDC unit;
-    `visibility_filter` (n, 1) int64 indices of the Gaussians with radius > 0, or None without want_visibility, which
-    saves waiting for a GPU; `radii` (N,) int32 pixels; `depth` inverse depth (1, H, W), or None unless want_depth.
+    `viewspace_points` (N, 3), whose gradient is that of the screen means, per NDC unit; its third column is 0, or with
+    want_absolute_gradient the length that `rasterize` tells of; `visibility_filter` (n, 1) int64 indices of the
+    Gaussians with radius > 0, or None without want_visibility, which saves waiting for a GPU; `radii` (N,) int32
+    pixels; `depth` inverse depth (1, H, W), or None unless want_depth.
     Without want_inactive_bands, get_features_rest gets no gradient at the active degree 0, instead of zeros.
     """
     if torch.is_tensor(separate_sh):
@@ -54,17 +56,15 @@ def render(
     colors = _colors(pc, pipe.convert_SHs_python, viewpoint_camera, separate_sh, override_color)
     if pc.active_sh_degree == 0 and not want_inactive_bands:
         colors = _without_rest(colors)
-    viewspace_points = _zero(xyz.device, xyz.dtype).expand_as(xyz)
-    leaves = (xyz, *geometry.values(), *colors.values())
-    viewspace_points.requires_grad_(torch.is_grad_enabled() and any(x.requires_grad for x in leaves))
+    viewspace_points = _screen_points(xyz, *geometry.values(), *colors.values())
     result = rasterize(
         xyz,
         viewspace_points,
         settings=rasterizer_settings(viewpoint_camera, pc, pipe, bg_color, scaling_modifier),
         want_inverse_depth=want_depth,
+        want_absolute_gradient=want_absolute_gradient,
         raw=raw,
-        **geometry,
-        **colors,
+        **(geometry | colors),
     )
     color = result.color
     if use_trained_exp and (name := _photo(viewpoint_camera)) is not None:
@@ -76,6 +76,12 @@ def render(
         "radii": result.radii,
         "depth": result.inverse_depth,
     }
+
+
+def _screen_points(xyz: Tensor, *others: Tensor) -> Tensor:
+    """Zeros (N, 3) that take a gradient if one of the tensors does."""
+    points = _zero(xyz.device, xyz.dtype).expand_as(xyz)
+    return points.requires_grad_(torch.is_grad_enabled() and any(x.requires_grad for x in (xyz, *others)))
 
 
 @cache

@@ -55,13 +55,15 @@ def step(
     image_gradient: Tensor,
     depth_gradient: Tensor | None,
     observe: bool,
+    absolute: bool = False,
     now: Tensor | None = None,
 ) -> None:
     """Take the step of every Gaussian. observe: add the view to the statistics of density control.
 
+    absolute: with the lengths of absolute gradients (`rasterize` of diff_gaussian_rasterization).
     now: (NOW_WORDS,) int64 on the Gaussians' device of `FusedAdam.write_now`, for a step that is recorded.
     """
     OPERATORS.rasterize_vjp_step_(
         *drawn.scene, *drawn.state, image_gradient, None, depth_gradient, *drawn.more, drawn.radii,
-        *adam.arguments(observe), now=now,
+        *adam.arguments(observe), now=now, absolute=absolute,
     )  # fmt: skip

@@ -74,6 +74,9 @@ OURS = {
     "prune_sh": 0.0,
     "seed": 0,
     "strategy": "adc",
+    "absgrad": False,
+    "absgrad_threshold": 8e-4,
+    "split": "sample",
 }
 
 
@@ -140,6 +143,9 @@ def test_short_forms_and_unique_prefixes():
         ("seed", "-1"),
         ("optimizer_type", "sgd"),
         ("strategy", "mine"),
+        ("absgrad_threshold", "0"),
+        ("absgrad_threshold", "nan"),
+        ("split", "halves"),
         ("exposure_lr_init", "-0.1"),
         ("exposure_lr_delay_steps", "-1"),
         ("exposure_lr_delay_mult", "1.5"),

@@ -36,15 +36,16 @@ SCHEMAS = [
     "bool inverse_depth, bool train) -> (Tensor color, Tensor transmittance, Tensor inverse_depth, Tensor last)",
     f"blend_vjp({BACKWARD}) -> Tensor moments",
     f"project_vjp({SCENE}, Tensor tile_counts, Tensor moments, bool[9] wanted) -> {GRADIENTS}",
-    f"rasterize(Tensor means2d, {SCENE}, Tensor background, bool inverse_depth, bool train) -> (Tensor color, "
-    "Tensor transmittance, Tensor inverse_depth, Tensor radii, Tensor splats, Tensor tile_counts, Tensor instances, "
-    "Tensor ranges, Tensor splat_slots, Tensor slots, Tensor last, Tensor layers)",
-    f"rasterize_vjp({SCENE}, {BACKWARD}, Tensor tile_counts, Tensor layers, bool[9] wanted) -> {GRADIENTS}",
+    f"rasterize(Tensor means2d, {SCENE}, Tensor background, bool inverse_depth, bool train, bool absolute=False) -> "
+    "(Tensor color, Tensor transmittance, Tensor inverse_depth, Tensor radii, Tensor splats, Tensor tile_counts, "
+    "Tensor instances, Tensor ranges, Tensor splat_slots, Tensor slots, Tensor last, Tensor layers)",
+    f"rasterize_vjp({SCENE}, {BACKWARD}, Tensor tile_counts, Tensor layers, bool[9] wanted, bool absolute=False) -> "
+    f"{GRADIENTS}",
     f"rasterize_vjp_step_({STEPPED_SCENE}, {BACKWARD}, Tensor tile_counts, Tensor layers, Tensor radii, "
     "int[] attributes, Tensor(g!)[] exp_avg, Tensor(h!)[] exp_avg_sq, Tensor(i!)[] steps, float[] rates, float beta1, "
     "float beta2, float eps, int[] columns, bool sparse, Tensor(j!)? max_radii=None, "
     "Tensor(k!)? gradient_sums=None, Tensor(l!)? views=None, Tensor? loss=None, Tensor(m!)? stopped=None, "
-    "int iteration=0, Tensor? now=None) -> ()",
+    "int iteration=0, Tensor? now=None, bool absolute=False) -> ()",
     "step_now_(Tensor(a!) now, int[] attributes, Tensor(b!)[] steps, float[] rates, float beta1, float beta2, "
     "float eps, bool sparse, int iteration) -> ()",
     "mark_visible(Tensor means, Tensor view) -> Tensor",

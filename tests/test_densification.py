@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from scene.gaussian_model import GaussianModel
 from scene.gaussians import density_rules as rules
+from scene.gaussians.long_axis import long_axis_children
 from utils.general_utils import build_rotation
 
 EXTENT = 2.0
@@ -104,6 +105,49 @@ def test_clones_and_splits_at_once_give_the_bytes_of_one_after_the_other(screen)
         assert torch.equal(value, parameters(theirs)[name]), name
         for key, average in moments(ours)[name].items():
             assert torch.equal(average, moments(theirs)[name][key]), (name, key)
+
+
+def test_children_along_the_longest_axis_are_told_from_clones():
+    """Clones stay copies; both children take the place of their parent, by the rule of scene/gaussians/long_axis.py."""
+    results = []
+    for seed in (1, 2):
+        gaussians = _toy([LIMIT / 2] * 3 + [LIMIT * 3] * 3, [1.0, 0.0, 1.0, 1.0, 0.0, 1.0], opacity=0.9)
+        before = parameters(gaussians)
+        _densify(gaussians, long_axis=True, seed=seed)
+        results.append(parameters(gaussians))
+    wanted = {name: value[[0, 1, 2, 4, 0, 2, 3, 5, 3, 5]] for name, value in before.items()}
+    rows = (before[name][[3, 5]] for name in ("xyz", "scaling", "rotation", "opacity"))
+    for name, value in long_axis_children(*rows).items():
+        wanted[name][6:] = value
+    for name, value in wanted.items():
+        assert torch.equal(results[0][name], value) and torch.equal(results[1][name], value), name
+
+
+def test_a_client_that_replaces_a_step_gets_the_same_children():
+    class Client(GaussianModel):
+        def densify_and_clone(self, *args: object) -> None:
+            super().densify_and_clone(*args)
+
+    models = []
+    for kind in (GaussianModel, Client):
+        gaussians = _toy([LIMIT / 2] * 3 + [LIMIT * 3] * 3, [1.0] * 6)
+        gaussians.__class__ = kind
+        _densify(gaussians, long_axis=True)
+        models.append(parameters(gaussians))
+    assert all(torch.equal(value, models[1][name]) for name, value in models[0].items())
+    with pytest.raises(ValueError, match="makes 2 children, not 3"):
+        _toy([LIMIT * 3], [1.0]).densify_and_split(torch.ones(1), 0.5, EXTENT, 3, long_axis=True)
+
+
+def test_opacities_of_another_activation_get_the_same_children():
+    ours, theirs = (_toy([LIMIT * 3] * 2, [1.0, 1.0], opacity=0.8) for _ in range(2))
+    theirs.opacity_activation, theirs.inverse_opacity_activation = torch.square, torch.sqrt
+    with torch.no_grad():
+        theirs._opacity.fill_(math.sqrt(0.8))
+    for gaussians in (ours, theirs):
+        _densify(gaussians, long_axis=True)
+    torch.testing.assert_close(ours.get_opacity, theirs.get_opacity, rtol=1e-6, atol=0)
+    assert (ours.get_opacity < 0.7).all()
 
 
 def test_statistics_start_again_and_moments_follow_their_rows():

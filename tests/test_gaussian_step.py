@@ -65,6 +65,7 @@ class Case:
     antialiasing: bool = False
     raw: bool = True
     depth: bool = False
+    absolute: bool = False  # the statistics take lengths of absolute gradients
     broken: float = 1.0  # the factor of a pixel's gradient in the second iteration
     loss: float = 0.5
 
@@ -102,9 +103,10 @@ def step_plainly(state: State, camera: GaussianRasterizationSettings, case: Case
     """Take one iteration's step from gradients in memory."""
     arguments, radii = rendered(state, camera, case, iteration)
     wanted = [name in ("means2d", *PARAMETERS) for name in schema.GRADIENTS]
-    gradients = dict(zip(schema.GRADIENTS, ops.rasterize_vjp(*arguments, wanted), strict=True))
+    gradients = dict(zip(schema.GRADIENTS, ops.rasterize_vjp(*arguments, wanted, case.absolute), strict=True))
     if case.observed:
-        ops.observe_(*state.statistics, radii, gradients["means2d"])
+        screen = gradients["means2d"]
+        ops.observe_(*state.statistics, radii, screen[:, 2] if case.absolute else screen)
     names = [PARAMETERS[place] for place in case.attributes]
     values, gradients = [state.values[name] for name in names], [gradients[name] for name in names]
     guard = case.guard(state, iteration)
@@ -124,7 +126,8 @@ def step_fused(state: State, camera: GaussianRasterizationSettings, case: Case, 
     arguments, radii = rendered(state, camera, case, iteration)
     statistics = state.statistics if case.observed else (None, None, None)
     lists = case.attributes, *case.lists(state)
-    ops.rasterize_vjp_step_(*arguments, radii, *lists, case.sparse, *statistics, *case.guard(state, iteration))
+    rest = case.sparse, *statistics, *case.guard(state, iteration)
+    ops.rasterize_vjp_step_(*arguments, radii, *lists, *rest, absolute=case.absolute)
 
 
 def step_recorded(state: State, camera: GaussianRasterizationSettings, case: Case, iteration: int) -> None:
@@ -140,7 +143,7 @@ def step_recorded(state: State, camera: GaussianRasterizationSettings, case: Cas
     last = (*guard[:2], 77) if guard else (None, None, 77)
     ops.rasterize_vjp_step_(
         *arguments, radii, case.attributes, *averages, *wrong, columns, case.sparse, *statistics, *last,
-        host.to(radii.device),
+        host.to(radii.device), case.absolute,
     )  # fmt: skip
 
 
@@ -169,6 +172,11 @@ CASES = {
     "antialiased": Case(antialiasing=True),
     "activated": Case(raw=False),
     "depth": Case(depth=True, guarded=True),
+    "absolute": Case(absolute=True),
+    "absolute, sparse, depth": Case(absolute=True, sparse=True, guarded=True, depth=True),
+    "absolute, only statistics": Case(absolute=True, attributes=()),
+    "absolute, unobserved": Case(absolute=True, observed=False),
+    "absolute NaN": Case(absolute=True, guarded=True, broken=math.nan),
 }
 
 
@@ -258,7 +266,7 @@ def _refused(match: str, case: Case | None = None, error: type = RuntimeError, *
     case = case or Case(guarded=True)
     state, camera = start_and_camera(case, 8, "cpu", torch.float32)
     arguments, radii = rendered(state, camera, case, 1)
-    rest = list(case.attributes), *case.lists(state), False, *state.statistics, *case.guard(state, 1), None
+    rest = list(case.attributes), *case.lists(state), False, *state.statistics, *case.guard(state, 1), None, False
     names = [argument.name for argument in ops.rasterize_vjp_step_.default._schema.arguments]
     named = dict(zip(names, (*arguments, radii, *rest), strict=True))
     changes = {name: change(named[name]) if callable(change) else change for name, change in changes.items()}

@@ -35,6 +35,7 @@ OPTIONS = {
     "depth": ("-d", "depths", "--depth_l1_weight_init", 1.0),
     "masks": ("--masks", "masks"),
     "degree 0": ("--sh_degree", 0),
+    "absgrad": ("--absgrad", "--absgrad_threshold", 2e-4, "--split", "long_axis"),
 }
 
 
@@ -213,8 +214,8 @@ ENDS_EARLY = ("--densify_until_iter", 30)  # so that two phases have steps to re
 
 @pytest.mark.parametrize(
     "options",
-    [(), OPTIONS["sparse"], ("-w", "--antialiasing"), ENDS_EARLY, OPTIONS["degree 0"]],
-    ids=["default", "sparse", "white", "two phases", "degree 0"],
+    [(), OPTIONS["sparse"], ("-w", "--antialiasing"), ENDS_EARLY, OPTIONS["degree 0"], OPTIONS["absgrad"]],
+    ids=["default", "sparse", "white", "two phases", "degree 0", "absgrad"],
 )
 def test_steps_that_are_recorded_give_the_same_bytes(scene, tmp_path, queued, monkeypatch, options):
     record, kinds = RecordedStep._record, []

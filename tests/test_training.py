@@ -73,6 +73,21 @@ def test_resume_equals_uninterrupted(colmap_scene, tmp_path, monkeypatch):
     assert again.read_bytes() != first.read_bytes()  # the seed matters
 
 
+@pytest.mark.parametrize(
+    "option", [("--absgrad", "--absgrad_threshold", 4e-4), ("--split", "long_axis")], ids=["absgrad", "long axis"]
+)
+def test_options_of_density_control_resume_and_matter(colmap_scene, tmp_path, option):
+    """Each by itself: the bytes of an uninterrupted run, other ones than without it, and the cap is held."""
+    options = [*RESUMED, "--percent_dense", 0.001]  # so that some are split
+    whole = _train(colmap_scene, tmp_path / "a", *options, *option, "--checkpoint_iterations", 140, iterations=220)
+    start = "--start_checkpoint", tmp_path / "a" / "chkpnt140.pth"
+    resumed = _train(colmap_scene, tmp_path / "b", *options, *option, *start, iterations=220)
+    assert whole.read_bytes() == resumed.read_bytes()
+    plain = _train(colmap_scene, tmp_path / "c", *options, iterations=220)
+    assert plain.read_bytes() != whole.read_bytes()
+    assert len(load_checkpoint(start[1])[0][1]) < len(_raw(whole)) <= 500
+
+
 def test_order_of_a_step(colmap_scene, tmp_path):
     """A save precedes the step. The last iteration and densifications take no step, nor do opacities in a reset."""
     every = [str(t) for t in range(1, 13)]

@@ -158,5 +158,6 @@ class Run:
             "want_depth": step.depth_weight > 0,
             "want_visibility": False,
             "want_inactive_bands": False,
+            "want_absolute_gradient": self.density.absolute_gradients and self.density.observes(step.iteration),
             "clamp": False,
         }

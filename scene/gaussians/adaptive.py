@@ -7,6 +7,7 @@ from torch import Tensor, nn
 
 from scene.gaussians import density_rules as rules
 from scene.gaussians.attributes import Rows
+from scene.gaussians.long_axis import long_axis_children
 from scene.gaussians.parameters import GaussianParameters, raw_rows
 from scene.gaussians.row_surgery import Group, States, append_rows, keep_rows, replace_values, row_groups
 from scene.gaussians.statistics import NAMES, Statistics
@@ -68,6 +69,10 @@ class AdaptiveGaussians(GaussianParameters):
         """
         self.statistics.observe(viewspace_points.grad, radii)
 
+    def observe_absolute(self, viewspace_points: Tensor, radii: Tensor) -> None:
+        """Do as observe with the lengths of absolute gradients, of a `render` with want_absolute_gradient."""
+        self.statistics.observe(viewspace_points.grad[:, 2], radii)
+
     def add_densification_stats(self, viewspace_point_tensor: Tensor, update_filter: Tensor) -> None:
         """Add this view's screen-space gradient lengths and count it, for the Gaussians it saw.
 
@@ -96,13 +101,15 @@ class AdaptiveGaussians(GaussianParameters):
         seed: int | None = None,
         iteration: int = 0,
         max_splats: int = 0,
+        long_axis: bool = False,
     ) -> None:
         """Clone small and split large Gaussians with a mean gradient >= max_grad, then remove useless ones.
 
         min_opacity: a Gaussian below it is removed. extent: of the scene, world units. max_screen_size: pixels; unless
         None, Gaussians wider than that or than a tenth of the extent are removed. radii: (N,) pixels of this view,
         `tmp_radii` until the end. seed and iteration decide the positions of split children; without a seed, torch's
-        generator draws one. max_splats > 0 bounds the number of Gaussians.
+        generator draws one. max_splats > 0 bounds the number of Gaussians. long_axis: split along the longest axis
+        (scene/gaussians/long_axis.py) instead, without random numbers.
         """
         if radii is not None:
             self.tmp_radii = radii
@@ -111,13 +118,15 @@ class AdaptiveGaussians(GaussianParameters):
         gradient = rules.mean_gradient(self.xyz_gradient_accum, self.denom)
         if max_splats > 0:
             gradient = rules.limit_growth(gradient, max_grad, max_splats - len(self))
-        draws = {} if seed is None else {"seed": seed, "iteration": iteration}
+        how = {} if seed is None else {"seed": seed, "iteration": iteration}
+        if long_axis:  # said only then, as a client's own densify_and_split may not know it
+            how["long_axis"] = True
         split = None
         if self._grows_by_own_steps():
-            split = self._clone_and_split(gradient, max_grad, extent, **draws)
+            split = self._clone_and_split(gradient, max_grad, extent, **how)
         else:
             self.densify_and_clone(gradient, max_grad, extent)
-            self.densify_and_split(gradient, max_grad, extent, **draws)
+            self.densify_and_split(gradient, max_grad, extent, **how)
         remove = rules.is_useless(self._opacity_logits(), min_opacity)
         if split is not None:
             remove[: len(split)] |= split
@@ -134,12 +143,10 @@ class AdaptiveGaussians(GaussianParameters):
         steps = self.densify_and_clone, self.densify_and_split, self.densification_postfix, self.prune_points
         return tuple(getattr(step, "__func__", None) for step in steps) == _OWN_STEPS
 
-    def _clone_and_split(
-        self, grads: Tensor, grad_threshold: float, scene_extent: float, seed: int | None = None, iteration: int = 0
-    ) -> Tensor:
+    def _clone_and_split(self, grads: Tensor, grad_threshold: float, scene_extent: float, **how: int) -> Tensor:
         """Append what densify_and_clone and densify_and_split append, in their order, with one copy of all tensors.
 
-        Returns the mask (N,) of those that were split; they are left to be removed.
+        how: seed, iteration and long_axis. Returns the mask (N,) of those that were split; they are left to be removed.
         """
         high = grads >= grad_threshold
         small = rules.is_small(self._log_scales(), self.percent_dense * scene_extent)
@@ -147,7 +154,7 @@ class AdaptiveGaussians(GaussianParameters):
         clones, parents = (mask.nonzero().reshape(-1) for mask in (high & small, split))
         origins = torch.cat((clones, parents, parents))
         rows = {name: values.index_select(0, origins) for name, values in raw_rows(self).items()}
-        self._make_children(rows, parents, 2, seed, iteration)
+        self._make_children(rows, parents, **how)
         self._append(rows, origins)
         return split
 
@@ -166,12 +173,15 @@ class AdaptiveGaussians(GaussianParameters):
         *,
         seed: int | None = None,
         iteration: int = 0,
+        long_axis: bool = False,
     ) -> None:
         """Replace each Gaussian with gradient >= threshold and scale > percent_dense * extent by N smaller ones.
 
         grads: (n,) or (n, 1) for the first n Gaussians; those appended since (fresh clones) have gradient 0. seed,
-        iteration: as in densify_and_prune.
+        iteration, long_axis: as in densify_and_prune; ValueError for long_axis unless N is 2.
         """
+        if long_axis and N != 2:
+            raise ValueError(f"a split along the longest axis makes 2 children, not {N}")
         before = len(self)
         large = ~rules.is_small(self._log_scales(), self.percent_dense * scene_extent)
         grads = grads.reshape(-1)
@@ -180,22 +190,35 @@ class AdaptiveGaussians(GaussianParameters):
         parents = large.nonzero().reshape(-1)
         origins = parents.repeat(N)
         rows = {name: values.index_select(0, origins) for name, values in raw_rows(self).items()}
-        self._make_children(rows, parents, N, seed, iteration)
+        self._make_children(rows, parents, N, seed, iteration, long_axis)
         self._append(rows, origins)
         self.prune_points(torch.cat((large, large.new_zeros(len(self) - before))))
 
-    def _make_children(self, rows: Rows, parents: Tensor, count: int, seed: int | None, iteration: int) -> None:
+    def _make_children(
+        self,
+        rows: Rows,
+        parents: Tensor,
+        count: int = 2,
+        seed: int | None = None,
+        iteration: int = 0,
+        long_axis: bool = False,
+    ) -> None:
         """Move and shrink the last rows, which are `count` copies of those of the `parents` (n,), one after another."""
-        if seed is None:
-            seed = int(torch.randint(2**62, ()))
         first = len(rows["xyz"]) - count * len(parents)
         xyz, rotation = (rows[name][first : first + len(parents)] for name in ("xyz", "rotation"))
         shapes = xyz, self._log_scales().index_select(0, parents), rotation
-        children = [
-            rules.split_children(*shapes, parents, child, count=count, seed=seed, iteration=iteration)
-            for child in range(count)
-        ]
-        positions, scales = (torch.cat(parts) for parts in zip(*children, strict=True))
+        if long_axis:
+            children = long_axis_children(*shapes, self._opacity_logits().index_select(0, parents))
+            positions, scales = children["xyz"], children["scaling"]
+            rows["opacity"][first:] = self._raw_opacity(children["opacity"])
+        else:
+            if seed is None:
+                seed = int(torch.randint(2**62, ()))
+            sampled = [
+                rules.split_children(*shapes, parents, child, count=count, seed=seed, iteration=iteration)
+                for child in range(count)
+            ]
+            positions, scales = (torch.cat(parts) for parts in zip(*sampled, strict=True))
         if not (self.kernels_activate and self.scaling_inverse_activation is torch.log):
             scales = self.scaling_inverse_activation(scales.exp())
         rows["xyz"][first:], rows["scaling"][first:] = positions, scales
@@ -265,6 +288,12 @@ class AdaptiveGaussians(GaussianParameters):
     def _opacity_logits(self) -> Tensor:
         """Logits (N, 1) of the opacities, whatever their activation is."""
         return (self._opacity if self.kernels_activate else inverse_sigmoid(self.get_opacity)).detach()
+
+    def _raw_opacity(self, logits: Tensor) -> Tensor:
+        """Raw values of opacities (n, 1) given by their logits, whatever their activation is."""
+        if self.kernels_activate and self.inverse_opacity_activation is inverse_sigmoid:
+            return logits
+        return self.inverse_opacity_activation(logits.sigmoid())
 
     # The reference's names for changes of the optimiser's parameters; the model's own attributes stay as they are.
 

@@ -12,7 +12,7 @@ class Statistics:
     """Observations of N Gaussians; the names are the reference's.
 
     max_radii2D (N,): largest radius in pixels. xyz_gradient_accum (N, 1): sum of the lengths of the screen-space
-    gradients, per NDC unit. denom (N, 1): number of views in that sum. All are float32.
+    gradients, or of the absolute ones, per NDC unit. denom (N, 1): number of views in that sum. All are float32.
     """
 
     max_radii2D: Tensor
@@ -25,7 +25,10 @@ class Statistics:
         return cls(*(torch.zeros(shape, device=device) for shape in ((count,), (count, 1), (count, 1))))
 
     def observe(self, gradient: Tensor, radii: Tensor) -> None:
-        """Add a view in one pass: gradient (N, 3) per NDC unit, radii (N,) int32 pixels, 0 if not seen."""
+        """Add a view in one pass: gradient (N, 3) per NDC unit, radii (N,) int32 pixels, 0 if not seen.
+
+        A gradient of shape (N,) has the lengths themselves.
+        """
         observe_(self.max_radii2D, self.xyz_gradient_accum, self.denom, radii, gradient)
 
     def add_gradient(self, gradient: Tensor, seen: Tensor) -> None:

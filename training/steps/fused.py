@@ -96,6 +96,6 @@ class FusedStep:
     def advance(self, at: Step, drawn: Drawn, gradients: tuple[Tensor, Tensor | None]) -> None:
         """Take the step of the Gaussians, and that of the exposures."""
         run = self._run
-        step(drawn, self._adam, *gradients, run.density.observes(at.iteration))
+        step(drawn, self._adam, *gradients, run.density.observes(at.iteration), run.density.absolute_gradients)
         run.gaussians.exposures.step()
         run.density.after_step(at)

@@ -187,7 +187,9 @@ class RecordedStep:
         run = self._run
         drawn, losses, gradients = self._fused.measure(still)
         run.gaussians.guard_loss(iteration, losses.total)
-        step(drawn, self._adam, *gradients, run.density.observes(iteration), self._inputs[:NOW_WORDS])
+        density = run.density
+        observed = density.observes(iteration), density.absolute_gradients
+        step(drawn, self._adam, *gradients, *observed, self._inputs[:NOW_WORDS])
         return torch.stack([losses.total, losses.l1])
 
     def _numbers_of(self, camera: Camera) -> np.ndarray:

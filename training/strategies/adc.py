@@ -1,4 +1,8 @@
-"""Adaptive density control, the method's own strategy (Kerbl et al. 2023, Section 5.2): clone, split, prune, reset."""
+"""Adaptive density control, the method's own strategy (Kerbl et al. 2023, Section 5.2): clone, split, prune, reset.
+
+--absgrad judges a Gaussian by its pixels' absolute gradients (Ye et al. 2024, AbsGS) with a threshold of its own, for
+splits and for clones. --split long_axis splits along the longest axis (scene/gaussians/long_axis.py).
+"""
 
 import argparse
 
@@ -26,6 +30,7 @@ class AdaptiveDensityControl(DensityControl):
         self._opt = opt
         self._white_background = white_background
         self._extent = extent
+        self.absolute_gradients = opt.absgrad
 
     def changes(self, iteration: int) -> bool:
         todo = self._actions(iteration)
@@ -38,7 +43,8 @@ class AdaptiveDensityControl(DensityControl):
     def after_backward(self, step: Step, package: dict[str, Tensor]) -> None:
         todo = self._actions(step.iteration)
         if todo.observe:
-            self._gaussians.observe(package["viewspace_points"], package["radii"])
+            observe = self._gaussians.observe_absolute if self.absolute_gradients else self._gaussians.observe
+            observe(package["viewspace_points"], package["radii"])
         if todo.densify:
             self._densify(step.iteration, todo.limit_size)
         if todo.reset_opacity:
@@ -49,13 +55,14 @@ class AdaptiveDensityControl(DensityControl):
 
     def _densify(self, iteration: int, limit_size: bool) -> None:
         self._gaussians.densify_and_prune(
-            self._opt.densify_grad_threshold,
+            self._opt.absgrad_threshold if self.absolute_gradients else self._opt.densify_grad_threshold,
             rules.MIN_OPACITY,
             self._extent,
             rules.MAX_SCREEN_SIZE if limit_size else None,
             seed=self._opt.seed,
             iteration=iteration,
             max_splats=self._opt.max_num_splats,
+            long_axis=self._opt.split == "long_axis",
         )
         if len(self._gaussians) == 0:
             raise UserError(

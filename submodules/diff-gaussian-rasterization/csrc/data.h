@@ -124,6 +124,7 @@ struct BlendGradient {
   T* moments;                       // out: (N, 10), Moments in math/footprint.h, then colour and inverse depth
   const T* layers = nullptr;        // Blended::layers, or null: then blend_vjp makes its own
   const Ahead* ahead = nullptr;     // on a GPU: take room for gradient rows, and do not wait for their number
+  T* absolute = nullptr;            // out: (N), absolute_length in math/absolute.h; or null
 };
 
 // A tensor that takes a step of Adam in place, in the `columns` leading values of each row.
@@ -151,6 +152,7 @@ struct ObserveInput {
   float *max_radii, *gradient_sums, *views;  // (N), updated: Observed in math/observe.h
   const int32_t* radii;                      // (N) of this view
   const float* gradients;                    // (N, 3) of the means on the screen; the third value is not read
+  const float* lengths = nullptr;            // (N) what stands for the gradients' lengths; or null
 };
 
 // Gaussians that density control splits, of each the child number `draw` (math/split.h).

@@ -75,12 +75,13 @@ def _(splats, *_):
 @_fake("project_vjp")
 @_fake("rasterize_vjp")
 def _(*arguments):
-    return _gradients(_scene(arguments), arguments[-1])
+    (wanted,) = [value for value in arguments if isinstance(value, list)]
+    return _gradients(_scene(arguments), wanted)
 
 
 @_fake("rasterize")
 def _(means2d, *arguments):
-    scene, (inverse_depth, train) = _scene(arguments), arguments[-2:]
+    scene, (inverse_depth, train) = _scene(arguments), arguments[len(SCENE) + 1 :][:2]
     means, height, width = scene["means"], scene["height"], scene["width"]
     count = means.shape[0]
     color, transmittance, depth, last = _blended(means, height, width, inverse_depth, train)

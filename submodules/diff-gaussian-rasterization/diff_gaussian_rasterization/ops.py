@@ -35,12 +35,15 @@ def rasterize(
     raw: bool = False,
     want_inverse_depth: bool = False,
     want_transmittance: bool = False,
+    want_absolute_gradient: bool = False,
     **others: Tensor | None,
 ) -> Rasterized:
     """Renders Gaussians (Kerbl et al. 2023, sections 4 and 6); differentiable in every tensor but the settings'.
 
     means, opacities and others: the fields of `Gaussians`, which has their shapes; all float32 or all float64.
-    means2d (N, 3): values unused; receives d loss / d mean on the image, per NDC unit.
+    means2d (N, 3): values unused; receives d loss / d mean on the image, per NDC unit, in x and y. The third value is
+    0, or with want_absolute_gradient the length of the absolute gradient (Ye et al. 2024, AbsGS), per NDC unit:
+    sqrt((sum |dL_p/dx|)^2 + (sum |dL_p/dy|)^2) over the pixels p, dL_p what p alone makes of the loss.
     raw: opacities are logits, scales are logarithms, and rotations have any length (zero means the identity).
     Gaussians with a NaN or an infinite value are left out and receive zero gradients.
     Second derivatives raise RuntimeError. Raises TypeError for None, other wrong types and dtypes, and ValueError for
@@ -58,7 +61,7 @@ def rasterize(
         arguments = scene_arguments(gaussians, settings, raw)
         # torch.compile knows the operator, whose autograd is registered below.
         function = _Rasterize.apply if train and not torch.compiler.is_compiling() else OPERATORS.rasterize
-        out = function(means2d, *arguments, settings.bg, want_inverse_depth, train)
+        out = function(means2d, *arguments, settings.bg, want_inverse_depth, train, want_absolute_gradient)
     except (AttributeError, TypeError, RuntimeError):
         _check_types(gaussians, settings, means2d)
         raise
@@ -136,11 +139,12 @@ def _check_gradients(inputs: dict[str, Tensor | None]) -> None:
 
 
 def _setup_context(ctx, inputs, output):
+    *inputs, absolute = (*inputs, False)[: len(INPUTS)]  # the dispatcher leaves a default out
     _, *scene, background, inverse_depth, train = inputs
     _, transmittance, _, _, splats, tile_counts, instances, ranges, splat_slots, slots, last, layers = output
     ctx.mark_non_differentiable(*output[3:])
     ctx.set_materialize_grads(False)
-    ctx.numbers, ctx.inverse_depth, ctx.train = scene[SCENE_TENSORS:], inverse_depth, train
+    ctx.numbers, ctx.inverse_depth, ctx.train, ctx.absolute = scene[SCENE_TENSORS:], inverse_depth, train, absolute
     state = (splats, instances, ranges, splat_slots, slots, background, last, transmittance)
     ctx.save_for_backward(*scene[:SCENE_TENSORS], *state, tile_counts, layers)
 
@@ -157,7 +161,7 @@ def _backward(ctx, grad_color, grad_transmittance, grad_inverse_depth, *_):
     if not ctx.inverse_depth:
         grad_inverse_depth = None
     image = grad_color, grad_transmittance, grad_inverse_depth
-    gradients = OPERATORS.rasterize_vjp(*scene, *state, *image, *more, wanted)
+    gradients = OPERATORS.rasterize_vjp(*scene, *state, *image, *more, wanted, ctx.absolute)
     by_input = [None] * len(INPUTS)
     for place, gradient, is_wanted in zip(GRADIENT_PLACES, gradients, wanted, strict=True):
         if is_wanted:

@@ -77,7 +77,8 @@ def observe_(max_radii: Tensor, gradient_sums: Tensor, views: Tensor, radii: Ten
     """Adds a view to the statistics of adaptive density control (Kerbl et al. 2023, section 5.2).
 
     max_radii, gradient_sums, views: N float32 values each, contiguous. radii: (N,) int32 px, 0 where not seen.
-    gradient: (N, 3) float32, d loss / d mean on the image, per NDC unit; the third column is not read.
+    gradient: (N, 3) float32, d loss / d mean on the image, per NDC unit; the third column is not read. Or (N,): lengths
+    that stand for those of gradients.
     Where radii > 0, raises max_radii to radii, adds the length of the gradient to gradient_sums and 1 to views.
     """
     _observe(max_radii, gradient_sums, views, radii, gradient)

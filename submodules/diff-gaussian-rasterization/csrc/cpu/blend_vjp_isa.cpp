@@ -3,6 +3,7 @@
 #include <vector>
 
 #include "../backend.h"
+#include "../math/absolute.h"
 #include "../math/exp2.h"
 #include "../math/slots.h"
 #include "gs/lane_sums.h"
@@ -124,8 +125,11 @@ struct RowTable {
   }
 };
 
-template <class T>
-using Sums = typename Simd<T>::Vec[kGradientValues];
+// Sums of an instance: kGradientValues, and perhaps kAbsoluteValues.
+template <bool kAbsolute>
+constexpr int kSums = kGradientValues + (kAbsolute ? kAbsoluteValues : 0);
+template <class T, bool kAbsolute>
+using Sums = typename Simd<T>::Vec[kSums<kAbsolute>];
 
 // A batch of splats in a tile, to be taken back to front.
 template <class T>
@@ -135,11 +139,12 @@ struct Batch {
   RowTable<T> table;
 };
 
-// Sums one splat's kGradientValues, lane by lane, over the rows with a bit, in vectors from column `first` on, until
-// `end`. k: the splat in its batch.
-template <class T, bool kDepth>
+// Sums one splat's values, lane by lane, over the rows with a bit, in vectors from column `first` on, until `end`.
+// k: the splat in its batch.
+template <class T, bool kDepth, bool kAbsolute>
 __attribute__((always_inline)) inline void sum_rows(const Batch<T>& batch, int k, int64_t position, uint32_t bits,
-                                                    int first, int end, BackwardState<T>& state, Sums<T>& sums) {
+                                                    int first, int end, BackwardState<T>& state,
+                                                    Sums<T, kAbsolute>& sums) {
   using S = Simd<T>;
   using V = typename S::Vec;
   using M = typename S::Mask;
@@ -147,7 +152,7 @@ __attribute__((always_inline)) inline void sum_rows(const Batch<T>& batch, int k
   const RowTable<T>& table = batch.table;
   const V zero = {};
   V q0 = zero, qu = zero, qv = zero, quu = zero, quv = zero, qvv = zero;
-  V red = zero, green = zero, blue = zero, depth = zero;
+  V red = zero, green = zero, blue = zero, depth = zero, absolute_u = zero, absolute_uv = zero;
   for (; bits; bits &= bits - 1) {
     const int row = __builtin_ctz(bits);
     const RowTerms<V> terms = {by_rows<T>(table.top, row, k), S::all(chunk.l11[k]), by_rows<T>(table.u0, row, k),
@@ -176,30 +181,34 @@ __attribute__((always_inline)) inline void sum_rows(const Batch<T>& batch, int k
       quu += qu_here * u, quv += qu_here * terms.v, qvv += qv_here * terms.v;
       red += weight * gr, green += weight * gg, blue += weight * gb;
       if (kDepth) depth += weight * gd;
+      if (kAbsolute) {
+        absolute_u += magnitude(qu_here);
+        absolute_uv += magnitude(V(chunk.l12[k] * qu_here + chunk.l22[k] * qv_here));
+      }
     } while ((column += kColumns<T>) < end && RowTable<T>::kParts == 1);
   }
-  const V all[kGradientValues] = {q0, qu, qv, quu, quv, qvv, red, green, blue, depth};
-  std::copy_n(all, kGradientValues, sums);
+  const V all[] = {q0, qu, qv, quu, quv, qvv, red, green, blue, depth, absolute_u, absolute_uv};
+  std::copy_n(all, kSums<kAbsolute>, sums);
 }
 
-// Sums one splat's kGradientValues over the pixels that it reaches, all of them from column `first` to `last`.
-template <class T, bool kDepth>
+// Sums one splat's values over the pixels that it reaches, all of them from column `first` to `last`.
+template <class T, bool kDepth, bool kAbsolute>
 void splat_gradient(const Batch<T>& batch, int k, int64_t position, BackwardState<T>& state, T* out) {
   constexpr int kParts = RowTable<T>::kParts;
   const int first = batch.columns.first[k], wide = batch.columns.last[k] - first;
-  Sums<T> sums;
+  Sums<T, kAbsolute> sums;
   if (wide < kColumns<T>) {  // one vector a row, which may begin at any column: that changes no sum
     const int begin = std::min(first, kTile - kColumns<T>);
-    sum_rows<T, kDepth>(batch, k, position, batch.table.rows(k), begin, begin + 1, state, sums);
+    sum_rows<T, kDepth, kAbsolute>(batch, k, position, batch.table.rows(k), begin, begin + 1, state, sums);
   } else {
     const int vectors = wide / kColumns<T> + 1, begin = std::min(first, kTile - vectors * kColumns<T>);
-    Sums<T> parts[kParts];
+    Sums<T, kAbsolute> parts[kParts];
     for (int p = 0; p < kParts; ++p) {
       const int from = kParts > 1 ? p * kColumns<T> : begin;
-      sum_rows<T, kDepth>(batch, k, position, batch.table.rows(k, p), from, begin + vectors * kColumns<T>, state,
-                          parts[p]);
+      sum_rows<T, kDepth, kAbsolute>(batch, k, position, batch.table.rows(k, p), from, begin + vectors * kColumns<T>,
+                                     state, parts[p]);
     }
-    for (int i = 0; i < kGradientValues; ++i) {
+    for (int i = 0; i < kSums<kAbsolute>; ++i) {
       sums[i] = parts[0][i];
       for (int p = 1; p < kParts; ++p) sums[i] += parts[p][i];
     }
@@ -207,10 +216,10 @@ void splat_gradient(const Batch<T>& batch, int k, int64_t position, BackwardStat
   LaneSums<T, int(sizeof sums[0])>::store(sums, out);
 }
 
-// Sums of the processed instances, a row of kGradientValues each, in the order of slots: those of a splat lie side by
-// side, whatever tiles they come from. A mark per slot tells which instances were processed, and a prefix sum over the
-// marks tells where a row is. So memory is for these rows only, and nothing is added concurrently.
-template <class T>
+// Sums of the processed instances, a row of kRow each, in the order of slots: those of a splat lie side by side,
+// whatever tiles they come from. A mark per slot tells which instances were processed, and a prefix sum over the marks
+// tells where a row is. So memory is for these rows only, and nothing is added concurrently.
+template <class T, int kRow>
 class GradientRows {
  public:
   explicit GradientRows(int64_t slots) : marks_((slots + 63) / 64 * 64, 0), bits_(marks_.size() / 64) {}
@@ -230,14 +239,14 @@ class GradientRows {
       bits_[w] = bits;
       before_[w + 1] = before_[w] + __builtin_popcountll(bits);
     }
-    rows_.reset(new T[kGradientValues * before_.back()]);  // not zeroed: every row is written
+    rows_.reset(new T[kRow * before_.back()]);  // not zeroed: every row is written
   }
 
   // The row of a slot; for a slot without one, the next row.
   T* row(int64_t slot) {
     const uint64_t lower = (uint64_t(1) << (slot & 63)) - 1;
     const int64_t rank = before_[slot >> 6] + (slot & 63 ? __builtin_popcountll(bits_[slot >> 6] & lower) : 0);
-    return rows_.get() + kGradientValues * rank;
+    return rows_.get() + kRow * rank;
   }
 
  private:
@@ -269,9 +278,9 @@ void read_state(const BlendInput<T>& in, const BlendGradient<T>& g, const Tile& 
     interleave<T>(pixels);
 }
 
-template <class T, bool kDepth>
+template <class T, bool kDepth, bool kAbsolute>
 void blend_tile_vjp(const BlendInput<T>& in, const BlendGradient<T>& g, int64_t index, int64_t processed,
-                    GradientRows<T>& rows) {
+                    GradientRows<T, kSums<kAbsolute>>& rows) {
   const Tile tile(index, in.image);
   const int64_t begin = in.ranges[index];
   BackwardState<T> state;
@@ -286,17 +295,16 @@ void blend_tile_vjp(const BlendInput<T>& in, const BlendGradient<T>& g, int64_t 
     batch.table.fill(batch.chunk, count, from, state);
     for (int64_t position = to - 1; position >= from; --position) {
       T* sums = rows.row(slot_of(g.slots, in.instances[begin + position], tile.x / kTile, tile.y / kTile));
-      splat_gradient<T, kDepth>(batch, int(position - from), position, state, sums);
+      splat_gradient<T, kDepth, kAbsolute>(batch, int(position - from), position, state, sums);
     }
   }
 }
 
-}  // namespace
-
-template <class T>
-void blend_vjp(const Executor& executor, const BlendInput<T>& in, const BlendGradient<T>& g) {
+template <class T, bool kAbsolute>
+void sum_gradients(const Executor& executor, const BlendInput<T>& in, const BlendGradient<T>& g) {
+  constexpr int kRow = kSums<kAbsolute>;
   const int64_t tiles = tiles_of(in.image);
-  GradientRows<T> rows(g.slot_count);
+  GradientRows<T, kRow> rows(g.slot_count);
   std::vector<int32_t> processed(tiles);
   for_dynamic(executor, tiles, 4, [&](int64_t begin, int64_t end) {
     for (int64_t index = begin; index < end; ++index) {
@@ -309,17 +317,30 @@ void blend_vjp(const Executor& executor, const BlendInput<T>& in, const BlendGra
     }
   });
   rows.allocate();
-  const auto run = g.inverse_depth ? blend_tile_vjp<T, true> : blend_tile_vjp<T, false>;
+  const auto run = g.inverse_depth ? blend_tile_vjp<T, true, kAbsolute> : blend_tile_vjp<T, false, kAbsolute>;
   for_dynamic(executor, tiles, 1, [&](int64_t tile, int64_t) { run(in, g, tile, processed[tile], rows); });
   for_dynamic(executor, g.count, 1024, [&](int64_t begin, int64_t end) {
     for (int64_t i = begin; i < end; ++i) {
-      double sums[kGradientValues] = {};  // a splat may have thousands of tiles
-      const T* stop = rows.row(g.slots[i + 1].first);
-      for (const T* row = rows.row(g.slots[i].first); row < stop; row += kGradientValues)
-        for (int v = 0; v < kGradientValues; ++v) sums[v] += row[v];
+      double sums[kRow] = {};  // a splat may have thousands of tiles
+      const T *start = rows.row(g.slots[i].first), *stop = rows.row(g.slots[i + 1].first);
+      for (const T* row = start; row < stop; row += kRow)
+        for (int v = 0; v < kRow; ++v) sums[v] += row[v];
       std::copy_n(sums, kGradientValues, g.moments + kGradientValues * i);
+      if constexpr (kAbsolute) {
+        const double* absolute = sums + kGradientValues;
+        g.absolute[i] = 0;
+        if (start < stop)  // else the splat is undefined
+          g.absolute[i] = absolute_length(in.splats[kSplatValues * i + 2], T(absolute[0]), T(absolute[1]), in.image);
+      }
     }
   });
+}
+
+}  // namespace
+
+template <class T>
+void blend_vjp(const Executor& executor, const BlendInput<T>& in, const BlendGradient<T>& g) {
+  (g.absolute ? sum_gradients<T, true> : sum_gradients<T, false>)(executor, in, g);
 }
 
 template void blend_vjp<float>(const Executor&, const BlendInput<float>&, const BlendGradient<float>&);

@@ -71,17 +71,25 @@ __global__ void __launch_bounds__(kTile* kTile)
 
 __global__ void judge_rows_kernel(Ahead ahead, const int32_t* rows) { judge_rows(ahead, *rows); }
 
-// Sums ten values over a warp in 12 shuffles: each step halves the values that a lane keeps and doubles the lanes that
-// are summed. The lane ends with the sum of `value`, or with none (-1).
-__device__ __forceinline__ float transposed_sum(const float (&v)[kGradientValues], int& value) {
+// Values that a lane sums: kGradientValues, and perhaps kAbsoluteValues.
+template <bool kAbsolute>
+constexpr int kSums = kGradientValues + (kAbsolute ? kAbsoluteValues : 0);
+
+// Sums ten values over a warp in 12 shuffles, or twelve in 13: each step halves the values that a lane keeps and
+// doubles the lanes that are summed. The lane ends with the sum of `value`, or with none (-1).
+template <int kCount>
+__device__ __forceinline__ float transposed_sum(const float (&v)[kCount], int& value) {
+  constexpr int kHalf = kCount / 2;
+  static_assert(kCount == 2 * kHalf && (kHalf == 5 || kHalf == 6), "halves are cut into parts of at most 3, 2, 1");
   const int lane = threadIdx.x % 32;
   const bool b16 = lane & 16, b8 = lane & 8, b4 = lane & 4, b2 = lane & 2;
-  float a[5], b[3], c[2];
+  float a[kHalf], b[3], c[2];
 #pragma unroll
-  for (int i = 0; i < 5; ++i) a[i] = (b16 ? v[i + 5] : v[i]) + __shfl_xor_sync(kWarp, b16 ? v[i] : v[i + 5], 16);
+  for (int i = 0; i < kHalf; ++i)
+    a[i] = (b16 ? v[i + kHalf] : v[i]) + __shfl_xor_sync(kWarp, b16 ? v[i] : v[i + kHalf], 16);
 #pragma unroll
   for (int i = 0; i < 3; ++i) {
-    const float high = i < 2 ? a[i + 3] : 0;
+    const float high = i + 3 < kHalf ? a[i + 3] : 0;
     b[i] = (b8 ? high : a[i]) + __shfl_xor_sync(kWarp, b8 ? a[i] : high, 8);
   }
 #pragma unroll
@@ -91,9 +99,9 @@ __device__ __forceinline__ float transposed_sum(const float (&v)[kGradientValues
   }
   float sum = (b2 ? c[1] : c[0]) + __shfl_xor_sync(kWarp, b2 ? c[0] : c[1], 2);
   sum += __shfl_xor_sync(kWarp, sum, 1);
-  const int within3 = b4 ? 2 : b2, within5 = (b8 ? 3 : 0) + within3;
-  const bool exists = !(lane & 1) && !(b4 && b2) && within5 < 5;
-  value = exists ? (b16 ? 5 : 0) + within5 : -1;
+  const int within3 = b4 ? 2 : b2, within = (b8 ? 3 : 0) + within3;
+  const bool exists = !(lane & 1) && !(b4 && b2) && within < kHalf;
+  value = exists ? (b16 ? kHalf : 0) + within : -1;
   return sum;
 }
 
@@ -217,14 +225,14 @@ __device__ __forceinline__ void start_before(const Pixels<Backward, kDepth>& pix
 
 // Steps the lanes over splat k of the batch, whose first splat is the chunk's splat `first`, and leaves the sums over
 // the warp's pixels in `sums`. A splat that reaches none of them changes nothing.
-template <bool kDepth, int kBatch>
+template <bool kDepth, bool kAbsolute, int kBatch>
 __device__ __forceinline__ void splat_gradient(const Batch<kBatch>& batch, const Pixels<Backward, kDepth>& pixels,
                                                const Backward& at, int k, int first, OfPixels& transmittance,
                                                OfPixels& behind, float* sums) {
   const LocalSplat<float> splat = batch.local(k);
   const float4 c = batch.color[k];
   const RowTerms<float> row = row_terms(splat, float(at.y));
-  float q0 = 0, qu = 0, quu = 0, r = 0, gr = 0, b = 0, d = 0;
+  float q0 = 0, qu = 0, quu = 0, r = 0, gr = 0, b = 0, d = 0, absolute_u = 0, absolute_uv = 0;
   bool any = false;
 #pragma unroll
   for (int p = 0; p < Backward::kRun; ++p) {
@@ -238,27 +246,32 @@ __device__ __forceinline__ void splat_gradient(const Batch<kBatch>& batch, const
     q0 += q, qu += qu_here, quu += qu_here * u;
     r += weight * pixels.red[p], gr += weight * pixels.green[p], b += weight * pixels.blue[p];
     if (kDepth) d += weight * pixels.depth[p];
+    if (kAbsolute) absolute_u += fabsf(qu_here), absolute_uv += fabsf(q * (splat.l12 * u + splat.l22 * row.v));
   }
   if (!__any_sync(kWarp, any)) return;
   // Along a row v is constant, so three of the moments come last.
-  const float v[kGradientValues] = {q0, qu, row.v * q0, quu, row.v * qu, row.v * row.v * q0, r, gr, b, d};
+  const float all[] = {q0, qu, row.v * q0, quu, row.v * qu, row.v * row.v * q0, r, gr, b, d, absolute_u, absolute_uv};
+  float v[kSums<kAbsolute>];
+#pragma unroll
+  for (int i = 0; i < kSums<kAbsolute>; ++i) v[i] = all[i];
   int value;
   const float sum = transposed_sum(v, value);
-  if (value >= 0) sums[(threadIdx.x / 32 * kBatch + k) * kGradientValues + value] = sum;
+  if (value >= 0) sums[(threadIdx.x / 32 * kBatch + k) * kSums<kAbsolute> + value] = sum;
 }
 
 // Walks each chunk back to front, a block each, and writes its gradient rows. Within these registers ptxas compiles the
 // loop over splats without spills on sm_90. If blocks per multiprocessor are bounded instead, it makes the loop a tenth
 // longer.
-template <bool kDepth, bool kMade>
-__global__ void GS_MAX_REGISTERS(kDepth ? 96 : 80)
+template <bool kDepth, bool kMade, bool kAbsolute>
+__global__ void GS_MAX_REGISTERS((kDepth ? 96 : 80) + (kAbsolute ? 8 : 0))
     blend_vjp_kernel(const int32_t* halted, BlendInput<float> in, BlendGradient<float> g, const int32_t* processed,
-                     const Chunk* chunks, int chunk_size, const Layer* layers, MadeLayers made, GradientRows rows) {
+                     const Chunk* chunks, int chunk_size, const Layer* layers, MadeLayers made, GradientRows rows,
+                     float* absolute) {
   if (is_halted(halted)) return;
   using L = Backward;
-  constexpr int kBatch = 64;
+  constexpr int kBatch = 64, kRow = kSums<kAbsolute>;
   __shared__ Batch<kBatch> batch;
-  __shared__ float sums[L::kWarps * kBatch * kGradientValues];
+  __shared__ float sums[L::kWarps * kBatch * kRow];
   __shared__ int64_t row_of[kBatch];
   const Chunk chunk = chunks[blockIdx.x];
   if (chunk.tile < 0) return;
@@ -284,7 +297,7 @@ __global__ void GS_MAX_REGISTERS(kDepth ? 96 : 80)
       batch.put(k, in.splats, splat, float(left), float(top));
       row_of[k] = rows.row(slot_of(g.slots, splat, chunk.tile % across, chunk.tile / across));
     }
-    for (int k = threadIdx.x; k < L::kWarps * kBatch * kGradientValues; k += L::kThreads) sums[k] = 0;
+    for (int k = threadIdx.x; k < L::kWarps * kBatch * kRow; k += L::kThreads) sums[k] = 0;
     __syncthreads();
     for (int from = (count - 1) / 32 * 32; from >= 0; from -= 32) {
       if (first + from >= pixels.furthest) continue;
@@ -292,16 +305,35 @@ __global__ void GS_MAX_REGISTERS(kDepth ? 96 : 80)
       while (hits) {
         const int bit = 31 - __clz(hits), k = from + bit;
         hits &= ~(1u << bit);
-        splat_gradient(batch, pixels, at, k, first, transmittance, behind, sums);
+        splat_gradient<kDepth, kAbsolute>(batch, pixels, at, k, first, transmittance, behind, sums);
       }
     }
     __syncthreads();
-    for (int k = threadIdx.x; k < count * kGradientValues; k += L::kThreads) {
+    for (int k = threadIdx.x; k < count * kRow; k += L::kThreads) {
       float sum = 0;
-      for (int w = 0; w < L::kWarps; ++w) sum += sums[w * kBatch * kGradientValues + k];
-      rows.values[kGradientValues * row_of[k / kGradientValues] + k % kGradientValues] = sum;
+      for (int w = 0; w < L::kWarps; ++w) sum += sums[w * kBatch * kRow + k];
+      const int64_t row = row_of[k / kRow];
+      const int value = k % kRow;
+      if (!kAbsolute || value < kGradientValues)
+        rows.values[kGradientValues * row + value] = sum;
+      else
+        absolute[kAbsoluteValues * row + value - kGradientValues] = sum;
     }
   }
+}
+
+__global__ void __launch_bounds__(256)
+    absolute_kernel(const int32_t* halted, int64_t count, SlotSumsOf<kAbsoluteValues> sums, const float* splats,
+                    Image image, float* absolute) {
+  if (is_halted(halted)) return;
+  const int64_t i = int64_t(blockIdx.x) * 256 + threadIdx.x;
+  constexpr int kStage = SlotSumsOf<kAbsoluteValues>::kStage;
+  __shared__ __align__(8) float stage[256 / 32 * kStage];
+  float of_pixels[kAbsoluteValues];
+  const bool seen = i < count && sums.seen(i);
+  sums.read(i, seen, of_pixels, stage + threadIdx.x / 32 * kStage);
+  if (i >= count) return;
+  absolute[i] = seen ? absolute_length(splats[kSplatValues * i + 2], of_pixels[0], of_pixels[1], image) : 0;
 }
 
 __global__ void __launch_bounds__(256)
@@ -321,6 +353,13 @@ void find_layers(const Queue& queue, const BlendInput<float>& in, const BlendGra
   const auto kernel = g.inverse_depth ? layers_kernel<L, true> : layers_kernel<L, false>;
   kernel<<<schedule.blocks, L::kThreads, 0, stream_of(queue)>>>(queue.halted, in, g, schedule.chunks, layers);
   check_launch("layers");
+}
+
+// The kernel that blends back to front, for what is wanted and what is there.
+template <bool kAbsolute>
+auto blend_vjp_kernel_for(bool depth, bool made) {
+  return depth ? (made ? blend_vjp_kernel<true, true, kAbsolute> : blend_vjp_kernel<true, false, kAbsolute>)
+               : (made ? blend_vjp_kernel<false, true, kAbsolute> : blend_vjp_kernel<false, false, kAbsolute>);
 }
 
 }  // namespace
@@ -353,13 +392,20 @@ GradientRows blend_rows(const Queue& queue, const BlendInput<float>& in, const B
   Layer* layers = queue.array<Layer>(made ? 0 : size_t(schedule.places) * kTile * kTile);
   if (schedule.places && !made)
     (tiles <= kFewTiles ? find_layers<Layout<1>> : find_layers<Layout<2>>)(queue, in, g, schedule, layers);
-  const auto kernel = g.inverse_depth ? (made ? blend_vjp_kernel<true, true> : blend_vjp_kernel<true, false>)
-                                      : (made ? blend_vjp_kernel<false, true> : blend_vjp_kernel<false, false>);
+  const AbsoluteRows absolute{bits, before, queue.array<float>(g.absolute ? size_t(rows) * kAbsoluteValues : 0)};
+  const bool depth = g.inverse_depth;
+  const auto kernel = g.absolute ? blend_vjp_kernel_for<true>(depth, made) : blend_vjp_kernel_for<false>(depth, made);
   kernel<<<schedule.blocks, Backward::kThreads, 0, stream>>>(queue.halted, in, g, processed, schedule.chunks,
                                                              chunk_size, layers, layers_at(g.layers, in.instance_count),
-                                                             gradients);
+                                                             gradients, absolute.values);
   check_launch("blend_vjp");
-  for (const void* done : {static_cast<const void*>(layers), static_cast<const void*>(schedule.chunks)})
+  if (g.absolute) {
+    absolute_kernel<<<blocks_for(g.count, 256), 256, 0, stream>>>(
+        queue.halted, g.count, SlotSumsOf<kAbsoluteValues>{absolute, g.slots}, in.splats, in.image, g.absolute);
+    check_launch("absolute");
+  }
+  for (const void* done : {static_cast<const void*>(layers), static_cast<const void*>(schedule.chunks),
+                           static_cast<const void*>(absolute.values)})
     queue.release(queue.context, done);  // the gradients come next, and take most of a step's memory
   return gradients;
 }

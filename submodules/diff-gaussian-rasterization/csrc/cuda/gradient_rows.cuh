@@ -5,16 +5,18 @@
 #include <cstdint>
 
 #include "../data.h"
+#include "../math/absolute.h"
 #include "../math/splat.h"
 #include "queue.cuh"
 
 namespace gs {
 namespace cuda {
 
-struct GradientRows {
+template <int kValues>
+struct RowsOf {
   const uint32_t* bits;
   const int32_t* before;  // bits set before each word
-  float* values;          // (processed, kGradientValues)
+  float* values;          // (processed, kValues)
 
   // The row of a slot; for a slot without one, the next row.
   __device__ int64_t row(int64_t slot) const {
@@ -23,25 +25,28 @@ struct GradientRows {
   }
 };
 
-// Runs the backward of blending up to the rows. Waits for the number of rows if there may be many and the host does not
-// run ahead.
+using GradientRows = RowsOf<baseline::kGradientValues>;
+using AbsoluteRows = RowsOf<baseline::kAbsoluteValues>;  // of the same instances
+
+// Runs the backward of blending up to the rows, and to BlendGradient::absolute if it is wanted. Waits for the number of
+// rows if there may be many and the host does not run ahead.
 GradientRows blend_rows(const Queue& queue, const BlendInput<float>& in, const BlendGradient<float>& g);
 
 // Sums a splat's rows, in an order that depends on their number alone. The rows of a warp's splats lie side by side, so
 // they come through shared memory in whole lines. A splat near the camera has thousands of rows, which the whole warp
 // adds.
-struct SlotSums {
+template <int kValues>
+struct SlotSumsOf {
   static constexpr int kOwnRows = 48;
-  static constexpr int kStaged = 32;                                  // rows at a time
-  static constexpr int kStage = kStaged * baseline::kGradientValues;  // floats of shared memory for each warp
-  GradientRows rows;
+  static constexpr int kStaged = 32;                // rows at a time
+  static constexpr int kStage = kStaged * kValues;  // floats of shared memory for each warp
+  RowsOf<kValues> rows;
   const SplatSlots* slots;
 
   __device__ bool seen(int64_t splat) const { return slots[splat + 1].first > slots[splat].first; }
 
   // All lanes of a warp call this. Those whose splat is wanted get its sums, the others zeros.
   __device__ void read(int64_t splat, bool wanted, float* sums, float* stage) const {
-    constexpr int kValues = baseline::kGradientValues;
     const int lane = threadIdx.x & 31;
     unsigned begin = 0, end = 0;  // instances are fewer than 2^31
     if (wanted) begin = unsigned(rows.row(slots[splat].first)), end = unsigned(rows.row(slots[splat + 1].first));
@@ -77,12 +82,14 @@ struct SlotSums {
 
  private:
   __device__ static void add(const float* row, float* sums) {
-    for (int v = 0; v < baseline::kGradientValues / 2; ++v) {
+    for (int v = 0; v < kValues / 2; ++v) {
       const float2 pair = reinterpret_cast<const float2*>(row)[v];
       sums[2 * v] += pair.x, sums[2 * v + 1] += pair.y;
     }
   }
 };
+
+using SlotSums = SlotSumsOf<baseline::kGradientValues>;
 
 }  // namespace cuda
 }  // namespace gs

@@ -17,7 +17,10 @@ __global__ void __launch_bounds__(kThreads) observe_kernel(const int32_t* halted
   const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
   if (i >= in.count) return;
   Observed o{in.max_radii[i], in.gradient_sums[i], in.views[i]};
-  gs::observe(in.radii[i], in.gradients[3 * i], in.gradients[3 * i + 1], o);
+  if (in.lengths)
+    gs::observe(in.radii[i], in.lengths[i], o);
+  else
+    gs::observe(in.radii[i], in.gradients[3 * i], in.gradients[3 * i + 1], o);
   in.max_radii[i] = o.max_radius, in.gradient_sums[i] = o.gradient_sum, in.views[i] = o.views;
 }
 

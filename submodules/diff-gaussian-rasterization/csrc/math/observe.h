@@ -23,4 +23,12 @@ GS_HD void observe(int32_t radius, float gradient_x, float gradient_y, Observed&
   o.views += 1;
 }
 
+// The same from a length that stands for the gradient's.
+GS_HD void observe(int32_t radius, float length, Observed& o) {
+  if (radius <= 0) return;
+  if (float(radius) > o.max_radius) o.max_radius = float(radius);
+  o.gradient_sum += length;
+  o.views += 1;
+}
+
 }  // namespace gs

@@ -35,7 +35,7 @@ struct Parameters {
 
 template <class T>
 struct Result {
-  std::vector<T> color, transmittance, depth, gradient;
+  std::vector<T> color, transmittance, depth, gradient, absolute;
   std::vector<int32_t> radii, tile_counts;
   std::vector<uint8_t> decisive;
   int64_t instances;
@@ -101,10 +101,10 @@ std::vector<T> memory_for_layers(const Where&, gs::Image image, int64_t instance
 // that a sanitizer sees an access outside. On a Queue the forward gives its layers to the backward. The gradient holds
 // means, means2d, opacities, scales, rotations, dc, rest, one after the other. records: projection gives binning a
 // record of each splat besides its rectangle. ahead: as a host that runs ahead gives it; a gradient of a halted run is
-// -77.
+// -77. absolute: with the lengths of absolute gradients.
 template <class T, class Where>
 Result<T> run(const Where& where, Parameters<T>& p, gs::Image image, bool antialiasing, bool records = false,
-              const gs::Ahead* ahead = nullptr) {
+              const gs::Ahead* ahead = nullptr, bool absolute = false) {
   using gs::cuda::bin, gs::cuda::blend, gs::cuda::blend_vjp, gs::cuda::project, gs::cuda::project_vjp;
   using gs::cuda::mark_decisive, gs::GS_ISA::mark_decisive;
   using gs::GS_ISA::bin, gs::GS_ISA::blend, gs::GS_ISA::blend_vjp, gs::GS_ISA::project, gs::GS_ISA::project_vjp;
@@ -161,10 +161,12 @@ Result<T> run(const Where& where, Parameters<T>& p, gs::Image image, bool antial
 
   const std::vector<T> ones(3 * pixels, T(1));
   std::vector<T> moments(kGradientValues * n);
+  out.absolute.assign(absolute ? n : 0, T(-77));
   blend_vjp(
       where, input,
       gs::BlendGradient<T>{p.count, room, slot_count, slots.data(), out.transmittance.data(), last.data(), ones.data(),
-                           ones.data(), ones.data(), moments.data(), layers.empty() ? nullptr : layers.data(), ahead});
+                           ones.data(), ones.data(), moments.data(), layers.empty() ? nullptr : layers.data(), ahead,
+                           absolute ? out.absolute.data() : nullptr});
   out.gradient.assign(n * (3 + 3 + 1 + 3 + 4 + 3 + 45), T(-77));
   T* g = out.gradient.data();
   const gs::SceneGradient<T> gradient = {g,       g + 3 * n, g + 6 * n,  g + 7 * n, g + 10 * n,

@@ -38,13 +38,14 @@ struct LongLists {
 };
 
 struct Blending {
-  std::vector<float> color, transmittance, depth, moments;
+  std::vector<float> color, transmittance, depth, moments, absolute;
   std::vector<int32_t> last;
   std::vector<double> exact_color, exact_transmittance, exact_depth;  // of blend_exactly alone
   std::vector<bool> decided;                                          // whether rounding cannot move the end
 };
 
-// depth, last: whether these outputs are asked for. layers: whether the forward gives its layers to the backward.
+// depth, last: whether these outputs are asked for; without depth the backward gives lengths of absolute gradients.
+// layers: whether the forward gives its layers to the backward.
 template <class Where>
 Blending blend_lists(const Where& where, const LongLists& lists, bool depth, bool last, bool layers) {
   using gs::cuda::blend, gs::cuda::blend_vjp, gs::GS_ISA::blend, gs::GS_ISA::blend_vjp;
@@ -68,11 +69,11 @@ Blending blend_lists(const Where& where, const LongLists& lists, bool depth, boo
   std::mt19937 numbers(8);
   for (size_t i = 0; i < 5 * pixels; ++i) gradients.push_back(float(std::normal_distribution<>()(numbers)));
   const float* g = gradients.data();
-  out.moments.resize(kGradientValues * lists.count());
+  out.moments.resize(kGradientValues * lists.count()), out.absolute.resize(depth ? 0 : lists.count());
   blend_vjp(where, in,
             gs::BlendGradient<float>{lists.count(), total, lists.count(), slots.data(), out.transmittance.data(),
                                      out.last.data(), g, depth ? g + 3 * pixels : nullptr, g + 4 * pixels,
-                                     out.moments.data(), to});
+                                     out.moments.data(), to, nullptr, depth ? nullptr : out.absolute.data()});
   return out;
 }
 

@@ -23,10 +23,10 @@ void check_near(const std::vector<float>& got, const std::vector<float>& wanted,
 }
 
 Result<float> run_emulated(Parameters<float>& p, gs::Image image, bool antialiasing, bool records,
-                           gs::emulation::Order order) {
+                           gs::emulation::Order order, bool absolute) {
   gs::emulation::order = order;
   gs::emulation::Memory memory;
-  return run(memory.queue(), p, image, antialiasing, records);
+  return run(memory.queue(), p, image, antialiasing, records, nullptr, absolute);
 }
 
 void check_results(const Result<float>& got, const Result<float>& cpu) {
@@ -34,18 +34,18 @@ void check_results(const Result<float>& got, const Result<float>& cpu) {
   // exp2 and the order of sums differ; a pixel's 300 blends add some 1e-7 each.
   check_near(got.color, cpu.color, 2e-5), check_near(got.transmittance, cpu.transmittance, 2e-5);
   check_near(got.depth, cpu.depth, 2e-5);
-  check_near(got.gradient, cpu.gradient, 2e-5);
+  check_near(got.gradient, cpu.gradient, 2e-5), check_near(got.absolute, cpu.absolute, 2e-5);
 }
 
 // Checks results near the CPU's, and the same bits in every order, with records and with rectangles.
-void check_scene(Parameters<float>& p, gs::Image image, bool antialiasing) {
+void check_scene(Parameters<float>& p, gs::Image image, bool antialiasing, bool absolute) {
   using gs::emulation::Order;
-  const Result<float> got = run_emulated(p, image, antialiasing, true, Order::forward);
-  check_results(got, run(gs::serial_executor(), p, image, antialiasing));
+  const Result<float> got = run_emulated(p, image, antialiasing, true, Order::forward, absolute);
+  check_results(got, run(gs::serial_executor(), p, image, antialiasing, false, nullptr, absolute));
   for (const Order order : {Order::backward, Order::shuffled}) {
-    const Result<float> again = run_emulated(p, image, antialiasing, order == Order::backward, order);
+    const Result<float> again = run_emulated(p, image, antialiasing, order == Order::backward, order, absolute);
     CHECK(again.color == got.color && again.transmittance == got.transmittance && again.depth == got.depth);
-    CHECK(again.gradient == got.gradient && again.decisive == got.decisive);
+    CHECK(again.gradient == got.gradient && again.decisive == got.decisive && again.absolute == got.absolute);
   }
 }
 
@@ -57,7 +57,7 @@ void test_against_cpu() {
         if (count == 300)  // one covers all tiles: a whole warp tests them
           for (int k = 0; k < 3; ++k) p.scales[3 * 17 + k] = 1;
         if (count > 1) p.dc[3 * 20] = NAN, p.rest[45 * 21] = INFINITY;  // culled for their colours alone
-        check_scene(p, image, antialiasing);
+        check_scene(p, image, antialiasing, antialiasing);
       }
 }
 
@@ -70,8 +70,8 @@ void test_many_tiles() {
     p.means[3 * i] = p.means[3 * i + 1] = 0.1f, p.means[3 * i + 2] = 4 + 0.001f * float(i);
     p.opacities[i] = -4.8f;
   }
-  check_results(run_emulated(p, image, false, true, gs::emulation::Order::shuffled),
-                run(gs::serial_executor(), p, image, false));
+  check_results(run_emulated(p, image, false, true, gs::emulation::Order::shuffled, true),
+                run(gs::serial_executor(), p, image, false, false, nullptr, true));
 }
 
 // Two tiles whose lists several blocks share. The splats are wide. Some pixels end in the middle of the list, at opaque
@@ -93,13 +93,13 @@ Parameters<float> two_long_lists(int64_t count) {
 
 void test_long_lists() {
   Parameters<float> p = two_long_lists(2100);
-  check_scene(p, kTwoTiles, false);
+  check_scene(p, kTwoTiles, false, true);
 }
 
 // A host that runs ahead: with enough room, exactly or more, the bits are those of a host that waits. With less room in
 // one of the lists, the step halts, says what it needs and leaves the gradients alone, and so does every later step.
-void check_ahead(Parameters<float>& p, gs::Image image) {
-  const Result<float> wanted = run_emulated(p, image, false, true, gs::emulation::Order::forward);
+void check_ahead(Parameters<float>& p, gs::Image image, bool absolute) {
+  const Result<float> wanted = run_emulated(p, image, false, true, gs::emulation::Order::forward, absolute);
   constexpr int kReports = 4;
   int32_t halted = 0;
   int64_t done = 0, reports[5 * kReports], *report = nullptr;
@@ -112,7 +112,7 @@ void check_ahead(Parameters<float>& p, gs::Image image) {
     const gs::Ahead ahead{&halted, &needed, &done, room, reports, kReports};
     report = reports + 5 * ((done + 1) % kReports);
     std::fill_n(report, 5, -1);
-    return run(queue, p, image, false, true, &ahead);
+    return run(queue, p, image, false, true, &ahead, absolute);
   };
   constexpr int64_t plenty = 20000;
   go({plenty, plenty, plenty});
@@ -122,10 +122,11 @@ void check_ahead(Parameters<float>& p, gs::Image image) {
   for (const int64_t more : {0, 1, 1000, 20000}) {
     const Result<float> got = go({exact.instances + more, exact.slots + more, exact.rows + more});
     CHECK(got.color == wanted.color && got.gradient == wanted.gradient && got.instances == wanted.instances);
+    CHECK(got.absolute == wanted.absolute);
     CHECK(halted == 0 && report[0] == exact.instances && report[1] == exact.slots && report[2] == exact.rows);
     CHECK(report[3] == 0 && report[4] == done);
   }
-  const std::vector<float> untouched(wanted.gradient.size(), -77.0f);
+  const std::vector<float> untouched(wanted.gradient.size(), -77.0f), no_lengths(wanted.absolute.size(), -77.0f);
   for (const int lacking : {0, 1, 2})
     for (const int64_t of : {int64_t(0), int64_t(1),
                              (lacking == 0   ? exact.instances
@@ -137,7 +138,8 @@ void check_ahead(Parameters<float>& p, gs::Image image) {
       CHECK(go(room).gradient == untouched);
       CHECK(halted == done + 1 && report[3] == done + 1 && report[4] == done + 1);
       CHECK(report[0] == exact.instances && report[1] == exact.slots && report[2] == (lacking == 2 ? exact.rows : 0));
-      CHECK(go({plenty, plenty, plenty}).gradient == untouched);
+      const Result<float> later = go({plenty, plenty, plenty});
+      CHECK(later.gradient == untouched && later.absolute == no_lengths);
       CHECK(halted == done + 1 && report[3] == done + 1 && report[4] == done + 1);
       halted = 0;
     }
@@ -146,9 +148,9 @@ void check_ahead(Parameters<float>& p, gs::Image image) {
 void test_ahead() {
   Parameters<float> p(300);
   for (int k = 0; k < 3; ++k) p.scales[3 * 17 + k] = 1;
-  check_ahead(p, gs::Image{330, 70});
+  check_ahead(p, gs::Image{330, 70}, false);
   p = two_long_lists(900);
-  check_ahead(p, kTwoTiles);
+  check_ahead(p, kTwoTiles, true);
 }
 
 // Checks that several orders give the same bits, and these bits against the rule and against the CPU. Every output may
@@ -180,6 +182,9 @@ void check_lists(const LongLists& lists) {
   const Blending cpu = blend_lists(gs::serial_executor(), lists, true, true, false);
   check_near(got.moments, cpu.moments, 2e-5);
   check_near(emulated(gs::emulation::Order::forward, true, true, false).moments, cpu.moments, 2e-5);
+  const Blending shallow = blend_lists(gs::serial_executor(), lists, false, true, false);
+  for (const bool layers : {false, true})
+    check_near(emulated(gs::emulation::Order::shuffled, false, true, layers).absolute, shallow.absolute, 2e-5);
   for (const gs::emulation::Order order : gs::emulation::kOrders) {
     const Blending again = emulated(order, true, true, true);
     CHECK(again.color == got.color && again.transmittance == got.transmittance && again.depth == got.depth);
@@ -426,15 +431,27 @@ void test_observe() {
       radii.push_back(std::max(0, int(20 * normal())));
       for (int k = 0; k < 3; ++k) gradients.push_back(float(normal())), start.push_back(float(10 + normal()));
     }
-    std::vector<float> wanted = start, got = start;
-    const auto input = [&](std::vector<float>& s) {
-      return gs::ObserveInput{n, s.data(), s.data() + n, s.data() + 2 * n, radii.data(), gradients.data()};
-    };
-    gs::observe(gs::serial_executor(), input(wanted));
-    gs::emulation::Memory memory;
-    gs::cuda::observe(memory.queue(), input(got));
-    CHECK(got == wanted);
-    for (int64_t i = 0; i < n; ++i) CHECK(got[2 * n + i] == start[2 * n + i] + (radii[i] > 0 ? 1 : 0));
+    for (const bool lengths : {false, true}) {
+      std::vector<float> wanted = start, got = start;
+      const auto input = [&](std::vector<float>& s) {
+        const float* from = gradients.data();
+        return gs::ObserveInput{n,
+                                s.data(),
+                                s.data() + n,
+                                s.data() + 2 * n,
+                                radii.data(),
+                                lengths ? nullptr : from,
+                                lengths ? from : nullptr};
+      };
+      gs::observe(gs::serial_executor(), input(wanted));
+      gs::emulation::Memory memory;
+      gs::cuda::observe(memory.queue(), input(got));
+      CHECK(got == wanted);
+      for (int64_t i = 0; i < n; ++i) {
+        CHECK(got[2 * n + i] == start[2 * n + i] + (radii[i] > 0 ? 1 : 0));
+        CHECK(!lengths || got[n + i] == start[n + i] + (radii[i] > 0 ? gradients[i] : 0));
+      }
+    }
   }
 }
 

@@ -76,11 +76,15 @@ Tensor BlendBackward::plane(const MaybeTensor& t, int64_t channels) const {
   return converted(*t, splats_);
 }
 
-Tensor blend_vjp(const BlendBackward& in) {
+Tensor absolute_like(const Tensor& splats, bool wanted) {
+  return wanted ? at::empty({splats.size(0)}, splats.options()) : Tensor();
+}
+
+Tensor blend_vjp(const BlendBackward& in, const Tensor& absolute) {
   Tensor moments = at::empty({in.splats().size(0), kGradientValues}, in.splats().options());
   with_scalar(moments.scalar_type(), [&](auto zero) {
     using T = decltype(zero);
-    GS_RUN(T, moments, blend_vjp, in.input<T>(), in.gradient<T>(moments.mutable_data_ptr<T>()));
+    GS_RUN(T, moments, blend_vjp, in.input<T>(), in.gradient<T>(moments.mutable_data_ptr<T>(), absolute));
   });
   return moments;
 }

@@ -64,8 +64,9 @@ class BlendBackward {
   gs::BlendInput<T> input() const {
     return blend_input<T>(splats_, instances_, ranges_, background_, image_);
   }
+  // absolute: gs::BlendGradient::absolute, if it is defined.
   template <class T>
-  gs::BlendGradient<T> gradient(T* moments) const {
+  gs::BlendGradient<T> gradient(T* moments, const Tensor& absolute) const {
     return {splats_.size(0),
             instances_.size(0),
             slot_count_,
@@ -77,7 +78,8 @@ class BlendBackward {
             alpha_.defined() ? alpha_.const_data_ptr<T>() : nullptr,
             moments,
             layers_.defined() && layers_.numel() ? layers_.const_data_ptr<T>() : nullptr,
-            ahead()};
+            ahead(),
+            absolute.defined() ? absolute.mutable_data_ptr<T>() : nullptr};
   }
 
  private:
@@ -94,6 +96,9 @@ class BlendBackward {
   Tensor color_, alpha_, depth_, layers_;
 };
 
-Tensor blend_vjp(const BlendBackward& in);
+Tensor blend_vjp(const BlendBackward& in, const Tensor& absolute = {});
+
+// Memory for the lengths of absolute gradients; undefined if they are not wanted.
+Tensor absolute_like(const Tensor& splats, bool wanted);
 
 }  // namespace gs::ops

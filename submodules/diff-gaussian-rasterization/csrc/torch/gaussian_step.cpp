@@ -89,37 +89,43 @@ const gs::StepNow* step_now(const MaybeTensor& now, const SceneTensors& scene) {
   return reinterpret_cast<const gs::StepNow*>(now->const_data_ptr<int64_t>());
 }
 
-void run(const SceneTensors& scene, const BlendBackward& in, const Tensor& tile_counts,
+// absolute: receives the lengths of absolute gradients, if it is defined; then they are what is observed.
+void run(const SceneTensors& scene, const BlendBackward& in, const Tensor& tile_counts, const Tensor& /*absolute*/,
          const gs::GaussianStep<double>& step) {
   const Tensor moments = blend_vjp(in);
   GS_DISPATCH(project_vjp_step, gs::torch_executor(), scene.scene<double>(), tile_counts.const_data_ptr<int32_t>(),
               moments.const_data_ptr<double>(), step);
 }
 
-void run(const SceneTensors& scene, const BlendBackward& in, const Tensor& tile_counts,
-         const gs::GaussianStep<float>& step) {
+void run(const SceneTensors& scene, const BlendBackward& in, const Tensor& tile_counts, const Tensor& absolute,
+         gs::GaussianStep<float> step) {
+  gs::ObserveInput later = step.observed;
+  if (absolute.defined()) later.lengths = absolute.const_data_ptr<float>(), step.observed.max_radii = nullptr;
 #ifdef GS_CUDA
   if (in.splats().is_cuda()) {
     gs::TorchQueue queue(in.splats().device(), halted());
-    return gs::cuda::rasterize_vjp_step(queue.queue(), scene.scene<float>(), in.input<float>(),
-                                        in.gradient<float>(nullptr), step);
+    gs::cuda::rasterize_vjp_step(queue.queue(), scene.scene<float>(), in.input<float>(),
+                                 in.gradient<float>(nullptr, absolute), step);
+    if (later.lengths) gs::cuda::observe(queue.queue(), later);
+    return;
   }
 #endif
-  const Tensor moments = blend_vjp(in);
+  const Tensor moments = blend_vjp(in, absolute);
   GS_DISPATCH(project_vjp_step, gs::torch_executor(), scene.scene<float>(), tile_counts.const_data_ptr<int32_t>(),
               moments.const_data_ptr<float>(), step);
+  if (later.lengths) gs::observe(gs::torch_executor(), later);
 }
 
 // rasterize_vjp, then adam_ (or sparse_adam_ on the Gaussians of a radius above 0) of the attributes that are named,
 // and observe_ if statistics are given: the same bits, without gradients in memory. Advances the counters as adam_
 // does. now: what `step_now_` wrote, which stands in for steps, rates and iteration, and has advanced the
-// counters.
+// counters. absolute: the statistics get the lengths of absolute gradients.
 void rasterize_vjp_step_op(SCENE_PARAMETERS, BACKWARD_PARAMETERS, const Tensor& tile_counts, const Tensor& layers,
                            const Tensor& radii, at::IntArrayRef attributes, at::TensorList exp_avg,
                            at::TensorList exp_avg_sq, at::TensorList steps, at::ArrayRef<double> rates, double beta1,
                            double beta2, double eps, at::IntArrayRef columns, bool sparse, const MaybeTensor& max_radii,
                            const MaybeTensor& gradient_sums, const MaybeTensor& views, const MaybeTensor& loss,
-                           const MaybeTensor& stopped, int64_t iteration, const MaybeTensor& now) {
+                           const MaybeTensor& stopped, int64_t iteration, const MaybeTensor& now, bool absolute) {
   const SceneTensors scene(SCENE_ARGUMENTS);
   TORCH_CHECK_VALUE(!cov3d && !colors, "a step needs scales, rotations, sh_dc and sh_rest, not cov3d or colors");
   check_tensor(splats, "splats", scene.dtype(), scene.device(), {scene.count(), kSplatValues});
@@ -130,13 +136,14 @@ void rasterize_vjp_step_op(SCENE_PARAMETERS, BACKWARD_PARAMETERS, const Tensor& 
   const StepLists lists{attributes, exp_avg, exp_avg_sq, steps, rates, columns, beta1, beta2, eps};
   lists.check();
   const Tensor counts = tile_counts.contiguous(), pixels = radii.contiguous();
+  const Tensor lengths = absolute_like(splats, absolute && max_radii);
   with_scalar(scene.dtype(), [&](auto zero) {
     using T = decltype(zero);
     auto step = gaussian_step<T>({means, opacities, *scales, *rotations, *sh_dc, *sh_rest}, lists, sparse);
     step.guard = step_guard<T>(means, loss, stopped, iteration);
     observe_in(step, pixels, max_radii, gradient_sums, views);
     step.now = step_now(now, scene);
-    run(scene, in, counts, step);
+    run(scene, in, counts, lengths, step);
   });
   if (!now) advance(steps);
 }
@@ -173,7 +180,7 @@ TORCH_LIBRARY_FRAGMENT(diff_gaussian_rasterization, m) {
              "exp_avg_sq, "
              "Tensor(i!)[] steps, float[] rates, float beta1, float beta2, float eps, int[] columns, bool sparse, "
              "Tensor(j!)? max_radii=None, Tensor(k!)? gradient_sums=None, Tensor(l!)? views=None, Tensor? loss=None, "
-             "Tensor(m!)? stopped=None, int iteration=0, Tensor? now=None) -> ()",
+             "Tensor(m!)? stopped=None, int iteration=0, Tensor? now=None, bool absolute=False) -> ()",
          &rasterize_vjp_step_op);
   define(m,
          "step_now_(Tensor(a!) now, int[] attributes, Tensor(b!)[] steps, float[] rates, float beta1, float beta2, "

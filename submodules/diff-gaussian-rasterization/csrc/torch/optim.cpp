@@ -97,17 +97,19 @@ void observe_op(Tensor& max_radii, Tensor& gradient_sums, Tensor& views, const T
   check_statistics(max_radii, gradient_sums, views, radii);
   check_given(gradient, "gradient");
   const int64_t n = radii.numel();
-  TORCH_CHECK(gradient.dim() == 2 && gradient.size(0) == n && gradient.size(1) == 3 &&
+  const bool lengths = gradient.dim() == 1;
+  TORCH_CHECK((lengths || (gradient.dim() == 2 && gradient.size(1) == 3)) && gradient.size(0) == n &&
                   gradient.scalar_type() == at::kFloat && gradient.device() == radii.device(),
-              "the gradient must be (", n, ", 3) float32 on ", radii.device(), ", got ", gradient.sizes(), " ",
-              gradient.scalar_type(), " on ", gradient.device());
+              "the gradient must be (", n, ", 3) float32 on ", radii.device(), ", or its lengths (", n, ",), got ",
+              gradient.sizes(), " ", gradient.scalar_type(), " on ", gradient.device());
   const Tensor pixels = radii.contiguous(), rows = gradient.contiguous();
   const gs::ObserveInput in{n,
                             max_radii.mutable_data_ptr<float>(),
                             gradient_sums.mutable_data_ptr<float>(),
                             views.mutable_data_ptr<float>(),
                             pixels.const_data_ptr<int32_t>(),
-                            rows.const_data_ptr<float>()};
+                            lengths ? nullptr : rows.const_data_ptr<float>(),
+                            lengths ? rows.const_data_ptr<float>() : nullptr};
 #ifdef GS_CUDA
   if (radii.is_cuda()) {
     gs::TorchQueue queue(radii.device(), halted());

@@ -175,8 +175,9 @@ Gradients project_vjp_op(SCENE_PARAMETERS, const Tensor& tile_counts, const Tens
 using Rasterized =
     std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor>;
 
+// absolute: what the backward that autograd runs gets; the forward does not depend on it.
 Rasterized rasterize_op(const Tensor& means2d, SCENE_PARAMETERS, const Tensor& background, bool inverse_depth,
-                        bool train) {
+                        bool train, bool /*absolute*/) {
   const SceneTensors scene(SCENE_ARGUMENTS);
   scene.checked(kMeans2d, means2d);  // it only receives a gradient
   ProjectedTensors p = project(scene, false);
@@ -186,13 +187,19 @@ Rasterized rasterize_op(const Tensor& means2d, SCENE_PARAMETERS, const Tensor& b
           b.instances, b.ranges,        b.splat_slots,   b.slots, o.last,   o.layers};
 }
 
+// absolute: the third value of a row of means2d becomes the length of its absolute gradient, instead of 0.
 Gradients rasterize_vjp_op(SCENE_PARAMETERS, BACKWARD_PARAMETERS, const Tensor& tile_counts, const Tensor& layers,
-                           Wanted wanted) {
+                           Wanted wanted, bool absolute) {
   const SceneTensors scene(SCENE_ARGUMENTS);
   check_tensor(splats, "splats", scene.dtype(), scene.device(), {scene.count(), kSplatValues});
   check_counts(tile_counts, scene.count(), scene.device());
   BlendBackward in(BACKWARD_ARGUMENTS);
   in.take_layers(layers);
+  const Tensor lengths = absolute_like(splats, absolute && wanted[kMeans2d]);
+  const auto with_lengths = [&](Gradients all) {
+    if (lengths.defined()) std::get<kMeans2d>(all).select(1, 2).copy_(lengths);
+    return all;
+  };
 #ifdef GS_CUDA
   if (splats.is_cuda()) {
     gs::TorchQueue queue(splats.device(), halted());
@@ -201,13 +208,13 @@ Gradients rasterize_vjp_op(SCENE_PARAMETERS, BACKWARD_PARAMETERS, const Tensor& 
     using Allocate = decltype(allocate);
     const gs::cuda::GradientMemory memory{[](void* context) { return (*static_cast<Allocate*>(context))(); },
                                           &allocate};
-    gs::cuda::rasterize_vjp(queue.queue(), scene.scene<float>(), in.input<float>(), in.gradient<float>(nullptr),
-                            memory);
+    gs::cuda::rasterize_vjp(queue.queue(), scene.scene<float>(), in.input<float>(),
+                            in.gradient<float>(nullptr, lengths), memory);
     if (!out) allocate();  // no Gaussians
-    return out->all();
+    return with_lengths(out->all());
   }
 #endif
-  return project_vjp(scene, tile_counts.contiguous(), blend_vjp(in), wanted);
+  return with_lengths(project_vjp(scene, tile_counts.contiguous(), blend_vjp(in, lengths), wanted));
 }
 
 Tensor mark_visible_op(const Tensor& means, const Tensor& view) {
@@ -256,15 +263,16 @@ TORCH_LIBRARY_FRAGMENT(diff_gaussian_rasterization, m) {
   define(m, "blend_vjp(" BACKWARD_SCHEMA ") -> Tensor moments", &blend_vjp_op);
   define(m, "project_vjp(" SCENE_SCHEMA ", Tensor tile_counts, Tensor moments, bool[9] wanted) -> " GRADIENTS_SCHEMA,
          &project_vjp_op);
-  define(m,
-         "rasterize(Tensor means2d, " SCENE_SCHEMA
-         ", Tensor background, bool inverse_depth, bool train) -> (Tensor color, Tensor transmittance, "
-         "Tensor inverse_depth, Tensor radii, Tensor splats, Tensor tile_counts, Tensor instances, "
-         "Tensor ranges, Tensor splat_slots, Tensor slots, Tensor last, Tensor layers)",
-         &rasterize_op);
+  define(
+      m,
+      "rasterize(Tensor means2d, " SCENE_SCHEMA
+      ", Tensor background, bool inverse_depth, bool train, bool absolute=False) -> (Tensor color, "
+      "Tensor transmittance, Tensor inverse_depth, Tensor radii, Tensor splats, Tensor tile_counts, Tensor instances, "
+      "Tensor ranges, Tensor splat_slots, Tensor slots, Tensor last, Tensor layers)",
+      &rasterize_op);
   define(m,
          "rasterize_vjp(" SCENE_SCHEMA ", " BACKWARD_SCHEMA
-         ", Tensor tile_counts, Tensor layers, bool[9] wanted) -> " GRADIENTS_SCHEMA,
+         ", Tensor tile_counts, Tensor layers, bool[9] wanted, bool absolute=False) -> " GRADIENTS_SCHEMA,
          &rasterize_vjp_op);
   define(m, "mark_visible(Tensor means, Tensor view) -> Tensor", &mark_visible_op);
   define(m, "decisive(Tensor splats, Tensor instances, Tensor ranges, Tensor last) -> Tensor", &decisive_op);
