@@ -25,9 +25,10 @@ BUDGET_OPTIONS: tuple[Option, ...] = (
     Option(
         "score_error",
         "l1",
-        "budget: error of a pixel. l1: mean absolute difference of the channels; squared: mean squared difference",
+        "budget: error of a pixel. l1: mean absolute difference of the channels; squared: mean squared difference; "
+        "loss: that of the loss, L1 and SSIM",
         "ours",
-        check=one_of("l1", "squared"),
+        check=one_of("l1", "squared", "loss"),
     ),
     Option(
         "score_join",
@@ -65,7 +66,8 @@ PACE_OPTIONS: tuple[Option, ...] = ()
 _STRATEGY = Option(
     "strategy",
     "adc",
-    "how many Gaussians there are, and where. adc: adaptive density control, the method's own; budget: growth to --max_num_splats where the error is",
+    "how many Gaussians there are, and where. adc: adaptive density control, the method's own; budget: growth to "
+    "--max_num_splats Gaussians, or one for 20 training pixels (100,000 to 1,000,000), where the error is",
     "ours",
     check=one_of("adc", "budget"),
 )

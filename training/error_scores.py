@@ -1,4 +1,4 @@
-"""Scores of Gaussians: how much of the error of training views each of them draws (Rota Bulo et al. 2024, section 3)."""
+"""Scores of Gaussians: how much of the error of training views each of them draws (Rota Bulo et al. 2024)."""
 
 import argparse
 from collections.abc import Sequence
@@ -16,19 +16,21 @@ from training.error_maps import error_map
 class ErrorScores:
     """Scores Gaussians by views, as the loss of training sees them: exposure, clamp, mask and columns that count.
 
-    error: name of the error of a pixel (training/error_maps.py). exposures: whether the photos' exposures are trained.
+    exposures: whether the photos' exposures are trained. opt: score_error is the kind of error (`error_map`), with
+    lambda_dssim; score_join is "sum" or "max".
     """
 
-    def __init__(self, gaussians: GaussianModel, pipe: argparse.Namespace, exposures: bool, error: str) -> None:
-        self._gaussians, self._pipe, self._exposures = gaussians, pipe, exposures
-        self._error = error
+    def __init__(
+        self, gaussians: GaussianModel, pipe: argparse.Namespace, exposures: bool, opt: argparse.Namespace
+    ) -> None:
+        self._gaussians, self._pipe, self._exposures, self._opt = gaussians, pipe, exposures, opt
 
-    def of_views(self, cameras: Sequence[Camera], background: Tensor, join: str) -> Tensor:
-        """`of_view` of several views, joined by "sum" or "max": (N,) float64."""
+    def of_views(self, cameras: Sequence[Camera], background: Tensor) -> Tensor:
+        """`of_view` of several views, joined to one score: (N,) float64."""
         total = torch.zeros(len(self._gaussians), dtype=torch.float64, device=background.device)
         for camera in cameras:
             score = self.of_view(camera, background)
-            total = torch.maximum(total, score) if join == "max" else total + score
+            total = torch.maximum(total, score) if self._opt.score_join == "max" else total + score
         return total
 
     def of_view(self, camera: Camera, background: Tensor) -> Tensor:
@@ -45,4 +47,4 @@ class ErrorScores:
         target, mask = camera.ground_truth(background)
         if self._exposures and (name := camera.exposure_name or camera.image_name) is not None:
             image = apply_exposure(image, self._gaussians.get_exposure_from_name(name))
-        return error_map(self._error, image, target, mask, camera.columns)
+        return error_map(self._opt.score_error, image, target, self._opt.lambda_dssim, mask, camera.columns)

@@ -31,7 +31,7 @@ FEWEST, MOST = 100_000, 1_000_000  # Gaussians of the default budget
 class BudgetControl(DensityControl):
     """Removes useless Gaussians and adds others, every densification_interval steps before densify_until_iter.
 
-    budget: the number of Gaussians at the end of that.
+    most: the number of Gaussians at the end of that.
     """
 
     fusable = True
@@ -39,8 +39,8 @@ class BudgetControl(DensityControl):
     def __init__(self, run: "Run") -> None:
         self._gaussians, self._opt = run.gaussians, run.opt
         self._cameras = run.scene.getTrainCameras()
-        self._scores = ErrorScores(run.gaussians, run.pipe, run.dataset.train_test_exp, run.opt.score_error)
-        self.budget = run.opt.max_num_splats or default_budget(self._cameras)
+        self._scores = ErrorScores(run.gaussians, run.pipe, run.dataset.train_test_exp, run.opt)
+        self.most = run.opt.max_num_splats or default_budget(self._cameras)
 
     def changes(self, iteration: int) -> bool:
         return iteration % self._opt.densification_interval == 0 and iteration < self._opt.densify_until_iter
@@ -48,9 +48,10 @@ class BudgetControl(DensityControl):
     def after_step(self, step: Step) -> None:
         if not self.changes(step.iteration):
             return
+        self._gaussians.check_steps()  # before rows change, so that an error finds the rows of the step
         passed, of = self._densifications(step.iteration)
         now = len(self._gaussians)
-        aim = count_after(now, self.budget, passed, of, self._opt.growth_power) if passed > 0 else now
+        aim = count_after(now, self.most, passed, of, self._opt.growth_power) if passed > 0 else now
         remove_useless(self._gaussians, self._opt.prune_opacity, max(aim, 1))
         self._check_rest(step.iteration)
         if passed > 0:
@@ -68,7 +69,7 @@ class BudgetControl(DensityControl):
     def _chosen(self, step: Step, count: int) -> Tensor:
         """Indices of at most `count` Gaussians to split, ascending."""
         opt = self._opt
-        scores = self._scores.of_views(self._scored_views(step.iteration), step.background, opt.score_join)
+        scores = self._scores.of_views(self._scored_views(step.iteration), step.background)
         weights = exp(opt.score_power * log(scores)) * (scores > 0)
         return weighted_choice(weights, count, seed=opt.seed, stream=Stream.DENSIFY, iteration=step.iteration)
 
