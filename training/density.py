@@ -13,9 +13,11 @@ class DensityControl:
     fusable: whether it reads gradients only in iterations that `changes` names. All others are then taken by
     training/steps/fused.py, which calls `observes` and `after_step` alone. It counts only where the class itself says
     so: a subclass may want more.
+    most: the number of Gaussians that a strategy grows to, 0: it has none of its own.
     """
 
     fusable: ClassVar[bool] = False
+    most = 0
 
     def changes(self, iteration: int) -> bool:
         """Whether this iteration will change rows of the Gaussians besides their optimiser step.

@@ -26,7 +26,6 @@ class AdaptiveDensityControl(DensityControl):
         self._opt = opt
         self._white_background = white_background
         self._extent = extent
-        self.most = opt.max_num_splats
 
     def changes(self, iteration: int) -> bool:
         todo = self._actions(iteration)
