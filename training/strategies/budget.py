@@ -55,16 +55,17 @@ class BudgetControl(DensityControl):
         remove_useless(self._gaussians, self._opt.prune_opacity, max(aim, 1))
         self._check_rest(step.iteration)
         if passed > 0:
-            split_in_two(self._gaussians, self._chosen(step, aim - len(self._gaussians)))
+            if aim > len(self._gaussians):
+                split_in_two(self._gaussians, self._chosen(step, aim - len(self._gaussians)))
             fade(self._gaussians, self._opt.opacity_decay)
 
     def _densifications(self, iteration: int) -> tuple[int, int]:
         """How many densifications there are up to this iteration, and in all. Before them it is not above 0."""
-        interval, before = (
-            self._opt.densification_interval,
-            self._opt.densify_from_iter // self._opt.densification_interval,
+        opt = self._opt
+        first, now, last = (
+            t // opt.densification_interval for t in (opt.densify_from_iter, iteration, opt.densify_until_iter - 1)
         )
-        return iteration // interval - before, (self._opt.densify_until_iter - 1) // interval - before
+        return now - first, last - first
 
     def _chosen(self, step: Step, count: int) -> Tensor:
         """Indices of at most `count` Gaussians to split, ascending."""
