@@ -94,14 +94,17 @@ def _zero(device: torch.device, dtype: torch.dtype) -> Tensor:
 def decisive_for(camera: Camera | MiniCam, pc: GaussianModel, pipe: argparse.Namespace) -> Tensor:
     """Gaussians that the image of `render` depends on, over any background (`decisive`): (N,) bool."""
     background = pc.get_xyz.new_zeros(3)
+    geometry, raw, colors = model_inputs(camera, pc, pipe)
+    settings = rasterizer_settings(camera, pc, pipe, background)
+    return decisive(pc.get_xyz, settings=settings, raw=raw, **geometry, **colors)
+
+
+def model_inputs(
+    camera: Camera | MiniCam, pc: GaussianModel, pipe: argparse.Namespace
+) -> tuple[dict[str, Tensor], bool, dict[str, Tensor]]:
+    """The rasterizer's inputs for a view of a model, by name: shapes and opacities, whether these are raw, colours."""
     geometry, raw = _geometry(pc, pipe.compute_cov3D_python, 1.0)
-    return decisive(
-        pc.get_xyz,
-        settings=rasterizer_settings(camera, pc, pipe, background),
-        raw=raw,
-        **geometry,
-        **_colors(pc, pipe.convert_SHs_python, camera, False, None),
-    )
+    return geometry, raw, _colors(pc, pipe.convert_SHs_python, camera, False, None)
 
 
 def rasterizer_settings(

@@ -62,7 +62,9 @@ def check_exposures(gaussians: GaussianModel, train_test_exp: bool, checkpoint: 
 
 
 def warn_of_late_reset(opt: argparse.Namespace, white_background: bool) -> None:
-    """Warn if opacities are reset so late that the model cannot recover."""
+    """Warn if adaptive density control resets opacities so late that the model cannot recover."""
+    if opt.strategy != "adc":
+        return
     last = range(max(1, opt.iterations - _RECOVERY + 1), opt.iterations)
     late = [t for t in last if rules.actions(t, opt, white_background).reset_opacity]
     if late:

@@ -12,12 +12,13 @@ class DensityControl:
 
     fusable: whether it reads gradients only in iterations that `changes` names. All others are then taken by
     training/steps/fused.py, which calls `observes` and `after_step` alone. It counts only where the class itself says
-    so: a subclass may want more. absolute_gradients: whether the statistics take the lengths of absolute gradients
-    (Ye et al. 2024); for the whole run.
+    so: a subclass may want more. most: the number of Gaussians that a strategy grows to, 0: it has none of its own.
+    absolute_gradients: whether the statistics take the lengths of absolute gradients (Ye et al. 2024); for the whole
+    run.
     """
 
     fusable: ClassVar[bool] = False
-
+    most: int = 0
     absolute_gradients: bool = False
 
     def changes(self, iteration: int) -> bool:

@@ -110,7 +110,7 @@ class Run:
         folder, start = self.scene.model_path, self.plan.start
         if not start or not (Path(folder) / "cameras.json").exists():
             self.scene.write_inputs()
-        announce_memory(self.scene, self.gaussians, self.opt.max_num_splats)
+        announce_memory(self.scene, self.gaussians, self.density.most or self.opt.max_num_splats)
         self.log, self.rows = continue_records(folder, start, self.first_iteration)
         self.losses = LossWatch(self.log.loss)
         self.clock = Stopwatch()

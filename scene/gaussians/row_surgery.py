@@ -76,6 +76,15 @@ def replace_values(group: Group, states: States, value: Tensor) -> nn.Parameter:
     return _replace(group, states, value, lambda mean: torch.zeros_like(value if mean.shape == old.shape else mean))
 
 
+def restart_rows(groups: list[Group], states: States, indices: Tensor) -> None:
+    """Zero the averages of rows (n,) in every group; step counters and values stay."""
+    for group in groups:
+        (param,) = group["params"]
+        for mean in states.get(param, {}).values():
+            if torch.is_tensor(mean) and mean.dim() == param.dim() and len(mean) == len(param):
+                mean.index_fill_(0, indices, 0.0)
+
+
 def _change_rows(
     groups: list[Group], states: States, change: Callable[[Tensor, str, bool], Tensor]
 ) -> dict[str, nn.Parameter]:

@@ -1,0 +1,44 @@
+"""Sums of blending weights over the pixels of a view, each pixel multiplied by a value that depends on the image."""
+
+import argparse
+from collections.abc import Callable
+
+import torch
+from diff_gaussian_rasterization.backend import OPERATORS
+from diff_gaussian_rasterization.gaussians import Gaussians
+from diff_gaussian_rasterization.ops import scene_arguments
+from diff_gaussian_rasterization.schema import GRADIENTS
+from torch import Tensor
+
+from gaussian_renderer import model_inputs, rasterizer_settings
+from scene.cameras import Camera, MiniCam
+from scene.gaussian_model import GaussianModel
+
+_ONLY_COLORS = [name == "colors" for name in GRADIENTS]
+
+
+@torch.no_grad()
+def weighted_sums(
+    camera: Camera | MiniCam,
+    gaussians: GaussianModel,
+    pipe: argparse.Namespace,
+    background: Tensor,
+    value: Callable[[Tensor], Tensor],
+) -> Tensor:
+    """Sum over the pixels of each Gaussian's blending weight, alpha times transmittance, times three values: (N, 3).
+
+    value: takes the image (3, H, W), not clamped, over background (3,), and returns values (3, H, W) float32.
+    An image is linear in the Gaussians' colours and the weight is its derivative, so the backward of the rasterizer
+    sums them. It gets what the forward has drawn, and is told that the colours were given, whatever their values.
+    """
+    geometry, raw, colors = model_inputs(camera, gaussians, pipe)
+    settings, xyz = rasterizer_settings(camera, gaussians, pipe, background), gaussians.get_xyz
+    drawn = scene_arguments(Gaussians(xyz, **geometry, **colors), settings, raw)
+    image, transmittance, _, _, splats, tile_counts, *lists, last, layers = OPERATORS.rasterize(
+        xyz, *drawn, background, False, True
+    )
+    given = scene_arguments(Gaussians(xyz, **geometry, colors=xyz), settings, raw)
+    state = (splats, *lists, background, last, transmittance)
+    planes = value(image), None, None
+    gradients = OPERATORS.rasterize_vjp(*given, *state, *planes, tile_counts, layers, _ONLY_COLORS)
+    return gradients[_ONLY_COLORS.index(True)]

@@ -1,0 +1,70 @@
+"""Changes of a model's Gaussians on their way to a given number: split in two, remove, fade."""
+
+import torch
+from torch import Tensor
+
+from scene.gaussians import density_rules as rules
+from scene.gaussians.adaptive import AdaptiveGaussians
+from scene.gaussians.long_axis import long_axis_children
+from scene.gaussians.parameters import raw_rows
+from scene.gaussians.row_surgery import restart_rows, row_groups
+from utils.exact.portable_math import exp, log
+
+
+def count_after(now: int, budget: int, passed: int, of: int, power: float) -> int:
+    """The number of Gaussians after the densification `passed`, counted from 1, of `of`.
+
+    They approach the budget so that what is missing of it is a part (1 - p)^power of what was missing at the start, p
+    the part of the densifications that have passed (Mallick et al. 2024, Taming 3DGS, for power 2). Computed from the
+    number `now` before this one, so that it needs no state, and a run that fell behind catches up.
+    """
+    left = (of - passed) / (of - passed + 1)
+    return budget - round((budget - now) * left**power)
+
+
+@torch.no_grad()
+def split_in_two(gaussians: AdaptiveGaussians, parents: Tensor) -> None:
+    """Split Gaussians, ascending indices (n,), along their longest axis (scene/gaussians/long_axis.py).
+
+    One child takes its parent's row, the other is appended. Adam's averages of both begin at zero, so that their first
+    steps are long: with the parent's averages they would stay almost where they are.
+    """
+    count = len(parents)
+    if not count:
+        return
+    rows = {name: values.index_select(0, parents) for name, values in raw_rows(gaussians).items()}
+    children = long_axis_children(rows["xyz"], rows["scaling"], rows["rotation"], rows["opacity"])
+    second = rows | {name: values[count:] for name, values in children.items()}
+    gaussians._take(gaussians.cat_tensors_to_optimizer(second))
+    gaussians._zero_statistics()
+    for name, values in children.items():
+        gaussians.raw(name)[parents] = values[:count]
+    groups, _, states = gaussians._groups()
+    restart_rows(row_groups(groups, len(gaussians)), states, parents)
+
+
+def remove_useless(gaussians: AdaptiveGaussians, min_opacity: float, most: int) -> None:
+    """Remove Gaussians of an opacity below min_opacity; then those of the lowest, until there are at most `most`."""
+    opacity = gaussians.raw("opacity").detach().reshape(-1)
+    remove = rules.is_useless(opacity, min_opacity)
+    over = len(gaussians) - most
+    if over > 0:
+        remove[torch.argsort(opacity, stable=True)[:over]] = True
+    gaussians.prune_points(remove)
+
+
+@torch.no_grad()
+def fade(gaussians: AdaptiveGaussians, factor: float) -> None:
+    """Multiply all opacities by a factor in (0, 1]. Adam's averages stay."""
+    if factor < 1.0:
+        opacity = gaussians.raw("opacity")
+        opacity.copy_(faded(opacity, factor))
+
+
+def faded(logits: Tensor, factor: float) -> Tensor:
+    """Logits (N, 1) of opacities multiplied by a factor in (0, 1): same bits on every device.
+
+    With a = 1 / (1 + e), e = exp(-logit), factor a / (1 - factor a) is factor / (e + 1 - factor).
+    """
+    below = exp(-logits) + (1.0 - factor)
+    return (log(torch.full_like(below, factor)) - log(below)).to(logits.dtype)

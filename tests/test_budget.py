@@ -1,0 +1,403 @@
+"""The strategy `budget`: scores against the oracle, fair draws, the growth curve, rows, and trainings to the byte."""
+
+import math
+import subprocess
+import sys
+from itertools import permutations
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from diff_gaussian_rasterization.reference import render as oracle
+from gaussians import model, moments, options, parameters, pipeline, take_steps
+from PIL import Image
+from scipy import stats
+from skimage.metrics import structural_similarity
+
+import train
+from gaussian_renderer import model_inputs, rasterizer_settings
+from gaussian_renderer.weighted_sums import weighted_sums
+from scene.cameras import MiniCam
+from scene.gaussian_model import GaussianModel
+from scene.gaussians.budgeted import count_after, fade, remove_useless, split_in_two
+from scene.gaussians.long_axis import long_axis_children
+from scene.readers.point_cloud import write_point_cloud
+from training.error_maps import error_map
+from training.error_scores import ErrorScores
+from training.strategies import budget
+from utils.exact.counter_rng import Stream
+from utils.exact.weighted_choice import weighted_choice
+from utils.graphics_utils import getProjectionMatrix
+from utils.loss_utils import photometric_loss
+from utils.system_utils import UserError
+
+ROOT = Path(__file__).parents[1]
+WIDTH, HEIGHT = 23, 17
+LEFT = slice(0, WIDTH // 2)
+GREY = torch.tensor([0.2, 0.5, 0.1])
+
+
+class View(MiniCam):
+    """A small view at 3 units, with a photo of noise, and a mask or columns."""
+
+    exposure_name, image_name = None, "photo"
+
+    def __init__(self, masked: bool = False, columns: slice | None = None, seed: int = 0) -> None:
+        world = torch.eye(4)
+        world[0, 3], world[2, 3] = 0.1 * seed, 3.0
+        projection = torch.as_tensor(getProjectionMatrix(0.01, 100.0, 0.8, 0.6)).float()
+        super().__init__(
+            WIDTH, HEIGHT, 0.6, 0.8, 0.01, 100.0, world.T.contiguous(), (projection @ world).T.contiguous()
+        )
+        rng = np.random.default_rng(seed)
+        self.photo = torch.from_numpy(rng.integers(0, 256, (3, HEIGHT, WIDTH)).astype(np.uint8))
+        self.mask = torch.from_numpy(rng.random((1, HEIGHT, WIDTH)) > 0.3) if masked else None
+        self.columns = columns
+
+    def ground_truth(self, background: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor | None]:
+        return self.photo, self.mask
+
+
+def _weights(camera: View, gaussians: GaussianModel) -> tuple[np.ndarray, np.ndarray]:
+    """The oracle's image over GREY (3, H, W), and the blending weight of each Gaussian at each pixel (N, H, W)."""
+    geometry, raw, colors = model_inputs(camera, gaussians, pipeline())
+    settings, xyz = rasterizer_settings(camera, gaussians, pipeline(), GREY), gaussians.get_xyz
+    shapes = {name: geometry[name] for name in ("scales", "rotations")}
+    with torch.no_grad():
+        place = torch.zeros_like(xyz), geometry["opacities"]
+        image = oracle(xyz, *place, settings, raw=raw, **shapes, **colors).color
+        black = settings._replace(bg=torch.zeros(3))
+        single = torch.eye(len(xyz))[:, :, None].expand(-1, -1, 3)  # one Gaussian is white
+        weights = [oracle(xyz, *place, black, raw=raw, **shapes, colors=one.contiguous()).color[0] for one in single]
+    return image.numpy(), torch.stack(weights).numpy()
+
+
+@pytest.mark.parametrize("case", ["plain", "mask", "columns", "mask and columns", "exposure"])
+def test_scores_are_those_of_a_slow_sum_over_pixels(case):
+    camera = View("mask" in case, LEFT if "columns" in case else None)
+    gaussians = model(14, extent=1.0, seed=3)
+    if case == "exposure":
+        gaussians.start_exposures([SimpleNamespace(image_name="photo")])
+        with torch.no_grad():
+            gaussians.exposures.values += 0.2 * torch.randn(1, 3, 4, generator=torch.Generator().manual_seed(1))
+    scores = ErrorScores(gaussians, pipeline(), case == "exposure", options()).of_view(camera, GREY)
+    image, weights = _weights(camera, gaussians)
+    if case == "exposure":
+        matrix = gaussians.get_exposure_from_name("photo").detach().double().numpy()
+        image = np.einsum("jhw,ji->ihw", image, matrix[:, :3]) + matrix[:, 3, None, None]
+    counting = np.ones((HEIGHT, WIDTH), bool) if camera.mask is None else camera.mask[0].numpy().copy()
+    of_half = 1.0
+    if camera.columns is not None:
+        counting[:, camera.columns.stop :] = False
+        of_half = camera.columns.stop / WIDTH
+    expected = np.zeros(len(gaussians))
+    for row, column in np.argwhere(counting):
+        pixel = np.clip(image[:, row, column], 0, 1) - camera.photo[:, row, column].numpy() / 255.0
+        expected += weights[:, row, column] * np.abs(pixel).mean() * of_half / counting.sum()
+    assert (expected > 1e-6).sum() >= 8
+    np.testing.assert_allclose(scores.numpy(), expected, rtol=2e-4, atol=1e-7)
+
+
+def test_black_gaussians_have_scores_and_channels_are_apart():
+    """A colour below 0 is drawn as 0 and stops the gradient of its coefficients; the sums do not depend on it."""
+    gaussians, camera = model(14, seed=3), View()
+    planes = torch.rand(3, HEIGHT, WIDTH, generator=torch.Generator().manual_seed(0))
+    sums = weighted_sums(camera, gaussians, pipeline(), GREY, lambda image: planes)
+    with torch.no_grad():
+        gaussians.raw("f_dc").fill_(-9.0)
+    black = weighted_sums(camera, gaussians, pipeline(), GREY, lambda image: planes)
+    assert torch.equal(sums, black) and (sums > 0).any()
+    _, weights = _weights(camera, gaussians)
+    expected = np.einsum("nhw,chw->nc", weights, planes.numpy())
+    np.testing.assert_allclose(sums.numpy(), expected, rtol=2e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("changes", [{"convert_SHs_python": True}, {"compute_cov3D_python": True}])
+def test_scores_of_a_model_drawn_in_python(changes):
+    gaussians, camera = model(14, seed=3), View()
+    ours, other = (ErrorScores(gaussians, pipe, False, options()) for pipe in (pipeline(), pipeline(**changes)))
+    torch.testing.assert_close(ours.of_view(camera, GREY), other.of_view(camera, GREY), rtol=1e-4, atol=1e-7)
+
+
+def test_views_are_joined_by_sum_or_maximum():
+    gaussians, views = model(14, seed=3), [View(seed=seed) for seed in range(3)]
+    single = [ErrorScores(gaussians, pipeline(), False, options()).of_view(view, GREY) for view in views]
+    for join, expected in (("sum", sum(single)), ("max", torch.stack(single).amax(dim=0))):
+        scores = ErrorScores(gaussians, pipeline(), False, options(score_join=join)).of_views(views, GREY)
+        assert torch.equal(scores, expected)
+
+
+def _pair() -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    generator = torch.Generator().manual_seed(2)
+    image = 0.6 + 0.4 * torch.randn(3, 33, 41, generator=generator)  # some values are clamped
+    target = torch.randint(0, 256, (3, 33, 41), dtype=torch.uint8, generator=generator)
+    return image, target, torch.rand(1, 33, 41, generator=generator) > 0.3
+
+
+@pytest.mark.parametrize("columns", [None, slice(0, 20)])
+def test_errors_of_pixels_add_up_to_the_loss(columns):
+    image, target, mask = _pair()
+    for kind, weight in (("loss", 0.3), ("l1", 0.0)):
+        total, _ = photometric_loss(image, target, weight, None, columns)
+        torch.testing.assert_close(error_map(kind, image, target, 0.3, None, columns).sum(), total, rtol=1e-5, atol=0)
+    for kind in ("l1", "squared", "loss"):
+        errors = error_map(kind, image, target, 0.3, mask, columns)
+        assert errors.shape == (1, 33, 41) and (errors >= 0).all()
+        counts = mask.clone()
+        if columns is not None:
+            counts[..., 20:] = False
+        assert torch.equal(errors > 0, counts)
+    squared = ((image.clamp(0, 1) - target / 255) ** 2).mean()
+    torch.testing.assert_close(error_map("squared", image, target, 0.3).sum(), squared, rtol=1e-5, atol=0)
+
+
+def test_similarity_is_that_of_scikit_image():
+    image, target, _ = _pair()
+    target = target.float() / 255
+    ours = error_map("loss", image, target, 1.0)[0] * image[0].numel()
+    _, theirs = structural_similarity(
+        image.clamp(0, 1).double().numpy(), target.double().numpy(), gaussian_weights=True, sigma=1.5, data_range=1.0,
+        use_sample_covariance=False, channel_axis=0, full=True,
+    )  # fmt: skip
+    inner = slice(5, -5), slice(5, -5)
+    np.testing.assert_allclose(ours[inner].numpy(), (1 - theirs).mean(axis=0)[inner], rtol=1e-4, atol=1e-5)
+
+
+# Draws
+
+
+def _drawn(weights: list[float], count: int, iteration: int, seed: int = 0) -> list[int]:
+    chosen = weighted_choice(torch.tensor(weights, dtype=torch.float64), count, seed=seed, stream=Stream.DENSIFY,
+                             iteration=iteration)  # fmt: skip
+    return chosen.tolist()
+
+
+def test_pairs_are_drawn_as_often_as_one_after_the_other():
+    weights, draws = [1.0, 2.0, 4.0, 0.0, 1.5], 2000
+    total = sum(weights)
+    expected = dict.fromkeys([(a, b) for a in range(5) for b in range(a + 1, 5) if 3 not in (a, b)], 0.0)
+    for first, second in permutations([0, 1, 2, 4], 2):
+        chance = weights[first] / total * weights[second] / (total - weights[first])
+        expected[min(first, second), max(first, second)] += chance
+    found = dict.fromkeys(expected, 0)
+    for iteration in range(draws):
+        found[tuple(_drawn(weights, 2, iteration))] += 1  # KeyError for item 3, which has no weight
+    # The numbers are fixed, so the p-value is a constant; a value below 1e-3 would mean a fault.
+    assert stats.chisquare(list(found.values()), [draws * chance for chance in expected.values()]).pvalue > 1e-3
+    best_only = sum(found[key] for key in found if 2 in key)
+    assert best_only < draws  # not the highest scores alone
+
+
+def test_large_draws_follow_the_weights():
+    """Inclusion of each item is 1 - exp(-t w) for a common t, as the waits are exponential (large N)."""
+    rng = np.random.default_rng(0)
+    weights = torch.from_numpy(rng.choice([1e-9, 3e-9, 9e-9], 60_000))
+    chosen = weighted_choice(weights, 6000, seed=1, stream=Stream.DENSIFY, iteration=7)
+    assert len(chosen) == 6000 and (chosen.diff() > 0).all()
+    shares = [float((weights[chosen] == w).sum() / (weights == w).sum()) for w in (1e-9, 3e-9, 9e-9)]
+    rates = -np.log1p(-np.array(shares))
+    np.testing.assert_allclose(rates / rates[0], [1, 3, 9], rtol=0.12)
+
+
+def test_draws_of_nothing_of_all_and_of_broken_weights():
+    assert _drawn([0.0, 0.0], 5, 1) == [] and _drawn([], 5, 1) == [] and _drawn([1.0, 2.0], 0, 1) == []
+    assert _drawn([1.0, 0.0, 2.0], 2, 1) == [0, 2] and _drawn([1.0, 2.0], -3, 1) == []
+    assert _drawn([math.nan, 1.0, math.inf, -1.0], 9, 1) == [1]
+    assert _drawn([1e-300, 1e-320], 1, 1) in ([0], [1])  # far below what float32 holds
+    assert len({tuple(_drawn([1.0] * 20, 5, iteration, seed)) for iteration in range(3) for seed in range(3)}) == 9
+
+
+# The curve
+
+
+@pytest.mark.parametrize("power", [1.0, 2.0, 3.5])
+def test_growth_follows_its_curve_without_state(power):
+    start, most, of = 1200, 90_000, 40
+    now = start
+    for passed in range(1, of + 1):
+        now = count_after(now, most, passed, of, power)
+        part = passed / of
+        assert abs(now - (start + (most - start) * (1 - (1 - part) ** power))) <= passed  # roundings
+    assert now == most
+    assert count_after(10, most, of, of, power) == most  # however few there are
+    assert count_after(2 * most, most, of - 1, of, power) < 2 * most and count_after(most, most, 3, of, power) == most
+
+
+# Rows
+
+
+def test_a_split_leaves_other_rows_alone_and_restarts_averages():
+    gaussians, parents = model(20), torch.tensor([2, 3, 11])
+    take_steps(gaussians, 3)
+    before, averages = parameters(gaussians), moments(gaussians)
+    gaussians.xyz_gradient_accum += 1
+    split_in_two(gaussians, parents)
+    after, then = parameters(gaussians), moments(gaussians)
+    assert len(gaussians) == 23 and gaussians.xyz_gradient_accum.shape == (23, 1)
+    others = torch.tensor([row for row in range(20) if row not in parents])
+    family = torch.cat((parents, torch.arange(20, 23)))
+    children = long_axis_children(*(before[name][parents] for name in ("xyz", "scaling", "rotation", "opacity")))
+    for name, values in after.items():
+        assert torch.equal(values[others], before[name][others])
+        assert torch.equal(values[family], children[name] if name in children else before[name][parents].repeat(
+            2, *[1] * (values.dim() - 1)))  # fmt: skip
+        for key in ("exp_avg", "exp_avg_sq"):
+            assert torch.equal(then[name][key][others], averages[name][key][others]) and averages[name][key].any()
+            assert not then[name][key][family].any()
+        assert then[name]["step"] == averages[name]["step"]
+    assert gaussians.get_xyz.requires_grad and gaussians.get_xyz.is_leaf
+
+
+def test_a_split_of_nothing_changes_nothing():
+    gaussians = model(5)
+    take_steps(gaussians, 1)
+    before = gaussians.get_xyz
+    split_in_two(gaussians, torch.zeros(0, dtype=torch.int64))
+    assert gaussians.get_xyz is before
+
+
+def test_useless_and_surplus_gaussians_go():
+    gaussians = model(6)
+    with torch.no_grad():
+        gaussians.raw("opacity").copy_(torch.tensor([0.9, 0.004, 0.3, 0.006, 0.3, 0.2])[:, None].logit())
+    remove_useless(gaussians, 0.005, 9)
+    assert len(gaussians) == 5
+    remove_useless(gaussians, 0.005, 3)
+    torch.testing.assert_close(gaussians.get_opacity[:, 0].detach(), torch.tensor([0.9, 0.3, 0.3]))
+    remove_useless(gaussians, 0.0, 3)
+    assert len(gaussians) == 3
+
+
+def test_fading_multiplies_opacities_and_keeps_averages():
+    gaussians = model(200)
+    with torch.no_grad():
+        gaussians.raw("opacity")[:3, 0] = torch.tensor([40.0, -40.0, 12.0])
+    take_steps(gaussians, 1)
+    before, averages, parameter = gaussians.get_opacity.detach().double(), moments(gaussians), gaussians.raw("opacity")
+    logits = parameter.detach().double()
+    fade(gaussians, 0.98)
+    assert gaussians.raw("opacity") is parameter
+    torch.testing.assert_close(gaussians.get_opacity.double(), 0.98 * before, rtol=1e-5, atol=0)
+    expected = torch.logit(0.98 * torch.sigmoid(logits))
+    torch.testing.assert_close(parameter.detach().double(), expected, rtol=3e-7, atol=3e-7)
+    assert torch.equal(moments(gaussians)["opacity"]["exp_avg"], averages["opacity"]["exp_avg"])
+    kept = parameter.detach().clone()
+    fade(gaussians, 1.0)
+    assert torch.equal(parameter, kept)
+
+
+# Trainings
+
+GROWING = [
+    "--strategy", "budget", "--densify_from_iter", 20, "--densification_interval", 20, "--densify_until_iter", 130,
+    "--score_views", 4, "--disable_viewer",
+]  # fmt: skip
+SMALL = ["-r", 48, "--test_iterations", -1, "--no_curve"]
+
+
+@pytest.fixture(autouse=True)
+def _stdout(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Restore stdout, which training stamps and may silence."""
+    monkeypatch.setattr(sys, "stdout", sys.stdout)
+
+
+def _train(scene: Path, out: Path, *more: object, iterations: int = 160) -> Path:
+    given = ["-s", scene, "-m", out, "--iterations", iterations, *SMALL, *GROWING, "--keep_unseen", *more]
+    train.main(list(map(str, given)))
+    return out / "point_cloud" / f"iteration_{iterations}" / "point_cloud.ply"
+
+
+def _count(ply: Path) -> int:
+    gaussians = GaussianModel(3)
+    gaussians.load_ply(ply)
+    return len(gaussians)
+
+
+@pytest.fixture
+def counts(monkeypatch) -> list[tuple[int, int]]:
+    """Iteration and number of Gaussians after each densification."""
+    found, after_step = [], budget.BudgetControl.after_step
+
+    def note(control, step) -> None:
+        after_step(control, step)
+        if control.changes(step.iteration):
+            found.append((step.iteration, len(control._gaussians)))
+
+    monkeypatch.setattr(budget.BudgetControl, "after_step", note)
+    return found
+
+
+def test_the_cap_is_reached_and_held(colmap_scene, tmp_path, counts):
+    ply = _train(colmap_scene, tmp_path / "out", "--max_num_splats", 700)
+    assert [iteration for iteration, _ in counts] == [20, 40, 60, 80, 100, 120]
+    numbers = [count for _, count in counts]
+    assert numbers == sorted(numbers) and numbers[0] == 300 and numbers[-1] == 700 == _count(ply)
+    assert numbers[1:] == [700 - round(400 * (1 - k / 5) ** 2) for k in range(1, 6)]
+
+
+def test_a_start_above_the_cap_shrinks_to_it(colmap_scene, tmp_path, counts):
+    _train(colmap_scene, tmp_path / "out", "--max_num_splats", 100)
+    numbers = [count for _, count in counts]
+    assert numbers[0] == 300 and numbers == sorted(numbers, reverse=True) and numbers[-1] == 100
+
+
+def test_a_scene_with_nothing_to_densify(colmap_scene, tmp_path, counts):
+    """Only a corner counts, to which no Gaussian reaches: none draws an error, so none is split, and none is lost."""
+    for path in (colmap_scene / "images").rglob("*.png"):
+        mask = colmap_scene / "masks" / f"{path.relative_to(colmap_scene / 'images')}.png"
+        mask.parent.mkdir(parents=True, exist_ok=True)
+        Image.fromarray(np.pad(np.full((4, 4), 255, np.uint8), ((0, 60), (0, 92)))).save(mask)
+    _train(colmap_scene, tmp_path / "out", "--masks", "masks", "--max_num_splats", 700, "-r", 96)
+    assert {count for _, count in counts} == {300}
+
+
+def test_resume_equals_uninterrupted_and_the_plain_step_changes_nothing(colmap_scene, tmp_path):
+    more = ["--max_num_splats", 700, "--random_background", "--seed", 5]
+    whole = _train(colmap_scene, tmp_path / "a", *more, "--checkpoint_iterations", 60)
+    start = ["--start_checkpoint", tmp_path / "a" / "chkpnt60.pth"]
+    resumed = _train(colmap_scene, tmp_path / "b", *more, *start)
+    assert whole.read_bytes() == resumed.read_bytes()
+    assert _train(colmap_scene, tmp_path / "c", *more, "--plain_step").read_bytes() == whole.read_bytes()
+    assert _train(colmap_scene, tmp_path / "d", *more[:-1], 6).read_bytes() != whole.read_bytes()
+
+
+@pytest.mark.parametrize("more", [["--optimizer_type", "sparse_adam"], ["--train_test_exp", "--eval"],
+                                  ["--score_error", "loss", "--score_join", "max", "--score_power", 2]])  # fmt: skip
+def test_with_other_options(colmap_scene, tmp_path, more):
+    ply = _train(colmap_scene, tmp_path / "out", "--max_num_splats", 500, *more)
+    assert _count(ply) == 500
+
+
+THREADED = "import sys, torch; torch.set_num_threads(int(sys.argv[1])); import train; train.main(sys.argv[2:])"
+
+
+def test_any_number_of_threads_gives_the_same_bytes(colmap_scene, tmp_path):
+    rng = np.random.default_rng(0)
+    # torch divides loops between two threads from 32,768 values on.
+    write_point_cloud(tmp_path / "cloud.ply", rng.normal(size=(40_003, 3)), rng.integers(0, 255, (40_003, 3)))
+    runs = []
+    for threads in (1, 2):
+        out = tmp_path / str(threads)
+        command = [
+            sys.executable, "-c", THREADED, threads, "-s", colmap_scene, "-m", out, "--init_pcd_path",
+            tmp_path / "cloud.ply", "--iterations", 34, *GROWING, "--densify_from_iter", 5, "--densification_interval",
+            10, "--score_error", "loss", "--max_num_splats", 60_000, "-r", 160, "--test_iterations", -1,
+        ]  # fmt: skip
+        done = subprocess.run(list(map(str, command)), cwd=ROOT, capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stderr
+        runs.append((out / "point_cloud/iteration_34/point_cloud.ply").read_bytes())
+    assert runs[0] == runs[1]
+
+
+def test_an_empty_model_is_an_error(colmap_scene, tmp_path):
+    with pytest.raises(UserError, match="no Gaussian was left after the densification of iteration 20: .*--prune_opac"):
+        _train(colmap_scene, tmp_path / "out", "--prune_opacity", 0.5)
+
+
+def test_the_default_budget_follows_the_pixels():
+    def budget_of(views: int, width: int) -> int:
+        return budget.default_budget([SimpleNamespace(image_width=width, image_height=500)] * views)
+
+    assert (budget_of(7, 500), budget_of(40, 300), budget_of(100, 4000)) == (100_000, 300_000, 1_000_000)

@@ -1,0 +1,92 @@
+"""Growth to a given number of Gaussians, where the training views' error is.
+
+After the growth curve of Mallick et al. 2024 (Taming 3DGS), the error-driven scores of Rota Bulo et al. 2024, and the
+long-axis split of Deng et al. 2025 (Improved-GS). Of these papers it departs as follows. Scores are sums of a pixel
+error times blending weight over several views, and nothing else counts. Gaussians are drawn by their scores without
+replacement, not the highest taken. Children keep their parent's mean and covariance. Opacities are multiplied by a
+factor, where Rota Bulo et al. subtract a constant.
+"""
+
+from typing import TYPE_CHECKING
+
+from torch import Tensor
+
+from scene.cameras import Camera
+from scene.gaussians.budgeted import count_after, fade, remove_useless, split_in_two
+from training.density import DensityControl
+from training.error_scores import ErrorScores
+from training.step import Step
+from utils.exact.counter_rng import Stream, permutation
+from utils.exact.portable_math import exp, log
+from utils.exact.weighted_choice import weighted_choice
+from utils.system_utils import UserError
+
+if TYPE_CHECKING:
+    from training.run import Run
+
+PIXELS = 20  # training pixels of all views for each Gaussian of the default budget
+FEWEST, MOST = 100_000, 1_000_000  # Gaussians of the default budget
+
+
+class BudgetControl(DensityControl):
+    """Removes useless Gaussians and adds others, every densification_interval steps before densify_until_iter.
+
+    most: the number of Gaussians at the end of that.
+    """
+
+    fusable = True
+
+    def __init__(self, run: "Run") -> None:
+        self._gaussians, self._opt = run.gaussians, run.opt
+        self._cameras = run.scene.getTrainCameras()
+        self._scores = ErrorScores(run.gaussians, run.pipe, run.dataset.train_test_exp, run.opt)
+        self.most = run.opt.max_num_splats or default_budget(self._cameras)
+
+    def changes(self, iteration: int) -> bool:
+        return iteration % self._opt.densification_interval == 0 and iteration < self._opt.densify_until_iter
+
+    def after_step(self, step: Step) -> None:
+        if not self.changes(step.iteration):
+            return
+        self._gaussians.check_steps()  # before rows change, so that an error finds the rows of the step
+        passed, of = self._densifications(step.iteration)
+        now = len(self._gaussians)
+        aim = count_after(now, self.most, passed, of, self._opt.growth_power) if passed > 0 else now
+        remove_useless(self._gaussians, self._opt.prune_opacity, max(aim, 1))
+        self._check_rest(step.iteration)
+        if passed > 0:
+            if aim > len(self._gaussians):
+                split_in_two(self._gaussians, self._chosen(step, aim - len(self._gaussians)))
+            fade(self._gaussians, self._opt.opacity_decay)
+
+    def _densifications(self, iteration: int) -> tuple[int, int]:
+        """How many densifications there are up to this iteration, and in all. Before them it is not above 0."""
+        opt = self._opt
+        first, now, last = (
+            t // opt.densification_interval for t in (opt.densify_from_iter, iteration, opt.densify_until_iter - 1)
+        )
+        return now - first, last - first
+
+    def _chosen(self, step: Step, count: int) -> Tensor:
+        """Indices of at most `count` Gaussians to split, ascending."""
+        opt = self._opt
+        scores = self._scores.of_views(self._scored_views(step.iteration), step.background)
+        weights = exp(opt.score_power * log(scores)) * (scores > 0)
+        return weighted_choice(weights, count, seed=opt.seed, stream=Stream.DENSIFY, iteration=step.iteration)
+
+    def _scored_views(self, iteration: int) -> list[Camera]:
+        order = permutation(self._opt.seed, Stream.SCORED_VIEWS, iteration, len(self._cameras))
+        return [self._cameras[index] for index in order[: self._opt.score_views]]
+
+    def _check_rest(self, iteration: int) -> None:
+        if len(self._gaussians) == 0:
+            raise UserError(
+                f"no Gaussian was left after the densification of iteration {iteration}: the views do not agree "
+                "with the points, or show nothing but the background; check the scene, or lower --prune_opacity"
+            )
+
+
+def default_budget(cameras: list[Camera]) -> int:
+    """The number of Gaussians where --max_num_splats is 0: one for PIXELS pixels, from FEWEST to MOST."""
+    pixels = sum(camera.image_width * camera.image_height for camera in cameras)
+    return min(max(pixels // PIXELS, FEWEST), MOST)
