@@ -62,9 +62,9 @@ def check_exposures(gaussians: GaussianModel, train_test_exp: bool, checkpoint: 
 
 
 def warn_of_late_reset(opt: argparse.Namespace, white_background: bool) -> None:
-    """Warn if opacities are reset so late that the model cannot recover."""
+    """Warn if adaptive density control resets opacities so late that the model cannot recover."""
     last = range(max(1, opt.iterations - _RECOVERY + 1), opt.iterations)
-    late = [t for t in last if rules.actions(t, opt, white_background).reset_opacity]
+    late = [t for t in last if opt.strategy == "adc" and rules.actions(t, opt, white_background).reset_opacity]
     if late:
         print(
             f"warning: opacities are reset in iteration {late[-1]}, and {opt.iterations - late[-1]} iterations are "

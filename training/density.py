@@ -12,10 +12,14 @@ class DensityControl:
 
     fusable: whether it reads gradients only in iterations that `changes` names. All others are then taken by
     training/steps/fused.py, which calls `observes` and `after_step` alone. It counts only where the class itself says
-    so: a subclass may want more.
+    so: a subclass may want more. most_gaussians: how many it lets there be, 0: any number.
     """
 
     fusable: ClassVar[bool] = False
+    most_gaussians = 0
+
+    def started(self) -> None:
+        """Called before the first iteration of a model that was made from points, not read from a file."""
 
     def changes(self, iteration: int) -> bool:
         """Whether this iteration will change rows of the Gaussians besides their optimiser step.

@@ -26,6 +26,7 @@ class AdaptiveDensityControl(DensityControl):
         self._opt = opt
         self._white_background = white_background
         self._extent = extent
+        self.most_gaussians = opt.max_num_splats
 
     def changes(self, iteration: int) -> bool:
         todo = self._actions(iteration)

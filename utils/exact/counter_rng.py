@@ -24,6 +24,8 @@ class Stream(IntEnum):
     VIEW_ORDER = 0
     BACKGROUND = 1
     SPLIT = 2
+    RELOCATION = 3
+    NOISE = 4
 
 
 def _multiply(x: Tensor, factor: int) -> tuple[Tensor, Tensor]:
