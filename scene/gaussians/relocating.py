@@ -2,17 +2,19 @@
 
 import math
 
+import utils.host.extensions  # noqa: F401  isort: skip  (before the extensions)
 import torch
+from diff_gaussian_rasterization.density import add_noise_, penalise_
 from torch import Tensor
 
 from scene.gaussians.adaptive import AdaptiveGaussians
 from scene.gaussians.attributes import Rows
 from scene.gaussians.density_rules import logit
 from scene.gaussians.parameters import raw_rows
+from scene.gaussians.penalty import Penalty
 from scene.gaussians.relocation import divided, draw, opacity_units
 from scene.gaussians.row_surgery import overwrite_rows, row_groups
-from utils.exact.counter_rng import Stream, normal
-from utils.general_utils import build_rotation
+from utils.exact.counter_rng import Stream
 
 _RELOCATION, _GROWTH = range(2)  # draws of one iteration
 
@@ -34,7 +36,7 @@ class RelocatingGaussians(AdaptiveGaussians):
         `most_parts`. Adam's averages of all of them restart at zero. seed and iteration decide the random numbers.
         Returns the number of such Gaussians; if all are, nothing changes.
         """
-        live = self._live(min_opacity)
+        live = self._opacity_logits().reshape(-1) > logit(min_opacity)
         dead = (~live).nonzero().reshape(-1)
         if 0 < len(dead) < len(live):
             origins = self._divide(live, len(dead), most_parts, seed, iteration, _RELOCATION)
@@ -42,34 +44,41 @@ class RelocatingGaussians(AdaptiveGaussians):
             self._overwrite(dead, rows)
         return len(dead)
 
-    def grow(self, count: int, min_opacity: float, most_parts: int, *, seed: int, iteration: int) -> None:
-        """Append `count` Gaussians, parts of others as `relocate` makes them; the opacity of one must be above it."""
-        origins = self._divide(self._live(min_opacity), count, most_parts, seed, iteration, _GROWTH)
+    def grow(self, count: int, most_parts: int, *, seed: int, iteration: int) -> None:
+        """Append `count` Gaussians, which are parts of others as `relocate` makes them."""
+        every = torch.ones(len(self), dtype=torch.bool, device=self._xyz.device)
+        origins = self._divide(every, count, most_parts, seed, iteration, _GROWTH)
         self._append({name: values.index_select(0, origins) for name, values in raw_rows(self).items()}, origins)
 
     @torch.no_grad()
-    def add_noise(self, step: float, steepness: float, threshold: float, *, seed: int, iteration: int) -> None:
-        """Move every centre by S n g `step`: S is its covariance, n is standard normal, and g = sigmoid(k (t - o)).
+    def add_noise(self, size: float, steepness: float, threshold: float, *, seed: int, iteration: int) -> None:
+        """Move every centre by size g C n: its covariance C, standard normal n, g = sigmoid(steepness (threshold - o)).
 
-        steepness, threshold: k and t. o: the opacity. seed and iteration decide n.
+        o: the opacity. seed and iteration decide n. Nothing moves once a guard holds steps back.
         """
-        items = torch.arange(len(self), device=self._xyz.device)
-        gate = torch.sigmoid(steepness * (threshold - self._opacity_logits().sigmoid()))
-        noise = normal(seed, Stream.NOISE, iteration, items)[:, :3].float()
-        turn = build_rotation(self._rotation)
-        shaped = turn @ ((2 * self._log_scales()).exp()[:, :, None] * (turn.transpose(1, 2) @ noise[:, :, None]))
-        self._xyz += step * gate * shaped[:, :, 0]
+        shapes = self._log_scales(), self._rotation, self._opacity_logits()
+        gate = {"size": size, "steepness": steepness, "threshold": threshold}
+        numbers = {"seed": seed, "stream": Stream.NOISE, "iteration": iteration}
+        guard = getattr(self.optimizer, "guard", None)
+        add_noise_(self._xyz, *shapes, **gate, **numbers, stopped=guard.stopped if guard else None)
 
-    def penalise(self, opacity: float, scale: float) -> None:
-        """Add the gradients of opacity * (mean opacity) + scale * (mean scale) to the parameters'."""
-        (opacity * self.get_opacity.mean() + scale * self.get_scaling.mean()).backward()
-
-    def _live(self, min_opacity: float) -> Tensor:
-        """Whether the opacity is above min_opacity: (N,) bool."""
-        return self._opacity_logits().reshape(-1) > logit(min_opacity)
+    def penalise(self, penalty: Penalty) -> None:
+        """Add a penalty's gradients to those of the parameters, with the bits of the step that adds them itself."""
+        if not self.kernels_activate:
+            mean = penalty.opacity * self.get_opacity.mean() + penalty.scale * self.get_scaling.mean()
+            return mean.backward()
+        params = self._opacity, self._scaling
+        for param in params:
+            if param.grad is None:
+                param.grad = torch.zeros_like(param)
+        each = penalty.of_each(len(self))
+        gradients = [param.grad.contiguous() for param in params]
+        penalise_(*(param.detach() for param in params), *gradients, opacity=each.opacity, scale=each.scale)
+        for param, gradient in zip(params, gradients, strict=True):
+            param.grad = gradient
 
     def _divide(self, live: Tensor, count: int, most: int, seed: int, iteration: int, which: int) -> Tensor:
-        """Draw the origins (count,) of new Gaussians, and make each a part of what it was."""
+        """Draw the origins (count,) of new Gaussians among those of `live` (N,), and make each a part of what it was."""
         logits = self._opacity_logits().reshape(-1)
         units = torch.where(live, opacity_units(logits), 0)
         origins = draw(units, count, seed=seed, iteration=iteration, draw=which)

@@ -31,8 +31,9 @@ def draw(units: Tensor, count: int, *, seed: int, iteration: int, draw: int) -> 
     ends = units.cumsum(0)
     items = torch.arange(count, device=units.device)
     bits = random_bits(seed, Stream.RELOCATION, iteration, items, draw)
-    tickets = ((bits[:, 0] >> 1) << 32 | bits[:, 1]) % ends[-1]  # of 2^63, so that the remainder favours nobody
-    return torch.searchsorted(ends, tickets, right=True)
+    share = ((bits[:, 0] >> 5) << 26 | bits[:, 1] >> 6).to(torch.float64) * 2.0**-53
+    tickets = (share * ends[-1]).to(torch.int64)
+    return torch.searchsorted(ends, torch.minimum(tickets, ends[-1] - 1), right=True)
 
 
 def divided(logits: Tensor, parts: Tensor) -> tuple[Tensor, Tensor]:

@@ -11,6 +11,7 @@ import argparse
 from torch import Tensor
 
 from scene.gaussian_model import GaussianModel
+from scene.gaussians.penalty import Penalty
 from training.density import DensityControl
 from training.step import Step
 from utils.system_utils import UserError
@@ -21,11 +22,14 @@ MOST_GAUSSIANS = 1_000_000  # where --max_num_splats is 0
 class MarkovChain(DensityControl):
     """The strategy of the MCMC paper, with the rules of scene/gaussians/relocation.py. It resets no opacities."""
 
+    fusable = True
+    queues = True
+
     def __init__(self, gaussians: GaussianModel, opt: argparse.Namespace) -> None:
         self._gaussians = gaussians
         self._opt = opt
         self.most_gaussians = opt.max_num_splats or MOST_GAUSSIANS
-        print("--strategy mcmc takes the plain step")
+        self.penalty = Penalty(opt.mcmc_opacity_reg, opt.mcmc_scale_reg)
 
     def started(self) -> None:
         """Make Gaussians more opaque and smaller than adaptive density control wants them (as the authors' release)."""
@@ -37,7 +41,6 @@ class MarkovChain(DensityControl):
         return within and iteration % opt.densification_interval == 0
 
     def after_backward(self, step: Step, package: dict[str, Tensor]) -> None:
-        self._gaussians.penalise(self._opt.mcmc_opacity_reg, self._opt.mcmc_scale_reg)
         if self.changes(step.iteration):
             self._relocate(step.iteration)
             self._grow(step.iteration)
@@ -64,4 +67,4 @@ class MarkovChain(DensityControl):
         count, opt = len(self._gaussians), self._opt
         new = min(int((1 + opt.mcmc_growth) * count), self.most_gaussians) - count
         if new > 0:
-            self._gaussians.grow(new, opt.mcmc_min_opacity, opt.mcmc_parts, seed=opt.seed, iteration=iteration)
+            self._gaussians.grow(new, opt.mcmc_parts, seed=opt.seed, iteration=iteration)
