@@ -76,11 +76,11 @@ class Run:
         self.background = torch.full((3,), 1.0 if dataset.white_background else 0.0, device=self.device)
         self.objective = Objective(opt)
         self.density = density_control(self)
-        if from_points:
-            self.density.started()
         self._depth_weight = get_expon_lr_func(
             opt.depth_l1_weight_init, opt.depth_l1_weight_final, max_steps=opt.iterations
         )
+        if from_points:
+            self.density.started()
 
     def _start(self, capture: tuple | None) -> bool:
         """Start the model from the dataset's points, from a file's Gaussians, or from the state of a checkpoint.

@@ -78,7 +78,7 @@ class RelocatingGaussians(AdaptiveGaussians):
             param.grad = gradient
 
     def _divide(self, live: Tensor, count: int, most: int, seed: int, iteration: int, which: int) -> Tensor:
-        """Draw the origins (count,) of new Gaussians among those of `live` (N,), and make each a part of what it was."""
+        """Draw the origins (count,) of new Gaussians among those of `live`, and make each a part of what it was."""
         logits = self._opacity_logits().reshape(-1)
         units = torch.where(live, opacity_units(logits), 0)
         origins = draw(units, count, seed=seed, iteration=iteration, draw=which)
