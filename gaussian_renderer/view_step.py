@@ -65,5 +65,5 @@ def step(
     """
     OPERATORS.rasterize_vjp_step_(
         *drawn.scene, *drawn.state, image_gradient, None, depth_gradient, *drawn.more, drawn.radii,
-        *adam.arguments(observe), now=now, absolute=absolute,
+        *adam.arguments(observe), now=now, absolute=absolute, **adam.penalties(),
     )  # fmt: skip

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.adam import GaussianAdam
+from scene.gaussians.penalty import NO_PENALTY, Penalty
 from scene.gaussians.sparse_adam import SparseGaussianAdam
 
 # In the operator's order (gs::Stepped).
@@ -18,10 +19,11 @@ NOW_WORDS = 22  # int64: what changes from step to step (gs::StepNow)
 
 
 class FusedAdam:
-    """Hands a model's optimiser to `rasterize_vjp_step_`. Make one only if `takes` says so."""
+    """Hands a model's optimiser, and a penalty, to `rasterize_vjp_step_`. Make one only if `takes` says so."""
 
-    def __init__(self, gaussians: GaussianModel) -> None:
+    def __init__(self, gaussians: GaussianModel, penalty: Penalty = NO_PENALTY) -> None:
         self._gaussians = gaussians
+        self._penalty = penalty
 
     @staticmethod
     def takes(gaussians: GaussianModel) -> bool:
@@ -52,6 +54,11 @@ class FusedAdam:
         statistics = self._statistics() if observe else (None, None, None)
         guard = optimizer.guard.arguments if optimizer.guard else ()
         return (attributes, *averages, steps, rates, *self._constants(), columns, self._sparse, *statistics, *guard)
+
+    def penalties(self) -> dict[str, float]:
+        """The operator's last arguments, which change with the number of Gaussians."""
+        each = self._penalty.of_each(len(self._gaussians))
+        return {"opacity_penalty": each.opacity, "scale_penalty": each.scale}
 
     def write_now(self, now: Tensor, iteration: int) -> None:
         """Write what the next step stands for, (NOW_WORDS,) int64 on the CPU, and advance the step counters.

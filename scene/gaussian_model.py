@@ -11,13 +11,13 @@ import torch
 from torch import Tensor, nn
 
 from scene.gaussians.adam import GaussianAdam, StepGuard
-from scene.gaussians.adaptive import AdaptiveGaussians
 from scene.gaussians.attributes import INITIAL_OPACITY
 from scene.gaussians.checkpoint import State, pack, unpack
 from scene.gaussians.exposed import Exposed
 from scene.gaussians.exposure import Exposures, read_exposures, read_pretrained
 from scene.gaussians.finite import check_finite
 from scene.gaussians.parameters import raw_rows
+from scene.gaussians.relocating import RelocatingGaussians
 from scene.gaussians.sparse_adam import SparseGaussianAdam
 from scene.gaussians.start import start_rows
 from scene.gaussians.trainable import trainable
@@ -30,12 +30,12 @@ from utils.system_utils import UserError
 _OPTIMIZERS = {"default": GaussianAdam, "sparse_adam": SparseGaussianAdam}
 
 
-class GaussianModel(Exposed, AdaptiveGaussians):
+class GaussianModel(Exposed, RelocatingGaussians):
     """Gaussians as they are trained, with the reference's names.
 
-    GaussianParameters has the parameters and their activated forms, AdaptiveGaussians has density control, and Exposed
-    the exposures. optimizer_type: "default" or "sparse_adam", whose step takes a mask of the visible Gaussians.
-    spatial_lr_scale: extent of the scene, world units.
+    GaussianParameters has the parameters and their activated forms, AdaptiveGaussians and RelocatingGaussians have
+    density control, and Exposed the exposures. optimizer_type: "default" or "sparse_adam", whose step takes a mask of
+    the visible Gaussians. spatial_lr_scale: extent of the scene, world units.
     """
 
     optimizer_type = "default"
@@ -126,6 +126,11 @@ class GaussianModel(Exposed, AdaptiveGaussians):
                 group["lr"] = rate
                 break
         return rate
+
+    @property
+    def position_rate(self) -> float:
+        """Learning rate of the positions, as `update_learning_rate` has set it."""
+        return next(group["lr"] for group in self.optimizer.param_groups if group.get("name") == "xyz")
 
     def step(self, radii: Tensor) -> None:
         """Step all optimisers and drop the gradients.

@@ -45,7 +45,7 @@ SCHEMAS = [
     "int[] attributes, Tensor(g!)[] exp_avg, Tensor(h!)[] exp_avg_sq, Tensor(i!)[] steps, float[] rates, float beta1, "
     "float beta2, float eps, int[] columns, bool sparse, Tensor(j!)? max_radii=None, "
     "Tensor(k!)? gradient_sums=None, Tensor(l!)? views=None, Tensor? loss=None, Tensor(m!)? stopped=None, "
-    "int iteration=0, Tensor? now=None, bool absolute=False) -> ()",
+    "int iteration=0, Tensor? now=None, bool absolute=False, float opacity_penalty=0., float scale_penalty=0.) -> ()",
     "step_now_(Tensor(a!) now, int[] attributes, Tensor(b!)[] steps, float[] rates, float beta1, float beta2, "
     "float eps, bool sparse, int iteration) -> ()",
     "mark_visible(Tensor means, Tensor view) -> Tensor",
@@ -59,6 +59,10 @@ SCHEMAS = [
     "observe_(Tensor(a!) max_radii, Tensor(b!) gradient_sums, Tensor(c!) views, Tensor radii, Tensor gradient) -> ()",
     "split_positions(Tensor means, Tensor log_scales, Tensor rotations, Tensor items, int seed, int stream, "
     "int iteration, int draw) -> Tensor",
+    "add_noise_(Tensor(a!) means, Tensor log_scales, Tensor rotations, Tensor logits, float size, float steepness, "
+    "float threshold, int seed, int stream, int iteration, Tensor? stopped=None) -> ()",
+    "penalise_(Tensor logits, Tensor log_scales, Tensor(a!) logit_gradients, Tensor(b!) log_scale_gradients, "
+    "float opacity, float scale) -> ()",
 ]
 
 

@@ -266,7 +266,17 @@ def _refused(match: str, case: Case | None = None, error: type = RuntimeError, *
     case = case or Case(guarded=True)
     state, camera = start_and_camera(case, 8, "cpu", torch.float32)
     arguments, radii = rendered(state, camera, case, 1)
-    rest = list(case.attributes), *case.lists(state), False, *state.statistics, *case.guard(state, 1), None, False
+    rest = (
+        list(case.attributes),
+        *case.lists(state),
+        False,
+        *state.statistics,
+        *case.guard(state, 1),
+        None,
+        False,
+        0.0,
+        0.0,
+    )
     names = [argument.name for argument in ops.rasterize_vjp_step_.default._schema.arguments]
     named = dict(zip(names, (*arguments, radii, *rest), strict=True))
     changes = {name: change(named[name]) if callable(change) else change for name, change in changes.items()}
@@ -297,6 +307,7 @@ def test_wrong_arguments_are_named():
     _refused("tile_counts must be", tile_counts=torch.ones(7, dtype=torch.int32), error=ValueError)
     _refused("now must be contiguous", now=torch.zeros(44, dtype=torch.int64)[::2], error=ValueError)
     _refused("now must be", now=torch.zeros(21, dtype=torch.int64), error=ValueError)
+    _refused("penalties are of raw Gaussians", raw=False, scale_penalty=0.1, error=ValueError)
     _refused("not cov3d or colors", sh_dc=None, sh_rest=None, colors=torch.rand(8, 3), error=ValueError)
 
 

@@ -4,6 +4,7 @@ from typing import ClassVar
 
 from torch import Tensor
 
+from scene.gaussians.penalty import NO_PENALTY
 from training.step import Step
 
 
@@ -12,14 +13,21 @@ class DensityControl:
 
     fusable: whether it reads gradients only in iterations that `changes` names. All others are then taken by
     training/steps/fused.py, which calls `observes` and `after_step` alone. It counts only where the class itself says
-    so: a subclass may want more. most: the number of Gaussians that a strategy grows to, 0: it has none of its own.
+    so: a subclass may want more. queues: whether `after_step` queues operators that change the model; it queues nothing
+    else, unless the iteration is one that `changes` names. most_gaussians: how many it lets there be, 0: any number.
+    penalty: a part of the loss besides the objective, of which steps add the gradients; no loss that is told has it.
     absolute_gradients: whether the statistics take the lengths of absolute gradients (Ye et al. 2024); for the whole
     run.
     """
 
     fusable: ClassVar[bool] = False
-    most: int = 0
-    absolute_gradients: bool = False
+    queues: ClassVar[bool] = False
+    most_gaussians = 0
+    penalty = NO_PENALTY
+    absolute_gradients = False
+
+    def started(self) -> None:
+        """Called before the first iteration of a model that was made from points, not read from a file."""
 
     def changes(self, iteration: int) -> bool:
         """Whether this iteration will change rows of the Gaussians besides their optimiser step.

@@ -68,7 +68,7 @@ class Run:
         check_scene(self.scene.info)
         self.views = ViewOrder(self.scene.getTrainCameras(), opt.seed)
         self._decode_ahead(self.first_iteration + 1)
-        self._start(capture)
+        from_points = self._start(capture)
         saves = [iteration for iteration in plan.save if iteration <= opt.iterations]
         check_folder(dataset.model_path, dataset.source_path, saves, plan.start, self.first_iteration)
         if plan.start:
@@ -79,9 +79,15 @@ class Run:
         self._depth_weight = get_expon_lr_func(
             opt.depth_l1_weight_init, opt.depth_l1_weight_final, max_steps=opt.iterations
         )
+        if from_points:
+            self.density.started()
 
-    def _start(self, capture: tuple | None) -> None:
-        """Start the model from the dataset's points, from a file's Gaussians, or from the state of a checkpoint."""
+    def _start(self, capture: tuple | None) -> bool:
+        """Start the model from the dataset's points, from a file's Gaussians, or from the state of a checkpoint.
+
+        Returns whether it was the points.
+        """
+        from_points = capture is None and self._first is None
         if capture is None:
             if self._first is None:
                 self.scene.create_gaussians()
@@ -94,6 +100,7 @@ class Run:
             self.gaussians.restore(capture, self.opt)
             check_exposures(self.gaussians, self.dataset.train_test_exp, self.plan.start)
         self.gaussians.limit_columns()
+        return from_points
 
     @property
     def _training_options(self) -> dict[str, Any]:
@@ -110,7 +117,7 @@ class Run:
         folder, start = self.scene.model_path, self.plan.start
         if not start or not (Path(folder) / "cameras.json").exists():
             self.scene.write_inputs()
-        announce_memory(self.scene, self.gaussians, self.density.most or self.opt.max_num_splats)
+        announce_memory(self.scene, self.gaussians, self.density.most_gaussians)
         self.log, self.rows = continue_records(folder, start, self.first_iteration)
         self.losses = LossWatch(self.log.loss)
         self.clock = Stopwatch()

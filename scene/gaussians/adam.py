@@ -23,20 +23,20 @@ class StepGuard:
 
     In that iteration, a value whose gradient or step is not finite keeps its value. Its exp_avg becomes NaN as a
     mark, which GaussianAdam.take_marks removes. All other values take their step. In later iterations no value does.
-    The flag stays on the device, and only `stopped_in` waits for it.
+    The flag `stopped` stays on the device, and only `stopped_in` waits for it.
     """
 
     def __init__(self, device: torch.device | str) -> None:
-        self._stopped = torch.zeros(1, dtype=torch.int64, device=device)
+        self.stopped = torch.zeros(1, dtype=torch.int64, device=device)
         self.arguments: tuple = ()  # the operators' last arguments
 
     def watch(self, iteration: int, loss: Tensor) -> None:
         """Take the scalar loss of an iteration (from 1), before its step."""
-        self.arguments = (loss, self._stopped, iteration)
+        self.arguments = (loss, self.stopped, iteration)
 
     def stopped_in(self) -> int:
         """The iteration that stopped the optimisers, 0 as long as none did. Waits for the device."""
-        return int(self._stopped)
+        return int(self.stopped)
 
 
 class GaussianAdam(torch.optim.Adam):

@@ -85,6 +85,21 @@ def restart_rows(groups: list[Group], states: States, indices: Tensor) -> None:
                 mean.index_fill_(0, indices, 0.0)
 
 
+@torch.no_grad()
+def overwrite_rows(groups: list[Group], states: States, indices: Tensor, rows: dict[str, Tensor]) -> None:
+    """Write `rows[name]` (n, ...) over the rows of `indices` (n,) int64, all different, of each group that has some.
+
+    groups: of `row_groups`. Averages of these rows restart at zero in every group, and gradients are dropped, as they
+    are those of other values.
+    """
+    for group in groups:
+        (param,) = group["params"]
+        if group.get("name") in rows:
+            param.index_copy_(0, indices, rows[group["name"]])
+        param.grad = None
+    restart_rows(groups, states, indices)
+
+
 def _change_rows(
     groups: list[Group], states: States, change: Callable[[Tensor, str, bool], Tensor]
 ) -> dict[str, nn.Parameter]:

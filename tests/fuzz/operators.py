@@ -58,6 +58,11 @@ def sound_calls() -> dict[str, Call]:
             ops.split_positions,
             [torch.rand(3, 3), torch.rand(3, 3), torch.rand(3, 4), torch.arange(3), 1, 2, 600, 0],
         ),
+        "add_noise_": (
+            ops.add_noise_,
+            [*(torch.rand(3, width) for width in (3, 3, 4, 1)), 1.0, 100.0, 0.005, 1, 4, 600, None],
+        ),
+        "penalise_": (ops.penalise_, [*(torch.rand(3, width) for width in (1, 3, 1, 3)), 0.01, 0.02]),
         "l1_ssim": (ssim.l1_ssim, [one, two, True, True]),
         "l1_ssim_vjp": (ssim.l1_ssim_vjp, [one, two, kept, torch.ones(()), torch.ones(())]),
         "photometric": (ssim.photometric, [one, two, 0.2, True]),

@@ -1,5 +1,7 @@
 """Steps of a host that runs ahead of its GPU (training/steps/run_ahead.py)."""
 
+from contextlib import nullcontext
+
 import torch
 
 from training.objective import Losses
@@ -91,7 +93,9 @@ class AheadStep:
             with self._ahead.room(step.camera.uid):
                 taken = self._queue_calls(step)
         else:
-            self._run.density.after_step(step)
+            density = self._run.density
+            with self._ahead.room(step.camera.uid) if density.queues else nullcontext():
+                density.after_step(step)
         if taken is not None:
             losses.append(taken)
         return taken is not None

@@ -22,7 +22,7 @@ class FusedStep:
     def __init__(self, run: Run) -> None:
         self._run = run
         self.plain = PlainStep(run)
-        self._adam = FusedAdam(run.gaussians)
+        self._adam = FusedAdam(run.gaussians, run.density.penalty)
         self._further_terms = False
 
     @staticmethod

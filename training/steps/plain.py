@@ -37,6 +37,8 @@ class PlainStep:
         package = render(step.camera, run.gaussians, run.pipe, step.background, **run.render_options(step))
         losses = run.objective(package, step)
         losses.total.backward()
+        if any(run.density.penalty):
+            run.gaussians.penalise(run.density.penalty)
         return package, losses
 
     def advance(self, step: Step, package: dict[str, Tensor]) -> None:

@@ -73,7 +73,8 @@ class RecordedStep:
 
     def __init__(self, run: Run, fused: FusedStep, room: Callable[[None], AbstractContextManager]) -> None:
         self._run, self._fused, self._room = run, fused, room
-        self._adam, self._recorder = FusedAdam(run.gaussians), Recorder(run.device)
+        self._adam = FusedAdam(run.gaussians, run.density.penalty)
+        self._recorder = Recorder(run.device)
         words = NOW_WORDS + (_CAMERA + 1) // 2
         self._host = torch.zeros(_SLOTS, words, dtype=torch.int64, pin_memory=run.device.type == "cuda")
         self._host_cameras = [row.numpy() for row in self._host[:, NOW_WORDS:].view(torch.float32)[:, :_CAMERA]]

@@ -31,6 +31,7 @@ class AdaptiveDensityControl(DensityControl):
         self._white_background = white_background
         self._extent = extent
         self.absolute_gradients = opt.absgrad
+        self.most_gaussians = opt.max_num_splats
 
     def changes(self, iteration: int) -> bool:
         todo = self._actions(iteration)

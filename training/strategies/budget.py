@@ -31,7 +31,7 @@ FEWEST, MOST = 100_000, 1_000_000  # Gaussians of the default budget
 class BudgetControl(DensityControl):
     """Removes useless Gaussians and adds others, every densification_interval steps before densify_until_iter.
 
-    most: the number of Gaussians at the end of that.
+    most_gaussians: their number at the end of that.
     """
 
     fusable = True
@@ -40,7 +40,7 @@ class BudgetControl(DensityControl):
         self._gaussians, self._opt = run.gaussians, run.opt
         self._cameras = run.scene.getTrainCameras()
         self._scores = ErrorScores(run.gaussians, run.pipe, run.dataset.train_test_exp, run.opt)
-        self.most = run.opt.max_num_splats or default_budget(self._cameras)
+        self.most_gaussians = run.opt.max_num_splats or default_budget(self._cameras)
 
     def changes(self, iteration: int) -> bool:
         return iteration % self._opt.densification_interval == 0 and iteration < self._opt.densify_until_iter
@@ -51,7 +51,7 @@ class BudgetControl(DensityControl):
         self._gaussians.check_steps()  # before rows change, so that an error finds the rows of the step
         passed, of = self._densifications(step.iteration)
         now = len(self._gaussians)
-        aim = count_after(now, self.most, passed, of, self._opt.growth_power) if passed > 0 else now
+        aim = count_after(now, self.most_gaussians, passed, of, self._opt.growth_power) if passed > 0 else now
         remove_useless(self._gaussians, self._opt.prune_opacity, max(aim, 1))
         self._check_rest(step.iteration)
         if passed > 0:

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 from training.density import DensityControl
 from training.strategies.adc import AdaptiveDensityControl
 from training.strategies.budget import BudgetControl
+from training.strategies.mcmc import MarkovChain
 
 if TYPE_CHECKING:
     from training.run import Run
@@ -14,5 +15,7 @@ def density_control(run: "Run") -> DensityControl:
     """The strategy that --strategy names, for the model and the scene of a run."""
     if run.opt.strategy == "budget":
         return BudgetControl(run)
+    if run.opt.strategy == "mcmc":
+        return MarkovChain(run.gaussians, run.opt)
     parts = run.gaussians, run.opt, run.dataset.white_background, run.scene.cameras_extent
     return AdaptiveDensityControl(*parts)

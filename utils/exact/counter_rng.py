@@ -24,8 +24,10 @@ class Stream(IntEnum):
     VIEW_ORDER = 0
     BACKGROUND = 1
     SPLIT = 2
-    SCORED_VIEWS = 3
-    DENSIFY = 4
+    RELOCATION = 3
+    NOISE = 4
+    SCORED_VIEWS = 5
+    DENSIFY = 6
 
 
 def _multiply(x: Tensor, factor: int) -> tuple[Tensor, Tensor]:

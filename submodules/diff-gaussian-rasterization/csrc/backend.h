@@ -15,31 +15,34 @@ struct BinMemory {
 };
 
 // Every backend's functions. `Where` says how they run: an Executor on the CPU, a Queue on a GPU.
-#define GS_BACKEND(Where)                                                                       \
-  template <class T>                                                                            \
-  void project(const Where&, const Scene<T>&, const Projected<T>&);                             \
-  template <class T>                                                                            \
-  void project_vjp(const Where&, const Scene<T>&, const int32_t* tile_counts, const T* moments, \
-                   const SceneGradient<T>&);                                                    \
-  template <class T>                                                                            \
-  void mark_visible(const Where&, int64_t count, const T* means, const T* view, bool* visible); \
-  template <class T>                                                                            \
-  void bin(const Where&, int64_t count, const Projected<T>&, Image, const BinMemory&);          \
-  template <class T>                                                                            \
-  void blend(const Where&, const BlendInput<T>&, const Blended<T>&);                            \
-  template <class T>                                                                            \
-  void blend_vjp(const Where&, const BlendInput<T>&, const BlendGradient<T>&);                  \
-  template <class T>                                                                            \
-  void mark_decisive(const Where&, const BlendInput<T>&, const int32_t* last, bool* decisive);  \
-  template <class T>                                                                            \
-  void adam(const Where&, const AdamInput<T>* tensors, int64_t count, const StepGuard<T>&);     \
-  /* Adam without bias correction on the visible rows, (rows); `step` is not read. */           \
-  template <class T>                                                                            \
-  void sparse_adam(const Where&, const AdamInput<T>&, const bool* visible, const StepGuard<T>&);
+#define GS_BACKEND(Where)                                                                        \
+  template <class T>                                                                             \
+  void project(const Where&, const Scene<T>&, const Projected<T>&);                              \
+  template <class T>                                                                             \
+  void project_vjp(const Where&, const Scene<T>&, const int32_t* tile_counts, const T* moments,  \
+                   const SceneGradient<T>&);                                                     \
+  template <class T>                                                                             \
+  void mark_visible(const Where&, int64_t count, const T* means, const T* view, bool* visible);  \
+  template <class T>                                                                             \
+  void bin(const Where&, int64_t count, const Projected<T>&, Image, const BinMemory&);           \
+  template <class T>                                                                             \
+  void blend(const Where&, const BlendInput<T>&, const Blended<T>&);                             \
+  template <class T>                                                                             \
+  void blend_vjp(const Where&, const BlendInput<T>&, const BlendGradient<T>&);                   \
+  template <class T>                                                                             \
+  void mark_decisive(const Where&, const BlendInput<T>&, const int32_t* last, bool* decisive);   \
+  template <class T>                                                                             \
+  void adam(const Where&, const AdamInput<T>* tensors, int64_t count, const StepGuard<T>&);      \
+  /* Adam without bias correction on the visible rows, (rows); `step` is not read. */            \
+  template <class T>                                                                             \
+  void sparse_adam(const Where&, const AdamInput<T>&, const bool* visible, const StepGuard<T>&); \
+  template <class T>                                                                             \
+  void penalise(const Where&, const PenaltyInput<T>&);
 
 // Compiled once: see gs/rounded.h.
 void observe(const Executor&, const ObserveInput&);
 void split_positions(const Executor&, const SplitInput&);
+void add_noise(const Executor&, const NoiseInput&);
 
 // What else the CPU offers. project_vjp_step: project_vjp, and every Gaussian's step as soon as its gradients are
 // known.
@@ -64,6 +67,7 @@ namespace cuda {
 GS_BACKEND(Queue)
 void observe(const Queue&, const ObserveInput&);
 void split_positions(const Queue&, const SplitInput&);
+void add_noise(const Queue&, const NoiseInput&);
 // Allocates the gradients; called while the GPU is busy, so that the host's work costs no time.
 struct GradientMemory {
   SceneGradient<float> (*take)(void* context);

@@ -165,6 +165,33 @@ struct SplitInput {
   float* positions;  // (N, 3), written
 };
 
+// Noise on the centres of Gaussians (math/noise.h). Nothing happens once `stopped` (StepGuard) is not 0.
+struct NoiseInput {
+  int64_t count;
+  float* means;                                  // (N, 3), updated
+  const float *log_scales, *rotations, *logits;  // (N, 3), (N, 4) wxyz, (N)
+  double size, steepness, threshold;
+  uint64_t seed;
+  uint32_t iteration, stream;
+  const int64_t* stopped;  // or null
+};
+
+// Weights of a Gaussian's opacity and of each of its scales in the loss (math/penalty.h).
+template <class T>
+struct Penalty {
+  T opacity, scale;
+  bool any() const { return opacity != 0 || scale != 0; }
+};
+
+// Gradients to which those of a penalty are added.
+template <class T>
+struct PenaltyInput {
+  int64_t count;
+  Penalty<T> penalty;
+  const T *logits, *log_scales;              // (N) and (N, 3)
+  T *logit_gradients, *log_scale_gradients;  // the same, updated
+};
+
 // The parameters of a Gaussian that take steps.
 enum Stepped { kStepMeans, kStepOpacities, kStepScales, kStepRotations, kStepShDc, kStepShRest, kStepped };
 
@@ -183,6 +210,7 @@ struct GaussianStep {
   StepGuard<T> guard;
   bool sparse;            // only Gaussians of observed.radii above 0 take a step, and without bias correction
   ObserveInput observed;  // the view's gradients are not read; with max_radii null nothing is observed
+  Penalty<T> penalty;     // whose gradients are added, where opacities and scales take steps
 };
 
 }  // namespace gs

@@ -5,6 +5,8 @@ from torch import Tensor
 from diff_gaussian_rasterization.backend import OPERATORS
 
 _split_positions = OPERATORS.split_positions
+_add_noise = OPERATORS.add_noise_
+_penalise = OPERATORS.penalise_
 
 
 def split_positions(
@@ -24,5 +26,53 @@ def split_positions(
     int64, their indices in the model. The random numbers are a function of seed (its lower 64 bits), stream, iteration,
     item and draw, each of the last four below 2^32. Every device and number of threads gives the same bits.
     """
-    signed = (seed + 2**63) % 2**64 - 2**63
-    return _split_positions(means, log_scales, rotations, items, signed, stream, iteration, draw)
+    return _split_positions(means, log_scales, rotations, items, _signed(seed), stream, iteration, draw)
+
+
+def add_noise_(
+    means: Tensor,
+    log_scales: Tensor,
+    rotations: Tensor,
+    logits: Tensor,
+    *,
+    size: float,
+    steepness: float,
+    threshold: float,
+    seed: int,
+    stream: int,
+    iteration: int,
+    stopped: Tensor | None = None,
+) -> None:
+    """Moves Gaussians at random (Kheradmand et al. 2024, section 3.2): each mean by size g C n.
+
+    C is the covariance (N, 3, 3), n (N, 3) standard normal, g = 1 / (1 + exp(steepness (o - threshold))) with the
+    opacity o. means (N, 3), log_scales (N, 3), rotations (N, 4) wxyz of any length and opacity logits (N, 1): float32;
+    means are contiguous and change. A mean that would not be finite stays. size is at least 0, steepness from 0 to
+    10,000. The random numbers are a function of seed (its lower 64 bits), stream, iteration and the Gaussian's index,
+    each of the last three below 2^32. Every device and number of threads gives the same bits. stopped: of a guard
+    (optim.py); once it is not 0, nothing changes.
+    """
+    shapes = log_scales, rotations, logits
+    _add_noise(means, *shapes, size, steepness, threshold, _signed(seed), stream, iteration, stopped)
+
+
+def penalise_(
+    logits: Tensor,
+    log_scales: Tensor,
+    logit_gradients: Tensor,
+    log_scale_gradients: Tensor,
+    *,
+    opacity: float,
+    scale: float,
+) -> None:
+    """Adds the gradients of opacity * sum(sigmoid(logits)) + scale * sum(exp(log_scales)) to those that are given.
+
+    logits and their gradients: (N, 1); log_scales and theirs: (N, 3); all float32, or on the CPU float64. The gradients
+    are contiguous and change. `rasterize_vjp_step_` adds the same bits.
+    """
+    _penalise(logits, log_scales, logit_gradients, log_scale_gradients, opacity, scale)
+
+
+def _signed(seed: int) -> int:
+    """The lower 64 bits of a seed as the operators take them."""
+    return (seed + 2**63) % 2**64 - 2**63

@@ -4,6 +4,8 @@
 
 #include "../backend.h"
 #include "adam_rows.h"
+#include "one_copy.h"
+#include "penalty_rows.h"
 #include "scene_lanes.h"
 
 GS_ISA_BEGIN
@@ -18,14 +20,6 @@ SceneGradient<T> part_of(const SceneGradient<T>& g, int64_t first, int rest_band
           from_row(g.scales, first, 3), from_row(g.rotations, first, 4), from_row(g.cov3d, first, 6),
           from_row(g.colors, first, 3), from_row(g.sh_dc, first, 3),     from_row(g.sh_rest, first, 3 * rest_bands)};
 }
-
-// A compiler must neither inline nor clone it: each copy could fuse other products, and gradients must have the same
-// bits whether they are written or stepped.
-#ifdef __clang__
-#define GS_ONE_COPY __attribute__((noinline))
-#else
-#define GS_ONE_COPY __attribute__((noipa))
-#endif
 
 // Zeroes the gradients of the Gaussians that were not seen, and lists the others.
 template <class T>
@@ -104,6 +98,15 @@ void observe_block(const ObserveInput& in, int64_t first, int64_t count, const B
                                       in.radii + first, gradient.means2d});
 }
 
+// Adds the gradients of the penalty of a block's Gaussians, as far as their parameters take steps.
+template <class T>
+void penalise_block(const GaussianStep<T>& in, int64_t first, int64_t count, BlockGradient<T>& gradient) {
+  const AdamInput<T>&logits = in.attributes[kStepOpacities], &log_scales = in.attributes[kStepScales];
+  if (in.penalty.any())
+    penalise_rows<T>({count, in.penalty, logits.value + first, log_scales.value + 3 * first,
+                      logits.columns ? gradient.opacities : nullptr, log_scales.columns ? gradient.scales : nullptr});
+}
+
 // Takes the steps of a block's Gaussians. Returns whether all values took theirs.
 template <class T>
 bool step_block(const GaussianStep<T>& in, const AdamStep<T>* steps, int64_t first, int64_t count,
@@ -157,6 +160,7 @@ void project_vjp_step(const Executor& executor, const Scene<T>& s, const int32_t
     if (!step.attributes[kStepShRest].columns) wanted.sh_rest = nullptr;
     project_vjp_rows(part_of(s, begin, count), camera, tile_counts + begin, moments + kGradientValues * begin, wanted);
     observe_block(step.observed, begin, count, gradient);
+    penalise_block(step, begin, count, gradient);
     if (may && !step_block(step, steps, begin, count, gradient)) __atomic_store_n(&finite, false, __ATOMIC_RELAXED);
   });
   if (!finite && *guard.stopped == 0) *guard.stopped = guard.iteration;

@@ -7,6 +7,7 @@
 #include "../math/observe.h"
 #include "../math/step_now.h"
 #include "guarded_adam.cuh"
+#include "penalty_row.cuh"
 #include "queue.cuh"
 
 namespace gs {
@@ -27,6 +28,11 @@ struct StepParameters {
   SteppedRows rows[kStepped];
   StepGuard<float> guard;
   ObserveInput observed;
+};
+
+// Of a step with a penalty. It is a type of its own, so that other steps have no code for it.
+struct PenalisedStep : StepParameters {
+  Penalty<float> penalty;
 };
 
 inline StepParameters step_parameters(const GaussianStep<float>& in) {
@@ -112,6 +118,15 @@ __device__ inline void observe_one(const ObserveInput& in, int64_t i, const floa
   Observed o{in.max_radii[i], in.gradient_sums[i], in.views[i]};
   gs::observe(in.radii[i], gradient[0], gradient[1], o);
   in.max_radii[i] = o.max_radius, in.gradient_sums[i] = o.gradient_sum, in.views[i] = o.views;
+}
+
+// Adds the gradients of a penalty to those of the lane's Gaussian `i`.
+__device__ __forceinline__ void penalise_one(const StepParameters&, int64_t, const WarpGradients&) {}
+__device__ inline void penalise_one(const PenalisedStep& in, int64_t i, const WarpGradients& g) {
+  const int lane = threadIdx.x & 31;
+  const SteppedRows &logits = in.rows[kStepOpacities], &log_scales = in.rows[kStepScales];
+  if (logits.columns) penalise_opacity(in.penalty, logits.value + i, g.opacities() + lane);
+  if (log_scales.columns) penalise_scales(in.penalty, log_scales.value + 3 * i, g.scales() + 3 * lane);
 }
 
 // Takes the step of a warp's Gaussians; all of its lanes call it. `first` is the warp's first Gaussian, `rest` has

@@ -62,11 +62,12 @@ __device__ void write_gradient(const RowGradient& g, const WarpGradients& to) {
 }
 
 // Computes gradients, and either writes them or takes the Gaussians' steps. It is one kernel for both, because a
-// compiler may fuse other products in another, and both must go the same way to the last bit.
-template <class Source>
+// compiler may fuse other products in another, and both must go the same way to the last bit. Step: StepParameters or
+// PenalisedStep, between which nothing differs but a call.
+template <class Source, class Step>
 __global__ void __launch_bounds__(kThreads)
     project_vjp_kernel(const int32_t* halted, Scene<float> s, Source source, SceneGradient<float> out,
-                       const __grid_constant__ StepParameters step) {
+                       const __grid_constant__ Step step) {
   if (is_halted(halted)) return;
   constexpr int kStage = SlotSums::kStage > WarpGradients::kFloats ? SlotSums::kStage : WarpGradients::kFloats;
   __shared__ Camera<float> camera;
@@ -99,6 +100,7 @@ __global__ void __launch_bounds__(kThreads)
     if (step.observed.max_radii && i < s.count) observe_one(step.observed, i, g.means2d);
     const WarpGradients gradients{warp_stage};
     write_gradient(g, gradients);
+    if (i < s.count) penalise_one(step, i, gradients);
     step_gaussians<kRest>(step, first, s.count, gradients, warp_rows);
     return;
   }
@@ -107,9 +109,9 @@ __global__ void __launch_bounds__(kThreads)
     write_rows(warp_rows, first, int(s.count - first < 32 ? s.count - first : 32), 3 * s.rest_bands, out.sh_rest);
 }
 
-template <class Source>
+template <class Source, class Step>
 void launch_project_vjp(const Queue& queue, const Scene<float>& s, const Source& source,
-                        const SceneGradient<float>& out, const StepParameters& step) {
+                        const SceneGradient<float>& out, const Step& step) {
   project_vjp_kernel<<<blocks_for(s.count, kThreads), kThreads, 0, stream_of(queue)>>>(queue.halted, s, source, out,
                                                                                        step);
   check_launch("project_vjp");
@@ -120,19 +122,25 @@ void launch_project_vjp(const Queue& queue, const Scene<float>& s, const Source&
 template <>
 void project_vjp<float>(const Queue& queue, const Scene<float>& s, const int32_t* tile_counts, const float* moments,
                         const SceneGradient<float>& out) {
-  if (s.count) launch_project_vjp(queue, s, StoredMoments{moments, tile_counts}, out, {});
+  if (s.count) launch_project_vjp(queue, s, StoredMoments{moments, tile_counts}, out, StepParameters{});
 }
 
 void rasterize_vjp(const Queue& queue, const Scene<float>& s, const BlendInput<float>& in,
                    const BlendGradient<float>& g, const GradientMemory& memory) {
   if (!s.count) return;
   const SlotSums source{blend_rows(queue, in, g), g.slots};
-  launch_project_vjp(queue, s, source, memory.take(memory.context), {});
+  launch_project_vjp(queue, s, source, memory.take(memory.context), StepParameters{});
 }
 
 void rasterize_vjp_step(const Queue& queue, const Scene<float>& s, const BlendInput<float>& in,
                         const BlendGradient<float>& g, const GaussianStep<float>& step) {
-  if (s.count) launch_project_vjp(queue, s, SlotSums{blend_rows(queue, in, g), g.slots}, {}, step_parameters(step));
+  if (!s.count) return;
+  const SlotSums source{blend_rows(queue, in, g), g.slots};
+  const StepParameters parameters = step_parameters(step);
+  if (step.penalty.any())
+    launch_project_vjp(queue, s, source, {}, PenalisedStep{parameters, step.penalty});
+  else
+    launch_project_vjp(queue, s, source, {}, parameters);
 }
 
 }  // namespace cuda

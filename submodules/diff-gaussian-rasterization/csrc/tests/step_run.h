@@ -12,6 +12,7 @@ struct StepCase {
   int64_t rest_columns = 45;
   bool opacities_step = true;
   float gradient = 1;  // dLoss/dcolor of a pixel in the middle; of the others 1
+  gs::Penalty<float> penalty = {0, 0};
 };
 
 // Everything that a step changes.
@@ -135,11 +136,15 @@ template <class Where, class Fill>
 void step_plainly(const Where& where, Stepping& s, const StepCase& how, const Rendered& r, int64_t iteration,
                   const Fill& fill) {
   using gs::observe, gs::cuda::observe, gs::cuda::adam, gs::cuda::sparse_adam;
-  using gs::GS_ISA::adam, gs::GS_ISA::sparse_adam;
+  using gs::cuda::penalise;
+  using gs::GS_ISA::adam, gs::GS_ISA::penalise, gs::GS_ISA::sparse_adam;
   GradientRowsInMemory gradient(s.values.count);
   const gs::SceneGradient<float>& g = gradient.pointers;
   fill(g);
   if (how.observed) observe(where, s.observe(how, r.radii.data(), g.means2d));
+  if (how.penalty.any())
+    penalise(where, gs::PenaltyInput<float>{s.values.count, how.penalty, s.values.opacities.data(),
+                                            s.values.scales.data(), g.opacities, g.scales});
   const float* const by_attribute[6] = {g.means, g.opacities, g.scales, g.rotations, g.sh_dc, g.sh_rest};
   gs::AdamInput<float> inputs[6];
   s.inputs(how, by_attribute, inputs);
@@ -155,6 +160,7 @@ inline gs::GaussianStep<float> gaussian_step(Stepping& s, const StepCase& how, c
   step.guard = s.guard(how, iteration);
   step.sparse = how.sparse;
   step.observed = s.observe(how, r.radii.data(), nullptr);
+  step.penalty = how.penalty;
   return step;
 }
 
@@ -169,4 +175,7 @@ inline const StepCase kStepCases[] = {
     {false, false, true, 9, true},
     {true, false, true, 24, true},
     {false, true, false, 0, false},
+    {false, true, true, 45, true, 1, {0.3f, 0.2f}},
+    {true, false, true, 45, true, 1, {0.3f, 0}},
+    {false, false, false, 9, false, 1, {0.3f, 0.2f}},
 };

@@ -474,6 +474,32 @@ void test_split_positions() {
   }
 }
 
+// Noise has the CPU's bits; a halted queue, and a guard that has stopped, leave the means alone.
+void test_noise() {
+  for (const int64_t n : {0, 1, 255, 700}) {
+    std::vector<float> means, values;
+    for (int64_t i = 0; i < 8 * n; ++i) values.push_back(float(2 * normal() - 3));
+    for (int64_t i = 0; i < 3 * n; ++i) means.push_back(float(normal()));
+    std::vector<float> wanted = means, got = means;
+    const int64_t stopped[2] = {0, 5};
+    const auto input = [&](std::vector<float>& to, const int64_t* guard) {
+      const float* v = values.data();
+      return gs::NoiseInput{n, to.data(), v, v + 3 * n, v + 7 * n, 30, 100, 0.005, 1ull << 40, 600, 4, guard};
+    };
+    gs::add_noise(gs::serial_executor(), input(wanted, nullptr));
+    gs::emulation::Memory memory;
+    gs::Queue queue = memory.queue();
+    const int32_t halted = 1;
+    queue.halted = &halted;
+    gs::cuda::add_noise(queue, input(got, nullptr));
+    queue.halted = nullptr;
+    gs::cuda::add_noise(queue, input(got, &stopped[1]));
+    CHECK(got == means);
+    gs::cuda::add_noise(queue, input(got, &stopped[0]));
+    CHECK(got == wanted && (n < 255 || got != means));
+  }
+}
+
 // Gradients of the emulated backward, into memory.
 void emulated_gradients(const gs::Queue& queue, const Rendered& r, const gs::SceneGradient<float>& g) {
   const auto take = [](void* to) { return *static_cast<const gs::SceneGradient<float>*>(to); };
@@ -603,6 +629,7 @@ int main() {
   test_step_guard();
   test_observe();
   test_split_positions();
+  test_noise();
   test_gaussian_step();
   test_given_covariances_and_colors();
   test_many_tiles();

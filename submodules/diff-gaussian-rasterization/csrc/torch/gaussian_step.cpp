@@ -116,16 +116,17 @@ void run(const SceneTensors& scene, const BlendBackward& in, const Tensor& tile_
   if (later.lengths) gs::observe(gs::torch_executor(), later);
 }
 
-// rasterize_vjp, then adam_ (or sparse_adam_ on the Gaussians of a radius above 0) of the attributes that are named,
-// and observe_ if statistics are given: the same bits, without gradients in memory. Advances the counters as adam_
-// does. now: what `step_now_` wrote, which stands in for steps, rates and iteration, and has advanced the
-// counters. absolute: the statistics get the lengths of absolute gradients.
+// rasterize_vjp, penalise_ unless both penalties are 0, then adam_ (or sparse_adam_ on the Gaussians of a radius above
+// 0) of the attributes that are named, and observe_ if statistics are given: the same bits, without gradients in
+// memory. Advances the counters as adam_ does. now: what `step_now_` wrote, which stands in for steps, rates and
+// iteration, and has advanced the counters. absolute: the statistics get the lengths of absolute gradients.
 void rasterize_vjp_step_op(SCENE_PARAMETERS, BACKWARD_PARAMETERS, const Tensor& tile_counts, const Tensor& layers,
                            const Tensor& radii, at::IntArrayRef attributes, at::TensorList exp_avg,
                            at::TensorList exp_avg_sq, at::TensorList steps, at::ArrayRef<double> rates, double beta1,
                            double beta2, double eps, at::IntArrayRef columns, bool sparse, const MaybeTensor& max_radii,
                            const MaybeTensor& gradient_sums, const MaybeTensor& views, const MaybeTensor& loss,
-                           const MaybeTensor& stopped, int64_t iteration, const MaybeTensor& now, bool absolute) {
+                           const MaybeTensor& stopped, int64_t iteration, const MaybeTensor& now, bool absolute,
+                           double opacity_penalty, double scale_penalty) {
   const SceneTensors scene(SCENE_ARGUMENTS);
   TORCH_CHECK_VALUE(!cov3d && !colors, "a step needs scales, rotations, sh_dc and sh_rest, not cov3d or colors");
   check_tensor(splats, "splats", scene.dtype(), scene.device(), {scene.count(), kSplatValues});
@@ -135,6 +136,8 @@ void rasterize_vjp_step_op(SCENE_PARAMETERS, BACKWARD_PARAMETERS, const Tensor& 
   in.take_layers(layers);
   const StepLists lists{attributes, exp_avg, exp_avg_sq, steps, rates, columns, beta1, beta2, eps};
   lists.check();
+  const bool penalised = opacity_penalty != 0 || scale_penalty != 0;
+  TORCH_CHECK_VALUE(!penalised || raw, "penalties are of raw Gaussians");
   const Tensor counts = tile_counts.contiguous(), pixels = radii.contiguous();
   const Tensor lengths = absolute_like(splats, absolute && max_radii);
   with_scalar(scene.dtype(), [&](auto zero) {
@@ -143,6 +146,7 @@ void rasterize_vjp_step_op(SCENE_PARAMETERS, BACKWARD_PARAMETERS, const Tensor& 
     step.guard = step_guard<T>(means, loss, stopped, iteration);
     observe_in(step, pixels, max_radii, gradient_sums, views);
     step.now = step_now(now, scene);
+    step.penalty = {T(opacity_penalty), T(scale_penalty)};
     run(scene, in, counts, lengths, step);
   });
   if (!now) advance(steps);
@@ -180,7 +184,8 @@ TORCH_LIBRARY_FRAGMENT(diff_gaussian_rasterization, m) {
              "exp_avg_sq, "
              "Tensor(i!)[] steps, float[] rates, float beta1, float beta2, float eps, int[] columns, bool sparse, "
              "Tensor(j!)? max_radii=None, Tensor(k!)? gradient_sums=None, Tensor(l!)? views=None, Tensor? loss=None, "
-             "Tensor(m!)? stopped=None, int iteration=0, Tensor? now=None, bool absolute=False) -> ()",
+             "Tensor(m!)? stopped=None, int iteration=0, Tensor? now=None, bool absolute=False, "
+             "float opacity_penalty=0, float scale_penalty=0) -> ()",
          &rasterize_vjp_step_op);
   define(m,
          "step_now_(Tensor(a!) now, int[] attributes, Tensor(b!)[] steps, float[] rates, float beta1, float beta2, "

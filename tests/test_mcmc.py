@@ -1,0 +1,138 @@
+"""Training by --strategy mcmc: the same bytes by every way to take a step, resuming, growth and its limit."""
+
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from rasterizer_tools import GPU_MARKS
+from test_steps import OPTIONS, differences, trained
+from test_steps import scene as scene  # a fixture
+
+import train
+from scene.gaussian_model import GaussianModel
+from scene.gaussians.checkpoint import load_checkpoint
+from training.density import DensityControl
+from training.steps import ahead, run_ahead
+from training.steps.fused import FusedStep
+from training.steps.recorded import RecordedStep
+from utils.system_utils import UserError
+
+# Within so few iterations no Gaussian fades, so the thresholds are at the opacities of the start.
+ACTIVE = ("--mcmc_noise", 5e4, "--mcmc_gate_opacity", 0.5, "--mcmc_min_opacity", 0.45)
+
+
+@pytest.fixture(autouse=True)
+def _stdout(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "stdout", sys.stdout)  # training stamps it
+
+
+def _train(source: Path, out: Path, *options: object, iterations: int = 60) -> Path:
+    words = ["-s", source, "-m", out, "-r", 48, "--iterations", iterations, "--no_curve", "--quiet"]
+    words += ["--strategy", "mcmc", "--disable_viewer"]
+    words += ["--densify_from_iter", 10, "--densification_interval", 10, "--test_iterations", -1, *options]
+    train.main(list(map(str, words)))
+    return out
+
+
+def _raw(out: Path, iteration: int) -> GaussianModel:
+    gaussians = GaussianModel(3)
+    gaussians.load_ply(out / f"point_cloud/iteration_{iteration}/point_cloud.ply")
+    return gaussians
+
+
+@pytest.mark.parametrize("options", OPTIONS.values(), ids=OPTIONS.keys())
+def test_the_fused_step_gives_the_bytes_of_the_plain_one(scene, tmp_path, monkeypatch, options):
+    plain = trained(scene, tmp_path / "plain", "--plain_step", "--strategy", "mcmc", *ACTIVE, *options)
+    fused, advance, take = [], FusedStep.advance, RecordedStep.take
+    monkeypatch.setattr(FusedStep, "advance", lambda self, at, *x: (fused.append(at.iteration), advance(self, at, *x)))
+
+    def noted(self, at):
+        losses = take(self, at)
+        fused.extend([at.iteration] if losses else [])
+        return losses
+
+    monkeypatch.setattr(RecordedStep, "take", noted)
+    assert differences(trained(scene, tmp_path / "fused", "--strategy", "mcmc", *ACTIVE, *options), plain) == []
+    # Relocations and the last iteration; there are no resets.
+    assert sorted({*fused}) == [t for t in range(1, 60) if t not in (20, 40)]
+
+
+@pytest.mark.parametrize("_", [pytest.param(None, marks=GPU_MARKS)])
+@pytest.mark.parametrize("options", [(), OPTIONS["sparse"]], ids=["default", "sparse"])
+def test_a_step_that_halts_is_moved_once(scene, tmp_path, monkeypatch, options, _):
+    """With room for what the last visit of a view needed, and no more, many steps halt and are repeated."""
+    options = ("--strategy", "mcmc", *ACTIVE, *options)
+    plain = trained(scene, tmp_path / "plain", "--plain_step", *options)
+    halts, repeat = [], run_ahead.RunAhead._repeat
+    monkeypatch.setattr(run_ahead.RunAhead, "_repeat", lambda *x: (halts.append(1), repeat(*x)))
+    monkeypatch.setattr(run_ahead, "_with_spare", lambda count: count)
+    for name, least in (("_INSTANCES", 0), ("_SLOTS", 0), ("_LEAST", 1)):
+        monkeypatch.setattr(ahead, name, least)
+    assert differences(trained(scene, tmp_path / "halting", *options), plain) == []
+    assert len(halts) > 5
+
+
+@pytest.mark.parametrize("name", ["mcmc_noise", "mcmc_opacity_reg", "mcmc_scale_reg", "mcmc_init_scale"])
+def test_every_part_has_an_effect(scene, tmp_path, name):
+    one, other = (
+        _train(scene, tmp_path / str(value), *ACTIVE, f"--{name}", value, iterations=15) for value in (0.001, 100)
+    )
+    assert not torch.equal(_raw(one, 15)._xyz, _raw(other, 15)._xyz)
+
+
+def test_resumed_training_gives_the_same_bytes(scene, tmp_path, monkeypatch):
+    relocated, relocate = [], GaussianModel.relocate
+
+    def noted(self, *x, **named):
+        relocated.append(relocate(self, *x, **named))
+        return relocated[-1]
+
+    monkeypatch.setattr(GaussianModel, "relocate", noted)
+    options = *ACTIVE, "--checkpoint_iterations", 35
+    whole = _train(scene, tmp_path / "a", *options)
+    assert len(relocated) == 5 and relocated[1] and relocated[-1]
+    resumed = _train(scene, tmp_path / "b", *options, "--start_checkpoint", whole / "chkpnt35.pth")
+    last = "point_cloud/iteration_60/point_cloud.ply"
+    assert (whole / last).read_bytes() == (resumed / last).read_bytes()
+    other = _train(scene, tmp_path / "c", *options, "--seed", 6)
+    assert (whole / last).read_bytes() != (other / last).read_bytes()
+
+
+def test_growth_ends_at_the_limit(scene, tmp_path):
+    every = [str(t) for t in range(5, 60, 10)]
+    counts = []
+    for limit, out in ((0, "free"), (430, "limited"), (3, "full")):
+        run = _train(
+            scene, tmp_path / out, "--max_num_splats", limit, "--mcmc_growth", 0.3, "--mcmc_until_iter", 50,
+            "--checkpoint_iterations", *every,
+        )  # fmt: skip
+        counts.append([len(load_checkpoint(run / f"chkpnt{t}.pth")[0][1]) for t in every])
+    start = counts[0][0]
+    grown = [start, start]  # 10 is not above --densify_from_iter, 50 is not below --mcmc_until_iter
+    for _ in range(3):
+        grown.append(int(1.3 * grown[-1]))
+    assert counts[0] == [*grown, grown[-1]]
+    assert counts[1] == [min(count, 430) for count in counts[0]] and counts[1][-1] == 430
+    assert counts[2] == [start] * 6  # nothing is removed
+
+
+def test_the_start_is_more_opaque_and_smaller_than_the_points(scene, tmp_path):
+    once = "--save_iterations", 1
+    mcmc, adc = (
+        _raw(_train(scene, tmp_path / name, *once, "--strategy", name, iterations=2), 1) for name in ("mcmc", "adc")
+    )
+    torch.testing.assert_close(mcmc.get_opacity, torch.full_like(mcmc._opacity, 0.5))
+    torch.testing.assert_close(mcmc.get_scaling, 0.1 * adc.get_scaling)
+    ply = tmp_path / "adc/point_cloud/iteration_1/point_cloud.ply"
+    given = _raw(_train(scene, tmp_path / "given", *once, "--init_ply", ply, iterations=2), 1)
+    torch.testing.assert_close(given.get_scaling, adc.get_scaling)  # a model brings its own shapes
+
+
+def test_a_scene_that_fades_is_refused(scene, tmp_path):
+    with pytest.raises(UserError, match="above 0.9 in iteration 20: .*lower --mcmc_opacity_reg"):
+        _train(scene, tmp_path, "--mcmc_min_opacity", 0.9)
+
+
+def test_other_strategies_have_no_penalty():
+    assert not any(DensityControl.penalty) and not DensityControl.queues

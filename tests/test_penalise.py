@@ -1,0 +1,80 @@
+"""The operator that adds the gradients of penalties on opacities and scales, and the model's use of it."""
+
+import pytest
+import torch
+from diff_gaussian_rasterization.density import penalise_
+from gaussians import model
+from rasterizer_tools import CPU_AND_GPU, ops
+from torch import Tensor, library
+
+from scene.gaussians.penalty import NO_PENALTY, Penalty
+
+WEIGHTS = {"opacity": 0.3, "scale": 0.7}
+
+
+def _tensors(count: int) -> list[Tensor]:
+    """Logits, log scales and gradients of both."""
+    generator = torch.Generator().manual_seed(0)
+    return [3 * torch.randn(count, width, generator=generator) for width in (1, 3, 1, 3)]
+
+
+@CPU_AND_GPU
+@pytest.mark.parametrize("count", [0, 1, 7, 5001])
+def test_gradients_are_autograds(count, device):
+    logits, log_scales, *gradients = _tensors(count)
+    exact = logits.double().requires_grad_(), log_scales.double().requires_grad_()
+    (0.3 * exact[0].sigmoid().sum() + 0.7 * exact[1].exp().sum()).backward()
+    got = [t.clone().to(device) for t in gradients]
+    penalise_(logits.to(device), log_scales.to(device), *got, **WEIGHTS)
+    for new, old, param in zip(got, gradients, exact, strict=True):
+        torch.testing.assert_close(new.cpu(), (old.double() + param.grad).float(), rtol=1e-6, atol=1e-6)
+
+
+def test_doubles_are_exact_and_threads_do_not_matter():
+    tensors = [t.double() for t in _tensors(5001)]
+    exact = [t.clone().requires_grad_() for t in tensors[:2]]
+    (0.3 * exact[0].sigmoid().sum() + 0.7 * exact[1].exp().sum()).backward()
+    before, results = torch.get_num_threads(), []
+    try:
+        for threads in (1, 3):
+            torch.set_num_threads(threads)
+            gradients = [t.clone() for t in tensors[2:]]
+            penalise_(*tensors[:2], *gradients, **WEIGHTS)
+            results.append(gradients)
+    finally:
+        torch.set_num_threads(before)
+    for one, other, old, param in zip(*results, tensors[2:], exact, strict=True):
+        assert torch.equal(one, other)
+        torch.testing.assert_close(one, old + param.grad, rtol=1e-13, atol=1e-13)
+
+
+@CPU_AND_GPU
+def test_opcheck(device):
+    library.opcheck(ops.penalise_, (*(t.to(device) for t in _tensors(5)), 0.3, 0.7))
+
+
+def test_what_does_not_fit_is_named():
+    logits, log_scales, *gradients = _tensors(4)
+    with pytest.raises(TypeError, match="log_scales must be torch.float32 on cpu, got torch.float64"):
+        penalise_(logits, log_scales.double(), *gradients, **WEIGHTS)
+    with pytest.raises(ValueError, match=r"log_scale_gradients must be \(4, 3\).*got \(4, 1\)"):
+        penalise_(logits, log_scales, gradients[0], gradients[0], **WEIGHTS)
+    with pytest.raises(ValueError, match="gradients must be contiguous"):
+        penalise_(logits, log_scales, gradients[0], gradients[1].T.contiguous().T, **WEIGHTS)
+
+
+@pytest.mark.parametrize("replaced", [False, True])
+@pytest.mark.parametrize("given", [False, True])
+def test_a_models_penalty_is_of_its_means(given, replaced):
+    """Of all Gaussians, whatever their activations and with or without gradients of the image."""
+    gaussians = model(30)
+    if replaced:
+        gaussians.opacity_activation = lambda x: x.sigmoid()
+    params = gaussians._opacity, gaussians._scaling
+    wanted = torch.autograd.grad(0.3 * params[0].sigmoid().mean() + 0.7 * params[1].exp().mean(), params)
+    for param in params:
+        param.grad = torch.ones_like(param) if given else None
+    gaussians.penalise(Penalty(0.3, 0.7))
+    for param, gradient in zip(params, wanted, strict=True):
+        torch.testing.assert_close(param.grad, gradient + given)
+    assert not any(NO_PENALTY)

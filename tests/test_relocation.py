@@ -1,0 +1,186 @@
+"""Relocation (Kheradmand et al. 2024): the rules on raw parameters, and on a model with its optimiser."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from gaussians import GROUPS, model, take_steps
+from torch import Tensor
+
+from scene.gaussian_model import GaussianModel
+from scene.gaussians.relocation import MOST_PARTS, divided, draw, opacity_units
+
+LOGITS = torch.tensor([-5.2, -2.0, 0.0, 1.5, 4.0, 9.0, 15.0])
+WHERE = {"seed": 3, "iteration": 600}
+DRAW = WHERE | {"draw": 1}
+RULE = 0.005, MOST_PARTS
+
+
+def _paper(before: float, parts: int) -> tuple[float, float]:
+    """Opacity and factor of the scales, by the paper's double sum."""
+    opacity = 1 - (1 - before) ** (1 / parts)
+    total = 0.0
+    for i in range(1, parts + 1):
+        total += sum(math.comb(i - 1, k) * (-1) ** k * opacity ** (k + 1) / math.sqrt(k + 1) for k in range(i))
+    return opacity, before / total
+
+
+@pytest.mark.parametrize("parts", [1, 2, 3, 17, MOST_PARTS])
+def test_parts_are_the_papers(parts):
+    logits, larger = divided(LOGITS, torch.full((len(LOGITS),), parts))
+    assert logits.dtype == larger.dtype == torch.float64
+    for logit, part, log_factor in zip(LOGITS.double().tolist(), logits.tolist(), larger.tolist(), strict=True):
+        opacity, factor = _paper(1 / (1 + math.exp(-logit)), parts)
+        assert 1 / (1 + math.exp(-part)) == pytest.approx(opacity, rel=1e-9)
+        assert math.exp(log_factor) == pytest.approx(factor, rel=1e-6)
+
+
+@pytest.mark.parametrize("parts", [2, 5, MOST_PARTS])
+def test_coinciding_parts_keep_the_image(parts):
+    """Parts that are blended one after another: as opaque in the middle, and as much hidden along a line."""
+    logits, larger = divided(LOGITS, torch.full((len(LOGITS),), parts))
+    line = np.linspace(-12, 12, 20_001)
+    for logit, part, log_factor in zip(LOGITS.double().tolist(), logits.tolist(), larger.tolist(), strict=True):
+        one = np.exp(-0.5 * line**2) / (1 + math.exp(-logit))
+        each = np.exp(-0.5 * (line / math.exp(log_factor)) ** 2) / (1 + math.exp(-part))
+        seen = np.ones_like(line)
+        for _ in range(parts):
+            seen *= 1 - each
+        assert 1 - seen[10_000] == pytest.approx(one[10_000], rel=1e-12)
+        assert (1 - seen).sum() == pytest.approx(one.sum(), rel=1e-9)
+
+
+def test_an_opacity_of_one_can_be_divided():
+    logits, larger = divided(torch.tensor([40.0, 500.0, math.inf]), torch.tensor([2, 51, 51]))
+    assert logits.isfinite().all() and larger.isfinite().all() and (larger < 0).all()
+
+
+def test_draws_are_in_proportion_and_the_same_for_any_number_of_threads():
+    units = torch.tensor([0, 1, 5, 0, 2, 0]) * 2**30
+    before = torch.get_num_threads()
+    try:
+        drawn = []
+        for threads in (1, 3):
+            torch.set_num_threads(threads)
+            drawn.append(draw(units, 80_000, **DRAW))
+    finally:
+        torch.set_num_threads(before)
+    assert torch.equal(*drawn)
+    share = drawn[0].bincount(minlength=6) / 80_000
+    assert (share[units == 0] == 0).all()
+    # Five standard deviations of a share of one half are 0.009.
+    torch.testing.assert_close(share, units / units.sum(), atol=0.009, rtol=0)
+    for name in DRAW:
+        assert not torch.equal(drawn[0], draw(units, 80_000, **DRAW | {name: DRAW[name] + 1})), name
+
+
+def test_units_are_opacities():
+    logits = torch.tensor([-math.inf, -800.0, -5.0, 0.0, 5.0, math.inf, math.nan])
+    units = opacity_units(logits)
+    assert units.min() == 1 and units.dtype == torch.int64
+    torch.testing.assert_close((units / 2**24)[2:6], logits.sigmoid()[2:6], atol=1e-7, rtol=0)
+
+
+def _trained(count: int = 40, dead: int = 12) -> GaussianModel:
+    """A model with averages of Adam, the last of whose Gaussians are dead."""
+    gaussians = model(count, degree=1)
+    take_steps(gaussians, 3)
+    with torch.no_grad():
+        gaussians._opacity.clamp_(-4.0, 4.0)
+        gaussians._opacity[count - dead :] = -6.0
+    for field in GROUPS.values():
+        getattr(gaussians, field).grad = torch.ones_like(getattr(gaussians, field))
+    return gaussians
+
+
+def _values(gaussians: GaussianModel) -> dict[str, Tensor]:
+    return {name: getattr(gaussians, field).detach().clone() for name, field in GROUPS.items()}
+
+
+def _averages(gaussians: GaussianModel) -> list[Tensor]:
+    state = [gaussians.optimizer.state[getattr(gaussians, field)] for field in GROUPS.values()]
+    return [s[key].reshape(len(gaussians), -1).clone() for s in state for key in ("exp_avg", "exp_avg_sq")]
+
+
+def test_dead_gaussians_become_parts_of_live_ones():
+    gaussians = _trained()
+    before, averages = _values(gaussians), _averages(gaussians)
+    assert gaussians.relocate(*RULE, **WHERE) == 12
+    after = _values(gaussians)
+    (origins,) = (after["xyz"][28:, None] == before["xyz"][None, :28]).all(dim=2).nonzero()[:, 1:].T
+    assert len(origins) == 12  # each lies where a live one is
+    copies = origins.bincount(minlength=28)
+    changed = copies > 0
+    for name in GROUPS:
+        assert torch.equal(after[name][28:], after[name][origins])
+        assert torch.equal(after[name][:28][~changed], before[name][:28][~changed])
+        if name not in ("opacity", "scaling"):
+            assert torch.equal(after[name][:28], before[name][:28])
+    logits, larger = divided(before["opacity"][:28, 0], copies + 1)
+    torch.testing.assert_close(after["opacity"][:28, 0], logits.float())
+    torch.testing.assert_close(after["scaling"][:28], before["scaling"][:28] + larger[:, None].float())
+    untouched = torch.cat((~changed, torch.zeros(12, dtype=torch.bool)))
+    for old, new in zip(averages, _averages(gaussians), strict=True):
+        assert torch.equal(new[untouched], old[untouched]) and new[untouched].any() and not new[~untouched].any()
+    assert all(getattr(gaussians, field).grad is None for field in GROUPS.values())
+
+
+def test_more_copies_than_parts_are_corrected_for_as_many():
+    gaussians = _trained(count=80, dead=79)
+    before = _values(gaussians)
+    gaussians.relocate(0.005, 3, **WHERE)
+    logits, _ = divided(before["opacity"][0], torch.tensor([3]))
+    torch.testing.assert_close(_values(gaussians)["opacity"], logits.float().expand(80, 1))
+
+
+@pytest.mark.parametrize("dead", [0, 40])
+def test_without_dead_or_without_live_gaussians_nothing_changes(dead):
+    gaussians = _trained(dead=dead)
+    before, averages = _values(gaussians), _averages(gaussians)
+    params = [getattr(gaussians, field) for field in GROUPS.values()]
+    assert gaussians.relocate(*RULE, **WHERE) == dead
+    assert all(torch.equal(value, before[name]) for name, value in _values(gaussians).items())
+    assert all(torch.equal(old, new) for old, new in zip(averages, _averages(gaussians), strict=True))
+    assert all(getattr(gaussians, f) is p and p.grad is not None for f, p in zip(GROUPS.values(), params, strict=True))
+
+
+def test_an_opacity_at_the_limit_is_dead():
+    gaussians = _trained(dead=0)
+    with torch.no_grad():
+        gaussians._opacity[0] = math.log(0.005 / 0.995)
+        gaussians._opacity[1] = torch.nextafter(gaussians._opacity[0], torch.zeros(1))
+    assert gaussians.relocate(*RULE, **WHERE) == 1
+
+
+def test_growth_appends_parts():
+    gaussians = _trained(dead=0)
+    before, averages = _values(gaussians), _averages(gaussians)
+    gaussians.grow(7, MOST_PARTS, **WHERE)
+    assert len(gaussians) == 47
+    after = _values(gaussians)
+    origins = (after["xyz"][40:, None] == before["xyz"][None]).all(dim=2).nonzero()[:, 1]
+    assert len(origins) == 7
+    logits, larger = divided(before["opacity"][:, 0], origins.bincount(minlength=40) + 1)
+    torch.testing.assert_close(after["opacity"][:40, 0], logits.float())
+    torch.testing.assert_close(after["scaling"][:40], before["scaling"] + larger[:, None].float())
+    assert all(torch.equal(after[name][40:], after[name][origins]) for name in GROUPS)
+    for old, new in zip(averages, _averages(gaussians), strict=True):
+        assert not new[40:].any() and not new[origins].any()
+        rest = [row for row in range(40) if row not in origins]
+        assert torch.equal(new[rest], old[rest])
+
+
+def test_other_activations_are_followed():
+    plain, own = _trained(), _trained()
+    with torch.no_grad():
+        own._opacity.sigmoid_()
+        own._scaling.exp_()
+    own.opacity_activation = own.inverse_opacity_activation = own.scaling_activation = torch.abs
+    own.scaling_inverse_activation = torch.abs
+    for gaussians in (plain, own):
+        gaussians.relocate(*RULE, **WHERE)
+        gaussians.start_as(0.5, 0.1)
+    torch.testing.assert_close(own.get_scaling, plain.get_scaling)
+    torch.testing.assert_close(own.get_opacity, torch.full_like(own._opacity, 0.5))
+    torch.testing.assert_close(plain.get_opacity, torch.full_like(own._opacity, 0.5))
