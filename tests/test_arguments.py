@@ -74,7 +74,7 @@ OURS = {
     "prune_sh": 0.0,
     "seed": 0,
     "strategy": "adc",
-    "growth_power": 2.0,
+    "growth_power": 1.0,
     "score_views": 10,
     "score_error": "l1",
     "score_join": "sum",
