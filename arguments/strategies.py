@@ -119,10 +119,10 @@ MCMC_OPTIONS: tuple[Option, ...] = (
 BUDGET_OPTIONS: tuple[Option, ...] = (
     Option(
         "growth_power",
-        2.0,
+        1.0,
         "budget: how early the Gaussians multiply. The part of the densifications that is left, to this power, is the "
         "part of the growth to --max_num_splats that is left; 1: evenly, higher: earlier",
-        "ours; Taming 3DGS's curve",
+        "ours; 2 in Taming 3DGS",
         check=above(0),
     ),
     Option(

@@ -77,7 +77,7 @@ OURS = {
     "absgrad": False,
     "absgrad_threshold": 8e-4,
     "split": "sample",
-    "growth_power": 2.0,
+    "growth_power": 1.0,
     "score_views": 10,
     "score_error": "l1",
     "score_join": "sum",

@@ -292,7 +292,7 @@ def test_fading_multiplies_opacities_and_keeps_averages():
 
 GROWING = [
     "--strategy", "budget", "--densify_from_iter", 20, "--densification_interval", 20, "--densify_until_iter", 130,
-    "--score_views", 4, "--disable_viewer",
+    "--growth_power", 2, "--score_views", 4, "--disable_viewer",
 ]  # fmt: skip
 SMALL = ["-r", 48, "--test_iterations", -1, "--no_curve"]
 
