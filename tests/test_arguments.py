@@ -74,6 +74,8 @@ OURS = {
     "prune_sh": 0.0,
     "seed": 0,
     "strategy": "adc",
+    "time_budget": 0.0,
+    "schedule": "",
 }
 
 
@@ -140,6 +142,8 @@ def test_short_forms_and_unique_prefixes():
         ("seed", "-1"),
         ("optimizer_type", "sgd"),
         ("strategy", "mine"),
+        ("time_budget", "-1"),
+        ("time_budget", "inf"),
         ("exposure_lr_init", "-0.1"),
         ("exposure_lr_delay_steps", "-1"),
         ("exposure_lr_delay_mult", "1.5"),

@@ -13,7 +13,6 @@ from utils.system_utils import UserError
 
 _SAMPLE = 16  # cameras whose depths are checked
 _FEWEST_BEYOND = 0.01  # share of the points in front of them that must lie beyond the nearest depth
-_RECOVERY = 1000  # iterations that a model needs to recover from a reset of its opacities
 
 
 def check_scene(info: SceneInfo) -> None:
@@ -63,7 +62,7 @@ def check_exposures(gaussians: GaussianModel, train_test_exp: bool, checkpoint: 
 
 def warn_of_late_reset(opt: argparse.Namespace, white_background: bool) -> None:
     """Warn if opacities are reset so late that the model cannot recover."""
-    last = range(max(1, opt.iterations - _RECOVERY + 1), opt.iterations)
+    last = range(max(1, opt.iterations - rules.RECOVERY + 1), opt.iterations)
     late = [t for t in last if rules.actions(t, opt, white_background).reset_opacity]
     if late:
         print(

@@ -4,6 +4,7 @@ from typing import ClassVar
 
 from torch import Tensor
 
+from training.pacing.pace import STEADY, Pace
 from training.step import Step
 
 
@@ -12,10 +13,12 @@ class DensityControl:
 
     fusable: whether it reads gradients only in iterations that `changes` names. All others are then taken by
     training/steps/fused.py, which calls `observes` and `after_step` alone. It counts only where the class itself says
-    so: a subclass may want more.
+    so: a subclass may want more. pace: tells how far the schedule is in an iteration (training/pacing/pace.py). Rules
+    that are windows of the schedule ask it; rules that count steps take the iteration itself.
     """
 
     fusable: ClassVar[bool] = False
+    pace: Pace = STEADY
 
     def changes(self, iteration: int) -> bool:
         """Whether this iteration will change rows of the Gaussians besides their optimiser step.

@@ -2,6 +2,7 @@
 
 import argparse
 from collections.abc import Iterator
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from training.history import check_folder, continue_records, report_changes
 from training.loss_watch import LossWatch
 from training.memory_estimate import announce_memory
 from training.objective import Objective
+from training.pacing.choose import pace_of
 from training.plan import Plan
 from training.step import Step
 from training.strategies.choose import density_control
@@ -27,7 +29,7 @@ from utils.exact.counter_rng import Stream, uniform
 from utils.general_utils import get_expon_lr_func
 from utils.host.interrupt import DeferredInterrupt
 from utils.host.process import seconds_since_start
-from utils.system_utils import UserError, compute_device
+from utils.system_utils import compute_device
 
 SH_INTERVAL = 1000  # iterations between raises of the active SH degree
 
@@ -35,8 +37,8 @@ SH_INTERVAL = 1000  # iterations between raises of the active SH degree
 class Run:
     """The objects that the loop and its observers share.
 
-    scene, gaussians, views (by iteration), objective, density; dataset, opt, pipe: the options; background: (3,) of the
-    scene; first_iteration: done before this run. From `begin` on: log, rows (of the curve so far), losses
+    scene, gaussians, views (by iteration), objective, density, pace; dataset, opt, pipe: the options; background: (3,)
+    of the scene; first_iteration: done before this run. From `begin` on: log, rows (of the curve so far), losses
     (running mean of the total) and clock (seconds of training). lost: steps that an error has taken back. first_done:
     seconds from the process's start to the end of its first iteration, None if the system does not say. interrupt: a
     signal that asks the loop to stop; an observer that waits has to look at it.
@@ -53,11 +55,7 @@ class Run:
         self.interrupt = DeferredInterrupt()
         self.device = compute_device()
         capture, self.first_iteration = load_checkpoint(plan.start, self.device) if plan.start else (None, 0)
-        if self.first_iteration >= opt.iterations:
-            raise UserError(
-                f"{plan.start} is at iteration {self.first_iteration}, so --iterations {opt.iterations} leaves nothing "
-                "to do; --iterations counts from the start of the first run"
-            )
+        self.pace = pace_of(opt, plan.start, self.first_iteration)
         warn_of_late_reset(opt, dataset.white_background)
         self.gaussians = GaussianModel(dataset.sh_degree, opt.optimizer_type)
         init_ply = option(dataset, "init_ply")
@@ -69,7 +67,7 @@ class Run:
         self.views = ViewOrder(self.scene.getTrainCameras(), opt.seed)
         self._decode_ahead(self.first_iteration + 1)
         self._start(capture)
-        saves = [iteration for iteration in plan.save if iteration <= opt.iterations]
+        saves = self.pace.known(plan.save)
         check_folder(dataset.model_path, dataset.source_path, saves, plan.start, self.first_iteration)
         if plan.start:
             report_changes(plan.start, argparse.Namespace(**vars(dataset), **self._training_options))
@@ -79,6 +77,7 @@ class Run:
         self._depth_weight = get_expon_lr_func(
             opt.depth_l1_weight_init, opt.depth_l1_weight_final, max_steps=opt.iterations
         )
+        self.density.pace = self.pace
 
     def _start(self, capture: tuple | None) -> None:
         """Start the model from the dataset's points, from a file's Gaussians, or from the state of a checkpoint."""
@@ -117,19 +116,31 @@ class Run:
 
     def steps(self) -> Iterator[Step]:
         """The iterations of this run."""
-        for iteration in range(self.first_iteration + 1, self.opt.iterations + 1):
-            camera = self.views[iteration]
-            yield Step(
+        for iteration in count(self.first_iteration + 1):
+            seconds, pace, camera = self.clock.seconds, self.pace, self.views[iteration]
+            pace.reach(iteration, self.log.seconds_before + seconds)
+            step = Step(
                 iteration,
-                last=iteration == self.opt.iterations,
+                last=False,
                 camera=camera,
                 background=self._background(iteration),
-                depth_weight=self._depth_weight(iteration) if camera.depth_reliable else 0.0,
-                changes=self.density.changes(iteration) or iteration % SH_INTERVAL == 0,
-                started=self.clock.seconds,
+                depth_weight=self._depth_weight(pace.nominal(iteration)) if camera.depth_reliable else 0.0,
+                changes=self.density.changes(iteration) or self._raises_degree(iteration) > 0,
+                started=seconds,
+                span=pace.span(iteration),
             )
+            if pace.is_last(iteration):
+                step.end(pace.length)
+            yield step
             if iteration == self.first_iteration + 1:
                 self.first_done = seconds_since_start()
+            if step.last:
+                return
+
+    def _raises_degree(self, iteration: int) -> int:
+        """How often the SH degree is raised in an iteration."""
+        before, now = (self.pace.nominal(t) // SH_INTERVAL for t in (iteration - 1, iteration))
+        return now - before
 
     def _background(self, iteration: int) -> Tensor:
         if not self.opt.random_background:
@@ -139,16 +150,22 @@ class Run:
 
     def prepare(self, step: Step) -> None:
         """Set learning rates and SH degree, and begin to decode the photos of the next views."""
-        self.gaussians.update_learning_rate(step.iteration)
-        if step.iteration % SH_INTERVAL == 0:
+        self.set_rates(step)
+        for _ in range(self._raises_degree(step.iteration)):
             self.gaussians.oneupSHdegree()
             self.gaussians.limit_columns()
         if step.iteration - 1 == self.plan.debug_from:
             self.pipe.debug = True
         self._decode_ahead(step.iteration)
 
+    def set_rates(self, step: Step) -> None:
+        """Set the learning rates of a step, which may be one that is repeated."""
+        self.gaussians.update_learning_rate(self.pace.nominal(step.iteration))
+
     def _decode_ahead(self, iteration: int) -> None:
-        ahead = min(self.scene.images.ahead, self.opt.iterations - iteration + 1)
+        ahead = self.scene.images.ahead
+        if (last := self.pace.ends) is not None:
+            ahead = min(ahead, last - iteration + 1)
         self.scene.prefetch(self.views.coming(iteration, ahead))
 
     def render_options(self, step: Step) -> dict[str, bool]:

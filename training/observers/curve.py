@@ -32,8 +32,9 @@ class Curve(Observer):
             lambda cameras: self._load(cameras, views),
             lambda cameras: views.scores(cameras, run.gaussians),
             run.device,
+            run.pace.nominal(run.first_iteration),
         )
-        self._due = False
+        self._due, self._length = False, run.pace.length
         self._seconds = 0.0
 
     def _load(self, cameras: Sequence[Camera], views: ScoredViews) -> None:
@@ -42,14 +43,19 @@ class Curve(Observer):
             views.load(camera)
 
     def due(self, step: Step) -> bool:
-        self._due = self._recorder.due(step.iteration, self._run.clock.seconds)
+        self._due = bool(step.span) and self._recorder.due(self._point(step), self._run.clock.seconds)
         return self._due
 
+    def _point(self, step: Step) -> int:
+        """The iteration of the schedule that a step's score is one of."""
+        points = [iteration for iteration in step.span if self._recorder.is_point(iteration)]
+        return (points or step.span)[-1]
+
     def measured(self, step: Step, losses: Losses) -> None:
-        if self._due:
+        if self._due or step.last:
             self._seconds = self._run.clock.seconds
             with self._run.clock.paused("scoring"):
-                self._recorder.add(step.iteration, self._seconds, len(self._run.gaussians))
+                self._recorder.add(self._point(step), self._seconds, len(self._run.gaussians), step.iteration)
 
     def ended(self, error: Error) -> None:
         if error is not None:

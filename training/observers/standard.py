@@ -15,6 +15,8 @@ from training.observers.progress import ProgressBar
 from training.observers.records import Records
 from training.observers.report import Report
 from training.observers.saves import Checkpoints, Saves
+from training.observers.schedule import ScheduleFile
+from training.pacing.pace import Paced
 from training.run import Run
 
 
@@ -35,5 +37,6 @@ def standard_observers(run: Run, writer: Any | None, report: Callable[..., dict[
         *([NetworkViewer(run)] if network_gui.listener else []),  # after all that write: it may make training wait
         MemoryGuard(run),  # from `measured` to `stepped` the model changes; otherwise it is whole
         checkpoints,  # writes the whole state after the step
+        *([ScheduleFile(run)] if isinstance(run.pace, Paced) else []),
         *([PageObserver(run, checkpoints)] if run.plan.viewer else []),  # last: may let the training wait
     ]

@@ -35,7 +35,7 @@ class AheadStep:
         if step.due or not self._able(step):
             self._unknown = True
             self._ahead.settle()  # nothing is pending, unless --debug_from has just come into force
-            self._run.gaussians.update_learning_rate(step.iteration)
+            self._run.set_rates(step)
             return self._fused.take(step, tell)
         losses: list[Losses] = []
         queued = self._ahead.take(
@@ -46,7 +46,7 @@ class AheadStep:
         )
         if queued:
             return tell.measured(step, losses[0])
-        self._run.gaussians.update_learning_rate(step.iteration)
+        self._run.set_rates(step)
         self._fused.plain.take(step, tell)
 
     def make_ready(self, step: Step) -> None:
@@ -112,7 +112,7 @@ class AheadStep:
 
     def _repeat(self, step: Step, first: Losses) -> None:
         """Queue a step once more; the losses that the observers hold get its values."""
-        self._run.gaussians.update_learning_rate(step.iteration)
+        self._run.set_rates(step)
         losses: list[Losses] = []
         self._queue(step, losses)
         self._copy(losses[0], first)
