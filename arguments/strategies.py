@@ -18,6 +18,22 @@ PACE_OPTIONS: tuple[Option, ...] = (
         check=at_least(0),
     ),
     Option(
+        "resolution_schedule",
+        "none",
+        "smaller views at first, so that the first iterations take less time. pyramid: a quarter of the size up to "
+        "10 % of the schedule, half of it up to 25 %; spectrum: sizes by how fine the photos' detail is",
+        "ours",
+        check=one_of("none", "pyramid", "spectrum"),
+    ),
+    Option(
+        "target_psnr",
+        0.0,
+        "stop, and save, once the mean PSNR (dB) of the test views (--eval) is at least this; 0: no target. They are "
+        "scored every 100 iterations, or every 20 times their number if that is more",
+        "ours",
+        check=at_least(0),
+    ),
+    Option(
         "schedule",
         "",
         "schedule.json of a run with --time_budget: train as that run did, without looking at the clock",

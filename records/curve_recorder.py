@@ -142,7 +142,9 @@ class CurveRecorder:
                 tqdm.write(f"warning: {error}; training continues without its curve", file=sys.stderr)
             self._warned = True
 
-    def finish(self, seconds: float, saved: Container[int], position_lr_max_steps: int, follows_length: bool) -> None:
+    def finish(
+        self, seconds: float, saved: Container[int], position_lr_max_steps: int | None, follows_length: bool
+    ) -> None:
         """Wait for the figure, print the curve's cost beside `seconds` of training in this run, and give `peak_advice`.
 
         The log's last record gets the costs: `curve_scoring_seconds`, `curve_writing_seconds` (of the file),

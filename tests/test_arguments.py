@@ -75,6 +75,8 @@ OURS = {
     "seed": 0,
     "strategy": "adc",
     "time_budget": 0.0,
+    "resolution_schedule": "none",
+    "target_psnr": 0.0,
     "schedule": "",
 }
 
@@ -142,6 +144,8 @@ def test_short_forms_and_unique_prefixes():
         ("seed", "-1"),
         ("optimizer_type", "sgd"),
         ("strategy", "mine"),
+        ("resolution_schedule", "fine"),
+        ("target_psnr", "-3"),
         ("time_budget", "-1"),
         ("time_budget", "inf"),
         ("exposure_lr_init", "-0.1"),

@@ -28,7 +28,7 @@ def _stdout(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def _fresh(length: int, budget: float) -> Clocked:
-    return Clocked(Schedule(length, [], None, budget))
+    return Clocked(Schedule(length, [], None, budget, levels=()))
 
 
 def _run(pace: Pace, cost: Callable[[int, int], float], first: int = 0, seconds: float = 0.0) -> tuple[int, float]:
@@ -134,7 +134,7 @@ GOOD = {
     "blocks": [
         {"last": 2, "seconds": 0.0, "start": 0.0, "step": 0.1}, {"last": 10, "seconds": 1.0, "start": 0.2, "step": 0.1}
     ],
-    "ended": 10, "iterations": 100, "time_budget": 5.0,
+    "ended": 10, "iterations": 100, "time_budget": 5.0, "resolution_schedule": "none", "levels": [],
 }  # fmt: skip
 
 
@@ -263,3 +263,87 @@ def test_a_budgeted_training_replays_and_resumes_to_the_byte(colmap_scene, tmp_p
     monkeypatch.undo()
     assert _train(colmap_scene, tmp_path / "both", *every, "--schedule", on / "schedule.json") == went_on
     assert "Training complete" in capsys.readouterr().out
+
+
+def test_training_stops_at_the_target_with_the_model_that_was_scored(colmap_scene, tmp_path, monkeypatch, capsys):
+    from training.observers import target
+
+    monkeypatch.setattr(target, "EVERY", 10)
+    monkeypatch.setattr(target, "PER_VIEW", 1)
+    whole, stopped, again = (tmp_path / name for name in ("whole", "stopped", "again"))
+    more = "--iterations", 120, "--prune_sh", -1, "--keep_unseen", "--save_iterations", *range(10, 120, 10)
+    saved = _train(colmap_scene, whole, *more, "--target_psnr", 99)
+    records = json.loads((whole / "train_log.json").read_text())
+    assert any("and --target_psnr 99 was not reached" in line for line in records[-1]["lines"])
+    scores = {record["iteration"]: record["test_views_psnr"] for record in records if "test_views_psnr" in record}
+    assert list(scores) == list(range(10, 130, 10)) and scores[60] > scores[10]
+    wanted = 0.5 * (scores[30] + scores[60])
+    end = next(iteration for iteration, psnr in scores.items() if psnr >= wanted)
+    assert 30 < end < 120
+    early = _train(colmap_scene, stopped, *more, "--target_psnr", wanted)
+    assert max(early) == end and early == {t: ply for t, ply in saved.items() if t <= end}
+    assert f"Trained {end} iterations" in capsys.readouterr().out
+    # With a time budget, whichever comes first; the schedule then says where the run ended.
+    _timed(monkeypatch, lambda t: 0.1)
+    early = _train(colmap_scene, again, "--time_budget", 20, "--target_psnr", wanted, "--plain_step")
+    ended = json.loads((again / "schedule.json").read_text())["ended"]
+    assert ended == max(early) < 200 and ended % 10 == 0
+    monkeypatch.undo()
+    replayed = _train(colmap_scene, tmp_path / "replayed", "--schedule", again / "schedule.json")
+    assert replayed == {t: ply for t, ply in early.items() if t == ended}
+
+
+def test_a_target_needs_test_views(colmap_scene, tmp_path):
+    words = ["-s", colmap_scene, "-m", tmp_path / "out", "--iterations", 5, "--target_psnr", 20, "--disable_viewer"]
+    with pytest.raises(
+        UserError, match="^--target_psnr needs held-out views to score, and there are none; give --eval"
+    ):
+        train.main(list(map(str, words)))
+    assert not (tmp_path / "out").exists()
+
+
+def test_what_contradicts_itself_is_refused(colmap_scene, tmp_path):
+    path = tmp_path / "schedule.json"
+
+    def refused(reason: str, *more: object) -> None:
+        with pytest.raises(UserError, match=reason):
+            _train(colmap_scene, tmp_path / "out", "--schedule", path, *more)
+
+    refused("cannot read .*schedule.json")
+    path.write_text(json.dumps(GOOD))
+    refused("give --iterations 100, as in the run that wrote it")
+    more = "--iterations", 100
+    refused("--time_budget and --schedule both give the pace", *more, "--time_budget", 3)
+    refused("is of a run with --resolution_schedule none; leave that", *more, "--resolution_schedule", "pyramid")
+    path.write_text(json.dumps(GOOD | {"ended": None}))
+    refused("is of a run that did not end", *more)
+    path.write_text("{}")
+    refused("'iterations' is missing", *more)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_checkpoint_finds_its_place_or_is_refused(colmap_scene, tmp_path, monkeypatch, capsys):
+    steady, clocked = tmp_path / "steady", tmp_path / "clocked"
+    _train(colmap_scene, steady, "--iterations", 60, "--checkpoint_iterations", 30)
+    start = "--start_checkpoint", steady / "chkpnt30.pth"
+    _timed(monkeypatch, lambda t: 0.1)
+    saved = _train(colmap_scene, clocked, "--iterations", 60, *start, "--time_budget", 5, "--checkpoint_iterations", 59)
+    first = json.loads((clocked / "schedule.json").read_text())["blocks"][0]
+    assert first["last"] == 30 and first["step"] == 1 / 60  # half of the schedule is done
+    assert max(saved) in (79, 80, 81)
+    (checkpoint,) = clocked.glob("chkpnt*.pth")
+    capsys.readouterr()
+    _train(colmap_scene, tmp_path / "on", "--iterations", 120, "--start_checkpoint", checkpoint)
+    assert "is of a run with --time_budget, and this one has none" in capsys.readouterr().err
+    for reason, more in (
+        ("of a schedule of 60 iterations, not 61", ("--iterations", 61, "--time_budget", 9)),
+        ("with --resolution_schedule none; resume", ("--iterations", 60, "--time_budget", 9, "--resolution_schedule",
+                                                     "pyramid")),
+    ):  # fmt: skip
+        with pytest.raises(UserError, match=reason):
+            _train(colmap_scene, tmp_path / "out", "--start_checkpoint", checkpoint, *more)
+    (steady / "schedule.json").write_text(json.dumps(GOOD | {"iterations": 60}))
+    with pytest.raises(UserError, match="ends before iteration 30 of .*chkpnt30.pth, so it is of another run"):
+        _train(colmap_scene, tmp_path / "out", "--iterations", 60, *start, "--time_budget", 9)
+    _train(colmap_scene, steady, "--iterations", 5)
+    assert not (steady / "schedule.json").exists()  # it was of another training

@@ -52,6 +52,12 @@ def _report_cameras_apart(info: SceneInfo) -> None:
         )
 
 
+def check_target(target_psnr: float, test_views: int) -> None:
+    """Refuse a target for test views that are not there (UserError)."""
+    if target_psnr and not test_views:
+        raise UserError("--target_psnr needs held-out views to score, and there are none; give --eval")
+
+
 def check_exposures(gaussians: GaussianModel, train_test_exp: bool, checkpoint: str) -> None:
     """Refuse a checkpoint with exposures that this run would not use (UserError); report the opposite case."""
     if gaussians.exposures.trained and not train_test_exp:

@@ -15,12 +15,14 @@ from scene import Scene
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.checkpoint import load_checkpoint
 from scene.options import option
-from training.checks import check_exposures, check_scene, warn_of_late_reset
+from training.checks import check_exposures, check_scene, check_target, warn_of_late_reset
 from training.history import check_folder, continue_records, report_changes
 from training.loss_watch import LossWatch
 from training.memory_estimate import announce_memory
 from training.objective import Objective
-from training.pacing.choose import pace_of
+from training.pacing import schedule_file
+from training.pacing.choose import pace_of, resolution_of
+from training.pacing.pace import Paced
 from training.plan import Plan
 from training.step import Step
 from training.strategies.choose import density_control
@@ -64,7 +66,9 @@ class Run:
         else:
             self.scene, self._first = Scene(dataset, self.gaussians, shuffle=False, start=False), None
         check_scene(self.scene.info)
+        check_target(opt.target_psnr, len(self.scene.getTestCameras()))
         self.views = ViewOrder(self.scene.getTrainCameras(), opt.seed)
+        self.resolution = resolution_of(opt, self.pace, self.scene.getTrainCameras(), self.scene.images)
         self._decode_ahead(self.first_iteration + 1)
         self._start(capture)
         saves = self.pace.known(plan.save)
@@ -109,6 +113,8 @@ class Run:
         folder, start = self.scene.model_path, self.plan.start
         if not start or not (Path(folder) / "cameras.json").exists():
             self.scene.write_inputs()
+        if not start and not isinstance(self.pace, Paced):
+            (Path(folder) / schedule_file.NAME).unlink(missing_ok=True)  # of an earlier training
         announce_memory(self.scene, self.gaussians, self.opt.max_num_splats)
         self.log, self.rows = continue_records(folder, start, self.first_iteration)
         self.losses = LossWatch(self.log.loss)
@@ -117,15 +123,16 @@ class Run:
     def steps(self) -> Iterator[Step]:
         """The iterations of this run."""
         for iteration in count(self.first_iteration + 1):
-            seconds, pace, camera = self.clock.seconds, self.pace, self.views[iteration]
+            seconds, pace = self.clock.seconds, self.pace
             pace.reach(iteration, self.log.seconds_before + seconds)
+            camera = self.resolution.view(self.views[iteration], pace.nominal(iteration))
             step = Step(
                 iteration,
                 last=False,
                 camera=camera,
                 background=self._background(iteration),
                 depth_weight=self._depth_weight(pace.nominal(iteration)) if camera.depth_reliable else 0.0,
-                changes=self.density.changes(iteration) or self._raises_degree(iteration) > 0,
+                changes=self._changes(iteration),
                 started=seconds,
                 span=pace.span(iteration),
             )
@@ -136,6 +143,10 @@ class Run:
                 self.first_done = seconds_since_start()
             if step.last:
                 return
+
+    def _changes(self, iteration: int) -> bool:
+        resizes = self.resolution.changes(*map(self.pace.nominal, (iteration - 1, iteration)))
+        return self.density.changes(iteration) or self._raises_degree(iteration) > 0 or resizes
 
     def _raises_degree(self, iteration: int) -> int:
         """How often the SH degree is raised in an iteration."""
@@ -166,7 +177,7 @@ class Run:
         ahead = self.scene.images.ahead
         if (last := self.pace.ends) is not None:
             ahead = min(ahead, last - iteration + 1)
-        self.scene.prefetch(self.views.coming(iteration, ahead))
+        self.scene.prefetch(list(filter(self.resolution.needs, self.views.coming(iteration, ahead))))
 
     def render_options(self, step: Step) -> dict[str, bool]:
         """Options of `render` that make it compute what this step's loss needs, and no more."""

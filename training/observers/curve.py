@@ -9,6 +9,7 @@ from records.curve_recorder import CurveRecorder, evenly_spread
 from scene.cameras import Camera
 from training.objective import Losses
 from training.observer import Error, Observer
+from training.pacing.pace import Paced
 from training.run import Run
 from training.step import Step
 from utils.system_utils import saved_iterations
@@ -34,7 +35,7 @@ class Curve(Observer):
             run.device,
             run.pace.nominal(run.first_iteration),
         )
-        self._due, self._length = False, run.pace.length
+        self._due = False
         self._seconds = 0.0
 
     def _load(self, cameras: Sequence[Camera], views: ScoredViews) -> None:
@@ -62,6 +63,8 @@ class Curve(Observer):
             self._recorder.abandon()
             return
         run = self._run
-        saved = {*run.plan.save} & {*saved_iterations(Path(run.scene.model_path) / "point_cloud")}
+        there = saved_iterations(Path(run.scene.model_path) / "point_cloud")
+        saved, lr_max_steps = {*run.pace.known(run.plan.save)} & {*there}, run.opt.position_lr_max_steps
         follows_length = schedules_follow_length(bool(run.dataset.depths), run.dataset.train_test_exp)
-        self._recorder.finish(self._seconds, saved, run.opt.position_lr_max_steps, follows_length)
+        steady = not isinstance(run.pace, Paced)
+        self._recorder.finish(self._seconds, saved, lr_max_steps if steady else None, follows_length)

@@ -62,7 +62,7 @@ class Report(Observer):
             run.scene, render, (run.pipe, run.background), run.dataset.train_test_exp,
         )  # fmt: skip
         if scores:
-            step.record = scores
+            step.record = (step.record or {}) | scores
 
     def ended(self, error: Error) -> None:
         if self._writer and error is None:

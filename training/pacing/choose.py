@@ -2,11 +2,16 @@
 
 import argparse
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
+from scene.cameras import Camera
+from scene.pictures.store import ImageStore
 from training.pacing.clocked import Clocked
 from training.pacing.pace import Block, Pace, Paced, Schedule
+from training.pacing.resolution import PYRAMID, Levels, Resolution
 from training.pacing.schedule_file import NAME, read_schedule
+from training.pacing.spectrum import levels_of
 from utils.system_utils import UserError
 
 
@@ -40,7 +45,7 @@ def _chosen(opt: argparse.Namespace, checkpoint: str | None, first_iteration: in
             )
         return Pace(opt.iterations)
     if not path:
-        return Clocked(Schedule(opt.iterations, [], None, opt.time_budget))
+        return Clocked(Schedule(opt.iterations, [], None, opt.time_budget, opt.resolution_schedule))
     return Clocked(_before(path, checkpoint, opt, first_iteration)._replace(time_budget=opt.time_budget))
 
 
@@ -48,6 +53,11 @@ def _recorded(path: Path, opt: argparse.Namespace) -> Schedule:
     if opt.time_budget:
         raise UserError("--time_budget and --schedule both give the pace of a run; leave one out")
     found = _read(path, opt)
+    if opt.resolution_schedule not in ("none", found.resolution_schedule):
+        raise UserError(
+            f"{path} is of a run with --resolution_schedule {found.resolution_schedule}; leave that option out, as "
+            "--schedule takes it from there"
+        )
     if found.ended is None:
         raise UserError(f"{path} is of a run that did not end; resume that run, or name the {NAME} of another one")
     return found
@@ -67,13 +77,32 @@ def _before(path: Path, checkpoint: str, opt: argparse.Namespace, first_iteratio
     """The schedule so far of the runs that are resumed; one block if they had no budget."""
     if not path.exists():
         step = 1.0 / max(opt.iterations, first_iteration + 1)
-        return Schedule(opt.iterations, [Block(first_iteration, 0.0, step, 0.0)], None, 0.0)
+        return Schedule(opt.iterations, [Block(first_iteration, 0.0, step, 0.0)], None, 0.0, opt.resolution_schedule)
     found = _read(path, opt)
     if found.blocks[-1].last < first_iteration:
         raise UserError(
             f"{path} ends before iteration {first_iteration} of {checkpoint}, so it is of another run; move it "
             "elsewhere to resume that checkpoint as one of a run without a time budget"
         )
+    if found.resolution_schedule != opt.resolution_schedule:
+        raise UserError(
+            f"{checkpoint} is of a run with --resolution_schedule {found.resolution_schedule}; resume it with that"
+        )
     if found.ended == first_iteration:
         return found
     return Paced(found).up_to(first_iteration)
+
+
+def resolution_of(opt: argparse.Namespace, pace: Pace, cameras: Sequence[Camera], images: ImageStore) -> Resolution:
+    """The sizes of the training views `cameras` by the options, or by the schedule that a run repeats or resumes."""
+    if isinstance(pace, Paced):
+        if pace.schedule.levels is None:
+            pace.schedule = pace.schedule._replace(levels=_levels(opt, cameras))
+        return Resolution(pace.schedule.levels, pace.length, images)
+    return Resolution(_levels(opt, cameras), pace.length, images)
+
+
+def _levels(opt: argparse.Namespace, cameras: Sequence[Camera]) -> Levels:
+    if opt.resolution_schedule == "spectrum":
+        return levels_of(cameras)
+    return PYRAMID if opt.resolution_schedule == "pyramid" else ()

@@ -22,6 +22,7 @@ class Clocked(Paced):
 
     def __init__(self, schedule: Schedule) -> None:
         super().__init__(schedule)
+        self._budget = schedule.time_budget
         self._speed: float | None = None  # seconds of an iteration
         self._measured = 0  # blocks of this run
         self._first = self.blocks[-1].last if self.blocks else 0
@@ -47,7 +48,7 @@ class Clocked(Paced):
     def _decide(self, seconds: float) -> None:
         """Add the block that comes next."""
         before = self.blocks[-1].last if self.blocks else 0
-        done, left = self.progress(before), self.budget - seconds
+        done, left = self.progress(before), self._budget - seconds
         count, final = self._count(left)
         if final:
             step = (1.0 - done) / count
@@ -59,8 +60,8 @@ class Clocked(Paced):
         self.blocks.append(Block(before + count, done, step, round(seconds, 6)))
         if final and self._measured <= 1:
             tqdm.write(
-                f"warning: --time_budget {self.budget:g} is too short for {self.ends + 1} iterations, so training ends "
-                f"with iteration {self.ends}; give more seconds, or lower --resolution (-r)",
+                f"warning: --time_budget {self._budget:g} is too short for {self.ends + 1} iterations, so training "
+                f"ends with iteration {self.ends}; give more seconds, or lower --resolution (-r)",
                 file=sys.stderr,
             )
 
@@ -74,7 +75,7 @@ class Clocked(Paced):
         if self._measured == 1:
             return 1, iterations < 0.5
         previous = self.blocks[-1].last - self._last(len(self.blocks) - 1)
-        block = max(1.0, min(_MOST_GROWTH * previous, PART * self.budget / self._speed))
+        block = max(1.0, min(_MOST_GROWTH * previous, PART * self._budget / self._speed))
         if iterations < _LAST * block:
             return max(1, int(iterations + 0.5)), True
         return int(block), False

@@ -72,6 +72,8 @@ class Schedule(NamedTuple):
     blocks: list[Block]
     ended: int | None  # the last iteration, None if the run has not ended
     time_budget: float  # seconds
+    resolution_schedule: str = "none"
+    levels: Sequence[tuple[float, float]] | None = None  # training/pacing/resolution.py; None: not decided yet
 
 
 class Paced(Pace):
@@ -79,9 +81,9 @@ class Paced(Pace):
 
     def __init__(self, schedule: Schedule) -> None:
         super().__init__(schedule.iterations)
+        self.schedule = schedule
         self.blocks = list(schedule.blocks)
         self.ends = schedule.ended
-        self.budget = schedule.time_budget
 
     def progress(self, iteration: int) -> float:
         """Part of the schedule that is done after an iteration, 0 to 1."""
@@ -107,13 +109,13 @@ class Paced(Pace):
         """The schedule of a run that has taken an iteration. last: it ended with it."""
         if last:
             return self.up_to(iteration)._replace(ended=iteration)
-        return Schedule(self.length, self.blocks, self.ends, self.budget)
+        return self.schedule
 
     def up_to(self, iteration: int) -> Schedule:
         """The schedule of a run that went no further than an iteration."""
         index, block = self._block(iteration)
         blocks = [*self.blocks[:index], block._replace(last=iteration)]
-        return Schedule(self.length, blocks, None, self.budget)
+        return self.schedule._replace(blocks=blocks, ended=None)
 
     def _block(self, iteration: int) -> tuple[int, Block]:
         index = bisect_left(self.blocks, iteration, key=lambda block: block.last)

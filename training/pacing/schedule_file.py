@@ -46,7 +46,11 @@ def _schedule(content: Any) -> Schedule:
         raise ValueError("its progress does not ascend")
     if ended is not None and _whole(ended, 1) != lasts[-1]:
         raise ValueError("its last block does not end with its last iteration")
-    schedule = Schedule(length, blocks, ended, _number(content["time_budget"], 0.0))
+    levels = [(_number(part, 0.0), _number(factor, 1.0)) for part, factor in content["levels"]]
+    if levels != sorted(levels):
+        raise ValueError("its levels do not ascend")
+    named = str(content["resolution_schedule"]), levels
+    schedule = Schedule(length, blocks, ended, _number(content["time_budget"], 0.0), *named)
     if max(map(Paced(schedule).progress, lasts)) > 1 + 1e-6:
         raise ValueError("its progress goes beyond its end")
     return schedule

@@ -39,7 +39,7 @@ class AheadStep:
             return self._fused.take(step, tell)
         losses: list[Losses] = []
         queued = self._ahead.take(
-            step.camera.uid,
+            _view(step),
             lambda: self._queue(step, losses),
             lambda: self._repeat(step, losses[0]),
             lambda: self._fused.measure(step),
@@ -88,7 +88,7 @@ class AheadStep:
         """Queue a step and append its losses, unless its loss has further terms."""
         taken = self._recorded.take(step)
         if taken is None:
-            with self._ahead.room(step.camera.uid):
+            with self._ahead.room(_view(step)):
                 taken = self._queue_calls(step)
         else:
             self._run.density.after_step(step)
@@ -116,3 +116,8 @@ class AheadStep:
         losses: list[Losses] = []
         self._queue(step, losses)
         self._copy(losses[0], first)
+
+
+def _view(step: Step) -> tuple[int, int]:
+    """What the room that a step needs depends on."""
+    return step.camera.uid, step.camera.image_width
