@@ -8,11 +8,17 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+import torch
 
 import train
 from records.training_log import Stopwatch
+from scene.gaussian_model import GaussianModel
 from scene.gaussians import density_rules as rules
+from scene.gaussians.checkpoint import load_checkpoint
 from training import loop
+from training.observer import Announcer
+from training.observers import target
+from training.observers.schedule import ScheduleFile
 from training.pacing.clocked import Clocked
 from training.pacing.pace import Block, Pace, Paced, Schedule
 from training.pacing.schedule_file import read_schedule, write_schedule
@@ -266,8 +272,6 @@ def test_a_budgeted_training_replays_and_resumes_to_the_byte(colmap_scene, tmp_p
 
 
 def test_training_stops_at_the_target_with_the_model_that_was_scored(colmap_scene, tmp_path, monkeypatch, capsys):
-    from training.observers import target
-
     monkeypatch.setattr(target, "EVERY", 10)
     monkeypatch.setattr(target, "PER_VIEW", 1)
     whole, stopped, again = (tmp_path / name for name in ("whole", "stopped", "again"))
@@ -347,3 +351,59 @@ def test_a_checkpoint_finds_its_place_or_is_refused(colmap_scene, tmp_path, monk
         _train(colmap_scene, tmp_path / "out", "--iterations", 60, *start, "--time_budget", 9)
     _train(colmap_scene, steady, "--iterations", 5)
     assert not (steady / "schedule.json").exists()  # it was of another training
+
+
+def test_a_slow_start_does_not_end_a_short_run():
+    last, seconds = _run(_fresh(30_000, 1.0), lambda t, n: 0.6 if t == 1 else 0.001)
+    assert seconds == pytest.approx(1.0, rel=0.03) and last > 300
+
+
+def test_a_paced_run_goes_through_rates_degrees_and_windows(colmap_scene, tmp_path, monkeypatch):
+    """40 iterations stand for 4000: the first tenth of the run for the first 400."""
+    path, rates, seen = tmp_path / "schedule.json", [], []
+    blocks = [Block(20, 0.0, 0.02, 0.0), Block(40, 0.4, 0.03, 0.0)]
+    write_schedule(path, Schedule(4000, blocks, 40, 0.0, levels=()))
+    update, begin = GaussianModel.update_learning_rate, GaussianModel.densify_and_prune
+
+    def rate(self, iteration: int) -> float:
+        rates.append(update(self, iteration))
+        seen.append((iteration, self.active_sh_degree))
+        return rates[-1]
+
+    def densify(self, *args, **options):
+        grown.append(options["iteration"])
+        return begin(self, *args, **options)
+
+    grown, steps, begins = [], [], Announcer.begins
+    monkeypatch.setattr(GaussianModel, "update_learning_rate", rate)
+    monkeypatch.setattr(GaussianModel, "densify_and_prune", densify)
+    monkeypatch.setattr(Announcer, "begins", lambda self, step: steps.append(step) or begins(self, step))
+    options = "--position_lr_max_steps", 4000, "--densify_from_iter", 400, "--densify_until_iter", 2000
+    _train(colmap_scene, tmp_path / "out", "--schedule", path, "--iterations", 4000, *options)
+    assert [iteration for iteration, _ in seen] == [*range(80, 1601, 80), *range(1720, 4001, 120)]
+    assert rates[-1] == pytest.approx(rates[0] / 100 * 100 ** (80 / 4000), rel=1e-6)
+    assert grown == [10, 15, 20]  # every fifth iteration within the window
+    assert [step.iteration for step in steps if step.changes] == [10, 13, 15, 20, 24, 32, 40]
+    assert [t for t in range(1, 40) if seen[t][1] > seen[t - 1][1]] == [13, 24, 32]  # after 1000, 2000 and 3000
+
+
+def test_a_checkpoint_comes_with_its_schedule_and_the_last_one_is_the_end(colmap_scene, tmp_path, monkeypatch):
+    _timed(monkeypatch, lambda t: 0.1)
+    with monkeypatch.context() as killed:
+        killed.setattr(ScheduleFile, "ended", lambda *_: None)  # as if the process were killed before
+        _train(colmap_scene, tmp_path, "--time_budget", 4, "--checkpoint_iterations", 3000)
+    (checkpoint,) = tmp_path.glob("chkpnt*.pth")
+    assert read_schedule(tmp_path / "schedule.json").ended == int(checkpoint.stem[6:])
+    with pytest.raises(UserError, match="and its schedule ends with .*, so nothing is left to do"):
+        _train(colmap_scene, tmp_path / "on", "--time_budget", 4, "--start_checkpoint", checkpoint)
+
+
+def test_an_iteration_that_becomes_the_last_takes_no_step(colmap_scene, tmp_path, monkeypatch):
+    monkeypatch.setattr(target, "EVERY", 7)
+    monkeypatch.setattr(target, "PER_VIEW", 1)
+    states = []
+    for name in ("fused", "plain"):
+        more = ["--plain_step"] if name == "plain" else []
+        _train(colmap_scene, tmp_path / name, "--target_psnr", 1, "--checkpoint_iterations", 100, *more)
+        states.append(load_checkpoint(tmp_path / name / "chkpnt7.pth")[0])
+    assert torch.equal(states[0][1], states[1][1]) and states[0][10]["state"][0]["step"].item() == 6
