@@ -1,4 +1,4 @@
-"""Levels of resolution by the photos' spectrum (Chen et al. 2025, DashGaussian, section 4: resolution by frequency)."""
+"""Levels of resolution by the photos' spectrum (the idea of Chen et al. 2025, DashGaussian)."""
 
 from collections.abc import Sequence
 
@@ -9,7 +9,7 @@ from scene.cameras import Camera
 from training.pacing.resolution import Levels
 
 FACTORS = (4.0, 3.0, 2.0, 1.5, 1.0)  # few, because a CUDA graph is recorded for each size
-UNTIL = 0.5  # part of the schedule by which views would have their full size if all detail were the finest
+UNTIL = 0.5  # part of the schedule by which views have their full size at the latest
 _SAMPLE = 8  # photos that are looked at
 _DECIMALS = 3  # of a part, so that the last bits of a Fourier transform decide nothing
 
@@ -19,8 +19,8 @@ def levels_of(cameras: Sequence[Camera]) -> Levels:
 
     The detail of a photo is the sum of the amplitudes of its frequencies, and a photo that is smaller by a factor keeps
     those below 1 / (2 factor) cycles per pixel in both directions. So a quarter of the size trains for longer where
-    photos are smooth. The parts are means over some photos, and the schedule is its first half (UNTIL). The paper gives
-    each frequency band a share of all iterations, and raises the resolution in steps that need not be few.
+    photos are smooth. The parts are means over some photos, and the schedule is its first half (UNTIL). The rule is
+    our own.
     """
     views = [camera for camera in cameras if isinstance(camera, Camera)]
     views = views[:: max(1, len(views) // _SAMPLE)][:_SAMPLE]
