@@ -13,12 +13,13 @@ def schedules_follow_length(depths: bool, train_test_exp: bool) -> bool:
 
 
 def peak_advice(
-    rows: list[Row], saved: Container[int], position_lr_max_steps: int, follows_length: bool = False
+    rows: list[Row], saved: Container[int], position_lr_max_steps: int | None, follows_length: bool = False
 ) -> str | None:
     """A line that names the iteration with the best test views; None unless they were clearly worse in the last row.
 
     Rows that score a subset of the views do not count. saved: iterations whose PLY this training has written.
-    follows_length: `schedules_follow_length`.
+    follows_length: `schedules_follow_length`. position_lr_max_steps: None for a run whose pace is not steady, of which
+    no other length ends with that model.
 
     A PLY is written before its iteration's step, so a saved one is the model that was scored; its exposures are those
     of the last save. A training of fewer --iterations ends with the same model, unless a schedule follows its length.
@@ -38,11 +39,13 @@ def peak_advice(
         line += f" (train views {best['train_psnr']:.2f} there, {rows[-1]['train_psnr']:.2f} at the end)"
     if iteration in saved:
         line += f"; that model is saved, use it with render.py --iteration {iteration}"
+    elif position_lr_max_steps is None:
+        return line
     elif follows_length:
         line += f"; --save_iterations {iteration} saves that model during the training"
     else:
         line += f"; --iterations {iteration} ends with that model, --save_iterations {iteration} also saves it"
-    if iteration < position_lr_max_steps:
+    if position_lr_max_steps is not None and iteration < position_lr_max_steps:
         length = f"--iterations {iteration} " if follows_length else ""
         line += (
             f"; {length}--position_lr_max_steps {iteration} {'' if follows_length else 'as well '}is a different "

@@ -39,7 +39,8 @@ def drawn(views: Sequence[View], count: int) -> list[View]:
 class CurveRecorder:
     """Scores views in the iterations of a schedule, keeps the curve's file up to date, and draws it at the end.
 
-    rows: those of the runs that this one resumes; `log` has their seconds. iterations: the last one; always: those
+    rows: those of the runs that this one resumes; `log` has their seconds. Iterations are those of the schedule, which
+    are those of the run unless `add` says otherwise. first: done already. iterations: the last one; always: those
     that score all views, as the last one does; the others score a fixed part of each set (`subset_size`, `drawn`).
     views: those to score, by set, "test" and "train". load(views) decodes their photos; scores(views) gives their mean
     scores by name. If the file cannot be written, one warning says so and the next point
@@ -57,6 +58,7 @@ class CurveRecorder:
         load: Callable[[Sequence[View]], None],
         scores: Callable[[Sequence[View]], dict[str, float]],
         device: torch.device,
+        first: int | None = None,
     ) -> None:
         self.rows = rows
         self._folder = Path(model_path)
@@ -67,7 +69,8 @@ class CurveRecorder:
         self._views, self._subset = views, {name: drawn(of_set, size) for name, of_set in views.items()}
         self._size = size if size < most else None
         self._count, count = (sum(map(len, sets.values())) for sets in (self._views, self._subset))
-        self._schedule = CurveSchedule(log.first_iteration, iterations, always, self._count, count)
+        self._first = log.first_iteration if first is None else first
+        self._schedule = CurveSchedule(self._first, iterations, always, self._count, count)
         self._iterations = iterations
         self._load = load
         self._scores = scores
@@ -78,9 +81,13 @@ class CurveRecorder:
         self._drawer = CurveDrawer()
         self._ahead = AHEAD if cores() >= MANY_CORES else 0.0
 
+    def is_point(self, iteration: int) -> bool:
+        """Whether an iteration may be scored."""
+        return self._schedule.has(iteration)
+
     def due(self, iteration: int, seconds: float) -> bool:
         """Whether to `add` a point after `seconds` of training in this run; if so, it waits for the GPU."""
-        pace = seconds / max(iteration - self._log.first_iteration, 1)
+        pace = seconds / max(iteration - self._first, 1)
         if pace * (self._iterations - iteration) <= self._ahead:
             self._drawer.begin()
         due = self._schedule.due(iteration, seconds)
@@ -88,15 +95,16 @@ class CurveRecorder:
             torch.cuda.synchronize(self._device)
         return due
 
-    def add(self, iteration: int, seconds: float, gaussians: int) -> None:
+    def add(self, iteration: int, seconds: float, gaussians: int, trained: int | None = None) -> None:
         """Score after `seconds` of training in this run, and write the curve with the new point.
 
-        With the last one, it is being drawn from then on until `finish`.
+        With the last one, it is being drawn from then on until `finish`. trained: iteration of the run, where that is
+        another one.
         """
         # The peaks of log and curve, because after a rescue the curve has rows beyond the log's last record.
         peaks = [self._log.peak_memory_mib(), *(row["peak_memory_mib"] for row in self.rows[-1:])]
         row = dict.fromkeys(COLUMNS) | {
-            "iteration": iteration,
+            "iteration": iteration if trained is None else trained,
             "seconds": round(self._log.seconds_before + seconds, 3),
             "wall_seconds": round(self._log.wall_seconds_before + wall_seconds(), 3),
             "gaussians": gaussians,
@@ -134,7 +142,9 @@ class CurveRecorder:
                 tqdm.write(f"warning: {error}; training continues without its curve", file=sys.stderr)
             self._warned = True
 
-    def finish(self, seconds: float, saved: Container[int], position_lr_max_steps: int, follows_length: bool) -> None:
+    def finish(
+        self, seconds: float, saved: Container[int], position_lr_max_steps: int | None, follows_length: bool
+    ) -> None:
         """Wait for the figure, print the curve's cost beside `seconds` of training in this run, and give `peak_advice`.
 
         The log's last record gets the costs: `curve_scoring_seconds`, `curve_writing_seconds` (of the file),

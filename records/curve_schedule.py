@@ -53,7 +53,7 @@ class CurveSchedule:
 
     def due(self, iteration: int, seconds: float) -> bool:
         """Whether to score after `seconds` of training in this run. Ask in every iteration, in ascending order."""
-        if iteration not in self._places and iteration not in self._always:
+        if not self.has(iteration):
             return False
         pace = (seconds - self._seen[1]) / (iteration - self._seen[0])
         self._seen = (iteration, seconds)
@@ -69,6 +69,10 @@ class CurveSchedule:
         sure = sum(t in self._sure for t in ahead)
         reserved = view_cost * self._views * sum(t > iteration for t in self._always) + cost * sure
         return budget - self.spent - reserved >= cost * (len(ahead) - sure)
+
+    def has(self, iteration: int) -> bool:
+        """Whether an iteration is one of the points."""
+        return iteration in self._places or iteration in self._always
 
     def whole(self, iteration: int) -> bool:
         """Whether an iteration scores all views."""

@@ -12,6 +12,7 @@ from fused_ssim import composite
 from torch import Tensor, nn
 
 from scene.pictures.in_memory import InMemory
+from scene.pictures.shrink import shrink_mask, shrink_photo, shrink_values
 from scene.pictures.store import ImageStore, Picture, Source, usable_device
 from scene.views.forms import SIGNATURE, view_of
 from utils.graphics_utils import camera_center, fov2focal, projection, world_to_camera
@@ -136,6 +137,30 @@ class Camera(nn.Module):
         twin.__setstate__(copy.deepcopy(self.__getstate__(), memo))
         twin._images = self._images
         return twin
+
+    def at_size(self, size: tuple[int, int]) -> "Camera":
+        """This view at a smaller size (width, height), with pictures that are area averages of its own.
+
+        They are decoded and computed now, and lie in the copy on `device`. Columns that count in it cover no other.
+        What was assigned is left out of it.
+        """
+        twin, (old, _) = copy.copy(self), self._size
+        twin.image_width, twin.image_height = twin._size = size
+        twin.fx, twin.fy = fov2focal(self.FoVx, size[0]), fov2focal(self.FoVy, size[1])
+        twin.cx, twin.cy = self.cx * size[0] / old, self.cy * size[1] / self._size[1]
+        if self.columns is not None:
+            start, stop, _ = self.columns.indices(old)
+            twin.columns = slice(-(-start * size[0] // old), stop * size[0] // old)
+        twin._assigned, twin._made, twin._photo_device = {}, {}, self.device
+        twin._source = InMemory(shrink_photo(self._pixels(), size, self._ignore_alpha))
+        twin._mask = None if self._mask is None else InMemory(shrink_mask(self._decoded(self._mask), size))
+        twin._depth = None if self._depth is None else InMemory(shrink_values(self._decoded(self._depth), size))
+        return twin
+
+    @property
+    def is_plain(self) -> bool:
+        """Whether its pictures are those of the dataset: nothing was assigned or changed in place."""
+        return not self._assigned and not self._edited
 
     @property
     def images(self) -> ImageStore:

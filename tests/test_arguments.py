@@ -95,6 +95,10 @@ OURS = {
     "mcmc_scale_reg": 0.01,
     "mcmc_init_opacity": 0.5,
     "mcmc_init_scale": 0.1,
+    "time_budget": 0.0,
+    "resolution_schedule": "none",
+    "target_psnr": 0.0,
+    "schedule": "",
 }
 
 
@@ -190,6 +194,10 @@ def test_short_forms_and_unique_prefixes():
         ("mcmc_scale_reg", "-0.01"),
         ("mcmc_init_opacity", "1"),
         ("mcmc_init_scale", "0"),
+        ("resolution_schedule", "fine"),
+        ("target_psnr", "-3"),
+        ("time_budget", "-1"),
+        ("time_budget", "inf"),
         ("exposure_lr_init", "-0.1"),
         ("exposure_lr_delay_steps", "-1"),
         ("exposure_lr_delay_mult", "1.5"),

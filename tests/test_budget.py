@@ -217,12 +217,12 @@ def test_growth_follows_its_curve_without_state(power):
     start, most, of = 1200, 90_000, 40
     now = start
     for passed in range(1, of + 1):
-        now = count_after(now, most, passed, of, power)
+        now = count_after(now, most, of - passed, power)
         part = passed / of
         assert abs(now - (start + (most - start) * (1 - (1 - part) ** power))) <= passed  # roundings
     assert now == most
-    assert count_after(10, most, of, of, power) == most  # however few there are
-    assert count_after(2 * most, most, of - 1, of, power) < 2 * most and count_after(most, most, 3, of, power) == most
+    assert count_after(10, most, 0, power) == most  # however few there are
+    assert count_after(2 * most, most, 1, power) < 2 * most and count_after(most, most, 37, power) == most
 
 
 # Rows

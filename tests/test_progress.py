@@ -4,14 +4,15 @@ from types import SimpleNamespace
 
 from training.loss_watch import LossWatch
 from training.observers.progress import ProgressBar
+from training.pacing.pace import Pace
 
 
 def test_the_number_of_gaussians_is_exact(capsys):
     run = SimpleNamespace(
         losses=LossWatch(), dataset=SimpleNamespace(depths=""), first_iteration=0,
-        opt=SimpleNamespace(iterations=20), gaussians=range(123_456), clock=SimpleNamespace(seconds=1.0),
+        pace=Pace(20), gaussians=range(123_456), clock=SimpleNamespace(seconds=1.0),
     )  # fmt: skip
     bar = ProgressBar(run)
-    bar.measured(SimpleNamespace(iteration=10, due=True), SimpleNamespace(depth=None))
+    bar.measured(SimpleNamespace(iteration=10, due=True, span=range(10, 11)), SimpleNamespace(depth=None))
     bar.ended(None)
     assert "Gaussians=123,456" in capsys.readouterr().err

@@ -13,7 +13,6 @@ from utils.system_utils import UserError
 
 _SAMPLE = 16  # cameras whose depths are checked
 _FEWEST_BEYOND = 0.01  # share of the points in front of them that must lie beyond the nearest depth
-_RECOVERY = 1000  # iterations that a model needs to recover from a reset of its opacities
 
 
 def check_scene(info: SceneInfo) -> None:
@@ -53,6 +52,12 @@ def _report_cameras_apart(info: SceneInfo) -> None:
         )
 
 
+def check_target(target_psnr: float, test_views: int) -> None:
+    """Refuse a target for test views that are not there (UserError)."""
+    if target_psnr and not test_views:
+        raise UserError("--target_psnr needs held-out views to score, and there are none; give --eval")
+
+
 def check_exposures(gaussians: GaussianModel, train_test_exp: bool, checkpoint: str) -> None:
     """Refuse a checkpoint with exposures that this run would not use (UserError); report the opposite case."""
     if gaussians.exposures.trained and not train_test_exp:
@@ -65,7 +70,7 @@ def warn_of_late_reset(opt: argparse.Namespace, white_background: bool) -> None:
     """Warn if adaptive density control resets opacities so late that the model cannot recover."""
     if opt.strategy != "adc":
         return
-    last = range(max(1, opt.iterations - _RECOVERY + 1), opt.iterations)
+    last = range(max(1, opt.iterations - rules.RECOVERY + 1), opt.iterations)
     late = [t for t in last if rules.actions(t, opt, white_background).reset_opacity]
     if late:
         print(

@@ -5,6 +5,7 @@ from typing import ClassVar
 from torch import Tensor
 
 from scene.gaussians.penalty import NO_PENALTY
+from training.pacing.pace import STEADY, Pace
 from training.step import Step
 
 
@@ -17,7 +18,8 @@ class DensityControl:
     else, unless the iteration is one that `changes` names. most_gaussians: how many it lets there be, 0: any number.
     penalty: a part of the loss besides the objective, of which steps add the gradients; no loss that is told has it.
     absolute_gradients: whether the statistics take the lengths of absolute gradients (Ye et al. 2024); for the whole
-    run.
+    run. pace: tells how far the schedule is in an iteration (training/pacing/pace.py). Rules that are windows of the
+    schedule ask it; rules that count steps take the iteration itself.
     """
 
     fusable: ClassVar[bool] = False
@@ -25,6 +27,7 @@ class DensityControl:
     most_gaussians = 0
     penalty = NO_PENALTY
     absolute_gradients = False
+    pace: Pace = STEADY
 
     def started(self) -> None:
         """Called before the first iteration of a model that was made from points, not read from a file."""

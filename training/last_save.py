@@ -20,20 +20,21 @@ def save_last(
     pipe: argparse.Namespace,
     background: Tensor,
     scored: bool,
+    iteration: int,
 ) -> LeftOut:
     """Save the finished model without what it does not need, and record in model.json what was left out.
 
-    scored: whether to compute the change in PSNR, which is cheap if the test photos are in memory.
+    scored: whether to compute the change in PSNR, which is cheap if the test photos are in memory. iteration: the last.
     """
     trained = scene.gaussians
     trained.optimizer.zero_grad(set_to_none=True)  # room for the trimmed copy
-    trimmed = trim(trained, scene.getTrainCameras(), pipe, opt.keep_unseen, opt.prune_sh, opt.iterations)
+    trimmed = trim(trained, scene.getTrainCameras(), pipe, opt.keep_unseen, opt.prune_sh, iteration)
     final, test = trimmed.gaussians, scene.getTestCameras()
     change = {}
     if test and (trimmed.unseen > trimmed.search.faint or trimmed.cut_bounds[final.max_sh_degree] > 0):
         views = ScoredViews(pipe, background, dataset.train_test_exp)
         change = change_on_views(trained, final, test, views, scored)
-    scene.save(opt.iterations, final)
+    scene.save(iteration, final)
     write_cfg_args(scene.model_path, argparse.Namespace(**vars(dataset) | {"sh_degree": final.max_sh_degree}))
     kept_pixels, file_pixels = scene.training_pixels()
     left_out = LeftOut(
@@ -43,7 +44,7 @@ def save_last(
         keep_unseen=opt.keep_unseen,
         search=trimmed.search.end,
         views=trimmed.search.views,
-        iterations=opt.iterations,
+        iterations=iteration,
         max_sh_degree=trained.max_sh_degree,
         sh_degree=final.max_sh_degree,
         cut_bounds=trimmed.cut_bounds,

@@ -7,7 +7,7 @@ from viewing.options import Address
 
 
 class Plan(NamedTuple):
-    """The user's requests for a run, besides training itself."""
+    """The user's requests for a run, besides training itself. Iterations: of the schedule (training/pacing)."""
 
     test: Sequence[int]  # -1: none
     save: Sequence[int]  # the PLY; -1: none

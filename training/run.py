@@ -2,6 +2,7 @@
 
 import argparse
 from collections.abc import Iterator
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -14,11 +15,14 @@ from scene import Scene
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.checkpoint import load_checkpoint
 from scene.options import option
-from training.checks import check_exposures, check_scene, warn_of_late_reset
+from training.checks import check_exposures, check_scene, check_target, warn_of_late_reset
 from training.history import check_folder, continue_records, report_changes
 from training.loss_watch import LossWatch
 from training.memory_estimate import announce_memory
 from training.objective import Objective
+from training.pacing import schedule_file
+from training.pacing.choose import pace_of, resolution_of
+from training.pacing.pace import Paced
 from training.plan import Plan
 from training.step import Step
 from training.strategies.choose import density_control
@@ -27,7 +31,7 @@ from utils.exact.counter_rng import Stream, uniform
 from utils.general_utils import get_expon_lr_func
 from utils.host.interrupt import DeferredInterrupt
 from utils.host.process import seconds_since_start
-from utils.system_utils import UserError, compute_device
+from utils.system_utils import compute_device
 
 SH_INTERVAL = 1000  # iterations between raises of the active SH degree
 
@@ -35,8 +39,8 @@ SH_INTERVAL = 1000  # iterations between raises of the active SH degree
 class Run:
     """The objects that the loop and its observers share.
 
-    scene, gaussians, views (by iteration), objective, density; dataset, opt, pipe: the options; background: (3,) of the
-    scene; first_iteration: done before this run. From `begin` on: log, rows (of the curve so far), losses
+    scene, gaussians, views (by iteration), objective, density, pace; dataset, opt, pipe: the options; background: (3,)
+    of the scene; first_iteration: done before this run. From `begin` on: log, rows (of the curve so far), losses
     (running mean of the total) and clock (seconds of training). lost: steps that an error has taken back. first_done:
     seconds from the process's start to the end of its first iteration, None if the system does not say. interrupt: a
     signal that asks the loop to stop; an observer that waits has to look at it.
@@ -53,11 +57,7 @@ class Run:
         self.interrupt = DeferredInterrupt()
         self.device = compute_device()
         capture, self.first_iteration = load_checkpoint(plan.start, self.device) if plan.start else (None, 0)
-        if self.first_iteration >= opt.iterations:
-            raise UserError(
-                f"{plan.start} is at iteration {self.first_iteration}, so --iterations {opt.iterations} leaves nothing "
-                "to do; --iterations counts from the start of the first run"
-            )
+        self.pace = pace_of(opt, plan.start, self.first_iteration)
         warn_of_late_reset(opt, dataset.white_background)
         self.gaussians = GaussianModel(dataset.sh_degree, opt.optimizer_type)
         init_ply = option(dataset, "init_ply")
@@ -66,10 +66,12 @@ class Run:
         else:
             self.scene, self._first = Scene(dataset, self.gaussians, shuffle=False, start=False), None
         check_scene(self.scene.info)
+        check_target(opt.target_psnr, len(self.scene.getTestCameras()))
         self.views = ViewOrder(self.scene.getTrainCameras(), opt.seed)
+        self.resolution = resolution_of(opt, self.pace, self.scene.getTrainCameras(), self.scene.images)
         self._decode_ahead(self.first_iteration + 1)
         from_points = self._start(capture)
-        saves = [iteration for iteration in plan.save if iteration <= opt.iterations]
+        saves = self.pace.known(plan.save)
         check_folder(dataset.model_path, dataset.source_path, saves, plan.start, self.first_iteration)
         if plan.start:
             report_changes(plan.start, argparse.Namespace(**vars(dataset), **self._training_options))
@@ -79,6 +81,7 @@ class Run:
         self._depth_weight = get_expon_lr_func(
             opt.depth_l1_weight_init, opt.depth_l1_weight_final, max_steps=opt.iterations
         )
+        self.density.pace = self.pace
         if from_points:
             self.density.started()
 
@@ -117,6 +120,8 @@ class Run:
         folder, start = self.scene.model_path, self.plan.start
         if not start or not (Path(folder) / "cameras.json").exists():
             self.scene.write_inputs()
+        if not start and not isinstance(self.pace, Paced):
+            (Path(folder) / schedule_file.NAME).unlink(missing_ok=True)  # of an earlier training
         announce_memory(self.scene, self.gaussians, self.density.most_gaussians)
         self.log, self.rows = continue_records(folder, start, self.first_iteration)
         self.losses = LossWatch(self.log.loss)
@@ -124,19 +129,36 @@ class Run:
 
     def steps(self) -> Iterator[Step]:
         """The iterations of this run."""
-        for iteration in range(self.first_iteration + 1, self.opt.iterations + 1):
-            camera = self.views[iteration]
-            yield Step(
+        for iteration in count(self.first_iteration + 1):
+            seconds, pace = self.clock.seconds, self.pace
+            pace.reach(iteration, self.log.seconds_before + seconds)
+            camera = self.resolution.view(self.views[iteration], pace.nominal(iteration))
+            step = Step(
                 iteration,
-                last=iteration == self.opt.iterations,
+                last=False,
                 camera=camera,
                 background=self._background(iteration),
-                depth_weight=self._depth_weight(iteration) if camera.depth_reliable else 0.0,
-                changes=self.density.changes(iteration) or iteration % SH_INTERVAL == 0,
-                started=self.clock.seconds,
+                depth_weight=self._depth_weight(pace.nominal(iteration)) if camera.depth_reliable else 0.0,
+                changes=self._changes(iteration),
+                started=seconds,
+                span=pace.span(iteration),
             )
+            if pace.is_last(iteration):
+                step.end(pace.length)
+            yield step
             if iteration == self.first_iteration + 1:
                 self.first_done = seconds_since_start()
+            if step.last:
+                return
+
+    def _changes(self, iteration: int) -> bool:
+        resizes = self.resolution.changes(*map(self.pace.nominal, (iteration - 1, iteration)))
+        return self.density.changes(iteration) or self._raises_degree(iteration) > 0 or resizes
+
+    def _raises_degree(self, iteration: int) -> int:
+        """How often the SH degree is raised in an iteration."""
+        before, now = (self.pace.nominal(t) // SH_INTERVAL for t in (iteration - 1, iteration))
+        return now - before
 
     def _background(self, iteration: int) -> Tensor:
         if not self.opt.random_background:
@@ -146,17 +168,23 @@ class Run:
 
     def prepare(self, step: Step) -> None:
         """Set learning rates and SH degree, and begin to decode the photos of the next views."""
-        self.gaussians.update_learning_rate(step.iteration)
-        if step.iteration % SH_INTERVAL == 0:
+        self.set_rates(step)
+        for _ in range(self._raises_degree(step.iteration)):
             self.gaussians.oneupSHdegree()
             self.gaussians.limit_columns()
         if step.iteration - 1 == self.plan.debug_from:
             self.pipe.debug = True
         self._decode_ahead(step.iteration)
 
+    def set_rates(self, step: Step) -> None:
+        """Set the learning rates of a step, which may be one that is repeated."""
+        self.gaussians.update_learning_rate(self.pace.nominal(step.iteration))
+
     def _decode_ahead(self, iteration: int) -> None:
-        ahead = min(self.scene.images.ahead, self.opt.iterations - iteration + 1)
-        self.scene.prefetch(self.views.coming(iteration, ahead))
+        ahead = self.scene.images.ahead
+        if (last := self.pace.ends) is not None:
+            ahead = min(ahead, last - iteration + 1)
+        self.scene.prefetch(list(filter(self.resolution.needs, self.views.coming(iteration, ahead))))
 
     def render_options(self, step: Step) -> dict[str, bool]:
         """Options of `render` that make it compute what this step's loss needs, and no more."""

@@ -11,14 +11,14 @@ from scene.gaussians.row_surgery import restart_rows, row_groups
 from utils.exact.portable_math import exp, log
 
 
-def count_after(now: int, budget: int, passed: int, of: int, power: float) -> int:
-    """The number of Gaussians after the densification `passed`, counted from 1, of `of`.
+def count_after(now: int, budget: int, remaining: int, power: float) -> int:
+    """The number of Gaussians after a densification that `remaining` others follow.
 
     They approach the budget so that what is missing of it is a part (1 - p)^power of what was missing at the start, p
     the part of the densifications that have passed (Mallick et al. 2024, Taming 3DGS, for power 2). Computed from the
     number `now` before this one, so that it needs no state, and a run that fell behind catches up.
     """
-    left = (of - passed) / (of - passed + 1)
+    left = remaining / (remaining + 1)
     return budget - round((budget - now) * left**power)
 
 

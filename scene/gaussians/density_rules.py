@@ -17,6 +17,7 @@ from utils.exact.counter_rng import Stream
 SHRINK = 0.8  # N children of a split have 1 / (0.8 N) of the parent's scale: 1 / 1.6 for two (paper, section 5.2)
 PRUNE_EXTENT = 0.1  # a Gaussian wider than this part of the scene's extent is removed, once sizes are limited
 RESET_OPACITY = 0.01
+RECOVERY = 1000  # iterations that a model needs to recover from a reset of its opacities
 MIN_OPACITY = 0.005  # a Gaussian below it is removed
 MAX_SCREEN_SIZE = 20  # pixels
 
@@ -30,15 +31,24 @@ class Actions(NamedTuple):
     reset_opacity: bool
 
 
-def actions(iteration: int, opt: argparse.Namespace, white_background: bool) -> Actions:
-    """Actions due in an iteration (paper, section 5.2, in the reference's windows): none from densify_until_iter on."""
-    active = iteration < opt.densify_until_iter
+def actions(
+    iteration: int, opt: argparse.Namespace, white_background: bool, span: range | None = None, stride: float = 1.0
+) -> Actions:
+    """Actions due in an iteration (paper, section 5.2, in the reference's windows): none from densify_until_iter on.
+
+    span, stride: the iterations of the schedule that it stands for, and their mean number there; by default itself.
+    The options' windows and resets are of the schedule; densifications come every densification_interval iterations,
+    as their statistics need views. Resets that a model would not recover from before the next one are left out.
+    """
+    before, now = (iteration - 1, iteration) if span is None else (span.start - 1, span.stop - 1)
+    active, interval = now < opt.densify_until_iter, opt.opacity_reset_interval
+    recovers = stride <= 1 or interval >= RECOVERY * stride
+    reset = now // interval > before // interval or (white_background and before < opt.densify_from_iter <= now)
     return Actions(
         observe=active,
-        densify=active and iteration > opt.densify_from_iter and iteration % opt.densification_interval == 0,
-        limit_size=iteration > opt.opacity_reset_interval,
-        reset_opacity=active
-        and (iteration % opt.opacity_reset_interval == 0 or (white_background and iteration == opt.densify_from_iter)),
+        densify=active and now > opt.densify_from_iter and iteration % opt.densification_interval == 0,
+        limit_size=now > interval,
+        reset_opacity=active and reset and recovers,
     )
 
 

@@ -9,6 +9,7 @@ from records.curve_recorder import CurveRecorder, evenly_spread
 from scene.cameras import Camera
 from training.objective import Losses
 from training.observer import Error, Observer
+from training.pacing.pace import Paced
 from training.run import Run
 from training.step import Step
 from utils.system_utils import saved_iterations
@@ -32,6 +33,7 @@ class Curve(Observer):
             lambda cameras: self._load(cameras, views),
             lambda cameras: views.scores(cameras, run.gaussians),
             run.device,
+            run.pace.nominal(run.first_iteration),
         )
         self._due = False
         self._seconds = 0.0
@@ -42,20 +44,27 @@ class Curve(Observer):
             views.load(camera)
 
     def due(self, step: Step) -> bool:
-        self._due = self._recorder.due(step.iteration, self._run.clock.seconds)
+        self._due = bool(step.span) and self._recorder.due(self._point(step), self._run.clock.seconds)
         return self._due
 
+    def _point(self, step: Step) -> int:
+        """The iteration of the schedule that a step's score is one of."""
+        points = [iteration for iteration in step.span if self._recorder.is_point(iteration)]
+        return (points or step.span)[-1]
+
     def measured(self, step: Step, losses: Losses) -> None:
-        if self._due:
+        if self._due or step.last:
             self._seconds = self._run.clock.seconds
             with self._run.clock.paused("scoring"):
-                self._recorder.add(step.iteration, self._seconds, len(self._run.gaussians))
+                self._recorder.add(self._point(step), self._seconds, len(self._run.gaussians), step.iteration)
 
     def ended(self, error: Error) -> None:
         if error is not None:
             self._recorder.abandon()
             return
         run = self._run
-        saved = {*run.plan.save} & {*saved_iterations(Path(run.scene.model_path) / "point_cloud")}
+        there = saved_iterations(Path(run.scene.model_path) / "point_cloud")
+        saved, lr_max_steps = {*run.pace.known(run.plan.save)} & {*there}, run.opt.position_lr_max_steps
         follows_length = schedules_follow_length(bool(run.dataset.depths), run.dataset.train_test_exp)
-        self._recorder.finish(self._seconds, saved, run.opt.position_lr_max_steps, follows_length)
+        steady = not isinstance(run.pace, Paced)
+        self._recorder.finish(self._seconds, saved, lr_max_steps if steady else None, follows_length)

@@ -22,10 +22,9 @@ class ProgressBar(Observer):
         self._run = run
         self._depth = LossWatch()
         self._shown = {"Loss": run.losses} | ({"Depth Loss": self._depth} if run.dataset.depths else {})
-        self._updated = -math.inf
-        self._bar = tqdm(
-            initial=run.first_iteration, total=run.opt.iterations, desc="Training progress", dynamic_ncols=True
-        )
+        self._updated, self._done = -math.inf, run.first_iteration
+        first = run.pace.nominal(run.first_iteration)
+        self._bar = tqdm(initial=first, total=run.pace.length, desc="Training progress", dynamic_ncols=True)
 
     def due(self, step: Step) -> bool:
         shown = step.iteration % BAR_INTERVAL == 0 and time.monotonic() - self._updated >= BAR_SECONDS
@@ -39,13 +38,15 @@ class ProgressBar(Observer):
         for loss in self._shown.values():
             loss.read()
         means = {name: f"{loss.mean:.7f}" for name, loss in self._shown.items()}
+        if step.span.stop - 1 != step.iteration:  # the bar counts iterations of the schedule
+            means["Iterations"] = f"{step.iteration:,}"
         # As text: tqdm would round the number to three digits.
         self._bar.set_postfix(means, Gaussians=f"{len(self._run.gaussians):,}", refresh=False)
-        self._bar.update(step.iteration - self._bar.n)
-        self._updated = time.monotonic()
+        self._bar.update(step.span.stop - 1 - self._bar.n)
+        self._updated, self._done = time.monotonic(), step.iteration
 
     def ended(self, error: Error) -> None:
         self._bar.close()
         if error is None:
-            count = self._run.opt.iterations - self._run.first_iteration
+            count = self._done - self._run.first_iteration
             print(f"Trained {count} iterations in {self._run.clock.seconds:.1f} s, without tests and saving")

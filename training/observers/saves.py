@@ -11,6 +11,7 @@ from training.left_out import LeftOut, lines
 from training.objective import Losses
 from training.observer import Error, Observer
 from training.observers.divergence import DivergenceWatch
+from training.observers.schedule import save_schedule
 from training.run import Run
 from training.step import Step
 
@@ -27,10 +28,10 @@ class Saves(Observer):
         self._left_out: LeftOut | None = None
 
     def due(self, step: Step) -> bool:
-        return step.iteration in self._run.plan.save
+        return step.takes(self._run.plan.save)
 
     def measured(self, step: Step, losses: Losses) -> None:
-        if step.iteration not in self._run.plan.save:
+        if not step.takes(self._run.plan.save):
             return
         run = self._run
         step.record = step.record or {}
@@ -39,7 +40,7 @@ class Saves(Observer):
             tqdm.write(f"[ITER {step.iteration}] Saving Gaussians", file=sys.stdout)
             if step.last:
                 self._left_out = save_last(
-                    run.scene, run.dataset, run.opt, run.pipe, run.background, self._test_in_memory
+                    run.scene, run.dataset, run.opt, run.pipe, run.background, self._test_in_memory, step.iteration
                 )
                 step.record["gaussians_left_out"] = self._left_out.unseen
             else:
@@ -58,10 +59,10 @@ class Checkpoints(Observer):
         self._watch = watch
 
     def due(self, step: Step) -> bool:
-        return step.iteration in self._run.plan.checkpoint
+        return step.takes(self._run.plan.checkpoint)
 
     def stepped(self, step: Step) -> None:
-        if step.stopping or step.iteration in self._run.plan.checkpoint:
+        if step.stopping or step.takes(self._run.plan.checkpoint):
             self.save(step)
 
     def save(self, step: Step) -> None:
@@ -73,6 +74,7 @@ class Checkpoints(Observer):
             run.gaussians.check_finite(step.iteration)
             tqdm.write(f"[ITER {step.iteration}] Saving Checkpoint", file=sys.stdout)
             path = Path(run.scene.model_path) / f"chkpnt{step.iteration}.pth"
+            save_schedule(run, step)  # first: a checkpoint never lacks its place in the schedule
             save_checkpoint(path, run.gaussians.capture(), step.iteration)
             run.log.add(step.iteration, seconds, gaussians=len(run.gaussians), loss=run.losses.mean)
         if step.stopping:

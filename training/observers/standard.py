@@ -15,6 +15,9 @@ from training.observers.progress import ProgressBar
 from training.observers.records import Records
 from training.observers.report import Report
 from training.observers.saves import Checkpoints, Saves
+from training.observers.schedule import ScheduleFile
+from training.observers.target import Target
+from training.pacing.pace import Paced
 from training.run import Run
 
 
@@ -28,6 +31,7 @@ def standard_observers(run: Run, writer: Any | None, report: Callable[..., dict[
         watch,  # first: observers that write rely on all losses so far being finite
         ProgressBar(run),  # reads the losses that the watch has checked
         MaskWatch(run.scene.getTrainCameras()),  # may refuse the scene before anything is written
+        *([Target(run)] if run.opt.target_psnr else []),  # may make this iteration the last, which others look at
         *([Curve(run)] if with_curve else []),  # the scores are those of the model saved at the same iteration
         Report(run, writer, report),
         Saves(run, test_in_memory),  # before the model changes
@@ -35,5 +39,6 @@ def standard_observers(run: Run, writer: Any | None, report: Callable[..., dict[
         *([NetworkViewer(run)] if network_gui.listener else []),  # after all that write: it may make training wait
         MemoryGuard(run),  # from `measured` to `stepped` the model changes; otherwise it is whole
         checkpoints,  # writes the whole state after the step
+        *([ScheduleFile(run)] if isinstance(run.pace, Paced) else []),
         *([PageObserver(run, checkpoints)] if run.plan.viewer else []),  # last: may let the training wait
     ]

@@ -37,18 +37,18 @@ class AheadStep:
         if step.due or not self._able(step):
             self._unknown = True
             self._ahead.settle()  # nothing is pending, unless --debug_from has just come into force
-            self._run.gaussians.update_learning_rate(step.iteration)
+            self._run.set_rates(step)
             return self._fused.take(step, tell)
         losses: list[Losses] = []
         queued = self._ahead.take(
-            step.camera.uid,
+            _view(step),
             lambda: self._queue(step, losses),
             lambda: self._repeat(step, losses[0]),
             lambda: self._fused.measure(step),
         )
         if queued:
             return tell.measured(step, losses[0])
-        self._run.gaussians.update_learning_rate(step.iteration)
+        self._run.set_rates(step)
         self._fused.plain.take(step, tell)
 
     def make_ready(self, step: Step) -> None:
@@ -90,7 +90,7 @@ class AheadStep:
         """Queue a step and append its losses, unless its loss has further terms."""
         taken = self._recorded.take(step)
         if taken is None:
-            with self._ahead.room(step.camera.uid):
+            with self._ahead.room(_view(step)):
                 taken = self._queue_calls(step)
         else:
             density = self._run.density
@@ -116,7 +116,12 @@ class AheadStep:
 
     def _repeat(self, step: Step, first: Losses) -> None:
         """Queue a step once more; the losses that the observers hold get its values."""
-        self._run.gaussians.update_learning_rate(step.iteration)
+        self._run.set_rates(step)
         losses: list[Losses] = []
         self._queue(step, losses)
         self._copy(losses[0], first)
+
+
+def _view(step: Step) -> tuple[int, int]:
+    """What the room that a step needs depends on."""
+    return step.camera.uid, step.camera.image_width

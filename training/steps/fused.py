@@ -49,7 +49,7 @@ class FusedStep:
             drawn, losses, gradients = self.measure(step)
             if not self.finds_further_terms():
                 tell.measured(step, losses)
-                return self.advance(step, drawn, gradients)
+                return None if step.last else self.advance(step, drawn, gradients)
         self.plain.take(step, tell)
 
     def make_ready(self, step: Step) -> None:

@@ -80,7 +80,7 @@ class RecordedStep:
         self._host_cameras = [row.numpy() for row in self._host[:, NOW_WORDS:].view(torch.float32)[:, :_CAMERA]]
         self._inputs = torch.zeros(words, dtype=torch.int64, device=run.device)
         self._background, self._copied = torch.empty_like(run.background), None
-        self._cameras: dict[Camera, tuple] = {}
+        self._cameras: dict[int, tuple] = {}  # by uid
         self._kinds: set[Kind] = set()
         self._records: dict[Kind, _Record] = {}
         self._baked: tuple = ()
@@ -119,6 +119,7 @@ class RecordedStep:
         run, optimizer = self._run, self._run.gaussians.optimizer
         columns = optimizer.active_columns("f_rest")
         used = run.objective, run.density, run.pipe.antialiasing, type(optimizer), optimizer.guard, columns
+        used = *used, run.resolution.factor
         baked = self._adam.places(), used
         if baked != self._baked:
             self._records.clear()
@@ -197,8 +198,8 @@ class RecordedStep:
         """The camera's numbers (35,) on the host, read from the GPU once."""
         tensors = camera.world_view_transform, camera.full_proj_transform, camera.camera_center
         state = [(id(tensor), tensor._version) for tensor in tensors]
-        kept = self._cameras.get(camera)
+        kept = self._cameras.get(camera.uid)
         if kept is None or kept[0] != state:
             numbers = torch.cat([tensor.detach().reshape(-1).float() for tensor in tensors]).cpu().numpy()
-            kept = self._cameras[camera] = state, numbers, tensors  # which are kept, as an id may be given again
+            kept = self._cameras[camera.uid] = state, numbers, tensors  # which are kept, as an id may be given again
         return kept[1]

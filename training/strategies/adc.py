@@ -52,7 +52,8 @@ class AdaptiveDensityControl(DensityControl):
             self._gaussians.reset_opacity()
 
     def _actions(self, iteration: int) -> rules.Actions:
-        return rules.actions(iteration, self._opt, self._white_background)
+        pace = self.pace
+        return rules.actions(iteration, self._opt, self._white_background, pace.span(iteration), pace.stride(iteration))
 
     def _densify(self, iteration: int, limit_size: bool) -> None:
         self._gaussians.densify_and_prune(

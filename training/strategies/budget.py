@@ -8,6 +8,7 @@ replacement, not the highest taken. Children keep their parent's mean and covari
 factor, where Rota Bulo et al. subtract a constant.
 """
 
+import math
 from typing import TYPE_CHECKING
 
 from torch import Tensor
@@ -44,29 +45,28 @@ class BudgetControl(DensityControl):
         self.most_gaussians = run.opt.max_num_splats or default_budget(self._cameras)
 
     def changes(self, iteration: int) -> bool:
-        return iteration % self._opt.densification_interval == 0 and iteration < self._opt.densify_until_iter
+        opt = self._opt
+        return iteration % opt.densification_interval == 0 and self.pace.nominal(iteration) < opt.densify_until_iter
 
     def after_step(self, step: Step) -> None:
         if not self.changes(step.iteration):
             return
         self._gaussians.check_steps()  # before rows change, so that an error finds the rows of the step
-        passed, of = self._densifications(step.iteration)
-        now = len(self._gaussians)
-        aim = count_after(now, self.most_gaussians, passed, of, self._opt.growth_power) if passed > 0 else now
+        grows = self.pace.nominal(step.iteration) > self._opt.densify_from_iter
+        aim = now = len(self._gaussians)
+        if grows:
+            aim = count_after(now, self.most_gaussians, self._remaining(step.iteration), self._opt.growth_power)
         remove_useless(self._gaussians, self._opt.prune_opacity, max(aim, 1))
         self._check_rest(step.iteration)
-        if passed > 0:
+        if grows:
             if aim > len(self._gaussians):
                 split_in_two(self._gaussians, self._chosen(step, aim - len(self._gaussians)))
             fade(self._gaussians, self._opt.opacity_decay)
 
-    def _densifications(self, iteration: int) -> tuple[int, int]:
-        """How many densifications there are up to this iteration, and in all. Before them it is not above 0."""
-        opt = self._opt
-        first, now, last = (
-            t // opt.densification_interval for t in (opt.densify_from_iter, iteration, opt.densify_until_iter - 1)
-        )
-        return now - first, last - first
+    def _remaining(self, iteration: int) -> int:
+        """How many densifications follow that of this iteration, at its pace."""
+        stride = self._opt.densification_interval * self.pace.stride(iteration)
+        return math.ceil((self._opt.densify_until_iter - self.pace.nominal(iteration)) / stride) - 1
 
     def _chosen(self, step: Step, count: int) -> Tensor:
         """Indices of at most `count` Gaussians to split, ascending."""

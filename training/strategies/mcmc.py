@@ -37,7 +37,7 @@ class MarkovChain(DensityControl):
 
     def changes(self, iteration: int) -> bool:
         opt = self._opt
-        within = opt.densify_from_iter < iteration < opt.mcmc_until_iter
+        within = opt.densify_from_iter < self.pace.nominal(iteration) < opt.mcmc_until_iter
         return within and iteration % opt.densification_interval == 0
 
     def after_backward(self, step: Step, package: dict[str, Tensor]) -> None:

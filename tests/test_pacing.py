@@ -1,0 +1,430 @@
+"""Paced training: it ends when its seconds are over, goes through the whole schedule, and can be repeated."""
+
+import argparse
+import json
+import random
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+
+import train
+from records.training_log import Stopwatch
+from scene.gaussian_model import GaussianModel
+from scene.gaussians import density_rules as rules
+from scene.gaussians.checkpoint import load_checkpoint
+from training import loop
+from training.observer import Announcer
+from training.observers import target
+from training.observers.progress import ProgressBar
+from training.observers.schedule import ScheduleFile
+from training.pacing.clocked import Clocked
+from training.pacing.pace import Block, Pace, Paced, Schedule
+from training.pacing.schedule_file import read_schedule, write_schedule
+from utils.system_utils import UserError
+
+OPTIONS = ["-r", 24, "--eval", "--no_curve", "--test_iterations", -1, "--densify_grad_threshold", 1e-4,
+           "--densification_interval", 5, "--max_num_splats", 400, "--iterations", 3000]  # fmt: skip
+
+
+@pytest.fixture(autouse=True)
+def _stdout(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "stdout", sys.stdout)  # training stamps it
+
+
+def _fresh(length: int, budget: float) -> Clocked:
+    return Clocked(Schedule(length, [], None, budget, levels=()))
+
+
+def _run(pace: Pace, cost: Callable[[int, int], float], first: int = 0, seconds: float = 0.0) -> tuple[int, float]:
+    """Take iterations of cost(iteration, nominal) seconds until the last: its number, and the seconds then."""
+    iteration = first
+    while not iteration or not pace.is_last(iteration):
+        iteration += 1
+        pace.reach(iteration, seconds)
+        seconds += cost(iteration, pace.nominal(iteration))
+    return iteration, seconds
+
+
+def _noisy(iteration: int, nominal: int) -> float:
+    return 0.01 * random.Random(iteration).uniform(0.5, 1.5)
+
+
+COSTS = {
+    "constant": lambda t, n: 0.01,
+    "noisy": _noisy,
+    "a slow start": lambda t, n: 0.8 if t == 1 else 0.005,
+    "growth": lambda t, n: 0.002 * (1 + 20 * min(1.0, n / 15_000)),
+    "sudden growth": lambda t, n: 0.002 if n < 20_000 else 0.03,
+    "faster than the schedule": lambda t, n: 0.0001,
+    "few iterations": lambda t, n: 0.25 if t % 2 else 0.2,
+    "dear events": lambda t, n: 0.01 + 0.1 * (t % 100 == 0),
+}
+
+
+@pytest.mark.parametrize("budget", [5.0, 20.0])
+@pytest.mark.parametrize("name", COSTS)
+def test_it_ends_within_three_percent_and_goes_through_the_whole_schedule(name, budget):
+    pace = _fresh(30_000, budget)
+    last, seconds = _run(pace, COSTS[name])
+    assert seconds == pytest.approx(budget, rel=0.03)
+    nominals = [pace.nominal(t) for t in range(last + 1)]
+    assert nominals == sorted(nominals) and nominals[0] == 0 and nominals[-1] == 30_000 > nominals[-2]
+    spans = [t for iteration in range(1, last + 1) for t in pace.span(iteration)]
+    assert spans == list(range(1, 30_001))  # each iteration of the schedule once
+    assert len(pace.blocks) < 420
+
+
+def test_progress_follows_the_seconds_that_are_left():
+    """Half of the schedule is done in half of the seconds, also where iterations become dearer or start slowly."""
+    for name in ("constant", "growth", "a slow start"):
+        pace, halfway = _fresh(30_000, 20.0), []
+        seconds = 0.0
+        for iteration in range(1, 100_000):
+            pace.reach(iteration, seconds)
+            if pace.nominal(iteration) >= 15_000:
+                halfway.append(seconds)
+                break
+            seconds += COSTS[name](iteration, pace.nominal(iteration))
+        assert halfway[0] == pytest.approx(10.0, abs=0.7), name
+
+
+def test_an_iteration_that_takes_longer_than_the_budget_is_followed_by_the_last(capsys):
+    pace = _fresh(30_000, 1.0)
+    assert _run(pace, lambda t, n: 5.0) == (2, 10.0)
+    assert "--time_budget 1 is too short for 3 iterations" in capsys.readouterr().err
+    assert _run(_fresh(1, 1.0), lambda t, n: 5.0)[0] == 2
+    assert _run(_fresh(1, 1.0), lambda t, n: 0.1)[0] == 10
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_a_schedule_replays_every_iteration(tmp_path):
+    pace = _fresh(30_000, 5.0)
+    last, _ = _run(pace, _noisy)
+    write_schedule(tmp_path / "schedule.json", pace.recorded(last, True))
+    again = Paced(read_schedule(tmp_path / "schedule.json"))
+    assert again.ends == last and again.is_last(last) and not again.is_last(last - 1)
+    for t in range(1, last + 1):
+        assert (again.span(t), again.stride(t)) == (pace.span(t), pace.stride(t))
+
+
+def test_a_resumed_run_goes_on_from_its_place_with_the_seconds_that_are_left(tmp_path):
+    whole = _fresh(30_000, 10.0)
+    at, seconds = 0, 0.0
+    while seconds < 4.0:
+        at += 1
+        whole.reach(at, seconds)
+        seconds += _noisy(at, 0)
+    assert at != whole.blocks[-1].last  # within a block
+    write_schedule(tmp_path / "schedule.json", whole.recorded(at, False))
+    before = read_schedule(tmp_path / "schedule.json")
+    assert before.ended is None
+    pace = Clocked(before)
+    last, ended = _run(pace, lambda t, n: 2 * _noisy(t, n), at, seconds)
+    assert ended == pytest.approx(10.0, rel=0.03) and 250 < last - at < 350
+    assert [pace.span(t) for t in range(1, at + 1)] == [whole.span(t) for t in range(1, at + 1)]
+    assert pace.nominal(at + 1) - pace.nominal(at) < 200
+    late = Clocked(before)  # nothing is left
+    assert _run(late, _noisy, at, 11.0)[0] == at + 1
+
+
+def test_the_steady_pace_changes_nothing():
+    pace = Pace(7)
+    assert [list(pace.span(t)) for t in range(1, 8)] == [[t] for t in range(1, 8)]
+    assert [t for t in range(1, 9) if pace.is_last(t)] == [7] and pace.is_over(7) and not pace.is_over(6)
+    assert pace.known([3, 7, 8]) == [3, 7]
+
+
+GOOD = {
+    "blocks": [
+        {"last": 2, "seconds": 0.0, "start": 0.0, "step": 0.1}, {"last": 10, "seconds": 1.0, "start": 0.2, "step": 0.1}
+    ],
+    "ended": 10, "iterations": 100, "time_budget": 5.0, "resolution_schedule": "none", "levels": [],
+}  # fmt: skip
+
+
+def _with_block(index: int, **values: object) -> dict:
+    blocks = [dict(block) for block in GOOD["blocks"]]
+    blocks[index] |= values
+    return GOOD | {"blocks": blocks}
+
+
+@pytest.mark.parametrize(
+    ("content", "reason"),
+    [
+        ("{", "is no schedule of a run"),
+        ("[" * 100_000, "is no schedule of a run"),
+        ([], "it is not a table"),
+        ({name: GOOD[name] for name in GOOD if name != "blocks"}, "'blocks' is missing"),
+        (GOOD | {"iterations": 0}, "0 is no whole number from 1 on"),
+        (GOOD | {"iterations": True}, "True is no whole number"),
+        (GOOD | {"blocks": []}, "its blocks do not follow each other"),
+        (GOOD | {"blocks": 3}, "is no schedule of a run"),
+        (GOOD | {"blocks": [3]}, "is no schedule of a run"),
+        (_with_block(1, last=2), "its blocks do not follow each other"),
+        (_with_block(1, last=9.0), "9.0 is no whole number"),
+        (_with_block(1, start=-0.1), "-0.1 is no number from 0 on"),
+        (_with_block(0, start=0.3), "its progress does not ascend"),
+        (_with_block(1, step=0.2), "its progress goes beyond its end"),
+        (_with_block(1, step="x"), "'x' is no number"),
+        (GOOD | {"ended": 9}, "its last block does not end with its last iteration"),
+        (json.dumps(GOOD).replace("5.0", "NaN"), "nan is no number"),
+    ],
+)
+def test_a_broken_schedule_is_refused(tmp_path, content, reason):
+    path = tmp_path / "schedule.json"
+    path.write_text(json.dumps(GOOD))
+    assert read_schedule(path).blocks[1] == Block(10, 0.2, 0.1, 1.0)
+    path.write_text(content if isinstance(content, str) else json.dumps(content))
+    with pytest.raises(UserError, match=reason) as error:
+        read_schedule(path)
+    assert str(path) in str(error.value) and "name the schedule.json of a run with --time_budget" in str(error.value)
+
+
+def _options(**changed: object) -> argparse.Namespace:
+    known = {"densify_from_iter": 500, "densify_until_iter": 15_000, "densification_interval": 100}
+    return argparse.Namespace(**known | {"opacity_reset_interval": 3000} | changed)
+
+
+def test_windows_and_resets_are_of_the_schedule_and_densifications_of_the_run():
+    pace = Paced(Schedule(30_000, [Block(15_000, 0.0, 1 / 15_000, 0.0)], 15_000, 0.0))  # two at a time
+    todo = {t: rules.actions(t, _options(), False, pace.span(t), pace.stride(t)) for t in range(1, 15_001)}
+    assert [t for t in todo if todo[t].densify] == list(range(300, 7500, 100))
+    assert [t for t in todo if todo[t].reset_opacity] == [1500, 3000, 4500, 6000]
+    assert min(t for t in todo if todo[t].limit_size) == 1501
+    assert max(t for t in todo if todo[t].observe) == 7499
+    white = {t: rules.actions(t, _options(densify_from_iter=501), True, pace.span(t), 2.0) for t in range(1, 1000)}
+    assert [t for t in white if white[t].reset_opacity] == [251]
+
+
+def test_a_short_run_does_without_resets_that_it_would_not_recover_from():
+    def resets(stride: int, **changed: int) -> int:
+        count = 30_000 // stride
+        pace = Paced(Schedule(30_000, [Block(count, 0.0, 1 / count, 0.0)], count, 0.0))
+        return sum(
+            rules.actions(t, _options(**changed), True, pace.span(t), pace.stride(t)).reset_opacity
+            for t in range(1, count + 1)
+        )
+
+    assert resets(3) == 5 and resets(4) == 0
+    assert resets(1, opacity_reset_interval=200) == 75  # as the user wants it
+    assert resets(4, opacity_reset_interval=5000) == 3
+
+
+@pytest.mark.parametrize("strategy", ["mcmc", "budget"])
+def test_strategies_grow_within_windows_of_the_schedule(colmap_scene, tmp_path, monkeypatch, strategy):
+    write_schedule(tmp_path / "two.json", Schedule(120, [Block(60, 0.0, 1 / 60, 0.0)], 60, 9.0, levels=()))  # two at a time
+    counts, begins = [], ProgressBar.begins
+
+    def note(self, step) -> None:
+        counts.append(len(self._run.gaussians))
+        begins(self, step)
+
+    monkeypatch.setattr(ProgressBar, "begins", note)
+    words = ["-s", colmap_scene, "-m", tmp_path / "out", "-r", 24, "--no_curve", "--test_iterations", -1,
+             "--schedule", tmp_path / "two.json", "--iterations", 120, "--strategy", strategy,
+             "--densification_interval", 5, "--densify_from_iter", 20, "--densify_until_iter", 80,
+             "--mcmc_until_iter", 80, "--max_num_splats", 5000, "--mcmc_growth", 0.2]  # fmt: skip
+    train.main([*map(str, words)])
+    assert len(counts) == 60
+    assert [t for t in range(1, 60) if counts[t] > counts[t - 1]] == [15, 20, 25, 30, 35]
+    assert strategy == "mcmc" or counts[-1] == 5000
+
+
+def _timed(monkeypatch: pytest.MonkeyPatch, cost: Callable[[int], float]) -> None:
+    """Let an iteration take cost(iteration) seconds of training by a clock of its own."""
+    now, chosen = [0.0], loop.step_taker
+
+    class Watch(Stopwatch):
+        @property
+        def seconds(self) -> float:
+            return now[0]
+
+    def taker(run):
+        now[0] = 0.0
+        taken = chosen(run)
+        take = taken.take
+
+        def timed(step, tell) -> None:
+            now[0] += cost(step.iteration)
+            take(step, tell)
+
+        taken.take = timed
+        return taken
+
+    monkeypatch.setattr("training.run.Stopwatch", Watch)
+    monkeypatch.setattr(loop, "step_taker", taker)
+
+
+def _train(scene: Path, out: Path, *more: object) -> dict[int, bytes]:
+    """Train; the PLYs by iteration."""
+    train.main(list(map(str, ["-s", scene, "-m", out, "--disable_viewer", *OPTIONS, *more])))
+    return {int(ply.parent.name[10:]): ply.read_bytes() for ply in out.glob("point_cloud/*/*.ply")}
+
+
+def _last_record(out: Path) -> dict:
+    return json.loads((out / "train_log.json").read_text())[-1]
+
+
+def test_a_budgeted_training_replays_and_resumes_to_the_byte(colmap_scene, tmp_path, monkeypatch, capsys):
+    clocked, replayed, resumed, on = (tmp_path / name for name in ("clocked", "replayed", "resumed", "on"))
+    every = "--random_background", "--save_iterations", 1500, "--checkpoint_iterations", 1200
+    _timed(monkeypatch, lambda t: 0.04 + 0.02 * (t % 3) + 0.1 * (t > 60))
+    saved = _train(colmap_scene, clocked, *every, "--time_budget", 20)
+    record = _last_record(clocked)
+    assert record["seconds"] == pytest.approx(20.0, rel=0.03) and len(saved) == 2 and record["iteration"] == max(saved)
+    assert "for --time_budget 20; the whole process" in record["lines"][-1]
+    (checkpoint,) = clocked.glob("chkpnt*.pth")
+    monkeypatch.undo()  # the clock of this machine has no say below
+    assert _train(colmap_scene, replayed, *every, "--schedule", clocked / "schedule.json") == saved
+    assert (replayed / "schedule.json").read_bytes() == (clocked / "schedule.json").read_bytes()
+    again = _train(
+        colmap_scene, resumed, *every, "--start_checkpoint", checkpoint, "--schedule", clocked / "schedule.json"
+    )
+    assert again == saved | again and max(again) == max(saved)
+    _timed(monkeypatch, lambda t: 0.3)
+    went_on = _train(colmap_scene, on, *every, "--start_checkpoint", checkpoint, "--time_budget", 20)
+    assert _last_record(on)["seconds"] == pytest.approx(20.0, rel=0.03) and max(went_on) < max(saved)
+    monkeypatch.undo()
+    assert _train(colmap_scene, tmp_path / "both", *every, "--schedule", on / "schedule.json") == went_on
+    assert "Training complete" in capsys.readouterr().out
+
+
+def test_training_stops_at_the_target_with_the_model_that_was_scored(colmap_scene, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(target, "EVERY", 10)
+    monkeypatch.setattr(target, "PER_VIEW", 1)
+    whole, stopped, again = (tmp_path / name for name in ("whole", "stopped", "again"))
+    more = "--iterations", 120, "--prune_sh", -1, "--keep_unseen", "--save_iterations", *range(10, 120, 10)
+    saved = _train(colmap_scene, whole, *more, "--target_psnr", 99)
+    records = json.loads((whole / "train_log.json").read_text())
+    assert any("and --target_psnr 99 was not reached" in line for line in records[-1]["lines"])
+    scores = {record["iteration"]: record["test_views_psnr"] for record in records if "test_views_psnr" in record}
+    assert list(scores) == list(range(10, 130, 10)) and scores[60] > scores[10]
+    wanted = 0.5 * (scores[30] + scores[60])
+    end = next(iteration for iteration, psnr in scores.items() if psnr >= wanted)
+    assert 30 < end < 120
+    early = _train(colmap_scene, stopped, *more, "--target_psnr", wanted)
+    assert max(early) == end and early == {t: ply for t, ply in saved.items() if t <= end}
+    assert f"Trained {end} iterations" in capsys.readouterr().out
+    # With a time budget, whichever comes first; the schedule then says where the run ended.
+    _timed(monkeypatch, lambda t: 0.1)
+    early = _train(colmap_scene, again, "--time_budget", 20, "--target_psnr", wanted, "--plain_step")
+    ended = json.loads((again / "schedule.json").read_text())["ended"]
+    assert ended == max(early) < 200 and ended % 10 == 0
+    monkeypatch.undo()
+    replayed = _train(colmap_scene, tmp_path / "replayed", "--schedule", again / "schedule.json")
+    assert replayed == {t: ply for t, ply in early.items() if t == ended}
+
+
+def test_a_target_needs_test_views(colmap_scene, tmp_path):
+    words = ["-s", colmap_scene, "-m", tmp_path / "out", "--iterations", 5, "--target_psnr", 20, "--disable_viewer"]
+    with pytest.raises(
+        UserError, match="^--target_psnr needs held-out views to score, and there are none; give --eval"
+    ):
+        train.main(list(map(str, words)))
+    assert not (tmp_path / "out").exists()
+
+
+def test_what_contradicts_itself_is_refused(colmap_scene, tmp_path):
+    path = tmp_path / "schedule.json"
+
+    def refused(reason: str, *more: object) -> None:
+        with pytest.raises(UserError, match=reason):
+            _train(colmap_scene, tmp_path / "out", "--schedule", path, *more)
+
+    refused("cannot read .*schedule.json")
+    path.write_text(json.dumps(GOOD))
+    refused("give --iterations 100, as in the run that wrote it")
+    more = "--iterations", 100
+    refused("--time_budget and --schedule both give the pace", *more, "--time_budget", 3)
+    refused("is of a run with --resolution_schedule none; leave that", *more, "--resolution_schedule", "pyramid")
+    path.write_text(json.dumps(GOOD | {"ended": None}))
+    refused("is of a run that did not end", *more)
+    path.write_text("{}")
+    refused("'iterations' is missing", *more)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_checkpoint_finds_its_place_or_is_refused(colmap_scene, tmp_path, monkeypatch, capsys):
+    steady, clocked = tmp_path / "steady", tmp_path / "clocked"
+    _train(colmap_scene, steady, "--iterations", 60, "--checkpoint_iterations", 30)
+    start = "--start_checkpoint", steady / "chkpnt30.pth"
+    _timed(monkeypatch, lambda t: 0.1)
+    saved = _train(colmap_scene, clocked, "--iterations", 60, *start, "--time_budget", 5, "--checkpoint_iterations", 59)
+    first = json.loads((clocked / "schedule.json").read_text())["blocks"][0]
+    assert first["last"] == 30 and first["step"] == 1 / 60  # half of the schedule is done
+    assert max(saved) in (79, 80, 81)
+    (checkpoint,) = clocked.glob("chkpnt*.pth")
+    capsys.readouterr()
+    _train(colmap_scene, tmp_path / "on", "--iterations", 120, "--start_checkpoint", checkpoint)
+    assert "is of a run with --time_budget, and this one has none" in capsys.readouterr().err
+    for reason, more in (
+        ("of a schedule of 60 iterations, not 61", ("--iterations", 61, "--time_budget", 9)),
+        ("with --resolution_schedule none; resume", ("--iterations", 60, "--time_budget", 9, "--resolution_schedule",
+                                                     "pyramid")),
+    ):  # fmt: skip
+        with pytest.raises(UserError, match=reason):
+            _train(colmap_scene, tmp_path / "out", "--start_checkpoint", checkpoint, *more)
+    (steady / "schedule.json").write_text(json.dumps(GOOD | {"iterations": 60}))
+    with pytest.raises(UserError, match="ends before iteration 30 of .*chkpnt30.pth, so it is of another run"):
+        _train(colmap_scene, tmp_path / "out", "--iterations", 60, *start, "--time_budget", 9)
+    _train(colmap_scene, steady, "--iterations", 5)
+    assert not (steady / "schedule.json").exists()  # it was of another training
+
+
+def test_a_slow_start_does_not_end_a_short_run():
+    last, seconds = _run(_fresh(30_000, 1.0), lambda t, n: 0.6 if t == 1 else 0.001)
+    assert seconds == pytest.approx(1.0, rel=0.03) and last > 300
+
+
+def test_a_paced_run_goes_through_rates_degrees_and_windows(colmap_scene, tmp_path, monkeypatch):
+    """40 iterations stand for 4000: the first tenth of the run for the first 400."""
+    path, rates, seen = tmp_path / "schedule.json", [], []
+    blocks = [Block(20, 0.0, 0.02, 0.0), Block(40, 0.4, 0.03, 0.0)]
+    write_schedule(path, Schedule(4000, blocks, 40, 0.0, levels=()))
+    update, begin = GaussianModel.update_learning_rate, GaussianModel.densify_and_prune
+
+    def rate(self, iteration: int) -> float:
+        rates.append(update(self, iteration))
+        seen.append((iteration, self.active_sh_degree))
+        return rates[-1]
+
+    def densify(self, *args, **options):
+        grown.append(options["iteration"])
+        return begin(self, *args, **options)
+
+    grown, steps, begins = [], [], Announcer.begins
+    monkeypatch.setattr(GaussianModel, "update_learning_rate", rate)
+    monkeypatch.setattr(GaussianModel, "densify_and_prune", densify)
+    monkeypatch.setattr(Announcer, "begins", lambda self, step: steps.append(step) or begins(self, step))
+    options = "--position_lr_max_steps", 4000, "--densify_from_iter", 400, "--densify_until_iter", 2000
+    _train(colmap_scene, tmp_path / "out", "--schedule", path, "--iterations", 4000, *options)
+    assert [iteration for iteration, _ in seen] == [*range(80, 1601, 80), *range(1720, 4001, 120)]
+    assert rates[-1] == pytest.approx(rates[0] / 100 * 100 ** (80 / 4000), rel=1e-6)
+    assert grown == [10, 15, 20]  # every fifth iteration within the window
+    assert [step.iteration for step in steps if step.changes] == [10, 13, 15, 20, 24, 32, 40]
+    assert [t for t in range(1, 40) if seen[t][1] > seen[t - 1][1]] == [13, 24, 32]  # after 1000, 2000 and 3000
+
+
+def test_a_checkpoint_comes_with_its_schedule_and_the_last_one_is_the_end(colmap_scene, tmp_path, monkeypatch):
+    _timed(monkeypatch, lambda t: 0.1)
+    with monkeypatch.context() as killed:
+        killed.setattr(ScheduleFile, "ended", lambda *_: None)  # as if the process were killed before
+        _train(colmap_scene, tmp_path, "--time_budget", 4, "--checkpoint_iterations", 3000)
+    (checkpoint,) = tmp_path.glob("chkpnt*.pth")
+    assert read_schedule(tmp_path / "schedule.json").ended == int(checkpoint.stem[6:])
+    with pytest.raises(UserError, match="and its schedule ends with .*, so nothing is left to do"):
+        _train(colmap_scene, tmp_path / "on", "--time_budget", 4, "--start_checkpoint", checkpoint)
+
+
+def test_an_iteration_that_becomes_the_last_takes_no_step(colmap_scene, tmp_path, monkeypatch):
+    monkeypatch.setattr(target, "EVERY", 7)
+    monkeypatch.setattr(target, "PER_VIEW", 1)
+    states = []
+    for name in ("fused", "plain"):
+        more = ["--plain_step"] if name == "plain" else []
+        _train(colmap_scene, tmp_path / name, "--target_psnr", 1, "--checkpoint_iterations", 100, *more)
+        states.append(load_checkpoint(tmp_path / name / "chkpnt7.pth")[0])
+    assert torch.equal(states[0][1], states[1][1]) and states[0][10]["state"][0]["step"].item() == 6

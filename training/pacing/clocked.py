@@ -1,0 +1,81 @@
+"""A pace that follows the clock, so that a run takes the seconds it was given (--time_budget)."""
+
+import sys
+
+from tqdm import tqdm
+
+from training.pacing.pace import Block, Paced, Schedule
+
+PART = 1 / 200  # of the budget that a block takes, so that what is left is known well before the end
+_MOST_GROWTH = 2  # of a block over the one before, while the first iterations are slower than the others
+_LAST = 1.5  # blocks; if no more are left, they are one
+
+
+class Clocked(Paced):
+    """Goes through the schedule as the seconds of training pass, and ends with them.
+
+    A block of iterations does as large a part of what is left of the schedule as it will take of the seconds that are
+    left, at the speed of the blocks before it. So seconds that were lost, by a slow start or by another program, are
+    taken from all that is left. Seconds are those of training, with those of the runs that this one resumes, whose
+    blocks are in the schedule.
+    """
+
+    def __init__(self, schedule: Schedule) -> None:
+        super().__init__(schedule)
+        self._budget = schedule.time_budget
+        self._speed: float | None = None  # seconds of an iteration
+        self._measured = 0  # blocks of this run
+        self._first = self.blocks[-1].last if self.blocks else 0
+
+    def reach(self, iteration: int, seconds: float) -> None:
+        if not self.blocks or iteration > self.blocks[-1].last:
+            self._measure(seconds)
+            self._decide(seconds)
+
+    def recorded(self, iteration: int, last: bool) -> Schedule:
+        return self.up_to(iteration)._replace(ended=iteration if last else None)
+
+    def _measure(self, seconds: float) -> None:
+        """Take the speed of the block that is done, if this run has taken it."""
+        if not self.blocks or self.blocks[-1].last == self._first:
+            return
+        block, before = self.blocks[-1], self._last(len(self.blocks) - 1)
+        speed = max(seconds - block.seconds, 1e-9) / (block.last - before)
+        self._measured += 1
+        # The first iteration loads kernels and photos, so it is no measure of the others.
+        self._speed = speed if self._measured <= 2 else (self._speed + speed) / 2
+
+    def _decide(self, seconds: float) -> None:
+        """Add the block that comes next."""
+        before = self.blocks[-1].last if self.blocks else 0
+        done, left = self.progress(before), self._budget - seconds
+        count, final = self._count(left)
+        if final:
+            step = (1.0 - done) / count
+            self.ends = before + count
+        elif self._speed is None:
+            step = min(1.0 / self.length, (1.0 - done) / 2)
+        else:
+            step = (1.0 - done) * min(self._speed / left, 0.5 / count)
+        self.blocks.append(Block(before + count, done, step, round(seconds, 6)))
+        if final and self._measured <= 1:
+            tqdm.write(
+                f"warning: --time_budget {self._budget:g} is too short for {self.ends + 1} iterations, so training "
+                f"ends with iteration {self.ends}; give more seconds, or lower --resolution (-r)",
+                file=sys.stderr,
+            )
+
+    def _count(self, left: float) -> tuple[int, bool]:
+        """Iterations of the next block, and whether the run ends with it."""
+        if left <= 0:
+            return 1, True
+        if self._speed is None:
+            return 1, False
+        iterations = left / self._speed
+        if self._measured == 1:
+            return 1, iterations < 0.5
+        previous = self.blocks[-1].last - self._last(len(self.blocks) - 1)
+        block = max(1.0, min(_MOST_GROWTH * previous, PART * self._budget / self._speed))
+        if iterations < _LAST * block:
+            return max(1, int(iterations + 0.5)), True
+        return int(block), False

@@ -1,0 +1,80 @@
+"""Coarse to fine: views that are smaller at first, by how far the schedule is (--resolution_schedule)."""
+
+from bisect import bisect_right
+from collections.abc import Sequence
+
+import torch
+
+from scene.cameras import Camera
+from scene.pictures.store import GPU_SHARE, ImageStore
+from utils.host.memory import free_memory
+
+Levels = Sequence[tuple[float, float]]  # part of the schedule that is done (0 to 1), and factor from then on
+
+PYRAMID: Levels = ((0.0, 4.0), (0.1, 2.0), (0.25, 1.0))
+LEAST = 32  # pixels of the shorter side; a picture is not made smaller than that
+
+
+class Resolution:
+    """Gives the views of training in the size that their place in the schedule asks for.
+
+    A smaller view is made when it is first needed, and kept while its level lasts. The smaller photos take 1 /
+    factor**2 of the memory of the photos, besides these. Where that is too much for a GPU, or where --images_to_load
+    limits the images, they are made again each time. Views of other classes, or with assigned pictures, keep their
+    size. factor: of the last view.
+    """
+
+    def __init__(self, levels: Levels, length: int, images: ImageStore) -> None:
+        """length: of the schedule, in iterations."""
+        self.factor = 1.0
+        self._starts = [part * length for part, _ in levels]
+        self._factors = [factor for _, factor in levels]
+        self._images = images
+        self._made: dict[Camera, Camera] = {}
+        self._keeps = True
+
+    def factor_at(self, nominal: int) -> float:
+        """The factor at an iteration of the schedule."""
+        index = bisect_right(self._starts, nominal) - 1
+        return self._factors[index] if index >= 0 else 1.0
+
+    def changes(self, before: int, now: int) -> bool:
+        """Whether the factor differs between two iterations of the schedule."""
+        return self.factor_at(before) != self.factor_at(now)
+
+    def view(self, camera: Camera, nominal: int) -> Camera:
+        """A view as it is trained at an iteration of the schedule. Ask in ascending order."""
+        factor = self.factor_at(nominal)
+        if factor != self.factor:
+            self._begin(factor)
+        if not self._shrinks(camera):
+            return camera
+        found = self._made.get(camera)
+        if found is None:
+            found = camera.at_size(smaller(camera, factor))
+            if self._keeps:
+                self._made[camera] = found
+        return found
+
+    def needs(self, camera: Camera) -> bool:
+        """Whether the pictures of a view will be needed in their own size."""
+        return camera not in self._made
+
+    def _shrinks(self, camera: Camera) -> bool:
+        if self.factor == 1 or not isinstance(camera, Camera) or not camera.is_plain:
+            return False
+        return smaller(camera, self.factor) != (camera.image_width, camera.image_height)
+
+    def _begin(self, factor: float) -> None:
+        self.factor = factor
+        self._made.clear()
+        free = free_memory(torch.device(self._images.device))
+        room = free is None or self._images.planned_bytes / factor**2 <= GPU_SHARE * free
+        self._keeps = not self._images.limit and room
+
+
+def smaller(camera: Camera, factor: float) -> tuple[int, int]:
+    """Size (width, height) of a view whose sides are divided by a factor, or by less if it is small."""
+    sides = camera.image_width, camera.image_height
+    factor = max(1.0, min(factor, min(sides) / LEAST))
+    return tuple(max(1, round(side / factor)) for side in sides)
