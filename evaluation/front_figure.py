@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,10 +20,12 @@ LABELS = {
 }
 
 
-def draw_fronts(path: Path, scene: str, found: Mapping[str, Any]) -> None:
-    """Draw PSNR against each cost. found: the scene's `fronts` in report.json.
+def draw_fronts(path: Path, scene: str, found: Mapping[str, Any], names: Sequence[str]) -> None:
+    """Draw PSNR against each cost.
 
-    A point is the mean over the seeds, a bar the standard deviation; the front goes through the means.
+    found: the scene's `fronts` in report.json. names: all option sets of the scene, which colours follow, so that they
+    are those of the curves. A point is the mean over the seeds, a bar the standard deviation; the front goes
+    through the means.
     """
     from matplotlib.figure import Figure  # imported here because only a report needs it
 
@@ -31,7 +33,8 @@ def draw_fronts(path: Path, scene: str, found: Mapping[str, Any]) -> None:
     figure.suptitle(f"{printable(scene)}: where each option set ended")
     for axes, cost in zip(figure.subplots(1, len(COSTS)), COSTS, strict=True):
         points = []
-        for index, (name, point) in enumerate(found["sets"].items()):
+        for name, point in found["sets"].items():
+            index = names.index(name)
             x, y = point[cost], point["PSNR"]
             points.append((x["mean"], y["mean"]))
             axes.errorbar(
@@ -42,6 +45,6 @@ def draw_fronts(path: Path, scene: str, found: Mapping[str, Any]) -> None:
         axes.set(xscale="log", xlabel=LABELS[cost], ylabel="PSNR of the test views (dB)")
         plain_log_axis(axes.xaxis)
         axes.grid(True, which="both", alpha=0.3)
-    figure.axes[-1].legend(fontsize="small")
+    figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside right upper", fontsize="small")
     with atomic_write(path) as temporary:
         figure.savefig(temporary, dpi=110, metadata={"Software": None})

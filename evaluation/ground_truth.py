@@ -47,7 +47,7 @@ def _why(run: dict[str, Any], runs: Sequence[dict[str, Any]]) -> str:
     reasons = reasons or ["the pixels of its test views differ, or which of them count"]
     ours, theirs = (_of_ground_truth(one["options"] or ()) for one in (run, other))
     if ours != theirs:
-        reasons.append(f"{' '.join(ours) or 'nothing'} instead of {' '.join(theirs) or 'nothing'}")
+        reasons.append(f"{' '.join(ours) or 'the defaults'} instead of {' '.join(theirs) or 'the defaults'}")
     return "; ".join(reasons)
 
 

@@ -137,7 +137,7 @@ def write_report(report: Mapping[str, Any], output: Path) -> None:
         )
         for scene in dict.fromkeys(run["scene"] for run in report["runs"])
     }
-    drawn = {scene: _draw_fronts(output, scene, found) for scene, found in report["fronts"].items()}
+    drawn = {scene: _draw_fronts(output, scene, report) for scene in report["fronts"]}
     sections = document(report, pictures, drawn)
     texts = {
         "report.md": to_markdown(TITLE, sections, output),
@@ -183,10 +183,11 @@ def _draw(
     return pictures
 
 
-def _draw_fronts(output: Path, scene: str, found: Mapping[str, Any]) -> list[Block]:
+def _draw_fronts(output: Path, scene: str, report: Mapping[str, Any]) -> list[Block]:
     path = output / "figures" / f"{scene}_fronts.png"
+    names = list(dict.fromkeys(run["config"] for run in report["runs"] if run["scene"] == scene))
     try:
-        draw_fronts(path, scene, found)
+        draw_fronts(path, scene, report["fronts"][scene], names)
     except ImportError as error:
         print(f"warning: no figure of {scene}'s fronts: matplotlib cannot be imported ({error})", file=sys.stderr)
         return []

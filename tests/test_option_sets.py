@@ -160,12 +160,15 @@ def test_a_set_within_the_spread_is_called_so():
 def test_the_figure_has_a_point_and_a_bar_for_each_set(tmp_path, monkeypatch):
     drawn, plain = [], Figure.savefig
     monkeypatch.setattr(Figure, "savefig", lambda self, *a, **k: (drawn.append(self), plain(self, *a, **k)))
-    draw_fronts(tmp_path / "fronts.png", "attic", fronts(comparable_sets(_runs(), "attic")))
+    draw_fronts(
+        tmp_path / "fronts.png", "attic", fronts(comparable_sets(_runs(), "attic")), ["apart", "adc", "fast", "small"]
+    )
     assert (tmp_path / "fronts.png").stat().st_size > 10_000
     seconds, gaussians, megabytes = drawn[0].axes
     assert megabytes.get_xlabel() == "megabytes of the PLY"
     marked = [bar.lines[0].get_xydata().tolist()[0] for bar in seconds.containers]
     assert marked == [[40, pytest.approx(31.2)], [20, pytest.approx(32.2)], [50, pytest.approx(30.4)]]
+    assert [bar.lines[0].get_color() for bar in seconds.containers] == ["C1", "C2", "C3"]  # as in the other figure
     assert all(len(bar.lines[2]) == 2 for bar in seconds.containers)  # of both numbers
     fronts_drawn = [
         next(line for line in axes.lines if line.get_label() == "Pareto front") for axes in (seconds, gaussians)
@@ -182,11 +185,11 @@ def _other(run: dict, **change) -> dict:
     ("change", "why"),
     [
         ({"test_sizes": [[48, 32]], "options": ["-r", "2", "--sh_degree", "1"]},
-         "its test views have 48x32 pixels, the others' 96x64; -r 2 instead of nothing"),
+         "its test views have 48x32 pixels, the others' 96x64; -r 2 instead of the defaults"),
         ({"test_sizes": [[48, 64]], "options": ["--sh_degree", "1", "--train_test_exp"]},
-         "its test views have 48x64 pixels, the others' 96x64; --train_test_exp instead of nothing"),
+         "its test views have 48x64 pixels, the others' 96x64; --train_test_exp instead of the defaults"),
         ({"options": ["--masks", "foreground"]},
-         "the pixels of its test views differ, or which of them count; --masks foreground instead of nothing"),
+         "the pixels of its test views differ, or which of them count; --masks foreground instead of the defaults"),
         ({"views": {"test": 3, "train": 6}}, "it has 3 test views, the others 2"),
         ({"ground_truth_sha256": None}, "its ground truth is not known"),
     ],
