@@ -23,8 +23,9 @@ from typing import Any
 import utils.host.openmp  # noqa: F401  isort: skip  (before torch)
 
 from evaluation import stages
-from evaluation.configs import check_options, read_configs
-from evaluation.document import Table, cheapest_table, result_blocks
+from evaluation.blocks import Table
+from evaluation.configs import check_options, read_configs, shipped
+from evaluation.document import cheapest_table, result_blocks
 from evaluation.earlier import joined, joined_peers, read_earlier
 from evaluation.machine import machine
 from evaluation.peers import peers_of
@@ -67,7 +68,8 @@ def _parser() -> ArgumentParser:
         help="train with each of these seeds and report mean and standard deviation (default: once)")  # fmt: skip
     add("--configs", type=Path, metavar="FILE",
         help='train with each option set of a JSON file, {"name": ["--sh_degree", "1"], ...}, and report which is '
-        "cheapest for a given error (default: once)")  # fmt: skip
+        f"cheapest for a given error; {' or '.join(shipped())} names a file that comes with this program "
+        "(default: once)")  # fmt: skip
     add("--peer", nargs=2, action="append", default=[], metavar=("NAME", "FILE"),
         help="draw another program's error against time beside ours, from a CSV file with the columns seconds and "
         "test_psnr (`python -m evaluation.peer_curve` makes it); with several scenes NAME is SCENE/NAME; may be given "

@@ -3,6 +3,7 @@
 import argparse
 import contextlib
 import io
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,11 @@ from diagnosis.lines import Line, from_error
 from diagnosis.values import only_reset, wrong_positions, wrong_sizes
 from gaussian_renderer import render
 from gaussian_renderer.scored_views import ScoredViews
+from records.error_curve import NAME as CURVE
+from records.error_curve import read_curve
+from records.training_log import NAME as LOG
+from records.training_log import read_log
+from records.what_to_try import what_to_try
 from scene import Scene
 from scene.cameras import Camera
 from scene.gaussian_model import GaussianModel
@@ -60,7 +66,18 @@ def check_model(model_path: str, iteration: int, source: str | None = None, imag
         return lines
     if wrong := wrong_sizes(gaussians, scene.cameras_extent):
         return [*lines, wrong]
-    return lines + check_shapes(gaussians, scene.cameras_extent) + check_renders(scene, options, stored)
+    lines += check_shapes(gaussians, scene.cameras_extent) + check_renders(scene, options, stored)
+    return lines + check_training(Path(model_path))
+
+
+def check_training(model: Path) -> list[Line]:
+    """Notes on what the log and the curve of the training suggest to try; none where it has written none."""
+    try:
+        rows = read_curve(model / CURVE) if (model / CURVE).is_file() else []
+        records = read_log(model / LOG)
+    except UserError as error:
+        return [from_error(error)]
+    return [Line(sentence, note=True) for sentence in what_to_try(rows, records)]
 
 
 def _load(model_path: str, stored: dict[str, Any], iteration: int) -> tuple[argparse.Namespace, Scene]:

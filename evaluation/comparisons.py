@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
+from evaluation.blocks import Comparison
 from evaluation.contact_sheet import GAIN, error_image, shrunk
-from evaluation.document import Comparison
 from evaluation.model_folder import counted_picture, load_scores, picture_name
 from utils.files.json_files import read_json
 

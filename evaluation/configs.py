@@ -1,4 +1,4 @@
-"""Named option sets for train.py, read from --configs FILE."""
+"""Named option sets for train.py, read from --configs FILE or one of the files in sets/."""
 
 from __future__ import annotations
 
@@ -13,18 +13,29 @@ from utils.system_utils import UserError
 
 LONGEST = 100  # bytes of a name, which is also part of a figure's name
 Parse = Callable[[Sequence[str]], object]
+SHIPPED = Path(__file__).parent / "sets"
 _SHAPE = 'like {"base": [], "sh1": ["--sh_degree", "1"]}'
+
+
+def shipped() -> list[str]:
+    """List the names of the files in sets/, which --configs takes."""
+    return sorted(file.stem for file in SHIPPED.glob("*.json"))
 
 
 def read_configs(path: Path, parse: Parse | None) -> dict[str, tuple[str, ...]]:
     """Read the option sets of a JSON file, {name: [word, ...]}, in its order. A word may also be a number.
 
-    parse: see `check_options`. UserError for any other content, or for words that train.py does not accept.
+    path: of the file, or if there is none, the name of one in sets/, without its ending. parse: see `check_options`.
+    UserError for any other content, or for words that train.py does not accept.
     """
+    if not path.is_file() and str(path) in shipped():
+        path = SHIPPED / f"{path}.json"
     try:
         content = json.loads(path.read_text(encoding="utf-8"), object_pairs_hook=_no_duplicates)
     except OSError as error:
-        raise UserError(f"cannot read {path} ({error.strerror}); --configs takes a JSON file {_SHAPE}") from error
+        raise UserError(
+            f"cannot read {path} ({error.strerror}); --configs takes a JSON file {_SHAPE}, or {' or '.join(shipped())}"
+        ) from error
     except (ValueError, RecursionError) as error:
         raise UserError(f"{path} is not a table of option sets ({error}); write it {_SHAPE}") from error
     if not isinstance(content, dict) or not content:

@@ -1,72 +1,19 @@
-"""Content of the report, for both renderings: sections of paragraphs, tables, figures and quoted messages."""
+"""Content of the report, for both renderings: its sections."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
+from evaluation.blocks import Block, Link, Quote, Section, Table, number, run_title, spread_cell
 from evaluation.machine import one_line
 from evaluation.published import COMPARED, published_tables
+from evaluation.set_sections import front_sections, reached_sections
 from evaluation.summary import SCORES
-
-
-@dataclass(frozen=True)
-class Table:
-    """A table of text cells; the first column is aligned to the left, the others to the right."""
-
-    header: list[str]
-    rows: list[list[str]]
-
-
-@dataclass(frozen=True)
-class Picture:
-    """A PNG on disk, with an absolute path."""
-
-    path: Path
-    caption: str
-
-
-@dataclass(frozen=True)
-class Quote:
-    """Messages of a program, verbatim."""
-
-    lines: list[str]
-
-
-@dataclass(frozen=True)
-class Link:
-    """A file beside the report. target: its path relative to the report's folder."""
-
-    text: str
-    target: str
-
-
-@dataclass(frozen=True)
-class Comparison:
-    """A test view, each picture as the bytes of a JPEG: photo, render, and their amplified difference."""
-
-    caption: str
-    photo: bytes
-    render: bytes
-    error: bytes
-
-
-Block = str | Table | Picture | Quote | Link | Comparison
-
-
-@dataclass(frozen=True)
-class Section:
-    """A title and the blocks under it."""
-
-    title: str
-    blocks: list[Block] = field(default_factory=list)
-
 
 _DIGITS = {
     **{"PSNR": 2, "SSIM": 4, "LPIPS": 4, "seconds": 1, "process_seconds": 1, "cpu_seconds": 1},
-    **{"gaussians": 0, "peak_memory_mib": 0, "render_ms": 2},
+    **{"optimizer_steps": 0, "gaussians": 0, "ply_mb": 1, "peak_memory_mib": 0, "render_ms": 2},
 }
 _LAST_OF_PEER = {"iteration": 0, "seconds": 1, "test_psnr": 2, "test_ssim": 4, "gaussians": 0}
 _HEADS = {
@@ -74,21 +21,12 @@ _HEADS = {
     "seconds": "training (s)",
     "process_seconds": "process (s)",
     "cpu_seconds": "CPU (s)",
+    "optimizer_steps": "optimiser steps",
     "gaussians": "Gaussians",
+    "ply_mb": "PLY (MB)",
     "peak_memory_mib": "peak memory (MiB)",
     "render_ms": "render (ms)",
 }
-
-
-def number(value: float | None, digits: int) -> str:
-    """Format a number for a cell; None becomes -."""
-    return "-" if value is None else f"{value:,.{digits}f}"
-
-
-def spread_cell(spread: Mapping[str, Any], digits: int) -> str:
-    """Format mean and standard deviation of a `summary.spread`."""
-    deviation = "" if spread["std"] is None else f" ± {spread['std']:,.{digits}f}"
-    return number(spread["mean"], digits) + deviation
 
 
 def results_table(rows: Sequence[Mapping[str, Any]]) -> Table:
@@ -104,19 +42,26 @@ def results_table(rows: Sequence[Mapping[str, Any]]) -> Table:
     for row in rows:
         label = [row["scene"], *([row["config"] or "-"] if configs else [])]
         seeds = " ".join(map(str, row["seeds"])) if row["seeds"] != [None] else "-"
-        cells.append(
-            [*label, f"{row['iteration']:,}", seeds, *(spread_cell(row[name], _DIGITS[name]) for name in quantities)]
-        )
+        cells.append([*label, _iteration(row), seeds, *(spread_cell(row[name], _DIGITS[name]) for name in quantities)])
     return Table(header, cells)
 
 
-def document(report: Mapping[str, Any], figures: Mapping[str, Sequence[Block]]) -> list[Section]:
-    """Return the sections of the report. figures: those of each scene and its comparisons, by scene."""
+def _iteration(row: Mapping[str, Any]) -> str:
+    several = row.get("iterations", [])  # reports of older versions lack it
+    return f"{several[0]:,} to {several[-1]:,}" if len(several) > 1 else f"{row['iteration']:,}"
+
+
+def document(
+    report: Mapping[str, Any], figures: Mapping[str, Sequence[Block]], fronts: Mapping[str, Sequence[Block]]
+) -> list[Section]:
+    """Return the sections of the report. figures: those of each scene and its comparisons; fronts: of its fronts."""
     return [
         *_failures(report),
         _results(report),
         *_peers(report),
         *_published(report),
+        *reached_sections(report),
+        *front_sections(report, fronts),
         *_cheapest(report),
         *_scenes(report, figures),
         *_closing(report),
@@ -135,19 +80,14 @@ def _failures(report: Mapping[str, Any]) -> list[Section]:
     return [Section("Failed", blocks)] if blocks else []
 
 
-def run_title(run: Mapping[str, Any]) -> str:
-    """Name a run by scene, option set and seed."""
-    seed = None if run["seed"] is None else f"seed {run['seed']}"
-    return ", ".join(part for part in (run["scene"], run["config"], seed) if part)
-
-
 def result_blocks(rows: Sequence[Mapping[str, Any]]) -> list[Block]:
     """Return the table of `summary`, and one of the rows that stand apart from the others."""
     apart = [row for row in rows if row.get("apart")]  # reports of older versions lack it
     if not apart:
         return [results_table(rows)]
     comparable = [row for row in rows if not row["apart"]]
-    title = "Scored on other ground truth, so not to be compared with other rows:"
+    why = {f"{row['scene']}, {row['config'] or '-'}: {row.get('why_apart') or 'not known'}": None for row in apart}
+    title = f"Scored on other ground truth, so not to be compared with other rows. {'. '.join(why)}."
     return [*([results_table(comparable)] if comparable else []), title, results_table(apart)]
 
 
@@ -168,6 +108,10 @@ def _results(report: Mapping[str, Any]) -> Section:
             "Gaussians are counted as trained, as in published tables. The saved models lack those that no training "
             "view depends on (gaussians_saved in report.json)."
         )
+    if any(row.get("open_ended") for row in rows):
+        blocks.append("Trainings with a time budget or a score to reach end by themselves: their row is of their end.")
+    if any(row["optimizer_steps"]["mean"] is not None for row in rows):
+        blocks.append("Where no optimiser steps are given, there was one in each iteration but the last.")
     if rows and all(row["LPIPS"]["mean"] is None for row in rows):
         blocks.append(
             "LPIPS is missing: metrics.py found no weights of its network, and its message says where to put them."
@@ -177,7 +121,7 @@ def _results(report: Mapping[str, Any]) -> Section:
     if means := report["dataset_means"]:
         header = ["data set", "options", "iteration", *(_HEADS.get(name, name) for name in _DIGITS)]
         cells = [
-            [mean["group"], mean["config"] or "-", f"{mean['iteration']:,}"]
+            [mean["group"], mean["config"] or "-", number(mean["iteration"], 0)]
             + [number(mean[name], digits) for name, digits in _DIGITS.items()]
             for mean in means
         ]

@@ -64,7 +64,7 @@ def draw_curves(path: Path, scene: str, runs: Sequence[dict[str, Any]], peers: S
     for axes, (value, label, sign) in zip(figure.subplots(1, len(panels)), panels, strict=True):
         every = _draw_runs(axes, runs, value, several)
         if several and sign and every:
-            _draw_front(axes, every, sign)
+            draw_front(axes, every, sign)
         theirs = _draw_peers(axes, peers, value)
         drawn = every + theirs
         seconds = "seconds of training, without scoring and saving" + (
@@ -108,7 +108,7 @@ def _draw_runs(axes: Axes, runs: Sequence[dict[str, Any]], value: Value, several
     return every
 
 
-def _draw_front(axes: Axes, points: Sequence[Point], sign: int) -> None:
+def draw_front(axes: Axes, points: Sequence[Point], sign: int) -> None:
     """Mark the Pareto front. sign: 1 if a lower number is better, -1 if a higher one is."""
     front = [points[i] for i in pareto_front([(seconds, sign * number) for seconds, number in points])]
     axes.plot(

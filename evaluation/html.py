@@ -12,7 +12,7 @@ from urllib.parse import quote
 import jinja2
 from PIL import Image
 
-from evaluation.document import Comparison, Link, Picture, Quote, Section, Table
+from evaluation.blocks import Comparison, Link, Picture, Quote, Section, Table
 
 _PHOTOGRAPHIC = 1 << 18  # bytes of a PNG above which a JPEG replaces it
 _QUALITY = 90

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from urllib.parse import quote
 
-from evaluation.document import Block, Comparison, Link, Picture, Quote, Section, Table
+from evaluation.blocks import Block, Comparison, Link, Picture, Quote, Section, Table
 from utils.files.markdown_table import markdown_table
 
 _MEANT = re.compile(r"[\\`*\[\]<>&]")  # characters that begin or end links, emphasis, code and HTML

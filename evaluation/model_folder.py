@@ -17,6 +17,8 @@ from utils.files.image_files import UNREADABLE, open_render
 from utils.files.json_files import read_json
 from utils.system_utils import UserError, saved_iterations
 
+SCHEDULE = "schedule.json"  # of a training whose iterations followed the clock
+
 
 def ply_file(model: Path, iteration: int) -> Path:
     """Return the path of a saved iteration's Gaussians."""
@@ -45,11 +47,13 @@ def trained_gaussians(model: Path, iteration: int) -> int:
         trained, unseen = int(left_out["gaussians"]), int(left_out["unseen"])
     except (UserError, KeyError, TypeError, ValueError):
         return saved  # a model of another program, which leaves nothing out
-    return trained if iteration == saved_iterations(model / "point_cloud")[-1] and trained - unseen == saved else saved
+    return trained if iteration == trained_iterations(model)[-1] and trained - unseen == saved else saved
 
 
 def shorter_ends_there(model: Path) -> bool:
     """Whether a training with fewer --iterations ends with the model that a longer one has then; False if unknown."""
+    if (model / SCHEDULE).is_file():
+        return False
     try:
         options = read_cfg_args(model)
     except UserError:
@@ -72,15 +76,35 @@ def load_scores(model: Path, method: str) -> tuple[dict[str, float | None], dict
 
 def training_seconds(model: Path, iteration: int) -> float | None:
     """Read the seconds of training until an iteration, without tests and saving; None if train.py logged none."""
+    return logged(model, warn=True).get(iteration, {}).get("seconds")
+
+
+def optimizer_steps(model: Path, iteration: int) -> int | None:
+    """Read the number of optimiser steps until an iteration; None if train.py logged none: one for each iteration."""
+    steps = logged(model).get(iteration, {}).get("optimizer_steps")
+    return steps if isinstance(steps, int) else None
+
+
+def logged(model: Path, warn: bool = False) -> dict[int, dict[str, Any]]:
+    """Read the records of train_log.json by their iterations; none without the file, or if it is damaged."""
     log = model / "train_log.json"
     if not log.is_file():
-        return None
+        return {}
     try:
-        seconds = {record["iteration"]: float(record["seconds"]) for record in read_json(log)}
-    except (OSError, KeyError, ValueError, TypeError) as error:
-        print(f"{log} is damaged ({type(error).__name__}), so the training time is unknown", file=sys.stderr)
-        return None
-    return seconds.get(iteration)
+        return {int(record["iteration"]): record | {"seconds": float(record["seconds"])} for record in read_json(log)}
+    except (OSError, KeyError, ValueError, TypeError, RecursionError) as error:
+        if warn:
+            print(f"{log} is damaged ({type(error).__name__}), so the training time is unknown", file=sys.stderr)
+        return {}
+
+
+def trained_iterations(model: Path) -> list[int]:
+    """List the saved iterations of the training that the log tells of, ascending.
+
+    Where the clock or a score ends a training, an earlier one of the same options may have left a later iteration.
+    """
+    saved, end = saved_iterations(model / "point_cloud"), max(logged(model), default=None)
+    return saved if end not in saved else [iteration for iteration in saved if iteration <= end]
 
 
 def closing_lines(model: Path) -> list[str]:

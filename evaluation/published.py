@@ -32,7 +32,8 @@ def compare(
     for table in published_tables():
         for row in rows:
             run = next(run for run in runs if (run["scene"], run["config"]) == (row["scene"], row["config"]))
-            theirs = table["scenes"].get(row["scene"], {}).get(str(row["iteration"]))
+            iteration = None if row["open_ended"] else row["iteration"]
+            theirs = table["scenes"].get(row["scene"], {}).get(str(iteration))
             if theirs and row["group"] in table["groups"] and _meets(run, table.get("requires", {})):
                 ours = {name: row[name]["mean"] for name in COMPARED}
                 compared.append(_comparison(table, row, row["scene"], ours, theirs, run["added_options"]))

@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from evaluation.blocks import Block, Picture, run_title
 from evaluation.comparisons import OF_A_REPORT, OF_A_RUN, comparisons
-from evaluation.document import Block, Picture, document, run_title
+from evaluation.document import document
 from evaluation.figures import draw_curves, draw_worst_views
+from evaluation.front_figure import draw_fronts
+from evaluation.fronts import fronts
 from evaluation.ground_truth import stand_apart
 from evaluation.html import to_html
 from evaluation.markdown import to_markdown
+from evaluation.option_sets import Sets, comparable_sets
 from evaluation.published import compare
+from evaluation.reached import reached
 from evaluation.summary import dataset_means, summarise
 from evaluation.tradeoff import cheapest
 from records.error_curve import whole_sets
@@ -43,6 +48,7 @@ def make_report(
     return {
         "cheapest": _cheapest(runs),
         "dataset_means": means,
+        "fronts": _of_scenes(runs, fronts),
         "manifest": {
             "command": list(command),
             "earlier_commands": [list(words) for words in earlier_commands if list(words) != list(command)],
@@ -51,10 +57,19 @@ def make_report(
         },
         "peers": list(peers),
         "published": compare(runs, rows, means),
+        "reached": _of_scenes(runs, reached),
         "runs": runs,
         "summary": rows,
         "warnings": _warnings(runs, rows),
     }
+
+
+def _of_scenes(
+    runs: Sequence[dict[str, Any]], of_sets: Callable[[Sets], dict[str, Any] | None]
+) -> dict[str, dict[str, Any]]:
+    """Return what a function says of the option sets of each scene that can be compared, if it says anything."""
+    scenes = dict.fromkeys(run["scene"] for run in runs)
+    return {scene: found for scene in scenes if (found := of_sets(comparable_sets(runs, scene)))}
 
 
 def _cheapest(runs: Sequence[dict[str, Any]]) -> dict[str, list[dict[str, Any]]]:
@@ -122,7 +137,8 @@ def write_report(report: Mapping[str, Any], output: Path) -> None:
         )
         for scene in dict.fromkeys(run["scene"] for run in report["runs"])
     }
-    sections = document(report, pictures)
+    drawn = {scene: _draw_fronts(output, scene, report) for scene in report["fronts"]}
+    sections = document(report, pictures, drawn)
     texts = {
         "report.md": to_markdown(TITLE, sections, output),
         "report.html": to_html(TITLE, sections),
@@ -165,6 +181,17 @@ def _draw(
             seen.add(run["config"])
             pictures += [Picture(path, f"{run_title(run)}: the test views with the lowest PSNR"), *views]
     return pictures
+
+
+def _draw_fronts(output: Path, scene: str, report: Mapping[str, Any]) -> list[Block]:
+    path = output / "figures" / f"{scene}_fronts.png"
+    names = list(dict.fromkeys(run["config"] for run in report["runs"] if run["scene"] == scene))
+    try:
+        draw_fronts(path, scene, report["fronts"][scene], names)
+    except ImportError as error:
+        print(f"warning: no figure of {scene}'s fronts: matplotlib cannot be imported ({error})", file=sys.stderr)
+        return []
+    return [Picture(path, f"{scene}: PSNR of each option set at its end, against seconds, Gaussians and megabytes")]
 
 
 def _timing(runs: Sequence[dict[str, Any]]) -> str:

@@ -9,13 +9,17 @@ from pathlib import Path
 from typing import Any
 
 from evaluation.model_folder import (
+    SCHEDULE,
     closing_lines,
     count_gaussians,
     load_scores,
+    optimizer_steps,
     picture_name,
     picture_size,
+    ply_file,
     shorter_ends_there,
     trained_gaussians,
+    trained_iterations,
     training_seconds,
     view_names,
 )
@@ -27,16 +31,17 @@ from records.error_curve import NAME as CURVE
 from records.error_curve import Row, best_test, read_curve, whole_sets
 from scene.readers.info import HOLD
 from utils.files.json_files import read_json
-from utils.system_utils import UserError, saved_iterations
+from utils.system_utils import UserError
 
+MB = 1e6  # bytes
 WORST = 3  # number of views with the lowest PSNR to show of each run
 
 
 def read_run(run: Run, output: Path, failure: Failure | None) -> dict[str, Any]:
     """Return everything known of a run, as JSON; missing parts are null or empty. Paths are relative to `output`.
 
-    finished: the last iteration is scored and no stage failed. A damaged file counts as a failure. options, source,
-    added_options: null if not known.
+    finished: the last iteration is scored and no stage failed. open_ended: the training itself decided when to end. A
+    damaged file counts as a failure. options, source, added_options: null if not known.
     """
     record = Record(run.model)
     trained = record.stage("train") or {}
@@ -57,6 +62,7 @@ def read_run(run: Run, output: Path, failure: Failure | None) -> dict[str, Any]:
         "machine": trained.get("machine") or {},
         "model": os.path.relpath(run.model, output),
         "options": known and known["options"],
+        "open_ended": _open_ended(run, known),
         "page": _page(run, output),
         "peak": _peak(curve, run.model),
         "scene": run.scene.name,
@@ -68,7 +74,7 @@ def read_run(run: Run, output: Path, failure: Failure | None) -> dict[str, Any]:
         "wall_seconds": trained.get("wall_seconds"),
         "worst_views": [],
     }
-    saved = saved_iterations(run.model / "point_cloud")
+    saved = trained_iterations(run.model)
     try:
         iterations = {str(n): _iteration(run.model, n, curve) for n in saved}
         if saved:  # the process trained to the end
@@ -90,6 +96,11 @@ def read_run(run: Run, output: Path, failure: Failure | None) -> dict[str, Any]:
     return result
 
 
+def _open_ended(run: Run, known: dict[str, Any] | None) -> bool:
+    options = tuple(known["options"]) if known else ()
+    return (run.model / SCHEDULE).is_file() or dataclasses.replace(run, options=options).iterations is None
+
+
 def _page(run: Run, output: Path) -> str | None:
     """Return the path of the model's HTML file, relative to the report, if full_eval.py --html_models has made it."""
     page = page_file(run.model, output)
@@ -109,7 +120,8 @@ def _curve(model: Path) -> list[Row]:
 def _iteration(model: Path, iteration: int, curve: list[Row]) -> dict[str, Any]:
     """Return the scores of metrics.py, time, size and memory at a saved iteration.
 
-    gaussians: as trained, as published tables count; gaussians_saved: without those left out as unseen.
+    gaussians: as trained, as published tables count; gaussians_saved: without those left out as unseen; ply_mb:
+    megabytes (10^6 bytes) of the PLY; optimizer_steps: null where there was one for each iteration.
     """
     method = f"ours_{iteration}"
     point = next((row for row in curve if row["iteration"] == iteration), {})
@@ -122,7 +134,9 @@ def _iteration(model: Path, iteration: int, curve: list[Row]) -> dict[str, Any]:
         "fps": None,
         "gaussians": trained_gaussians(model, iteration),
         "gaussians_saved": count_gaussians(model, iteration),
+        "optimizer_steps": optimizer_steps(model, iteration),
         "peak_memory_mib": point.get("peak_memory_mib"),
+        "ply_mb": ply_file(model, iteration).stat().st_size / MB,
         "process_seconds": None,
         "render_ms": None,
         "seconds": point.get("seconds") if (logged := training_seconds(model, iteration)) is None else logged,

@@ -14,7 +14,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from evaluation.document import Table, result_blocks
+from evaluation.blocks import Table
+from evaluation.document import result_blocks
 from evaluation.machine import one_line
 from evaluation.markdown import table_text
 from utils.files.json_files import read_json

@@ -15,6 +15,8 @@ from utils.system_utils import UserError
 
 _DEFAULT_ITERATIONS = next(option.default for option in OptimizationParams.options if option.name == "iterations")
 
+ENDING = ("time_budget", "schedule", "target_psnr")  # options by which a training ends before or after --iterations
+
 
 @dataclass(frozen=True)
 class Run:
@@ -43,13 +45,17 @@ class Run:
 
     @property
     def iterations(self) -> int | None:
-        """The last iteration, from the options; None if they are invalid, which train.py will report."""
+        """The last iteration, from the options; None if the training decides it, or train.py will refuse them."""
         parser = argparse.ArgumentParser(add_help=False, exit_on_error=False)
         parser.add_argument("--iterations", type=int, default=_DEFAULT_ITERATIONS)
+        for name in ENDING:
+            parser.add_argument(f"--{name}", default="0")
         try:
-            return parser.parse_known_args(list(self.options))[0].iterations
+            values = vars(parser.parse_known_args(list(self.options))[0])
         except argparse.ArgumentError:
             return None
+        # Zeros alone, as in 0.0, mean that the option is off.
+        return None if any(values[name].strip("0.") for name in ENDING) else values["iterations"]
 
 
 def plan_runs(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 import signal
 import sys
@@ -11,11 +12,11 @@ from pathlib import Path
 from typing import Any
 
 from evaluation.child import Finished, run_child
-from evaluation.model_folder import ground_truth_digest, load_scores, ply_file, view_names
+from evaluation.model_folder import ground_truth_digest, load_scores, logged, ply_file, trained_iterations, view_names
 from evaluation.record import Record
 from evaluation.runs import Run
 from records import render_times
-from utils.system_utils import UserError, mkdir_p, saved_iterations
+from utils.system_utils import UserError, mkdir_p
 
 _ROOT = Path(__file__).resolve().parents[1]
 
@@ -67,8 +68,8 @@ def train(run: Run, machine: dict[str, Any]) -> None:
         if left:
             _note_stop(record, done, max(left, key=_iteration_of), spent)
     _expect_success("train", command, done)
-    iterations = saved_iterations(run.model / "point_cloud")
-    if run.iterations not in iterations:
+    iterations = trained_iterations(run.model)
+    if (run.iterations or max(logged(run.model), default=None)) not in iterations:
         raise StageFailed(Failure("train", command, [f"train.py succeeded, but {run.model} lacks the last iteration"]))
     record.note("train", iterations=iterations, machine=machine, **spent)
     _stop_if_asked(done)
@@ -89,7 +90,7 @@ def _sum(before: dict[str, float | None], done: Finished) -> dict[str, float | N
 
 def _trained(run: Run, record: Record) -> bool:
     done = record.stage("train")
-    if not done or run.iterations not in done["iterations"]:
+    if not done or run.iterations not in (None, *done["iterations"]):
         return False
     return all(ply_file(run.model, iteration).is_file() for iteration in done["iterations"])
 
@@ -97,7 +98,7 @@ def _trained(run: Run, record: Record) -> bool:
 def _checkpoints(run: Run) -> dict[Path, list[int]]:
     """Return the checkpoints in the model folder before the last iteration, each with its `_stamp`."""
     found = [path for path in run.model.glob("chkpnt*.pth") if re.fullmatch(r"\d+", path.stem[6:])]
-    return {path: _stamp(path) for path in found if _iteration_of(path) < (run.iterations or 0)}
+    return {path: _stamp(path) for path in found if _iteration_of(path) < (run.iterations or math.inf)}
 
 
 def _iteration_of(checkpoint: Path) -> int:
@@ -133,7 +134,7 @@ def render(run: Run, options: Sequence[str]) -> None:
     options: more words for render.py.
     """
     record = Record(run.model)
-    iterations = saved_iterations(run.model / "point_cloud")
+    iterations = trained_iterations(run.model)
     if not iterations:
         raise StageFailed(Failure("render", [], [f"{run.model} has no saved iteration; train it first"]))
     source = ("-s", str(run.scene.source)) if run.scene.source else ()
@@ -173,7 +174,7 @@ def score(run: Run, download: bool = True) -> bool:
     answer takes 10 seconds.
     """
     record = Record(run.model)
-    iterations = saved_iterations(run.model / "point_cloud")
+    iterations = trained_iterations(run.model)
     methods = [f"ours_{iteration}" for iteration in iterations if _rendered(run.model, iteration)]
     if not methods:
         raise StageFailed(Failure("metrics", [], [f"{run.model} has no rendered test views; render them first"]))
@@ -202,7 +203,7 @@ def page(run: Run, output: Path, options: Sequence[str]) -> None:
     options: more words for export.py.
     """
     record = Record(run.model)
-    iterations = saved_iterations(run.model / "point_cloud")
+    iterations = trained_iterations(run.model)
     if not iterations:
         raise StageFailed(Failure("html", [], [f"{run.model} has no saved iteration; train it first"]))
     file = page_file(run.model, output)
@@ -212,7 +213,8 @@ def page(run: Run, output: Path, options: Sequence[str]) -> None:
         return
     source = ("-s", str(run.scene.source)) if run.scene.source else ()
     mkdir_p(file.parent)
-    command = _script("export.py", "-m", str(run.model), *source, "--to", str(file), *options)
+    last = "--iteration", str(iterations[-1])
+    command = _script("export.py", "-m", str(run.model), *source, *last, "--to", str(file), *options)
     _say("writing the model as a page")
     finished = run_child(command)
     _expect_success("html", command, finished)

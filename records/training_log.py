@@ -10,7 +10,7 @@ from pathlib import Path
 
 from utils.files.json_files import read_json, write_json
 from utils.host.process import peak_memory_mib, wall_seconds
-from utils.system_utils import compute_device
+from utils.system_utils import UserError, compute_device
 
 NAME = "train_log.json"
 SHORT = 2000  # iterations; after trainings up to this length, what training says at its end is short
@@ -54,8 +54,8 @@ class TrainingLog:
     started; `peak_memory_mib`, the most so far; `gaussians`; `loss`, a running mean; and for each set tested
     `<set>_l1`, `<set>_psnr`. Seconds and memory include the runs that were resumed. The last record also has
     `gaussians_left_out`, those that the last save does not have, the costs of the curve (curve_recorder.py), the
-    seconds of this process by what they were spent on (training/observers/records.py), and `lines`, what training said
-    at its end.
+    seconds of this process by what they were spent on (training/observers/records.py), `iterations_planned` and, if
+    there was one, `max_num_splats` (what_to_try.py), and `lines`, what training said at its end.
 
     first_iteration, seconds_before, wall_seconds_before: done by the runs that this one resumes.
     """
@@ -125,15 +125,25 @@ class TrainingLog:
             write_json(self._path, self.records)
 
 
-def _read(path: Path) -> list[dict]:
-    """Records of a log; none, with a warning, if the file is damaged: that is no reason to stop a training."""
+def read_log(path: str | os.PathLike) -> list[dict]:
+    """Records of a log; none if there is no file. UserError if it is damaged."""
+    if not Path(path).is_file():
+        return []
     try:
-        records = read_json(path)
+        records = read_json(Path(path))
         if not all(isinstance(r["iteration"], int) and math.isfinite(r["seconds"]) for r in records):
             raise ValueError
         if not all(math.isfinite(r.get(name) or 0.0) for r in records for name in _FINITE):
             raise ValueError
-    except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError):
-        print(f"warning: {path} cannot be read as a training log; a new one is started", file=sys.stderr)
-        return []
+    except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
+        raise UserError(f"{path} cannot be read as a training log; train again to record one") from error
     return records
+
+
+def _read(path: Path) -> list[dict]:
+    """Records of a log; none, with a warning, if the file is damaged: that is no reason to stop a training."""
+    try:
+        return read_log(path)
+    except UserError as error:
+        print(f"warning: {str(error).partition('; ')[0]}; a new one is started", file=sys.stderr)
+        return []

@@ -102,7 +102,8 @@ def test_a_failed_seed_is_left_out_and_named():
     def run(seed, failure):
         values = dict.fromkeys(QUANTITIES, 1.0 + seed) | {"views": 3}
         return {"scene": "a", "group": "scenes", "config": None, "seed": seed, "failure": failure,
-                "iterations": {"10": values}, "ground_truth_sha256": "x", "apart": False}  # fmt: skip
+                "iterations": {"10": values}, "ground_truth_sha256": "x", "apart": False,
+                "open_ended": False}  # fmt: skip
 
     (row,) = summarise([run(0, None), run(1, {"stage": "train"}), run(2, None)])
     assert row["PSNR"] == {"mean": 2.0, "std": pytest.approx(2**0.5), "values": [1.0, 3.0]}
@@ -124,7 +125,7 @@ def test_published_scenes_add_up_to_the_published_means():
 def _blender_run(**change):
     run = {"scene": "lego", "config": None, "group": "scenes", "added_options": [], "options": ["--eval", "-w"],
            "test_sizes": [[800, 800]], "views": {"test": 200, "train": 100}}  # fmt: skip
-    row = {"scene": "lego", "config": None, "group": "scenes", "iteration": 30000}
+    row = {"scene": "lego", "config": None, "group": "scenes", "iteration": 30000, "open_ended": False}
     row |= {name: spread([35.0 if name == "PSNR" else 0.5]) for name in QUANTITIES}
     return published.compare([run | change], [row], [])
 

@@ -1,5 +1,6 @@
 """full_eval.py: its runs, resumes, refusals and reports, with stand-ins for its programs and once with real ones."""
 
+import argparse
 import base64
 import contextlib
 import dataclasses
@@ -21,13 +22,17 @@ from PIL import Image
 from synthetic import folder_state
 
 import full_eval
+from arguments import write_cfg_args
 from evaluation import report as report_module
 from evaluation import results_page, stages
 from evaluation.comparisons import comparisons
 from evaluation.contact_sheet import GAIN, GAP, HEADER
 from evaluation.figures import draw_curves, draw_worst_views
+from evaluation.front_figure import draw_fronts
+from evaluation.model_folder import SCHEDULE, shorter_ends_there
 from evaluation.results_page import BEGIN, END
-from evaluation.scenes import DATASETS
+from evaluation.runs import Run
+from evaluation.scenes import DATASETS, SceneEntry
 from records.error_curve import COLUMNS
 from utils.system_utils import UserError
 
@@ -44,12 +49,14 @@ def _stand_ins(monkeypatch):
     monkeypatch.setattr(stages, "_ROOT", STAND_INS)
     monkeypatch.setattr(full_eval, "machine", lambda: MACHINE)
     monkeypatch.setattr(report_module, "draw_curves", lambda *_: False)  # half a second each; see `figures`
+    monkeypatch.setattr(report_module, "draw_fronts", lambda path, *_: Image.new("RGB", (9, 9)).save(path))
 
 
 @pytest.fixture
 def figures(monkeypatch):
     """Draw the figures of the curves, for tests that need them."""
     monkeypatch.setattr(report_module, "draw_curves", draw_curves)
+    monkeypatch.setattr(report_module, "draw_fronts", draw_fronts)
 
 
 @pytest.fixture
@@ -96,7 +103,8 @@ def test_commands_of_a_plain_scene(figures, scenes, tmp_path):
     assert first["finished"] and first["failure"] is None and first["model"] == "attic"
     assert first["iterations"]["40"] == {
         "PSNR": 23.0, "SSIM": 0.9, "LPIPS": None, "fps": 250.0, "gaussians": 16000, "gaussians_saved": 16000,
-        "peak_memory_mib": 340.0, "render_ms": 4.0, "seconds": 16.0, "views": 2,
+        "optimizer_steps": None, "peak_memory_mib": 340.0, "ply_mb": 36e-6, "render_ms": 4.0, "seconds": 16.0,
+        "views": 2,
     }  # fmt: skip
     assert first["views"] == {"test": 2, "train": 7} and first["test_sizes"] == [[120, 80]]
     assert first["worst_views"][0] == {"PSNR": 22.0, "file": "00001.png", "picture": "photo_1.jpg"}
@@ -230,7 +238,8 @@ def _start(scenes: Path, words: list[str]) -> subprocess.Popen:
     (scenes / "attic" / "slow").touch()
     program = (
         "import pathlib, sys; from evaluation import stages; import full_eval; from utils.system_utils import run_cli;"
-        f"stages._ROOT = pathlib.Path({str(STAND_INS)!r}); full_eval.machine = dict; run_cli(full_eval.main)"
+        f"stages._ROOT = pathlib.Path({str(STAND_INS)!r}); full_eval.machine = dict;"
+        "full_eval._parse_for_training = lambda words: None; run_cli(full_eval.main)"
     )
     process = subprocess.Popen([sys.executable, "-c", program, *words], cwd=ROOT, stderr=subprocess.PIPE, text=True,
                                start_new_session=True)  # fmt: skip
@@ -238,6 +247,23 @@ def _start(scenes: Path, words: list[str]) -> subprocess.Popen:
     while not (scenes / "attic" / "started").exists() and process.poll() is None and time.monotonic() < deadline:
         time.sleep(0.05)
     return process
+
+
+def test_a_checkpoint_beyond_the_iterations_is_resumed_where_the_training_decides_its_end(
+    scenes, tmp_path, any_options
+):
+    out = tmp_path / "out"
+    words = ["--scenes", str(scenes / "attic"), "--output_path", str(out), "--iterations", "40"]
+    words += ["--", "--time_budget", "20"]
+    process = _start(scenes, words)
+    try:
+        process.send_signal(signal.SIGINT)
+        said = process.communicate(timeout=30)[1]
+    finally:
+        process.kill()
+    assert process.returncode == 130, said
+    assert run(*words)["runs"][0]["final_iteration"] == 43
+    assert calls(scenes)[-2][-2:] == ["--start_checkpoint", str(out / "attic" / "chkpnt41.pth")]
 
 
 @pytest.mark.parametrize(("sent", "status"), [(signal.SIGINT, 130), (signal.SIGHUP, 143)])
@@ -316,6 +342,61 @@ def test_an_interrupts_checkpoint_stays_the_one_to_go_on_from(scenes, tmp_path):
     report = run(*words)
     assert calls(scenes)[-2][-2:] == ["--start_checkpoint", str(out / "attic" / "chkpnt5.pth")]
     assert before > 0.5 and report["runs"][0]["wall_seconds"] > before
+
+
+@pytest.fixture
+def any_options(monkeypatch):
+    """Let stand-ins have options that train.py does not take (yet)."""
+    monkeypatch.setattr(full_eval, "_parse_for_training", lambda words: None)
+
+
+def test_a_training_that_ends_by_itself(scenes, tmp_path, any_options):
+    """The stand-in goes on beyond --iterations until its time is over, with seed 1 longer than with seed 0."""
+    out = tmp_path / "out"
+    command = ["--scenes", scenes / "attic", "--output_path", out, "--iterations", 40, "--seeds", 0, 1]
+    stale = out / "attic" / "seed_0" / "point_cloud" / "iteration_99" / "point_cloud.ply"
+    report = run(*command, "--", "--time_budget", 20)
+    assert [entry["final_iteration"] for entry in report["runs"]] == [43, 46]
+    assert all(entry["finished"] and entry["open_ended"] for entry in report["runs"])
+    (row,) = report["summary"]
+    assert row["iterations"] == [43, 46] and row["seeds"] == [0, 1] and row["PSNR"]["values"] == [23.0, 23.1]
+    assert row["seconds"]["values"] == pytest.approx([17.2, 18.4])  # those of the log at the end
+    assert " 43 to 46 |" in (out / "report.md").read_text()
+    done = calls(scenes)
+    assert run(*command, "--", "--time_budget", 20)["summary"] == [row] and calls(scenes) == done
+
+    # An earlier attempt of the same training came further.
+    stale.parent.mkdir()
+    stale.write_text("ply\nelement vertex 1\nend_header\n")
+    assert run(*command, "--", "--time_budget", 20)["runs"][0]["final_iteration"] == 43 and calls(scenes) == done
+    (stale.parents[1] / "iteration_43" / "point_cloud.ply").unlink()
+    assert run(*command, "--", "--time_budget", 20)["runs"][0]["final_iteration"] == 43
+    assert [words[0] for words in calls(scenes)[len(done) :]] == ["train", "render"]
+    assert "ours_99" not in [path.name for path in (out / "attic" / "seed_0" / "test").iterdir()]
+
+
+@pytest.mark.parametrize(
+    ("words", "last"),
+    [
+        ((), 30_000),
+        (("--iterations", "40", "--time_budget", "0.0", "--schedule", ""), 40),
+        (("--iterations", "40", "--time_budget", "0.5"), None),
+        (("--time_budget=20",), None),
+        (("--schedule", "schedule.json"), None),
+        (("--target_psnr", "30"), None),
+        (("--iterations", "40", "--resolution_schedule", "pyramid"), 40),
+        (("--iterations", "many"), None),
+    ],
+)
+def test_the_last_iteration_as_far_as_options_tell_it(tmp_path, words, last):
+    assert Run(SceneEntry("attic", "scenes", None), None, None, tmp_path, words, ()).iterations == last
+
+
+def test_a_schedule_that_was_recorded_is_no_reason_for_fewer_iterations(tmp_path):
+    write_cfg_args(tmp_path, argparse.Namespace())
+    assert shorter_ends_there(tmp_path)
+    (tmp_path / SCHEDULE).touch()
+    assert not shorter_ends_there(tmp_path)
 
 
 def test_trained_gaussians_are_reported_and_those_saved_beside(scenes, tmp_path):
@@ -451,6 +532,12 @@ def test_seeds_and_option_sets(figures, scenes, tmp_path, capsys, monkeypatch):
     said = capsys.readouterr().out
     assert "attic: cheapest option set for a given error" in said and "23.10 ± 0.14" in said
     assert (out / "figures" / "attic_sh1_worst_views.png").exists()
+    found = report["reached"]["attic"]
+    assert found["default"] == "base" and found["sets"]["sh1"]["final"]["mean"] == pytest.approx(21.1)
+    assert report["fronts"]["attic"]["beaten"]["seconds"] == {"base": None, "sh1": None}
+    text = (out / "report.md").read_text()
+    assert "## Seconds to reach a test PSNR" in text and "## Pareto fronts of option sets" in text
+    assert "(figures/attic_fronts.png)" in text and (out / "figures" / "attic_fronts.png").stat().st_size > 10_000
 
     page = tmp_path / "training.md"
     page.write_text(f"before\n\n{BEGIN}\nold\n{END}\n\nafter\n")
@@ -755,8 +842,8 @@ def test_each_model_becomes_a_page_that_the_report_links(scenes, tmp_path):
     pages = ["models/attic/seed_0.html", "models/attic/seed_1.html"]
     assert [entry["page"] for entry in report["runs"]] == pages
     made = [words for words in calls(scenes) if words[0] == "export"]
-    assert made[0] == ["export", "-m", str(out / "attic/seed_0"), "-s", str(scenes / "attic"), "--to",
-                       str(out / pages[0]), "--antialiasing"]  # fmt: skip
+    assert made[0] == ["export", "-m", str(out / "attic/seed_0"), "-s", str(scenes / "attic"), "--iteration", "40",
+                       "--to", str(out / pages[0]), "--antialiasing"]  # fmt: skip
     html, markdown = ((out / f"report.{kind}").read_text() for kind in ("html", "md"))
     for page in pages:
         assert f'<a href="{page}">' in html and f"]({page})" in markdown and (out / page).is_file()

@@ -45,7 +45,7 @@ MAY_IMPORT = {
     "training": ("exports", "viewing.options", "gaussian_renderer", "scene", "records", "arguments", "utils"),
     "viewing": ("moving_cameras", "gaussian_renderer", "scene", "utils"),
     "training.observers": ("training", "viewing", "gaussian_renderer", "scene", "records", "arguments", "utils"),
-    "diagnosis": ("gaussian_renderer", "scene", "arguments", "utils"),
+    "diagnosis": ("gaussian_renderer", "scene", "records", "arguments", "utils"),
     "conversion": ("scene.readers", "scene.pictures", "utils"),
     "evaluation": ("records", "arguments", "scene.saved_iterations", "scene.readers.info", "utils"),
     "demo": ("evaluation", "arguments", "utils"),

@@ -14,7 +14,7 @@ from gaussians import pipeline
 from html_scene import SIZE, balls, cameras
 from PIL import Image
 
-from evaluation.document import Comparison, Section
+from evaluation.blocks import Comparison, Section
 from evaluation.html import to_html
 from exports.html import write_html
 from exports.of_model import model_of

@@ -1,5 +1,6 @@
 """Stand-in for train.py: it writes the files of a training at once, with numbers that depend on the options.
 
+With --time_budget it ends three iterations later than with --iterations, and three more for each seed above 0.
 A file `broken` in the scene folder makes it fail, `full` makes it fail and leave a checkpoint, `slow` makes it wait for
 a signal.
 """
@@ -18,8 +19,10 @@ parser.add_argument("-m", type=Path)
 parser.add_argument("--iterations", type=int, default=30000)
 parser.add_argument("--sh_degree", type=int, default=3)
 parser.add_argument("--seed", type=int, default=0)
+parser.add_argument("--time_budget", type=float, default=0)
 parser.add_argument("--start_checkpoint")
 args = parser.parse_known_args()[0]
+end = args.iterations + (3 + 3 * args.seed if args.time_budget else 0)
 
 with (args.s.parent / "calls.txt").open("a") as calls:
     calls.write(json.dumps(["train", *sys.argv[1:]]) + "\n")
@@ -39,7 +42,7 @@ def stop(signum, frame):
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: sys.exit("two signals: no checkpoint"))
     time.sleep(0.5)
-    (args.m / "chkpnt5.pth").write_bytes(b"")
+    (args.m / ("chkpnt41.pth" if args.time_budget else "chkpnt5.pth")).write_bytes(b"")
     sys.exit(128 + signum)
 
 
@@ -55,16 +58,16 @@ best = 20.0 + args.sh_degree + 0.1 * args.seed  # dB at the end
 slowness = 1 + args.sh_degree  # seconds an iteration, times ten
 scores = ",".join(f"{views}_{score}" for views in ("test", "train") for score in ("l1", "psnr", "ssim"))
 rows = [f"iteration,seconds,wall_seconds,gaussians,peak_memory_mib,{scores}"]
-for t in (args.iterations // 4, args.iterations // 2, args.iterations):
-    progress = t / args.iterations
+for t in (end // 4, end // 2, end):
+    progress = t / end
     cost = f"{t},{t * slowness / 10},{t},{100 * t * slowness},{300 + t}"
     rows.append(f"{cost},0.1,{best - 10 + 10 * progress},{0.7 + 0.2 * progress},0.1,30,0.95")
 (args.m / "error_vs_time.csv").write_text("\n".join(rows) + "\n")
 (args.m / "stand_in.json").write_text(json.dumps({"psnr": best}))
 (args.m / "cameras.json").write_text(json.dumps([{"img_name": f"photo_{i}.jpg"} for i in range(9)]))
 log = []
-for t in {7000, 30000, args.iterations}:
-    if t <= args.iterations:
+for t in sorted({7000, 30000, end}):
+    if t <= end:
         ply = args.m / "point_cloud" / f"iteration_{t}" / "point_cloud.ply"
         ply.parent.mkdir(parents=True, exist_ok=True)
         ply.write_text(f"ply\nelement vertex {100 * t * slowness}\nend_header\n")

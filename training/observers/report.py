@@ -1,4 +1,4 @@
-"""Scores in testing iterations, and the events for TensorBoard."""
+"""Scores in testing iterations, the events for TensorBoard, and what to try after the training."""
 
 import sys
 from collections.abc import Callable, Sequence
@@ -10,6 +10,7 @@ from tqdm import tqdm
 
 from gaussian_renderer import render
 from gaussian_renderer.scored_views import ScoredViews
+from records.what_to_try import CAP, PLANNED, what_to_try
 from scene import Scene
 from scene.cameras import Camera
 from scene.gaussian_model import GaussianModel
@@ -65,8 +66,14 @@ class Report(Observer):
             step.record = (step.record or {}) | scores
 
     def ended(self, error: Error) -> None:
-        if self._writer and error is None:
+        if error is not None:
+            return
+        if self._writer:
             self._writer.close()
+        log, opt = self._run.log, self._run.opt
+        log.note(**{PLANNED: opt.iterations}, **({CAP: opt.max_num_splats} if opt.max_num_splats else {}))
+        if sentences := what_to_try(self._run.rows, log.records):
+            log.tell(*sentences)
 
 
 def training_report(

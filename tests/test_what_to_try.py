@@ -1,0 +1,127 @@
+"""Advice after a training: what made-up logs and curves are told, at the end of train.py and by doctor.py."""
+
+import json
+import re
+import sys
+from pathlib import Path
+
+import pytest
+
+import train
+from arguments import OptimizationParams
+from diagnosis.model import check_training
+from records.error_curve import COLUMNS, NAME, Row, write_curve
+from records.training_log import NAME as LOG
+from records.what_to_try import what_to_try
+
+COUNTS = (1000, 1500, 4000, 8000)
+
+
+def _curve(test: list[float], train_views: list[float], gaussians: tuple[int, ...] = COUNTS) -> list[Row]:
+    """Points at 2000, 4000, ... iterations, of which each takes 10 ms."""
+    rows = []
+    for i, (score, other, count) in enumerate(zip(test, train_views, gaussians, strict=True), 1):
+        row = {"iteration": 2000 * i, "seconds": 20.0 * i, "test_psnr": score, "train_psnr": other, "gaussians": count}
+        rows.append(dict.fromkeys(COLUMNS) | row)
+    return rows
+
+
+RISING = [20.0, 24.0, 26.0, 28.0]
+
+
+def test_a_healthy_training_is_told_nothing():
+    assert what_to_try(_curve(RISING, RISING), [{"iteration": 8000, "iterations_planned": 8000}]) == []
+    assert what_to_try([], []) == [] and what_to_try(_curve(RISING, RISING)[:1], []) == []
+
+
+def test_test_views_that_fall_while_training_views_rise():
+    (said,) = what_to_try(_curve([20.0, 24.0, 23.0, 22.5], RISING), [])
+    assert said.startswith("After iteration 4000 the test views lost 1.50 dB while the training views gained 4.00 dB")
+    assert "--max_num_splats 4000, half as many as now" in said and "--densify_grad_threshold" in said
+    both_fall = [20.0, 29.0, 28.0, 27.0]
+    assert what_to_try(_curve([20.0, 24.0, 23.0, 22.5], both_fall), []) == []  # a reset, or rates too high
+    assert what_to_try(_curve([20.0, 24.0, 23.9, 23.95], [20.0, 24.0, 26.0, 28.0]), [])[0].startswith("The last 40.0")
+
+
+def test_subsets_tell_nothing_of_scores():
+    rows = _curve([20.0, 24.0, 23.0, 22.5], RISING)
+    for row in rows[:3]:
+        row["subset"] = 2
+    assert what_to_try(rows, []) == []
+
+
+def test_gaussians_at_their_cap():
+    rows = _curve(RISING, RISING, (1000, 3970, 3999, 3998))
+    (said,) = what_to_try(rows, [{"iteration": 8000, "max_num_splats": 4000}])
+    assert said.startswith("From iteration 4000 on there was no room for more Gaussians (--max_num_splats 4000)")
+    assert "test views changed by +4.00 dB; try a higher one" in said
+    assert what_to_try(rows, [{"iteration": 8000, "max_num_splats": 5000}]) == []
+    overfitting = _curve([20.0, 24.0, 23.0, 22.5], RISING, (1000, 3970, 3999, 3998))
+    (said,) = what_to_try(overfitting, [{"iteration": 8000, "max_num_splats": 4000}])
+    assert "a higher one" not in said
+
+
+def test_no_densification():
+    (said,) = what_to_try(_curve(RISING, RISING, (1000, 1000, 900, 900)), [])
+    assert said.startswith("The number of Gaussians never rose from one scoring to the next (1000 at first, 900 at")
+    assert "--densify_grad_threshold" in said
+    # From a random start, most Gaussians are removed before others are made.
+    assert what_to_try(_curve(RISING, RISING, (100_000, 30_000, 50_000, 60_000)), []) == []
+    short = [row | {"iteration": row["iteration"] // 10} for row in _curve(RISING, RISING, (1000,) * 4)]
+    assert what_to_try(short, []) == []
+
+
+def test_seconds_that_buy_nothing():
+    rows = _curve([20.0, 27.95, 28.0, 28.02], RISING)
+    for row, seconds in zip(rows, (5.0, 20.0, 50.0, 80.0), strict=True):
+        row["seconds"] = seconds
+    rows.insert(0, rows[0] | {"iteration": 100, "seconds": 0.2})
+    rows.insert(1, rows[0] | {"iteration": 900, "seconds": 1.8})
+    (said,) = what_to_try(rows, [{"iteration": 8000, "iterations_planned": 8000}])
+    assert said.startswith("The last 30.0 of 80.0 s changed the test views by +0.02 dB, at 15 ms an iteration after 2")
+    assert "try --iterations 6000 --position_lr_max_steps 6000" in said
+    # With a time budget, or a score to reach, the iterations are not the user's choice.
+    assert what_to_try(rows, [{"iteration": 8000, "iterations_planned": 30_000}]) == []
+    rows[-1]["test_psnr"] = 28.2
+    assert what_to_try(rows, []) == []
+
+
+def test_every_option_named_is_one_of_training():
+    known = {option.name for option in OptimizationParams.options} | {"sh_degree"}
+    cases = [
+        (_curve([20.0, 24.0, 23.0, 22.5], RISING), []),
+        (_curve(RISING, RISING), [{"max_num_splats": 4000}]),
+        (_curve(RISING, RISING, (1000,) * 4), []),
+        (_curve([20.0, 27.95, 28.0, 28.02], RISING), []),
+    ]
+    said = [what_to_try(*case) for case in cases]
+    assert [len(sentences) for sentences in said] == [1, 1, 1, 1]
+    named = set(re.findall(r"--(\w+)", str(said)))
+    assert len(named) >= 6 and named <= known
+
+
+def test_doctor_repeats_it(tmp_path):
+    assert check_training(tmp_path) == []
+    write_curve(tmp_path / NAME, _curve([20.0, 24.0, 23.0, 22.5], RISING))
+    (line,) = check_training(tmp_path)
+    assert line.note and not line.finding and line.text.startswith("After iteration 4000")
+    write_curve(tmp_path / NAME, _curve(RISING, RISING))
+    assert check_training(tmp_path) == []
+    (tmp_path / LOG).write_text(json.dumps([{"iteration": 8000, "seconds": 80.0, "max_num_splats": 8000}]))
+    (line,) = check_training(tmp_path)
+    assert "--max_num_splats 8000" in line.text
+    (tmp_path / LOG).write_text("{")
+    (line,) = check_training(tmp_path)
+    assert "cannot be read as a training log" in line.text and line.remedy == "train again to record one"
+
+
+@pytest.mark.parametrize("cap", [0, 300])
+def test_training_says_it_at_its_end(colmap_scene, tmp_path, capsys, monkeypatch, cap):
+    monkeypatch.setattr(sys, "stdout", sys.stdout)  # training stamps it
+    words = ["-s", str(colmap_scene), "-m", str(tmp_path), "--eval", "--iterations", "12", "-r", "32"]
+    train.main([*words, "--disable_viewer", "--max_num_splats", str(cap)])
+    last = json.loads((tmp_path / LOG).read_text())[-1]
+    assert last["iterations_planned"] == 12 and last.get("max_num_splats") == (cap or None)
+    told = "there was no room for more Gaussians (--max_num_splats 300)"
+    assert (told in capsys.readouterr().out) == (told in " ".join(last["lines"])) == bool(cap)
+    assert [told in line.text for line in check_training(Path(tmp_path))] == [True] * bool(cap)
