@@ -18,7 +18,7 @@ VERSION = "0.1.0"
 
 _STORED = {option.name: option.default for option in ModelParams.options if option.stored}
 _REMEMBERED = {option.name: option.default for option in ModelParams.options if option.remembered}
-_OF_TRAINING = ("antialiasing", "optimizer_type", "seed")
+_OF_TRAINING = ("antialiasing", "optimizer_type", "seed", "strategy", "resolution_schedule")
 
 
 def write_cfg_args(model_path: str | os.PathLike, args: argparse.Namespace) -> None:
@@ -118,7 +118,7 @@ def read_stored_options(model_path: str | os.PathLike) -> dict[str, Value]:
 def read_training_options(model_path: str | os.PathLike) -> dict[str, Any]:
     """Read all options of its training that a model folder has.
 
-    These are the ones of cfg_args and, if there is a model.json, masks, antialiasing, seed and optimizer_type.
+    These are the ones of cfg_args and, if there is a model.json, masks and what training.run.Run.kept adds.
     UserError as in both readers.
     """
     stored, record = read_cfg_args(model_path), read_model_json(model_path)

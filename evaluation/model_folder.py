@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from arguments.stored import read_cfg_args, read_model_json
+from arguments.stored import read_model_json, read_training_options
 from records.curve_peak import schedules_follow_length
 from utils.files.image_files import UNREADABLE, open_render
 from utils.files.json_files import read_json
@@ -55,10 +55,12 @@ def shorter_ends_there(model: Path) -> bool:
     if (model / SCHEDULE).is_file():
         return False
     try:
-        options = read_cfg_args(model)
+        options = read_training_options(model)
     except UserError:
         return False
-    return not schedules_follow_length(bool(options.get("depths")), bool(options.get("train_test_exp")))
+    return not schedules_follow_length(
+        bool(options.get("depths")), bool(options.get("train_test_exp")), options.get("resolution_schedule", "none")
+    )
 
 
 def load_scores(model: Path, method: str) -> tuple[dict[str, float | None], dict[str, dict[str, float | None]]]:

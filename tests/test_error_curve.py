@@ -320,6 +320,7 @@ class TestPeak:
         assert not schedules_follow_length(depths=False, train_test_exp=False)
         assert schedules_follow_length(depths=True, train_test_exp=False)
         assert schedules_follow_length(depths=False, train_test_exp=True)
+        assert schedules_follow_length(depths=False, train_test_exp=False, resolution_schedule="pyramid")
         line = peak_advice(list(self.ROWS), {7000}, 30_000, follows_length=True)
         assert "ends with that model" not in line
         assert "; --save_iterations 2000 saves that model during the training; --iterations 2000 --position_lr" in line

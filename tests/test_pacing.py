@@ -215,7 +215,8 @@ def test_a_short_run_does_without_resets_that_it_would_not_recover_from():
 
 @pytest.mark.parametrize("strategy", ["mcmc", "budget"])
 def test_strategies_grow_within_windows_of_the_schedule(colmap_scene, tmp_path, monkeypatch, strategy):
-    write_schedule(tmp_path / "two.json", Schedule(120, [Block(60, 0.0, 1 / 60, 0.0)], 60, 9.0, levels=()))  # two at a time
+    two_at_a_time = Schedule(120, [Block(60, 0.0, 1 / 60, 0.0)], 60, 9.0, levels=())
+    write_schedule(tmp_path / "two.json", two_at_a_time)
     counts, begins = [], ProgressBar.begins
 
     def note(self, step) -> None:

@@ -16,7 +16,7 @@ from utils.system_utils import UserError, saved_iterations
 # Options that change what is learnt. Others are checked elsewhere (train_test_exp, sh_degree), or change nothing.
 _TOLD = (
     "source_path", "images", "depths", "resolution", "white_background", "eval", "masks", "invert_masks",
-    "mask_meaning", "antialiasing", "optimizer_type", "seed",
+    "mask_meaning", "antialiasing", "optimizer_type", "seed", "strategy", "resolution_schedule",
 )  # fmt: skip
 
 
@@ -50,7 +50,7 @@ def check_folder(
 def report_changes(checkpoint: str, now: argparse.Namespace) -> None:
     """Warn if the run that wrote a checkpoint had other options than this run, `now`.
 
-    now: model options, antialiasing, optimizer_type and seed. Options that the checkpoint's folder does not record are
+    now: model options, antialiasing, and those of `Run.kept`. Options that the checkpoint's folder does not record are
     not compared.
     """
     folder = Path(checkpoint).parent

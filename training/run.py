@@ -108,7 +108,8 @@ class Run:
     @property
     def _training_options(self) -> dict[str, Any]:
         opt = self.opt
-        return {"antialiasing": self.pipe.antialiasing, "optimizer_type": opt.optimizer_type, "seed": opt.seed}
+        names = "optimizer_type", "seed", "strategy", "resolution_schedule"
+        return {"antialiasing": self.pipe.antialiasing} | {name: getattr(opt, name) for name in names}
 
     @property
     def kept(self) -> dict[str, Any]:

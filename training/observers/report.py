@@ -71,7 +71,8 @@ class Report(Observer):
         if self._writer:
             self._writer.close()
         log, opt = self._run.log, self._run.opt
-        log.note(**{PLANNED: opt.iterations}, **({CAP: opt.max_num_splats} if opt.max_num_splats else {}))
+        capped = opt.strategy == "adc" and opt.max_num_splats  # the others are meant to reach their number
+        log.note(**{PLANNED: opt.iterations}, **({CAP: opt.max_num_splats} if capped else {}))
         if sentences := what_to_try(self._run.rows, log.records):
             log.tell(*sentences)
 
