@@ -13,13 +13,17 @@ PLANES = ("depth", "alpha")
 
 
 @torch.no_grad()
-def view_planes(camera: Camera | MiniCam, gaussians: GaussianModel, pipe: argparse.Namespace) -> dict[str, Tensor]:
+def view_planes(
+    camera: Camera | MiniCam, gaussians: GaussianModel, pipe: argparse.Namespace, scaling: float = 1.0
+) -> dict[str, Tensor]:
     """`depth` and `alpha` of a view, (1, H, W) float32 each, by the weights w_i of the image's Gaussians.
 
     depth: inverse depth, the sum of w_i / z_i, per world unit; z_i is the depth of a mean. Where alpha is below 1 it is
     that much smaller, so divide it by alpha to get that of what is there. alpha: the sum of w_i, in [0, 1].
+    scaling: factor of all scales.
     """
     white = gaussians.get_xyz.new_ones(len(gaussians), 3)
     black = gaussians.get_xyz.new_zeros(3)
-    drawn = render(camera, gaussians, pipe, black, override_color=white, want_depth=True, want_visibility=False)
+    options = {"override_color": white, "want_depth": True, "want_visibility": False}
+    drawn = render(camera, gaussians, pipe, black, scaling, **options)
     return {"depth": drawn["depth"], "alpha": drawn["render"][:1]}

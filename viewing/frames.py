@@ -9,6 +9,7 @@ from torch import Tensor
 
 from gaussian_renderer import render
 from gaussian_renderer.free_view import free_view
+from gaussian_renderer.view_planes import view_planes
 from gaussian_renderer.walked import gaussians_walked
 from scene.cameras import Camera, MiniCam
 from scene.gaussian_model import GaussianModel
@@ -78,14 +79,12 @@ class Frames:
         part = shown_part(self._gaussians, settings)
         if settings.mode == COUNT:
             return tints.tinted_counts(gaussians_walked(view, part, self._pipe, settings.scaling))
-        options = {"scaling_modifier": settings.scaling, "want_visibility": False}
         if settings.mode in (DEPTH, OPACITY):
-            black, white = part.get_xyz.new_zeros(3), part.get_xyz.new_ones(len(part), 3)
-            drawn = render(view, part, self._pipe, black, override_color=white, **options)
-            alpha = drawn["render"][:1]
-            return tints.tinted_depth(drawn["depth"], alpha) if settings.mode == DEPTH else alpha.expand(3, -1, -1)
-        options |= {"want_depth": False, "use_trained_exp": self._with_exposures and photo is not None}
-        colour = render(view, part, self._pipe, self._background(settings), **options)["render"]
+            planes = view_planes(view, part, self._pipe, settings.scaling)
+            return tints.tinted_depth(**planes) if settings.mode == DEPTH else planes["alpha"].expand(3, -1, -1)
+        exposed = self._with_exposures and photo is not None
+        options = {"want_depth": False, "want_visibility": False, "use_trained_exp": exposed}
+        colour = render(view, part, self._pipe, self._background(settings), settings.scaling, **options)["render"]
         return tints.error_of(photo, colour) if settings.mode == ERROR and photo is not None else colour
 
 

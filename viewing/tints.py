@@ -18,13 +18,13 @@ def tinted(values: Tensor) -> Tensor:
     return torch.lerp(stops[below], stops[below + 1], (place - below)[..., None]).permute(2, 0, 1)
 
 
-def tinted_depth(inverse_depth: Tensor, alpha: Tensor) -> Tensor:
-    """Colours (3, H, W) of inverse depths, both (1, H, W) as the rasterizer blends them: near is bright.
+def tinted_depth(depth: Tensor, alpha: Tensor) -> Tensor:
+    """Colours (3, H, W) of the planes of `view_planes`, (1, H, W) each; depth is inverse: near is bright.
 
     Where less than half of a pixel is covered there is no depth, and the colour is black.
     """
     there = alpha[0] >= 0.5
-    values = inverse_depth[0] / alpha[0].clamp_min(1e-6)
+    values = depth[0] / alpha[0].clamp_min(1e-6)
     known = values[there]
     if not len(known):
         return torch.zeros_like(alpha).expand(3, -1, -1)

@@ -1,6 +1,7 @@
 """The viewer's page in a real browser, while a training runs on the CPU in another process."""
 
 import io
+import json
 import os
 import re
 import subprocess
@@ -115,6 +116,40 @@ def test_the_training_pauses_steps_and_its_curve_grows(tab, page_errors, request
     tab.get_by_role("button", name="Resume").click()
     _until(lambda: _number(tab, "Iteration") > paused + 2, "the training does not resume")
     assert _number(tab, "Loss") > 0 and _number(tab, "Gaussians") > 0
+    assert not page_errors
+
+
+def _type(tab, label: str, text: str) -> None:
+    field = _field(tab, label)
+    field.fill(text)
+    field.press("Enter")
+
+
+def test_every_kind_of_control_is_heard(tab, page_errors, training):
+    """The server drops what does not have the form of this viser's messages."""
+    address, scene = training
+    _open(tab, address)
+    tab.get_by_role("tab", name="Path").click()
+    _type(tab, "Seconds to the next", "3")
+    _type(tab, "Name", "typed")
+    for count in ("1", "2"):
+        tab.get_by_role("button", name="Add this view").click()
+        _until(lambda count=count: _field(tab, "Keyframes").input_value() == count, "no keyframe was added")
+    tab.get_by_role("button", name="Save path").click()
+    path = scene.parent / "out/camera_paths/typed.json"
+    _until(path.is_file, "the path was not saved")
+    assert [keyframe["seconds"] for keyframe in json.loads(path.read_text())["keyframes"]] == [0, 3]
+    tab.get_by_role("tab", name="View").click()
+    tab.get_by_role("checkbox", name="Crop box").click()
+    _type(tab, "Corner 1", "900")
+    _type(tab, "Background", "rgb(250, 0, 0)")
+    # Now the box is far away, and what is outside of it is not drawn.
+    _type(tab, "Corner 2", "901")
+    red = np.array([250, 0, 0])
+    _until(lambda: abs(np.median(_picture(tab)[150:], (0, 1)) - red).max() < 5, "the crop box was not heard")
+    tab.get_by_role("checkbox", name="Crop box").click()
+    _until(lambda: abs(np.median(_picture(tab)[150:], (0, 1)) - red).max() > 20, "the crop box stays")
+    _type(tab, "Background", "rgb(0, 0, 0)")
     assert not page_errors
 
 

@@ -7,7 +7,7 @@ import json
 import os
 import sys
 from argparse import ArgumentParser
-from random import randint
+from random import randint, seed
 
 import torch
 
@@ -41,6 +41,7 @@ def importance():
     return total
 
 
+seed(0)  # the views drawn below
 losses, counts, stack = [], [gaussians.get_xyz.shape[0]], None
 for iteration in range(first + 1, opt.iterations + 1):
     gaussians.update_learning_rate(iteration)
