@@ -70,14 +70,14 @@ def write_model_json(
     *,
     antialiasing: bool | None = None,
     seed: int | None = None,
-    optimizer_type: str | None = None,
     world_offset: Sequence[float] = (0.0, 0.0, 0.0),
+    **of_training: Value,
 ) -> None:
     """Write `model.json`, the options that cfg_args has no place for, with sorted keys.
 
     args: model options; those that differ from their default are written. antialiasing, seed: None: those of `args`, or
-    False and 0. optimizer_type: that of the training; None writes no entry. world_offset: world coordinates of the
-    origin of the model's frame (scene/readers/world_offset.py); zero writes no entry.
+    False and 0. world_offset: world coordinates of the origin of the model's frame (scene/readers/world_offset.py);
+    zero writes no entry. of_training: other options of the training, by name.
     """
     record = {
         "antialiasing": getattr(args, "antialiasing", False) if antialiasing is None else antialiasing,
@@ -87,8 +87,7 @@ def write_model_json(
     for name, default in _REMEMBERED.items():
         if (value := getattr(args, name, default)) != default:
             record[name] = value
-    if optimizer_type is not None:
-        record["optimizer_type"] = optimizer_type
+    record |= of_training
     if any(world_offset):
         record[OFFSET] = list(world_offset)
     model_json.write_model_json(model_path, record)
