@@ -103,9 +103,10 @@ class GaussianModel(Exposed, RelocatingGaussians):
         self.percent_dense = training_args.percent_dense
         self._take({name: trainable(getattr(self, a.field)) for name, a in self._attributes.items()})
         self._zero_statistics()
+        self._rates = {n: a.rate(training_args, self.spatial_lr_scale) for n, a in self._attributes.items()}
         self.optimizer = _OPTIMIZERS[self.optimizer_type](
             [
-                {"params": [getattr(self, a.field)], "lr": a.rate(training_args, self.spatial_lr_scale), "name": name}
+                {"params": [getattr(self, a.field)], "lr": self._rates[name], "name": name}
                 for name, a in self._attributes.items()
             ]
         )
@@ -126,6 +127,12 @@ class GaussianModel(Exposed, RelocatingGaussians):
                 group["lr"] = rate
                 break
         return rate
+
+    def scale_rates(self, factor: float) -> None:
+        """Set the learning rates that `training_setup` has made to a multiple, but that of the positions."""
+        for group in self.optimizer.param_groups:
+            if group.get("name") in self._rates and group["name"] != "xyz":
+                group["lr"] = factor * self._rates[group["name"]]
 
     @property
     def position_rate(self) -> float:

@@ -2,6 +2,7 @@
 
 import argparse
 import json
+import math
 import random
 import sys
 from collections.abc import Callable
@@ -232,6 +233,24 @@ def test_strategies_grow_within_windows_of_the_schedule(colmap_scene, tmp_path, 
     assert len(counts) == 60
     assert [t for t in range(1, 60) if counts[t] > counts[t - 1]] == [15, 20, 25, 30, 35]
     assert strategy == "mcmc" or counts[-1] == 5000
+
+
+@pytest.mark.parametrize(("steps", "factor"), [(60, math.sqrt(2)), (3, 5.0), (240, 1.0)])
+def test_few_steps_have_larger_rates(colmap_scene, tmp_path, monkeypatch, steps, factor):
+    path, rates, begins = tmp_path / "few.json", [], ProgressBar.begins
+    write_schedule(path, Schedule(120, [Block(steps, 0.0, 1 / steps, 0.0)], steps, 9.0, levels=()))
+
+    def note(self, step) -> None:
+        rates.append({group["name"]: group["lr"] for group in self._run.gaussians.optimizer.param_groups})
+        begins(self, step)
+
+    monkeypatch.setattr(ProgressBar, "begins", note)
+    words = ["-s", colmap_scene, "-m", tmp_path / "out", "-r", 24, "--no_curve", "--test_iterations", -1]
+    train.main([*map(str, words), "--schedule", str(path), "--iterations", "120", "--plain_step"])
+    assert len(rates) == steps
+    before, later = rates[0], rates[-1]  # the first one is told before its rates are set
+    assert [later[n] / before[n] for n in ("f_dc", "opacity", "scaling", "rotation")] == pytest.approx([factor] * 4)
+    assert later["xyz"] < 1.01 * before["xyz"]
 
 
 def _timed(monkeypatch: pytest.MonkeyPatch, cost: Callable[[int], float]) -> None:

@@ -180,6 +180,8 @@ class Run:
     def set_rates(self, step: Step) -> None:
         """Set the learning rates of a step, which may be one that is repeated."""
         self.gaussians.update_learning_rate(self.pace.nominal(step.iteration))
+        if isinstance(self.pace, Paced):
+            self.gaussians.scale_rates(self.pace.rate_factor(step.iteration))
 
     def _decode_ahead(self, iteration: int) -> None:
         ahead = self.scene.images.ahead

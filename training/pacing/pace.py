@@ -5,10 +5,12 @@ and when to test or save. A steady run takes each of them once. A paced run is l
 through the whole schedule.
 """
 
+import math
 from bisect import bisect_left
 from collections.abc import Sequence
 from typing import NamedTuple
 
+MOST_RATE = 5.0  # what 1,000 steps for 30,000 were best with, about
 _ROUNDING = 1e-6  # iterations of the schedule; progress is a float, and just below a whole number counts as that
 
 
@@ -38,6 +40,10 @@ class Pace:
 
     def stride(self, iteration: int) -> float:
         """Iterations of the schedule that one of the run stands for, at that place."""
+        return 1.0
+
+    def rate_factor(self, iteration: int) -> float:
+        """Factor of the learning rates that have no schedule."""
         return 1.0
 
     def is_last(self, iteration: int) -> bool:
@@ -101,6 +107,10 @@ class Paced(Pace):
 
     def stride(self, iteration: int) -> float:
         return self._block(iteration)[1].step * self.length
+
+    def rate_factor(self, iteration: int) -> float:
+        """The root of `stride`, 1 to MOST_RATE: few steps have to be longer ones."""
+        return min(max(math.sqrt(self.stride(iteration)), 1.0), MOST_RATE)
 
     def known(self, planned: Sequence[int]) -> list[int]:
         return []
