@@ -201,6 +201,18 @@ def test_large_draws_follow_the_weights():
     np.testing.assert_allclose(rates / rates[0], [1, 3, 9], rtol=0.12)
 
 
+def test_a_high_power_takes_the_highest_of_small_scores():
+    control = object.__new__(budget.BudgetControl)
+    control._opt = SimpleNamespace(score_power=200.0, seed=0)
+    control._scored_views = lambda iteration: []
+    scores = 1e-6 * torch.arange(20, dtype=torch.float64)
+    control._scores = SimpleNamespace(of_views=lambda views, background: scores)
+    step = SimpleNamespace(iteration=1, background=None)
+    assert control._chosen(step, 3).tolist() == [17, 18, 19]
+    scores = torch.zeros(20, dtype=torch.float64)
+    assert len(control._chosen(step, 3)) == 0  # photos that are reproduced to the bit
+
+
 def test_draws_of_nothing_of_all_and_of_broken_weights():
     assert _drawn([0.0, 0.0], 5, 1) == [] and _drawn([], 5, 1) == [] and _drawn([1.0, 2.0], 0, 1) == []
     assert _drawn([1.0, 0.0, 2.0], 2, 1) == [0, 2] and _drawn([1.0, 2.0], -3, 1) == []

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 
 PIXELS = 20  # training pixels of all views for each Gaussian of the default budget
 FEWEST, MOST = 100_000, 1_000_000  # Gaussians of the default budget
+_SMALLEST = 1e-300
 
 
 class BudgetControl(DensityControl):
@@ -72,7 +73,8 @@ class BudgetControl(DensityControl):
         """Indices of at most `count` Gaussians to split, ascending."""
         opt = self._opt
         scores = self._scores.of_views(self._scored_views(step.iteration), step.background)
-        weights = exp(opt.score_power * log(scores)) * (scores > 0)
+        relative = scores / scores.max().clamp_min(_SMALLEST)  # the power of a score itself may be too small a number
+        weights = exp(opt.score_power * log(relative)) * (scores > 0)
         return weighted_choice(weights, count, seed=opt.seed, stream=Stream.DENSIFY, iteration=step.iteration)
 
     def _scored_views(self, iteration: int) -> list[Camera]:
