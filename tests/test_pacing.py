@@ -171,6 +171,7 @@ def _with_block(index: int, **values: object) -> dict:
         (_with_block(1, step="x"), "'x' is no number"),
         (GOOD | {"ended": 9}, "its last block does not end with its last iteration"),
         (json.dumps(GOOD).replace("5.0", "NaN"), "nan is no number"),
+        (GOOD | {"time_budget": 10**400}, "is no schedule of a run"),
     ],
 )
 def test_a_broken_schedule_is_refused(tmp_path, content, reason):

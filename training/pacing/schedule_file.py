@@ -24,7 +24,7 @@ def read_schedule(path: Path) -> Schedule:
         raise UserError(
             f"cannot read {path} ({error.strerror}); name the {NAME} of a run with --time_budget"
         ) from error
-    except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
+    except (ValueError, TypeError, KeyError, AttributeError, OverflowError, RecursionError) as error:
         raise UserError(
             f"{path} is no schedule of a run ({_reason(error)}); name the {NAME} of a run with --time_budget"
         ) from error
