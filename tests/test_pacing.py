@@ -320,6 +320,26 @@ def test_training_stops_at_the_target_with_the_model_that_was_scored(colmap_scen
     assert replayed == {t: ply for t, ply in early.items() if t == ended}
 
 
+def test_a_target_may_leave_an_earlier_models_last_iteration(colmap_scene, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(target, "EVERY", 5)
+    monkeypatch.setattr(target, "PER_VIEW", 1)
+    _train(colmap_scene, tmp_path, "--iterations", 20)
+    assert "of an earlier training" not in capsys.readouterr().err
+    assert set(_train(colmap_scene, tmp_path, "--iterations", 20, "--target_psnr", 1)) == {5, 20}
+    assert "keeps iteration 20 of an earlier training, and render.py takes the highest" in capsys.readouterr().err
+
+
+def test_a_repeated_schedule_names_its_own_resolution_schedule(colmap_scene, tmp_path, capsys):
+    schedule = Schedule(100, [Block(20, 0.0, 0.05, 0.0)], 20, 5.0, "pyramid", ((0.0, 4.0), (0.5, 1.0)))
+    write_schedule(tmp_path / "schedule.json", schedule)
+    words = "--iterations", 100, "--schedule", tmp_path / "schedule.json"
+    _train(colmap_scene, tmp_path / "out", *words, "--checkpoint_iterations", 50)
+    assert json.loads((tmp_path / "out" / "model.json").read_text())["resolution_schedule"] == "pyramid"
+    start = "--start_checkpoint", tmp_path / "out" / "chkpnt10.pth"
+    _train(colmap_scene, tmp_path / "out", *words, *start, "--resolution_schedule", "pyramid")
+    assert "was trained with" not in capsys.readouterr().err
+
+
 def test_a_target_needs_test_views(colmap_scene, tmp_path):
     words = ["-s", colmap_scene, "-m", tmp_path / "out", "--iterations", 5, "--target_psnr", 20, "--disable_viewer"]
     with pytest.raises(
