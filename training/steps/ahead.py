@@ -94,7 +94,7 @@ class AheadStep:
                 taken = self._queue_calls(step)
         else:
             density = self._run.density
-            with self._ahead.room(step.camera.uid) if density.queues else nullcontext():
+            with self._ahead.room(_view(step)) if density.queues else nullcontext():
                 density.after_step(step)
         if taken is not None:
             losses.append(taken)
