@@ -383,6 +383,7 @@ def test_a_checkpoint_finds_its_place_or_is_refused(colmap_scene, tmp_path, monk
     _train(colmap_scene, tmp_path / "on", "--iterations", 120, "--start_checkpoint", checkpoint)
     assert "is of a run with --time_budget, and this one has none" in capsys.readouterr().err
     for reason, more in (
+        ("and without one --iterations 60 leaves nothing to do; resume it with --time_budget", ("--iterations", 60)),
         ("of a schedule of 60 iterations, not 61", ("--iterations", 61, "--time_budget", 9)),
         ("with --resolution_schedule none; resume", ("--iterations", 60, "--time_budget", 9, "--resolution_schedule",
                                                      "pyramid")),

@@ -38,15 +38,25 @@ def _chosen(opt: argparse.Namespace, checkpoint: str | None, first_iteration: in
     path = Path(checkpoint).parent / NAME if checkpoint else None
     if not opt.time_budget:
         if path and path.exists():
-            print(
-                f"warning: {checkpoint} is of a run with --time_budget, and this one has none: it goes on at iteration "
-                f"{first_iteration} of {opt.iterations}",
-                file=sys.stderr,
-            )
+            _tell_of_budget(checkpoint, first_iteration, opt.iterations)
         return Pace(opt.iterations)
     if not path:
         return Clocked(Schedule(opt.iterations, [], None, opt.time_budget, opt.resolution_schedule))
     return Clocked(_before(path, checkpoint, opt, first_iteration)._replace(time_budget=opt.time_budget))
+
+
+def _tell_of_budget(checkpoint: str, first_iteration: int, iterations: int) -> None:
+    """Warn that a run goes on without the time budget that it had; UserError if no iteration is left then."""
+    if first_iteration >= iterations:
+        raise UserError(
+            f"{checkpoint} is at iteration {first_iteration} of a run with --time_budget, and without one --iterations "
+            f"{iterations} leaves nothing to do; resume it with --time_budget"
+        )
+    print(
+        f"warning: {checkpoint} is of a run with --time_budget, and this one has none: it goes on at iteration "
+        f"{first_iteration} of {iterations}",
+        file=sys.stderr,
+    )
 
 
 def _recorded(path: Path, opt: argparse.Namespace) -> Schedule:
