@@ -14,7 +14,7 @@ from utils.system_utils import UserError, compute_device
 
 NAME = "train_log.json"
 SHORT = 2000  # iterations; after trainings up to this length, what training says at its end is short
-_FINITE = ("loss", "peak_memory_mib", "wall_seconds")  # if present
+_FINITE = ("loss", "peak_memory_mib", "wall_seconds", "max_num_splats")  # if present
 
 
 class Stopwatch:

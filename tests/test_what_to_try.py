@@ -120,9 +120,10 @@ def test_doctor_repeats_it(tmp_path):
     (tmp_path / LOG).write_text(json.dumps([{"iteration": 8000, "seconds": 80.0, "max_num_splats": 8000}]))
     (line,) = check_training(tmp_path)
     assert "--max_num_splats 8000" in line.text
-    (tmp_path / LOG).write_text("{")
-    (line,) = check_training(tmp_path)
-    assert "cannot be read as a training log" in line.text and line.remedy == "train again to record one"
+    for broken in ("{", '[{"iteration": 8000, "seconds": 80.0, "max_num_splats": "8000"}]'):
+        (tmp_path / LOG).write_text(broken)
+        (line,) = check_training(tmp_path)
+        assert "cannot be read as a training log" in line.text and line.remedy == "train again to record one"
 
 
 @pytest.mark.parametrize("cap", [0, 300])
