@@ -26,6 +26,7 @@ from scene.gaussians.long_axis import long_axis_children
 from scene.readers.point_cloud import write_point_cloud
 from training.error_maps import error_map
 from training.error_scores import ErrorScores
+from training.pacing.pace import Block, Paced, Schedule
 from training.strategies import budget
 from utils.exact.counter_rng import Stream
 from utils.exact.weighted_choice import weighted_choice
@@ -238,6 +239,16 @@ def test_growth_follows_its_curve_without_state(power):
 
 
 # Rows
+
+
+def test_a_pace_that_quickens_before_the_last_densification_leaves_none_missing():
+    control = object.__new__(budget.BudgetControl)
+    control._opt = SimpleNamespace(densification_interval=10, densify_until_iter=1000)
+    control.pace = Paced(Schedule(2000, [Block(80, 0.0, 11 / 2000, 0.0), Block(160, 0.44, 13 / 2000, 0.0)], None, 9.0))
+    now, changes = 100, [t for t in range(1, 160) if control.changes(t)]
+    for iteration in changes:
+        now = count_after(now, 1000, control._remaining(iteration), 1.0)
+    assert changes[-1] == 80 and now == 1000  # at the pace of the 80th, the 90th comes just in time
 
 
 def test_a_split_leaves_other_rows_alone_and_restarts_averages():

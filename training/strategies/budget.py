@@ -66,8 +66,11 @@ class BudgetControl(DensityControl):
 
     def _remaining(self, iteration: int) -> int:
         """How many densifications follow that of this iteration, at its pace."""
-        stride = self._opt.densification_interval * self.pace.stride(iteration)
-        return math.ceil((self._opt.densify_until_iter - self.pace.nominal(iteration)) / stride) - 1
+        opt, stride = self._opt, self.pace.stride(iteration)
+        ahead = (opt.densify_until_iter - self.pace.nominal(iteration)) / (opt.densification_interval * stride)
+        if stride != 1:
+            ahead -= 0.5  # the pace changes, so one that just comes in time may not come
+        return max(math.ceil(ahead) - 1, 0)
 
     def _chosen(self, step: Step, count: int) -> Tensor:
         """Indices of at most `count` Gaussians to split, ascending."""
