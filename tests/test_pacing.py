@@ -390,6 +390,9 @@ def test_a_checkpoint_finds_its_place_or_is_refused(colmap_scene, tmp_path, monk
     ):  # fmt: skip
         with pytest.raises(UserError, match=reason):
             _train(colmap_scene, tmp_path / "out", "--start_checkpoint", checkpoint, *more)
+    (steady / "schedule.json").write_text("{")
+    with pytest.raises(UserError, match="is no schedule .*; restore it for .*chkpnt30.pth, or move it elsewhere"):
+        _train(colmap_scene, tmp_path / "out", "--iterations", 60, *start, "--time_budget", 9)
     (steady / "schedule.json").write_text(json.dumps(GOOD | {"iterations": 60}))
     with pytest.raises(UserError, match="ends before iteration 30 of .*chkpnt30.pth, so it is of another run"):
         _train(colmap_scene, tmp_path / "out", "--iterations", 60, *start, "--time_budget", 9)

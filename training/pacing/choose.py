@@ -73,8 +73,8 @@ def _recorded(path: Path, opt: argparse.Namespace) -> Schedule:
     return found
 
 
-def _read(path: Path, opt: argparse.Namespace) -> Schedule:
-    found = read_schedule(path)
+def _read(path: Path, opt: argparse.Namespace, *remedy: str) -> Schedule:
+    found = read_schedule(path, *remedy)
     if found.iterations != opt.iterations:
         raise UserError(
             f"{path} is of a schedule of {found.iterations} iterations, not {opt.iterations}; give --iterations "
@@ -88,11 +88,11 @@ def _before(path: Path, checkpoint: str, opt: argparse.Namespace, first_iteratio
     if not path.exists():
         step = 1.0 / max(opt.iterations, first_iteration + 1)
         return Schedule(opt.iterations, [Block(first_iteration, 0.0, step, 0.0)], None, 0.0, opt.resolution_schedule)
-    found = _read(path, opt)
+    remedy = "move it elsewhere to resume that checkpoint as one of a run without a time budget"
+    found = _read(path, opt, f"restore it for {checkpoint}, or {remedy}")
     if found.blocks[-1].last < first_iteration:
         raise UserError(
-            f"{path} ends before iteration {first_iteration} of {checkpoint}, so it is of another run; move it "
-            "elsewhere to resume that checkpoint as one of a run without a time budget"
+            f"{path} ends before iteration {first_iteration} of {checkpoint}, so it is of another run; {remedy}"
         )
     if found.resolution_schedule != opt.resolution_schedule:
         raise UserError(
