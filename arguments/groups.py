@@ -286,8 +286,8 @@ class OptimizationParams(OptionTable):
         Option(
             "max_num_splats",
             0,
-            "largest number of Gaussians, 0: no limit, or 1,000,000 with mcmc; near it, adc densifies only those with "
-            "the largest gradients",
+            "largest number of Gaussians, 0: no limit, 1,000,000 with mcmc, or with budget what --strategy says; near "
+            "it, adc densifies only those with the largest gradients",
             "ours",
             check=at_least(0),
         ),

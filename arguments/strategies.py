@@ -6,23 +6,23 @@ ADC_OPTIONS: tuple[Option, ...] = (
     Option(
         "absgrad",
         False,
-        "densify by the sum of the pixels' absolute gradients (AbsGS), which do not cancel out where a large Gaussian "
-        "covers fine detail; absgrad_threshold then stands for densify_grad_threshold",
+        "adc: densify by the sum of the pixels' absolute gradients (AbsGS), which do not cancel out where a large "
+        "Gaussian covers fine detail; absgrad_threshold then stands for densify_grad_threshold",
         "ours",
     ),
     Option(
         "absgrad_threshold",
         0.0008,
-        "absolute screen-space gradient (per NDC unit) that makes a Gaussian clone or split, with --absgrad; lower: "
-        "more Gaussians",
+        "adc: absolute screen-space gradient (per NDC unit) that makes a Gaussian clone or split, with --absgrad; "
+        "lower: more Gaussians",
         "ours, as gsplat recommends",
         check=above(0),
     ),
     Option(
         "split",
         "sample",
-        "where the two children of a split Gaussian are. sample: at random, as by its density, each 1.6 times smaller; "
-        "long_axis: on both sides along its longest axis, which keeps its mean and covariance",
+        "adc: where the two children of a split Gaussian are. sample: at random, as by its density, each 1.6 times "
+        "smaller; long_axis: on both sides along its longest axis, which keeps its mean and covariance",
         "ours",
         check=one_of("sample", "long_axis"),
     ),

@@ -7,7 +7,8 @@ from typing import Any
 from records.curve_peak import CLEAR
 from records.error_curve import Row, whole_sets
 
-CAP, PLANNED = "max_num_splats", "iterations_planned"  # entries of the log's last record: options of the training
+# Entries of the log's last record: options of the training.
+CAP, PLANNED, STRATEGY = "max_num_splats", "iterations_planned", "strategy"
 FULL = 0.99  # of the cap: a densification that removes some Gaussians ends a little below it
 SETTLED = 1000  # iterations; the default densification begins after 500, so that a shorter training says little
 
@@ -21,12 +22,13 @@ def what_to_try(rows: Sequence[Row], records: Sequence[Mapping[str, Any]]) -> li
     scored = [row for row in whole_sets(rows) if row["test_psnr"] is not None]
     last = records[-1] if records else {}
     # More Gaussians are no remedy for overfitting. Without growth, a cap that is far away is none either.
-    first = _overfitting(scored) or _at_cap(rows, scored, last.get(CAP)) or _never_grew(rows)
+    strategy = last.get(STRATEGY, "adc")
+    first = _overfitting(scored, strategy) or _at_cap(rows, scored, last.get(CAP)) or _never_grew(rows, strategy)
     ended_by_itself = last.get(PLANNED) not in (None, last.get("iteration"))
     return [sentence for sentence in (first, None if ended_by_itself else _late(rows, scored)) if sentence]
 
 
-def _overfitting(scored: Sequence[Row]) -> str | None:
+def _overfitting(scored: Sequence[Row], strategy: str) -> str | None:
     """Test views lose while training views gain."""
     best = max(scored, key=lambda row: row["test_psnr"], default=None)
     if best is None or None in (best["train_psnr"], scored[-1]["train_psnr"]):
@@ -36,11 +38,12 @@ def _overfitting(scored: Sequence[Row]) -> str | None:
     if lost < CLEAR or gained < CLEAR:
         return None
     half = max(1, int((scored[-1]["gaussians"] or 0) / 2))
-    fewer = f"--max_num_splats {half}, half as many as now, or " if half > 1 else ""
+    fewer = [f"--max_num_splats {half}, half as many as now"] * (half > 1)
+    fewer += ["a higher --densify_grad_threshold"] * (strategy == "adc")
+    known = f" ({', or '.join(fewer)})" if fewer else ""
     return (
         f"After iteration {best['iteration']} the test views lost {lost:.2f} dB while the training views gained "
-        f"{gained:.2f} dB, so it overfits; try fewer Gaussians ({fewer}a higher --densify_grad_threshold), a lower "
-        "--sh_degree, or more photos"
+        f"{gained:.2f} dB, so it overfits; try fewer Gaussians{known}, a lower --sh_degree, or more photos"
     )
 
 
@@ -57,16 +60,18 @@ def _at_cap(rows: Sequence[Row], scored: Sequence[Row], cap: int | None) -> str 
     )
 
 
-def _never_grew(rows: Sequence[Row]) -> str | None:
+def _never_grew(rows: Sequence[Row], strategy: str) -> str | None:
     """Nothing was densified, or no more than was removed."""
     counts = [row["gaussians"] for row in rows if row["gaussians"] is not None]
     grew = any(after > before for before, after in pairwise(counts))  # from a random start they first become fewer
     if len(counts) < 2 or rows[-1]["iteration"] < SETTLED or grew:
         return None
+    remedy = "a lower --densify_grad_threshold" if strategy == "adc" else "a higher --max_num_splats"
+    end = "--mcmc_until_iter" if strategy == "mcmc" else "--densify_until_iter"
     return (
         f"The number of Gaussians never rose from one scoring to the next ({counts[0]} at first, {counts[-1]} at the "
-        "end): nothing was densified, or more was removed; try a lower --densify_grad_threshold, and see whether "
-        "--densify_from_iter and --densify_until_iter leave iterations for it"
+        f"end): nothing was densified, or more was removed; try {remedy}, and see whether "
+        f"--densify_from_iter and {end} leave iterations for it"
     )
 
 

@@ -26,6 +26,7 @@ from scene.gaussians.long_axis import long_axis_children
 from scene.readers.point_cloud import write_point_cloud
 from training.error_maps import error_map
 from training.error_scores import ErrorScores
+from training.pacing.pace import Block, Paced, Schedule
 from training.strategies import budget
 from utils.exact.counter_rng import Stream
 from utils.exact.weighted_choice import weighted_choice
@@ -201,6 +202,18 @@ def test_large_draws_follow_the_weights():
     np.testing.assert_allclose(rates / rates[0], [1, 3, 9], rtol=0.12)
 
 
+def test_a_high_power_takes_the_highest_of_small_scores():
+    control = object.__new__(budget.BudgetControl)
+    control._opt = SimpleNamespace(score_power=200.0, seed=0)
+    control._scored_views = lambda iteration: []
+    scores = 1e-6 * torch.arange(20, dtype=torch.float64)
+    control._scores = SimpleNamespace(of_views=lambda views, background: scores)
+    step = SimpleNamespace(iteration=1, background=None)
+    assert control._chosen(step, 3).tolist() == [17, 18, 19]
+    scores = torch.zeros(20, dtype=torch.float64)
+    assert len(control._chosen(step, 3)) == 0  # photos that are reproduced to the bit
+
+
 def test_draws_of_nothing_of_all_and_of_broken_weights():
     assert _drawn([0.0, 0.0], 5, 1) == [] and _drawn([], 5, 1) == [] and _drawn([1.0, 2.0], 0, 1) == []
     assert _drawn([1.0, 0.0, 2.0], 2, 1) == [0, 2] and _drawn([1.0, 2.0], -3, 1) == []
@@ -226,6 +239,16 @@ def test_growth_follows_its_curve_without_state(power):
 
 
 # Rows
+
+
+def test_a_pace_that_quickens_before_the_last_densification_leaves_none_missing():
+    control = object.__new__(budget.BudgetControl)
+    control._opt = SimpleNamespace(densification_interval=10, densify_until_iter=1000)
+    control.pace = Paced(Schedule(2000, [Block(80, 0.0, 11 / 2000, 0.0), Block(160, 0.44, 13 / 2000, 0.0)], None, 9.0))
+    now, changes = 100, [t for t in range(1, 160) if control.changes(t)]
+    for iteration in changes:
+        now = count_after(now, 1000, control._remaining(iteration), 1.0)
+    assert changes[-1] == 80 and now == 1000  # at the pace of the 80th, the 90th comes just in time
 
 
 def test_a_split_leaves_other_rows_alone_and_restarts_averages():

@@ -1,5 +1,6 @@
 """Training by --strategy mcmc: the same bytes by every way to take a step, resuming, growth and its limit."""
 
+import argparse
 import sys
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from training.density import DensityControl
 from training.steps import ahead, run_ahead
 from training.steps.fused import FusedStep
 from training.steps.recorded import RecordedStep
+from training.strategies.mcmc import MarkovChain
 from utils.system_utils import UserError
 
 # Within so few iterations no Gaussian fades, so the thresholds are at the opacities of the start.
@@ -115,6 +117,21 @@ def test_growth_ends_at_the_limit(scene, tmp_path):
     assert counts[0] == [*grown, grown[-1]]
     assert counts[1] == [min(count, 430) for count in counts[0]] and counts[1][-1] == 430
     assert counts[2] == [start] * 6  # nothing is removed
+
+
+@pytest.mark.parametrize(("growth", "count", "grown"), [(0.05, 5, 6), (0.05, 40, 42), (0.0, 5, 5), (1.0, 30, 45)])
+def test_a_few_gaussians_grow_at_least_by_one(growth, count, grown):
+    counts = [count]
+
+    class Few:
+        __len__ = staticmethod(lambda: counts[-1])
+
+        def grow(self, new, *_, **__) -> None:
+            counts.append(counts[-1] + new)
+
+    options = dict.fromkeys(("mcmc_opacity_reg", "mcmc_scale_reg", "mcmc_parts", "seed"), 0)
+    MarkovChain(Few(), argparse.Namespace(max_num_splats=45, mcmc_growth=growth, **options))._grow(1)
+    assert counts[-1] == grown
 
 
 def test_the_start_is_more_opaque_and_smaller_than_the_points(scene, tmp_path):

@@ -172,6 +172,7 @@ def _with_block(index: int, **values: object) -> dict:
         (_with_block(1, step="x"), "'x' is no number"),
         (GOOD | {"ended": 9}, "its last block does not end with its last iteration"),
         (json.dumps(GOOD).replace("5.0", "NaN"), "nan is no number"),
+        (GOOD | {"time_budget": 10**400}, "is no schedule of a run"),
     ],
 )
 def test_a_broken_schedule_is_refused(tmp_path, content, reason):
@@ -338,6 +339,26 @@ def test_training_stops_at_the_target_with_the_model_that_was_scored(colmap_scen
     assert replayed == {t: ply for t, ply in early.items() if t == ended}
 
 
+def test_a_target_may_leave_an_earlier_models_last_iteration(colmap_scene, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(target, "EVERY", 5)
+    monkeypatch.setattr(target, "PER_VIEW", 1)
+    _train(colmap_scene, tmp_path, "--iterations", 20)
+    assert "of an earlier training" not in capsys.readouterr().err
+    assert set(_train(colmap_scene, tmp_path, "--iterations", 20, "--target_psnr", 1)) == {5, 20}
+    assert "keeps iteration 20 of an earlier training, and render.py takes the highest" in capsys.readouterr().err
+
+
+def test_a_repeated_schedule_names_its_own_resolution_schedule(colmap_scene, tmp_path, capsys):
+    schedule = Schedule(100, [Block(20, 0.0, 0.05, 0.0)], 20, 5.0, "pyramid", ((0.0, 4.0), (0.5, 1.0)))
+    write_schedule(tmp_path / "schedule.json", schedule)
+    words = "--iterations", 100, "--schedule", tmp_path / "schedule.json"
+    _train(colmap_scene, tmp_path / "out", *words, "--checkpoint_iterations", 50)
+    assert json.loads((tmp_path / "out" / "model.json").read_text())["resolution_schedule"] == "pyramid"
+    start = "--start_checkpoint", tmp_path / "out" / "chkpnt10.pth"
+    _train(colmap_scene, tmp_path / "out", *words, *start, "--resolution_schedule", "pyramid")
+    assert "was trained with" not in capsys.readouterr().err
+
+
 def test_a_target_needs_test_views(colmap_scene, tmp_path):
     words = ["-s", colmap_scene, "-m", tmp_path / "out", "--iterations", 5, "--target_psnr", 20, "--disable_viewer"]
     with pytest.raises(
@@ -381,12 +402,16 @@ def test_a_checkpoint_finds_its_place_or_is_refused(colmap_scene, tmp_path, monk
     _train(colmap_scene, tmp_path / "on", "--iterations", 120, "--start_checkpoint", checkpoint)
     assert "is of a run with --time_budget, and this one has none" in capsys.readouterr().err
     for reason, more in (
+        ("and without one --iterations 60 leaves nothing to do; resume it with --time_budget", ("--iterations", 60)),
         ("of a schedule of 60 iterations, not 61", ("--iterations", 61, "--time_budget", 9)),
         ("with --resolution_schedule none; resume", ("--iterations", 60, "--time_budget", 9, "--resolution_schedule",
                                                      "pyramid")),
     ):  # fmt: skip
         with pytest.raises(UserError, match=reason):
             _train(colmap_scene, tmp_path / "out", "--start_checkpoint", checkpoint, *more)
+    (steady / "schedule.json").write_text("{")
+    with pytest.raises(UserError, match="is no schedule .*; restore it for .*chkpnt30.pth, or move it elsewhere"):
+        _train(colmap_scene, tmp_path / "out", "--iterations", 60, *start, "--time_budget", 9)
     (steady / "schedule.json").write_text(json.dumps(GOOD | {"iterations": 60}))
     with pytest.raises(UserError, match="ends before iteration 30 of .*chkpnt30.pth, so it is of another run"):
         _train(colmap_scene, tmp_path / "out", "--iterations", 60, *start, "--time_budget", 9)

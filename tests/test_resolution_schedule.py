@@ -158,6 +158,11 @@ def _photo(cycles: float, depth: InMemory | None = None) -> Camera:
     return Camera(View(0, 0, np.eye(3), np.zeros(3), 1.0, 1.0, "a", (96, 64), **given))
 
 
+def test_a_factor_beyond_all_sizes_makes_the_smallest_views(colmap_scene, tmp_path):
+    scene, _ = _scene(colmap_scene, tmp_path, resolution=1)
+    assert Resolution([(0.0, 1e300)], 10, scene.images).view(scene.getTrainCameras()[0], 1)._size == (48, 32)
+
+
 def test_levels_by_the_spectrum_last_as_long_as_they_keep_detail():
     # Kept by the factors 4, 3, 2, 1.5, 1: cycles up to 1/8, 1/6, 1/4, 1/3, 1/2.
     assert levels_of([_photo(1 / 12)]) == ((0.0, 4.0), (UNTIL, 1.0))

@@ -43,6 +43,16 @@ def test_test_views_that_fall_while_training_views_rise():
     assert what_to_try(_curve([20.0, 24.0, 23.9, 23.95], [20.0, 24.0, 26.0, 28.0]), [])[0].startswith("The last 40.0")
 
 
+@pytest.mark.parametrize(("strategy", "end"), [("mcmc", "--mcmc_until_iter"), ("budget", "--densify_until_iter")])
+def test_other_strategies_are_told_of_their_own_options(strategy, end):
+    log = [{"iteration": 8000, "strategy": strategy}]
+    (said,) = what_to_try(_curve([20.0, 24.0, 23.0, 22.5], RISING), log)
+    assert "(--max_num_splats 4000, half as many as now), a lower" in said
+    (said,) = what_to_try(_curve(RISING, RISING, (1000, 1000, 900, 900)), log)
+    assert "try a higher --max_num_splats" in said and f"--densify_from_iter and {end} leave" in said
+    assert "threshold" not in said
+
+
 def test_subsets_tell_nothing_of_scores():
     rows = _curve([20.0, 24.0, 23.0, 22.5], RISING)
     for row in rows[:3]:
@@ -110,9 +120,10 @@ def test_doctor_repeats_it(tmp_path):
     (tmp_path / LOG).write_text(json.dumps([{"iteration": 8000, "seconds": 80.0, "max_num_splats": 8000}]))
     (line,) = check_training(tmp_path)
     assert "--max_num_splats 8000" in line.text
-    (tmp_path / LOG).write_text("{")
-    (line,) = check_training(tmp_path)
-    assert "cannot be read as a training log" in line.text and line.remedy == "train again to record one"
+    for broken in ("{", '[{"iteration": 8000, "seconds": 80.0, "max_num_splats": "8000"}]'):
+        (tmp_path / LOG).write_text(broken)
+        (line,) = check_training(tmp_path)
+        assert "cannot be read as a training log" in line.text and line.remedy == "train again to record one"
 
 
 @pytest.mark.parametrize("cap", [0, 300])

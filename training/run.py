@@ -71,7 +71,7 @@ class Run:
         self.resolution = resolution_of(opt, self.pace, self.scene.getTrainCameras(), self.scene.images)
         self._decode_ahead(self.first_iteration + 1)
         from_points = self._start(capture)
-        saves = self.pace.known(plan.save)
+        saves = [] if opt.target_psnr else self.pace.known(plan.save)  # a target may come before any of them
         check_folder(dataset.model_path, dataset.source_path, saves, plan.start, self.first_iteration)
         if plan.start:
             report_changes(plan.start, argparse.Namespace(**vars(dataset), **self._training_options))
@@ -107,9 +107,11 @@ class Run:
 
     @property
     def _training_options(self) -> dict[str, Any]:
-        opt = self.opt
-        names = "optimizer_type", "seed", "strategy", "resolution_schedule"
-        return {"antialiasing": self.pipe.antialiasing} | {name: getattr(opt, name) for name in names}
+        options = {name: getattr(self.opt, name) for name in ("optimizer_type", "seed", "strategy")}
+        options["resolution_schedule"] = self.opt.resolution_schedule
+        if isinstance(self.pace, Paced):  # a schedule that is repeated brings its own
+            options["resolution_schedule"] = self.pace.schedule.resolution_schedule
+        return {"antialiasing": self.pipe.antialiasing} | options
 
     @property
     def kept(self) -> dict[str, Any]:

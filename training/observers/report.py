@@ -10,7 +10,7 @@ from tqdm import tqdm
 
 from gaussian_renderer import render
 from gaussian_renderer.scored_views import ScoredViews
-from records.what_to_try import CAP, PLANNED, what_to_try
+from records.what_to_try import CAP, PLANNED, STRATEGY, what_to_try
 from scene import Scene
 from scene.cameras import Camera
 from scene.gaussian_model import GaussianModel
@@ -72,7 +72,7 @@ class Report(Observer):
             self._writer.close()
         log, opt = self._run.log, self._run.opt
         capped = opt.strategy == "adc" and opt.max_num_splats  # the others are meant to reach their number
-        log.note(**{PLANNED: opt.iterations}, **({CAP: opt.max_num_splats} if capped else {}))
+        log.note(**{PLANNED: opt.iterations, STRATEGY: opt.strategy}, **({CAP: opt.max_num_splats} if capped else {}))
         if sentences := what_to_try(self._run.rows, log.records):
             log.tell(*sentences)
 

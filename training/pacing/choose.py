@@ -38,15 +38,25 @@ def _chosen(opt: argparse.Namespace, checkpoint: str | None, first_iteration: in
     path = Path(checkpoint).parent / NAME if checkpoint else None
     if not opt.time_budget:
         if path and path.exists():
-            print(
-                f"warning: {checkpoint} is of a run with --time_budget, and this one has none: it goes on at iteration "
-                f"{first_iteration} of {opt.iterations}",
-                file=sys.stderr,
-            )
+            _tell_of_budget(checkpoint, first_iteration, opt.iterations)
         return Pace(opt.iterations)
     if not path:
         return Clocked(Schedule(opt.iterations, [], None, opt.time_budget, opt.resolution_schedule))
     return Clocked(_before(path, checkpoint, opt, first_iteration)._replace(time_budget=opt.time_budget))
+
+
+def _tell_of_budget(checkpoint: str, first_iteration: int, iterations: int) -> None:
+    """Warn that a run goes on without the time budget that it had; UserError if no iteration is left then."""
+    if first_iteration >= iterations:
+        raise UserError(
+            f"{checkpoint} is at iteration {first_iteration} of a run with --time_budget, and without one --iterations "
+            f"{iterations} leaves nothing to do; resume it with --time_budget"
+        )
+    print(
+        f"warning: {checkpoint} is of a run with --time_budget, and this one has none: it goes on at iteration "
+        f"{first_iteration} of {iterations}",
+        file=sys.stderr,
+    )
 
 
 def _recorded(path: Path, opt: argparse.Namespace) -> Schedule:
@@ -63,8 +73,8 @@ def _recorded(path: Path, opt: argparse.Namespace) -> Schedule:
     return found
 
 
-def _read(path: Path, opt: argparse.Namespace) -> Schedule:
-    found = read_schedule(path)
+def _read(path: Path, opt: argparse.Namespace, *remedy: str) -> Schedule:
+    found = read_schedule(path, *remedy)
     if found.iterations != opt.iterations:
         raise UserError(
             f"{path} is of a schedule of {found.iterations} iterations, not {opt.iterations}; give --iterations "
@@ -78,11 +88,11 @@ def _before(path: Path, checkpoint: str, opt: argparse.Namespace, first_iteratio
     if not path.exists():
         step = 1.0 / max(opt.iterations, first_iteration + 1)
         return Schedule(opt.iterations, [Block(first_iteration, 0.0, step, 0.0)], None, 0.0, opt.resolution_schedule)
-    found = _read(path, opt)
+    remedy = "move it elsewhere to resume that checkpoint as one of a run without a time budget"
+    found = _read(path, opt, f"restore it for {checkpoint}, or {remedy}")
     if found.blocks[-1].last < first_iteration:
         raise UserError(
-            f"{path} ends before iteration {first_iteration} of {checkpoint}, so it is of another run; move it "
-            "elsewhere to resume that checkpoint as one of a run without a time budget"
+            f"{path} ends before iteration {first_iteration} of {checkpoint}, so it is of another run; {remedy}"
         )
     if found.resolution_schedule != opt.resolution_schedule:
         raise UserError(

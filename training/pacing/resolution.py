@@ -69,7 +69,7 @@ class Resolution:
         self.factor = factor
         self._made.clear()
         free = free_memory(torch.device(self._images.device))
-        room = free is None or self._images.planned_bytes / factor**2 <= GPU_SHARE * free
+        room = free is None or self._images.planned_bytes / factor / factor <= GPU_SHARE * free
         self._keeps = not self._images.limit and room
 
 

@@ -16,18 +16,14 @@ def write_schedule(path: Path, schedule: Schedule) -> None:
     write_json(path, schedule._asdict() | {"blocks": [block._asdict() for block in schedule.blocks]})
 
 
-def read_schedule(path: Path) -> Schedule:
-    """The schedule of a file. UserError if it is missing or broken."""
+def read_schedule(path: Path, remedy: str = f"name the {NAME} of a run with --time_budget") -> Schedule:
+    """The schedule of a file. UserError, which ends with the remedy, if it is missing or broken."""
     try:
         return _schedule(read_json(path))
     except OSError as error:
-        raise UserError(
-            f"cannot read {path} ({error.strerror}); name the {NAME} of a run with --time_budget"
-        ) from error
-    except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
-        raise UserError(
-            f"{path} is no schedule of a run ({_reason(error)}); name the {NAME} of a run with --time_budget"
-        ) from error
+        raise UserError(f"cannot read {path} ({error.strerror}); {remedy}") from error
+    except (ValueError, TypeError, KeyError, AttributeError, OverflowError, RecursionError) as error:
+        raise UserError(f"{path} is no schedule of a run ({_reason(error)}); {remedy}") from error
 
 
 def _reason(error: Exception) -> str:

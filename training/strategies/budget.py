@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 
 PIXELS = 20  # training pixels of all views for each Gaussian of the default budget
 FEWEST, MOST = 100_000, 1_000_000  # Gaussians of the default budget
+_SMALLEST = 1e-300
 
 
 class BudgetControl(DensityControl):
@@ -65,14 +66,18 @@ class BudgetControl(DensityControl):
 
     def _remaining(self, iteration: int) -> int:
         """How many densifications follow that of this iteration, at its pace."""
-        stride = self._opt.densification_interval * self.pace.stride(iteration)
-        return math.ceil((self._opt.densify_until_iter - self.pace.nominal(iteration)) / stride) - 1
+        opt, stride = self._opt, self.pace.stride(iteration)
+        ahead = (opt.densify_until_iter - self.pace.nominal(iteration)) / (opt.densification_interval * stride)
+        if stride != 1:
+            ahead -= 0.5  # the pace changes, so one that just comes in time may not come
+        return max(math.ceil(ahead) - 1, 0)
 
     def _chosen(self, step: Step, count: int) -> Tensor:
         """Indices of at most `count` Gaussians to split, ascending."""
         opt = self._opt
         scores = self._scores.of_views(self._scored_views(step.iteration), step.background)
-        weights = exp(opt.score_power * log(scores)) * (scores > 0)
+        relative = scores / scores.max().clamp_min(_SMALLEST)  # the power of a score itself may be too small a number
+        weights = exp(opt.score_power * log(relative)) * (scores > 0)
         return weighted_choice(weights, count, seed=opt.seed, stream=Stream.DENSIFY, iteration=step.iteration)
 
     def _scored_views(self, iteration: int) -> list[Camera]:

@@ -63,8 +63,9 @@ class MarkovChain(DensityControl):
             )
 
     def _grow(self, iteration: int) -> None:
-        """Grow by a part of the number of Gaussians (paper, section 3.3)."""
+        """Grow by a part of the number of Gaussians (paper, section 3.3), at least by one."""
         count, opt = len(self._gaussians), self._opt
-        new = min(int((1 + opt.mcmc_growth) * count), self.most_gaussians) - count
+        grown = max(int((1 + opt.mcmc_growth) * count), count + (opt.mcmc_growth > 0))
+        new = min(grown, self.most_gaussians) - count
         if new > 0:
             self._gaussians.grow(new, opt.mcmc_parts, seed=opt.seed, iteration=iteration)
