@@ -243,7 +243,8 @@ def test_growth_follows_its_curve_without_state(power):
 
 def test_a_pace_that_quickens_before_the_last_densification_leaves_none_missing():
     control = object.__new__(budget.BudgetControl)
-    control._opt = SimpleNamespace(densification_interval=10, densify_until_iter=1000)
+    # The window begins so early that the interval stays.
+    control._opt = SimpleNamespace(densification_interval=10, densify_from_iter=-1700, densify_until_iter=1000)
     control.pace = Paced(Schedule(2000, [Block(80, 0.0, 11 / 2000, 0.0), Block(160, 0.44, 13 / 2000, 0.0)], None, 9.0))
     now, changes = 100, [t for t in range(1, 160) if control.changes(t)]
     for iteration in changes:

@@ -201,6 +201,18 @@ def test_windows_and_resets_are_of_the_schedule_and_densifications_of_the_run():
     assert [t for t in white if white[t].reset_opacity] == [251]
 
 
+def test_a_run_of_few_steps_still_densifies_twenty_times():
+    def densifications(stride: int, **changed: int) -> list[int]:
+        todo = ((t, range(stride * (t - 1) + 1, stride * t + 1)) for t in range(1, 30_000 // stride + 1))
+        opt = _options(**changed)
+        return [t for t, span in todo if rules.actions(t, opt, False, span, stride).densify]
+
+    assert len(densifications(1)) == 144 and len(densifications(5)) == 28
+    few = densifications(30)
+    assert few == list(range(24, 500, 24)) and len(few) == 20
+    assert len(densifications(30, densify_from_iter=14_900)) == 3  # each of its iterations
+
+
 def test_a_short_run_does_without_resets_that_it_would_not_recover_from():
     def resets(stride: int, **changed: int) -> int:
         count = 30_000 // stride
@@ -229,10 +241,11 @@ def test_strategies_grow_within_windows_of_the_schedule(colmap_scene, tmp_path, 
     words = ["-s", colmap_scene, "-m", tmp_path / "out", "-r", 24, "--no_curve", "--test_iterations", -1,
              "--schedule", tmp_path / "two.json", "--iterations", 120, "--strategy", strategy,
              "--densification_interval", 5, "--densify_from_iter", 20, "--densify_until_iter", 80,
-             "--mcmc_until_iter", 80, "--max_num_splats", 5000, "--mcmc_growth", 0.2]  # fmt: skip
+             "--mcmc_until_iter", 80, "--max_num_splats", 5000, "--mcmc_growth", 0.02]  # fmt: skip
     train.main([*map(str, words)])
     assert len(counts) == 60
-    assert [t for t in range(1, 60) if counts[t] > counts[t - 1]] == [15, 20, 25, 30, 35]
+    # Every fifth iteration would be 5 times, so they are more often.
+    assert [t for t in range(1, 60) if counts[t] > counts[t - 1]] == [*range(11, 40)]
     assert strategy == "mcmc" or counts[-1] == 5000
 
 
@@ -448,8 +461,8 @@ def test_a_paced_run_goes_through_rates_degrees_and_windows(colmap_scene, tmp_pa
     _train(colmap_scene, tmp_path / "out", "--schedule", path, "--iterations", 4000, *options)
     assert [iteration for iteration, _ in seen] == [*range(80, 1601, 80), *range(1720, 4001, 120)]
     assert rates[-1] == pytest.approx(rates[0] / 100 * 100 ** (80 / 4000), rel=1e-6)
-    assert grown == [10, 15, 20]  # every fifth iteration within the window
-    assert [step.iteration for step in steps if step.changes] == [10, 13, 15, 20, 24, 32, 40]
+    assert grown == [*range(6, 24)]  # all in the window, as every fifth would be too few
+    assert [step.iteration for step in steps if step.changes] == [*range(6, 25), 32, 40]
     assert [t for t in range(1, 40) if seen[t][1] > seen[t - 1][1]] == [13, 24, 32]  # after 1000, 2000 and 3000
 
 

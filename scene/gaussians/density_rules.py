@@ -18,6 +18,7 @@ SHRINK = 0.8  # N children of a split have 1 / (0.8 N) of the parent's scale: 1 
 PRUNE_EXTENT = 0.1  # a Gaussian wider than this part of the scene's extent is removed, once sizes are limited
 RESET_OPACITY = 0.01
 RECOVERY = 1000  # iterations that a model needs to recover from a reset of its opacities
+FEW_DENSIFICATIONS = 20  # a run that takes fewer steps than its schedule still has so many
 MIN_OPACITY = 0.005  # a Gaussian below it is removed
 MAX_SCREEN_SIZE = 20  # pixels
 
@@ -31,23 +32,37 @@ class Actions(NamedTuple):
     reset_opacity: bool
 
 
+def interval(opt: argparse.Namespace, until: int, stride: float) -> int:
+    """Iterations from one densification to the next: densification_interval of the options, in most runs.
+
+    until: the end of the window of densifications, which begins with densify_from_iter, in iterations of the schedule;
+    stride: of these, how many each iteration stands for. Where they are several, there would be too few densifications.
+    """
+    if stride <= 1:
+        return opt.densification_interval
+    steps = (until - opt.densify_from_iter) / stride
+    return min(opt.densification_interval, max(1, int(steps / FEW_DENSIFICATIONS)))
+
+
 def actions(
     iteration: int, opt: argparse.Namespace, white_background: bool, span: range | None = None, stride: float = 1.0
 ) -> Actions:
     """Actions due in an iteration (paper, section 5.2, in the reference's windows): none from densify_until_iter on.
 
     span, stride: the iterations of the schedule that it stands for, and their mean number there; by default itself.
-    The options' windows and resets are of the schedule; densifications come every densification_interval iterations,
-    as their statistics need views. Resets that a model would not recover from before the next one are left out.
+    The options' windows and resets are of the schedule; densifications come every `interval` iterations, as their
+    statistics need views. Resets that a model would not recover from before the next one are left out.
     """
     before, now = (iteration - 1, iteration) if span is None else (span.start - 1, span.stop - 1)
-    active, interval = now < opt.densify_until_iter, opt.opacity_reset_interval
-    recovers = stride <= 1 or interval >= RECOVERY * stride
-    reset = now // interval > before // interval or (white_background and before < opt.densify_from_iter <= now)
+    active, resets = now < opt.densify_until_iter, opt.opacity_reset_interval
+    recovers = stride <= 1 or resets >= RECOVERY * stride
+    reset = now // resets > before // resets or (white_background and before < opt.densify_from_iter <= now)
     return Actions(
         observe=active,
-        densify=active and now > opt.densify_from_iter and iteration % opt.densification_interval == 0,
-        limit_size=now > interval,
+        densify=active
+        and now > opt.densify_from_iter
+        and iteration % interval(opt, opt.densify_until_iter, stride) == 0,
+        limit_size=now > resets,
         reset_opacity=active and reset and recovers,
     )
 

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 from torch import Tensor
 
 from scene.cameras import Camera
+from scene.gaussians import density_rules as rules
 from scene.gaussians.budgeted import count_after, fade, remove_useless, split_in_two
 from training.density import DensityControl
 from training.error_scores import ErrorScores
@@ -46,8 +47,8 @@ class BudgetControl(DensityControl):
         self.most_gaussians = run.opt.max_num_splats or default_budget(self._cameras)
 
     def changes(self, iteration: int) -> bool:
-        opt = self._opt
-        return iteration % opt.densification_interval == 0 and self.pace.nominal(iteration) < opt.densify_until_iter
+        in_time = self.pace.nominal(iteration) < self._opt.densify_until_iter
+        return in_time and iteration % self._interval(iteration) == 0
 
     def after_step(self, step: Step) -> None:
         if not self.changes(step.iteration):
@@ -67,10 +68,13 @@ class BudgetControl(DensityControl):
     def _remaining(self, iteration: int) -> int:
         """How many densifications follow that of this iteration, at its pace."""
         opt, stride = self._opt, self.pace.stride(iteration)
-        ahead = (opt.densify_until_iter - self.pace.nominal(iteration)) / (opt.densification_interval * stride)
+        ahead = (opt.densify_until_iter - self.pace.nominal(iteration)) / (self._interval(iteration) * stride)
         if stride != 1:
             ahead -= 0.5  # the pace changes, so one that just comes in time may not come
         return max(math.ceil(ahead) - 1, 0)
+
+    def _interval(self, iteration: int) -> int:
+        return rules.interval(self._opt, self._opt.densify_until_iter, self.pace.stride(iteration))
 
     def _chosen(self, step: Step, count: int) -> Tensor:
         """Indices of at most `count` Gaussians to split, ascending."""

@@ -11,6 +11,7 @@ import argparse
 from torch import Tensor
 
 from scene.gaussian_model import GaussianModel
+from scene.gaussians import density_rules as rules
 from scene.gaussians.penalty import Penalty
 from training.density import DensityControl
 from training.step import Step
@@ -38,7 +39,8 @@ class MarkovChain(DensityControl):
     def changes(self, iteration: int) -> bool:
         opt = self._opt
         within = opt.densify_from_iter < self.pace.nominal(iteration) < opt.mcmc_until_iter
-        return within and iteration % opt.densification_interval == 0
+        stride = self.pace.stride(iteration)
+        return within and iteration % rules.interval(opt, opt.mcmc_until_iter, stride) == 0
 
     def after_backward(self, step: Step, package: dict[str, Tensor]) -> None:
         if self.changes(step.iteration):
