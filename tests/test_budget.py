@@ -312,6 +312,24 @@ def test_fading_multiplies_opacities_and_keeps_averages():
     assert torch.equal(parameter, kept)
 
 
+def test_other_activations_are_followed():
+    plain, own = model(6), model(6)
+    with torch.no_grad():
+        own._opacity.sigmoid_()
+        own._scaling.exp_()
+    own.opacity_activation = own.inverse_opacity_activation = torch.abs
+    own.scaling_activation = own.scaling_inverse_activation = torch.abs
+    for gaussians in (plain, own):
+        split_in_two(gaussians, torch.tensor([1, 4]))
+    least = float(plain.get_opacity.detach().sort(dim=0).values[2:4].mean())
+    for gaussians in (plain, own):
+        remove_useless(gaussians, least, 99)
+        fade(gaussians, 0.9)
+    assert len(own) == len(plain) == 5
+    for name in ("get_opacity", "get_scaling", "get_xyz"):
+        torch.testing.assert_close(getattr(own, name), getattr(plain, name))
+
+
 # Trainings
 
 GROWING = [

@@ -131,6 +131,11 @@ def test_a_resumed_run_goes_on_from_its_place_with_the_seconds_that_are_left(tmp
     assert _run(late, _noisy, at, 11.0)[0] == at + 1
 
 
+def test_the_end_of_a_repeated_schedule_is_known():
+    repeated = Paced(Schedule(100, [Block(20, 0.0, 0.05, 0.0)], 20, 9.0))
+    assert repeated.known([50, 100]) == [20] and repeated.known([50]) == [] == _fresh(100, 9.0).known([50, 100])
+
+
 def test_the_steady_pace_changes_nothing():
     pace = Pace(7)
     assert [list(pace.span(t)) for t in range(1, 8)] == [[t] for t in range(1, 8)]

@@ -4,9 +4,9 @@ import torch
 from torch import Tensor
 
 from scene.gaussians import density_rules as rules
-from scene.gaussians.adaptive import AdaptiveGaussians
 from scene.gaussians.long_axis import long_axis_children
 from scene.gaussians.parameters import raw_rows
+from scene.gaussians.relocating import RelocatingGaussians
 from scene.gaussians.row_surgery import restart_rows, row_groups
 from utils.exact.portable_math import exp, log
 
@@ -23,7 +23,7 @@ def count_after(now: int, budget: int, remaining: int, power: float) -> int:
 
 
 @torch.no_grad()
-def split_in_two(gaussians: AdaptiveGaussians, parents: Tensor) -> None:
+def split_in_two(gaussians: RelocatingGaussians, parents: Tensor) -> None:
     """Split Gaussians, ascending indices (n,), along their longest axis (scene/gaussians/long_axis.py).
 
     One child takes its parent's row, the other is appended. Adam's averages of both begin at zero, so that their first
@@ -33,7 +33,10 @@ def split_in_two(gaussians: AdaptiveGaussians, parents: Tensor) -> None:
     if not count:
         return
     rows = {name: values.index_select(0, parents) for name, values in raw_rows(gaussians).items()}
-    children = long_axis_children(rows["xyz"], rows["scaling"], rows["rotation"], rows["opacity"])
+    shapes = gaussians._log_scales(), gaussians._opacity_logits()
+    log_scales, logits = (values.index_select(0, parents) for values in shapes)
+    children = long_axis_children(rows["xyz"], log_scales, rows["rotation"], logits)
+    children |= gaussians._raw_shapes(children["opacity"], children["scaling"])
     second = rows | {name: values[count:] for name, values in children.items()}
     gaussians._take(gaussians.cat_tensors_to_optimizer(second))
     gaussians._zero_statistics()
@@ -43,9 +46,9 @@ def split_in_two(gaussians: AdaptiveGaussians, parents: Tensor) -> None:
     restart_rows(row_groups(groups, len(gaussians)), states, parents)
 
 
-def remove_useless(gaussians: AdaptiveGaussians, min_opacity: float, most: int) -> None:
+def remove_useless(gaussians: RelocatingGaussians, min_opacity: float, most: int) -> None:
     """Remove Gaussians of an opacity below min_opacity; then those of the lowest, until there are at most `most`."""
-    opacity = gaussians.raw("opacity").detach().reshape(-1)
+    opacity = gaussians._opacity_logits().reshape(-1)
     remove = rules.is_useless(opacity, min_opacity)
     over = len(gaussians) - most
     if over > 0:
@@ -54,11 +57,11 @@ def remove_useless(gaussians: AdaptiveGaussians, min_opacity: float, most: int) 
 
 
 @torch.no_grad()
-def fade(gaussians: AdaptiveGaussians, factor: float) -> None:
+def fade(gaussians: RelocatingGaussians, factor: float) -> None:
     """Multiply all opacities by a factor in (0, 1]. Adam's averages stay."""
     if factor < 1.0:
-        opacity = gaussians.raw("opacity")
-        opacity.copy_(faded(opacity, factor))
+        logits = faded(gaussians._opacity_logits(), factor)
+        gaussians.raw("opacity").copy_(gaussians._raw_opacity(logits))
 
 
 def faded(logits: Tensor, factor: float) -> Tensor:

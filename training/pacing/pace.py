@@ -55,7 +55,7 @@ class Pace:
         return self.ends is not None and iteration >= self.ends
 
     def known(self, planned: Sequence[int]) -> list[int]:
-        """Those iterations of the schedule, up to its end, of which it is known when the run will take them."""
+        """Iterations of the run that will take those of the schedule that are planned, as far as it is known."""
         return [iteration for iteration in planned if iteration <= self.length]
 
 
@@ -113,7 +113,7 @@ class Paced(Pace):
         return min(max(math.sqrt(self.stride(iteration)), 1.0), MOST_RATE)
 
     def known(self, planned: Sequence[int]) -> list[int]:
-        return []
+        return [self.ends] if self.ends is not None and self.length in planned else []
 
     def recorded(self, iteration: int, last: bool) -> Schedule:
         """The schedule of a run that has taken an iteration. last: it ended with it."""
