@@ -120,9 +120,16 @@ def test_the_training_pauses_steps_and_its_curve_grows(tab, page_errors, request
 
 
 def _type(tab, label: str, text: str) -> None:
+    """Type a text, and again where the field falls back to its value before: it does if it is drawn anew meanwhile."""
     field = _field(tab, label)
-    field.fill(text)
-    field.press("Enter")
+
+    def holds() -> bool:
+        field.fill(text)
+        field.press("Enter")
+        time.sleep(0.3)
+        return field.input_value() == text
+
+    _until(holds, f"{label} does not take {text}")
 
 
 def test_every_kind_of_control_is_heard(tab, page_errors, training):
