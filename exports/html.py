@@ -15,7 +15,7 @@ import numpy as np
 from exports.compressed_ply import write_compressed_ply
 from exports.splats import Splats
 from exports.upright import turn_upright, turned, up_of
-from exports.vendor import FOLDER, RECORD
+from exports.vendor import FOLDER, RECORD, VIEWER
 from exports.viewer_settings import settings
 from moving_cameras.moments import TimedPath
 from moving_cameras.poses import Poses, poses_of
@@ -61,7 +61,7 @@ def write_html(
         page=_embedded(page),
         record=read_json(RECORD),
         title=Path(path).stem if title is None else title,
-        viewer=_packed((FOLDER / "viewer.js").read_bytes()),
+        viewer=_in_base64((FOLDER / VIEWER).read_bytes()),
     )
     with atomic_write(path) as temporary:
         # Names that are not UTF-8 have surrogates, which appear as numbers.
@@ -100,7 +100,11 @@ def _template() -> jinja2.Template:
 
 
 def _packed(content: bytes) -> str:
-    return base64.b64encode(gzip.compress(content, mtime=0)).decode()
+    return _in_base64(gzip.compress(content, mtime=0))
+
+
+def _in_base64(content: bytes) -> str:
+    return base64.b64encode(content).decode()
 
 
 def _embedded(content: Any) -> str:

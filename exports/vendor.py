@@ -3,11 +3,12 @@
 python -m exports.vendor
 
 Needs Node, npm and the network, and is run only when the viewer's version changes: vendored.json, in that folder, names
-package, version, integrity and minifier, and the SHA-256 of each file. The same record gives the same bytes on any
-machine; other bytes are an error, and nothing is written.
+package, version, integrity and minifier, and the SHA-256 of each file, unpacked. The same record gives the same code on
+any machine; other code is an error, and nothing is written.
 """
 
 import base64
+import gzip
 import hashlib
 import json
 import shutil
@@ -23,7 +24,9 @@ from utils.system_utils import UserError, atomic_write, run_cli
 ROOT = Path(__file__).resolve().parents[1]
 FOLDER = ROOT / "exports" / "viewer"
 RECORD = FOLDER / "vendored.json"
-_SOURCES = {"viewer.js": "public/index.js", "viewer.css": "public/index.css"}  # our name: the package's, to be minified
+VIEWER = "viewer.js.gz"  # packed as each page carries it, a quarter of its size
+UNPACKED = VIEWER.removesuffix(".gz")
+_SOURCES = {UNPACKED: "public/index.js", "viewer.css": "public/index.css"}  # our name: the package's, to be minified
 
 
 def main(argv: Sequence[str] | None = None) -> None:
@@ -43,6 +46,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     digests = {name: hashlib.sha256(content).hexdigest() for name, content in sorted(files.items())}
     if digests != record["sha256"]:
         raise UserError(f"the files differ from those of {RECORD}; after a look at them, enter {json.dumps(digests)}")
+    files[VIEWER] = gzip.compress(files.pop(UNPACKED), mtime=0)
     for name, content in files.items():
         with atomic_write(FOLDER / name) as written:
             written.write_bytes(content)

@@ -79,13 +79,12 @@ def rendered(splats, camera) -> np.ndarray:
 
 def test_vendored_files_are_those_of_the_record():
     record = json.loads(vendor.RECORD.read_text())
-    files = {path.name for path in vendor.FOLDER.iterdir()} - {vendor.RECORD.name}
-    assert files == set(record["sha256"])
-    for name, digest in record["sha256"].items():
-        assert hashlib.sha256((vendor.FOLDER / name).read_bytes()).hexdigest() == digest, name
+    files = {path.name: path.read_bytes() for path in vendor.FOLDER.iterdir() if path != vendor.RECORD}
+    files[vendor.UNPACKED] = gzip.decompress(files.pop(vendor.VIEWER))
+    assert {name: hashlib.sha256(content).hexdigest() for name, content in files.items()} == record["sha256"]
     assert record["license"] == "MIT" and (vendor.FOLDER / "LICENSE").read_text().startswith("MIT License")
     for name in ("viewer.js", "viewer.css"):
-        assert f"{record['package']} {record['version']}, MIT" in (vendor.FOLDER / name).read_text()[:100]
+        assert f"{record['package']} {record['version']}, MIT" in files[name][:100].decode()
 
 
 def test_vendor_writes_nothing_that_differs_from_the_record(tmp_path, monkeypatch):
@@ -105,7 +104,8 @@ def test_vendor_writes_nothing_that_differs_from_the_record(tmp_path, monkeypatc
 
 
 def test_the_viewer_names_no_other_addresses():
-    code = (vendor.FOLDER / "viewer.js").read_text() + (vendor.FOLDER / "viewer.css").read_text()
+    code = gzip.decompress((vendor.FOLDER / vendor.VIEWER).read_bytes()).decode()
+    code += (vendor.FOLDER / "viewer.css").read_text()
     assert set(re.findall(r"""(?:https?|wss?)://[^"'`\s<>)\\]+""", code)) == ADDRESSES
     assert "@import" not in code and "new Function" not in code
 
@@ -117,7 +117,7 @@ def test_the_page_refers_to_nothing_outside(page):
     for name, text in page.texts.items():
         without_comments = re.sub(r"(^|\s)// .*$", "", text, flags=re.MULTILINE)
         assert "//" not in without_comments or name in ("model", "viewer"), name
-    assert page.unpacked("viewer") == (vendor.FOLDER / "viewer.js").read_bytes()
+    assert page.unpacked("viewer") == gzip.decompress((vendor.FOLDER / vendor.VIEWER).read_bytes())
     policy = next(a["content"] for _, a in page.tags if a.get("http-equiv") == "Content-Security-Policy")
     allowed = {words.split()[0]: words.split()[1:] for words in policy.split(";")}
     assert allowed["default-src"] == ["'none'"]
