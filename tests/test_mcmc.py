@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 from rasterizer_tools import GPU_MARKS
-from test_steps import OPTIONS, differences, trained
+from test_steps import OPTIONS, differences, fused_iterations, trained
 from test_steps import scene as scene  # a fixture
 
 import train
@@ -15,8 +15,6 @@ from scene.gaussian_model import GaussianModel
 from scene.gaussians.checkpoint import load_checkpoint
 from training.density import DensityControl
 from training.steps import ahead, run_ahead
-from training.steps.fused import FusedStep
-from training.steps.recorded import RecordedStep
 from training.strategies.mcmc import MarkovChain
 from utils.system_utils import UserError
 
@@ -46,15 +44,7 @@ def _raw(out: Path, iteration: int) -> GaussianModel:
 @pytest.mark.parametrize("options", OPTIONS.values(), ids=OPTIONS.keys())
 def test_the_fused_step_gives_the_bytes_of_the_plain_one(scene, tmp_path, monkeypatch, options):
     plain = trained(scene, tmp_path / "plain", "--plain_step", "--strategy", "mcmc", *ACTIVE, *options)
-    fused, advance, take = [], FusedStep.advance, RecordedStep.take
-    monkeypatch.setattr(FusedStep, "advance", lambda self, at, *x: (fused.append(at.iteration), advance(self, at, *x)))
-
-    def noted(self, at):
-        losses = take(self, at)
-        fused.extend([at.iteration] if losses else [])
-        return losses
-
-    monkeypatch.setattr(RecordedStep, "take", noted)
+    fused = fused_iterations(monkeypatch)
     assert differences(trained(scene, tmp_path / "fused", "--strategy", "mcmc", *ACTIVE, *options), plain) == []
     # Relocations and the last iteration; there are no resets.
     assert sorted({*fused}) == [t for t in range(1, 60) if t not in (20, 40)]

@@ -91,9 +91,8 @@ def differences(one: dict[str, bytes | list], other: dict[str, bytes | list]) ->
     return found + (["ply"] if one["ply"] != other["ply"] else [])
 
 
-@pytest.mark.parametrize("options", OPTIONS.values(), ids=OPTIONS.keys())
-def test_the_fused_step_gives_the_bytes_of_the_plain_one(scene, tmp_path, monkeypatch, options):
-    plain = trained(scene, tmp_path / "plain", "--plain_step", *options)
+def fused_iterations(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """A list to which every iteration that is not taken plainly will be appended."""
     fused, advance, take = [], FusedStep.advance, RecordedStep.take
     monkeypatch.setattr(FusedStep, "advance", lambda self, at, *x: (fused.append(at.iteration), advance(self, at, *x)))
 
@@ -103,6 +102,13 @@ def test_the_fused_step_gives_the_bytes_of_the_plain_one(scene, tmp_path, monkey
         return losses
 
     monkeypatch.setattr(RecordedStep, "take", noted)
+    return fused
+
+
+@pytest.mark.parametrize("options", OPTIONS.values(), ids=OPTIONS.keys())
+def test_the_fused_step_gives_the_bytes_of_the_plain_one(scene, tmp_path, monkeypatch, options):
+    plain = trained(scene, tmp_path / "plain", "--plain_step", *options)
+    fused = fused_iterations(monkeypatch)
     assert trained(scene, tmp_path / "fused", *options) == plain
     # Densification, the resets of opacities and the last iteration change rows, or take no step.
     assert sorted({*fused}) == [t for t in range(1, ITERATIONS) if t not in (20, 30, 40)]  # some are repeated
