@@ -20,6 +20,7 @@ _HEIGHT, _WIDTH = SCENE.index("height"), SCENE.index("width")
 class View:
     """An image by all ranks, and what the way back needs."""
 
+    ranks: Ranks
     color: Tensor  # (3, H, W)
     transmittance: Tensor  # (1, H, W)
     inverse_depth: Tensor  # (1, H, W), or no rows if it is not wanted
@@ -49,15 +50,25 @@ def draw_view(ranks: Ranks, scene: tuple[Any, ...], background: Tensor, want_dep
     rows = planes[:, begin * TILE : end * TILE].transpose(0, 1).contiguous()
     image = ranks.gather(rows).transpose(0, 1).contiguous()
     state = (splats, instances, ranges, *slots, background, last, transmittance)
-    return View(image[:3], image[3:4], image[4:], radii, tile_counts, sent, state)
+    return View(ranks, image[:3], image[3:4], image[4:], radii, tile_counts, sent, state)
 
 
 def gradient_rows(
-    ranks: Ranks, view: View, gradients: tuple[Tensor, Tensor | None, Tensor | None], absolute: bool
+    view: View, gradients: tuple[Tensor, Tensor | None, Tensor | None], absolute: bool
 ) -> tuple[Tensor, Tensor]:
-    """The gradient rows of the rank's own Gaussians, and how many each has, from those of the image.
+    """The gradient rows of the rank's own Gaussians, and how many each has, from the gradients of the image.
 
     gradients: of colour, transmittance and inverse depth, whole on every rank.
     """
     rows, counts = OPERATORS.blend_rows(*view.state, *gradients, absolute)
-    return return_rows(ranks, view.sent, len(view.radii), rows, counts)
+    return return_rows(view.ranks, view.sent, len(view.radii), rows, counts)
+
+
+def decisive_in(view: View) -> Tensor:
+    """The rank's own Gaussians that the image depends on (`decisive` of diff_gaussian_rasterization): (N,) bool."""
+    splats, instances, ranges, *_, last, _ = view.state
+    by_band = view.ranks.exchange(OPERATORS.decisive(splats, instances, ranges, last).split(view.sent.received))
+    found = torch.zeros(len(view.radii), dtype=torch.bool, device=splats.device)
+    for indices, part in zip(view.sent.indices, by_band, strict=True):
+        found[indices] |= part
+    return found

@@ -67,5 +67,3 @@ def _unpacked(rows: Tensor, like: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
         part.contiguous().view(-1).view(t.dtype).view(len(rows), *t.shape[1:])
         for part, t in zip(parts, like, strict=True)
     )
-
-

@@ -51,7 +51,7 @@ class _OverRanks(torch.autograd.Function):
         ctx.mark_non_differentiable(view.radii)
         ctx.set_materialize_grads(False)
         if train:
-            ctx.ranks, ctx.view, ctx.want_depth, ctx.absolute = ranks, view, want_depth, absolute
+            ctx.view, ctx.want_depth, ctx.absolute = view, want_depth, absolute
             ctx.numbers = scene[SCENE_TENSORS:]
             ctx.save_for_backward(*scene[:SCENE_TENSORS])
         return view.color, view.inverse_depth, view.radii
@@ -63,7 +63,7 @@ class _OverRanks(torch.autograd.Function):
         if grad_color is None:
             grad_color = torch.zeros_like(view.color)
         gradients = grad_color, None, grad_depth if ctx.want_depth else None
-        rows, counts = gradient_rows(ctx.ranks, view, gradients, ctx.absolute)
+        rows, counts = gradient_rows(view, gradients, ctx.absolute)
         wanted = [ctx.needs_input_grad[1 + place] for place in GRADIENT_PLACES]
         found = OPERATORS.rows_vjp(*scene, view.tile_counts, rows, counts, wanted, ctx.absolute)
         by_input: list[Tensor | None] = [None] * len(INPUTS)
