@@ -1,5 +1,6 @@
 """What ranks send each other in a view: splats to the bands that they reach, and gradient rows back."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -27,9 +28,14 @@ def send_splats(ranks: Ranks, bands: list[int], splats: tuple[Tensor, ...]) -> t
         ((tile_counts > 0) & (top < end) & (bottom > begin)).nonzero().reshape(-1)
         for begin, end in zip(bands, bands[1:], strict=False)
     ]
-    rows = _packed(splats)
-    received = ranks.exchange([rows.index_select(0, chosen) for chosen in indices])
-    return _unpacked(torch.cat(received), splats), Sent(indices, list(map(len, received)))
+    return send(ranks, [splats] * ranks.size, indices)
+
+
+def send(ranks: Ranks, splats: Sequence[tuple[Tensor, ...]], indices: list[Tensor]) -> tuple[tuple[Tensor, ...], Sent]:
+    """Send rows `indices[r]` of the tensors `splats[r]` to rank r; receive this rank's, in the order of ranks."""
+    parts = [_packed(tensors, chosen) for tensors, chosen in zip(splats, indices, strict=True)]
+    received = ranks.exchange(parts)
+    return _unpacked(torch.cat(received), splats[0]), Sent(indices, list(map(len, received)))
 
 
 def return_rows(ranks: Ranks, sent: Sent, count: int, rows: Tensor, counts: Tensor) -> tuple[Tensor, Tensor]:
@@ -55,15 +61,19 @@ def return_rows(ranks: Ranks, sent: Sent, count: int, rows: Tensor, counts: Tens
     return out, total.int()
 
 
-def _packed(tensors: tuple[Tensor, ...]) -> Tensor:
+def _packed(tensors: tuple[Tensor, ...], indices: Tensor) -> Tensor:
     """Rows of bytes."""
-    return torch.cat([t.reshape(len(t), -1).view(torch.uint8) for t in tensors], 1)
+    return torch.cat([t.index_select(0, indices).reshape(len(indices), _columns(t)).view(torch.uint8) for t in tensors], 1)
 
 
 def _unpacked(rows: Tensor, like: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
-    widths = [t.shape[1:].numel() * t.element_size() for t in like]
+    widths = [_columns(t) * t.element_size() for t in like]
     parts = rows.split(widths, 1)
     return tuple(
         part.contiguous().view(-1).view(t.dtype).view(len(rows), *t.shape[1:])
         for part, t in zip(parts, like, strict=True)
     )
+
+
+def _columns(t: Tensor) -> int:
+    return t.shape[1:].numel()
