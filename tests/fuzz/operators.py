@@ -22,7 +22,7 @@ def sound_calls() -> dict[str, Call]:
     scene = list(scene_arguments(raw, camera))
     splats, depths, rects, counts, _ = ops.project(*scene)
     instances, ranges, *slots = ops.bin(splats, depths, rects, counts, height, width, True)
-    image, transmittance, plane, last = ops.blend(splats, instances, ranges, background, height, width, True, True)
+    image, transmittance, plane, last, _ = ops.blend(splats, instances, ranges, background, height, width, True, True)
     state = [splats, instances, ranges, *slots, background, last, transmittance]
     layers = torch.zeros(5 * 256)  # as a GPU makes them of few instances
     planes = [torch.ones_like(image), torch.ones_like(transmittance), torch.ones_like(plane)]

@@ -127,6 +127,24 @@ struct BlendGradient {
   T* absolute = nullptr;            // out: (N), absolute_length in math/absolute.h; or null
 };
 
+// Gradient rows that lie by splat: those of a splat side by side, in the order of its slots.
+template <class T>
+struct SplatRows {
+  int64_t count;
+  const int32_t* tile_counts;  // (N)
+  const int32_t* counts;       // (N) rows of each splat; 0 where tile_counts is 0
+  const T* rows;               // (R, 10) as in BlendGradient::moments; (R, 12) for lengths of absolute gradients
+  int64_t row_count;           // R
+};
+
+// Where the sums of a splat's rows go, and what lengths of absolute gradients need besides.
+template <class T>
+struct RowSums {
+  const T* splats;  // not read without `absolute`
+  Image image;
+  T *moments, *absolute;  // as in BlendGradient; `absolute` null unless the rows are of twelve values
+};
+
 // A tensor that takes a step of Adam in place, in the `columns` leading values of each row.
 template <class T>
 struct AdamInput {
