@@ -74,7 +74,7 @@ def step(
     if (view := drawn.view) is not None:
         rows = gradient_rows(view, (image_gradient, None, depth_gradient), absolute and observe)
         OPERATORS.rows_vjp_step_(
-            *drawn.scene, view.tile_counts, *rows, drawn.radii, *adam.arguments(observe), **further
+            *drawn.scene, view.splats, view.tile_counts, *rows, drawn.radii, *adam.arguments(observe), **further
         )
         return
     OPERATORS.rasterize_vjp_step_(

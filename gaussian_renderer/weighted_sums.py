@@ -40,7 +40,7 @@ def weighted_sums(
     if (ranks := ranks_of(gaussians)).several:
         view = draw_view(ranks, drawn, background, want_depth=False, train=True)
         rows = gradient_rows(view, (value(view.color), None, None), absolute=False)
-        gradients = OPERATORS.rows_vjp(*given, view.tile_counts, *rows, _ONLY_COLORS)
+        gradients = OPERATORS.rows_vjp(*given, view.splats, view.tile_counts, *rows, _ONLY_COLORS)
         return gradients[_ONLY_COLORS.index(True)]
     image, transmittance, _, _, splats, tile_counts, *lists, last, layers = OPERATORS.rasterize(
         xyz, *drawn, background, False, True

@@ -3,12 +3,14 @@
 import pytest
 import torch
 from diff_gaussian_rasterization import rasterize
+from diff_gaussian_rasterization.gaussians import Gaussians
 from processes import in_ranks
 from rasterizer_tools import leaves
 from torch import Tensor
 
 from benchmarks.workloads.splat_scenes import settings
 from gaussian_renderer.over_ranks.rasterize import rasterize_over
+from gaussian_renderer.over_ranks.views import rasterize_views
 from utils.ranks.ranks import ranks
 
 SIZES = [2, 3]
@@ -80,10 +82,60 @@ def test_ranks_render_the_image_and_the_gradients_of_one_process(size):
         alone = _render(rasterize, width, height, options, slice(None))
         for name, values in alone.items():
             parts = [of_rank[number][name] for of_rank in found]
-            whole = [parts[0]] if name in ("color", "inverse_depth") else [torch.cat(parts)]
-            if name in ("color", "inverse_depth"):
-                whole = parts
-            for other in whole:
-                assert torch.equal(other, values), (number, name)
-        seen = alone["color"].std() > 0.01
+            for whole in parts if name in ("color", "inverse_depth") else [torch.cat(parts)]:
+                assert torch.equal(whole, values), (number, name)
+        seen = (alone["radii"] > 0).any()
         assert seen == (options.get("count", 300) > 0 and not options.get("behind"))
+
+
+VIEWS = [(80, 50, 0.0), (40, 70, 0.4), (64, 33, -0.3)]  # width, height, and where the camera stands
+
+
+def _cameras() -> list:
+    cameras = []
+    for width, height, x in VIEWS[: ranks().size]:
+        view = torch.eye(4)
+        view[0, 3] = x
+        cameras.append(settings(width, height, torch.float32, view=view))
+    return cameras
+
+
+def _loss(color: Tensor, depth: Tensor, view: int) -> Tensor:
+    generator = torch.Generator().manual_seed(view)
+    return sum((torch.randn(x.shape, generator=generator) * x).sum() for x in (color, depth))
+
+
+def _render_views() -> dict[str, Tensor]:
+    here = ranks()
+    rows = slice(20 * here.rank, 20 * here.rank + 20 if here.rank < here.size - 1 else None)
+    inputs = leaves({name: values[rows] for name, values in _scene(80, 50, {}).items()})
+    screen = torch.zeros(here.size, *inputs["means"].shape).requires_grad_()
+    wants = {"want_inverse_depth": True, "want_absolute_gradient": True}
+    out = rasterize_views(here, Gaussians(**inputs), screen, _cameras(), raw=True, **wants)
+    _loss(out.color, out.inverse_depth, here.rank).backward()
+    gradients = {name: values.grad for name, values in inputs.items()}
+    return {"color": out.color.detach(), "radii": out.radii, "screen": screen.grad} | gradients
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_a_batch_has_the_sum_of_the_gradients_of_its_views(size):
+    found = in_ranks(size, _render_views)
+    inputs = leaves(_scene(80, 50, {}))
+    total: dict[str, Tensor] = {}
+    for view in range(size):
+        screen = torch.zeros_like(inputs["means"]).requires_grad_()
+        rest = dict(inputs)
+        view_matrix = torch.eye(4)
+        view_matrix[0, 3] = VIEWS[view][2]
+        camera = settings(*VIEWS[view][:2], torch.float32, view=view_matrix)
+        wants = {"want_inverse_depth": True, "want_absolute_gradient": True, "raw": True}
+        out = rasterize(rest.pop("means"), screen, rest.pop("opacities"), settings=camera, **rest, **wants)
+        _loss(out.color, out.inverse_depth, view).backward()
+        assert torch.equal(found[view]["color"], out.color)
+        assert torch.equal(torch.cat([each["radii"][view] for each in found]), out.radii)
+        assert torch.equal(torch.cat([each["screen"][view] for each in found]), screen.grad)
+        for name, values in inputs.items():
+            total[name] = total[name] + values.grad if view else values.grad
+            values.grad = None
+    for name, values in total.items():
+        assert torch.equal(torch.cat([each[name] for each in found]), values), name

@@ -25,9 +25,11 @@ class View:
     transmittance: Tensor  # (1, H, W)
     inverse_depth: Tensor  # (1, H, W), or no rows if it is not wanted
     radii: Tensor  # (N,) of the rank's own Gaussians
+    splats: Tensor  # (N, 10)
     tile_counts: Tensor  # (N,)
     sent: Sent
     state: tuple[Tensor, ...]  # of the band: splats, instances, ranges, splat_slots, slots, background, last, ...
+    layers: Tensor
 
 
 def draw_view(ranks: Ranks, scene: tuple[Any, ...], background: Tensor, want_depth: bool, train: bool) -> View:
@@ -36,21 +38,21 @@ def draw_view(ranks: Ranks, scene: tuple[Any, ...], background: Tensor, want_dep
     Every rank gets the image of one process, to the bit.
     """
     height, width = scene[_HEIGHT], scene[_WIDTH]
-    splats, depths, rects, tile_counts, radii = OPERATORS.project(*scene)
+    own, depths, rects, tile_counts, radii = OPERATORS.project(*scene)
     bands = find_bands(ranks, row_loads(rects, tile_counts, height, width), width)
-    (splats, depths, rects, counts), sent = send_splats(ranks, bands, (splats, depths, rects, tile_counts))
+    (splats, depths, rects, counts), sent = send_splats(ranks, bands, (own, depths, rects, tile_counts))
     instances, ranges, *slots = OPERATORS.bin(splats, depths, rects, counts, height, width, train)
     begin, end = bands[ranks.rank], bands[ranks.rank + 1]
     across = (len(ranges) - 1) // tile_rows(height)
     ranges = ranges.clamp(ranges[begin * across], ranges[end * across])  # lists of other bands become empty
-    color, transmittance, inverse_depth, last = OPERATORS.blend(
+    color, transmittance, inverse_depth, last, layers = OPERATORS.blend(
         splats, instances, ranges, background, height, width, want_depth, train
     )
     planes = torch.cat((color, transmittance, inverse_depth))
     rows = planes[:, begin * TILE : end * TILE].transpose(0, 1).contiguous()
     image = ranks.gather(rows).transpose(0, 1).contiguous()
     state = (splats, instances, ranges, *slots, background, last, transmittance)
-    return View(ranks, image[:3], image[3:4], image[4:], radii, tile_counts, sent, state)
+    return View(ranks, image[:3], image[3:4], image[4:], radii, own, tile_counts, sent, state, layers)
 
 
 def gradient_rows(
@@ -60,7 +62,7 @@ def gradient_rows(
 
     gradients: of colour, transmittance and inverse depth, whole on every rank.
     """
-    rows, counts = OPERATORS.blend_rows(*view.state, *gradients, absolute)
+    rows, counts = OPERATORS.blend_rows(*view.state, *gradients, view.layers, absolute)
     return return_rows(view.ranks, view.sent, len(view.radii), rows, counts)
 
 

@@ -63,7 +63,9 @@ def return_rows(ranks: Ranks, sent: Sent, count: int, rows: Tensor, counts: Tens
 
 def _packed(tensors: tuple[Tensor, ...], indices: Tensor) -> Tensor:
     """Rows of bytes."""
-    return torch.cat([t.index_select(0, indices).reshape(len(indices), _columns(t)).view(torch.uint8) for t in tensors], 1)
+    return torch.cat(
+        [t.index_select(0, indices).reshape(len(indices), _columns(t)).view(torch.uint8) for t in tensors], 1
+    )
 
 
 def _unpacked(rows: Tensor, like: tuple[Tensor, ...]) -> tuple[Tensor, ...]:

@@ -65,7 +65,7 @@ class _OverRanks(torch.autograd.Function):
         gradients = grad_color, None, grad_depth if ctx.want_depth else None
         rows, counts = gradient_rows(view, gradients, ctx.absolute)
         wanted = [ctx.needs_input_grad[1 + place] for place in GRADIENT_PLACES]
-        found = OPERATORS.rows_vjp(*scene, view.tile_counts, rows, counts, wanted, ctx.absolute)
+        found = OPERATORS.rows_vjp(*scene, view.splats, view.tile_counts, rows, counts, wanted, ctx.absolute)
         by_input: list[Tensor | None] = [None] * len(INPUTS)
         for place, gradient, is_wanted in zip(GRADIENT_PLACES, found, wanted, strict=True):
             if is_wanted:

@@ -66,12 +66,12 @@ class _Views(torch.autograd.Function):
         height, width = cameras[ranks.rank][5:7]
         lists = OPERATORS.bin(splats, depths, rects, counts, height, width, True)
         planes = OPERATORS.blend(splats, *lists[:2], background, height, width, wants[0], True)
-        color, transmittance, inverse_depth, last = planes
+        color, transmittance, inverse_depth, last, ctx.layers = planes
         radii = torch.stack([radii for *_, radii in projected])
         ctx.mark_non_differentiable(radii)
         ctx.set_materialize_grads(False)
         ctx.ranks, ctx.cameras, ctx.wants, ctx.sent = ranks, cameras, wants, sent
-        ctx.tile_counts = [tile_counts for *_, tile_counts, _ in projected]
+        ctx.own = [(own, tile_counts) for own, _, _, tile_counts, _ in projected]
         ctx.state = (splats, *lists, background, last, transmittance)
         ctx.save_for_backward(*gaussians)
         return color, inverse_depth, radii
@@ -83,14 +83,14 @@ class _Views(torch.autograd.Function):
         if grad_color is None:
             grad_color = ctx.state[-1].new_zeros(3, *ctx.state[-1].shape[1:])
         planes = grad_color, None, grad_depth if want_depth else None
-        rows, counts = OPERATORS.blend_rows(*ctx.state, *planes, absolute)
+        rows, counts = OPERATORS.blend_rows(*ctx.state, *planes, ctx.layers, absolute)
         gaussians = ctx.saved_tensors
         needed = dict(zip(Gaussians._fields, ctx.needs_input_grad[5:], strict=True), means2d=ctx.needs_input_grad[4])
         wanted = [needed[name] for name in GRADIENTS]
         sums: dict[str, Tensor] = {}
         screen = []
         for view, (own, own_counts) in enumerate(_by_view(ctx.ranks, ctx.sent, len(gaussians[0]), rows, counts)):
-            arguments = *gaussians, *ctx.cameras[view], ctx.tile_counts[view], own, own_counts
+            arguments = *gaussians, *ctx.cameras[view], *ctx.own[view], own, own_counts
             found = dict(zip(GRADIENTS, OPERATORS.rows_vjp(*arguments, wanted, absolute), strict=True))
             screen.append(found.pop("means2d"))
             sums = {name: sums[name] + value if sums else value for name, value in found.items()}

@@ -10,7 +10,6 @@ from gaussian_renderer import model_inputs, rasterizer_settings
 from gaussian_renderer.over_ranks.views import rasterize_views
 from scene.gaussians.exposure import apply_exposure
 from training.objective import Losses
-from training.run import Run
 from training.step import Step
 from training.steps.plain import PlainStep
 from utils.ranks.ranks import ranks
