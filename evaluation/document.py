@@ -111,7 +111,10 @@ def _results(report: Mapping[str, Any]) -> Section:
     if any(row.get("open_ended") for row in rows):
         blocks.append("Trainings with a time budget or a score to reach end by themselves: their row is of their end.")
     if any(row["optimizer_steps"]["mean"] is not None for row in rows):
-        blocks.append("Where no optimiser steps are given, there was one in each iteration but the last.")
+        blocks.append(
+            "Where no optimiser steps are given, there was one in each iteration but the last, and those in which adc "
+            "or mcmc changed the Gaussians."
+        )
     if rows and all(row["LPIPS"]["mean"] is None for row in rows):
         blocks.append(
             "LPIPS is missing: metrics.py found no weights of its network, and its message says where to put them."

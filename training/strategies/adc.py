@@ -32,6 +32,7 @@ class AdaptiveDensityControl(DensityControl):
         self._extent = extent
         self.absolute_gradients = opt.absgrad
         self.most_gaussians = opt.max_num_splats
+        self.ends = opt.densify_until_iter
 
     def changes(self, iteration: int) -> bool:
         todo = self._actions(iteration)

@@ -45,6 +45,7 @@ class BudgetControl(DensityControl):
         self._cameras = run.scene.getTrainCameras()
         self._scores = ErrorScores(run.gaussians, run.pipe, run.dataset.train_test_exp, run.opt)
         self.most_gaussians = run.opt.max_num_splats or default_budget(self._cameras)
+        self.ends = run.opt.densify_until_iter
 
     def changes(self, iteration: int) -> bool:
         in_time = self.pace.nominal(iteration) < self._opt.densify_until_iter

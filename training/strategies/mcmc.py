@@ -30,6 +30,7 @@ class MarkovChain(DensityControl):
         self._gaussians = gaussians
         self._opt = opt
         self.most_gaussians = opt.max_num_splats or MOST_GAUSSIANS
+        self.ends = opt.mcmc_until_iter
         self.penalty = Penalty(opt.mcmc_opacity_reg, opt.mcmc_scale_reg)
 
     def started(self) -> None:
