@@ -47,6 +47,13 @@ class DensityControl:
         """Whether the view of this iteration counts in the Gaussians' statistics, where the step is fused."""
         return False
 
+    def most_after(self, count: int, first: int, last: int) -> int:
+        """The most that `count` Gaussians can become from iteration `first` to `last`, both known to the pace.
+
+        `most_gaussians` where the strategy has no number to reach.
+        """
+        return self.most_gaussians
+
     def after_backward(self, step: Step, package: dict[str, Tensor]) -> None:
         """Called with the gradients computed, before the optimiser's step. package: the result of `render`."""
 
