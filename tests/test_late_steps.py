@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from gaussians import model, options
 from rasterizer_tools import GPU_MARKS
 from test_divergence import _nan_loss_in
 from test_steps import OPTIONS, differences, fused_iterations, trained
@@ -125,6 +126,21 @@ def test_a_training_resumed_within_a_step_gives_the_same_bytes(scene, tmp_path, 
     anew = load_checkpoint(tmp_path / "34" / "chkpnt58.pth")[0][10]["held"]
     assert torch.equal(anew["seen"], states[58]["held"]["seen"])
     assert all(torch.equal(anew["gradients"][name], values) for name, values in states[58]["held"]["gradients"].items())
+
+
+def test_the_sparse_optimiser_steps_what_any_of_the_views_saw():
+    gaussians = model(4, optimizer_type="sparse_adam")
+    gaussians.training_setup(options())
+    before = gaussians._xyz.detach().clone()
+    gaussians._xyz.grad = torch.ones_like(before)
+    for row in (0, 2):
+        gaussians.hold(torch.eye(4, dtype=torch.int32)[row])
+    gaussians.step(torch.tensor([0, 1, 0, 0]))
+    assert (gaussians._xyz != before).any(dim=1).tolist() == [True, True, True, False]
+    gaussians._xyz.grad = torch.ones_like(before)
+    after = gaussians._xyz.detach().clone()
+    gaussians.step(torch.tensor([0, 0, 0, 1]))
+    assert (gaussians._xyz != after).any(dim=1).tolist() == [False, False, False, True]
 
 
 def test_gradients_that_were_not_held_would_be_missed(scene, tmp_path):
