@@ -204,18 +204,6 @@ PACE_OPTIONS: tuple[Option, ...] = (
     ),
 )
 
-LATE_OPTIONS: tuple[Option, ...] = (
-    Option(
-        "views_per_step",
-        1,
-        "iterations, each of one view, whose gradients one step of the optimisers adds up, once the strategy changes "
-        "the number of Gaussians no more; 1: each iteration steps. These iterations do without the fast step, and "
-        "train_log.json says how many steps there were",
-        "ours",
-        check=at_least(1),
-    ),
-)
-
 _STRATEGY = Option(
     "strategy",
     "adc",
@@ -226,4 +214,4 @@ _STRATEGY = Option(
     check=one_of("adc", "mcmc", "budget"),
 )
 
-STRATEGY_OPTIONS = (_STRATEGY, *ADC_OPTIONS, *MCMC_OPTIONS, *BUDGET_OPTIONS, *PACE_OPTIONS, *LATE_OPTIONS)
+STRATEGY_OPTIONS = (_STRATEGY, *ADC_OPTIONS, *MCMC_OPTIONS, *BUDGET_OPTIONS, *PACE_OPTIONS)

@@ -16,7 +16,6 @@ from scene.gaussians.checkpoint import State, pack, unpack
 from scene.gaussians.exposed import Exposed
 from scene.gaussians.exposure import Exposures, read_exposures, read_pretrained
 from scene.gaussians.finite import check_finite
-from scene.gaussians.held import HELD, held_state, take_held
 from scene.gaussians.parameters import raw_rows
 from scene.gaussians.relocating import RelocatingGaussians
 from scene.gaussians.sparse_adam import SparseGaussianAdam
@@ -41,7 +40,6 @@ class GaussianModel(Exposed, RelocatingGaussians):
 
     optimizer_type = "default"
     spatial_lr_scale = 0.0
-    _seen: Tensor | None = None  # (N,) bool: in the views whose gradients wait; None: none waits
 
     def __init__(self, sh_degree: int, optimizer_type: str = "default") -> None:
         if optimizer_type not in _OPTIMIZERS:
@@ -144,42 +142,14 @@ class GaussianModel(Exposed, RelocatingGaussians):
     def step(self, radii: Tensor) -> None:
         """Step all optimisers and drop the gradients.
 
-        radii: (N,) pixels in the view of this iteration; the sparse optimiser skips Gaussians of radius 0 in it and in
-        all views that `hold` was told of since the last step.
+        radii: (N,) pixels in the view of this iteration; the sparse optimiser skips Gaussians of radius 0.
         """
         if isinstance(self.optimizer, SparseGaussianAdam):
-            self.optimizer.step(self._seen_since(radii))
+            self.optimizer.step(radii > 0)
         else:
             self.optimizer.step()
         self.optimizer.zero_grad(set_to_none=True)
         self.exposures.step()
-        self._seen = None
-
-    def hold(self, radii: Tensor) -> None:
-        """Let the gradients of a view wait for the step of a later one, to which they are added. radii: as for `step`.
-
-        A guard that finds the loss not finite stops all later steps.
-        """
-        self._seen = self._seen_since(radii)
-        if guard := getattr(self.optimizer, "guard", None):
-            guard.note_loss()
-
-    def drop_gradients(self) -> None:
-        """Drop all gradients, also those that wait."""
-        self.optimizer.zero_grad(set_to_none=True)
-        self.exposures.values.grad = self._seen = None
-
-    @property
-    def optimizer_steps(self) -> int:
-        """Steps that the optimiser of the Gaussians has taken, in this run and in those that it resumes."""
-        return int(self.optimizer.state.get(self._xyz, {}).get("step", 0))
-
-    def _seen_since(self, radii: Tensor) -> Tensor:
-        return radii > 0 if self._seen is None else self._seen | (radii > 0)
-
-    def _stepped(self) -> dict[str, Tensor]:
-        """All parameters by name."""
-        return {name: self.raw(name) for name in self._attributes} | {"exposures": self.exposures.values}
 
     def guard_steps(self, guard: StepGuard) -> None:
         """Let a guard hold back the steps of all optimisers; training_setup makes unguarded ones."""
@@ -228,13 +198,12 @@ class GaussianModel(Exposed, RelocatingGaussians):
         Values of Gaussians are parameters: the reference trains on with the very tensors that a checkpoint holds.
         """
         raw = {name: getattr(self, a.field) for name, a in self._attributes.items()}
-        held = {} if self._seen is None else held_state(self._seen, self._stepped())
         return pack(
             State(
                 self.active_sh_degree,
                 {name: x if isinstance(x, nn.Parameter) else nn.Parameter(x.detach()) for name, x in raw.items()},
                 self.statistics,
-                self.optimizer.state_dict() | held,
+                self.optimizer.state_dict(),
                 float(self.spatial_lr_scale),
                 self.exposures.capture() if self.exposures.trained else None,
             )
@@ -259,8 +228,6 @@ class GaussianModel(Exposed, RelocatingGaussians):
             else:  # a subclass has set up another
                 self.optimizer.load_state_dict(state.optimizer)
                 lacking = []
-            if HELD in state.optimizer:
-                self._seen = take_held(state.optimizer[HELD], self._stepped(), len(self))
         except ValueError as error:
             raise UserError(f"the optimiser state of the checkpoint does not fit ({error}); use another one") from error
         if "xyz" in lacking:  # f_rest may lack it, as Gaussians without active bands have no steps

@@ -99,7 +99,6 @@ OURS = {
     "resolution_schedule": "none",
     "target_psnr": 0.0,
     "schedule": "",
-    "views_per_step": 1,
 }
 
 
@@ -166,7 +165,6 @@ def test_short_forms_and_unique_prefixes():
         ("seed", "-1"),
         ("optimizer_type", "sgd"),
         ("strategy", "mine"),
-        ("views_per_step", "0"),
         ("absgrad_threshold", "0"),
         ("absgrad_threshold", "nan"),
         ("split", "halves"),

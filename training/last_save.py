@@ -27,7 +27,7 @@ def save_last(
     scored: whether to compute the change in PSNR, which is cheap if the test photos are in memory. iteration: the last.
     """
     trained = scene.gaussians
-    trained.drop_gradients()  # room for the trimmed copy
+    trained.optimizer.zero_grad(set_to_none=True)  # room for the trimmed copy
     trimmed = trim(trained, scene.getTrainCameras(), pipe, opt.keep_unseen, opt.prune_sh, iteration)
     final, test = trimmed.gaussians, scene.getTestCameras()
     change = {}

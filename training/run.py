@@ -18,7 +18,6 @@ from scene.gaussians.checkpoint import load_checkpoint
 from scene.options import option
 from training.checks import check_exposures, check_scene, check_target, warn_of_fewer, warn_of_late_reset
 from training.history import check_folder, continue_records, report_changes
-from training.late_steps import LateSteps
 from training.loss_watch import LossWatch
 from training.memory_estimate import announce_memory
 from training.objective import Objective
@@ -41,11 +40,11 @@ SH_INTERVAL = 1000  # iterations between raises of the active SH degree
 class Run:
     """The objects that the loop and its observers share.
 
-    scene, gaussians, views (by iteration), objective, density, pace, late (iterations that share a step); dataset, opt,
-    pipe: the options; background: (3,) of the scene; first_iteration: done before this run. From `begin` on: log, rows
-    (of the curve so far), losses (running mean of the total) and clock (seconds of training). lost: steps that an error
-    has taken back. first_done: seconds from the process's start to the end of its first iteration, None if the system
-    does not say. interrupt: a signal that asks the loop to stop; an observer that waits has to look at it.
+    scene, gaussians, views (by iteration), objective, density, pace; dataset, opt, pipe: the options; background: (3,)
+    of the scene; first_iteration: done before this run. From `begin` on: log, rows (of the curve so far), losses
+    (running mean of the total) and clock (seconds of training). lost: steps that an error has taken back. first_done:
+    seconds from the process's start to the end of its first iteration, None if the system does not say. interrupt: a
+    signal that asks the loop to stop; an observer that waits has to look at it.
     """
 
     first_done: float | None = None
@@ -84,7 +83,6 @@ class Run:
             opt.depth_l1_weight_init, opt.depth_l1_weight_final, max_steps=opt.iterations
         )
         self.density.pace = self.pace
-        self.late = LateSteps(opt.views_per_step, self.density, self._changes)
         warn_of_fewer(self.density, opt, len(self.gaussians), self.first_iteration + 1)
         if from_points:
             self.density.started()
@@ -149,8 +147,6 @@ class Run:
                 background=self._background(iteration),
                 depth_weight=self._depth_weight(pace.nominal(iteration)) if camera.depth_reliable else 0.0,
                 changes=self._changes(iteration),
-                shares=self.late.shares(iteration),
-                waits=self.late.waits(iteration),
                 started=seconds,
                 span=pace.span(iteration),
             )

@@ -21,8 +21,6 @@ class Step:
     background: Tensor  # (3,), random or that of the scene
     depth_weight: float  # of the depth loss, 0 if the view has no reliable depth map
     changes: bool  # rows of the Gaussians, the SH degree or the size of views change in this iteration
-    shares: bool  # one step of the optimisers is for several iterations, this among them
-    waits: bool  # its gradients wait for the step of a later one
     started: float  # seconds of training before it
     due: bool = False  # the model is read, written or changed, so every loss so far must be checked first
     record: dict[str, float] | None = None  # what train_log.json gets of this iteration; None: no record

@@ -34,11 +34,6 @@ class StepGuard:
         """Take the scalar loss of an iteration (from 1), before its step."""
         self.arguments = (loss, self.stopped, iteration)
 
-    def note_loss(self) -> None:
-        """Stop the optimisers if the loss of an iteration that takes no step is not finite."""
-        loss, stopped, iteration = self.arguments
-        stopped.masked_fill_(~loss.detach().isfinite() & (stopped == 0), iteration)
-
     def stopped_in(self) -> int:
         """The iteration that stopped the optimisers, 0 as long as none did. Waits for the device."""
         return int(self.stopped)

@@ -60,14 +60,12 @@ class DivergenceWatch(Observer):
         if bad == stopped == math.inf:
             return
         first = int(min(bad, stopped))
-        late = self._run.late
         if bad == first:
             # The guard held that iteration's step back, too.
-            good, what = late.whole(first - 1), f"the loss became {losses[first]}"
+            good, what = first - 1, f"the loss became {losses[first]}"
         else:
             good, what = first, f"{self._unstepped()} had no finite step"
-        self._gaussians.rewind(late.steps(range(good + 1, iteration + stepped)))
-        self._gaussians.drop_gradients()
+        self._gaussians.rewind(iteration - good if stepped else iteration - 1 - good)
         if good < iteration:
             self._gaussians.active_sh_degree = self._sh_degrees[0]
         view = self._run.views[first].image_name
@@ -96,7 +94,7 @@ class DivergenceWatch(Observer):
         return " and ".join(parts)
 
     def _rescue(self, iteration: int) -> str:
-        if iteration <= self._run.first_iteration:
+        if iteration == self._run.first_iteration:
             return "no iteration was trained before it; lower the learning rates"
         path = Path(self._run.scene.model_path) / f"chkpnt{iteration}.pth"
         try:

@@ -17,10 +17,9 @@ from utils.system_utils import UserError
 class MemoryGuard(Observer):
     """Saves the model when memory runs out, and turns the error into a UserError.
 
-    Until an iteration is `measured`, the saved state is that after the iteration before, or after the last one that
-    left no gradient waiting: a resumed run then equals one that was never stopped. After that, the saved model is
-    usable as well, but densification or the optimiser's step may be incomplete. So this observer comes after those that
-    only read the model, and before those that need it whole.
+    Until an iteration is `measured`, the saved state is that after the iteration before: a resumed run then equals one
+    that was never stopped. After that, the saved model is usable as well, but densification or the optimiser's step may
+    be incomplete. So this observer comes after those that only read the model, and before those that need it whole.
     """
 
     def __init__(self, run: Run) -> None:
@@ -56,12 +55,9 @@ class MemoryGuard(Observer):
 
     def _rescue(self) -> str:
         """Save the model. Return what was saved, and what to do."""
-        if not self._changing:
-            self._iteration = self._run.late.whole(self._iteration)
-        if self._iteration <= self._first and not self._changing:
+        if self._iteration == self._first and not self._changing:
             return "nothing was trained yet; lower --resolution (-r), --max_num_splats, --images_to_load or --sh_degree"
         gaussians, iteration = self._gaussians, self._iteration + self._changing
-        gaussians.drop_gradients()  # those of this iteration may be among them, or be incomplete
         anew, state = "--sh_degree", f"the model after iteration {iteration}"
         further = "a lower --resolution (-r) or --images_to_load"
         try:

@@ -6,13 +6,6 @@ from training.run import Run
 from training.step import Step
 
 
-def steps_taken(run: Run, iterations: int) -> dict[str, int]:
-    """The number of optimiser steps after so many iterations, for their record, if there were fewer."""
-    shared = run.opt.views_per_step > 1 or any("optimizer_steps" in record for record in run.log.records)
-    steps = run.gaussians.optimizer_steps if shared else iterations
-    return {} if steps == iterations else {"optimizer_steps": steps}
-
-
 class Records(Observer):
     """Writes what other observers have put into the step's record, once all of it is there."""
 
@@ -26,8 +19,7 @@ class Records(Observer):
         run, seconds = self._run, self._run.clock.seconds
         self._seconds = seconds
         with run.clock.paused("saving"):
-            record = step.record | steps_taken(run, step.iteration - 1)
-            run.log.add(step.iteration, seconds, gaussians=len(run.gaussians), loss=run.losses.mean, **record)
+            run.log.add(step.iteration, seconds, gaussians=len(run.gaussians), loss=run.losses.mean, **step.record)
 
     def ended(self, error: Error) -> None:
         """Note the seconds of this process: up to its first iteration, of training, of scoring and of saving."""

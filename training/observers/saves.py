@@ -11,7 +11,6 @@ from training.left_out import LeftOut, lines
 from training.objective import Losses
 from training.observer import Error, Observer
 from training.observers.divergence import DivergenceWatch
-from training.observers.records import steps_taken
 from training.observers.schedule import save_schedule
 from training.run import Run
 from training.step import Step
@@ -77,7 +76,6 @@ class Checkpoints(Observer):
             path = Path(run.scene.model_path) / f"chkpnt{step.iteration}.pth"
             save_schedule(run, step)  # first: a checkpoint never lacks its place in the schedule
             save_checkpoint(path, run.gaussians.capture(), step.iteration)
-            steps = steps_taken(run, step.iteration)
-            run.log.add(step.iteration, seconds, gaussians=len(run.gaussians), loss=run.losses.mean, **steps)
+            run.log.add(step.iteration, seconds, gaussians=len(run.gaussians), loss=run.losses.mean)
         if step.stopping:
             tqdm.write(f"resume with --start_checkpoint {path}", file=sys.stderr)

@@ -37,11 +37,11 @@ class FusedStep:
     def is_usual(self, step: Step) -> bool:
         """Whether it can be as far as the model does not matter.
 
-        The last step, one that changes the Gaussians' rows, and one for several iterations use the gradients.
+        The last step, and one that changes the Gaussians' rows, use the gradients.
         """
         pipe = self._run.pipe
         in_python = pipe.compute_cov3D_python or pipe.convert_SHs_python or pipe.debug
-        return not (step.changes or step.last or step.shares or in_python or self._further_terms)
+        return not (step.changes or step.last or in_python or self._further_terms)
 
     def take(self, step: Step, tell: Announcer) -> None:
         """Take a step; the observers are told once the loss is known."""

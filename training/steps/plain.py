@@ -45,9 +45,6 @@ class PlainStep:
         """Let density control and the optimisers use the gradients."""
         run = self._run
         run.density.after_backward(step, package)
-        if step.last:  # as in the reference, the last iteration takes no step
-            return
-        if step.waits:
-            return run.gaussians.hold(package["radii"])
-        run.gaussians.step(package["radii"])
-        run.density.after_step(step)
+        if not step.last:  # as in the reference, the last iteration takes no step
+            run.gaussians.step(package["radii"])
+            run.density.after_step(step)

@@ -34,8 +34,8 @@ class AdaptiveDensityControl(DensityControl):
         self._white_background = white_background
         self._extent = extent
         self.absolute_gradients = opt.absgrad
-        self.most_gaussians = opt.max_num_splats
         self.ends = opt.densify_until_iter
+        self.most_gaussians = opt.max_num_splats
 
     def changes(self, iteration: int) -> bool:
         todo = self._actions(iteration)

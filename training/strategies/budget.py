@@ -43,9 +43,9 @@ class BudgetControl(DensityControl):
     def __init__(self, run: "Run") -> None:
         self._gaussians, self._opt = run.gaussians, run.opt
         self._cameras = run.scene.getTrainCameras()
+        self.ends = run.opt.densify_until_iter
         self._scores = ErrorScores(run.gaussians, run.pipe, run.dataset.train_test_exp, run.opt)
         self.most_gaussians = run.opt.max_num_splats or default_budget(self._cameras)
-        self.ends = run.opt.densify_until_iter
 
     def changes(self, iteration: int) -> bool:
         in_time = self.pace.nominal(iteration) < self._opt.densify_until_iter

@@ -30,8 +30,8 @@ class MarkovChain(DensityControl):
         self._gaussians = gaussians
         self._opt = opt
         self.most_gaussians = opt.max_num_splats or MOST_GAUSSIANS
-        self.ends = opt.mcmc_until_iter
         self.penalty = Penalty(opt.mcmc_opacity_reg, opt.mcmc_scale_reg)
+        self.ends = opt.mcmc_until_iter
 
     def started(self) -> None:
         """Make Gaussians more opaque and smaller than adaptive density control wants them (as the authors' release)."""
