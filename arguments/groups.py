@@ -287,7 +287,8 @@ class OptimizationParams(OptionTable):
             "max_num_splats",
             0,
             "largest number of Gaussians, 0: no limit, 1,000,000 with mcmc, or with budget what --strategy says; near "
-            "it, adc densifies only those with the largest gradients",
+            "it, adc densifies only those with the largest gradients. adc and mcmc keep a start with more, budget "
+            "removes what is too many",
             "ours",
             check=at_least(0),
         ),

@@ -153,7 +153,7 @@ BUDGET_OPTIONS: tuple[Option, ...] = (
         "budget: Gaussians are drawn for splitting with a chance that grows as their score to this power; higher: only "
         "the worst, 0: any that draws an error",
         "ours",
-        check=at_least(0),
+        check=within(0, 100),  # beyond, the chances of most would be too small a number
     ),
     Option(
         "opacity_decay",

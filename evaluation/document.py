@@ -13,7 +13,7 @@ from evaluation.summary import SCORES
 
 _DIGITS = {
     **{"PSNR": 2, "SSIM": 4, "LPIPS": 4, "seconds": 1, "process_seconds": 1, "cpu_seconds": 1},
-    **{"optimizer_steps": 0, "gaussians": 0, "ply_mb": 1, "peak_memory_mib": 0, "render_ms": 2},
+    **{"gaussians": 0, "ply_mb": 1, "peak_memory_mib": 0, "render_ms": 2},
 }
 _LAST_OF_PEER = {"iteration": 0, "seconds": 1, "test_psnr": 2, "test_ssim": 4, "gaussians": 0}
 _HEADS = {
@@ -21,7 +21,6 @@ _HEADS = {
     "seconds": "training (s)",
     "process_seconds": "process (s)",
     "cpu_seconds": "CPU (s)",
-    "optimizer_steps": "optimiser steps",
     "gaussians": "Gaussians",
     "ply_mb": "PLY (MB)",
     "peak_memory_mib": "peak memory (MiB)",
@@ -110,8 +109,6 @@ def _results(report: Mapping[str, Any]) -> Section:
         )
     if any(row.get("open_ended") for row in rows):
         blocks.append("Trainings with a time budget or a score to reach end by themselves: their row is of their end.")
-    if any(row["optimizer_steps"]["mean"] is not None for row in rows):
-        blocks.append("Where no optimiser steps are given, there was one in each iteration but the last.")
     if rows and all(row["LPIPS"]["mean"] is None for row in rows):
         blocks.append(
             "LPIPS is missing: metrics.py found no weights of its network, and its message says where to put them."

@@ -81,12 +81,6 @@ def training_seconds(model: Path, iteration: int) -> float | None:
     return logged(model, warn=True).get(iteration, {}).get("seconds")
 
 
-def optimizer_steps(model: Path, iteration: int) -> int | None:
-    """Read the number of optimiser steps until an iteration; None if train.py logged none: one for each iteration."""
-    steps = logged(model).get(iteration, {}).get("optimizer_steps")
-    return steps if isinstance(steps, int) else None
-
-
 def logged(model: Path, warn: bool = False) -> dict[int, dict[str, Any]]:
     """Read the records of train_log.json by their iterations; none without the file, or if it is damaged."""
     log = model / "train_log.json"

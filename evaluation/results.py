@@ -13,7 +13,6 @@ from evaluation.model_folder import (
     closing_lines,
     count_gaussians,
     load_scores,
-    optimizer_steps,
     picture_name,
     picture_size,
     ply_file,
@@ -121,7 +120,7 @@ def _iteration(model: Path, iteration: int, curve: list[Row]) -> dict[str, Any]:
     """Return the scores of metrics.py, time, size and memory at a saved iteration.
 
     gaussians: as trained, as published tables count; gaussians_saved: without those left out as unseen; ply_mb:
-    megabytes (10^6 bytes) of the PLY; optimizer_steps: null where there was one for each iteration.
+    megabytes (10^6 bytes) of the PLY.
     """
     method = f"ours_{iteration}"
     point = next((row for row in curve if row["iteration"] == iteration), {})
@@ -134,7 +133,6 @@ def _iteration(model: Path, iteration: int, curve: list[Row]) -> dict[str, Any]:
         "fps": None,
         "gaussians": trained_gaussians(model, iteration),
         "gaussians_saved": count_gaussians(model, iteration),
-        "optimizer_steps": optimizer_steps(model, iteration),
         "peak_memory_mib": point.get("peak_memory_mib"),
         "ply_mb": ply_file(model, iteration).stat().st_size / MB,
         "process_seconds": None,

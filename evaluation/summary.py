@@ -11,7 +11,7 @@ from evaluation.scenes import DATASETS
 SCORES = ("PSNR", "SSIM", "LPIPS")
 QUANTITIES = (
     *(*SCORES, "seconds", "process_seconds", "cpu_seconds", "gaussians", "gaussians_saved", "peak_memory_mib"),
-    *("render_ms", "fps", "ply_mb", "optimizer_steps"),
+    *("render_ms", "fps", "ply_mb"),
 )
 
 

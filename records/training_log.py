@@ -14,7 +14,7 @@ from utils.system_utils import UserError, compute_device
 
 NAME = "train_log.json"
 SHORT = 2000  # iterations; after trainings up to this length, what training says at its end is short
-_FINITE = ("loss", "peak_memory_mib", "wall_seconds", "max_num_splats")  # if present
+_FINITE = ("loss", "peak_memory_mib", "wall_seconds", "max_num_splats", "default_budget")  # if present
 
 
 class Stopwatch:
@@ -55,7 +55,7 @@ class TrainingLog:
     `<set>_l1`, `<set>_psnr`. Seconds and memory include the runs that were resumed. The last record also has
     `gaussians_left_out`, those that the last save does not have, the costs of the curve (curve_recorder.py), the
     seconds of this process by what they were spent on (training/observers/records.py), `iterations_planned`,
-    `strategy` and, if there was one, `max_num_splats` (what_to_try.py), and `lines`, what training said at its end.
+    `strategy`, and `max_num_splats` or `default_budget` (what_to_try.py), and `lines`, what training said at its end.
 
     first_iteration, seconds_before, wall_seconds_before: done by the runs that this one resumes.
     """

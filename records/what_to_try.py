@@ -9,6 +9,8 @@ from records.error_curve import Row, whole_sets
 
 # Entries of the log's last record: options of the training.
 CAP, PLANNED, STRATEGY = "max_num_splats", "iterations_planned", "strategy"
+BUDGET = "default_budget"  # Gaussians that --strategy budget takes for the scene where no number is given
+MANY = 2  # times as many are more than the scene needs (docs/guide/strategies.md: better with a fifth)
 FULL = 0.99  # of the cap: a densification that removes some Gaussians ends a little below it
 SETTLED = 1000  # iterations; the default densification begins after 500, so that a shorter training says little
 
@@ -24,6 +26,7 @@ def what_to_try(rows: Sequence[Row], records: Sequence[Mapping[str, Any]]) -> li
     # More Gaussians are no remedy for overfitting. Without growth, a cap that is far away is none either.
     strategy = last.get(STRATEGY, "adc")
     first = _overfitting(scored, strategy) or _at_cap(rows, scored, last.get(CAP)) or _never_grew(rows, strategy)
+    first = first or _many(rows, last.get(BUDGET))
     ended_by_itself = last.get(PLANNED) not in (None, last.get("iteration"))
     return [sentence for sentence in (first, None if ended_by_itself else _late(rows, scored)) if sentence]
 
@@ -38,12 +41,11 @@ def _overfitting(scored: Sequence[Row], strategy: str) -> str | None:
     if lost < CLEAR or gained < CLEAR:
         return None
     half = max(1, int((scored[-1]["gaussians"] or 0) / 2))
-    fewer = [f"--max_num_splats {half}, half as many as now"] * (half > 1)
-    fewer += ["a higher --densify_grad_threshold"] * (strategy == "adc")
-    known = f" ({', or '.join(fewer)})" if fewer else ""
+    fewer = f" (--max_num_splats {half}, half as many as now)" if half > 1 else ""
+    others = {"adc": "--strategy mcmc or budget with ", "budget": "--strategy mcmc, "}.get(strategy, "")
     return (
         f"After iteration {best['iteration']} the test views lost {lost:.2f} dB while the training views gained "
-        f"{gained:.2f} dB, so it overfits; try fewer Gaussians{known}, a lower --sh_degree, or more photos"
+        f"{gained:.2f} dB, so it overfits; try {others}fewer Gaussians{fewer}, a lower --sh_degree, or more photos"
     )
 
 
@@ -56,7 +58,19 @@ def _at_cap(rows: Sequence[Row], scored: Sequence[Row], cap: int | None) -> str 
     gained = f"; since then test views changed by {after[-1] - after[0]:+.2f} dB" if len(after) > 1 else ""
     return (
         f"From iteration {first['iteration']} on there was no room for more Gaussians (--max_num_splats {cap})"
-        f"{gained}; try a higher one, if memory and time allow it"
+        f"{gained}; try --strategy budget with the same number, which puts them where the error is, or a higher one, "
+        "if memory and time allow it"
+    )
+
+
+def _many(rows: Sequence[Row], budget: int | None) -> str | None:
+    """Adaptive density control made far more Gaussians than --strategy budget takes."""
+    count = (rows[-1]["gaussians"] or 0) if rows else 0
+    if not budget or count < MANY * budget:
+        return None
+    return (
+        f"There are {count} Gaussians, {count / budget:.1f} times as many as --strategy budget takes for these photos "
+        f"({budget}); try that, as fewer take less time, and were often as good"
     )
 
 

@@ -174,6 +174,7 @@ def test_short_forms_and_unique_prefixes():
         ("score_error", "l2"),
         ("score_join", "mean"),
         ("score_power", "-0.5"),
+        ("score_power", "100.5"),
         ("opacity_decay", "1.01"),
         ("opacity_decay", "0.4"),
         ("prune_opacity", "0.6"),

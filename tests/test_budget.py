@@ -1,6 +1,8 @@
 """The strategy `budget`: scores against the oracle, fair draws, the growth curve, rows, and trainings to the byte."""
 
+import json
 import math
+import re
 import subprocess
 import sys
 from itertools import permutations
@@ -443,3 +445,33 @@ def test_the_default_budget_follows_the_pixels():
         return budget.default_budget([SimpleNamespace(image_width=width, image_height=500)] * views)
 
     assert (budget_of(7, 500), budget_of(40, 300), budget_of(100, 4000)) == (100_000, 300_000, 1_000_000)
+
+
+# What is out of reach
+
+
+def test_a_number_out_of_reach_is_told(colmap_scene, tmp_path, capsys):
+    def said(*more: object, strategy: str = "budget") -> str:
+        _train(colmap_scene, tmp_path / "out", "--strategy", strategy, *more)
+        return "".join(line for line in capsys.readouterr().err.splitlines() if line.startswith("warning: --strategy"))
+
+    window = "--densify_from_iter", 10, "--densification_interval", 20, "--max_num_splats"
+    assert said(*window, 2000, "--densify_until_iter", 100) == ""
+    assert "as --densify_until_iter 300 is not before the end; lower it" in said(
+        *window, 2000, "--densify_until_iter", 300
+    )
+    # 300 Gaussians double in 20, 40, 60 and 80, but not in 100.
+    told = said(*window, 10_000, "--densify_until_iter", 100)
+    assert "budget gets to 4,800 of 10,000 Gaussians at the most, as they at most double each time" in told
+    mcmc = "--mcmc_until_iter", 100, "--mcmc_growth", 0.5
+    assert said(*mcmc, *window, 1518, strategy="mcmc") == ""
+    told = said(*mcmc, *window, 1519, strategy="mcmc")
+    assert "mcmc gets to 1,518 of 1,519 Gaussians at the most, as --mcmc_growth 0.5 adds too few" in told
+    assert said(*mcmc, *window, 0, strategy="mcmc") == said(*window, 301, strategy="adc") == ""
+
+
+def test_what_is_told_to_be_the_most_is_reached(colmap_scene, tmp_path, capsys):
+    window = "--densify_from_iter", 10, "--densification_interval", 20, "--densify_until_iter", 300
+    _train(colmap_scene, tmp_path, *window, "--max_num_splats", 2000, "--prune_opacity", 0, "--growth_power", 2)
+    (most,) = re.findall("gets to (.*) of 2,000", capsys.readouterr().err)
+    assert int(most.replace(",", "")) == json.loads((tmp_path / "train_log.json").read_text())[-1]["gaussians"]

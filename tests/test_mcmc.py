@@ -119,7 +119,7 @@ def test_a_few_gaussians_grow_at_least_by_one(growth, count, grown):
         def grow(self, new, *_, **__) -> None:
             counts.append(counts[-1] + new)
 
-    options = dict.fromkeys(("mcmc_opacity_reg", "mcmc_scale_reg", "mcmc_parts", "seed"), 0)
+    options = dict.fromkeys(("mcmc_opacity_reg", "mcmc_scale_reg", "mcmc_parts", "mcmc_until_iter", "seed"), 0)
     MarkovChain(Few(), argparse.Namespace(max_num_splats=45, mcmc_growth=growth, **options))._grow(1)
     assert counts[-1] == grown
 

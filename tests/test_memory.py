@@ -250,6 +250,9 @@ def test_the_estimate_and_its_warnings(colmap_scene, tmp_path, monkeypatch, capf
         and "6,000 (scenes often grow 20-fold); 1024.0 GiB free" in line
     )
     assert not warning
+    assert f"training {gib(at_start)} with 300" in line
+    absolute = said("--absgrad", "--max_num_splats", 2_000_000_000)[0]  # 25 bytes more of each
+    assert f"{gib(2e9 * 1095)} with 2,000,000,000" in absolute
     assert "--images_to_load" not in line and "--images_to_load" not in said("--images_to_load", 17)[0]
     assert "photos 0.00 GiB (--images_to_load keeps 5 of 17 decoded images), " in said("--images_to_load", 5)[0]
     line, warning = said("--max_num_splats", 2_000_000_000)
@@ -274,6 +277,8 @@ def test_the_estimate_counts_what_a_step_allocates():
     tensors += [value for state in gaussians.optimizer.state.values() for value in state.values() if value.dim()]
     counted = sum(tensor.untyped_storage().nbytes() for tensor in tensors)
     assert training_bytes(gaussians, 50, 0) - 50 * memory_estimate.PER_GAUSSIAN == counted
+    more = training_bytes(gaussians, 50, 0, absolute=True) - training_bytes(gaussians, 50, 0)
+    assert more == 50 * memory_estimate.PER_ABSOLUTE >= 50 * (4 + 8)  # a length, and a row of two values at least
 
 
 # Images and processes

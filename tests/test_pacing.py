@@ -4,6 +4,7 @@ import argparse
 import json
 import math
 import random
+import re
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -491,3 +492,67 @@ def test_an_iteration_that_becomes_the_last_takes_no_step(colmap_scene, tmp_path
         _train(colmap_scene, tmp_path / name, "--target_psnr", 1, "--checkpoint_iterations", 100, *more)
         states.append(load_checkpoint(tmp_path / name / "chkpnt7.pth")[0])
     assert torch.equal(states[0][1], states[1][1]) and states[0][10]["state"][0]["step"].item() == 6
+
+
+def test_a_steady_run_leaves_the_schedule_of_a_folder_where_it_goes_on(colmap_scene, tmp_path, monkeypatch, capsys):
+    """Earlier checkpoints keep their place in it; later ones are of no schedule."""
+    out, path = tmp_path / "out", tmp_path / "out" / "schedule.json"
+    _timed(monkeypatch, lambda t: 0.1)
+    plans = "--checkpoint_iterations", 20, 40
+    whole = _train(colmap_scene, out, "--iterations", 60, *plans, "--time_budget", 5)
+    before, (early, late) = read_schedule(path), sorted(out.glob("chkpnt*.pth"), key=lambda c: int(c.stem[6:]))
+    on = int(late.stem[6:])
+    assert before.ended == max(whole) > on
+    more = "--iterations", on + 20, "--checkpoint_iterations", on + 10, "--start_checkpoint"
+    _train(colmap_scene, out, *more, late)
+    assert "this one has none" in capsys.readouterr().err
+    left = read_schedule(path)
+    assert left == Paced(before).up_to(on) and (left.ended, left.blocks[-1].last) == (None, on)
+    with pytest.raises(UserError, match="is of a run that did not end"):
+        _train(colmap_scene, tmp_path / "a", "--iterations", 60, "--schedule", path)
+    # A checkpoint of the steady run is of no run with a budget, and one from before still is.
+    steady = out / f"chkpnt{on + 10}.pth"
+    _train(colmap_scene, out, *more, steady)
+    assert "--time_budget" not in capsys.readouterr().err and read_schedule(path) == left
+    with pytest.raises(UserError, match=f"ends before iteration {on + 10} of .*, so it is of another run"):
+        _train(colmap_scene, tmp_path / "b", "--iterations", 60, "--time_budget", 5, "--start_checkpoint", steady)
+    _train(colmap_scene, out, "--iterations", 60, "--time_budget", 5, "--start_checkpoint", early)
+    first = Paced(before).up_to(int(early.stem[6:])).blocks
+    assert read_schedule(path).blocks[: len(first)] == first and len(first) > 3
+
+
+def test_a_steady_run_from_elsewhere_removes_the_schedule_of_its_folder(colmap_scene, tmp_path):
+    _train(colmap_scene, tmp_path / "a", "--iterations", 20, "--checkpoint_iterations", 10)
+    (tmp_path / "b").mkdir()
+    (tmp_path / "b" / "schedule.json").write_text(json.dumps(GOOD))
+    start = "--start_checkpoint", tmp_path / "a" / "chkpnt10.pth"
+    _train(colmap_scene, tmp_path / "b", "--iterations", 20, *start)
+    assert not (tmp_path / "b" / "schedule.json").exists()
+
+
+@pytest.mark.parametrize(("seconds", "reset", "late"), [(20, 3000, True), (20, 1000, False), (300, 3000, False)])
+def test_a_late_reset_of_a_run_with_a_time_budget(colmap_scene, tmp_path, monkeypatch, capsys, seconds, reset, late):
+    """3000 of 3600 iterations of the schedule: some 33 or 500 of the run are left. The shorter run leaves out resets
+    that it would not recover from before the next one; these come once.
+    """
+    monkeypatch.setattr(rules, "RECOVERY", 50)
+    _timed(monkeypatch, lambda t: 0.1)
+    words = "--opacity_reset_interval", reset, "--densify_until_iter", reset + 500, "--iterations", 3600
+    _train(colmap_scene, tmp_path, *words, "--time_budget", seconds)
+    out, err = capsys.readouterr()
+    told = re.findall(r"opacities are reset in iteration (\d+), and about (\d+) iterations that are left of", err)
+    assert bool(told) == late and "are too few" not in out
+    if late:
+        assert [int(number) for number in told[0]] == [pytest.approx(167, abs=3), pytest.approx(33, abs=3)]
+
+
+def test_a_late_reset_of_a_recorded_schedule_counts_its_own_iterations(colmap_scene, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(rules, "RECOVERY", 50)
+    blocks = [Block(200, 0.0, 1 / 200, 0.0)]  # 18 iterations of the schedule at a time
+    write_schedule(tmp_path / "schedule.json", Schedule(3600, blocks, 200, 20.0, levels=()))
+    words = "--iterations", 3600, "--schedule", tmp_path / "schedule.json", "--densify_until_iter", 3500
+    _train(colmap_scene, tmp_path / "a", *words, "--opacity_reset_interval", 3000)
+    told = "opacities are reset in iteration 167, and 33 iterations are too few to recover from that; change --opacity_"
+    assert told in capsys.readouterr().out
+    _train(colmap_scene, tmp_path / "b", *words, "--opacity_reset_interval", 2500)  # 139: 61 are left
+    assert "too few" not in capsys.readouterr().out

@@ -37,17 +37,20 @@ def test_a_healthy_training_is_told_nothing():
 def test_test_views_that_fall_while_training_views_rise():
     (said,) = what_to_try(_curve([20.0, 24.0, 23.0, 22.5], RISING), [])
     assert said.startswith("After iteration 4000 the test views lost 1.50 dB while the training views gained 4.00 dB")
-    assert "--max_num_splats 4000, half as many as now" in said and "--densify_grad_threshold" in said
+    assert "try --strategy mcmc or budget with fewer Gaussians (--max_num_splats 4000, half as many as now), a" in said
     both_fall = [20.0, 29.0, 28.0, 27.0]
     assert what_to_try(_curve([20.0, 24.0, 23.0, 22.5], both_fall), []) == []  # a reset, or rates too high
     assert what_to_try(_curve([20.0, 24.0, 23.9, 23.95], [20.0, 24.0, 26.0, 28.0]), [])[0].startswith("The last 40.0")
 
 
-@pytest.mark.parametrize(("strategy", "end"), [("mcmc", "--mcmc_until_iter"), ("budget", "--densify_until_iter")])
-def test_other_strategies_are_told_of_their_own_options(strategy, end):
+@pytest.mark.parametrize(
+    ("strategy", "end", "other"),
+    [("mcmc", "--mcmc_until_iter", "try fewer"), ("budget", "--densify_until_iter", "try --strategy mcmc, fewer")],
+)
+def test_other_strategies_are_told_of_their_own_options(strategy, end, other):
     log = [{"iteration": 8000, "strategy": strategy}]
     (said,) = what_to_try(_curve([20.0, 24.0, 23.0, 22.5], RISING), log)
-    assert "(--max_num_splats 4000, half as many as now), a lower" in said
+    assert f"{other} Gaussians (--max_num_splats 4000, half as many as now), a lower" in said
     (said,) = what_to_try(_curve(RISING, RISING, (1000, 1000, 900, 900)), log)
     assert "try a higher --max_num_splats" in said and f"--densify_from_iter and {end} leave" in said
     assert "threshold" not in said
@@ -64,7 +67,10 @@ def test_gaussians_at_their_cap():
     rows = _curve(RISING, RISING, (1000, 3970, 3999, 3998))
     (said,) = what_to_try(rows, [{"iteration": 8000, "max_num_splats": 4000}])
     assert said.startswith("From iteration 4000 on there was no room for more Gaussians (--max_num_splats 4000)")
-    assert "test views changed by +4.00 dB; try a higher one" in said
+    assert (
+        "test views changed by +4.00 dB; try --strategy budget with the same number" in said
+        and "or a higher one" in said
+    )
     assert what_to_try(rows, [{"iteration": 8000, "max_num_splats": 5000}]) == []
     overfitting = _curve([20.0, 24.0, 23.0, 22.5], RISING, (1000, 3970, 3999, 3998))
     (said,) = what_to_try(overfitting, [{"iteration": 8000, "max_num_splats": 4000}])
@@ -79,6 +85,17 @@ def test_no_densification():
     assert what_to_try(_curve(RISING, RISING, (100_000, 30_000, 50_000, 60_000)), []) == []
     short = [row | {"iteration": row["iteration"] // 10} for row in _curve(RISING, RISING, (1000,) * 4)]
     assert what_to_try(short, []) == []
+
+
+def test_far_more_gaussians_than_a_budget_takes():
+    rows = _curve(RISING, RISING)
+    (said,) = what_to_try(rows, [{"iteration": 8000, "default_budget": 3200}])
+    assert said.startswith(
+        "There are 8000 Gaussians, 2.5 times as many as --strategy budget takes for these photos (3200)"
+    )
+    assert what_to_try(rows, [{"iteration": 8000, "default_budget": 4001}]) == []
+    (said,) = what_to_try(_curve([20.0, 24.0, 23.0, 22.5], RISING), [{"iteration": 8000, "default_budget": 3200}])
+    assert "it overfits" in said
 
 
 def test_seconds_that_buy_nothing():
@@ -102,10 +119,11 @@ def test_every_option_named_is_one_of_training():
         (_curve([20.0, 24.0, 23.0, 22.5], RISING), []),
         (_curve(RISING, RISING), [{"max_num_splats": 4000}]),
         (_curve(RISING, RISING, (1000,) * 4), []),
+        (_curve(RISING, RISING), [{"default_budget": 10}]),
         (_curve([20.0, 27.95, 28.0, 28.02], RISING), []),
     ]
     said = [what_to_try(*case) for case in cases]
-    assert [len(sentences) for sentences in said] == [1, 1, 1, 1]
+    assert [len(sentences) for sentences in said] == [1, 1, 1, 1, 1]
     named = set(re.findall(r"--(\w+)", str(said)))
     assert len(named) >= 6 and named <= known
 
@@ -133,6 +151,7 @@ def test_training_says_it_at_its_end(colmap_scene, tmp_path, capsys, monkeypatch
     train.main([*words, "--disable_viewer", "--max_num_splats", str(cap)])
     last = json.loads((tmp_path / LOG).read_text())[-1]
     assert last["iterations_planned"] == 12 and last.get("max_num_splats") == (cap or None)
+    assert last.get("default_budget") == (None if cap else 100_000)
     told = "there was no room for more Gaussians (--max_num_splats 300)"
     assert (told in capsys.readouterr().out) == (told in " ".join(last["lines"])) == bool(cap)
     assert [told in line.text for line in check_training(Path(tmp_path))] == [True] * bool(cap)

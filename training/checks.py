@@ -8,6 +8,9 @@ import numpy as np
 from scene.gaussian_model import GaussianModel
 from scene.gaussians import density_rules as rules
 from scene.readers.info import APART, NEAREST, SceneInfo, camera_centers, standing_apart
+from training.density import DensityControl
+from training.pacing.clocked import Clocked
+from training.pacing.pace import Pace
 from utils.files.listing import some
 from utils.system_utils import UserError
 
@@ -66,14 +69,55 @@ def check_exposures(gaussians: GaussianModel, train_test_exp: bool, checkpoint: 
         print(f"{checkpoint} has no exposures: all photos start without a correction")
 
 
-def warn_of_late_reset(opt: argparse.Namespace, white_background: bool) -> None:
-    """Warn if adaptive density control resets opacities so late that the model cannot recover."""
-    if opt.strategy != "adc":
+def warn_of_late_reset(opt: argparse.Namespace, white_background: bool, pace: Pace) -> None:
+    """Warn if adaptive density control resets opacities so late that the model cannot recover.
+
+    Iterations are those of the run. A run with a time budget does not know them yet: `late_reset` then tells.
+    """
+    if opt.strategy != "adc" or pace.ends is None:
         return
-    last = range(max(1, opt.iterations - rules.RECOVERY + 1), opt.iterations)
-    late = [t for t in last if rules.actions(t, opt, white_background).reset_opacity]
-    if late:
+    last = range(max(1, pace.ends - rules.RECOVERY + 1), pace.ends)
+    due = [t for t in last if rules.actions(t, opt, white_background, pace.span(t), pace.stride(t)).reset_opacity]
+    if due:
+        remedy = "--iterations or --opacity_reset_interval" if pace.ends == pace.length else "--opacity_reset_interval"
         print(
-            f"warning: opacities are reset in iteration {late[-1]}, and {opt.iterations - late[-1]} iterations are "
-            "too few to recover from that; change --iterations or --opacity_reset_interval"
+            f"warning: opacities are reset in iteration {due[-1]}, and {pace.ends - due[-1]} iterations are "
+            f"too few to recover from that; change {remedy}"
         )
+
+
+def late_reset(iteration: int, pace: Pace) -> str | None:
+    """The warning for a reset in an iteration of a run with a time budget, by its speed; None if it is in time."""
+    left = (pace.length - pace.nominal(iteration)) / pace.stride(iteration)
+    if not isinstance(pace, Clocked) or left >= rules.RECOVERY:
+        return None
+    return (
+        f"warning: opacities are reset in iteration {iteration}, and about {left:.0f} iterations that are left of "
+        "--time_budget are too few to recover from that; raise it, or change --opacity_reset_interval"
+    )
+
+
+def warn_of_fewer(density: DensityControl, opt: argparse.Namespace, count: int, first: int) -> None:
+    """Warn if a strategy cannot reach its number of Gaussians in time.
+
+    count: of Gaussians, now; first: the next iteration. Not known of a run with a time budget.
+    """
+    pace, aim = density.pace, density.most_gaussians
+    # The number that mcmc takes where none is given is a limit, nothing to reach.
+    if pace.ends is None or (opt.strategy == "mcmc" and not opt.max_num_splats):
+        return
+    if pace.nominal(first) >= density.ends > 0:
+        return  # a resumed run has no say in it any more
+    most = density.most_after(count, first, pace.ends)
+    if most >= aim:
+        return
+    if opt.strategy == "mcmc":
+        why = f"--mcmc_growth {opt.mcmc_growth:g} adds too few each time; raise it, or lower --densification_interval"
+    elif pace.length < density.ends:
+        why = f"--densify_until_iter {opt.densify_until_iter} is not before the end; lower it"
+    else:
+        why = "they at most double each time; lower --densification_interval, or raise --densify_until_iter"
+    print(
+        f"warning: --strategy {opt.strategy} gets to {most:,} of {aim:,} Gaussians at the most, as {why}",
+        file=sys.stderr,
+    )

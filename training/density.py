@@ -1,5 +1,6 @@
 """The hooks by which a strategy of density control acts on a training (strategies: training/strategies)."""
 
+import math
 from typing import ClassVar
 
 from torch import Tensor
@@ -18,8 +19,9 @@ class DensityControl:
     else, unless the iteration is one that `changes` names. most_gaussians: how many it lets there be, 0: any number.
     penalty: a part of the loss besides the objective, of which steps add the gradients; no loss that is told has it.
     absolute_gradients: whether the statistics take the lengths of absolute gradients (Ye et al. 2024); for the whole
-    run. pace: tells how far the schedule is in an iteration (training/pacing/pace.py). Rules that are windows of the
-    schedule ask it; rules that count steps take the iteration itself.
+    run. ends: the iteration of the schedule from which it changes no rows. pace: tells how far the schedule is in an
+    iteration (training/pacing/pace.py). Rules that are windows of the schedule ask it; rules that count steps take the
+    iteration itself.
     """
 
     fusable: ClassVar[bool] = False
@@ -27,6 +29,7 @@ class DensityControl:
     most_gaussians = 0
     penalty = NO_PENALTY
     absolute_gradients = False
+    ends = math.inf
     pace: Pace = STEADY
 
     def started(self) -> None:
@@ -42,6 +45,13 @@ class DensityControl:
     def observes(self, iteration: int) -> bool:
         """Whether the view of this iteration counts in the Gaussians' statistics, where the step is fused."""
         return False
+
+    def most_after(self, count: int, first: int, last: int) -> int:
+        """The most that `count` Gaussians can become from iteration `first` to `last`, both known to the pace.
+
+        `most_gaussians` where the strategy has no number to reach.
+        """
+        return self.most_gaussians
 
     def after_backward(self, step: Step, package: dict[str, Tensor]) -> None:
         """Called with the gradients computed, before the optimiser's step. package: the result of `render`."""

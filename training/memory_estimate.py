@@ -14,20 +14,24 @@ from utils.host.memory import free_memory, gib
 # statistics of density control, and the images that the loss keeps.
 PER_GAUSSIAN = 106 + 20
 PER_PIXEL = 57 + 72
+# Of absolute gradients: their length, and two values more beside the ten of a tile's gradient of a Gaussian, of which
+# the 106 bytes are the most part.
+PER_ABSOLUTE = 4 + 106 // 5
 GROWTH = 20  # photo scenes grow 10- to 100-fold in 7,000 iterations (docs/results/training.md), random points 2-fold
 
 
-def announce_memory(scene: Scene, gaussians: GaussianModel, max_splats: int) -> None:
+def announce_memory(scene: Scene, gaussians: GaussianModel, max_splats: int, absolute: bool = False) -> None:
     """Print the memory that photos and Gaussians need and what is free; warn, with a remedy, if they do not fit.
 
     max_splats: limit of the number of Gaussians. Without a limit (0), the estimate is for GROWTH times the number now.
+    absolute: with absolute gradients.
     """
     images, device = scene.images, gaussians.get_xyz.device
     pixels = max(camera.image_width * camera.image_height for camera in scene.getTrainCameras())
     now = len(gaussians)
     later = max(max_splats, now) if max_splats else GROWTH * now
     why = "--max_num_splats" if max_splats else f"scenes often grow {GROWTH}-fold"
-    at_start, at_end = training_bytes(gaussians, now, pixels), training_bytes(gaussians, later, pixels)
+    at_start, at_end = (training_bytes(gaussians, count, pixels, absolute) for count in (now, later))
     training = f"training {gib(at_start)} with {now:,} Gaussians, {gib(at_end)} with {later:,} ({why})"
     pictures = images.planned_bytes
     photos = f"photos {gib(pictures)}"
@@ -62,7 +66,11 @@ def _name(device: torch.device) -> str:
     return "GPU" if device.type == "cuda" else "CPU"
 
 
-def training_bytes(gaussians: GaussianModel, count: int, pixels: int) -> int:
-    """Bytes of `count` Gaussians with all that training keeps for them, and of one view's buffers."""
+def training_bytes(gaussians: GaussianModel, count: int, pixels: int, absolute: bool = False) -> int:
+    """Bytes of `count` Gaussians with all that training keeps for them, and of one view's buffers.
+
+    absolute: with absolute gradients.
+    """
     values = sum(group["params"][0][:1].numel() for group in gaussians.optimizer.param_groups)
-    return count * (4 * 4 * values + PER_GAUSSIAN) + pixels * PER_PIXEL
+    each = 4 * 4 * values + PER_GAUSSIAN + absolute * PER_ABSOLUTE
+    return count * each + pixels * PER_PIXEL

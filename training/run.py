@@ -1,6 +1,7 @@
 """A training run: scene, model, objective and density control, made and checked before a file is written."""
 
 import argparse
+import os
 from collections.abc import Iterator
 from itertools import count
 from pathlib import Path
@@ -15,7 +16,7 @@ from scene import Scene
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.checkpoint import load_checkpoint
 from scene.options import option
-from training.checks import check_exposures, check_scene, check_target, warn_of_late_reset
+from training.checks import check_exposures, check_scene, check_target, warn_of_fewer, warn_of_late_reset
 from training.history import check_folder, continue_records, report_changes
 from training.loss_watch import LossWatch
 from training.memory_estimate import announce_memory
@@ -58,7 +59,7 @@ class Run:
         self.device = compute_device()
         capture, self.first_iteration = load_checkpoint(plan.start, self.device) if plan.start else (None, 0)
         self.pace = pace_of(opt, plan.start, self.first_iteration)
-        warn_of_late_reset(opt, dataset.white_background)
+        warn_of_late_reset(opt, dataset.white_background, self.pace)
         self.gaussians = GaussianModel(dataset.sh_degree, opt.optimizer_type)
         init_ply = option(dataset, "init_ply")
         if init_ply and not plan.start:
@@ -82,6 +83,7 @@ class Run:
             opt.depth_l1_weight_init, opt.depth_l1_weight_final, max_steps=opt.iterations
         )
         self.density.pace = self.pace
+        warn_of_fewer(self.density, opt, len(self.gaussians), self.first_iteration + 1)
         if from_points:
             self.density.started()
 
@@ -123,9 +125,11 @@ class Run:
         folder, start = self.scene.model_path, self.plan.start
         if not start or not (Path(folder) / "cameras.json").exists():
             self.scene.write_inputs()
-        if not start and not isinstance(self.pace, Paced):
-            (Path(folder) / schedule_file.NAME).unlink(missing_ok=True)  # of an earlier training
-        announce_memory(self.scene, self.gaussians, self.density.most_gaussians)
+        if not isinstance(self.pace, Paced):
+            goes_on = start and os.path.realpath(Path(start).parent) == os.path.realpath(folder)
+            schedule_file.leave_schedule(Path(folder), self.first_iteration if goes_on else 0)
+        density = self.density
+        announce_memory(self.scene, self.gaussians, density.most_gaussians, density.absolute_gradients)
         self.log, self.rows = continue_records(folder, start, self.first_iteration)
         self.losses = LossWatch(self.log.loss)
         self.clock = Stopwatch()

@@ -41,7 +41,7 @@ def divided(logits: Tensor, parts: Tensor) -> tuple[Tensor, Tensor]:
 
     logits: (n,) of the Gaussians before; parts: (n,) int64 from 1 to MOST_PARTS. Returns float64. With N parts, the
     opacity o becomes p = 1 - (1 - o)^(1/N), and scales are multiplied by o / sum_{k=1..N} C(N, k) (-1)^(k+1) p^k /
-    sqrt(k) (paper, section 3.3 and its supplement; its double sum, with the inner binomials added up). So in the
+    sqrt(k) (the paper's rule of relocation; its double sum, with the inner binomials added up). So in the
     middle the parts together are as opaque as the one was, and along any line through it they hide as much in total.
     """
     before = logits.to(torch.float64).clamp_max(_MOST_LOGIT)

@@ -10,7 +10,7 @@ from tqdm import tqdm
 
 from gaussian_renderer import render
 from gaussian_renderer.scored_views import ScoredViews
-from records.what_to_try import CAP, PLANNED, STRATEGY, what_to_try
+from records.what_to_try import BUDGET, CAP, PLANNED, STRATEGY, what_to_try
 from scene import Scene
 from scene.cameras import Camera
 from scene.gaussian_model import GaussianModel
@@ -18,6 +18,7 @@ from training.objective import Losses
 from training.observer import Error, Observer
 from training.run import Run
 from training.step import Step
+from training.strategies.budget import default_budget
 from utils.image_utils import as_float, pixels_that_count, psnr
 from utils.loss_utils import l1_loss
 
@@ -71,8 +72,11 @@ class Report(Observer):
         if self._writer:
             self._writer.close()
         log, opt = self._run.log, self._run.opt
-        capped = opt.strategy == "adc" and opt.max_num_splats  # the others are meant to reach their number
-        log.note(**{PLANNED: opt.iterations, STRATEGY: opt.strategy}, **({CAP: opt.max_num_splats} if capped else {}))
+        options = {PLANNED: opt.iterations, STRATEGY: opt.strategy}
+        if opt.strategy == "adc":  # the others are meant to reach their number
+            budget = default_budget(self._run.scene.getTrainCameras())
+            options |= {CAP: opt.max_num_splats} if opt.max_num_splats else {BUDGET: budget}
+        log.note(**options)
         if sentences := what_to_try(self._run.rows, log.records):
             log.tell(*sentences)
 

@@ -10,7 +10,7 @@ from scene.pictures.store import ImageStore
 from training.pacing.clocked import Clocked
 from training.pacing.pace import Block, Pace, Paced, Schedule
 from training.pacing.resolution import PYRAMID, Levels, Resolution
-from training.pacing.schedule_file import NAME, read_schedule
+from training.pacing.schedule_file import NAME, covers, read_schedule
 from training.pacing.spectrum import levels_of
 from utils.system_utils import UserError
 
@@ -37,7 +37,7 @@ def _chosen(opt: argparse.Namespace, checkpoint: str | None, first_iteration: in
         return Paced(_recorded(Path(opt.schedule), opt))
     path = Path(checkpoint).parent / NAME if checkpoint else None
     if not opt.time_budget:
-        if path and path.exists():
+        if path and covers(path, first_iteration):
             _tell_of_budget(checkpoint, first_iteration, opt.iterations)
         return Pace(opt.iterations)
     if not path:

@@ -1,6 +1,7 @@
 """schedule.json: how a run with --time_budget went through its schedule, so that another one can do the same."""
 
 import math
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +29,28 @@ def read_schedule(path: Path, remedy: str = f"name the {NAME} of a run with --ti
 
 def _reason(error: Exception) -> str:
     return f"{error} is missing" if isinstance(error, KeyError) else str(error)
+
+
+def leave_schedule(folder: Path, iteration: int) -> None:
+    """Let the schedule of a folder end with an iteration, from which a run without a pace goes on; 0: remove it.
+
+    Checkpoints up to there keep their place in it. A broken file stays as it is.
+    """
+    path = folder / NAME
+    if not iteration:
+        return path.unlink(missing_ok=True)
+    with suppress(UserError):
+        found = read_schedule(path)
+        if found.blocks[-1].last >= iteration:
+            write_schedule(path, Paced(found).up_to(iteration))
+
+
+def covers(path: Path, iteration: int) -> bool:
+    """Whether an iteration was one of the run of a schedule; True for a broken file, False without one."""
+    try:
+        return path.exists() and read_schedule(path).blocks[-1].last >= iteration
+    except UserError:
+        return True
 
 
 def _schedule(content: Any) -> Schedule:

@@ -5,11 +5,14 @@ splits and for clones. --split long_axis splits along the longest axis (scene/ga
 """
 
 import argparse
+import sys
 
 from torch import Tensor
+from tqdm import tqdm
 
 from scene.gaussian_model import GaussianModel
 from scene.gaussians import density_rules as rules
+from training.checks import late_reset
 from training.density import DensityControl
 from training.step import Step
 from utils.system_utils import UserError
@@ -31,6 +34,7 @@ class AdaptiveDensityControl(DensityControl):
         self._white_background = white_background
         self._extent = extent
         self.absolute_gradients = opt.absgrad
+        self.ends = opt.densify_until_iter
         self.most_gaussians = opt.max_num_splats
 
     def changes(self, iteration: int) -> bool:
@@ -49,6 +53,8 @@ class AdaptiveDensityControl(DensityControl):
         if todo.densify:
             self._densify(step.iteration, todo.limit_size)
         if todo.reset_opacity:
+            if warning := late_reset(step.iteration, self.pace):
+                tqdm.write(warning, file=sys.stderr)
             self._gaussians.reset_opacity()
 
     def _actions(self, iteration: int) -> rules.Actions:

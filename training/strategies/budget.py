@@ -43,6 +43,7 @@ class BudgetControl(DensityControl):
     def __init__(self, run: "Run") -> None:
         self._gaussians, self._opt = run.gaussians, run.opt
         self._cameras = run.scene.getTrainCameras()
+        self.ends = run.opt.densify_until_iter
         self._scores = ErrorScores(run.gaussians, run.pipe, run.dataset.train_test_exp, run.opt)
         self.most_gaussians = run.opt.max_num_splats or default_budget(self._cameras)
 
@@ -54,7 +55,7 @@ class BudgetControl(DensityControl):
         if not self.changes(step.iteration):
             return
         self._gaussians.check_steps()  # before rows change, so that an error finds the rows of the step
-        grows = self.pace.nominal(step.iteration) > self._opt.densify_from_iter
+        grows = self._grows(step.iteration)
         aim = now = len(self._gaussians)
         if grows:
             aim = count_after(now, self.most_gaussians, self._remaining(step.iteration), self._opt.growth_power)
@@ -64,6 +65,16 @@ class BudgetControl(DensityControl):
             if aim > len(self._gaussians):
                 split_in_two(self._gaussians, self._chosen(step, aim - len(self._gaussians)))
             fade(self._gaussians, self._opt.opacity_decay)
+
+    def most_after(self, count: int, first: int, last: int) -> int:
+        for iteration in filter(self.changes, range(first, last)):  # the last iteration takes no step
+            if self._grows(iteration):
+                aim = count_after(count, self.most_gaussians, self._remaining(iteration), self._opt.growth_power)
+                count = min(aim, 2 * count)
+        return count
+
+    def _grows(self, iteration: int) -> bool:
+        return self.pace.nominal(iteration) > self._opt.densify_from_iter
 
     def _remaining(self, iteration: int) -> int:
         """How many densifications follow that of this iteration, at its pace."""

@@ -31,6 +31,7 @@ class MarkovChain(DensityControl):
         self._opt = opt
         self.most_gaussians = opt.max_num_splats or MOST_GAUSSIANS
         self.penalty = Penalty(opt.mcmc_opacity_reg, opt.mcmc_scale_reg)
+        self.ends = opt.mcmc_until_iter
 
     def started(self) -> None:
         """Make Gaussians more opaque and smaller than adaptive density control wants them (as the authors' release)."""
@@ -42,20 +43,25 @@ class MarkovChain(DensityControl):
         stride = self.pace.stride(iteration)
         return within and iteration % rules.interval(opt, opt.mcmc_until_iter, stride) == 0
 
+    def most_after(self, count: int, first: int, last: int) -> int:
+        for _ in filter(self.changes, range(first, last + 1)):
+            count = max(count, self._grown(count))
+        return count
+
     def after_backward(self, step: Step, package: dict[str, Tensor]) -> None:
         if self.changes(step.iteration):
             self._relocate(step.iteration)
             self._grow(step.iteration)
 
     def after_step(self, step: Step) -> None:
-        """Add the noise (paper, section 3.2)."""
+        """Add the noise of the random walk (the paper's update by Langevin dynamics)."""
         opt = self._opt
         rate = self._gaussians.position_rate * opt.mcmc_noise
         gate = opt.mcmc_gate_steepness, opt.mcmc_gate_opacity
         self._gaussians.add_noise(rate, *gate, seed=opt.seed, iteration=step.iteration)
 
     def _relocate(self, iteration: int) -> None:
-        """Move what nobody sees (paper, section 3.3)."""
+        """Move what nobody sees (the paper's relocation of dead Gaussians)."""
         least, parts, seed = self._opt.mcmc_min_opacity, self._opt.mcmc_parts, self._opt.seed
         dead = self._gaussians.relocate(least, parts, seed=seed, iteration=iteration)
         if dead == len(self._gaussians):
@@ -65,9 +71,13 @@ class MarkovChain(DensityControl):
             )
 
     def _grow(self, iteration: int) -> None:
-        """Grow by a part of the number of Gaussians (paper, section 3.3), at least by one."""
+        """Grow to `_grown`."""
         count, opt = len(self._gaussians), self._opt
-        grown = max(int((1 + opt.mcmc_growth) * count), count + (opt.mcmc_growth > 0))
-        new = min(grown, self.most_gaussians) - count
+        new = self._grown(count) - count
         if new > 0:
             self._gaussians.grow(new, opt.mcmc_parts, seed=opt.seed, iteration=iteration)
+
+    def _grown(self, count: int) -> int:
+        """The number after a growth: more by a part of it (the paper's rule of adding Gaussians), at least by one."""
+        growth = self._opt.mcmc_growth
+        return min(max(int((1 + growth) * count), count + (growth > 0)), self.most_gaussians)

@@ -43,7 +43,7 @@ def add_noise_(
     iteration: int,
     stopped: Tensor | None = None,
 ) -> None:
-    """Moves Gaussians at random (Kheradmand et al. 2024, section 3.2): each mean by size g C n.
+    """Moves Gaussians at random (Kheradmand et al. 2024): each mean by size g C n.
 
     C is the covariance (N, 3, 3), n (N, 3) standard normal, g = 1 / (1 + exp(steepness (o - threshold))) with the
     opacity o. means (N, 3), log_scales (N, 3), rotations (N, 4) wxyz of any length and opacity logits (N, 1): float32;
