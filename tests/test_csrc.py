@@ -28,12 +28,20 @@ GRADIENTS = (
     "(Tensor means, Tensor means2d, Tensor opacities, Tensor scales, Tensor rotations, Tensor cov3d, Tensor colors, "
     "Tensor sh_dc, Tensor sh_rest)"
 )
+STEP = (
+    "Tensor radii, int[] attributes, Tensor(g!)[] exp_avg, Tensor(h!)[] exp_avg_sq, Tensor(i!)[] steps, float[] rates, "
+    "float beta1, float beta2, float eps, int[] columns, bool sparse, Tensor(j!)? max_radii=None, "
+    "Tensor(k!)? gradient_sums=None, Tensor(l!)? views=None, Tensor? loss=None, Tensor(m!)? stopped=None, "
+    "int iteration=0, Tensor? now=None, bool absolute=False, float opacity_penalty=0., float scale_penalty=0."
+)
+ROWS = "Tensor splats, Tensor tile_counts, Tensor rows, Tensor counts"
 SCHEMAS = [
     f"project({SCENE}) -> (Tensor splats, Tensor depths, Tensor rects, Tensor tile_counts, Tensor radii)",
     "bin(Tensor splats, Tensor depths, Tensor rects, Tensor tile_counts, int height, int width, bool train) -> "
     "(Tensor instances, Tensor ranges, Tensor splat_slots, Tensor slots)",
     "blend(Tensor splats, Tensor instances, Tensor ranges, Tensor background, int height, int width, "
-    "bool inverse_depth, bool train) -> (Tensor color, Tensor transmittance, Tensor inverse_depth, Tensor last)",
+    "bool inverse_depth, bool train) -> (Tensor color, Tensor transmittance, Tensor inverse_depth, Tensor last, "
+    "Tensor layers)",
     f"blend_vjp({BACKWARD}) -> Tensor moments",
     f"project_vjp({SCENE}, Tensor tile_counts, Tensor moments, bool[9] wanted) -> {GRADIENTS}",
     f"rasterize(Tensor means2d, {SCENE}, Tensor background, bool inverse_depth, bool train, bool absolute=False) -> "
@@ -41,11 +49,10 @@ SCHEMAS = [
     "Tensor instances, Tensor ranges, Tensor splat_slots, Tensor slots, Tensor last, Tensor layers)",
     f"rasterize_vjp({SCENE}, {BACKWARD}, Tensor tile_counts, Tensor layers, bool[9] wanted, bool absolute=False) -> "
     f"{GRADIENTS}",
-    f"rasterize_vjp_step_({STEPPED_SCENE}, {BACKWARD}, Tensor tile_counts, Tensor layers, Tensor radii, "
-    "int[] attributes, Tensor(g!)[] exp_avg, Tensor(h!)[] exp_avg_sq, Tensor(i!)[] steps, float[] rates, float beta1, "
-    "float beta2, float eps, int[] columns, bool sparse, Tensor(j!)? max_radii=None, "
-    "Tensor(k!)? gradient_sums=None, Tensor(l!)? views=None, Tensor? loss=None, Tensor(m!)? stopped=None, "
-    "int iteration=0, Tensor? now=None, bool absolute=False, float opacity_penalty=0., float scale_penalty=0.) -> ()",
+    f"blend_rows({BACKWARD}, Tensor layers, bool absolute=False) -> (Tensor rows, Tensor counts)",
+    f"rows_vjp({SCENE}, {ROWS}, bool[9] wanted, bool absolute=False) -> {GRADIENTS}",
+    f"rasterize_vjp_step_({STEPPED_SCENE}, {BACKWARD}, Tensor tile_counts, Tensor layers, {STEP}) -> ()",
+    f"rows_vjp_step_({STEPPED_SCENE}, {ROWS}, {STEP}) -> ()",
     "step_now_(Tensor(a!) now, int[] attributes, Tensor(b!)[] steps, float[] rates, float beta1, float beta2, "
     "float eps, bool sparse, int iteration) -> ()",
     "mark_visible(Tensor means, Tensor view) -> Tensor",

@@ -26,6 +26,7 @@ def sound_calls() -> dict[str, Call]:
     state = [splats, instances, ranges, *slots, background, last, transmittance]
     layers = torch.zeros(5 * 256)  # as a GPU makes them of few instances
     planes = [torch.ones_like(image), torch.ones_like(transmittance), torch.ones_like(plane)]
+    rows = ops.blend_rows(*state, *planes, layers)
     wanted = [True, True, True, True, True, False, False, True, True]
     lists = [[torch.rand(3, 3), torch.rand(2, 5)] for _ in range(4)]
     guard = [torch.rand(()), torch.zeros(1, dtype=torch.int64), 3]
@@ -40,6 +41,9 @@ def sound_calls() -> dict[str, Call]:
         "bin": (ops.bin, [splats, depths, rects, counts, height, width, True]),
         "blend": (ops.blend, [splats, instances, ranges, background, height, width, True, True]),
         "blend_vjp": (ops.blend_vjp, [*state, *planes]),
+        "blend_rows": (ops.blend_rows, [*state, *planes, layers, True]),
+        "rows_vjp": (ops.rows_vjp, [*scene, splats, counts, *rows, wanted]),
+        "rows_vjp_step_": (ops.rows_vjp_step_, [*scene, splats, counts, *rows, *_step(raw), *guard]),
         "project_vjp": (ops.project_vjp, [*scene, counts, ops.blend_vjp(*state, *planes), wanted]),
         "rasterize": (ops.rasterize, [torch.zeros(3, 3), *scene, background, True, True]),
         "rasterize_vjp": (ops.rasterize_vjp, [*scene, *state, *planes, counts, layers, wanted]),
@@ -73,7 +77,7 @@ def sound_calls() -> dict[str, Call]:
 
 
 def _step(raw: dict[str, Tensor]) -> list:
-    """The arguments of `rasterize_vjp_step_` from `radii` to the statistics."""
+    """The arguments of `rasterize_vjp_step_` and `rows_vjp_step_` from `radii` to the statistics."""
     count = len(raw["means"])
     averages = [[torch.rand_like(value) for value in raw.values()] for _ in range(2)]
     counters = [torch.tensor(float(place)) for place in range(6)]

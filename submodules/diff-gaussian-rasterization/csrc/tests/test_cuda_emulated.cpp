@@ -7,6 +7,7 @@
 #include "front_first.cuh"
 #include "long_lists.h"
 #include "math/step_now.h"
+#include "rows_run.h"
 #include "step_run.h"
 
 namespace {
@@ -507,6 +508,41 @@ void emulated_gradients(const gs::Queue& queue, const Rendered& r, const gs::Sce
   gs::cuda::rasterize_vjp(queue, r.scene, r.input, r.backward, {take, &copy});
 }
 
+// Gradients of the emulated backward, from rows or from the lists.
+std::vector<float> gradients_from(const gs::Queue& queue, const Rendered& r, const KeptRows* rows, float* lengths) {
+  GradientRowsInMemory gradient(r.scene.count);
+  const auto take = [](void* to) { return *static_cast<const gs::SceneGradient<float>*>(to); };
+  gs::BlendGradient<float> g = r.backward;
+  g.absolute = lengths;
+  if (rows)
+    gs::cuda::rows_vjp(queue, r.scene, rows->given(r), {r.splats.data(), r.scene.image, nullptr, lengths},
+                       {take, &gradient.pointers});
+  else
+    gs::cuda::rasterize_vjp(queue, r.scene, r.input, g, {take, &gradient.pointers});
+  return gradient.memory;
+}
+
+// Rows, of the image or of bands of it, give the bits of the lists, in every order of threads, also of splats with more
+// rows than a lane adds.
+void test_rows() {
+  const auto check = [](Parameters<float> p, gs::Image image, gs::emulation::Order order, bool depth, bool layers) {
+    gs::emulation::order = order;
+    gs::emulation::Memory memory;
+    const gs::Queue queue = memory.queue();
+    check_rows(queue, scene_of(p, image, false), depth, layers,
+               [&](const Rendered& r, const KeptRows* rows, float* lengths) {
+                 return gradients_from(queue, r, rows, lengths);
+               });
+  };
+  int at = 0;
+  for (const Parameters<float>& p : scenes_for_rows())
+    for (const bool depth : {false, true})
+      for (const bool layers : {false, true}) check(p, {40, 70}, gs::emulation::kOrders[at++ % 3], depth, layers);
+  check(scenes_for_rows()[3], {120, 118}, gs::emulation::Order::shuffled, false, true);
+  const Parameters<float> p = two_long_lists(900);
+  for (const bool layers : {false, true}) check(p, {25, 40}, gs::emulation::Order::shuffled, true, layers);
+}
+
 // Moves what changes from step to step to `now`.
 void put_off(gs::GaussianStep<float>& step, gs::StepNow& now) {
   for (int a = 0; a < gs::kStepped; ++a) {
@@ -519,12 +555,12 @@ void put_off(gs::GaussianStep<float>& step, gs::StepNow& now) {
 }
 
 // Steps taken inside the backward give the bits of steps from gradients in memory, in every order of threads, and with
-// their constants in memory. A halted queue changes nothing.
+// their constants in memory, or from rows. A halted queue changes nothing.
 void test_gaussian_step() {
   for (const int64_t count : {0, 1, 33, 200})
     for (const StepCase& how : kStepCases) {
       const Stepping start{Parameters<float>(count)};
-      Stepping plain = start, fused = start;
+      Stepping plain = start, fused = start, stepped = start;
       for (int64_t iteration = 1; iteration <= 3; ++iteration) {
         gs::emulation::order = gs::emulation::kOrders[iteration % 3];
         const float gradient = iteration == 2 ? how.gradient : 1;
@@ -545,6 +581,10 @@ void test_gaussian_step() {
           CHECK(word == 0 || fused.bytes() == unchanged);
         }
         CHECK(fused.bytes() == plain.bytes());
+        const KeptRows rows = keep_rows(queue, r->input, r->backward, false);
+        gs::cuda::rows_vjp_step(queue, scene_of(stepped.values, r->scene.image, r->scene.antialiasing), rows.given(*r),
+                                {}, gaussian_step(stepped, how, *r, iteration));
+        CHECK(stepped.bytes() == plain.bytes());
       }
       CHECK(count < 200 || (fused.stopped == 2) == (how.guarded && std::isnan(how.gradient)));
       CHECK(count < 200 || fused.values.means != start.values.means);
@@ -630,6 +670,7 @@ int main() {
   test_observe();
   test_split_positions();
   test_noise();
+  test_rows();
   test_gaussian_step();
   test_given_covariances_and_colors();
   test_many_tiles();

@@ -35,6 +35,7 @@ Rows::Rows(const SceneTensors& scene, ROWS_PARAMETERS, bool absolute, bool lengt
   check_tensor(rows, "rows", scene.dtype(), scene.device(), {-1, row_values(absolute)});
   check_tensor(counts, "counts", at::kInt, scene.device(), {scene.count()});
   TORCH_CHECK(rows.size(0) <= std::numeric_limits<int32_t>::max(), rows.size(0), " rows are more than 2^31 - 1");
+  TORCH_CHECK(rows.is_cpu() || scene.dtype() == at::kFloat, kFloatAlone);
   splats_ = splats.contiguous(), counts_ = counts.contiguous();
   rows_ = (lengths ? rows : rows.narrow(1, 0, kGradientValues)).contiguous();
   if (rows.is_cpu()) check_sum();  // reading counts from a GPU waits for it
