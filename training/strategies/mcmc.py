@@ -58,7 +58,7 @@ class MarkovChain(DensityControl):
         """Move what nobody sees (paper, section 3.3)."""
         least, parts, seed = self._opt.mcmc_min_opacity, self._opt.mcmc_parts, self._opt.seed
         dead = self._gaussians.relocate(least, parts, seed=seed, iteration=iteration)
-        if dead == len(self._gaussians):
+        if dead == self._gaussians.total:
             raise UserError(
                 f"no Gaussian was left with an opacity above {least} in iteration {iteration}: the views do not agree "
                 "with the points, or show nothing but the background; check the scene, or lower --mcmc_opacity_reg"
@@ -66,7 +66,7 @@ class MarkovChain(DensityControl):
 
     def _grow(self, iteration: int) -> None:
         """Grow by a part of the number of Gaussians (paper, section 3.3), at least by one."""
-        count, opt = len(self._gaussians), self._opt
+        count, opt = self._gaussians.total, self._opt
         grown = max(int((1 + opt.mcmc_growth) * count), count + (opt.mcmc_growth > 0))
         new = min(grown, self.most_gaussians) - count
         if new > 0:
