@@ -67,7 +67,7 @@ SCHEMAS = [
     "split_positions(Tensor means, Tensor log_scales, Tensor rotations, Tensor items, int seed, int stream, "
     "int iteration, int draw) -> Tensor",
     "add_noise_(Tensor(a!) means, Tensor log_scales, Tensor rotations, Tensor logits, float size, float steepness, "
-    "float threshold, int seed, int stream, int iteration, Tensor? stopped=None) -> ()",
+    "float threshold, int seed, int stream, int iteration, Tensor? stopped=None, int first=0) -> ()",
     "penalise_(Tensor logits, Tensor log_scales, Tensor(a!) logit_gradients, Tensor(b!) log_scale_gradients, "
     "float opacity, float scale) -> ()",
 ]

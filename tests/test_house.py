@@ -24,7 +24,7 @@ MAY_IMPORT = {
     "utils": (),
     "utils.host": (),
     "utils.ranks": (),
-    "utils.exact": (),
+    "utils.exact": ("utils.ranks",),
     "utils.files": ("utils",),
     "utils.camera_utils": ("scene.cameras", "scene.views", "scene.options", "scene.pictures", "scene.readers", "utils"),
     "utils.make_depth_scale": ("scene.readers.depth_scale", "utils"),  # a command of the reference

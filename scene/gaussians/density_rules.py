@@ -13,6 +13,8 @@ from diff_gaussian_rasterization.density import split_positions
 from torch import Tensor
 
 from utils.exact.counter_rng import Stream
+from utils.ranks.ranks import ALONE, Ranks
+from utils.ranks.selection import lowest
 
 SHRINK = 0.8  # N children of a split have 1 / (0.8 N) of the parent's scale: 1 / 1.6 for two (paper, section 5.2)
 PRUNE_EXTENT = 0.1  # a Gaussian wider than this part of the scene's extent is removed, once sizes are limited
@@ -87,15 +89,13 @@ def mean_gradient(accumulated: Tensor, count: Tensor) -> Tensor:
     return torch.where(mean.isnan(), 0.0, mean)
 
 
-def limit_growth(gradient: Tensor, threshold: float, room: int) -> Tensor:
-    """Zero the gradients of all candidates (>= threshold) except the `room` largest, ties by index: (N,)."""
+def limit_growth(gradient: Tensor, threshold: float, room: int, ranks: Ranks = ALONE) -> Tensor:
+    """Zero the gradients of all ranks' candidates (>= threshold) except the `room` largest, ties by index: (N,)."""
     candidates = (gradient >= threshold).nonzero().reshape(-1)
-    if len(candidates) <= room:
+    if ranks.before(len(candidates))[1] <= room:
         return gradient
-    order = torch.argsort(gradient[candidates], descending=True, stable=True)
-    limited = gradient.clone()
-    limited[candidates[order[max(room, 0) :]]] = 0.0
-    return limited
+    grow = candidates[lowest(gradient[candidates], room, ranks, highest=True)]
+    return gradient.index_fill(0, candidates, 0.0).index_copy_(0, grow, gradient[grow])
 
 
 def is_small(scaling: Tensor, limit: float) -> Tensor:

@@ -41,10 +41,10 @@ def append_rows(groups: list[Group], states: States, rows: dict[str, Tensor]) ->
         return torch.cat((values, values.new_zeros(len(new), *values.shape[1:]) if is_state else new))
 
     try:
-        return _change_rows(groups, states, grow)
+        return map_rows(groups, states, grow)
     except (MemoryError, RuntimeError) as error:
         if is_out_of_memory(error):
-            _change_rows(groups, states, lambda values, *_: values[:count])
+            map_rows(groups, states, lambda values, *_: values[:count])
         raise
 
 
@@ -64,7 +64,7 @@ def keep_rows(groups: list[Group], states: States, indices: Tensor) -> dict[str,
             errors.append(error)
             return _move_up(values, indices)
 
-    params = _change_rows(groups, states, select)
+    params = map_rows(groups, states, select)
     if errors:
         raise errors[0]
     return params
@@ -100,10 +100,13 @@ def overwrite_rows(groups: list[Group], states: States, indices: Tensor, rows: d
     restart_rows(groups, states, indices)
 
 
-def _change_rows(
+def map_rows(
     groups: list[Group], states: States, change: Callable[[Tensor, str, bool], Tensor]
 ) -> dict[str, nn.Parameter]:
-    """Map all parameters and averages; `change` takes values, the group's name, and whether they are averages."""
+    """Map all parameters and averages; `change` takes values, the group's name, and whether they are averages.
+
+    Returns the new parameters by name, without gradient.
+    """
     params = {}
     for group in groups:
         name = group.get("name")

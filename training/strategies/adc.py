@@ -72,7 +72,7 @@ class AdaptiveDensityControl(DensityControl):
             max_splats=self._opt.max_num_splats,
             long_axis=self._opt.split == "long_axis",
         )
-        if len(self._gaussians) == 0:
+        if self._gaussians.total == 0:
             raise UserError(
                 f"no Gaussian was left after the densification of iteration {iteration}: the views do not agree "
                 "with the points, or show nothing but the background; check the scene, or raise "

@@ -192,6 +192,7 @@ struct NoiseInput {
   uint64_t seed;
   uint32_t iteration, stream;
   const int64_t* stopped;  // or null
+  int64_t first = 0;       // index of the first one, which decides its random numbers
 };
 
 // Weights of a Gaussian's opacity and of each of its scales in the loss (math/penalty.h).
