@@ -32,6 +32,7 @@ from utils.exact.counter_rng import Stream, uniform
 from utils.general_utils import get_expon_lr_func
 from utils.host.interrupt import DeferredInterrupt
 from utils.host.process import seconds_since_start
+from utils.ranks.ranks import ranks
 from utils.system_utils import compute_device
 
 SH_INTERVAL = 1000  # iterations between raises of the active SH degree
@@ -61,6 +62,7 @@ class Run:
         self.pace = pace_of(opt, plan.start, self.first_iteration)
         warn_of_late_reset(opt, dataset.white_background, self.pace)
         self.gaussians = GaussianModel(dataset.sh_degree, opt.optimizer_type)
+        self.gaussians.divide(ranks())
         init_ply = option(dataset, "init_ply")
         if init_ply and not plan.start:
             self.scene, self._first = scene_with(init_ply, dataset, self.gaussians)
@@ -83,7 +85,7 @@ class Run:
             opt.depth_l1_weight_init, opt.depth_l1_weight_final, max_steps=opt.iterations
         )
         self.density.pace = self.pace
-        warn_of_fewer(self.density, opt, len(self.gaussians), self.first_iteration + 1)
+        warn_of_fewer(self.density, opt, self.gaussians.total, self.first_iteration + 1)
         if from_points:
             self.density.started()
 

@@ -8,6 +8,7 @@ from training.run import Run
 from training.steps.ahead import AheadStep
 from training.steps.fused import FusedStep
 from training.steps.plain import PlainStep
+from utils.ranks.ranks import ranks
 
 Taker: TypeAlias = PlainStep | FusedStep | AheadStep
 
@@ -20,4 +21,5 @@ def step_taker(run: Run) -> Taker:
     """
     if run.plan.plain_step or torch.is_anomaly_enabled() or not FusedStep.suits(run):
         return PlainStep(run)
-    return AheadStep(run) if run.device.type == "cuda" else FusedStep(run)
+    runs_ahead = run.device.type == "cuda" and not ranks().several  # ranks tell each other numbers in each step
+    return AheadStep(run) if runs_ahead else FusedStep(run)
