@@ -31,6 +31,7 @@ from utils.exact.counter_rng import Stream, uniform
 from utils.general_utils import get_expon_lr_func
 from utils.host.interrupt import DeferredInterrupt
 from utils.host.process import seconds_since_start
+from utils.ranks.ranks import ranks
 from utils.system_utils import compute_device
 
 SH_INTERVAL = 1000  # iterations between raises of the active SH degree
@@ -56,10 +57,12 @@ class Run:
         self.lost = 0
         self.interrupt = DeferredInterrupt()
         self.device = compute_device()
-        capture, self.first_iteration = load_checkpoint(plan.start, self.device) if plan.start else (None, 0)
+        place = "cpu" if ranks().several else self.device  # a rank keeps a part
+        capture, self.first_iteration = load_checkpoint(plan.start, place) if plan.start else (None, 0)
         self.pace = pace_of(opt, plan.start, self.first_iteration)
         warn_of_late_reset(opt, dataset.white_background)
         self.gaussians = GaussianModel(dataset.sh_degree, opt.optimizer_type)
+        self.gaussians.divide(ranks())
         init_ply = option(dataset, "init_ply")
         if init_ply and not plan.start:
             self.scene, self._first = scene_with(init_ply, dataset, self.gaussians)
