@@ -170,7 +170,8 @@ class GaussianModel(Exposed, RelocatingGaussians):
 
     def take_marks(self) -> list[tuple[str, list[int] | list[str], int]]:
         """Values whose step a guard held back: name of the tensor, its rows or photos, and number of all rows."""
-        marks = [(name, rows.tolist(), len(self)) for name, rows in self.optimizer.take_marks().items()]
+        rows_of = self.shards.together(self.optimizer.take_marks(), self._attributes)
+        marks = [(name, rows.tolist(), self.total) for name, rows in rows_of.items()]
         for name, rows in self.exposures.optimizer.take_marks().items():
             marks.append((name, [self.exposures.names[row] for row in rows.tolist()], len(self.exposures.names)))
         return marks
@@ -243,7 +244,7 @@ class GaussianModel(Exposed, RelocatingGaussians):
     def check_finite(self, iteration: int) -> None:
         """UserError for a parameter that is not finite; call it before anything of this iteration is saved."""
         remedy = "nothing of this iteration was saved; lower the learning rates, or resume from an earlier checkpoint"
-        check_finite(raw_rows(self), f"iteration {iteration}", remedy)
+        check_finite(raw_rows(self), f"iteration {iteration}", remedy, self.shards)
         self.exposures.check_finite(f"iteration {iteration}", remedy)
 
 

@@ -1,5 +1,6 @@
 """Models whose rows are divided among ranks: the files of one process, after any change of rows."""
 
+import math
 import zipfile
 import zlib
 from collections.abc import Callable
@@ -16,13 +17,15 @@ from torch import Tensor
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.checkpoint import load_checkpoint, save_checkpoint
 from scene.gaussians.density_rules import logit
+from scene.gaussians.sh_bands import cut_bounds
 from training.strategies.adc import AdaptiveDensityControl
 from training.strategies.budget import BudgetControl
 from training.strategies.mcmc import MarkovChain
 from utils.ranks.ranks import ranks
+from utils.system_utils import UserError
 
 EXTENT, THRESHOLD = 2.0, 2e-4
-ITERATIONS = (600, 700, 3000, 3100)  # densifications; in the last two, opacities are reset and sizes limited
+ITERATIONS = (599, 600, 650, 700, 2999, 3000, 3001, 3100, 3101)  # opacities are reset in 3000, sizes limited in 3100
 
 
 class Client(GaussianModel):
@@ -81,7 +84,7 @@ def _limited(gaussians: GaussianModel) -> None:
 
 def _by_hand(gaussians: GaussianModel) -> None:
     """Steps one by one, with radii and a seed of torch's, and statistics that stay."""
-    _adc(gaussians, 550)
+    _adc(gaussians, 549, 550)
     gaussians.prune_points(_random(gaussians, "pruned") < -1)
     gaussians.tmp_radii = gaussians.shards.items(torch.arange(len(gaussians)))
     torch.manual_seed(5)
@@ -93,11 +96,11 @@ def _by_hand(gaussians: GaussianModel) -> None:
 
 def _emptied(gaussians: GaussianModel) -> None:
     """All rows of the first ranks are removed, then some rows are added, then nothing is."""
-    _adc(gaussians, 550)
+    _adc(gaussians, 549, 550)
     with torch.no_grad():
         first = gaussians.shards.items(torch.arange(len(gaussians))) < 0.8 * gaussians.total
         gaussians.raw("opacity")[first] = -9.0
-    _adc(gaussians, 600)
+    _adc(gaussians, 600, 601)
     _adc(gaussians, 700, densify_grad_threshold=1e6)
 
 
@@ -156,7 +159,20 @@ SCENARIOS: dict[str, Scenario] = {
 RESUMED = ("adc", "few", "mcmc")  # from the files of one process, and trained further
 
 
-def _run(folder: Path, start: Path) -> dict[str, tuple[int, int, int]]:
+def _told(gaussians: GaussianModel) -> list[object]:
+    """What is said of a whole model, some of whose values are then broken."""
+    told: list[object] = [cut_bounds(gaussians.raw("f_rest").detach(), gaussians.shards.ranks), gaussians.ply_bytes]
+    with torch.no_grad():
+        some = _random(gaussians, "broken") > 1
+        gaussians.raw("scaling")[some] = math.nan
+        gaussians.optimizer.state[gaussians.raw("opacity")]["exp_avg"][some] = math.nan
+    told.append(gaussians.take_marks())
+    with pytest.raises(UserError) as error:
+        gaussians.check_finite(7)
+    return [*told, str(error.value)]
+
+
+def _run(folder: Path, start: Path) -> tuple[dict[str, tuple[int, int, int]], list[object]]:
     """Write checkpoints and PLYs after each scenario, and after resuming some of one process."""
     shapes = {}
     for name, (count, kind, change, changes) in SCENARIOS.items():
@@ -168,11 +184,12 @@ def _run(folder: Path, start: Path) -> dict[str, tuple[int, int, int]]:
         gaussians.divide(ranks())
         gaussians.restore(load_checkpoint(start / name / "chkpnt7.pth")[0], options())
         _save(gaussians, folder / f"{name}, resumed")
-        _adc(gaussians, 900)
+        _adc(gaussians, 899, 900, 901)
         shapes[f"{name}, further"] = _save(gaussians, folder / f"{name}, further")
+        told = _told(gaussians)
         gaussians.load_ply(start / name / "point_cloud.ply")
         gaussians.part(_random(gaussians, "part") < 0.5, 0).save_ply(folder / f"{name}, resumed" / "part.ply")
-    return shapes
+    return shapes, told
 
 
 def _save(gaussians: GaussianModel, folder: Path) -> tuple[int, int, int]:
@@ -197,8 +214,9 @@ def alone(tmp_path_factory):
 
 @pytest.mark.parametrize("size", [2, 3])
 def test_ranks_together_write_the_files_of_one_process(alone, tmp_path, size):
-    folder, shapes = alone
-    every = in_ranks(size, _run, tmp_path, folder)
+    folder, (shapes, told) = alone
+    every, others = zip(*in_ranks(size, _run, tmp_path, folder), strict=True)
+    assert others == (told,) * size
     for name, (_, _, total) in shapes.items():
         bounds = [rank * total // size for rank in range(size + 1)]
         assert [rank[name] for rank in every] == [(a, b - a, total) for a, b in pairwise(bounds)], name
@@ -210,7 +228,9 @@ def test_ranks_together_write_the_files_of_one_process(alone, tmp_path, size):
 
 def test_the_scenarios_change_rows(alone):
     """Each in another way, so that none is in vain."""
-    folder, shapes = alone
+    folder, (shapes, _) = alone
     totals = {name: total for name, (_, _, total) in shapes.items()}
     assert all(total > 0 for total in totals.values()), totals
     assert all(totals[name] != count for name, (count, *_) in SCENARIOS.items() if name != "one"), totals
+    averages = load_checkpoint(folder / "adc" / "chkpnt7.pth")[0][10]["state"]
+    assert len(averages) == 6 and all(state["exp_avg"].any() for state in averages.values())

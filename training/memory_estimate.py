@@ -28,11 +28,14 @@ def announce_memory(scene: Scene, gaussians: GaussianModel, max_splats: int, abs
     """
     images, device = scene.images, gaussians.get_xyz.device
     pixels = max(camera.image_width * camera.image_height for camera in scene.getTrainCameras())
-    now = len(gaussians)
+    now, size = gaussians.total, gaussians.shards.ranks.size
     later = max(max_splats, now) if max_splats else GROWTH * now
     why = "--max_num_splats" if max_splats else f"scenes often grow {GROWTH}-fold"
-    at_start, at_end = (training_bytes(gaussians, count, pixels, absolute) for count in (now, later))
+    sizes = (-(-count // size) for count in (now, later))
+    at_start, at_end = (training_bytes(gaussians, count, pixels, absolute) for count in sizes)
     training = f"training {gib(at_start)} with {now:,} Gaussians, {gib(at_end)} with {later:,} ({why})"
+    if size > 1:
+        training += f" for each of {size} processes"
     pictures = images.planned_bytes
     photos = f"photos {gib(pictures)}"
     if images.limit:

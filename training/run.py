@@ -58,7 +58,8 @@ class Run:
         self.lost = 0
         self.interrupt = DeferredInterrupt()
         self.device = compute_device()
-        capture, self.first_iteration = load_checkpoint(plan.start, self.device) if plan.start else (None, 0)
+        place = "cpu" if ranks().several else self.device  # a rank keeps a part
+        capture, self.first_iteration = load_checkpoint(plan.start, place) if plan.start else (None, 0)
         self.pace = pace_of(opt, plan.start, self.first_iteration)
         warn_of_late_reset(opt, dataset.white_background, self.pace)
         self.gaussians = GaussianModel(dataset.sh_degree, opt.optimizer_type)

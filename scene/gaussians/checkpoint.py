@@ -129,13 +129,16 @@ def _reason(temporary: Path) -> OSError:
 
 
 def load_checkpoint(path: str | os.PathLike, device: torch.device | str = "cpu") -> tuple[tuple, int]:
-    """Read (capture, iteration), ours or the reference's. UserError for any other file."""
+    """Read (capture, iteration), ours or the reference's. UserError for any other file.
+
+    Where several ranks read it, tensors on the CPU stay in the file until somebody reads a part of them.
+    """
     _refuse_other_kinds(path)
     try:
         _refuse_other_formats(path)
         _refuse_damaged(path)
         with torch.serialization.safe_globals(_ALLOWED):
-            content = torch.load(path, map_location=device, weights_only=True)
+            content = torch.load(path, map_location=device, weights_only=True, mmap=ranks().several)
     except UserError:
         raise
     except Exception as error:  # a damaged file can raise any exception in the unpickler

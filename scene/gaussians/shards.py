@@ -1,8 +1,11 @@
 """Place of a model's rows among those of all ranks, which together are the rows of one process, in its order."""
 
+from collections.abc import Iterable
+
 import torch
 from torch import Tensor
 
+from utils.host.device import compute_device
 from utils.ranks.ranks import ALONE, Ranks
 
 _PART, _RANK = 43, 32  # bits of a key below the number of a part, and below the rank or piece in it
@@ -32,6 +35,10 @@ class Shards:
     def items(self, indices: Tensor) -> Tensor:
         """Indices (n,) among all rows, of those of this rank."""
         return indices
+
+    def together(self, found: dict[str, Tensor], names: Iterable[str]) -> dict[str, Tensor]:
+        """Indices (n,) among all rows that any rank has found, by some of the names; of those without any nothing."""
+        return found
 
     def begin(self, count: int, device: torch.device) -> bool:
         """Begin a change of `count` rows, unless one goes on. Returns whether to divide the rows anew after it."""
@@ -80,6 +87,11 @@ class Divided(Shards):
 
     def items(self, indices: Tensor) -> Tensor:
         return indices + self.first
+
+    def together(self, found: dict[str, Tensor], names: Iterable[str]) -> dict[str, Tensor]:
+        none = torch.empty(0, dtype=torch.int64, device=compute_device())
+        every = {name: self.ranks.gather(self.items(found.get(name, none))) for name in names}
+        return {name: rows for name, rows in every.items() if len(rows)}
 
     def begin(self, count: int, device: torch.device) -> bool:
         if self.keys is not None:

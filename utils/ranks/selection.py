@@ -1,4 +1,4 @@
-"""Selections among the values of all ranks, which follow each other in the order of ranks."""
+"""Selections among the values of all ranks, which follow each other in the order of ranks, and sums."""
 
 import torch
 from torch import Tensor
@@ -26,3 +26,8 @@ def largest(values: Tensor, ranks: Ranks = ALONE) -> Tensor:
     if ranks.several:
         values = ranks.gather(values.amax(0, keepdim=True) if len(values) else values)
     return values.max()
+
+
+def summed(mask: Tensor, ranks: Ranks = ALONE) -> int:
+    """How many values of all ranks' masks (n,) bool are true."""
+    return ranks.before(int(mask.sum()))[1]
