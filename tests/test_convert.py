@@ -341,8 +341,10 @@ def test_ctrl_c_ends_the_program_that_works(tmp_path):
     told = tmp_path / "pid"
 
     def interrupt() -> None:
-        wait_for(lambda: told.is_file() and told.read_text())
-        os.kill(os.getpid(), signal.SIGINT)
+        try:
+            wait_for(lambda: told.is_file() and told.read_text())
+        finally:
+            os.kill(os.getpid(), signal.SIGINT)
 
     threading.Thread(target=interrupt).start()
     with pytest.raises(KeyboardInterrupt):
