@@ -9,8 +9,6 @@ import stat
 import subprocess
 import sys
 import threading
-import time
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -21,6 +19,7 @@ import pytest
 from photo_room import FOCAL, SIZE, camera_centers, make_photos
 from PIL import Image
 from synthetic import folder_state
+from waiting import LIMIT, wait_for
 
 import convert
 from conversion import programs, report
@@ -338,12 +337,20 @@ def test_looks_into_the_database(copy):
 
 
 def test_ctrl_c_ends_the_program_that_works(tmp_path):
-    script = "import os, sys, time; open(sys.argv[1], 'w').write(str(os.getpid())); time.sleep(60)"
-    threading.Timer(1.0, os.kill, (os.getpid(), signal.SIGINT)).start()
+    script = "import os, sys, time; open(sys.argv[1], 'w').write(str(os.getpid())); time.sleep(600)"
+    told = tmp_path / "pid"
+
+    def interrupt() -> None:
+        try:
+            wait_for(lambda: told.is_file() and told.read_text())
+        finally:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    threading.Thread(target=interrupt).start()
     with pytest.raises(KeyboardInterrupt):
-        run_programs([[sys.executable, "-c", script, str(tmp_path / "pid")]], tmp_path / "log", "Waiting", 1, lambda: 0)
+        run_programs([[sys.executable, "-c", script, str(told)]], tmp_path / "log", "Waiting", 1, lambda: 0)
     with pytest.raises(ProcessLookupError):
-        os.kill(int((tmp_path / "pid").read_text()), 0)
+        os.kill(int(told.read_text()), 0)
 
 
 def _killed_while(tmp_path: Path, command: list[str]) -> None:
@@ -354,7 +361,7 @@ def _killed_while(tmp_path: Path, command: list[str]) -> None:
     )
     log = tmp_path / "log"
     caller = subprocess.Popen([sys.executable, "-c", code, str(log), *command], cwd=ROOT, stderr=subprocess.DEVNULL)
-    _wait_for(lambda: log.is_file() and log.read_text().endswith("\n"))
+    wait_for(lambda: log.is_file() and log.read_text().endswith("\n"))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(programs, "_ORPHAN_PATIENCE", 0.0)
         with pytest.raises(
@@ -365,18 +372,12 @@ def _killed_while(tmp_path: Path, command: list[str]) -> None:
     caller.wait()
 
 
-def _wait_for(condition: Callable[[], bool]) -> None:
-    deadline = time.monotonic() + 20  # generous for a busy machine; usually under one second
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.02)
-
-
-def test_a_killed_caller_leaves_no_worker(tmp_path):
+def test_a_killed_caller_leaves_no_worker(tmp_path, monkeypatch):
+    monkeypatch.setattr(programs, "_ORPHAN_PATIENCE", LIMIT)
     (tmp_path / "job.json").write_text('{"step": "wait"}')
     code = (
         "import sys, time; sys.path.insert(0, 'conversion'); import worker; "
-        "worker.STEPS['wait'] = lambda job: (print('at work', flush=True), time.sleep(60)); "
+        "worker.STEPS['wait'] = lambda job: (print('at work', flush=True), time.sleep(600)); "
         "worker.main(sys.argv[1])"
     )
     _killed_while(tmp_path, [sys.executable, "-c", code, str(tmp_path / "job.json")])
@@ -385,7 +386,7 @@ def test_a_killed_caller_leaves_no_worker(tmp_path):
 
 
 def test_programs_that_outlive_a_killed_caller_are_waited_for(tmp_path, monkeypatch):
-    script = "import os, time; print(os.getpid(), flush=True); time.sleep(60)"
+    script = "import os, time; print(os.getpid(), flush=True); time.sleep(600)"
     _killed_while(tmp_path, [sys.executable, "-c", script])
     log = tmp_path / "log"
     pid = int(log.read_text())
@@ -396,6 +397,7 @@ def test_programs_that_outlive_a_killed_caller_are_waited_for(tmp_path, monkeypa
                 run(log)
     finally:
         os.kill(pid, signal.SIGKILL)
+    monkeypatch.setattr(programs, "_ORPHAN_PATIENCE", LIMIT)
     refuse_while_working(log)
 
 

@@ -1,8 +1,8 @@
 """The process that draws error_vs_time.png while the finished model is saved."""
 
+import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -103,10 +103,9 @@ def test_waiting_can_be_interrupted(tmp_path, monkeypatch):
 
     process.stdout.close()
     monkeypatch.setattr(process, "stdout", Interrupted())
-    start = time.monotonic()
     with pytest.raises(KeyboardInterrupt):
         drawer.finish()
-    assert process.returncode is not None and time.monotonic() - start < 5
+    assert process.returncode == -signal.SIGKILL  # it was not waited for
 
 
 @pytest.mark.parametrize(("cores", "begun"), [(2, 100), (16, 80)])

@@ -270,7 +270,7 @@ def test_a_place_that_cannot_be_written_is_named(tmp_path, monkeypatch, kind):
 
 def test_absurd_numbers_end_with_a_sentence_and_status_2(tmp_path):
     command = [sys.executable, "-m", "demo.make_scene", str(tmp_path / "out"), "--views", "0"]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60)
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=300)
     assert (done.returncode, done.stderr) == (2, "error: --views must be at least 3, got 0\n")
     assert not (tmp_path / "out").exists()
 

@@ -12,7 +12,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +19,7 @@ import pytest
 from matplotlib.figure import Figure
 from PIL import Image
 from synthetic import folder_state
+from waiting import LIMIT, wait_for
 
 import full_eval
 from arguments import write_cfg_args
@@ -243,9 +243,7 @@ def _start(scenes: Path, words: list[str]) -> subprocess.Popen:
     )
     process = subprocess.Popen([sys.executable, "-c", program, *words], cwd=ROOT, stderr=subprocess.PIPE, text=True,
                                start_new_session=True)  # fmt: skip
-    deadline = time.monotonic() + 60
-    while not (scenes / "attic" / "started").exists() and process.poll() is None and time.monotonic() < deadline:
-        time.sleep(0.05)
+    wait_for(lambda: (scenes / "attic" / "started").exists() or process.poll() is not None)
     return process
 
 
@@ -258,7 +256,7 @@ def test_a_checkpoint_beyond_the_iterations_is_resumed_where_the_training_decide
     process = _start(scenes, words)
     try:
         process.send_signal(signal.SIGINT)
-        said = process.communicate(timeout=30)[1]
+        said = process.communicate(timeout=2 * LIMIT)[1]
     finally:
         process.kill()
     assert process.returncode == 130, said
@@ -273,7 +271,7 @@ def test_a_signal_reaches_the_training_and_the_next_call_resumes_it(scenes, tmp_
     process = _start(scenes, words)
     try:
         os.killpg(process.pid, sent)  # to the whole group, as from a terminal on Ctrl-C or when it is closed
-        said = process.communicate(timeout=30)[1]
+        said = process.communicate(timeout=2 * LIMIT)[1]
     finally:
         process.kill()
     assert process.returncode == status, said
@@ -296,18 +294,22 @@ def test_a_second_one_is_refused_while_the_first_or_its_training_lives(scenes, t
         with pytest.raises(UserError, match=rf"\(process {process.pid}\).* is at work in .*out; wait"):
             run(*words)
         process.kill()
-        process.communicate(timeout=30)
+        process.communicate(timeout=2 * LIMIT)
         with pytest.raises(UserError, match="is at work in"):
             run(*words)  # the training has outlived it
     finally:
         process.kill()
         os.kill(trainer, signal.SIGKILL)
     (scenes / "attic" / "slow").unlink()
-    deadline, report = time.monotonic() + 30, None
-    while report is None and time.monotonic() < deadline:
+    reports = []
+
+    def released() -> bool:
         with contextlib.suppress(UserError):  # the system may take a moment to release the lock
-            report = run(*words)
-    assert report["runs"][0]["finished"]  # the remains of the first run do not block it
+            reports.append(run(*words))
+        return bool(reports)
+
+    wait_for(released)
+    assert reports[0]["runs"][0]["finished"]  # the remains of the first run do not block it
 
 
 def test_a_checkpoint_of_a_failure_is_not_gone_on_from(scenes, tmp_path, capsys):
@@ -331,7 +333,7 @@ def test_an_interrupts_checkpoint_stays_the_one_to_go_on_from(scenes, tmp_path):
     process = _start(scenes, words)
     try:
         process.send_signal(signal.SIGINT)
-        process.communicate(timeout=30)
+        process.communicate(timeout=2 * LIMIT)
     finally:
         process.kill()
     before = json.loads((out / "attic" / "full_eval.json").read_text())["stages"]["train_interrupted"]["wall_seconds"]

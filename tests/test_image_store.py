@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from waiting import wait_for
 
 import train
 from scene.pictures.decode import decode
@@ -29,33 +30,43 @@ def files(tmp_path) -> list[Path]:
 
 
 class Decodings:
-    """Counters of the calls of `decode` by file, and of the images in memory at once."""
+    """Counters of the calls of `decode` by file, and a watch on the images in memory at once.
+
+    limit: most of them, 0: any number. exceeded: whether there have been more. A thread that has decoded an image may
+    hold it for a moment after another one has dropped it, so that such a moment is waited for; no decoding ends
+    meanwhile.
+    """
 
     def __init__(self) -> None:
         self.names: list[str] = []
-        self.alive = self.most = 0
+        self.alive = self.limit = 0
+        self.exceeded = False
         self.threads: set[str] = set()
         self.seconds = 0.0
-        self._lock = threading.Lock()
+        self._begins, self._counts = threading.Lock(), threading.RLock()
 
     def __call__(self, path, size):
-        with self._lock:
+        with self._begins:
+            self._count(1)
             self.names.append(path.stem)
             self.threads.add(threading.current_thread().name)
-            self.alive += 1
-            self.most = max(self.most, self.alive)
+            try:
+                wait_for(lambda: self.exceeded or not self.limit or self.alive <= self.limit)
+            except TimeoutError:
+                self.exceeded = True
         time.sleep(self.seconds)
         try:
-            picture = decode(path, size)
+            with self._begins:
+                picture = decode(path, size)
         except BaseException:
-            self._gone()
+            self._count(-1)
             raise
-        weakref.finalize(picture, self._gone)
+        weakref.finalize(picture, self._count, -1)
         return picture
 
-    def _gone(self) -> None:
-        with self._lock:
-            self.alive -= 1
+    def _count(self, more: int) -> None:
+        with self._counts:
+            self.alive += more
 
 
 @pytest.fixture
@@ -83,7 +94,7 @@ def test_each_is_decoded_once_within_the_limit(files, decodings, limit, decoded)
 def test_decoding_ahead_gives_the_right_pictures_within_the_limit(files, decodings, limit, workers):
     store = ImageStore(limit)
     store._workers = workers
-    decodings.seconds = 0.002
+    decodings.seconds, decodings.limit = 0.002, limit
     store.plan(_pictures(files))
     order = np.random.default_rng(0)
     order = [int(i) for _ in range(4) for i in order.permutation(len(files))]
@@ -97,7 +108,7 @@ def test_decoding_ahead_gives_the_right_pictures_within_the_limit(files, decodin
         assert not limit or len(store) <= limit
     gc.collect()
     if limit:
-        assert decodings.most <= limit
+        assert not decodings.exceeded
     else:
         assert sorted(decodings.names) == [path.stem for path in files]
     if limit != 1:
@@ -109,9 +120,7 @@ def test_what_comes_next_is_decoded_meanwhile(files, decodings):
     store._workers = 2
     store.plan(_pictures(files))
     store.prefetch(_pictures(files[:3]))
-    deadline = time.monotonic() + 10
-    while len(decodings.names) < 3 and time.monotonic() < deadline:
-        time.sleep(0.001)
+    wait_for(lambda: len(decodings.names) >= 3)
     assert sorted(decodings.names) == ["0", "1", "2"]
     for path in files[:3]:
         store.get(path, SIZE)
@@ -137,10 +146,7 @@ def test_no_threads_remain_when_all_is_there(files):
         store.prefetch(_pictures(files[step : step + store.ahead]))
         store.get(path, SIZE)
     assert store.ahead == 0
-    deadline = time.monotonic() + 10
-    while (left := set(_decoders()) - set(others)) and time.monotonic() < deadline:
-        time.sleep(0.001)
-    assert not left
+    wait_for(lambda: set(_decoders()) <= set(others))
 
 
 def _decoders() -> list[threading.Thread]:

@@ -21,7 +21,7 @@ from pathlib import Path
 from utils.host.interrupt import DeferredInterrupt
 with DeferredInterrupt() as interrupt:
     print("ready", flush=True)
-    deadline = time.monotonic() + 20
+    deadline = time.monotonic() + 60
     while not interrupt.requested and time.monotonic() < deadline:
         time.sleep(0.02)
     print("saving", flush=True)

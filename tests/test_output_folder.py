@@ -17,7 +17,7 @@ ROOT = Path(__file__).parents[1]
 HOLD = (
     "import sys, time; from training.output_folder import own_folder\n"
     "with own_folder(sys.argv[1]):\n"
-    "    print('held', flush=True); time.sleep(60)"
+    "    print('held', flush=True); time.sleep(600)"
 )
 
 
@@ -68,7 +68,7 @@ def test_a_lock_whose_file_was_replaced_is_taken_anew(tmp_path, monkeypatch):
 def test_temporary_files_of_dead_processes_are_removed(tmp_path):
     dead = subprocess.Popen([sys.executable, "-c", ""])
     dead.wait()
-    living = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"])
+    living = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(600)"])
     inner = tmp_path / "point_cloud" / "iteration_7"
     inner.mkdir(parents=True)
     gone = [tmp_path / f".chkpnt200.{dead.pid}.tmp.pth", inner / f".point_cloud.{dead.pid}.tmp.ply"]

@@ -417,15 +417,18 @@ def test_tensorboard_gets_the_references_tags(colmap_scene, tmp_path, monkeypatc
 
 
 def test_seconds_leave_evaluation_and_saving_out(colmap_scene, tmp_path, monkeypatch):
+    later, clock = [0.0], time.perf_counter  # seconds that a clock of this test's own is ahead
+    monkeypatch.setattr(time, "perf_counter", lambda: clock() + later[0])
+
     def slow(*_: object) -> dict[str, float]:
-        time.sleep(0.5)
+        later[0] += 1000
         return {"test_psnr": 1.0}
 
     monkeypatch.setattr(train, "training_report", slow)
     _train(colmap_scene, tmp_path, iterations=4)
     log = json.loads((tmp_path / "train_log.json").read_text())
-    # Four evaluations take 2 s, four iterations some 20 ms; the first also loads parts of torch.
-    assert log[-1]["seconds"] - log[0]["seconds"] < 0.4
+    assert len(log) > 1 and log[-1]["seconds"] < 500
+    assert later[0] == 4000  # four evaluations
 
 
 def test_minus_one_saves_the_last_iteration_only(colmap_scene, tmp_path):

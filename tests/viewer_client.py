@@ -3,10 +3,10 @@
 import json
 import socket
 import struct
-import time
 
 import numpy as np
 import torch
+from waiting import LIMIT
 
 from scene.cameras import MiniCam
 
@@ -41,7 +41,7 @@ class Viewer:
         self.socket = socket.socket()
         if buffer:
             self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, buffer)
-        self.socket.settimeout(20)
+        self.socket.settimeout(LIMIT)
         self.socket.connect(("127.0.0.1", port))
 
     def say(self, message: object) -> None:
@@ -76,15 +76,6 @@ class Viewer:
     def leave(self) -> None:
         """Close the connection."""
         self.socket.close()
-
-
-def wait_for(condition, seconds: float = 20.0) -> None:
-    """Wait until a condition holds; TimeoutError if it never does."""
-    end = time.monotonic() + seconds
-    while not condition():
-        if time.monotonic() > end:
-            raise TimeoutError
-        time.sleep(0.002)
 
 
 def as_bytes(image: torch.Tensor) -> np.ndarray:

@@ -11,6 +11,7 @@ from PIL import Image
 from websockets.sync.client import connect
 
 _HEAD = 16  # bytes: two lengths before the compressed messages
+_PATIENCE = 60.0  # seconds, as a busy machine may keep the server from its work
 
 
 class Client:
@@ -21,7 +22,7 @@ class Client:
         self._socket = connect(
             url.replace("http:", "ws:").split("?")[0],
             subprotocols=[protocol], origin=origin, additional_headers=headers, max_size=None, compression=None,
-            close_timeout=0.2,
+            open_timeout=_PATIENCE, close_timeout=0.2,
         )  # fmt: skip
 
     def __enter__(self) -> "Client":
@@ -42,7 +43,7 @@ class Client:
             image_width=size[0], image_height=size[1], look_at=[0.0, 0.0, 0.0], up_direction=[0.0, -1.0, 0.0],
         )  # fmt: skip
 
-    def messages(self, timeout: float = 10.0) -> list[dict[str, Any]]:
+    def messages(self, timeout: float = _PATIENCE) -> list[dict[str, Any]]:
         """The messages of the next packet. TimeoutError without one."""
         packet = self._socket.recv(timeout)
         length = int.from_bytes(packet[8:_HEAD], "little")
@@ -50,14 +51,14 @@ class Client:
             "messages"
         ]
 
-    def until(self, kind: str, timeout: float = 10.0) -> dict[str, Any]:
+    def until(self, kind: str, timeout: float = _PATIENCE) -> dict[str, Any]:
         """The next message of a kind."""
         while True:
             for message in self.messages(timeout):
                 if message["type"] == kind:
                     return message
 
-    def picture(self, timeout: float = 10.0) -> np.ndarray:
+    def picture(self, timeout: float = _PATIENCE) -> np.ndarray:
         """The next picture (H, W, 3) uint8."""
         message = {"rgb_data": None}  # as a server sends it that has been reset
         while message["rgb_data"] is None:

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page
 
 pytestmark = pytest.mark.browser
-SECONDS = 20  # until something must have happened
+SECONDS = 60  # until something must have happened
 BARE = ".sse-viewer > :not(canvas) { display: none !important }"  # the picture without buttons
 BACKGROUND = (0.2, 0.4, 0.3)
 

@@ -21,7 +21,7 @@ from synthetic import make_colmap_scene
 pytest.importorskip("viser", reason="viser is not installed: pip install '.[viewer]'")
 pytestmark = pytest.mark.browser
 ROOT = Path(__file__).resolve().parents[2]
-SECONDS = 20  # until something must have happened
+SECONDS = 60  # until something must have happened
 
 
 @pytest.fixture(scope="module")

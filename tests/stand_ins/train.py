@@ -51,7 +51,7 @@ if (args.s / "slow").exists() and not args.start_checkpoint:
     signal.signal(signal.SIGINT, stop)
     signal.signal(signal.SIGTERM, stop)
     (args.s / "started").touch()
-    time.sleep(30)
+    time.sleep(600)
     sys.exit("no signal came")
 
 best = 20.0 + args.sh_degree + 0.1 * args.seed  # dB at the end

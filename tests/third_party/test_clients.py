@@ -203,7 +203,7 @@ def watch(port: int, replies: list[tuple[bytes, str]], over: threading.Event) ->
             connection = socket.create_connection(("127.0.0.1", port), timeout=60)
             break
         except OSError:
-            if over.wait(0.05):
+            if over.wait(0.01):  # often, as a training of 30 iterations listens for less than a second
                 return
     with connection, connection.makefile("rb") as stream:
         for _ in range(3):
