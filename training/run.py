@@ -13,6 +13,7 @@ from torch import Tensor
 from exports.in_scene import scene_with, start_from
 from records.training_log import Stopwatch
 from scene import Scene
+from scene.cameras import Camera
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.checkpoint import load_checkpoint
 from scene.options import option
@@ -22,6 +23,7 @@ from training.loss_watch import LossWatch
 from training.memory_estimate import announce_memory
 from training.objective import Objective
 from training.pacing import schedule_file
+from training.pacing.batched import Batched
 from training.pacing.choose import pace_of, resolution_of
 from training.pacing.pace import Paced
 from training.plan import Plan
@@ -60,7 +62,8 @@ class Run:
         self.device = compute_device()
         place = "cpu" if ranks().several else self.device  # a rank keeps a part
         capture, self.first_iteration = load_checkpoint(plan.start, place) if plan.start else (None, 0)
-        self.pace = pace_of(opt, plan.start, self.first_iteration)
+        views = ranks().size if plan.parallel == "views" else 1
+        self.pace = pace_of(opt, plan.start, self.first_iteration, views)
         warn_of_late_reset(opt, dataset.white_background, self.pace)
         self.gaussians = GaussianModel(dataset.sh_degree, opt.optimizer_type)
         self.gaussians.divide(ranks())
@@ -71,7 +74,8 @@ class Run:
             self.scene, self._first = Scene(dataset, self.gaussians, shuffle=False, start=False), None
         check_scene(self.scene.info)
         check_target(opt.target_psnr, len(self.scene.getTestCameras()))
-        self.views = ViewOrder(self.scene.getTrainCameras(), opt.seed)
+        place = ranks().rank if self.pace.views > 1 else 0
+        self.views = ViewOrder(self.scene.getTrainCameras(), opt.seed, self.pace.views, place)
         self.resolution = resolution_of(opt, self.pace, self.scene.getTrainCameras(), self.scene.images)
         self._decode_ahead(self.first_iteration + 1)
         from_points = self._start(capture)
@@ -108,12 +112,16 @@ class Run:
             self.gaussians.restore(capture, self.opt)
             check_exposures(self.gaussians, self.dataset.train_test_exp, self.plan.start)
         self.gaussians.limit_columns()
+        if (views := self.pace.views) > 1:
+            self.gaussians.optimizer.set_betas(0.9**views, 0.999**views)
         return from_points
 
     @property
     def _training_options(self) -> dict[str, Any]:
         options = {name: getattr(self.opt, name) for name in ("optimizer_type", "seed", "strategy")}
         options["resolution_schedule"] = self.opt.resolution_schedule
+        if self.pace.views > 1:
+            options["views"] = self.pace.views
         if isinstance(self.pace, Paced):  # a schedule that is repeated brings its own
             options["resolution_schedule"] = self.pace.schedule.resolution_schedule
         return {"antialiasing": self.pipe.antialiasing} | options
@@ -147,7 +155,7 @@ class Run:
                 iteration,
                 last=False,
                 camera=camera,
-                background=self._background(iteration),
+                background=self._background(self.views.own(iteration)),
                 depth_weight=self._depth_weight(pace.nominal(iteration)) if camera.depth_reliable else 0.0,
                 changes=self._changes(iteration),
                 started=seconds,
@@ -170,10 +178,17 @@ class Run:
         before, now = (self.pace.nominal(t) // SH_INTERVAL for t in (iteration - 1, iteration))
         return now - before
 
-    def _background(self, iteration: int) -> Tensor:
+    def batch(self, iteration: int) -> list[tuple[Camera, Tensor]]:
+        """All views of an iteration, of which each rank shows its own, and their backgrounds (3,)."""
+        nominal = self.pace.nominal(iteration)
+        numbers = self.views.numbers(iteration)
+        return [(self.resolution.view(self.views.of(n), nominal), self._background(n)) for n in numbers]
+
+    def _background(self, view: int) -> Tensor:
+        """view: the number of a view, which is its iteration where an iteration has one."""
         if not self.opt.random_background:
             return self.background
-        draws = uniform(self.opt.seed, Stream.BACKGROUND, iteration, torch.zeros(1, dtype=torch.int64))
+        draws = uniform(self.opt.seed, Stream.BACKGROUND, view, torch.zeros(1, dtype=torch.int64))
         return draws[0, :3].to(self.device)
 
     def prepare(self, step: Step) -> None:
@@ -189,7 +204,7 @@ class Run:
     def set_rates(self, step: Step) -> None:
         """Set the learning rates of a step, which may be one that is repeated."""
         self.gaussians.update_learning_rate(self.pace.nominal(step.iteration))
-        if isinstance(self.pace, Paced):
+        if isinstance(self.pace, (Paced, Batched)):
             self.gaussians.scale_rates(self.pace.rate_factor(step.iteration))
 
     def _decode_ahead(self, iteration: int) -> None:

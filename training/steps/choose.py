@@ -8,6 +8,7 @@ from training.run import Run
 from training.steps.ahead import AheadStep
 from training.steps.fused import FusedStep
 from training.steps.plain import PlainStep
+from training.steps.views import ViewsStep
 from utils.ranks.ranks import ranks
 
 Taker: TypeAlias = PlainStep | FusedStep | AheadStep
@@ -19,6 +20,8 @@ def step_taker(run: Run) -> Taker:
     The plain one where the user asks for it (--plain_step, --detect_anomaly), and for an objective or a density control
     that is not ours: it may want gradients, or wait for values that the GPU has not computed yet.
     """
+    if run.pace.views > 1:
+        return ViewsStep(run)
     if run.plan.plain_step or torch.is_anomaly_enabled() or not FusedStep.suits(run):
         return PlainStep(run)
     runs_ahead = run.device.type == "cuda" and not ranks().several  # ranks tell each other numbers in each step
