@@ -148,7 +148,7 @@ class GaussianModel(Exposed, RelocatingGaussians):
         of radius 0.
         """
         if isinstance(self.optimizer, SparseGaussianAdam):
-            self.optimizer.step(radii.view(-1, len(self)).amax(0) > 0)
+            self.optimizer.step((radii if radii.dim() == 1 else radii.amax(0)) > 0)
         else:
             self.optimizer.step()
         self.optimizer.zero_grad(set_to_none=True)

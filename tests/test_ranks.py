@@ -1,4 +1,4 @@
-"""What the processes of a training tell each other."""
+"""Messages between the processes of a training."""
 
 import pytest
 import torch

@@ -1,4 +1,4 @@
-"""What ranks send each other in a view: splats to the bands that they reach, and gradient rows back."""
+"""Exchange of what ranks need of each other in a view: splats for the bands that they reach, gradient rows back."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
