@@ -15,6 +15,7 @@ from scene import Scene
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.checkpoint import load_checkpoint
 from scene.options import option
+from training.agreement import agree_on_scene
 from training.checks import check_exposures, check_scene, check_target, warn_of_late_reset
 from training.history import check_folder, continue_records, report_changes
 from training.loss_watch import LossWatch
@@ -24,6 +25,7 @@ from training.pacing import schedule_file
 from training.pacing.choose import pace_of, resolution_of
 from training.pacing.pace import Paced
 from training.plan import Plan
+from training.restart import resumed
 from training.step import Step
 from training.strategies.choose import density_control
 from training.view_order import ViewOrder
@@ -31,6 +33,7 @@ from utils.exact.counter_rng import Stream, uniform
 from utils.general_utils import get_expon_lr_func
 from utils.host.interrupt import DeferredInterrupt
 from utils.host.process import seconds_since_start
+from utils.ranks.ranks import ranks
 from utils.system_utils import compute_device
 
 SH_INTERVAL = 1000  # iterations between raises of the active SH degree
@@ -52,6 +55,7 @@ class Run:
         self, dataset: argparse.Namespace, opt: argparse.Namespace, pipe: argparse.Namespace, plan: Plan
     ) -> None:
         """Read and check everything that can be refused; nothing is written. UserError for what is refused."""
+        plan = plan._replace(start=resumed(plan.start, dataset.model_path, opt.iterations))
         self.dataset, self.opt, self.pipe, self.plan = dataset, opt, pipe, plan
         self.lost = 0
         self.interrupt = DeferredInterrupt()
@@ -84,6 +88,7 @@ class Run:
         self.density.pace = self.pace
         if from_points:
             self.density.started()
+        agree_on_scene(self.scene, plan.start)
 
     def _start(self, capture: tuple | None) -> bool:
         """Start the model from the dataset's points, from a file's Gaussians, or from the state of a checkpoint.
@@ -123,7 +128,7 @@ class Run:
         folder, start = self.scene.model_path, self.plan.start
         if not start or not (Path(folder) / "cameras.json").exists():
             self.scene.write_inputs()
-        if not start and not isinstance(self.pace, Paced):
+        if not start and not isinstance(self.pace, Paced) and ranks().first:
             (Path(folder) / schedule_file.NAME).unlink(missing_ok=True)  # of an earlier training
         announce_memory(self.scene, self.gaussians, self.density.most_gaussians)
         self.log, self.rows = continue_records(folder, start, self.first_iteration)

@@ -13,6 +13,7 @@ import torch
 from scene.gaussians.attributes import IN_CHECKPOINT, Attribute, Rows
 from scene.gaussians.finite import check_finite
 from scene.gaussians.statistics import Statistics
+from utils.ranks.ranks import ranks
 from utils.system_utils import UserError, atomic_write
 
 _LARGEST = 1e15  # extent; learning rates are multiples of it
@@ -104,7 +105,9 @@ def _check_rows(rows: Rows, table: dict[str, Attribute], max_sh_degree: int) -> 
 
 
 def save_checkpoint(path: str | os.PathLike, capture: tuple, iteration: int) -> None:
-    """Write (capture, iteration); the whole file or none."""
+    """Write (capture, iteration); the whole file or none. Of several ranks, the first writes."""
+    if not ranks().first:
+        return
     with atomic_write(path) as temporary:
         try:
             torch.save((capture, iteration), temporary)

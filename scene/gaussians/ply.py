@@ -11,6 +11,7 @@ from torch import Tensor
 from scene.gaussians.attributes import Rows, attributes
 from utils.files.ply_header import check_header
 from utils.files.ply_rows import check_rows
+from utils.ranks.ranks import ranks
 from utils.system_utils import UserError, atomic_write
 
 _NORMALS = ["nx", "ny", "nz"]  # zeros after the positions, as in the reference's files
@@ -25,8 +26,12 @@ def write_ply(
 ) -> None:
     """Write a binary little-endian PLY, float32, SH bands channel by channel; the whole file or none.
 
+    Of several ranks, the first writes.
+
     world_offset: world coordinates of the origin, written as a comment unless they are zero. comments: further ones.
     """
+    if not ranks().first:
+        return
     count = len(rows["xyz"])
     parts = [(attribute.columns, rows[name]) for name, attribute in attributes(sh_degree).items()]
     parts.insert(1, (_NORMALS, torch.zeros(count, 3)))
