@@ -17,6 +17,7 @@ from scene.cameras import Camera
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.checkpoint import load_checkpoint
 from scene.options import option
+from training.agreement import agree_on_scene
 from training.checks import check_exposures, check_scene, check_target, warn_of_fewer, warn_of_late_reset
 from training.history import check_folder, continue_records, report_changes
 from training.loss_watch import LossWatch
@@ -27,6 +28,7 @@ from training.pacing.batched import Batched
 from training.pacing.choose import pace_of, resolution_of
 from training.pacing.pace import Paced
 from training.plan import Plan
+from training.restart import resumed
 from training.step import Step
 from training.strategies.choose import density_control
 from training.view_order import ViewOrder
@@ -56,6 +58,7 @@ class Run:
         self, dataset: argparse.Namespace, opt: argparse.Namespace, pipe: argparse.Namespace, plan: Plan
     ) -> None:
         """Read and check everything that can be refused; nothing is written. UserError for what is refused."""
+        plan = plan._replace(start=resumed(plan.start, dataset.model_path, opt.iterations))
         self.dataset, self.opt, self.pipe, self.plan = dataset, opt, pipe, plan
         self.lost = 0
         self.interrupt = DeferredInterrupt()
@@ -93,6 +96,7 @@ class Run:
         warn_of_fewer(self.density, opt, self.gaussians.total, self.first_iteration + 1)
         if from_points:
             self.density.started()
+        agree_on_scene(self.scene, plan.start)
 
     def _start(self, capture: tuple | None) -> bool:
         """Start the model from the dataset's points, from a file's Gaussians, or from the state of a checkpoint.
@@ -136,7 +140,7 @@ class Run:
         folder, start = self.scene.model_path, self.plan.start
         if not start or not (Path(folder) / "cameras.json").exists():
             self.scene.write_inputs()
-        if not isinstance(self.pace, Paced):
+        if not isinstance(self.pace, Paced) and ranks().first:
             goes_on = start and os.path.realpath(Path(start).parent) == os.path.realpath(folder)
             schedule_file.leave_schedule(Path(folder), self.first_iteration if goes_on else 0)
         density = self.density

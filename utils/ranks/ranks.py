@@ -1,11 +1,16 @@
-"""The processes (ranks) that train together. By itself, a process is all of them."""
+"""The processes (ranks) that train together. By itself, a process is all of them.
+
+torch is imported on first use: not every program needs it.
+"""
+
+from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from typing import TypeVar
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from typing import TYPE_CHECKING, TypeVar
 
-import torch
-from torch import Tensor
+if TYPE_CHECKING:
+    from torch import Tensor
 
 Value = TypeVar("Value")
 
@@ -19,6 +24,7 @@ class Ranks:
 
     rank = 0
     size = 1
+    prompt = False  # whether the others may expect this rank at the next collective call within seconds
 
     @property
     def several(self) -> bool:
@@ -32,11 +38,20 @@ class Ranks:
 
     def numbers(self, *values: int) -> Tensor:
         """The whole numbers that each rank gives, of which all give as many: (size, len(values)) int64 on the CPU."""
+        import torch
+
         return torch.tensor([values], dtype=torch.int64)
 
     def shared(self, value: Value) -> Value:
         """Rank 0's value; of the others it is not read. It can be any object that pickles."""
         return value
+
+    def everyone(self, value: Value) -> list[Value]:
+        """All ranks' values, in the order of ranks; any objects that pickle."""
+        return [value]
+
+    def largest_(self, numbers: Tensor) -> None:
+        """Replace each number of a tensor by the largest that a rank has there, without waiting for a GPU."""
 
     def exchange(self, parts: Sequence[Tensor]) -> list[Tensor]:
         """Send part d (n_d, ...) to rank d, and receive each rank's part for this one, in the order of ranks.
@@ -47,7 +62,11 @@ class Ranks:
 
     def gather(self, rows: Tensor) -> Tensor:
         """All ranks' rows (n, ...), in the order of ranks."""
-        return torch.cat(self.exchange([rows] * self.size)) if self.several else rows
+        if not self.several:
+            return rows
+        import torch
+
+        return torch.cat(self.exchange([rows] * self.size))
 
     def before(self, count: int) -> tuple[int, int]:
         """The sum of all counts of lower ranks, and of all ranks."""
@@ -57,6 +76,13 @@ class Ranks:
     def anyone(self, fact: bool) -> bool:
         """Whether a fact holds on any rank."""
         return bool(self.numbers(int(fact)).any())
+
+    def busy(self) -> AbstractContextManager[None]:
+        """Within it, the others have to wait for this rank as long as it takes, as for a large file."""
+        return nullcontext()
+
+    def tell_notes(self) -> None:
+        """Print what only other ranks have said so far, with their names (utils/ranks/quiet.py)."""
 
 
 ALONE = Ranks()

@@ -32,6 +32,14 @@ class SeveralRanks(Ranks):
         dist.broadcast_object_list(box, src=0, group=self._numbers)
         return box[0]
 
+    def everyone(self, value: Value) -> list[Value]:
+        box: list = [None] * self.size
+        dist.all_gather_object(box, value, group=self._numbers)
+        return box
+
+    def largest_(self, numbers: Tensor) -> None:
+        dist.all_reduce(numbers, dist.ReduceOp.MAX, group=None if numbers.is_cuda else self._numbers)
+
     def exchange(self, parts: Sequence[Tensor]) -> list[Tensor]:
         counts = self.numbers(*map(len, parts))[:, self.rank].tolist()
         shape, dtype, device = parts[0].shape[1:], parts[0].dtype, parts[0].device
