@@ -48,6 +48,7 @@ def training(
     plain_step: bool = False,
     remote_viewer: tuple[str, int] | None = None,
     viewer: Address | None = None,
+    parallel: str = "tiles",
 ) -> None:
     """Train from the options of the three groups; write model, checkpoints and log to dataset.model_path.
 
@@ -55,12 +56,12 @@ def training(
     checkpoint: a chkpntN.pth to resume, or None. debug_from: switch pipe.debug on after this iteration. plain_step: no
     fast steps. record_curve: with test views, write error_vs_time.csv during training, and draw it. remote_viewer:
     where to listen for it, None: nowhere, unless network_gui listens already. viewer: where the web page listens, None:
-    no page.
+    no page. parallel: how several ranks share the work, "tiles" or "views".
     """
     dataset.model_path = dataset.model_path or new_folder()
     print(f"Optimizing {dataset.model_path}")
     iterations = testing_iterations, saving_iterations, checkpoint_iterations
-    plan = Plan(*iterations, checkpoint, debug_from, record_curve, plain_step, viewer)
+    plan = Plan(*iterations, checkpoint, debug_from, record_curve, plain_step, viewer, parallel)
     run = Run(dataset, opt, pipe, plan)
     # Write nothing before every input check has passed: a mistyped option must not overwrite a finished model.
     with own_folder(dataset.model_path), network_gui.listening(remote_viewer):
@@ -130,9 +131,9 @@ def main(argv: Sequence[str] | None = None) -> None:
     agree_on_options(args)
     torch.autograd.set_detect_anomaly(args.detect_anomaly)
     listening = viewers(args, checked_address(args.viewer_host, args.viewer))
-    further = args.start_checkpoint, args.debug_from, not args.no_curve, args.plain_step, *listening
+    further = args.debug_from, not args.no_curve, args.plain_step, *listening, args.parallel
     iterations = args.test_iterations, [*args.save_iterations, opt.iterations], args.checkpoint_iterations
-    training(dataset, opt, pipe, *iterations, *further)
+    training(dataset, opt, pipe, *iterations, args.start_checkpoint, *further)
     print("Training complete.")
 
 

@@ -80,7 +80,7 @@ STANDS = "the last checkpoint stands: resume with --start_checkpoint {out}/chkpn
         ("user 1 7", "error: rank 1: this cannot be; do something else", 5),
         ("bug 1 7", "error: rank 1: ValueError: no such thing", 5),
         ("hang 1 7", "error: rank 1 hung: the others waited", 5),
-        ("overflow 1 7", "error: xyz of 1 of 300 (3) on rank 1 had no finite step in iteration 7", 7),
+        ("overflow 1 7", "error: xyz of 1 of 300 (153) had no finite step in iteration 7", 7),
     ],
     ids=lambda value: value.split()[0] if isinstance(value, str) and value[:5] != "error" else "",
 )

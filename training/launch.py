@@ -10,9 +10,10 @@ from viewing.options import Address, add_viewer_options
 def add_launch_options(parser: argparse.ArgumentParser) -> None:
     """Add --parallel, the options of the remote viewer, and those of the web page."""
     add = parser.add_argument
-    add("--parallel", choices=["tiles"], default="tiles",
-        help="how processes that torchrun has started share the training; tiles: each has a part of the Gaussians and "
-        "draws a part of every view, and the result is that of one process (default: tiles)")  # fmt: skip
+    add("--parallel", choices=["tiles", "views"], default="tiles",
+        help="how processes that torchrun has started share the training, of which each has a part of the Gaussians; "
+        "tiles: each draws a part of every view, and the result is that of one process; views: each draws a view of "
+        "its own, so that an iteration shows several (default: tiles)")  # fmt: skip
     add("--ip", type=str, default="127.0.0.1", help="address to listen at for the remote viewer (default: 127.0.0.1)")
     add("--port", type=int, default=6009, help="port for the remote viewer, 0: any free one (default: 6009)")
     add("--disable_viewer", action="store_true", help="open no port for the remote viewer")

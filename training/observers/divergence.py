@@ -95,14 +95,10 @@ class DivergenceWatch(Observer):
         return next((value for value in ranks().everyone(loss) if not math.isfinite(value)), loss)
 
     def _unstepped(self) -> str:
-        """What was not stepped, by the ranks that have it."""
         parts = []
         for name, rows, count in self._gaussians.take_marks():
             more = ", ..." if len(rows) > _SHOWN else ""
             parts.append(f"{name} of {len(rows)} of {count} ({', '.join(map(str, rows[:_SHOWN]))}{more})")
-        several = [(rank, said) for rank, said in enumerate(ranks().everyone(parts)) if said]
-        if ranks().several:
-            parts = [f"{' and '.join(said)} on rank {rank}" for rank, said in several]
         return " and ".join(parts)
 
     def _rescue(self, iteration: int) -> str:

@@ -1,0 +1,92 @@
+"""Trainings by several ranks: the files of one process, to the byte, and batches of views."""
+
+import hashlib
+from pathlib import Path
+
+import pytest
+import torch
+from processes import in_ranks
+from test_masks import masked_scene  # noqa: F401  (a fixture)
+
+import train
+from gaussian_renderer import render
+from training.observer import Announcer, Observer
+from training.observers.standard import standard_observers
+from training.plan import Plan
+from training.run import Run
+from utils.ranks.ranks import ranks
+
+EVERYTHING = (
+    *("--eval", "--iterations", 300, "--checkpoint_iterations", 150, "--save_iterations", 150, "--random_background"),
+    *("--densify_from_iter", 20, "--densification_interval", 40, "--densify_until_iter", 260, "-r", 2),
+    *("--opacity_reset_interval", 130, "--test_iterations", -1, "--densify_grad_threshold", 0.0004),
+)
+OTHERS = {
+    "mcmc": ("--strategy", "mcmc", "--max_num_splats", 400, "--densify_from_iter", 5, "--densification_interval", 10),
+    "budget": ("--strategy", "budget", "--max_num_splats", 330, "--densify_from_iter", 5, "--densification_interval", 20),
+    "sparse": ("--optimizer_type", "sparse_adam", "--absgrad", "--densify_from_iter", 5, "--antialiasing"),
+    "plain": ("--plain_step", "--train_test_exp", "--densify_from_iter", 5, "--densification_interval", 20),
+    "tiny": ("-r", 8, "--densify_from_iter", 5, "--densification_interval", 20),  # images of one tile
+}
+SHORT = ("--iterations", 60, "--densify_until_iter", 55, "--save_iterations", -1, "--test_iterations", -1, "--eval")
+
+
+def _train(scene: Path, folder: Path, *options: object) -> dict[str, str]:
+    """Train, and return digests of what is written."""
+    train.main(["-s", str(scene), "-m", str(folder), *map(str, options), "--disable_viewer", "--quiet"])
+    return _digests(folder) if ranks().first else {}
+
+
+def _digests(folder: Path) -> dict[str, str]:
+    found = {}
+    for path in sorted(folder.rglob("*.p*")):
+        if path.suffix == ".ply":
+            found[str(path.relative_to(folder))] = hashlib.sha256(path.read_bytes()).hexdigest()
+        elif path.suffix == ".pth":
+            found[path.name] = hashlib.sha256(b"".join(_bytes(torch.load(path, weights_only=False)))).hexdigest()
+    curve = folder / "error_vs_time.csv"
+    if curve.is_file():
+        rows = [line.split(",") for line in curve.read_text().splitlines()]
+        kept = [column for column, name in enumerate(rows[0]) if "seconds" not in name and "memory" not in name]
+        found[curve.name] = str([[row[column] for column in kept] for row in rows])
+    return found
+
+
+def _bytes(value: object) -> list[bytes]:
+    """All that a checkpoint has, in its order."""
+    if torch.is_tensor(value):
+        return [value.detach().numpy().tobytes()]
+    if isinstance(value, dict):
+        return [part for key, item in value.items() for part in (repr(key).encode(), *_bytes(item))]
+    if isinstance(value, (list, tuple)):
+        return [part for item in value for part in _bytes(item)]
+    return [repr(value).encode()]
+
+
+def _all(scene: Path, folder: Path) -> dict[str, dict[str, str]]:
+    """All trainings, one after the other, in the same processes."""
+    torch.set_num_threads(1)
+    folder = folder / str(ranks().size)
+    results = {"everything": _train(scene, folder / "everything", *EVERYTHING)}
+    for name, options in OTHERS.items():
+        results[name] = _train(scene, folder / name, *SHORT, *options)
+    return results
+
+
+@pytest.fixture(scope="module")
+def alone(tmp_path_factory) -> dict:
+    """Results of one process, by scene."""
+    return {}
+
+
+@pytest.mark.parametrize("size", [2, 3])
+def test_ranks_write_the_bytes_of_one_process(masked_scene, tmp_path, size):  # noqa: F811
+    (one,) = in_ranks(1, _all, masked_scene, tmp_path)
+    several = in_ranks(size, _all, masked_scene, tmp_path)[0]
+    assert one == several
+    assert {"chkpnt150.pth", "point_cloud/iteration_300/point_cloud.ply", "error_vs_time.csv"} < one["everything"].keys()
+    assert len({str(result) for result in one.values()}) == len(one)
+
+
+def _resume(scene: Path, folder: Path, checkpoint: Path) -> dict[str, str]:
+    return _train(scene, folder / f"by_{ranks().size}", *EVERYTHING, "--start_checkpoint", checkpoint)
