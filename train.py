@@ -118,8 +118,7 @@ def parse(argv: Sequence[str] | None = None) -> tuple[argparse.Namespace, ...]:
     args = parser.parse_args(argv)
     options = [group.extract(args) for group in groups]
     for name in ("test_iterations", "save_iterations", "checkpoint_iterations"):
-        wrong = [t for t in getattr(args, name) if t < 1 and t != -1]
-        if wrong:
+        if wrong := [t for t in getattr(args, name) if t < 1 and t != -1]:
             raise UserError(f"--{name} takes iterations from 1 on, or -1 for none, got {wrong[0]}")
     return args, *options
 

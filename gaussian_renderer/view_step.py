@@ -70,9 +70,10 @@ def step(
     absolute: with the lengths of absolute gradients (`rasterize` of diff_gaussian_rasterization).
     now: (NOW_WORDS,) int64 on the Gaussians' device of `FusedAdam.write_now`, for a step that is recorded.
     """
+    absolute &= observe
     further = {"now": now, "absolute": absolute, **adam.penalties()}
     if (view := drawn.view) is not None:
-        rows = gradient_rows(view, (image_gradient, None, depth_gradient), absolute and observe)
+        rows = gradient_rows(view, (image_gradient, None, depth_gradient), absolute)
         OPERATORS.rows_vjp_step_(
             *drawn.scene, view.splats, view.tile_counts, *rows, drawn.radii, *adam.arguments(observe), **further
         )

@@ -1,5 +1,6 @@
 """Trainings by several ranks: the files of one process, to the byte, and batches of views."""
 
+import csv
 import hashlib
 from pathlib import Path
 
@@ -9,11 +10,6 @@ from processes import in_ranks
 from test_masks import masked_scene  # noqa: F401  (a fixture)
 
 import train
-from gaussian_renderer import render
-from training.observer import Announcer, Observer
-from training.observers.standard import standard_observers
-from training.plan import Plan
-from training.run import Run
 from utils.ranks.ranks import ranks
 
 EVERYTHING = (
@@ -21,14 +17,18 @@ EVERYTHING = (
     *("--densify_from_iter", 20, "--densification_interval", 40, "--densify_until_iter", 260, "-r", 2),
     *("--opacity_reset_interval", 130, "--test_iterations", -1, "--densify_grad_threshold", 0.0004),
 )
+LAST = "point_cloud/iteration_300/point_cloud.ply"
 OTHERS = {
-    "mcmc": ("--strategy", "mcmc", "--max_num_splats", 400, "--densify_from_iter", 5, "--densification_interval", 10),
-    "budget": ("--strategy", "budget", "--max_num_splats", 330, "--densify_from_iter", 5, "--densification_interval", 20),
-    "sparse": ("--optimizer_type", "sparse_adam", "--absgrad", "--densify_from_iter", 5, "--antialiasing"),
-    "plain": ("--plain_step", "--train_test_exp", "--densify_from_iter", 5, "--densification_interval", 20),
-    "tiny": ("-r", 8, "--densify_from_iter", 5, "--densification_interval", 20),  # images of one tile
+    "mcmc": ("--strategy", "mcmc", "--max_num_splats", 400, "--densification_interval", 10),
+    "budget": ("--strategy", "budget", "--max_num_splats", 330),
+    "sparse": ("--optimizer_type", "sparse_adam", "--absgrad", "--antialiasing"),
+    "plain": ("--plain_step", "--train_test_exp"),
+    "tiny": ("-r", 8),  # images of one tile
 }
-SHORT = ("--iterations", 60, "--densify_until_iter", 55, "--save_iterations", -1, "--test_iterations", -1, "--eval")
+SHORT = (
+    *("--iterations", 60, "--densify_until_iter", 55, "--save_iterations", -1, "--test_iterations", -1, "--eval"),
+    *("--densify_from_iter", 5, "--densification_interval", 20),
+)
 
 
 def _train(scene: Path, folder: Path, *options: object) -> dict[str, str]:
@@ -44,12 +44,21 @@ def _digests(folder: Path) -> dict[str, str]:
             found[str(path.relative_to(folder))] = hashlib.sha256(path.read_bytes()).hexdigest()
         elif path.suffix == ".pth":
             found[path.name] = hashlib.sha256(b"".join(_bytes(torch.load(path, weights_only=False)))).hexdigest()
-    curve = folder / "error_vs_time.csv"
-    if curve.is_file():
-        rows = [line.split(",") for line in curve.read_text().splitlines()]
-        kept = [column for column, name in enumerate(rows[0]) if "seconds" not in name and "memory" not in name]
-        found[curve.name] = str([[row[column] for column in kept] for row in rows])
     return found
+
+
+def _curve(folder: Path) -> dict[str, dict[str, str]]:
+    """Points of the curve by iteration, without seconds and memory. How many there are depends on the seconds."""
+    with (folder / "error_vs_time.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    kept = [name for name in rows[0] if "seconds" not in name and "memory" not in name]
+    return {row["iteration"]: {name: row[name] for name in kept} for row in rows}
+
+
+def _assert_same_curves(one: dict, other: dict) -> None:
+    both = one.keys() & other.keys()
+    assert {"300"} < both and len(both) > 4
+    assert [one[iteration] for iteration in both] == [other[iteration] for iteration in both]
 
 
 def _bytes(value: object) -> list[bytes]:
@@ -73,20 +82,26 @@ def _all(scene: Path, folder: Path) -> dict[str, dict[str, str]]:
     return results
 
 
-@pytest.fixture(scope="module")
-def alone(tmp_path_factory) -> dict:
-    """Results of one process, by scene."""
-    return {}
-
-
 @pytest.mark.parametrize("size", [2, 3])
 def test_ranks_write_the_bytes_of_one_process(masked_scene, tmp_path, size):  # noqa: F811
     (one,) = in_ranks(1, _all, masked_scene, tmp_path)
     several = in_ranks(size, _all, masked_scene, tmp_path)[0]
-    assert one == several
-    assert {"chkpnt150.pth", "point_cloud/iteration_300/point_cloud.ply", "error_vs_time.csv"} < one["everything"].keys()
+    for name, files in one.items():
+        assert files == several[name], name
+    _assert_same_curves(*(_curve(tmp_path / str(count) / "everything") for count in (1, size)))
+    assert {"chkpnt150.pth", LAST} < one["everything"].keys()
     assert len({str(result) for result in one.values()}) == len(one)
 
 
 def _resume(scene: Path, folder: Path, checkpoint: Path) -> dict[str, str]:
+    torch.set_num_threads(1)
     return _train(scene, folder / f"by_{ranks().size}", *EVERYTHING, "--start_checkpoint", checkpoint)
+
+
+def test_a_checkpoint_is_resumed_by_any_number_of_ranks(masked_scene, tmp_path):  # noqa: F811
+    in_ranks(2, _train, masked_scene, tmp_path, *EVERYTHING)
+    whole = _digests(tmp_path)
+    for size in (1, 3):
+        resumed = in_ranks(size, _resume, masked_scene, tmp_path, tmp_path / "chkpnt150.pth")[0]
+        assert resumed[LAST] == whole[LAST]
+        _assert_same_curves(_curve(tmp_path / f"by_{size}"), _curve(tmp_path))
