@@ -73,30 +73,41 @@ STANDS = "the last checkpoint stands: resume with --start_checkpoint {out}/chkpn
 
 
 @pytest.mark.parametrize(
-    ("fault", "said", "saved"),
+    ("fault", "said"),
     [
-        ("kill 0 7", "error: rank 0 ended without a word (killed, or crashed); " + STANDS, 5),
-        ("memory 1 7", "error: rank 1: training ran out of memory in iteration 7 (", 5),
-        ("user 1 7", "error: rank 1: this cannot be; do something else", 5),
-        ("bug 1 7", "error: rank 1: ValueError: no such thing", 5),
-        ("hang 1 7", "error: rank 1 hung: the others waited", 5),
-        ("overflow 1 7", "error: xyz of 1 of 300 (153) had no finite step in iteration 7", 7),
+        ("kill 0 7", "error: rank 0 ended without a word (killed, or crashed); " + STANDS),
+        ("memory 1 7", "error: rank 1: training ran out of memory in iteration 7 ("),
+        ("user 1 7", "error: rank 1: this cannot be; do something else"),
+        ("bug 1 7", "error: rank 1: ValueError: no such thing"),
+        ("hang 1 7", "error: rank 1 hung: the others waited"),
     ],
     ids=lambda value: value.split()[0] if isinstance(value, str) and value[:5] != "error" else "",
 )
-def test_a_fault_of_one_rank_ends_all_with_one_sentence(colmap_scene, tmp_path, fault, said, saved):
+def test_a_fault_of_one_rank_ends_all_with_one_sentence(colmap_scene, tmp_path, fault, said):
     began = time.monotonic()
     done = _fault(colmap_scene, tmp_path, fault, size=3 if fault == "kill 0 7" else 2)
-    assert time.monotonic() - began < 60  # 30 of them to start on a busy machine
+    assert time.monotonic() - began < 90  # 30 seconds on a machine that does nothing else
     assert done.status != 0
     (line,) = done.errors
     assert line.startswith(said.format(out=tmp_path / "out")), line
-    assert "chkpnt" in line or fault[:4] in ("user", "bug ")
+    assert f"--start_checkpoint {tmp_path}/out/chkpnt5.pth" in line or fault[:4] in ("user", "bug ")
     text = "".join(done.stderr)
     assert "closed by peer" not in text and ("Traceback" in text) == fault.startswith("bug")
-    checkpoints = sorted(path.name for path in (tmp_path / "out").glob("chkpnt*.pth"))
-    assert checkpoints == sorted({"chkpnt5.pth", f"chkpnt{saved}.pth"})
+    assert [path.name for path in (tmp_path / "out").glob("chkpnt*.pth")] == ["chkpnt5.pth"]
     assert not list((tmp_path / "out").rglob("*.tmp*"))
+
+
+def test_no_rank_goes_on_after_one_has_stopped(colmap_scene, tmp_path):
+    """Rank 0 has no fault of its own: what it saves is the model after the iteration in which the other stopped."""
+    done = _fault(colmap_scene, tmp_path, "overflow 1 7")
+    (line,) = done.errors
+    assert line.startswith("error: xyz of 1 of 300 (153) had no finite step in iteration 7 (view "), line
+    assert sorted(path.name for path in (tmp_path / "out").glob("chkpnt*")) == ["chkpnt5.pth", "chkpnt7.pth"]
+    _train(colmap_scene, tmp_path / "one", "--no_curve", "--checkpoint_iterations", "7")
+    # The parameters; statistics of density control go on until the fault is noticed, as with one process.
+    was, now = (_tensors(folder / "chkpnt7.pth")[:6] for folder in (tmp_path / "one", tmp_path / "out"))
+    differ = {row for pair in zip(was, now, strict=True) for row in (pair[0] != pair[1]).nonzero()[:, 0].tolist()}
+    assert differ <= {153}  # row 3 of the second of two parts, if the ranks have parts
 
 
 def test_a_signal_to_one_rank_stops_all_after_one_iteration(colmap_scene, tmp_path):
