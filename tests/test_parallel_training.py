@@ -6,11 +6,16 @@ from pathlib import Path
 
 import pytest
 import torch
+from gaussians import options
 from processes import in_ranks
 from test_masks import masked_scene  # noqa: F401  (a fixture)
 
 import train
+from scene.gaussians.density_rules import actions
+from training.pacing.batched import Batched
+from training.view_order import ViewOrder
 from utils.ranks.ranks import ranks
+from utils.system_utils import UserError
 
 EVERYTHING = (
     *("--eval", "--iterations", 300, "--checkpoint_iterations", 150, "--save_iterations", 150, "--random_background"),
@@ -64,8 +69,8 @@ def _all(scene: Path, folder: Path) -> dict[str, dict[str, str]]:
     torch.set_num_threads(1)
     folder = folder / str(ranks().size)
     results = {"everything": _train(scene, folder / "everything", *EVERYTHING)}
-    for name, options in OTHERS.items():
-        results[name] = _train(scene, folder / name, *SHORT, *options)
+    for name, changes in OTHERS.items():
+        results[name] = _train(scene, folder / name, *SHORT, *changes)
     return results
 
 
@@ -92,3 +97,42 @@ def test_a_checkpoint_is_resumed_by_any_number_of_ranks(masked_scene, tmp_path):
         resumed = in_ranks(size, _resume, masked_scene, tmp_path, tmp_path / "chkpnt150.pth")[0]
         assert resumed[LAST] == whole[LAST]
         _assert_same_curves(_curve(tmp_path / f"by_{size}"), _curve(tmp_path))
+
+
+def _batches(scene: Path, folder: Path, *options: object) -> dict[str, str]:
+    torch.set_num_threads(1)
+    try:
+        return _train(scene, folder, *SHORT, "--checkpoint_iterations", 30, "--parallel", "views", *options)
+    except UserError as error:
+        return {"error": str(error)}
+
+
+def test_batches_of_views_can_be_resumed_by_as_many_ranks(masked_scene, tmp_path):  # noqa: F811
+    whole = in_ranks(2, _batches, masked_scene, tmp_path / "a", "--random_background")[0]
+    last = "point_cloud/iteration_30/point_cloud.ply"  # 60 views
+    assert whole.keys() >= {"chkpnt15.pth", last}
+    resume = ("--random_background", "--start_checkpoint", tmp_path / "a" / "chkpnt15.pth")
+    assert in_ranks(2, _batches, masked_scene, tmp_path / "b", *resume)[0][last] == whole[last]
+    refused = in_ranks(1, _batches, masked_scene, tmp_path / "c", *resume)[0]
+    assert "had 2 views in each iteration, and this one would have 1" in refused["error"]
+
+
+def test_a_batch_goes_through_the_schedule_by_views():
+    pace = Batched(30_000, 4)
+    assert pace.ends == 7500 and pace.nominal(7500) == 30_000 and list(pace.span(2)) == [5, 6, 7, 8]
+    assert pace.rate_factor(1) == 2.0 and pace.known([7000, 30_000, 40_000]) == [1750, 7500]
+    assert Batched(10, 4).ends == 3 and list(Batched(10, 4).span(3)) == [9, 10]
+    opt = options(densify_until_iter=15_000)
+    found = [t for t in range(1, 7501) if actions(t, opt, False, pace.span(t), 4.0, 4).densify]
+    assert found[:2] == [150, 175] and found[-1] == 3725  # every 100 views
+    resets = [t for t in range(1, 7501) if actions(t, opt, False, pace.span(t), 4.0, 4).reset_opacity]
+    assert resets == [750, 1500, 2250, 3000]
+
+
+def test_the_views_of_a_batch_follow_each_other():
+    cameras = list("abcdefg")
+    one = ViewOrder(cameras, 3)
+    ranks_views = [ViewOrder(cameras, 3, 2, place) for place in (0, 1)]
+    shown = [order[t] for t in range(1, 11) for order in ranks_views]
+    assert shown == [one[t] for t in range(1, 21)]
+    assert [ranks_views[0].of(n) for n in ranks_views[0].numbers(4)] == [one[7], one[8]]

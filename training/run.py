@@ -19,7 +19,7 @@ from scene.gaussians.checkpoint import load_checkpoint
 from scene.options import option
 from training.agreement import agree_on_scene
 from training.checks import check_exposures, check_scene, check_target, warn_of_fewer, warn_of_late_reset
-from training.history import check_folder, continue_records, report_changes
+from training.history import VIEWS, check_folder, check_views, continue_records, report_changes
 from training.loss_watch import LossWatch
 from training.memory_estimate import announce_memory
 from training.objective import Objective
@@ -85,6 +85,7 @@ class Run:
         saves = [] if opt.target_psnr else self.pace.known(plan.save)  # a target may come before any of them
         check_folder(dataset.model_path, dataset.source_path, saves, plan.start, self.first_iteration)
         if plan.start:
+            check_views(plan.start, self.pace.views)
             report_changes(plan.start, argparse.Namespace(**vars(dataset), **self._training_options))
         self.background = torch.full((3,), 1.0 if dataset.white_background else 0.0, device=self.device)
         self.objective = Objective(opt)
@@ -125,7 +126,7 @@ class Run:
         options = {name: getattr(self.opt, name) for name in ("optimizer_type", "seed", "strategy")}
         options["resolution_schedule"] = self.opt.resolution_schedule
         if self.pace.views > 1:
-            options["views"] = self.pace.views
+            options[VIEWS] = self.pace.views
         if isinstance(self.pace, Paced):  # a schedule that is repeated brings its own
             options["resolution_schedule"] = self.pace.schedule.resolution_schedule
         return {"antialiasing": self.pipe.antialiasing} | options
