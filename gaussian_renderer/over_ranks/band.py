@@ -6,7 +6,6 @@ from typing import Any, NamedTuple
 
 import torch
 from diff_gaussian_rasterization.backend import OPERATORS
-from diff_gaussian_rasterization.fakes import TILE
 from diff_gaussian_rasterization.schema import SCENE
 from fused_ssim import REACH
 from torch import Tensor

@@ -1,4 +1,4 @@
-"""What ranks send each other in a view: splats to the bands that they reach, and gradient rows back."""
+"""Traffic of the ranks in a view: splats to the bands that they reach, and gradient rows back."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
