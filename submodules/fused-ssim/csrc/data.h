@@ -54,7 +54,7 @@ struct L1SsimVjp {
   ImagePair<T> images;
   const T* ssim_gradient;  // L1Ssim::gradient
   double grad_l1, grad_ssim;
-  T* grad_img1;  // out
+  T* grad_img1;                    // out
   const RowRange* rows = nullptr;  // that are wanted; the others may get any value
 };
 

@@ -288,7 +288,7 @@ void vjp(const L1SsimVjp<T>& args, const Executor& executor) {
     for (int64_t i = begin * kBlock; i < std::min(end * kBlock, n); i += kBlock)
       if (wanted(i, std::min(i + kBlock, n)))
         vjp_block(image.img1 + i, img2 + i, image.clamp, args.ssim_gradient + i, T(args.grad_l1 / double(n)),
-                T(args.grad_ssim), std::min(kBlock, n - i), args.grad_img1 + i);
+                  T(args.grad_ssim), std::min(kBlock, n - i), args.grad_img1 + i);
   });
 }
 

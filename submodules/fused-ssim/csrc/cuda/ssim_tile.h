@@ -68,7 +68,8 @@ struct Tiles {
 
   static Tiles of(int rows, int64_t planes, RowRange range, int64_t width) {
     const int64_t across = (width + kTileColumns - 1) / kTileColumns;
-    const int64_t first = range.begin / rows, down = range.begin < range.end ? (range.end + rows - 1) / rows - first : 1;
+    const int64_t first = range.begin / rows,
+                  down = range.begin < range.end ? (range.end + rows - 1) / rows - first : 1;
     return {rows, int(first), Divider::of(across), Divider::of(down),
             range.begin < range.end ? planes * across * down : 0};
   }

@@ -138,8 +138,12 @@ at::Tensor vjp(const at::Tensor& img1_, const at::Tensor& img2_, const at::Tenso
                T grad_ssim, const gs::RowRange* rows = nullptr) {
   const at::Tensor img1 = img1_.contiguous(), img2 = img2_.contiguous(), kept = kept_.contiguous();
   at::Tensor grad_img1 = at::empty(img1.sizes(), img1.options());
-  const gs::L1SsimVjp<T> args{image_pair<T>(img1, img2, clamp), kept.const_data_ptr<T>(), double(grad_l1),
-                              double(grad_ssim), grad_img1.mutable_data_ptr<T>(), rows};
+  const gs::L1SsimVjp<T> args{image_pair<T>(img1, img2, clamp),
+                              kept.const_data_ptr<T>(),
+                              double(grad_l1),
+                              double(grad_ssim),
+                              grad_img1.mutable_data_ptr<T>(),
+                              rows};
   GS_DISPATCH(l1_ssim_vjp_cpu, args, gs::torch_executor());
   return grad_img1;
 }
@@ -210,8 +214,9 @@ std::tuple<at::Tensor, at::Tensor> photometric_band(const at::Tensor& img1_, con
   at::Tensor kept = at::empty(kept_shape(img1, rows), img1.options()), sums = no_sums(img1);
   with_scalar(img1, [&](auto zero) {
     using T = decltype(zero);
-    const gs::L1Ssim<T> args{image_pair<T>(img1, img2, true), false, nullptr, nullptr, kept.mutable_data_ptr<T>(),
-                             &rows, sums.mutable_data_ptr<double>()};
+    const gs::L1Ssim<T> args{
+        image_pair<T>(img1, img2, true), false, nullptr, nullptr, kept.mutable_data_ptr<T>(), &rows,
+        sums.mutable_data_ptr<double>()};
     GS_DISPATCH(l1_ssim_cpu, args, gs::torch_executor());
   });
   return {sums, kept};
@@ -227,8 +232,7 @@ std::tuple<at::Tensor, at::Tensor> photometric_of_sums(const at::Tensor& img1, c
     const gs::L1SsimMeans<T> args{image_pair<T>(img1, img1, true), sums.const_data_ptr<double>(), &means.l1,
                                   &means.ssim};
     GS_DISPATCH(l1_ssim_means_cpu, args);
-    return std::tuple(scalar(photometric_loss<T>(means, lambda), img1.options()),
-                      scalar(T(means.l1), img1.options()));
+    return std::tuple(scalar(photometric_loss<T>(means, lambda), img1.options()), scalar(T(means.l1), img1.options()));
   });
 }
 
@@ -329,8 +333,14 @@ std::tuple<at::Tensor, at::Tensor> photometric_of_sums_on_cuda(const at::Tensor&
   check_sums(sums, img1);
   gs::TorchQueue queue(img1.device());
   at::Tensor loss = at::empty({}, img1.options()), l1 = at::empty({}, img1.options());
-  gs::L1SsimCuda args{image_pair<float>(img1, img1, true), false, l1.mutable_data_ptr<float>(), nullptr, nullptr,
-                      loss.mutable_data_ptr<float>(), float(1 - lambda), float(lambda)};
+  gs::L1SsimCuda args{image_pair<float>(img1, img1, true),
+                      false,
+                      l1.mutable_data_ptr<float>(),
+                      nullptr,
+                      nullptr,
+                      loss.mutable_data_ptr<float>(),
+                      float(1 - lambda),
+                      float(lambda)};
   args.sums = const_cast<double*>(sums.const_data_ptr<double>());
   gs::l1_ssim_means_cuda(args, queue.queue());
   return {loss, l1};
