@@ -53,20 +53,42 @@ class Ranks:
     def largest_(self, numbers: Tensor) -> None:
         """Replace each number of a tensor by the largest that a rank has there, without waiting for a GPU."""
 
+    def table(self, values: Tensor) -> Tensor:
+        """All ranks' values (...), which have one shape and dtype: (size, ...) on their device."""
+        return values[None]
+
+    def added(self, values: Tensor) -> Tensor:
+        """The sum over all ranks, in no certain order: for whole numbers, or where all but one rank have 0."""
+        return values
+
+    def send(self, rows: Tensor, sizes: Sequence[int], counts: Sequence[int] | None = None) -> tuple[Tensor, list[int]]:
+        """Send the first sizes[0] of the rows (n, ...) to rank 0, the next to rank 1, and so on.
+
+        counts: how many rows each rank sends here, if this is known; else the ranks tell each other, which a GPU waits
+        for. Rows have one dtype and the same trailing shape on every rank. Returns the rows for this rank, in the order
+        of ranks, and how many each has sent.
+        """
+        return rows, list(sizes)
+
     def exchange(self, parts: Sequence[Tensor]) -> list[Tensor]:
         """Send part d (n_d, ...) to rank d, and receive each rank's part for this one, in the order of ranks.
 
         All parts have one dtype and the same trailing shape, on every rank.
         """
-        return list(parts)
+        if not self.several:
+            return list(parts)
+        import torch
 
-    def gather(self, rows: Tensor) -> Tensor:
-        """All ranks' rows (n, ...), in the order of ranks."""
+        rows, counts = self.send(torch.cat(list(parts)), list(map(len, parts)))
+        return list(rows.split(counts))
+
+    def gather(self, rows: Tensor, counts: Sequence[int] | None = None) -> Tensor:
+        """All ranks' rows (n, ...), in the order of ranks. counts: how many each has, if this is known (`send`)."""
         if not self.several:
             return rows
         import torch
 
-        return torch.cat(self.exchange([rows] * self.size))
+        return self.send(torch.cat([rows] * self.size), [len(rows)] * self.size, counts)[0]
 
     def before(self, count: int) -> tuple[int, int]:
         """The sum of all counts of lower ranks, and of all ranks."""

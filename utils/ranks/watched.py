@@ -30,13 +30,13 @@ def _watched(call: Callable[..., Any]) -> Callable[..., Any]:
     """Note that a rank waits in a collective call, and turn the loss of another rank into RankLost."""
 
     @wraps(call)
-    def wrapped(self: "WatchedRanks", *args: Any) -> Any:
+    def wrapped(self: "WatchedRanks", *args: Any, **named: Any) -> Any:
         if self.waiting_since is not None:  # one call in another
-            return call(self, *args)
+            return call(self, *args, **named)
         self.calls += 1
         self.waiting_since = time.monotonic()
         try:
-            return call(self, *args)
+            return call(self, *args, **named)
         except RuntimeError as error:
             lost = isinstance(error, dist.DistError) or any(words in str(error).lower() for words in _WORDS)
             if is_out_of_memory(error) or not lost:
@@ -107,5 +107,13 @@ class WatchedRanks(SeveralRanks):
         super().largest_(numbers)
 
     @_watched
-    def exchange(self, parts: Sequence[Tensor]) -> list[Tensor]:
-        return super().exchange(parts)
+    def table(self, values: Tensor) -> Tensor:
+        return super().table(values)
+
+    @_watched
+    def added(self, values: Tensor) -> Tensor:
+        return super().added(values)
+
+    @_watched
+    def send(self, rows: Tensor, sizes: Sequence[int], counts: Sequence[int] | None = None) -> tuple[Tensor, list[int]]:
+        return super().send(rows, sizes, counts)
