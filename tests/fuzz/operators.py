@@ -71,6 +71,12 @@ def sound_calls() -> dict[str, Call]:
         "l1_ssim_vjp": (ssim.l1_ssim_vjp, [one, two, kept, torch.ones(()), torch.ones(())]),
         "photometric": (ssim.photometric, [one, two, 0.2, True]),
         "photometric_vjp": (ssim.photometric_vjp, [one, two, kept, 0.2, torch.ones(())]),
+        "photometric_band": (ssim.photometric_band, [one, two, 0, one.shape[-2]]),
+        "photometric_of_sums": (ssim.photometric_of_sums, [one, ssim.photometric_band(one, two, 0, 0)[0], 0.2]),
+        "photometric_band_vjp": (
+            ssim.photometric_band_vjp,
+            [one, two, kept, 0.2, torch.ones(()), 0, one.shape[-2]],
+        ),
         "composite": (ssim.composite, [torch.zeros(4, 5, 6, dtype=torch.uint8), torch.ones(3)]),
         "mean_distance2": (torch.ops.simple_knn.mean_distance2, [torch.rand(9, 3)]),
     }
