@@ -16,6 +16,7 @@ from scene import Scene
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.checkpoint import load_checkpoint
 from scene.options import option
+from scene.spilled_model import SpilledGaussians
 from training.checks import check_exposures, check_scene, check_target, warn_of_fewer, warn_of_late_reset
 from training.history import check_folder, continue_records, report_changes
 from training.loss_watch import LossWatch
@@ -58,11 +59,12 @@ class Run:
         self.lost = 0
         self.interrupt = DeferredInterrupt()
         self.device = compute_device()
-        place = "cpu" if ranks().several else self.device  # a rank keeps a part
+        place = "cpu" if ranks().several or opt.spill else self.device  # a part of it is kept there
         capture, self.first_iteration = load_checkpoint(plan.start, place) if plan.start else (None, 0)
         self.pace = pace_of(opt, plan.start, self.first_iteration)
         warn_of_late_reset(opt, dataset.white_background, self.pace)
-        self.gaussians = GaussianModel(dataset.sh_degree, opt.optimizer_type)
+        kind = SpilledGaussians if opt.spill else GaussianModel
+        self.gaussians = kind(dataset.sh_degree, opt.optimizer_type)
         self.gaussians.divide(ranks())
         init_ply = option(dataset, "init_ply")
         if init_ply and not plan.start:
