@@ -144,10 +144,11 @@ class GaussianModel(Exposed, RelocatingGaussians):
     def step(self, radii: Tensor) -> None:
         """Step all optimisers and drop the gradients.
 
-        radii: (N,) pixels in the view of this iteration; the sparse optimiser skips Gaussians of radius 0.
+        radii: (N,) pixels in the view of this iteration, or (V, N) in its views; the sparse optimiser skips Gaussians
+        of radius 0.
         """
         if isinstance(self.optimizer, SparseGaussianAdam):
-            self.optimizer.step(radii > 0)
+            self.optimizer.step((radii if radii.dim() == 1 else radii.amax(0)) > 0)
         else:
             self.optimizer.step()
         self.optimizer.zero_grad(set_to_none=True)

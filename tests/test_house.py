@@ -23,7 +23,7 @@ LONGEST = 60  # lines of a function
 MAY_IMPORT = {
     "utils": (),
     "utils.host": (),
-    "utils.ranks": (),
+    "utils.ranks": ("utils",),
     "utils.exact": ("utils.ranks",),
     "utils.files": ("utils",),
     "utils.camera_utils": ("scene.cameras", "scene.views", "scene.options", "scene.pictures", "scene.readers", "utils"),

@@ -1,64 +1,97 @@
-"""What ranks send each other in a view: splats to the bands that they reach, and gradient rows back."""
+"""Exchange of what ranks need of each other in a view: splats for the bands that they reach, gradient rows back."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import chain
 
 import torch
 from torch import Tensor
 
+from gaussian_renderer.over_ranks.bands import Bands
 from utils.ranks.ranks import Ranks
+
+_WORDS = {4: torch.int32, 8: torch.int64}
 
 
 @dataclass(slots=True)
 class Sent:
-    """Which of a rank's own Gaussians each band got, and how many Gaussians this band got from each rank."""
+    """Which of a rank's own Gaussians each rank got, as a record, and how many records this one got from each."""
 
-    indices: list[Tensor]  # ascending, for each rank
+    indices: Tensor  # (n,) of the Gaussians, ascending for each rank, rank after rank
+    sizes: list[int]  # records for each rank
     received: list[int]
+    order: Tensor | None  # (n,): places of the records, if those of a Gaussian lie side by side; None if they do
 
 
-def send_splats(ranks: Ranks, bands: list[int], splats: tuple[Tensor, ...]) -> tuple[tuple[Tensor, ...], Sent]:
+def send_splats(
+    ranks: Ranks, bands: Bands, seen: Tensor, splats: tuple[Tensor, ...]
+) -> tuple[tuple[Tensor, ...], Sent]:
     """Send splats to the bands that their rectangles reach; receive those of this band, in the order of all Gaussians.
 
-    splats: tensors with a row for each Gaussian of the rank: splats, depths, rectangles (N, 4), tile counts (N,).
+    seen: (n,) the Gaussians that have tiles. splats: tensors with a row for each Gaussian of the rank: splats, depths,
+    rectangles (N, 4), tile counts (N,).
     """
-    _, _, rects, tile_counts = splats
-    top, bottom = rects[:, 1], rects[:, 3]
-    indices = [
-        ((tile_counts > 0) & (top < end) & (bottom > begin)).nonzero().reshape(-1)
-        for begin, end in zip(bands, bands[1:], strict=False)
-    ]
-    return send(ranks, [splats] * ranks.size, indices)
+    top, bottom = splats[2].index_select(0, seen)[:, 1::2].unbind(1)
+    borders = torch.tensor(bands.borders).to(top.device, non_blocking=True)[:, None]
+    first, end = borders[:-1], borders[1:]
+    reached = (top < end) & (bottom > first) & (first < end)  # (size, n)
+    sizes = bands.splats[ranks.rank]
+    band, place = torch.nonzero_static(reached, size=sum(sizes)).unbind(1)
+    each = reached.sum(0)
+    earlier = reached.cumsum(0, dtype=torch.int32)[band, place] - 1  # records of the same splat
+    order = (each.cumsum(0) - each).index_select(0, place) + earlier
+    indices = seen.index_select(0, place)
+    counts = [splats_of[ranks.rank] for splats_of in bands.splats]
+    rows, received = ranks.send(_packed(splats, indices), sizes, counts)
+    return _unpacked(rows, splats), Sent(indices, sizes, received, order)
 
 
-def send(ranks: Ranks, splats: Sequence[tuple[Tensor, ...]], indices: list[Tensor]) -> tuple[tuple[Tensor, ...], Sent]:
-    """Send rows `indices[r]` of the tensors `splats[r]` to rank r; receive this rank's, in the order of ranks."""
-    parts = [_packed(tensors, chosen) for tensors, chosen in zip(splats, indices, strict=True)]
-    received = ranks.exchange(parts)
-    return _unpacked(torch.cat(received), splats[0]), Sent(indices, list(map(len, received)))
+def send_views(
+    ranks: Ranks, views: Sequence[tuple[Tensor, ...]], chosen: Sequence[Tensor], count: int
+) -> tuple[tuple[Tensor, ...], Sent]:
+    """Send rows `chosen[r]` of the tensors `views[r]` to rank r; receive this rank's, in the order of ranks.
+
+    count: of the rank's Gaussians. The records are those of Gaussian v * count + i for Gaussian i of view v.
+    """
+    sizes = list(map(len, chosen))
+    packed = [_packed(tensors, indices) for tensors, indices in zip(views, chosen, strict=True)]
+    rows, received = ranks.send(torch.cat(packed), sizes)
+    indices = torch.cat([own + view * count for view, own in enumerate(chosen)])
+    return _unpacked(rows, views[0]), Sent(indices, sizes, received, None)
 
 
 def return_rows(ranks: Ranks, sent: Sent, count: int, rows: Tensor, counts: Tensor) -> tuple[Tensor, Tensor]:
-    """Send gradient rows back; receive those of the rank's own `count` Gaussians from all bands.
+    """Send gradient rows back; receive those of the rank's own `count` Gaussians from all ranks.
 
-    rows: (R, V), those of a splat side by side; counts (n,) int32: of each splat of this band. Returns the same for the
-    rank's Gaussians, each with its rows in the order of bands, which is that of its tiles.
+    rows: (R, V), those of a record side by side; counts (n,) int32: of each record here. Returns the same for the
+    rank's Gaussians, each with its rows in the order of ranks, which is that of its tiles.
     """
-    by_rank = counts.split(sent.received)
-    lengths = torch.stack([part.sum() for part in by_rank]).tolist()
-    counts_back = ranks.exchange(by_rank)
-    rows_back = ranks.exchange(rows.split(lengths))
-    total = torch.zeros(count, dtype=torch.int64, device=rows.device)
-    for indices, part in zip(sent.indices, counts_back, strict=True):
-        total.index_add_(0, indices, part.long())
-    place = total.cumsum(0) - total  # of each Gaussian's next row
-    out = rows.new_empty(sum(map(len, rows_back)), rows.shape[1])
-    for indices, part, values in zip(sent.indices, counts_back, rows_back, strict=True):
-        part = part.long()
-        shift = place.index_select(0, indices) - (part.cumsum(0) - part)
-        out[torch.arange(len(values), device=rows.device) + shift.repeat_interleave(part)] = values
-        place.index_add_(0, indices, part)
-    return out, total.int()
+    values, word = rows.shape[1], _WORDS[rows.element_size()]
+    lengths = [values * n for n in _sums(counts, sent.received)]
+    pairs = zip(counts.to(word).view(rows.dtype).split(sent.received), rows.view(-1).split(lengths), strict=True)
+    sizes = [records + length for records, length in zip(sent.received, lengths, strict=True)]
+    words, sizes = ranks.send(torch.cat(list(chain(*pairs))), sizes)
+    parts = words.split(list(chain(*((records, n - records) for records, n in zip(sent.sizes, sizes, strict=True)))))
+    counts, rows = torch.cat(parts[::2]).view(word).long(), torch.cat(parts[1::2]).view(-1, values)
+    total = torch.zeros(count, dtype=torch.int64, device=rows.device).index_add_(0, sent.indices, counts)
+    if sent.order is not None:
+        rows = _by_gaussian(rows, counts, sent.order)
+    return rows, total.int()
+
+
+def _sums(counts: Tensor, sizes: Sequence[int]) -> list[int]:
+    """The sums of runs of counts, waiting once for a GPU."""
+    ends = torch.tensor([0, *sizes]).cumsum(0).to(counts.device, non_blocking=True)
+    return torch.nn.functional.pad(counts.cumsum(0, dtype=torch.int64), (1, 0)).index_select(0, ends).diff().tolist()
+
+
+def _by_gaussian(rows: Tensor, counts: Tensor, order: Tensor) -> Tensor:
+    """Rows (R, V), `counts` (n,) of each record, with the records put into their places."""
+    ordered = torch.empty_like(counts).index_copy_(0, order, counts)
+    begins = (ordered.cumsum(0) - ordered).index_select(0, order)
+    shift = begins - (counts.cumsum(0) - counts)
+    places = torch.arange(len(rows), device=rows.device) + shift.repeat_interleave(counts, output_size=len(rows))
+    return torch.empty_like(rows).index_copy_(0, places, rows)
 
 
 def _packed(tensors: tuple[Tensor, ...], indices: Tensor) -> Tensor:

@@ -11,7 +11,7 @@ from diff_gaussian_rasterization.ops import Rasterized, scene_arguments
 from diff_gaussian_rasterization.schema import GRADIENT_PLACES, INPUTS, SCENE_TENSORS
 from torch import Tensor
 
-from gaussian_renderer.over_ranks.band import draw_view, gradient_rows
+from gaussian_renderer.over_ranks.band import draw_view, gradient_rows, whole_image
 from utils.ranks.ranks import Ranks
 
 
@@ -47,7 +47,7 @@ class _OverRanks(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, ranks: Ranks, *inputs: Any) -> tuple[Tensor, Tensor, Tensor]:
         _, *scene, background, want_depth, train, absolute = inputs
-        view = draw_view(ranks, tuple(scene), background, want_depth, train)
+        view = whole_image(draw_view(ranks, tuple(scene), background, want_depth, train))
         ctx.mark_non_differentiable(view.radii)
         ctx.set_materialize_grads(False)
         if train:

@@ -12,7 +12,7 @@ from diff_gaussian_rasterization.ops import scene_arguments
 from diff_gaussian_rasterization.schema import GRADIENTS
 from torch import Tensor
 
-from gaussian_renderer.over_ranks.exchange import Sent, return_rows, send
+from gaussian_renderer.over_ranks.exchange import Sent, return_rows, send_views
 from utils.ranks.ranks import Ranks
 
 
@@ -62,7 +62,7 @@ class _Views(torch.autograd.Function):
         projected = [OPERATORS.project(*gaussians, *camera) for camera in cameras]
         chosen = [(tile_counts > 0).nonzero().reshape(-1) for *_, tile_counts, _ in projected]
         rows = [tensors[:4] for tensors in projected]
-        (splats, depths, rects, counts), sent = send(ranks, rows, chosen)
+        (splats, depths, rects, counts), sent = send_views(ranks, rows, chosen, len(gaussians[0]))
         height, width = cameras[ranks.rank][5:7]
         lists = OPERATORS.bin(splats, depths, rects, counts, height, width, True)
         planes = OPERATORS.blend(splats, *lists[:2], background, height, width, wants[0], True)
@@ -100,8 +100,7 @@ class _Views(torch.autograd.Function):
 
 def _by_view(ranks: Ranks, sent: Sent, count: int, rows: Tensor, counts: Tensor) -> list[tuple[Tensor, Tensor]]:
     """`return_rows` for each view by itself: as Gaussian i of view v, row v * count + i of all."""
-    indices = [chosen + view * count for view, chosen in enumerate(sent.indices)]
-    all_rows, totals = return_rows(ranks, Sent(indices, sent.received), count * ranks.size, rows, counts)
+    all_rows, totals = return_rows(ranks, sent, count * ranks.size, rows, counts)
     totals = list(totals.split(count)) if count else [totals] * ranks.size
-    lengths = [int(total.sum()) for total in totals]
+    lengths = torch.stack([total.sum() for total in totals]).tolist()
     return list(zip(all_rows.split(lengths), totals, strict=True))

@@ -66,13 +66,16 @@ class AdaptiveGaussians(GaussianParameters):
         """Add a view to the statistics: largest radius, gradient length and count of the Gaussians it saw.
 
         viewspace_points: (N, 3) with `.grad` per NDC unit; radii: (N,) int32 pixels, 0 where not seen. One pass updates
-        max_radii2D and does the work of add_densification_stats for radii > 0.
+        max_radii2D and does the work of add_densification_stats for radii > 0. Several views at once: (V, N, 3) and
+        (V, N).
         """
-        self.statistics.observe(viewspace_points.grad, radii)
+        for gradient, pixels in _views(viewspace_points.grad, radii):
+            self.statistics.observe(gradient, pixels)
 
     def observe_absolute(self, viewspace_points: Tensor, radii: Tensor) -> None:
         """Do as observe with the lengths of absolute gradients, of a `render` with want_absolute_gradient."""
-        self.statistics.observe(viewspace_points.grad[:, 2], radii)
+        for gradient, pixels in _views(viewspace_points.grad, radii):
+            self.statistics.observe(gradient[:, 2], pixels)
 
     def add_densification_stats(self, viewspace_point_tensor: Tensor, update_filter: Tensor) -> None:
         """Add this view's screen-space gradient lengths and count it, for the Gaussians it saw.
@@ -346,6 +349,11 @@ class AdaptiveGaussians(GaussianParameters):
             if name not in names
         ]
         return optimised, others, {} if self.optimizer is None else self.optimizer.state
+
+
+def _views(gradient: Tensor, radii: Tensor) -> list[tuple[Tensor, Tensor]]:
+    """The gradients and radii of each view."""
+    return [(gradient, radii)] if radii.dim() == 1 else list(zip(gradient, radii, strict=True))
 
 
 # Read once, so that a step is told from one that replaces it, in a subclass or in this class.

@@ -108,9 +108,10 @@ def save_checkpoint(path: str | os.PathLike, capture: tuple, iteration: int) -> 
     """Write (capture, iteration), on the rank that writes; the whole file or none."""
     if not ranks().first:
         return
-    with atomic_write(path) as temporary:
+    # To an open file, as torch would write a path's name into the archive, and the temporary one is never the same.
+    with atomic_write(path) as temporary, open(temporary, "wb") as file:
         try:
-            torch.save((capture, iteration), temporary)
+            torch.save((capture, iteration), file)
         except RuntimeError as error:
             # torch hides the cause when its archive writer fails, but the content is never the cause.
             if "inline_container" not in str(error) and "PytorchStreamWriter" not in str(error):

@@ -14,6 +14,7 @@ from utils.files.ply_header import check_header
 from utils.files.ply_rows import check_rows
 from utils.ranks.gathering import in_order
 from utils.ranks.ranks import ALONE, Ranks
+from utils.ranks.ranks import ranks as all_ranks
 from utils.system_utils import UserError, atomic_write
 
 _NORMALS = ["nx", "ny", "nz"]  # zeros after the positions, as in the reference's files
@@ -32,6 +33,8 @@ def write_ply(
     world_offset: world coordinates of the origin, written as a comment unless they are zero. comments: further ones.
     ranks: those whose rows together make the file, of which the first writes it. Every rank must call it.
     """
+    if not (ranks.several or all_ranks().first):
+        return
     count = len(rows["xyz"])
     header = ["ply", "format binary_little_endian 1.0"]
     header += [f"comment {comment}" for comment in (*offset_comments(world_offset), *comments)]

@@ -10,6 +10,7 @@ from training.steps.ahead import AheadStep
 from training.steps.fused import FusedStep
 from training.steps.plain import PlainStep
 from training.steps.spilled import SpilledStep
+from training.steps.views import ViewsStep
 from utils.ranks.ranks import ranks
 
 Taker: TypeAlias = PlainStep | FusedStep | AheadStep
@@ -22,6 +23,8 @@ def step_taker(run: Run) -> Taker:
     that is not ours: it may want gradients, or wait for values that the GPU has not computed yet. With --spill that of
     a part of the model.
     """
+    if run.pace.views > 1:
+        return ViewsStep(run)
     if isinstance(run.gaussians, SpilledGaussians):
         return SpilledStep(run)
     if run.plan.plain_step or torch.is_anomaly_enabled() or not FusedStep.suits(run):

@@ -59,5 +59,5 @@ class ViewsStep(PlainStep):
 def _mean(losses: Losses) -> Losses:
     """Means over the ranks; the mask stays that of the rank's own view."""
     own = torch.stack([losses.total.detach(), losses.l1.detach()])
-    total, l1 = ranks().gather(own[None]).mean(0)
+    total, l1 = ranks().table(own).mean(0)
     return losses._replace(total=total, l1=l1, depth=None if losses.depth is None else losses.depth.detach())

@@ -59,7 +59,8 @@ class AdaptiveDensityControl(DensityControl):
 
     def _actions(self, iteration: int) -> rules.Actions:
         pace = self.pace
-        return rules.actions(iteration, self._opt, self._white_background, pace.span(iteration), pace.stride(iteration))
+        place = pace.span(iteration), pace.stride(iteration), pace.views
+        return rules.actions(iteration, self._opt, self._white_background, *place)
 
     def _densify(self, iteration: int, limit_size: bool) -> None:
         self._gaussians.densify_and_prune(

@@ -86,7 +86,7 @@ class BudgetControl(DensityControl):
         return max(math.ceil(ahead) - 1, 0)
 
     def _interval(self, iteration: int) -> int:
-        return rules.interval(self._opt, self._opt.densify_until_iter, self.pace.stride(iteration))
+        return rules.interval(self._opt, self._opt.densify_until_iter, self.pace.stride(iteration), self.pace.views)
 
     def _chosen(self, step: Step, count: int) -> Tensor:
         """Indices of this rank's Gaussians to split, ascending; those of all ranks are at most `count`."""

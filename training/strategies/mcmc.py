@@ -41,7 +41,7 @@ class MarkovChain(DensityControl):
         opt = self._opt
         within = opt.densify_from_iter < self.pace.nominal(iteration) < opt.mcmc_until_iter
         stride = self.pace.stride(iteration)
-        return within and iteration % rules.interval(opt, opt.mcmc_until_iter, stride) == 0
+        return within and iteration % rules.interval(opt, opt.mcmc_until_iter, stride, self.pace.views) == 0
 
     def most_after(self, count: int, first: int, last: int) -> int:
         for _ in filter(self.changes, range(first, last + 1)):

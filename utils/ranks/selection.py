@@ -15,8 +15,7 @@ def lowest(values: Tensor, count: int, ranks: Ranks = ALONE, *, highest: bool = 
     mine = torch.argsort(values, descending=highest, stable=True)[:count]
     if not ranks.several:
         return mine
-    mine = mine.sort().values
-    every = ranks.gather(values[mine])
+    every = ranks.gather(values[mine])  # of equal values of a rank the first comes first, as ranks do
     chosen = torch.argsort(every, descending=highest, stable=True)[:count] - ranks.before(len(mine))[0]
     return mine[chosen[(chosen >= 0) & (chosen < len(mine))]]
 

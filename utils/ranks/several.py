@@ -13,13 +13,15 @@ from utils.ranks.ranks import Ranks, Value
 class SeveralRanks(Ranks):
     """The ranks of the default process group.
 
-    Numbers and objects go by a group of CPUs. Rows go by NCCL, where the group has it, or else by way of the CPU.
+    Numbers and objects of the host go by a group of CPUs. Tensors go by NCCL, where the group has it, or else by way of
+    the CPU.
     """
 
     def __init__(self) -> None:
         self.rank, self.size = dist.get_rank(), dist.get_world_size()
-        self._by_gpu = dist.get_backend() == "nccl"
-        self._numbers = dist.new_group(backend="gloo") if self._by_gpu else dist.group.WORLD
+        by_gpu = dist.get_backend() == "nccl"
+        self._place = "cuda" if by_gpu else "cpu"  # of what the default group sends
+        self._numbers = dist.new_group(backend="gloo") if by_gpu else dist.group.WORLD
 
     def numbers(self, *values: int) -> Tensor:
         mine = torch.tensor(values, dtype=torch.int64)
@@ -32,22 +34,39 @@ class SeveralRanks(Ranks):
         dist.broadcast_object_list(box, src=0, group=self._numbers)
         return box[0]
 
-    def exchange(self, parts: Sequence[Tensor]) -> list[Tensor]:
-        counts = self.numbers(*map(len, parts))[:, self.rank].tolist()
-        shape, dtype, device = parts[0].shape[1:], parts[0].dtype, parts[0].device
+    def everyone(self, value: Value) -> list[Value]:
+        box: list = [None] * self.size
+        dist.all_gather_object(box, value, group=self._numbers)
+        return box
+
+    def largest_(self, numbers: Tensor) -> None:
+        dist.all_reduce(numbers, dist.ReduceOp.MAX, group=None if numbers.is_cuda else self._numbers)
+
+    def table(self, values: Tensor) -> Tensor:
+        mine = values.detach().contiguous().to(self._place)
+        every = mine.new_empty(self.size, *mine.shape)
+        dist.all_gather(list(every.unbind()), mine)
+        return every.to(values.device)
+
+    def added(self, values: Tensor) -> Tensor:
+        total = values.detach().to(self._place, copy=True)
+        dist.all_reduce(total)
+        return total.to(values.device)
+
+    def send(self, rows: Tensor, sizes: Sequence[int], counts: Sequence[int] | None = None) -> tuple[Tensor, list[int]]:
+        counts = self._counts(sizes) if counts is None else list(counts)
+        shape, dtype, total = rows.shape[1:], rows.dtype, sum(counts)
         width = prod(shape) * dtype.itemsize  # bytes of a row
         if not width:
-            return [parts[0].new_empty(count, *shape) for count in counts]
-        place = device if self._by_gpu else "cpu"
-        sent = torch.cat([part.detach().contiguous().view(-1).view(torch.uint8) for part in parts]).to(place)
-        received = torch.empty(width * sum(counts), dtype=torch.uint8, device=place)
-        dist.all_to_all_single(received, sent, [width * n for n in counts], [width * len(part) for part in parts])
-        pieces = received.to(device).split([width * n for n in counts])
-        return [_rows(piece, dtype, count, shape) for piece, count in zip(pieces, counts, strict=True)]
+            return rows.new_empty(total, *shape), counts
+        sent = rows.detach().contiguous().view(-1).view(torch.uint8).to(self._place)
+        received = sent.new_empty(width * total)
+        dist.all_to_all_single(received, sent, [width * n for n in counts], [width * n for n in sizes])
+        return received.to(rows.device).view(dtype).view(total, *shape), counts
 
-
-def _rows(piece: Tensor, dtype: torch.dtype, count: int, shape: torch.Size) -> Tensor:
-    """The rows in some bytes, copied where these begin at an odd place."""
-    if piece.storage_offset() % dtype.itemsize:
-        piece = piece.clone()
-    return piece.view(dtype).view(count, *shape)
+    def _counts(self, sizes: Sequence[int]) -> list[int]:
+        """How many rows each rank sends here, where this one sends `sizes`."""
+        sent = torch.tensor(sizes, dtype=torch.int64, device=self._place)
+        counts = torch.empty_like(sent)
+        dist.all_to_all_single(counts, sent)
+        return counts.tolist()

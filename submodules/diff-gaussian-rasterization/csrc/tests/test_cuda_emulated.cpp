@@ -535,7 +535,7 @@ void test_noise() {
     const int64_t stopped[2] = {0, 5};
     const auto input = [&](std::vector<float>& to, const int64_t* guard) {
       const float* v = values.data();
-      return gs::NoiseInput{n, to.data(), v, v + 3 * n, v + 7 * n, 30, 100, 0.005, 1ull << 40, 600, 4, guard};
+      return gs::NoiseInput{n, to.data(), v, v + 3 * n, v + 7 * n, 30, 100, 0.005, 1ull << 40, 600, 4, guard, 7'000};
     };
     gs::add_noise(gs::serial_executor(), input(wanted, nullptr));
     gs::emulation::Memory memory;
