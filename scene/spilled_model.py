@@ -1,5 +1,6 @@
 """The trained model with a part of it in the host's memory (`--spill`)."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import utils.host.extensions  # noqa: F401  isort: skip  (before the extensions)
@@ -43,12 +44,16 @@ class SpilledGaussians(GaussianModel):
     """A GaussianModel whose SH bands above 0, with their averages, lie in the host's memory; on the CPU the same one.
 
     A step concerns copies of the rows that a view sees: `fetch` makes them, `take_gradients` takes their gradients, and
-    `step` writes them back. Other rows take their steps of Adam later, each with its own rate and correction: when a
-    view sees them, or before anybody reads the bands of all Gaussians or their averages through this class.
+    `step` writes them back. `fetch_ahead` copies beside a step what the next one will want. Other rows take their steps
+    of Adam later, each with its own rate and correction: when a view sees them, or before anybody reads the bands of
+    all Gaussians or their averages through this class.
     """
 
     def __init__(self, sh_degree: int, optimizer_type: str = "default") -> None:
         self._missed, self._seen, self._copies = _Missed(), None, SideStream()
+        self._near: list[
+            tuple[Tensor, Sequence[Tensor]]
+        ] = []  # rows and their copies, as they are in the host's memory
         super().__init__(sh_degree, optimizer_type)
 
     @property
@@ -59,12 +64,13 @@ class SpilledGaussians(GaussianModel):
     @_features_rest.setter
     def _features_rest(self, values: Tensor) -> None:
         values.data = in_host_memory(values.data)
-        self._rest, self._missed = values, _Missed()
+        self._rest, self._missed, self._near = values, _Missed(), []
 
     @torch.no_grad()
     def catch_up(self) -> None:
         """Let all rows take the steps that they have missed."""
         self._copies.join()
+        self._near = []
         missed = self._missed
         if missed.steps:
             self._missed = _Missed()
@@ -95,14 +101,36 @@ class SpilledGaussians(GaussianModel):
         return seen
 
     def _fetch_stored(self, rows: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        with self._copies.aside(rows) as keep:
-            found = [keep(stored[:, : self.active_bands].index_select(0, rows)) for stored in self._stored()]
+        near, self._near = self._near, []
+        known = torch.cat([rows[:0], *(there for there, _ in near)])
+        place = torch.full((len(self),), -1, device=rows.device)
+        place[known] = torch.arange(len(known), device=rows.device)
+        place = place[rows]
+        far = place < 0
+        late = self._copied(rows[far])
         self._copies.join()
+        index = torch.where(far, len(known) + far.cumsum(0) - 1, place)
+        each = zip(*(copies for _, copies in near), late, strict=True)
+        found = [torch.cat(parts).index_select(0, index) for parts in each]
         found += [torch.zeros_like(found[0]) for _ in range(3 - len(found))]
         missed = self._missed
         if missed.steps:
             self._take_missed(missed, missed.taken[rows], found)
         return tuple(found)
+
+    def _copied(self, rows: Tensor) -> list[Tensor]:
+        """Copies (n, bands, 3) of what rows have in the host's memory; before use, the current stream has to wait."""
+        with self._copies.aside(rows) as keep:
+            return [keep(stored[:, : self.active_bands].index_select(0, rows)) for stored in self._stored()]
+
+    @torch.no_grad()
+    def fetch_ahead(self, rows: Tensor) -> None:
+        """Begin to copy the rows (n,) of the next `fetch`, but those of the last one, which are about to change."""
+        if self._seen.copies and len(self._stored()) == 3:
+            fresh = torch.ones(len(self), dtype=torch.bool, device=rows.device)
+            fresh[self._seen.rows] = False
+            rows = rows[fresh[rows]]
+            self._near.append((rows, self._copied(rows)))
 
     @torch.no_grad()
     def take_gradients(self) -> Tensor:
@@ -165,6 +193,7 @@ class SpilledGaussians(GaussianModel):
         with self._copies.aside(rows, *copies):
             for stored, copy in zip(self._stored(), copies, strict=True):
                 stored[:, : copy.shape[1]].index_copy_(0, rows, copy)
+        self._near.append((rows, copies))
         if len(missed.steps) >= _MOST_MISSED:
             self.catch_up()
 

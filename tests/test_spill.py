@@ -209,5 +209,5 @@ def test_the_estimate_leaves_out_what_lies_in_the_hosts_memory():
     usual, spilled = (training_bytes(gaussians, 1000, 0, spill=spill) for spill in (None, True))
     assert usual == 1000 * (16 * 59 + memory_estimate.PER_GAUSSIAN)
     assert spilled_bytes(gaussians, 1000) == 1000 * 12 * 45
-    seen = memory_estimate.SEEN * (45 * 16 + 14 * 8)
+    seen = memory_estimate.SEEN * (45 * 32 + 14 * 8)
     assert spilled == 1000 * (16 * 14 + 4 + seen + memory_estimate.PER_GAUSSIAN)

@@ -19,8 +19,9 @@ PER_PIXEL = 57 + 72
 # Of absolute gradients: their length, and two values more beside the ten of a tile's gradient of a Gaussian, of which
 # the 106 bytes are the most part.
 PER_ABSOLUTE = 4 + 106 // 5
-# Part of the Gaussians that a view is taken to see, for what --spill keeps on the GPU only of those in view.
-SEEN = 0.5
+# Part of the Gaussians that a view is taken to see, for what --spill keeps on the GPU only of those in view: that of a
+# large scene, which is what it is for.
+SEEN = 0.25
 GROWTH = 20  # photo scenes grow 10- to 100-fold in 7,000 iterations (docs/results/training.md), random points 2-fold
 _REMEDY = "--images_to_load, or lower --resolution (-r) or --sh_degree"
 
@@ -99,9 +100,9 @@ def training_bytes(
     each = 4 * 4 * values
     if isinstance(gaussians, SpilledGaussians) if spill is None else spill:
         bands = _bands(gaussians)
-        # All rows: the other values, and how many steps were taken. Rows in view: their bands, and copies of the others
-        # with gradients.
-        each = 4 * 4 * (values - bands) + 4 + int(SEEN * 4 * (4 * bands + 2 * (values - bands)))
+        # All rows: the other values, and how many steps were taken. Rows in view: bands and averages, of this view and
+        # the next, and one of the three once more while they are joined; gradients; copies of the other values.
+        each = 4 * 4 * (values - bands) + 4 + int(SEEN * 4 * ((3 + 3 + 1 + 1) * bands + 2 * (values - bands)))
     return count * (each + PER_GAUSSIAN + absolute * PER_ABSOLUTE) + pixels * PER_PIXEL
 
 

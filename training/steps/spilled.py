@@ -14,13 +14,19 @@ class SpilledStep(PlainStep):
     """Takes the steps of a `SpilledGaussians` with the bytes of `PlainStep`."""
 
     def render(self, step: Step, gaussians: GaussianModel) -> dict[str, Tensor]:
-        seen = gaussians.fetch(visible_rows(step.camera, gaussians, self._run.pipe))
-        return super().render(step, seen)
+        run = self._run
+        seen = gaussians.fetch(visible_rows(step.camera, gaussians, run.pipe))
+        package = super().render(step, seen)
+        if not (step.last or step.changes):  # after a change of rows, copies would be in vain
+            # As it would see them now; what the step moves into view is copied late.
+            gaussians.fetch_ahead(visible_rows(run.views[step.iteration + 1], gaussians, run.pipe))
+        return package
 
     def follow(self, losses: Losses, package: dict[str, Tensor]) -> dict[str, Tensor]:
         """Compute the gradients of all rows. Returns the package with a row for each of them."""
+        run = self._run
+        gaussians = run.gaussians
         losses.total.backward()
-        gaussians = self._run.gaussians
         rows = gaussians.take_gradients()
         count = len(gaussians)
         points = package["viewspace_points"]
