@@ -48,9 +48,16 @@ void catch_up_op(Tensor& value, Tensor& exp_avg, Tensor& exp_avg_sq, const Tenso
   });
 }
 
+void check_values(const Tensor& values) {
+  check_given(values, "values");
+  TORCH_CHECK(values.layout() == at::kStrided, "values must be dense, got ", values.layout());
+  with_scalar(values.scalar_type(), [](auto) {});
+}
+
 // A copy in page-locked memory of the host that is yet a tensor of the GPU: kernels read and write it over the bus. A
 // plain copy on the CPU.
 Tensor in_host_memory_op(const Tensor& values) {
+  check_values(values);
 #ifdef GS_CUDA
   if (values.is_cuda()) {
     const c10::cuda::CUDAGuard guard(values.device());
@@ -72,6 +79,7 @@ Tensor in_host_memory_op(const Tensor& values) {
 
 // Whether `in_host_memory` has put it there.
 bool is_in_host_memory_op(const Tensor& values) {
+  check_values(values);
 #ifdef GS_CUDA
   if (values.is_cuda() && values.numel() != 0) {
     cudaPointerAttributes found{};
