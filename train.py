@@ -17,6 +17,8 @@ import torch
 from arguments import ModelParams, OptimizationParams, OptionParser, PipelineParams, write_cfg_args, write_model_json
 from gaussian_renderer import network_gui
 from records.event_writer import EventWriter, tensorboard_is_installed
+from training.agreement import agree_on_options
+from training.launch import add_launch_options, viewers
 from training.loop import run_training
 from training.observers.report import training_report
 from training.observers.standard import standard_observers
@@ -24,8 +26,9 @@ from training.output_folder import new_folder, own_folder
 from training.plan import Plan
 from training.run import Run
 from utils.general_utils import safe_state
+from utils.ranks.ranks import ranks
 from utils.system_utils import UserError, mkdir_p, run_cli
-from viewing.options import Address, add_viewer_options
+from viewing.options import Address
 from viewing.server import checked_address
 
 SummaryWriter = EventWriter if tensorboard_is_installed() else None
@@ -45,6 +48,7 @@ def training(
     plain_step: bool = False,
     remote_viewer: tuple[str, int] | None = None,
     viewer: Address | None = None,
+    parallel: str = "tiles",
 ) -> None:
     """Train from the options of the three groups; write model, checkpoints and log to dataset.model_path.
 
@@ -52,16 +56,16 @@ def training(
     checkpoint: a chkpntN.pth to resume, or None. debug_from: switch pipe.debug on after this iteration. plain_step: no
     fast steps. record_curve: with test views, write error_vs_time.csv during training, and draw it. remote_viewer:
     where to listen for it, None: nowhere, unless network_gui listens already. viewer: where the web page listens, None:
-    no page.
+    no page. parallel: how several ranks share the work, "tiles" or "views".
     """
     dataset.model_path = dataset.model_path or new_folder()
     print(f"Optimizing {dataset.model_path}")
     iterations = testing_iterations, saving_iterations, checkpoint_iterations
-    plan = Plan(*iterations, checkpoint, debug_from, record_curve, plain_step, viewer)
+    plan = Plan(*iterations, checkpoint, debug_from, record_curve, plain_step, viewer, parallel)
     run = Run(dataset, opt, pipe, plan)
     # Write nothing before every input check has passed: a mistyped option must not overwrite a finished model.
     with own_folder(dataset.model_path), network_gui.listening(remote_viewer):
-        writer = prepare_output_and_logger(dataset, **run.kept)
+        writer = prepare_output_and_logger(dataset, **run.kept) if ranks().first else None
         run.begin()
         run_training(run, standard_observers(run, writer, training_report))
 
@@ -86,10 +90,7 @@ def _parser() -> tuple[argparse.ArgumentParser, ModelParams, OptimizationParams,
     parser = OptionParser(description="Train a Gaussian model from photos with known cameras.")
     groups = ModelParams(parser), OptimizationParams(parser), PipelineParams(parser)
     add = parser.add_argument
-    add("--ip", type=str, default="127.0.0.1", help="address to listen at for the remote viewer (default: 127.0.0.1)")
-    add("--port", type=int, default=6009, help="port for the remote viewer, 0: any free one (default: 6009)")
-    add("--disable_viewer", action="store_true", help="open no port for the remote viewer")
-    add_viewer_options(parser)
+    add_launch_options(parser)
     add("--debug_from", type=int, default=-1, metavar="N", help="switch --debug on after iteration N (default: never)")
     add("--detect_anomaly", action="store_true", help="let autograd name the operation that produced a NaN; slow")
     listed = {"type": int, "nargs": "+", "metavar": "N"}
@@ -117,8 +118,7 @@ def parse(argv: Sequence[str] | None = None) -> tuple[argparse.Namespace, ...]:
     args = parser.parse_args(argv)
     options = [group.extract(args) for group in groups]
     for name in ("test_iterations", "save_iterations", "checkpoint_iterations"):
-        wrong = [t for t in getattr(args, name) if t < 1 and t != -1]
-        if wrong:
+        if wrong := [t for t in getattr(args, name) if t < 1 and t != -1]:
             raise UserError(f"--{name} takes iterations from 1 on, or -1 for none, got {wrong[0]}")
     return args, *options
 
@@ -127,14 +127,14 @@ def main(argv: Sequence[str] | None = None) -> None:
     """Train as the command line says."""
     args, dataset, opt, pipe = parse(argv)
     safe_state(args.quiet, opt.seed)
-    viewer = checked_address(args.viewer_host, args.viewer)
+    agree_on_options(args)
     torch.autograd.set_detect_anomaly(args.detect_anomaly)
-    remote_viewer = None if args.disable_viewer else (args.ip, args.port)
-    further = args.start_checkpoint, args.debug_from, not args.no_curve, args.plain_step, remote_viewer, viewer
+    listening = viewers(args, checked_address(args.viewer_host, args.viewer))
+    further = args.debug_from, not args.no_curve, args.plain_step, *listening, args.parallel
     iterations = args.test_iterations, [*args.save_iterations, opt.iterations], args.checkpoint_iterations
-    training(dataset, opt, pipe, *iterations, *further)
+    training(dataset, opt, pipe, *iterations, args.start_checkpoint, *further)
     print("Training complete.")
 
 
 if __name__ == "__main__":
-    run_cli(main)
+    run_cli(main, several=True)

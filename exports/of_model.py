@@ -50,5 +50,5 @@ def fill_model(gaussians: GaussianModel, splats: Splats) -> None:
     }
     started = attributes(gaussians.max_sh_degree).items()
     further = {name: torch.full((len(splats), *a.shape), a.start) for name, a in started if name not in rows}
-    gaussians.set_rows(rows | further)
+    gaussians.take_whole(rows | further)
     gaussians.active_sh_degree = min(gaussians.max_sh_degree, splats.sh_degree)

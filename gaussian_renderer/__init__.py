@@ -2,13 +2,20 @@
 
 import argparse
 import math
-from functools import cache
+from collections.abc import Callable
+from functools import cache, partial
 
 import utils.host.extensions  # noqa: F401  isort: skip  (before the extensions)
 import torch
 from diff_gaussian_rasterization import GaussianRasterizationSettings, decisive, rasterize
+from diff_gaussian_rasterization.backend import OPERATORS
+from diff_gaussian_rasterization.gaussians import Gaussians
+from diff_gaussian_rasterization.ops import Rasterized, scene_arguments
 from torch import Tensor
 
+from gaussian_renderer.over_ranks.band import decisive_in, draw_view
+from gaussian_renderer.over_ranks.models import ranks_of
+from gaussian_renderer.over_ranks.rasterize import rasterize_over
 from scene.cameras import Camera, MiniCam
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.exposure import apply_exposure
@@ -57,7 +64,7 @@ def render(
     if pc.active_sh_degree == 0 and not want_inactive_bands:
         colors = _without_rest(colors)
     viewspace_points = _screen_points(xyz, *geometry.values(), *colors.values())
-    result = rasterize(
+    result = _rasterizer(pc)(
         xyz,
         viewspace_points,
         settings=rasterizer_settings(viewpoint_camera, pc, pipe, bg_color, scaling_modifier),
@@ -78,6 +85,11 @@ def render(
     }
 
 
+def _rasterizer(pc: GaussianModel) -> Callable[..., Rasterized]:
+    """The rasterizer, or that of the ranks among which a model is divided."""
+    return partial(rasterize_over, ranks) if (ranks := ranks_of(pc)).several else rasterize
+
+
 def _screen_points(xyz: Tensor, *others: Tensor) -> Tensor:
     """Zeros (N, 3) that take a gradient if one of the tensors does."""
     points = _zero(xyz.device, xyz.dtype).expand_as(xyz)
@@ -96,7 +108,21 @@ def decisive_for(camera: Camera | MiniCam, pc: GaussianModel, pipe: argparse.Nam
     background = pc.get_xyz.new_zeros(3)
     geometry, raw, colors = model_inputs(camera, pc, pipe)
     settings = rasterizer_settings(camera, pc, pipe, background)
+    if (ranks := ranks_of(pc)).several:
+        scene = scene_arguments(Gaussians(pc.get_xyz, **geometry, **colors), settings, raw)
+        return decisive_in(draw_view(ranks, scene, background, want_depth=False, train=True))
     return decisive(pc.get_xyz, settings=settings, raw=raw, **geometry, **colors)
+
+
+@torch.no_grad()
+def visible_rows(camera: Camera | MiniCam, pc: GaussianModel, pipe: argparse.Namespace) -> Tensor:
+    """Gaussians that the view may draw, or give a radius > 0: (n,) int64, ascending. Reads no SH bands above 0."""
+    geometry, raw = _geometry(pc, pipe.compute_cov3D_python, 1.0)
+    # Only whether colours are finite matters here, and for that any will do in place of those that the bands give.
+    gaussians = Gaussians(pc.get_xyz, **geometry, colors=pc.get_features_dc.reshape(-1, 3))
+    settings = rasterizer_settings(camera, pc, pipe, pc.get_xyz.new_zeros(3))
+    *_, tile_counts, radii = OPERATORS.project(*scene_arguments(gaussians, settings, raw))
+    return ((tile_counts > 0) | (radii > 0)).nonzero().reshape(-1)  # a small one may be drawn with a radius of 0
 
 
 def model_inputs(

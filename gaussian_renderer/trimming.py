@@ -17,6 +17,7 @@ from gaussian_renderer.scored_views import ScoredViews
 from scene.cameras import Camera, MiniCam
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.sh_bands import cut_bounds, needed_degree
+from utils.ranks.selection import summed
 
 FAINT = -math.log(254) - 1e-4  # logit of opacity 1/255, below which no pixel draws a Gaussian, less some rounding
 WORTH = 0.01  # share of the Gaussians; fewer unseen ones stay, because leaving them out saves little and is a risk
@@ -78,7 +79,8 @@ def search_unseen(
     takes more than a view for ITERATIONS_PER_VIEW of the `iterations` trained, they are kept.
     """
     keep = gaussians.raw("opacity").detach()[:, 0] >= FAINT
-    search = Search(keep, faint=int((~keep).sum()))
+    ranks = gaussians.shards.ranks
+    search = Search(keep, faint=summed(~keep, ranks))
     pairs, search.views = walk(cameras, iterations / ITERATIONS_PER_VIEW)
     if search.views > iterations / ITERATIONS_PER_VIEW:
         search.end = TOO_LONG
@@ -86,11 +88,11 @@ def search_unseen(
     seen, search.views = decisive_for_any(cameras, gaussians, pipe), len(cameras)
     walks = chain.from_iterable(views_between(cameras[i], cameras[j]) for i, j in pairs)
     for camera in tqdm(walks, desc="Looking between", total=len(FRACTIONS) * len(pairs), unit="view", leave=False):
-        if int((keep & ~seen).sum()) < WORTH * len(gaussians):
+        if summed(keep & ~seen, ranks) < WORTH * gaussians.total:
             break
         seen |= decisive_for(camera, gaussians, pipe)
         search.views += 1
-    few = int((keep & ~seen).sum()) < WORTH * len(gaussians)
+    few = summed(keep & ~seen, ranks) < WORTH * gaussians.total
     search.end = FEW if few else DONE
     search.keep = keep if few else keep & seen
     return search
@@ -113,11 +115,12 @@ def trim(
     start = time.perf_counter()
     every = torch.ones(len(gaussians), dtype=torch.bool, device=gaussians.get_xyz.device)
     search = Search(every) if keep_unseen else search_unseen(gaussians, cameras, pipe, iterations)
-    if not search.keep.any():  # never an empty model
+    ranks = gaussians.shards.ranks
+    if not summed(search.keep, ranks):  # never an empty model
         search = Search(every, end=FEW)
-    unseen = int((~search.keep).sum())
+    unseen = summed(~search.keep, ranks)
     rest = gaussians.get_features_rest.detach()
-    bounds = cut_bounds(rest[search.keep] if unseen else rest)
+    bounds = cut_bounds(rest[search.keep] if unseen else rest, ranks)
     degree = gaussians.max_sh_degree if prune_sh < 0 else needed_degree(bounds, prune_sh)
     if unseen or degree < gaussians.max_sh_degree:
         gaussians = gaussians.part(search.keep if unseen else slice(None), degree)

@@ -16,6 +16,8 @@ from diff_gaussian_rasterization.ops import scene_arguments
 from torch import Tensor
 
 from gaussian_renderer import rasterizer_settings
+from gaussian_renderer.over_ranks.band import Band, View, draw_view, gradient_rows, surroundings, whole_image
+from gaussian_renderer.over_ranks.models import ranks_of
 from scene.cameras import Camera
 from scene.fused_adam import FusedAdam
 from scene.gaussian_model import GaussianModel
@@ -23,24 +25,42 @@ from scene.gaussian_model import GaussianModel
 
 @dataclass(slots=True)
 class Drawn:
-    """A view's image (3, H, W) and, if wanted, inverse depth (1, H, W); both may be given `requires_grad`."""
+    """A view's image (3, H, W) and, if wanted, inverse depth (1, H, W); both may be given `requires_grad`.
+
+    The image's gradient needs no more rows than the image has.
+    """
 
     image: Tensor
     depth: Tensor | None
     radii: Tensor  # (N,) int32 pixels
     scene: tuple[Any, ...]  # arguments of the operators
-    state: tuple[Tensor, ...]
-    more: tuple[Tensor, ...]  # what the backward wants after the image's gradients
+    state: tuple[Tensor, ...] = ()
+    more: tuple[Tensor, ...] = ()  # what the backward wants after the image's gradients
+    view: View | None = None  # of several ranks, which have the state
+    band: Band | None = None  # if the image is right only there and around it
 
 
 @torch.no_grad()
 def draw(
-    camera: Camera, gaussians: GaussianModel, pipe: argparse.Namespace, background: Tensor, want_depth: bool
+    camera: Camera,
+    gaussians: GaussianModel,
+    pipe: argparse.Namespace,
+    background: Tensor,
+    want_depth: bool,
+    by_bands: bool = False,
 ) -> Drawn:
-    """Render a view for `step`. The Gaussians must be ones that `FusedAdam` takes."""
+    """Render a view for `step`. The Gaussians must be ones that `FusedAdam` takes.
+
+    by_bands: of a model that is divided among ranks, each needs no more of the image than the loss of its band.
+    """
     colors = {"sh_dc": gaussians.get_features_dc, "sh_rest": gaussians.get_features_rest}
     rows = Gaussians(gaussians.get_xyz, **gaussians.raw_geometry(), **colors)
     scene = scene_arguments(rows, rasterizer_settings(camera, gaussians, pipe, background), True)
+    if (ranks := ranks_of(gaussians)).several:
+        view = draw_view(ranks, scene, background, want_depth, train=True)
+        view = surroundings(view) if by_bands else whole_image(view)
+        depth = view.inverse_depth if want_depth else None
+        return Drawn(view.color, depth, view.radii, scene, view=view, band=view.band if by_bands else None)
     color, transmittance, depth, radii, splats, tile_counts, *lists, last, layers = OPERATORS.rasterize(
         rows.means, *scene, background, want_depth, True
     )
@@ -63,7 +83,15 @@ def step(
     absolute: with the lengths of absolute gradients (`rasterize` of diff_gaussian_rasterization).
     now: (NOW_WORDS,) int64 on the Gaussians' device of `FusedAdam.write_now`, for a step that is recorded.
     """
+    absolute &= observe
+    further = {"now": now, "absolute": absolute, **adam.penalties()}
+    if (view := drawn.view) is not None:
+        rows = gradient_rows(view, (image_gradient, None, depth_gradient), absolute)
+        OPERATORS.rows_vjp_step_(
+            *drawn.scene, view.splats, view.tile_counts, *rows, drawn.radii, *adam.arguments(observe), **further
+        )
+        return
     OPERATORS.rasterize_vjp_step_(
         *drawn.scene, *drawn.state, image_gradient, None, depth_gradient, *drawn.more, drawn.radii,
-        *adam.arguments(observe), now=now, absolute=absolute, **adam.penalties(),
+        *adam.arguments(observe), **further,
     )  # fmt: skip

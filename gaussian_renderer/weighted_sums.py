@@ -11,6 +11,8 @@ from diff_gaussian_rasterization.schema import GRADIENTS
 from torch import Tensor
 
 from gaussian_renderer import model_inputs, rasterizer_settings
+from gaussian_renderer.over_ranks.band import draw_view, gradient_rows, whole_image
+from gaussian_renderer.over_ranks.models import ranks_of
 from scene.cameras import Camera, MiniCam
 from scene.gaussian_model import GaussianModel
 
@@ -34,10 +36,15 @@ def weighted_sums(
     geometry, raw, colors = model_inputs(camera, gaussians, pipe)
     settings, xyz = rasterizer_settings(camera, gaussians, pipe, background), gaussians.get_xyz
     drawn = scene_arguments(Gaussians(xyz, **geometry, **colors), settings, raw)
+    given = scene_arguments(Gaussians(xyz, **geometry, colors=xyz), settings, raw)
+    if (ranks := ranks_of(gaussians)).several:
+        view = whole_image(draw_view(ranks, drawn, background, want_depth=False, train=True))
+        rows = gradient_rows(view, (value(view.color), None, None), absolute=False)
+        gradients = OPERATORS.rows_vjp(*given, view.splats, view.tile_counts, *rows, _ONLY_COLORS)
+        return gradients[_ONLY_COLORS.index(True)]
     image, transmittance, _, _, splats, tile_counts, *lists, last, layers = OPERATORS.rasterize(
         xyz, *drawn, background, False, True
     )
-    given = scene_arguments(Gaussians(xyz, **geometry, colors=xyz), settings, raw)
     state = (splats, *lists, background, last, transmittance)
     planes = value(image), None, None
     gradients = OPERATORS.rasterize_vjp(*given, *state, *planes, tile_counts, layers, _ONLY_COLORS)

@@ -17,6 +17,7 @@ from records.error_curve import COLUMNS, FIGURE, NAME, SUBSET, Row, write_curve
 from records.training_log import SHORT, TrainingLog
 from utils.host.process import wall_seconds
 from utils.host.threads import cores
+from utils.ranks.ranks import ranks
 from utils.system_utils import UserError
 
 AHEAD, MANY_CORES = 2.0, 4  # seconds before the end at which drawing gets ready, where that takes no core from training
@@ -88,9 +89,11 @@ class CurveRecorder:
     def due(self, iteration: int, seconds: float) -> bool:
         """Whether to `add` a point after `seconds` of training in this run; if so, it waits for the GPU."""
         pace = seconds / max(iteration - self._first, 1)
-        if pace * (self._iterations - iteration) <= self._ahead:
+        if ranks().first and pace * (self._iterations - iteration) <= self._ahead:
             self._drawer.begin()
         due = self._schedule.due(iteration, seconds)
+        if self.is_point(iteration):
+            due = ranks().shared(due)  # it follows from the clock
         if due and self._device.type == "cuda":
             torch.cuda.synchronize(self._device)
         return due
@@ -180,5 +183,5 @@ class CurveRecorder:
         self._drawer.abandon()
 
     def _draw(self) -> None:
-        if failure := self._drawer.finish():
+        if ranks().first and (failure := self._drawer.finish()):
             print(f"warning: no {FIGURE}: {failure}", file=sys.stderr)

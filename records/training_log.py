@@ -10,6 +10,7 @@ from pathlib import Path
 
 from utils.files.json_files import read_json, write_json
 from utils.host.process import peak_memory_mib, wall_seconds
+from utils.ranks.ranks import ranks
 from utils.system_utils import UserError, compute_device
 
 NAME = "train_log.json"
@@ -37,7 +38,8 @@ class Stopwatch:
         before, outer, others = time.perf_counter(), self._stopped, sum(self.spent.values())
         self._stopped = before if outer is None else outer
         try:
-            yield
+            with ranks().busy():
+                yield
         finally:
             taken = time.perf_counter() - before
             inner = sum(self.spent.values()) - others

@@ -57,7 +57,7 @@ class FusedAdam:
 
     def penalties(self) -> dict[str, float]:
         """The operator's last arguments, which change with the number of Gaussians."""
-        each = self._penalty.of_each(len(self._gaussians))
+        each = self._penalty.of_each(self._gaussians.total)
         return {"opacity_penalty": each.opacity, "scale_penalty": each.scale}
 
     def write_now(self, now: Tensor, iteration: int) -> None:

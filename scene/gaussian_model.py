@@ -11,6 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from scene.gaussians.adam import GaussianAdam, StepGuard
+from scene.gaussians.agreement import match_optimizer
 from scene.gaussians.attributes import INITIAL_OPACITY
 from scene.gaussians.checkpoint import State, pack, unpack
 from scene.gaussians.exposed import Exposed
@@ -21,6 +22,7 @@ from scene.gaussians.relocating import RelocatingGaussians
 from scene.gaussians.sparse_adam import SparseGaussianAdam
 from scene.gaussians.start import start_rows
 from scene.gaussians.trainable import trainable
+from scene.gaussians.whole import own_state, whole_state
 from scene.readers.info import exposure_names
 from utils.general_utils import get_expon_lr_func, inverse_sigmoid
 from utils.graphics_utils import BasicPointCloud
@@ -64,9 +66,9 @@ class GaussianModel(Exposed, RelocatingGaussians):
             rows["opacity"] = self.inverse_opacity_activation(opacity)
         self.spatial_lr_scale = float(spatial_lr_scale)
         self.active_sh_degree = 0
-        self.set_rows(rows)
+        self.take_whole(rows)
         self.start_exposures(cam_infos)
-        print(f"Number of points at initialisation :  {len(self)}")
+        print(f"Number of points at initialisation :  {self.total}")
 
     def load_ply(self, path: str | os.PathLike, use_train_test_exp: bool = False) -> None:
         """Take all parameters from a PLY of this model's SH degree (else UserError); all SH bands become active.
@@ -142,10 +144,11 @@ class GaussianModel(Exposed, RelocatingGaussians):
     def step(self, radii: Tensor) -> None:
         """Step all optimisers and drop the gradients.
 
-        radii: (N,) pixels in the view of this iteration; the sparse optimiser skips Gaussians of radius 0.
+        radii: (N,) pixels in the view of this iteration, or (V, N) in its views; the sparse optimiser skips Gaussians
+        of radius 0.
         """
         if isinstance(self.optimizer, SparseGaussianAdam):
-            self.optimizer.step(radii > 0)
+            self.optimizer.step((radii if radii.dim() == 1 else radii.amax(0)) > 0)
         else:
             self.optimizer.step()
         self.optimizer.zero_grad(set_to_none=True)
@@ -168,7 +171,8 @@ class GaussianModel(Exposed, RelocatingGaussians):
 
     def take_marks(self) -> list[tuple[str, list[int] | list[str], int]]:
         """Values whose step a guard held back: name of the tensor, its rows or photos, and number of all rows."""
-        marks = [(name, rows.tolist(), len(self)) for name, rows in self.optimizer.take_marks().items()]
+        rows_of = self.shards.together(self.optimizer.take_marks(), self._attributes)
+        marks = [(name, rows.tolist(), self.total) for name, rows in rows_of.items()]
         for name, rows in self.exposures.optimizer.take_marks().items():
             marks.append((name, [self.exposures.names[row] for row in rows.tolist()], len(self.exposures.names)))
         return marks
@@ -195,19 +199,20 @@ class GaussianModel(Exposed, RelocatingGaussians):
     def capture(self) -> tuple:
         """Everything a resumed training needs, as tensors and numbers; `pack` gives the order.
 
-        Values of Gaussians are parameters: the reference trains on with the very tensors that a checkpoint holds.
+        Values of Gaussians are parameters: the reference trains on with the very tensors that a checkpoint holds. Of
+        several ranks, all of which must call it, the first has the whole state, on the CPU, and others have no rows.
         """
         raw = {name: getattr(self, a.field) for name, a in self._attributes.items()}
-        return pack(
-            State(
-                self.active_sh_degree,
-                {name: x if isinstance(x, nn.Parameter) else nn.Parameter(x.detach()) for name, x in raw.items()},
-                self.statistics,
-                self.optimizer.state_dict(),
-                float(self.spatial_lr_scale),
-                self.exposures.capture() if self.exposures.trained else None,
-            )
+        match_optimizer(self)
+        state = State(
+            self.active_sh_degree,
+            {name: x if isinstance(x, nn.Parameter) else nn.Parameter(x.detach()) for name, x in raw.items()},
+            self.statistics,
+            self.optimizer.state_dict(),
+            float(self.spatial_lr_scale),
+            self.exposures.capture() if self.exposures.trained else None,
         )
+        return pack(whole_state(state, self.shards.ranks))
 
     def restore(self, model_args: Sequence[Any], training_args: argparse.Namespace) -> None:
         """Take the state of `capture()`. Learning rates and densification options come from `training_args`.
@@ -215,7 +220,7 @@ class GaussianModel(Exposed, RelocatingGaussians):
         A model without exposures takes those of the state, too; one that has them must have the same photos.
         UserError when the state was made with another maximal SH degree or does not fit together.
         """
-        state = unpack(model_args, self._attributes, self.max_sh_degree)
+        state = own_state(unpack(model_args, self._attributes, self.max_sh_degree), self.shards)
         self.active_sh_degree = state.active_sh_degree
         self.spatial_lr_scale = state.spatial_lr_scale
         self.set_rows(state.rows)
@@ -240,7 +245,7 @@ class GaussianModel(Exposed, RelocatingGaussians):
     def check_finite(self, iteration: int) -> None:
         """UserError for a parameter that is not finite; call it before anything of this iteration is saved."""
         remedy = "nothing of this iteration was saved; lower the learning rates, or resume from an earlier checkpoint"
-        check_finite(raw_rows(self), f"iteration {iteration}", remedy)
+        check_finite(raw_rows(self), f"iteration {iteration}", remedy, self.shards)
         self.exposures.check_finite(f"iteration {iteration}", remedy)
 
 

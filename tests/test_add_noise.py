@@ -90,6 +90,14 @@ def test_every_argument_matters():
     assert torch.equal(base, moved(seed=3 + 2**64)) and torch.equal(moved(size=0.0), gaussians[0])
 
 
+def test_a_part_of_the_gaussians_gets_the_noise_of_the_whole():
+    gaussians = _gaussians(500)
+    part = [values[200:].clone() for values in gaussians]
+    add_noise_(*gaussians, **GATE, **WHERE)
+    add_noise_(*part, **GATE, **WHERE, first=200)
+    assert torch.equal(part[0], gaussians[0][200:])
+
+
 @CPU_AND_GPU
 def test_a_guard_that_has_stopped_keeps_the_means(device):
     gaussians = [t.to(device) for t in _gaussians(50)]

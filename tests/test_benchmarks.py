@@ -8,7 +8,9 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks import scaling_model
 from benchmarks.harness.calls import Stages
+from benchmarks.harness.page import replace_tables
 from benchmarks.harness.timing import short_name
 from benchmarks.kernels.fragments import TILE, fragments, processed_per_tile
 from benchmarks.kernels.host_ops import NODE, calls_per_iteration, operator_calls
@@ -104,3 +106,39 @@ def test_the_profile_of_a_step_adds_up_kernels_by_name():
     sums = step_profile._by_name(run)
     assert sums["blend_kernel"] == (5.0, 3.0) and sums["vectorized_elementwise_kernel"] == (1.0, 1.5)
     assert step_profile._kernels(run) == 6.0  # a copy from the host runs beside the kernels
+
+
+def test_the_page_on_scaling_has_the_tables_of_the_model():
+    page = (BENCHMARKS.parent / "docs" / "inside" / "scaling.md").read_text(encoding="utf-8")
+    for name, lines in scaling_model.tables().items():
+        assert f"<!-- begin {name} -->" in page
+        assert replace_tables(page, name, lines) == page, name
+
+
+def test_the_model_of_scaling_sends_the_bytes_of_the_code():
+    projected = Stages(frustum(9, 40, 27, 4.0)).calls["project"]()
+    sizes = [tensor[:1].nbytes for tensor in projected]
+    assert sum(sizes[:4]) == scaling_model.RECORD
+    assert sum(sizes) == scaling_model.PROJECTED
+
+
+def test_the_model_of_scaling_agrees_with_stages_that_were_measured():
+    """M+, L and XL of docs/results/kernels.md: project, bin, blend, blend_vjp."""
+    measured = {
+        (1e6, 4.41e6, 1.68e6): (0.112, 0.270, 0.295, 0.665),
+        (3e6, 10.03e6, 2.22e6): (0.287, 0.569, 0.346, 0.816),
+        (6e6, 17.25e6, 2.69e6): (0.544, 0.985, 0.388, 0.953),
+    }
+    for (n, instances, processed), wanted in measured.items():
+        parts = scaling_model.stages(n, n, n, instances, processed, 1600 * 1060)
+        got = [parts[name] for name in ("project", "bin", "blend", "blend_vjp")]
+        assert got == pytest.approx(wanted, rel=0.02)
+
+
+def test_two_ranks_send_each_other_half_of_what_a_view_sees():
+    scene = scaling_model.Workload("", 100, 80, 200, 60, 32, 64, rows=1.0)
+    sent = scaling_model.tiles_traffic(scene, 2)
+    assert sent == {"records": 64 * 20, "image": 2 * 10 * 32 * 12, "rows": 40 * 15, "counts": 4 * 20}
+    whole = scaling_model.tiles_traffic(scene, 2, scaling_model.WHOLE_IMAGE)
+    assert whole == sent | {"image": 12 * 32 * 64 / 2}
+    assert scaling_model.tiles_traffic(scene, 1) == dict.fromkeys(sent, 0)

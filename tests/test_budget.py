@@ -25,6 +25,7 @@ from scene.cameras import MiniCam
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.budgeted import count_after, fade, remove_useless, split_in_two
 from scene.gaussians.long_axis import long_axis_children
+from scene.gaussians.shards import WHOLE
 from scene.readers.point_cloud import write_point_cloud
 from training.error_maps import error_map
 from training.error_scores import ErrorScores
@@ -206,6 +207,7 @@ def test_large_draws_follow_the_weights():
 
 def test_a_high_power_takes_the_highest_of_small_scores():
     control = object.__new__(budget.BudgetControl)
+    control._gaussians = SimpleNamespace(shards=WHOLE)
     control._opt = SimpleNamespace(score_power=200.0, seed=0)
     control._scored_views = lambda iteration: []
     scores = 1e-6 * torch.arange(20, dtype=torch.float64)

@@ -6,6 +6,7 @@ import os
 import pickle
 import zipfile
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -181,7 +182,7 @@ def test_a_failed_save_leaves_the_old_file(tmp_path, monkeypatch):
     before = path.read_bytes()
 
     def fail(_: object, target) -> None:
-        target.write_bytes(b"half")
+        target.write(b"half")
         raise OSError("disk full")
 
     monkeypatch.setattr("scene.gaussians.checkpoint.torch.save", fail)
@@ -305,7 +306,8 @@ def test_why_a_checkpoint_cannot_be_written_is_the_systems_own_reason(tmp_path, 
     """torch hides it: a file system that has become read-only is not a full disk."""
 
     def refuse(_: object, target) -> None:
-        target.mkdir()  # now the file cannot be opened for writing
+        Path(target.name).unlink()
+        Path(target.name).mkdir()  # now the file cannot be opened for writing
         raise RuntimeError("[enforce fail at inline_container.cc] unexpected pos")
 
     monkeypatch.setattr("scene.gaussians.checkpoint.torch.save", refuse)

@@ -107,7 +107,7 @@ def test_an_opaque_tile_takes_no_more_splats(device):
     instances = torch.arange(front + behind, dtype=torch.int32, device=device).repeat(tiles)
     ranges = (front + behind) * torch.arange(tiles + 1, device=device)
     background = torch.zeros(3, device=device)
-    color, left, _, last = ops.blend(splats, instances, ranges, background, 30, 45, False, True)
+    color, left, _, last, _ = ops.blend(splats, instances, ranges, background, 30, 45, False, True)
     assert color.isfinite().all() and last.max() <= front and left.max() < 1e-3
     # They do show if one splat in front is less than opaque.
     splats[:front, 5] = math.log2(0.1)

@@ -28,12 +28,20 @@ GRADIENTS = (
     "(Tensor means, Tensor means2d, Tensor opacities, Tensor scales, Tensor rotations, Tensor cov3d, Tensor colors, "
     "Tensor sh_dc, Tensor sh_rest)"
 )
+STEP = (
+    "Tensor radii, int[] attributes, Tensor(g!)[] exp_avg, Tensor(h!)[] exp_avg_sq, Tensor(i!)[] steps, float[] rates, "
+    "float beta1, float beta2, float eps, int[] columns, bool sparse, Tensor(j!)? max_radii=None, "
+    "Tensor(k!)? gradient_sums=None, Tensor(l!)? views=None, Tensor? loss=None, Tensor(m!)? stopped=None, "
+    "int iteration=0, Tensor? now=None, bool absolute=False, float opacity_penalty=0., float scale_penalty=0."
+)
+ROWS = "Tensor splats, Tensor tile_counts, Tensor rows, Tensor counts"
 SCHEMAS = [
     f"project({SCENE}) -> (Tensor splats, Tensor depths, Tensor rects, Tensor tile_counts, Tensor radii)",
     "bin(Tensor splats, Tensor depths, Tensor rects, Tensor tile_counts, int height, int width, bool train) -> "
     "(Tensor instances, Tensor ranges, Tensor splat_slots, Tensor slots)",
     "blend(Tensor splats, Tensor instances, Tensor ranges, Tensor background, int height, int width, "
-    "bool inverse_depth, bool train) -> (Tensor color, Tensor transmittance, Tensor inverse_depth, Tensor last)",
+    "bool inverse_depth, bool train) -> (Tensor color, Tensor transmittance, Tensor inverse_depth, Tensor last, "
+    "Tensor layers)",
     f"blend_vjp({BACKWARD}) -> Tensor moments",
     f"project_vjp({SCENE}, Tensor tile_counts, Tensor moments, bool[9] wanted) -> {GRADIENTS}",
     f"rasterize(Tensor means2d, {SCENE}, Tensor background, bool inverse_depth, bool train, bool absolute=False) -> "
@@ -41,11 +49,10 @@ SCHEMAS = [
     "Tensor instances, Tensor ranges, Tensor splat_slots, Tensor slots, Tensor last, Tensor layers)",
     f"rasterize_vjp({SCENE}, {BACKWARD}, Tensor tile_counts, Tensor layers, bool[9] wanted, bool absolute=False) -> "
     f"{GRADIENTS}",
-    f"rasterize_vjp_step_({STEPPED_SCENE}, {BACKWARD}, Tensor tile_counts, Tensor layers, Tensor radii, "
-    "int[] attributes, Tensor(g!)[] exp_avg, Tensor(h!)[] exp_avg_sq, Tensor(i!)[] steps, float[] rates, float beta1, "
-    "float beta2, float eps, int[] columns, bool sparse, Tensor(j!)? max_radii=None, "
-    "Tensor(k!)? gradient_sums=None, Tensor(l!)? views=None, Tensor? loss=None, Tensor(m!)? stopped=None, "
-    "int iteration=0, Tensor? now=None, bool absolute=False, float opacity_penalty=0., float scale_penalty=0.) -> ()",
+    f"blend_rows({BACKWARD}, Tensor layers, bool absolute=False) -> (Tensor rows, Tensor counts)",
+    f"rows_vjp({SCENE}, {ROWS}, bool[9] wanted, bool absolute=False) -> {GRADIENTS}",
+    f"rasterize_vjp_step_({STEPPED_SCENE}, {BACKWARD}, Tensor tile_counts, Tensor layers, {STEP}) -> ()",
+    f"rows_vjp_step_({STEPPED_SCENE}, {ROWS}, {STEP}) -> ()",
     "step_now_(Tensor(a!) now, int[] attributes, Tensor(b!)[] steps, float[] rates, float beta1, float beta2, "
     "float eps, bool sparse, int iteration) -> ()",
     "mark_visible(Tensor means, Tensor view) -> Tensor",
@@ -56,11 +63,15 @@ SCHEMAS = [
     "sparse_adam_(Tensor(a!) value, Tensor gradient, Tensor(b!) exp_avg, Tensor(c!) exp_avg_sq, Tensor visible, "
     "float lr, float beta1, float beta2, float eps, int columns=-1, Tensor? loss=None, Tensor(d!)? stopped=None, "
     "int iteration=0) -> ()",
+    "catch_up_(Tensor(a!) value, Tensor(b!) exp_avg, Tensor(c!) exp_avg_sq, Tensor taken, float[] rates, "
+    "float[] steps, float beta1, float beta2, float eps, int columns=-1) -> ()",
+    "in_host_memory(Tensor values) -> Tensor",
+    "is_in_host_memory(Tensor values) -> bool",
     "observe_(Tensor(a!) max_radii, Tensor(b!) gradient_sums, Tensor(c!) views, Tensor radii, Tensor gradient) -> ()",
     "split_positions(Tensor means, Tensor log_scales, Tensor rotations, Tensor items, int seed, int stream, "
     "int iteration, int draw) -> Tensor",
     "add_noise_(Tensor(a!) means, Tensor log_scales, Tensor rotations, Tensor logits, float size, float steepness, "
-    "float threshold, int seed, int stream, int iteration, Tensor? stopped=None) -> ()",
+    "float threshold, int seed, int stream, int iteration, Tensor? stopped=None, int first=0) -> ()",
     "penalise_(Tensor logits, Tensor log_scales, Tensor(a!) logit_gradients, Tensor(b!) log_scale_gradients, "
     "float opacity, float scale) -> ()",
 ]

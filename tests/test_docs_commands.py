@@ -23,7 +23,7 @@ FORWARDING = (
     "benchmarks.viewing.share",
 )
 # Flags of other programs.
-FOREIGN = {"--peers", "--eval_steps", "--save_steps"}
+FOREIGN = {"--peers", "--eval_steps", "--save_steps", "--nnodes", "--shutdown_timeout"}
 
 
 @functools.cache

@@ -14,6 +14,8 @@ from test_fused_ssim import (
     out_of_range,
     with_gradient,
 )
+from test_loss_by_bands import check_bands
+from test_loss_by_bands import image_pair as render_and_photo
 from torch import Tensor, library
 
 pytestmark = [
@@ -241,3 +243,13 @@ def test_messages() -> None:
     kept = torch.ops.fused_ssim.l1_ssim(image, image, False, True)[2]
     with pytest.raises(RuntimeError, match="gradients must be float32"):
         torch.ops.fused_ssim.l1_ssim_vjp(image, image, kept, torch.ones(()), torch.ones(()))
+
+
+@pytest.mark.parametrize(
+    ("height", "width", "borders"), [(70, 33, [0, 1, 1, 3, 5]), (97, 600, [0, 0, 4, 7]), (1060, 1600, [0, 20, 67])]
+)
+@pytest.mark.parametrize("as_bytes", [True, False], ids=["bytes", "floats"])
+def test_bands_have_the_loss_and_the_gradient_of_the_whole_image(height, width, borders, as_bytes):
+    """The last image is so large that blocks of the forward have 16 rows."""
+    images = render_and_photo(height, width, torch.float32, as_bytes)
+    check_bands(height, borders, tuple(image.cuda() for image in images))

@@ -66,6 +66,7 @@ class Case:
     raw: bool = True
     depth: bool = False
     absolute: bool = False  # the statistics take lengths of absolute gradients
+    penalties: tuple[float, float] = (0.0, 0.0)  # of opacities and of scales
     broken: float = 1.0  # the factor of a pixel's gradient in the second iteration
     loss: float = 0.5
 
@@ -104,6 +105,10 @@ def step_plainly(state: State, camera: GaussianRasterizationSettings, case: Case
     arguments, radii = rendered(state, camera, case, iteration)
     wanted = [name in ("means2d", *PARAMETERS) for name in schema.GRADIENTS]
     gradients = dict(zip(schema.GRADIENTS, ops.rasterize_vjp(*arguments, wanted, case.absolute), strict=True))
+    if any(case.penalties):
+        penalised = "opacities", "scales"
+        of = [state.values[name] for name in penalised], [gradients[name] for name in penalised]
+        ops.penalise_(*of[0], *of[1], *case.penalties)
     if case.observed:
         screen = gradients["means2d"]
         ops.observe_(*state.statistics, radii, screen[:, 2] if case.absolute else screen)
@@ -124,10 +129,32 @@ def step_plainly(state: State, camera: GaussianRasterizationSettings, case: Case
 def step_fused(state: State, camera: GaussianRasterizationSettings, case: Case, iteration: int) -> None:
     """Take the same step inside the backward."""
     arguments, radii = rendered(state, camera, case, iteration)
+    ops.rasterize_vjp_step_(*arguments, radii, *rest_of(case, state, iteration), **named_rest_of(case))
+
+
+def step_from_rows(state: State, camera: GaussianRasterizationSettings, case: Case, iteration: int) -> None:
+    """Take the same step from gradient rows."""
+    arguments, radii = rendered(state, camera, case, iteration)
+    scene, given = scene_and_rows(arguments, case)
+    ops.rows_vjp_step_(*scene, *given, radii, *rest_of(case, state, iteration), **named_rest_of(case))
+
+
+def scene_and_rows(arguments: tuple, case: Case) -> tuple[tuple, tuple]:
+    """The arguments of the scene and of its rows, from those of a backward from lists."""
+    *backward, counts, layers = arguments[len(schema.SCENE) :]
+    return arguments[: len(schema.SCENE)], (backward[0], counts, *ops.blend_rows(*backward, layers, case.absolute))
+
+
+def rest_of(case: Case, state: State, iteration: int) -> tuple:
+    """The arguments of a step after the radii, up to the guard's."""
     statistics = state.statistics if case.observed else (None, None, None)
-    lists = case.attributes, *case.lists(state)
-    rest = case.sparse, *statistics, *case.guard(state, iteration)
-    ops.rasterize_vjp_step_(*arguments, radii, *lists, *rest, absolute=case.absolute)
+    return case.attributes, *case.lists(state), case.sparse, *statistics, *case.guard(state, iteration)
+
+
+def named_rest_of(case: Case) -> dict:
+    """The arguments of a step behind the guard's."""
+    opacity, scale = case.penalties
+    return {"absolute": case.absolute, "opacity_penalty": opacity, "scale_penalty": scale}
 
 
 def step_recorded(state: State, camera: GaussianRasterizationSettings, case: Case, iteration: int) -> None:
@@ -143,7 +170,7 @@ def step_recorded(state: State, camera: GaussianRasterizationSettings, case: Cas
     last = (*guard[:2], 77) if guard else (None, None, 77)
     ops.rasterize_vjp_step_(
         *arguments, radii, case.attributes, *averages, *wrong, columns, case.sparse, *statistics, *last,
-        host.to(radii.device), case.absolute,
+        host.to(radii.device), case.absolute, *case.penalties,
     )  # fmt: skip
 
 
@@ -177,6 +204,8 @@ CASES = {
     "absolute, only statistics": Case(absolute=True, attributes=()),
     "absolute, unobserved": Case(absolute=True, observed=False),
     "absolute NaN": Case(absolute=True, guarded=True, broken=math.nan),
+    "penalties": Case(penalties=(0.3, 0.2)),
+    "sparse penalty": Case(penalties=(0.3, 0.0), sparse=True, guarded=True, absolute=True),
 }
 
 
@@ -198,12 +227,13 @@ def test_it_has_the_bytes_of_the_plain_step(case, device, dtype):
     if dtype == torch.float64:
         case = replace(case, observed=False)
     start, camera = start_and_camera(case, 700, device, dtype)
-    plain, fused = start.copy(), start.copy()
+    plain, fused, from_rows = start.copy(), start.copy(), start.copy()
     for iteration in (1, 2, 3):
         step_plainly(plain, camera, case, iteration)
         step_fused(fused, camera, case, iteration)
-        for one, other in zip(fused.tensors(), plain.tensors(), strict=True):
-            assert same_bytes(one, other)
+        step_from_rows(from_rows, camera, case, iteration)
+        for one, other, third in zip(fused.tensors(), plain.tensors(), from_rows.tensors(), strict=True):
+            assert same_bytes(one, other) and same_bytes(third, other)
     if case.attributes and math.isfinite(case.loss):
         assert not torch.equal(fused.values["means"], start.values["means"])
     if case.guarded:
@@ -230,10 +260,12 @@ def test_sizes(n, bands, device, dtype):
     state, camera = start_and_camera(case, n, device, dtype)
     rest = state.values["sh_rest"][:, :bands].contiguous()
     start = State.start(state.values | {"sh_rest": rest})
-    plain, fused = start.copy(), start.copy()
+    plain, fused, from_rows = start.copy(), start.copy(), start.copy()
     step_plainly(plain, camera, case, 1)
     step_fused(fused, camera, case, 1)
-    assert all(same_bytes(one, other) for one, other in zip(fused.tensors(), plain.tensors(), strict=True))
+    step_from_rows(from_rows, camera, case, 1)
+    for other in (fused, from_rows):
+        assert all(same_bytes(one, two) for one, two in zip(other.tensors(), plain.tensors(), strict=True))
 
 
 def test_any_number_of_threads_gives_the_same_bytes():
@@ -259,6 +291,8 @@ def test_opcheck(device, dtype):
     statistics = state.statistics if case.observed else (None, None, None)
     rest = *case.lists(state), False, *statistics, *case.guard(state, 1)
     library.opcheck(ops.rasterize_vjp_step_, (*arguments, radii, list(case.attributes), *rest))
+    scene, given = scene_and_rows(arguments, case)
+    library.opcheck(ops.rows_vjp_step_, (*scene, *given, radii, list(case.attributes), *rest))
 
 
 def _refused(match: str, case: Case | None = None, error: type = RuntimeError, **changes) -> None:

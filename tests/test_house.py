@@ -23,7 +23,8 @@ LONGEST = 60  # lines of a function
 MAY_IMPORT = {
     "utils": (),
     "utils.host": (),
-    "utils.exact": (),
+    "utils.ranks": ("utils",),
+    "utils.exact": ("utils.ranks",),
     "utils.files": ("utils",),
     "utils.camera_utils": ("scene.cameras", "scene.views", "scene.options", "scene.pictures", "scene.readers", "utils"),
     "utils.make_depth_scale": ("scene.readers.depth_scale", "utils"),  # a command of the reference

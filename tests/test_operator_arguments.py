@@ -19,6 +19,7 @@ for outcome in outcomes():
     print("|".join(outcome), flush=True)
 """
 RASTERIZER = ("project", "bin", "blend", "blend_vjp", "project_vjp", "rasterize", "rasterize_vjp", "mark_visible")
+RASTERIZER += ("blend_rows", "rows_vjp")
 NEEDLESS = ("means2d", "grad_transmittance", "grad_inverse_depth", "stopped", "words")  # tensors that may be None
 
 

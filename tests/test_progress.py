@@ -10,7 +10,7 @@ from training.pacing.pace import Pace
 def test_the_number_of_gaussians_is_exact(capsys):
     run = SimpleNamespace(
         losses=LossWatch(), dataset=SimpleNamespace(depths=""), first_iteration=0,
-        pace=Pace(20), gaussians=range(123_456), clock=SimpleNamespace(seconds=1.0),
+        pace=Pace(20), gaussians=SimpleNamespace(total=123_456), clock=SimpleNamespace(seconds=1.0),
     )  # fmt: skip
     bar = ProgressBar(run)
     bar.measured(SimpleNamespace(iteration=10, due=True, span=range(10, 11)), SimpleNamespace(depth=None))

@@ -46,7 +46,7 @@ def test_opcheck_every_other_op(device):
     instances, ranges, *slots = ops.bin(splats, depths, rects, counts, height, width, True)
     for inverse_depth, train in [(False, False), (True, True)]:
         _check(ops.blend, splats, instances, ranges, background, height, width, inverse_depth, train)
-    image, transmittance, plane, last = ops.blend(splats, instances, ranges, background, height, width, True, True)
+    image, transmittance, plane, last, _ = ops.blend(splats, instances, ranges, background, height, width, True, True)
     _check(ops.decisive, splats, instances, ranges, last)
     state = (splats, instances, ranges, *slots, background, last, transmittance)
     gradients = (torch.ones_like(image), torch.ones_like(transmittance), torch.ones_like(plane))
@@ -77,7 +77,7 @@ def test_the_steps_one_by_one_are_the_whole(device, dtype):
     arguments = scene_arguments(raw, camera)
     splats, depths, rects, counts, radii = ops.project(*arguments)
     instances, ranges, *slots = ops.bin(splats, depths, rects, counts, 7, 18, True)
-    color, transmittance, inverse_depth, last = ops.blend(splats, instances, ranges, camera.bg, 7, 18, True, True)
+    color, transmittance, inverse_depth, last, _ = ops.blend(splats, instances, ranges, camera.bg, 7, 18, True, True)
     inputs = leaves(raw)
     out = render(inputs, camera)
     assert torch.equal(out.color, color) and torch.equal(out.transmittance, transmittance)
@@ -114,7 +114,7 @@ def test_the_fake_kernels_have_the_sizes_of_the_real_ones():
     for size, tiles in ((fakes.TILE, 1), (fakes.TILE + 1, 4)):
         assert len(ops.bin(splats, depths, rects, 0 * counts, size, size, False)[1]) == tiles + 1
     lists = ops.bin(splats, depths, rects, counts, 7, 18, True)
-    color, transmittance, _, last = ops.blend(splats, *lists[:2], camera.bg, 7, 18, False, True)
+    color, transmittance, _, last, _ = ops.blend(splats, *lists[:2], camera.bg, 7, 18, False, True)
     moments = ops.blend_vjp(splats, *lists, camera.bg, last, transmittance, color, None, None)
     assert moments.shape[1] == fakes.MOMENT_VALUES
 

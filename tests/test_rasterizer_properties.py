@@ -232,7 +232,7 @@ def test_halves_of_an_image_are_the_whole_to_the_bit(seed, places, antialiasing)
         shifted[:, 1] -= top
         representable = (shifted[:, 1] + top == splats[:, 1]).all()
         half = ops.blend(shifted, instances, own, camera.bg, 16, WIDTH, True, True)
-        for a, b in zip(half, whole, strict=True):
+        for a, b in zip(half[:4], whole[:4], strict=True):
             assert not representable or torch.equal(a, b[..., top : top + 16, :])
 
 

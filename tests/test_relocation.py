@@ -63,7 +63,7 @@ def test_draws_are_in_proportion_and_the_same_for_any_number_of_threads():
         drawn = []
         for threads in (1, 3):
             torch.set_num_threads(threads)
-            drawn.append(draw(units, 80_000, **DRAW))
+            drawn.append(draw(units, 80_000, **DRAW)[1])
     finally:
         torch.set_num_threads(before)
     assert torch.equal(*drawn)
@@ -72,7 +72,7 @@ def test_draws_are_in_proportion_and_the_same_for_any_number_of_threads():
     # Five standard deviations of a share of one half are 0.009.
     torch.testing.assert_close(share, units / units.sum(), atol=0.009, rtol=0)
     for name in DRAW:
-        assert not torch.equal(drawn[0], draw(units, 80_000, **DRAW | {name: DRAW[name] + 1})), name
+        assert not torch.equal(drawn[0], draw(units, 80_000, **DRAW | {name: DRAW[name] + 1})[1]), name
 
 
 def test_units_are_opacities():

@@ -8,5 +8,7 @@ observer, observers/       everything that watches: checks, progress, curve, rep
 checks, history            before: checks that the scene can be trained, and traces of earlier runs
 memory_estimate            before: an estimate of the memory that a training needs
 view_order                 the camera of each iteration
+launch, agreement          several ranks: options, and what has to be the same on all before the start
+together, restart          several ranks: what they share in each iteration, and where a restarted training goes on
 left_out                   after: the lines about what the saved model does not need
 """

@@ -7,11 +7,13 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from arguments import read_training_options
+from arguments import read_model_json, read_training_options
 from records import training_log
 from records.error_curve import Row, continue_curve
 from records.training_log import TrainingLog
 from utils.system_utils import UserError, saved_iterations
+
+VIEWS = "views_per_iteration"  # entry of model.json, where it is not 1
 
 # Options that change what is learnt. Others are checked elsewhere (train_test_exp, sh_degree), or change nothing.
 _TOLD = (
@@ -44,6 +46,17 @@ def check_folder(
             "and render.py takes the highest unless --iteration is given; remove the old ones, or name another folder "
             "with -m",
             file=sys.stderr,
+        )
+
+
+def check_views(checkpoint: str, views: int) -> None:
+    """UserError if the run that wrote a checkpoint had another number of views in each iteration than this run."""
+    then = read_model_json(str(Path(checkpoint).parent)).get(VIEWS, 1)
+    if then != views:
+        how = f"--parallel views and {then} processes" if then > 1 else "--parallel tiles"
+        raise UserError(
+            f"{checkpoint} is of a run that had {then} views in each iteration, and this one would have {views}; "
+            f"resume it with {how}"
         )
 
 

@@ -38,7 +38,7 @@ def save_last(
     write_cfg_args(scene.model_path, argparse.Namespace(**vars(dataset) | {"sh_degree": final.max_sh_degree}))
     kept_pixels, file_pixels = scene.training_pixels()
     left_out = LeftOut(
-        gaussians=len(trained),
+        gaussians=trained.total,
         unseen=trimmed.unseen,
         faint=trimmed.search.faint,
         keep_unseen=opt.keep_unseen,

@@ -8,6 +8,7 @@ import torch
 from training.observer import Announcer, Observer
 from training.run import Run
 from training.steps.choose import Taker, step_taker
+from training.together import Together
 
 
 def run_training(run: Run, observers: Sequence[Observer]) -> None:
@@ -16,19 +17,22 @@ def run_training(run: Run, observers: Sequence[Observer]) -> None:
     Whatever else happens is an observer's business, in the order of the list (training/observers/standard.py).
     Raises KeyboardInterrupt or Terminated, after a complete step, if a signal asked for it.
     """
-    tell, taker = Announcer(observers), step_taker(run)
+    tell, taker, together = Announcer(observers), step_taker(run), Together(run)
     with run.interrupt, tell, _backward_on_this_thread(), _whole_steps(run, taker):
         for step in run.steps():
             tell.begins(step)
+            together.begins(step)
             taker.make_ready(step)  # before the learning rates are set, which a repeated step changes
             run.prepare(step)  # learning rates, SH degree, photos of the next views
             taker.take(step, tell)
-            step.stopping = run.interrupt.requested  # read once: a signal may come at any moment
+            step.stopping = together.stopping  # read once: a signal may come at any moment
             if step.stopping:
                 taker.settle()
             tell.stepped(step)
             if step.stopping:
+                together.wait()
                 raise step.stopping
+    together.ended()
     tell.ended()  # out here a signal stops at once what is only drawn and printed
 
 

@@ -1,8 +1,9 @@
 """The loss of a render: photometric, and inverse depth where a depth map supervises. Further terms belong here."""
 
 import argparse
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+from fused_ssim import photometric_loss_by_bands
 from torch import Tensor
 
 from training.step import Step
@@ -24,10 +25,21 @@ class Objective:
     def __init__(self, opt: argparse.Namespace) -> None:
         self._lambda_dssim = opt.lambda_dssim
 
-    def __call__(self, package: dict[str, Tensor], step: Step) -> Losses:
-        """package: of `render`, with `depth` where step.depth_weight is above 0."""
+    def takes_bands(self, step: Step) -> bool:
+        """Whether the loss of a step needs of the image no more than each rank's band and what surrounds it."""
+        return step.depth_weight == 0 and step.camera.counts_all and step.camera.columns is None
+
+    def __call__(self, package: dict[str, Any], step: Step) -> Losses:
+        """package: of `render`, with `depth` where step.depth_weight is above 0.
+
+        With a `band` (gaussian_renderer/over_ranks/band.py) the gradient is right in its rows only.
+        """
         camera = step.camera
         target, mask = camera.ground_truth(step.background)
+        if (band := package.get("band")) is not None:
+            return Losses(
+                *photometric_loss_by_bands(package["render"], target, self._lambda_dssim, *band), depth=None, mask=None
+            )
         total, l1 = photometric_loss(package["render"], target, self._lambda_dssim, mask, camera.columns)
         depth = None
         if step.depth_weight > 0:

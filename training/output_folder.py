@@ -10,6 +10,7 @@ from pathlib import Path
 from utils.files.listing import some
 from utils.files.lock import locked
 from utils.files.temporary_files import remove_temporary_files
+from utils.ranks.ranks import ranks
 from utils.system_utils import mkdir_p
 
 _INPUTS = ("cfg_args", "model.json", "cameras.json", "input.ply")
@@ -18,7 +19,7 @@ _INPUTS = ("cfg_args", "model.json", "cameras.json", "input.ply")
 def new_folder() -> str:
     """Name of a new folder under ./output, after OAR_JOB_ID or at random, as in the reference."""
     name = os.environ.get("OAR_JOB_ID") or str(uuid.uuid4())
-    return os.path.join("./output/", name[:10])
+    return os.path.join("./output/", ranks().shared(name)[:10])
 
 
 @contextlib.contextmanager
@@ -26,8 +27,11 @@ def own_folder(model_path: str) -> Iterator[None]:
     """Make the folder and keep it for this training. UserError if another train.py is at work in it.
 
     Temporary files of killed runs are removed first. A message says if files of the run are missing at the end, as
-    when the folder was removed meanwhile.
+    when the folder was removed meanwhile. Of several ranks, the first does so for all.
     """
+    if not ranks().first:
+        yield
+        return
     folder = Path(model_path)
     mkdir_p(folder)
     with locked(folder, "train.py", "another train.py (process {process})", "-m"):

@@ -17,3 +17,4 @@ class Plan(NamedTuple):
     record_curve: bool  # error_vs_time.csv, if there are test views
     plain_step: bool = False  # take every step by autograd, and wait for the GPU in it
     viewer: Address | None = None  # of the web page; None: no page
+    parallel: str = "tiles"  # how several ranks share the work: the tiles of each view, or "views"

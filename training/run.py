@@ -13,18 +13,23 @@ from torch import Tensor
 from exports.in_scene import scene_with, start_from
 from records.training_log import Stopwatch
 from scene import Scene
+from scene.cameras import Camera
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.checkpoint import load_checkpoint
 from scene.options import option
+from scene.spilled_model import SpilledGaussians
+from training.agreement import agree_on_scene
 from training.checks import check_exposures, check_scene, check_target, warn_of_fewer, warn_of_late_reset
-from training.history import check_folder, continue_records, report_changes
+from training.history import VIEWS, check_folder, check_views, continue_records, report_changes
 from training.loss_watch import LossWatch
 from training.memory_estimate import announce_memory
 from training.objective import Objective
 from training.pacing import schedule_file
+from training.pacing.batched import Batched
 from training.pacing.choose import pace_of, resolution_of
 from training.pacing.pace import Paced
 from training.plan import Plan
+from training.restart import resumed
 from training.step import Step
 from training.strategies.choose import density_control
 from training.view_order import ViewOrder
@@ -32,7 +37,8 @@ from utils.exact.counter_rng import Stream, uniform
 from utils.general_utils import get_expon_lr_func
 from utils.host.interrupt import DeferredInterrupt
 from utils.host.process import seconds_since_start
-from utils.system_utils import compute_device
+from utils.ranks.ranks import ranks
+from utils.system_utils import UserError, compute_device
 
 SH_INTERVAL = 1000  # iterations between raises of the active SH degree
 
@@ -53,14 +59,21 @@ class Run:
         self, dataset: argparse.Namespace, opt: argparse.Namespace, pipe: argparse.Namespace, plan: Plan
     ) -> None:
         """Read and check everything that can be refused; nothing is written. UserError for what is refused."""
+        plan = plan._replace(start=resumed(plan.start, dataset.model_path, opt.iterations))
         self.dataset, self.opt, self.pipe, self.plan = dataset, opt, pipe, plan
         self.lost = 0
         self.interrupt = DeferredInterrupt()
         self.device = compute_device()
-        capture, self.first_iteration = load_checkpoint(plan.start, self.device) if plan.start else (None, 0)
-        self.pace = pace_of(opt, plan.start, self.first_iteration)
+        place = "cpu" if ranks().several or opt.spill else self.device  # a part of it is kept there
+        capture, self.first_iteration = load_checkpoint(plan.start, place) if plan.start else (None, 0)
+        views = ranks().size if plan.parallel == "views" else 1
+        if opt.spill and views > 1:
+            raise UserError("--spill takes one view in each iteration; use --parallel tiles")
+        self.pace = pace_of(opt, plan.start, self.first_iteration, views)
         warn_of_late_reset(opt, dataset.white_background, self.pace)
-        self.gaussians = GaussianModel(dataset.sh_degree, opt.optimizer_type)
+        kind = SpilledGaussians if opt.spill else GaussianModel
+        self.gaussians = kind(dataset.sh_degree, opt.optimizer_type)
+        self.gaussians.divide(ranks())
         init_ply = option(dataset, "init_ply")
         if init_ply and not plan.start:
             self.scene, self._first = scene_with(init_ply, dataset, self.gaussians)
@@ -68,13 +81,15 @@ class Run:
             self.scene, self._first = Scene(dataset, self.gaussians, shuffle=False, start=False), None
         check_scene(self.scene.info)
         check_target(opt.target_psnr, len(self.scene.getTestCameras()))
-        self.views = ViewOrder(self.scene.getTrainCameras(), opt.seed)
+        place = ranks().rank if self.pace.views > 1 else 0
+        self.views = ViewOrder(self.scene.getTrainCameras(), opt.seed, self.pace.views, place)
         self.resolution = resolution_of(opt, self.pace, self.scene.getTrainCameras(), self.scene.images)
         self._decode_ahead(self.first_iteration + 1)
         from_points = self._start(capture)
         saves = [] if opt.target_psnr else self.pace.known(plan.save)  # a target may come before any of them
         check_folder(dataset.model_path, dataset.source_path, saves, plan.start, self.first_iteration)
         if plan.start:
+            check_views(plan.start, self.pace.views)
             report_changes(plan.start, argparse.Namespace(**vars(dataset), **self._training_options))
         self.background = torch.full((3,), 1.0 if dataset.white_background else 0.0, device=self.device)
         self.objective = Objective(opt)
@@ -83,9 +98,10 @@ class Run:
             opt.depth_l1_weight_init, opt.depth_l1_weight_final, max_steps=opt.iterations
         )
         self.density.pace = self.pace
-        warn_of_fewer(self.density, opt, len(self.gaussians), self.first_iteration + 1)
+        warn_of_fewer(self.density, opt, self.gaussians.total, self.first_iteration + 1)
         if from_points:
             self.density.started()
+        agree_on_scene(self.scene, plan.start)
 
     def _start(self, capture: tuple | None) -> bool:
         """Start the model from the dataset's points, from a file's Gaussians, or from the state of a checkpoint.
@@ -105,12 +121,16 @@ class Run:
             self.gaussians.restore(capture, self.opt)
             check_exposures(self.gaussians, self.dataset.train_test_exp, self.plan.start)
         self.gaussians.limit_columns()
+        if (views := self.pace.views) > 1:
+            self.gaussians.optimizer.set_betas(0.9**views, 0.999**views)
         return from_points
 
     @property
     def _training_options(self) -> dict[str, Any]:
         options = {name: getattr(self.opt, name) for name in ("optimizer_type", "seed", "strategy")}
         options["resolution_schedule"] = self.opt.resolution_schedule
+        if self.pace.views > 1:
+            options[VIEWS] = self.pace.views
         if isinstance(self.pace, Paced):  # a schedule that is repeated brings its own
             options["resolution_schedule"] = self.pace.schedule.resolution_schedule
         return {"antialiasing": self.pipe.antialiasing} | options
@@ -125,7 +145,7 @@ class Run:
         folder, start = self.scene.model_path, self.plan.start
         if not start or not (Path(folder) / "cameras.json").exists():
             self.scene.write_inputs()
-        if not isinstance(self.pace, Paced):
+        if not isinstance(self.pace, Paced) and ranks().first:
             goes_on = start and os.path.realpath(Path(start).parent) == os.path.realpath(folder)
             schedule_file.leave_schedule(Path(folder), self.first_iteration if goes_on else 0)
         density = self.density
@@ -144,7 +164,7 @@ class Run:
                 iteration,
                 last=False,
                 camera=camera,
-                background=self._background(iteration),
+                background=self._background(self.views.own(iteration)),
                 depth_weight=self._depth_weight(pace.nominal(iteration)) if camera.depth_reliable else 0.0,
                 changes=self._changes(iteration),
                 started=seconds,
@@ -167,10 +187,17 @@ class Run:
         before, now = (self.pace.nominal(t) // SH_INTERVAL for t in (iteration - 1, iteration))
         return now - before
 
-    def _background(self, iteration: int) -> Tensor:
+    def batch(self, iteration: int) -> list[tuple[Camera, Tensor]]:
+        """All views of an iteration, of which each rank shows its own, and their backgrounds (3,)."""
+        nominal = self.pace.nominal(iteration)
+        numbers = self.views.numbers(iteration)
+        return [(self.resolution.view(self.views.of(n), nominal), self._background(n)) for n in numbers]
+
+    def _background(self, view: int) -> Tensor:
+        """view: the number of a view, which is its iteration where an iteration has one."""
         if not self.opt.random_background:
             return self.background
-        draws = uniform(self.opt.seed, Stream.BACKGROUND, iteration, torch.zeros(1, dtype=torch.int64))
+        draws = uniform(self.opt.seed, Stream.BACKGROUND, view, torch.zeros(1, dtype=torch.int64))
         return draws[0, :3].to(self.device)
 
     def prepare(self, step: Step) -> None:
@@ -186,7 +213,7 @@ class Run:
     def set_rates(self, step: Step) -> None:
         """Set the learning rates of a step, which may be one that is repeated."""
         self.gaussians.update_learning_rate(self.pace.nominal(step.iteration))
-        if isinstance(self.pace, Paced):
+        if isinstance(self.pace, (Paced, Batched)):
             self.gaussians.scale_rates(self.pace.rate_factor(step.iteration))
 
     def _decode_ahead(self, iteration: int) -> None:

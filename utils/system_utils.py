@@ -7,10 +7,11 @@ import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from utils.host import start
+from utils.host import start, torchrun
 from utils.host.device import compute_device
 from utils.host.interrupt import Terminated
 from utils.host.memory import is_out_of_memory, shortage
+from utils.ranks.ranks import ranks
 
 __all__ = [
     "Terminated",
@@ -36,15 +37,17 @@ def first_line(error: BaseException) -> str:
     return next(iter(str(error).splitlines()), "")[:200] or type(error).__name__
 
 
-def run_cli(main: Callable[[], object]) -> None:
+def run_cli(main: Callable[[], object], several: bool = False) -> None:
     """Run a command line: a UserError prints its sentence and exits 2; a bug keeps its traceback.
+
+    several: whether processes of torchrun can run it together (utils/ranks/together.py); others refuse to.
 
     Signals exit as in shells: Ctrl-C 130, SIGTERM 143, and 141 if the reader of the output is gone (`| head`). An
     output that cannot be written (disk full) exits 2, and one that is closed does not matter.
     """
     start.imported()
     try:
-        status = _status(main)
+        status = _status(main) if torchrun.size() == 1 else _status_of_several(main, several)
         sys.stdout.flush()  # now, while a broken pipe can still be caught
     except BrokenPipeError:
         _discard_output()
@@ -78,36 +81,51 @@ def _discard_output() -> None:
 
 
 def _status(main: Callable[[], object]) -> int:
+    status, line = _outcome(main)
+    if line:
+        print(line, file=sys.stderr)
+    return status
+
+
+def _status_of_several(main: Callable[[], object], several: bool) -> int:
+    if not several:
+        if torchrun.rank() == 0:
+            print(f"error: {Path(sys.argv[0]).name} runs in one process; start it without torchrun", file=sys.stderr)
+        return 2
+    from utils.ranks.together import run_together  # it loads torch.distributed
+
+    return run_together(main, _outcome)
+
+
+def _outcome(main: Callable[[], object]) -> tuple[int, str]:
+    """Run a command. Returns its exit status, and what there is to say on stderr."""
     try:
         main()
     except UserError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
+        return 2, f"error: {error}"
     except (MemoryError, RuntimeError) as error:
         if not is_out_of_memory(error):
             raise
-        print(
-            f"error: ran out of memory ({shortage(error, compute_device())}); lower --resolution (-r), or free memory "
-            "that other programs use",
-            file=sys.stderr,
-        )
-        return 2
+        reason = f"error: ran out of memory ({shortage(error, compute_device())})"
+        return 2, f"{reason}; lower --resolution (-r), or free memory that other programs use"
     except Terminated:
-        print("terminated", file=sys.stderr)
-        return 143
+        return 143, "terminated"
     except KeyboardInterrupt:
-        print("interrupted", file=sys.stderr)
-        return 130
-    return 0
+        return 130, "interrupted"
+    return 0, ""
 
 
 @contextlib.contextmanager
-def atomic_write(path: str | os.PathLike) -> Iterator[Path]:
+def atomic_write(path: str | os.PathLike, every_rank: bool = False) -> Iterator[Path]:
     """Yield a temporary path beside `path`, with its suffix; rename it to `path` if the block succeeds, else delete it.
 
     Creates a missing folder. A killed process may leave the hidden temporary file, but never half a `path`. An OSError
-    of the block or of renaming (disk full, `path` is a folder) becomes a UserError.
+    of the block or of renaming (disk full, `path` is a folder) becomes a UserError. Of ranks that train together, only
+    the first writes, and the others' writing leads nowhere. every_rank: each of them writes, as into a cache.
     """
+    if not (every_rank or ranks().first):
+        yield Path(os.devnull)
+        return
     target = Path(path)
     mkdir_p(target.parent)
     temporary = target.with_name(f".{target.stem}.{os.getpid()}.tmp{target.suffix}")

@@ -68,7 +68,7 @@ def _gradient_errors(parameters: dict[str, Tensor], camera) -> tuple[float, floa
 
     instances, ranges, *slots = _OPS.bin(splats, depths, rects, counts, height, width, True)
     background = torch.zeros(3)
-    _, transmittance, _, last = _OPS.blend(splats, instances, ranges, background, height, width, False, True)
+    _, transmittance, _, last, _ = _OPS.blend(splats, instances, ranges, background, height, width, False, True)
     state = (splats, instances, ranges, *slots, background, last, transmittance)
     quu, quv, qvv = _OPS.blend_vjp(*state, weights.float(), None, None)[order, 3:6].double().unbind(1)
     uu, uv = quu * l11, quv * l11  # gradient of a symmetric matrix, 2 ln2^2 L^T W2 L; xy stands for two entries

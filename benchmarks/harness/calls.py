@@ -72,7 +72,7 @@ class Stages:
         self.splats, counts = projected[0], projected[3]
         self.instances, self.ranges, *slots = OPS.bin(*projected[:4], *size, True)
         blend = (self.splats, self.instances, self.ranges, settings.bg, *size, False)
-        _, transmittance, _, self.last = OPS.blend(*blend, True)
+        _, transmittance, _, self.last, _ = OPS.blend(*blend, True)
         state = (self.splats, self.instances, self.ranges, *slots, settings.bg, self.last)
         state += (transmittance, image_gradient(scene), None, None)
         moments = OPS.blend_vjp(*state)

@@ -8,6 +8,7 @@ from torch import Tensor, nn
 from scene.gaussians import density_rules as rules
 from scene.gaussians.attributes import Rows
 from scene.gaussians.long_axis import long_axis_children
+from scene.gaussians.moves import changes_rows
 from scene.gaussians.parameters import GaussianParameters, raw_rows
 from scene.gaussians.row_surgery import Group, States, append_rows, keep_rows, replace_values, row_groups
 from scene.gaussians.statistics import NAMES, Statistics
@@ -65,13 +66,16 @@ class AdaptiveGaussians(GaussianParameters):
         """Add a view to the statistics: largest radius, gradient length and count of the Gaussians it saw.
 
         viewspace_points: (N, 3) with `.grad` per NDC unit; radii: (N,) int32 pixels, 0 where not seen. One pass updates
-        max_radii2D and does the work of add_densification_stats for radii > 0.
+        max_radii2D and does the work of add_densification_stats for radii > 0. Several views at once: (V, N, 3) and
+        (V, N).
         """
-        self.statistics.observe(viewspace_points.grad, radii)
+        for gradient, pixels in _views(viewspace_points.grad, radii):
+            self.statistics.observe(gradient, pixels)
 
     def observe_absolute(self, viewspace_points: Tensor, radii: Tensor) -> None:
         """Do as observe with the lengths of absolute gradients, of a `render` with want_absolute_gradient."""
-        self.statistics.observe(viewspace_points.grad[:, 2], radii)
+        for gradient, pixels in _views(viewspace_points.grad, radii):
+            self.statistics.observe(gradient[:, 2], pixels)
 
     def add_densification_stats(self, viewspace_point_tensor: Tensor, update_filter: Tensor) -> None:
         """Add this view's screen-space gradient lengths and count it, for the Gaussians it saw.
@@ -90,6 +94,7 @@ class AdaptiveGaussians(GaussianParameters):
         if not self.statistics.fit(len(self)):
             self._zero_statistics()
 
+    @changes_rows
     def densify_and_prune(
         self,
         max_grad: float,
@@ -117,7 +122,8 @@ class AdaptiveGaussians(GaussianParameters):
             getattr(self, attribute.field).grad = None
         gradient = rules.mean_gradient(self.xyz_gradient_accum, self.denom)
         if max_splats > 0:
-            gradient = rules.limit_growth(gradient, max_grad, max_splats - len(self))
+            room = max_splats - self.total
+            gradient = rules.limit_growth(gradient, max_grad, room, self.shards.ranks)
         how = {} if seed is None else {"seed": seed, "iteration": iteration}
         if long_axis:  # said only then, as a client's own densify_and_split may not know it
             how["long_axis"] = True
@@ -155,15 +161,17 @@ class AdaptiveGaussians(GaussianParameters):
         origins = torch.cat((clones, parents, parents))
         rows = {name: values.index_select(0, origins) for name, values in raw_rows(self).items()}
         self._make_children(rows, parents, **how)
-        self._append(rows, origins)
+        self._append(rows, clones, parents, parents)
         return split
 
+    @changes_rows
     def densify_and_clone(self, grads: Tensor, grad_threshold: float, scene_extent: float) -> None:
         """Append an exact copy of each Gaussian with gradient >= threshold and scale <= percent_dense * extent."""
         small = rules.is_small(self._log_scales(), self.percent_dense * scene_extent)
         chosen = ((grads.reshape(-1) >= grad_threshold) & small).nonzero().reshape(-1)
         self._append({name: values.index_select(0, chosen) for name, values in raw_rows(self).items()}, chosen)
 
+    @changes_rows
     def densify_and_split(
         self,
         grads: Tensor,
@@ -191,7 +199,7 @@ class AdaptiveGaussians(GaussianParameters):
         origins = parents.repeat(N)
         rows = {name: values.index_select(0, origins) for name, values in raw_rows(self).items()}
         self._make_children(rows, parents, N, seed, iteration, long_axis)
-        self._append(rows, origins)
+        self._append(rows, *[parents] * N)
         self.prune_points(torch.cat((large, large.new_zeros(len(self) - before))))
 
     def _make_children(
@@ -213,9 +221,10 @@ class AdaptiveGaussians(GaussianParameters):
             rows["opacity"][first:] = self._raw_opacity(children["opacity"])
         else:
             if seed is None:
-                seed = int(torch.randint(2**62, ()))
+                seed = self.shards.ranks.shared(int(torch.randint(2**62, ())))
+            items = self.shards.items(parents)
             sampled = [
-                rules.split_children(*shapes, parents, child, count=count, seed=seed, iteration=iteration)
+                rules.split_children(*shapes, items, child, count=count, seed=seed, iteration=iteration)
                 for child in range(count)
             ]
             positions, scales = (torch.cat(parts) for parts in zip(*sampled, strict=True))
@@ -223,13 +232,18 @@ class AdaptiveGaussians(GaussianParameters):
             scales = self.scaling_inverse_activation(scales.exp())
         rows["xyz"][first:], rows["scaling"][first:] = positions, scales
 
-    def _append(self, rows: Rows, origins: Tensor) -> None:
-        """Append rows by `densification_postfix`, or what overrides it, with the radii of their origins (n,) if set."""
+    def _append(self, rows: Rows, *origins: Tensor) -> None:
+        """Append rows by `densification_postfix`, or what overrides it, with the radii of their origins if set.
+
+        origins: (n,) of the rows of each part, which over all ranks follow each other part by part.
+        """
         standard = [rows.pop(name) for name in _STANDARD]
         if self.tmp_radii is not None:
-            standard.append(self.tmp_radii.index_select(0, origins))
+            standard.append(self.tmp_radii.index_select(0, torch.cat(origins)))
         self.densification_postfix(*standard, **rows)
+        self.shards.order(*map(self.shards.items, origins))
 
+    @changes_rows
     def densification_postfix(
         self,
         new_xyz: Tensor,
@@ -251,8 +265,10 @@ class AdaptiveGaussians(GaussianParameters):
         if self.tmp_radii is not None:
             new = self.tmp_radii.new_zeros(len(new_xyz)) if new_tmp_radii is None else new_tmp_radii
             self.tmp_radii = torch.cat((self.tmp_radii, new))
+        self.shards.appended(len(new_xyz))
         self._zero_statistics()
 
+    @changes_rows
     def prune_points(self, mask: Tensor) -> None:
         """Remove the Gaussians of a mask, with their optimiser state and statistics.
 
@@ -268,6 +284,7 @@ class AdaptiveGaussians(GaussianParameters):
         if len(keep) == len(kept):
             return
         self._take(self._prune_optimizer(kept))
+        self.shards.kept(keep)
         for name in (*NAMES, "tmp_radii"):
             values = getattr(self, name, None)  # users delete those that they do not need
             if values is not None:
@@ -332,6 +349,11 @@ class AdaptiveGaussians(GaussianParameters):
             if name not in names
         ]
         return optimised, others, {} if self.optimizer is None else self.optimizer.state
+
+
+def _views(gradient: Tensor, radii: Tensor) -> list[tuple[Tensor, Tensor]]:
+    """The gradients and radii of each view."""
+    return [(gradient, radii)] if radii.dim() == 1 else list(zip(gradient, radii, strict=True))
 
 
 # Read once, so that a step is told from one that replaces it, in a subclass or in this class.

@@ -5,10 +5,12 @@ from torch import Tensor
 
 from scene.gaussians import density_rules as rules
 from scene.gaussians.long_axis import long_axis_children
+from scene.gaussians.moves import changes_rows
 from scene.gaussians.parameters import raw_rows
 from scene.gaussians.relocating import RelocatingGaussians
 from scene.gaussians.row_surgery import restart_rows, row_groups
 from utils.exact.portable_math import exp, log
+from utils.ranks.selection import lowest
 
 
 def count_after(now: int, budget: int, remaining: int, power: float) -> int:
@@ -23,6 +25,7 @@ def count_after(now: int, budget: int, remaining: int, power: float) -> int:
 
 
 @torch.no_grad()
+@changes_rows
 def split_in_two(gaussians: RelocatingGaussians, parents: Tensor) -> None:
     """Split Gaussians, ascending indices (n,), along their longest axis (scene/gaussians/long_axis.py).
 
@@ -30,7 +33,7 @@ def split_in_two(gaussians: RelocatingGaussians, parents: Tensor) -> None:
     steps are long: with the parent's averages they would stay almost where they are.
     """
     count = len(parents)
-    if not count:
+    if not gaussians.shards.ranks.anyone(count > 0):
         return
     rows = {name: values.index_select(0, parents) for name, values in raw_rows(gaussians).items()}
     shapes = gaussians._log_scales(), gaussians._opacity_logits()
@@ -39,6 +42,8 @@ def split_in_two(gaussians: RelocatingGaussians, parents: Tensor) -> None:
     children |= gaussians._raw_shapes(children["opacity"], children["scaling"])
     second = rows | {name: values[count:] for name, values in children.items()}
     gaussians._take(gaussians.cat_tensors_to_optimizer(second))
+    gaussians.shards.appended(count)
+    gaussians.shards.order(gaussians.shards.items(parents))
     gaussians._zero_statistics()
     for name, values in children.items():
         gaussians.raw(name)[parents] = values[:count]
@@ -46,13 +51,14 @@ def split_in_two(gaussians: RelocatingGaussians, parents: Tensor) -> None:
     restart_rows(row_groups(groups, len(gaussians)), states, parents)
 
 
+@changes_rows
 def remove_useless(gaussians: RelocatingGaussians, min_opacity: float, most: int) -> None:
     """Remove Gaussians of an opacity below min_opacity; then those of the lowest, until there are at most `most`."""
     opacity = gaussians._opacity_logits().reshape(-1)
     remove = rules.is_useless(opacity, min_opacity)
-    over = len(gaussians) - most
+    over = gaussians.total - most
     if over > 0:
-        remove[torch.argsort(opacity, stable=True)[:over]] = True
+        remove[lowest(opacity, over, gaussians.shards.ranks)] = True
     gaussians.prune_points(remove)
 
 

@@ -13,6 +13,7 @@ import torch
 from scene.gaussians.attributes import IN_CHECKPOINT, Attribute, Rows
 from scene.gaussians.finite import check_finite
 from scene.gaussians.statistics import Statistics
+from utils.ranks.ranks import ranks
 from utils.system_utils import UserError, atomic_write
 
 _LARGEST = 1e15  # extent; learning rates are multiples of it
@@ -104,10 +105,13 @@ def _check_rows(rows: Rows, table: dict[str, Attribute], max_sh_degree: int) -> 
 
 
 def save_checkpoint(path: str | os.PathLike, capture: tuple, iteration: int) -> None:
-    """Write (capture, iteration); the whole file or none."""
-    with atomic_write(path) as temporary:
+    """Write (capture, iteration), on the rank that writes; the whole file or none."""
+    if not ranks().first:
+        return
+    # To an open file, as torch would write a path's name into the archive, and the temporary one is never the same.
+    with atomic_write(path) as temporary, open(temporary, "wb") as file:
         try:
-            torch.save((capture, iteration), temporary)
+            torch.save((capture, iteration), file)
         except RuntimeError as error:
             # torch hides the cause when its archive writer fails, but the content is never the cause.
             if "inline_container" not in str(error) and "PytorchStreamWriter" not in str(error):
@@ -126,13 +130,16 @@ def _reason(temporary: Path) -> OSError:
 
 
 def load_checkpoint(path: str | os.PathLike, device: torch.device | str = "cpu") -> tuple[tuple, int]:
-    """Read (capture, iteration), ours or the reference's. UserError for any other file."""
+    """Read (capture, iteration), ours or the reference's. UserError for any other file.
+
+    Where several ranks read it, tensors on the CPU stay in the file until somebody reads a part of them.
+    """
     _refuse_other_kinds(path)
     try:
         _refuse_other_formats(path)
         _refuse_damaged(path)
         with torch.serialization.safe_globals(_ALLOWED):
-            content = torch.load(path, map_location=device, weights_only=True)
+            content = torch.load(path, map_location=device, weights_only=True, mmap=ranks().several)
     except UserError:
         raise
     except Exception as error:  # a damaged file can raise any exception in the unpickler

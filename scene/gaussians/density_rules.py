@@ -13,6 +13,8 @@ from diff_gaussian_rasterization.density import split_positions
 from torch import Tensor
 
 from utils.exact.counter_rng import Stream
+from utils.ranks.ranks import ALONE, Ranks
+from utils.ranks.selection import lowest
 
 SHRINK = 0.8  # N children of a split have 1 / (0.8 N) of the parent's scale: 1 / 1.6 for two (paper, section 5.2)
 PRUNE_EXTENT = 0.1  # a Gaussian wider than this part of the scene's extent is removed, once sizes are limited
@@ -32,36 +34,43 @@ class Actions(NamedTuple):
     reset_opacity: bool
 
 
-def interval(opt: argparse.Namespace, until: int, stride: float) -> int:
+def interval(opt: argparse.Namespace, until: int, stride: float, views: int = 1) -> int:
     """Iterations from one densification to the next: densification_interval of the options, in most runs.
 
     until: the end of the window of densifications, which begins with densify_from_iter, in iterations of the schedule;
     stride: of these, how many each iteration stands for. Where they are several, there would be too few densifications.
+    views: of each iteration; densification_interval counts views.
     """
     if stride <= 1:
         return opt.densification_interval
     steps = (until - opt.densify_from_iter) / stride
-    return min(opt.densification_interval, max(1, int(steps / FEW_DENSIFICATIONS)))
+    return min(math.ceil(opt.densification_interval / views), max(1, int(steps / FEW_DENSIFICATIONS)))
 
 
 def actions(
-    iteration: int, opt: argparse.Namespace, white_background: bool, span: range | None = None, stride: float = 1.0
+    iteration: int,
+    opt: argparse.Namespace,
+    white_background: bool,
+    span: range | None = None,
+    stride: float = 1.0,
+    views: int = 1,
 ) -> Actions:
     """Actions due in an iteration (paper, section 5.2, in the reference's windows): none from densify_until_iter on.
 
     span, stride: the iterations of the schedule that it stands for, and their mean number there; by default itself.
     The options' windows and resets are of the schedule; densifications come every `interval` iterations, as their
-    statistics need views. Resets that a model would not recover from before the next one are left out.
+    statistics need views (views: of each iteration). Resets that a model would not recover from before the next one
+    are left out.
     """
     before, now = (iteration - 1, iteration) if span is None else (span.start - 1, span.stop - 1)
     active, resets = now < opt.densify_until_iter, opt.opacity_reset_interval
-    recovers = stride <= 1 or resets >= RECOVERY * stride
+    recovers = stride <= 1 or resets >= RECOVERY * stride / views
     reset = now // resets > before // resets or (white_background and before < opt.densify_from_iter <= now)
     return Actions(
         observe=active,
         densify=active
         and now > opt.densify_from_iter
-        and iteration % interval(opt, opt.densify_until_iter, stride) == 0,
+        and iteration % interval(opt, opt.densify_until_iter, stride, views) == 0,
         limit_size=now > resets,
         reset_opacity=active and reset and recovers,
     )
@@ -87,15 +96,13 @@ def mean_gradient(accumulated: Tensor, count: Tensor) -> Tensor:
     return torch.where(mean.isnan(), 0.0, mean)
 
 
-def limit_growth(gradient: Tensor, threshold: float, room: int) -> Tensor:
-    """Zero the gradients of all candidates (>= threshold) except the `room` largest, ties by index: (N,)."""
+def limit_growth(gradient: Tensor, threshold: float, room: int, ranks: Ranks = ALONE) -> Tensor:
+    """Zero the gradients of all ranks' candidates (>= threshold) except the `room` largest, ties by index: (N,)."""
     candidates = (gradient >= threshold).nonzero().reshape(-1)
-    if len(candidates) <= room:
+    if ranks.before(len(candidates))[1] <= room:
         return gradient
-    order = torch.argsort(gradient[candidates], descending=True, stable=True)
-    limited = gradient.clone()
-    limited[candidates[order[max(room, 0) :]]] = 0.0
-    return limited
+    grow = candidates[lowest(gradient[candidates], room, ranks, highest=True)]
+    return gradient.index_fill(0, candidates, 0.0).index_copy_(0, grow, gradient[grow])
 
 
 def is_small(scaling: Tensor, limit: float) -> Tensor:

@@ -14,6 +14,7 @@ from scene.gaussians.adam import GaussianAdam
 from scene.gaussians.trainable import trainable
 from utils.general_utils import get_expon_lr_func
 from utils.host.device import compute_device
+from utils.ranks.ranks import Ranks
 from utils.system_utils import UserError, atomic_write
 
 NAME = "exposure.json"
@@ -90,6 +91,13 @@ class Exposures:
         if self.optimizer is not None and self.values.grad is not None:
             self.optimizer.step()
             self.optimizer.zero_grad(set_to_none=True)
+
+    def add_gradients(self, ranks: Ranks) -> None:
+        """Give every rank the sum of all ranks' gradients."""
+        if not ranks.several or not ranks.anyone(self.values.grad is not None):
+            return
+        own = torch.zeros_like(self.values) if self.values.grad is None else self.values.grad
+        self.values.grad = ranks.gather(own[None]).sum(0)
 
     def capture(self) -> dict[str, Any]:
         """State that a resumed training needs, as plain values."""

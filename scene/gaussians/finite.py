@@ -5,19 +5,23 @@ import sys
 import torch
 
 from scene.gaussians.attributes import Rows
+from scene.gaussians.shards import WHOLE, Shards
 from utils.system_utils import UserError
 
 _PART = 1 << 16  # rows checked at a time, as there may be little memory left
 
 
-def check_finite(rows: Rows, where: str, remedy: str) -> None:
-    """UserError naming the first attribute with values that are not finite, how many Gaussians, and the first one."""
+def check_finite(rows: Rows, where: str, remedy: str, shards: Shards = WHOLE) -> None:
+    """UserError naming the first attribute with values that are not finite, how many Gaussians, and the first one.
+
+    shards: the place of the rows among those of all ranks, which are told the same.
+    """
     for name, values in rows.items():
         finite = torch.cat([part.isfinite().flatten(1).all(dim=1) for part in values.split(_PART)])
-        if not finite.all():
-            bad = (~finite).nonzero()
+        if shards.ranks.anyone(not finite.all()):
+            bad = shards.ranks.gather(shards.items((~finite).nonzero().reshape(-1)))
             raise UserError(
-                f"{name} of {len(bad)} of {len(values)} Gaussians in {where} is not finite "
+                f"{name} of {len(bad)} of {shards.total(len(values))} Gaussians in {where} is not finite "
                 f"(the first is Gaussian {int(bad[0])}); {remedy}"
             )
 

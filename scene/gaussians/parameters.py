@@ -10,8 +10,10 @@ from torch import Tensor, nn
 from scene.gaussians.attributes import Attribute, Rows, attributes
 from scene.gaussians.finite import tell_of_undrawn
 from scene.gaussians.ply import column_names, read_ply, row_bytes, write_ply
+from scene.gaussians.shards import WHOLE, Divided, Shards
 from utils.general_utils import build_scaling_rotation, inverse_sigmoid, strip_symmetric
 from utils.host.device import compute_device
+from utils.ranks.ranks import Ranks
 from utils.system_utils import UserError
 
 
@@ -38,13 +40,15 @@ class GaussianParameters:
     `_xyz` (N,3) world; `_features_dc` (N,1,3), `_features_rest` (N,K,3), K = (D+1)^2 - 1; `_scaling` (N,3) log;
     `_rotation` (N,4) wxyz, any length; `_opacity` (N,1) logit. world_offset: the world's coordinates of the origin
     (scene/readers/world_offset.py), kept in the PLY. Activations are attributes, which `setup_functions` sets.
-    The tensors become parameters when rows are taken; an empty model has plain ones, as in the reference.
+    The tensors become parameters when rows are taken; an empty model has plain ones, as in the reference. shards: where
+    these rows are among those of all ranks, if several have a part of the model each.
     """
 
     # What a subclass need not set whose __init__ sets the reference's attributes and does not call this one.
     active_sh_degree = 0
     max_sh_degree = 3
     world_offset = (0.0, 0.0, 0.0)
+    shards: Shards = WHOLE
 
     _xyz: Tensor
     _features_dc: Tensor
@@ -76,8 +80,18 @@ class GaussianParameters:
         return attributes(self.max_sh_degree)
 
     def __len__(self) -> int:
-        """Number of Gaussians."""
+        """Number of Gaussians that this process has."""
         return self._xyz.shape[0]
+
+    @property
+    def total(self) -> int:
+        """Number of Gaussians that all ranks have."""
+        return self.shards.total(len(self))
+
+    def divide(self, ranks: Ranks) -> None:
+        """Let ranks share the Gaussians of an empty model: what is loaded from now on, each keeps its part of."""
+        if ranks.several:
+            self.shards = Divided(ranks, len(self))
 
     def __bool__(self) -> bool:
         """True, also for a model without Gaussians: the reference's has no length."""
@@ -173,17 +187,17 @@ class GaussianParameters:
         """Take all parameters from a PLY of this model's SH degree (else UserError); all SH bands become active."""
         rows = read_ply(path, self.max_sh_degree)
         tell_of_undrawn(rows, path)
-        self.set_rows(rows)
+        self.take_whole(rows)
         self.active_sh_degree = self.max_sh_degree
 
     def save_ply(self, path: str | os.PathLike) -> None:
         """Write the raw parameters as a PLY in the reference's layout."""
-        write_ply(path, raw_rows(self), self._degree_of_tensors(), self.world_offset)
+        write_ply(path, raw_rows(self), self._degree_of_tensors(), self.world_offset, ranks=self.shards.ranks)
 
     @property
     def ply_bytes(self) -> int:
         """Size of the PLY without its header."""
-        return len(self) * row_bytes(self.max_sh_degree)
+        return self.total * row_bytes(self.max_sh_degree)
 
     def part(self, keep: Tensor | slice, sh_degree: int) -> "GaussianParameters":
         """A copy of the Gaussians `keep`, (N,) bool or a slice, with the SH bands up to sh_degree."""
@@ -202,6 +216,11 @@ class GaussianParameters:
         """Take raw values of any number of Gaussians by optimiser group; they move to the device that computes."""
         device = compute_device()
         self._take({name: nn.Parameter(rows[name].to(device)) for name in self._attributes})
+        self.shards = self.shards.of(len(self))
+
+    def take_whole(self, rows: Rows) -> None:
+        """Do as set_rows with the rows of a whole model, of which this rank keeps its part."""
+        self.set_rows({name: self.shards.own(values) for name, values in rows.items()})
 
     def _take(self, params: dict[str, Tensor]) -> None:
         """Set the tensors of these attributes; tensors of other names are not the table's."""

@@ -1,6 +1,7 @@
 """PLY files of trained models, with the columns of the reference in its order, as other tools read them."""
 
 import os
+from collections import deque
 from collections.abc import Collection, Iterable, Iterator, Sequence
 
 import numpy as np
@@ -11,6 +12,9 @@ from torch import Tensor
 from scene.gaussians.attributes import Rows, attributes
 from utils.files.ply_header import check_header
 from utils.files.ply_rows import check_rows
+from utils.ranks.gathering import in_order
+from utils.ranks.ranks import ALONE, Ranks
+from utils.ranks.ranks import ranks as all_ranks
 from utils.system_utils import UserError, atomic_write
 
 _NORMALS = ["nx", "ny", "nz"]  # zeros after the positions, as in the reference's files
@@ -22,30 +26,36 @@ def write_ply(
     sh_degree: int,
     world_offset: Sequence[float] = (0.0, 0.0, 0.0),
     comments: Sequence[str] = (),
+    ranks: Ranks = ALONE,
 ) -> None:
     """Write a binary little-endian PLY, float32, SH bands channel by channel; the whole file or none.
 
     world_offset: world coordinates of the origin, written as a comment unless they are zero. comments: further ones.
+    ranks: those whose rows together make the file, of which the first writes it. Every rank must call it.
     """
+    if not (ranks.several or all_ranks().first):
+        return
     count = len(rows["xyz"])
-    parts = [(attribute.columns, rows[name]) for name, attribute in attributes(sh_degree).items()]
-    parts.insert(1, (_NORMALS, torch.zeros(count, 3)))
-    names = column_names(sh_degree)
-    matrix = np.zeros((count, len(names)), dtype="<f4")
-    start = 0
-    for columns, values in parts:
-        if values.dim() == 3:
-            values = values.transpose(1, 2)
-        stop = start + len(columns)
-        matrix[:, start:stop] = values.reshape(count, len(columns)).cpu().numpy()
-        start = stop
     header = ["ply", "format binary_little_endian 1.0"]
     header += [f"comment {comment}" for comment in (*offset_comments(world_offset), *comments)]
-    header += [f"element vertex {count}"]
-    header += [f"property float {name}" for name in names]
+    header += [f"element vertex {ranks.before(count)[1]}"]
+    header += [f"property float {name}" for name in column_names(sh_degree)]
+    pieces = in_order(ranks, count, lambda part: _table(rows, sh_degree, part))
+    if not ranks.first:
+        return deque(pieces, maxlen=0).clear()
     with atomic_write(path) as temporary, open(temporary, "wb") as file:
         file.write("\n".join([*header, "end_header\n"]).encode("ascii"))
-        file.write(matrix)  # not tofile, which loses the last bytes on a full disk without an error
+        for piece in pieces:
+            # Not tofile, which loses the last bytes on a full disk without an error.
+            file.write(piece.cpu().numpy().astype("<f4", copy=False))
+
+
+def _table(rows: Rows, sh_degree: int, part: slice) -> Tensor:
+    """Some Gaussians (n, columns) as a PLY has them, float32."""
+    parts = [rows[name][part] for name in attributes(sh_degree)]
+    parts.insert(1, torch.zeros_like(parts[0]))
+    columns = [(values.transpose(1, 2) if values.dim() == 3 else values).flatten(1) for values in parts]
+    return torch.cat(columns, dim=1).float()
 
 
 def column_names(sh_degree: int) -> list[str]:

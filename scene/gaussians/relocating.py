@@ -10,6 +10,7 @@ from torch import Tensor
 from scene.gaussians.adaptive import AdaptiveGaussians
 from scene.gaussians.attributes import Rows
 from scene.gaussians.density_rules import logit
+from scene.gaussians.moves import changes_rows, rows_by_draw
 from scene.gaussians.parameters import raw_rows
 from scene.gaussians.penalty import Penalty
 from scene.gaussians.relocation import divided, draw, opacity_units
@@ -38,17 +39,21 @@ class RelocatingGaussians(AdaptiveGaussians):
         """
         live = self._opacity_logits().reshape(-1) > logit(min_opacity)
         dead = (~live).nonzero().reshape(-1)
-        if 0 < len(dead) < len(live):
-            origins = self._divide(live, len(dead), most_parts, seed, iteration, _RELOCATION)
+        counts = self.shards.ranks.numbers(len(dead))[:, 0]
+        count = int(counts.sum())
+        if 0 < count < self.total:
+            draws, origins = self._divide(live, count, most_parts, seed, iteration, _RELOCATION)
             rows = {name: values.index_select(0, origins) for name, values in raw_rows(self).items()}
-            self._overwrite(dead, rows)
-        return len(dead)
+            self._overwrite(dead, rows_by_draw(rows, draws, counts, self.shards.ranks))
+        return count
 
+    @changes_rows
     def grow(self, count: int, most_parts: int, *, seed: int, iteration: int) -> None:
         """Append `count` Gaussians, which are parts of others as `relocate` makes them."""
         every = torch.ones(len(self), dtype=torch.bool, device=self._xyz.device)
-        origins = self._divide(every, count, most_parts, seed, iteration, _GROWTH)
+        draws, origins = self._divide(every, count, most_parts, seed, iteration, _GROWTH)
         self._append({name: values.index_select(0, origins) for name, values in raw_rows(self).items()}, origins)
+        self.shards.order(draws)
 
     @torch.no_grad()
     def add_noise(self, size: float, steepness: float, threshold: float, *, seed: int, iteration: int) -> None:
@@ -60,33 +65,41 @@ class RelocatingGaussians(AdaptiveGaussians):
         gate = {"size": size, "steepness": steepness, "threshold": threshold}
         numbers = {"seed": seed, "stream": Stream.NOISE, "iteration": iteration}
         guard = getattr(self.optimizer, "guard", None)
-        add_noise_(self._xyz, *shapes, **gate, **numbers, stopped=guard.stopped if guard else None)
+        where = {"stopped": guard.stopped if guard else None, "first": self.shards.first}
+        add_noise_(self._xyz, *shapes, **gate, **numbers, **where)
 
     def penalise(self, penalty: Penalty) -> None:
         """Add a penalty's gradients to those of the parameters, with the bits of the step that adds them itself."""
         if not self.kernels_activate:
-            mean = penalty.opacity * self.get_opacity.mean() + penalty.scale * self.get_scaling.mean()
-            return mean.backward()
+            total = self.total
+            opacity, scale = self.get_opacity.sum() / total, self.get_scaling.sum() / (3 * total)
+            return (penalty.opacity * opacity + penalty.scale * scale).backward()
         params = self._opacity, self._scaling
         for param in params:
             if param.grad is None:
                 param.grad = torch.zeros_like(param)
-        each = penalty.of_each(len(self))
+        each = penalty.of_each(self.total)
         gradients = [param.grad.contiguous() for param in params]
         penalise_(*(param.detach() for param in params), *gradients, opacity=each.opacity, scale=each.scale)
         for param, gradient in zip(params, gradients, strict=True):
             param.grad = gradient
 
-    def _divide(self, live: Tensor, count: int, most: int, seed: int, iteration: int, which: int) -> Tensor:
-        """Draw the origins (count,) of new Gaussians among those of `live`, and make each a part of what it was."""
+    def _divide(
+        self, live: Tensor, count: int, most: int, seed: int, iteration: int, which: int
+    ) -> tuple[Tensor, Tensor]:
+        """Draw the origins of `count` new Gaussians among those of `live`, and make each a part of what it was.
+
+        Returns which draws (n,) fell on this rank's Gaussians, and the origins (n,).
+        """
         logits = self._opacity_logits().reshape(-1)
         units = torch.where(live, opacity_units(logits), 0)
-        origins = draw(units, count, seed=seed, iteration=iteration, draw=which)
+        numbers = {"seed": seed, "iteration": iteration, "draw": which}
+        draws, origins = draw(units, count, **numbers, ranks=self.shards.ranks)
         sources, copies = origins.unique(return_counts=True)
         opacities, larger = divided(logits[sources], (copies + 1).clamp_max(most))
         log_scales = self._log_scales()[sources] + larger[:, None]
         self._overwrite(sources, self._raw_shapes(opacities[:, None].float(), log_scales.float()))
-        return origins
+        return draws, origins
 
     def _overwrite(self, indices: Tensor, rows: Rows) -> None:
         groups, others, states = self._groups()

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from utils.exact.counter_rng import Stream, random_bits
 from utils.exact.portable_math import exp, log
+from utils.ranks.ranks import ALONE, Ranks
 
 MOST_PARTS = 51  # of one Gaussian (paper): itself and 50 copies
 _UNITS = 2**24  # of opacity 1, where Gaussians are drawn in proportion to it
@@ -23,17 +24,26 @@ def opacity_units(logits: Tensor) -> Tensor:
     return (_UNITS / (1.0 + exp(-logits.nan_to_num()))).to(torch.int64).clamp_min(1)
 
 
-def draw(units: Tensor, count: int, *, seed: int, iteration: int, draw: int) -> Tensor:
-    """Indices (count,) drawn with replacement in proportion to `units` (N,), whole numbers whose sum is above 0.
+def draw(
+    units: Tensor, count: int, *, seed: int, iteration: int, draw: int, ranks: Ranks = ALONE
+) -> tuple[Tensor, Tensor]:
+    """`count` draws with replacement among all ranks, in proportion to `units` (N,), whole numbers of a sum above 0.
 
-    seed, iteration and draw decide the random numbers.
+    Returns which of the draws, (n,) ascending, fell on this rank's items, and on which of them, (n,). seed, iteration
+    and draw decide the random numbers.
     """
     ends = units.cumsum(0)
     items = torch.arange(count, device=units.device)
     bits = random_bits(seed, Stream.RELOCATION, iteration, items, draw)
     share = ((bits[:, 0] >> 5) << 26 | bits[:, 1] >> 6).to(torch.float64) * 2.0**-53
-    tickets = (share * ends[-1]).to(torch.int64)
-    return torch.searchsorted(ends, torch.minimum(tickets, ends[-1] - 1), right=True)
+    if not ranks.several:
+        tickets = (share * ends[-1]).to(torch.int64)
+        return items, torch.searchsorted(ends, torch.minimum(tickets, ends[-1] - 1), right=True)
+    own = int(units.sum())
+    below, total = ranks.before(own)
+    tickets = (share * total).to(torch.int64).clamp_max(total - 1) - below
+    mine = ((tickets >= 0) & (tickets < own)).nonzero().reshape(-1)
+    return mine, torch.searchsorted(ends, tickets[mine], right=True)
 
 
 def divided(logits: Tensor, parts: Tensor) -> tuple[Tensor, Tensor]:

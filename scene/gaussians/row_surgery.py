@@ -6,6 +6,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from scene.gaussians.host_memory import beside
 from utils.host.memory import is_out_of_memory
 
 _CHUNK = 1 << 16  # rows moved at a time when memory is too short for all of them
@@ -41,10 +42,10 @@ def append_rows(groups: list[Group], states: States, rows: dict[str, Tensor]) ->
         return torch.cat((values, values.new_zeros(len(new), *values.shape[1:]) if is_state else new))
 
     try:
-        return _change_rows(groups, states, grow)
+        return map_rows(groups, states, grow)
     except (MemoryError, RuntimeError) as error:
         if is_out_of_memory(error):
-            _change_rows(groups, states, lambda values, *_: values[:count])
+            map_rows(groups, states, lambda values, *_: values[:count])
         raise
 
 
@@ -57,14 +58,14 @@ def keep_rows(groups: list[Group], states: States, indices: Tensor) -> dict[str,
 
     def select(values: Tensor, *_: object) -> Tensor:
         try:
-            return values.index_select(0, indices)
+            return beside(values, values.index_select(0, indices))
         except (MemoryError, RuntimeError) as error:
             if not is_out_of_memory(error):
                 raise
             errors.append(error)
             return _move_up(values, indices)
 
-    params = _change_rows(groups, states, select)
+    params = map_rows(groups, states, select)
     if errors:
         raise errors[0]
     return params
@@ -100,14 +101,18 @@ def overwrite_rows(groups: list[Group], states: States, indices: Tensor, rows: d
     restart_rows(groups, states, indices)
 
 
-def _change_rows(
+def map_rows(
     groups: list[Group], states: States, change: Callable[[Tensor, str, bool], Tensor]
 ) -> dict[str, nn.Parameter]:
-    """Map all parameters and averages; `change` takes values, the group's name, and whether they are averages."""
+    """Map all parameters and averages; `change` takes values, the group's name, and whether they are averages.
+
+    Returns the new parameters by name, without gradient.
+    """
     params = {}
     for group in groups:
         name = group.get("name")
-        value = change(group["params"][0].detach(), name, False)
+        old = group["params"][0].detach()
+        value = beside(old, change(old, name, False))
         params[name] = _replace(group, states, value, lambda mean, name=name: change(mean, name, True))
     return params
 
@@ -120,7 +125,7 @@ def _replace(group: Group, states: States, value: Tensor, change: Callable[[Tens
         for key, mean in state.items():
             # Longer than the parameter: appended just before memory ran out, and now to be cut again.
             if torch.is_tensor(mean) and mean.dim() == old.dim() and len(mean) >= len(old):
-                state[key] = change(mean)
+                state[key] = beside(mean, change(mean))
         states[param] = states.pop(old)
     group["params"] = [param]
     return param

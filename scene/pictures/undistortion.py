@@ -162,12 +162,12 @@ def _make(photo: Photo, path: Path) -> None:
     mask_path = _mask_path(path)
     has_mask = not shown.all()
     if has_mask:
-        with atomic_write(mask_path) as temporary:
+        with atomic_write(mask_path, every_rank=True) as temporary:
             Image.fromarray(np.where(shown, 255, 0).astype(np.uint8)).save(temporary)
     text = PngInfo()
     text.add_text(_HAS_MASK, "yes" if has_mask else "no")
     # Written after the mask, so that a file never lacks its mask.
-    with atomic_write(path) as temporary:
+    with atomic_write(path, every_rank=True) as temporary:
         Image.fromarray(_warp_picture(pixels, plan)).save(temporary, compress_level=1, pnginfo=text)
 
 

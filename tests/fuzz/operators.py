@@ -22,10 +22,11 @@ def sound_calls() -> dict[str, Call]:
     scene = list(scene_arguments(raw, camera))
     splats, depths, rects, counts, _ = ops.project(*scene)
     instances, ranges, *slots = ops.bin(splats, depths, rects, counts, height, width, True)
-    image, transmittance, plane, last = ops.blend(splats, instances, ranges, background, height, width, True, True)
+    image, transmittance, plane, last, _ = ops.blend(splats, instances, ranges, background, height, width, True, True)
     state = [splats, instances, ranges, *slots, background, last, transmittance]
     layers = torch.zeros(5 * 256)  # as a GPU makes them of few instances
     planes = [torch.ones_like(image), torch.ones_like(transmittance), torch.ones_like(plane)]
+    rows = ops.blend_rows(*state, *planes, layers)
     wanted = [True, True, True, True, True, False, False, True, True]
     lists = [[torch.rand(3, 3), torch.rand(2, 5)] for _ in range(4)]
     guard = [torch.rand(()), torch.zeros(1, dtype=torch.int64), 3]
@@ -40,6 +41,9 @@ def sound_calls() -> dict[str, Call]:
         "bin": (ops.bin, [splats, depths, rects, counts, height, width, True]),
         "blend": (ops.blend, [splats, instances, ranges, background, height, width, True, True]),
         "blend_vjp": (ops.blend_vjp, [*state, *planes]),
+        "blend_rows": (ops.blend_rows, [*state, *planes, layers, True]),
+        "rows_vjp": (ops.rows_vjp, [*scene, splats, counts, *rows, wanted]),
+        "rows_vjp_step_": (ops.rows_vjp_step_, [*scene, splats, counts, *rows, *_step(raw), *guard]),
         "project_vjp": (ops.project_vjp, [*scene, counts, ops.blend_vjp(*state, *planes), wanted]),
         "rasterize": (ops.rasterize, [torch.zeros(3, 3), *scene, background, True, True]),
         "rasterize_vjp": (ops.rasterize_vjp, [*scene, *state, *planes, counts, layers, wanted]),
@@ -53,6 +57,12 @@ def sound_calls() -> dict[str, Call]:
         "sparse_adam_": (ops.sparse_adam_, [*sparse, *guard]),
         "run_ahead_": (ops.run_ahead_, [torch.zeros(5, dtype=torch.int64), [1, 1, 1], None]),  # refused: not on a GPU
         "step_now_": (ops.step_now_, _step_now()),
+        "catch_up_": (
+            ops.catch_up_,
+            [*(torch.rand(3, 4) for _ in range(3)), torch.zeros(3, dtype=torch.int32), [0.1], [1.0], 0.9, 0.999, 1e-8],
+        ),
+        "in_host_memory": (ops.in_host_memory, [torch.rand(3, 4)]),
+        "is_in_host_memory": (ops.is_in_host_memory, [torch.rand(3, 4)]),
         "observe_": (ops.observe_, [*statistics, torch.rand(3, 3)]),
         "split_positions": (
             ops.split_positions,
@@ -67,13 +77,19 @@ def sound_calls() -> dict[str, Call]:
         "l1_ssim_vjp": (ssim.l1_ssim_vjp, [one, two, kept, torch.ones(()), torch.ones(())]),
         "photometric": (ssim.photometric, [one, two, 0.2, True]),
         "photometric_vjp": (ssim.photometric_vjp, [one, two, kept, 0.2, torch.ones(())]),
+        "photometric_band": (ssim.photometric_band, [one, two, 0, one.shape[-2]]),
+        "photometric_of_sums": (ssim.photometric_of_sums, [one, ssim.photometric_band(one, two, 0, 0)[0], 0.2]),
+        "photometric_band_vjp": (
+            ssim.photometric_band_vjp,
+            [one, two, kept, 0.2, torch.ones(()), 0, one.shape[-2]],
+        ),
         "composite": (ssim.composite, [torch.zeros(4, 5, 6, dtype=torch.uint8), torch.ones(3)]),
         "mean_distance2": (torch.ops.simple_knn.mean_distance2, [torch.rand(9, 3)]),
     }
 
 
 def _step(raw: dict[str, Tensor]) -> list:
-    """The arguments of `rasterize_vjp_step_` from `radii` to the statistics."""
+    """The arguments of `rasterize_vjp_step_` and `rows_vjp_step_` from `radii` to the statistics."""
     count = len(raw["means"])
     averages = [[torch.rand_like(value) for value in raw.values()] for _ in range(2)]
     counters = [torch.tensor(float(place)) for place in range(6)]

@@ -56,7 +56,7 @@ class Curve(Observer):
         if self._due or step.last:
             self._seconds = self._run.clock.seconds
             with self._run.clock.paused("scoring"):
-                self._recorder.add(self._point(step), self._seconds, len(self._run.gaussians), step.iteration)
+                self._recorder.add(self._point(step), self._seconds, self._run.gaussians.total, step.iteration)
 
     def ended(self, error: Error) -> None:
         if error is not None:

@@ -3,6 +3,7 @@
 import math
 import sys
 from collections import deque
+from collections.abc import Callable
 from pathlib import Path
 
 from tqdm import tqdm
@@ -13,10 +14,12 @@ from training.objective import Losses
 from training.observer import Error, Observer
 from training.run import Run
 from training.step import Step
+from utils.ranks.ranks import ranks
 from utils.system_utils import UserError
 
 _SHOWN = 5  # rows that a message names
 _COMPARED = 10  # losses compared, at the start and at the end, each of a different view
+_NEVER = 1 << 62  # an iteration
 _WORSE_AFTER = 100  # iterations after which a loss should have fallen
 
 
@@ -55,14 +58,14 @@ class DivergenceWatch(Observer):
         self._earliest = [*self._earliest, *losses.values()][:_COMPARED]
         self._latest.extend(losses.values())
         self._iteration = iteration
-        bad = next((t for t, loss in losses.items() if not math.isfinite(loss)), math.inf)
-        stopped = self._guard.stopped_in() or math.inf
-        if bad == stopped == math.inf:
+        bad = next((t for t, loss in losses.items() if not math.isfinite(loss)), _NEVER)
+        bad, stopped = ranks().numbers(bad, self._guard.stopped_in() or _NEVER).amin(0).tolist()
+        if bad == stopped == _NEVER:
             return
-        first = int(min(bad, stopped))
+        first = min(bad, stopped)
         if bad == first:
             # The guard held that iteration's step back, too.
-            good, what = first - 1, f"the loss became {losses[first]}"
+            good, what = first - 1, f"the loss became {self._value_of(losses[first])}"
         else:
             good, what = first, f"{self._unstepped()} had no finite step"
         self._gaussians.rewind(iteration - good if stepped else iteration - 1 - good)
@@ -86,6 +89,11 @@ class DivergenceWatch(Observer):
                 file=sys.stderr,
             )
 
+    @staticmethod
+    def _value_of(loss: float) -> float:
+        """The loss of an iteration that was not finite, on whatever rank."""
+        return next((value for value in ranks().everyone(loss) if not math.isfinite(value)), loss)
+
     def _unstepped(self) -> str:
         parts = []
         for name, rows, count in self._gaussians.take_marks():
@@ -94,16 +102,26 @@ class DivergenceWatch(Observer):
         return " and ".join(parts)
 
     def _rescue(self, iteration: int) -> str:
+        """Save the model, all ranks together, if it is whole on each. Return what was saved, and what to do."""
         if iteration == self._run.first_iteration:
             return "no iteration was trained before it; lower the learning rates"
         path = Path(self._run.scene.model_path) / f"chkpnt{iteration}.pth"
-        try:
-            self._gaussians.check_finite(iteration)
+        fault = next(filter(None, ranks().everyone(self._fault(lambda: self._gaussians.check_finite(iteration)))), None)
+        if fault is None:
             self._gaussians.drop_broken_statistics()
-            save_checkpoint(path, self._gaussians.capture(), iteration)
-        except UserError as error:
-            return f"and the model could not be saved ({error}); resume an earlier checkpoint"
+            state = self._gaussians.capture()
+            fault = ranks().shared(self._fault(lambda: save_checkpoint(path, state, iteration)))
+        if fault is not None:
+            return f"and the model could not be saved ({fault}); resume an earlier checkpoint"
         return (
             f"the last good model, after iteration {iteration}, is saved: resume with --start_checkpoint {path} and "
             "lower learning rates"
         )
+
+    @staticmethod
+    def _fault(call: Callable[[], object]) -> str | None:
+        try:
+            call()
+        except UserError as error:
+            return str(error)
+        return None

@@ -11,6 +11,7 @@ from training.observer import Error, Observer
 from training.run import Run
 from training.step import Step
 from utils.host.memory import is_out_of_memory
+from utils.ranks.ranks import ranks
 from utils.system_utils import UserError
 
 
@@ -54,7 +55,9 @@ class MemoryGuard(Observer):
             ) from error
 
     def _rescue(self) -> str:
-        """Save the model. Return what was saved, and what to do."""
+        """Save the model, unless other ranks have parts of it. Return what was saved, and what to do."""
+        if ranks().several:
+            return f"{ranks().stands()}, with a lower --resolution (-r), --max_num_splats or --images_to_load"
         if self._iteration == self._first and not self._changing:
             return "nothing was trained yet; lower --resolution (-r), --max_num_splats, --images_to_load or --sh_degree"
         gaussians, iteration = self._gaussians, self._iteration + self._changing
@@ -64,7 +67,7 @@ class MemoryGuard(Observer):
             if self._changing:
                 gaussians.take_from_optimizer()
                 state = f"the model in iteration {iteration}, whose last changes may be incomplete,"
-                further = f"--max_num_splats {len(gaussians)}, {further}"
+                further = f"--max_num_splats {gaussians.total}, {further}"
             else:
                 gaussians.active_sh_degree = self._sh_degree
                 anew = "--max_num_splats or --sh_degree"  # a resumed run with as many Gaussians would end here again

@@ -41,7 +41,7 @@ class ProgressBar(Observer):
         if step.span.stop - 1 != step.iteration:  # the bar counts iterations of the schedule
             means["Iterations"] = f"{step.iteration:,}"
         # As text: tqdm would round the number to three digits.
-        self._bar.set_postfix(means, Gaussians=f"{len(self._run.gaussians):,}", refresh=False)
+        self._bar.set_postfix(means, Gaussians=f"{self._run.gaussians.total:,}", refresh=False)
         self._bar.update(step.span.stop - 1 - self._bar.n)
         self._updated, self._done = time.monotonic(), step.iteration
 

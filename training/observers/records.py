@@ -19,7 +19,7 @@ class Records(Observer):
         run, seconds = self._run, self._run.clock.seconds
         self._seconds = seconds
         with run.clock.paused("saving"):
-            run.log.add(step.iteration, seconds, gaussians=len(run.gaussians), loss=run.losses.mean, **step.record)
+            run.log.add(step.iteration, seconds, gaussians=run.gaussians.total, loss=run.losses.mean, **step.record)
 
     def ended(self, error: Error) -> None:
         """Note the seconds of this process: up to its first iteration, of training, of scoring and of saving."""

@@ -76,6 +76,6 @@ class Checkpoints(Observer):
             path = Path(run.scene.model_path) / f"chkpnt{step.iteration}.pth"
             save_schedule(run, step)  # first: a checkpoint never lacks its place in the schedule
             save_checkpoint(path, run.gaussians.capture(), step.iteration)
-            run.log.add(step.iteration, seconds, gaussians=len(run.gaussians), loss=run.losses.mean)
+            run.log.add(step.iteration, seconds, gaussians=run.gaussians.total, loss=run.losses.mean)
         if step.stopping:
             tqdm.write(f"resume with --start_checkpoint {path}", file=sys.stderr)

@@ -19,6 +19,7 @@ from training.observers.schedule import ScheduleFile
 from training.observers.target import Target
 from training.pacing.pace import Paced
 from training.run import Run
+from utils.ranks.ranks import ranks
 
 
 def standard_observers(run: Run, writer: Any | None, report: Callable[..., dict[str, float]]) -> list[Observer]:
@@ -29,7 +30,7 @@ def standard_observers(run: Run, writer: Any | None, report: Callable[..., dict[
     checkpoints = Checkpoints(run, watch)
     return [
         watch,  # first: observers that write rely on all losses so far being finite
-        ProgressBar(run),  # reads the losses that the watch has checked
+        *([ProgressBar(run)] if ranks().first else []),  # reads the losses that the watch has checked
         MaskWatch(run.scene.getTrainCameras()),  # may refuse the scene before anything is written
         *([Target(run)] if run.opt.target_psnr else []),  # may make this iteration the last, which others look at
         *([Curve(run)] if with_curve else []),  # the scores are those of the model saved at the same iteration

@@ -9,6 +9,7 @@ from training.objective import Losses
 from training.observer import Error, Observer
 from training.run import Run
 from training.step import Step
+from utils.ranks.ranks import ranks
 
 EVERY = 100  # iterations between scorings, at least
 PER_VIEW = 20  # iterations for each test view: to score one costs half of an iteration, so all cost some 2.5 %
@@ -38,7 +39,7 @@ class Target(Observer):
         run, target = self._run, self._run.opt.target_psnr
         with run.clock.paused("scoring"):
             run.scene.prefetch(self._cameras)
-            self._psnr = self._views.scores(self._cameras, run.gaussians).get("psnr")
+            self._psnr = ranks().shared(self._views.scores(self._cameras, run.gaussians).get("psnr"))
         if self._psnr is None:  # masks leave no pixel of the views
             return
         step.record = (step.record or {}) | {"test_views_psnr": self._psnr}

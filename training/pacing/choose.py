@@ -7,6 +7,7 @@ from pathlib import Path
 
 from scene.cameras import Camera
 from scene.pictures.store import ImageStore
+from training.pacing.batched import Batched
 from training.pacing.clocked import Clocked
 from training.pacing.pace import Block, Pace, Paced, Schedule
 from training.pacing.resolution import PYRAMID, Levels, Resolution
@@ -15,12 +16,12 @@ from training.pacing.spectrum import levels_of
 from utils.system_utils import UserError
 
 
-def pace_of(opt: argparse.Namespace, checkpoint: str | None, first_iteration: int) -> Pace:
+def pace_of(opt: argparse.Namespace, checkpoint: str | None, first_iteration: int, views: int = 1) -> Pace:
     """The pace of a run. UserError for a schedule that this run cannot follow, or that leaves nothing to do.
 
-    checkpoint: a chkpntN.pth that is resumed, or None. first_iteration: its N, or 0.
+    checkpoint: a chkpntN.pth that is resumed, or None. first_iteration: its N, or 0. views: of each iteration.
     """
-    pace = _chosen(opt, checkpoint, first_iteration)
+    pace = _chosen(opt, checkpoint, first_iteration) if views == 1 else _batched(opt, views)
     if not pace.is_over(first_iteration):
         return pace
     at = f"{checkpoint} is at iteration {first_iteration}"
@@ -30,6 +31,13 @@ def pace_of(opt: argparse.Namespace, checkpoint: str | None, first_iteration: in
         f"{at}, so --iterations {opt.iterations} leaves nothing to do; --iterations counts from the start of the first "
         "run"
     )
+
+
+def _batched(opt: argparse.Namespace, views: int) -> Pace:
+    for name in ("schedule", "time_budget"):
+        if getattr(opt, name):
+            raise UserError(f"--{name} and --parallel views both give the pace of a run; leave one out")
+    return Batched(opt.iterations, views)
 
 
 def _chosen(opt: argparse.Namespace, checkpoint: str | None, first_iteration: int) -> Pace:

@@ -5,6 +5,7 @@ import sys
 from tqdm import tqdm
 
 from training.pacing.pace import Block, Paced, Schedule
+from utils.ranks.ranks import ranks
 
 PART = 1 / 200  # of the budget that a block takes, so that what is left is known well before the end
 _MOST_GROWTH = 2  # of a block over the one before, while the first iterations are slower than the others
@@ -29,6 +30,7 @@ class Clocked(Paced):
 
     def reach(self, iteration: int, seconds: float) -> None:
         if not self.blocks or iteration > self.blocks[-1].last:
+            seconds = ranks().shared(seconds)
             self._measure(seconds)
             self._decide(seconds)
 

@@ -17,8 +17,11 @@ _ROUNDING = 1e-6  # iterations of the schedule; progress is a float, and just be
 class Pace:
     """The steady pace: each iteration stands for itself.
 
-    length: of the schedule, in iterations. ends: the last iteration of the run, None: not known yet.
+    length: of the schedule, in iterations. ends: the last iteration of the run, None: not known yet. views: of each
+    iteration.
     """
+
+    views = 1
 
     def __init__(self, length: int) -> None:
         self.length = length

@@ -11,6 +11,7 @@ from training.observer import Announcer
 from training.run import Run
 from training.step import Step
 from training.steps.plain import PlainStep
+from utils.ranks.ranks import ranks
 
 
 class FusedStep:
@@ -65,15 +66,17 @@ class FusedStep:
     def measure(self, step: Step) -> tuple[Drawn, Losses, tuple[Tensor, Tensor | None]]:
         """Render: what was drawn, the losses, and their gradients of image and depth."""
         run = self._run
-        drawn = draw(step.camera, run.gaussians, run.pipe, step.background, step.depth_weight > 0)
+        exposed = run.dataset.train_test_exp
+        by_bands = ranks().several and not exposed and run.objective.takes_bands(step)
+        drawn = draw(step.camera, run.gaussians, run.pipe, step.background, step.depth_weight > 0, by_bands)
         with torch.enable_grad():
             image, depth = drawn.image.requires_grad_(), drawn.depth
             if depth is not None:
                 depth.requires_grad_()
             rendered = image
-            if run.dataset.train_test_exp and (name := step.camera.exposure_name or step.camera.image_name) is not None:
+            if exposed and (name := step.camera.exposure_name or step.camera.image_name) is not None:
                 rendered = apply_exposure(image, run.gaussians.get_exposure_from_name(name))
-            losses = run.objective({"render": rendered, "depth": depth}, step)
+            losses = run.objective({"render": rendered, "depth": depth, "band": drawn.band}, step)
             losses.total.backward()
         # Observers keep losses for a while, which must not keep the image and its gradient.
         losses = losses._replace(

@@ -59,7 +59,8 @@ class AdaptiveDensityControl(DensityControl):
 
     def _actions(self, iteration: int) -> rules.Actions:
         pace = self.pace
-        return rules.actions(iteration, self._opt, self._white_background, pace.span(iteration), pace.stride(iteration))
+        place = pace.span(iteration), pace.stride(iteration), pace.views
+        return rules.actions(iteration, self._opt, self._white_background, *place)
 
     def _densify(self, iteration: int, limit_size: bool) -> None:
         self._gaussians.densify_and_prune(
@@ -72,7 +73,7 @@ class AdaptiveDensityControl(DensityControl):
             max_splats=self._opt.max_num_splats,
             long_axis=self._opt.split == "long_axis",
         )
-        if len(self._gaussians) == 0:
+        if self._gaussians.total == 0:
             raise UserError(
                 f"no Gaussian was left after the densification of iteration {iteration}: the views do not agree "
                 "with the points, or show nothing but the background; check the scene, or raise "

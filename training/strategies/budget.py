@@ -22,6 +22,7 @@ from training.step import Step
 from utils.exact.counter_rng import Stream, permutation
 from utils.exact.portable_math import exp, log
 from utils.exact.weighted_choice import weighted_choice
+from utils.ranks.selection import largest
 from utils.system_utils import UserError
 
 if TYPE_CHECKING:
@@ -56,14 +57,14 @@ class BudgetControl(DensityControl):
             return
         self._gaussians.check_steps()  # before rows change, so that an error finds the rows of the step
         grows = self._grows(step.iteration)
-        aim = now = len(self._gaussians)
+        aim = now = self._gaussians.total
         if grows:
             aim = count_after(now, self.most_gaussians, self._remaining(step.iteration), self._opt.growth_power)
         remove_useless(self._gaussians, self._opt.prune_opacity, max(aim, 1))
         self._check_rest(step.iteration)
         if grows:
-            if aim > len(self._gaussians):
-                split_in_two(self._gaussians, self._chosen(step, aim - len(self._gaussians)))
+            if aim > self._gaussians.total:
+                split_in_two(self._gaussians, self._chosen(step, aim - self._gaussians.total))
             fade(self._gaussians, self._opt.opacity_decay)
 
     def most_after(self, count: int, first: int, last: int) -> int:
@@ -85,22 +86,24 @@ class BudgetControl(DensityControl):
         return max(math.ceil(ahead) - 1, 0)
 
     def _interval(self, iteration: int) -> int:
-        return rules.interval(self._opt, self._opt.densify_until_iter, self.pace.stride(iteration))
+        return rules.interval(self._opt, self._opt.densify_until_iter, self.pace.stride(iteration), self.pace.views)
 
     def _chosen(self, step: Step, count: int) -> Tensor:
-        """Indices of at most `count` Gaussians to split, ascending."""
-        opt = self._opt
+        """Indices of this rank's Gaussians to split, ascending; those of all ranks are at most `count`."""
+        opt, shards = self._opt, self._gaussians.shards
         scores = self._scores.of_views(self._scored_views(step.iteration), step.background)
-        relative = scores / scores.max().clamp_min(_SMALLEST)  # the power of a score itself may be too small a number
+        # The power of a score itself may be too small a number.
+        relative = scores / largest(scores, shards.ranks).clamp_min(_SMALLEST)
         weights = exp(opt.score_power * log(relative)) * (scores > 0)
-        return weighted_choice(weights, count, seed=opt.seed, stream=Stream.DENSIFY, iteration=step.iteration)
+        numbers = {"seed": opt.seed, "stream": Stream.DENSIFY, "iteration": step.iteration}
+        return weighted_choice(weights, count, **numbers, first=shards.first, ranks=shards.ranks)
 
     def _scored_views(self, iteration: int) -> list[Camera]:
         order = permutation(self._opt.seed, Stream.SCORED_VIEWS, iteration, len(self._cameras))
         return [self._cameras[index] for index in order[: self._opt.score_views]]
 
     def _check_rest(self, iteration: int) -> None:
-        if len(self._gaussians) == 0:
+        if self._gaussians.total == 0:
             raise UserError(
                 f"no Gaussian was left after the densification of iteration {iteration}: the views do not agree "
                 "with the points, or show nothing but the background; check the scene, or lower --prune_opacity"

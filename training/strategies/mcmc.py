@@ -41,7 +41,7 @@ class MarkovChain(DensityControl):
         opt = self._opt
         within = opt.densify_from_iter < self.pace.nominal(iteration) < opt.mcmc_until_iter
         stride = self.pace.stride(iteration)
-        return within and iteration % rules.interval(opt, opt.mcmc_until_iter, stride) == 0
+        return within and iteration % rules.interval(opt, opt.mcmc_until_iter, stride, self.pace.views) == 0
 
     def most_after(self, count: int, first: int, last: int) -> int:
         for _ in filter(self.changes, range(first, last + 1)):
@@ -64,7 +64,7 @@ class MarkovChain(DensityControl):
         """Move what nobody sees (the paper's relocation of dead Gaussians)."""
         least, parts, seed = self._opt.mcmc_min_opacity, self._opt.mcmc_parts, self._opt.seed
         dead = self._gaussians.relocate(least, parts, seed=seed, iteration=iteration)
-        if dead == len(self._gaussians):
+        if dead == self._gaussians.total:
             raise UserError(
                 f"no Gaussian was left with an opacity above {least} in iteration {iteration}: the views do not agree "
                 "with the points, or show nothing but the background; check the scene, or lower --mcmc_opacity_reg"
@@ -72,7 +72,7 @@ class MarkovChain(DensityControl):
 
     def _grow(self, iteration: int) -> None:
         """Grow to `_grown`."""
-        count, opt = len(self._gaussians), self._opt
+        count, opt = self._gaussians.total, self._opt
         new = self._grown(count) - count
         if new > 0:
             self._gaussians.grow(new, opt.mcmc_parts, seed=opt.seed, iteration=iteration)

@@ -5,20 +5,25 @@ from torch import Tensor
 
 from utils.exact.counter_rng import Stream, random_bits
 from utils.exact.portable_math import log
+from utils.ranks.ranks import ALONE, Ranks
+from utils.ranks.selection import lowest
 
 
-def weighted_choice(weights: Tensor, count: int, *, seed: int, stream: Stream, iteration: int) -> Tensor:
+def weighted_choice(
+    weights: Tensor, count: int, *, seed: int, stream: Stream, iteration: int, first: int = 0, ranks: Ranks = ALONE
+) -> Tensor:
     """Indices of `count` items, drawn one after another by the weights of those left: ascending, (n,) int64.
 
     weights: (N,) float64. An item whose weight is not above 0, or not finite, is never drawn, so there may be fewer.
     Algorithm A-Res: with a uniform number u for each item, the largest log(u) / weight are drawn; ties go to the lower
-    index. Same weights, same items, on every device and number of threads.
+    index. Same weights, same items, on every device and number of threads. Items of several ranks follow each other:
+    `first` is the index of this rank's first one among all, and its own of those drawn are returned.
     """
     items = ((weights > 0) & weights.isfinite()).nonzero().reshape(-1)
-    if len(items) <= count:
+    if ranks.before(len(items))[1] <= count:
         return items
-    waits = -log(_uniform(random_bits(seed, stream, iteration, items))) / weights[items]
-    return items[torch.argsort(waits, stable=True)[: max(count, 0)]].sort().values
+    waits = -log(_uniform(random_bits(seed, stream, iteration, items + first))) / weights[items]
+    return items[lowest(waits, count, ranks)].sort().values
 
 
 def _uniform(bits: Tensor) -> Tensor:

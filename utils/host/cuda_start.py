@@ -5,6 +5,8 @@ import importlib.util
 import threading
 from pathlib import Path
 
+from utils.host import torchrun
+
 _DRIVER = "libcuda.so.1"
 
 
@@ -32,11 +34,11 @@ def _computes_on_a_gpu() -> bool:
 
 
 def _make_context() -> None:
-    """Retain the primary context of the first visible GPU, which torch computes on."""
+    """Retain the primary context of the visible GPU that torch will compute on."""
     try:
         driver = ctypes.CDLL(_DRIVER)
         device, context = ctypes.c_int(), ctypes.c_void_p()
-        if driver.cuInit(0) == 0 and driver.cuDeviceGet(ctypes.byref(device), 0) == 0:
+        if driver.cuInit(0) == 0 and driver.cuDeviceGet(ctypes.byref(device), torchrun.local_rank()) == 0:
             driver.cuDevicePrimaryCtxRetain(ctypes.byref(context), device)
     except (OSError, AttributeError):  # no driver, or another one of that name
         pass

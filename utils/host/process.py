@@ -9,13 +9,14 @@ import torch
 _IMPORTED = time.perf_counter()
 
 
-def seconds_since_start() -> float | None:
-    """Seconds since the process started, to a clock tick; None if the system does not say."""
+def seconds_since_start(process: int | None = None) -> float | None:
+    """Seconds since this process, or another one, started, to a clock tick; None if the system does not say."""
     try:
         # The command's name, in brackets, may have spaces. Field 22 of proc(5) is the start in clock ticks since boot.
-        fields = Path("/proc/self/stat").read_text().rpartition(")")[2].split()
+        fields = Path(f"/proc/{process or 'self'}/stat").read_text().rpartition(")")[2].split()
         started = int(fields[22 - 3]) / os.sysconf("SC_CLK_TCK")
-        return max(time.clock_gettime(time.CLOCK_BOOTTIME) - started, time.perf_counter() - _IMPORTED)
+        least = 0.0 if process else time.perf_counter() - _IMPORTED
+        return max(time.clock_gettime(time.CLOCK_BOOTTIME) - started, least)
     except (OSError, ValueError, IndexError, AttributeError):
         return None
 

@@ -4,15 +4,20 @@ import math
 import os
 from pathlib import Path
 
+from utils.host import torchrun
+
 MOST_THREADS = 16  # for work on image files: more threads only wait for memory and disk
 _CGROUPS = Path("/sys/fs/cgroup")
 _OWN_CGROUPS = Path("/proc/self/cgroup")
 
 
 def cores() -> int:
-    """Processors allowed by affinity (taskset, Slurm) and by the quota of the process's cgroups (Docker's --cpus)."""
+    """Processors allowed by affinity (taskset, Slurm) and by the quota of the process's cgroups (Docker's --cpus).
+
+    Processes that train together on this host share them evenly.
+    """
     count = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return max(1, math.ceil(min(count, _quota())))
+    return max(1, math.ceil(min(count, _quota())) // torchrun.local_size())
 
 
 def threads(most: int = MOST_THREADS) -> int:

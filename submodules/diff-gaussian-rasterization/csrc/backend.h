@@ -14,29 +14,44 @@ struct BinMemory {
   const Ahead* ahead = nullptr;  // on a GPU: take room for lists, and do not wait for their lengths
 };
 
+// Allocates gradient rows once their number is known; may throw.
+template <class T>
+struct RowMemory {
+  T* (*take)(void* context, int64_t rows);  // as in SplatRows
+  void* context;
+  int32_t* counts;  // (N) rows of each splat, filled
+  bool absolute;    // whether rows have what lengths of absolute gradients need
+};
+
 // Every backend's functions. `Where` says how they run: an Executor on the CPU, a Queue on a GPU.
-#define GS_BACKEND(Where)                                                                        \
-  template <class T>                                                                             \
-  void project(const Where&, const Scene<T>&, const Projected<T>&);                              \
-  template <class T>                                                                             \
-  void project_vjp(const Where&, const Scene<T>&, const int32_t* tile_counts, const T* moments,  \
-                   const SceneGradient<T>&);                                                     \
-  template <class T>                                                                             \
-  void mark_visible(const Where&, int64_t count, const T* means, const T* view, bool* visible);  \
-  template <class T>                                                                             \
-  void bin(const Where&, int64_t count, const Projected<T>&, Image, const BinMemory&);           \
-  template <class T>                                                                             \
-  void blend(const Where&, const BlendInput<T>&, const Blended<T>&);                             \
-  template <class T>                                                                             \
-  void blend_vjp(const Where&, const BlendInput<T>&, const BlendGradient<T>&);                   \
-  template <class T>                                                                             \
-  void mark_decisive(const Where&, const BlendInput<T>&, const int32_t* last, bool* decisive);   \
-  template <class T>                                                                             \
-  void adam(const Where&, const AdamInput<T>* tensors, int64_t count, const StepGuard<T>&);      \
-  /* Adam without bias correction on the visible rows, (rows); `step` is not read. */            \
-  template <class T>                                                                             \
-  void sparse_adam(const Where&, const AdamInput<T>&, const bool* visible, const StepGuard<T>&); \
-  template <class T>                                                                             \
+#define GS_BACKEND(Where)                                                                            \
+  template <class T>                                                                                 \
+  void project(const Where&, const Scene<T>&, const Projected<T>&);                                  \
+  template <class T>                                                                                 \
+  void project_vjp(const Where&, const Scene<T>&, const int32_t* tile_counts, const T* moments,      \
+                   const SceneGradient<T>&);                                                         \
+  template <class T>                                                                                 \
+  void mark_visible(const Where&, int64_t count, const T* means, const T* view, bool* visible);      \
+  template <class T>                                                                                 \
+  void bin(const Where&, int64_t count, const Projected<T>&, Image, const BinMemory&);               \
+  template <class T>                                                                                 \
+  void blend(const Where&, const BlendInput<T>&, const Blended<T>&);                                 \
+  template <class T>                                                                                 \
+  void blend_vjp(const Where&, const BlendInput<T>&, const BlendGradient<T>&);                       \
+  /* The rows of the processed instances, which blend_vjp sums. No gradient's output is written. */  \
+  template <class T>                                                                                 \
+  void blend_rows(const Where&, const BlendInput<T>&, const BlendGradient<T>&, const RowMemory<T>&); \
+  template <class T>                                                                                 \
+  void mark_decisive(const Where&, const BlendInput<T>&, const int32_t* last, bool* decisive);       \
+  template <class T>                                                                                 \
+  void adam(const Where&, const AdamInput<T>* tensors, int64_t count, const StepGuard<T>&);          \
+  /* Adam without bias correction on the visible rows, (rows); `step` is not read. */                \
+  template <class T>                                                                                 \
+  void sparse_adam(const Where&, const AdamInput<T>&, const bool* visible, const StepGuard<T>&);     \
+  /* Adam's steps without a gradient that rows have missed (MissedSteps), under no guard. */         \
+  template <class T>                                                                                 \
+  void catch_up(const Where&, const AdamInput<T>&, const MissedSteps<T>&);                           \
+  template <class T>                                                                                 \
   void penalise(const Where&, const PenaltyInput<T>&);
 
 // Compiled once: see gs/rounded.h.
@@ -44,10 +59,12 @@ void observe(const Executor&, const ObserveInput&);
 void split_positions(const Executor&, const SplitInput&);
 void add_noise(const Executor&, const NoiseInput&);
 
-// What else the CPU offers. project_vjp_step: project_vjp, and every Gaussian's step as soon as its gradients are
-// known.
+// What else the CPU offers. sum_rows: the rest of blend_vjp after blend_rows. project_vjp_step: project_vjp, and every
+// Gaussian's step as soon as its gradients are known.
 #define GS_CPU_BACKEND                                                                                  \
   GS_BACKEND(Executor)                                                                                  \
+  template <class T>                                                                                    \
+  void sum_rows(const Executor&, const SplatRows<T>&, const RowSums<T>&);                               \
   template <class T>                                                                                    \
   void project_vjp_step(const Executor&, const Scene<T>&, const int32_t* tile_counts, const T* moments, \
                         const GaussianStep<T>&);
@@ -79,6 +96,10 @@ void rasterize_vjp(const Queue&, const Scene<float>&, const BlendInput<float>&, 
 // The same, and every Gaussian's step as soon as its gradients are known. No gradient is written.
 void rasterize_vjp_step(const Queue&, const Scene<float>&, const BlendInput<float>&, const BlendGradient<float>&,
                         const GaussianStep<float>&);
+// Both from the rows of blend_rows. RowSums::moments is not written.
+void rows_vjp(const Queue&, const Scene<float>&, const SplatRows<float>&, const RowSums<float>&, const GradientMemory&);
+void rows_vjp_step(const Queue&, const Scene<float>&, const SplatRows<float>&, const RowSums<float>&,
+                   const GaussianStep<float>&);
 }  // namespace cuda
 
 }  // namespace gs

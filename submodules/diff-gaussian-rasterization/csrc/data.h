@@ -127,6 +127,24 @@ struct BlendGradient {
   T* absolute = nullptr;            // out: (N), absolute_length in math/absolute.h; or null
 };
 
+// Gradient rows that lie by splat: those of a splat side by side, in the order of its slots.
+template <class T>
+struct SplatRows {
+  int64_t count;
+  const int32_t* tile_counts;  // (N)
+  const int32_t* counts;       // (N) rows of each splat; 0 where tile_counts is 0
+  const T* rows;               // (R, 10) as in BlendGradient::moments; (R, 12) for lengths of absolute gradients
+  int64_t row_count;           // R
+};
+
+// Where the sums of a splat's rows go, and what lengths of absolute gradients need besides.
+template <class T>
+struct RowSums {
+  const T* splats;  // not read without `absolute`
+  Image image;
+  T *moments, *absolute;  // as in BlendGradient; `absolute` null unless the rows are of twelve values
+};
+
 // A tensor that takes a step of Adam in place, in the `columns` leading values of each row.
 template <class T>
 struct AdamInput {
@@ -144,6 +162,15 @@ struct StepGuard {
   const T* loss;     // scalar; if it is not finite, no step is taken
   int64_t* stopped;  // the first iteration whose loss or step was not finite, else 0; later iterations take no step
   int64_t iteration;
+};
+
+// Past steps of Adam, of which each row of a tensor has taken the first ones. The tensor's gradient, rate and step are
+// not read.
+template <class T>
+struct MissedSteps {
+  const T* constants;    // (count, 7): AdamStep in math/adam.h of each step, in their order
+  const int32_t* taken;  // (rows) how many of them a row has taken
+  int32_t count;
 };
 
 // A view to add to the statistics of density control.
@@ -174,6 +201,7 @@ struct NoiseInput {
   uint64_t seed;
   uint32_t iteration, stream;
   const int64_t* stopped;  // or null
+  int64_t first = 0;       // index of the first one, which decides its random numbers
 };
 
 // Weights of a Gaussian's opacity and of each of its scales in the loss (math/penalty.h).

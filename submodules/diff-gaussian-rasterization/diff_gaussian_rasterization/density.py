@@ -42,6 +42,7 @@ def add_noise_(
     stream: int,
     iteration: int,
     stopped: Tensor | None = None,
+    first: int = 0,
 ) -> None:
     """Moves Gaussians at random (Kheradmand et al. 2024): each mean by size g C n.
 
@@ -49,11 +50,11 @@ def add_noise_(
     opacity o. means (N, 3), log_scales (N, 3), rotations (N, 4) wxyz of any length and opacity logits (N, 1): float32;
     means are contiguous and change. A mean that would not be finite stays. size is at least 0, steepness from 0 to
     10,000. The random numbers are a function of seed (its lower 64 bits), stream, iteration and the Gaussian's index,
-    each of the last three below 2^32. Every device and number of threads gives the same bits. stopped: of a guard
-    (optim.py); once it is not 0, nothing changes.
+    each of the last three below 2^32; first: the index of the first one. Every device and number of threads gives the
+    same bits. stopped: of a guard (optim.py); once it is not 0, nothing changes.
     """
     shapes = log_scales, rotations, logits
-    _add_noise(means, *shapes, size, steepness, threshold, _signed(seed), stream, iteration, stopped)
+    _add_noise(means, *shapes, size, steepness, threshold, _signed(seed), stream, iteration, stopped, first)
 
 
 def penalise_(

@@ -8,10 +8,11 @@ from diff_gaussian_rasterization.schema import GRADIENTS, SCENE
 # A Gaussian's values in each input; a row of sh_rest depends on the number of bands.
 _ROWS = {"means": (3,), "means2d": (3,), "opacities": (1,), "scales": (3,), "rotations": (4,), "cov3d": (6,)}
 _ROWS |= {"colors": (3,), "sh_dc": (1, 3)}
-# These three are constants of csrc; tests/test_rasterizer_ops.py holds them to it.
+# These four are constants of csrc; tests/test_rasterizer_ops.py holds them to it.
 TILE = 16  # pixels
 SPLAT_VALUES = 10  # of a row of `splats`
-MOMENT_VALUES = 10  # of a row of `moments`
+MOMENT_VALUES = 10  # of a row of `moments`, and of `rows`
+ABSOLUTE_VALUES = 2  # of a row of `rows` besides, for absolute gradients
 
 
 def _fake(name: str):
@@ -47,6 +48,7 @@ def _blended(like: Tensor, height: int, width: int, inverse_depth: bool, train: 
         like.new_empty((1, height, width)),
         like.new_empty((1 if inverse_depth else 0, height, width)),
         like.new_empty((height if train else 0, width), dtype=torch.int32),
+        like.new_empty((library.get_ctx().new_dynamic_size() if like.is_cuda and train else 0,)),
     )
 
 
@@ -72,8 +74,17 @@ def _(splats, *_):
     return splats.new_empty((splats.shape[0], MOMENT_VALUES))
 
 
+@_fake("blend_rows")
+def _(splats, *others):
+    *_, absolute = others if isinstance(others[-1], bool) else (False,)  # the dispatcher leaves a default out
+    values = MOMENT_VALUES + (ABSOLUTE_VALUES if absolute else 0)
+    rows = splats.new_empty((library.get_ctx().new_dynamic_size(), values))
+    return rows, splats.new_empty((splats.shape[0],), dtype=torch.int32)
+
+
 @_fake("project_vjp")
 @_fake("rasterize_vjp")
+@_fake("rows_vjp")
 def _(*arguments):
     (wanted,) = [value for value in arguments if isinstance(value, list)]
     return _gradients(_scene(arguments), wanted)
@@ -84,12 +95,11 @@ def _(means2d, *arguments):
     scene, (inverse_depth, train) = _scene(arguments), arguments[len(SCENE) + 1 :][:2]
     means, height, width = scene["means"], scene["height"], scene["width"]
     count = means.shape[0]
-    color, transmittance, depth, last = _blended(means, height, width, inverse_depth, train)
+    color, transmittance, depth, last, layers = _blended(means, height, width, inverse_depth, train)
     radii, tile_counts = (means.new_empty((count,), dtype=torch.int32) for _ in range(2))
     projected = radii, means.new_empty((count, SPLAT_VALUES)), tile_counts
-    values = library.get_ctx().new_dynamic_size() if means.is_cuda and train else 0
     lists = _binned(means, count, height, width, train)
-    return color, transmittance, depth, *projected, *lists, last, means.new_empty((values,))
+    return color, transmittance, depth, *projected, *lists, last, layers
 
 
 @_fake("mark_visible")
@@ -107,10 +117,17 @@ def _(means, *_):
     return means.new_empty((means.shape[0], 3))
 
 
+@_fake("in_host_memory")
+def _(values):
+    return torch.empty_like(values)
+
+
 @_fake("adam_")
+@_fake("catch_up_")
 @_fake("sparse_adam_")
 @_fake("observe_")
 @_fake("rasterize_vjp_step_")
+@_fake("rows_vjp_step_")
 @_fake("step_now_")
 @_fake("add_noise_")
 @_fake("penalise_")

@@ -14,6 +14,14 @@ struct ImagePair {
   bool clamp = false;  // use img1 clamped to [0, 1]; it has no gradient outside
 };
 
+// Rows of every plane. A band of an image begins at a multiple of kBandRows, and ends at one or with the image.
+struct RowRange {
+  int64_t begin, end;
+};
+constexpr int64_t kBandRows = 16;
+
+// With `rows`, only their sums and gradients are written, to the places that they have in those of the whole image, and
+// no means. Pixels more than 2 kRadius rows away count for nothing.
 template <class T>
 struct L1Ssim {
   ImagePair<T> images;
@@ -21,19 +29,46 @@ struct L1Ssim {
   double* l1;    // out: mean of |img1 - img2|, over all pixels
   double* ssim;  // out: mean of SSIM
   T* gradient;   // out, like img1: d ssim / d img1, clamped or not; null if not wanted
+  const RowRange* rows = nullptr;
+  double* sums = nullptr;  // with rows, out: (planes, height, row_parts, 2), of |img1 - img2| and of SSIM
 };
+
+// From the sums of all rows, the means that the whole image has.
+template <class T>
+struct L1SsimMeans {
+  ImagePair<T> images;
+  const double* sums;  // L1Ssim::sums
+  double *l1, *ssim;   // out
+};
+
+// Parts of a row whose sums are taken apart on the CPU.
+template <class T>
+constexpr int64_t kRowPart = 2048 / sizeof(T);
+template <class T>
+constexpr int64_t row_parts(int64_t width) {
+  return (width + kRowPart<T> - 1) / kRowPart<T>;
+}
 
 template <class T>
 struct L1SsimVjp {
   ImagePair<T> images;
   const T* ssim_gradient;  // L1Ssim::gradient
   double grad_l1, grad_ssim;
-  T* grad_img1;  // out
+  T* grad_img1;                    // out
+  const RowRange* rows = nullptr;  // that are wanted; the others may get any value
 };
 
-// L1SsimCuda::maps are (planes, strips, height, kMapRow) floats. Each strip has kMapColumns columns of a plane.
+// L1SsimCuda::maps are (planes, strips, map_rows, kMapRow) floats. Each strip has kMapColumns columns of a plane.
 constexpr int kMapColumns = 116, kMapRow = 408;
 constexpr int64_t map_strips(int64_t width) { return (width + kMapColumns - 1) / kMapColumns; }
+// The rows that the maps of a band have: those of the windows' blocks that its gradient reads.
+inline RowRange map_rows(RowRange band, int64_t height) {
+  constexpr int64_t kBlock = 8;
+  if (band.begin >= band.end) return {band.begin, band.begin};
+  return {band.begin < kBlock ? 0 : band.begin - kBlock, height - band.end < kBlock ? height : band.end + kBlock};
+}
+// Sums of each block of pixels, of |img1 - img2| and of 1 - SSIM: (sum_blocks, 2).
+int64_t sum_blocks(int64_t planes, int64_t height, int64_t width);
 
 // As L1Ssim<float>, with every pointer to the device.
 struct L1SsimCuda {
@@ -44,6 +79,8 @@ struct L1SsimCuda {
   float* loss = nullptr;  // out: l1_weight l1 + dssim_weight (1 - ssim); null if not wanted
   float l1_weight = 0, dssim_weight = 0;
   const int32_t* halted = nullptr;  // while this is not 0, nothing is done; null: never
+  const RowRange* rows = nullptr;   // of the host
+  double* sums = nullptr;           // with rows, out, and those of other blocks stay as they are; in for l1_ssim_means
 };
 
 // As L1SsimVjp<float>, with every pointer to the device.
@@ -53,6 +90,7 @@ struct L1SsimVjpCuda {
   float* grad_img1;
   float l1_weight = 1, ssim_weight = 1;  // of grad_l1 and grad_ssim
   const int32_t* halted = nullptr;       // as in L1SsimCuda
+  const RowRange* rows = nullptr;        // that are written, and whose maps these are
 };
 
 // An image with alpha, to be composited on a background.

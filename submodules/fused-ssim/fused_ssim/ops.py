@@ -36,7 +36,7 @@ def fused_l1_ssim(img1: Tensor, img2: Tensor, padding: str = "same") -> tuple[Te
     The first mean is over all pixels, with either padding; its gradient is 0 where both images are equal. Nothing is
     kept for the gradient unless img1 needs one.
     """
-    _check_inputs(img1, img2, padding)
+    check_images(img1, img2, padding)
     train = torch.is_grad_enabled() and img1.requires_grad
     l1, ssim, _ = OPERATORS.l1_ssim(img1, img2.detach(), padding == "valid", train)
     return l1, ssim
@@ -49,7 +49,7 @@ def fused_photometric_loss(img1: Tensor, img2: Tensor, lambda_dssim: float) -> t
     torch's clamp, img1 receives no gradient where it lies outside [0, 1]. The L1 has no gradient. Nothing is kept for
     the gradient unless img1 needs one.
     """
-    _check_inputs(img1, img2, "same")
+    check_images(img1, img2, "same")
     train = torch.is_grad_enabled() and img1.requires_grad
     if train and not torch.compiler.is_compiling():  # torch.compile knows the operator
         return _Photometric.apply(img1, img2, float(lambda_dssim), True)[:2]
@@ -66,7 +66,8 @@ def composite(picture: Tensor, background: Tensor) -> Tensor:
     return OPERATORS.composite(picture, background)
 
 
-def _check_inputs(img1: Tensor, img2: Tensor, padding: str) -> None:
+def check_images(img1: Tensor, img2: Tensor, padding: str) -> None:
+    """Check the arguments of `fused_ssim`; TypeError or ValueError for one that does not fit."""
     if padding not in PADDINGS:
         raise ValueError(f'padding must be "same" or "valid", got {padding!r}')
     if img1.dtype not in (torch.float32, torch.float64):

@@ -1,4 +1,5 @@
-// The backward of blending. A thread takes a tile, a vector takes pixels of one or two of its rows.
+// The backward of blending, up to gradient rows or to their sums. A thread takes a tile, a vector takes pixels of one
+// or two of its rows.
 #include <memory>
 #include <vector>
 
@@ -7,6 +8,7 @@
 #include "../math/exp2.h"
 #include "../math/slots.h"
 #include "gs/lane_sums.h"
+#include "one_copy.h"
 #include "tile_chunk.h"
 
 GS_ISA_BEGIN
@@ -226,7 +228,9 @@ class GradientRows {
 
   void mark(int64_t slot) { marks_[slot] = 1; }
 
-  void allocate() {
+  // memory: gives room for as many rows as it is asked for. It need not be zeroed: every row is written.
+  template <class Memory>
+  void allocate(const Memory& memory) {
     before_.resize(bits_.size() + 1);
     before_[0] = 0;
     for (size_t w = 0; w < bits_.size(); ++w) {
@@ -239,21 +243,21 @@ class GradientRows {
       bits_[w] = bits;
       before_[w + 1] = before_[w] + __builtin_popcountll(bits);
     }
-    rows_.reset(new T[kRow * before_.back()]);  // not zeroed: every row is written
+    rows_ = memory(before_.back());
   }
 
   // The row of a slot; for a slot without one, the next row.
-  T* row(int64_t slot) {
+  T* row(int64_t slot) const {
     const uint64_t lower = (uint64_t(1) << (slot & 63)) - 1;
     const int64_t rank = before_[slot >> 6] + (slot & 63 ? __builtin_popcountll(bits_[slot >> 6] & lower) : 0);
-    return rows_.get() + kRow * rank;
+    return rows_ + kRow * rank;
   }
 
  private:
   std::vector<uint8_t> marks_;
   std::vector<uint64_t> bits_;
   std::vector<int64_t> before_;
-  std::unique_ptr<T[]> rows_;
+  T* rows_ = nullptr;
 };
 
 template <class T>
@@ -280,7 +284,7 @@ void read_state(const BlendInput<T>& in, const BlendGradient<T>& g, const Tile& 
 
 template <class T, bool kDepth, bool kAbsolute>
 void blend_tile_vjp(const BlendInput<T>& in, const BlendGradient<T>& g, int64_t index, int64_t processed,
-                    GradientRows<T, kSums<kAbsolute>>& rows) {
+                    const GradientRows<T, kSums<kAbsolute>>& rows) {
   const Tile tile(index, in.image);
   const int64_t begin = in.ranges[index];
   BackwardState<T> state;
@@ -300,11 +304,11 @@ void blend_tile_vjp(const BlendInput<T>& in, const BlendGradient<T>& g, int64_t 
   }
 }
 
-template <class T, bool kAbsolute>
-void sum_gradients(const Executor& executor, const BlendInput<T>& in, const BlendGradient<T>& g) {
-  constexpr int kRow = kSums<kAbsolute>;
+template <class T, bool kAbsolute, class Memory>
+GradientRows<T, kSums<kAbsolute>> fill_rows(const Executor& executor, const BlendInput<T>& in,
+                                            const BlendGradient<T>& g, const Memory& memory) {
   const int64_t tiles = tiles_of(in.image);
-  GradientRows<T, kRow> rows(g.slot_count);
+  GradientRows<T, kSums<kAbsolute>> rows(g.slot_count);
   std::vector<int32_t> processed(tiles);
   for_dynamic(executor, tiles, 4, [&](int64_t begin, int64_t end) {
     for (int64_t index = begin; index < end; ++index) {
@@ -316,24 +320,63 @@ void sum_gradients(const Executor& executor, const BlendInput<T>& in, const Blen
         rows.mark(slot_of(g.slots, in.instances[in.ranges[index] + k], tile.x / kTile, tile.y / kTile));
     }
   });
-  rows.allocate();
+  rows.allocate(memory);
   const auto run = g.inverse_depth ? blend_tile_vjp<T, true, kAbsolute> : blend_tile_vjp<T, false, kAbsolute>;
   for_dynamic(executor, tiles, 1, [&](int64_t tile, int64_t) { run(in, g, tile, processed[tile], rows); });
-  for_dynamic(executor, g.count, 1024, [&](int64_t begin, int64_t end) {
-    for (int64_t i = begin; i < end; ++i) {
-      double sums[kRow] = {};  // a splat may have thousands of tiles
-      const T *start = rows.row(g.slots[i].first), *stop = rows.row(g.slots[i + 1].first);
-      for (const T* row = start; row < stop; row += kRow)
-        for (int v = 0; v < kRow; ++v) sums[v] += row[v];
-      std::copy_n(sums, kGradientValues, g.moments + kGradientValues * i);
-      if constexpr (kAbsolute) {
-        const double* absolute = sums + kGradientValues;
-        g.absolute[i] = 0;
-        if (start < stop)  // else the splat is undefined
-          g.absolute[i] = absolute_length(in.splats[kSplatValues * i + 2], T(absolute[0]), T(absolute[1]), in.image);
-      }
-    }
+  return rows;
+}
+
+// Sums the rows of splat i, from `start` to `stop`.
+template <class T, bool kAbsolute>
+GS_ONE_COPY void sum_splat(const T* start, const T* stop, int64_t i, const RowSums<T>& to) {
+  constexpr int kRow = kSums<kAbsolute>;
+  double sums[kRow] = {};  // a splat may have thousands of tiles
+  for (const T* row = start; row < stop; row += kRow)
+    for (int v = 0; v < kRow; ++v) sums[v] += row[v];
+  std::copy_n(sums, kGradientValues, to.moments + kGradientValues * i);
+  if constexpr (kAbsolute) {
+    const double* absolute = sums + kGradientValues;
+    to.absolute[i] = 0;
+    if (start < stop)  // else the splat is undefined
+      to.absolute[i] = absolute_length(to.splats[kSplatValues * i + 2], T(absolute[0]), T(absolute[1]), to.image);
+  }
+}
+
+// begin(i): where the rows of splat i begin, and those of the splat in front of it end.
+template <class T, bool kAbsolute, class Begin>
+void sum_splats(const Executor& executor, int64_t count, const Begin& begin, const RowSums<T>& to) {
+  for_dynamic(executor, count, 1024, [&](int64_t first, int64_t end) {
+    for (int64_t i = first; i < end; ++i) sum_splat<T, kAbsolute>(begin(i), begin(i + 1), i, to);
   });
+}
+
+template <class T, bool kAbsolute>
+void sum_gradients(const Executor& executor, const BlendInput<T>& in, const BlendGradient<T>& g) {
+  std::unique_ptr<T[]> memory;
+  const auto rows = fill_rows<T, kAbsolute>(executor, in, g, [&](int64_t count) {
+    memory.reset(new T[kSums<kAbsolute> * count]);
+    return memory.get();
+  });
+  sum_splats<T, kAbsolute>(executor, g.count, [&](int64_t i) { return rows.row(g.slots[i].first); },
+                           {in.splats, in.image, g.moments, g.absolute});
+}
+
+template <class T, bool kAbsolute>
+void keep_rows(const Executor& executor, const BlendInput<T>& in, const BlendGradient<T>& g,
+               const RowMemory<T>& memory) {
+  const auto rows =
+      fill_rows<T, kAbsolute>(executor, in, g, [&](int64_t count) { return memory.take(memory.context, count); });
+  for_dynamic(executor, g.count, 1024, [&](int64_t begin, int64_t end) {
+    for (int64_t i = begin; i < end; ++i)
+      memory.counts[i] = int32_t((rows.row(g.slots[i + 1].first) - rows.row(g.slots[i].first)) / kSums<kAbsolute>);
+  });
+}
+
+template <class T, bool kAbsolute>
+void sum_given(const Executor& executor, const SplatRows<T>& in, const RowSums<T>& to) {
+  std::vector<const T*> begin(in.count + 1, in.rows);
+  for (int64_t i = 0; i < in.count; ++i) begin[i + 1] = begin[i] + kSums<kAbsolute> * int64_t(in.counts[i]);
+  sum_splats<T, kAbsolute>(executor, in.count, [&](int64_t i) { return begin[i]; }, to);
 }
 
 }  // namespace
@@ -343,7 +386,22 @@ void blend_vjp(const Executor& executor, const BlendInput<T>& in, const BlendGra
   (g.absolute ? sum_gradients<T, true> : sum_gradients<T, false>)(executor, in, g);
 }
 
-template void blend_vjp<float>(const Executor&, const BlendInput<float>&, const BlendGradient<float>&);
-template void blend_vjp<double>(const Executor&, const BlendInput<double>&, const BlendGradient<double>&);
+template <class T>
+void blend_rows(const Executor& executor, const BlendInput<T>& in, const BlendGradient<T>& g,
+                const RowMemory<T>& memory) {
+  (memory.absolute ? keep_rows<T, true> : keep_rows<T, false>)(executor, in, g, memory);
+}
+
+template <class T>
+void sum_rows(const Executor& executor, const SplatRows<T>& in, const RowSums<T>& to) {
+  (to.absolute ? sum_given<T, true> : sum_given<T, false>)(executor, in, to);
+}
+
+#define GS_INSTANTIATE(T)                                                                                           \
+  template void blend_vjp<T>(const Executor&, const BlendInput<T>&, const BlendGradient<T>&);                       \
+  template void blend_rows<T>(const Executor&, const BlendInput<T>&, const BlendGradient<T>&, const RowMemory<T>&); \
+  template void sum_rows<T>(const Executor&, const SplatRows<T>&, const RowSums<T>&);
+GS_INSTANTIATE(float)
+GS_INSTANTIATE(double)
 
 GS_ISA_END

@@ -323,20 +323,6 @@ __global__ void GS_MAX_REGISTERS((kDepth ? 96 : 80) + (kAbsolute ? 8 : 0))
 }
 
 __global__ void __launch_bounds__(256)
-    absolute_kernel(const int32_t* halted, int64_t count, SlotSumsOf<kAbsoluteValues> sums, const float* splats,
-                    Image image, float* absolute) {
-  if (is_halted(halted)) return;
-  const int64_t i = int64_t(blockIdx.x) * 256 + threadIdx.x;
-  constexpr int kStage = SlotSumsOf<kAbsoluteValues>::kStage;
-  __shared__ __align__(8) float stage[256 / 32 * kStage];
-  float of_pixels[kAbsoluteValues];
-  const bool seen = i < count && sums.seen(i);
-  sums.read(i, seen, of_pixels, stage + threadIdx.x / 32 * kStage);
-  if (i >= count) return;
-  absolute[i] = seen ? absolute_length(splats[kSplatValues * i + 2], of_pixels[0], of_pixels[1], image) : 0;
-}
-
-__global__ void __launch_bounds__(256)
     moments_kernel(const int32_t* halted, int64_t count, SlotSums sums, float* moments) {
   if (is_halted(halted)) return;
   const int64_t i = int64_t(blockIdx.x) * 256 + threadIdx.x;
@@ -362,9 +348,11 @@ auto blend_vjp_kernel_for(bool depth, bool made) {
                : (made ? blend_vjp_kernel<false, true, kAbsolute> : blend_vjp_kernel<false, false, kAbsolute>);
 }
 
-}  // namespace
-
-GradientRows blend_rows(const Queue& queue, const BlendInput<float>& in, const BlendGradient<float>& g) {
+// Runs the backward up to the rows. take: allocates those of the gradients, for their number, for which the host waits
+// if `exact`, else perhaps for more.
+template <class Take>
+FilledRows blend_back(const Queue& queue, const BlendInput<float>& in, const BlendGradient<float>& g, bool absolute,
+                      bool exact, const Take& take) {
   const cudaStream_t stream = stream_of(queue);
   const unsigned tiles = unsigned(tiles_of(in.image));
   const int64_t words = (g.slot_count + 31) / 32;
@@ -383,37 +371,54 @@ GradientRows blend_rows(const Queue& queue, const BlendInput<float>& in, const B
   if (g.ahead) {
     judge_rows_kernel<<<1, 1, 0, stream>>>(*g.ahead, before + words);
     check_launch("judge_rows");
-  } else if (rows > kRowsUnasked)
+  } else if (exact || rows > kRowsUnasked)
     processed_count.emplace(queue, before + words, 1);
   Schedule schedule = longest_first(queue, tiles, ProcessedLength{processed}, chunk_size, rows);
   if (processed_count) rows = *processed_count->wait(), schedule = schedule.shortened(rows);
-  const GradientRows gradients{bits, before, queue.array<float>(size_t(rows) * kGradientValues)};
+  const GradientRows gradients{bits, before, take(rows)};
   const bool made = g.layers && makes_layers(in.image);
   Layer* layers = queue.array<Layer>(made ? 0 : size_t(schedule.places) * kTile * kTile);
   if (schedule.places && !made)
     (tiles <= kFewTiles ? find_layers<Layout<1>> : find_layers<Layout<2>>)(queue, in, g, schedule, layers);
-  const AbsoluteRows absolute{bits, before, queue.array<float>(g.absolute ? size_t(rows) * kAbsoluteValues : 0)};
+  const AbsoluteRows lengths{bits, before, queue.array<float>(absolute ? size_t(rows) * kAbsoluteValues : 0)};
   const bool depth = g.inverse_depth;
-  const auto kernel = g.absolute ? blend_vjp_kernel_for<true>(depth, made) : blend_vjp_kernel_for<false>(depth, made);
+  const auto kernel = absolute ? blend_vjp_kernel_for<true>(depth, made) : blend_vjp_kernel_for<false>(depth, made);
   kernel<<<schedule.blocks, Backward::kThreads, 0, stream>>>(queue.halted, in, g, processed, schedule.chunks,
                                                              chunk_size, layers, layers_at(g.layers, in.instance_count),
-                                                             gradients, absolute.values);
+                                                             gradients, lengths.values);
   check_launch("blend_vjp");
-  if (g.absolute) {
-    absolute_kernel<<<blocks_for(g.count, 256), 256, 0, stream>>>(
-        queue.halted, g.count, SlotSumsOf<kAbsoluteValues>{absolute, g.slots}, in.splats, in.image, g.absolute);
-    check_launch("absolute");
-  }
-  for (const void* done : {static_cast<const void*>(layers), static_cast<const void*>(schedule.chunks),
-                           static_cast<const void*>(absolute.values)})
-    queue.release(queue.context, done);  // the gradients come next, and take most of a step's memory
-  return gradients;
+  queue.release(queue.context, layers), queue.release(queue.context, schedule.chunks);
+  return {gradients, lengths};
+}
+
+}  // namespace
+
+GradientRows fill_rows(const Queue& queue, const BlendInput<float>& in, const BlendGradient<float>& g) {
+  const FilledRows rows = blend_back(queue, in, g, g.absolute != nullptr, false, [&](int64_t count) {
+    return queue.array<float>(size_t(count) * kGradientValues);
+  });
+  if (g.absolute) find_lengths(queue, g.count, {rows.absolute, g.slots}, in.splats, in.image, g.absolute);
+  queue.release(queue.context, rows.absolute.values);  // the gradients come next, and take most of a step's memory
+  return rows.gradients;
+}
+
+template <>
+void blend_rows<float>(const Queue& queue, const BlendInput<float>& in, const BlendGradient<float>& g,
+                       const RowMemory<float>& memory) {
+  float* rows = nullptr;
+  int64_t count = 0;
+  const FilledRows filled = blend_back(queue, in, g, memory.absolute, true, [&](int64_t exact) {
+    count = exact, rows = memory.take(memory.context, exact);
+    return memory.absolute ? queue.array<float>(size_t(exact) * kGradientValues) : rows;
+  });
+  if (g.count) count_rows(queue, g.count, filled.gradients, g.slots, memory.counts);
+  if (memory.absolute) join_rows(queue, count, filled, rows);
 }
 
 template <>
 void blend_vjp<float>(const Queue& queue, const BlendInput<float>& in, const BlendGradient<float>& g) {
   if (!g.count) return;
-  const SlotSums sums{blend_rows(queue, in, g), g.slots};
+  const SlotSums sums{fill_rows(queue, in, g), g.slots};
   moments_kernel<<<blocks_for(g.count, 256), 256, 0, stream_of(queue)>>>(queue.halted, g.count, sums, g.moments);
   check_launch("moments");
 }

@@ -28,9 +28,15 @@ struct RowsOf {
 using GradientRows = RowsOf<baseline::kGradientValues>;
 using AbsoluteRows = RowsOf<baseline::kAbsoluteValues>;  // of the same instances
 
+// The rows of a backward; those of absolute gradients have no memory unless they are wanted.
+struct FilledRows {
+  GradientRows gradients;
+  AbsoluteRows absolute;
+};
+
 // Runs the backward of blending up to the rows, and to BlendGradient::absolute if it is wanted. Waits for the number of
 // rows if there may be many and the host does not run ahead.
-GradientRows blend_rows(const Queue& queue, const BlendInput<float>& in, const BlendGradient<float>& g);
+GradientRows fill_rows(const Queue& queue, const BlendInput<float>& in, const BlendGradient<float>& g);
 
 // Sums a splat's rows, in an order that depends on their number alone. The rows of a warp's splats lie side by side, so
 // they come through shared memory in whole lines. A splat near the camera has thousands of rows, which the whole warp
@@ -90,6 +96,19 @@ struct SlotSumsOf {
 };
 
 using SlotSums = SlotSumsOf<baseline::kGradientValues>;
+
+// Finds the lengths of absolute gradients (N), 0 where a splat was not seen.
+void find_lengths(const Queue& queue, int64_t count, const SlotSumsOf<baseline::kAbsoluteValues>& sums,
+                  const float* splats, Image image, float* absolute);
+
+// Counts each splat's rows.
+void count_rows(const Queue& queue, int64_t count, const GradientRows& rows, const SplatSlots* slots, int32_t* counts);
+
+// Writes rows of both kinds as rows of twelve values.
+void join_rows(const Queue& queue, int64_t rows, const FilledRows& from, float* to);
+
+// Makes rows by splat a source of sums, and finds RowSums::absolute if it is wanted.
+SlotSums sums_of(const Queue& queue, const SplatRows<float>& in, const RowSums<float>& to);
 
 }  // namespace cuda
 }  // namespace gs

@@ -117,6 +117,14 @@ void launch_project_vjp(const Queue& queue, const Scene<float>& s, const Source&
   check_launch("project_vjp");
 }
 
+void launch_step(const Queue& queue, const Scene<float>& s, const SlotSums& source, const GaussianStep<float>& step) {
+  const StepParameters parameters = step_parameters(step);
+  if (step.penalty.any())
+    launch_project_vjp(queue, s, source, {}, PenalisedStep{parameters, step.penalty});
+  else
+    launch_project_vjp(queue, s, source, {}, parameters);
+}
+
 }  // namespace
 
 template <>
@@ -128,19 +136,25 @@ void project_vjp<float>(const Queue& queue, const Scene<float>& s, const int32_t
 void rasterize_vjp(const Queue& queue, const Scene<float>& s, const BlendInput<float>& in,
                    const BlendGradient<float>& g, const GradientMemory& memory) {
   if (!s.count) return;
-  const SlotSums source{blend_rows(queue, in, g), g.slots};
+  const SlotSums source{fill_rows(queue, in, g), g.slots};
   launch_project_vjp(queue, s, source, memory.take(memory.context), StepParameters{});
 }
 
 void rasterize_vjp_step(const Queue& queue, const Scene<float>& s, const BlendInput<float>& in,
                         const BlendGradient<float>& g, const GaussianStep<float>& step) {
+  if (s.count) launch_step(queue, s, {fill_rows(queue, in, g), g.slots}, step);
+}
+
+void rows_vjp(const Queue& queue, const Scene<float>& s, const SplatRows<float>& in, const RowSums<float>& to,
+              const GradientMemory& memory) {
   if (!s.count) return;
-  const SlotSums source{blend_rows(queue, in, g), g.slots};
-  const StepParameters parameters = step_parameters(step);
-  if (step.penalty.any())
-    launch_project_vjp(queue, s, source, {}, PenalisedStep{parameters, step.penalty});
-  else
-    launch_project_vjp(queue, s, source, {}, parameters);
+  const SlotSums source = sums_of(queue, in, to);
+  launch_project_vjp(queue, s, source, memory.take(memory.context), StepParameters{});
+}
+
+void rows_vjp_step(const Queue& queue, const Scene<float>& s, const SplatRows<float>& in, const RowSums<float>& to,
+                   const GaussianStep<float>& step) {
+  if (s.count) launch_step(queue, s, sums_of(queue, in, to), step);
 }
 
 }  // namespace cuda

@@ -26,7 +26,7 @@ GS_HD void add_noise_to(const NoiseInput& in, int64_t i) {
   const double above = rounded_product(in.steepness, opacity - in.threshold);
   const double size = in.size / (1 + portable::exp(above));
   double n[4];
-  normals(philox({{uint32_t(i), 0, in.iteration, in.stream}}, in.seed), n);
+  normals(philox({{uint32_t(in.first + i), 0, in.iteration, in.stream}}, in.seed), n);
   const float* q = in.rotations + 4 * i;
   const float back[4] = {q[0], -q[1], -q[2], -q[3]};
   const Offset own = rotated(back, {n[0], n[1], n[2]});

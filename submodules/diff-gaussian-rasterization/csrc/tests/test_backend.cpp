@@ -3,6 +3,7 @@
 #include <thread>
 
 #include "backend_run.h"
+#include "rows_run.h"
 #include "step_run.h"
 
 namespace {
@@ -116,6 +117,24 @@ void test_poison() {
       }
 }
 
+// Rows, of the image or of bands of it, give the bits of the lists.
+void test_rows() {
+  for (Parameters<float>& p : scenes_for_rows())
+    for (const bool depth : {false, true})
+      check_rows(threads(), scene_of(p, {40, 70}, false), depth, false,
+                 [](const Rendered& r, const KeptRows* rows, float* lengths) {
+                   std::vector<float> moments(kGradientValues * r.scene.count, NAN);
+                   gs::BlendGradient<float> g = r.backward;
+                   g.moments = moments.data(), g.absolute = lengths;
+                   if (rows)
+                     sum_rows(threads(), rows->given(r),
+                              gs::RowSums<float>{r.splats.data(), r.scene.image, moments.data(), lengths});
+                   else
+                     blend_vjp(threads(), r.input, g);
+                   return moments;
+                 });
+}
+
 // Steps taken inside the backward give the bits of steps from gradients in memory: several iterations, the last ones
 // after a step that was not finite.
 void test_gaussian_step() {
@@ -146,6 +165,7 @@ int main() {
   test_threads_and_sizes<float>(), test_threads_and_sizes<double>();
   test_gradient();
   test_poison<float>(), test_poison<double>();
+  test_rows();
   test_gaussian_step();
   return gs::finish_tests("rasterizer backend");
 }

@@ -7,6 +7,7 @@
 #include "front_first.cuh"
 #include "long_lists.h"
 #include "math/step_now.h"
+#include "rows_run.h"
 #include "step_run.h"
 
 namespace {
@@ -368,6 +369,56 @@ void test_adam() {
   }
 }
 
+// Steps that rows have missed are those of adam with zeros as gradient, to the bit; on the CPU likewise.
+void test_catch_up() {
+  constexpr int64_t rows = 37, row = 45;
+  constexpr int32_t count = 70;
+  using Step = gs::baseline::AdamStep<float>;
+  std::vector<Step> steps;
+  for (int32_t k = 0; k < count; ++k)
+    steps.push_back(gs::baseline::make_adam_step<float>(0.01 / (1 + k % 3), 0.9, 0.999, 1e-15, 5 + k));
+  std::vector<int32_t> taken;
+  for (int64_t r = 0; r < rows; ++r) taken.push_back(int32_t(r * 2));  // some rows lack none
+  for (const int64_t columns : {int64_t(0), int64_t(9), row})
+    for (const bool on_gpu : {false, true}) {
+      std::vector<float> start[3], zero(rows * row);
+      for (int64_t i = 0; i < rows * row; ++i)
+        for (std::vector<float>& part : start) part.push_back(i % 7 ? float(std::abs(normal())) : 0.0f);
+      std::vector<float> got[3] = {start[0], start[1], start[2]}, wanted[3] = {start[0], start[1], start[2]};
+      gs::emulation::Memory memory;
+      const auto rows_of = [&](std::vector<float>(&s)[3], int64_t r, int64_t n) {
+        return gs::AdamInput<float>{s[0].data() + r * row,
+                                    zero.data(),
+                                    s[1].data() + r * row,
+                                    s[2].data() + r * row,
+                                    n,
+                                    row,
+                                    columns,
+                                    0,
+                                    0.9,
+                                    0.999,
+                                    1e-15,
+                                    0};
+      };
+      for (int64_t r = 0; r < rows; ++r)
+        for (int32_t k = taken[r]; k < count; ++k) {
+          gs::AdamInput<float> one = rows_of(wanted, r, 1);
+          one.lr = 0.01 / (1 + k % 3), one.step = 5 + k;
+          if (on_gpu)
+            gs::cuda::adam(memory.queue(), &one, 1, gs::StepGuard<float>{});
+          else
+            adam(gs::serial_executor(), &one, 1, gs::StepGuard<float>{});
+        }
+      const gs::MissedSteps<float> missed{reinterpret_cast<const float*>(steps.data()), taken.data(), count};
+      if (on_gpu)
+        gs::cuda::catch_up(memory.queue(), rows_of(got, 0, rows), missed);
+      else
+        catch_up(gs::serial_executor(), rows_of(got, 0, rows), missed);
+      for (int part = 0; part < 3; ++part) CHECK(got[part] == wanted[part]);
+      CHECK((got[0] != start[0]) == (columns > 0));
+    }
+}
+
 // Under a guard, dense and sparse: values that are not finite are marked, the others take their step, and later steps
 // change nothing.
 void test_step_guard() {
@@ -484,7 +535,7 @@ void test_noise() {
     const int64_t stopped[2] = {0, 5};
     const auto input = [&](std::vector<float>& to, const int64_t* guard) {
       const float* v = values.data();
-      return gs::NoiseInput{n, to.data(), v, v + 3 * n, v + 7 * n, 30, 100, 0.005, 1ull << 40, 600, 4, guard};
+      return gs::NoiseInput{n, to.data(), v, v + 3 * n, v + 7 * n, 30, 100, 0.005, 1ull << 40, 600, 4, guard, 7'000};
     };
     gs::add_noise(gs::serial_executor(), input(wanted, nullptr));
     gs::emulation::Memory memory;
@@ -507,6 +558,41 @@ void emulated_gradients(const gs::Queue& queue, const Rendered& r, const gs::Sce
   gs::cuda::rasterize_vjp(queue, r.scene, r.input, r.backward, {take, &copy});
 }
 
+// Gradients of the emulated backward, from rows or from the lists.
+std::vector<float> gradients_from(const gs::Queue& queue, const Rendered& r, const KeptRows* rows, float* lengths) {
+  GradientRowsInMemory gradient(r.scene.count);
+  const auto take = [](void* to) { return *static_cast<const gs::SceneGradient<float>*>(to); };
+  gs::BlendGradient<float> g = r.backward;
+  g.absolute = lengths;
+  if (rows)
+    gs::cuda::rows_vjp(queue, r.scene, rows->given(r), {r.splats.data(), r.scene.image, nullptr, lengths},
+                       {take, &gradient.pointers});
+  else
+    gs::cuda::rasterize_vjp(queue, r.scene, r.input, g, {take, &gradient.pointers});
+  return gradient.memory;
+}
+
+// Rows, of the image or of bands of it, give the bits of the lists, in every order of threads, also of splats with more
+// rows than a lane adds.
+void test_rows() {
+  const auto check = [](Parameters<float> p, gs::Image image, gs::emulation::Order order, bool depth, bool layers) {
+    gs::emulation::order = order;
+    gs::emulation::Memory memory;
+    const gs::Queue queue = memory.queue();
+    check_rows(queue, scene_of(p, image, false), depth, layers,
+               [&](const Rendered& r, const KeptRows* rows, float* lengths) {
+                 return gradients_from(queue, r, rows, lengths);
+               });
+  };
+  int at = 0;
+  for (const Parameters<float>& p : scenes_for_rows())
+    for (const bool depth : {false, true})
+      for (const bool layers : {false, true}) check(p, {40, 70}, gs::emulation::kOrders[at++ % 3], depth, layers);
+  check(scenes_for_rows()[3], {120, 118}, gs::emulation::Order::shuffled, false, true);
+  const Parameters<float> p = two_long_lists(900);
+  for (const bool layers : {false, true}) check(p, {25, 40}, gs::emulation::Order::shuffled, true, layers);
+}
+
 // Moves what changes from step to step to `now`.
 void put_off(gs::GaussianStep<float>& step, gs::StepNow& now) {
   for (int a = 0; a < gs::kStepped; ++a) {
@@ -519,12 +605,12 @@ void put_off(gs::GaussianStep<float>& step, gs::StepNow& now) {
 }
 
 // Steps taken inside the backward give the bits of steps from gradients in memory, in every order of threads, and with
-// their constants in memory. A halted queue changes nothing.
+// their constants in memory, or from rows. A halted queue changes nothing.
 void test_gaussian_step() {
   for (const int64_t count : {0, 1, 33, 200})
     for (const StepCase& how : kStepCases) {
       const Stepping start{Parameters<float>(count)};
-      Stepping plain = start, fused = start;
+      Stepping plain = start, fused = start, stepped = start;
       for (int64_t iteration = 1; iteration <= 3; ++iteration) {
         gs::emulation::order = gs::emulation::kOrders[iteration % 3];
         const float gradient = iteration == 2 ? how.gradient : 1;
@@ -545,6 +631,10 @@ void test_gaussian_step() {
           CHECK(word == 0 || fused.bytes() == unchanged);
         }
         CHECK(fused.bytes() == plain.bytes());
+        const KeptRows rows = keep_rows(queue, r->input, r->backward, false);
+        gs::cuda::rows_vjp_step(queue, scene_of(stepped.values, r->scene.image, r->scene.antialiasing), rows.given(*r),
+                                {}, gaussian_step(stepped, how, *r, iteration));
+        CHECK(stepped.bytes() == plain.bytes());
       }
       CHECK(count < 200 || (fused.stopped == 2) == (how.guarded && std::isnan(how.gradient)));
       CHECK(count < 200 || fused.values.means != start.values.means);
@@ -626,10 +716,12 @@ int main() {
   test_against_cpu();
   test_sparse_adam();
   test_adam();
+  test_catch_up();
   test_step_guard();
   test_observe();
   test_split_positions();
   test_noise();
+  test_rows();
   test_gaussian_step();
   test_given_covariances_and_colors();
   test_many_tiles();

@@ -1,17 +1,13 @@
-// The op that runs the rasterizer's backward and takes the Gaussians' steps in one.
+// The ops that run the rasterizer's backward and take the Gaussians' steps in one.
 #include <array>
 
-#include "backward.h"
-#include "math/splat.h"
+#include "gradient_source.h"
 #include "math/step_now.h"
 #include "optim.h"
-#include "scene.h"
 
 namespace gs::ops {
 
 namespace {
-
-using gs::baseline::kSplatValues;
 
 // Checks the attributes that step, their counters, and the lengths of the lists with an entry for each.
 void check_steps(at::IntArrayRef attributes, at::TensorList steps, std::initializer_list<size_t> lengths) {
@@ -89,57 +85,60 @@ const gs::StepNow* step_now(const MaybeTensor& now, const SceneTensors& scene) {
   return reinterpret_cast<const gs::StepNow*>(now->const_data_ptr<int64_t>());
 }
 
-// absolute: receives the lengths of absolute gradients, if it is defined; then they are what is observed.
-void run(const SceneTensors& scene, const BlendBackward& in, const Tensor& tile_counts, const Tensor& /*absolute*/,
+// source: Lists or Rows. lengths: of absolute gradients, if it is defined; then they are what is observed.
+template <class Source>
+void run(const SceneTensors& scene, const Source& source, const Tensor& /*lengths*/,
          const gs::GaussianStep<double>& step) {
-  const Tensor moments = blend_vjp(in);
-  GS_DISPATCH(project_vjp_step, gs::torch_executor(), scene.scene<double>(), tile_counts.const_data_ptr<int32_t>(),
-              moments.const_data_ptr<double>(), step);
+  const Tensor moments = source.moments({});
+  GS_DISPATCH(project_vjp_step, gs::torch_executor(), scene.scene<double>(),
+              source.tile_counts().template const_data_ptr<int32_t>(), moments.const_data_ptr<double>(), step);
 }
 
-void run(const SceneTensors& scene, const BlendBackward& in, const Tensor& tile_counts, const Tensor& absolute,
-         gs::GaussianStep<float> step) {
+template <class Source>
+void run(const SceneTensors& scene, const Source& source, const Tensor& lengths, gs::GaussianStep<float> step) {
   gs::ObserveInput later = step.observed;
-  if (absolute.defined()) later.lengths = absolute.const_data_ptr<float>(), step.observed.max_radii = nullptr;
+  if (lengths.defined()) later.lengths = lengths.const_data_ptr<float>(), step.observed.max_radii = nullptr;
 #ifdef GS_CUDA
-  if (in.splats().is_cuda()) {
-    gs::TorchQueue queue(in.splats().device(), halted());
-    gs::cuda::rasterize_vjp_step(queue.queue(), scene.scene<float>(), in.input<float>(),
-                                 in.gradient<float>(nullptr, absolute), step);
+  if (scene.device().is_cuda()) {
+    gs::TorchQueue queue(scene.device(), halted());
+    source.step(queue.queue(), scene.scene<float>(), lengths, step);
     if (later.lengths) gs::cuda::observe(queue.queue(), later);
     return;
   }
 #endif
-  const Tensor moments = blend_vjp(in, absolute);
-  GS_DISPATCH(project_vjp_step, gs::torch_executor(), scene.scene<float>(), tile_counts.const_data_ptr<int32_t>(),
-              moments.const_data_ptr<float>(), step);
+  const Tensor moments = source.moments(lengths);
+  GS_DISPATCH(project_vjp_step, gs::torch_executor(), scene.scene<float>(),
+              source.tile_counts().template const_data_ptr<int32_t>(), moments.const_data_ptr<float>(), step);
   if (later.lengths) gs::observe(gs::torch_executor(), later);
 }
 
-// rasterize_vjp, penalise_ unless both penalties are 0, then adam_ (or sparse_adam_ on the Gaussians of a radius above
-// 0) of the attributes that are named, and observe_ if statistics are given: the same bits, without gradients in
-// memory. Advances the counters as adam_ does. now: what `step_now_` wrote, which stands in for steps, rates and
-// iteration, and has advanced the counters. absolute: the statistics get the lengths of absolute gradients.
-void rasterize_vjp_step_op(SCENE_PARAMETERS, BACKWARD_PARAMETERS, const Tensor& tile_counts, const Tensor& layers,
-                           const Tensor& radii, at::IntArrayRef attributes, at::TensorList exp_avg,
-                           at::TensorList exp_avg_sq, at::TensorList steps, at::ArrayRef<double> rates, double beta1,
-                           double beta2, double eps, at::IntArrayRef columns, bool sparse, const MaybeTensor& max_radii,
-                           const MaybeTensor& gradient_sums, const MaybeTensor& views, const MaybeTensor& loss,
-                           const MaybeTensor& stopped, int64_t iteration, const MaybeTensor& now, bool absolute,
-                           double opacity_penalty, double scale_penalty) {
+#define STEP_SCHEMA                                                                                              \
+  "Tensor radii, int[] attributes, Tensor(g!)[] exp_avg, Tensor(h!)[] exp_avg_sq, Tensor(i!)[] steps, "          \
+  "float[] rates, float beta1, float beta2, float eps, int[] columns, bool sparse, Tensor(j!)? max_radii=None, " \
+  "Tensor(k!)? gradient_sums=None, Tensor(l!)? views=None, Tensor? loss=None, Tensor(m!)? stopped=None, "        \
+  "int iteration=0, Tensor? now=None, bool absolute=False, float opacity_penalty=0, float scale_penalty=0"
+#define STEP_PARAMETERS                                                                                     \
+  const Tensor &radii, at::IntArrayRef attributes, at::TensorList exp_avg, at::TensorList exp_avg_sq,       \
+      at::TensorList steps, at::ArrayRef<double> rates, double beta1, double beta2, double eps,             \
+      at::IntArrayRef columns, bool sparse, const MaybeTensor &max_radii, const MaybeTensor &gradient_sums, \
+      const MaybeTensor &views, const MaybeTensor &loss, const MaybeTensor &stopped, int64_t iteration,     \
+      const MaybeTensor &now, bool absolute, double opacity_penalty, double scale_penalty
+#define STEP_ARGUMENTS                                                                                                \
+  radii, attributes, exp_avg, exp_avg_sq, steps, rates, beta1, beta2, eps, columns, sparse, max_radii, gradient_sums, \
+      views, loss, stopped, iteration, now, absolute, opacity_penalty, scale_penalty
+
+// Takes the step of the Gaussians whose gradients come from what `source_of` makes of the scene.
+template <class SourceOf>
+void step_from(const SourceOf& source_of, SCENE_PARAMETERS, STEP_PARAMETERS) {
   const SceneTensors scene(SCENE_ARGUMENTS);
   TORCH_CHECK_VALUE(!cov3d && !colors, "a step needs scales, rotations, sh_dc and sh_rest, not cov3d or colors");
-  check_tensor(splats, "splats", scene.dtype(), scene.device(), {scene.count(), kSplatValues});
-  check_counts(tile_counts, scene.count(), scene.device());
   check_tensor(radii, "radii", at::kInt, scene.device(), {scene.count()});
-  BlendBackward in(BACKWARD_ARGUMENTS);
-  in.take_layers(layers);
+  const auto source = source_of(scene);
   const StepLists lists{attributes, exp_avg, exp_avg_sq, steps, rates, columns, beta1, beta2, eps};
   lists.check();
   const bool penalised = opacity_penalty != 0 || scale_penalty != 0;
   TORCH_CHECK_VALUE(!penalised || raw, "penalties are of raw Gaussians");
-  const Tensor counts = tile_counts.contiguous(), pixels = radii.contiguous();
-  const Tensor lengths = absolute_like(splats, absolute && max_radii);
+  const Tensor pixels = radii.contiguous(), lengths = absolute_like(means, absolute && max_radii);
   with_scalar(scene.dtype(), [&](auto zero) {
     using T = decltype(zero);
     auto step = gaussian_step<T>({means, opacities, *scales, *rotations, *sh_dc, *sh_rest}, lists, sparse);
@@ -147,9 +146,26 @@ void rasterize_vjp_step_op(SCENE_PARAMETERS, BACKWARD_PARAMETERS, const Tensor& 
     observe_in(step, pixels, max_radii, gradient_sums, views);
     step.now = step_now(now, scene);
     step.penalty = {T(opacity_penalty), T(scale_penalty)};
-    run(scene, in, counts, lengths, step);
+    run(scene, source, lengths, step);
   });
   if (!now) advance(steps);
+}
+
+// rasterize_vjp, penalise_ unless both penalties are 0, then adam_ (or sparse_adam_ on the Gaussians of a radius above
+// 0) of the attributes that are named, and observe_ if statistics are given: the same bits, without gradients in
+// memory. Advances the counters as adam_ does. now: what `step_now_` wrote, which stands in for steps, rates and
+// iteration, and has advanced the counters. absolute: the statistics get the lengths of absolute gradients.
+void rasterize_vjp_step_op(SCENE_PARAMETERS, LISTS_PARAMETERS, STEP_PARAMETERS) {
+  const auto lists = [&](const SceneTensors& scene) { return Lists(scene, LISTS_ARGUMENTS); };
+  step_from(lists, SCENE_ARGUMENTS, STEP_ARGUMENTS);
+}
+
+// The same from the rows of blend_rows, as rows_vjp takes them.
+void rows_vjp_step_op(SCENE_PARAMETERS, ROWS_PARAMETERS, STEP_PARAMETERS) {
+  const auto given = [&](const SceneTensors& scene) {
+    return Rows(scene, ROWS_ARGUMENTS, absolute, absolute && max_radii);
+  };
+  step_from(given, SCENE_ARGUMENTS, STEP_ARGUMENTS);
 }
 
 // Writes what the next step stands for, and advances the counters.
@@ -177,16 +193,8 @@ TORCH_LIBRARY_FRAGMENT(diff_gaussian_rasterization, m) {
     const size_t type = scene.rfind("Tensor", scene.find(std::string(" ") + name + ","));
     scene.insert(type + 6, std::string("(") + alias++ + "!)");
   }
-  define(m,
-         "rasterize_vjp_step_(" + scene +
-             ", " BACKWARD_SCHEMA
-             ", Tensor tile_counts, Tensor layers, Tensor radii, int[] attributes, Tensor(g!)[] exp_avg, Tensor(h!)[] "
-             "exp_avg_sq, "
-             "Tensor(i!)[] steps, float[] rates, float beta1, float beta2, float eps, int[] columns, bool sparse, "
-             "Tensor(j!)? max_radii=None, Tensor(k!)? gradient_sums=None, Tensor(l!)? views=None, Tensor? loss=None, "
-             "Tensor(m!)? stopped=None, int iteration=0, Tensor? now=None, bool absolute=False, "
-             "float opacity_penalty=0, float scale_penalty=0) -> ()",
-         &rasterize_vjp_step_op);
+  define(m, "rasterize_vjp_step_(" + scene + ", " LISTS_SCHEMA ", " STEP_SCHEMA ") -> ()", &rasterize_vjp_step_op);
+  define(m, "rows_vjp_step_(" + scene + ", " ROWS_SCHEMA ", " STEP_SCHEMA ") -> ()", &rows_vjp_step_op);
   define(m,
          "step_now_(Tensor(a!) now, int[] attributes, Tensor(b!)[] steps, float[] rates, float beta1, float beta2, "
          "float eps, bool sparse, int iteration) -> ()",

@@ -7,7 +7,7 @@ namespace {
 
 void add_noise_op(Tensor& means, const Tensor& log_scales, const Tensor& rotations, const Tensor& logits, double size,
                   double steepness, double threshold, int64_t seed, int64_t stream, int64_t iteration,
-                  const MaybeTensor& stopped) {
+                  const MaybeTensor& stopped, int64_t first) {
   check_given(means, "means");
   const int64_t n = means.dim() > 0 ? means.size(0) : 0;
   check_tensor(means, "means", at::kFloat, means.device(), {n, 3});
@@ -30,7 +30,8 @@ void add_noise_op(Tensor& means, const Tensor& log_scales, const Tensor& rotatio
                           uint64_t(seed),
                           uint32_t(iteration),
                           uint32_t(stream),
-                          stopped ? stopped->const_data_ptr<int64_t>() : nullptr};
+                          stopped ? stopped->const_data_ptr<int64_t>() : nullptr,
+                          first};
 #ifdef GS_CUDA
   if (means.is_cuda()) {
     gs::TorchQueue queue(means.device(), halted());
@@ -45,7 +46,8 @@ void add_noise_op(Tensor& means, const Tensor& log_scales, const Tensor& rotatio
 TORCH_LIBRARY_FRAGMENT(diff_gaussian_rasterization, m) {
   define(m,
          "add_noise_(Tensor(a!) means, Tensor log_scales, Tensor rotations, Tensor logits, float size, "
-         "float steepness, float threshold, int seed, int stream, int iteration, Tensor? stopped=None) -> ()",
+         "float steepness, float threshold, int seed, int stream, int iteration, Tensor? stopped=None, int first=0) "
+         "-> ()",
          &add_noise_op);
 }
 

@@ -1,4 +1,4 @@
-// The ops of rendering: each stage by itself, all of them in one, and their backwards.
+// The ops of rendering: each stage by itself, and all of them in one.
 #include <ATen/ops/empty.h>
 #include <ATen/ops/topk.h>
 #include <ATen/ops/zeros.h>
@@ -16,8 +16,7 @@ namespace gs::ops {
 
 namespace {
 
-using gs::baseline::kGradientValues, gs::baseline::kSplatValues, gs::baseline::layer_values;
-using gs::baseline::tile_count, gs::baseline::tiles_of;
+using gs::baseline::kSplatValues, gs::baseline::layer_values, gs::baseline::tile_count, gs::baseline::tiles_of;
 
 struct ProjectedTensors {
   Tensor splats, depths, rects, tile_counts, radii;
@@ -99,35 +98,25 @@ struct BlendedTensors {
   Tensor layers;  // (V): gs::Blended::layers, of no values on the CPU
 };
 
-// last: whether the backward will need it. layers: whether it gets them.
+// train: whether a backward will follow, for which the forward makes `last` and layers.
 BlendedTensors blend(const Tensor& splats, const Tensor& instances, const Tensor& ranges, const Tensor& background,
-                     gs::Image image, bool inverse_depth, bool last, bool layers) {
+                     gs::Image image, bool inverse_depth, bool train) {
   const int64_t h = image.height, w = image.width;
-  const bool made = layers && splats.is_cuda();
+  const bool layers = train && splats.is_cuda();
   BlendedTensors out{at::empty({3, h, w}, splats.options()), at::empty({1, h, w}, splats.options()),
                      at::empty({inverse_depth ? 1 : 0, h, w}, splats.options()),
-                     at::empty({last ? h : 0, w}, splats.options().dtype(at::kInt)),
-                     at::empty({made ? layer_values(image, instances.size(0), inverse_depth) : 0}, splats.options())};
+                     at::empty({train ? h : 0, w}, splats.options().dtype(at::kInt)),
+                     at::empty({layers ? layer_values(image, instances.size(0), inverse_depth) : 0}, splats.options())};
   const Tensor bg = background_like(background, splats);
   with_scalar(splats.scalar_type(), [&](auto zero) {
     using T = decltype(zero);
     const gs::Blended<T> blended{out.color.mutable_data_ptr<T>(), out.transmittance.mutable_data_ptr<T>(),
                                  inverse_depth ? out.inverse_depth.mutable_data_ptr<T>() : nullptr,
-                                 last ? out.last.mutable_data_ptr<int32_t>() : nullptr,
+                                 train ? out.last.mutable_data_ptr<int32_t>() : nullptr,
                                  out.layers.numel() ? out.layers.mutable_data_ptr<T>() : nullptr};
     GS_RUN(T, splats, blend, blend_input<T>(splats, instances, ranges, bg, image), blended);
   });
   return out;
-}
-
-Gradients project_vjp(const SceneTensors& in, const Tensor& tile_counts, const Tensor& moments, const Wanted& wanted) {
-  SceneGradients out(in, wanted);
-  with_scalar(in.dtype(), [&](auto zero) {
-    using T = decltype(zero);
-    GS_RUN(T, moments, project_vjp, in.scene<T>(), tile_counts.const_data_ptr<int32_t>(), moments.const_data_ptr<T>(),
-           out.pointers<T>());
-  });
-  return out.all();
 }
 
 using Tensors5 = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor>;
@@ -153,23 +142,14 @@ Tensors4 bin_op(const Tensor& splats, const Tensor& depths, const Tensor& rects,
   return {b.instances, b.ranges, b.splat_slots, b.slots};
 }
 
-Tensors4 blend_op(const Tensor& splats, const Tensor& instances, const Tensor& ranges, const Tensor& background,
+Tensors5 blend_op(const Tensor& splats, const Tensor& instances, const Tensor& ranges, const Tensor& background,
                   int64_t height, int64_t width, bool inverse_depth, bool train) {
   check_splats(splats);
   const gs::Image image = checked_image(height, width);
   check_lists(instances, ranges, splats, image);
-  const BlendedTensors b = blend(splats.contiguous(), instances.contiguous(), ranges.contiguous(), background, image,
-                                 inverse_depth, train, false);
-  return {b.color, b.transmittance, b.inverse_depth, b.last};
-}
-
-Tensor blend_vjp_op(BACKWARD_PARAMETERS) { return blend_vjp(BlendBackward(BACKWARD_ARGUMENTS)); }
-
-Gradients project_vjp_op(SCENE_PARAMETERS, const Tensor& tile_counts, const Tensor& moments, Wanted wanted) {
-  const SceneTensors scene(SCENE_ARGUMENTS);
-  check_counts(tile_counts, scene.count(), scene.device());
-  check_tensor(moments, "moments", scene.dtype(), scene.device(), {scene.count(), kGradientValues});
-  return project_vjp(scene, tile_counts.contiguous(), moments.contiguous(), wanted);
+  const BlendedTensors b =
+      blend(splats.contiguous(), instances.contiguous(), ranges.contiguous(), background, image, inverse_depth, train);
+  return {b.color, b.transmittance, b.inverse_depth, b.last, b.layers};
 }
 
 using Rasterized =
@@ -182,39 +162,9 @@ Rasterized rasterize_op(const Tensor& means2d, SCENE_PARAMETERS, const Tensor& b
   scene.checked(kMeans2d, means2d);  // it only receives a gradient
   ProjectedTensors p = project(scene, false);
   BinnedTensors b = bin(p, scene.image(), train);
-  BlendedTensors o = blend(p.splats, b.instances, b.ranges, background, scene.image(), inverse_depth, train, train);
+  BlendedTensors o = blend(p.splats, b.instances, b.ranges, background, scene.image(), inverse_depth, train);
   return {o.color,     o.transmittance, o.inverse_depth, p.radii, p.splats, p.tile_counts,
           b.instances, b.ranges,        b.splat_slots,   b.slots, o.last,   o.layers};
-}
-
-// absolute: the third value of a row of means2d becomes the length of its absolute gradient, instead of 0.
-Gradients rasterize_vjp_op(SCENE_PARAMETERS, BACKWARD_PARAMETERS, const Tensor& tile_counts, const Tensor& layers,
-                           Wanted wanted, bool absolute) {
-  const SceneTensors scene(SCENE_ARGUMENTS);
-  check_tensor(splats, "splats", scene.dtype(), scene.device(), {scene.count(), kSplatValues});
-  check_counts(tile_counts, scene.count(), scene.device());
-  BlendBackward in(BACKWARD_ARGUMENTS);
-  in.take_layers(layers);
-  const Tensor lengths = absolute_like(splats, absolute && wanted[kMeans2d]);
-  const auto with_lengths = [&](Gradients all) {
-    if (lengths.defined()) std::get<kMeans2d>(all).select(1, 2).copy_(lengths);
-    return all;
-  };
-#ifdef GS_CUDA
-  if (splats.is_cuda()) {
-    gs::TorchQueue queue(splats.device(), halted());
-    std::optional<SceneGradients> out;
-    auto allocate = [&] { return out.emplace(scene, wanted).pointers<float>(); };
-    using Allocate = decltype(allocate);
-    const gs::cuda::GradientMemory memory{[](void* context) { return (*static_cast<Allocate*>(context))(); },
-                                          &allocate};
-    gs::cuda::rasterize_vjp(queue.queue(), scene.scene<float>(), in.input<float>(),
-                            in.gradient<float>(nullptr, lengths), memory);
-    if (!out) allocate();  // no Gaussians
-    return with_lengths(out->all());
-  }
-#endif
-  return with_lengths(project_vjp(scene, tile_counts.contiguous(), blend_vjp(in, lengths), wanted));
 }
 
 Tensor mark_visible_op(const Tensor& means, const Tensor& view) {
@@ -258,11 +208,9 @@ TORCH_LIBRARY_FRAGMENT(diff_gaussian_rasterization, m) {
          &bin_op);
   define(m,
          "blend(Tensor splats, Tensor instances, Tensor ranges, Tensor background, int height, int width, "
-         "bool inverse_depth, bool train) -> (Tensor color, Tensor transmittance, Tensor inverse_depth, Tensor last)",
+         "bool inverse_depth, bool train) -> (Tensor color, Tensor transmittance, Tensor inverse_depth, Tensor last, "
+         "Tensor layers)",
          &blend_op);
-  define(m, "blend_vjp(" BACKWARD_SCHEMA ") -> Tensor moments", &blend_vjp_op);
-  define(m, "project_vjp(" SCENE_SCHEMA ", Tensor tile_counts, Tensor moments, bool[9] wanted) -> " GRADIENTS_SCHEMA,
-         &project_vjp_op);
   define(
       m,
       "rasterize(Tensor means2d, " SCENE_SCHEMA
@@ -270,10 +218,6 @@ TORCH_LIBRARY_FRAGMENT(diff_gaussian_rasterization, m) {
       "Tensor transmittance, Tensor inverse_depth, Tensor radii, Tensor splats, Tensor tile_counts, Tensor instances, "
       "Tensor ranges, Tensor splat_slots, Tensor slots, Tensor last, Tensor layers)",
       &rasterize_op);
-  define(m,
-         "rasterize_vjp(" SCENE_SCHEMA ", " BACKWARD_SCHEMA
-         ", Tensor tile_counts, Tensor layers, bool[9] wanted, bool absolute=False) -> " GRADIENTS_SCHEMA,
-         &rasterize_vjp_op);
   define(m, "mark_visible(Tensor means, Tensor view) -> Tensor", &mark_visible_op);
   define(m, "decisive(Tensor splats, Tensor instances, Tensor ranges, Tensor last) -> Tensor", &decisive_op);
 }

@@ -20,6 +20,8 @@ namespace gs::ops {
 using at::Tensor;
 using MaybeTensor = std::optional<Tensor>;
 
+constexpr const char* kFloatAlone = "the CUDA backend computes in float32, got float64: pass .float(), or use the CPU";
+
 // Returns `t` contiguous, with the dtype and on the device of `like`. Asks first: torch's conversion costs time even
 // where there is nothing to convert, and a step makes some ten.
 inline Tensor converted(const Tensor& t, const Tensor& like) {
@@ -84,14 +86,14 @@ void define(torch::Library& library, const std::string& schema, Function* functi
 
 // Runs a backend's function on the device of the tensor `like`.
 #ifdef GS_CUDA
-#define GS_RUN(T, like, fn, ...)                                                                            \
-  if (!(like).is_cuda()) {                                                                                  \
-    GS_DISPATCH(fn, gs::torch_executor(), __VA_ARGS__);                                                     \
-  } else if constexpr (std::is_same_v<T, float>) {                                                          \
-    gs::TorchQueue queue((like).device(), gs::ops::halted());                                               \
-    gs::cuda::fn(queue.queue(), __VA_ARGS__);                                                               \
-  } else {                                                                                                  \
-    TORCH_CHECK(false, "the CUDA backend computes in float32, got float64: pass .float(), or use the CPU"); \
+#define GS_RUN(T, like, fn, ...)                              \
+  if (!(like).is_cuda()) {                                    \
+    GS_DISPATCH(fn, gs::torch_executor(), __VA_ARGS__);       \
+  } else if constexpr (std::is_same_v<T, float>) {            \
+    gs::TorchQueue queue((like).device(), gs::ops::halted()); \
+    gs::cuda::fn(queue.queue(), __VA_ARGS__);                 \
+  } else {                                                    \
+    TORCH_CHECK(false, gs::ops::kFloatAlone);                 \
   }
 #else
 #define GS_RUN(T, like, fn, ...) GS_DISPATCH(fn, gs::torch_executor(), __VA_ARGS__)

@@ -30,7 +30,7 @@ Range part(int64_t n, int64_t count, int64_t i) { return {n * i / count, n * (i 
 // The working memory of a tile. Its inputs reach two windows beyond the tile, its maps one.
 template <class T>
 struct Scratch {
-  static constexpr int64_t kColumns = 2048 / sizeof(T);
+  static constexpr int64_t kColumns = kRowPart<T>;
   static constexpr int64_t kStride = kColumns + 2 * round_up(kReach, Simd<T>::kLanes);
   T x1[kTileRows + 2 * kReach][kStride], delta[kTileRows + 2 * kReach][kStride];
   T mu1[kStride], mu_delta[kStride], var1[kStride], var_delta[kStride], cov[kStride];  // of one row of columns
@@ -154,11 +154,13 @@ void gradient_row(Scratch<T>& s, int64_t row, int64_t width) {
 }
 
 struct Sums {
-  double l1 = 0, ssim = 0;
+  double l1, ssim;
 };
 
+// sums: of the first row of the tile in its columns; those of the next row come `across` later.
 template <class T, class Source>
-Sums tile(const L1Ssim<T>& args, int64_t plane, Range rows, Range columns, double gradient_scale, Scratch<T>& s) {
+void tile(const L1Ssim<T>& args, int64_t plane, Range rows, Range columns, double gradient_scale, Scratch<T>& s,
+          Sums* sums, int64_t across) {
   const auto& image = args.images;
   const int64_t height = image.height, width = image.width;
   const T* img1 = image.img1 + plane * height * width;
@@ -178,7 +180,7 @@ Sums tile(const L1Ssim<T>& args, int64_t plane, Range rows, Range columns, doubl
              first_column, input_columns, s.x1[i], s.delta[i]);
   }
 
-  Sums sums;
+  for (int64_t i = 0; i < rows.size(); ++i) sums[i * across] = {};
   // The map's columns that count: for the value those of the tile, for the gradient all inside the image.
   const int64_t map_begin = columns.begin - margin;
   const int64_t exist_begin = std::max(rim - map_begin, int64_t(0));
@@ -192,7 +194,7 @@ Sums tile(const L1Ssim<T>& args, int64_t plane, Range rows, Range columns, doubl
       column_stats(s, i, input_columns);
       ssim_row(s, map_columns, maps);
       if (row >= rows.begin && row < rows.end && count_begin < count_end)
-        sums.ssim += row_sum(s.row + count_begin, count_end - count_begin);
+        sums[(row - rows.begin) * across].ssim = row_sum(s.row + count_begin, count_end - count_begin);
       if (maps)
         for (T* map : {maps->value, maps->slope1, maps->slope_delta}) {
           std::fill(map, map + exist_begin, T(0));
@@ -211,31 +213,53 @@ Sums tile(const L1Ssim<T>& args, int64_t plane, Range rows, Range columns, doubl
   for (int64_t i = 0; i < rows.size(); ++i) {
     const T* delta = s.delta[i + margin + kRadius] + margin + kRadius;
     for (int64_t j = 0; j < columns.size(); ++j) s.row[j] = std::abs(delta[j]);
-    sums.l1 += row_sum(s.row, columns.size());
+    sums[i * across].l1 = row_sum(s.row, columns.size());
   }
-  return sums;
+}
+
+// Adds the sums of the rows tile by tile.
+template <class T>
+void means(const L1SsimMeans<T>& args, bool valid) {
+  const auto& image = args.images;
+  const Sums* sums = reinterpret_cast<const Sums*>(args.sums);
+  const int64_t down = parts(image.height, kTileRows), across = row_parts<T>(image.width);
+  const int64_t rim = valid ? kReach : 0;
+  Sums total{};
+  for (int64_t i = 0; i < image.planes * down * across; ++i) {
+    const Range rows = part(image.height, down, i / across % down);
+    Sums one{};
+    for (int64_t row = rows.begin; row < rows.end; ++row) {
+      const Sums& of_row = sums[(i / (down * across) * image.height + row) * across + i % across];
+      one.l1 += of_row.l1;
+      one.ssim += of_row.ssim;
+    }
+    total.l1 += one.l1;
+    total.ssim += one.ssim;
+  }
+  *args.l1 = total.l1 / (double(image.planes) * double(image.height) * double(image.width));
+  *args.ssim = total.ssim / (double(image.planes) * double(image.height - rim) * double(image.width - rim));
 }
 
 template <class T, class Source>
 void all_tiles(const L1Ssim<T>& args, const Executor& executor) {
   const auto& image = args.images;
-  const int64_t down = parts(image.height, kTileRows), across = parts(image.width, Scratch<T>::kColumns);
+  const int64_t down = parts(image.height, kTileRows), across = row_parts<T>(image.width);
   const int64_t rim = args.valid ? kReach : 0;
   const double ssim_count = double(image.planes) * double(image.height - rim) * double(image.width - rim);
-  std::vector<Sums> sums(image.planes * down * across);
-  executor.run(int64_t(sums.size()), 1, [&](int64_t begin, int64_t end) {
+  std::vector<double> own_sums(args.rows ? 0 : 2 * image.planes * image.height * across);
+  double* const all_sums = args.rows ? args.sums : own_sums.data();
+  executor.run(image.planes * down * across, 1, [&](int64_t begin, int64_t end) {
     const std::unique_ptr<Scratch<T>> scratch(new Scratch<T>);
-    for (int64_t i = begin; i < end; ++i)
-      sums[i] = tile<T, Source>(args, i / (down * across), part(image.height, down, i / across % down),
-                                part(image.width, across, i % across), 1 / ssim_count, *scratch);
+    for (int64_t i = begin; i < end; ++i) {
+      const int64_t plane = i / (down * across);
+      Range rows = part(image.height, down, i / across % down);
+      if (args.rows) rows = {std::max(rows.begin, args.rows->begin), std::min(rows.end, args.rows->end)};
+      if (rows.size() <= 0) continue;
+      Sums* const sums = reinterpret_cast<Sums*>(all_sums) + (plane * image.height + rows.begin) * across + i % across;
+      tile<T, Source>(args, plane, rows, part(image.width, across, i % across), 1 / ssim_count, *scratch, sums, across);
+    }
   });
-  Sums total;
-  for (const Sums& one : sums) {
-    total.l1 += one.l1;
-    total.ssim += one.ssim;
-  }
-  *args.l1 = total.l1 / (double(image.planes) * double(image.height) * double(image.width));
-  *args.ssim = total.ssim / ssim_count;
+  if (!args.rows) means<T>({image, all_sums, args.l1, args.ssim}, args.valid);
 }
 
 template <class T, class Source>
@@ -253,10 +277,18 @@ void vjp(const L1SsimVjp<T>& args, const Executor& executor) {
   const auto& image = args.images;
   const int64_t n = image.planes * image.height * image.width;
   const Source* img2 = static_cast<const Source*>(image.img2);
+  // Whole blocks, also where a band begins or ends.
+  const auto wanted = [&](int64_t begin, int64_t end) {
+    if (!args.rows) return true;
+    for (int64_t row = begin / image.width; row <= (end - 1) / image.width; ++row)
+      if (row % image.height >= args.rows->begin && row % image.height < args.rows->end) return true;
+    return false;
+  };
   executor.run((n + kBlock - 1) / kBlock, 1, [&](int64_t begin, int64_t end) {
     for (int64_t i = begin * kBlock; i < std::min(end * kBlock, n); i += kBlock)
-      vjp_block(image.img1 + i, img2 + i, image.clamp, args.ssim_gradient + i, T(args.grad_l1 / double(n)),
-                T(args.grad_ssim), std::min(kBlock, n - i), args.grad_img1 + i);
+      if (wanted(i, std::min(i + kBlock, n)))
+        vjp_block(image.img1 + i, img2 + i, image.clamp, args.ssim_gradient + i, T(args.grad_l1 / double(n)),
+                  T(args.grad_ssim), std::min(kBlock, n - i), args.grad_img1 + i);
   });
 }
 
@@ -274,6 +306,8 @@ void dispatch(const L1SsimVjp<T>& args, const Executor& executor) {
 
 void l1_ssim_cpu(const L1Ssim<float>& args, const Executor& executor) { dispatch(args, executor); }
 void l1_ssim_cpu(const L1Ssim<double>& args, const Executor& executor) { dispatch(args, executor); }
+void l1_ssim_means_cpu(const L1SsimMeans<float>& args) { means(args, false); }
+void l1_ssim_means_cpu(const L1SsimMeans<double>& args) { means(args, false); }
 void l1_ssim_vjp_cpu(const L1SsimVjp<float>& args, const Executor& executor) { dispatch(args, executor); }
 void l1_ssim_vjp_cpu(const L1SsimVjp<double>& args, const Executor& executor) { dispatch(args, executor); }
 

@@ -49,23 +49,33 @@ __device__ Plane<Source> plane_of(const ImagePair<float>& images, const Tile& ti
           images.clamp};
 }
 
+// What the forward does: windows of `windows`, and the sums of those blocks that lie in `band`.
+struct Part {
+  int windows_begin, windows_end, band_begin, band_end;
+  int down;  // blocks of the whole image, one below the other
+};
+
 template <class Source, bool kGradient>
-__global__ void __launch_bounds__(kColumns, 7) l1_ssim_kernel(ImagePair<float> images, Tiles tiles, Maps maps,
-                                                              Frame frame, BlockSums* sums, const int32_t* halted) {
+__global__ void __launch_bounds__(kColumns, 7)
+    l1_ssim_kernel(ImagePair<float> images, Tiles tiles, Part part, Maps maps, Frame frame, BlockSums* sums,
+                   const int32_t* halted) {
   if (halted && *halted) return;
   __shared__ ForwardTile shared;
   Tile tile = tile_of(tiles, blockIdx.x);
   const Plane<Source> plane = plane_of<Source>(images, tile);
-  const int thread = threadIdx.x;
+  const int thread = threadIdx.x, first = tile.row;
   Sums own{};
-  for (const int end = tile.row + tiles.rows; tile.row < end && tile.row < plane.height; tile.row += kForwardRows) {
+  const int below = first + tiles.rows, end = below < part.windows_end ? below : part.windows_end;
+  if (tile.row < part.windows_begin) tile.row = part.windows_begin;
+  for (; tile.row < end; tile.row += kForwardRows) {
     column_stats(shared, tile, plane, thread, own);
     __syncthreads();
     window_rows<kGradient>(shared, tile, frame, maps, thread, own);
     __syncthreads();
   }
   const BlockSums all = block_sum<kColumns>(own.l1, own.unlike);
-  if (thread == 0) sums[blockIdx.x] = all;
+  if (thread == 0 && first >= part.band_begin && first < part.band_end)
+    sums[(int64_t(tile.plane) * part.down + first / tiles.rows) * tiles.across.by + tile.across] = all;
 }
 
 constexpr int kSumThreads = 512;
@@ -94,34 +104,62 @@ void check_size(const ImagePair<float>& images, int64_t tiles) {
   if (tiles > INT32_MAX) throw std::runtime_error("the images have too many planes for one call: pass fewer");
 }
 
-Maps maps_of(const ImagePair<float>& images, float* maps) {
-  return {maps, int(images.height), int(map_strips(images.width))};
+// maps: of these rows.
+Maps maps_of(const ImagePair<float>& images, float* maps, RowRange rows) {
+  float* const first = maps ? maps - rows.begin * kMapRow : nullptr;
+  return {first, int(images.height), int(map_strips(images.width)), int(rows.end - rows.begin)};
+}
+
+RowRange band_of(const ImagePair<float>& images, const RowRange* rows) {
+  return rows ? *rows : RowRange{0, images.height};
 }
 
 constexpr int64_t kManyTiles = 1024;  // enough for every processor of a large GPU to have several at once
 
-// Two tiles a block halve what a block costs beside its pixels.
-Tiles forward_tiles(const ImagePair<float>& images) {
-  const Tiles tiles = Tiles::of(kForwardRows, images.planes, images.height, images.width);
-  check_size(images, tiles.count);
-  return tiles.count < kManyTiles ? tiles : Tiles::of(2 * kForwardRows, images.planes, images.height, images.width);
+// Rows of a block of the forward. Two tiles a block halve what a block costs beside its pixels.
+int forward_rows(int64_t planes, int64_t height, int64_t width) {
+  const int64_t tiles = Tiles::of(kForwardRows, planes, {0, height}, width).count;
+  return tiles < kManyTiles ? kForwardRows : 2 * kForwardRows;
+}
+static_assert(kBandRows % (2 * kForwardRows) == 0);
+
+struct Counts {
+  double l1, ssim;  // pixels, and windows that count
+};
+
+Counts counts_of(const ImagePair<float>& images, bool valid) {
+  const int64_t rim = valid ? kReach : 0;
+  return {double(images.planes) * double(images.height) * double(images.width),
+          double(images.planes) * double(images.height - rim) * double(images.width - rim)};
+}
+
+void find_means(const L1SsimCuda& args, const BlockSums* sums, const Queue& queue) {
+  const auto& images = args.images;
+  const Counts counts = counts_of(images, args.valid);
+  mean_kernel<<<1, kSumThreads, 0, static_cast<cudaStream_t>(queue.stream)>>>(
+      sums, sum_blocks(images.planes, images.height, images.width), counts.l1, counts.ssim, args);
+  check_launch("mean_kernel");
 }
 
 template <class Source, bool kGradient>
 void l1_ssim(const L1SsimCuda& args, const Queue& queue) {
   const auto& images = args.images;
   const auto stream = static_cast<cudaStream_t>(queue.stream);
-  const Tiles tiles = forward_tiles(images);
-  const int64_t rim = args.valid ? kReach : 0;
-  const double l1_count = double(images.planes) * double(images.height) * double(images.width);
-  const double ssim_count = double(images.planes) * double(images.height - rim) * double(images.width - rim);
-  const Frame frame{int(images.width), int(rim / 2), float(1 / ssim_count)};
-  BlockSums* sums = queue.array<BlockSums>(tiles.count);
-  l1_ssim_kernel<Source, kGradient><<<unsigned(tiles.count), kColumns, 0, stream>>>(
-      images, tiles, maps_of(images, args.maps), frame, sums, args.halted);
-  check_launch("l1_ssim_kernel");
-  mean_kernel<<<1, kSumThreads, 0, stream>>>(sums, tiles.count, l1_count, ssim_count, args);
-  check_launch("mean_kernel");
+  const int rows = forward_rows(images.planes, images.height, images.width);
+  check_size(images, Tiles::of(kForwardRows, images.planes, {0, images.height}, images.width).count);
+  const RowRange band = band_of(images, args.rows), windows = map_rows(band, images.height);
+  const Tiles tiles = Tiles::of(rows, images.planes, windows, images.width);
+  const Part part{int(windows.begin), int(windows.end), int(band.begin), int(band.end),
+                  int((images.height + rows - 1) / rows)};
+  const Counts counts = counts_of(images, args.valid);
+  const Frame frame{int(images.width), args.valid ? kRadius : 0, float(1 / counts.ssim)};
+  BlockSums* sums = args.rows ? reinterpret_cast<BlockSums*>(args.sums) : queue.array<BlockSums>(tiles.count);
+  if (tiles.count) {
+    l1_ssim_kernel<Source, kGradient><<<unsigned(tiles.count), kColumns, 0, stream>>>(
+        images, tiles, part, maps_of(images, args.maps, windows), frame, sums, args.halted);
+    check_launch("l1_ssim_kernel");
+  }
+  if (!args.rows) find_means(args, sums, queue);
 }
 
 template <int kRows, class Source>
@@ -146,12 +184,14 @@ bool is_multiple(const void* pointer, size_t bytes) { return reinterpret_cast<ui
 template <int kRows, class Source>
 void l1_ssim_vjp(const L1SsimVjpCuda& args, const Queue& queue) {
   const auto& images = args.images;
-  const Tiles tiles = Tiles::of(kRows, images.planes, images.height, images.width);
+  const RowRange band = band_of(images, args.rows);
+  const Tiles tiles = Tiles::of(kRows, images.planes, band, images.width);
   check_size(images, tiles.count);
+  if (!tiles.count) return;
   const bool quads = images.width % 4 == 0 && is_multiple(images.img1, sizeof(Four)) &&
                      is_multiple(images.img2, sizeof(Quad<Source>)) && is_multiple(args.grad_img1, sizeof(Four));
   const double mean = 1 / double(images.planes * images.height * images.width);
-  const Maps maps = maps_of(images, const_cast<float*>(args.maps));
+  const Maps maps = maps_of(images, const_cast<float*>(args.maps), map_rows(band, images.height));
   l1_ssim_vjp_kernel<kRows, Source>
       <<<unsigned(tiles.count), kColumns, 0, static_cast<cudaStream_t>(queue.stream)>>>(args, tiles, maps, mean, quads);
   check_launch("l1_ssim_vjp_kernel");
@@ -161,11 +201,19 @@ void l1_ssim_vjp(const L1SsimVjpCuda& args, const Queue& queue) {
 template <class Source>
 void l1_ssim_vjp(const L1SsimVjpCuda& args, const Queue& queue) {
   const auto& images = args.images;
-  const int64_t tiles = Tiles::of(16, images.planes, images.height, images.width).count;
+  const int64_t tiles = Tiles::of(16, images.planes, band_of(images, args.rows), images.width).count;
   tiles < kManyTiles / 2 ? l1_ssim_vjp<8, Source>(args, queue) : l1_ssim_vjp<16, Source>(args, queue);
 }
 
 }  // namespace
+
+int64_t sum_blocks(int64_t planes, int64_t height, int64_t width) {
+  return Tiles::of(forward_rows(planes, height, width), planes, {0, height}, width).count;
+}
+
+void l1_ssim_means_cuda(const L1SsimCuda& args, const Queue& queue) {
+  find_means(args, reinterpret_cast<const BlockSums*>(args.sums), queue);
+}
 
 void l1_ssim_cuda(const L1SsimCuda& args, const Queue& queue) {
   if (args.images.img2_is_bytes)

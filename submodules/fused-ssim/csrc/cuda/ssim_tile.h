@@ -59,15 +59,19 @@ struct Divider {
   }
 };
 
-// The cut of planes into tiles. It depends on the image's size alone, so its sums are the same on every GPU.
+// The cut of rows of all planes into tiles, which lie at multiples of their size. It depends on the image's size alone,
+// so its sums are the same on every GPU.
 struct Tiles {
-  int rows;
+  int rows, first;  // first: number of the topmost tiles
   Divider across, down;
   int64_t count;
 
-  static Tiles of(int rows, int64_t planes, int64_t height, int64_t width) {
-    const int64_t across = (width + kTileColumns - 1) / kTileColumns, down = (height + rows - 1) / rows;
-    return {rows, Divider::of(across), Divider::of(down), planes * across * down};
+  static Tiles of(int rows, int64_t planes, RowRange range, int64_t width) {
+    const int64_t across = (width + kTileColumns - 1) / kTileColumns;
+    const int64_t first = range.begin / rows,
+                  down = range.begin < range.end ? (range.end + rows - 1) / rows - first : 1;
+    return {rows, int(first), Divider::of(across), Divider::of(down),
+            range.begin < range.end ? planes * across * down : 0};
   }
 };
 
@@ -79,7 +83,7 @@ struct Tile {
 GS_HD Tile tile_of(const Tiles& tiles, unsigned block) {
   const unsigned rest = tiles.across(block), plane = tiles.down(rest);
   const int across = int(block - rest * tiles.across.by), down = int(rest - plane * tiles.down.by);
-  return {int(plane), across, down * tiles.rows, across * kTileColumns};
+  return {int(plane), across, (tiles.first + down) * tiles.rows, across * kTileColumns};
 }
 
 // A value of the second image while it is on its way: a register has 32 bits.
@@ -117,12 +121,13 @@ struct Plane {
 // column. Each strip of a plane, one tile wide, lies on its own, so what a thread loads of one column lies at constant
 // distances.
 struct Maps {
-  float* first;
+  float* first;  // row 0 of the image, whether or not it is there
   int height, across;
+  int rows;  // that are there
 
   static constexpr int kAnchors = 3 * kMapColumns;  // begin in a row
   GS_HD float* row(int plane, int strip, int row) const {
-    return first + (int64_t(plane * across + strip) * height + row) * kMapRow;
+    return first + (int64_t(plane * across + strip) * rows + row) * kMapRow;
   }
   GS_HD Pair* anchors(int plane, int strip, int row) const {
     return reinterpret_cast<Pair*>(this->row(plane, strip, row) + kAnchors);

@@ -60,6 +60,60 @@ void check(int64_t planes, int64_t height, int64_t width, bool valid, bool clamp
   }
 }
 
+// Bands, of which each knows 10 rows of the others, give the sums, means and gradients of the whole image, on both
+// backends.
+void check_bands(int64_t planes, int64_t height, int64_t width, const std::vector<int64_t>& borders) {
+  std::mt19937 random(unsigned(height * 1000 + width));
+  std::uniform_real_distribution<float> wide(-0.5f, 1.5f);
+  std::vector<float> img1(planes * height * width);
+  std::vector<uint8_t> img2(img1.size());
+  for (float& x : img1) x = wide(random);
+  for (uint8_t& x : img2) x = uint8_t(random());
+  const gs::ImagePair<float> images = {img1.data(), img2.data(), true, planes, height, width, true};
+  gs::emulation::Memory memory;
+  const float one = 1;
+  float l1, loss, band_l1, band_loss;
+  std::vector<float> maps(planes * gs::map_strips(width) * height * gs::kMapRow), vjp(img1.size());
+  gs::l1_ssim_cuda({images, false, &l1, nullptr, maps.data(), &loss, 0.8f, 0.2f}, memory.queue());
+  gs::l1_ssim_vjp_cuda({images, maps.data(), &one, &one, vjp.data(), 0.8f, -0.2f}, memory.queue());
+  double cpu_l1, cpu_ssim, band_cpu_l1, band_cpu_ssim;
+  std::vector<float> cpu_gradient(img1.size()), cpu_vjp(img1.size());
+  gs::GS_ISA::l1_ssim_cpu({images, false, &cpu_l1, &cpu_ssim, cpu_gradient.data()}, gs::serial_executor());
+  gs::GS_ISA::l1_ssim_vjp_cpu({images, cpu_gradient.data(), 0.8, -0.2, cpu_vjp.data()}, gs::serial_executor());
+
+  std::vector<double> sums(2 * gs::sum_blocks(planes, height, width));
+  std::vector<double> cpu_sums(2 * planes * height * gs::row_parts<float>(width));
+  for (size_t i = 0; i + 1 < borders.size(); ++i) {
+    const gs::RowRange rows{borders[i], borders[i + 1]}, kept = gs::map_rows(rows, height);
+    std::vector<float> known(img1.size(), NAN), band_vjp(img1.size()), cpu_band(img1.size(), NAN);
+    for (int64_t at = 0; at < int64_t(img1.size()); ++at)
+      if (const int64_t row = at / width % height; row >= rows.begin - 10 && row < rows.end + 10) known[at] = img1[at];
+    const gs::ImagePair<float> part = {known.data(), img2.data(), true, planes, height, width, true};
+    std::vector<float> band_maps(planes * gs::map_strips(width) * (kept.end - kept.begin) * gs::kMapRow);
+    gs::L1SsimCuda forward{part, false, nullptr, nullptr, band_maps.data()};
+    forward.rows = &rows, forward.sums = sums.data();
+    gs::l1_ssim_cuda(forward, memory.queue());
+    gs::L1SsimVjpCuda backward{part, band_maps.data(), &one, &one, band_vjp.data(), 0.8f, -0.2f};
+    backward.rows = &rows;
+    gs::l1_ssim_vjp_cuda(backward, memory.queue());
+    gs::GS_ISA::l1_ssim_cpu({part, false, nullptr, nullptr, cpu_band.data(), &rows, cpu_sums.data()},
+                            gs::serial_executor());
+    std::vector<float> cpu_band_vjp(img1.size());
+    gs::GS_ISA::l1_ssim_vjp_cpu({part, cpu_band.data(), 0.8, -0.2, cpu_band_vjp.data(), &rows}, gs::serial_executor());
+    for (int64_t at = 0; at < int64_t(img1.size()); ++at) {
+      const bool own = at / width % height >= rows.begin && at / width % height < rows.end;
+      CHECK(band_vjp[at] == (own ? vjp[at] : 0));
+      CHECK(!own || cpu_band_vjp[at] == cpu_vjp[at]);
+    }
+  }
+  gs::L1SsimCuda means{images, false, &band_l1, nullptr, nullptr, &band_loss, 0.8f, 0.2f};
+  means.sums = sums.data();
+  gs::l1_ssim_means_cuda(means, memory.queue());
+  CHECK(band_l1 == l1 && band_loss == loss);
+  gs::GS_ISA::l1_ssim_means_cpu(gs::L1SsimMeans<float>{images, cpu_sums.data(), &band_cpu_l1, &band_cpu_ssim});
+  CHECK(band_cpu_l1 == cpu_l1 && band_cpu_ssim == cpu_ssim);
+}
+
 void check_composite(int64_t pixels) {
   std::mt19937 random(3);
   std::uniform_int_distribution<int> byte(0, 255);
@@ -105,6 +159,10 @@ int main() {
   check<float>(3, 1, 1, false);
   check<uint8_t>(3, 5, 130, false);
   check<uint8_t>(3, 37, 110, false, true);
+  check_bands(3, 37, 130, {0, 16, 37});
+  check_bands(1, 70, 9, {0, 0, 16, 32, 48, 48, 70, 70});
+  check_bands(2, 10, 5, {0, 10});
+  check_bands(64, 70, 125, {0, 16, 48, 70});  // blocks of two tiles
   // So many tiles that a block takes two, and that those of the backward are higher.
   check<uint8_t>(342, 17, 2, false, false, 1);
   return gs::finish_tests("CUDA SSIM, emulated");

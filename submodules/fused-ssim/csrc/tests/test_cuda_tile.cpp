@@ -69,7 +69,7 @@ struct Result {
 
 template <bool kGradient, class Source>
 Result run_forward(const Images<Source>& images, const Maps& maps, int forward_rows) {
-  const Tiles tiles = Tiles::of(forward_rows, images.planes, images.height, images.width);
+  const Tiles tiles = Tiles::of(forward_rows, images.planes, {0, images.height}, images.width);
   const Frame frame{int(images.width), int(images.rim() / 2), float(1 / images.windows())};
   Result result;
   double unlike = 0;
@@ -90,7 +90,7 @@ Result run_forward(const Images<Source>& images, const Maps& maps, int forward_r
 
 template <int kRows, class Source>
 std::vector<float> run_backward(const Images<Source>& images, const Maps& maps, bool quads) {
-  const Tiles tiles = Tiles::of(kRows, images.planes, images.height, images.width);
+  const Tiles tiles = Tiles::of(kRows, images.planes, {0, images.height}, images.width);
   std::vector<float> gradient(images.img1.size(), kNan);  // shows pixels that are not written
   for (int64_t block = 0; block < tiles.count; ++block) {
     const Tile tile = tile_of(tiles, unsigned(block));
@@ -108,7 +108,7 @@ template <class Source>
 Result run_kernels(const Images<Source>& images) {
   const int strips = int(gs::map_strips(images.width));
   std::vector<Four> memory(images.planes * strips * images.height * gs::kMapRow / 4, Four{{kNan, kNan, kNan, kNan}});
-  const Maps maps{memory[0].of, int(images.height), strips};
+  const Maps maps{memory[0].of, int(images.height), strips, int(images.height)};
   Result result = run_forward<true>(images, maps, kForwardRows);
   result.gradient = run_backward<16>(images, maps, false);
   CHECK(run_backward<8>(images, maps, false) == result.gradient);

@@ -1,0 +1,118 @@
+"""A rank's band of a view: forward to the image, and back to the gradient rows of the rank's Gaussians."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import torch
+from diff_gaussian_rasterization.backend import OPERATORS
+from diff_gaussian_rasterization.schema import SCENE
+from fused_ssim import REACH
+from torch import Tensor
+
+from gaussian_renderer.over_ranks.bands import Bands, find_bands, tile_rows
+from gaussian_renderer.over_ranks.exchange import Sent, return_rows, send_splats
+from utils.ranks.ranks import Ranks
+
+_HEIGHT, _WIDTH = SCENE.index("height"), SCENE.index("width")
+
+
+class Band(NamedTuple):
+    """What a loss by bands has to know (`photometric_loss_by_bands` of fused_ssim)."""
+
+    rows: tuple[int, int]  # of pixels, first and end
+    add: Callable[[Tensor], Tensor]  # sums over all bands
+
+
+@dataclass(slots=True)
+class View:
+    """A rank's band of a view, and what the way back needs. Planes are of the size of the whole image."""
+
+    ranks: Ranks
+    bands: Bands
+    color: Tensor  # (3, H, W), right in the rows of the band, unless `whole_image` or `surroundings` says more
+    inverse_depth: Tensor  # (1, H, W), or no rows if it is not wanted
+    radii: Tensor  # (N,) of the rank's own Gaussians
+    splats: Tensor  # (N, 10)
+    tile_counts: Tensor  # (N,)
+    sent: Sent
+    state: tuple[Tensor, ...]  # of the band: splats, instances, ranges, splat_slots, slots, background, last, ...
+    layers: Tensor
+
+    @property
+    def band(self) -> Band:
+        return Band(self.bands.pixels(self.ranks.rank), self.ranks.added)
+
+
+def draw_view(ranks: Ranks, scene: tuple[Any, ...], background: Tensor, want_depth: bool, train: bool) -> View:
+    """Render the rank's band of a view with the Gaussians of all ranks, with the bits of one process.
+
+    scene: the rasterizer's arguments with the rank's own Gaussians.
+    """
+    height, width = scene[_HEIGHT], scene[_WIDTH]
+    own, depths, rects, tile_counts, radii = OPERATORS.project(*scene)
+    seen = (tile_counts > 0).nonzero().view(-1)
+    bands = find_bands(ranks, rects.index_select(0, seen), height, width)
+    (splats, depths, rects, counts), sent = send_splats(ranks, bands, seen, (own, depths, rects, tile_counts))
+    instances, ranges, *slots = OPERATORS.bin(splats, depths, rects, counts, height, width, train)
+    begin, end = bands.borders[ranks.rank : ranks.rank + 2]
+    across = (len(ranges) - 1) // tile_rows(height)
+    ranges = ranges.clamp(ranges[begin * across], ranges[end * across])  # lists of other bands become empty
+    color, transmittance, inverse_depth, last, layers = OPERATORS.blend(
+        splats, instances, ranges, background, height, width, want_depth, train
+    )
+    state = (splats, instances, ranges, *slots, background, last, transmittance)
+    return View(ranks, bands, color, inverse_depth, radii, own, tile_counts, sent, state, layers)
+
+
+def whole_image(view: View) -> View:
+    """Give every rank all rows of the image, and of the inverse depth if it is wanted. Returns the view."""
+    ranks, bands = view.ranks, view.bands
+    rows = [bands.pixels(rank) for rank in range(ranks.size)]
+    first, end = rows[ranks.rank]
+    own = torch.cat((view.color, view.inverse_depth))[:, first:end].transpose(0, 1)
+    planes = ranks.gather(own, [end - first for first, end in rows]).transpose(0, 1).contiguous()
+    view.color, view.inverse_depth = planes[:3], planes[3:]
+    return view
+
+
+def surroundings(view: View) -> View:
+    """Give every rank the rows of colour around its band that its loss depends on (REACH). Returns the view."""
+    ranks, bands, color = view.ranks, view.bands, view.color
+    own, wide = bands.pixels(ranks.rank), bands.pixels(ranks.rank, REACH)
+    others = [rank for rank in range(ranks.size) if rank != ranks.rank]
+    common = dict.fromkeys(range(ranks.size), (0, 0))
+    given = common | {rank: _common(own, bands.pixels(rank, REACH)) for rank in others}
+    taken = common | {rank: _common(bands.pixels(rank), wide) for rank in others}
+    rows = torch.cat([color[:, first:end].transpose(0, 1) for first, end in given.values()])
+    sizes, counts = ([end - first for first, end in parts.values()] for parts in (given, taken))
+    received = ranks.send(rows, sizes, counts)[0].transpose(0, 1)
+    above = own[0] - wide[0]
+    color[:, wide[0] : own[0]], color[:, own[1] : wide[1]] = received[:, :above], received[:, above:]
+    return view
+
+
+def _common(one: tuple[int, int], other: tuple[int, int]) -> tuple[int, int]:
+    """Rows, first and end, that are in both."""
+    first = max(one[0], other[0])
+    return first, max(min(one[1], other[1]), first)
+
+
+def gradient_rows(
+    view: View, gradients: tuple[Tensor, Tensor | None, Tensor | None], absolute: bool
+) -> tuple[Tensor, Tensor]:
+    """The gradient rows of the rank's own Gaussians, and how many each has, from the gradients of the image.
+
+    gradients: of colour, transmittance and inverse depth, (., H, W), of which the rows of the band count.
+    """
+    rows, counts = OPERATORS.blend_rows(*view.state, *gradients, view.layers, absolute)
+    return return_rows(view.ranks, view.sent, len(view.radii), rows, counts)
+
+
+def decisive_in(view: View) -> Tensor:
+    """The rank's own Gaussians that the image depends on (`decisive` of diff_gaussian_rasterization): (N,) bool."""
+    splats, instances, ranges, *_, last, _ = view.state
+    mask, sent = OPERATORS.decisive(splats, instances, ranges, last), view.sent
+    by_band, _ = view.ranks.send(mask, sent.received, sent.sizes)
+    found = torch.zeros(len(view.radii), dtype=torch.int32, device=splats.device)
+    return found.index_add_(0, sent.indices, by_band.int()) > 0

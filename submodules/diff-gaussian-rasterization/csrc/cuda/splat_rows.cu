@@ -1,0 +1,144 @@
+// Gradient rows by splat: taken from a backward, and put where SlotSums finds them.
+#include <thrust/iterator/counting_iterator.h>
+#include <thrust/iterator/transform_iterator.h>
+
+#include <cub/cub.cuh>
+
+#include "../backend.h"
+#include "gradient_rows.cuh"
+
+namespace gs {
+namespace cuda {
+
+using namespace baseline;
+
+namespace {
+
+constexpr int kThreads = 256;
+
+__global__ void __launch_bounds__(kThreads)
+    absolute_kernel(const int32_t* halted, int64_t count, SlotSumsOf<kAbsoluteValues> sums, const float* splats,
+                    Image image, float* absolute) {
+  if (is_halted(halted)) return;
+  const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
+  constexpr int kStage = SlotSumsOf<kAbsoluteValues>::kStage;
+  __shared__ __align__(8) float stage[kThreads / 32 * kStage];
+  float of_pixels[kAbsoluteValues];
+  const bool seen = i < count && sums.seen(i);
+  sums.read(i, seen, of_pixels, stage + threadIdx.x / 32 * kStage);
+  if (i >= count) return;
+  absolute[i] = seen ? absolute_length(splats[kSplatValues * i + 2], of_pixels[0], of_pixels[1], image) : 0;
+}
+
+__global__ void __launch_bounds__(kThreads) count_rows_kernel(const int32_t* halted, int64_t count, GradientRows rows,
+                                                              const SplatSlots* slots, int32_t* counts) {
+  if (is_halted(halted)) return;
+  const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
+  if (i < count) counts[i] = int32_t(rows.row(slots[i + 1].first) - rows.row(slots[i].first));
+}
+
+// Rows of twelve values, in pairs, and the two arrays that have ten and two of them.
+constexpr int kGradientPairs = kGradientValues / 2, kPairs = kGradientPairs + kAbsoluteValues / 2;
+
+template <class Pair>
+struct Halves {
+  Pair *gradients, *absolute;
+  __device__ Pair& operator[](int64_t pair) const {
+    const int64_t row = pair / kPairs;
+    const int of_row = int(pair - row * kPairs);
+    return of_row < kGradientPairs ? gradients[kGradientPairs * row + of_row] : absolute[row];
+  }
+};
+
+template <class From, class To>
+__global__ void __launch_bounds__(kThreads) copy_pairs_kernel(const int32_t* halted, int64_t pairs, From from, To to) {
+  if (is_halted(halted)) return;
+  const int64_t k = int64_t(blockIdx.x) * kThreads + threadIdx.x;
+  if (k < pairs) to[k] = from[k];
+}
+
+template <class From, class To>
+void copy_rows(const Queue& queue, int64_t rows, From from, To to) {
+  if (!rows) return;
+  const int64_t pairs = kPairs * rows;
+  copy_pairs_kernel<<<blocks_for(pairs, kThreads), kThreads, 0, stream_of(queue)>>>(queue.halted, pairs, from, to);
+  check_launch("copy_pairs");
+}
+
+Halves<float2> halves(float* gradients, float* absolute) {
+  return {reinterpret_cast<float2*>(gradients), reinterpret_cast<float2*>(absolute)};
+}
+
+// What lies before a splat: splats that were seen, in the upper 32 bits, and rows, in the lower ones.
+struct SeenAndRows {
+  SplatRows<float> in;
+  __host__ __device__ int64_t operator()(int64_t splat) const {
+#ifdef __CUDA_ARCH__
+    if (splat < in.count && in.tile_counts[splat]) return (int64_t(1) << 32) + in.counts[splat];
+#endif
+    return 0;
+  }
+};
+
+// A splat that was seen has 32 slots, the bits of one word, and before that word lie the rows before the splat. So no
+// bit is looked at, and SlotSums finds each splat's rows, and whether it was seen.
+struct WordAt {
+  SplatRows<float> in;
+  SplatSlots* slots;
+  int32_t* before;
+  int64_t splat;
+  __host__ __device__ void operator=(int64_t sums) const {
+    const int64_t word = sums >> 32;
+    slots[splat] = {32 * word, 0, 0};
+    if (splat == in.count || in.tile_counts[splat]) before[word] = int32_t(sums);
+  }
+};
+
+struct Words {
+  SplatRows<float> in;
+  SplatSlots* slots;
+  int32_t* before;
+  __host__ __device__ WordAt operator()(int64_t splat) const { return {in, slots, before, splat}; }
+};
+
+}  // namespace
+
+void find_lengths(const Queue& queue, int64_t count, const SlotSumsOf<kAbsoluteValues>& sums, const float* splats,
+                  Image image, float* absolute) {
+  absolute_kernel<<<blocks_for(count, kThreads), kThreads, 0, stream_of(queue)>>>(queue.halted, count, sums, splats,
+                                                                                  image, absolute);
+  check_launch("absolute");
+}
+
+void count_rows(const Queue& queue, int64_t count, const GradientRows& rows, const SplatSlots* slots, int32_t* counts) {
+  count_rows_kernel<<<blocks_for(count, kThreads), kThreads, 0, stream_of(queue)>>>(queue.halted, count, rows, slots,
+                                                                                    counts);
+  check_launch("count_rows");
+}
+
+void join_rows(const Queue& queue, int64_t rows, const FilledRows& from, float* to) {
+  copy_rows(queue, rows, halves(from.gradients.values, from.absolute.values), reinterpret_cast<float2*>(to));
+}
+
+SlotSums sums_of(const Queue& queue, const SplatRows<float>& in, const RowSums<float>& to) {
+  SplatSlots* slots = queue.array<SplatSlots>(in.count + 1);
+  int32_t* before = queue.array<int32_t>(in.count + 1);
+  const thrust::counting_iterator<int64_t> splats(0);
+  const auto counts = thrust::make_transform_iterator(splats, SeenAndRows{in});
+  const auto words = thrust::make_transform_iterator(splats, Words{in, slots, before});
+  with_memory(queue, [&](void* memory, size_t& bytes) {
+    return cub::DeviceScan::ExclusiveSum(memory, bytes, counts, words, in.count + 1, stream_of(queue));
+  });
+  float* gradients = const_cast<float*>(in.rows);  // sums only read them
+  if (to.absolute) {
+    gradients = queue.array<float>(in.row_count * kGradientValues);
+    float* absolute = queue.array<float>(in.row_count * kAbsoluteValues);
+    copy_rows(queue, in.row_count, reinterpret_cast<const float2*>(in.rows), halves(gradients, absolute));
+    find_lengths(queue, in.count, {{nullptr, before, absolute}, slots}, to.splats, to.image, to.absolute);
+    queue.release(queue.context, absolute);
+  }
+  return {{nullptr, before, gradients}, slots};
+}
+
+}  // namespace cuda
+}  // namespace gs

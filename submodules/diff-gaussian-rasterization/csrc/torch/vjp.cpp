@@ -1,0 +1,110 @@
+// The ops of the backwards: each stage by itself, both in one, and both with gradient rows in between.
+#include <ATen/ops/empty.h>
+
+#include "gradient_source.h"
+#include "math/splat.h"
+
+namespace gs::ops {
+
+namespace {
+
+using gs::baseline::kGradientValues;
+
+Gradients project_vjp(const SceneTensors& in, const Tensor& tile_counts, const Tensor& moments, const Wanted& wanted) {
+  SceneGradients out(in, wanted);
+  with_scalar(in.dtype(), [&](auto zero) {
+    using T = decltype(zero);
+    GS_RUN(T, moments, project_vjp, in.scene<T>(), tile_counts.const_data_ptr<int32_t>(), moments.const_data_ptr<T>(),
+           out.pointers<T>());
+  });
+  return out.all();
+}
+
+// source: Lists or Rows. lengths: of absolute gradients, if it is defined.
+template <class Source>
+Gradients vjp(const SceneTensors& scene, const Source& source, const Tensor& lengths, const Wanted& wanted) {
+#ifdef GS_CUDA
+  if (scene.device().is_cuda()) {
+    gs::TorchQueue queue(scene.device(), halted());
+    std::optional<SceneGradients> out;
+    auto allocate = [&] { return out.emplace(scene, wanted).template pointers<float>(); };
+    using Allocate = decltype(allocate);
+    const gs::cuda::GradientMemory memory{[](void* context) { return (*static_cast<Allocate*>(context))(); },
+                                          &allocate};
+    source.vjp(queue.queue(), scene.scene<float>(), lengths, memory);
+    if (!out) allocate();  // no Gaussians
+    return out->all();
+  }
+#endif
+  return project_vjp(scene, source.tile_counts(), source.moments(lengths), wanted);
+}
+
+// The same, and the third value of a row of means2d becomes the length of its absolute gradient, instead of 0.
+template <class Source>
+Gradients vjp_with_lengths(const SceneTensors& scene, const Source& source, const Tensor& splats, bool absolute,
+                           const Wanted& wanted) {
+  const Tensor lengths = absolute_like(splats, absolute && wanted[kMeans2d]);
+  Gradients all = vjp(scene, source, lengths, wanted);
+  if (lengths.defined()) std::get<kMeans2d>(all).select(1, 2).copy_(lengths);
+  return all;
+}
+
+Tensor blend_vjp_op(BACKWARD_PARAMETERS) { return blend_vjp(BlendBackward(BACKWARD_ARGUMENTS)); }
+
+Gradients project_vjp_op(SCENE_PARAMETERS, const Tensor& tile_counts, const Tensor& moments, Wanted wanted) {
+  const SceneTensors scene(SCENE_ARGUMENTS);
+  check_counts(tile_counts, scene.count(), scene.device());
+  check_tensor(moments, "moments", scene.dtype(), scene.device(), {scene.count(), kGradientValues});
+  return project_vjp(scene, tile_counts.contiguous(), moments.contiguous(), wanted);
+}
+
+Gradients rasterize_vjp_op(SCENE_PARAMETERS, LISTS_PARAMETERS, Wanted wanted, bool absolute) {
+  const SceneTensors scene(SCENE_ARGUMENTS);
+  return vjp_with_lengths(scene, Lists(scene, LISTS_ARGUMENTS), splats, absolute, wanted);
+}
+
+// The rows that rasterize_vjp sums, those of a splat side by side, in the order of its tiles, and their number for each
+// splat. absolute: they end with what lengths of absolute gradients need.
+std::tuple<Tensor, Tensor> blend_rows_op(BACKWARD_PARAMETERS, const Tensor& layers, bool absolute) {
+  BlendBackward in(BACKWARD_ARGUMENTS);
+  in.take_layers(layers);
+  TORCH_CHECK(!ahead(), "blend_rows waits for the number of rows, so the host cannot run ahead");
+  Tensor rows, counts = at::empty({splats.size(0)}, splats.options().dtype(at::kInt));
+  with_scalar(splats.scalar_type(), [&](auto zero) {
+    using T = decltype(zero);
+    auto take = [&](int64_t count) {
+      rows = at::empty({count, row_values(absolute)}, splats.options());
+      return rows.mutable_data_ptr<T>();
+    };
+    using Take = decltype(take);
+    const gs::RowMemory<T> memory{[](void* context, int64_t count) { return (*static_cast<Take*>(context))(count); },
+                                  &take, counts.mutable_data_ptr<int32_t>(), absolute};
+    GS_RUN(T, splats, blend_rows, in.input<T>(), in.gradient<T>(nullptr, {}), memory);
+  });
+  return {rows, counts};
+}
+
+// The rest of rasterize_vjp, the same bits. rows: of blend_rows, or of several calls of it on parts of the lists, each
+// a run of whole tiles; then those of a splat come in the order of the parts.
+Gradients rows_vjp_op(SCENE_PARAMETERS, ROWS_PARAMETERS, Wanted wanted, bool absolute) {
+  const SceneTensors scene(SCENE_ARGUMENTS);
+  const Rows source(scene, ROWS_ARGUMENTS, absolute, absolute && wanted[kMeans2d]);
+  return vjp_with_lengths(scene, source, splats, absolute, wanted);
+}
+
+}  // namespace
+
+TORCH_LIBRARY_FRAGMENT(diff_gaussian_rasterization, m) {
+  define(m, "blend_vjp(" BACKWARD_SCHEMA ") -> Tensor moments", &blend_vjp_op);
+  define(m, "project_vjp(" SCENE_SCHEMA ", Tensor tile_counts, Tensor moments, bool[9] wanted) -> " GRADIENTS_SCHEMA,
+         &project_vjp_op);
+  define(m,
+         "rasterize_vjp(" SCENE_SCHEMA ", " LISTS_SCHEMA ", bool[9] wanted, bool absolute=False) -> " GRADIENTS_SCHEMA,
+         &rasterize_vjp_op);
+  define(m, "blend_rows(" BACKWARD_SCHEMA ", Tensor layers, bool absolute=False) -> (Tensor rows, Tensor counts)",
+         &blend_rows_op);
+  define(m, "rows_vjp(" SCENE_SCHEMA ", " ROWS_SCHEMA ", bool[9] wanted, bool absolute=False) -> " GRADIENTS_SCHEMA,
+         &rows_vjp_op);
+}
+
+}  // namespace gs::ops

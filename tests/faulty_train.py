@@ -1,0 +1,84 @@
+"""train.py with a fault in one rank, for tests of several: `faulty_train.py FAULT RANK ITERATION OPTIONS...`.
+
+FAULT is one of `_FAULTS`, which come in that iteration; or options (one more), code (other files, in the folder that
+OTHER_CODE names), warning, none. A restarted training has no fault. All ranks print the same lines at first.
+"""
+
+import os
+import sys
+
+fault, rank, iteration, options = sys.argv[1], int(sys.argv[2]), int(sys.argv[3]), sys.argv[4:]
+mine = os.environ["RANK"] == str(rank) and os.environ["TORCHELASTIC_RESTART_COUNT"] == "0"
+if mine and fault == "code":
+    sys.path.insert(0, os.environ["OTHER_CODE"])
+
+# ruff: noqa: E402
+import utils.host.early  # noqa: F401  isort: skip  (as train.py begins)
+import signal
+from collections.abc import Callable
+
+import torch
+
+import train
+import utils.ranks.watch
+from training.run import Run
+from training.step import Step
+from utils.system_utils import UserError, run_cli
+
+utils.ranks.watch.PATIENCE = 3.0
+prepare = Run.prepare
+
+
+def _raise(error: Exception) -> Callable[[Run], None]:
+    def fail(run: Run) -> None:
+        raise error
+
+    return fail
+
+
+def _hang(run: Run) -> None:
+    while True:
+        signal.pause()
+
+
+def _overflow(run: Run) -> None:
+    """Make a gradient of the next step infinite."""
+    optimizer = run.gaussians.optimizer
+    usual = optimizer.step
+
+    def step(*args: object) -> object:
+        optimizer.param_groups[0]["params"][0].grad[3, 0] = torch.inf
+        optimizer.step = usual
+        return usual(*args)
+
+    optimizer.step = step
+
+
+_FAULTS = {
+    "kill": lambda run: os.kill(os.getpid(), signal.SIGKILL),
+    "interrupt": lambda run: os.kill(os.getpid(), signal.SIGINT),
+    "memory": _raise(MemoryError()),
+    "bug": _raise(ValueError("no such thing")),
+    "user": _raise(UserError("this cannot be; do something else")),
+    "hang": _hang,
+    "overflow": _overflow,
+}
+
+
+def _prepare(run: Run, step: Step) -> None:
+    prepare(run, step)
+    if mine and step.iteration == iteration and fault in _FAULTS:
+        _FAULTS[fault](run)
+
+
+def _main() -> None:
+    print("printed by every rank")
+    print("warning: of every rank", file=sys.stderr)
+    if mine and fault == "warning":
+        print("warning: of one rank alone", file=sys.stderr)
+    train.main([*options, "--random_background"] if mine and fault == "options" else options)
+
+
+Run.prepare = _prepare
+if __name__ == "__main__":
+    run_cli(_main, several=True)

@@ -1,0 +1,56 @@
+"""Starts of train.py by torchrun, on the CPU, with the outputs of each rank in files."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import NamedTuple
+
+ROOT = Path(__file__).resolve().parents[1]
+OPTIONS = ("--iterations", "12", "--checkpoint_iterations", "5", "--save_iterations", "6", "-r", "2")
+
+
+class Launched(NamedTuple):
+    """How a training of several ranks has ended. Outputs: of all ranks and restarts, by rank."""
+
+    status: int
+    stdout: list[str]
+    stderr: list[str]
+
+    @property
+    def errors(self) -> list[str]:
+        """Lines of error that our ranks have printed."""
+        return [line for text in self.stderr for line in text.splitlines() if line.startswith("error:")]
+
+
+def command(logs: Path, size: int, fault: str, *options: str, restarts: int = 0) -> list[str]:
+    """The command line. fault: the first arguments of faulty_train.py."""
+    torchrun = [sys.executable, "-m", "torch.distributed.run", "--standalone", f"--nproc_per_node={size}"]
+    torchrun += [f"--max-restarts={restarts}", f"--log-dir={logs}", "--redirects=3"]
+    return [*torchrun, str(ROOT / "tests" / "faulty_train.py"), *fault.split(), *options]
+
+
+def environment(**more: str) -> dict[str, str]:
+    """The environment, in which ranks find the code of this checkout."""
+    return {name: value for name, value in os.environ.items() if name != "OMP_NUM_THREADS"} | {
+        "PYTHONPATH": str(ROOT),
+        "GLOO_SOCKET_IFNAME": "lo",
+        **more,
+    }
+
+
+def outputs(logs: Path, size: int, status: int) -> Launched:
+    """Read the logs."""
+
+    def of(name: str) -> list[str]:
+        found = [sorted(logs.glob(f"*/attempt_*/{rank}/{name}.log")) for rank in range(size)]
+        return ["".join(path.read_text().replace("\r", "\n") for path in paths) for paths in found]
+
+    return Launched(status, of("stdout"), of("stderr"))
+
+
+def launch(logs: Path, fault: str, *options: str, size: int = 2, restarts: int = 0, **more: str) -> Launched:
+    """Train until it ends, at most two minutes."""
+    line = command(logs, size, fault, *options, restarts=restarts)
+    done = subprocess.run(line, cwd=logs.parent, env=environment(**more), capture_output=True, timeout=120)
+    return outputs(logs, size, done.returncode)

@@ -1,0 +1,161 @@
+"""Parts of a launch on several ranks that need no second process."""
+
+import argparse
+import io
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import train
+from training.launch import viewers
+from training.restart import newest_checkpoint, what_stands
+from utils.host import threads, torchrun
+from utils.ranks import quiet
+from utils.ranks.alike import refuse_differences
+from utils.ranks.board import here, is_gone
+from utils.ranks.ending import DONE, FAULT, HANG, LOST, SIGNAL, End, verdict
+from utils.ranks.ranks import Ranks, using
+from utils.system_utils import UserError, atomic_write, run_cli
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+class _Second(Ranks):
+    rank, size = 1, 2
+
+
+@pytest.fixture
+def in_torchrun(monkeypatch):
+    """The environment of one of four ranks, two on each host."""
+    names = {"RANK": "3", "WORLD_SIZE": "4", "LOCAL_RANK": "1", "LOCAL_WORLD_SIZE": "2", "MASTER_ADDR": "a"}
+    for name, value in (names | {"MASTER_PORT": "1"}).items():
+        monkeypatch.setenv(name, value)
+    return monkeypatch
+
+
+def test_the_environment_of_torchrun_is_whole_or_none(in_torchrun):
+    assert (torchrun.rank(), torchrun.size(), torchrun.local_rank(), torchrun.local_size()) == (3, 4, 1, 2)
+    in_torchrun.setattr(os, "sched_getaffinity", lambda pid: set(range(8)), raising=False)
+    in_torchrun.setattr(threads, "_quota", lambda: float("inf"))
+    assert threads.cores() == 4
+    in_torchrun.delenv("LOCAL_RANK")  # as on a cluster that sets some of these names itself
+    assert (torchrun.rank(), torchrun.size(), torchrun.local_size()) == (0, 1, 1)
+    assert threads.cores() == 8
+
+
+def test_a_command_for_one_process_refuses_several(in_torchrun, capsys):
+    for rank, said in ((3, ""), (0, "error: render.py runs in one process; start it without torchrun\n")):
+        in_torchrun.setenv("RANK", str(rank))
+        in_torchrun.setattr(sys, "argv", ["/some/render.py"])
+        with pytest.raises(SystemExit) as ended:
+            run_cli(lambda: print("ran"))
+        assert ended.value.code == 2 and capsys.readouterr() == ("", said)
+    several = [path.name for path in ROOT.glob("*.py") if "several=True" in path.read_text(encoding="utf-8")]
+    assert several == ["train.py"]
+
+
+def test_a_page_is_refused_on_several_ranks_and_no_port_opened():
+    args = argparse.Namespace(ip="127.0.0.1", port=6009, disable_viewer=False)
+    assert viewers(args, None) == (("127.0.0.1", 6009), None)
+    with using(_Second()):
+        assert viewers(args, None) == (None, None)
+        with pytest.raises(UserError, match="--viewer needs a training of one process"):
+            viewers(args, ("127.0.0.1", 8080))
+
+
+def test_only_the_first_rank_writes(tmp_path):
+    with using(_Second()):
+        with atomic_write(tmp_path / "new" / "a") as path:
+            path.write_text("a")
+        with atomic_write(tmp_path / "b", every_rank=True) as path:
+            path.write_text("b")
+    assert [path.name for path in tmp_path.iterdir()] == ["b"]
+
+
+@pytest.mark.parametrize(
+    ("ends", "gone", "expected"),
+    [
+        ({0: End(DONE, 0), 1: End(DONE, 0)}, [], (0, "", 0, False)),
+        ({0: End(FAULT, 2, "error: a"), 1: End(FAULT, 2, "error: a")}, [], (0, "error: a", 2, False)),
+        ({0: End(FAULT, 2, "error: a"), 1: End(FAULT, 2, "error: b")}, [], (0, "error: rank 0: a", 2, False)),
+        ({0: End(LOST, 1), 1: End(FAULT, 2, "error: b")}, [], (1, "error: rank 1: b", 2, False)),
+        ({0: End(SIGNAL, 143, "terminated"), 1: End(FAULT, 2, "error: b")}, [], (1, "error: rank 1: b", 2, False)),
+        ({1: End(SIGNAL, 143, "terminated")}, [0], (1, "error: rank 0 ended without a word", 1, True)),
+        ({0: End(LOST, 1), 1: End(HANG, 1, "error: rank 2 hung")}, [], (1, "error: rank 2 hung", 1, True)),
+        ({0: End(SIGNAL, 130, "interrupted"), 1: End(SIGNAL, 130, "interrupted")}, [], (0, "interrupted", 130, False)),
+        ({0: End(LOST, 1, "error: x"), 1: End(LOST, 1, "error: x")}, [], (0, "error: x", 1, True)),
+    ],
+)
+def test_one_rank_speaks_for_all(ends, gone, expected):
+    speaker, line, status, lost = verdict(ends, gone, 2)
+    assert (speaker, status, lost) == (expected[0], *expected[2:])
+    assert line == expected[1] or gone and line.startswith(expected[1])
+
+
+def test_differences_name_what_and_whose():
+    refuse_differences([{"a": "1"}, {"a": "1"}], "remedy")
+    with pytest.raises(UserError) as refused:
+        refuse_differences([{"a": "1"}, {"a": "1"}, {"a": "2", "b": "3"}], "do so")
+    assert str(refused.value) == "rank 2 differs from rank 0 in a (2, not 1), b (3, not nothing); do so"
+
+
+def test_lines_are_told_once_with_the_ranks_that_say_them(monkeypatch):
+    said = io.StringIO()
+    first = quiet.Noted(said, printed=True)
+    first.write("\r 50%|##   |\rwarning: of all\n")
+    monkeypatch.setattr(quiet, "_noted", first)
+    others = ["warning: of all", "warning: of two"]
+    for _ in range(2):
+        quiet.tell({1: others, 2: [*others, "warning: of one"]})
+    told = said.getvalue().splitlines()[-2:]
+    assert told == ["ranks 1, 2: warning: of two", "rank 2: warning: of one"]
+    assert said.getvalue().count("of two") == 1
+    second = quiet.Noted(said, printed=False)
+    monkeypatch.setattr(quiet, "_noted", second)
+    second.write("half")
+    second.write(" a line\nand")
+    assert (quiet.take(), quiet.take()) == (["half a line"], [])
+    assert "half" not in said.getvalue()
+
+
+def test_a_process_of_this_host_is_gone_once_it_has_ended():
+    process = subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE)
+    host, _, space = here()
+    who = [host, process.pid, space]
+    assert not is_gone(who)
+    process.kill()
+    os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOWAIT)
+    assert is_gone(who)  # although nobody has asked for its status
+    process.communicate()
+    assert is_gone(who)
+    assert not is_gone(["another", *who[1:]])
+
+
+def test_checkpoints_of_earlier_trainings_do_not_stand(tmp_path):
+    for iteration, age in ((5, 0), (40, 0), (300, 1e9)):
+        path = tmp_path / f"chkpnt{iteration}.pth"
+        path.touch()
+        os.utime(path, (path.stat().st_mtime - age,) * 2)
+    (tmp_path / "chkpnt_best.pth").touch()
+    assert newest_checkpoint(str(tmp_path)) == str(tmp_path / "chkpnt40.pth")
+    assert newest_checkpoint(str(tmp_path), below=40) == str(tmp_path / "chkpnt5.pth")
+    assert what_stands(str(tmp_path / "none"), None).startswith("no checkpoint was saved")
+    assert what_stands(str(tmp_path / "none"), "a.pth").endswith("--start_checkpoint a.pth")
+
+
+def test_a_training_of_one_process_loads_nothing_of_several(colmap_scene, tmp_path):
+    code = (
+        "import sys, train\n"
+        "train.main(sys.argv[1:])\n"
+        "names = [n for n in sys.modules if n.startswith('utils.ranks.')]\n"
+        "print('loaded', *sorted(names), file=sys.stderr)"
+    )
+    options = ["-s", str(colmap_scene), "-m", str(tmp_path / "out"), "--iterations", "2", "--disable_viewer"]
+    done = subprocess.run([sys.executable, "-c", code, *options], cwd=ROOT, capture_output=True, text=True, check=True)
+    loaded = done.stderr.splitlines()[-1].split()
+    assert loaded[0] == "loaded" and "utils.ranks.ranks" in loaded
+    assert not {f"utils.ranks.{name}" for name in ("several", "together", "watch", "watched", "board")} & {*loaded}
+    assert train.parse(options)[0].parallel == "tiles"

@@ -1,0 +1,217 @@
+"""Gradient rows as processes exchange them: of bands of an image, put together by splat, they give the same bits."""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import pytest
+import torch
+from diff_gaussian_rasterization import GaussianRasterizationSettings, fakes, schema
+from rasterizer_tools import BOTH_AND_GPU, few, ops, scene_arguments
+from torch import Tensor, library
+
+from benchmarks.workloads.splat_scenes import PARAMETERS, frustum, on_device, settings
+
+WIDTH, HEIGHT = 45, 70  # 3 x 5 tiles, some cut off
+ACROSS, DOWN = 3, 5
+WANTED = [name in (*PARAMETERS, "means2d") for name in schema.GRADIENTS]
+
+
+class Rows(NamedTuple):
+    """The results of `blend_rows`."""
+
+    rows: Tensor
+    counts: Tensor
+
+
+@dataclass
+class Forward:
+    """A scene projected, binned and blended by single operators, and a gradient of its planes."""
+
+    scene: tuple  # the arguments that operators have in common
+    projected: tuple[Tensor, ...]  # splats, depths, rects, tile_counts, radii
+    lists: tuple[Tensor, ...]  # instances, ranges, splat_slots, slots
+    background: Tensor
+    planes: list[Tensor]  # gradients; None where not wanted
+    blended: tuple[Tensor, ...]  # color, transmittance, inverse_depth, last, layers
+    depth: bool
+
+    @classmethod
+    def of(cls, raw: dict[str, Tensor], camera: GaussianRasterizationSettings, depth: bool) -> "Forward":
+        scene = scene_arguments(raw, camera)
+        projected, size = ops.project(*scene), (camera.image_height, camera.image_width)
+        lists = ops.bin(*projected[:4], *size, True)
+        blended = ops.blend(projected[0], *lists[:2], camera.bg, *size, depth, True)
+        generator = torch.Generator().manual_seed(2)
+        planes = [torch.randn(t.shape, generator=generator).to(t) for t in blended[:3]]
+        return cls(scene, projected, lists, camera.bg, planes if depth else [planes[0], None, None], blended, depth)
+
+    def blend_band(self, top: int, bottom: int) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...]]:
+        """Blend tile rows `top` to `bottom` only, whose lists stay; return these lists and the planes."""
+        instances, ranges, *slots = self.lists
+        ranges = ranges.clamp(ranges[top * ACROSS], ranges[bottom * ACROSS])
+        size = self.blended[1].shape[1:]
+        blended = ops.blend(self.projected[0], instances, ranges, self.background, *size, self.depth, True)
+        return (instances, ranges, *slots), blended
+
+    def state(self, lists: tuple[Tensor, ...], blended: tuple[Tensor, ...]) -> tuple:
+        """Arguments of a backward of blending, up to the layers."""
+        _, transmittance, _, last, _ = blended
+        return (self.projected[0], *lists, self.background, last, transmittance, *self.planes)
+
+    def rows(self, absolute: bool) -> Rows:
+        return Rows(*ops.blend_rows(*self.state(self.lists, self.blended), self.blended[4], absolute))
+
+    def rows_of_bands(self, cuts: list[int], absolute: bool) -> Rows:
+        """The rows of the bands between cuts, each splat's in the order of the bands."""
+        bands = []
+        for top, bottom in zip(cuts, cuts[1:], strict=False):
+            lists, blended = self.blend_band(top, bottom)
+            bands.append(Rows(*ops.blend_rows(*self.state(lists, blended), blended[4], absolute)))
+        splats = torch.arange(len(self.projected[0]), device=self.background.device)
+        owners = torch.cat([torch.repeat_interleave(splats, band.counts) for band in bands])
+        rows = torch.cat([band.rows for band in bands])[torch.argsort(owners, stable=True)]
+        return Rows(rows, torch.stack([band.counts for band in bands]).sum(0, dtype=torch.int32))
+
+    def rows_vjp(self, rows: Rows, absolute: bool, wanted: list[bool] = WANTED) -> tuple[Tensor, ...]:
+        splats, _, _, tile_counts, _ = self.projected
+        return ops.rows_vjp(*self.scene, splats, tile_counts, *rows, wanted, absolute)
+
+    def lists_vjp(self, absolute: bool, wanted: list[bool] = WANTED) -> tuple[Tensor, ...]:
+        state = self.state(self.lists, self.blended)
+        return ops.rasterize_vjp(*self.scene, *state, self.projected[3], self.blended[4], wanted, absolute)
+
+
+def same_bits(one: Tensor, other: Tensor) -> bool:
+    bits = [t.cpu().contiguous().numpy().tobytes() for t in (one, other)]
+    return one.shape == other.shape and one.dtype == other.dtype and bits[0] == bits[1]
+
+
+def scene_of(kind: str, device: str, dtype: torch.dtype) -> tuple[dict[str, Tensor], GaussianRasterizationSettings]:
+    """Raw parameters and a camera of WIDTH x HEIGHT."""
+    scene = frustum({"empty": 0, "one": 1}.get(kind, 300), WIDTH, HEIGHT, 4.0, seed=3)
+    raw = {name: scene.parameters[name].clone() for name in PARAMETERS}
+    raw["means"] *= torch.tensor([1.6, 1.6, 1.0])  # some are not seen
+    if kind == "behind":
+        raw["means"][:, 2] *= -1
+    elif kind == "giants":  # two over the whole image, and culled ones among others
+        raw["means"][[40, 200]], raw["scales"][[40, 200]] = torch.tensor([0.0, 0.0, 3.0]), 1.5
+        raw["opacities"][[40, 200]] = -2.0
+        raw["opacities"][::7] = torch.nan
+    camera = settings(WIDTH, HEIGHT, dtype)
+    return {name: t.to(device, dtype).contiguous() for name, t in raw.items()}, on_device(camera, device)
+
+
+SCENES = pytest.mark.parametrize("kind", ["empty", "one", "behind", "giants", "many"])
+DEPTH = pytest.mark.parametrize("depth", [False, True])
+ABSOLUTE = pytest.mark.parametrize("absolute", [False, True])
+
+
+@BOTH_AND_GPU
+@SCENES
+@DEPTH
+def test_single_steps_of_the_forward_are_rasterize_to_the_bit(kind, depth, device, dtype):
+    raw, camera = scene_of(kind, device, dtype)
+    forward = Forward.of(raw, camera, depth)
+    out = ops.rasterize(None, *forward.scene, camera.bg, depth, True)
+    color, transmittance, inverse_depth, radii, splats, tile_counts, *lists, last, layers = out
+    seen = tile_counts > 0  # the other rows are undefined
+    assert (kind in ("empty", "behind")) == (not seen.any())
+    assert same_bits(splats[seen], forward.projected[0][seen])
+    assert same_bits(tile_counts, forward.projected[3]) and same_bits(radii, forward.projected[4])
+    assert all(same_bits(a, b) for a, b in zip(lists[:2], forward.lists[:2], strict=True))
+    assert same_bits(lists[2][:, 0], forward.lists[2][:, 0])
+    planes = color, transmittance, inverse_depth, last
+    assert all(same_bits(a, b) for a, b in zip(planes, forward.blended[:4], strict=True))
+    assert layers.shape == forward.blended[4].shape and (layers.numel() > 0) == (device == "cuda")
+
+
+@BOTH_AND_GPU
+@SCENES
+@DEPTH
+@ABSOLUTE
+def test_rows_give_the_gradients_of_the_lists(kind, depth, absolute, device, dtype):
+    forward = Forward.of(*scene_of(kind, device, dtype), depth)
+    rows = forward.rows(absolute)
+    assert rows.rows.shape == (int(rows.counts.sum()), 12 if absolute else 10) and rows.counts.dtype == torch.int32
+    assert not rows.counts[forward.projected[3] == 0].any()
+    for wanted in ([False] * 2 + WANTED[2:], WANTED):
+        got, expected = forward.rows_vjp(rows, absolute, wanted), forward.lists_vjp(absolute, wanted)
+        assert all(same_bits(a, b) for a, b in zip(got, expected, strict=True))
+    if kind == "giants":
+        assert rows.counts[40] == ACROSS * DOWN and got[0].count_nonzero() > 100
+        assert (got[1][40, 2] > 0) == absolute
+
+
+@BOTH_AND_GPU
+@SCENES
+@DEPTH
+@ABSOLUTE
+def test_bands_give_the_rows_of_the_image(kind, depth, absolute, device, dtype):
+    forward = Forward.of(*scene_of(kind, device, dtype), depth)
+    whole = forward.rows(absolute)
+    for cuts in ([0, 1, 2, 3, 4, 5], [0, 2, 5], [0, 0, 4, 5, 5]):
+        bands = forward.rows_of_bands(cuts, absolute)
+        assert same_bits(bands.rows, whole.rows) and same_bits(bands.counts, whole.counts)
+
+
+@BOTH_AND_GPU
+@SCENES
+@DEPTH
+def test_a_band_has_the_pixels_of_the_image(kind, depth, device, dtype):
+    forward = Forward.of(*scene_of(kind, device, dtype), depth)
+    for top, bottom in ((0, 1), (1, 4), (4, 5), (2, 2)):
+        _, blended = forward.blend_band(top, bottom)
+        for got, whole in zip(blended[:4], forward.blended[:4], strict=True):
+            assert same_bits(got[..., 16 * top : 16 * bottom, :], whole[..., 16 * top : 16 * bottom, :])
+
+
+def test_any_number_of_threads_gives_the_same_bits():
+    before, results = torch.get_num_threads(), []
+    try:
+        for threads in (1, 2, 3):
+            torch.set_num_threads(threads)
+            forward = Forward.of(*scene_of("giants", "cpu", torch.float32), True)
+            rows = forward.rows(True)
+            results.append([*rows, *forward.rows_vjp(rows, True)])
+    finally:
+        torch.set_num_threads(before)
+    for tensors in results[1:]:
+        assert all(same_bits(one, other) for one, other in zip(tensors, results[0], strict=True))
+
+
+@BOTH_AND_GPU
+@ABSOLUTE
+def test_opcheck(absolute, device, dtype):
+    raw, size = few(dtype=dtype)
+    raw, camera = {name: t.to(device) for name, t in raw.items()}, on_device(settings(**size), device)
+    forward = Forward.of(raw, camera, True)
+    state, rows = forward.state(forward.lists, forward.blended), forward.rows(absolute)
+    library.opcheck(ops.blend_rows, (*state, forward.blended[4], absolute))
+    splats, _, _, tile_counts, _ = forward.projected
+    library.opcheck(ops.rows_vjp, (*forward.scene, splats, tile_counts, *rows, WANTED, absolute))
+    assert rows.rows.shape[1] == fakes.MOMENT_VALUES + (fakes.ABSOLUTE_VALUES if absolute else 0)
+
+
+def test_wrong_rows_are_named():
+    forward = Forward.of(*scene_of("giants", "cpu", torch.float32), False)
+    rows, counts = forward.rows(False)
+    seen, unseen = int(counts.argmax()), int((forward.projected[3] == 0).nonzero()[0])
+
+    def refused(error: type, match: str, rows: Tensor = rows, counts: Tensor = counts, absolute: bool = False) -> None:
+        with pytest.raises(error, match=match):
+            forward.rows_vjp(Rows(rows, counts), absolute)
+
+    def moved(place: int, by: int) -> Tensor:
+        other = counts.clone()
+        other[place] += by
+        return other
+
+    refused(ValueError, r"rows must be \(-1, 12\)", absolute=True)
+    refused(ValueError, r"rows must be \(-1, 10\)", rows=rows[:, :9])
+    refused(TypeError, "rows must be torch.float32", rows=rows.double())
+    refused(ValueError, r"counts must be \(300,\)", counts=counts[1:])
+    refused(TypeError, "counts must be torch.int32", counts=counts.long())
+    refused(ValueError, f"counts add up to {len(rows) + 1}, but there are {len(rows)} rows", counts=moved(seen, 1))
+    refused(ValueError, f"there are {len(rows) - 1} rows", rows=rows[1:])
+    refused(ValueError, f"got 1 of splat {unseen}", counts=moved(unseen, 1))
+    refused(ValueError, f"got -1 of splat {unseen}", counts=moved(unseen, -1))

@@ -1,0 +1,186 @@
+"""Trainings that torchrun starts: one writer, one voice, one end. Every rank trains the whole model, or a part."""
+
+import csv
+import json
+import os
+import shutil
+import signal
+import subprocess
+import time
+from pathlib import Path
+
+import pytest
+import torch
+from launching import OPTIONS, ROOT, Launched, command, environment, launch, outputs
+
+import train
+from training.agreement import _ROOMS
+
+SECONDS = ("seconds", "wall_seconds", "peak_memory_mib")
+
+
+def _files(folder: Path) -> list[str]:
+    names = (path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file())
+    return sorted(name for name in names if "tfevents" not in name)
+
+
+def _train(scene: Path, out: Path, *options: str) -> None:
+    train.main(["-s", str(scene), "-m", str(out), *OPTIONS, *options, "--disable_viewer", "--quiet"])
+
+
+def _fault(scene: Path, folder: Path, fault: str, **more) -> Launched:
+    return launch(
+        folder / "logs",
+        fault,
+        "-s",
+        str(scene),
+        "-m",
+        str(folder / "out"),
+        *OPTIONS,
+        "--no_curve",
+        "--plain_step",
+        **more,
+    )
+
+
+def test_several_ranks_write_the_files_of_one_and_speak_with_one_voice(colmap_scene, tmp_path):
+    _train(colmap_scene, tmp_path / "one", "--eval")
+    options = ("-s", str(colmap_scene), "-m", str(tmp_path / "out"), *OPTIONS, "--eval")
+    done = launch(tmp_path / "logs", "warning 1 0", *options)
+    assert done.status == 0
+    one, out = tmp_path / "one", tmp_path / "out"
+    assert _files(one) == _files(out)
+    for name in ("cameras.json", "input.ply", *(name for name in _files(one) if name.endswith("point_cloud.ply"))):
+        assert (one / name).read_bytes() == (out / name).read_bytes(), name
+    for was, now in zip(*(_tensors(folder / "chkpnt5.pth") for folder in (one, out)), strict=True):
+        assert torch.equal(was, now)
+    rows = [list(csv.DictReader((folder / "error_vs_time.csv").open())) for folder in (one, out)]
+    for was, now in zip(*rows, strict=True):
+        assert {k: v for k, v in was.items() if k not in SECONDS} == {k: v for k, v in now.items() if k not in SECONDS}
+    assert done.stdout[0].count("printed by every rank") == 1 and "Training complete." in done.stdout[0]
+    assert done.stdout[1] == done.stderr[1] == ""
+    assert "Training progress" in done.stderr[0]
+    assert done.stderr[0].count("warning: of every rank") == 1
+    assert "rank 1: warning: of one rank alone" in done.stderr[0].splitlines()
+
+
+def _tensors(path: Path) -> list[torch.Tensor]:
+    capture, _ = torch.load(path, weights_only=False)
+    return [part for part in capture if torch.is_tensor(part)]
+
+
+STANDS = "the last checkpoint stands: resume with --start_checkpoint {out}/chkpnt5.pth"
+
+
+@pytest.mark.parametrize(
+    ("fault", "said"),
+    [
+        ("kill 0 7", "error: rank 0 ended without a word (killed, or crashed); " + STANDS),
+        ("memory 1 7", "error: rank 1: training ran out of memory in iteration 7 ("),
+        ("user 1 7", "error: rank 1: this cannot be; do something else"),
+        ("bug 1 7", "error: rank 1: ValueError: no such thing"),
+        ("hang 1 7", "error: rank 1 hung: the others waited"),
+    ],
+    ids=lambda value: value.split()[0] if isinstance(value, str) and value[:5] != "error" else "",
+)
+def test_a_fault_of_one_rank_ends_all_with_one_sentence(colmap_scene, tmp_path, fault, said):
+    began = time.monotonic()
+    done = _fault(colmap_scene, tmp_path, fault, size=3 if fault == "kill 0 7" else 2)
+    assert time.monotonic() - began < 90  # 30 seconds on a machine that does nothing else
+    assert done.status != 0
+    (line,) = done.errors
+    assert line.startswith(said.format(out=tmp_path / "out")), line
+    assert f"--start_checkpoint {tmp_path}/out/chkpnt5.pth" in line or fault[:4] in ("user", "bug ")
+    text = "".join(done.stderr)
+    assert "closed by peer" not in text and ("Traceback" in text) == fault.startswith("bug")
+    assert [path.name for path in (tmp_path / "out").glob("chkpnt*.pth")] == ["chkpnt5.pth"]
+    assert not list((tmp_path / "out").rglob("*.tmp*"))
+
+
+def test_no_rank_goes_on_after_one_has_stopped(colmap_scene, tmp_path):
+    """Rank 0 has no fault of its own: what it saves is the model after the iteration in which the other stopped."""
+    done = _fault(colmap_scene, tmp_path, "overflow 1 7")
+    (line,) = done.errors
+    assert line.startswith("error: xyz of 1 of 300 (153) had no finite step in iteration 7 (view "), line
+    assert sorted(path.name for path in (tmp_path / "out").glob("chkpnt*")) == ["chkpnt5.pth", "chkpnt7.pth"]
+    _train(colmap_scene, tmp_path / "one", "--no_curve", "--checkpoint_iterations", "7")
+    # The parameters; statistics of density control go on until the fault is noticed, as with one process.
+    was, now = (_tensors(folder / "chkpnt7.pth")[:6] for folder in (tmp_path / "one", tmp_path / "out"))
+    differ = {row for pair in zip(was, now, strict=True) for row in (pair[0] != pair[1]).nonzero()[:, 0].tolist()}
+    assert differ <= {153}  # row 3 of the second of two parts, if the ranks have parts
+
+
+def test_a_signal_to_one_rank_stops_all_after_one_iteration(colmap_scene, tmp_path):
+    done = _fault(colmap_scene, tmp_path, "interrupt 1 7")
+    assert done.status != 0 and done.errors == []
+    text = "".join(done.stderr)
+    assert text.count("interrupted") == 1 and text.count("resume with --start_checkpoint") == 1
+    assert [path.name for path in sorted((tmp_path / "out").glob("chkpnt*.pth"))] == ["chkpnt5.pth", "chkpnt8.pth"]
+    records = json.loads((tmp_path / "out" / "train_log.json").read_text())
+    assert [record["iteration"] for record in records] == [5, 6, 8]
+
+
+def test_a_signal_to_torchrun_saves_one_checkpoint(colmap_scene, tmp_path):
+    options = ("-s", str(colmap_scene), "-m", str(tmp_path / "out"), *OPTIONS, "--no_curve", "--iterations", "100000")
+    line = command(tmp_path / "logs", 2, "none 0 0", *options)
+    with subprocess.Popen(line, cwd=tmp_path, env=environment(), stdout=-3, stderr=-3) as process:
+        try:
+            deadline = time.monotonic() + 60
+            while not (tmp_path / "out" / "chkpnt5.pth").exists() and time.monotonic() < deadline:
+                time.sleep(0.05)
+            process.send_signal(signal.SIGINT)
+            status = process.wait(60)
+        finally:
+            process.kill()
+    done = outputs(tmp_path / "logs", 2, status)
+    assert done.status != 0 and done.errors == []
+    text = "".join(done.stderr)
+    assert text.count("interrupted") == 1 and text.count("resume with --start_checkpoint") == 1
+    assert len(list((tmp_path / "out").glob("chkpnt*.pth"))) == 2
+
+
+def test_a_restarted_training_goes_on_from_its_newest_checkpoint(colmap_scene, tmp_path):
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "chkpnt9.pth").write_text("of an earlier training")
+    old = time.time() - 86400
+    os.utime(tmp_path / "out" / "chkpnt9.pth", (old, old))
+    done = _fault(colmap_scene, tmp_path, "kill 1 7", restarts=1)
+    assert done.status == 0
+    assert f"Restarted by torchrun: resuming {tmp_path / 'out' / 'chkpnt5.pth'}" in done.stdout[0]
+    _train(colmap_scene, tmp_path / "one", "--no_curve")
+    for iteration in (6, 12):
+        name = f"point_cloud/iteration_{iteration}/point_cloud.ply"
+        assert (tmp_path / "one" / name).read_bytes() == (tmp_path / "out" / name).read_bytes()
+
+
+def test_ranks_with_other_options_are_refused(colmap_scene, tmp_path):
+    done = _fault(colmap_scene, tmp_path, "options 1 0")
+    assert done.status != 0
+    assert done.errors == [
+        "error: rank 1 differs from rank 0 in --random_background (True, not False); start all ranks with the same "
+        "command"
+    ]
+    assert not (tmp_path / "out").exists()
+
+
+def test_ranks_with_other_code_are_refused(colmap_scene, tmp_path):
+    other = tmp_path / "other"
+    for room in (*_ROOMS, "viewing", "moving_cameras"):
+        shutil.copytree(ROOT / room, other / room, dirs_exist_ok=True)
+    shutil.copy(ROOT / "train.py", other)
+    with (other / "training" / "density.py").open("a") as file:
+        file.write("# changed\n")
+    done = _fault(colmap_scene, tmp_path, "code 1 0", OTHER_CODE=str(other))
+    assert done.errors == ["error: rank 1 differs from rank 0 in training/density.py; give all ranks the same files"]
+    assert not (tmp_path / "out").exists()
+
+
+def test_ranks_keep_the_pace_of_the_first(colmap_scene, tmp_path):
+    done = launch(
+        tmp_path / "logs", "none 0 0", "-s", str(colmap_scene), "-m", str(tmp_path / "out"), "--iterations", "3000",
+        "--eval", "--time_budget", "2", "--target_psnr", "90", "-r", "2", "--test_iterations", "-1",
+    )  # fmt: skip
+    assert done.status == 0 and done.errors == []
+    schedule = json.loads((tmp_path / "out" / "schedule.json").read_text())
+    records = json.loads((tmp_path / "out" / "train_log.json").read_text())
+    assert schedule["ended"] == records[-1]["iteration"] > 20

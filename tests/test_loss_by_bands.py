@@ -1,0 +1,159 @@
+"""The photometric loss by bands of an image: the bits of the whole image, from what a rank has of it."""
+
+from collections.abc import Callable
+from itertools import pairwise
+from types import SimpleNamespace
+
+import pytest
+import torch
+from fused_ssim import BAND_ROWS, REACH, fused_photometric_loss, photometric_loss_by_bands
+from processes import in_ranks
+from torch import Tensor
+
+from gaussian_renderer.over_ranks.band import surroundings, whole_image
+from gaussian_renderer.over_ranks.bands import Bands, find_bands, row_steps, tile_rows
+from utils.ranks.ranks import Ranks, ranks
+
+# Height, width, and the rows of tiles where bands begin and the last one ends.
+CASES = [
+    (70, 33, [0, 1, 1, 3, 5]),
+    (16, 9, [0, 1]),
+    (97, 600, [0, 0, 4, 7]),  # a row has two parts whose sums are taken apart
+    (40, 20, [0, 1, 2, 3]),  # the last band has 8 rows of pixels
+    (33, 1, [0, 2, 3, 3]),  # the last band has one row
+    (5, 130, [0, 0, 1]),
+]
+
+
+def image_pair(height: int, width: int, dtype: torch.dtype, as_bytes: bool) -> tuple[Tensor, Tensor]:
+    """A render with values outside [0, 1], and a photo."""
+    generator = torch.Generator().manual_seed(height)
+    image = 1.6 * torch.rand(3, height, width, generator=generator, dtype=dtype) - 0.3
+    photo = torch.randint(256, (3, height, width), generator=generator, dtype=torch.uint8)
+    return image, photo if as_bytes else photo.to(dtype) / 255
+
+
+def _whole(image: Tensor, photo: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    image = image.clone().requires_grad_()
+    loss, l1 = fused_photometric_loss(image, photo, 0.2)
+    (0.7 * loss).backward()
+    return loss.detach(), l1, image.grad
+
+
+def check_bands(height: int, borders: list[int], images: tuple[Tensor, Tensor]) -> None:
+    """Bands of an image, of which each knows 10 rows of the others, against the whole."""
+    image, photo = images
+    wanted, bands, sums = _whole(image, photo), Bands(borders, [], height), []
+
+    def losses(rank: int, add: Callable[[Tensor], Tensor]) -> tuple[Tensor, ...]:
+        around = slice(*bands.pixels(rank, REACH))
+        known, seen = torch.full_like(image, torch.nan), torch.zeros_like(photo)
+        known[:, around], seen[:, around] = image[:, around], photo[:, around]
+        known.requires_grad_()
+        return *photometric_loss_by_bands(known, seen, 0.2, bands.pixels(rank), add), known
+
+    def note(own: Tensor) -> Tensor:
+        sums.append(own)
+        return own
+
+    for rank in range(len(borders) - 1):
+        losses(rank, note)
+    total = torch.stack(sums).sum(0)
+    assert ((torch.stack(sums) != 0).sum(0) <= 1).all()
+    for rank in range(len(borders) - 1):
+        loss, l1, known = losses(rank, lambda own: total)
+        (0.7 * loss).backward()
+        assert torch.equal(loss, wanted[0]) and torch.equal(l1, wanted[1])
+        own = slice(*bands.pixels(rank))
+        assert torch.equal(known.grad[:, own], wanted[2][:, own])
+
+
+@pytest.mark.parametrize("as_bytes", [True, False], ids=["bytes", "floats"])
+@pytest.mark.parametrize("precision", [torch.float32, torch.float64])
+@pytest.mark.parametrize(("height", "width", "borders"), CASES)
+def test_bands_have_the_loss_and_the_gradient_of_the_whole_image(height, width, borders, precision, as_bytes):
+    check_bands(height, borders, image_pair(height, width, precision, as_bytes))
+
+
+@pytest.mark.parametrize("rows", [(0, 20), (8, 40), (16, 0), (0, 48), (-16, 16)])
+def test_a_band_begins_and_ends_between_tiles(rows):
+    with pytest.raises(ValueError, match=f"multiples of {BAND_ROWS} rows or with the image, got {rows[0]} and"):
+        photometric_loss_by_bands(*image_pair(40, 20, torch.float32, True), 0.2, rows, torch.clone)
+
+
+def test_a_band_takes_the_images_that_the_loss_takes():
+    image, photo = image_pair(40, 20, torch.float32, True)
+    with pytest.raises(ValueError, match="must have the same shape"):
+        photometric_loss_by_bands(image, photo[:, 1:], 0.2, (0, 16), torch.clone)
+
+
+OF_FOUR = [
+    (70, [0, 1, 1, 3, 5]),
+    (33, [0, 0, 0, 2, 3]),
+    (40, [0, 1, 2, 3, 3]),  # the last band but one has 8 rows, fewer than the loss reads
+    (33, [0, 1, 2, 3, 3]),  # or one
+    (12, [0, 0, 0, 0, 1]),
+]
+
+
+def _shared() -> list[tuple[Tensor, ...]]:
+    here, found = ranks(), []
+    for height, borders in OF_FOUR:
+        image, photo = image_pair(height, 20, torch.float32, True)
+        bands = Bands(borders, [], height)
+        view = SimpleNamespace(ranks=here, bands=bands, color=torch.full_like(image, torch.nan))
+        view.inverse_depth = torch.full_like(image[:1], torch.nan)
+        first, end = bands.pixels(here.rank)
+        view.color[:, first:end], view.inverse_depth[:, first:end] = image[:, first:end], photo[:1, first:end]
+        color = surroundings(view).color.clone().requires_grad_()
+        loss, l1 = photometric_loss_by_bands(color, photo, 0.2, (first, end), here.added)
+        (0.7 * loss).backward()
+        whole_image(view)
+        found.append((loss.detach(), l1, color.grad[:, first:end], view.color, view.inverse_depth))
+    return found
+
+
+def test_ranks_send_each_other_what_a_loss_needs_and_wholeimage_pair():
+    found = in_ranks(4, _shared)
+    for case, (height, _) in enumerate(OF_FOUR):
+        image, photo = image_pair(height, 20, torch.float32, True)
+        loss, l1, gradient = _whole(image, photo)
+        of_case = [of_rank[case] for of_rank in found]
+        assert torch.equal(torch.cat([each[2] for each in of_case], 1), gradient)
+        for each in of_case:
+            assert torch.equal(each[0], loss) and torch.equal(each[1], l1)
+            assert torch.equal(each[3], image) and torch.equal(each[4], photo[:1].float())
+
+
+class _Others(Ranks):
+    """Ranks whose splats are all known here."""
+
+    size = 3
+
+    def __init__(self, rects: list[Tensor]) -> None:
+        self._rects = rects
+
+    def table(self, values: Tensor) -> Tensor:
+        return torch.stack([row_steps(rects, 97) for rects in self._rects])
+
+
+@pytest.mark.parametrize("rows", [1, 3, 7])
+def test_every_rank_knows_how_many_splats_reach_a_band(rows):
+    generator = torch.Generator().manual_seed(rows)
+    rects = []
+    for count in (50, 0, 9):
+        top = torch.randint(7, (count,), generator=generator)
+        bottom = (top + torch.randint(1, rows + 1, (count,), generator=generator)).clamp(max=7)
+        rects.append(torch.stack((torch.zeros_like(top), top, 1 + top % 3, bottom), 1).int())
+    bands = find_bands(_Others(rects), rects[0], 97, 40)
+    assert bands.borders[0] == 0 and bands.borders[-1] == tile_rows(97) == 7 and sorted(bands.borders) == bands.borders
+    for of_rank, counts in zip(rects, bands.splats, strict=True):
+        for (first, end), count in zip(pairwise(bands.borders), counts, strict=True):
+            assert count == sum(
+                1 for _, top, _, bottom in of_rank.tolist() if top < end and bottom > first and first < end
+            )
+    rows_of_tiles = torch.zeros(7)
+    for left, top, right, bottom in torch.cat(rects).tolist():
+        rows_of_tiles[top:bottom] += right - left
+    loads = [rows_of_tiles[first:end].sum() for first, end in pairwise(bands.borders)]
+    assert max(loads) < 0.75 * sum(loads)

@@ -1,0 +1,141 @@
+"""A view by several processes: the image and all gradients of one process, to the bit."""
+
+import pytest
+import torch
+from diff_gaussian_rasterization import rasterize
+from diff_gaussian_rasterization.gaussians import Gaussians
+from processes import in_ranks
+from rasterizer_tools import leaves
+from torch import Tensor
+
+from benchmarks.workloads.splat_scenes import settings
+from gaussian_renderer.over_ranks.rasterize import rasterize_over
+from gaussian_renderer.over_ranks.views import rasterize_views
+from utils.ranks.ranks import ranks
+
+SIZES = [2, 3]
+# Width, height, and what differs from an ordinary call.
+CASES = [
+    (80, 150, {}),
+    (33, 20, {"want_inverse_depth": True}),  # fewer rows of tiles than ranks
+    (16, 16, {"want_inverse_depth": True}),  # one tile
+    (40, 70, {"want_absolute_gradient": True}),
+    (120, 33, {"kind": "near"}),
+    (50, 90, {"count": 2}),  # fewer Gaussians than ranks
+    (20, 40, {"count": 0}),
+    (64, 64, {"behind": True}),  # nothing is seen
+]
+
+
+def _scene(width: int, height: int, options: dict) -> dict[str, Tensor]:
+    generator = torch.Generator().manual_seed(width)
+    count = options.get("count", 300)
+    depth = 1.5 + 3 * torch.rand(count, 1, generator=generator)
+    across = torch.rand(count, 2, generator=generator) - 0.5
+    size = 0.6 if options.get("kind") == "near" else 0.12
+    parameters = {
+        "means": torch.cat([1.2 * across * depth, -depth if options.get("behind") else depth], 1),
+        "opacities": torch.randn(count, 1, generator=generator),
+        "scales": torch.randn(count, 3, generator=generator) * 0.8 + torch.tensor(size).log(),
+        "rotations": torch.randn(count, 4, generator=generator),
+        "sh_dc": torch.randn(count, 1, 3, generator=generator),
+        "sh_rest": 0.2 * torch.randn(count, 15, 3, generator=generator),
+    }
+    return {name: values.float() for name, values in parameters.items()}
+
+
+def _render(function, width: int, height: int, options: dict, rows: slice) -> dict[str, Tensor]:
+    """Image, radii and gradients of the Gaussians `rows`."""
+    wanted = {name: value for name, value in options.items() if name.startswith("want")}
+    inputs = leaves({name: values[rows] for name, values in _scene(width, height, options).items()})
+    screen = torch.zeros_like(inputs["means"]).requires_grad_()
+    rest = dict(inputs)
+    camera = settings(width, height, torch.float32)
+    out = function(rest.pop("means"), screen, rest.pop("opacities"), settings=camera, raw=True, **rest, **wanted)
+    generator = torch.Generator().manual_seed(5)
+    loss = (torch.randn(out.color.shape, generator=generator) * out.color).sum()
+    if out.inverse_depth is not None:
+        loss = loss + (torch.randn(out.inverse_depth.shape, generator=generator) * out.inverse_depth).sum()
+    loss.backward()
+    gradients = {f"d {name}": values.grad for name, values in inputs.items()} | {"d means2d": screen.grad}
+    planes = {"color": out.color.detach()}
+    if out.inverse_depth is not None:
+        planes["inverse_depth"] = out.inverse_depth.detach()
+    return {**planes, "radii": out.radii, **gradients}
+
+
+def _render_shards() -> list[dict[str, Tensor]]:
+    here, results = ranks(), []
+    for width, height, options in CASES:
+        count = options.get("count", 300)
+        # Shards of different lengths, the first of which is short.
+        cuts = [0, *[(count * (r * r)) // (here.size * here.size) for r in range(1, here.size)], count]
+        rows = slice(cuts[here.rank], cuts[here.rank + 1])
+        results.append(_render(lambda *x, **y: rasterize_over(here, *x, **y), width, height, options, rows))
+    return results
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_ranks_render_the_image_and_the_gradients_of_one_process(size):
+    found = in_ranks(size, _render_shards)
+    for number, (width, height, options) in enumerate(CASES):
+        alone = _render(rasterize, width, height, options, slice(None))
+        for name, values in alone.items():
+            parts = [of_rank[number][name] for of_rank in found]
+            for whole in parts if name in ("color", "inverse_depth") else [torch.cat(parts)]:
+                assert torch.equal(whole, values), (number, name)
+        seen = (alone["radii"] > 0).any()
+        assert seen == (options.get("count", 300) > 0 and not options.get("behind"))
+
+
+VIEWS = [(80, 50, 0.0), (40, 70, 0.4), (64, 33, -0.3)]  # width, height, and where the camera stands
+
+
+def _cameras() -> list:
+    cameras = []
+    for width, height, x in VIEWS[: ranks().size]:
+        view = torch.eye(4)
+        view[0, 3] = x
+        cameras.append(settings(width, height, torch.float32, view=view))
+    return cameras
+
+
+def _loss(color: Tensor, depth: Tensor, view: int) -> Tensor:
+    generator = torch.Generator().manual_seed(view)
+    return sum((torch.randn(x.shape, generator=generator) * x).sum() for x in (color, depth))
+
+
+def _render_views() -> dict[str, Tensor]:
+    here = ranks()
+    rows = slice(20 * here.rank, 20 * here.rank + 20 if here.rank < here.size - 1 else None)
+    inputs = leaves({name: values[rows] for name, values in _scene(80, 50, {}).items()})
+    screen = torch.zeros(here.size, *inputs["means"].shape).requires_grad_()
+    wants = {"want_inverse_depth": True, "want_absolute_gradient": True}
+    out = rasterize_views(here, Gaussians(**inputs), screen, _cameras(), raw=True, **wants)
+    _loss(out.color, out.inverse_depth, here.rank).backward()
+    gradients = {name: values.grad for name, values in inputs.items()}
+    return {"color": out.color.detach(), "radii": out.radii, "screen": screen.grad} | gradients
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_a_batch_has_the_sum_of_the_gradients_of_its_views(size):
+    found = in_ranks(size, _render_views)
+    inputs = leaves(_scene(80, 50, {}))
+    total: dict[str, Tensor] = {}
+    for view in range(size):
+        screen = torch.zeros_like(inputs["means"]).requires_grad_()
+        rest = dict(inputs)
+        view_matrix = torch.eye(4)
+        view_matrix[0, 3] = VIEWS[view][2]
+        camera = settings(*VIEWS[view][:2], torch.float32, view=view_matrix)
+        wants = {"want_inverse_depth": True, "want_absolute_gradient": True, "raw": True}
+        out = rasterize(rest.pop("means"), screen, rest.pop("opacities"), settings=camera, **rest, **wants)
+        _loss(out.color, out.inverse_depth, view).backward()
+        assert torch.equal(found[view]["color"], out.color)
+        assert torch.equal(torch.cat([each["radii"][view] for each in found]), out.radii)
+        assert torch.equal(torch.cat([each["screen"][view] for each in found]), screen.grad)
+        for name, values in inputs.items():
+            total[name] = total[name] + values.grad if view else values.grad
+            values.grad = None
+    for name, values in total.items():
+        assert torch.equal(torch.cat([each[name] for each in found]), values), name

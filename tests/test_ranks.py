@@ -1,0 +1,61 @@
+"""Messages between the processes of a training."""
+
+import pytest
+import torch
+from processes import in_ranks
+
+from utils.ranks.ranks import ALONE, ranks
+
+
+def _talk() -> dict[str, object]:
+    here = ranks()
+    rows = torch.arange(6.0).view(2, 3)[: here.rank] + 10 * here.rank
+    parts = [torch.full((here.rank + d, 2), 10 * here.rank + d, dtype=torch.int16) for d in range(here.size)]
+    bits = [torch.ones(d, dtype=torch.bool) for d in range(here.size)]
+    return {
+        "numbers": here.numbers(here.rank, 7).tolist(),
+        "shared": here.shared({"rank": here.rank}),
+        "parts": [part.tolist() for part in here.exchange(parts)],
+        "bits": [part.tolist() for part in here.exchange(bits)],
+        "rows": here.gather(rows).tolist(),
+        "nothing": here.gather(torch.empty(3, 0)).shape,
+        "sent": _listed(here.send(torch.arange(3), [0] * (here.size - 1) + [3])),
+        "known": _listed(here.send(torch.full((here.size,), here.rank), [1] * here.size, [1] * here.size)),
+        "known rows": here.gather(rows, [min(r, 2) for r in range(here.size)]).tolist(),
+        "table": here.table(torch.tensor([[here.rank, 0.5]])).tolist(),
+        "added": here.added(torch.tensor([0.1, 0.0, 7.0 * here.rank], dtype=torch.float64) * (here.rank == 1)).tolist(),
+        "before": here.before(here.rank + 1),
+        "anyone": (here.anyone(here.rank == 1), here.anyone(False)),
+    }
+
+
+def _listed(sent: tuple[torch.Tensor, list[int]]) -> tuple[list, list[int]]:
+    return sent[0].tolist(), sent[1]
+
+
+@pytest.mark.parametrize("size", [2, 3])
+def test_ranks_tell_each_other(size):
+    for rank, said in enumerate(in_ranks(size, _talk)):
+        assert said["numbers"] == [[other, 7] for other in range(size)]
+        assert said["shared"] == {"rank": 0}
+        assert said["parts"] == [[[10 * other + rank] * 2] * (other + rank) for other in range(size)]
+        assert said["bits"] == [[True] * rank] * size
+        rows = [[10.0 * r + 3 * i + j for j in range(3)] for r in range(size) for i in range(min(r, 2))]
+        assert said["rows"] == rows
+        assert said["nothing"] == (3 * size, 0)
+        assert said["sent"] == ([0, 1, 2] * size if rank == size - 1 else [], [3 * (rank == size - 1)] * size)
+        assert said["known"] == (list(range(size)), [1] * size)
+        assert said["known rows"] == rows
+        assert said["table"] == [[[other, 0.5]] for other in range(size)]
+        assert said["added"] == [0.1, 0.0, 7.0]
+        assert said["before"] == (sum(range(rank + 1)), size * (size + 1) // 2)
+        assert said["anyone"] == (True, False)
+
+
+def test_a_process_by_itself_is_all_ranks():
+    rows = torch.ones(3, 2)
+    assert ranks() is ALONE and ALONE.first and not ALONE.several
+    assert ALONE.gather(rows) is rows and ALONE.exchange([rows]) == [rows]
+    assert ALONE.numbers(4, 5).tolist() == [[4, 5]] and ALONE.before(3) == (0, 3)
+    assert ALONE.send(rows, [3]) == (rows, [3]) and ALONE.added(rows) is rows and ALONE.table(rows).shape == (1, 3, 2)
+    assert ALONE.shared(rows) is rows and ALONE.anyone(True) and not ALONE.anyone(False)

@@ -1,0 +1,119 @@
+"""Ranks whose collective calls are watched, so that one that fails or never returns ends in a sentence."""
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from datetime import timedelta
+from functools import wraps
+from typing import Any
+
+import torch.distributed as dist
+from torch import Tensor
+
+from utils.host.memory import is_out_of_memory
+from utils.ranks import quiet
+from utils.ranks.ranks import Value
+from utils.ranks.several import SeveralRanks
+
+# Of a collective call. It has to be longer than any work of one rank that the others wait for, as rank 0 writing tens
+# of gigabytes to a slow disk. A rank that is gone or hangs is noticed by others means and within seconds (watch.py).
+TIMEOUT = timedelta(minutes=30)
+# Of gloo's errors for a rank that cannot be reached, and of torch's for a store.
+_WORDS = ("closed by peer", "reset by peer", "broken pipe", "timed out", "timeout", "connect", "read error", "socket")
+
+
+class RankLost(Exception):
+    """A collective call failed because of another rank; that one, or whoever misses it, says what happened."""
+
+
+def _watched(call: Callable[..., Any]) -> Callable[..., Any]:
+    """Note that a rank waits in a collective call, and turn the loss of another rank into RankLost."""
+
+    @wraps(call)
+    def wrapped(self: "WatchedRanks", *args: Any, **named: Any) -> Any:
+        if self.waiting_since is not None:  # one call in another
+            return call(self, *args, **named)
+        self.calls += 1
+        self.waiting_since = time.monotonic()
+        try:
+            return call(self, *args, **named)
+        except RuntimeError as error:
+            lost = isinstance(error, dist.DistError) or any(words in str(error).lower() for words in _WORDS)
+            if is_out_of_memory(error) or not lost:
+                raise
+            raise RankLost(str(error)) from error
+        finally:
+            if self.prompt:
+                self.longest = max(self.longest, time.monotonic() - self.waiting_since)
+            self.waiting_since = None
+
+    return wrapped
+
+
+class WatchedRanks(SeveralRanks):
+    """The ranks of a training that torchrun has started.
+
+    calls: collective calls so far, the same number on all ranks that are in the same call. waiting_since: the
+    monotonic time when the running one began, or None. longest: seconds that one took while `prompt`. stands: says
+    what is left of the training if a rank is lost, and how to go on.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.calls = 0
+        self.waiting_since: float | None = None
+        self.longest = 0.0
+        self._at_work = 0
+        self.stands: Callable[[], str] = lambda: "start it again"
+
+    @contextmanager
+    def busy(self) -> Iterator[None]:
+        self._at_work += 1
+        try:
+            yield
+        finally:
+            self._at_work -= 1
+
+    @property
+    def expected(self) -> bool:
+        """Whether the others may expect this rank at the next collective call within seconds."""
+        return self.prompt and not self._at_work
+
+    def tell_notes(self) -> None:
+        said = self.everyone(quiet.take())
+        if self.first:
+            quiet.tell(dict(enumerate(said)))
+
+    def leave(self) -> None:
+        """Close the connections, so that ranks that wait for this one wait no longer."""
+        self._numbers = None
+        if dist.is_initialized():
+            dist.destroy_process_group()
+
+    @_watched
+    def numbers(self, *values: int) -> Tensor:
+        return super().numbers(*values)
+
+    @_watched
+    def shared(self, value: Value) -> Value:
+        return super().shared(value)
+
+    @_watched
+    def everyone(self, value: Value) -> list[Value]:
+        return super().everyone(value)
+
+    @_watched
+    def largest_(self, numbers: Tensor) -> None:
+        super().largest_(numbers)
+
+    @_watched
+    def table(self, values: Tensor) -> Tensor:
+        return super().table(values)
+
+    @_watched
+    def added(self, values: Tensor) -> Tensor:
+        return super().added(values)
+
+    @_watched
+    def send(self, rows: Tensor, sizes: Sequence[int], counts: Sequence[int] | None = None) -> tuple[Tensor, list[int]]:
+        return super().send(rows, sizes, counts)
