@@ -36,7 +36,7 @@ $(VENV)/.requirements: requirements.txt requirements-dev.txt
 	@touch $@
 
 .SECONDEXPANSION:
-$(VENV)/.built-%: $(VENV)/.requirements $$(call sources,$$*)
+$(VENV)/.built-%: $(VENV)/.requirements version.txt $$(call sources,$$*)
 	$(BIN)/pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation ./submodules/$*
 	@touch $@
 
