@@ -119,6 +119,6 @@ def test_release_notes_point_to_no_file(tmp_path):
     script.write_bytes(NOTES.read_bytes())
     (tmp_path / "version.txt").write_text("1.2.3\n")
     (tmp_path / "CHANGELOG.md").write_text(
-        "# All\n\n## [1.2.3] - 2026-01-02\n\n- See [a page](docs/a.md#b) and [the web](https://a.b).\n\n## [1.2.2] - x\n"
+        "## [1.2.3] - 2026-01-02\n\n- See [a page](docs/a.md#b) and [the web](https://a.b).\n\n## [1.2.2] - x\n"
     )
     assert _notes("1.2.3", script=script).stdout == "- See a page and [the web](https://a.b).\n"
