@@ -51,7 +51,7 @@ def test_the_context_is_the_commands_and_their_rooms(context):
 
 
 def test_the_context_is_ready(context):
-    """Its doctor, with the extensions installed here, lacks no file. Whether these are up to date is not the question."""
+    """Its doctor lacks no file. Whether the extensions installed here are up to date is not the question."""
     done = subprocess.run([sys.executable, "-B", "doctor.py"], cwd=context, capture_output=True, text=True)
     problems = [line for line in done.stdout.splitlines() if "PROBLEM" in line and "from other sources" not in line]
     assert not problems and done.stderr == ""
