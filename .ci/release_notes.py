@@ -6,6 +6,7 @@ VERSION, by default that of version.txt, may be a tag such as v0.1.0. Exit statu
 that version with a date, or if the version is not that of version.txt.
 """
 
+import argparse
 import re
 import sys
 from pathlib import Path
@@ -29,10 +30,12 @@ def release_notes(changelog: str, version: str) -> str:
     return LINK.sub(r"\1", section[1].strip()) + "\n"
 
 
-def main(words: list[str]) -> int:
+def main() -> int:
     """Print the notes; return the exit status."""
     current = (ROOT / "version.txt").read_text(encoding="utf-8").strip()
-    version = words[0].removeprefix("v") if words else current
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("version", nargs="?", default=current, help="as 0.1.0 or v0.1.0 (default: that of version.txt)")
+    version = parser.parse_args().version.removeprefix("v")
     try:
         if version != current:
             raise ValueError(f"version.txt says {current}, not {version}; release the commit that is version {version}")
@@ -44,4 +47,4 @@ def main(words: list[str]) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    sys.exit(main())

@@ -5,6 +5,7 @@ python .ci/test_without_make.py [OPTION OF PYTEST...]
 Lint and the C++ tests are left out; both need make.
 """
 
+import argparse
 import subprocess
 import sys
 import venv
@@ -24,8 +25,10 @@ def commands(python: Path, options: list[str]) -> list[list[str]]:
     return lines
 
 
-def main(options: list[str]) -> int:
+def main() -> int:
     """Run them; return the exit status of the first that fails, or 0."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0], epilog="other options go to pytest")
+    options = parser.parse_known_args()[1]
     python = VENV / ("Scripts/python.exe" if sys.platform == "win32" else "bin/python")
     if not python.exists():
         venv.create(VENV, with_pip=True)
@@ -37,4 +40,4 @@ def main(options: list[str]) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    sys.exit(main())
