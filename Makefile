@@ -3,6 +3,8 @@
 # make test-browser   the tests that need Chromium, which is installed first where Debian's package manager may be used
 # make test-foreign   the tests by programs of npm that read our exports; they skip without npm
 # make format rewrites what the format check would complain about
+# make wheels the extensions as wheels for the torch and platform of .venv: build/wheels
+# make gate   three trainings against the stored baseline: quality and, beside an older build, time; takes minutes
 # make docs   the site, build/site/index.html; a dead link or a page outside of the navigation fails
 # All set up .venv first: pinned requirements and the three extensions, again only when their sources have changed.
 # The site needs neither and has an environment of its own, .venv-docs.
@@ -24,7 +26,7 @@ CXX_SOURCES := $(shell find submodules benchmarks -name build -prune -o \( -name
 sources = $(shell find submodules/common submodules/$(1) \( -name build -o -name tests -o -name emulation \) -prune -o \
             \( -name '*.cpp' -o -name '*.cu*' -o -name '*.h' -o -name '*.py' -o -name '*.toml' \) -print)
 
-.PHONY: install demo test test-browser test-foreign lint format cpp-test docs clean
+.PHONY: install demo test test-browser test-foreign lint format cpp-test docs wheels gate clean
 .NOTPARALLEL:
 
 install: $(EXTENSIONS:%=$(VENV)/.built-%)
@@ -36,7 +38,7 @@ $(VENV)/.requirements: requirements.txt requirements-dev.txt
 	@touch $@
 
 .SECONDEXPANSION:
-$(VENV)/.built-%: $(VENV)/.requirements $$(call sources,$$*)
+$(VENV)/.built-%: $(VENV)/.requirements version.txt $$(call sources,$$*)
 	$(BIN)/pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation ./submodules/$*
 	@touch $@
 
@@ -64,6 +66,7 @@ lint: $(VENV)/.requirements
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/clang-format --dry-run -Werror $(CXX_SOURCES)
+	PATH="$(CURDIR)/$(BIN):$$PATH" .ci/lint
 
 format: $(VENV)/.requirements
 	$(BIN)/ruff check --fix .
@@ -89,6 +92,14 @@ build/%/csrc/tests/test_cuda_emulated: submodules/%/csrc/tests/test_cuda_emulate
 	$(CXX) $(CXX_TEST_FLAGS) -Wno-unknown-pragmas -I$(@D)/emulated -Isubmodules/$*/csrc -Isubmodules/$*/csrc/cuda -I$(EMULATION) \
 	    -Isubmodules/common/include $< $(@D)/emulated/*.cpp $(EMULATION)/emulation.cpp \
 	    $(wildcard submodules/$*/csrc/cpu/*.cpp) -o $@
+
+wheels: $(VENV)/.requirements
+	rm -rf build/wheels
+	$(BIN)/pip wheel --quiet --disable-pip-version-check --no-deps --no-build-isolation -w build/wheels \
+	    $(EXTENSIONS:%=./submodules/%)
+
+gate: install
+	$(BIN)/python -m benchmarks.gate
 
 docs: $(DOCS_VENV)/.requirements
 	NO_MKDOCS_2_WARNING=true $(DOCS_VENV)/bin/mkdocs build --strict

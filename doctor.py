@@ -73,7 +73,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     if problems:
         print(f"{problems} problem{'s' if problems > 1 else ''}")
         sys.exit(1)
-    print("no problems found")
+    print("no problems found: ready")
 
 
 if __name__ == "__main__":

@@ -31,7 +31,7 @@ def extension_url(name: str) -> str:
 
 setup(
     name="gaussian-splatting",
-    version="0.1.0",
+    version=(ROOT / "version.txt").read_text(encoding="utf-8").strip(),
     license="Apache-2.0",
     python_requires=">=3.10",
     packages=[],

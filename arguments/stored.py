@@ -12,9 +12,8 @@ from arguments.groups import ModelParams
 from arguments.param_group import Value
 from utils.files import model_json
 from utils.files.model_json import OFFSET
+from utils.host.version import VERSION
 from utils.system_utils import UserError, atomic_write
-
-VERSION = "0.1.0"
 
 _STORED = {option.name: option.default for option in ModelParams.options if option.stored}
 _REMEMBERED = {option.name: option.default for option in ModelParams.options if option.remembered}

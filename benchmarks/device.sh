@@ -62,6 +62,7 @@ build() {
   key=$( (
     python3 -c 'import sys, torch; print(sys.version, torch.__version__)'
     echo "$TORCH_CUDA_ARCH_LIST"
+    cat version.txt
     find submodules -type f \( -name '*.py' -o -name '*.toml' -o -name '*.h' -o -name '*.cpp' -o -name '*.cu*' \) \
       -not -path '*/build/*' -print0 | LC_ALL=C sort -z | xargs -0 sha256sum
   ) | sha256sum | cut -c1-16)

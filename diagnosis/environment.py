@@ -107,9 +107,7 @@ def _check_extension(name: str, package: str, torch_version: str) -> list[Line]:
     installed = _version(name)
     if installed is None:
         return [Line(f"the extension {name} is not installed", again)]
-    wanted = re.search(r'^VERSION = "(.+)"', (ROOT / "submodules/common/build_extension.py").read_text(), re.MULTILINE)[
-        1
-    ]
+    wanted = (ROOT / "version.txt").read_text(encoding="utf-8").strip()
     if installed != wanted:
         return [Line(f"the extension {name} is version {installed}, but this code is {wanted}", again)]
     try:

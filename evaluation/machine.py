@@ -30,8 +30,8 @@ def machine() -> dict[str, Any]:
 def _describe() -> dict[str, Any]:
     import torch
 
-    from arguments.stored import VERSION
     from utils.host.machine import commit, cpu_name, gpu_name, instruction_set
+    from utils.host.version import VERSION
     from utils.system_utils import compute_device
 
     device = compute_device().type

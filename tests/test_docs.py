@@ -48,7 +48,9 @@ def test_every_page_is_in_the_navigation():
     listed = re.findall(r"^\s+- .+: (\S+\.md)$", (ROOT / "mkdocs.yml").read_text(encoding="utf-8"), re.MULTILINE)
     docs = ROOT / "docs"
     pages = [page.relative_to(docs).as_posix() for page in PAGES if page.is_relative_to(docs)]
-    assert sorted(listed) == sorted([*pages, "benchmarks.md", "changelog.md", "contributing.md"])  # docs/hooks.py
+    assert sorted(listed) == sorted(
+        [*pages, "benchmarks.md", "changelog.md", "contributing.md", "security.md"]
+    )  # docs/hooks.py
 
 
 def test_figures_of_the_readme_stand_in_the_results():

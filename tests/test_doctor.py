@@ -50,7 +50,7 @@ def exit_status(*argv: str) -> int:
 
 def test_exit_statuses(healthy, colmap_scene, tmp_path, capsys):
     assert exit_status() == 0
-    assert capsys.readouterr().out.endswith("no problems found\n")
+    assert capsys.readouterr().out.endswith("no problems found: ready\n")
     assert exit_status("-s", str(colmap_scene)) == 1
     out = capsys.readouterr().out
     assert "PROBLEM only 17 photos -> " in out and "PROBLEM only 300 points" in out and out.endswith("2 problems\n")
@@ -72,10 +72,9 @@ def test_missing_packages_end_it(monkeypatch, colmap_scene, capsys):
 
 def _sources(root: Path, version: str = "0.1.0") -> Path:
     """A repository with the installed Python part of simple-knn."""
-    common, package = root / "submodules" / "common", root / "submodules" / "simple-knn" / "simple_knn"
-    common.mkdir(parents=True)
+    package = root / "submodules" / "simple-knn" / "simple_knn"
     package.mkdir(parents=True)
-    (common / "build_extension.py").write_text(f'VERSION = "{version}"\n')
+    (root / "version.txt").write_text(f"{version}\n")
     import simple_knn
 
     for path in Path(simple_knn.__file__).parent.glob("*.py"):
@@ -96,7 +95,7 @@ def test_extensions_that_do_not_fit(monkeypatch, tmp_path):
     assert "was built for torch==2.13.*, torch is 9.0.1" in check("9.0.1")[0]
     (package / "ops.py").write_text("changed")
     assert "installed from other sources than these (ops.py) -> run `pip install ./submodules/simple-knn`" in check()[0]
-    (tmp_path / "submodules" / "common" / "build_extension.py").write_text('VERSION = "0.2.0"\n')
+    (tmp_path / "version.txt").write_text("0.2.0\n")
     assert "is version 0.1.0, but this code is 0.2.0" in check()[0]
     monkeypatch.setattr(environment, "_version", lambda name: None)
     assert "simple-knn is not installed" in check()[0]

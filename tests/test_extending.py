@@ -42,6 +42,7 @@ CODE = (
     "train.py",
     "render.py",
     "pyproject.toml",
+    "version.txt",
 )
 TESTS = ("conftest.py", "gaussians.py", "synthetic.py", "test_densification.py")
 HOT, COLD, START = 0.9, 0.2, 0.5

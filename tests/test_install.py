@@ -277,7 +277,7 @@ def test_requirements_are_pinned() -> None:
 
 
 def test_root_wheel_has_requirements_and_no_packages(tmp_path: Path) -> None:
-    for name in ("setup.py", "pyproject.toml", "requirements.txt"):
+    for name in ("setup.py", "pyproject.toml", "requirements.txt", "version.txt"):
         shutil.copy(ROOT / name, tmp_path)
     for package in ("utils", "scene"):  # setuptools would find these by itself
         (tmp_path / package).mkdir()

@@ -21,18 +21,27 @@ from utils.system_utils import UserError, compute_device, run_cli
 ROOT = Path(__file__).resolve().parents[2]
 
 
-def run(script: str, *options: str) -> float:
-    """Run a script of the repository; return its wall seconds. UserError with the end of its output if it fails."""
+def run(script: str, *options: str, folder: Path = ROOT, environment: dict[str, str] | None = None) -> float:
+    """Run a script of the repository, or of another checkout; return its wall seconds.
+
+    environment: None: that of this process. UserError with the end of its output if it fails.
+    """
     start = time.perf_counter()
-    done = subprocess.run([sys.executable, script, *options], cwd=ROOT, capture_output=True, text=True)
+    words = [sys.executable, script, *options]
+    done = subprocess.run(words, cwd=folder, env=environment, capture_output=True, text=True)
     if done.returncode:
         said = (done.stdout + done.stderr)[-4000:]
         raise UserError(f"{script} {' '.join(options)} ended with status {done.returncode}:\n{said}")
     return time.perf_counter() - start
 
 
+def seconds_of(model: Path) -> float:
+    """Return the training seconds of a model folder."""
+    return json.loads((model / "train_log.json").read_text())[-1]["seconds"]
+
+
 def train(scene: Path, model: Path, seed: int, options: list[str]) -> dict:
-    """Train, render and score one model; return seconds, PSNR (dB), SSIM, Gaussians and a hash of the PLY."""
+    """Train, render and score one model; return seconds, PSNR (dB), SSIM, Gaussians, bytes and a hash of the PLY."""
     arguments = ["-s", str(scene), "-m", str(model), "--eval", "--seed", str(seed)]
     process = run("train.py", *arguments, "--test_iterations", "-1", "--no_curve", *options)
     run("render.py", "-m", str(model), "--skip_train")
@@ -43,11 +52,12 @@ def train(scene: Path, model: Path, seed: int, options: list[str]) -> dict:
     ply = model / "point_cloud" / f"iteration_{iteration}" / "point_cloud.ply"
     return {
         "seed": seed,
-        "seconds": record["seconds"],
+        "seconds": seconds_of(model),
         "process": process,
         "PSNR": scores["PSNR"],
         "SSIM": scores["SSIM"],
         "Gaussians": record["gaussians"],
+        "bytes": ply.stat().st_size,
         "hash": hashlib.sha256(ply.read_bytes()).hexdigest()[:16],
     }
 

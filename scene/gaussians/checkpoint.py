@@ -13,12 +13,13 @@ import torch
 from scene.gaussians.attributes import IN_CHECKPOINT, Attribute, Rows
 from scene.gaussians.finite import check_finite
 from scene.gaussians.statistics import Statistics
+from utils.host.version import VERSION
 from utils.ranks.ranks import ranks
 from utils.system_utils import UserError, atomic_write
 
 _LARGEST = 1e15  # extent; learning rates are multiples of it
 _ENTRIES = 12  # the reference's; the values of further attributes may follow
-EXPOSURES = "exposures"  # key in the optimiser's state dict
+EXPOSURES, WRITTEN_BY = "exposures", "version"  # keys in the optimiser's state dict
 # The reference stores the scene extent as a NumPy scalar, which NumPy 1 and 2 rebuild by functions of other names.
 _SCALAR = np.float64(0).__reduce__()[0]
 _ALLOWED = [
@@ -44,17 +45,18 @@ class State(NamedTuple):
 def pack(state: State) -> tuple:
     """The 12 entries of the reference, in its order.
 
-    Attributes that the reference does not have follow as further entries. Exposures, if they are trained, stand in the
-    optimiser's state dict, where the reference, which takes exactly 12 entries, does not see them.
+    Attributes that the reference does not have follow as further entries. Exposures, if they are trained, and the
+    version of this code stand in the optimiser's state dict: the reference takes exactly 12 entries, and torch's
+    optimisers pass over keys that they do not know.
     """
-    exposures = {} if state.exposures is None else {EXPOSURES: state.exposures}
+    ours = {WRITTEN_BY: VERSION} if state.exposures is None else {WRITTEN_BY: VERSION, EXPOSURES: state.exposures}
     return (
         state.active_sh_degree,
         *(state.rows[name] for name in IN_CHECKPOINT),
         state.statistics.max_radii2D,
         state.statistics.xyz_gradient_accum,
         state.statistics.denom,
-        state.optimizer | exposures,
+        state.optimizer | ours,
         state.spatial_lr_scale,
         *(values for name, values in state.rows.items() if name not in IN_CHECKPOINT),
     )

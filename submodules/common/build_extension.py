@@ -25,7 +25,7 @@ from setuptools import Extension, find_packages, setup
 from setuptools.command.build_ext import build_ext
 from setuptools.command.build_py import build_py
 
-VERSION = "0.1.0"
+VERSION = (Path(__file__).resolve().parents[2] / "version.txt").read_text(encoding="utf-8").strip()
 BUILT_FOR = "built-for"  # the extra that tells doctor.py which torch an extension was built for
 OLDEST_TORCH = (2, 11)
 OLDEST_ARCHITECTURE = 80  # reductions over a warp in one instruction

@@ -1,0 +1,43 @@
+"""Set up .venv and run the Python tests with nothing but Python: `make test` for systems that lack make.
+
+python .ci/test_without_make.py [OPTION OF PYTEST...]
+
+Lint and the C++ tests are left out; both need make.
+"""
+
+import argparse
+import subprocess
+import sys
+import venv
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+VENV = ROOT / ".venv"
+EXTENSIONS = ("simple-knn", "fused-ssim", "diff-gaussian-rasterization")
+
+
+def commands(python: Path, options: list[str]) -> list[list[str]]:
+    """Return the command lines in their order: requirements, the three extensions, the tests."""
+    install = [str(python), "-m", "pip", "install", "--quiet", "--disable-pip-version-check"]
+    lines = [[*install, "-r", "requirements-dev.txt"]]
+    lines += [[*install, "--no-deps", "--no-build-isolation", f"./submodules/{name}"] for name in EXTENSIONS]
+    lines.append([str(python), "-m", "pytest", "-m", "not browser", "--numprocesses", "auto", *options])
+    return lines
+
+
+def main() -> int:
+    """Run them; return the exit status of the first that fails, or 0."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0], epilog="other options go to pytest")
+    options = parser.parse_known_args()[1]
+    python = VENV / ("Scripts/python.exe" if sys.platform == "win32" else "bin/python")
+    if not python.exists():
+        venv.create(VENV, with_pip=True)
+    for command in commands(python, options):
+        print("+", *command, flush=True)
+        if status := subprocess.run(command, cwd=ROOT).returncode:
+            return status
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

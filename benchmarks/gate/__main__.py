@@ -1,0 +1,85 @@
+"""Gate before a release: is this code worse, or slower, than the stored baseline?
+
+    python -m benchmarks.gate            # exit status 1 and a table if it is
+    python -m benchmarks.gate --write    # store the numbers of this commit
+
+Three scenes with two seeds are trained and scored. PSNR, SSIM, the number of Gaussians and the bytes of the PLY may be
+worse than the stored means by three standard deviations over the stored seeds. Seconds are compared with those of the
+stored commit, which is built here and takes turns with this code: this, stored, stored, this. The better of both times
+counts, and the ratio may be 1.10.
+"""
+
+import argparse
+import sys
+from pathlib import Path
+
+from tqdm import tqdm
+
+from benchmarks.gate.baseline import FILE, machine_kind, read_baseline, write_baseline
+from benchmarks.gate.judging import HEADER, QUANTITIES, Row, judge_quality, judge_time
+from benchmarks.gate.trainings import Build, Task, head, older_build, scored, tasks, timed
+from benchmarks.harness.environment import describe, print_table
+from utils.system_utils import compute_device, run_cli
+
+SEEDS, STORED_SEEDS = (0, 1), (0, 1, 2, 3, 4)
+ITERATIONS = {"cpu": 1000, "cuda": 7000}  # some seconds of training, beside which noise is small
+
+
+def store(path: Path, kind: str, work: dict[str, Task], iterations: int) -> None:
+    """Train every scene with the stored seeds and write the baseline of this kind of machine."""
+    commit = head()
+    scenes: dict[str, list[dict[str, float]]] = {name: [] for name in work}
+    with tqdm(total=len(work) * len(STORED_SEEDS), desc="Training", unit="run") as bar:
+        for name, task in work.items():
+            for seed in STORED_SEEDS:
+                found = scored(task, seed)
+                scenes[name].append({key: found[key] for key in ("seed", *(q.name for q in QUANTITIES))})
+                bar.update()
+    write_baseline(path, kind, {"commit": commit, "iterations": iterations, "scenes": scenes})
+
+
+def compare(stored: dict[str, list[dict]], work: dict[str, Task], build: Build) -> list[Row]:
+    """Train every scene by this code and by the stored build, in turns; return the judgement."""
+    rows = []
+    with tqdm(total=4 * len(work) * len(SEEDS), desc="Training", unit="run") as bar:
+        for name, task in work.items():
+            found, pairs = [], []
+            for seed in SEEDS:
+                found.append(scored(task, seed))
+                seconds: dict[Build | None, list[float]] = {None: [found[-1]["seconds"]], build: []}
+                bar.update()
+                for turn in (build, build, None):
+                    seconds[turn].append(timed(task, seed, turn))
+                    bar.update()
+                pairs.append((min(seconds[None]), min(seconds[build])))
+            rows += [*judge_quality(name, stored[name], found), judge_time(name, pairs)]
+    return rows
+
+
+def main() -> None:
+    """Run the command line. Exit status 1 if something is worse."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0], allow_abbrev=False)
+    parser.add_argument("--write", action="store_true", help="store the numbers of this commit instead of comparing")
+    parser.add_argument(
+        "--baseline", type=Path, default=FILE, help="the stored numbers (default: benchmarks/gate.json)"
+    )
+    parser.add_argument("--iterations", type=int, help="of each training (default: 1000, on a GPU 7000)")
+    args = parser.parse_args()
+    device = compute_device()
+    iterations = ITERATIONS[device.type] if args.iterations is None else args.iterations
+    kind, work = machine_kind(), tasks(iterations)
+    print(describe(device), flush=True)
+    if args.write:
+        store(args.baseline, kind, work, iterations)
+        return
+    record = read_baseline(args.baseline, kind, list(work), iterations)
+    rows = compare(record["scenes"], work, older_build(record["commit"]))
+    print_table(HEADER, [row.cells() for row in rows])
+    worse = [row for row in rows if not row.passed]
+    print(f"{len(worse)} of {len(rows)} are worse than at {record['commit'][:7]}" if worse else "the gate is passed")
+    if worse:
+        sys.exit(1)
+
+
+if __name__ == "__main__":
+    run_cli(main)

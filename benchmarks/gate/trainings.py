@@ -1,0 +1,118 @@
+"""Trainings of the gate: three scenes, each by this code, and by an older build in turns with it."""
+
+import io
+import os
+import subprocess
+import sys
+import tarfile
+import tempfile
+from pathlib import Path
+from typing import NamedTuple
+
+from benchmarks.scenes.training import ROOT, run, seconds_of, train
+from demo.make_scene import make_scene
+from utils.system_utils import UserError
+
+WORK = ROOT / "build" / "gate"
+REAL = {"fox_tiny": [], "bonsai_small": [], "nerf_lego200_tiny": ["-w"]}
+# Made where the real ones are missing. Arguments of make_scene, and options of train.py.
+MADE = {
+    "demo": ((40, 200, 150, 8000, 0), []),
+    "demo_few_points": ((24, 200, 150, 800, 1), ["--random_background"]),
+    "demo_large": ((24, 320, 240, 8000, 2), ["--antialiasing"]),
+}
+
+
+class Task(NamedTuple):
+    """A scene and the options that it is trained with."""
+
+    scene: Path
+    options: list[str]
+
+
+def tasks(iterations: int) -> dict[str, Task]:
+    """Return the real scenes below $GS_SHARED or beside the repository if all are there, else made ones, by name."""
+    real = Path(os.environ.get("GS_SHARED") or ROOT.parent / "shared") / "scenes"
+    length = ["--iterations", str(iterations)]
+    if all((real / name).is_dir() for name in REAL):
+        return {name: Task(real / name, [*length, *options]) for name, options in REAL.items()}
+    made = {}
+    for name, (arguments, options) in MADE.items():
+        folder = WORK / "scenes" / name
+        if not folder.is_dir():
+            make_scene(folder, *arguments)
+        made[name] = Task(folder, [*length, *options])
+    return made
+
+
+class Build(NamedTuple):
+    """A checkout of an older commit and the folder of its extensions, None: those that are installed are the same."""
+
+    folder: Path
+    site: Path | None
+
+    def environment(self) -> dict[str, str]:
+        """Return the environment for its programs."""
+        return os.environ | ({} if self.site is None else {"PYTHONPATH": str(self.site)})
+
+
+def older_build(commit: str) -> Build:
+    """Check a commit out below build/gate and build its extensions, if they differ from those here.
+
+    UserError if git has no such commit.
+    """
+    folder = WORK / commit
+    if not folder.is_dir():
+        archive = subprocess.run(["git", "archive", commit], cwd=ROOT, capture_output=True)
+        if archive.returncode:
+            raise UserError(f"git has no commit {commit} here; fetch the whole history: git fetch --unshallow")
+        WORK.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=WORK) as work:
+            with tarfile.open(fileobj=io.BytesIO(archive.stdout)) as files:
+                files.extractall(work, filter="data")
+            if not _same_extensions(commit):
+                _build_extensions(Path(work))
+            Path(work).rename(folder)
+            Path(work).mkdir()  # for the end of the context
+    site = folder / "site"
+    return Build(folder, site if site.is_dir() else None)
+
+
+def _same_extensions(commit: str) -> bool:
+    return subprocess.run(["git", "diff", "--quiet", commit, "--", "submodules"], cwd=ROOT).returncode == 0
+
+
+def _build_extensions(folder: Path) -> None:
+    pip = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--no-build-isolation"]
+    names = ("simple-knn", "fused-ssim", "diff-gaussian-rasterization")
+    done = subprocess.run(
+        [*pip, "--target", str(folder / "site"), *(f"./submodules/{name}" for name in names)],
+        cwd=folder, capture_output=True, text=True,
+    )  # fmt: skip
+    if done.returncode:
+        raise UserError(f"the extensions of the stored build do not compile here:\n{done.stderr[-2000:]}")
+
+
+def head() -> str:
+    """Return the commit of this checkout. UserError if files differ from it, since it could not be built again."""
+    status = ["git", "status", "--porcelain", "--untracked-files=no"]
+    changed = subprocess.run(status, cwd=ROOT, capture_output=True, text=True)
+    commit = subprocess.run(["git", "rev-parse", "HEAD"], cwd=ROOT, capture_output=True, text=True)
+    if commit.returncode or changed.stdout:
+        raise UserError("a baseline is of a commit, but files here differ from it; commit or remove the changes first")
+    return commit.stdout.strip()
+
+
+def scored(task: Task, seed: int) -> dict[str, float]:
+    """Train by this code, render and score the test views."""
+    with tempfile.TemporaryDirectory() as folder:
+        return train(task.scene, Path(folder) / "model", seed, task.options)
+
+
+def timed(task: Task, seed: int, build: Build | None) -> float:
+    """Return the training seconds of this code (None) or of an older build."""
+    folder, environment = (ROOT, None) if build is None else (build.folder, build.environment())
+    with tempfile.TemporaryDirectory() as model:
+        words = ["-s", str(task.scene), "-m", model, "--eval", "--seed", str(seed), "--test_iterations", "-1"]
+        run("train.py", *words, "--no_curve", *task.options, folder=folder, environment=environment)
+        return seconds_of(Path(model))

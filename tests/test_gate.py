@@ -1,0 +1,192 @@
+"""The gate: its judgement on made-up numbers, the stored file, the older build, and the command's exit status."""
+
+import json
+import math
+import re
+
+import pytest
+
+from benchmarks.gate import __main__ as gate
+from benchmarks.gate import baseline, trainings
+from benchmarks.gate.judging import judge_quality, judge_time
+from utils.system_utils import UserError
+
+STORED = [
+    {"seed": seed, "PSNR": 30.0 + offset, "SSIM": 0.9 + offset / 100, "Gaussians": 1000 + seed, "bytes": 62000 + seed}
+    for seed, offset in enumerate((-0.2, -0.1, 0.0, 0.1, 0.2))
+]
+DEVIATION = math.sqrt(0.025)  # of the PSNR: of -0.2, -0.1, 0, 0.1 and 0.2 with n - 1
+RECORD = {"commit": "a" * 40, "iterations": 1000, "scenes": {"a": STORED, "b": STORED, "c": STORED}}
+
+
+def _found(**changed: float) -> list[dict[str, float]]:
+    mean = {"PSNR": 30.0, "SSIM": 0.9, "Gaussians": 1002, "bytes": 62002}
+    return [mean | changed, mean | changed]
+
+
+def _worse(found: list[dict[str, float]]) -> list[str]:
+    return [row.name for row in judge_quality("a", STORED, found) if not row.passed]
+
+
+def test_the_same_numbers_pass():
+    assert _worse(_found()) == [] and _worse(STORED) == []
+
+
+@pytest.mark.parametrize(
+    ("name", "just_passes", "just_fails"),
+    [
+        ("PSNR", 30 - 2.99 * DEVIATION, 30 - 3.01 * DEVIATION),
+        ("SSIM", 0.9 - 2.99 * DEVIATION / 100, 0.9 - 3.01 * DEVIATION / 100),
+        # Here the seeds agree to 0.16 %, so the least deviation of 0.2 % counts.
+        ("Gaussians", 1002 * (1 + 2.99 * 0.002), 1002 * (1 + 3.01 * 0.002)),
+        ("bytes", 62002 * (1 + 2.99 * 0.002), 62002 * (1 + 3.01 * 0.002)),
+    ],
+)
+def test_three_deviations_are_allowed(name, just_passes, just_fails):
+    assert _worse(_found(**{name: just_passes})) == []
+    assert _worse(_found(**{name: just_fails})) == [name]
+
+
+def test_better_is_never_worse():
+    assert _worse(_found(PSNR=40.0, SSIM=0.99, Gaussians=10, bytes=620)) == []
+
+
+def test_what_is_not_a_number_does_not_pass():
+    assert _worse(_found(PSNR=math.nan)) == ["PSNR"]
+    assert not judge_time("a", [(math.nan, 1.0)]).passed
+
+
+@pytest.mark.parametrize(
+    ("pairs", "ratio", "passed"),
+    [
+        ([(10.0, 10.0), (12.0, 12.0)], 1.0, True),
+        ([(10.9, 10.0), (13.1, 12.0)], 1.0908, True),
+        ([(11.2, 10.0), (13.3, 12.0)], 1.1142, False),
+        ([(20.0, 10.0), (5.0, 10.0)], 1.0, True),  # ratios are averaged as logarithms
+        ([(5.0, 10.0), (6.0, 12.0)], 0.5, True),
+    ],
+)
+def test_time_may_rise_by_a_tenth(pairs, ratio, passed):
+    row = judge_time("a", pairs)
+    assert (round(row.found, 4), row.passed) == (ratio, passed)
+
+
+def test_the_table_names_what_is_worse():
+    (row, *_) = judge_quality("a", STORED, _found(PSNR=29.0))
+    assert row.cells() == ["a", "PSNR", "30.000", "29.000", "-1.000", "0.474", "WORSE"]
+
+
+def test_a_baseline_is_kept_by_kind(tmp_path):
+    path = tmp_path / "gate.json"
+    baseline.write_baseline(path, "CPU one", RECORD)
+    baseline.write_baseline(path, "GPU two", RECORD | {"commit": "b" * 40})
+    baseline.write_baseline(path, "GPU two", RECORD | {"commit": "c" * 40})
+    read = {kind: baseline.read_baseline(path, kind, ["b", "a", "c"], 1000) for kind in ("CPU one", "GPU two")}
+    assert read == {"CPU one": RECORD, "GPU two": RECORD | {"commit": "c" * 40}}
+
+
+@pytest.mark.parametrize(
+    ("content", "scenes", "iterations", "complaint"),
+    [
+        (None, "abc", 1000, "has no baseline of this kind of machine"),
+        ("{", "abc", 1000, "is not JSON"),
+        ("[]", "abc", 1000, "has no baseline of this kind of machine"),
+        (json.dumps({"other": RECORD}), "abc", 1000, "has no baseline of this kind of machine"),
+        (json.dumps({"kind": RECORD}), "abd", 1000, "is of a, b, c at 1000 iterations, not of a, b, d at 1000"),
+        (json.dumps({"kind": RECORD}), "abc", 30, "is of a, b, c at 1000 iterations, not of a, b, c at 30"),
+        (json.dumps({"kind": RECORD | {"commit": "--output=x"}}), "abc", 1000, "broken baseline"),
+        (json.dumps({"kind": RECORD | {"scenes": {"a": STORED[:1]}}}), "a", 1000, "broken baseline"),
+        (json.dumps({"kind": RECORD | {"scenes": {"a": [{"PSNR": 1.0}] * 2}}}), "a", 1000, "broken baseline"),
+    ],
+)
+def test_a_baseline_that_does_not_fit_says_what_to_do(tmp_path, content, scenes, iterations, complaint):
+    path = tmp_path / "gate.json"
+    if content is not None:
+        path.write_text(content)
+    with pytest.raises(UserError, match=f"{re.escape(complaint)}.*; .*python -m benchmarks.gate --write --baseline"):
+        baseline.read_baseline(path, "kind", list(scenes), iterations)
+
+
+@pytest.fixture
+def stand_in(monkeypatch, tmp_path):
+    """The command with trainings that only say what they would have measured; returns its arguments and the turns."""
+    turns: list[tuple[int, str]] = []
+    seconds = {"this": 10.0, "stored": 10.0}
+
+    def timed(task, seed, build):
+        name = "this" if build is None else "stored"
+        turns.append((seed, name))
+        return seconds[name]
+
+    def scored(task, seed):
+        return STORED[seed] | {"seconds": timed(task, seed, None), "hash": ""}
+
+    monkeypatch.setattr(gate, "tasks", lambda iterations: {name: None for name in "abc"})
+    monkeypatch.setattr(gate, "older_build", lambda commit: trainings.Build(tmp_path, None))
+    monkeypatch.setattr(gate, "timed", timed)
+    monkeypatch.setattr(gate, "scored", scored)
+    monkeypatch.setattr(gate, "head", lambda: "d" * 40)
+    path = tmp_path / "gate.json"
+    monkeypatch.setattr("sys.argv", ["gate", "--baseline", str(path)])
+    return path, turns, seconds
+
+
+def test_the_gate_is_written_and_then_passed(monkeypatch, stand_in, capsys):
+    path, turns, seconds = stand_in
+    with monkeypatch.context() as patch:
+        patch.setattr("sys.argv", ["gate", "--baseline", str(path), "--write"])
+        gate.main()
+    (record,) = json.loads(path.read_text()).values()
+    assert record == RECORD | {"commit": "d" * 40}
+    del turns[:]
+    gate.main()
+    assert capsys.readouterr().out.endswith("the gate is passed\n")
+    assert turns == [(seed, name) for seed in (0, 1) for name in ("this", "stored", "stored", "this")] * 3
+    seconds["this"] = 11.5
+    with pytest.raises(SystemExit) as ended:
+        gate.main()
+    assert ended.value.code == 1
+    said = capsys.readouterr().out
+    assert said.endswith("3 of 15 are worse than at ddddddd\n") and said.count("WORSE") == 3
+
+
+def test_the_stored_build_is_a_checkout_of_its_commit(monkeypatch, tmp_path):
+    if not (trainings.ROOT / ".git").exists():
+        pytest.skip("a copy without git")
+    monkeypatch.setattr(trainings, "WORK", tmp_path)
+    built = []
+    monkeypatch.setattr(
+        trainings, "_build_extensions", lambda folder: (folder / "site").mkdir() or built.append(folder)
+    )
+    for same in (True, False):
+        monkeypatch.setattr(trainings, "_same_extensions", lambda commit, same=same: same)
+        build = trainings.older_build("HEAD" if same else "HEAD~1")
+        assert (build.folder / "train.py").is_file() and len(list(tmp_path.iterdir())) == (1 if same else 2)
+        assert build.environment().get("PYTHONPATH") == (None if same else str(build.folder / "site"))
+        assert trainings.older_build("HEAD" if same else "HEAD~1") == build and len(built) == (not same)
+    with pytest.raises(UserError, match="git has no commit 0123456 here; fetch the whole history"):
+        trainings.older_build("0123456")
+
+
+def test_scenes_are_real_or_made(monkeypatch, tmp_path):
+    monkeypatch.setattr(trainings, "WORK", tmp_path / "work")
+    made = {name: ((4, 24, 16, 60, seed), options) for seed, (name, (_, options)) in enumerate(trainings.MADE.items())}
+    monkeypatch.setattr(trainings, "MADE", made)
+    monkeypatch.setenv("GS_SHARED", str(tmp_path))
+    work = trainings.tasks(30)
+    assert list(work) == list(made) and all((task.scene / "sparse" / "0").is_dir() for task in work.values())
+    for name in trainings.REAL:
+        (tmp_path / "scenes" / name).mkdir(parents=True)
+    work = trainings.tasks(30)
+    assert list(work) == list(trainings.REAL)
+    assert work["nerf_lego200_tiny"] == (tmp_path / "scenes" / "nerf_lego200_tiny", ["--iterations", "30", "-w"])
+
+
+def test_the_stored_file_fits_the_code():
+    if not baseline.FILE.is_file():
+        pytest.skip("no baseline is stored yet")
+    for kind, record in json.loads(baseline.FILE.read_text()).items():
+        names = list(record["scenes"])
+        assert sorted(names) in (sorted(trainings.REAL), sorted(trainings.MADE))
+        iterations = gate.ITERATIONS["cpu" if kind.startswith("CPU ") else "cuda"]
+        assert baseline.read_baseline(baseline.FILE, kind, names, iterations) == record
