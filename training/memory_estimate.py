@@ -62,8 +62,8 @@ def _announce(device: torch.device, content: str, pictures: int) -> float:
     free, sharing = free_memory(device), local_size() if device.type == "cpu" else 1
     if free is not None:
         free //= sharing
-    known = ("?" if free is None else gib(free)) + (" each" if sharing > 1 else "")
-    print(f"Memory of the {_name(device)}, estimated: {content}; {known} free")
+    known = ("?" if free is None else gib(free)) + " free" + (" for each" if sharing > 1 else "")
+    print(f"Memory of the {_name(device)}, estimated: {content}; {known}")
     return math.inf if free is None else free - pictures
 
 
