@@ -57,6 +57,12 @@ def sound_calls() -> dict[str, Call]:
         "sparse_adam_": (ops.sparse_adam_, [*sparse, *guard]),
         "run_ahead_": (ops.run_ahead_, [torch.zeros(5, dtype=torch.int64), [1, 1, 1], None]),  # refused: not on a GPU
         "step_now_": (ops.step_now_, _step_now()),
+        "catch_up_": (
+            ops.catch_up_,
+            [*(torch.rand(3, 4) for _ in range(3)), torch.zeros(3, dtype=torch.int32), [0.1], [1.0], 0.9, 0.999, 1e-8],
+        ),
+        "in_host_memory": (ops.in_host_memory, [torch.rand(3, 4)]),
+        "is_in_host_memory": (ops.is_in_host_memory, [torch.rand(3, 4)]),
         "observe_": (ops.observe_, [*statistics, torch.rand(3, 3)]),
         "split_positions": (
             ops.split_positions,
