@@ -14,22 +14,24 @@ from exports.selection import drawable, selected
 from exports.splats import Splats
 from scene import Scene
 from scene.gaussian_model import GaussianModel
+from utils.ranks.ranks import ALONE, Ranks
 from utils.sh_utils import C0
 from utils.system_utils import UserError
 
 
 def scene_with(
-    path: str, options: argparse.Namespace, gaussians: GaussianModel, shuffle: bool = False
+    path: str, options: argparse.Namespace, gaussians: GaussianModel, shuffle: bool = False, sharing: Ranks = ALONE
 ) -> tuple[Scene, Splats | None]:
     """A scene whose points are a file's, and the file's splats in the scene's frame; None for a point cloud.
 
     The model stays empty. options: the model options. Positions in the file are those of the world, unless our comment
-    world_offset tells their origin. UserError for a file without splats that are drawn, and as from Scene.
+    world_offset tells their origin. sharing: as of Scene. UserError for a file without splats that are drawn, and as
+    from Scene.
     """
     options = copy.copy(options)
     if is_point_cloud(path):
         options.init_pcd_path = path
-        return Scene(options, gaussians, shuffle=shuffle, start=False), None
+        return Scene(options, gaussians, shuffle=shuffle, start=False, sharing=sharing), None
     splats = read_splats(path)
     splats = selected(splats, drawable(splats))
     if not len(splats):
@@ -39,7 +41,7 @@ def scene_with(
         colors = np.clip(splats.sh[:, 0] * C0 + 0.5, 0, 1)
         np.savez(points, points=splats.means.astype(np.float64) + splats.world_offset, colors=colors)
         options.init_pcd_path = str(points)
-        scene = Scene(options, gaussians, shuffle=shuffle, start=False)
+        scene = Scene(options, gaussians, shuffle=shuffle, start=False, sharing=sharing)
     means = np.ascontiguousarray(scene.info.point_cloud.points, dtype=np.float32)
     return scene, replace(splats, means=means, world_offset=tuple(scene.info.offset.tolist()))
 

@@ -11,6 +11,7 @@ import torch
 from fused_ssim import composite
 from torch import Tensor, nn
 
+from scene.pictures.handing import AT_HAND, Handed
 from scene.pictures.in_memory import InMemory
 from scene.pictures.shrink import shrink_mask, shrink_photo, shrink_values
 from scene.pictures.store import ImageStore, Picture, Source, usable_device
@@ -141,8 +142,8 @@ class Camera(nn.Module):
     def at_size(self, size: tuple[int, int]) -> "Camera":
         """This view at a smaller size (width, height), with pictures that are area averages of its own.
 
-        They are decoded and computed now, and lie in the copy on `device`. Columns that count in it cover no other.
-        What was assigned is left out of it.
+        They are decoded and computed now, and lie in the copy on `device`; of a picture that ranks share, one of them
+        does so later (Handed.changed). Columns that count in it cover no other. What was assigned is left out of it.
         """
         twin, (old, _) = copy.copy(self), self._size
         twin.image_width, twin.image_height = twin._size = size
@@ -152,10 +153,20 @@ class Camera(nn.Module):
             start, stop, _ = self.columns.indices(old)
             twin.columns = slice(-(-start * size[0] // old), stop * size[0] // old)
         twin._assigned, twin._made, twin._photo_device = {}, {}, self.device
-        twin._source = InMemory(shrink_photo(self._pixels(), size, self._ignore_alpha))
-        twin._mask = None if self._mask is None else InMemory(shrink_mask(self._decoded(self._mask), size))
-        twin._depth = None if self._depth is None else InMemory(shrink_values(self._decoded(self._depth), size))
+        twin._source = self._changed(self._source, lambda photo: shrink_photo(photo, size, self._ignore_alpha))
+        twin._mask = self._changed(self._mask, lambda mask: shrink_mask(mask, size))
+        twin._depth = self._changed(self._depth, lambda depth: shrink_values(depth, size))
         return twin
+
+    def _changed(
+        self, source: Source | InMemory | Handed | None, change: Callable[[Tensor], Tensor]
+    ) -> InMemory | Handed | None:
+        def on_device(pixels: Tensor) -> Tensor:
+            return change(pixels.to(self.device, non_blocking=True))
+
+        if source is None or isinstance(source, AT_HAND):
+            return source and source.changed(on_device)
+        return self.images.changed(source, self._size, on_device)
 
     @property
     def is_plain(self) -> bool:
@@ -180,12 +191,12 @@ class Camera(nn.Module):
         Empty if they were given as pixels.
         """
         sources = (self._source, self._mask, self._depth)
-        return [(s, self._size) for s in sources if s is not None and not isinstance(s, InMemory)]
+        return [(s, self._size) for s in sources if s is not None and not isinstance(s, AT_HAND)]
 
-    def _stored(self, source: Source | InMemory) -> Tensor:
-        return source.pixels if isinstance(source, InMemory) else self.images.get(source, self._size)
+    def _stored(self, source: Source | InMemory | Handed) -> Tensor:
+        return source.pixels if isinstance(source, AT_HAND) else self.images.get(source, self._size)
 
-    def _decoded(self, source: Source | InMemory) -> Tensor:
+    def _decoded(self, source: Source | InMemory | Handed) -> Tensor:
         return self._stored(source).to(self.device, non_blocking=True)
 
     def _pixels(self) -> Tensor:

@@ -25,6 +25,7 @@ from scene.views.of_info import file_size
 from utils.files.model_json import OFFSET, read_model_json
 from utils.graphics_utils import BasicPointCloud
 from utils.host.device import compute_device
+from utils.ranks.ranks import ALONE, Ranks
 from utils.system_utils import UserError, atomic_write
 
 
@@ -53,7 +54,7 @@ class Scene:
     the last saved iteration, N that one. shuffle: mix the order of the views (always the same way). resolution_scales:
     factors by which views are made smaller, one list of cameras each. train_cameras, test_cameras: these lists by
     scale, which may be replaced. info: the dataset as read. cameras_extent: E in world units, from the training views.
-    images: the store of the decoded photos.
+    images: the store of the decoded photos. sharing: ranks that divide these photos (ImageStore).
     """
 
     def __init__(
@@ -64,6 +65,7 @@ class Scene:
         shuffle: bool = True,
         resolution_scales: Sequence[float] = (1.0,),
         start: bool = True,
+        sharing: Ranks = ALONE,
     ) -> None:
         self.model_path = args.model_path
         self.gaussians = gaussians
@@ -73,7 +75,8 @@ class Scene:
         self.cameras_extent = self.info.extent
 
         device = compute_device()
-        self.images = ImageStore(option(args, "images_to_load"), picture_device(args.data_device, device), device)
+        place = picture_device(args.data_device, device)
+        self.images = ImageStore(option(args, "images_to_load"), place, device, sharing)
         self.train_cameras = {scale: self._cameras(args, scale, shuffle, False) for scale in resolution_scales}
         self.test_cameras = {scale: self._cameras(args, scale, shuffle, True) for scale in resolution_scales}
         self.images.plan(self._pictures(self.train_cameras), self._pictures(self.test_cameras))

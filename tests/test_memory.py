@@ -260,6 +260,10 @@ def test_the_estimate_and_its_warnings(colmap_scene, tmp_path, monkeypatch, capf
     assert "too small for 2,000,000,000 Gaussians; set a lower --max_num_splats" in warning
     free = pictures + at_start
     assert "6,000 Gaussians" in said()[1] and not said("--max_num_splats", 300)[1]
+    with monkeypatch.context() as patch:
+        patch.setattr(memory_estimate, "local_size", lambda: 2)  # processes that share what is free
+        line, warning = said("--max_num_splats", 300)
+    assert f"{gib(free // 2)} free for each" in line and "for 300 Gaussians" in warning
     free -= 1
     assert "for 300 Gaussians; set --images_to_load" in said()[1]
 

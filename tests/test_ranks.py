@@ -4,7 +4,7 @@ import pytest
 import torch
 from processes import in_ranks
 
-from utils.ranks.ranks import ALONE, ranks
+from utils.ranks.ranks import ALONE, Ranks, ranks
 
 
 def _talk() -> dict[str, object]:
@@ -14,7 +14,8 @@ def _talk() -> dict[str, object]:
     bits = [torch.ones(d, dtype=torch.bool) for d in range(here.size)]
     return {
         "numbers": here.numbers(here.rank, 7).tolist(),
-        "shared": here.shared({"rank": here.rank}),
+        "shared": [here.shared({"rank": here.rank}, *holder) for holder in ((), (1,))],
+        "handed": _handed(here),
         "parts": [part.tolist() for part in here.exchange(parts)],
         "bits": [part.tolist() for part in here.exchange(bits)],
         "rows": here.gather(rows).tolist(),
@@ -29,6 +30,13 @@ def _talk() -> dict[str, object]:
     }
 
 
+def _handed(here: Ranks) -> list[list[float]]:
+    """Values of rank 1 in two types, of which other ranks know the shape."""
+    kept = [torch.tensor([1, 2, 3], dtype=torch.uint8), torch.tensor([0.5, 9.0, 2.5, 9.0])[::2]]
+    mine = [values if here.rank == 1 else None for values in kept]
+    return [here.handed(1, x, like.shape, like.dtype, like.device).tolist() for x, like in zip(mine, kept, strict=True)]
+
+
 def _listed(sent: tuple[torch.Tensor, list[int]]) -> tuple[list, list[int]]:
     return sent[0].tolist(), sent[1]
 
@@ -37,7 +45,8 @@ def _listed(sent: tuple[torch.Tensor, list[int]]) -> tuple[list, list[int]]:
 def test_ranks_tell_each_other(size):
     for rank, said in enumerate(in_ranks(size, _talk)):
         assert said["numbers"] == [[other, 7] for other in range(size)]
-        assert said["shared"] == {"rank": 0}
+        assert said["shared"] == [{"rank": 0}, {"rank": 1}]
+        assert said["handed"] == [[1, 2, 3], [0.5, 2.5]]
         assert said["parts"] == [[[10 * other + rank] * 2] * (other + rank) for other in range(size)]
         assert said["bits"] == [[True] * rank] * size
         rows = [[10.0 * r + 3 * i + j for j in range(3)] for r in range(size) for i in range(min(r, 2))]

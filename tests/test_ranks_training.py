@@ -20,8 +20,11 @@ STEP = {
     "all_gather": 1,  # where splats begin and end, from which follow bands, and what each rank sends
     "all_reduce": 1,  # sums of the loss
     "all_to_all_single": 4,  # splats, rows around a band; numbers of gradient rows, the rows with their numbers
+    "broadcast": 1,  # the photo
 }
-WHOLE_STEP = {"all_gather": 1, "all_to_all_single": 4}  # the image in place of the rows around a band
+# the image in place of the rows around a band
+WHOLE_STEP = {"all_gather": 1, "all_to_all_single": 4, "broadcast": 1}
+FIRST = "broadcast_object_list"  # once for each photo: its shape
 
 
 def _train(scene: str, out: str, options: list[str]) -> tuple[list[bytes], list[dict[str, int]], bytes]:
@@ -76,4 +79,5 @@ def test_ranks_train_as_one_process(colmap_scene, tmp_path, size, options, cost)
     assert found[0][2] == alone[2] and len(alone[0]) > 20
     for losses, calls, _ in found:
         assert losses == alone[0]
+        assert 10 < sum(each.pop(FIRST, 0) for each in calls) <= 20
         assert len(calls) > 20 and all(each == cost for each in calls), calls

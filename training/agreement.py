@@ -27,7 +27,7 @@ def agree_on_options(args: argparse.Namespace) -> None:
 
 
 def agree_on_scene(scene: Scene, start: str | None) -> None:
-    """UserError if ranks have read another scene or checkpoint than rank 0; then rank 0 prints what only others said.
+    """UserError if ranks have read another scene or checkpoint than rank 0.
 
     From here on, a fault that cannot save the model names the checkpoint that stands (start: the one resumed).
     """
@@ -38,7 +38,6 @@ def agree_on_scene(scene: Scene, start: str | None) -> None:
         facts[start] = hashlib.sha256(Path(start).read_bytes()).hexdigest()
     refuse_differences(ranks().everyone(facts), "give all ranks the same dataset", shown=False)
     ranks().stands = lambda: what_stands(scene.model_path, start)
-    ranks().tell_notes()
 
 
 def _code() -> dict[str, str]:
@@ -53,9 +52,10 @@ def _code() -> dict[str, str]:
 
 
 def _digest(cameras: Sequence[Camera]) -> str:
-    """Digest of names, sizes and matrices."""
+    """Digest of names, sizes, matrices, and kinds of pictures."""
     digest = hashlib.sha256()
     for camera in cameras:
-        digest.update(f"{camera.image_name} {camera.image_width} {camera.image_height}\n".encode())
+        kinds = [getattr(source, "suffix", type(source).__name__) for source, _ in getattr(camera, "pictures", ())]
+        digest.update(f"{camera.image_name} {camera.image_width} {camera.image_height} {kinds}\n".encode())
         digest.update(camera.full_proj_transform.cpu().numpy().tobytes())
     return digest.hexdigest()

@@ -10,6 +10,7 @@ from scene.gaussian_model import GaussianModel
 from scene.pictures.store import ImageStore
 from scene.spilled_model import SpilledGaussians
 from utils.host.memory import free_memory, gib
+from utils.host.torchrun import local_size
 
 # Bytes besides the parameters, their gradients and Adam's two averages. 106 and 57 were fitted to the peak memory of
 # forward and backward in docs/results/kernels.md (100 thousand to 6 million Gaussians, within 4 %). The rest are the
@@ -30,7 +31,7 @@ def announce_memory(scene: Scene, gaussians: GaussianModel, max_splats: int, abs
     """Print the memory that photos and Gaussians need and what is free; warn, with a remedy, if they do not fit.
 
     max_splats: limit of the number of Gaussians. Without a limit (0), the estimate is for GROWTH times the number now.
-    absolute: with absolute gradients.
+    absolute: with absolute gradients. Of several ranks, each says what itself needs.
     """
     images, device = scene.images, gaussians.get_xyz.device
     pixels = max(camera.image_width * camera.image_height for camera in scene.getTrainCameras())
@@ -40,21 +41,20 @@ def announce_memory(scene: Scene, gaussians: GaussianModel, max_splats: int, abs
     per_rank = [-(-count // size) for count in (now, later)]
     at_start, at_end = (training_bytes(gaussians, count, pixels, absolute) for count in per_rank)
     training = f"training {gib(at_start)} with {now:,} Gaussians, {gib(at_end)} with {later:,} ({why})"
-    if size > 1:
-        training += f" for each of {size} processes"
+    each = f" for each of {size} processes" if size > 1 else ""
     pictures = images.planned_bytes
     photos = f"photos {gib(pictures)}"
     if images.limit:
         photos += f" (--images_to_load keeps {images.limit:,} of {images.planned:,} decoded images)"
     if isinstance(gaussians, SpilledGaussians) and device.type == "cuda":
-        _announce_host(images, spilled_bytes(gaussians, per_rank[1]) * size, f"{later:,} Gaussians")
+        _announce_host(images, spilled_bytes(gaussians, per_rank[1]), f"{later:,} Gaussians", each)
     together = images.keep_on.type == device.type and (images.keep_on.index or 0) == (device.index or 0)
     if not together:
-        room = _announce(images.keep_on, photos, pictures)
+        room = _announce(images.keep_on, photos + each, pictures)
         if room < 0:
             _warn(images.keep_on, "all photos", "set --images_to_load, or lower --resolution (-r)")
         pictures = 0
-    room = _announce(device, f"{photos}, {training}" if together else training, pictures)
+    room = _announce(device, (f"{photos}, {training}" if together else training) + each, pictures)
     for count, own, needed, first in (
         (now, per_rank[0], at_start, "set "),
         (later, per_rank[1], at_end, "set a lower --max_num_splats, or "),
@@ -66,18 +66,25 @@ def announce_memory(scene: Scene, gaussians: GaussianModel, max_splats: int, abs
             break
 
 
-def _announce_host(images: ImageStore, needed: int, what: str) -> None:
+def _announce_host(images: ImageStore, needed: int, what: str, each: str) -> None:
     """Print what --spill keeps in the host's memory, besides photos there; warn if it does not fit."""
     host = torch.device("cpu")
-    room = _announce(host, f"--spill {gib(needed)} with {what}", images.planned_bytes if images.keep_on == host else 0)
+    pictures = images.planned_bytes if images.keep_on == host else 0
+    room = _announce(host, f"--spill {gib(needed)} with {what}{each}", pictures)
     if room < needed:
         _warn(host, what, f"set a lower --max_num_splats, or {_REMEDY}")
 
 
 def _announce(device: torch.device, content: str, pictures: int) -> float:
-    """Print one device's line. Return the bytes that are free besides the photos, infinity if that is not known."""
-    free = free_memory(device)
-    print(f"Memory of the {_name(device)}, estimated: {content}; {'?' if free is None else gib(free)} free")
+    """Print one device's line. Return the bytes that are free besides the photos, infinity if that is not known.
+
+    The processes of a host have equal parts of what its CPU has free.
+    """
+    free, sharing = free_memory(device), local_size() if device.type == "cpu" else 1
+    if free is not None:
+        free //= sharing
+    known = ("?" if free is None else gib(free)) + " free" + (" for each" if sharing > 1 else "")
+    print(f"Memory of the {_name(device)}, estimated: {content}; {known}")
     return math.inf if free is None else free - pictures
 
 

@@ -37,7 +37,7 @@ from utils.exact.counter_rng import Stream, uniform
 from utils.general_utils import get_expon_lr_func
 from utils.host.interrupt import DeferredInterrupt
 from utils.host.process import seconds_since_start
-from utils.ranks.ranks import ranks
+from utils.ranks.ranks import ALONE, ranks
 from utils.system_utils import UserError, compute_device
 
 SH_INTERVAL = 1000  # iterations between raises of the active SH degree
@@ -74,14 +74,17 @@ class Run:
         kind = SpilledGaussians if opt.spill else GaussianModel
         self.gaussians = kind(dataset.sh_degree, opt.optimizer_type)
         self.gaussians.divide(ranks())
+        sharing = ranks() if views == 1 else ALONE  # all ranks read the same pictures in the same order
         init_ply = option(dataset, "init_ply")
         if init_ply and not plan.start:
-            self.scene, self._first = scene_with(init_ply, dataset, self.gaussians)
+            self.scene, self._first = scene_with(init_ply, dataset, self.gaussians, sharing=sharing)
         else:
-            self.scene, self._first = Scene(dataset, self.gaussians, shuffle=False, start=False), None
+            scene = Scene(dataset, self.gaussians, shuffle=False, start=False, sharing=sharing)
+            self.scene, self._first = scene, None
         check_scene(self.scene.info)
         check_target(opt.target_psnr, len(self.scene.getTestCameras()))
         place = ranks().rank if self.pace.views > 1 else 0
+        agree_on_scene(self.scene, plan.start)  # before a picture is shared
         self.views = ViewOrder(self.scene.getTrainCameras(), opt.seed, self.pace.views, place)
         self.resolution = resolution_of(opt, self.pace, self.scene.getTrainCameras(), self.scene.images)
         self._decode_ahead(self.first_iteration + 1)
@@ -101,7 +104,7 @@ class Run:
         warn_of_fewer(self.density, opt, self.gaussians.total, self.first_iteration + 1)
         if from_points:
             self.density.started()
-        agree_on_scene(self.scene, plan.start)
+        ranks().tell_notes()
 
     def _start(self, capture: tuple | None) -> bool:
         """Start the model from the dataset's points, from a file's Gaussians, or from the state of a checkpoint.

@@ -1,5 +1,6 @@
 """Pictures that were given as pixels, and need no decoding."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 from torch import Tensor
@@ -14,6 +15,10 @@ class InMemory:
     """
 
     pixels: Tensor
+
+    def changed(self, change: Callable[[Tensor], Tensor]) -> "InMemory":
+        """Another picture, made of this one now."""
+        return InMemory(change(self.pixels))
 
     def __deepcopy__(self, memo: dict) -> "InMemory":
         return self  # never changed in place, so that copies of a camera can share it

@@ -3,8 +3,9 @@
 import os
 import sys
 from collections import OrderedDict
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
+from functools import partial
 from pathlib import Path
 from typing import Protocol
 
@@ -13,8 +14,11 @@ from torch import Tensor
 
 from scene.pictures.decode import decode
 from scene.pictures.device_copies import DeviceCopies
+from scene.pictures.handing import Handed, holders
+from scene.pictures.in_memory import InMemory
 from utils.host.memory import free_memory
 from utils.host.threads import threads
+from utils.ranks.ranks import ALONE, Ranks
 
 GPU_SHARE = 0.25  # of a GPU's free memory at the start that images may take; the model needs the rest
 COPIES_AHEAD = 2  # images copied to the GPU ahead of their use; a copy takes less than an iteration
@@ -45,30 +49,40 @@ class ImageStore:
     an image. keep_on: device that keeps them. device: where `get` returns them (default: keep_on). If only `device`
     is a GPU, images lie in pinned memory and are copied without waiting. Threads exist only while there is something to
     decode ahead. Call all methods from one thread.
+
+    sharing: ranks that have the same `plan`. Each decodes and keeps a part of it, and hands an image of it to the
+    others whenever it is read: all have to read the same images in the same order. The limit counts for each rank.
     """
 
     def __init__(
-        self, limit: int = 0, keep_on: torch.device | str = "cpu", device: torch.device | str | None = None
+        self,
+        limit: int = 0,
+        keep_on: torch.device | str = "cpu",
+        device: torch.device | str | None = None,
+        sharing: Ranks = ALONE,
     ) -> None:
         self.limit = limit
+        self.sharing = sharing
         self.keep_on = torch.device(keep_on)
         self.device = torch.device(keep_on if device is None else device)
         self._kept: OrderedDict[Key, Tensor | Future[Tensor]] = OrderedDict()  # in order of use
         self._planned: set[Key] = set()
         self._awaited: set[Key] = set()  # planned for training, and not decoded yet
+        self._handed: dict[Key, Handed] = {}  # all that ranks share
         self._workers = threads()
         self._room_for_floats = True
         self._threads: ThreadPoolExecutor | None = None
         self._copies: DeviceCopies | None = None
 
     def plan(self, training: Iterable[Picture], others: Iterable[Picture] = ()) -> None:
-        """Announce all images, before the first is asked for.
+        """Announce all images, before the first is asked for; ranks that share them get a part of the bytes each.
 
         If the images kept at once exceed GPU_SHARE of a GPU's free memory, the CPU keeps them. A limit that all images
         fit into is dropped.
         """
-        self._awaited = {_key(source, size) for source, size in training}
-        self._planned = self._awaited | {_key(source, size) for source, size in others}
+        training = dict.fromkeys(_key(source, size) for source, size in training)
+        self._planned = self._own_part([*training, *(_key(source, size) for source, size in others)])
+        self._awaited = self._planned & training.keys()
         if self.limit >= len(self._planned):
             self.limit = 0
         if self.keep_on.type == "cuda":
@@ -79,14 +93,23 @@ class ImageStore:
         if self.device.type == "cuda" and self.keep_on.type == "cpu":
             self._copies = DeviceCopies(self.device)
 
+    def _own_part(self, keys: Iterable[Key]) -> set[Key]:
+        """Those of the images that this rank decodes; by itself, all."""
+        keys, ranks = list(dict.fromkeys(keys)), self.sharing
+        if not ranks.several:
+            return set(keys)
+        chosen = dict(zip(keys, holders((_bytes(*key) for key in keys), ranks.size), strict=True))
+        self._handed = {key: Handed(ranks, chosen[key], partial(self._own, key), self.device) for key in keys}
+        return {key for key in keys if chosen[key] == ranks.rank}
+
     @property
     def planned(self) -> int:
-        """Number of the images of `plan`."""
+        """Number of the images of `plan` that this rank decodes."""
         return len(self._planned)
 
     @property
     def planned_bytes(self) -> int:
-        """Upper bound on the bytes of the images of `plan` that are kept at once."""
+        """Upper bound on the bytes of the images of `plan` that this rank keeps at once."""
         sizes = sorted((_bytes(*key) for key in self._planned), reverse=True)
         if self._copies:
             sizes = [1 << (size - 1).bit_length() for size in sizes]  # torch pins memory in powers of two
@@ -95,7 +118,7 @@ class ImageStore:
     @property
     def keeps_floats(self) -> bool:
         """Whether images may also be kept as float32, four times as large, on the device of --data_device."""
-        return not self.limit and self._room_for_floats
+        return not self.limit and self._room_for_floats and not self.sharing.several
 
     def get(self, source: Source, size: Size) -> Tensor:
         """Image (3 or 4,H,W) uint8 of a photo, or the tensor that another source decodes to, on the store's device.
@@ -103,6 +126,15 @@ class ImageStore:
         UserError as `decode`.
         """
         key = _key(source, size)
+        handed = self._handed.get(key)
+        return self._own(key) if handed is None else handed.pixels
+
+    def changed(self, source: Source, size: Size, change: Callable[[Tensor], Tensor]) -> InMemory | Handed:
+        """A picture made of an image, of which the store keeps nothing: now, or by one rank for those that share it."""
+        handed = self._handed.get(_key(source, size))
+        return InMemory(change(self.get(source, size))) if handed is None else handed.changed(change)
+
+    def _own(self, key: Key) -> Tensor:
         picture = self._kept.get(key)
         if picture is None or isinstance(picture, Future):
             picture = self._finished(key)
@@ -111,18 +143,23 @@ class ImageStore:
 
     @property
     def ahead(self) -> int:
-        """Number of images that `prefetch` can use, the current one included; 0 when it has nothing to do."""
+        """Number of images that `prefetch` can use, the current one included; 0 when it has nothing to do.
+
+        Those of other ranks count as well, though it leaves them out.
+        """
+        count = 1 + COPIES_AHEAD if self._copies else 0
         if self.limit or self._awaited:
             most = 1 + 2 * self._workers
-            return min(self.limit, most) if self.limit else most
-        return 1 + COPIES_AHEAD if self._copies else 0
+            count = min(self.limit, most) if self.limit else most
+        return count * self.sharing.size
 
     def prefetch(self, coming: Sequence[Picture]) -> None:
         """Start to prepare the images that `get` is asked for next, in that order and at most `limit`; never waits.
 
         An image that cannot be decoded raises its error in `get`.
         """
-        keys = list(dict.fromkeys(_key(source, size) for source, size in coming))[: self.limit or None]
+        keys = dict.fromkeys(_key(source, size) for source, size in coming)
+        keys = [key for key in keys if key not in self._handed or key in self._planned][: self.limit or None]
         for key in keys:
             if key in self._kept:
                 self._kept.move_to_end(key)

@@ -10,6 +10,7 @@ from contextlib import AbstractContextManager, contextmanager, nullcontext
 from typing import TYPE_CHECKING, TypeVar
 
 if TYPE_CHECKING:
+    import torch
     from torch import Tensor
 
 Value = TypeVar("Value")
@@ -42,9 +43,15 @@ class Ranks:
 
         return torch.tensor([values], dtype=torch.int64)
 
-    def shared(self, value: Value) -> Value:
-        """Rank 0's value; of the others it is not read. It can be any object that pickles."""
+    def shared(self, value: Value, holder: int = 0) -> Value:
+        """The value of one rank, the holder; of the others it is not read. It can be any object that pickles."""
         return value
+
+    def handed(
+        self, holder: int, values: Tensor | None, shape: Sequence[int], dtype: torch.dtype, device: torch.device
+    ) -> Tensor:
+        """The values of one rank, the holder, which have a shape and dtype that all know; on others, on a device."""
+        return values
 
     def everyone(self, value: Value) -> list[Value]:
         """All ranks' values, in the order of ranks; any objects that pickle."""

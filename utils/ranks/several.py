@@ -29,10 +29,20 @@ class SeveralRanks(Ranks):
         dist.all_gather(everyone, mine, group=self._numbers)
         return torch.stack(everyone)
 
-    def shared(self, value: Value) -> Value:
+    def shared(self, value: Value, holder: int = 0) -> Value:
         box = [value]
-        dist.broadcast_object_list(box, src=0, group=self._numbers)
+        dist.broadcast_object_list(box, src=holder, group=self._numbers)
         return box[0]
+
+    def handed(
+        self, holder: int, values: Tensor | None, shape: Sequence[int], dtype: torch.dtype, device: torch.device
+    ) -> Tensor:
+        if self.rank == holder:
+            dist.broadcast(values.detach().contiguous().to(self._place), holder)
+            return values
+        received = torch.empty(shape, dtype=dtype, device=self._place)
+        dist.broadcast(received, holder)
+        return received.to(device)
 
     def everyone(self, value: Value) -> list[Value]:
         box: list = [None] * self.size

@@ -7,6 +7,7 @@ from datetime import timedelta
 from functools import wraps
 from typing import Any
 
+import torch
 import torch.distributed as dist
 from torch import Tensor
 
@@ -95,8 +96,14 @@ class WatchedRanks(SeveralRanks):
         return super().numbers(*values)
 
     @_watched
-    def shared(self, value: Value) -> Value:
-        return super().shared(value)
+    def shared(self, value: Value, holder: int = 0) -> Value:
+        return super().shared(value, holder)
+
+    @_watched
+    def handed(
+        self, holder: int, values: Tensor | None, shape: Sequence[int], dtype: torch.dtype, device: torch.device
+    ) -> Tensor:
+        return super().handed(holder, values, shape, dtype, device)
 
     @_watched
     def everyone(self, value: Value) -> list[Value]:
