@@ -31,6 +31,7 @@ BIN_SPLAT, SLOTS_SPLAT = 44, 16  # of a record while binning: keys, orders, offs
 BIN_INSTANCE, INSTANCE = 18, 4  # while binning: keys twice, splats twice, memory of the sort; afterwards
 SLOT = 0.25  # a bit, and its share of the prefix sums
 IMAGE = 12  # of a pixel: colour
+PHOTO = 3  # of a pixel, from the rank that keeps the photo
 PIXEL = 57 + 72 + 3 * IMAGE  # training/memory_estimate.py, and an image's copies on its way to all ranks
 
 HALO = 10  # rows on each side of a band: SSIM reads 5, and so does its gradient (REACH of fused_ssim)
@@ -108,9 +109,9 @@ class Design:
     operators: int  # small ones, whatever the number of ranks
 
 
-AS_WRITTEN = Design("as written", False, 6, 6, 60)
-WHOLE_IMAGE = Design("whole image", True, 6, 5, 60)
-LEAN = Design("lean", False, 0, 3, 0)
+AS_WRITTEN = Design("as written", False, 6, 7, 60)
+WHOLE_IMAGE = Design("whole image", True, 6, 6, 60)
+LEAN = Design("lean", False, 0, 4, 0)
 DESIGNS = (AS_WRITTEN, WHOLE_IMAGE, LEAN)
 
 GROWTHS = (1.2, 1.96)  # of a square block: by borders of a twentieth and a fifth of its side
@@ -131,6 +132,7 @@ def tiles_traffic(scene: Workload, gpus: int, design: Design = AS_WRITTEN) -> di
         "image": IMAGE * scene.pixels * away if design.whole_image else halo,
         "rows": ROW * scene.processed / gpus * away,
         "counts": COUNT * records,
+        "photo": PHOTO * scene.pixels * away,
     }
 
 
@@ -301,12 +303,12 @@ def traffic_table(scene: Workload) -> list[str]:
     for machine in MACHINES[1:5]:
         gpus = machine.gpus
         written, whole = tiles_traffic(scene, gpus), tiles_traffic(scene, gpus, WHOLE_IMAGE)
-        cells = [*(written[name] for name in ("records", "rows", "counts")), whole["image"]]
+        cells = [*(written[name] for name in ("records", "rows", "counts", "photo")), whole["image"]]
         cells += [sum(sent.values()) for sent in (written, whole, views_traffic(scene, gpus))]
-        needed = cells[4] / (0.25e-3 * _work(tiles_step(scene, machine))) / 1e9
+        needed = cells[5] / (0.25e-3 * _work(tiles_step(scene, machine))) / 1e9
         crossed = f"{bands_crossed(scene, gpus):.3f}"
         rows.append([str(gpus), crossed, *(f"{x / 1e6:,.1f}" for x in cells), f"{needed:,.0f}"])
-    header = ["GPUs", "bands", "records", "rows", "counts", "image", "tiles", "tiles, whole image", "views", "GB/s"]
+    header = ["GPUs", "bands", "records", "rows", "counts", "photo", "image", "tiles", "tiles, whole image", "views", "GB/s"]
     return table(header, rows)
 
 
