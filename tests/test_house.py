@@ -63,6 +63,7 @@ for room, below in {
     "scenes": ("benchmarks.harness", "benchmarks.workloads"),
     "exports": ("benchmarks.harness", "benchmarks.workloads"),
     "viewing": ("benchmarks.harness", "benchmarks.workloads"),
+    "parallel": ("benchmarks.peers", "benchmarks.harness", "benchmarks.workloads"),
 }.items():
     MAY_IMPORT[f"benchmarks.{room}"] = (*below, *MEASURED)
 
@@ -125,7 +126,14 @@ def test_a_module_imports_only_rooms_below_it(path):
 
 
 def test_tests_import_only_workloads_of_the_benchmarks_that_they_do_not_test():
-    tested = {"test_benchmarks", "test_costs", "test_stability", "test_accuracy_benchmark", "test_exports_foreign"}
+    tested = {
+        "test_parallel_benchmarks",
+        "test_benchmarks",
+        "test_costs",
+        "test_stability",
+        "test_accuracy_benchmark",
+        "test_exports_foreign",
+    }
     for path in (ROOT / "tests").rglob("*.py"):
         if path.stem not in tested:
             named = [name for name in _imports(path) if _within(name, "benchmarks")]
