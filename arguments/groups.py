@@ -284,6 +284,14 @@ class OptimizationParams(OptionTable):
             check=one_of("default", "sparse_adam"),
         ),
         Option(
+            "spill",
+            False,
+            "keep the SH bands above 0 and their averages of Adam, three quarters of a Gaussian, in the memory of the "
+            "host, and bring those that a view sees to the GPU: for more Gaussians than the GPU holds, slower and with "
+            "the same result",
+            "ours",
+        ),
+        Option(
             "max_num_splats",
             0,
             "largest number of Gaussians, 0: no limit, 1,000,000 with mcmc, or with budget what --strategy says; near "

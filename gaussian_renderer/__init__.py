@@ -8,6 +8,7 @@ from functools import cache, partial
 import utils.host.extensions  # noqa: F401  isort: skip  (before the extensions)
 import torch
 from diff_gaussian_rasterization import GaussianRasterizationSettings, decisive, rasterize
+from diff_gaussian_rasterization.backend import OPERATORS
 from diff_gaussian_rasterization.gaussians import Gaussians
 from diff_gaussian_rasterization.ops import Rasterized, scene_arguments
 from torch import Tensor
@@ -111,6 +112,17 @@ def decisive_for(camera: Camera | MiniCam, pc: GaussianModel, pipe: argparse.Nam
         scene = scene_arguments(Gaussians(pc.get_xyz, **geometry, **colors), settings, raw)
         return decisive_in(draw_view(ranks, scene, background, want_depth=False, train=True))
     return decisive(pc.get_xyz, settings=settings, raw=raw, **geometry, **colors)
+
+
+@torch.no_grad()
+def visible_rows(camera: Camera | MiniCam, pc: GaussianModel, pipe: argparse.Namespace) -> Tensor:
+    """Gaussians that the view may draw, or give a radius > 0: (n,) int64, ascending. Reads no SH bands above 0."""
+    geometry, raw = _geometry(pc, pipe.compute_cov3D_python, 1.0)
+    # Only whether colours are finite matters here, and for that any will do in place of those that the bands give.
+    gaussians = Gaussians(pc.get_xyz, **geometry, colors=pc.get_features_dc.reshape(-1, 3))
+    settings = rasterizer_settings(camera, pc, pipe, pc.get_xyz.new_zeros(3))
+    *_, tile_counts, radii = OPERATORS.project(*scene_arguments(gaussians, settings, raw))
+    return ((tile_counts > 0) | (radii > 0)).nonzero().reshape(-1)  # a small one may be drawn with a radius of 0
 
 
 def model_inputs(

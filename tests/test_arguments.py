@@ -69,6 +69,7 @@ OURS = {
     "invert_masks": False,
     "mask_meaning": "auto",
     "images_to_load": 0,
+    "spill": False,
     "max_num_splats": 0,
     "keep_unseen": False,
     "prune_sh": 0.0,

@@ -63,6 +63,10 @@ SCHEMAS = [
     "sparse_adam_(Tensor(a!) value, Tensor gradient, Tensor(b!) exp_avg, Tensor(c!) exp_avg_sq, Tensor visible, "
     "float lr, float beta1, float beta2, float eps, int columns=-1, Tensor? loss=None, Tensor(d!)? stopped=None, "
     "int iteration=0) -> ()",
+    "catch_up_(Tensor(a!) value, Tensor(b!) exp_avg, Tensor(c!) exp_avg_sq, Tensor taken, float[] rates, "
+    "float[] steps, float beta1, float beta2, float eps, int columns=-1) -> ()",
+    "in_host_memory(Tensor values) -> Tensor",
+    "is_in_host_memory(Tensor values) -> bool",
     "observe_(Tensor(a!) max_radii, Tensor(b!) gradient_sums, Tensor(c!) views, Tensor radii, Tensor gradient) -> ()",
     "split_positions(Tensor means, Tensor log_scales, Tensor rotations, Tensor items, int seed, int stream, "
     "int iteration, int draw) -> Tensor",

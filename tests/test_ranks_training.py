@@ -28,7 +28,7 @@ def _train(scene: str, out: str, options: list[str]) -> tuple[list[bytes], list[
     """Train: the losses, the collective calls of fused steps, and the model."""
     torch.set_num_threads(1)
     calls, losses, counted = Counter(), [], []
-    measure, advance, out = FusedStep.measure, FusedStep.advance, f"{out}_{ranks().size}_{ranks().rank}"
+    measure, advance, out = FusedStep.measure, FusedStep.advance, f"{out}_{ranks().size}"
 
     def counting(name: str) -> None:
         call = getattr(several.dist, name)

@@ -7,6 +7,8 @@ import torch
 
 from scene import Scene
 from scene.gaussian_model import GaussianModel
+from scene.pictures.store import ImageStore
+from scene.spilled_model import SpilledGaussians
 from utils.host.memory import free_memory, gib
 
 # Bytes besides the parameters, their gradients and Adam's two averages. 106 and 57 were fitted to the peak memory of
@@ -17,7 +19,11 @@ PER_PIXEL = 57 + 72
 # Of absolute gradients: their length, and two values more beside the ten of a tile's gradient of a Gaussian, of which
 # the 106 bytes are the most part.
 PER_ABSOLUTE = 4 + 106 // 5
+# Part of the Gaussians that a view is taken to see, for what --spill keeps on the GPU only of those in view: that of a
+# large scene, which is what it is for.
+SEEN = 0.25
 GROWTH = 20  # photo scenes grow 10- to 100-fold in 7,000 iterations (docs/results/training.md), random points 2-fold
+_REMEDY = "--images_to_load, or lower --resolution (-r) or --sh_degree"
 
 
 def announce_memory(scene: Scene, gaussians: GaussianModel, max_splats: int, absolute: bool = False) -> None:
@@ -31,8 +37,8 @@ def announce_memory(scene: Scene, gaussians: GaussianModel, max_splats: int, abs
     now, size = gaussians.total, gaussians.shards.ranks.size
     later = max(max_splats, now) if max_splats else GROWTH * now
     why = "--max_num_splats" if max_splats else f"scenes often grow {GROWTH}-fold"
-    sizes = (-(-count // size) for count in (now, later))
-    at_start, at_end = (training_bytes(gaussians, count, pixels, absolute) for count in sizes)
+    per_rank = [-(-count // size) for count in (now, later)]
+    at_start, at_end = (training_bytes(gaussians, count, pixels, absolute) for count in per_rank)
     training = f"training {gib(at_start)} with {now:,} Gaussians, {gib(at_end)} with {later:,} ({why})"
     if size > 1:
         training += f" for each of {size} processes"
@@ -40,6 +46,8 @@ def announce_memory(scene: Scene, gaussians: GaussianModel, max_splats: int, abs
     photos = f"photos {gib(pictures)}"
     if images.limit:
         photos += f" (--images_to_load keeps {images.limit:,} of {images.planned:,} decoded images)"
+    if isinstance(gaussians, SpilledGaussians) and device.type == "cuda":
+        _announce_host(images, spilled_bytes(gaussians, per_rank[1]) * size, f"{later:,} Gaussians")
     together = images.keep_on.type == device.type and (images.keep_on.index or 0) == (device.index or 0)
     if not together:
         room = _announce(images.keep_on, photos, pictures)
@@ -47,11 +55,23 @@ def announce_memory(scene: Scene, gaussians: GaussianModel, max_splats: int, abs
             _warn(images.keep_on, "all photos", "set --images_to_load, or lower --resolution (-r)")
         pictures = 0
     room = _announce(device, f"{photos}, {training}" if together else training, pictures)
-    if room < at_start:
-        _warn(device, f"{now:,} Gaussians", "set --images_to_load, or lower --resolution (-r) or --sh_degree")
-    elif room < at_end:
-        remedy = "set a lower --max_num_splats, or --images_to_load, or lower --resolution (-r) or --sh_degree"
-        _warn(device, f"{later:,} Gaussians", remedy)
+    for count, own, needed, first in (
+        (now, per_rank[0], at_start, "set "),
+        (later, per_rank[1], at_end, "set a lower --max_num_splats, or "),
+    ):
+        if room < needed:
+            helps = device.type == "cuda" and training_bytes(gaussians, own, pixels, absolute, spill=True) <= room
+            spill = "set --spill, or " if helps else ""
+            _warn(device, f"{count:,} Gaussians", f"{spill}{first}{_REMEDY}")
+            break
+
+
+def _announce_host(images: ImageStore, needed: int, what: str) -> None:
+    """Print what --spill keeps in the host's memory, besides photos there; warn if it does not fit."""
+    host = torch.device("cpu")
+    room = _announce(host, f"--spill {gib(needed)} with {what}", images.planned_bytes if images.keep_on == host else 0)
+    if room < needed:
+        _warn(host, what, f"set a lower --max_num_splats, or {_REMEDY}")
 
 
 def _announce(device: torch.device, content: str, pictures: int) -> float:
@@ -69,11 +89,28 @@ def _name(device: torch.device) -> str:
     return "GPU" if device.type == "cuda" else "CPU"
 
 
-def training_bytes(gaussians: GaussianModel, count: int, pixels: int, absolute: bool = False) -> int:
+def training_bytes(
+    gaussians: GaussianModel, count: int, pixels: int, absolute: bool = False, spill: bool | None = None
+) -> int:
     """Bytes of `count` Gaussians with all that training keeps for them, and of one view's buffers.
 
-    absolute: with absolute gradients.
+    absolute: with absolute gradients. spill: with --spill, on the GPU; None: as the model is.
     """
     values = sum(group["params"][0][:1].numel() for group in gaussians.optimizer.param_groups)
-    each = 4 * 4 * values + PER_GAUSSIAN + absolute * PER_ABSOLUTE
-    return count * each + pixels * PER_PIXEL
+    each = 4 * 4 * values
+    if isinstance(gaussians, SpilledGaussians) if spill is None else spill:
+        bands = _bands(gaussians)
+        # All rows: the other values, and how many steps were taken. Rows in view: bands and averages, of this view and
+        # the next, and one of the three once more while they are joined; gradients; copies of the other values.
+        each = 4 * 4 * (values - bands) + 4 + int(SEEN * 4 * ((3 + 3 + 1 + 1) * bands + 2 * (values - bands)))
+    return count * (each + PER_GAUSSIAN + absolute * PER_ABSOLUTE) + pixels * PER_PIXEL
+
+
+def spilled_bytes(gaussians: GaussianModel, count: int) -> int:
+    """Bytes of `count` Gaussians in the host's memory with --spill: bands above 0 and two averages of them."""
+    return count * 4 * 3 * _bands(gaussians)
+
+
+def _bands(gaussians: GaussianModel) -> int:
+    """Values of a Gaussian that --spill keeps in the host's memory."""
+    return 3 * ((gaussians.max_sh_degree + 1) ** 2 - 1)

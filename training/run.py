@@ -17,6 +17,7 @@ from scene.cameras import Camera
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.checkpoint import load_checkpoint
 from scene.options import option
+from scene.spilled_model import SpilledGaussians
 from training.agreement import agree_on_scene
 from training.checks import check_exposures, check_scene, check_target, warn_of_fewer, warn_of_late_reset
 from training.history import VIEWS, check_folder, check_views, continue_records, report_changes
@@ -37,7 +38,7 @@ from utils.general_utils import get_expon_lr_func
 from utils.host.interrupt import DeferredInterrupt
 from utils.host.process import seconds_since_start
 from utils.ranks.ranks import ranks
-from utils.system_utils import compute_device
+from utils.system_utils import UserError, compute_device
 
 SH_INTERVAL = 1000  # iterations between raises of the active SH degree
 
@@ -63,12 +64,15 @@ class Run:
         self.lost = 0
         self.interrupt = DeferredInterrupt()
         self.device = compute_device()
-        place = "cpu" if ranks().several else self.device  # a rank keeps a part
+        place = "cpu" if ranks().several or opt.spill else self.device  # a part of it is kept there
         capture, self.first_iteration = load_checkpoint(plan.start, place) if plan.start else (None, 0)
         views = ranks().size if plan.parallel == "views" else 1
+        if opt.spill and views > 1:
+            raise UserError("--spill takes one view in each iteration; use --parallel tiles")
         self.pace = pace_of(opt, plan.start, self.first_iteration, views)
         warn_of_late_reset(opt, dataset.white_background, self.pace)
-        self.gaussians = GaussianModel(dataset.sh_degree, opt.optimizer_type)
+        kind = SpilledGaussians if opt.spill else GaussianModel
+        self.gaussians = kind(dataset.sh_degree, opt.optimizer_type)
         self.gaussians.divide(ranks())
         init_ply = option(dataset, "init_ply")
         if init_ply and not plan.start:

@@ -1,9 +1,10 @@
 """Adam over the tensors of a Gaussian model."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from operator import itemgetter
-from typing import Any
+from types import MappingProxyType
+from typing import Any, NamedTuple
 
 import utils.host.extensions  # noqa: F401  isort: skip  (before the extensions)
 import torch
@@ -11,6 +12,7 @@ from diff_gaussian_rasterization.optim import adam_
 from torch import Tensor
 from torch.optim.optimizer import _global_optimizer_post_hooks, _global_optimizer_pre_hooks
 
+from scene.gaussians.host_memory import beside
 from scene.gaussians.row_surgery import Group
 from scene.gaussians.undecorated import undecorated
 
@@ -39,15 +41,27 @@ class StepGuard:
         return int(self.stopped)
 
 
+class Part(NamedTuple):
+    """Some rows of a parameter, which take its step in copies."""
+
+    rows: Tensor  # (n,) indices, ascending
+    value: Tensor  # (n, ...), this and all others
+    gradient: Tensor
+    exp_avg: Tensor
+    exp_avg_sq: Tensor
+
+
 class GaussianAdam(torch.optim.Adam):
     """torch.optim.Adam with one parameter (N, ...) per named group, and the same bits for any number of threads.
 
     State and state dict have torch's form (step, exp_avg, exp_avg_sq), so checkpoints of both can be exchanged.
     guard: see StepGuard. Groups that the kernel cannot step are stepped by torch, unguarded: several parameters, or
     another dtype, device, betas, eps or further option than the optimiser's. Groups may change between any two steps.
+    parts: by group, what takes the next step in place of a parameter that has a gradient; its values are not read.
     """
 
     guard: StepGuard | None = None
+    parts: Mapping[str, Part] = MappingProxyType({})
 
     def __init__(self, groups: list[dict], eps: float = 1e-15) -> None:
         """Take groups: dicts with `params` (a list of one Parameter), `lr` and `name`."""
@@ -120,7 +134,11 @@ class GaussianAdam(torch.optim.Adam):
                     gradient = param
             if gradient is not None:
                 state = self.state_of(param)
-                tensors.append((param, gradient, state["exp_avg"], state["exp_avg_sq"], state["step"]))
+                if part := self.parts.get(group.get("name")):
+                    tensors.append((*part[1:], state["step"]))
+                    active = -1
+                else:
+                    tensors.append((param, gradient, state["exp_avg"], state["exp_avg_sq"], state["step"]))
                 rates.append(group["lr"])
                 columns.append(active)
         if tensors:
@@ -196,8 +214,8 @@ class GaussianAdam(torch.optim.Adam):
         state = self.state[param]
         if not state:
             state["step"] = torch.zeros((), dtype=torch.float32)
-            state["exp_avg"] = torch.zeros_like(param)
-            state["exp_avg_sq"] = torch.zeros_like(param)
+            state["exp_avg"] = beside(param, torch.zeros_like(param))
+            state["exp_avg_sq"] = beside(param, torch.zeros_like(param))
         return state
 
     def take_state(self, state_dict: Any) -> list[str]:
@@ -249,5 +267,9 @@ def _fitting(entry: Any, param: Tensor, name: str | None) -> dict[str, Tensor]:
         raise ValueError(f"step of {name} is not a number") from error
     if not (math.isfinite(step) and step >= 0):
         raise ValueError(f"step of {name} is {step}")
-    averages = {key: value for key, value in entry.items() if torch.is_tensor(value) and value.shape == param.shape}
+    averages = {
+        key: beside(param, value)
+        for key, value in entry.items()
+        if torch.is_tensor(value) and value.shape == param.shape
+    }
     return {"step": torch.tensor(step, dtype=torch.float32), **averages}

@@ -6,6 +6,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from scene.gaussians.host_memory import beside
 from utils.host.memory import is_out_of_memory
 
 _CHUNK = 1 << 16  # rows moved at a time when memory is too short for all of them
@@ -57,7 +58,7 @@ def keep_rows(groups: list[Group], states: States, indices: Tensor) -> dict[str,
 
     def select(values: Tensor, *_: object) -> Tensor:
         try:
-            return values.index_select(0, indices)
+            return beside(values, values.index_select(0, indices))
         except (MemoryError, RuntimeError) as error:
             if not is_out_of_memory(error):
                 raise
@@ -110,7 +111,8 @@ def map_rows(
     params = {}
     for group in groups:
         name = group.get("name")
-        value = change(group["params"][0].detach(), name, False)
+        old = group["params"][0].detach()
+        value = beside(old, change(old, name, False))
         params[name] = _replace(group, states, value, lambda mean, name=name: change(mean, name, True))
     return params
 
@@ -123,7 +125,7 @@ def _replace(group: Group, states: States, value: Tensor, change: Callable[[Tens
         for key, mean in state.items():
             # Longer than the parameter: appended just before memory ran out, and now to be cut again.
             if torch.is_tensor(mean) and mean.dim() == old.dim() and len(mean) >= len(old):
-                state[key] = change(mean)
+                state[key] = beside(mean, change(mean))
         states[param] = states.pop(old)
     group["params"] = [param]
     return param

@@ -30,10 +30,12 @@ class SparseGaussianAdam(GaussianAdam):
                 continue
             state = self.state_of(param)
             state["step"] += 1
-            moments = state["exp_avg"], state["exp_avg_sq"]
             beta1, beta2 = group["betas"]
             columns = self._active_columns.get(group.get("name"), -1) or -1  # 0, yet with a gradient: all
             guard = self.guard.arguments if self.guard else ()
-            sparse_adam_(param, param.grad, *moments, visible, group["lr"], beta1, beta2, group["eps"], columns, *guard)
+            tensors = param, param.grad, state["exp_avg"], state["exp_avg_sq"], visible
+            if part := self.parts.get(group.get("name")):
+                tensors, columns = (*part[1:], visible[part.rows]), -1
+            sparse_adam_(*tensors, group["lr"], beta1, beta2, group["eps"], columns, *guard)
         if others:
             self._step_by_torch(others)

@@ -57,6 +57,12 @@ def sound_calls() -> dict[str, Call]:
         "sparse_adam_": (ops.sparse_adam_, [*sparse, *guard]),
         "run_ahead_": (ops.run_ahead_, [torch.zeros(5, dtype=torch.int64), [1, 1, 1], None]),  # refused: not on a GPU
         "step_now_": (ops.step_now_, _step_now()),
+        "catch_up_": (
+            ops.catch_up_,
+            [*(torch.rand(3, 4) for _ in range(3)), torch.zeros(3, dtype=torch.int32), [0.1], [1.0], 0.9, 0.999, 1e-8],
+        ),
+        "in_host_memory": (ops.in_host_memory, [torch.rand(3, 4)]),
+        "is_in_host_memory": (ops.is_in_host_memory, [torch.rand(3, 4)]),
         "observe_": (ops.observe_, [*statistics, torch.rand(3, 3)]),
         "split_positions": (
             ops.split_positions,
@@ -71,6 +77,12 @@ def sound_calls() -> dict[str, Call]:
         "l1_ssim_vjp": (ssim.l1_ssim_vjp, [one, two, kept, torch.ones(()), torch.ones(())]),
         "photometric": (ssim.photometric, [one, two, 0.2, True]),
         "photometric_vjp": (ssim.photometric_vjp, [one, two, kept, 0.2, torch.ones(())]),
+        "photometric_band": (ssim.photometric_band, [one, two, 0, one.shape[-2]]),
+        "photometric_of_sums": (ssim.photometric_of_sums, [one, ssim.photometric_band(one, two, 0, 0)[0], 0.2]),
+        "photometric_band_vjp": (
+            ssim.photometric_band_vjp,
+            [one, two, kept, 0.2, torch.ones(()), 0, one.shape[-2]],
+        ),
         "composite": (ssim.composite, [torch.zeros(4, 5, 6, dtype=torch.uint8), torch.ones(3)]),
         "mean_distance2": (torch.ops.simple_knn.mean_distance2, [torch.rand(9, 3)]),
     }

@@ -11,6 +11,7 @@ from training.observer import Announcer
 from training.run import Run
 from training.step import Step
 from training.steps.plain import PlainStep
+from utils.ranks.ranks import ranks
 
 
 class FusedStep:
@@ -66,7 +67,7 @@ class FusedStep:
         """Render: what was drawn, the losses, and their gradients of image and depth."""
         run = self._run
         exposed = run.dataset.train_test_exp
-        by_bands = not exposed and run.objective.takes_bands(step)
+        by_bands = ranks().several and not exposed and run.objective.takes_bands(step)
         drawn = draw(step.camera, run.gaussians, run.pipe, step.background, step.depth_weight > 0, by_bands)
         with torch.enable_grad():
             image, depth = drawn.image.requires_grad_(), drawn.depth

@@ -3,6 +3,7 @@
 from torch import Tensor
 
 from gaussian_renderer import render
+from scene.gaussian_model import GaussianModel
 from training.objective import Losses
 from training.observer import Announcer
 from training.run import Run
@@ -34,12 +35,22 @@ class PlainStep:
     def backward(self, step: Step) -> tuple[dict[str, Tensor], Losses]:
         """Render and differentiate: the result of `render`, and the losses."""
         run = self._run
-        package = render(step.camera, run.gaussians, run.pipe, step.background, **run.render_options(step))
+        package = self.render(step, run.gaussians)
         losses = run.objective(package, step)
-        losses.total.backward()
+        package = self.follow(losses, package)
         if any(run.density.penalty):
             run.gaussians.penalise(run.density.penalty)
         return package, losses
+
+    def render(self, step: Step, gaussians: GaussianModel) -> dict[str, Tensor]:
+        """The result of `render`, with what the loss needs."""
+        run = self._run
+        return render(step.camera, gaussians, run.pipe, step.background, **run.render_options(step))
+
+    def follow(self, losses: Losses, package: dict[str, Tensor]) -> dict[str, Tensor]:
+        """Compute the gradients. Returns the result of `render`."""
+        losses.total.backward()
+        return package
 
     def advance(self, step: Step, package: dict[str, Tensor]) -> None:
         """Let density control and the optimisers use the gradients."""

@@ -117,7 +117,13 @@ def _(means, *_):
     return means.new_empty((means.shape[0], 3))
 
 
+@_fake("in_host_memory")
+def _(values):
+    return torch.empty_like(values)
+
+
 @_fake("adam_")
+@_fake("catch_up_")
 @_fake("sparse_adam_")
 @_fake("observe_")
 @_fake("rasterize_vjp_step_")

@@ -369,6 +369,56 @@ void test_adam() {
   }
 }
 
+// Steps that rows have missed are those of adam with zeros as gradient, to the bit; on the CPU likewise.
+void test_catch_up() {
+  constexpr int64_t rows = 37, row = 45;
+  constexpr int32_t count = 70;
+  using Step = gs::baseline::AdamStep<float>;
+  std::vector<Step> steps;
+  for (int32_t k = 0; k < count; ++k)
+    steps.push_back(gs::baseline::make_adam_step<float>(0.01 / (1 + k % 3), 0.9, 0.999, 1e-15, 5 + k));
+  std::vector<int32_t> taken;
+  for (int64_t r = 0; r < rows; ++r) taken.push_back(int32_t(r * 2));  // some rows lack none
+  for (const int64_t columns : {int64_t(0), int64_t(9), row})
+    for (const bool on_gpu : {false, true}) {
+      std::vector<float> start[3], zero(rows * row);
+      for (int64_t i = 0; i < rows * row; ++i)
+        for (std::vector<float>& part : start) part.push_back(i % 7 ? float(std::abs(normal())) : 0.0f);
+      std::vector<float> got[3] = {start[0], start[1], start[2]}, wanted[3] = {start[0], start[1], start[2]};
+      gs::emulation::Memory memory;
+      const auto rows_of = [&](std::vector<float>(&s)[3], int64_t r, int64_t n) {
+        return gs::AdamInput<float>{s[0].data() + r * row,
+                                    zero.data(),
+                                    s[1].data() + r * row,
+                                    s[2].data() + r * row,
+                                    n,
+                                    row,
+                                    columns,
+                                    0,
+                                    0.9,
+                                    0.999,
+                                    1e-15,
+                                    0};
+      };
+      for (int64_t r = 0; r < rows; ++r)
+        for (int32_t k = taken[r]; k < count; ++k) {
+          gs::AdamInput<float> one = rows_of(wanted, r, 1);
+          one.lr = 0.01 / (1 + k % 3), one.step = 5 + k;
+          if (on_gpu)
+            gs::cuda::adam(memory.queue(), &one, 1, gs::StepGuard<float>{});
+          else
+            adam(gs::serial_executor(), &one, 1, gs::StepGuard<float>{});
+        }
+      const gs::MissedSteps<float> missed{reinterpret_cast<const float*>(steps.data()), taken.data(), count};
+      if (on_gpu)
+        gs::cuda::catch_up(memory.queue(), rows_of(got, 0, rows), missed);
+      else
+        catch_up(gs::serial_executor(), rows_of(got, 0, rows), missed);
+      for (int part = 0; part < 3; ++part) CHECK(got[part] == wanted[part]);
+      CHECK((got[0] != start[0]) == (columns > 0));
+    }
+}
+
 // Under a guard, dense and sparse: values that are not finite are marked, the others take their step, and later steps
 // change nothing.
 void test_step_guard() {
@@ -666,6 +716,7 @@ int main() {
   test_against_cpu();
   test_sparse_adam();
   test_adam();
+  test_catch_up();
   test_step_guard();
   test_observe();
   test_split_positions();

@@ -1,0 +1,213 @@
+"""--spill: rows that step late, in the host's memory, give the bytes of rows that step in time."""
+
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from diff_gaussian_rasterization.optim import adam_, catch_up_
+from gaussians import model
+from processes import in_ranks
+from synthetic import FOCAL, make_colmap_scene
+from test_steps import ITERATIONS, differences, trained
+
+import train
+from scene import spilled_model
+from scene.gaussian_model import GaussianModel
+from scene.gaussians.checkpoint import load_checkpoint
+from scene.spilled_model import SpilledGaussians
+from training import memory_estimate, objective, run
+from training.memory_estimate import spilled_bytes, training_bytes
+from utils.system_utils import UserError
+
+BETAS, EPS = (0.9, 0.999), 1e-15
+MCMC = ("--strategy", "mcmc", "--mcmc_noise", 5e4, "--mcmc_gate_opacity", 0.5, "--mcmc_min_opacity", 0.45)
+OPTIONS = {
+    "adc": (),
+    "sparse": ("--optimizer_type", "sparse_adam", "--random_background"),
+    "mcmc": MCMC,
+    "budget": ("--strategy", "budget", "--max_num_splats", 500, "--densify_until_iter", 50),
+    "exposure": ("--train_test_exp", "--antialiasing", "--white_background"),
+    "degree 1": ("--sh_degree", 1, "--absgrad", "--absgrad_threshold", 2e-4),
+    "python": ("--convert_SHs_python",),
+}
+
+
+@pytest.fixture(autouse=True)
+def _stdout(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "stdout", sys.stdout)  # training stamps it
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A scene of which a view sees a part."""
+    folder = tmp_path_factory.mktemp("narrow") / "scene"
+    make_colmap_scene(folder, params=(5 * FOCAL, 5 * FOCAL, 48.0, 32.0))
+    return folder
+
+
+@pytest.fixture(autouse=True)
+def _raised_soon(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Raise the SH degree every 12 iterations, between those that change rows."""
+    monkeypatch.setattr(run, "SH_INTERVAL", 12)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=["float32", "float64"])
+@pytest.mark.parametrize("columns", [-1, 0, 9, 24])
+def test_missed_steps_are_steps_without_a_gradient(dtype, columns):
+    count, past = 130, 90
+    generator = torch.Generator().manual_seed(0)
+    state = [torch.randn(count, 15, 3, generator=generator, dtype=dtype) for _ in range(3)]
+    # Averages of all sizes, some of which fade to nothing.
+    scale = 10 ** torch.linspace(-44, 5, count, dtype=torch.float64).reshape(-1, 1, 1).to(dtype)
+    state[1], state[2] = state[1] * scale, (state[2] * scale) ** 2
+    state[1][::5], state[2][::5] = 0, 0
+    rates, numbers = [0.01 / (1 + k % 4) for k in range(past)], [float(40 + k) for k in range(past)]
+    taken = (torch.arange(count, dtype=torch.int32) * 7) % (past + 1)
+    wanted = [t.clone() for t in state]
+    for k in range(past):
+        rows = (taken <= k).nonzero().reshape(-1)
+        part = [t[rows] for t in wanted]
+        lists = [part[0]], [torch.zeros_like(part[0])], [part[1]], [part[2]], [torch.tensor(numbers[k] - 1)]
+        adam_(*lists, [rates[k]], *BETAS, EPS, [columns])
+        for whole, values in zip(wanted, part, strict=True):
+            whole[rows] = values
+    assert (state[0] == wanted[0]).all() == (columns == 0)
+    before = torch.get_num_threads()
+    for threads in (1, 3):
+        found = [t.clone() for t in state]
+        try:
+            torch.set_num_threads(threads)
+            catch_up_(*found, taken, rates, numbers, *BETAS, EPS, columns)
+        finally:
+            torch.set_num_threads(before)
+        assert all(torch.equal(a, b) for a, b in zip(found, wanted, strict=True))
+
+
+def test_what_does_not_fit_is_refused():
+    state = [torch.ones(4, 3) for _ in range(3)]
+    taken = torch.zeros(4, dtype=torch.int32)
+    with pytest.raises(TypeError, match=r"taken must be torch.int32"):
+        catch_up_(*state, taken.long(), [0.1], [1.0], *BETAS, EPS)
+    with pytest.raises(ValueError, match=r"taken must be \(4,\)"):
+        catch_up_(*state, taken[:3], [0.1], [1.0], *BETAS, EPS)
+    with pytest.raises(ValueError, match="a rate for each of the 1 steps, got 2"):
+        catch_up_(*state, taken, [0.1, 0.1], [1.0], *BETAS, EPS)
+    assert all((t == 1).all() for t in state)
+
+
+@pytest.mark.parametrize("options", OPTIONS.values(), ids=OPTIONS.keys())
+def test_a_training_writes_the_same_files(scene, tmp_path, monkeypatch, options):
+    usual = trained(scene, tmp_path / "usual", *options)
+    late, steps = [], SpilledGaussians._take_missed
+
+    def noted(self, missed, taken, *others):
+        late.append(len(missed.steps) - int(taken.min()))
+        return steps(self, missed, taken, *others)
+
+    monkeypatch.setattr(SpilledGaussians, "_take_missed", noted)
+    assert differences(trained(scene, tmp_path / "spilled", "--spill", *options), usual) == []
+    assert bool(late) == ("sparse_adam" not in options)
+    assert not late or max(late) >= 5
+
+
+@pytest.mark.parametrize("most", [1, 4])
+def test_a_long_list_of_missed_steps_is_cut(scene, tmp_path, monkeypatch, most):
+    usual = trained(scene, tmp_path / "usual")
+    monkeypatch.setattr(spilled_model, "_MOST_MISSED", most)
+    assert differences(trained(scene, tmp_path / "spilled", "--spill"), usual) == []
+
+
+@pytest.mark.parametrize("kind", ["adc", "sparse", "mcmc"])
+def test_resuming_from_either_way_to_the_other(scene, tmp_path, kind):
+    whole = trained(scene, tmp_path / "whole", *OPTIONS[kind])
+    for first, then in (((), ("--spill",)), (("--spill",), ())):
+        out = tmp_path / f"{len(first)}"
+        trained(scene, out / "a", *OPTIONS[kind], *first, "--checkpoint_iterations", 33, ITERATIONS)
+        words = "--start_checkpoint", out / "a" / "chkpnt33.pth", *then
+        assert differences(trained(scene, out / "b", *OPTIONS[kind], *words), whole) == []
+
+
+def test_looking_at_the_model_changes_nothing(scene, tmp_path):
+    looks = "--test_iterations", 3, 17, 31, 45, "--save_iterations", 9, 44, "--checkpoint_iterations", 21, ITERATIONS
+    usual = trained(scene, tmp_path / "usual", *looks)
+    assert differences(trained(scene, tmp_path / "spilled", "--spill", *looks), usual) == []
+    for iteration in (9, 44):
+        ply = f"point_cloud/iteration_{iteration}/point_cloud.ply"
+        assert (tmp_path / "usual" / ply).read_bytes() == (tmp_path / "spilled" / ply).read_bytes()
+
+
+def _stopped(scene: Path, out: Path, *options: object) -> tuple[str, list[object]]:
+    """What a run says that stops, and the state that it leaves, but for its statistics and learning rates."""
+    with pytest.raises(UserError) as error:
+        trained(scene, out, *options)
+    (path,) = out.glob("chkpnt*.pth")
+    capture, iteration = load_checkpoint(path)
+    said = str(error.value).replace(str(out), "")
+    return said, [iteration, *capture[:7], capture[10]["state"], capture[11]]
+
+
+def _equal(a: object, b: object) -> bool:
+    if isinstance(a, dict):
+        return a.keys() == b.keys() and all(_equal(a[key], b[key]) for key in a)
+    return torch.equal(a, b) if torch.is_tensor(a) else a == b
+
+
+@pytest.mark.parametrize("kind", ["adc", "sparse"])
+@pytest.mark.parametrize("what", ["loss", "f_rest", "xyz"])
+def test_a_guard_leaves_the_same_model_and_marks(scene, tmp_path, monkeypatch, what, kind):
+    """From iteration 34 on, which is found out in 36, where the SH degree is raised."""
+    results = []
+    for name, further in (("usual", ("--plain_step",)), ("spilled", ("--spill",))):
+        calls, loss, step = [], objective.photometric_loss, GaussianModel.step
+
+        def broken(*args: object, calls=calls, loss=loss) -> tuple[torch.Tensor, torch.Tensor]:
+            calls.append(1)
+            total, l1 = loss(*args)
+            return (total * float("nan") if what == "loss" and len(calls) == 34 else total), l1
+
+        def poisoned(self: GaussianModel, radii: torch.Tensor, calls=calls, step=step) -> None:
+            if what != "loss" and len(calls) == 34:
+                row = int(radii.argmax())
+                if what == "f_rest" and self.optimizer.parts:
+                    part = self.optimizer.parts["f_rest"]
+                    part.gradient[(part.rows == row).nonzero(), 1, 2] = float("inf")
+                else:
+                    self.raw(what).grad.view(len(self), -1)[row, 5 if what == "f_rest" else 1] = float("inf")
+            step(self, radii)
+
+        with monkeypatch.context() as patch:
+            patch.setattr(objective, "photometric_loss", broken)
+            patch.setattr(GaussianModel, "step", poisoned)
+            results.append(_stopped(scene, tmp_path / name, *OPTIONS[kind], *further))
+    (said, usual), (told, spilled) = results
+    assert said == told and ("became nan" if what == "loss" else f"{what} of 1 of") in said
+    assert all(map(_equal, spilled, usual))
+
+
+def _trained_together(scene: Path, out: Path, *options: object) -> None:
+    run.SH_INTERVAL = 12
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "stdout", sys.stdout)
+        words = ["-s", scene, "-m", out, "-r", 48, "--iterations", 30, "--densify_from_iter", 5, "--no_curve"]
+        words += ["--densification_interval", 8, "--test_iterations", -1, "--quiet", "--disable_viewer"]
+        words += ["--checkpoint_iterations", 30, *options]
+        train.main(list(map(str, words)))
+
+
+def test_ranks_each_spill_their_part(scene, tmp_path):
+    _trained_together(scene, tmp_path / "alone")
+    in_ranks(2, _trained_together, scene, tmp_path / "two", "--spill")
+    ply = "point_cloud/iteration_30/point_cloud.ply"
+    assert (tmp_path / "two" / ply).read_bytes() == (tmp_path / "alone" / ply).read_bytes()
+    two, alone = (load_checkpoint(tmp_path / name / "chkpnt30.pth")[0] for name in ("two", "alone"))
+    assert all(map(_equal, (*two[:10], two[10]["state"]), (*alone[:10], alone[10]["state"])))
+
+
+def test_the_estimate_leaves_out_what_lies_in_the_hosts_memory():
+    gaussians = model(50)
+    usual, spilled = (training_bytes(gaussians, 1000, 0, spill=spill) for spill in (None, True))
+    assert usual == 1000 * (16 * 59 + memory_estimate.PER_GAUSSIAN)
+    assert spilled_bytes(gaussians, 1000) == 1000 * 12 * 45
+    seen = memory_estimate.SEEN * (45 * 32 + 14 * 8)
+    assert spilled == 1000 * (16 * 14 + 4 + seen + memory_estimate.PER_GAUSSIAN)
