@@ -157,7 +157,7 @@ ranks() {
   local launch=(python3 -m torch.distributed.run --standalone --nproc_per_node "$count" -m)
   shift 2
   # One host: gloo needs no network.
-  export GLOO_SOCKET_IFNAME=${GLOO_SOCKET_IFNAME:-lo}
+  export GLOO_SOCKET_IFNAME=${GLOO_SOCKET_IFNAME:-lo} NCCL_DEBUG=${NCCL_DEBUG:-WARN}
   nvidia-smi topo -m || true
   [ $# -gt 0 ] || set -- tests scene steps memory
   for name in "$@"; do
@@ -167,11 +167,11 @@ ranks() {
           tests/test_ranks_gpu.py || status=1
         ;;
       scene)
-        part 120 "a scene by ranks" python3 -m benchmarks.parallel.training "$scene" --ranks "$count" \
+        part 150 "a scene by ranks" python3 -m benchmarks.parallel.training "$scene" --ranks "$count" \
           --parallel tiles views --test_iterations 7000 --no_curve --limit 60 || status=1
         ;;
       steps)
-        part 160 "steps by ranks" python3 -m benchmarks.parallel.table --ranks "$count" --rounds 1 --limit 75 || status=1
+        part 210 "steps by ranks" python3 -m benchmarks.parallel.table --ranks "$count" --limit 75 || status=1
         ;;
       memory)
         part 60 "memory of one process" python3 -m benchmarks.parallel.memory || status=1

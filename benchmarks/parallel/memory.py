@@ -10,6 +10,7 @@ many are trained, with the learning rates of train.py.
 
 import argparse
 import gc
+import sys
 import time
 
 import torch
@@ -30,6 +31,7 @@ from utils.system_utils import UserError, compute_device, run_cli
 _USABLE = 0.92  # of a GPU
 _STEPS = 4
 _GIB = 2**30
+_HEADER = ["", "peak GiB by rank before the last step", "peak GiB by rank", "GiB of the GPU in use"]
 
 
 class Progress(Observer):
@@ -39,9 +41,14 @@ class Progress(Observer):
         self._device, self._every = device, every
         self._losses: list[torch.Tensor] = []
         self.ends: list[float] = []
+        self.peak_mib = 0.0  # before the last step
 
     def due(self, step: Step) -> bool:
         return False
+
+    def begins(self, step: Step) -> None:
+        if step.last:
+            self.peak_mib = peak_memory_mib(self._device) or 0.0
 
     def measured(self, step: Step, losses: Losses) -> None:
         self._losses.append(losses.total.detach().clone())
@@ -57,8 +64,11 @@ class Progress(Observer):
         return torch.stack(self._losses).tolist()
 
 
-def train(workload: Workload, steps: int, every: int) -> tuple[Progress, list[float], list[float]]:
-    """Train: the progress, and by rank peak bytes of torch, and bytes of the GPU that are in use at the end."""
+def train(workload: Workload, steps: int, every: int) -> tuple[Progress, list[tuple[float, ...]]]:
+    """Train: the progress, and bytes by rank: peak before the last step, peak, and of the GPU in use at the end.
+
+    The last step of a training writes gradients, as steps do that add or remove Gaussians; others write none.
+    """
     device = compute_device()
     gc.collect()
     run = WorkloadRun(workload, "tiles", steps, still=False)
@@ -68,9 +78,8 @@ def train(workload: Workload, steps: int, every: int) -> tuple[Progress, list[fl
     progress = Progress(device, every)
     run.begin()
     run_training(run, [DivergenceWatch(run), progress])
-    own = 2**20 * (peak_memory_mib(device) or 0.0), _taken(device)
-    peaks, taken = zip(*ranks().everyone(own), strict=True)
-    return progress, list(peaks), list(taken)
+    own = 2**20 * progress.peak_mib, 2**20 * (peak_memory_mib(device) or 0.0), _taken(device)
+    return progress, list(zip(*ranks().everyone(own), strict=True))
 
 
 def _taken(device: torch.device) -> float:
@@ -82,19 +91,25 @@ def _taken(device: torch.device) -> float:
 
 def measure(counts: list[int], size: tuple[int, int] | None) -> None:
     """Print the peaks of several numbers of Gaussians, and what follows from them."""
-    rows, peaks = [], []
+    peaks: list[list[float]] = []
     for count in counts:
         workload = CITY.changed(count, size)
-        _, torchs, taken = train(workload, _STEPS, _STEPS)
-        peaks.append(max(torchs))
-        rows.append([f"{workload}", *(" ".join(f"{x / _GIB:.2f}" for x in many) for many in (torchs, taken))])
-        print_table(["", "peak GiB by rank", "GiB of the GPU in use"], rows[-1:])
-    each = (peaks[-1] - peaks[0]) / (counts[-1] - counts[0])
-    fixed = peaks[0] - each * counts[0]
-    print(f"{each * ranks().size:.0f} bytes a Gaussian over {ranks().size} ranks, and {fixed / _GIB:.2f} GiB on each")
-    if torch.cuda.is_available() and each > 0:
-        most = (_USABLE * torch.cuda.get_device_properties(0).total_memory - fixed) / each
-        print(f"so {most / 1e6:.0f} M Gaussians would fit")
+        _, found = train(workload, _STEPS, _STEPS)
+        peaks.append([max(by_rank) for by_rank in found])
+        print_table(_HEADER, [_cells(workload, found)])
+        sys.stdout.flush()
+    for name, first, last in zip(_HEADER[1:3], peaks[0], peaks[-1], strict=False):
+        each = (last - first) / (counts[-1] - counts[0])
+        fixed = first - each * counts[0]
+        told = f"{name}: {each * ranks().size:.0f} bytes a Gaussian over all ranks, and {fixed / _GIB:.2f} GiB on each"
+        if torch.cuda.is_available() and each > 0:
+            most = (_USABLE * torch.cuda.mem_get_info()[1] - fixed) / each
+            told += f", so {most / 1e6:.0f} M Gaussians fit"
+        print(told)
+
+
+def _cells(workload: Workload, found: list[tuple[float, ...]]) -> list[str]:
+    return [f"{workload}", *(" ".join(f"{x / _GIB:.2f}" for x in by_rank) for by_rank in found)]
 
 
 def main() -> None:
@@ -113,12 +128,12 @@ def main() -> None:
         measure(args.gaussians, args.size)
     if args.train:
         workload = CITY.changed(args.train, args.size)
-        progress, peaks, taken = train(workload, args.iterations, max(args.iterations // 10, 1))
+        progress, found = train(workload, args.iterations, max(args.iterations // 10, 1))
         losses, ends = progress.losses, progress.ends
         step = 1e3 * (ends[-1] - ends[0]) / (args.iterations * (len(ends) - 1) / len(ends))
         print(f"{workload}: {args.iterations} steps by {ranks().size} ranks, {step:.1f} ms each")
-        print(f"loss {losses[0]:.5f} to {losses[-1]:.5f}, peak GiB by rank", *(f"{x / _GIB:.2f}" for x in peaks))
-        print("GiB of the GPU in use", *(f"{x / _GIB:.2f}" for x in taken))
+        print(f"loss {losses[0]:.5f} to {losses[-1]:.5f}")
+        print_table(_HEADER, [_cells(workload, found)])
 
 
 if __name__ == "__main__":

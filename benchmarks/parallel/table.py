@@ -35,7 +35,7 @@ def measure(count: int, options: list[str], limit: float) -> dict[str, Any] | No
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "found.json"
         line = command(count, [*options, "--json", str(path)])
-        with subprocess.Popen(line, cwd=ROOT, start_new_session=True, stdout=sys.stderr) as process:
+        with subprocess.Popen(line, cwd=ROOT, stdout=sys.stderr) as process:
             try:
                 process.wait(limit)
             except subprocess.TimeoutExpired:
