@@ -8,6 +8,8 @@
 #   benchmarks/device.sh accuracy                  python3 -m benchmarks.accuracy.oracle --json OUT/accuracy.json;
 #                                                  benchmarks.accuracy.figure draws it on a machine with matplotlib
 #   benchmarks/device.sh train SCENE [OPTION...]   python3 -m benchmarks.scenes.training SCENE OPTION...
+#   benchmarks/device.sh ranks COUNT SCENE [PART...]
+#                                                  training over COUNT GPUs; parts: tests, scene, steps, memory
 #   benchmarks/device.sh run COMMAND...            any other command, after building the extensions
 #
 # Environment: GS_COMMIT, the commit measured, for a copy without git. OUT, a folder for logs and the built wheels; put
@@ -15,7 +17,7 @@
 set -euo pipefail
 cd "$(dirname "$0")/.."
 
-mode=${1:?test, sanitize, kernels, accuracy, train or run}
+mode=${1:?test, sanitize, kernels, accuracy, train, ranks or run}
 shift
 out=${OUT:-build/device/out}
 site=$PWD/build/device/site
@@ -141,6 +143,47 @@ sanitize() {
   return $status
 }
 
+# Run a command for at most so many seconds, and end before a call of ten minutes does.
+part() {
+  local limit=$1 name=$2 left=$((575 - SECONDS))
+  shift 2
+  [ "$left" -ge 20 ] || { say "$name: left out, no time is left" && return 1; }
+  [ "$limit" -le "$left" ] || limit=$left
+  say "$name (at most $limit s)"
+  timeout --kill-after 15 "$limit" "$@" || { say "$name: failed with status $?" && return 1; }
+}
+
+ranks() {
+  local count=$1 scene=$2 name status=0
+  local launch=(python3 -m torch.distributed.run --standalone --nproc_per_node "$count" -m)
+  shift 2
+  # One host: gloo needs no network.
+  export GLOO_SOCKET_IFNAME=${GLOO_SOCKET_IFNAME:-lo} NCCL_DEBUG=${NCCL_DEBUG:-WARN}
+  nvidia-smi topo -m || true
+  [ $# -gt 0 ] || set -- tests scene steps memory
+  for name in "$@"; do
+    case $name in
+      tests)
+        part 170 "tests of ranks" python3 -m pytest -q -p no:cacheprovider -m gpu --durations=0 \
+          tests/test_ranks_gpu.py || status=1
+        ;;
+      scene)
+        part 150 "a scene by ranks" python3 -m benchmarks.parallel.training "$scene" --ranks "$count" \
+          --parallel tiles views --test_iterations 7000 --no_curve --limit 60 || status=1
+        ;;
+      steps)
+        part 210 "steps by ranks" python3 -m benchmarks.parallel.table --ranks "$count" --limit 75 || status=1
+        ;;
+      memory)
+        part 60 "memory of one process" python3 -m benchmarks.parallel.memory || status=1
+        part 90 "memory of ranks" "${launch[@]}" benchmarks.parallel.memory --train 50000000 || status=1
+        ;;
+      *) say "no part is named $name" && status=2 ;;
+    esac
+  done
+  return $status
+}
+
 describe
 say "missing packages"
 install_missing
@@ -164,6 +207,7 @@ build
       say "training on $scene"
       python3 -m benchmarks.scenes.training "$scene" "$(mktemp -d build/device/models.XXXX)/models" "$@"
       ;;
+    ranks) ranks "${1:?a number of GPUs}" "${2:?a scene}" "${@:3}" ;;
     run) "$@" ;;
     *) echo "device.sh: unknown mode $mode" >&2 && exit 2 ;;
   esac

@@ -308,7 +308,8 @@ def traffic_table(scene: Workload) -> list[str]:
         needed = cells[5] / (0.25e-3 * _work(tiles_step(scene, machine))) / 1e9
         crossed = f"{bands_crossed(scene, gpus):.3f}"
         rows.append([str(gpus), crossed, *(f"{x / 1e6:,.1f}" for x in cells), f"{needed:,.0f}"])
-    header = ["GPUs", "bands", "records", "rows", "counts", "photo", "image", "tiles", "tiles, whole image", "views", "GB/s"]
+    parts = ["records", "rows", "counts", "photo", "image"]
+    header = ["GPUs", "bands", *parts, "tiles", "tiles, whole image", "views", "GB/s"]
     return table(header, rows)
 
 

@@ -33,7 +33,7 @@ def command(logs: Path, size: int, fault: str, *options: str, restarts: int = 0)
 def environment(**more: str) -> dict[str, str]:
     """The environment, in which ranks find the code of this checkout."""
     return {name: value for name, value in os.environ.items() if name != "OMP_NUM_THREADS"} | {
-        "PYTHONPATH": str(ROOT),
+        "PYTHONPATH": os.pathsep.join([str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]),
         "GLOO_SOCKET_IFNAME": "lo",
         **more,
     }

@@ -64,6 +64,7 @@ for room, below in {
     "exports": ("benchmarks.harness", "benchmarks.workloads"),
     "viewing": ("benchmarks.harness", "benchmarks.workloads"),
     "gate": ("benchmarks.scenes.training", "benchmarks.harness"),
+    "parallel": ("benchmarks.peers", "benchmarks.harness", "benchmarks.workloads"),
 }.items():
     MAY_IMPORT[f"benchmarks.{room}"] = (*below, *MEASURED)
 
@@ -127,6 +128,7 @@ def test_a_module_imports_only_rooms_below_it(path):
 
 def test_tests_import_only_workloads_of_the_benchmarks_that_they_do_not_test():
     tested = {
+        "test_parallel_benchmarks",
         "test_benchmarks",
         "test_costs",
         "test_stability",

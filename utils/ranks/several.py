@@ -15,13 +15,15 @@ class SeveralRanks(Ranks):
 
     Numbers and objects of the host go by a group of CPUs. Tensors go by NCCL, where the group has it, or else by way of
     the CPU.
+
+    by_gpu: whether there is NCCL. A call then returns before the GPU has done it.
     """
 
     def __init__(self) -> None:
         self.rank, self.size = dist.get_rank(), dist.get_world_size()
-        by_gpu = dist.get_backend() == "nccl"
-        self._place = "cuda" if by_gpu else "cpu"  # of what the default group sends
-        self._numbers = dist.new_group(backend="gloo") if by_gpu else dist.group.WORLD
+        self.by_gpu = dist.get_backend() == "nccl"
+        self._place = "cuda" if self.by_gpu else "cpu"  # of what the default group sends
+        self._numbers = dist.new_group(backend="gloo") if self.by_gpu else dist.group.WORLD
 
     def numbers(self, *values: int) -> Tensor:
         mine = torch.tensor(values, dtype=torch.int64)

@@ -2,10 +2,13 @@
 
 import os
 import signal
+import sys
 import threading
+import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
+from typing import NoReturn
 
 import torch
 import torch.distributed as dist
@@ -54,12 +57,24 @@ def run_together(main: Callable[[], object], outcome: Callable[[Callable[[], obj
     if not ending.begin():
         threading.Event().wait()  # the watch ends this process
     if watch.ranks:
-        watch.ranks.leave()
+        watch.ranks.leave(end.kind == DONE)
     status, spoke = ending.finish(end)
     if error is not None and spoke:
         quiet.unhush()
-        raise error
+        if watch.ranks and watch.ranks.by_gpu:
+            traceback.print_exception(error)
+        else:
+            raise error
+    if watch.ranks and watch.ranks.by_gpu and status:
+        _leave_at_once(status)
     return status
+
+
+def _leave_at_once(status: int) -> NoReturn:
+    """End without Python's own end, which would wait for kernels of NCCL that wait for a rank that is gone."""
+    for stream in (sys.stdout, sys.stderr):
+        stream.flush()
+    os._exit(status)
 
 
 def _ended(run: Callable[[], tuple[int, str]]) -> tuple[End, BaseException | None]:
@@ -103,6 +118,8 @@ def _joined(board: Board) -> Iterator[WatchedRanks]:
     refuse_differences(_everyone(board, _machine(device)), "start all ranks with the same installation")
     options = {"device_id": device} if device.type == "cuda" else {}
     backend = "nccl" if device.type == "cuda" else "gloo"
+    # NCCL's own watchdog would abort this process as soon as another is gone, before anybody has said which.
+    os.environ.setdefault("TORCH_NCCL_ASYNC_ERROR_HANDLING", "0")
     dist.init_process_group(
         backend,
         store=dist.PrefixStore("group", board.store),
@@ -120,16 +137,16 @@ def _everyone(board: Board, facts: dict[str, str]) -> list[dict[str, str]]:
 
 
 def _own_device() -> torch.device:
-    """The device of this rank. On GPUs it becomes the current one; on CPUs, the ranks of a host share its cores."""
+    """The device of this rank, on GPUs the current one from now on. The ranks of a host share its cores."""
     device = compute_device()
+    if os.environ.get("OMP_NUM_THREADS", "1") == "1":  # which torchrun sets where the user does not
+        torch.set_num_threads(cores())
     if device.type == "cuda":
         number, count = torchrun.local_rank(), torch.cuda.device_count()
         if number >= count:
             raise UserError(f"there is no GPU for it, as this host has {count}; lower --nproc_per_node to {count}")
         torch.cuda.set_device(number)
         return torch.device("cuda", number)
-    if os.environ.get("OMP_NUM_THREADS", "1") == "1":  # which torchrun sets where the user does not
-        torch.set_num_threads(cores())
     return device
 
 

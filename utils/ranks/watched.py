@@ -1,5 +1,6 @@
 """Ranks whose collective calls are watched, so that one that fails or never returns ends in a sentence."""
 
+import contextlib
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -32,12 +33,14 @@ def _watched(call: Callable[..., Any]) -> Callable[..., Any]:
 
     @wraps(call)
     def wrapped(self: "WatchedRanks", *args: Any, **named: Any) -> Any:
-        if self.waiting_since is not None:  # one call in another
+        if self._called is not None:  # one call in another
             return call(self, *args, **named)
         self.calls += 1
-        self.waiting_since = time.monotonic()
+        self._called = time.monotonic()
         try:
-            return call(self, *args, **named)
+            result = call(self, *args, **named)
+            self._note_queued()
+            return result
         except RuntimeError as error:
             lost = isinstance(error, dist.DistError) or any(words in str(error).lower() for words in _WORDS)
             if is_out_of_memory(error) or not lost:
@@ -45,8 +48,8 @@ def _watched(call: Callable[..., Any]) -> Callable[..., Any]:
             raise RankLost(str(error)) from error
         finally:
             if self.prompt:
-                self.longest = max(self.longest, time.monotonic() - self.waiting_since)
-            self.waiting_since = None
+                self.longest = max(self.longest, time.monotonic() - self._called)
+            self._called = None
 
     return wrapped
 
@@ -54,15 +57,15 @@ def _watched(call: Callable[..., Any]) -> Callable[..., Any]:
 class WatchedRanks(SeveralRanks):
     """The ranks of a training that torchrun has started.
 
-    calls: collective calls so far, the same number on all ranks that are in the same call. waiting_since: the
-    monotonic time when the running one began, or None. longest: seconds that one took while `prompt`. stands: says
-    what is left of the training if a rank is lost, and how to go on.
+    calls: collective calls so far, the same number on all ranks that are in the same call. longest: seconds that one
+    took while `prompt`. stands: says what is left of the training if a rank is lost, and how to go on.
     """
 
     def __init__(self) -> None:
         super().__init__()
         self.calls = 0
-        self.waiting_since: float | None = None
+        self._called: float | None = None  # when the running call began
+        self._queued: tuple[torch.cuda.Event, float] | None = None  # the end of the last one on a GPU, and its begin
         self.longest = 0.0
         self._at_work = 0
         self.stands: Callable[[], str] = lambda: "start it again"
@@ -85,11 +88,35 @@ class WatchedRanks(SeveralRanks):
         if self.first:
             quiet.tell(dict(enumerate(said)))
 
-    def leave(self) -> None:
-        """Close the connections, so that ranks that wait for this one wait no longer."""
-        self._numbers = None
-        if dist.is_initialized():
+    @property
+    def waiting_since(self) -> float | None:
+        """The monotonic time when the collective call began that this rank, or its GPU, waits for; None if none."""
+        called, queued = self._called, self._queued
+        if called is not None or queued is None:
+            return called
+        with contextlib.suppress(RuntimeError):  # of the GPU, which the main thread will meet
+            return None if queued[0].query() else queued[1]
+        return None
+
+    def _note_queued(self) -> None:
+        if self.by_gpu:
+            event = torch.cuda.Event()
+            event.record()
+            self._queued = event, self._called
+
+    def leave(self, done: bool) -> None:
+        """Close the connections, so that ranks that wait for this one wait no longer.
+
+        done: all ranks have come to the end. If not, NCCL's are left to the end of the process: they close when all
+        their calls are done, and another rank may never come to one.
+        """
+        numbers, self._numbers = self._numbers, None
+        if not dist.is_initialized():
+            return
+        if done or not self.by_gpu:
             dist.destroy_process_group()
+        else:
+            dist.destroy_process_group(numbers)
 
     @_watched
     def numbers(self, *values: int) -> Tensor:

@@ -1,0 +1,73 @@
+"""A training of a workload by the ranks of this process, by the code of train.py, without a scene folder."""
+
+from types import SimpleNamespace
+
+import torch
+
+import train
+from benchmarks.parallel.workload import Workload
+from records.training_log import Stopwatch
+from scene.gaussian_model import GaussianModel
+from training.loss_watch import LossWatch
+from training.objective import Objective
+from training.pacing.choose import pace_of
+from training.pacing.resolution import Resolution
+from training.plan import Plan
+from training.run import Run
+from training.strategies.choose import density_control
+from training.view_order import ViewOrder
+from utils.general_utils import get_expon_lr_func
+from utils.host.interrupt import DeferredInterrupt
+from utils.ranks.ranks import ranks
+from utils.system_utils import compute_device
+
+_EXTENT = 5.0  # world units
+_STILL = ("--position_lr_init", "0", "--position_lr_final", "0", "--feature_lr", "0", "--opacity_lr", "0",
+          "--scaling_lr", "0", "--rotation_lr", "0")  # fmt: skip
+
+
+class WorkloadRun(Run):
+    """A run whose scene is a workload. Gaussians are observed, and none is added or removed.
+
+    steps: how many it takes; in the last one the optimisers rest. still: with learning rates of 0, which have the
+    arithmetic of a step but leave the scene as it is, so that every step does the same work.
+    """
+
+    def __init__(self, workload: Workload, parallel: str, steps: int, still: bool) -> None:
+        here = ranks()
+        views = here.size if parallel == "views" else 1
+        words = ["-s", ".", "--iterations", str(steps * views), "--densify_from_iter", "10000", *_STILL * still]
+        _, self.dataset, self.opt, self.pipe = train.parse(words)
+        self.plan = Plan([], [], [], None, -1, False, parallel=parallel)
+        self.lost = self.first_iteration = 0
+        self.interrupt, self.device = DeferredInterrupt(), compute_device()
+        self.pace = pace_of(self.opt, None, 0, views)
+        self.gaussians = _model(workload, self.opt, self.device)
+        if views > 1:
+            self.gaussians.optimizer.set_betas(0.9**views, 0.999**views)
+        cameras = workload.cameras()
+        images = SimpleNamespace(ahead=0)
+        self.scene = SimpleNamespace(cameras_extent=_EXTENT, images=images, prefetch=lambda _: None, model_path=".")
+        self.views = ViewOrder(cameras, self.opt.seed, views, here.rank if views > 1 else 0)
+        self.resolution = Resolution((), self.pace.length, images)
+        self.background = torch.zeros(3, device=self.device)
+        self.objective = Objective(self.opt)
+        self.density = density_control(self)
+        self.density.pace = self.pace
+        self._depth_weight = get_expon_lr_func(0.0, 0.0)
+
+    def begin(self) -> None:
+        """Start the clocks; nothing is written."""
+        self.log, self.rows = SimpleNamespace(seconds_before=0.0), []
+        self.losses, self.clock = LossWatch(), Stopwatch()
+
+
+def _model(workload: Workload, opt: object, device: torch.device) -> GaussianModel:
+    model = GaussianModel(3)
+    model.divide(ranks())
+    model.set_rows(workload.rows(ranks().rank, ranks().size, device))
+    model.active_sh_degree, model.spatial_lr_scale = 3, _EXTENT
+    model.start_exposures(())
+    model.training_setup(opt)
+    model.limit_columns()
+    return model

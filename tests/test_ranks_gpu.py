@@ -1,0 +1,69 @@
+"""Trainings by two ranks with a GPU each, by NCCL: the bytes of one GPU, and one end for all after a fault."""
+
+import hashlib
+import time
+from pathlib import Path
+
+import pytest
+import torch
+from launching import OPTIONS, Launched, launch
+
+pytestmark = [
+    pytest.mark.gpu,
+    pytest.mark.skipif(torch.cuda.device_count() < 2, reason="torch finds fewer than two NVIDIA GPUs"),
+]
+
+LONG = (
+    *("--eval", "--iterations", "300", "--checkpoint_iterations", "150", "--save_iterations", "150", "-r", "2"),
+    *("--densify_from_iter", "20", "--densification_interval", "40", "--densify_until_iter", "260"),
+    *("--opacity_reset_interval", "130", "--densify_grad_threshold", "0.0004", "--random_background"),
+)
+
+
+def _train(scene: Path, folder: Path, size: int, *options: str) -> dict[str, str]:
+    """Train, and return digests of models and checkpoints by their paths."""
+    out = folder / f"{size}"
+    done = launch(folder / f"logs{size}", "none 0 0", "-s", str(scene), "-m", str(out), *LONG, *options, size=size)
+    assert done.status == 0, done.stderr
+    paths = [path for path in sorted(out.rglob("*.p*")) if path.suffix in (".ply", ".pth")]
+    return {str(path.relative_to(out)): hashlib.sha256(path.read_bytes()).hexdigest() for path in paths}
+
+
+@pytest.mark.parametrize("options", [(), ("--strategy", "mcmc", "--max_num_splats", "400", "--train_test_exp")])
+def test_two_gpus_write_the_bytes_of_one(colmap_scene, tmp_path, options):
+    one = _train(colmap_scene, tmp_path, 1, *options)
+    assert len(one) >= 4
+    assert _train(colmap_scene, tmp_path, 2, *options) == one
+
+
+def _fault(scene: Path, folder: Path, fault: str) -> Launched:
+    options = ("-s", str(scene), "-m", str(folder / "out"), *OPTIONS, "--no_curve", "--plain_step")
+    began = time.monotonic()
+    done = launch(folder / "logs", fault, *options)
+    assert time.monotonic() - began < 60  # half of it to start
+    assert done.status != 0
+    return done
+
+
+@pytest.mark.parametrize(
+    ("fault", "said"),
+    [
+        ("kill 1 7", "error: rank 1 ended without a word (killed, or crashed); the last checkpoint stands"),
+        ("hang 1 7", "error: rank 1 hung: the others waited"),
+        ("memory 1 7", "error: rank 1: training ran out of memory in iteration 7 ("),
+        ("overflow 1 7", "error: xyz of 1 of 300 (153) had no finite step in iteration 7 (view "),
+    ],
+    ids=lambda value: value.split()[0] if value[:5] != "error" else "",
+)
+def test_a_fault_of_one_rank_ends_both_with_one_sentence(colmap_scene, tmp_path, fault, said):
+    done = _fault(colmap_scene, tmp_path, fault)
+    (line,) = done.errors
+    assert line.startswith(said), line
+    names = {path.name for path in (tmp_path / "out").glob("chkpnt*.pth")}
+    assert names == ({"chkpnt5.pth", "chkpnt7.pth"} if fault.startswith("overflow") else {"chkpnt5.pth"})
+
+
+def test_a_signal_to_one_rank_stops_both_with_a_checkpoint(colmap_scene, tmp_path):
+    done = _fault(colmap_scene, tmp_path, "interrupt 1 7")
+    assert done.errors == [] and "".join(done.stderr).count("interrupted") == 1
+    assert {path.name for path in (tmp_path / "out").glob("chkpnt*.pth")} == {"chkpnt5.pth", "chkpnt8.pth"}
