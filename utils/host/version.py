@@ -2,4 +2,5 @@
 
 from pathlib import Path
 
-VERSION = (Path(__file__).resolve().parents[2] / "version.txt").read_text(encoding="utf-8").strip()
+_FILE = Path(__file__).resolve().parents[2] / "version.txt"
+VERSION = _FILE.read_text(encoding="utf-8").strip() if _FILE.is_file() else "unknown"  # where only the code was copied
