@@ -4,7 +4,6 @@ import csv
 import hashlib
 from pathlib import Path
 
-import pytest
 import torch
 from gaussians import options
 from processes import in_ranks
@@ -64,25 +63,14 @@ def _assert_same_curves(one: dict, other: dict) -> None:
     assert [one[iteration] for iteration in both] == [other[iteration] for iteration in both]
 
 
-def _all(scene: Path, folder: Path) -> dict[str, dict[str, str]]:
-    """All trainings, one after the other, in the same processes."""
+def _all(scene: Path, folder: Path, others: bool) -> dict[str, dict[str, str]]:
+    """All trainings, or the long one alone, in the same processes."""
     torch.set_num_threads(1)
     folder = folder / str(ranks().size)
     results = {"everything": _train(scene, folder / "everything", *EVERYTHING)}
-    for name, changes in OTHERS.items():
+    for name, changes in OTHERS.items() if others else ():
         results[name] = _train(scene, folder / name, *SHORT, *changes)
     return results
-
-
-@pytest.mark.parametrize("size", [2, 3])
-def test_ranks_write_the_bytes_of_one_process(masked_scene, tmp_path, size):  # noqa: F811
-    (one,) = in_ranks(1, _all, masked_scene, tmp_path)
-    several = in_ranks(size, _all, masked_scene, tmp_path)[0]
-    for name, files in one.items():
-        assert files == several[name], name
-    _assert_same_curves(*(_curve(tmp_path / str(count) / "everything") for count in (1, size)))
-    assert {"chkpnt150.pth", LAST} < one["everything"].keys()
-    assert len({str(result) for result in one.values()}) == len(one)
 
 
 def _resume(scene: Path, folder: Path, checkpoint: Path) -> dict[str, str]:
@@ -90,13 +78,21 @@ def _resume(scene: Path, folder: Path, checkpoint: Path) -> dict[str, str]:
     return _train(scene, folder / f"by_{ranks().size}", *EVERYTHING, "--start_checkpoint", checkpoint)
 
 
-def test_a_checkpoint_is_resumed_by_any_number_of_ranks(masked_scene, tmp_path):  # noqa: F811
-    in_ranks(2, _train, masked_scene, tmp_path, *EVERYTHING)
-    whole = _digests(tmp_path)
-    for size in (1, 3):
-        resumed = in_ranks(size, _resume, masked_scene, tmp_path, tmp_path / "chkpnt150.pth")[0]
-        assert resumed[LAST] == whole[LAST]
-        _assert_same_curves(_curve(tmp_path / f"by_{size}"), _curve(tmp_path))
+def test_ranks_write_the_bytes_of_one_process(masked_scene, tmp_path):  # noqa: F811
+    one, two, three = (in_ranks(size, _all, masked_scene, tmp_path, size != 2)[0] for size in (1, 2, 3))
+    for several in (two, three):
+        for name, files in several.items():
+            assert files == one[name], name
+    assert len(three) == len(one) == len(OTHERS) + 1
+    assert {"chkpnt150.pth", LAST} < one["everything"].keys()
+    assert len({str(result) for result in one.values()}) == len(one)
+    folders = [tmp_path / str(size) / "everything" for size in (1, 2, 3)]
+    for size in (1, 3):  # a checkpoint is resumed by any number of ranks
+        resumed = in_ranks(size, _resume, masked_scene, tmp_path, folders[1] / "chkpnt150.pth")[0]
+        assert resumed[LAST] == two["everything"][LAST]
+        folders.append(tmp_path / f"by_{size}")
+    for folder in folders[1:]:
+        _assert_same_curves(_curve(folders[0]), _curve(folder))
 
 
 def _batches(scene: Path, folder: Path, *options: object) -> dict[str, str]:

@@ -5,6 +5,7 @@
 #include "backend_run.h"
 #include "emulated_queue.h"
 #include "front_first.cuh"
+#include "gs/check_shared.h"
 #include "long_lists.h"
 #include "math/step_now.h"
 #include "rows_run.h"
@@ -713,25 +714,24 @@ void test_longest_first() {
 }  // namespace
 
 int main() {
-  test_against_cpu();
-  test_sparse_adam();
-  test_adam();
-  test_catch_up();
-  test_step_guard();
-  test_observe();
-  test_split_positions();
-  test_noise();
-  test_rows();
-  test_gaussian_step();
-  test_given_covariances_and_colors();
-  test_many_tiles();
-  test_long_lists();
-  test_ahead();
-  test_pixels_that_end_in_every_chunk();
-  test_lists_of_all_lengths();
-  test_shared_lists_are_blended_as_whole_ones();
-  test_front_first();
-  test_lists();
-  test_longest_first();
-  return gs::finish_tests("CUDA kernels, emulated");
+  return gs::run_shared("CUDA kernels, emulated", {test_rows,
+                                                   test_gaussian_step,
+                                                   test_lists,
+                                                   test_ahead,
+                                                   test_pixels_that_end_in_every_chunk,
+                                                   test_against_cpu,
+                                                   test_lists_of_all_lengths,
+                                                   test_many_tiles,
+                                                   test_long_lists,
+                                                   test_shared_lists_are_blended_as_whole_ones,
+                                                   test_longest_first,
+                                                   test_front_first,
+                                                   test_catch_up,
+                                                   test_sparse_adam,
+                                                   test_adam,
+                                                   test_step_guard,
+                                                   test_observe,
+                                                   test_split_positions,
+                                                   test_noise,
+                                                   test_given_covariances_and_colors});
 }
