@@ -35,6 +35,7 @@ CXX_FLAGS = ["-O3", "-std=c++17", "-fPIC", "-Wall", "-Wextra", "-fno-math-errno"
 # Symbols stay inside: the three libraries hold templates of the same names.
 CXX_FLAGS += ["-fvisibility=hidden", "-fvisibility-inlines-hidden"]
 X86_ISAS = {"baseline": [], "avx2": ["-march=x86-64-v3"], "avx512": ["-march=x86-64-v4", "-mprefer-vector-width=512"]}
+ARM64_ISAS = {"baseline": ["-DGS_PLAIN", "-ffp-contract=off"], "neon": []}
 
 
 def setup_extension(name: str, package: str, root: Path) -> None:
@@ -101,6 +102,9 @@ class BuildBackend(build_ext):
         if platform.machine() in ("x86_64", "AMD64"):
             compile_cxx.append("-DGS_X86")
             isas = X86_ISAS
+        elif platform.machine() in ("aarch64", "arm64", "ARM64"):
+            compile_cxx.append("-DGS_ARM64")
+            isas = ARM64_ISAS
         torch_dir = Path(torch.__file__).parent
         # -fopenmp: at::parallel_for is a template over the OpenMP that torch itself was built with.
         ops_flags = ["-isystem", str(torch_dir / "include")]
