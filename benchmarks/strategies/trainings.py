@@ -2,9 +2,9 @@
 
     python -m benchmarks.strategies.trainings OUT --scenes SCENE ... --sets benchmarks/strategies/equal.json --gpus 0 1
 
-A file of sets has the options of each by name, as those of `full_eval.py --configs`. An option may be a part of what the
-default training "adc" of the same scene took, the mean over the seeds: "50% of gaussians", "33.3% of seconds". So "adc"
-is trained first. Seconds are those of training, and only mean something with one job a GPU (--jobs 1). Trainings that
+A file of sets has the options of each by name, like those of `full_eval.py --configs`. An option may be a part of what
+the default training "adc" of the same scene took, the mean over the seeds: "50% of gaussians", "33.3% of seconds". So
+"adc" is trained first. Seconds are those of training, and only mean something with one job a GPU. Trainings that
 OUT has already are not repeated. OUT/trainings.json has all that the tables of benchmarks.strategies.tables need.
 """
 
