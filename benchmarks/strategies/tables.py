@@ -108,6 +108,8 @@ def _beside_fronts(found: dict, budgets: list[str]) -> str:
                 for other in found["sets"]
                 if other not in budgets and _ends(found, scene, other)
             }
+            if not fixed:
+                continue
             best = max(fixed, key=fixed.__getitem__)
             ours = statistics.fmean(end["test_psnr"] for end in ends)
             rows.append([

@@ -3,8 +3,8 @@
     python -m benchmarks.strategies.trainings OUT --scenes SCENE ... --sets benchmarks/strategies/equal.json --gpus 0 1
 
 A file of sets has the options of each by name, like those of `full_eval.py --configs`. An option may be a part of what
-the default training "adc" of the same scene took, the mean over the seeds: "50% of gaussians", "33.3% of seconds". So
-"adc" is trained first. Seconds are those of training, and only mean something with one job a GPU. Trainings that
+the default training "adc" of the same scene took, the mean over the seeds: "50% of gaussians", "33.3% of seconds".
+These sets are trained last. Seconds are those of training, and only mean something with one job a GPU. Trainings that
 OUT has already are not repeated. OUT/trainings.json has all that the tables of benchmarks.strategies.tables need.
 """
 
@@ -110,8 +110,8 @@ def run_all(args: argparse.Namespace, sets: dict[str, list[str]], extra: list[st
             bar.update()
 
     with ThreadPoolExecutor(free.qsize()) as pool, tqdm(total=len(folder), desc="Trainings") as bar:
-        firsts = [name for name in sets if name == DEFAULT]
-        for names in (firsts, [name for name in sets if name not in firsts]):
+        later = [name for name in sets if any(map(_PART.fullmatch, sets[name]))]
+        for names in ([name for name in sets if name not in later], later):
             tasks = []
             for seed in args.seeds:
                 for scene in args.scenes:
