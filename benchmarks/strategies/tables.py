@@ -12,7 +12,6 @@ import statistics
 from collections.abc import Sequence
 from pathlib import Path
 
-from evaluation.summary import spread
 from utils.files.markdown_table import markdown_table
 from utils.system_utils import run_cli
 
@@ -31,8 +30,14 @@ def print_tables(found: dict) -> None:
             markdown_table([*_HEADER, *_SCORES], [line for scene in found["scenes"] for line in _against(found, scene)])
         )
         print(f"\n{_means(found)}")
-    if budgets := [name for name, words in found["sets"].items() if BUDGET in words]:
-        print(_beside_fronts(found, budgets))
+    if budgets := {name: float(given) for name, words in found["sets"].items() if (given := _given(words))}:
+        print(f"\n{_beside_fronts(found, budgets)}")
+
+
+def _given(words: Sequence[str]) -> str:
+    """The seconds that a set's options give; nothing for a part of the default's."""
+    after = "".join(words[words.index(BUDGET) + 1 :][:1]) if BUDGET in words else ""
+    return "" if "%" in after else after
 
 
 def _ends(found: dict, scene: str, name: str) -> list[dict]:
@@ -78,9 +83,8 @@ def _best(curve: Sequence[dict]) -> float:
 
 
 def _shown(values: Sequence[float], form: str) -> str:
-    found = spread(values)
-    deviation = "" if found["std"] is None else f" ± {found['std']:{form}}"
-    return f"{found['mean']:{form}}{deviation}"
+    deviation = f" ± {statistics.stdev(values):{form}}" if len(values) > 1 else ""
+    return f"{statistics.fmean(values):{form}}{deviation}"
 
 
 def _means(found: dict) -> str:
@@ -94,19 +98,18 @@ def _means(found: dict) -> str:
     return markdown_table(["options", "scenes", "mean of more than adc (dB)", "least"], rows)
 
 
-def _beside_fronts(found: dict, budgets: list[str]) -> str:
-    """A table of time budgets: PSNR at their end, and the best of the sets without one at that time."""
+def _beside_fronts(found: dict, budgets: dict[str, float]) -> str:
+    """A table of time budgets (seconds): PSNR at their end, and the best of the sets without one at that time."""
     rows = []
     for scene in found["scenes"]:
-        for name in budgets:
+        for name, given in budgets.items():
             ends = _ends(found, scene, name)
             if not ends:
                 continue
-            given = float(found["sets"][name][found["sets"][name].index(BUDGET) + 1])
             fixed = {
                 other: statistics.fmean(at(end["curve"], given) for end in _ends(found, scene, other))
                 for other in found["sets"]
-                if other not in budgets and _ends(found, scene, other)
+                if BUDGET not in found["sets"][other] and _ends(found, scene, other)
             }
             if not fixed:
                 continue
