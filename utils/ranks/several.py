@@ -9,6 +9,10 @@ from torch import Tensor
 
 from utils.ranks.ranks import Ranks, Value
 
+# Into one tensor. The older name warns where there is a newer one.
+ALL_GATHER = "all_gather_single" if hasattr(dist, "all_gather_single") else "all_gather_into_tensor"
+_NEWS = 2  # numbers that are posted
+
 
 class SeveralRanks(Ranks):
     """The ranks of the default process group.
@@ -24,6 +28,8 @@ class SeveralRanks(Ranks):
         self.by_gpu = dist.get_backend() == "nccl"
         self._place = "cuda" if self.by_gpu else "cpu"  # of what the default group sends
         self._numbers = dist.new_group(backend="gloo") if self.by_gpu else dist.group.WORLD
+        self._silence = torch.zeros(_NEWS, dtype=torch.int64, device=self._place)
+        self._news, self._heard = [0] * _NEWS, [0] * _NEWS
 
     def numbers(self, *values: int) -> Tensor:
         mine = torch.tensor(values, dtype=torch.int64)
@@ -51,17 +57,35 @@ class SeveralRanks(Ranks):
         dist.all_gather_object(box, value, group=self._numbers)
         return box
 
-    def largest_(self, numbers: Tensor) -> None:
-        dist.all_reduce(numbers, dist.ReduceOp.MAX, group=None if numbers.is_cuda else self._numbers)
+    def agree(self, numbers: Tensor) -> list[list[int]]:
+        news = torch.tensor(self._news, device=self._place) if any(self._news) else self._silence
+        flag = self._silence[:1] if self.flag is None else self.flag.to(self._place)
+        found = self._table(torch.cat((numbers.to(self._place), flag, news))).tolist()
+        first = len(numbers)
+        flags = [row[first] for row in found]
+        if flags[self.rank] < max(flags):
+            self.flag.fill_(max(flags))
+        self._heard = [max(each) for each in zip(*(row[first + 1 :] for row in found), strict=True)]
+        return [row[:first] for row in found]
+
+    def post(self, *news: int) -> None:
+        self._news, self._heard = news, None
+
+    def heard(self) -> Sequence[int]:
+        if self._heard is None:
+            self.agree(self._silence[:0])
+        return self._heard
 
     def table(self, values: Tensor) -> Tensor:
-        mine = values.detach().contiguous().to(self._place)
-        every = mine.new_empty(self.size, *mine.shape)
-        dist.all_gather(list(every.unbind()), mine)
-        return every.to(values.device)
+        return self._table(values.detach().contiguous().to(self._place)).to(values.device)
+
+    def _table(self, mine: Tensor) -> Tensor:
+        every = mine.new_empty(self.size * mine.numel())
+        getattr(dist, ALL_GATHER)(every, mine.view(-1))
+        return every.view(self.size, *mine.shape)
 
     def added(self, values: Tensor) -> Tensor:
-        total = values.detach().to(self._place, copy=True)
+        total = values.detach().to(self._place)
         dist.all_reduce(total)
         return total.to(values.device)
 
