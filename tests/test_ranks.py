@@ -10,7 +10,7 @@ from utils.ranks.ranks import ALONE, Ranks, ranks
 def _talk() -> dict[str, object]:
     here = ranks()
     rows = torch.arange(6.0).view(2, 3)[: here.rank] + 10 * here.rank
-    parts = [torch.full((here.rank + d, 2), 10 * here.rank + d, dtype=torch.int16) for d in range(here.size)]
+    parts = [torch.full((here.rank + d, 2), 10 * here.rank + d, dtype=torch.int32) for d in range(here.size)]
     bits = [torch.ones(d, dtype=torch.bool) for d in range(here.size)]
     return {
         "numbers": here.numbers(here.rank, 7).tolist(),

@@ -46,7 +46,7 @@ def send_splats(ranks: Ranks, bands: Bands, splats: tuple[Tensor, ...]) -> tuple
     rank, gaussian, sizes, received = find_records(ranks, reached)
     # Gaussians are numbered without those that no band gets, so that memory is for records only.
     numbers = reached.any(0).cumsum(0, dtype=torch.int32).index_select(0, gaussian)
-    places = rank.add_(numbers, alpha=ranks.size)
+    places = rank.add(numbers, alpha=ranks.size)
     rows = ranks.send(_packed(splats, gaussian), sizes, received)[0]
     return _unpacked(rows, splats), Sent(gaussian, sizes, received, places)
 

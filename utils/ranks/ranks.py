@@ -88,8 +88,8 @@ class Ranks:
         """Send the first sizes[0] of the rows (n, ...) to rank 0, the next to rank 1, and so on.
 
         counts: how many rows each rank sends here, if this is known; else the ranks tell each other, which a GPU waits
-        for. Rows have one dtype and the same trailing shape on every rank. Returns the rows for this rank, in the order
-        of ranks, and how many each has sent.
+        for. Rows have one dtype, not of 16 bits, and the same trailing shape on every rank. Returns the rows for this
+        rank, in the order of ranks, and how many each has sent.
         """
         return rows, list(sizes)
 

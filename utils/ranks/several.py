@@ -1,7 +1,6 @@
 """Several processes that train together, by torch.distributed: gloo on CPUs, NCCL on GPUs."""
 
 from collections.abc import Sequence
-from math import prod
 
 import torch
 import torch.distributed as dist
@@ -91,14 +90,11 @@ class SeveralRanks(Ranks):
 
     def send(self, rows: Tensor, sizes: Sequence[int], counts: Sequence[int] | None = None) -> tuple[Tensor, list[int]]:
         counts = self._counts(sizes) if counts is None else list(counts)
-        shape, dtype, total = rows.shape[1:], rows.dtype, sum(counts)
-        width = prod(shape) * dtype.itemsize  # bytes of a row
-        if not width:
-            return rows.new_empty(total, *shape), counts
-        sent = rows.detach().contiguous().view(-1).view(torch.uint8).to(self._place)
-        received = sent.new_empty(width * total)
-        dist.all_to_all_single(received, sent, [width * n for n in counts], [width * n for n in sizes])
-        return received.to(rows.device).view(dtype).view(total, *shape), counts
+        sent = rows.detach().to(self._place).contiguous()
+        received = sent.new_empty(sum(counts), *rows.shape[1:])
+        if all(rows.shape[1:]):
+            dist.all_to_all_single(received, sent, counts, list(sizes))
+        return received.to(rows.device), counts
 
     def _counts(self, sizes: Sequence[int]) -> list[int]:
         """How many rows each rank sends here, where this one sends `sizes`."""
