@@ -4,6 +4,9 @@ Each extension's setup.py calls `setup_extension`; pip does the rest. The result
 registers its operators when torch.ops.load_library loads it. setuptools' own extension builder and torch's know
 neither several instruction sets of one source nor parallel compilation without ninja, so this runs the commands.
 
+The library uses torch's stable interface alone, so that it runs with every torch from OLDEST_TORCH on, and a torch
+without CUDA is enough to build CUDA kernels.
+
 Environment: CXX (compiler), CUDA_HOME (toolkit), GS_CUDA=0|1 (never, or always, build CUDA; unset: where nvcc is
 found and torch was built with CUDA), TORCH_CUDA_ARCH_LIST ("9.0" or "8.0;9.0+PTX"; unset: those of the GPUs that are
 visible, or with none all major ones from 8.0).
@@ -27,7 +30,7 @@ from setuptools.command.build_py import build_py
 
 VERSION = (Path(__file__).resolve().parents[2] / "version.txt").read_text(encoding="utf-8").strip()
 BUILT_FOR = "built-for"  # the extra that tells doctor.py which torch an extension was built for
-OLDEST_TORCH = (2, 11)
+OLDEST_TORCH = (2, 10)  # the first whose stable interface has all that csrc/torch calls
 OLDEST_ARCHITECTURE = 80  # reductions over a warp in one instruction
 COMMON_INCLUDE = Path(__file__).resolve().parent / "include"
 # No -ffast-math: NaN, infinities and the order of sums matter. Nobody reads errno or traps.
@@ -102,15 +105,15 @@ class BuildBackend(build_ext):
             compile_cxx.append("-DGS_X86")
             isas = X86_ISAS
         torch_dir = Path(torch.__file__).parent
-        # -fopenmp: at::parallel_for is a template over the OpenMP that torch itself was built with.
-        ops_flags = ["-isystem", str(torch_dir / "include")]
-        ops_flags += [f"-D_GLIBCXX_USE_CXX11_ABI={int(torch.compiled_with_cxx11_abi())}"]
-        ops_flags += ["-fopenmp"] if sys.platform == "linux" else []
-        libraries = [f"-L{torch_dir / 'lib'}", "-ltorch_cpu", "-lc10"]
+        ops_flags = ["-isystem", str(torch_dir / "include"), f"-DTORCH_TARGET_VERSION={target_version(OLDEST_TORCH)}"]
+        # libtorch stands for its parts: that for CUDA, too, where there is one.
+        libraries = [f"-L{torch_dir / 'lib'}"]
+        libraries += ["-Wl,--no-as-needed", "-ltorch", "-Wl,--as-needed"] if sys.platform == "linux" else ["-ltorch"]
         if nvcc:
             toolkit = toolkit_root(nvcc)
-            ops_flags += ["-DGS_CUDA", "-isystem", str(toolkit / "include")]
-            libraries += ["-ltorch_cuda", "-lc10_cuda", f"-L{toolkit / 'lib64'}", f"-L{toolkit / 'lib'}", "-lcudart"]
+            ops_flags += ["-DGS_CUDA", "-DUSE_CUDA", "-isystem", str(toolkit / "include")]
+            # Static: torch may have another version of the runtime, or none. Both share the GPU's primary context.
+            libraries += [f"-L{toolkit / 'lib64'}", f"-L{toolkit / 'lib'}", "-lcudart_static", "-ldl", "-lrt"]
 
         ops = sorted((csrc / "torch").glob("*.cpp"))
         compilations = [([*compile_cxx, *ops_flags], source, f"{source.stem}.torch.o") for source in ops]
@@ -137,6 +140,11 @@ class BuildBackend(build_ext):
         libraries += ["-l:libstdc++.so.6"] if sys.platform == "linux" else []
         shared = ["-dynamiclib", "-undefined", "dynamic_lookup"] if sys.platform == "darwin" else ["-shared"]
         run([*cxx, *shared, *(obj for _, _, obj in compilations), *libraries, "-o", str(library)], objects_dir)
+
+
+def target_version(version: tuple[int, int]) -> str:
+    """The oldest torch that a library is to run with, as torch's stable headers take it."""
+    return f"0x{version[0]:02x}{version[1]:02x}000000000000"
 
 
 def is_per_isa(source: Path) -> bool:
@@ -170,23 +178,22 @@ def find_nvcc(torch_cuda: str | None) -> str | None:
     switch = os.environ.get("GS_CUDA", "")
     if switch not in ("", "0", "1"):
         fail(f"GS_CUDA must be 0 or 1, not {switch!r}")
-    if switch == "0":
+    if switch == "0" or not (switch or torch_cuda):
         return None
     home = os.environ.get("CUDA_HOME")
     nvcc = shutil.which("nvcc", path=str(Path(home) / "bin") if home else None)
-    if nvcc and torch_cuda:
-        release = re.search(r"release (\d+)\.", run([nvcc, "--version"]))
-        if release and release[1] != torch_cuda.split(".")[0]:
-            fail(
-                f"{nvcc} is of CUDA {release[1]} but torch was built with CUDA {torch_cuda}: "
-                "set CUDA_HOME to a toolkit of that version, or GS_CUDA=0 to build for the CPU only"
-            )
-        return nvcc
-    if switch == "1":
+    if switch and not nvcc:
         place = f"in CUDA_HOME ({home})" if home else "on PATH"
-        missing = "the torch that is installed has no CUDA" if nvcc else f"there is no nvcc {place}"
-        fail(f"GS_CUDA=1 but {missing}: install it, or unset GS_CUDA to build for the CPU only")
-    return None
+        fail(f"GS_CUDA=1 but there is no nvcc {place}: install it, or unset GS_CUDA to build for the CPU only")
+    if nvcc and not switch:
+        release = re.search(r"release (\d+)\.", run([nvcc, "--version"]))
+        if release and int(release[1]) > int(torch_cuda.split(".")[0]):
+            fail(
+                f"{nvcc} is of CUDA {release[1]} but torch was built with CUDA {torch_cuda}, whose driver may be too old "
+                "for it: set CUDA_HOME to a toolkit of that version, GS_CUDA=0 to build for the CPU only, or GS_CUDA=1 "
+                "to build all the same"
+            )
+    return nvcc
 
 
 def toolkit_root(nvcc: str) -> Path:

@@ -1,0 +1,78 @@
+#pragma once
+// Tensors of operators through torch's stable interface: checks, memory and conversions. For csrc/torch alone.
+#include <torch/csrc/stable/ops.h>
+
+#include <optional>
+#include <vector>
+
+#include "gs/torch_words.h"
+
+namespace gs {
+
+using MaybeTensor = std::optional<Tensor>;
+using Shape = std::vector<int64_t>;
+template <class T>
+using List = torch::headeronly::HeaderOnlyArrayRef<T>;
+
+// TypeError for Python's None, which arrives as an undefined tensor where the schema wants one.
+inline void check_given(const Tensor& t, const char* name) {
+  GS_CHECK_TYPE(t.defined(), name, " must be a tensor, got None");
+}
+
+inline bool is_floating(ScalarType type) { return type == ScalarType::Float || type == ScalarType::Double; }
+
+// Memory without content for a tensor of T, on the device of `like`.
+template <class T>
+Tensor empty(Sizes sizes, const Tensor& like);
+
+// The same with the dtype of `like`.
+Tensor empty(Sizes sizes, const Tensor& like);
+
+namespace detail {
+
+inline Tensor empty(Sizes sizes, int32_t dtype, const Tensor& like) {
+  int32_t device = 0, index = 0;
+  aoti_torch_get_device_type(like.get(), &device), aoti_torch_get_device_index(like.get(), &index);
+  Shape strides(sizes.size());
+  int64_t values = 1;
+  for (size_t axis = sizes.size(); axis-- > 0; values *= std::max<int64_t>(sizes[axis], 1)) strides[axis] = values;
+  AtenTensorHandle made = nullptr;
+  const auto status = aoti_torch_empty_strided(sizes.size(), sizes.data(), strides.data(), dtype, device, index, &made);
+  GS_CHECK_MEMORY(status == TORCH_SUCCESS, "out of memory. Tried to allocate ",
+                  values * aoti_torch_dtype_element_size(dtype), " bytes for ", in_words(sizes));
+  return Tensor(made);
+}
+
+}  // namespace detail
+
+template <class T>
+Tensor empty(Sizes sizes, const Tensor& like) {
+  return detail::empty(sizes, aoti_torch_dtype<T>(), like);
+}
+
+inline Tensor empty(Sizes sizes, const Tensor& like) {
+  int32_t dtype = 0;
+  aoti_torch_get_dtype(like.get(), &dtype);
+  return detail::empty(sizes, dtype, like);
+}
+
+// A scalar with the dtype and on the device of `like`, which is the CPU.
+template <class T>
+Tensor scalar(T value, const Tensor& like) {
+  Tensor out = empty({}, like);
+  *out.mutable_data_ptr<T>() = value;
+  return out;
+}
+
+// Asks first: torch's functions cost time even where there is nothing to do.
+inline Tensor packed(const Tensor& t) { return t.is_contiguous() ? t : torch::stable::contiguous(t); }
+
+// Returns `t` contiguous, with the dtype and on the device of `like`.
+inline Tensor converted(const Tensor& t, const Tensor& like) {
+  const ScalarType type = like.scalar_type();
+  const Device device = like.device();
+  const bool fits = t.scalar_type() == type && t.device() == device;
+  return packed(fits ? t : torch::stable::to(t, type, std::nullopt, device));
+}
+
+}  // namespace gs
