@@ -2,6 +2,7 @@
 // Tensors of operators through torch's stable interface: checks, memory and conversions. For csrc/torch alone.
 #include <torch/csrc/stable/ops.h>
 
+#include <algorithm>
 #include <optional>
 #include <vector>
 
@@ -19,14 +20,8 @@ inline void check_given(const Tensor& t, const char* name) {
   GS_CHECK_TYPE(t.defined(), name, " must be a tensor, got None");
 }
 
+// Whether one of the two dtypes that are computed in.
 inline bool is_floating(ScalarType type) { return type == ScalarType::Float || type == ScalarType::Double; }
-
-// Memory without content for a tensor of T, on the device of `like`.
-template <class T>
-Tensor empty(Sizes sizes, const Tensor& like);
-
-// The same with the dtype of `like`.
-Tensor empty(Sizes sizes, const Tensor& like);
 
 namespace detail {
 
@@ -45,11 +40,13 @@ inline Tensor empty(Sizes sizes, int32_t dtype, const Tensor& like) {
 
 }  // namespace detail
 
+// Memory without content for a tensor of T, on the device of `like`.
 template <class T>
 Tensor empty(Sizes sizes, const Tensor& like) {
   return detail::empty(sizes, aoti_torch_dtype<T>(), like);
 }
 
+// The same with the dtype of `like`.
 inline Tensor empty(Sizes sizes, const Tensor& like) {
   int32_t dtype = 0;
   aoti_torch_get_dtype(like.get(), &dtype);
@@ -62,6 +59,18 @@ Tensor scalar(T value, const Tensor& like) {
   Tensor out = empty({}, like);
   *out.mutable_data_ptr<T>() = value;
   return out;
+}
+
+// The value of a tensor of one float or double, for which the host waits.
+template <class T>
+T value_of(const Tensor& t) {
+  T value{};
+  if constexpr (std::is_same_v<T, float>) {
+    TORCH_ERROR_CODE_CHECK(aoti_torch_item_float32(t.get(), &value));
+  } else {
+    TORCH_ERROR_CODE_CHECK(aoti_torch_item_float64(t.get(), &value));
+  }
+  return value;
 }
 
 // Asks first: torch's functions cost time even where there is nothing to do.

@@ -5,6 +5,8 @@
 #include <sstream>
 #include <stdexcept>
 #include <string>
+#include <type_traits>
+#include <vector>
 
 namespace gs {
 
@@ -40,10 +42,19 @@ inline std::string in_words(const Tensor& t) {
   return in_words(t.sizes()) + " " + in_words(t.scalar_type()) + " on " + in_words(t.device());
 }
 
+template <class Part>
+decltype(auto) written(const Part& part) {
+  constexpr bool is_sizes = std::is_same_v<Part, Sizes> || std::is_same_v<Part, std::vector<int64_t>>;
+  if constexpr (is_sizes || std::is_same_v<Part, ScalarType> || std::is_same_v<Part, Device>)
+    return in_words(part);
+  else
+    return (part);
+}
+
 template <class... Parts>
 std::string joined(const Parts&... parts) {
   std::ostringstream words;
-  (words << ... << parts);
+  (words << ... << written(parts));
   return words.str();
 }
 

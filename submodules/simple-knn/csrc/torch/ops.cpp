@@ -28,9 +28,9 @@ void fill_mean_distance2(const Tensor& rows, const Tensor& out) {
 
 Tensor mean_distance2(const Tensor& points) {
   gs::check_given(points, "points");
-  GS_CHECK(points.dim() == 2 && points.size(1) == 3, "points must be (N, 3), got ", gs::in_words(points.sizes()));
+  GS_CHECK(points.dim() == 2 && points.size(1) == 3, "points must be (N, 3), got ", points.sizes());
   const gs::ScalarType type = points.scalar_type();
-  GS_CHECK(gs::is_floating(type), "points must be float32 or float64, got ", gs::in_words(type));
+  GS_CHECK(gs::is_floating(type), "points must be float32 or float64, got ", type);
   GS_CHECK(points.is_cpu() || points.size(0) <= std::numeric_limits<int32_t>::max(),
            "the CUDA backend takes fewer than 2^31 points, got ", points.size(0), ": pass points.cpu()");
   const Tensor rows = gs::packed(points), out = gs::empty({rows.size(0)}, rows);
