@@ -189,9 +189,9 @@ def find_nvcc(torch_cuda: str | None) -> str | None:
         release = re.search(r"release (\d+)\.", run([nvcc, "--version"]))
         if release and int(release[1]) > int(torch_cuda.split(".")[0]):
             fail(
-                f"{nvcc} is of CUDA {release[1]} but torch was built with CUDA {torch_cuda}, whose driver may be too old "
-                "for it: set CUDA_HOME to a toolkit of that version, GS_CUDA=0 to build for the CPU only, or GS_CUDA=1 "
-                "to build all the same"
+                f"{nvcc} is of CUDA {release[1]} but torch was built with CUDA {torch_cuda}, whose driver may be too "
+                "old: set CUDA_HOME to a toolkit of that version, GS_CUDA=0 to build for the CPU only, or GS_CUDA=1 to "
+                "build all the same"
             )
     return nvcc
 

@@ -35,6 +35,12 @@ class Operators {
     if (cuda) cuda_.impl(name.c_str(), cuda);
   }
 
+  // The same with one function for all devices, for calls without a tensor too.
+  void define_for_all(const std::string& schema, Boxed function) {
+    schemas_.def(schema.c_str());
+    schemas_.impl(schema.substr(0, schema.find('(')).c_str(), function);
+  }
+
  private:
   using Library = torch::stable::detail::StableLibrary;
   Library schemas_, cpu_, cuda_;

@@ -11,6 +11,7 @@
 namespace gs {
 
 using MaybeTensor = std::optional<Tensor>;
+using torch::headeronly::DeviceType;
 using Shape = std::vector<int64_t>;
 template <class T>
 using List = torch::headeronly::HeaderOnlyArrayRef<T>;
@@ -23,18 +24,24 @@ inline void check_given(const Tensor& t, const char* name) {
 // Whether one of the two dtypes that are computed in.
 inline bool is_floating(ScalarType type) { return type == ScalarType::Float || type == ScalarType::Double; }
 
+// The strides of a contiguous tensor.
+inline Shape strides_of(Sizes sizes) {
+  Shape strides(sizes.size());
+  int64_t values = 1;
+  for (size_t axis = sizes.size(); axis-- > 0; values *= std::max<int64_t>(sizes[axis], 1)) strides[axis] = values;
+  return strides;
+}
+
 namespace detail {
 
 inline Tensor empty(Sizes sizes, int32_t dtype, const Tensor& like) {
   int32_t device = 0, index = 0;
   aoti_torch_get_device_type(like.get(), &device), aoti_torch_get_device_index(like.get(), &index);
-  Shape strides(sizes.size());
-  int64_t values = 1;
-  for (size_t axis = sizes.size(); axis-- > 0; values *= std::max<int64_t>(sizes[axis], 1)) strides[axis] = values;
+  const Shape strides = strides_of(sizes);
   AtenTensorHandle made = nullptr;
   const auto status = aoti_torch_empty_strided(sizes.size(), sizes.data(), strides.data(), dtype, device, index, &made);
   GS_CHECK_MEMORY(status == TORCH_SUCCESS, "out of memory. Tried to allocate ",
-                  values * aoti_torch_dtype_element_size(dtype), " bytes for ", in_words(sizes));
+                  (sizes.empty() ? 1 : sizes[0] * strides[0]) * aoti_torch_dtype_element_size(dtype), " bytes");
   return Tensor(made);
 }
 

@@ -20,7 +20,7 @@ namespace gs::ops {
 // CPU, as reading one from a GPU waits for it. Other indices are the caller's concern.
 void check_splats(const Tensor& splats);
 void check_lists(const Tensor& instances, const Tensor& ranges, const Tensor& splats, gs::Image image);
-void check_counts(const Tensor& tile_counts, int64_t count, at::Device device);
+void check_counts(const Tensor& tile_counts, int64_t count, Device device);
 // The size of the image whose `last` this is.
 gs::Image image_of(const Tensor& last, const Tensor& splats);
 Tensor background_like(const Tensor& background, const Tensor& splats);
@@ -43,14 +43,14 @@ class BlendBackward {
                 const Tensor& slots, const Tensor& background, const Tensor& last, const Tensor& transmittance,
                 const Tensor& grad_color, const MaybeTensor& grad_transmittance, const MaybeTensor& grad_inverse_depth)
       : image_(checked(splats, instances, ranges, splat_slots, slots, last, transmittance, grad_color)),
-        splats_(splats.contiguous()),
-        instances_(instances.contiguous()),
-        ranges_(ranges.contiguous()),
-        splat_slots_(splat_slots.contiguous()),
+        splats_(packed(splats)),
+        instances_(packed(instances)),
+        ranges_(packed(ranges)),
+        splat_slots_(packed(splat_slots)),
         slot_count_(slots.size(0)),
         background_(background_like(background, splats)),
-        last_(last.contiguous()),
-        transmittance_(transmittance.contiguous()),
+        last_(packed(last)),
+        transmittance_(packed(transmittance)),
         color_(plane(grad_color, 3)),
         alpha_(plane(grad_transmittance, 1)),
         depth_(plane(grad_inverse_depth, 1)) {}

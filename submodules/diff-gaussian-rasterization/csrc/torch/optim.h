@@ -14,13 +14,12 @@ template <class T>
 gs::StepGuard<T> step_guard(const Tensor& value, const MaybeTensor& loss, const MaybeTensor& stopped,
                             int64_t iteration) {
   if (!stopped) return {};
-  TORCH_CHECK(
-      loss && loss->numel() == 1 && loss->scalar_type() == value.scalar_type() && loss->device() == value.device(),
-      "a guarded step needs the loss, one ", value.scalar_type(), " on ", value.device());
-  TORCH_CHECK(stopped->numel() == 1 && stopped->scalar_type() == at::kLong && stopped->device() == value.device(),
-              "stopped must be one int64 on ", value.device(), ", got ", stopped->sizes(), " ", stopped->scalar_type(),
-              " on ", stopped->device());
-  TORCH_CHECK(iteration > 0, "iterations of guarded steps count from 1, got ", iteration);
+  GS_CHECK(loss && loss->numel() == 1 && loss->scalar_type() == value.scalar_type() && loss->device() == value.device(),
+           "a guarded step needs the loss, one ", value.scalar_type(), " on ", value.device());
+  GS_CHECK(stopped->numel() == 1 && stopped->scalar_type() == ScalarType::Long && stopped->device() == value.device(),
+           "stopped must be one int64 on ", value.device(), ", got ", stopped->sizes(), " ", stopped->scalar_type(),
+           " on ", stopped->device());
+  GS_CHECK(iteration > 0, "iterations of guarded steps count from 1, got ", iteration);
   return {loss->const_data_ptr<T>(), stopped->mutable_data_ptr<int64_t>(), iteration};
 }
 
@@ -31,7 +30,7 @@ template <class T>
 gs::AdamInput<T> adam_input(const Tensor& value, const Tensor& gradient, const Tensor& exp_avg,
                             const Tensor& exp_avg_sq, int64_t columns) {
   const int64_t rows = rows_of(value), row = rows ? value.numel() / rows : 0;
-  TORCH_CHECK(rows == 0 || columns <= row, "columns must be at most ", row, ", got ", columns);
+  GS_CHECK(rows == 0 || columns <= row, "columns must be at most ", row, ", got ", columns);
   gs::AdamInput<T> in{};
   in.value = value.mutable_data_ptr<T>(), in.gradient = gradient.const_data_ptr<T>();
   in.mean = exp_avg.mutable_data_ptr<T>(), in.square = exp_avg_sq.mutable_data_ptr<T>();

@@ -36,6 +36,9 @@ using InputTensors = std::array<Tensor, kInputs>;
 using Gradients = decltype(std::tuple_cat(std::declval<InputTensors>()));
 using Wanted = std::array<bool, kInputs>;
 
+// The same from a list that a caller gave.
+Wanted checked_wanted(const std::vector<bool>& wanted);
+
 // Checks the inputs, and owns the contiguous tensors that a gs::Scene points into.
 class SceneTensors {
  public:
@@ -44,11 +47,11 @@ class SceneTensors {
   // Checks the shape, dtype and device of an input. Returns it contiguous; undefined where it was not given.
   Tensor checked(Input input, const MaybeTensor& given) const;
 
+  const Tensor& means() const { return inputs_[kMeans]; }
   int64_t count() const { return inputs_[kMeans].size(0); }
   gs::Image image() const { return image_; }
-  at::ScalarType dtype() const { return inputs_[kMeans].scalar_type(); }
-  at::Device device() const { return inputs_[kMeans].device(); }
-  at::TensorOptions options() const { return inputs_[kMeans].options(); }
+  ScalarType dtype() const { return inputs_[kMeans].scalar_type(); }
+  Device device() const { return inputs_[kMeans].device(); }
   int64_t rest_bands() const { return inputs_[kShRest].defined() ? inputs_[kShRest].size(1) : 0; }
 
   template <class T>
