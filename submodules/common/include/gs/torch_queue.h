@@ -57,7 +57,7 @@ class TorchQueue {
                                                         aoti_torch_device_type_cpu(), -1, &made);
     GS_CHECK_MEMORY(status == TORCH_SUCCESS, "the host is out of memory: ", count, " numbers of page-locked memory");
     numbers.emplace_back(made);
-    return numbers.back().mutable_data_ptr<int64_t>();
+    return write<int64_t>(numbers.back());
   }
 
   torch::stable::accelerator::DeviceGuard guard_;

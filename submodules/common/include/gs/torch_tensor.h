@@ -4,6 +4,7 @@
 
 #include <algorithm>
 #include <optional>
+#include <utility>
 #include <vector>
 
 #include "gs/torch_words.h"
@@ -21,8 +22,57 @@ inline void check_given(const Tensor& t, const char* name) {
   GS_CHECK_TYPE(t.defined(), name, " must be a tensor, got None");
 }
 
+// Not an operator: torch's own is missing in some of its versions.
+inline bool same(Sizes one, Sizes two) { return one.equals(two); }
+
 // Whether one of the two dtypes that are computed in.
 inline bool is_floating(ScalarType type) { return type == ScalarType::Float || type == ScalarType::Double; }
+
+// Asks for one dtype, where torch's own function tries several.
+inline bool has_dtype(const Tensor& t, ScalarType type) {
+  int32_t dtype = 0;
+  aoti_torch_get_dtype(t.get(), &dtype);
+  switch (type) {
+    case ScalarType::Float:
+      return dtype == aoti_torch_dtype_float32();
+    case ScalarType::Double:
+      return dtype == aoti_torch_dtype_float64();
+    case ScalarType::Int:
+      return dtype == aoti_torch_dtype_int32();
+    case ScalarType::Long:
+      return dtype == aoti_torch_dtype_int64();
+    default:
+      return t.scalar_type() == type;
+  }
+}
+
+// Whether two tensors have one dtype and are on one device.
+inline bool alike(const Tensor& one, const Tensor& two) {
+  int32_t of_one[3] = {}, of_two[3] = {};
+  for (auto [t, of] : {std::pair(&one, of_one), std::pair(&two, of_two)}) {
+    aoti_torch_get_dtype(t->get(), &of[0]);
+    aoti_torch_get_device_type(t->get(), &of[1]), aoti_torch_get_device_index(t->get(), &of[2]);
+  }
+  return std::equal(of_one, of_one + 3, of_two);
+}
+
+// The values of a tensor of T, to read and to write.
+template <class T>
+void check_holds(const Tensor& t) {
+  int32_t dtype = 0;
+  aoti_torch_get_dtype(t.get(), &dtype);
+  GS_CHECK(dtype == aoti_torch_dtype<T>(), "a tensor has another dtype than that of its values: ", t.scalar_type());
+}
+template <class T>
+const T* read(const Tensor& t) {
+  check_holds<T>(t);
+  return static_cast<const T*>(t.const_data_ptr());
+}
+template <class T>
+T* write(const Tensor& t) {
+  check_holds<T>(t);
+  return static_cast<T*>(t.mutable_data_ptr());
+}
 
 // The strides of a contiguous tensor.
 inline Shape strides_of(Sizes sizes) {
@@ -64,7 +114,7 @@ inline Tensor empty(Sizes sizes, const Tensor& like) {
 template <class T>
 Tensor scalar(T value, const Tensor& like) {
   Tensor out = empty({}, like);
-  *out.mutable_data_ptr<T>() = value;
+  *write<T>(out) = value;
   return out;
 }
 
@@ -85,10 +135,7 @@ inline Tensor packed(const Tensor& t) { return t.is_contiguous() ? t : torch::st
 
 // Returns `t` contiguous, with the dtype and on the device of `like`.
 inline Tensor converted(const Tensor& t, const Tensor& like) {
-  const ScalarType type = like.scalar_type();
-  const Device device = like.device();
-  const bool fits = t.scalar_type() == type && t.device() == device;
-  return packed(fits ? t : torch::stable::to(t, type, std::nullopt, device));
+  return packed(alike(t, like) ? t : torch::stable::to(t, like.scalar_type(), std::nullopt, like.device()));
 }
 
 }  // namespace gs

@@ -12,7 +12,7 @@ namespace {
 thread_local std::optional<gs::Ahead> current;
 
 // Whether a tensor is in page-locked memory.
-bool is_pinned(const Tensor& t) {
+bool page_locked(const Tensor& t) {
   using torch::stable::detail::from;
   StableIValue stack[] = {from(t), from(std::nullopt)};
   TORCH_ERROR_CODE_CHECK(torch_call_dispatcher("aten::is_pinned", "", stack, TORCH_ABI_VERSION));
@@ -33,15 +33,11 @@ void run_ahead_op(const MaybeTensor& words, Sizes room, const MaybeTensor& repor
   const int64_t count = reports && reports->dim() == 2 ? reports->size(0) : 0;
   if (reports) check_tensor(*reports, "reports", ScalarType::Long, DeviceType::CPU, {count, 5});
   GS_CHECK_VALUE(!reports || (0 < count && count <= most), "reports need a row");
-  GS_CHECK_VALUE(words->is_contiguous() && (!reports || (reports->is_contiguous() && is_pinned(*reports))),
+  GS_CHECK_VALUE(words->is_contiguous() && (!reports || (reports->is_contiguous() && page_locked(*reports))),
                  "words and reports must be contiguous, and the reports in page-locked memory");
-  int64_t* first = words->mutable_data_ptr<int64_t>();
-  current = gs::Ahead{reinterpret_cast<int32_t*>(first),
-                      reinterpret_cast<gs::Room*>(first + 1),
-                      first + 4,
-                      {room[0], room[1], room[2]},
-                      reports ? reports->mutable_data_ptr<int64_t>() : nullptr,
-                      int(count)};
+  int64_t* first = write<int64_t>(*words);
+  current = gs::Ahead{reinterpret_cast<int32_t*>(first), reinterpret_cast<gs::Room*>(first + 1),       first + 4,
+                      {room[0], room[1], room[2]},       reports ? write<int64_t>(*reports) : nullptr, int(count)};
 }
 
 }  // namespace

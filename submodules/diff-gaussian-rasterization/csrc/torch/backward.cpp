@@ -23,7 +23,7 @@ void check_lists(const Tensor& instances, const Tensor& ranges, const Tensor& sp
   check_tensor(instances, "instances", ScalarType::Int, splats.device(), {-1});
   check_tensor(ranges, "ranges", ScalarType::Long, splats.device(), {tiles_of(image) + 1});
   if (!ranges.is_cpu()) return;
-  const int64_t end = ranges.const_data_ptr<int64_t>()[tiles_of(image) * ranges.stride(0)], n = instances.size(0);
+  const int64_t end = read<int64_t>(ranges)[tiles_of(image) * ranges.stride(0)], n = instances.size(0);
   GS_CHECK_VALUE(end <= n && (end <= 0 || splats.size(0) > 0), "ranges end at ", end, ", but there are ", n,
                  " instances of ", splats.size(0), " splats");
 }
@@ -52,7 +52,7 @@ gs::Image BlendBackward::checked(const Tensor& splats, const Tensor& instances, 
   check_tensor(splat_slots, "splat_slots", ScalarType::Long, device, {splats.size(0) + 1, 2});
   check_tensor(slots, "slots", ScalarType::Int, device, {-1, 0});
   if (device.is_cpu()) {
-    const int64_t end = splat_slots.const_data_ptr<int64_t>()[splats.size(0) * splat_slots.stride(0)];
+    const int64_t end = read<int64_t>(splat_slots)[splats.size(0) * splat_slots.stride(0)];
     GS_CHECK_VALUE(end == slots.size(0), "splat_slots end at ", end, ", but there are ", slots.size(0), " slots");
   }
   check_tensor(transmittance, "transmittance", splats.scalar_type(), device, {1, image.height, image.width});
@@ -80,7 +80,7 @@ Tensor blend_vjp(const BlendBackward& in, const Tensor& absolute) {
   Tensor moments = empty({in.splats().size(0), kGradientValues}, in.splats());
   with_scalar(moments.scalar_type(), [&](auto zero) {
     using T = decltype(zero);
-    GS_RUN(T, moments, blend_vjp, in.input<T>(), in.gradient<T>(moments.mutable_data_ptr<T>(), absolute));
+    GS_RUN(T, moments, blend_vjp, in.input<T>(), in.gradient<T>(write<T>(moments), absolute));
   });
   return moments;
 }

@@ -28,12 +28,8 @@ Tensor background_like(const Tensor& background, const Tensor& splats);
 template <class T>
 gs::BlendInput<T> blend_input(const Tensor& splats, const Tensor& instances, const Tensor& ranges,
                               const Tensor& background, gs::Image image) {
-  return {splats.const_data_ptr<T>(),
-          instances.const_data_ptr<int32_t>(),
-          ranges.const_data_ptr<int64_t>(),
-          background.const_data_ptr<T>(),
-          image,
-          instances.size(0)};
+  return {read<T>(splats), read<int32_t>(instances), read<int64_t>(ranges), read<T>(background),
+          image,           instances.size(0)};
 }
 
 // Owns the tensors that the gs::BlendInput and gs::BlendGradient of a backward point into.
@@ -71,15 +67,15 @@ class BlendBackward {
             instances_.size(0),
             slot_count_,
             static_cast<const gs::SplatSlots*>(splat_slots_.const_data_ptr()),
-            transmittance_.const_data_ptr<T>(),
-            last_.const_data_ptr<int32_t>(),
-            color_.const_data_ptr<T>(),
-            depth_.defined() ? depth_.const_data_ptr<T>() : nullptr,
-            alpha_.defined() ? alpha_.const_data_ptr<T>() : nullptr,
+            read<T>(transmittance_),
+            read<int32_t>(last_),
+            read<T>(color_),
+            depth_.defined() ? read<T>(depth_) : nullptr,
+            alpha_.defined() ? read<T>(alpha_) : nullptr,
             moments,
-            layers_.defined() && layers_.numel() ? layers_.const_data_ptr<T>() : nullptr,
+            layers_.defined() && layers_.numel() ? read<T>(layers_) : nullptr,
             ahead(),
-            absolute.defined() ? absolute.mutable_data_ptr<T>() : nullptr};
+            absolute.defined() ? write<T>(absolute) : nullptr};
   }
 
  private:

@@ -26,7 +26,7 @@ void check_steps(Sizes attributes, List<Tensor> steps, std::initializer_list<siz
 
 // Advances the counters of steps.
 void advance(List<Tensor> steps) {
-  for (const Tensor& step : steps) *step.mutable_data_ptr<float>() += 1;
+  for (const Tensor& step : steps) *write<float>(step) += 1;
 }
 
 // Adam's lists, with an entry for each attribute that `attributes` names by its place in gs::Stepped.
@@ -53,7 +53,7 @@ gs::GaussianStep<T> gaussian_step(const Values& values, const StepLists& lists, 
     check_moments(value, value, lists.exp_avg[k], lists.exp_avg_sq[k]);
     gs::AdamInput<T> in = adam_input<T>(value, value, lists.exp_avg[k], lists.exp_avg_sq[k], lists.columns[k]);
     in.lr = lists.rates[k], in.beta1 = lists.beta1, in.beta2 = lists.beta2, in.eps = lists.eps;
-    in.step = double(*lists.steps[k].const_data_ptr<float>()) + 1;
+    in.step = double(*read<float>(lists.steps[k])) + 1;
     out.attributes[lists.attributes[k]] = in;
   }
   return out;
@@ -63,16 +63,16 @@ gs::GaussianStep<T> gaussian_step(const Values& values, const StepLists& lists, 
 template <class T>
 void observe_in(gs::GaussianStep<T>& step, const Tensor& radii, const MaybeTensor& max_radii,
                 const MaybeTensor& gradient_sums, const MaybeTensor& views) {
-  step.observed = {radii.numel(), nullptr, nullptr, nullptr, radii.const_data_ptr<int32_t>(), nullptr};
+  step.observed = {radii.numel(), nullptr, nullptr, nullptr, read<int32_t>(radii), nullptr};
   const bool given = max_radii.has_value();
   GS_CHECK(gradient_sums.has_value() == given && views.has_value() == given,
            "give max_radii, gradient_sums and views, or none of them");
   if (!given) return;
   check_statistics(*max_radii, *gradient_sums, *views, radii);
   GS_CHECK((std::is_same_v<T, float>), "statistics are of float32 Gaussians, got float64");
-  step.observed.max_radii = max_radii->mutable_data_ptr<float>();
-  step.observed.gradient_sums = gradient_sums->mutable_data_ptr<float>();
-  step.observed.views = views->mutable_data_ptr<float>();
+  step.observed.max_radii = write<float>(*max_radii);
+  step.observed.gradient_sums = write<float>(*gradient_sums);
+  step.observed.views = write<float>(*views);
 }
 
 // The numbers of a step that was recorded before; null for those of the call.
@@ -81,7 +81,7 @@ const gs::StepNow* step_now(const MaybeTensor& now, const SceneTensors& scene) {
   check_tensor(*now, "now", ScalarType::Long, scene.device(), {gs::kStepNowWords});
   GS_CHECK_VALUE(now->is_contiguous(), "now must be contiguous");
   GS_CHECK(scene.dtype() == ScalarType::Float, "now is of float32 Gaussians, got float64");
-  return reinterpret_cast<const gs::StepNow*>(now->const_data_ptr<int64_t>());
+  return reinterpret_cast<const gs::StepNow*>(read<int64_t>(*now));
 }
 
 // source: Lists or Rows. lengths: of absolute gradients, if it is defined; then they are what is observed.
@@ -89,14 +89,14 @@ template <class Source>
 void run(const SceneTensors& scene, const Source& source, const Tensor& /*lengths*/,
          const gs::GaussianStep<double>& step) {
   const Tensor moments = source.moments({});
-  GS_DISPATCH(project_vjp_step, gs::torch_executor(), scene.scene<double>(),
-              source.tile_counts().template const_data_ptr<int32_t>(), moments.const_data_ptr<double>(), step);
+  GS_DISPATCH(project_vjp_step, gs::torch_executor(), scene.scene<double>(), read<int32_t>(source.tile_counts()),
+              read<double>(moments), step);
 }
 
 template <class Source>
 void run(const SceneTensors& scene, const Source& source, const Tensor& lengths, gs::GaussianStep<float> step) {
   gs::ObserveInput later = step.observed;
-  if (lengths.defined()) later.lengths = lengths.const_data_ptr<float>(), step.observed.max_radii = nullptr;
+  if (lengths.defined()) later.lengths = read<float>(lengths), step.observed.max_radii = nullptr;
 #ifdef GS_CUDA
   if (scene.device().is_cuda()) {
     gs::TorchQueue queue(scene.device(), halted());
@@ -106,8 +106,8 @@ void run(const SceneTensors& scene, const Source& source, const Tensor& lengths,
   }
 #endif
   const Tensor moments = source.moments(lengths);
-  GS_DISPATCH(project_vjp_step, gs::torch_executor(), scene.scene<float>(),
-              source.tile_counts().template const_data_ptr<int32_t>(), moments.const_data_ptr<float>(), step);
+  GS_DISPATCH(project_vjp_step, gs::torch_executor(), scene.scene<float>(), read<int32_t>(source.tile_counts()),
+              read<float>(moments), step);
   if (later.lengths) gs::observe(gs::torch_executor(), later);
 }
 
@@ -173,11 +173,10 @@ void step_now_op(Tensor& now, Sizes attributes, List<Tensor> steps, List<double>
   check_tensor(now, "now", ScalarType::Long, DeviceType::CPU, {gs::kStepNowWords});
   GS_CHECK_VALUE(now.is_contiguous(), "now must be contiguous");
   check_steps(attributes, steps, {rates.size()});
-  auto* to = reinterpret_cast<gs::StepNow*>(now.mutable_data_ptr<int64_t>());
+  auto* to = reinterpret_cast<gs::StepNow*>(write<int64_t>(now));
   for (size_t k = 0; k < attributes.size(); ++k)
-    gs::set_constants(
-        *to, attributes[k],
-        gs::step_constants(sparse, rates[k], beta1, beta2, eps, double(*steps[k].const_data_ptr<float>()) + 1));
+    gs::set_constants(*to, attributes[k],
+                      gs::step_constants(sparse, rates[k], beta1, beta2, eps, double(*read<float>(steps[k])) + 1));
   to->iteration = iteration;
   advance(steps);
 }

@@ -41,7 +41,7 @@ Rows::Rows(const SceneTensors& scene, ROWS_PARAMETERS, bool absolute, bool lengt
 }
 
 void Rows::check_sum() const {
-  const int32_t *counts = counts_.const_data_ptr<int32_t>(), *tile_counts = tile_counts_.const_data_ptr<int32_t>();
+  const int32_t *counts = read<int32_t>(counts_), *tile_counts = read<int32_t>(tile_counts_);
   int64_t sum = 0;
   for (int64_t i = 0; i < counts_.size(0); sum += counts[i++])
     GS_CHECK_VALUE(counts[i] == 0 || (counts[i] > 0 && tile_counts[i] != 0),
@@ -53,7 +53,7 @@ Tensor Rows::moments(const Tensor& lengths) const {
   Tensor moments = empty({counts_.size(0), kGradientValues}, rows_);
   with_scalar(moments.scalar_type(), [&](auto zero) {
     using T = decltype(zero);
-    GS_DISPATCH(sum_rows, gs::torch_executor(), input<T>(), sums<T>(moments.mutable_data_ptr<T>(), lengths));
+    GS_DISPATCH(sum_rows, gs::torch_executor(), input<T>(), sums<T>(write<T>(moments), lengths));
   });
   return moments;
 }

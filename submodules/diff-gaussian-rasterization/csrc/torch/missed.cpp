@@ -25,7 +25,7 @@ Tensor constants_of(const Tensor& value, List<double> rates, List<double> steps,
   using Step = gs::baseline::AdamStep<T>;
   static_assert(sizeof(Step) == 7 * sizeof(T), "AdamStep has seven numbers");
   const Tensor table = torch::stable::empty({int64_t(steps.size()), 7}, value.scalar_type());
-  auto* row = reinterpret_cast<Step*>(table.mutable_data_ptr<T>());
+  auto* row = reinterpret_cast<Step*>(write<T>(table));
   for (size_t k = 0; k < steps.size(); ++k)
     row[k] = gs::baseline::make_adam_step<T>(rates[k], beta1, beta2, eps, steps[k]);
   return value.is_cpu() ? table : torch::stable::to(table, value.device());
@@ -45,14 +45,16 @@ void catch_up_op(Tensor& value, Tensor& exp_avg, Tensor& exp_avg_sq, const Tenso
     using T = decltype(zero);
     const gs::AdamInput<T> in = adam_input<T>(value, value, exp_avg, exp_avg_sq, columns);
     const Tensor table = constants_of<T>(value, rates, steps, beta1, beta2, eps);
-    const gs::MissedSteps<T> missed{table.const_data_ptr<T>(), counts.const_data_ptr<int32_t>(), int32_t(steps.size())};
+    const gs::MissedSteps<T> missed{read<T>(table), read<int32_t>(counts), int32_t(steps.size())};
     GS_RUN(T, value, catch_up, in, missed);
   });
 }
 
 void check_values(const Tensor& values) {
   check_given(values, "values");
-  GS_CHECK(values.layout() == torch::headeronly::Layout::Strided, "values must be dense");
+  int32_t layout = 0;
+  aoti_torch_get_layout(values.get(), &layout);
+  GS_CHECK(layout == aoti_torch_layout_strided(), "values must be dense");
   with_scalar(values.scalar_type(), [](auto) {});
 }
 

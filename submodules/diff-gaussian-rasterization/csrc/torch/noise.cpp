@@ -20,17 +20,17 @@ void add_noise_op(Tensor& means, const Tensor& log_scales, const Tensor& rotatio
                  "10000, got ", size, " and ", steepness);
   const Tensor sizes = packed(log_scales), turns = packed(rotations), opacities = packed(logits);
   const gs::NoiseInput in{n,
-                          means.mutable_data_ptr<float>(),
-                          sizes.const_data_ptr<float>(),
-                          turns.const_data_ptr<float>(),
-                          opacities.const_data_ptr<float>(),
+                          write<float>(means),
+                          read<float>(sizes),
+                          read<float>(turns),
+                          read<float>(opacities),
                           size,
                           steepness,
                           threshold,
                           uint64_t(seed),
                           uint32_t(iteration),
                           uint32_t(stream),
-                          stopped ? stopped->const_data_ptr<int64_t>() : nullptr,
+                          stopped ? read<int64_t>(*stopped) : nullptr,
                           first};
 #ifdef GS_CUDA
   if (means.is_cuda()) {

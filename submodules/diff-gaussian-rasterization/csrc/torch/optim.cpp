@@ -11,19 +11,17 @@ void check_moments(const Tensor& value, const Tensor& gradient, const Tensor& ex
                                 std::pair("exp_avg", &exp_avg), std::pair("exp_avg_sq", &exp_avg_sq)})
     check_given(*t, name);
   for (const Tensor* t : {&gradient, &exp_avg, &exp_avg_sq})
-    GS_CHECK(t->sizes() == value.sizes() && t->scalar_type() == value.scalar_type() && t->device() == value.device(),
-             "gradient and averages must have the shape, dtype and device of the parameter, ", value.sizes(), " ",
-             value.scalar_type(), " on ", value.device(), ", got ", t->sizes(), " ", t->scalar_type(), " on ",
-             t->device());
+    GS_CHECK(same(t->sizes(), value.sizes()) && alike(*t, value),
+             "gradient and averages must have the shape, dtype and device of the parameter, ", in_words(value),
+             ", got ", in_words(*t));
   GS_CHECK(value.is_contiguous() && exp_avg.is_contiguous() && exp_avg_sq.is_contiguous(),
            "parameter and averages must be contiguous");
 }
 
 void check_counter(const Tensor& step) {
   check_given(step, "step");
-  GS_CHECK(step.is_cpu() && step.numel() == 1 && step.scalar_type() == ScalarType::Float,
-           "a step counter must be one float32 on the CPU, got ", step.sizes(), " ", step.scalar_type(), " on ",
-           step.device());
+  GS_CHECK(step.is_cpu() && step.numel() == 1 && has_dtype(step, ScalarType::Float),
+           "a step counter must be one float32 on the CPU, got ", in_words(step));
 }
 
 void check_statistics(const Tensor& max_radii, const Tensor& gradient_sums, const Tensor& views, const Tensor& radii) {
@@ -33,12 +31,11 @@ void check_statistics(const Tensor& max_radii, const Tensor& gradient_sums, cons
   check_given(radii, "radii");
   const int64_t n = radii.numel();
   for (const Tensor* t : {&max_radii, &gradient_sums, &views}) {
-    GS_CHECK(t->numel() == n && t->scalar_type() == ScalarType::Float && t->device() == radii.device(),
-             "statistics must be ", n, " float32 on ", radii.device(), ", got ", t->sizes(), " ", t->scalar_type(),
-             " on ", t->device());
+    GS_CHECK(t->numel() == n && has_dtype(*t, ScalarType::Float) && t->device() == radii.device(),
+             "statistics must be ", n, " float32 on ", radii.device(), ", got ", in_words(*t));
     GS_CHECK(t->is_contiguous(), "statistics must be contiguous");
   }
-  GS_CHECK(radii.scalar_type() == ScalarType::Int, "radii must be int32, got ", radii.scalar_type());
+  GS_CHECK(has_dtype(radii, ScalarType::Int), "radii must be int32, got ", radii.scalar_type());
 }
 
 namespace {
@@ -58,19 +55,18 @@ void adam_op(List<Tensor> values, List<Tensor> gradients, List<Tensor> exp_avg, 
     std::vector<gs::AdamInput<T>> inputs;
     std::vector<Tensor> contiguous;  // keeps the gradients' memory until the call is over
     for (size_t i = 0; i < n; ++i) {
-      GS_CHECK(values[i].scalar_type() == first.scalar_type() && values[i].device() == first.device(),
-               "all parameters must have one dtype and device");
+      GS_CHECK(alike(values[i], first), "all parameters must have one dtype and device");
       check_moments(values[i], gradients[i], exp_avg[i], exp_avg_sq[i]);
       check_counter(steps[i]);
       contiguous.push_back(packed(gradients[i]));
       gs::AdamInput<T> in = adam_input<T>(values[i], contiguous.back(), exp_avg[i], exp_avg_sq[i], columns[i]);
       in.lr = rates[i], in.beta1 = beta1, in.beta2 = beta2, in.eps = eps;
-      in.step = double(*steps[i].const_data_ptr<float>()) + 1;
+      in.step = double(*read<float>(steps[i])) + 1;
       inputs.push_back(in);
     }
     GS_RUN(T, first, adam, inputs.data(), int64_t(n), step_guard<T>(first, loss, stopped, iteration));
   });
-  for (const Tensor& step : steps) *step.mutable_data_ptr<float>() += 1;
+  for (const Tensor& step : steps) *write<float>(step) += 1;
 }
 
 void sparse_adam_op(Tensor& value, const Tensor& gradient, Tensor& exp_avg, Tensor& exp_avg_sq, const Tensor& visible,
@@ -79,17 +75,16 @@ void sparse_adam_op(Tensor& value, const Tensor& gradient, Tensor& exp_avg, Tens
   check_moments(value, gradient, exp_avg, exp_avg_sq);
   check_given(visible, "visible");
   const int64_t rows = rows_of(value);
-  GS_CHECK(visible.dim() == 1 && visible.size(0) == rows && visible.scalar_type() == ScalarType::Bool &&
+  GS_CHECK(visible.dim() == 1 && visible.size(0) == rows && has_dtype(visible, ScalarType::Bool) &&
                visible.device() == value.device(),
-           "visible must be (", rows, ") bool on ", value.device(), ", got ", visible.sizes(), " ",
-           visible.scalar_type(), " on ", visible.device());
+           "visible must be (", rows, ") bool on ", value.device(), ", got ", in_words(visible));
   if (value.numel() == 0) return;
   const Tensor g = packed(gradient), mask = packed(visible);
   with_scalar(value.scalar_type(), [&](auto zero) {
     using T = decltype(zero);
     gs::AdamInput<T> in = adam_input<T>(value, g, exp_avg, exp_avg_sq, columns);
     in.lr = lr, in.beta1 = beta1, in.beta2 = beta2, in.eps = eps;
-    GS_RUN(T, value, sparse_adam, in, mask.const_data_ptr<bool>(), step_guard<T>(value, loss, stopped, iteration));
+    GS_RUN(T, value, sparse_adam, in, read<bool>(mask), step_guard<T>(value, loss, stopped, iteration));
   });
 }
 
@@ -99,17 +94,17 @@ void observe_op(Tensor& max_radii, Tensor& gradient_sums, Tensor& views, const T
   const int64_t n = radii.numel();
   const bool lengths = gradient.dim() == 1;
   GS_CHECK((lengths || (gradient.dim() == 2 && gradient.size(1) == 3)) && gradient.size(0) == n &&
-               gradient.scalar_type() == ScalarType::Float && gradient.device() == radii.device(),
+               has_dtype(gradient, ScalarType::Float) && gradient.device() == radii.device(),
            "the gradient must be (", n, ", 3) float32 on ", radii.device(), ", or its lengths (", n, ",), got ",
-           gradient.sizes(), " ", gradient.scalar_type(), " on ", gradient.device());
+           in_words(gradient));
   const Tensor pixels = packed(radii), rows = packed(gradient);
   const gs::ObserveInput in{n,
-                            max_radii.mutable_data_ptr<float>(),
-                            gradient_sums.mutable_data_ptr<float>(),
-                            views.mutable_data_ptr<float>(),
-                            pixels.const_data_ptr<int32_t>(),
-                            lengths ? nullptr : rows.const_data_ptr<float>(),
-                            lengths ? rows.const_data_ptr<float>() : nullptr};
+                            write<float>(max_radii),
+                            write<float>(gradient_sums),
+                            write<float>(views),
+                            read<int32_t>(pixels),
+                            lengths ? nullptr : read<float>(rows),
+                            lengths ? read<float>(rows) : nullptr};
 #ifdef GS_CUDA
   if (radii.is_cuda()) {
     gs::TorchQueue queue(radii.device(), halted());

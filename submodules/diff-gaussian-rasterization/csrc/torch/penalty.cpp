@@ -21,10 +21,10 @@ void penalise_op(const Tensor& logits, const Tensor& log_scales, Tensor& logit_g
     using T = decltype(zero);
     const gs::PenaltyInput<T> in{n,
                                  {T(opacity), T(scale)},
-                                 opacities.const_data_ptr<T>(),
-                                 sizes.const_data_ptr<T>(),
-                                 logit_gradients.mutable_data_ptr<T>(),
-                                 log_scale_gradients.mutable_data_ptr<T>()};
+                                 read<T>(opacities),
+                                 read<T>(sizes),
+                                 write<T>(logit_gradients),
+                                 write<T>(log_scale_gradients)};
     GS_RUN(T, logits, penalise, in);
   });
 }

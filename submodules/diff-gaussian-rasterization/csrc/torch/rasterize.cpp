@@ -21,11 +21,11 @@ struct ProjectedTensors {
   Tensor records;  // undefined where an image has too many tiles
   template <class T>
   gs::Projected<T> pointers() {
-    return {splats.mutable_data_ptr<T>(),
-            depths.mutable_data_ptr<T>(),
-            rects.defined() ? rects.mutable_data_ptr<int32_t>() : nullptr,
-            tile_counts.mutable_data_ptr<int32_t>(),
-            radii.mutable_data_ptr<int32_t>(),
+    return {write<T>(splats),
+            write<T>(depths),
+            rects.defined() ? write<int32_t>(rects) : nullptr,
+            write<int32_t>(tile_counts),
+            write<int32_t>(radii),
             records.defined() ? static_cast<gs::TileRecord*>(records.mutable_data_ptr()) : nullptr};
   }
 };
@@ -53,7 +53,7 @@ ProjectedTensors project(const SceneTensors& in, bool rects) {
 // Names the Gaussians with the most tiles; often a few giants cover nearly all.
 std::string giants(const Tensor& tile_counts) {
   const Tensor on_host = torch::stable::to(tile_counts, DeviceType::CPU);
-  const auto* counts = on_host.const_data_ptr<int32_t>();
+  const auto* counts = read<int32_t>(on_host);
   std::vector<int64_t> rows(on_host.size(0));
   std::iota(rows.begin(), rows.end(), 0);
   const auto end = rows.begin() + std::min<size_t>(3, rows.size());
@@ -82,7 +82,7 @@ BinnedTensors bin(ProjectedTensors& in, gs::Image image, bool slots) {
     out.instances = empty<int32_t>({total}, in.depths);
     out.ranges = empty<int64_t>({tiles_of(image) + 1}, in.depths);
     out.slots = empty<int32_t>({slot_count, 0}, in.depths);
-    return gs::Binned{out.instances.mutable_data_ptr<int32_t>(), out.ranges.mutable_data_ptr<int64_t>()};
+    return gs::Binned{write<int32_t>(out.instances), write<int64_t>(out.ranges)};
   };
   using Allocate = decltype(allocate);
   const gs::BinMemory memory{
@@ -111,10 +111,9 @@ BlendedTensors blend(const Tensor& splats, const Tensor& instances, const Tensor
   const Tensor bg = background_like(background, splats);
   with_scalar(splats.scalar_type(), [&](auto zero) {
     using T = decltype(zero);
-    const gs::Blended<T> blended{out.color.mutable_data_ptr<T>(), out.transmittance.mutable_data_ptr<T>(),
-                                 inverse_depth ? out.inverse_depth.mutable_data_ptr<T>() : nullptr,
-                                 train ? out.last.mutable_data_ptr<int32_t>() : nullptr,
-                                 out.layers.numel() ? out.layers.mutable_data_ptr<T>() : nullptr};
+    const gs::Blended<T> blended{
+        write<T>(out.color), write<T>(out.transmittance), inverse_depth ? write<T>(out.inverse_depth) : nullptr,
+        train ? write<int32_t>(out.last) : nullptr, out.layers.numel() ? write<T>(out.layers) : nullptr};
     GS_RUN(T, splats, blend, blend_input<T>(splats, instances, ranges, bg, image), blended);
   });
   return out;
@@ -176,8 +175,7 @@ Tensor mark_visible_op(const Tensor& means, const Tensor& view) {
   Tensor visible = empty<bool>({rows.size(0)}, rows);
   with_scalar(rows.scalar_type(), [&](auto zero) {
     using T = decltype(zero);
-    GS_RUN(T, rows, mark_visible, rows.size(0), rows.const_data_ptr<T>(), matrix.const_data_ptr<T>(),
-           visible.mutable_data_ptr<bool>());
+    GS_RUN(T, rows, mark_visible, rows.size(0), read<T>(rows), read<T>(matrix), write<bool>(visible));
   });
   return visible;
 }
@@ -191,8 +189,8 @@ Tensor decisive_op(const Tensor& splats, const Tensor& instances, const Tensor& 
   const Tensor lists = packed(instances), bounds = packed(ranges), ends = packed(last);
   with_scalar(rows.scalar_type(), [&](auto zero) {
     using T = decltype(zero);
-    GS_RUN(T, rows, mark_decisive, blend_input<T>(rows, lists, bounds, no_background, image),
-           ends.const_data_ptr<int32_t>(), decisive.mutable_data_ptr<bool>());
+    GS_RUN(T, rows, mark_decisive, blend_input<T>(rows, lists, bounds, no_background, image), read<int32_t>(ends),
+           write<bool>(decisive));
   });
   return decisive;
 }

@@ -51,7 +51,9 @@ gs::Image checked_image(int64_t height, int64_t width) {
 }
 
 SceneTensors::SceneTensors(SCENE_PARAMETERS)
-    : tan_x_(tan_x),
+    : dtype_(ScalarType::Float),
+      device_(DeviceType::CPU),
+      tan_x_(tan_x),
       tan_y_(tan_y),
       scale_modifier_(scale_modifier),
       sh_degree_(int(sh_degree)),
@@ -59,9 +61,8 @@ SceneTensors::SceneTensors(SCENE_PARAMETERS)
       raw_(raw),
       image_(checked_image(height, width)) {
   check_given(means, "means");
-  const ScalarType type = means.scalar_type();
-  GS_CHECK_TYPE(type == ScalarType::Float || type == ScalarType::Double, "means must be float32 or float64, got ",
-                type);
+  dtype_ = means.scalar_type(), device_ = means.device();
+  GS_CHECK_TYPE(is_floating(dtype_), "means must be float32 or float64, got ", dtype_);
   GS_CHECK_VALUE(means.dim() == 2 && means.size(1) == 3, "means must be (N, 3), got ", means.sizes());
   GS_CHECK_VALUE(cov3d.has_value() != (scales.has_value() && rotations.has_value()),
                  "give scales and rotations, or cov3d");
@@ -83,13 +84,13 @@ Tensor SceneTensors::checked(Input input, const MaybeTensor& given) const {
   GS_CHECK_TYPE(!none || input != kOpacities, row.name, " must be a tensor, got None");
   if (none) return {};
   const Tensor& t = *given;
-  GS_CHECK_TYPE(t.scalar_type() == dtype() && t.device() == device(), row.name, " must be ", dtype(), " on ", device(),
+  GS_CHECK_TYPE(has_dtype(t, dtype_) && t.device() == device_, row.name, " must be ", dtype(), " on ", device(),
                 " like means, got ", t.scalar_type(), " on ", t.device());
   if (input == kShRest) return checked_rest(t);
   const Shape wanted = sizes_of(row, count(), 0);
   const bool flat = input == kOpacities && t.dim() == 1 && t.size(0) == count();
   const char* hint = input != kScales ? "" : raw_ ? " (logarithms of the scales)" : " (activated scales, one per axis)";
-  GS_CHECK_VALUE(t.sizes() == Sizes(wanted) || flat, row.name, " must be ", wanted, hint, ", got ", t.sizes());
+  GS_CHECK_VALUE(same(t.sizes(), wanted) || flat, row.name, " must be ", wanted, hint, ", got ", t.sizes());
   return row.bands == kNoBands ? packed(t) : with_whole_rows(t);
 }
 

@@ -50,13 +50,13 @@ class SceneTensors {
   const Tensor& means() const { return inputs_[kMeans]; }
   int64_t count() const { return inputs_[kMeans].size(0); }
   gs::Image image() const { return image_; }
-  ScalarType dtype() const { return inputs_[kMeans].scalar_type(); }
-  Device device() const { return inputs_[kMeans].device(); }
+  ScalarType dtype() const { return dtype_; }
+  Device device() const { return device_; }
   int64_t rest_bands() const { return inputs_[kShRest].defined() ? inputs_[kShRest].size(1) : 0; }
 
   template <class T>
   gs::Scene<T> scene() const {
-    const auto pointer = [](const Tensor& t) { return t.defined() ? t.const_data_ptr<T>() : nullptr; };
+    const auto pointer = [](const Tensor& t) { return t.defined() ? read<T>(t) : nullptr; };
     const auto stride = [](const Tensor& t) { return t.defined() ? t.stride(0) : 0; };
     return {count(),
             pointer(inputs_[kMeans]),
@@ -86,6 +86,8 @@ class SceneTensors {
   Tensor checked_rest(const Tensor& t) const;
   void check_settings() const;
 
+  ScalarType dtype_;
+  Device device_;
   InputTensors inputs_;  // means2d stays undefined
   Tensor view_, projection_, center_;
   double tan_x_, tan_y_, scale_modifier_;
@@ -109,7 +111,7 @@ class SceneGradients {
   template <class T, size_t... kInput>
   gs::SceneGradient<T> pointers(std::index_sequence<kInput...>) {
     static_assert(sizeof(gs::SceneGradient<T>) == kInputs * sizeof(T*), "SceneGradient and Input have the same fields");
-    return {(wanted_[kInput] ? tensors_[kInput].template mutable_data_ptr<T>() : nullptr)...};
+    return {(wanted_[kInput] ? write<T>(tensors_[kInput]) : nullptr)...};
   }
 
   Wanted wanted_;

@@ -18,15 +18,15 @@ Tensor split_positions_op(const Tensor& means, const Tensor& log_scales, const T
   const Tensor indices = packed(items);
   Tensor positions = empty({n, 3}, means);
   const gs::SplitInput in{n,
-                          at_means.const_data_ptr<float>(),
-                          sizes.const_data_ptr<float>(),
-                          turns.const_data_ptr<float>(),
-                          indices.const_data_ptr<int64_t>(),
+                          read<float>(at_means),
+                          read<float>(sizes),
+                          read<float>(turns),
+                          read<int64_t>(indices),
                           uint64_t(seed),
                           uint32_t(draw),
                           uint32_t(iteration),
                           uint32_t(stream),
-                          positions.mutable_data_ptr<float>()};
+                          write<float>(positions)};
 #ifdef GS_CUDA
   if (items.is_cuda()) {
     gs::TorchQueue queue(items.device());

@@ -19,7 +19,7 @@ constexpr const char* kFloatAlone = "the CUDA backend computes in float32, got f
 // TypeError for None and for another dtype or device, ValueError for other sizes; a size of -1 allows any.
 inline void check_tensor(const Tensor& t, const char* name, ScalarType type, Device device, Sizes sizes) {
   check_given(t, name);
-  GS_CHECK_TYPE(t.scalar_type() == type && t.device() == device, name, " must be ", type, " on ", device, ", got ",
+  GS_CHECK_TYPE(has_dtype(t, type) && t.device() == device, name, " must be ", type, " on ", device, ", got ",
                 t.scalar_type(), " on ", t.device());
   bool fits = t.dim() == int64_t(sizes.size());
   for (size_t axis = 0; fits && axis < sizes.size(); ++axis) fits = sizes[axis] < 0 || t.size(axis) == sizes[axis];
@@ -29,8 +29,9 @@ inline void check_tensor(const Tensor& t, const char* name, ScalarType type, Dev
 // The same for a tensor that is converted to the dtype and device of others: both precisions are taken.
 inline void check_precise(const Tensor& t, const char* name, Sizes sizes) {
   check_given(t, name);
-  GS_CHECK_TYPE(is_floating(t.scalar_type()), name, " must be float32 or float64, got ", t.scalar_type());
-  GS_CHECK_VALUE(t.sizes() == sizes, name, " must be ", sizes, ", got ", t.sizes());
+  GS_CHECK_TYPE(has_dtype(t, ScalarType::Float) || has_dtype(t, ScalarType::Double), name,
+                " must be float32 or float64, got ", t.scalar_type());
+  GS_CHECK_VALUE(same(t.sizes(), sizes), name, " must be ", sizes, ", got ", t.sizes());
 }
 
 // Calls f with a zero of the C++ type behind the dtype.

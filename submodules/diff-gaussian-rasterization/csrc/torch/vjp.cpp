@@ -13,8 +13,7 @@ Gradients project_vjp(const SceneTensors& in, const Tensor& tile_counts, const T
   SceneGradients out(in, wanted);
   with_scalar(in.dtype(), [&](auto zero) {
     using T = decltype(zero);
-    GS_RUN(T, moments, project_vjp, in.scene<T>(), tile_counts.const_data_ptr<int32_t>(), moments.const_data_ptr<T>(),
-           out.pointers<T>());
+    GS_RUN(T, moments, project_vjp, in.scene<T>(), read<int32_t>(tile_counts), read<T>(moments), out.pointers<T>());
   });
   return out.all();
 }
@@ -77,11 +76,11 @@ std::tuple<Tensor, Tensor> blend_rows_op(BACKWARD_PARAMETERS, const Tensor& laye
     using T = decltype(zero);
     auto take = [&](int64_t count) {
       rows = empty({count, row_values(absolute)}, splats);
-      return rows.mutable_data_ptr<T>();
+      return write<T>(rows);
     };
     using Take = decltype(take);
     const gs::RowMemory<T> memory{[](void* context, int64_t count) { return (*static_cast<Take*>(context))(count); },
-                                  &take, counts.mutable_data_ptr<int32_t>(), absolute};
+                                  &take, write<int32_t>(counts), absolute};
     GS_RUN(T, splats, blend_rows, in.input<T>(), in.gradient<T>(nullptr, {}), memory);
   });
   return {rows, counts};

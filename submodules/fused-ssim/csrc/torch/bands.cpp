@@ -33,7 +33,7 @@ void check_sums(const Tensor& sums, const Tensor& img1) {
   check_given(sums, "sums");
   const Shape wanted = sums_shape(img1);
   GS_CHECK(sums.is_contiguous() && sums.scalar_type() == ScalarType::Double && sums.device() == img1.device() &&
-               sums.sizes() == wanted,
+               same(sums.sizes(), wanted),
            "sums must be those of all bands added, ", wanted, " float64, got ", sums.sizes(), " ", sums.scalar_type());
 }
 
@@ -46,8 +46,7 @@ std::tuple<Tensor, Tensor> photometric_band(const Tensor& img1_, const Tensor& i
   with_scalar(img1, [&](auto zero) {
     using T = decltype(zero);
     const gs::L1Ssim<T> args{
-        image_pair<T>(img1, img2, true), false, nullptr, nullptr, kept.mutable_data_ptr<T>(), &rows,
-        sums.mutable_data_ptr<double>()};
+        image_pair<T>(img1, img2, true), false, nullptr, nullptr, write<T>(kept), &rows, write<double>(sums)};
     GS_DISPATCH(l1_ssim_cpu, args, gs::torch_executor());
   });
   return {sums, kept};
@@ -60,8 +59,7 @@ std::tuple<Tensor, Tensor> photometric_of_sums(const Tensor& img1, const Tensor&
   return with_scalar(img1, [&](auto zero) {
     using T = decltype(zero);
     Means means{};
-    const gs::L1SsimMeans<T> args{image_pair<T>(img1, img1, true), sums.const_data_ptr<double>(), &means.l1,
-                                  &means.ssim};
+    const gs::L1SsimMeans<T> args{image_pair<T>(img1, img1, true), read<double>(sums), &means.l1, &means.ssim};
     GS_DISPATCH(l1_ssim_means_cpu, args);
     return std::tuple(scalar(photometric_loss<T>(means, lambda), img1), scalar(T(means.l1), img1));
   });
@@ -83,8 +81,8 @@ std::tuple<Tensor, Tensor> photometric_band_on_cuda(const Tensor& img1_, const T
   gs::TorchQueue queue(img1_.device());
   const Tensor img1 = packed(img1_), img2 = packed(img2_);
   Tensor kept = empty(kept_shape(img1, rows), img1), sums = no_sums(img1);
-  gs::L1SsimCuda args{image_pair<float>(img1, img2, true), false, nullptr, nullptr, kept.mutable_data_ptr<float>()};
-  args.rows = &rows, args.sums = sums.mutable_data_ptr<double>();
+  gs::L1SsimCuda args{image_pair<float>(img1, img2, true), false, nullptr, nullptr, write<float>(kept)};
+  args.rows = &rows, args.sums = write<double>(sums);
   gs::l1_ssim_cuda(args, queue.queue());
   return {sums, kept};
 }
@@ -96,13 +94,13 @@ std::tuple<Tensor, Tensor> photometric_of_sums_on_cuda(const Tensor& img1, const
   Tensor loss = empty({}, img1), l1 = empty({}, img1);
   gs::L1SsimCuda args{image_pair<float>(img1, img1, true),
                       false,
-                      l1.mutable_data_ptr<float>(),
+                      write<float>(l1),
                       nullptr,
                       nullptr,
-                      loss.mutable_data_ptr<float>(),
+                      write<float>(loss),
                       float(1 - lambda),
                       float(lambda)};
-  args.sums = const_cast<double*>(sums.const_data_ptr<double>());
+  args.sums = const_cast<double*>(read<double>(sums));
   gs::l1_ssim_means_cuda(args, queue.queue());
   return {loss, l1};
 }

@@ -9,8 +9,7 @@ namespace {
 template <class T>
 Means means_of(const gs::ImagePair<T>& images, bool valid, Tensor& gradient) {
   Means means{};
-  const gs::L1Ssim<T> args{images, valid, &means.l1, &means.ssim,
-                           gradient.numel() ? gradient.mutable_data_ptr<T>() : nullptr};
+  const gs::L1Ssim<T> args{images, valid, &means.l1, &means.ssim, gradient.numel() ? write<T>(gradient) : nullptr};
   GS_DISPATCH(l1_ssim_cpu, args, gs::torch_executor());
   return means;
 }
@@ -62,8 +61,8 @@ Tensors3 l1_ssim_on_cuda(const Tensor& img1_, const Tensor& img2_, bool valid, b
   const Tensor img1 = packed(img1_), img2 = packed(img2_);
   Tensor l1 = empty({}, img1), ssim = empty({}, img1);
   Tensor kept = empty_kept(img1, train);
-  gs::l1_ssim_cuda({image_pair<float>(img1, img2, false), valid, l1.mutable_data_ptr<float>(),
-                    ssim.mutable_data_ptr<float>(), train ? kept.mutable_data_ptr<float>() : nullptr},
+  gs::l1_ssim_cuda({image_pair<float>(img1, img2, false), valid, write<float>(l1), write<float>(ssim),
+                    train ? write<float>(kept) : nullptr},
                    queue.queue());
   return {l1, ssim, kept};
 }
@@ -74,9 +73,8 @@ Tensors3 photometric_on_cuda(const Tensor& img1_, const Tensor& img2_, double la
   const Tensor img1 = packed(img1_), img2 = packed(img2_);
   Tensor loss = empty({}, img1), l1 = empty({}, img1);
   Tensor kept = empty_kept(img1, train);
-  gs::l1_ssim_cuda({image_pair<float>(img1, img2, true), false, l1.mutable_data_ptr<float>(), nullptr,
-                    train ? kept.mutable_data_ptr<float>() : nullptr, loss.mutable_data_ptr<float>(), float(1 - lambda),
-                    float(lambda)},
+  gs::l1_ssim_cuda({image_pair<float>(img1, img2, true), false, write<float>(l1), nullptr,
+                    train ? write<float>(kept) : nullptr, write<float>(loss), float(1 - lambda), float(lambda)},
                    queue.queue());
   return {loss, l1, kept};
 }
@@ -103,8 +101,8 @@ Tensor composite(const Tensor& picture_, const Tensor& background_) {
            " and the background on ", background_.device());
   const Tensor picture = packed(picture_), background = packed(background_);
   Tensor out = empty({3, picture.size(1), picture.size(2)}, background);
-  const gs::Composite args{picture.const_data_ptr<uint8_t>(), background.const_data_ptr<float>(),
-                           picture.size(1) * picture.size(2), out.mutable_data_ptr<float>()};
+  const gs::Composite args{read<uint8_t>(picture), read<float>(background), picture.size(1) * picture.size(2),
+                           write<float>(out)};
 #ifdef GS_CUDA
   if (picture.is_cuda()) {
     gs::TorchQueue queue(picture.device());

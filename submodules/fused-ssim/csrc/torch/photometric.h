@@ -16,7 +16,7 @@ inline void check_images(const Tensor& img1, const Tensor& img2, bool valid) {
   GS_CHECK(is_floating(img1.scalar_type()), "img1 must be float32 or float64, got ", img1.scalar_type());
   GS_CHECK(img2.scalar_type() == img1.scalar_type() || img2.scalar_type() == ScalarType::Byte, "img2 must be ",
            img1.scalar_type(), " like img1, or uint8, got ", img2.scalar_type());
-  GS_CHECK(img1.dim() >= 2 && img1.numel() > 0 && img1.sizes() == img2.sizes(),
+  GS_CHECK(img1.dim() >= 2 && img1.numel() > 0 && same(img1.sizes(), img2.sizes()),
            "img1 and img2 must be images of the same shape (..., H, W), got ", img1.sizes(), " and ", img2.sizes());
   GS_CHECK(!valid || (img1.size(-1) >= 11 && img1.size(-2) >= 11), "valid needs 11 x 11 pixels or more, got ",
            img1.sizes());
@@ -25,7 +25,7 @@ inline void check_images(const Tensor& img1, const Tensor& img2, bool valid) {
 template <class T>
 gs::ImagePair<T> image_pair(const Tensor& img1, const Tensor& img2, bool clamp) {
   const int64_t height = img1.size(-2), width = img1.size(-1);
-  return {img1.const_data_ptr<T>(),
+  return {read<T>(img1),
           img2.const_data_ptr(),
           img2.scalar_type() == ScalarType::Byte,
           img1.numel() / (height * width),
@@ -68,7 +68,7 @@ T photometric_loss(const Means& means, double lambda) {
 inline void check_kept(const Tensor& kept, const Tensor& img1, const gs::RowRange& rows) {
   check_given(kept, "kept");
   const Shape wanted = kept_shape(img1, rows);
-  GS_CHECK(kept.sizes() == wanted && kept.scalar_type() == img1.scalar_type(), "kept must be ", wanted, " of ",
+  GS_CHECK(same(kept.sizes(), wanted) && kept.scalar_type() == img1.scalar_type(), "kept must be ", wanted, " of ",
            img1.scalar_type(), ", as a forward with train = True gives it, got ", kept.sizes(), " of ",
            kept.scalar_type());
 }
@@ -87,12 +87,8 @@ Tensor vjp(const Tensor& img1_, const Tensor& img2_, const Tensor& kept_, bool c
            const gs::RowRange* rows = nullptr) {
   const Tensor img1 = packed(img1_), img2 = packed(img2_), kept = packed(kept_);
   Tensor grad_img1 = empty(img1.sizes(), img1);
-  const gs::L1SsimVjp<T> args{image_pair<T>(img1, img2, clamp),
-                              kept.const_data_ptr<T>(),
-                              double(grad_l1),
-                              double(grad_ssim),
-                              grad_img1.mutable_data_ptr<T>(),
-                              rows};
+  const gs::L1SsimVjp<T> args{
+      image_pair<T>(img1, img2, clamp), read<T>(kept), double(grad_l1), double(grad_ssim), write<T>(grad_img1), rows};
   GS_DISPATCH(l1_ssim_vjp_cpu, args, gs::torch_executor());
   return grad_img1;
 }
@@ -137,10 +133,9 @@ inline Tensor vjp_on_cuda(const Tensor& img1_, const Tensor& img2_, const Tensor
   const bool aligned = reinterpret_cast<uintptr_t>(kept_.const_data_ptr()) % 16 == 0;  // else a view of the caller's
   const Tensor kept = aligned ? packed(kept_) : torch::stable::clone(packed(kept_));
   Tensor grad_img1 = empty(img1.sizes(), img1);
-  gs::l1_ssim_vjp_cuda(
-      {image_pair<float>(img1, img2, clamp), kept.const_data_ptr<float>(), grad_l1.const_data_ptr<float>(),
-       grad_ssim.const_data_ptr<float>(), grad_img1.mutable_data_ptr<float>(), l1_weight, ssim_weight, nullptr, rows},
-      queue.queue());
+  gs::l1_ssim_vjp_cuda({image_pair<float>(img1, img2, clamp), read<float>(kept), read<float>(grad_l1),
+                        read<float>(grad_ssim), write<float>(grad_img1), l1_weight, ssim_weight, nullptr, rows},
+                       queue.queue());
   return grad_img1;
 }
 #endif

@@ -10,34 +10,36 @@
 #include "gs/torch_queue.h"
 #endif
 
-namespace {
+namespace gs {
 
-using gs::Tensor;
+namespace {
 
 template <class T>
 void fill_mean_distance2(const Tensor& rows, const Tensor& out) {
-  const T* points = rows.const_data_ptr<T>();
+  const T* points = read<T>(rows);
 #ifdef GS_CUDA
   if (rows.is_cuda()) {
-    gs::TorchQueue queue(rows.device());
-    return gs::mean_distance2_cuda(points, rows.size(0), out.mutable_data_ptr<T>(), queue.queue());
+    TorchQueue queue(rows.device());
+    return mean_distance2_cuda(points, rows.size(0), write<T>(out), queue.queue());
   }
 #endif
-  gs::mean_distance2_cpu(points, rows.size(0), out.mutable_data_ptr<T>(), gs::torch_executor());
+  mean_distance2_cpu(points, rows.size(0), write<T>(out), torch_executor());
 }
 
 Tensor mean_distance2(const Tensor& points) {
-  gs::check_given(points, "points");
+  check_given(points, "points");
   GS_CHECK(points.dim() == 2 && points.size(1) == 3, "points must be (N, 3), got ", points.sizes());
-  const gs::ScalarType type = points.scalar_type();
-  GS_CHECK(gs::is_floating(type), "points must be float32 or float64, got ", type);
+  const ScalarType type = points.scalar_type();
+  GS_CHECK(is_floating(type), "points must be float32 or float64, got ", type);
   GS_CHECK(points.is_cpu() || points.size(0) <= std::numeric_limits<int32_t>::max(),
            "the CUDA backend takes fewer than 2^31 points, got ", points.size(0), ": pass points.cpu()");
-  const Tensor rows = gs::packed(points), out = gs::empty({rows.size(0)}, rows);
-  type == gs::ScalarType::Float ? fill_mean_distance2<float>(rows, out) : fill_mean_distance2<double>(rows, out);
+  const Tensor rows = packed(points), out = empty({rows.size(0)}, rows);
+  type == ScalarType::Float ? fill_mean_distance2<float>(rows, out) : fill_mean_distance2<double>(rows, out);
   return out;
 }
 
 }  // namespace
 
 GS_OPERATORS(simple_knn, m) { m.define("mean_distance2(Tensor points) -> Tensor", TORCH_BOX(&mean_distance2)); }
+
+}  // namespace gs
