@@ -37,7 +37,7 @@ class TorchQueue {
     // Calls the allocator itself: a step has some fifteen arrays, and the dispatcher would make a tensor for each.
     void* memory = nullptr;
     const auto status = aoti_torch_cuda_caching_allocator_raw_alloc(bytes, &memory);
-    GS_CHECK_MEMORY(status == TORCH_SUCCESS, "CUDA out of memory. Tried to allocate ", bytes, " bytes");
+    if (status != TORCH_SUCCESS) raise_said(joined("CUDA out of memory. Tried to allocate ", bytes, " bytes"));
     static_cast<TorchQueue*>(context)->memory_.push_back(memory);
     return memory;
   }
@@ -55,7 +55,7 @@ class TorchQueue {
     AtenTensorHandle made = nullptr;
     const auto status = aoti_torch_empty_strided_pinned(1, &count, &stride, aoti_torch_dtype_int64(),
                                                         aoti_torch_device_type_cpu(), -1, &made);
-    GS_CHECK_MEMORY(status == TORCH_SUCCESS, "the host is out of memory: ", count, " numbers of page-locked memory");
+    if (status != TORCH_SUCCESS) raise_said(joined("the host is out of memory: ", count, " page-locked numbers"));
     numbers.emplace_back(made);
     return write<int64_t>(numbers.back());
   }

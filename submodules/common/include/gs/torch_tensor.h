@@ -90,8 +90,9 @@ inline Tensor empty(Sizes sizes, int32_t dtype, const Tensor& like) {
   const Shape strides = strides_of(sizes);
   AtenTensorHandle made = nullptr;
   const auto status = aoti_torch_empty_strided(sizes.size(), sizes.data(), strides.data(), dtype, device, index, &made);
-  GS_CHECK_MEMORY(status == TORCH_SUCCESS, "out of memory. Tried to allocate ",
-                  (sizes.empty() ? 1 : sizes[0] * strides[0]) * aoti_torch_dtype_element_size(dtype), " bytes");
+  const int64_t values = sizes.empty() ? 1 : sizes[0] * strides[0];
+  if (status != TORCH_SUCCESS)
+    raise_said(joined("out of memory. Tried to allocate ", values * aoti_torch_dtype_element_size(dtype), " bytes"));
   return Tensor(made);
 }
 
@@ -131,11 +132,14 @@ T value_of(const Tensor& t) {
 }
 
 // Asks first: torch's functions cost time even where there is nothing to do.
-inline Tensor packed(const Tensor& t) { return t.is_contiguous() ? t : torch::stable::contiguous(t); }
+inline Tensor packed(const Tensor& t) {
+  return heard([&] { return t.is_contiguous() ? t : torch::stable::contiguous(t); });
+}
 
 // Returns `t` contiguous, with the dtype and on the device of `like`.
 inline Tensor converted(const Tensor& t, const Tensor& like) {
-  return packed(alike(t, like) ? t : torch::stable::to(t, like.scalar_type(), std::nullopt, like.device()));
+  if (alike(t, like)) return packed(t);
+  return heard([&] { return packed(torch::stable::to(t, like.scalar_type(), std::nullopt, like.device())); });
 }
 
 }  // namespace gs

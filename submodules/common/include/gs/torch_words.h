@@ -6,7 +6,11 @@
 #include <stdexcept>
 #include <string>
 #include <type_traits>
+#include <utility>
 #include <vector>
+
+// In torch from 2.13 on.
+extern "C" __attribute__((weak)) const char* torch_exception_get_what_without_backtrace();
 
 namespace gs {
 
@@ -68,4 +72,26 @@ std::string joined(const Parts&... parts) {
   } while (0)
 #define GS_CHECK_TYPE(condition, ...) GS_CHECK(condition, "TypeError: ", __VA_ARGS__)
 #define GS_CHECK_VALUE(condition, ...) GS_CHECK(condition, "ValueError: ", __VA_ARGS__)
-#define GS_CHECK_MEMORY(condition, ...) GS_CHECK(condition, "OutOfMemoryError: ", __VA_ARGS__)
+
+namespace gs {
+
+// Raises what a failed call of torch has said, of which torch's interface hands on the failure alone. Before torch 2.13
+// it is on stderr, and the caller's own words stand for it.
+[[noreturn]] inline void raise_said(const std::string& otherwise) {
+  const bool known = torch_exception_get_what_without_backtrace;
+  const std::string said = known ? torch_exception_get_what_without_backtrace() : otherwise;
+  const bool memory = said.find("out of memory") != said.npos || said.find("allocate memory") != said.npos;
+  throw std::runtime_error((memory ? "OutOfMemoryError: " : "") + said);
+}
+
+// The result of a function that calls torch.
+template <class Function>
+auto heard(const Function& function) {
+  try {
+    return function();
+  } catch (const std::runtime_error& error) {
+    raise_said(error.what());
+  }
+}
+
+}  // namespace gs

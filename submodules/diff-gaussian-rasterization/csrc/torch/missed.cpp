@@ -63,7 +63,8 @@ void* host_memory(size_t bytes) {
   void* place = nullptr;
   const bool found = cudaHostAlloc(&place, std::max<size_t>(bytes, 1), cudaHostAllocDefault) == cudaSuccess;
   if (!found) cudaGetLastError();  // so that nobody else meets the error
-  GS_CHECK_MEMORY(found, "the host is out of memory: ", bytes, " bytes of page-locked memory were asked for");
+  GS_CHECK(found, "OutOfMemoryError: the host is out of memory: ", bytes,
+           " bytes of page-locked memory were asked for");
   return place;
 }
 
