@@ -4,7 +4,8 @@
 # make test-browser   the tests that need Chromium, which is installed first where Debian's package manager may be used
 # make test-foreign   the tests by programs of npm that read our exports; they skip without npm
 # make format rewrites what the format check would complain about
-# make wheels the extensions as wheels for the torch and platform of .venv: build/wheels
+# make wheels a wheel for every torch from 2.10 and every Python, one with CUDA kernels where nvcc is found, and the
+#             source distribution: build/wheels
 # make gate   three trainings against the stored baseline: quality and, beside an older build, time; takes minutes
 # make docs   the site, build/site/index.html; a dead link or a page outside of the navigation fails
 # All set up .venv first: pinned requirements and the three extensions, again only when their sources have changed.
@@ -98,9 +99,7 @@ build/%/csrc/tests/test_cuda_emulated: submodules/%/csrc/tests/test_cuda_emulate
 	    $(wildcard submodules/$*/csrc/cpu/*.cpp) -o $@
 
 wheels: $(VENV)/.requirements
-	rm -rf build/wheels
-	$(BIN)/pip wheel --quiet --disable-pip-version-check --no-deps --no-build-isolation -w build/wheels \
-	    $(EXTENSIONS:%=./submodules/%)
+	.ci/wheels $(BIN)/python
 
 gate: install
 	$(BIN)/python -m benchmarks.gate

@@ -1,16 +1,22 @@
 """`pip install .` installs the dependencies and the three extensions, but not the code, which runs from this folder.
 
-Packages called `utils` and `scene` would clash with others in a shared environment.
+Packages called `utils` and `scene` would clash with others in a shared environment. The three are one distribution
+here; each can be installed by itself too, from its folder. With GS_CUDA=1 the version tells the CUDA of the kernels.
 """
 
-import importlib.metadata
+import os
 import re
-import site
+import sys
+from importlib.util import find_spec
 from pathlib import Path
 
 from setuptools import setup
 
 ROOT = Path(__file__).resolve().parent
+sys.path.insert(0, str(ROOT / "submodules" / "common"))
+
+from build_extension import OLDEST_TORCH, VERSION, cuda_major, extension_options, find_nvcc  # noqa: E402
+
 EXTENSIONS = ("diff-gaussian-rasterization", "fused-ssim", "simple-knn")
 
 
@@ -18,24 +24,21 @@ def requirements() -> list[str]:
     """Read requirements.txt. If torch is installed, do not pin torch and torchvision, so that it stays."""
     lines = (ROOT / "requirements.txt").read_text(encoding="utf-8").splitlines()
     lines = [line for line in lines if line and not line.startswith("#")]
-    # pip's isolation hides the environment's packages from imports, but its folders can be read.
-    if any(importlib.metadata.distributions(name="torch", path=site.getsitepackages())):
-        lines = [re.sub(r"^(torch|torchvision)==.*", r"\1", line) for line in lines]
+    if find_spec("torch"):
+        fitting = {"torch": "torch>={}.{}".format(*OLDEST_TORCH), "torchvision": "torchvision"}
+        lines = [re.sub(r"^(torch|torchvision)==.*", lambda pin: fitting[pin[1]], line) for line in lines]
     return lines
 
 
-def extension_url(name: str) -> str:
-    # Without "/.", pip takes a folder named like "simple-knn" for a release, and uses a wheel cached from old sources.
-    return (ROOT / "submodules" / name).as_uri() + "/."
+def version() -> str:
+    """Tell a wheel with CUDA kernels from one without."""
+    return f"{VERSION}+cu{cuda_major(find_nvcc(None))}" if os.environ.get("GS_CUDA") == "1" else VERSION
 
 
 setup(
     name="gaussian-splatting",
-    version=(ROOT / "version.txt").read_text(encoding="utf-8").strip(),
+    version=version(),
     license="Apache-2.0",
-    python_requires=">=3.10",
-    packages=[],
-    py_modules=[],
     extras_require={
         "export": [  # .usdz and .spz
             'usd-core==26.8; python_version < "3.11"',
@@ -45,5 +48,6 @@ setup(
         "video": ["imageio-ffmpeg==0.8.1"],  # convert.py --video, render.py --path
         "viewer": ["viser==1.1.1"],  # view.py, train.py --viewer
     },
-    install_requires=requirements() + [f"{name} @ {extension_url(name)}" for name in EXTENSIONS],
+    install_requires=requirements(),
+    **extension_options({name.replace("-", "_"): ROOT / "submodules" / name for name in EXTENSIONS}),
 )

@@ -182,11 +182,12 @@ PACE_OPTIONS: tuple[Option, ...] = (
     ),
     Option(
         "resolution_schedule",
-        "none",
+        "auto",
         "smaller views at first, so that the first iterations take less time. pyramid: a quarter of the size up to "
-        "10 % of the schedule, half of it up to 25 %; spectrum: sizes by how fine the photos' detail is",
+        "10 % of the schedule, half of it up to 25 %; spectrum: sizes by how fine the photos' detail is; auto: pyramid "
+        "where --time_budget leaves no more than an iteration for 6 of the schedule, else none",
         "ours",
-        check=one_of("none", "pyramid", "spectrum"),
+        check=one_of("auto", "none", "pyramid", "spectrum"),
     ),
     Option(
         "target_psnr",
@@ -208,8 +209,8 @@ _STRATEGY = Option(
     "strategy",
     "adc",
     "how many Gaussians there are, and where. adc: adaptive density control, the method's own; mcmc: Gaussians that "
-    "nobody sees are moved to others, and positions get noise; budget: growth to --max_num_splats Gaussians, or one "
-    "for 20 training pixels (100,000 to 1,000,000), where the error is",
+    "nobody sees are moved to others, and positions get noise; budget: growth to --max_num_splats Gaussians, where the "
+    "error is; 0: one for 64 training pixels, 100,000 to 1,000,000, or fewer if --time_budget allows few iterations",
     "ours",
     check=one_of("adc", "mcmc", "budget"),
 )

@@ -54,29 +54,23 @@ pip_install() {
   python3 -m pip install --quiet --no-index --no-deps --no-compile --no-cache-dir --upgrade --target "$site" "$@"
 }
 
-# Build the three extensions in parallel, as wheels in a folder named by a hash of everything they depend on.
+# Build the three extensions as one wheel, in a folder named by a hash of everything it depends on.
 build() {
   export GS_CUDA=1
   TORCH_CUDA_ARCH_LIST=${TORCH_CUDA_ARCH_LIST:-$(python3 -c \
     'import torch; print("{}.{}".format(*torch.cuda.get_device_capability()))')}
   export TORCH_CUDA_ARCH_LIST
-  local key wheels new name pids=()
+  local key wheels new
   key=$( (
-    python3 -c 'import sys, torch; print(sys.version, torch.__version__)'
     echo "$TORCH_CUDA_ARCH_LIST"
-    cat version.txt
+    cat version.txt setup.py requirements.txt
     find submodules -type f \( -name '*.py' -o -name '*.toml' -o -name '*.h' -o -name '*.cpp' -o -name '*.cu*' \) \
       -not -path '*/build/*' -print0 | LC_ALL=C sort -z | xargs -0 sha256sum
   ) | sha256sum | cut -c1-16)
   wheels=build/device/wheels/$key
   if [ ! -d "$wheels" ]; then
     new=$(mktemp -d build/device/new.XXXX)
-    for name in diff-gaussian-rasterization simple-knn fused-ssim; do
-      python3 -m pip wheel --quiet --no-index --no-deps --no-build-isolation --no-cache-dir -w "$new" \
-        "./submodules/$name" &
-      pids+=($!)
-    done
-    for name in "${pids[@]}"; do wait "$name"; done
+    python3 -m pip wheel --quiet --no-index --no-deps --no-build-isolation --no-cache-dir -w "$new" .
     mkdir -p build/device/wheels
     mv "$new" "$wheels"
   fi

@@ -24,8 +24,10 @@ HELD = PARAMETERS + MOMENTS + STATISTICS
 # Bytes of a Gaussian that projection leaves until the step ends: splat, depth, rectangle, tile count, radius.
 PROJECTED = 40 + 4 + 16 + 4 + 4
 TILE_RECORD = 16  # while projection runs
+REACHED = 2  # for each band: whether it is reached, while records are chosen
 RECORD = 40 + 4 + 16 + 4  # of a visible Gaussian, sent to each band that it reaches
 COUNT = 4  # of gradient rows, sent back for each record
+PLACE = 8  # of a record for each band, while its rows are put in order
 ROW = 40  # of gradients, sent back for each processed instance; 48 with absolute gradients
 BIN_SPLAT, SLOTS_SPLAT = 44, 16  # of a record while binning: keys, orders, offsets and memory of the sort; its slots
 BIN_INSTANCE, INSTANCE = 18, 4  # while binning: keys twice, splats twice, memory of the sort; afterwards
@@ -46,8 +48,8 @@ PCIE = 50e9  # assumed of a Gen5 x16 slot, each way at once
 MEMORY = 3.0e12  # bytes a second that copies move on a GPU, read and written: 70 % of the 4.3 TB/s of a plain copy
 
 WAIT = 20e-6  # assumed: the host reads a number of the GPU, which then waits for the next kernel
-OPERATOR = 5e-6  # assumed: a small operator of torch, from Python
-VIEW_OPERATORS = 30  # of each view in a batch
+OPERATOR = 10e-6  # assumed: a small operator of torch, from Python
+VIEW_OPERATORS = 30  # of each view in a batch; counted for two
 
 
 @dataclass(frozen=True)
@@ -109,8 +111,8 @@ class Design:
     operators: int  # small ones, whatever the number of ranks
 
 
-AS_WRITTEN = Design("as written", False, 6, 7, 60)
-WHOLE_IMAGE = Design("whole image", True, 6, 6, 60)
+AS_WRITTEN = Design("as written", False, 4, 7, 50)  # operators that compute or copy, counted
+WHOLE_IMAGE = Design("whole image", True, 4, 6, 50)
 LEAN = Design("lean", False, 0, 4, 0)
 DESIGNS = (AS_WRITTEN, WHOLE_IMAGE, LEAN)
 
@@ -239,8 +241,11 @@ def step_bytes(scene: Workload, gpus: int) -> float:
     exchange = 2 * arrived
     binning = (BIN_SPLAT + SLOTS_SPLAT) * splats + BIN_INSTANCE * instances
     lists = SLOTS_SPLAT * splats + INSTANCE * instances + SLOT * scene.slots * share
-    rows = ROW * processed * (1 if gpus == 1 else 4)  # made, joined, received, put in order
-    return PROJECTED + max(TILE_RECORD, arrived + max(exchange, binning, lists + rows))
+    rows, chosen = ROW * processed, 0.0
+    if gpus > 1:
+        rows = max(3 * rows, rows + PLACE * gpus * records)  # made, received, put in order
+        chosen = REACHED * gpus
+    return PROJECTED + max(TILE_RECORD, chosen, arrived + max(exchange, binning, lists + rows))
 
 
 def peak_bytes(scene: Workload, gpus: int, spill: bool = False) -> float:

@@ -7,6 +7,7 @@ statistics get the same bits as by `render`, backward, `observe` and the optimis
 
 import argparse
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import torch
@@ -17,6 +18,7 @@ from torch import Tensor
 
 from gaussian_renderer import rasterizer_settings
 from gaussian_renderer.over_ranks.band import Band, View, draw_view, gradient_rows, surroundings, whole_image
+from gaussian_renderer.over_ranks.bands import KnownBands
 from gaussian_renderer.over_ranks.models import ranks_of
 from scene.cameras import Camera
 from scene.fused_adam import FusedAdam
@@ -48,16 +50,19 @@ def draw(
     background: Tensor,
     want_depth: bool,
     by_bands: bool = False,
+    bands: KnownBands | None = None,
 ) -> Drawn:
     """Render a view for `step`. The Gaussians must be ones that `FusedAdam` takes.
 
-    by_bands: of a model that is divided among ranks, each needs no more of the image than the loss of its band.
+    Of a model that is divided among ranks: by_bands: each needs no more of the image than the loss of its band. bands:
+    those of earlier steps, in which the camera's uid stands for the view.
     """
     colors = {"sh_dc": gaussians.get_features_dc, "sh_rest": gaussians.get_features_rest}
     rows = Gaussians(gaussians.get_xyz, **gaussians.raw_geometry(), **colors)
     scene = scene_arguments(rows, rasterizer_settings(camera, gaussians, pipe, background), True)
     if (ranks := ranks_of(gaussians)).several:
-        view = draw_view(ranks, scene, background, want_depth, train=True)
+        find = bands and partial(bands.find, camera.uid)
+        view = draw_view(ranks, scene, background, want_depth, train=True, find=find)
         view = surroundings(view) if by_bands else whole_image(view)
         depth = view.inverse_depth if want_depth else None
         return Drawn(view.color, depth, view.radii, scene, view=view, band=view.band if by_bands else None)

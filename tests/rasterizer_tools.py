@@ -15,11 +15,10 @@ from diff_gaussian_rasterization import (
     rasterize,
 )
 from diff_gaussian_rasterization import ops as functions
+from diff_gaussian_rasterization.backend import OPERATORS as ops
 from torch import Tensor
 
 from benchmarks.workloads.splat_scenes import on_device, settings
-
-ops = torch.ops.diff_gaussian_rasterization
 
 BUILT = has_cuda_kernels()
 GPU_MARKS = (

@@ -115,5 +115,5 @@ def test_the_statistics_add_up_lengths_as_they_are():
     assert statistics.xyz_gradient_accum.reshape(-1).tolist() == (2 * lengths * (radii > 0)).tolist()
     assert statistics.denom.reshape(-1).tolist() == [2, 2, 0, 2]
     assert statistics.max_radii2D.tolist() == [1, 5, 0, 2]
-    with pytest.raises(RuntimeError, match=r"or its lengths \(4,\), got \[3\]"):
+    with pytest.raises(RuntimeError, match=r"or its lengths \(4,\), got \(3,\)"):
         optim.observe_(*vars(statistics).values(), radii, lengths[:3])

@@ -136,7 +136,9 @@ def test_any_number_of_threads_gives_the_same():
 
 @CPU_AND_GPU
 def test_opcheck(device):
-    library.opcheck(ops.add_noise_, (*(t.to(device) for t in _gaussians(5)), 80.0, 100.0, 0.005, 1, 4, 600, None))
+    library.opcheck(
+        ops.add_noise_.default, (*(t.to(device) for t in _gaussians(5)), 80.0, 100.0, 0.005, 1, 4, 600, None)
+    )
 
 
 def test_what_does_not_fit_is_named():

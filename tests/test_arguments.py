@@ -97,7 +97,7 @@ OURS = {
     "mcmc_init_opacity": 0.5,
     "mcmc_init_scale": 0.1,
     "time_budget": 0.0,
-    "resolution_schedule": "none",
+    "resolution_schedule": "auto",
     "target_psnr": 0.0,
     "schedule": "",
 }

@@ -446,7 +446,24 @@ def test_the_default_budget_follows_the_pixels():
     def budget_of(views: int, width: int) -> int:
         return budget.default_budget([SimpleNamespace(image_width=width, image_height=500)] * views)
 
-    assert (budget_of(7, 500), budget_of(40, 300), budget_of(100, 4000)) == (100_000, 300_000, 1_000_000)
+    assert (budget_of(7, 500), budget_of(40, 300), budget_of(100, 4000)) == (100_000, 100_000, 1_000_000)
+
+
+def test_the_default_budget_follows_the_iterations_that_the_clock_allows():
+    cameras = [SimpleNamespace(image_width=6400, image_height=1000)] * 4
+
+    def aim(given: int, stride: float) -> int:
+        """What there is to be after the last densification, whatever there is before it."""
+        run = SimpleNamespace(opt=options(max_num_splats=given), pipe=None, gaussians=None)
+        run.dataset = SimpleNamespace(train_test_exp=False)
+        run.scene = SimpleNamespace(getTrainCameras=lambda: cameras)
+        run.pace = Paced(Schedule(30_000, [Block(15_000, 0.0, stride / 30_000, 0.0)], None, 9.0))
+        control = budget.BudgetControl(run)
+        control.pace = run.pace
+        return control._aim(10_000, int(14_999 / stride))
+
+    assert (aim(0, 10.0), aim(0, 2.0), aim(0, 1.0)) == (25 * 3000, 25 * 15_000, 400_000)
+    assert aim(123_456, 10.0) == 123_456  # as it was given
 
 
 # What is out of reach

@@ -78,9 +78,9 @@ def test_opcheck(device: str) -> None:
 
 
 def test_what_does_not_fit_is_named() -> None:
-    with pytest.raises(RuntimeError, match=r"picture must be \(4, H, W\) uint8, got .3, 2, 2. Byte"):
+    with pytest.raises(RuntimeError, match=r"picture must be \(4, H, W\) uint8, got .3, 2, 2. torch.uint8"):
         composite(torch.zeros(3, 2, 2, dtype=torch.uint8), BACKGROUND)
-    with pytest.raises(RuntimeError, match=r"picture must be \(4, H, W\) uint8, got .4, 2, 2. Float"):
+    with pytest.raises(RuntimeError, match=r"picture must be \(4, H, W\) uint8, got .4, 2, 2. torch.float32"):
         composite(torch.zeros(4, 2, 2), BACKGROUND)
-    with pytest.raises(RuntimeError, match="background must be 3 float32, got .4. Float"):
+    with pytest.raises(RuntimeError, match="background must be 3 float32, got .4,. torch.float32"):
         composite(torch.zeros(4, 2, 2, dtype=torch.uint8), torch.zeros(4))

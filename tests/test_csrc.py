@@ -1,6 +1,9 @@
-"""The sources of the extensions: who may include what, and the operators' schemas."""
+"""The extensions: who may include what, the operators' schemas, and what the libraries take from torch."""
 
+import importlib.util
 import re
+import shutil
+import subprocess
 from pathlib import Path
 
 import diff_gaussian_rasterization  # noqa: F401  (loads the library with the operators)
@@ -9,6 +12,7 @@ import torch
 
 ROOT = Path(__file__).parents[1]
 CSRC = sorted((ROOT / "submodules").glob("*/csrc"))
+PACKAGES = ("diff_gaussian_rasterization", "fused_ssim", "simple_knn")
 SUFFIXES = {".cpp", ".cu", ".cuh", ".h"}
 
 SCENE = (
@@ -99,3 +103,14 @@ def test_math_stands_below_everything(csrc):
     headers = {path.name for path in (csrc / "math").iterdir()}
     for path, name in includes(csrc / "math"):
         assert name in headers or name == "../data.h" or re.fullmatch(r"gs/\w+\.h|c\w+|limits|algorithm", name), path
+
+
+@pytest.mark.skipif(shutil.which("nm") is None, reason="needs nm of the binary utilities")
+@pytest.mark.parametrize("package", PACKAGES)
+def test_a_library_uses_torch_through_its_stable_interface_alone(package):
+    library = Path(importlib.util.find_spec(package).origin).with_name("_backend.so")
+    symbols = subprocess.run(["nm", "-D", str(library)], capture_output=True, text=True, check=True).stdout
+    names = [line.split()[-1].partition("@")[0] for line in symbols.splitlines()]
+    assert "torch_library_impl" in names
+    forbidden = re.compile(r"_Z.*N[VK]*(3c10|2at|5torch|8pybind11)\d|_?Py[A-Z_]")
+    assert [name for name in names if forbidden.match(name)] == []

@@ -290,9 +290,9 @@ def test_opcheck(device, dtype):
     arguments, radii = rendered(state, camera, case, 1)
     statistics = state.statistics if case.observed else (None, None, None)
     rest = *case.lists(state), False, *statistics, *case.guard(state, 1)
-    library.opcheck(ops.rasterize_vjp_step_, (*arguments, radii, list(case.attributes), *rest))
+    library.opcheck(ops.rasterize_vjp_step_.default, (*arguments, radii, list(case.attributes), *rest))
     scene, given = scene_and_rows(arguments, case)
-    library.opcheck(ops.rows_vjp_step_, (*scene, *given, radii, list(case.attributes), *rest))
+    library.opcheck(ops.rows_vjp_step_.default, (*scene, *given, radii, list(case.attributes), *rest))
 
 
 def _refused(match: str, case: Case | None = None, error: type = RuntimeError, **changes) -> None:

@@ -186,9 +186,9 @@ def test_opcheck(absolute, device, dtype):
     raw, camera = {name: t.to(device) for name, t in raw.items()}, on_device(settings(**size), device)
     forward = Forward.of(raw, camera, True)
     state, rows = forward.state(forward.lists, forward.blended), forward.rows(absolute)
-    library.opcheck(ops.blend_rows, (*state, forward.blended[4], absolute))
+    library.opcheck(ops.blend_rows.default, (*state, forward.blended[4], absolute))
     splats, _, _, tile_counts, _ = forward.projected
-    library.opcheck(ops.rows_vjp, (*forward.scene, splats, tile_counts, *rows, WANTED, absolute))
+    library.opcheck(ops.rows_vjp.default, (*forward.scene, splats, tile_counts, *rows, WANTED, absolute))
     assert rows.rows.shape[1] == fakes.MOMENT_VALUES + (fakes.ABSOLUTE_VALUES if absolute else 0)
 
 

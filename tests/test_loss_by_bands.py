@@ -11,7 +11,7 @@ from processes import in_ranks
 from torch import Tensor
 
 from gaussian_renderer.over_ranks.band import surroundings, whole_image
-from gaussian_renderer.over_ranks.bands import Bands, find_bands, row_steps, tile_rows
+from gaussian_renderer.over_ranks.bands import Bands, KnownBands, find_bands, row_widths, tile_rows
 from utils.ranks.ranks import Ranks, ranks
 
 # Height, width, and the rows of tiles where bands begin and the last one ends.
@@ -43,7 +43,7 @@ def _whole(image: Tensor, photo: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 def check_bands(height: int, borders: list[int], images: tuple[Tensor, Tensor]) -> None:
     """Bands of an image, of which each knows 10 rows of the others, against the whole."""
     image, photo = images
-    wanted, bands, sums = _whole(image, photo), Bands(borders, [], height), []
+    wanted, bands, sums = _whole(image, photo), Bands(borders, height, 0, image.device), []
 
     def losses(rank: int, add: Callable[[Tensor], Tensor]) -> tuple[Tensor, ...]:
         around = slice(*bands.pixels(rank, REACH))
@@ -100,7 +100,7 @@ def _shared() -> list[tuple[Tensor, ...]]:
     here, found = ranks(), []
     for height, borders in OF_FOUR:
         image, photo = image_pair(height, 20, torch.float32, True)
-        bands = Bands(borders, [], height)
+        bands = Bands(borders, height, here.rank, image.device)
         view = SimpleNamespace(ranks=here, bands=bands, color=torch.full_like(image, torch.nan))
         view.inverse_depth = torch.full_like(image[:1], torch.nan)
         first, end = bands.pixels(here.rank)
@@ -132,28 +132,44 @@ class _Others(Ranks):
 
     def __init__(self, rects: list[Tensor]) -> None:
         self._rects = rects
+        self.told = 0
 
     def table(self, values: Tensor) -> Tensor:
-        return torch.stack([row_steps(rects, 97) for rects in self._rects])
+        self.told += 1
+        return torch.stack([row_widths(rects, 97) for rects in self._rects])
 
 
 @pytest.mark.parametrize("rows", [1, 3, 7])
-def test_every_rank_knows_how_many_splats_reach_a_band(rows):
+def test_bands_have_about_equal_loads(rows):
     generator = torch.Generator().manual_seed(rows)
     rects = []
     for count in (50, 0, 9):
         top = torch.randint(7, (count,), generator=generator)
         bottom = (top + torch.randint(1, rows + 1, (count,), generator=generator)).clamp(max=7)
         rects.append(torch.stack((torch.zeros_like(top), top, 1 + top % 3, bottom), 1).int())
-    bands = find_bands(_Others(rects), rects[0], 97, 40)
+    tile_counts = torch.arange(50) % 5  # the first rectangle and every fifth one after it do not count
+    reaching = rects[0]
+    rects[0] = rects[0][tile_counts > 0]
+    bands = find_bands(_Others(rects), reaching, tile_counts, 97, 40)
     assert bands.borders[0] == 0 and bands.borders[-1] == tile_rows(97) == 7 and sorted(bands.borders) == bands.borders
-    for of_rank, counts in zip(rects, bands.splats, strict=True):
-        for (first, end), count in zip(pairwise(bands.borders), counts, strict=True):
-            assert count == sum(
-                1 for _, top, _, bottom in of_rank.tolist() if top < end and bottom > first and first < end
-            )
+    reached = bands.reached(reaching, tile_counts).tolist()
+    for (first, end), of_band in zip(pairwise(bands.borders), reached, strict=True):
+        assert of_band == [
+            count > 0 and top < end and bottom > first and first < end
+            for (_, top, _, bottom), count in zip(reaching.tolist(), tile_counts.tolist(), strict=True)
+        ]
     rows_of_tiles = torch.zeros(7)
     for left, top, right, bottom in torch.cat(rects).tolist():
         rows_of_tiles[top:bottom] += right - left
     loads = [rows_of_tiles[first:end].sum() for first, end in pairwise(bands.borders)]
     assert max(loads) < 0.75 * sum(loads)
+
+
+def test_bands_of_a_view_are_kept_for_some_visits():
+    rects = torch.tensor([[0, 0, 1, 1]] * 9, dtype=torch.int32)
+    ranks, known, counts = _Others([rects, rects, rects]), KnownBands(), torch.ones(9, dtype=torch.int32)
+    found = [known.find("a", ranks, rects, counts, 97, 40) for _ in range(8)]
+    assert ranks.told == 1 and all(bands is found[0] for bands in found)
+    assert known.find("b", ranks, rects, counts, 97, 40) is not found[0] and ranks.told == 2
+    assert known.find("a", ranks, rects, counts, 90, 40) is not found[0] and ranks.told == 3
+    assert known.find("a", ranks, rects, counts, 97, 40) is not found[0] and ranks.told == 4

@@ -24,6 +24,7 @@ from training.observers.progress import ProgressBar
 from training.observers.schedule import ScheduleFile
 from training.pacing.clocked import Clocked
 from training.pacing.pace import Block, Pace, Paced, Schedule
+from training.pacing.resolution import Resolution
 from training.pacing.schedule_file import read_schedule, write_schedule
 from utils.system_utils import UserError
 
@@ -64,6 +65,34 @@ COSTS = {
     "few iterations": lambda t, n: 0.25 if t % 2 else 0.2,
     "dear events": lambda t, n: 0.01 + 0.1 * (t % 100 == 0),
 }
+
+
+def _factors(pace: Pace, last: int) -> list[float]:
+    sizes = Resolution(pace, None)
+    return [sizes.factor_at(pace.nominal(t)) for t in range(1, last + 1)]
+
+
+@pytest.mark.parametrize(("cost", "name"), [(0.02, "pyramid"), (0.005, "none")])
+def test_a_budget_of_few_iterations_takes_smaller_views_at_first(cost, name):
+    """Its schedule repeats them, also those before the decision; a run that has begun otherwise stays as it is."""
+    pace = Clocked(Schedule(30_000, [], None, 30.0, "auto"))
+    seen: list[float] = []
+
+    def seconds(iteration: int, nominal: int) -> float:
+        seen.append(Resolution(pace, None).factor_at(nominal))
+        return cost / seen[-1]
+
+    last, _ = _run(pace, seconds)
+    recorded = pace.recorded(last, last=True)
+    assert recorded.resolution_schedule == pace.sizes == name and _factors(Paced(recorded), last) == seen
+    assert list(dict.fromkeys(seen)) == ([1.0, 4.0, 2.0] if name == "pyramid" else [1.0])  # at last whole again
+    assert seen[0] == seen[-1] == 1.0
+    resumed = Clocked(Paced(recorded).up_to(last // 2)._replace(time_budget=30.0))
+    _run(resumed, lambda t, n: 0.1, first=last // 2, seconds=15.0)
+    assert resumed.levels == pace.levels
+    late = Clocked(Schedule(30_000, [Block(6_000, 0.0, 1 / 30_000, 0.0)], None, 30.0, "auto"))
+    _run(late, lambda t, n: 0.1, first=6_000)
+    assert late.levels == () and late.sizes == "none"
 
 
 @pytest.mark.parametrize("budget", [5.0, 20.0])
@@ -330,6 +359,22 @@ def test_a_budgeted_training_replays_and_resumes_to_the_byte(colmap_scene, tmp_p
     monkeypatch.undo()
     assert _train(colmap_scene, tmp_path / "both", *every, "--schedule", on / "schedule.json") == went_on
     assert "Training complete" in capsys.readouterr().out
+
+
+def test_a_short_training_by_the_clock_begins_with_smaller_views_and_replays(colmap_scene, tmp_path, monkeypatch):
+    def trained(name: str, *more: object) -> dict[int, bytes]:
+        return _train(colmap_scene, tmp_path / name, "-r", 1, "--iterations", 1200, *more)
+
+    def told(name: str) -> str:
+        return json.loads((tmp_path / name / "model.json").read_text())["resolution_schedule"]
+
+    _timed(monkeypatch, lambda t: 0.04)
+    short = trained("short", "--time_budget", 4)
+    whole = trained("whole", "--time_budget", 4, "--resolution_schedule", "none")
+    assert (told("short"), told("whole")) == ("pyramid", "none")
+    assert short.keys() == whole.keys() and short != whole  # by a clock that sizes do not move
+    monkeypatch.undo()
+    assert trained("again", "--schedule", tmp_path / "short" / "schedule.json") == short and told("again") == "pyramid"
 
 
 def test_training_stops_at_the_target_with_the_model_that_was_scored(colmap_scene, tmp_path, monkeypatch, capsys):

@@ -8,7 +8,7 @@ import pytest
 import torch
 from processes import in_ranks
 
-from benchmarks.parallel import steps, workload
+from benchmarks.parallel import host, steps, workload
 from benchmarks.parallel.stages import Stages
 from benchmarks.parallel.table import best, ratios
 
@@ -55,3 +55,12 @@ def test_two_ranks_are_measured(parallel):
     rows = ratios(best([{"link": 0.0, "results": [alone]}]) + best([{"link": 1e9, "results": [found]}]))
     times = median(alone["by_rank"][0]["ms"]) * found["views"] / steps.milliseconds(found)
     assert [row[-1] for row in rows] == ["1.00", f"{times:.2f}"]
+
+
+def test_the_host_is_profiled_by_step():
+    profile = host.profiled(workload.CITY.changed(**SMALL), "tiles", 3)
+    rows = profile.rows(1000)
+    assert profile.milliseconds > 0
+    (calls,) = [calls for name, calls, _ in rows if name.startswith("take (steps/fused.py")]
+    assert calls == "1.0"
+    assert [float(row[2]) for row in rows] == sorted((float(row[2]) for row in rows), reverse=True)

@@ -50,7 +50,7 @@ def test_doubles_are_exact_and_threads_do_not_matter():
 
 @CPU_AND_GPU
 def test_opcheck(device):
-    library.opcheck(ops.penalise_, (*(t.to(device) for t in _tensors(5)), 0.3, 0.7))
+    library.opcheck(ops.penalise_.default, (*(t.to(device) for t in _tensors(5)), 0.3, 0.7))
 
 
 def test_what_does_not_fit_is_named():

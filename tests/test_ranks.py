@@ -10,10 +10,11 @@ from utils.ranks.ranks import ALONE, Ranks, ranks
 def _talk() -> dict[str, object]:
     here = ranks()
     rows = torch.arange(6.0).view(2, 3)[: here.rank] + 10 * here.rank
-    parts = [torch.full((here.rank + d, 2), 10 * here.rank + d, dtype=torch.int16) for d in range(here.size)]
+    parts = [torch.full((here.rank + d, 2), 10 * here.rank + d, dtype=torch.int32) for d in range(here.size)]
     bits = [torch.ones(d, dtype=torch.bool) for d in range(here.size)]
     return {
         "numbers": here.numbers(here.rank, 7).tolist(),
+        "agreed": _agreed(here),
         "shared": [here.shared({"rank": here.rank}, *holder) for holder in ((), (1,))],
         "handed": _handed(here),
         "parts": [part.tolist() for part in here.exchange(parts)],
@@ -37,6 +38,18 @@ def _handed(here: Ranks) -> list[list[float]]:
     return [here.handed(1, x, like.shape, like.dtype, like.device).tolist() for x, like in zip(mine, kept, strict=True)]
 
 
+def _agreed(here: Ranks) -> list:
+    """Numbers by rank, a flag that rank 1 has raised, and what was posted: with the numbers, and without any."""
+    here.flag = torch.tensor([5 if here.rank == 1 else 0])
+    here.post(int(here.rank == 1), 2 * here.rank)
+    found = [here.agree(torch.tensor([here.rank, 7])), here.flag.item(), list(here.heard())]
+    here.agree(torch.tensor([0]))  # as a second view of an iteration
+    found.append(list(here.heard()))
+    here.flag.fill_(6 + here.rank)
+    here.post(0, 3)
+    return [*found, list(here.heard()), here.flag.item()]
+
+
 def _listed(sent: tuple[torch.Tensor, list[int]]) -> tuple[list, list[int]]:
     return sent[0].tolist(), sent[1]
 
@@ -45,6 +58,8 @@ def _listed(sent: tuple[torch.Tensor, list[int]]) -> tuple[list, list[int]]:
 def test_ranks_tell_each_other(size):
     for rank, said in enumerate(in_ranks(size, _talk)):
         assert said["numbers"] == [[other, 7] for other in range(size)]
+        last = size - 1
+        assert said["agreed"] == [[[other, 7] for other in range(size)], 5, *[[1, 2 * last]] * 2, [0, 3], 6 + last]
         assert said["shared"] == [{"rank": 0}, {"rank": 1}]
         assert said["handed"] == [[1, 2, 3], [0.5, 2.5]]
         assert said["parts"] == [[[10 * other + rank] * 2] * (other + rank) for other in range(size)]

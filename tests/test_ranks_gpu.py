@@ -3,6 +3,7 @@
 import hashlib
 import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -20,13 +21,32 @@ LONG = (
 )
 
 
-def _train(scene: Path, folder: Path, size: int, *options: str) -> dict[str, str]:
-    """Train, and return digests of models and checkpoints by their paths."""
+def _train(scene: Path, folder: Path, size: int, *options: str) -> dict[str, Any]:
+    """Train, and return what models and checkpoints hold by their paths."""
     out = folder / f"{size}"
     done = launch(folder / f"logs{size}", "none 0 0", "-s", str(scene), "-m", str(out), *LONG, *options, size=size)
     assert done.status == 0, done.stderr
     paths = [path for path in sorted(out.rglob("*.p*")) if path.suffix in (".ply", ".pth")]
-    return {str(path.relative_to(out)): hashlib.sha256(path.read_bytes()).hexdigest() for path in paths}
+    return {str(path.relative_to(out)): _content(path) for path in paths}
+
+
+def _content(path: Path) -> Any:
+    """Digest of a PLY's bytes; of a checkpoint, whose tensors one GPU tags as its own, digests of each tensor's."""
+    if path.suffix == ".ply":
+        return hashlib.sha256(path.read_bytes()).hexdigest()
+    return _digests(torch.load(path, map_location="cpu", weights_only=True))
+
+
+def _digests(part: Any) -> Any:
+    """The same structure, with kind, shape and digest in place of each tensor."""
+    if isinstance(part, dict):
+        return {key: _digests(value) for key, value in part.items()}
+    if isinstance(part, tuple | list):
+        return [type(part).__name__, *map(_digests, part)]
+    if torch.is_tensor(part):
+        values = hashlib.sha256(part.detach().numpy().tobytes()).hexdigest()
+        return type(part).__name__, part.dtype, part.requires_grad, tuple(part.shape), values
+    return type(part).__name__, part
 
 
 @pytest.mark.parametrize("options", [(), ("--strategy", "mcmc", "--max_num_splats", "400", "--train_test_exp")])

@@ -13,17 +13,17 @@ from training.steps.fused import FusedStep
 from utils.ranks import several
 from utils.ranks.ranks import ranks
 
-COLLECTIVES = ("all_gather", "all_gather_object", "all_reduce", "all_to_all_single", "barrier", "broadcast",
-               "broadcast_object_list")  # fmt: skip
+COLLECTIVES = ("all_gather", several.ALL_GATHER, "all_gather_object", "all_reduce", "all_to_all_single", "barrier",
+               "broadcast", "broadcast_object_list")  # fmt: skip
 # What a step costs that changes no rows. Each call waits for the slowest rank: add none without need.
 STEP = {
-    "all_gather": 1,  # where splats begin and end, from which follow bands, and what each rank sends
+    several.ALL_GATHER: 1,  # numbers of splats that each rank sends, with signals and flags
     "all_reduce": 1,  # sums of the loss
-    "all_to_all_single": 4,  # splats, rows around a band; numbers of gradient rows, the rows with their numbers
+    "all_to_all_single": 4,  # splats, rows around a band; numbers of gradient rows of each splat, the rows
     "broadcast": 1,  # the photo
 }
 # the image in place of the rows around a band
-WHOLE_STEP = {"all_gather": 1, "all_to_all_single": 4, "broadcast": 1}
+WHOLE_STEP = {several.ALL_GATHER: 1, "all_to_all_single": 4, "broadcast": 1}
 FIRST = "broadcast_object_list"  # once for each photo: its shape
 
 
@@ -80,4 +80,6 @@ def test_ranks_train_as_one_process(colmap_scene, tmp_path, size, options, cost)
     for losses, calls, _ in found:
         assert losses == alone[0]
         assert 10 < sum(each.pop(FIRST, 0) for each in calls) <= 20
-        assert len(calls) > 20 and all(each == cost for each in calls), calls
+        found_bands = cost | {several.ALL_GATHER: 2}
+        assert 10 < sum(each == found_bands for each in calls) <= 20  # at a view's first visit
+        assert len(calls) > 20 and all(each in (cost, found_bands) for each in calls), calls

@@ -18,7 +18,7 @@ def _few(device: str, dtype: torch.dtype = torch.float32) -> tuple[dict, Gaussia
 
 
 def _check(op, *arguments, **keywords):
-    library.opcheck(op, arguments, keywords)
+    library.opcheck(op.default, arguments, keywords)
 
 
 @CPU_AND_GPU
@@ -31,7 +31,7 @@ def test_opcheck_rasterize(inverse_depth, train, device):
     arguments = means2d, *scene_arguments(inputs, camera), camera.bg.float(), inverse_depth, train
     # On a GPU the layers of lists that are not cut are memory that nobody has written, so no two calls agree in them.
     compared = () if device == "cuda" and train else ("test_aot_dispatch_dynamic",)
-    library.opcheck(ops.rasterize, arguments, test_utils=(*UNCOMPARED, *compared))
+    library.opcheck(ops.rasterize.default, arguments, test_utils=(*UNCOMPARED, *compared))
 
 
 @CPU_AND_GPU
@@ -153,9 +153,9 @@ def test_statistics_that_do_not_fit_are_named():
         optim.observe_(torch.zeros(3), *three[1:], radii, gradient)
     with pytest.raises(RuntimeError, match="statistics must be contiguous"):
         optim.observe_(torch.zeros(8)[::2], *three[1:], radii, gradient)
-    with pytest.raises(RuntimeError, match="radii must be int32, got Float"):
+    with pytest.raises(RuntimeError, match="radii must be int32, got torch.float32"):
         optim.observe_(*three, radii.float(), gradient)
-    wanted = "the gradient must be .4, 3. float32 on cpu, or its lengths .4,., got .4, 2. Float"
+    wanted = "the gradient must be .4, 3. float32 on cpu, or its lengths .4,., got .4, 2. torch.float32"
     with pytest.raises(RuntimeError, match=wanted):
         optim.observe_(*three, radii, gradient[:, :2])
     optim.observe_(torch.zeros(0), torch.zeros(0, 1), torch.zeros(0, 1), radii[:0], gradient[:0])

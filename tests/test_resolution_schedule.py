@@ -20,7 +20,8 @@ from scene.pictures.in_memory import InMemory
 from scene.pictures.shrink import shrink_mask, shrink_photo, shrink_values
 from scene.views.view import View
 from training import loop
-from training.pacing.resolution import PYRAMID, Resolution, smaller
+from training.pacing.pace import PYRAMID, Pace
+from training.pacing.resolution import Resolution, smaller
 from training.pacing.spectrum import FACTORS, UNTIL, levels_of
 from utils.system_utils import UserError
 
@@ -36,6 +37,13 @@ def _scene(folder: Path, out: Path, **options: object) -> tuple[Scene, GaussianM
     )
     gaussians = GaussianModel(args.sh_degree)
     return Scene(args, gaussians, shuffle=False), gaussians
+
+
+def _pace(length: int) -> Pace:
+    """A steady pace with smaller views at first."""
+    pace = Pace(length)
+    pace.levels = PYRAMID
+    return pace
 
 
 def _slow_average(pixels: np.ndarray, width: int, height: int) -> np.ndarray:
@@ -128,7 +136,7 @@ def test_masks_depth_maps_and_columns_are_smaller_too(colmap_scene, tmp_path):
 def test_levels_are_of_the_schedule_and_small_views_stay():
     levels = ((0.0, 4.0), (0.1, 2.0), (0.25, 1.0))
     assert levels == PYRAMID
-    sizes = Resolution(PYRAMID, 1000, None)
+    sizes = Resolution(_pace(1000), None)
     factors = [sizes.factor_at(t) for t in range(1, 1001)]
     assert [factors.index(f) + 1 for f in (4.0, 2.0, 1.0)] == [1, 100, 250] and factors == sorted(factors)[::-1]
     assert [t for t in range(2, 1001) if sizes.changes(t - 1, t)] == [100, 250]
@@ -140,14 +148,14 @@ def test_levels_are_of_the_schedule_and_small_views_stay():
 def test_views_are_made_once_a_level_and_assigned_pictures_are_left_alone(colmap_scene, tmp_path):
     scene, _ = _scene(colmap_scene, tmp_path, resolution=1)
     first, second, third = scene.getTrainCameras()[:3]
-    sizes = Resolution(PYRAMID, 1000, scene.images)
+    sizes = Resolution(_pace(1000), scene.images)
     third.original_image = torch.zeros(3, 64, 96)
     small = sizes.view(first, 1)
     assert small._size == (48, 32) and small is sizes.view(first, 2) and sizes.view(third, 2) is third
     assert not sizes.needs(first) and sizes.needs(second)
     assert sizes.view(first, 250) is first and sizes.needs(first)
     limited, _ = _scene(colmap_scene, tmp_path / "limited", resolution=1, images_to_load=3)
-    sizes, view = Resolution(PYRAMID, 1000, limited.images), limited.getTrainCameras()[0]
+    sizes, view = Resolution(_pace(1000), limited.images), limited.getTrainCameras()[0]
     assert sizes.view(view, 1) is not sizes.view(view, 1) and sizes.needs(view)
 
 
@@ -160,7 +168,9 @@ def _photo(cycles: float, depth: InMemory | None = None) -> Camera:
 
 def test_a_factor_beyond_all_sizes_makes_the_smallest_views(colmap_scene, tmp_path):
     scene, _ = _scene(colmap_scene, tmp_path, resolution=1)
-    assert Resolution([(0.0, 1e300)], 10, scene.images).view(scene.getTrainCameras()[0], 1)._size == (48, 32)
+    pace = _pace(10)
+    pace.levels = ((0.0, 1e300),)
+    assert Resolution(pace, scene.images).view(scene.getTrainCameras()[0], 1)._size == (48, 32)
 
 
 def test_levels_by_the_spectrum_last_as_long_as_they_keep_detail():
@@ -219,5 +229,5 @@ def test_exposures_and_depths_are_trained_on_smaller_views(colmap_scene, tmp_pat
 
 
 def test_a_wrong_resolution_schedule_is_refused(colmap_scene, tmp_path):
-    with pytest.raises(UserError, match="^--resolution_schedule must be none or pyramid or spectrum"):
+    with pytest.raises(UserError, match="^--resolution_schedule must be auto or none or pyramid or spectrum"):
         _train(colmap_scene, tmp_path, "--resolution_schedule", "fine")

@@ -102,7 +102,7 @@ def test_any_number_of_threads_gives_the_same():
 
 @CPU_AND_GPU
 def test_opcheck(device):
-    library.opcheck(ops.split_positions, (*(t.to(device) for t in _parents(5)), 1, 2, 600, 0))
+    library.opcheck(ops.split_positions.default, (*(t.to(device) for t in _parents(5)), 1, 2, 600, 0))
 
 
 def test_what_does_not_fit_is_named():

@@ -9,6 +9,7 @@ from training.observer import Announcer, Observer
 from training.run import Run
 from training.steps.choose import Taker, step_taker
 from training.together import Together
+from utils.ranks.ranks import ranks
 
 
 def run_training(run: Run, observers: Sequence[Observer]) -> None:
@@ -17,11 +18,11 @@ def run_training(run: Run, observers: Sequence[Observer]) -> None:
     Whatever else happens is an observer's business, in the order of the list (training/observers/standard.py).
     Raises KeyboardInterrupt or Terminated, after a complete step, if a signal asked for it.
     """
-    tell, taker, together = Announcer(observers), step_taker(run), Together(run)
+    taker, together = step_taker(run), Together(run)
+    tell = Announcer([together, *observers] if ranks().several else observers)
     with run.interrupt, tell, _backward_on_this_thread(), _whole_steps(run, taker):
         for step in run.steps():
             tell.begins(step)
-            together.begins(step)
             taker.make_ready(step)  # before the learning rates are set, which a repeated step changes
             run.prepare(step)  # learning rates, SH degree, photos of the next views
             taker.take(step, tell)
@@ -32,7 +33,7 @@ def run_training(run: Run, observers: Sequence[Observer]) -> None:
             if step.stopping:
                 together.wait()
                 raise step.stopping
-    together.ended()
+    together.finish()
     tell.ended()  # out here a signal stops at once what is only drawn and printed
 
 

@@ -131,11 +131,9 @@ class Run:
     @property
     def _training_options(self) -> dict[str, Any]:
         options = {name: getattr(self.opt, name) for name in ("optimizer_type", "seed", "strategy")}
-        options["resolution_schedule"] = self.opt.resolution_schedule
+        options["resolution_schedule"] = self.pace.sizes
         if self.pace.views > 1:
             options[VIEWS] = self.pace.views
-        if isinstance(self.pace, Paced):  # a schedule that is repeated brings its own
-            options["resolution_schedule"] = self.pace.schedule.resolution_schedule
         return {"antialiasing": self.pipe.antialiasing} | options
 
     @property

@@ -12,18 +12,18 @@ from diff_gaussian_rasterization.backend import OPERATORS
 from torch import Tensor
 
 from gaussian_renderer import view_step
-from gaussian_renderer.over_ranks import band, views
+from gaussian_renderer.over_ranks import band, exchange, views
+from gaussian_renderer.over_ranks.bands import KnownBands
 from scene.gaussian_model import GaussianModel
 from training.steps.fused import FusedStep
 from training.steps.views import ViewsStep
-from training.together import Together
 from utils.ranks.ranks import Ranks
 
 REST = "rest"
 STAGES = {
-    "signals and flags": [(Together, "begins")],
     "project": [(OPERATORS, "project")],
-    "agree on bands": [(band, "find_bands")],
+    "agree on bands": [(band, "find_bands"), (KnownBands, "find")],
+    "numbers of splats": [(exchange, "find_records")],
     "splats to bands": [(band, "send_splats")],
     "splats to views": [(views, "send_views")],
     "bin": [(OPERATORS, "bin")],
@@ -70,7 +70,7 @@ class Stages:
                 for owner, name in places:
                     patches.enter_context(patch.object(owner, name, self._around(stage, getattr(owner, name))))
             if ranks.several:
-                for name, sent in (("send", _sent), ("table", _copies), ("added", _ring)):
+                for name, sent in (("send", _sent), ("agree", _copies), ("table", _copies), ("added", _ring)):
                     patches.enter_context(patch.object(ranks, name, self._counting(ranks, name, sent)))
             self.mark()
             yield

@@ -7,7 +7,6 @@ from typing import Any, NamedTuple
 import torch
 from diff_gaussian_rasterization.backend import OPERATORS
 from diff_gaussian_rasterization.schema import SCENE
-from fused_ssim import REACH
 from torch import Tensor
 
 from gaussian_renderer.over_ranks.bands import Bands, find_bands, tile_rows
@@ -44,16 +43,22 @@ class View:
         return Band(self.bands.pixels(self.ranks.rank), self.ranks.added)
 
 
-def draw_view(ranks: Ranks, scene: tuple[Any, ...], background: Tensor, want_depth: bool, train: bool) -> View:
+def draw_view(
+    ranks: Ranks,
+    scene: tuple[Any, ...],
+    background: Tensor,
+    want_depth: bool,
+    train: bool,
+    find: Callable[..., Bands] | None = None,
+) -> View:
     """Render the rank's band of a view with the Gaussians of all ranks, with the bits of one process.
 
-    scene: the rasterizer's arguments with the rank's own Gaussians.
+    scene: the rasterizer's arguments with the rank's own Gaussians. find: takes the place of `find_bands`.
     """
     height, width = scene[_HEIGHT], scene[_WIDTH]
     own, depths, rects, tile_counts, radii = OPERATORS.project(*scene)
-    seen = (tile_counts > 0).nonzero().view(-1)
-    bands = find_bands(ranks, rects.index_select(0, seen), height, width)
-    (splats, depths, rects, counts), sent = send_splats(ranks, bands, seen, (own, depths, rects, tile_counts))
+    bands = (find or find_bands)(ranks, rects, tile_counts, height, width)
+    (splats, depths, rects, counts), sent = send_splats(ranks, bands, (own, depths, rects, tile_counts))
     instances, ranges, *slots = OPERATORS.bin(splats, depths, rects, counts, height, width, train)
     begin, end = bands.borders[ranks.rank : ranks.rank + 2]
     across = (len(ranges) - 1) // tile_rows(height)
@@ -78,24 +83,11 @@ def whole_image(view: View) -> View:
 
 def surroundings(view: View) -> View:
     """Give every rank the rows of colour around its band that its loss depends on (REACH). Returns the view."""
-    ranks, bands, color = view.ranks, view.bands, view.color
-    own, wide = bands.pixels(ranks.rank), bands.pixels(ranks.rank, REACH)
-    others = [rank for rank in range(ranks.size) if rank != ranks.rank]
-    common = dict.fromkeys(range(ranks.size), (0, 0))
-    given = common | {rank: _common(own, bands.pixels(rank, REACH)) for rank in others}
-    taken = common | {rank: _common(bands.pixels(rank), wide) for rank in others}
-    rows = torch.cat([color[:, first:end].transpose(0, 1) for first, end in given.values()])
-    sizes, counts = ([end - first for first, end in parts.values()] for parts in (given, taken))
-    received = ranks.send(rows, sizes, counts)[0].transpose(0, 1)
-    above = own[0] - wide[0]
-    color[:, wide[0] : own[0]], color[:, own[1] : wide[1]] = received[:, :above], received[:, above:]
+    given, taken = view.bands.halo
+    rows = view.color.transpose(0, 1).index_select(0, given.indices)
+    received = view.ranks.send(rows, given.sizes, taken.sizes)[0]
+    view.color.index_copy_(1, taken.indices, received.transpose(0, 1))
     return view
-
-
-def _common(one: tuple[int, int], other: tuple[int, int]) -> tuple[int, int]:
-    """Rows, first and end, that are in both."""
-    first = max(one[0], other[0])
-    return first, max(min(one[1], other[1]), first)
 
 
 def gradient_rows(
@@ -106,7 +98,7 @@ def gradient_rows(
     gradients: of colour, transmittance and inverse depth, (., H, W), of which the rows of the band count.
     """
     rows, counts = OPERATORS.blend_rows(*view.state, *gradients, view.layers, absolute)
-    return return_rows(view.ranks, view.sent, len(view.radii), rows, counts)
+    return return_rows(view.ranks, view.sent, len(view.radii), rows, counts)[:2]
 
 
 def decisive_in(view: View) -> Tensor:
@@ -115,4 +107,4 @@ def decisive_in(view: View) -> Tensor:
     mask, sent = OPERATORS.decisive(splats, instances, ranges, last), view.sent
     by_band, _ = view.ranks.send(mask, sent.received, sent.sizes)
     found = torch.zeros(len(view.radii), dtype=torch.int32, device=splats.device)
-    return found.index_add_(0, sent.indices, by_band.int()) > 0
+    return found.index_add_(0, sent.gaussians, by_band.int()) > 0

@@ -1,28 +1,69 @@
 """The division of an image's rows of tiles into bands, one for each rank."""
 
-from dataclasses import dataclass
+from collections.abc import Hashable, Sequence
+from functools import cached_property
 
 import torch
 from diff_gaussian_rasterization.fakes import TILE
+from fused_ssim import REACH
 from torch import Tensor
 
 from utils.ranks.ranks import Ranks
 
 _TILE_COST = 8  # of a tile without instances, in instances
+_VISITS = 8  # of a view, for which its bands are kept
+_NOWHERE = 1 << 30  # a row of tiles that no rectangle reaches
 
 
-@dataclass(frozen=True, slots=True)
 class Bands:
-    """The bands of all ranks, the same on every rank. They decide no bit of a result."""
+    """The bands of all ranks, the same on every rank. They decide no bit of a result.
 
-    borders: list[int]  # rows of tiles where a band begins, and where the last one ends: size + 1 numbers
-    splats: list[list[int]]  # number of a rank's splats that reach a band, by rank and band
-    height: int  # of the image, pixels
+    borders: rows of tiles where a band begins, and where the last one ends: size + 1 numbers. height: of the image,
+    pixels. device: of the tensors. rank: this one.
+    """
+
+    def __init__(self, borders: Sequence[int], height: int, rank: int, device: torch.device) -> None:
+        self.borders, self.height = list(borders), height
+        self._rank, self._device = rank, device
 
     def pixels(self, rank: int, reach: int = 0) -> tuple[int, int]:
         """The rows of pixels of a band, first and end, and `reach` more on either side, unless it is empty."""
         first, end = (min(TILE * border, self.height) for border in self.borders[rank : rank + 2])
         return (max(first - reach, 0), min(end + reach, self.height)) if first < end else (first, end)
+
+    def reached(self, rects: Tensor, tile_counts: Tensor) -> Tensor:
+        """Which Gaussians reach which band: (size, N) bool. rects: (N, 4), which count where tile_counts (N,) do."""
+        first, end = self._limits
+        return (rects[:, 1] < end).logical_and_(rects[:, 3] > first).logical_and_(tile_counts > 0)
+
+    @cached_property
+    def _limits(self) -> Tensor:
+        """Rows of tiles where each band begins and ends: (2, size, 1) int32; an empty band is nowhere."""
+        pairs = [(a, b) if a < b else (_NOWHERE, -1) for a, b in zip(self.borders, self.borders[1:], strict=False)]
+        return torch.tensor(pairs, dtype=torch.int32).T[:, :, None].to(self._device)
+
+    @cached_property
+    def halo(self) -> tuple["Rows", "Rows"]:
+        """The rows of pixels that other ranks' losses need of this band, and that this rank's loss needs of theirs."""
+        own, wide = self.pixels(self._rank), self.pixels(self._rank, REACH)
+        others = [rank for rank in range(len(self.borders) - 1) if rank != self._rank]
+        given = {rank: _common(own, self.pixels(rank, REACH)) for rank in others}
+        taken = {rank: _common(self.pixels(rank), wide) for rank in others}
+        return tuple(Rows(parts | {self._rank: range(0)}, self._device) for parts in (given, taken))
+
+
+class Rows:
+    """Rows of pixels, which belong to the ranks 0, 1 and so on. indices: (n,) on a device. sizes: how many by rank."""
+
+    def __init__(self, parts: dict[int, range], device: torch.device) -> None:
+        self.sizes = [len(parts[rank]) for rank in range(len(parts))]
+        self.indices = torch.tensor([row for rank in range(len(parts)) for row in parts[rank]], dtype=torch.int64)
+        self.indices = self.indices.to(device)
+
+
+def _common(one: tuple[int, int], other: tuple[int, int]) -> range:
+    """Rows that are in both."""
+    return range(max(one[0], other[0]), min(one[1], other[1]))
 
 
 def tile_rows(height: int) -> int:
@@ -30,34 +71,45 @@ def tile_rows(height: int) -> int:
     return -(-height // TILE)
 
 
-def row_steps(rects: Tensor, height: int) -> Tensor:
-    """What begins and ends in each row of tiles, and below the last one: (rows + 1, 3) int64.
+def row_widths(rects: Tensor, height: int) -> Tensor:
+    """By how much the sum of widths changes at each row of tiles, and below the last one: (rows + 1,) int64.
 
-    rects: (n, 4), the rectangles of splats that have tiles. In each row, how many begin there, how many have ended
-    above it, and by how much the sum of their widths changes.
+    rects: (n, 4), the rectangles of splats that have tiles.
     """
     left, top, right, bottom = rects.long().unbind(1)
-    wide, one = right - left, torch.ones_like(top)
-    steps = torch.zeros(3 * (tile_rows(height) + 1), dtype=torch.int64, device=rects.device)
-    places = torch.cat((3 * top, 3 * bottom + 1, 3 * top + 2, 3 * bottom + 2))
-    return steps.index_add_(0, places, torch.cat((one, one, wide, -wide))).view(-1, 3)
+    wide = right - left
+    steps = torch.zeros(tile_rows(height) + 1, dtype=torch.int64, device=rects.device)
+    return steps.index_add_(0, torch.cat((top, bottom)), torch.cat((wide, -wide)))
 
 
-def find_bands(ranks: Ranks, rects: Tensor, height: int, width: int) -> Bands:
-    """Bands of about equal loads. rects: (n, 4), of the rank's own splats that have tiles.
+def find_bands(ranks: Ranks, rects: Tensor, tile_counts: Tensor, height: int, width: int) -> Bands:
+    """Bands of about equal loads. rects: (N, 4), of the rank's own Gaussians, which count where tile_counts (N,) do.
 
-    A splat is as much work as its rectangle is wide, in each of its rows. All ranks tell each other what begins and
-    ends where, so that they need no further word on how many splats each of them sends.
+    A splat is as much work as its rectangle is wide, in each of its rows.
     """
-    begun, ended, widths = ranks.table(row_steps(rects, height)).cpu().cumsum(1).unbind(2)  # (size, rows + 1) each
-    total = widths[:, :-1].sum(0) + _TILE_COST * tile_rows(width)
+    widths = ranks.table(row_widths(rects[tile_counts > 0], height)).sum(0).cpu().cumsum(0)
+    total = widths[:-1] + _TILE_COST * tile_rows(width)
     ends = total.cumsum(0)
     shares = torch.arange(1, ranks.size) * int(ends[-1]) // ranks.size
     # A row belongs to the band in which its middle lies.
     cuts = torch.searchsorted(2 * ends - total, 2 * shares)
-    borders = torch.nn.functional.pad(cuts, (1, 1))
-    borders[-1] = len(total)
-    first, end = borders[:-1], borders[1:]
-    # Those that begin above a band's end, less those that end above its begin.
-    reaching = torch.nn.functional.pad(begun, (1, 0))[:, end] - ended[:, first]
-    return Bands(borders.tolist(), torch.where(first < end, reaching, 0).tolist(), height)
+    return Bands([0, *cuts.tolist(), len(total)], height, ranks.rank, rects.device)
+
+
+class KnownBands:
+    """Bands of views that come again: found anew after some visits only, as they follow what changes slowly.
+
+    All ranks have to ask for the same views in the same order.
+    """
+
+    def __init__(self) -> None:
+        self._kept: dict[Hashable, tuple[Bands, int]] = {}
+
+    def find(self, view: Hashable, ranks: Ranks, rects: Tensor, tile_counts: Tensor, height: int, width: int) -> Bands:
+        """`find_bands`, or the bands of an earlier visit of the view."""
+        key = view, height, width
+        bands, visits = self._kept.get(key, (None, _VISITS))
+        if visits >= _VISITS:
+            bands, visits = find_bands(ranks, rects, tile_counts, height, width), 0
+        self._kept[key] = bands, visits + 1
+        return bands

@@ -60,9 +60,7 @@ class _Views(torch.autograd.Function):
         *gaussians: Tensor | None,
     ) -> tuple[Tensor, Tensor, Tensor]:
         projected = [OPERATORS.project(*gaussians, *camera) for camera in cameras]
-        chosen = [(tile_counts > 0).nonzero().reshape(-1) for *_, tile_counts, _ in projected]
-        rows = [tensors[:4] for tensors in projected]
-        (splats, depths, rects, counts), sent = send_views(ranks, rows, chosen, len(gaussians[0]))
+        (splats, depths, rects, counts), sent = send_views(ranks, [tensors[:4] for tensors in projected])
         height, width = cameras[ranks.rank][5:7]
         lists = OPERATORS.bin(splats, depths, rects, counts, height, width, True)
         planes = OPERATORS.blend(splats, *lists[:2], background, height, width, wants[0], True)
@@ -87,20 +85,21 @@ class _Views(torch.autograd.Function):
         gaussians = ctx.saved_tensors
         needed = dict(zip(Gaussians._fields, ctx.needs_input_grad[5:], strict=True), means2d=ctx.needs_input_grad[4])
         wanted = [needed[name] for name in GRADIENTS]
-        sums: dict[str, Tensor] = {}
-        screen = []
+        sums, screen = [], []
         for view, (own, own_counts) in enumerate(_by_view(ctx.ranks, ctx.sent, len(gaussians[0]), rows, counts)):
             arguments = *gaussians, *ctx.cameras[view], *ctx.own[view], own, own_counts
             found = dict(zip(GRADIENTS, OPERATORS.rows_vjp(*arguments, wanted, absolute), strict=True))
             screen.append(found.pop("means2d"))
-            sums = {name: sums[name] + value if sums else value for name, value in found.items()}
-        by_name = [sums[name] if needed[name] else None for name in Gaussians._fields]
-        return None, None, None, None, torch.stack(screen) if needed["means2d"] else None, *by_name
+            if sums:
+                torch._foreach_add_(sums, list(found.values()))
+            else:
+                sums, names = list(found.values()), list(found)
+        by_name = dict(zip(names, sums, strict=True))
+        of_inputs = [by_name[name] if needed[name] else None for name in Gaussians._fields]
+        return None, None, None, None, torch.stack(screen) if needed["means2d"] else None, *of_inputs
 
 
 def _by_view(ranks: Ranks, sent: Sent, count: int, rows: Tensor, counts: Tensor) -> list[tuple[Tensor, Tensor]]:
     """`return_rows` for each view by itself: as Gaussian i of view v, row v * count + i of all."""
-    all_rows, totals = return_rows(ranks, sent, count * ranks.size, rows, counts)
-    totals = list(totals.split(count)) if count else [totals] * ranks.size
-    lengths = torch.stack([total.sum() for total in totals]).tolist()
-    return list(zip(all_rows.split(lengths), totals, strict=True))
+    all_rows, totals, lengths = return_rows(ranks, sent, count * ranks.size, rows, counts)
+    return list(zip(all_rows.split(lengths), totals.view(ranks.size, count).unbind(), strict=True))

@@ -94,10 +94,8 @@ class Exposures:
 
     def add_gradients(self, ranks: Ranks) -> None:
         """Give every rank the sum of all ranks' gradients."""
-        if not ranks.several or not ranks.anyone(self.values.grad is not None):
-            return
         own = torch.zeros_like(self.values) if self.values.grad is None else self.values.grad
-        self.values.grad = ranks.gather(own[None]).sum(0)
+        self.values.grad = ranks.table(own).sum(0)
 
     def capture(self) -> dict[str, Any]:
         """State that a resumed training needs, as plain values."""

@@ -1,15 +1,17 @@
-"""Builds a torch extension with a CPU backend and, once it has csrc/cuda/*.cu, a CUDA one.
+"""Builds torch extensions with a CPU backend and, once they have csrc/cuda/*.cu, a CUDA one.
 
-Each extension's setup.py calls `setup_extension`; pip does the rest. The result is <package>/_backend.so, which
-registers its operators when torch.ops.load_library loads it. setuptools' own extension builder and torch's know
-neither several instruction sets of one source nor parallel compilation without ninja, so this runs the commands.
+Each extension's setup.py calls `setup_extension`, and the repository's own passes `extension_options` for all of them;
+pip does the rest. The result is <package>/_backend.so, which registers its operators when torch.ops.load_library loads
+it. It takes only C functions from torch, those of torch's stable interface, so that it runs with every torch from
+OLDEST_TORCH on, and a torch without CUDA is enough to build CUDA kernels. It takes nothing from Python, so that a wheel
+serves every Python from 3.10 on. setuptools' own extension builder and torch's know neither several instruction sets of
+one source nor parallel compilation without ninja, so this runs the commands.
 
 Environment: CXX (compiler), CUDA_HOME (toolkit), GS_CUDA=0|1 (never, or always, build CUDA; unset: where nvcc is
 found and torch was built with CUDA), TORCH_CUDA_ARCH_LIST ("9.0" or "8.0;9.0+PTX"; unset: those of the GPUs that are
 visible, or with none all major ones from 8.0).
 """
 
-import importlib.metadata
 import os
 import platform
 import re
@@ -20,14 +22,14 @@ import sys
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from types import ModuleType
+from typing import Any, NamedTuple, NoReturn
 
 from setuptools import Extension, find_packages, setup
 from setuptools.command.build_ext import build_ext
 from setuptools.command.build_py import build_py
 
 VERSION = (Path(__file__).resolve().parents[2] / "version.txt").read_text(encoding="utf-8").strip()
-BUILT_FOR = "built-for"  # the extra that tells doctor.py which torch an extension was built for
-OLDEST_TORCH = (2, 11)
+OLDEST_TORCH = (2, 10)  # the first whose stable interface has all that csrc/torch calls
 OLDEST_ARCHITECTURE = 80  # reductions over a warp in one instruction
 COMMON_INCLUDE = Path(__file__).resolve().parent / "include"
 # No -ffast-math: NaN, infinities and the order of sums matter. Nobody reads errno or traps.
@@ -41,26 +43,32 @@ ARM64_ISAS = {"baseline": ["-DGS_PLAIN", "-ffp-contract=off"], "neon": []}
 
 def setup_extension(name: str, package: str, root: Path) -> None:
     """Runs setuptools for the extension in folder `root`: distribution `name`, import name `package`."""
-    setup(
-        name=name,
-        version=VERSION,
-        license="Apache-2.0",
-        python_requires=">=3.10",
-        packages=find_packages(str(root), include=[package, f"{package}.*"]),
-        # A requirement on torch would let pip replace the one that is there, and an extra is not installed unasked.
-        extras_require={BUILT_FOR: [torch_requirement()]},
-        # The real source list is found by the builder; setuptools only needs to know that there is a library.
-        ext_modules=[Extension(f"{package}._backend", sources=[])],
-        cmdclass={
-            "build_ext": type("BuildBackend", (BuildBackend,), {"root": Path(root).resolve()}),
+    # There is no requirement on torch, since it would let pip replace the one that is there.
+    setup(name=name, version=VERSION, license="Apache-2.0", **extension_options({package: Path(root)}))
+
+
+def extension_options(roots: dict[str, Path]) -> dict[str, Any]:
+    """setuptools' options for extensions, each an import name and its folder, which the running setup.py is above."""
+    here, packages = Path.cwd(), []
+    for package, root in roots.items():
+        packages += find_packages(str(root), include=[package, f"{package}.*"])
+    return {
+        "python_requires": ">=3.10",
+        "packages": packages,
+        "package_dir": {package: os.path.relpath(root / package, here) for package, root in roots.items()},
+        # The real source lists are found by the builder; setuptools only needs to know that there are libraries.
+        "ext_modules": [Extension(f"{package}._backend", sources=[]) for package in roots],
+        "cmdclass": {
+            "build_ext": type("BuildBackends", (BuildBackends,), {"roots": roots}),
             "build_py": BuildModules,
         },
-        zip_safe=False,
-    )
+        "options": {"bdist_wheel": {"py_limited_api": "cp310"}},
+        "zip_safe": False,
+    }
 
 
 class BuildModules(build_py):
-    """Copies the package's modules, after removing those that an earlier build of the same folder has left."""
+    """Copies the packages' modules, after removing those that an earlier build of the same folder has left."""
 
     def run(self) -> None:
         for package in self.packages or []:
@@ -69,79 +77,101 @@ class BuildModules(build_py):
         super().run()
 
 
-def torch_requirement() -> str:
-    """The torch that an extension works with, only the minor version that it was built against, as pip writes it."""
-    try:
-        major, minor = importlib.metadata.version("torch").split(".")[:2]
-    except importlib.metadata.PackageNotFoundError:
-        return "torch>={}.{}".format(*OLDEST_TORCH)
-    return f"torch=={major}.{minor}.*"
+class Compilation(NamedTuple):
+    """A compiler's command without its input and output, and these."""
+
+    command: list[str]
+    source: Path
+    output: Path
 
 
-class BuildBackend(build_ext):
-    """Compiles csrc/ of the extension in `root` into one shared library."""
+class BuildBackends(build_ext):
+    """Compiles csrc/ of each extension into one shared library."""
 
-    root: Path
+    roots: dict[str, Path]
 
     def get_ext_filename(self, fullname: str) -> str:
         # No interpreter tag: the library never sees Python.
         return str(Path(*fullname.split(".")).with_suffix(".so"))
 
-    def build_extension(self, ext: Extension) -> None:
-        torch = import_torch()
-        cxx = find_compiler()
-        csrc = self.root / "csrc"
-        kernels = sorted((csrc / "cuda").glob("*.cu"))
-        nvcc = find_nvcc(torch.version.cuda) if kernels else None
-        objects_dir = Path(self.build_temp).resolve() / ext.name
-        objects_dir.mkdir(parents=True, exist_ok=True)
-        library = Path(self.get_ext_fullpath(ext.name)).resolve()
-        library.parent.mkdir(parents=True, exist_ok=True)
-
-        compile_cxx = [*cxx, *CXX_FLAGS, f"-I{csrc}", f"-I{COMMON_INCLUDE}"]
-        isas = {"baseline": []}
-        if platform.machine() in ("x86_64", "AMD64"):
-            compile_cxx.append("-DGS_X86")
-            isas = X86_ISAS
-        elif platform.machine() in ("aarch64", "arm64", "ARM64"):
-            compile_cxx.append("-DGS_ARM64")
-            isas = ARM64_ISAS
-        torch_dir = Path(torch.__file__).parent
-        # -fopenmp: at::parallel_for is a template over the OpenMP that torch itself was built with.
-        ops_flags = ["-isystem", str(torch_dir / "include")]
-        ops_flags += [f"-D_GLIBCXX_USE_CXX11_ABI={int(torch.compiled_with_cxx11_abi())}"]
-        ops_flags += ["-fopenmp"] if sys.platform == "linux" else []
-        libraries = [f"-L{torch_dir / 'lib'}", "-ltorch_cpu", "-lc10"]
-        if nvcc:
-            toolkit = toolkit_root(nvcc)
-            ops_flags += ["-DGS_CUDA", "-isystem", str(toolkit / "include")]
-            libraries += ["-ltorch_cuda", "-lc10_cuda", f"-L{toolkit / 'lib64'}", f"-L{toolkit / 'lib'}", "-lcudart"]
-
-        ops = sorted((csrc / "torch").glob("*.cpp"))
-        compilations = [([*compile_cxx, *ops_flags], source, f"{source.stem}.torch.o") for source in ops]
-        sources = sorted((csrc / "cpu").glob("*.cpp"))
-        # Sources that are compiled once round alike on every machine, so products are never fused (gs/rounded.h).
-        once = [*compile_cxx, "-ffp-contract=off"]
-        compilations += [(once, source, f"{source.stem}.o") for source in sources if not is_per_isa(source)]
-        # Baseline first: if several objects have the same template of the standard library, the linker keeps
-        # the first one, which must run on every machine.
-        for isa, flags in isas.items():
-            command = [*compile_cxx, *flags, f"-DGS_ISA={isa}"]
-            compilations += [(command, source, f"{source.stem}.{isa}.o") for source in sources if is_per_isa(source)]
-        if nvcc:
-            compile_cuda = [nvcc, "-O3", "-std=c++17", "-Xcompiler", "-fPIC,-fvisibility=hidden"]
-            at_hand = [torch.cuda.get_device_capability(k) for k in range(torch.cuda.device_count())]
-            compile_cuda += architecture_flags(nvcc, at_hand)
-            compile_cuda += [f"-I{csrc}", f"-I{COMMON_INCLUDE}"]
-            compilations += [(compile_cuda, source, f"{source.stem}.cu.o") for source in kernels]
+    def build_extensions(self) -> None:
+        torch, cxx = import_torch(), find_compiler()
+        nvcc = find_nvcc(torch.version.cuda)
+        plans = {}
+        for ext in self.extensions:
+            root = Path(self.roots[ext.name.partition(".")[0]]).resolve()
+            objects = Path(self.build_temp).resolve() / ext.name
+            objects.mkdir(parents=True, exist_ok=True)
+            plans[ext.name] = compilations(torch, cxx, nvcc, root / "csrc", objects)
         with ThreadPoolExecutor(os.cpu_count()) as pool:
-            commands = [[*compiler, "-c", str(source), "-o", obj] for compiler, source, obj in compilations]
-            list(pool.map(lambda command: run(command, objects_dir), commands))
-        # Linked without -fopenmp: its runtime must be the one torch has loaded, not a second one. The same holds
-        # for the C++ library, named in full since some machines link only the static one by default.
-        libraries += ["-l:libstdc++.so.6"] if sys.platform == "linux" else []
-        shared = ["-dynamiclib", "-undefined", "dynamic_lookup"] if sys.platform == "darwin" else ["-shared"]
-        run([*cxx, *shared, *(obj for _, _, obj in compilations), *libraries, "-o", str(library)], objects_dir)
+            list(pool.map(compile_one, [one for plan in plans.values() for one in plan]))
+        for name, plan in plans.items():
+            library = Path(self.get_ext_fullpath(name)).resolve()
+            library.parent.mkdir(parents=True, exist_ok=True)
+            link(torch, cxx, nvcc, [one.output for one in plan], library)
+
+
+def compilations(torch: ModuleType, cxx: list[str], nvcc: str | None, csrc: Path, objects: Path) -> list[Compilation]:
+    """All that is compiled for one library. nvcc: None for a build without CUDA."""
+    compile_cxx = [*cxx, *CXX_FLAGS, f"-I{csrc}", f"-I{COMMON_INCLUDE}"]
+    isas = {"baseline": []}
+    if platform.machine() in ("x86_64", "AMD64"):
+        compile_cxx.append("-DGS_X86")
+        isas = X86_ISAS
+    elif platform.machine() in ("aarch64", "arm64", "ARM64"):
+        compile_cxx.append("-DGS_ARM64")
+        isas = ARM64_ISAS
+    ops_flags = ["-isystem", str(Path(torch.__file__).parent / "include")]
+    ops_flags += [f"-DTORCH_TARGET_VERSION={target_version(OLDEST_TORCH)}"]
+    kernels = sorted((csrc / "cuda").glob("*.cu")) if nvcc else []
+    if kernels:
+        ops_flags += ["-DGS_CUDA", "-DUSE_CUDA", "-isystem", str(toolkit_root(nvcc) / "include")]
+
+    ops = sorted((csrc / "torch").glob("*.cpp"))
+    plan = [Compilation([*compile_cxx, *ops_flags], source, objects / f"{source.stem}.torch.o") for source in ops]
+    sources = sorted((csrc / "cpu").glob("*.cpp"))
+    # Sources that are compiled once round alike on every machine, so products are never fused (gs/rounded.h).
+    once = [*compile_cxx, "-ffp-contract=off"]
+    plan += [Compilation(once, source, objects / f"{source.stem}.o") for source in sources if not is_per_isa(source)]
+    # Baseline first: if several objects have the same template of the standard library, the linker keeps
+    # the first one, which must run on every machine.
+    for isa, flags in isas.items():
+        command = [*compile_cxx, *flags, f"-DGS_ISA={isa}"]
+        per_isa = [source for source in sources if is_per_isa(source)]
+        plan += [Compilation(command, source, objects / f"{source.stem}.{isa}.o") for source in per_isa]
+    if kernels:
+        compile_cuda = [nvcc, "-O3", "-std=c++17", "-Xcompiler", "-fPIC,-fvisibility=hidden"]
+        at_hand = [torch.cuda.get_device_capability(k) for k in range(torch.cuda.device_count())]
+        compile_cuda += [*architecture_flags(nvcc, at_hand), f"-I{csrc}", f"-I{COMMON_INCLUDE}"]
+        plan += [Compilation(compile_cuda, source, objects / f"{source.stem}.cu.o") for source in kernels]
+    return plan
+
+
+def compile_one(compilation: Compilation) -> None:
+    """Runs one command."""
+    command, source, output = compilation
+    run([*command, "-c", str(source), "-o", str(output)], output.parent)
+
+
+def link(torch: ModuleType, cxx: list[str], nvcc: str | None, objects: list[Path], library: Path) -> None:
+    """Links objects into a library."""
+    # libtorch stands for its parts: that for CUDA, too, where there is one.
+    libraries = [f"-L{Path(torch.__file__).parent / 'lib'}"]
+    libraries += ["-Wl,--no-as-needed", "-ltorch", "-Wl,--as-needed"] if sys.platform == "linux" else ["-ltorch"]
+    if nvcc:
+        # Static: torch may have another version of the runtime, or none. Both share the GPU's primary context.
+        toolkit = toolkit_root(nvcc)
+        libraries += [f"-L{toolkit / 'lib64'}", f"-L{toolkit / 'lib'}", "-lcudart_static", "-ldl", "-lrt"]
+    # The C++ library must be the one torch has loaded; it is named in full since some machines link only the static one
+    # by default.
+    libraries += ["-l:libstdc++.so.6"] if sys.platform == "linux" else []
+    shared = ["-dynamiclib", "-undefined", "dynamic_lookup"] if sys.platform == "darwin" else ["-shared"]
+    run([*cxx, *shared, *map(str, objects), *libraries, "-o", str(library)], objects[0].parent)
+
+
+def target_version(version: tuple[int, int]) -> str:
+    """The oldest torch that a library is to run with, as torch's stable headers take it."""
+    return f"0x{version[0]:02x}{version[1]:02x}000000000000"
 
 
 def is_per_isa(source: Path) -> bool:
@@ -179,23 +209,28 @@ def find_nvcc(torch_cuda: str | None) -> str | None:
     switch = os.environ.get("GS_CUDA", "")
     if switch not in ("", "0", "1"):
         fail(f"GS_CUDA must be 0 or 1, not {switch!r}")
-    if switch == "0":
+    if switch == "0" or not (switch or torch_cuda):
         return None
     home = os.environ.get("CUDA_HOME")
     nvcc = shutil.which("nvcc", path=str(Path(home) / "bin") if home else None)
-    if nvcc and torch_cuda:
-        release = re.search(r"release (\d+)\.", run([nvcc, "--version"]))
-        if release and release[1] != torch_cuda.split(".")[0]:
-            fail(
-                f"{nvcc} is of CUDA {release[1]} but torch was built with CUDA {torch_cuda}: "
-                "set CUDA_HOME to a toolkit of that version, or GS_CUDA=0 to build for the CPU only"
-            )
-        return nvcc
-    if switch == "1":
+    if switch and not nvcc:
         place = f"in CUDA_HOME ({home})" if home else "on PATH"
-        missing = "the torch that is installed has no CUDA" if nvcc else f"there is no nvcc {place}"
-        fail(f"GS_CUDA=1 but {missing}: install it, or unset GS_CUDA to build for the CPU only")
-    return None
+        fail(f"GS_CUDA=1 but there is no nvcc {place}: install it, or unset GS_CUDA to build for the CPU only")
+    if nvcc and not switch:
+        major = cuda_major(nvcc)
+        if major > int(torch_cuda.split(".")[0]):
+            fail(
+                f"{nvcc} is of CUDA {major} but torch was built with CUDA {torch_cuda}, whose driver may be too "
+                "old: set CUDA_HOME to a toolkit of that version, GS_CUDA=0 to build for the CPU only, or GS_CUDA=1 to "
+                "build all the same"
+            )
+    return nvcc
+
+
+def cuda_major(nvcc: str) -> int:
+    """The major version of the toolkit, 13 for one."""
+    release = re.search(r"release (\d+)\.", run([nvcc, "--version"]))
+    return int(release[1]) if release else fail(f"{nvcc} does not tell its version: set CUDA_HOME to a toolkit")
 
 
 def toolkit_root(nvcc: str) -> Path:
@@ -240,6 +275,6 @@ def run(command: list[str], folder: Path | None = None) -> str:
     return done.stdout
 
 
-def fail(message: str) -> None:
+def fail(message: str) -> NoReturn:
     """Ends the build with one line and no traceback."""
     raise SystemExit(f"error: {message}")

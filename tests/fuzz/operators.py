@@ -3,10 +3,10 @@
 from collections.abc import Iterator
 from typing import Any
 
-import fused_ssim  # noqa: F401  (registers its operators)
-import simple_knn._C  # noqa: F401
 import torch
+from fused_ssim.backend import OPERATORS as ssim
 from rasterizer_tools import few, ops, scene_arguments
+from simple_knn.backend import OPERATORS as knn
 from torch import Tensor
 
 from benchmarks.workloads.splat_scenes import settings
@@ -34,7 +34,6 @@ def sound_calls() -> dict[str, Call]:
     sparse = [*(torch.rand(3, 3) for _ in range(4)), torch.tensor([True, False, True]), 0.1, 0.9, 0.99, 1e-8, -1]
     statistics = [torch.rand(3), torch.rand(3, 1), torch.rand(3, 1), torch.ones(3, dtype=torch.int32)]
     one, two = torch.rand(3, 20, 20), torch.rand(3, 20, 20)
-    ssim = torch.ops.fused_ssim
     kept = ssim.l1_ssim(one, two, False, True)[2]
     return {
         "project": (ops.project, scene),
@@ -84,7 +83,7 @@ def sound_calls() -> dict[str, Call]:
             [one, two, kept, 0.2, torch.ones(()), 0, one.shape[-2]],
         ),
         "composite": (ssim.composite, [torch.zeros(4, 5, 6, dtype=torch.uint8), torch.ones(3)]),
-        "mean_distance2": (torch.ops.simple_knn.mean_distance2, [torch.rand(9, 3)]),
+        "mean_distance2": (knn.mean_distance2, [torch.rand(9, 3)]),
     }
 
 

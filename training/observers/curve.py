@@ -65,8 +65,6 @@ class Curve(Observer):
         run = self._run
         there = saved_iterations(Path(run.scene.model_path) / "point_cloud")
         saved, lr_max_steps = {*run.pace.known(run.plan.save)} & {*there}, run.opt.position_lr_max_steps
-        follows_length = schedules_follow_length(
-            bool(run.dataset.depths), run.dataset.train_test_exp, run.opt.resolution_schedule
-        )
+        follows_length = schedules_follow_length(bool(run.dataset.depths), run.dataset.train_test_exp, run.pace.sizes)
         steady = not isinstance(run.pace, Paced)
         self._recorder.finish(self._seconds, saved, lr_max_steps if steady else None, follows_length)

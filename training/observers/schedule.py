@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+from arguments import add_to_model_json
 from training.observer import Error, Observer
 from training.pacing.pace import Paced
 from training.pacing.schedule_file import NAME, write_schedule
@@ -11,9 +12,12 @@ from utils.host.process import wall_seconds
 
 
 def save_schedule(run: Run, step: Step) -> None:
-    """Write what the pace has decided up to an iteration, if it decides anything."""
+    """Write what the pace has decided up to an iteration, if it decides anything; the sizes of views to model.json."""
     if isinstance(run.pace, Paced):
-        write_schedule(Path(run.scene.model_path) / NAME, run.pace.recorded(step.iteration, step.last))
+        folder = run.scene.model_path
+        write_schedule(Path(folder) / NAME, run.pace.recorded(step.iteration, step.last))
+        if run.opt.time_budget:
+            add_to_model_json(folder, resolution_schedule=run.pace.sizes)
 
 
 class ScheduleFile(Observer):

@@ -9,8 +9,8 @@ from scene.cameras import Camera
 from scene.pictures.store import ImageStore
 from training.pacing.batched import Batched
 from training.pacing.clocked import Clocked
-from training.pacing.pace import Block, Pace, Paced, Schedule
-from training.pacing.resolution import PYRAMID, Levels, Resolution
+from training.pacing.pace import PYRAMID, Block, Levels, Pace, Paced, Schedule
+from training.pacing.resolution import Resolution
 from training.pacing.schedule_file import NAME, covers, read_schedule
 from training.pacing.spectrum import levels_of
 from utils.system_utils import UserError
@@ -71,7 +71,7 @@ def _recorded(path: Path, opt: argparse.Namespace) -> Schedule:
     if opt.time_budget:
         raise UserError("--time_budget and --schedule both give the pace of a run; leave one out")
     found = _read(path, opt)
-    if opt.resolution_schedule not in ("none", found.resolution_schedule):
+    if opt.resolution_schedule not in ("auto", found.resolution_schedule):
         raise UserError(
             f"{path} is of a run with --resolution_schedule {found.resolution_schedule}; leave that option out, as "
             "--schedule takes it from there"
@@ -102,7 +102,7 @@ def _before(path: Path, checkpoint: str, opt: argparse.Namespace, first_iteratio
         raise UserError(
             f"{path} ends before iteration {first_iteration} of {checkpoint}, so it is of another run; {remedy}"
         )
-    if found.resolution_schedule != opt.resolution_schedule:
+    if opt.resolution_schedule not in ("auto", found.resolution_schedule):
         raise UserError(
             f"{checkpoint} is of a run with --resolution_schedule {found.resolution_schedule}; resume it with that"
         )
@@ -113,14 +113,14 @@ def _before(path: Path, checkpoint: str, opt: argparse.Namespace, first_iteratio
 
 def resolution_of(opt: argparse.Namespace, pace: Pace, cameras: Sequence[Camera], images: ImageStore) -> Resolution:
     """The sizes of the training views `cameras` by the options, or by the schedule that a run repeats or resumes."""
-    if isinstance(pace, Paced):
-        if pace.schedule.levels is None:
-            pace.schedule = pace.schedule._replace(levels=_levels(opt, cameras))
-        return Resolution(pace.schedule.levels, pace.length, images)
-    return Resolution(_levels(opt, cameras), pace.length, images)
+    if not isinstance(pace, Paced):
+        pace.sizes = "none" if opt.resolution_schedule == "auto" else opt.resolution_schedule
+    if not pace.levels:
+        pace.levels = _levels(pace.sizes, cameras)
+    return Resolution(pace, images)
 
 
-def _levels(opt: argparse.Namespace, cameras: Sequence[Camera]) -> Levels:
-    if opt.resolution_schedule == "spectrum":
+def _levels(sizes: str, cameras: Sequence[Camera]) -> Levels:
+    if sizes == "spectrum":
         return levels_of(cameras)
-    return PYRAMID if opt.resolution_schedule == "pyramid" else ()
+    return PYRAMID if sizes == "pyramid" else ()

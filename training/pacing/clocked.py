@@ -4,11 +4,13 @@ import sys
 
 from tqdm import tqdm
 
-from training.pacing.pace import Block, Paced, Schedule
+from training.pacing.pace import PYRAMID, Block, Paced, Schedule
 from utils.ranks.ranks import ranks
 
 PART = 1 / 200  # of the budget that a block takes, so that what is left is known well before the end
 _MOST_GROWTH = 2  # of a block over the one before, while the first iterations are slower than the others
+_KNOWN = 1 / 50  # of the budget, after which the speed says how many iterations there may be
+SHORT = 6.0  # iterations of the schedule for each one, from which on smaller views at first gain more than they lose
 _LAST = 1.5  # blocks; if no more are left, they are one
 
 
@@ -23,6 +25,9 @@ class Clocked(Paced):
 
     def __init__(self, schedule: Schedule) -> None:
         super().__init__(schedule)
+        self._open = self.sizes == "auto"
+        if self._open:
+            self.sizes = "none"
         self._budget = schedule.time_budget
         self._speed: float | None = None  # seconds of an iteration
         self._measured = 0  # blocks of this run
@@ -32,6 +37,8 @@ class Clocked(Paced):
         if not self.blocks or iteration > self.blocks[-1].last:
             seconds = ranks().shared(seconds)
             self._measure(seconds)
+            if self._open and self._measured > 2 and seconds > _KNOWN * self._budget:
+                self._choose_sizes(iteration - 1, seconds)
             self._decide(seconds)
 
     def recorded(self, iteration: int, last: bool) -> Schedule:
@@ -46,6 +53,15 @@ class Clocked(Paced):
         self._measured += 1
         # The first iteration loads kernels and photos, so it is no measure of the others.
         self._speed = speed if self._measured <= 2 else (self._speed + speed) / 2
+
+    def _choose_sizes(self, done: int, seconds: float) -> None:
+        """Take smaller views if few iterations are possible: from the next one on, and all of that is recorded."""
+        self._open = False
+        now = (self.nominal(done) + 0.5) / self.length
+        possible = done + max(self._budget - seconds, 0.0) / self._speed
+        short = self.length / possible >= SHORT and now < PYRAMID[1][0]
+        self.sizes = "pyramid" if short else "none"
+        self.levels = ((now, PYRAMID[0][1]), *PYRAMID[1:]) if short else ()
 
     def _decide(self, seconds: float) -> None:
         """Add the block that comes next."""

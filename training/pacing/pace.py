@@ -11,6 +11,9 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 MOST_RATE = 5.0  # what 1,000 steps for 30,000 were best with, about
+Levels = Sequence[tuple[float, float]]  # part of the schedule that is done (0 to 1), and factor of sizes from then on
+
+PYRAMID: Levels = ((0.0, 4.0), (0.1, 2.0), (0.25, 1.0))
 _ROUNDING = 1e-6  # iterations of the schedule; progress is a float, and just below a whole number counts as that
 
 
@@ -18,10 +21,12 @@ class Pace:
     """The steady pace: each iteration stands for itself.
 
     length: of the schedule, in iterations. ends: the last iteration of the run, None: not known yet. views: of each
-    iteration.
+    iteration. sizes: the schedule of the views' sizes that is in force (--resolution_schedule); levels: of that.
     """
 
     views = 1
+    sizes = "none"
+    levels: Levels = ()
 
     def __init__(self, length: int) -> None:
         self.length = length
@@ -82,7 +87,7 @@ class Schedule(NamedTuple):
     ended: int | None  # the last iteration, None if the run has not ended
     time_budget: float  # seconds
     resolution_schedule: str = "none"
-    levels: Sequence[tuple[float, float]] | None = None  # training/pacing/resolution.py; None: not decided yet
+    levels: Levels = ()
 
 
 class Paced(Pace):
@@ -93,6 +98,7 @@ class Paced(Pace):
         self.schedule = schedule
         self.blocks = list(schedule.blocks)
         self.ends = schedule.ended
+        self.sizes, self.levels = schedule.resolution_schedule, schedule.levels
 
     def progress(self, iteration: int) -> float:
         """Part of the schedule that is done after an iteration, 0 to 1."""
@@ -128,7 +134,7 @@ class Paced(Pace):
         """The schedule of a run that went no further than an iteration."""
         index, block = self._block(iteration)
         blocks = [*self.blocks[:index], block._replace(last=iteration)]
-        return self.schedule._replace(blocks=blocks, ended=None)
+        return self.schedule._replace(blocks=blocks, ended=None, resolution_schedule=self.sizes, levels=self.levels)
 
     def _block(self, iteration: int) -> tuple[int, Block]:
         index = bisect_left(self.blocks, iteration, key=lambda block: block.last)

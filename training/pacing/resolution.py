@@ -1,17 +1,14 @@
 """Coarse to fine: views that are smaller at first, by how far the schedule is (--resolution_schedule)."""
 
 from bisect import bisect_right
-from collections.abc import Sequence
 
 import torch
 
 from scene.cameras import Camera
 from scene.pictures.store import GPU_SHARE, ImageStore
+from training.pacing.pace import Pace
 from utils.host.memory import free_memory
 
-Levels = Sequence[tuple[float, float]]  # part of the schedule that is done (0 to 1), and factor from then on
-
-PYRAMID: Levels = ((0.0, 4.0), (0.1, 2.0), (0.25, 1.0))
 LEAST = 32  # pixels of the shorter side; a picture is not made smaller than that
 
 
@@ -24,19 +21,18 @@ class Resolution:
     size. factor: of the last view.
     """
 
-    def __init__(self, levels: Levels, length: int, images: ImageStore) -> None:
-        """length: of the schedule, in iterations."""
+    def __init__(self, pace: Pace, images: ImageStore) -> None:
         self.factor = 1.0
-        self._starts = [part * length for part, _ in levels]
-        self._factors = [factor for _, factor in levels]
+        self._pace = pace
         self._images = images
         self._made: dict[Camera, Camera] = {}
         self._keeps = True
 
     def factor_at(self, nominal: int) -> float:
         """The factor at an iteration of the schedule."""
-        index = bisect_right(self._starts, nominal) - 1
-        return self._factors[index] if index >= 0 else 1.0
+        levels, length = self._pace.levels, self._pace.length
+        index = bisect_right(levels, nominal, key=lambda level: level[0] * length) - 1
+        return levels[index][1] if index >= 0 else 1.0
 
     def changes(self, before: int, now: int) -> bool:
         """Whether the factor differs between two iterations of the schedule."""

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from scene.cameras import Camera
-from training.pacing.resolution import Levels
+from training.pacing.pace import Levels
 
 FACTORS = (4.0, 3.0, 2.0, 1.5, 1.0)  # few, because a CUDA graph is recorded for each size
 UNTIL = 0.5  # part of the schedule by which views have their full size at the latest

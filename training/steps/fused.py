@@ -3,6 +3,7 @@
 import torch
 from torch import Tensor
 
+from gaussian_renderer.over_ranks.bands import KnownBands
 from gaussian_renderer.view_step import Drawn, draw, step
 from scene.fused_adam import FusedAdam
 from scene.gaussians.exposure import apply_exposure
@@ -24,6 +25,7 @@ class FusedStep:
         self._run = run
         self.plain = PlainStep(run)
         self._adam = FusedAdam(run.gaussians, run.density.penalty)
+        self._bands = KnownBands()
         self._further_terms = False
 
     @staticmethod
@@ -68,7 +70,8 @@ class FusedStep:
         run = self._run
         exposed = run.dataset.train_test_exp
         by_bands = ranks().several and not exposed and run.objective.takes_bands(step)
-        drawn = draw(step.camera, run.gaussians, run.pipe, step.background, step.depth_weight > 0, by_bands)
+        want_depth = step.depth_weight > 0
+        drawn = draw(step.camera, run.gaussians, run.pipe, step.background, want_depth, by_bands, self._bands)
         with torch.enable_grad():
             image, depth = drawn.image.requires_grad_(), drawn.depth
             if depth is not None:

@@ -27,7 +27,8 @@ class ViewsStep(PlainStep):
         package = self._render(step)
         losses = run.objective(package, step)
         losses.total.backward()
-        run.gaussians.exposures.add_gradients(here)
+        if run.dataset.train_test_exp:
+            run.gaussians.exposures.add_gradients(here)
         if any(run.density.penalty):
             run.gaussians.penalise(run.density.penalty.times(here.size))
         return package, _mean(losses)

@@ -18,6 +18,7 @@ from scene.gaussians import density_rules as rules
 from scene.gaussians.budgeted import count_after, fade, remove_useless, split_in_two
 from training.density import DensityControl
 from training.error_scores import ErrorScores
+from training.pacing.pace import Paced
 from training.step import Step
 from utils.exact.counter_rng import Stream, permutation
 from utils.exact.portable_math import exp, log
@@ -28,8 +29,9 @@ from utils.system_utils import UserError
 if TYPE_CHECKING:
     from training.run import Run
 
-PIXELS = 20  # training pixels of all views for each Gaussian of the default budget
+PIXELS = 64  # training pixels of all views for each Gaussian of the default budget
 FEWEST, MOST = 100_000, 1_000_000  # Gaussians of the default budget
+AN_ITERATION = 25  # Gaussians of the default budget for each iteration, at most, where the clock sets their number
 _SMALLEST = 1e-300
 
 
@@ -47,6 +49,7 @@ class BudgetControl(DensityControl):
         self.ends = run.opt.densify_until_iter
         self._scores = ErrorScores(run.gaussians, run.pipe, run.dataset.train_test_exp, run.opt)
         self.most_gaussians = run.opt.max_num_splats or default_budget(self._cameras)
+        self._follows_clock = not run.opt.max_num_splats and isinstance(run.pace, Paced)
 
     def changes(self, iteration: int) -> bool:
         in_time = self.pace.nominal(iteration) < self._opt.densify_until_iter
@@ -59,7 +62,7 @@ class BudgetControl(DensityControl):
         grows = self._grows(step.iteration)
         aim = now = self._gaussians.total
         if grows:
-            aim = count_after(now, self.most_gaussians, self._remaining(step.iteration), self._opt.growth_power)
+            aim = self._aim(now, step.iteration)
         remove_useless(self._gaussians, self._opt.prune_opacity, max(aim, 1))
         self._check_rest(step.iteration)
         if grows:
@@ -70,9 +73,15 @@ class BudgetControl(DensityControl):
     def most_after(self, count: int, first: int, last: int) -> int:
         for iteration in filter(self.changes, range(first, last)):  # the last iteration takes no step
             if self._grows(iteration):
-                aim = count_after(count, self.most_gaussians, self._remaining(iteration), self._opt.growth_power)
-                count = min(aim, 2 * count)
+                count = min(self._aim(count, iteration), 2 * count)
         return count
+
+    def _aim(self, now: int, iteration: int) -> int:
+        """How many Gaussians there are to be after the densification of an iteration, `now` before it."""
+        most, stride = self.most_gaussians, self.pace.stride(iteration)
+        if self._follows_clock and stride > 1:
+            most = min(most, max(int(AN_ITERATION * self.pace.length / stride), 1))
+        return count_after(now, most, self._remaining(iteration), self._opt.growth_power)
 
     def _grows(self, iteration: int) -> bool:
         return self.pace.nominal(iteration) > self._opt.densify_from_iter

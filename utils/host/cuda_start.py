@@ -24,11 +24,11 @@ def begin() -> threading.Thread | None:
 
 
 def _computes_on_a_gpu() -> bool:
-    """Whether the rasterizer was built with CUDA kernels: its library then names CUDA's part of torch."""
+    """Whether the rasterizer was built with CUDA kernels: its library then asks torch for a stream."""
     found = importlib.util.find_spec("diff_gaussian_rasterization")
     library = found and found.origin and Path(found.origin).with_name("_backend.so")
     try:
-        return bool(library) and b"libc10_cuda" in library.read_bytes()
+        return bool(library) and b"aoti_torch_get_current_cuda_stream" in library.read_bytes()
     except OSError:
         return False
 

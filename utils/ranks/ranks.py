@@ -26,6 +26,7 @@ class Ranks:
     rank = 0
     size = 1
     prompt = False  # whether the others may expect this rank at the next collective call within seconds
+    flag: Tensor | None = None  # (1,) int64, which each `agree` raises to the largest of all ranks
 
     @property
     def several(self) -> bool:
@@ -57,23 +58,38 @@ class Ranks:
         """All ranks' values, in the order of ranks; any objects that pickle."""
         return [value]
 
-    def largest_(self, numbers: Tensor) -> None:
-        """Replace each number of a tensor by the largest that a rank has there, without waiting for a GPU."""
+    def agree(self, numbers: Tensor) -> list[list[int]]:
+        """The whole numbers (n,) int64 of each rank, by rank; the host waits for them.
+
+        `flag` and what was posted go with them, so that these need no exchange of their own.
+        """
+        return [numbers.tolist()]
+
+    def post(self, *news: int) -> None:
+        """Leave two whole numbers, 0 or more, that go with the next `agree`."""
+        self._news = news
+
+    def heard(self) -> Sequence[int]:
+        """The largest of all ranks of each of the numbers that were posted last."""
+        return self._news
 
     def table(self, values: Tensor) -> Tensor:
         """All ranks' values (...), which have one shape and dtype: (size, ...) on their device."""
         return values[None]
 
     def added(self, values: Tensor) -> Tensor:
-        """The sum over all ranks, in no certain order: for whole numbers, or where all but one rank have 0."""
+        """The sum over all ranks, in no certain order: for whole numbers, or where all but one rank have 0.
+
+        It may take the place of the values.
+        """
         return values
 
     def send(self, rows: Tensor, sizes: Sequence[int], counts: Sequence[int] | None = None) -> tuple[Tensor, list[int]]:
         """Send the first sizes[0] of the rows (n, ...) to rank 0, the next to rank 1, and so on.
 
         counts: how many rows each rank sends here, if this is known; else the ranks tell each other, which a GPU waits
-        for. Rows have one dtype and the same trailing shape on every rank. Returns the rows for this rank, in the order
-        of ranks, and how many each has sent.
+        for. Rows have one dtype, not of 16 bits, and the same trailing shape on every rank. Returns the rows for this
+        rank, in the order of ranks, and how many each has sent.
         """
         return rows, list(sizes)
 

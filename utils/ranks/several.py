@@ -1,13 +1,16 @@
 """Several processes that train together, by torch.distributed: gloo on CPUs, NCCL on GPUs."""
 
 from collections.abc import Sequence
-from math import prod
 
 import torch
 import torch.distributed as dist
 from torch import Tensor
 
 from utils.ranks.ranks import Ranks, Value
+
+# Into one tensor. The older name warns where there is a newer one.
+ALL_GATHER = "all_gather_single" if hasattr(dist, "all_gather_single") else "all_gather_into_tensor"
+_NEWS = 2  # numbers that are posted
 
 
 class SeveralRanks(Ranks):
@@ -24,6 +27,8 @@ class SeveralRanks(Ranks):
         self.by_gpu = dist.get_backend() == "nccl"
         self._place = "cuda" if self.by_gpu else "cpu"  # of what the default group sends
         self._numbers = dist.new_group(backend="gloo") if self.by_gpu else dist.group.WORLD
+        self._silence = torch.zeros(_NEWS, dtype=torch.int64, device=self._place)
+        self._news, self._heard = [0] * _NEWS, [0] * _NEWS
 
     def numbers(self, *values: int) -> Tensor:
         mine = torch.tensor(values, dtype=torch.int64)
@@ -51,30 +56,45 @@ class SeveralRanks(Ranks):
         dist.all_gather_object(box, value, group=self._numbers)
         return box
 
-    def largest_(self, numbers: Tensor) -> None:
-        dist.all_reduce(numbers, dist.ReduceOp.MAX, group=None if numbers.is_cuda else self._numbers)
+    def agree(self, numbers: Tensor) -> list[list[int]]:
+        news = torch.tensor(self._news, device=self._place) if any(self._news) else self._silence
+        flag = self._silence[:1] if self.flag is None else self.flag.to(self._place)
+        found = self._table(torch.cat((numbers.to(self._place), flag, news))).tolist()
+        first = len(numbers)
+        flags = [row[first] for row in found]
+        if flags[self.rank] < max(flags):
+            self.flag.fill_(max(flags))
+        self._heard = [max(each) for each in zip(*(row[first + 1 :] for row in found), strict=True)]
+        return [row[:first] for row in found]
+
+    def post(self, *news: int) -> None:
+        self._news, self._heard = news, None
+
+    def heard(self) -> Sequence[int]:
+        if self._heard is None:
+            self.agree(self._silence[:0])
+        return self._heard
 
     def table(self, values: Tensor) -> Tensor:
-        mine = values.detach().contiguous().to(self._place)
-        every = mine.new_empty(self.size, *mine.shape)
-        dist.all_gather(list(every.unbind()), mine)
-        return every.to(values.device)
+        return self._table(values.detach().contiguous().to(self._place)).to(values.device)
+
+    def _table(self, mine: Tensor) -> Tensor:
+        every = mine.new_empty(self.size * mine.numel())
+        getattr(dist, ALL_GATHER)(every, mine.view(-1))
+        return every.view(self.size, *mine.shape)
 
     def added(self, values: Tensor) -> Tensor:
-        total = values.detach().to(self._place, copy=True)
+        total = values.detach().to(self._place)
         dist.all_reduce(total)
         return total.to(values.device)
 
     def send(self, rows: Tensor, sizes: Sequence[int], counts: Sequence[int] | None = None) -> tuple[Tensor, list[int]]:
         counts = self._counts(sizes) if counts is None else list(counts)
-        shape, dtype, total = rows.shape[1:], rows.dtype, sum(counts)
-        width = prod(shape) * dtype.itemsize  # bytes of a row
-        if not width:
-            return rows.new_empty(total, *shape), counts
-        sent = rows.detach().contiguous().view(-1).view(torch.uint8).to(self._place)
-        received = sent.new_empty(width * total)
-        dist.all_to_all_single(received, sent, [width * n for n in counts], [width * n for n in sizes])
-        return received.to(rows.device).view(dtype).view(total, *shape), counts
+        sent = rows.detach().to(self._place).contiguous()
+        received = sent.new_empty(sum(counts), *rows.shape[1:])
+        if all(rows.shape[1:]):
+            dist.all_to_all_single(received, sent, counts, list(sizes))
+        return received.to(rows.device), counts
 
     def _counts(self, sizes: Sequence[int]) -> list[int]:
         """How many rows each rank sends here, where this one sends `sizes`."""

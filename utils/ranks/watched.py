@@ -100,7 +100,7 @@ class WatchedRanks(SeveralRanks):
 
     def _note_queued(self) -> None:
         if self.by_gpu:
-            event = torch.cuda.Event()
+            event = self._queued[0] if self._queued else torch.cuda.Event()
             event.record()
             self._queued = event, self._called
 
@@ -137,8 +137,8 @@ class WatchedRanks(SeveralRanks):
         return super().everyone(value)
 
     @_watched
-    def largest_(self, numbers: Tensor) -> None:
-        super().largest_(numbers)
+    def agree(self, numbers: Tensor) -> list[list[int]]:
+        return super().agree(numbers)
 
     @_watched
     def table(self, values: Tensor) -> Tensor:

@@ -5,6 +5,8 @@ from pathlib import Path
 _BUILD = "run `pip install ./submodules/diff-gaussian-rasterization` in the repository"
 try:
     import torch
+
+    from diff_gaussian_rasterization.operators import operators
 except ModuleNotFoundError as error:
     if error.name != "torch":
         raise
@@ -17,7 +19,7 @@ except OSError as error:
     what = f"does not fit torch {torch.__version__}" if _LIBRARY.exists() else "is not built"
     raise ImportError(f"diff_gaussian_rasterization {what}: {_BUILD}") from error
 
-OPERATORS = torch.ops.diff_gaussian_rasterization
+OPERATORS = operators("diff_gaussian_rasterization")
 
 
 def has_cuda_kernels() -> bool:

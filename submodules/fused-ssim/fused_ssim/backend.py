@@ -5,6 +5,8 @@ from pathlib import Path
 _BUILD = "run `pip install ./submodules/fused-ssim` in the repository"
 try:
     import torch
+
+    from fused_ssim.operators import operators
 except ModuleNotFoundError as error:
     if error.name != "torch":
         raise
@@ -17,4 +19,4 @@ except OSError as error:
     what = f"does not fit torch {torch.__version__}" if _LIBRARY.exists() else "is not built"
     raise ImportError(f"fused_ssim {what}: {_BUILD}") from error
 
-OPERATORS = torch.ops.fused_ssim
+OPERATORS = operators("fused_ssim")

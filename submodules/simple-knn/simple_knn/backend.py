@@ -5,6 +5,8 @@ from pathlib import Path
 _BUILD = "run `pip install ./submodules/simple-knn` in the repository"
 try:
     import torch
+
+    from simple_knn.operators import operators
 except ModuleNotFoundError as error:
     if error.name != "torch":
         raise
@@ -17,4 +19,4 @@ except OSError as error:
     what = f"does not fit torch {torch.__version__}" if _LIBRARY.exists() else "is not built"
     raise ImportError(f"simple_knn {what}: {_BUILD}") from error
 
-OPERATORS = torch.ops.simple_knn
+OPERATORS = operators("simple_knn")

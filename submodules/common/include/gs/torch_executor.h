@@ -1,14 +1,27 @@
 #pragma once
 // An Executor over torch's intra-op pool, which torch.set_num_threads sizes. For csrc/torch alone.
-#include <ATen/Parallel.h>
+#include <torch/csrc/stable/ops.h>
+
+#include <atomic>
+#include <exception>
 
 #include "gs/parallel.h"
 
 namespace gs {
 
 inline Executor torch_executor() {
-  return {at::get_num_threads(), [](int64_t n, int64_t grain, const std::function<void(int64_t, int64_t)>& body) {
-            at::parallel_for(0, n, grain, body);
+  return {int(torch::stable::get_num_threads()),
+          [](int64_t n, int64_t grain, const std::function<void(int64_t, int64_t)>& body) {
+            std::exception_ptr error;  // the interface would drop its type
+            std::atomic_flag thrown = ATOMIC_FLAG_INIT;
+            torch::stable::parallel_for(0, n, grain, [&](int64_t begin, int64_t end) {
+              try {
+                body(begin, end);
+              } catch (...) {
+                if (!thrown.test_and_set()) error = std::current_exception();
+              }
+            });
+            if (error) std::rethrow_exception(error);
           }};
 }
 

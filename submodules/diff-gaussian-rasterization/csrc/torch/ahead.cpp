@@ -11,37 +11,41 @@ namespace {
 
 thread_local std::optional<gs::Ahead> current;
 
+// Whether a tensor is in page-locked memory.
+bool page_locked(const Tensor& t) {
+  using torch::stable::detail::from;
+  StableIValue stack[] = {from(t), from(std::nullopt)};
+  TORCH_ERROR_CODE_CHECK(torch_call_dispatcher("aten::is_pinned", "", stack, TORCH_ABI_VERSION));
+  return torch::stable::detail::to<bool>(stack[0]);
+}
+
 // words: halted, then what the last step needed (gs::Room), then the number of steps that were done. reports: of
 // gs::Ahead. room: gs::Room.
-void run_ahead_op(const MaybeTensor& words, at::IntArrayRef room, const MaybeTensor& reports) {
+void run_ahead_op(const MaybeTensor& words, Sizes room, const MaybeTensor& reports) {
   current.reset();
   if (!words) return;
-  TORCH_CHECK_VALUE(words->is_cuda(), "words must be on a GPU, got ", words->device());
-  check_tensor(*words, "words", at::kLong, words->device(), {5});
-  TORCH_CHECK_VALUE(room.size() == 3, "room must be of instances, slots and rows, got ", room.size(), " numbers");
+  GS_CHECK_VALUE(words->is_cuda(), "words must be on a GPU, got ", words->device());
+  check_tensor(*words, "words", ScalarType::Long, words->device(), {5});
+  GS_CHECK_VALUE(room.size() == 3, "room must be of instances, slots and rows, got ", room.size(), " numbers");
   const int64_t most = std::numeric_limits<int32_t>::max();
-  TORCH_CHECK_VALUE(room[0] >= 0 && room[0] <= most && room[1] >= 0 && room[2] >= 0 && room[2] <= most,
-                    "room must be from 0 to 2^31 - 1, got ", in_words(room));
+  GS_CHECK_VALUE(room[0] >= 0 && room[0] <= most && room[1] >= 0 && room[2] >= 0 && room[2] <= most,
+                 "room must be from 0 to 2^31 - 1, got ", room);
   const int64_t count = reports && reports->dim() == 2 ? reports->size(0) : 0;
-  if (reports) check_tensor(*reports, "reports", at::kLong, at::kCPU, {count, 5});
-  TORCH_CHECK_VALUE(!reports || (0 < count && count <= most), "reports need a row");
-  TORCH_CHECK_VALUE(words->is_contiguous() && (!reports || (reports->is_contiguous() && reports->is_pinned())),
-                    "words and reports must be contiguous, and the reports in page-locked memory");
-  int64_t* first = words->mutable_data_ptr<int64_t>();
-  current = gs::Ahead{reinterpret_cast<int32_t*>(first),
-                      reinterpret_cast<gs::Room*>(first + 1),
-                      first + 4,
-                      {room[0], room[1], room[2]},
-                      reports ? reports->mutable_data_ptr<int64_t>() : nullptr,
-                      int(count)};
+  if (reports) check_tensor(*reports, "reports", ScalarType::Long, DeviceType::CPU, {count, 5});
+  GS_CHECK_VALUE(!reports || (0 < count && count <= most), "reports need a row");
+  GS_CHECK_VALUE(words->is_contiguous() && (!reports || (reports->is_contiguous() && page_locked(*reports))),
+                 "words and reports must be contiguous, and the reports in page-locked memory");
+  int64_t* first = write<int64_t>(*words);
+  current = gs::Ahead{reinterpret_cast<int32_t*>(first), reinterpret_cast<gs::Room*>(first + 1),       first + 4,
+                      {room[0], room[1], room[2]},       reports ? write<int64_t>(*reports) : nullptr, int(count)};
 }
 
 }  // namespace
 
 const gs::Ahead* ahead() { return current ? &*current : nullptr; }
 
-TORCH_LIBRARY_FRAGMENT(diff_gaussian_rasterization, m) {
-  m.def("run_ahead_(Tensor(a!)? words, int[] room, Tensor(b!)? reports) -> ()", &run_ahead_op);
+GS_OPERATORS(diff_gaussian_rasterization, m) {
+  m.define_for_all("run_ahead_(Tensor(a!)? words, int[] room, Tensor(b!)? reports) -> ()", TORCH_BOX(&run_ahead_op));
 }
 
 }  // namespace gs::ops

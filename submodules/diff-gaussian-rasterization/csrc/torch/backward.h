@@ -20,7 +20,7 @@ namespace gs::ops {
 // CPU, as reading one from a GPU waits for it. Other indices are the caller's concern.
 void check_splats(const Tensor& splats);
 void check_lists(const Tensor& instances, const Tensor& ranges, const Tensor& splats, gs::Image image);
-void check_counts(const Tensor& tile_counts, int64_t count, at::Device device);
+void check_counts(const Tensor& tile_counts, int64_t count, Device device);
 // The size of the image whose `last` this is.
 gs::Image image_of(const Tensor& last, const Tensor& splats);
 Tensor background_like(const Tensor& background, const Tensor& splats);
@@ -28,12 +28,8 @@ Tensor background_like(const Tensor& background, const Tensor& splats);
 template <class T>
 gs::BlendInput<T> blend_input(const Tensor& splats, const Tensor& instances, const Tensor& ranges,
                               const Tensor& background, gs::Image image) {
-  return {splats.const_data_ptr<T>(),
-          instances.const_data_ptr<int32_t>(),
-          ranges.const_data_ptr<int64_t>(),
-          background.const_data_ptr<T>(),
-          image,
-          instances.size(0)};
+  return {read<T>(splats), read<int32_t>(instances), read<int64_t>(ranges), read<T>(background),
+          image,           instances.size(0)};
 }
 
 // Owns the tensors that the gs::BlendInput and gs::BlendGradient of a backward point into.
@@ -43,14 +39,14 @@ class BlendBackward {
                 const Tensor& slots, const Tensor& background, const Tensor& last, const Tensor& transmittance,
                 const Tensor& grad_color, const MaybeTensor& grad_transmittance, const MaybeTensor& grad_inverse_depth)
       : image_(checked(splats, instances, ranges, splat_slots, slots, last, transmittance, grad_color)),
-        splats_(splats.contiguous()),
-        instances_(instances.contiguous()),
-        ranges_(ranges.contiguous()),
-        splat_slots_(splat_slots.contiguous()),
+        splats_(packed(splats)),
+        instances_(packed(instances)),
+        ranges_(packed(ranges)),
+        splat_slots_(packed(splat_slots)),
         slot_count_(slots.size(0)),
         background_(background_like(background, splats)),
-        last_(last.contiguous()),
-        transmittance_(transmittance.contiguous()),
+        last_(packed(last)),
+        transmittance_(packed(transmittance)),
         color_(plane(grad_color, 3)),
         alpha_(plane(grad_transmittance, 1)),
         depth_(plane(grad_inverse_depth, 1)) {}
@@ -71,15 +67,15 @@ class BlendBackward {
             instances_.size(0),
             slot_count_,
             static_cast<const gs::SplatSlots*>(splat_slots_.const_data_ptr()),
-            transmittance_.const_data_ptr<T>(),
-            last_.const_data_ptr<int32_t>(),
-            color_.const_data_ptr<T>(),
-            depth_.defined() ? depth_.const_data_ptr<T>() : nullptr,
-            alpha_.defined() ? alpha_.const_data_ptr<T>() : nullptr,
+            read<T>(transmittance_),
+            read<int32_t>(last_),
+            read<T>(color_),
+            depth_.defined() ? read<T>(depth_) : nullptr,
+            alpha_.defined() ? read<T>(alpha_) : nullptr,
             moments,
-            layers_.defined() && layers_.numel() ? layers_.const_data_ptr<T>() : nullptr,
+            layers_.defined() && layers_.numel() ? read<T>(layers_) : nullptr,
             ahead(),
-            absolute.defined() ? absolute.mutable_data_ptr<T>() : nullptr};
+            absolute.defined() ? write<T>(absolute) : nullptr};
   }
 
  private:

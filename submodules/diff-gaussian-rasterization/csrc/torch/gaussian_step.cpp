@@ -10,32 +10,31 @@ namespace gs::ops {
 namespace {
 
 // Checks the attributes that step, their counters, and the lengths of the lists with an entry for each.
-void check_steps(at::IntArrayRef attributes, at::TensorList steps, std::initializer_list<size_t> lengths) {
+void check_steps(Sizes attributes, List<Tensor> steps, std::initializer_list<size_t> lengths) {
   const size_t n = attributes.size();
-  TORCH_CHECK(steps.size() == n, "every list must have an entry for each of the ", n, " attributes, got ",
-              steps.size());
+  GS_CHECK(steps.size() == n, "every list must have an entry for each of the ", n, " attributes, got ", steps.size());
   for (size_t length : lengths)
-    TORCH_CHECK(length == n, "every list must have an entry for each of the ", n, " attributes, got ", length);
+    GS_CHECK(length == n, "every list must have an entry for each of the ", n, " attributes, got ", length);
   std::array<bool, gs::kStepped> named{};
   for (int64_t a : attributes) {
-    TORCH_CHECK(a >= 0 && a < gs::kStepped && !named[a], "attributes must be different numbers from 0 to ",
-                gs::kStepped - 1, ", got ", attributes);
+    GS_CHECK(a >= 0 && a < gs::kStepped && !named[a], "attributes must be different numbers from 0 to ",
+             gs::kStepped - 1, ", got ", attributes);
     named[a] = true;
   }
   for (const Tensor& step : steps) check_counter(step);
 }
 
 // Advances the counters of steps.
-void advance(at::TensorList steps) {
-  for (const Tensor& step : steps) *step.mutable_data_ptr<float>() += 1;
+void advance(List<Tensor> steps) {
+  for (const Tensor& step : steps) *write<float>(step) += 1;
 }
 
 // Adam's lists, with an entry for each attribute that `attributes` names by its place in gs::Stepped.
 struct StepLists {
-  at::IntArrayRef attributes;
-  at::TensorList exp_avg, exp_avg_sq, steps;
-  at::ArrayRef<double> rates;
-  at::IntArrayRef columns;
+  Sizes attributes;
+  List<Tensor> exp_avg, exp_avg_sq, steps;
+  List<double> rates;
+  Sizes columns;
   double beta1, beta2, eps;
 
   void check() const {
@@ -54,7 +53,7 @@ gs::GaussianStep<T> gaussian_step(const Values& values, const StepLists& lists, 
     check_moments(value, value, lists.exp_avg[k], lists.exp_avg_sq[k]);
     gs::AdamInput<T> in = adam_input<T>(value, value, lists.exp_avg[k], lists.exp_avg_sq[k], lists.columns[k]);
     in.lr = lists.rates[k], in.beta1 = lists.beta1, in.beta2 = lists.beta2, in.eps = lists.eps;
-    in.step = double(*lists.steps[k].const_data_ptr<float>()) + 1;
+    in.step = double(*read<float>(lists.steps[k])) + 1;
     out.attributes[lists.attributes[k]] = in;
   }
   return out;
@@ -64,25 +63,25 @@ gs::GaussianStep<T> gaussian_step(const Values& values, const StepLists& lists, 
 template <class T>
 void observe_in(gs::GaussianStep<T>& step, const Tensor& radii, const MaybeTensor& max_radii,
                 const MaybeTensor& gradient_sums, const MaybeTensor& views) {
-  step.observed = {radii.numel(), nullptr, nullptr, nullptr, radii.const_data_ptr<int32_t>(), nullptr};
+  step.observed = {radii.numel(), nullptr, nullptr, nullptr, read<int32_t>(radii), nullptr};
   const bool given = max_radii.has_value();
-  TORCH_CHECK(gradient_sums.has_value() == given && views.has_value() == given,
-              "give max_radii, gradient_sums and views, or none of them");
+  GS_CHECK(gradient_sums.has_value() == given && views.has_value() == given,
+           "give max_radii, gradient_sums and views, or none of them");
   if (!given) return;
   check_statistics(*max_radii, *gradient_sums, *views, radii);
-  TORCH_CHECK((std::is_same_v<T, float>), "statistics are of float32 Gaussians, got float64");
-  step.observed.max_radii = max_radii->mutable_data_ptr<float>();
-  step.observed.gradient_sums = gradient_sums->mutable_data_ptr<float>();
-  step.observed.views = views->mutable_data_ptr<float>();
+  GS_CHECK((std::is_same_v<T, float>), "statistics are of float32 Gaussians, got float64");
+  step.observed.max_radii = write<float>(*max_radii);
+  step.observed.gradient_sums = write<float>(*gradient_sums);
+  step.observed.views = write<float>(*views);
 }
 
 // The numbers of a step that was recorded before; null for those of the call.
 const gs::StepNow* step_now(const MaybeTensor& now, const SceneTensors& scene) {
   if (!now) return nullptr;
-  check_tensor(*now, "now", at::kLong, scene.device(), {gs::kStepNowWords});
-  TORCH_CHECK_VALUE(now->is_contiguous(), "now must be contiguous");
-  TORCH_CHECK(scene.dtype() == at::kFloat, "now is of float32 Gaussians, got float64");
-  return reinterpret_cast<const gs::StepNow*>(now->const_data_ptr<int64_t>());
+  check_tensor(*now, "now", ScalarType::Long, scene.device(), {gs::kStepNowWords});
+  GS_CHECK_VALUE(now->is_contiguous(), "now must be contiguous");
+  GS_CHECK(scene.dtype() == ScalarType::Float, "now is of float32 Gaussians, got float64");
+  return reinterpret_cast<const gs::StepNow*>(read<int64_t>(*now));
 }
 
 // source: Lists or Rows. lengths: of absolute gradients, if it is defined; then they are what is observed.
@@ -90,14 +89,14 @@ template <class Source>
 void run(const SceneTensors& scene, const Source& source, const Tensor& /*lengths*/,
          const gs::GaussianStep<double>& step) {
   const Tensor moments = source.moments({});
-  GS_DISPATCH(project_vjp_step, gs::torch_executor(), scene.scene<double>(),
-              source.tile_counts().template const_data_ptr<int32_t>(), moments.const_data_ptr<double>(), step);
+  GS_DISPATCH(project_vjp_step, gs::torch_executor(), scene.scene<double>(), read<int32_t>(source.tile_counts()),
+              read<double>(moments), step);
 }
 
 template <class Source>
 void run(const SceneTensors& scene, const Source& source, const Tensor& lengths, gs::GaussianStep<float> step) {
   gs::ObserveInput later = step.observed;
-  if (lengths.defined()) later.lengths = lengths.const_data_ptr<float>(), step.observed.max_radii = nullptr;
+  if (lengths.defined()) later.lengths = read<float>(lengths), step.observed.max_radii = nullptr;
 #ifdef GS_CUDA
   if (scene.device().is_cuda()) {
     gs::TorchQueue queue(scene.device(), halted());
@@ -107,8 +106,8 @@ void run(const SceneTensors& scene, const Source& source, const Tensor& lengths,
   }
 #endif
   const Tensor moments = source.moments(lengths);
-  GS_DISPATCH(project_vjp_step, gs::torch_executor(), scene.scene<float>(),
-              source.tile_counts().template const_data_ptr<int32_t>(), moments.const_data_ptr<float>(), step);
+  GS_DISPATCH(project_vjp_step, gs::torch_executor(), scene.scene<float>(), read<int32_t>(source.tile_counts()),
+              read<float>(moments), step);
   if (later.lengths) gs::observe(gs::torch_executor(), later);
 }
 
@@ -117,12 +116,12 @@ void run(const SceneTensors& scene, const Source& source, const Tensor& lengths,
   "float[] rates, float beta1, float beta2, float eps, int[] columns, bool sparse, Tensor(j!)? max_radii=None, " \
   "Tensor(k!)? gradient_sums=None, Tensor(l!)? views=None, Tensor? loss=None, Tensor(m!)? stopped=None, "        \
   "int iteration=0, Tensor? now=None, bool absolute=False, float opacity_penalty=0, float scale_penalty=0"
-#define STEP_PARAMETERS                                                                                     \
-  const Tensor &radii, at::IntArrayRef attributes, at::TensorList exp_avg, at::TensorList exp_avg_sq,       \
-      at::TensorList steps, at::ArrayRef<double> rates, double beta1, double beta2, double eps,             \
-      at::IntArrayRef columns, bool sparse, const MaybeTensor &max_radii, const MaybeTensor &gradient_sums, \
-      const MaybeTensor &views, const MaybeTensor &loss, const MaybeTensor &stopped, int64_t iteration,     \
-      const MaybeTensor &now, bool absolute, double opacity_penalty, double scale_penalty
+#define STEP_PARAMETERS                                                                                              \
+  const Tensor &radii, Sizes attributes, List<Tensor> exp_avg, List<Tensor> exp_avg_sq, List<Tensor> steps,          \
+      List<double> rates, double beta1, double beta2, double eps, Sizes columns, bool sparse,                        \
+      const MaybeTensor &max_radii, const MaybeTensor &gradient_sums, const MaybeTensor &views,                      \
+      const MaybeTensor &loss, const MaybeTensor &stopped, int64_t iteration, const MaybeTensor &now, bool absolute, \
+      double opacity_penalty, double scale_penalty
 #define STEP_ARGUMENTS                                                                                                \
   radii, attributes, exp_avg, exp_avg_sq, steps, rates, beta1, beta2, eps, columns, sparse, max_radii, gradient_sums, \
       views, loss, stopped, iteration, now, absolute, opacity_penalty, scale_penalty
@@ -131,14 +130,14 @@ void run(const SceneTensors& scene, const Source& source, const Tensor& lengths,
 template <class SourceOf>
 void step_from(const SourceOf& source_of, SCENE_PARAMETERS, STEP_PARAMETERS) {
   const SceneTensors scene(SCENE_ARGUMENTS);
-  TORCH_CHECK_VALUE(!cov3d && !colors, "a step needs scales, rotations, sh_dc and sh_rest, not cov3d or colors");
-  check_tensor(radii, "radii", at::kInt, scene.device(), {scene.count()});
+  GS_CHECK_VALUE(!cov3d && !colors, "a step needs scales, rotations, sh_dc and sh_rest, not cov3d or colors");
+  check_tensor(radii, "radii", ScalarType::Int, scene.device(), {scene.count()});
   const auto source = source_of(scene);
   const StepLists lists{attributes, exp_avg, exp_avg_sq, steps, rates, columns, beta1, beta2, eps};
   lists.check();
   const bool penalised = opacity_penalty != 0 || scale_penalty != 0;
-  TORCH_CHECK_VALUE(!penalised || raw, "penalties are of raw Gaussians");
-  const Tensor pixels = radii.contiguous(), lengths = absolute_like(means, absolute && max_radii);
+  GS_CHECK_VALUE(!penalised || raw, "penalties are of raw Gaussians");
+  const Tensor pixels = packed(radii), lengths = absolute_like(means, absolute && max_radii);
   with_scalar(scene.dtype(), [&](auto zero) {
     using T = decltype(zero);
     auto step = gaussian_step<T>({means, opacities, *scales, *rotations, *sh_dc, *sh_rest}, lists, sparse);
@@ -169,23 +168,22 @@ void rows_vjp_step_op(SCENE_PARAMETERS, ROWS_PARAMETERS, STEP_PARAMETERS) {
 }
 
 // Writes what the next step stands for, and advances the counters.
-void step_now_op(Tensor& now, at::IntArrayRef attributes, at::TensorList steps, at::ArrayRef<double> rates,
-                 double beta1, double beta2, double eps, bool sparse, int64_t iteration) {
-  check_tensor(now, "now", at::kLong, at::kCPU, {gs::kStepNowWords});
-  TORCH_CHECK_VALUE(now.is_contiguous(), "now must be contiguous");
+void step_now_op(Tensor& now, Sizes attributes, List<Tensor> steps, List<double> rates, double beta1, double beta2,
+                 double eps, bool sparse, int64_t iteration) {
+  check_tensor(now, "now", ScalarType::Long, DeviceType::CPU, {gs::kStepNowWords});
+  GS_CHECK_VALUE(now.is_contiguous(), "now must be contiguous");
   check_steps(attributes, steps, {rates.size()});
-  auto* to = reinterpret_cast<gs::StepNow*>(now.mutable_data_ptr<int64_t>());
+  auto* to = reinterpret_cast<gs::StepNow*>(write<int64_t>(now));
   for (size_t k = 0; k < attributes.size(); ++k)
-    gs::set_constants(
-        *to, attributes[k],
-        gs::step_constants(sparse, rates[k], beta1, beta2, eps, double(*steps[k].const_data_ptr<float>()) + 1));
+    gs::set_constants(*to, attributes[k],
+                      gs::step_constants(sparse, rates[k], beta1, beta2, eps, double(*read<float>(steps[k])) + 1));
   to->iteration = iteration;
   advance(steps);
 }
 
 }  // namespace
 
-TORCH_LIBRARY_FRAGMENT(diff_gaussian_rasterization, m) {
+GS_OPERATORS(diff_gaussian_rasterization, m) {
   // The values of the Gaussians are read, and stepped in place.
   std::string scene = SCENE_SCHEMA;
   char alias = 'a';
@@ -193,12 +191,13 @@ TORCH_LIBRARY_FRAGMENT(diff_gaussian_rasterization, m) {
     const size_t type = scene.rfind("Tensor", scene.find(std::string(" ") + name + ","));
     scene.insert(type + 6, std::string("(") + alias++ + "!)");
   }
-  define(m, "rasterize_vjp_step_(" + scene + ", " LISTS_SCHEMA ", " STEP_SCHEMA ") -> ()", &rasterize_vjp_step_op);
-  define(m, "rows_vjp_step_(" + scene + ", " ROWS_SCHEMA ", " STEP_SCHEMA ") -> ()", &rows_vjp_step_op);
-  define(m,
-         "step_now_(Tensor(a!) now, int[] attributes, Tensor(b!)[] steps, float[] rates, float beta1, float beta2, "
-         "float eps, bool sparse, int iteration) -> ()",
-         &step_now_op);
+  m.define("rasterize_vjp_step_(" + scene + ", " LISTS_SCHEMA ", " STEP_SCHEMA ") -> ()",
+           TORCH_BOX(&rasterize_vjp_step_op));
+  m.define("rows_vjp_step_(" + scene + ", " ROWS_SCHEMA ", " STEP_SCHEMA ") -> ()", TORCH_BOX(&rows_vjp_step_op));
+  m.define(
+      "step_now_(Tensor(a!) now, int[] attributes, Tensor(b!)[] steps, float[] rates, float beta1, float beta2, "
+      "float eps, bool sparse, int iteration) -> ()",
+      TORCH_BOX(&step_now_op));
 }
 
 }  // namespace gs::ops

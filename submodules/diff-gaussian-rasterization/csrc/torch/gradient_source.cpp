@@ -1,8 +1,6 @@
 // The checks of what gradients come from, and what a backend makes of it.
 #include "gradient_source.h"
 
-#include <ATen/ops/empty.h>
-
 #include <limits>
 
 #include "math/absolute.h"
@@ -18,7 +16,7 @@ namespace {
 Tensor checked_counts(const SceneTensors& scene, const Tensor& splats, const Tensor& tile_counts) {
   check_tensor(splats, "splats", scene.dtype(), scene.device(), {scene.count(), kSplatValues});
   check_counts(tile_counts, scene.count(), scene.device());
-  return tile_counts.contiguous();
+  return packed(tile_counts);
 }
 
 }  // namespace
@@ -33,28 +31,29 @@ Lists::Lists(const SceneTensors& scene, LISTS_PARAMETERS)
 Rows::Rows(const SceneTensors& scene, ROWS_PARAMETERS, bool absolute, bool lengths)
     : image_(scene.image()), tile_counts_(checked_counts(scene, splats, tile_counts)) {
   check_tensor(rows, "rows", scene.dtype(), scene.device(), {-1, row_values(absolute)});
-  check_tensor(counts, "counts", at::kInt, scene.device(), {scene.count()});
-  TORCH_CHECK(rows.size(0) <= std::numeric_limits<int32_t>::max(), rows.size(0), " rows are more than 2^31 - 1");
-  TORCH_CHECK(rows.is_cpu() || scene.dtype() == at::kFloat, kFloatAlone);
-  splats_ = splats.contiguous(), counts_ = counts.contiguous();
-  rows_ = (lengths ? rows : rows.narrow(1, 0, kGradientValues)).contiguous();
+  check_tensor(counts, "counts", ScalarType::Int, scene.device(), {scene.count()});
+  GS_CHECK(rows.size(0) <= std::numeric_limits<int32_t>::max(), rows.size(0), " rows are more than 2^31 - 1");
+  GS_CHECK(rows.is_cpu() || scene.dtype() == ScalarType::Float, kFloatAlone);
+  splats_ = packed(splats), counts_ = packed(counts);
+  Tensor given = rows;
+  rows_ = packed(lengths ? given : torch::stable::narrow(given, 1, 0, kGradientValues));
   if (rows.is_cpu()) check_sum();  // reading counts from a GPU waits for it
 }
 
 void Rows::check_sum() const {
-  const int32_t *counts = counts_.const_data_ptr<int32_t>(), *tile_counts = tile_counts_.const_data_ptr<int32_t>();
+  const int32_t *counts = read<int32_t>(counts_), *tile_counts = read<int32_t>(tile_counts_);
   int64_t sum = 0;
   for (int64_t i = 0; i < counts_.size(0); sum += counts[i++])
-    TORCH_CHECK_VALUE(counts[i] == 0 || (counts[i] > 0 && tile_counts[i] != 0),
-                      "counts must be 0 or more, and 0 where tile_counts is, got ", counts[i], " of splat ", i);
-  TORCH_CHECK_VALUE(sum == rows_.size(0), "counts add up to ", sum, ", but there are ", rows_.size(0), " rows");
+    GS_CHECK_VALUE(counts[i] == 0 || (counts[i] > 0 && tile_counts[i] != 0),
+                   "counts must be 0 or more, and 0 where tile_counts is, got ", counts[i], " of splat ", i);
+  GS_CHECK_VALUE(sum == rows_.size(0), "counts add up to ", sum, ", but there are ", rows_.size(0), " rows");
 }
 
 Tensor Rows::moments(const Tensor& lengths) const {
-  Tensor moments = at::empty({counts_.size(0), kGradientValues}, rows_.options());
+  Tensor moments = empty({counts_.size(0), kGradientValues}, rows_);
   with_scalar(moments.scalar_type(), [&](auto zero) {
     using T = decltype(zero);
-    GS_DISPATCH(sum_rows, gs::torch_executor(), input<T>(), sums<T>(moments.mutable_data_ptr<T>(), lengths));
+    GS_DISPATCH(sum_rows, gs::torch_executor(), input<T>(), sums<T>(write<T>(moments), lengths));
   });
   return moments;
 }

@@ -53,12 +53,11 @@ class Rows {
 
   template <class T>
   gs::SplatRows<T> input() const {
-    return {counts_.size(0), tile_counts_.const_data_ptr<int32_t>(), counts_.const_data_ptr<int32_t>(),
-            rows_.const_data_ptr<T>(), rows_.size(0)};
+    return {counts_.size(0), read<int32_t>(tile_counts_), read<int32_t>(counts_), read<T>(rows_), rows_.size(0)};
   }
   template <class T>
   gs::RowSums<T> sums(T* moments, const Tensor& lengths) const {
-    return {splats_.const_data_ptr<T>(), image_, moments, lengths.defined() ? lengths.mutable_data_ptr<T>() : nullptr};
+    return {read<T>(splats_), image_, moments, lengths.defined() ? write<T>(lengths) : nullptr};
   }
 
   gs::Image image_;

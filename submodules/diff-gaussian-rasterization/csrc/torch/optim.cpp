@@ -11,19 +11,17 @@ void check_moments(const Tensor& value, const Tensor& gradient, const Tensor& ex
                                 std::pair("exp_avg", &exp_avg), std::pair("exp_avg_sq", &exp_avg_sq)})
     check_given(*t, name);
   for (const Tensor* t : {&gradient, &exp_avg, &exp_avg_sq})
-    TORCH_CHECK(t->sizes() == value.sizes() && t->scalar_type() == value.scalar_type() && t->device() == value.device(),
-                "gradient and averages must have the shape, dtype and device of the parameter, ", value.sizes(), " ",
-                value.scalar_type(), " on ", value.device(), ", got ", t->sizes(), " ", t->scalar_type(), " on ",
-                t->device());
-  TORCH_CHECK(value.is_contiguous() && exp_avg.is_contiguous() && exp_avg_sq.is_contiguous(),
-              "parameter and averages must be contiguous");
+    GS_CHECK(same(t->sizes(), value.sizes()) && alike(*t, value),
+             "gradient and averages must have the shape, dtype and device of the parameter, ", in_words(value),
+             ", got ", in_words(*t));
+  GS_CHECK(value.is_contiguous() && exp_avg.is_contiguous() && exp_avg_sq.is_contiguous(),
+           "parameter and averages must be contiguous");
 }
 
 void check_counter(const Tensor& step) {
   check_given(step, "step");
-  TORCH_CHECK(step.is_cpu() && step.numel() == 1 && step.scalar_type() == at::kFloat,
-              "a step counter must be one float32 on the CPU, got ", step.sizes(), " ", step.scalar_type(), " on ",
-              step.device());
+  GS_CHECK(step.is_cpu() && step.numel() == 1 && has_dtype(step, ScalarType::Float),
+           "a step counter must be one float32 on the CPU, got ", in_words(step));
 }
 
 void check_statistics(const Tensor& max_radii, const Tensor& gradient_sums, const Tensor& views, const Tensor& radii) {
@@ -33,24 +31,23 @@ void check_statistics(const Tensor& max_radii, const Tensor& gradient_sums, cons
   check_given(radii, "radii");
   const int64_t n = radii.numel();
   for (const Tensor* t : {&max_radii, &gradient_sums, &views}) {
-    TORCH_CHECK(t->numel() == n && t->scalar_type() == at::kFloat && t->device() == radii.device(),
-                "statistics must be ", n, " float32 on ", radii.device(), ", got ", t->sizes(), " ", t->scalar_type(),
-                " on ", t->device());
-    TORCH_CHECK(t->is_contiguous(), "statistics must be contiguous");
+    GS_CHECK(t->numel() == n && has_dtype(*t, ScalarType::Float) && t->device() == radii.device(),
+             "statistics must be ", n, " float32 on ", radii.device(), ", got ", in_words(*t));
+    GS_CHECK(t->is_contiguous(), "statistics must be contiguous");
   }
-  TORCH_CHECK(radii.scalar_type() == at::kInt, "radii must be int32, got ", radii.scalar_type());
+  GS_CHECK(has_dtype(radii, ScalarType::Int), "radii must be int32, got ", radii.scalar_type());
 }
 
 namespace {
 
 // Takes one step of every parameter, in one launch on a GPU. Advances each counter first, as torch does, even if
 // the guard holds the step back.
-void adam_op(at::TensorList values, at::TensorList gradients, at::TensorList exp_avg, at::TensorList exp_avg_sq,
-             at::TensorList steps, at::ArrayRef<double> rates, double beta1, double beta2, double eps,
-             at::IntArrayRef columns, const MaybeTensor& loss, const MaybeTensor& stopped, int64_t iteration) {
+void adam_op(List<Tensor> values, List<Tensor> gradients, List<Tensor> exp_avg, List<Tensor> exp_avg_sq,
+             List<Tensor> steps, List<double> rates, double beta1, double beta2, double eps, Sizes columns,
+             const MaybeTensor& loss, const MaybeTensor& stopped, int64_t iteration) {
   const size_t n = values.size();
   for (size_t size : {gradients.size(), exp_avg.size(), exp_avg_sq.size(), steps.size(), rates.size(), columns.size()})
-    TORCH_CHECK(size == n, "every list must have an entry for each of the ", n, " parameters, got ", size);
+    GS_CHECK(size == n, "every list must have an entry for each of the ", n, " parameters, got ", size);
   if (n == 0) return;
   const Tensor& first = values[0];
   with_scalar(first.scalar_type(), [&](auto zero) {
@@ -58,19 +55,18 @@ void adam_op(at::TensorList values, at::TensorList gradients, at::TensorList exp
     std::vector<gs::AdamInput<T>> inputs;
     std::vector<Tensor> contiguous;  // keeps the gradients' memory until the call is over
     for (size_t i = 0; i < n; ++i) {
-      TORCH_CHECK(values[i].scalar_type() == first.scalar_type() && values[i].device() == first.device(),
-                  "all parameters must have one dtype and device");
+      GS_CHECK(alike(values[i], first), "all parameters must have one dtype and device");
       check_moments(values[i], gradients[i], exp_avg[i], exp_avg_sq[i]);
       check_counter(steps[i]);
-      contiguous.push_back(gradients[i].contiguous());
+      contiguous.push_back(packed(gradients[i]));
       gs::AdamInput<T> in = adam_input<T>(values[i], contiguous.back(), exp_avg[i], exp_avg_sq[i], columns[i]);
       in.lr = rates[i], in.beta1 = beta1, in.beta2 = beta2, in.eps = eps;
-      in.step = double(*steps[i].const_data_ptr<float>()) + 1;
+      in.step = double(*read<float>(steps[i])) + 1;
       inputs.push_back(in);
     }
     GS_RUN(T, first, adam, inputs.data(), int64_t(n), step_guard<T>(first, loss, stopped, iteration));
   });
-  for (const Tensor& step : steps) *step.mutable_data_ptr<float>() += 1;
+  for (const Tensor& step : steps) *write<float>(step) += 1;
 }
 
 void sparse_adam_op(Tensor& value, const Tensor& gradient, Tensor& exp_avg, Tensor& exp_avg_sq, const Tensor& visible,
@@ -79,17 +75,16 @@ void sparse_adam_op(Tensor& value, const Tensor& gradient, Tensor& exp_avg, Tens
   check_moments(value, gradient, exp_avg, exp_avg_sq);
   check_given(visible, "visible");
   const int64_t rows = rows_of(value);
-  TORCH_CHECK(visible.dim() == 1 && visible.size(0) == rows && visible.scalar_type() == at::kBool &&
-                  visible.device() == value.device(),
-              "visible must be (", rows, ") bool on ", value.device(), ", got ", visible.sizes(), " ",
-              visible.scalar_type(), " on ", visible.device());
+  GS_CHECK(visible.dim() == 1 && visible.size(0) == rows && has_dtype(visible, ScalarType::Bool) &&
+               visible.device() == value.device(),
+           "visible must be (", rows, ") bool on ", value.device(), ", got ", in_words(visible));
   if (value.numel() == 0) return;
-  const Tensor g = gradient.contiguous(), mask = visible.contiguous();
+  const Tensor g = packed(gradient), mask = packed(visible);
   with_scalar(value.scalar_type(), [&](auto zero) {
     using T = decltype(zero);
     gs::AdamInput<T> in = adam_input<T>(value, g, exp_avg, exp_avg_sq, columns);
     in.lr = lr, in.beta1 = beta1, in.beta2 = beta2, in.eps = eps;
-    GS_RUN(T, value, sparse_adam, in, mask.const_data_ptr<bool>(), step_guard<T>(value, loss, stopped, iteration));
+    GS_RUN(T, value, sparse_adam, in, read<bool>(mask), step_guard<T>(value, loss, stopped, iteration));
   });
 }
 
@@ -98,18 +93,18 @@ void observe_op(Tensor& max_radii, Tensor& gradient_sums, Tensor& views, const T
   check_given(gradient, "gradient");
   const int64_t n = radii.numel();
   const bool lengths = gradient.dim() == 1;
-  TORCH_CHECK((lengths || (gradient.dim() == 2 && gradient.size(1) == 3)) && gradient.size(0) == n &&
-                  gradient.scalar_type() == at::kFloat && gradient.device() == radii.device(),
-              "the gradient must be (", n, ", 3) float32 on ", radii.device(), ", or its lengths (", n, ",), got ",
-              gradient.sizes(), " ", gradient.scalar_type(), " on ", gradient.device());
-  const Tensor pixels = radii.contiguous(), rows = gradient.contiguous();
+  GS_CHECK((lengths || (gradient.dim() == 2 && gradient.size(1) == 3)) && gradient.size(0) == n &&
+               has_dtype(gradient, ScalarType::Float) && gradient.device() == radii.device(),
+           "the gradient must be (", n, ", 3) float32 on ", radii.device(), ", or its lengths (", n, ",), got ",
+           in_words(gradient));
+  const Tensor pixels = packed(radii), rows = packed(gradient);
   const gs::ObserveInput in{n,
-                            max_radii.mutable_data_ptr<float>(),
-                            gradient_sums.mutable_data_ptr<float>(),
-                            views.mutable_data_ptr<float>(),
-                            pixels.const_data_ptr<int32_t>(),
-                            lengths ? nullptr : rows.const_data_ptr<float>(),
-                            lengths ? rows.const_data_ptr<float>() : nullptr};
+                            write<float>(max_radii),
+                            write<float>(gradient_sums),
+                            write<float>(views),
+                            read<int32_t>(pixels),
+                            lengths ? nullptr : read<float>(rows),
+                            lengths ? read<float>(rows) : nullptr};
 #ifdef GS_CUDA
   if (radii.is_cuda()) {
     gs::TorchQueue queue(radii.device(), halted());
@@ -121,21 +116,21 @@ void observe_op(Tensor& max_radii, Tensor& gradient_sums, Tensor& views, const T
 
 }  // namespace
 
-TORCH_LIBRARY_FRAGMENT(diff_gaussian_rasterization, m) {
-  define(m,
-         "adam_(Tensor(a!)[] values, Tensor[] gradients, Tensor(b!)[] exp_avg, Tensor(c!)[] exp_avg_sq, "
-         "Tensor(d!)[] steps, float[] rates, float beta1, float beta2, float eps, int[] columns, Tensor? loss=None, "
-         "Tensor(e!)? stopped=None, int iteration=0) -> ()",
-         &adam_op);
-  define(m,
-         "sparse_adam_(Tensor(a!) value, Tensor gradient, Tensor(b!) exp_avg, Tensor(c!) exp_avg_sq, Tensor visible, "
-         "float lr, float beta1, float beta2, float eps, int columns=-1, Tensor? loss=None, Tensor(d!)? stopped=None, "
-         "int iteration=0) -> ()",
-         &sparse_adam_op);
-  define(m,
-         "observe_(Tensor(a!) max_radii, Tensor(b!) gradient_sums, Tensor(c!) views, Tensor radii, Tensor gradient) "
-         "-> ()",
-         &observe_op);
+GS_OPERATORS(diff_gaussian_rasterization, m) {
+  m.define(
+      "adam_(Tensor(a!)[] values, Tensor[] gradients, Tensor(b!)[] exp_avg, Tensor(c!)[] exp_avg_sq, "
+      "Tensor(d!)[] steps, float[] rates, float beta1, float beta2, float eps, int[] columns, Tensor? loss=None, "
+      "Tensor(e!)? stopped=None, int iteration=0) -> ()",
+      TORCH_BOX(&adam_op));
+  m.define(
+      "sparse_adam_(Tensor(a!) value, Tensor gradient, Tensor(b!) exp_avg, Tensor(c!) exp_avg_sq, Tensor visible, "
+      "float lr, float beta1, float beta2, float eps, int columns=-1, Tensor? loss=None, Tensor(d!)? stopped=None, "
+      "int iteration=0) -> ()",
+      TORCH_BOX(&sparse_adam_op));
+  m.define(
+      "observe_(Tensor(a!) max_radii, Tensor(b!) gradient_sums, Tensor(c!) views, Tensor radii, Tensor gradient) "
+      "-> ()",
+      TORCH_BOX(&observe_op));
 }
 
 }  // namespace gs::ops

@@ -14,14 +14,12 @@ template <class T>
 gs::StepGuard<T> step_guard(const Tensor& value, const MaybeTensor& loss, const MaybeTensor& stopped,
                             int64_t iteration) {
   if (!stopped) return {};
-  TORCH_CHECK(
-      loss && loss->numel() == 1 && loss->scalar_type() == value.scalar_type() && loss->device() == value.device(),
-      "a guarded step needs the loss, one ", value.scalar_type(), " on ", value.device());
-  TORCH_CHECK(stopped->numel() == 1 && stopped->scalar_type() == at::kLong && stopped->device() == value.device(),
-              "stopped must be one int64 on ", value.device(), ", got ", stopped->sizes(), " ", stopped->scalar_type(),
-              " on ", stopped->device());
-  TORCH_CHECK(iteration > 0, "iterations of guarded steps count from 1, got ", iteration);
-  return {loss->const_data_ptr<T>(), stopped->mutable_data_ptr<int64_t>(), iteration};
+  GS_CHECK(loss && loss->numel() == 1 && alike(*loss, value), "a guarded step needs the loss, one ",
+           value.scalar_type(), " on ", value.device());
+  GS_CHECK(stopped->numel() == 1 && has_dtype(*stopped, ScalarType::Long) && stopped->device() == value.device(),
+           "stopped must be one int64 on ", value.device(), ", got ", in_words(*stopped));
+  GS_CHECK(iteration > 0, "iterations of guarded steps count from 1, got ", iteration);
+  return {read<T>(*loss), write<int64_t>(*stopped), iteration};
 }
 
 inline int64_t rows_of(const Tensor& t) { return t.dim() > 0 ? t.size(0) : 1; }
@@ -31,10 +29,10 @@ template <class T>
 gs::AdamInput<T> adam_input(const Tensor& value, const Tensor& gradient, const Tensor& exp_avg,
                             const Tensor& exp_avg_sq, int64_t columns) {
   const int64_t rows = rows_of(value), row = rows ? value.numel() / rows : 0;
-  TORCH_CHECK(rows == 0 || columns <= row, "columns must be at most ", row, ", got ", columns);
+  GS_CHECK(rows == 0 || columns <= row, "columns must be at most ", row, ", got ", columns);
   gs::AdamInput<T> in{};
-  in.value = value.mutable_data_ptr<T>(), in.gradient = gradient.const_data_ptr<T>();
-  in.mean = exp_avg.mutable_data_ptr<T>(), in.square = exp_avg_sq.mutable_data_ptr<T>();
+  in.value = write<T>(value), in.gradient = read<T>(gradient);
+  in.mean = write<T>(exp_avg), in.square = write<T>(exp_avg_sq);
   in.rows = rows, in.row = row, in.columns = columns < 0 ? row : columns;
   return in;
 }

@@ -1,10 +1,8 @@
 // The ops of rendering: each stage by itself, and all of them in one.
-#include <ATen/ops/empty.h>
-#include <ATen/ops/topk.h>
-#include <ATen/ops/zeros.h>
 
 #include <algorithm>
 #include <limits>
+#include <numeric>
 
 #include "backward.h"
 #include "math/layers.h"
@@ -23,11 +21,11 @@ struct ProjectedTensors {
   Tensor records;  // undefined where an image has too many tiles
   template <class T>
   gs::Projected<T> pointers() {
-    return {splats.mutable_data_ptr<T>(),
-            depths.mutable_data_ptr<T>(),
-            rects.defined() ? rects.mutable_data_ptr<int32_t>() : nullptr,
-            tile_counts.mutable_data_ptr<int32_t>(),
-            radii.mutable_data_ptr<int32_t>(),
+    return {write<T>(splats),
+            write<T>(depths),
+            rects.defined() ? write<int32_t>(rects) : nullptr,
+            write<int32_t>(tile_counts),
+            write<int32_t>(radii),
             records.defined() ? static_cast<gs::TileRecord*>(records.mutable_data_ptr()) : nullptr};
   }
 };
@@ -35,16 +33,16 @@ struct ProjectedTensors {
 // rects: whether the caller wants them; with records nothing else needs them.
 ProjectedTensors project(const SceneTensors& in, bool rects) {
   const int64_t n = in.count();
-  const auto ints = in.options().dtype(at::kInt);
+  const Tensor& like = in.means();
   ProjectedTensors out;
-  out.splats = at::empty({n, kSplatValues}, in.options());
-  out.depths = at::empty({n}, in.options());
-  out.tile_counts = at::empty({n}, ints);
-  out.radii = at::empty({n}, ints);
+  out.splats = empty({n, kSplatValues}, like);
+  out.depths = empty({n}, like);
+  out.tile_counts = empty<int32_t>({n}, like);
+  out.radii = empty<int32_t>({n}, like);
   const int most_tiles = tile_count(std::max(in.image().width, in.image().height));
   const bool records = most_tiles <= std::numeric_limits<uint16_t>::max();
-  if (rects || !records) out.rects = at::empty({n, 4}, ints);
-  if (records) out.records = at::empty({n, int64_t(sizeof(gs::TileRecord))}, in.options().dtype(at::kByte));
+  if (rects || !records) out.rects = empty<int32_t>({n, 4}, like);
+  if (records) out.records = empty<uint8_t>({n, int64_t(sizeof(gs::TileRecord))}, like);
   with_scalar(in.dtype(), [&](auto zero) {
     using T = decltype(zero);
     GS_RUN(T, out.splats, project, in.scene<T>(), out.pointers<T>());
@@ -54,11 +52,15 @@ ProjectedTensors project(const SceneTensors& in, bool rects) {
 
 // Names the Gaussians with the most tiles; often a few giants cover nearly all.
 std::string giants(const Tensor& tile_counts) {
-  const auto [counts, rows] = at::topk(tile_counts.cpu(), std::min<int64_t>(3, tile_counts.size(0)));
+  const Tensor on_host = torch::stable::to(tile_counts, DeviceType::CPU);
+  const auto* counts = read<int32_t>(on_host);
+  std::vector<int64_t> rows(on_host.size(0));
+  std::iota(rows.begin(), rows.end(), 0);
+  const auto end = rows.begin() + std::min<size_t>(3, rows.size());
+  std::partial_sort(rows.begin(), end, rows.end(), [&](int64_t a, int64_t b) { return counts[a] > counts[b]; });
   std::string words;
-  for (int64_t k = 0; k < counts.size(0); ++k)
-    words += (k ? ", " : "") + std::to_string(rows.const_data_ptr<int64_t>()[k]) + " (" +
-             std::to_string(counts.const_data_ptr<int32_t>()[k]) + ")";
+  for (auto row = rows.begin(); row != end; ++row)
+    words += (row == rows.begin() ? "" : ", ") + joined(*row, " (", counts[*row], ")");
   return words;
 }
 
@@ -70,17 +72,17 @@ struct BinnedTensors {
 
 // slots: whether the backward will need them.
 BinnedTensors bin(ProjectedTensors& in, gs::Image image, bool slots) {
-  const auto ints = in.depths.options().dtype(at::kInt), longs = in.depths.options().dtype(at::kLong);
   BinnedTensors out;
-  out.splat_slots = at::empty({slots ? in.depths.size(0) + 1 : 0, 2}, longs);
+  out.splat_slots = empty<int64_t>({slots ? in.depths.size(0) + 1 : 0, 2}, in.depths);
   auto allocate = [&](int64_t total, int64_t slot_count) {
     const int64_t n = in.depths.size(0);
-    TORCH_CHECK(total <= std::numeric_limits<int32_t>::max(), n, " Gaussians cover ", total,
-                " tile instances, more than 2^31 - 1; most are those of Gaussian ", giants(in.tile_counts),
-                ": remove such giants, or render at a lower resolution or with fewer Gaussians");
-    out.instances = at::empty({total}, ints), out.ranges = at::empty({tiles_of(image) + 1}, longs);
-    out.slots = at::empty({slot_count, 0}, ints);
-    return gs::Binned{out.instances.mutable_data_ptr<int32_t>(), out.ranges.mutable_data_ptr<int64_t>()};
+    GS_CHECK(total <= std::numeric_limits<int32_t>::max(), n, " Gaussians cover ", total,
+             " tile instances, more than 2^31 - 1; most are those of Gaussian ", giants(in.tile_counts),
+             ": remove such giants, or render at a lower resolution or with fewer Gaussians");
+    out.instances = empty<int32_t>({total}, in.depths);
+    out.ranges = empty<int64_t>({tiles_of(image) + 1}, in.depths);
+    out.slots = empty<int32_t>({slot_count, 0}, in.depths);
+    return gs::Binned{write<int32_t>(out.instances), write<int64_t>(out.ranges)};
   };
   using Allocate = decltype(allocate);
   const gs::BinMemory memory{
@@ -103,17 +105,15 @@ BlendedTensors blend(const Tensor& splats, const Tensor& instances, const Tensor
                      gs::Image image, bool inverse_depth, bool train) {
   const int64_t h = image.height, w = image.width;
   const bool layers = train && splats.is_cuda();
-  BlendedTensors out{at::empty({3, h, w}, splats.options()), at::empty({1, h, w}, splats.options()),
-                     at::empty({inverse_depth ? 1 : 0, h, w}, splats.options()),
-                     at::empty({train ? h : 0, w}, splats.options().dtype(at::kInt)),
-                     at::empty({layers ? layer_values(image, instances.size(0), inverse_depth) : 0}, splats.options())};
+  BlendedTensors out{empty({3, h, w}, splats), empty({1, h, w}, splats), empty({inverse_depth ? 1 : 0, h, w}, splats),
+                     empty<int32_t>({train ? h : 0, w}, splats),
+                     empty({layers ? layer_values(image, instances.size(0), inverse_depth) : 0}, splats)};
   const Tensor bg = background_like(background, splats);
   with_scalar(splats.scalar_type(), [&](auto zero) {
     using T = decltype(zero);
-    const gs::Blended<T> blended{out.color.mutable_data_ptr<T>(), out.transmittance.mutable_data_ptr<T>(),
-                                 inverse_depth ? out.inverse_depth.mutable_data_ptr<T>() : nullptr,
-                                 train ? out.last.mutable_data_ptr<int32_t>() : nullptr,
-                                 out.layers.numel() ? out.layers.mutable_data_ptr<T>() : nullptr};
+    const gs::Blended<T> blended{
+        write<T>(out.color), write<T>(out.transmittance), inverse_depth ? write<T>(out.inverse_depth) : nullptr,
+        train ? write<int32_t>(out.last) : nullptr, out.layers.numel() ? write<T>(out.layers) : nullptr};
     GS_RUN(T, splats, blend, blend_input<T>(splats, instances, ranges, bg, image), blended);
   });
   return out;
@@ -130,14 +130,14 @@ Tensors5 project_op(SCENE_PARAMETERS) {
 Tensors4 bin_op(const Tensor& splats, const Tensor& depths, const Tensor& rects, const Tensor& tile_counts,
                 int64_t height, int64_t width, bool train) {
   check_splats(splats);
-  const at::Device device = splats.device();
+  const Device device = splats.device();
   const int64_t n = splats.size(0);
   check_tensor(depths, "depths", splats.scalar_type(), device, {n});
-  check_tensor(rects, "rects", at::kInt, device, {n, 4});
+  check_tensor(rects, "rects", ScalarType::Int, device, {n, 4});
   check_counts(tile_counts, n, device);
   ProjectedTensors p;
-  p.splats = splats.contiguous(), p.depths = depths.contiguous(), p.rects = rects.contiguous();
-  p.tile_counts = p.radii = tile_counts.contiguous();
+  p.splats = packed(splats), p.depths = packed(depths), p.rects = packed(rects);
+  p.tile_counts = p.radii = packed(tile_counts);
   const BinnedTensors b = bin(p, checked_image(height, width), train);
   return {b.instances, b.ranges, b.splat_slots, b.slots};
 }
@@ -148,7 +148,7 @@ Tensors5 blend_op(const Tensor& splats, const Tensor& instances, const Tensor& r
   const gs::Image image = checked_image(height, width);
   check_lists(instances, ranges, splats, image);
   const BlendedTensors b =
-      blend(splats.contiguous(), instances.contiguous(), ranges.contiguous(), background, image, inverse_depth, train);
+      blend(packed(splats), packed(instances), packed(ranges), background, image, inverse_depth, train);
   return {b.color, b.transmittance, b.inverse_depth, b.last, b.layers};
 }
 
@@ -169,14 +169,13 @@ Rasterized rasterize_op(const Tensor& means2d, SCENE_PARAMETERS, const Tensor& b
 
 Tensor mark_visible_op(const Tensor& means, const Tensor& view) {
   check_given(means, "positions");
-  TORCH_CHECK_VALUE(means.dim() == 2 && means.size(1) == 3, "positions must be (N, 3), got ", in_words(means.sizes()));
+  GS_CHECK_VALUE(means.dim() == 2 && means.size(1) == 3, "positions must be (N, 3), got ", means.sizes());
   check_precise(view, "the view matrix", {4, 4});
-  const Tensor rows = means.contiguous(), matrix = converted(view, means);
-  Tensor visible = at::empty({rows.size(0)}, rows.options().dtype(at::kBool));
+  const Tensor rows = packed(means), matrix = converted(view, means);
+  Tensor visible = empty<bool>({rows.size(0)}, rows);
   with_scalar(rows.scalar_type(), [&](auto zero) {
     using T = decltype(zero);
-    GS_RUN(T, rows, mark_visible, rows.size(0), rows.const_data_ptr<T>(), matrix.const_data_ptr<T>(),
-           visible.mutable_data_ptr<bool>());
+    GS_RUN(T, rows, mark_visible, rows.size(0), read<T>(rows), read<T>(matrix), write<bool>(visible));
   });
   return visible;
 }
@@ -185,41 +184,40 @@ Tensor decisive_op(const Tensor& splats, const Tensor& instances, const Tensor& 
   check_splats(splats);
   const gs::Image image = image_of(last, splats);
   check_lists(instances, ranges, splats, image);
-  Tensor decisive = at::zeros({splats.size(0)}, splats.options().dtype(at::kBool));
-  const Tensor rows = splats.contiguous(), no_background = at::zeros({3}, splats.options());
-  const Tensor lists = instances.contiguous(), bounds = ranges.contiguous(), ends = last.contiguous();
+  Tensor decisive = torch::stable::new_zeros(splats, {splats.size(0)}, ScalarType::Bool);
+  const Tensor rows = packed(splats), no_background = torch::stable::new_zeros(splats, {3});
+  const Tensor lists = packed(instances), bounds = packed(ranges), ends = packed(last);
   with_scalar(rows.scalar_type(), [&](auto zero) {
     using T = decltype(zero);
-    GS_RUN(T, rows, mark_decisive, blend_input<T>(rows, lists, bounds, no_background, image),
-           ends.const_data_ptr<int32_t>(), decisive.mutable_data_ptr<bool>());
+    GS_RUN(T, rows, mark_decisive, blend_input<T>(rows, lists, bounds, no_background, image), read<int32_t>(ends),
+           write<bool>(decisive));
   });
   return decisive;
 }
 
 }  // namespace
 
-TORCH_LIBRARY_FRAGMENT(diff_gaussian_rasterization, m) {
-  define(m,
-         "project(" SCENE_SCHEMA ") -> (Tensor splats, Tensor depths, Tensor rects, Tensor tile_counts, Tensor radii)",
-         &project_op);
-  define(m,
-         "bin(Tensor splats, Tensor depths, Tensor rects, Tensor tile_counts, int height, int width, bool train) -> "
-         "(Tensor instances, Tensor ranges, Tensor splat_slots, Tensor slots)",
-         &bin_op);
-  define(m,
-         "blend(Tensor splats, Tensor instances, Tensor ranges, Tensor background, int height, int width, "
-         "bool inverse_depth, bool train) -> (Tensor color, Tensor transmittance, Tensor inverse_depth, Tensor last, "
-         "Tensor layers)",
-         &blend_op);
-  define(
-      m,
+GS_OPERATORS(diff_gaussian_rasterization, m) {
+  m.define("project(" SCENE_SCHEMA
+           ") -> (Tensor splats, Tensor depths, Tensor rects, Tensor tile_counts, Tensor radii)",
+           TORCH_BOX(&project_op));
+  m.define(
+      "bin(Tensor splats, Tensor depths, Tensor rects, Tensor tile_counts, int height, int width, bool train) -> "
+      "(Tensor instances, Tensor ranges, Tensor splat_slots, Tensor slots)",
+      TORCH_BOX(&bin_op));
+  m.define(
+      "blend(Tensor splats, Tensor instances, Tensor ranges, Tensor background, int height, int width, "
+      "bool inverse_depth, bool train) -> (Tensor color, Tensor transmittance, Tensor inverse_depth, Tensor last, "
+      "Tensor layers)",
+      TORCH_BOX(&blend_op));
+  m.define(
       "rasterize(Tensor means2d, " SCENE_SCHEMA
       ", Tensor background, bool inverse_depth, bool train, bool absolute=False) -> (Tensor color, "
       "Tensor transmittance, Tensor inverse_depth, Tensor radii, Tensor splats, Tensor tile_counts, Tensor instances, "
       "Tensor ranges, Tensor splat_slots, Tensor slots, Tensor last, Tensor layers)",
-      &rasterize_op);
-  define(m, "mark_visible(Tensor means, Tensor view) -> Tensor", &mark_visible_op);
-  define(m, "decisive(Tensor splats, Tensor instances, Tensor ranges, Tensor last) -> Tensor", &decisive_op);
+      TORCH_BOX(&rasterize_op));
+  m.define("mark_visible(Tensor means, Tensor view) -> Tensor", TORCH_BOX(&mark_visible_op));
+  m.define("decisive(Tensor splats, Tensor instances, Tensor ranges, Tensor last) -> Tensor", TORCH_BOX(&decisive_op));
 }
 
 }  // namespace gs::ops

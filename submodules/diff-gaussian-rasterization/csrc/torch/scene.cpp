@@ -1,8 +1,5 @@
 #include "scene.h"
 
-#include <ATen/ops/empty.h>
-#include <c10/util/DimVector.h>
-
 #include <cmath>
 #include <iterator>
 #include <limits>
@@ -31,7 +28,7 @@ constexpr Row kRows[] = {
     {"sh_rest", 3, kAnyBands}};
 static_assert(std::size(kRows) == kInputs, "every input has a row");
 
-at::DimVector sizes_of(const Row& row, int64_t count, int64_t rest_bands) {
+Shape sizes_of(const Row& row, int64_t count, int64_t rest_bands) {
   if (row.bands == kNoBands) return {count, row.values};
   return {count, row.bands == kAnyBands ? rest_bands : row.bands, row.values};
 }
@@ -39,22 +36,24 @@ at::DimVector sizes_of(const Row& row, int64_t count, int64_t rest_bands) {
 // Rows may lie apart, so that a slice of more bands needs no copy.
 Tensor with_whole_rows(const Tensor& t) {
   const bool whole = t.size(1) == 0 || (t.stride(2) == 1 && t.stride(1) == t.size(2));
-  return whole ? t : t.contiguous();
+  return whole ? t : packed(t);
 }
 
 }  // namespace
 
 gs::Image checked_image(int64_t height, int64_t width) {
-  TORCH_CHECK(height > 0 && width > 0 && height < (1 << 24) && width < (1 << 24), "image size ", width, "x", height,
-              " is out of range");
+  GS_CHECK(height > 0 && width > 0 && height < (1 << 24) && width < (1 << 24), "image size ", width, "x", height,
+           " is out of range");
   const gs::Image image{int(width), int(height)};
-  TORCH_CHECK(tiles_of(image) <= std::numeric_limits<int32_t>::max(), "image size ", width, "x", height,
-              " has more than 2^31 - 1 tiles of ", kTile, "x", kTile);
+  GS_CHECK(tiles_of(image) <= std::numeric_limits<int32_t>::max(), "image size ", width, "x", height,
+           " has more than 2^31 - 1 tiles of ", kTile, "x", kTile);
   return image;
 }
 
 SceneTensors::SceneTensors(SCENE_PARAMETERS)
-    : tan_x_(tan_x),
+    : dtype_(ScalarType::Float),
+      device_(DeviceType::CPU),
+      tan_x_(tan_x),
       tan_y_(tan_y),
       scale_modifier_(scale_modifier),
       sh_degree_(int(sh_degree)),
@@ -62,15 +61,14 @@ SceneTensors::SceneTensors(SCENE_PARAMETERS)
       raw_(raw),
       image_(checked_image(height, width)) {
   check_given(means, "means");
-  const at::ScalarType type = means.scalar_type();
-  TORCH_CHECK_TYPE(type == at::kFloat || type == at::kDouble, "means must be float32 or float64, got ", in_words(type));
-  TORCH_CHECK_VALUE(means.dim() == 2 && means.size(1) == 3, "means must be (N, 3), got ", in_words(means.sizes()));
-  TORCH_CHECK_VALUE(cov3d.has_value() != (scales.has_value() && rotations.has_value()),
-                    "give scales and rotations, or cov3d");
-  TORCH_CHECK_VALUE(colors.has_value() != (sh_dc.has_value() && sh_rest.has_value()),
-                    "give sh_dc and sh_rest, or colors");
-  TORCH_CHECK_VALUE(sh_degree >= 0 && sh_degree <= kMaxShDegree, "sh_degree must be 0 to 3, got ", sh_degree);
-  inputs_[kMeans] = means.contiguous();
+  dtype_ = means.scalar_type(), device_ = means.device();
+  GS_CHECK_TYPE(is_floating(dtype_), "means must be float32 or float64, got ", dtype_);
+  GS_CHECK_VALUE(means.dim() == 2 && means.size(1) == 3, "means must be (N, 3), got ", means.sizes());
+  GS_CHECK_VALUE(cov3d.has_value() != (scales.has_value() && rotations.has_value()),
+                 "give scales and rotations, or cov3d");
+  GS_CHECK_VALUE(colors.has_value() != (sh_dc.has_value() && sh_rest.has_value()), "give sh_dc and sh_rest, or colors");
+  GS_CHECK_VALUE(sh_degree >= 0 && sh_degree <= kMaxShDegree, "sh_degree must be 0 to 3, got ", sh_degree);
+  inputs_[kMeans] = packed(means);
   const MaybeTensor given[kInputs] = {means, {}, opacities, scales, rotations, cov3d, colors, sh_dc, sh_rest};
   for (int input = kMeans2d; input < kInputs; ++input) inputs_[input] = checked(Input(input), given[input]);
   check_precise(view, "view", {4, 4});
@@ -83,40 +81,46 @@ SceneTensors::SceneTensors(SCENE_PARAMETERS)
 Tensor SceneTensors::checked(Input input, const MaybeTensor& given) const {
   const Row& row = kRows[input];
   const bool none = !given.has_value() || !given->defined();  // Python's None for an argument that must be a tensor
-  TORCH_CHECK_TYPE(!none || input != kOpacities, row.name, " must be a tensor, got None");
+  GS_CHECK_TYPE(!none || input != kOpacities, row.name, " must be a tensor, got None");
   if (none) return {};
   const Tensor& t = *given;
-  TORCH_CHECK_TYPE(t.scalar_type() == dtype() && t.device() == device(), row.name, " must be ", in_words(dtype()),
-                   " on ", device(), " like means, got ", in_words(t.scalar_type()), " on ", t.device());
+  GS_CHECK_TYPE(has_dtype(t, dtype_) && t.device() == device_, row.name, " must be ", dtype(), " on ", device(),
+                " like means, got ", t.scalar_type(), " on ", t.device());
   if (input == kShRest) return checked_rest(t);
-  const at::DimVector wanted = sizes_of(row, count(), 0);
+  const Shape wanted = sizes_of(row, count(), 0);
   const bool flat = input == kOpacities && t.dim() == 1 && t.size(0) == count();
   const char* hint = input != kScales ? "" : raw_ ? " (logarithms of the scales)" : " (activated scales, one per axis)";
-  TORCH_CHECK_VALUE(t.sizes() == at::IntArrayRef(wanted) || flat, row.name, " must be ", in_words(wanted), hint,
-                    ", got ", in_words(t.sizes()));
-  return row.bands == kNoBands ? t.contiguous() : with_whole_rows(t);
+  GS_CHECK_VALUE(same(t.sizes(), wanted) || flat, row.name, " must be ", wanted, hint, ", got ", t.sizes());
+  return row.bands == kNoBands ? packed(t) : with_whole_rows(t);
 }
 
 Tensor SceneTensors::checked_rest(const Tensor& t) const {
   const int64_t needed = sh_count(sh_degree_) - 1;
   const bool fits = t.dim() == 3 && t.size(0) == count() && t.size(1) >= needed && t.size(2) == 3;
-  TORCH_CHECK_VALUE(fits, "sh_rest must be (", count(), ", ", needed, " or more, 3) for sh_degree ", sh_degree_,
-                    ", got ", in_words(t.sizes()));
-  TORCH_CHECK(t.size(1) <= kMostRestBands, "sh_rest has ", t.size(1), " bands, more than the ", kMostRestBands,
-              " of degree 3");
+  GS_CHECK_VALUE(fits, "sh_rest must be (", count(), ", ", needed, " or more, 3) for sh_degree ", sh_degree_, ", got ",
+                 t.sizes());
+  GS_CHECK(t.size(1) <= kMostRestBands, "sh_rest has ", t.size(1), " bands, more than the ", kMostRestBands,
+           " of degree 3");
   return with_whole_rows(t);
 }
 
 void SceneTensors::check_settings() const {
   for (const auto& [name, tan] : {std::pair("tan_x", tan_x_), std::pair("tan_y", tan_y_)})
-    TORCH_CHECK_VALUE(tan > 0 && std::isfinite(tan), name, " must be the tangent of half an angle of view, got ", tan);
-  TORCH_CHECK_VALUE(std::isfinite(scale_modifier_), "scale_modifier must be finite, got ", scale_modifier_);
-  TORCH_CHECK(count() < std::numeric_limits<int32_t>::max(), "more than 2^31 Gaussians");
+    GS_CHECK_VALUE(tan > 0 && std::isfinite(tan), name, " must be the tangent of half an angle of view, got ", tan);
+  GS_CHECK_VALUE(std::isfinite(scale_modifier_), "scale_modifier must be finite, got ", scale_modifier_);
+  GS_CHECK(count() < std::numeric_limits<int32_t>::max(), "more than 2^31 Gaussians");
+}
+
+Wanted checked_wanted(const std::vector<bool>& wanted) {
+  Wanted out{};
+  GS_CHECK_VALUE(wanted.size() == out.size(), "wanted must have ", out.size(), " entries, got ", wanted.size());
+  std::copy(wanted.begin(), wanted.end(), out.begin());
+  return out;
 }
 
 SceneGradients::SceneGradients(const SceneTensors& in, const Wanted& wanted) : wanted_(wanted) {
   for (int input = 0; input < kInputs; ++input)
-    tensors_[input] = at::empty(sizes_of(kRows[input], wanted[input] ? in.count() : 0, in.rest_bands()), in.options());
+    tensors_[input] = empty(sizes_of(kRows[input], wanted[input] ? in.count() : 0, in.rest_bands()), in.means());
 }
 
 }  // namespace gs::ops

@@ -36,6 +36,9 @@ using InputTensors = std::array<Tensor, kInputs>;
 using Gradients = decltype(std::tuple_cat(std::declval<InputTensors>()));
 using Wanted = std::array<bool, kInputs>;
 
+// The same from a list that a caller gave.
+Wanted checked_wanted(const std::vector<bool>& wanted);
+
 // Checks the inputs, and owns the contiguous tensors that a gs::Scene points into.
 class SceneTensors {
  public:
@@ -44,16 +47,16 @@ class SceneTensors {
   // Checks the shape, dtype and device of an input. Returns it contiguous; undefined where it was not given.
   Tensor checked(Input input, const MaybeTensor& given) const;
 
+  const Tensor& means() const { return inputs_[kMeans]; }
   int64_t count() const { return inputs_[kMeans].size(0); }
   gs::Image image() const { return image_; }
-  at::ScalarType dtype() const { return inputs_[kMeans].scalar_type(); }
-  at::Device device() const { return inputs_[kMeans].device(); }
-  at::TensorOptions options() const { return inputs_[kMeans].options(); }
+  ScalarType dtype() const { return dtype_; }
+  Device device() const { return device_; }
   int64_t rest_bands() const { return inputs_[kShRest].defined() ? inputs_[kShRest].size(1) : 0; }
 
   template <class T>
   gs::Scene<T> scene() const {
-    const auto pointer = [](const Tensor& t) { return t.defined() ? t.const_data_ptr<T>() : nullptr; };
+    const auto pointer = [](const Tensor& t) { return t.defined() ? read<T>(t) : nullptr; };
     const auto stride = [](const Tensor& t) { return t.defined() ? t.stride(0) : 0; };
     return {count(),
             pointer(inputs_[kMeans]),
@@ -83,6 +86,8 @@ class SceneTensors {
   Tensor checked_rest(const Tensor& t) const;
   void check_settings() const;
 
+  ScalarType dtype_;
+  Device device_;
   InputTensors inputs_;  // means2d stays undefined
   Tensor view_, projection_, center_;
   double tan_x_, tan_y_, scale_modifier_;
@@ -106,7 +111,7 @@ class SceneGradients {
   template <class T, size_t... kInput>
   gs::SceneGradient<T> pointers(std::index_sequence<kInput...>) {
     static_assert(sizeof(gs::SceneGradient<T>) == kInputs * sizeof(T*), "SceneGradient and Input have the same fields");
-    return {(wanted_[kInput] ? tensors_[kInput].template mutable_data_ptr<T>() : nullptr)...};
+    return {(wanted_[kInput] ? write<T>(tensors_[kInput]) : nullptr)...};
   }
 
   Wanted wanted_;

@@ -1,5 +1,4 @@
 // The op that places the children of split Gaussians.
-#include <ATen/ops/empty.h>
 
 #include "tensors.h"
 
@@ -11,23 +10,23 @@ Tensor split_positions_op(const Tensor& means, const Tensor& log_scales, const T
                           int64_t seed, int64_t stream, int64_t iteration, int64_t draw) {
   check_given(items, "items");
   const int64_t n = items.numel();
-  check_tensor(items, "items", at::kLong, items.device(), {n});
-  check_tensor(means, "means", at::kFloat, items.device(), {n, 3});
-  check_tensor(log_scales, "log_scales", at::kFloat, items.device(), {n, 3});
-  check_tensor(rotations, "rotations", at::kFloat, items.device(), {n, 4});
-  const Tensor at_means = means.contiguous(), sizes = log_scales.contiguous(), turns = rotations.contiguous();
-  const Tensor indices = items.contiguous();
-  Tensor positions = at::empty({n, 3}, means.options());
+  check_tensor(items, "items", ScalarType::Long, items.device(), {n});
+  check_tensor(means, "means", ScalarType::Float, items.device(), {n, 3});
+  check_tensor(log_scales, "log_scales", ScalarType::Float, items.device(), {n, 3});
+  check_tensor(rotations, "rotations", ScalarType::Float, items.device(), {n, 4});
+  const Tensor at_means = packed(means), sizes = packed(log_scales), turns = packed(rotations);
+  const Tensor indices = packed(items);
+  Tensor positions = empty({n, 3}, means);
   const gs::SplitInput in{n,
-                          at_means.const_data_ptr<float>(),
-                          sizes.const_data_ptr<float>(),
-                          turns.const_data_ptr<float>(),
-                          indices.const_data_ptr<int64_t>(),
+                          read<float>(at_means),
+                          read<float>(sizes),
+                          read<float>(turns),
+                          read<int64_t>(indices),
                           uint64_t(seed),
                           uint32_t(draw),
                           uint32_t(iteration),
                           uint32_t(stream),
-                          positions.mutable_data_ptr<float>()};
+                          write<float>(positions)};
 #ifdef GS_CUDA
   if (items.is_cuda()) {
     gs::TorchQueue queue(items.device());
@@ -41,11 +40,11 @@ Tensor split_positions_op(const Tensor& means, const Tensor& log_scales, const T
 
 }  // namespace
 
-TORCH_LIBRARY_FRAGMENT(diff_gaussian_rasterization, m) {
-  define(m,
-         "split_positions(Tensor means, Tensor log_scales, Tensor rotations, Tensor items, int seed, int stream, "
-         "int iteration, int draw) -> Tensor",
-         &split_positions_op);
+GS_OPERATORS(diff_gaussian_rasterization, m) {
+  m.define(
+      "split_positions(Tensor means, Tensor log_scales, Tensor rotations, Tensor items, int seed, int stream, "
+      "int iteration, int draw) -> Tensor",
+      TORCH_BOX(&split_positions_op));
 }
 
 }  // namespace gs::ops

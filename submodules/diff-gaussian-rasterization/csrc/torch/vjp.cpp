@@ -1,5 +1,4 @@
 // The ops of the backwards: each stage by itself, both in one, and both with gradient rows in between.
-#include <ATen/ops/empty.h>
 
 #include "gradient_source.h"
 #include "math/splat.h"
@@ -14,8 +13,7 @@ Gradients project_vjp(const SceneTensors& in, const Tensor& tile_counts, const T
   SceneGradients out(in, wanted);
   with_scalar(in.dtype(), [&](auto zero) {
     using T = decltype(zero);
-    GS_RUN(T, moments, project_vjp, in.scene<T>(), tile_counts.const_data_ptr<int32_t>(), moments.const_data_ptr<T>(),
-           out.pointers<T>());
+    GS_RUN(T, moments, project_vjp, in.scene<T>(), read<int32_t>(tile_counts), read<T>(moments), out.pointers<T>());
   });
   return out.all();
 }
@@ -45,22 +43,26 @@ Gradients vjp_with_lengths(const SceneTensors& scene, const Source& source, cons
                            const Wanted& wanted) {
   const Tensor lengths = absolute_like(splats, absolute && wanted[kMeans2d]);
   Gradients all = vjp(scene, source, lengths, wanted);
-  if (lengths.defined()) std::get<kMeans2d>(all).select(1, 2).copy_(lengths);
+  if (lengths.defined()) {
+    Tensor column = torch::stable::select(std::get<kMeans2d>(all), 1, 2);
+    torch::stable::copy_(column, lengths);
+  }
   return all;
 }
 
 Tensor blend_vjp_op(BACKWARD_PARAMETERS) { return blend_vjp(BlendBackward(BACKWARD_ARGUMENTS)); }
 
-Gradients project_vjp_op(SCENE_PARAMETERS, const Tensor& tile_counts, const Tensor& moments, Wanted wanted) {
+Gradients project_vjp_op(SCENE_PARAMETERS, const Tensor& tile_counts, const Tensor& moments,
+                         const std::vector<bool>& wanted) {
   const SceneTensors scene(SCENE_ARGUMENTS);
   check_counts(tile_counts, scene.count(), scene.device());
   check_tensor(moments, "moments", scene.dtype(), scene.device(), {scene.count(), kGradientValues});
-  return project_vjp(scene, tile_counts.contiguous(), moments.contiguous(), wanted);
+  return project_vjp(scene, packed(tile_counts), packed(moments), checked_wanted(wanted));
 }
 
-Gradients rasterize_vjp_op(SCENE_PARAMETERS, LISTS_PARAMETERS, Wanted wanted, bool absolute) {
+Gradients rasterize_vjp_op(SCENE_PARAMETERS, LISTS_PARAMETERS, const std::vector<bool>& wanted, bool absolute) {
   const SceneTensors scene(SCENE_ARGUMENTS);
-  return vjp_with_lengths(scene, Lists(scene, LISTS_ARGUMENTS), splats, absolute, wanted);
+  return vjp_with_lengths(scene, Lists(scene, LISTS_ARGUMENTS), splats, absolute, checked_wanted(wanted));
 }
 
 // The rows that rasterize_vjp sums, those of a splat side by side, in the order of its tiles, and their number for each
@@ -68,17 +70,17 @@ Gradients rasterize_vjp_op(SCENE_PARAMETERS, LISTS_PARAMETERS, Wanted wanted, bo
 std::tuple<Tensor, Tensor> blend_rows_op(BACKWARD_PARAMETERS, const Tensor& layers, bool absolute) {
   BlendBackward in(BACKWARD_ARGUMENTS);
   in.take_layers(layers);
-  TORCH_CHECK(!ahead(), "blend_rows waits for the number of rows, so the host cannot run ahead");
-  Tensor rows, counts = at::empty({splats.size(0)}, splats.options().dtype(at::kInt));
+  GS_CHECK(!ahead(), "blend_rows waits for the number of rows, so the host cannot run ahead");
+  Tensor rows, counts = empty<int32_t>({splats.size(0)}, splats);
   with_scalar(splats.scalar_type(), [&](auto zero) {
     using T = decltype(zero);
     auto take = [&](int64_t count) {
-      rows = at::empty({count, row_values(absolute)}, splats.options());
-      return rows.mutable_data_ptr<T>();
+      rows = empty({count, row_values(absolute)}, splats);
+      return write<T>(rows);
     };
     using Take = decltype(take);
     const gs::RowMemory<T> memory{[](void* context, int64_t count) { return (*static_cast<Take*>(context))(count); },
-                                  &take, counts.mutable_data_ptr<int32_t>(), absolute};
+                                  &take, write<int32_t>(counts), absolute};
     GS_RUN(T, splats, blend_rows, in.input<T>(), in.gradient<T>(nullptr, {}), memory);
   });
   return {rows, counts};
@@ -86,25 +88,26 @@ std::tuple<Tensor, Tensor> blend_rows_op(BACKWARD_PARAMETERS, const Tensor& laye
 
 // The rest of rasterize_vjp, the same bits. rows: of blend_rows, or of several calls of it on parts of the lists, each
 // a run of whole tiles; then those of a splat come in the order of the parts.
-Gradients rows_vjp_op(SCENE_PARAMETERS, ROWS_PARAMETERS, Wanted wanted, bool absolute) {
+Gradients rows_vjp_op(SCENE_PARAMETERS, ROWS_PARAMETERS, const std::vector<bool>& wanted, bool absolute) {
   const SceneTensors scene(SCENE_ARGUMENTS);
-  const Rows source(scene, ROWS_ARGUMENTS, absolute, absolute && wanted[kMeans2d]);
-  return vjp_with_lengths(scene, source, splats, absolute, wanted);
+  const Wanted wants = checked_wanted(wanted);
+  const Rows source(scene, ROWS_ARGUMENTS, absolute, absolute && wants[kMeans2d]);
+  return vjp_with_lengths(scene, source, splats, absolute, wants);
 }
 
 }  // namespace
 
-TORCH_LIBRARY_FRAGMENT(diff_gaussian_rasterization, m) {
-  define(m, "blend_vjp(" BACKWARD_SCHEMA ") -> Tensor moments", &blend_vjp_op);
-  define(m, "project_vjp(" SCENE_SCHEMA ", Tensor tile_counts, Tensor moments, bool[9] wanted) -> " GRADIENTS_SCHEMA,
-         &project_vjp_op);
-  define(m,
-         "rasterize_vjp(" SCENE_SCHEMA ", " LISTS_SCHEMA ", bool[9] wanted, bool absolute=False) -> " GRADIENTS_SCHEMA,
-         &rasterize_vjp_op);
-  define(m, "blend_rows(" BACKWARD_SCHEMA ", Tensor layers, bool absolute=False) -> (Tensor rows, Tensor counts)",
-         &blend_rows_op);
-  define(m, "rows_vjp(" SCENE_SCHEMA ", " ROWS_SCHEMA ", bool[9] wanted, bool absolute=False) -> " GRADIENTS_SCHEMA,
-         &rows_vjp_op);
+GS_OPERATORS(diff_gaussian_rasterization, m) {
+  m.define("blend_vjp(" BACKWARD_SCHEMA ") -> Tensor moments", TORCH_BOX(&blend_vjp_op));
+  m.define("project_vjp(" SCENE_SCHEMA ", Tensor tile_counts, Tensor moments, bool[9] wanted) -> " GRADIENTS_SCHEMA,
+           TORCH_BOX(&project_vjp_op));
+  m.define("rasterize_vjp(" SCENE_SCHEMA ", " LISTS_SCHEMA
+           ", bool[9] wanted, bool absolute=False) -> " GRADIENTS_SCHEMA,
+           TORCH_BOX(&rasterize_vjp_op));
+  m.define("blend_rows(" BACKWARD_SCHEMA ", Tensor layers, bool absolute=False) -> (Tensor rows, Tensor counts)",
+           TORCH_BOX(&blend_rows_op));
+  m.define("rows_vjp(" SCENE_SCHEMA ", " ROWS_SCHEMA ", bool[9] wanted, bool absolute=False) -> " GRADIENTS_SCHEMA,
+           TORCH_BOX(&rows_vjp_op));
 }
 
 }  // namespace gs::ops

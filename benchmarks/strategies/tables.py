@@ -1,0 +1,170 @@
+"""Tables of strategies beside the default, and of time budgets beside the best fixed setting at their time.
+
+    python -m benchmarks.strategies.tables OUT/trainings.json ...
+
+Several files of the same commit and machine are read as one.
+"""
+
+import argparse
+import json
+import math
+import statistics
+from collections.abc import Sequence
+from pathlib import Path
+
+from utils.files.markdown_table import markdown_table
+from utils.system_utils import run_cli
+
+DEFAULT = "adc"
+BUDGET = "--time_budget"
+_HEADER = ["scene", "options", "seeds", "iterations", "seconds", "of adc's", "Gaussians", "MB"]
+_SCORES = ["test PSNR (dB)", "more than adc", "best of its curve", "train PSNR"]
+
+
+def print_tables(found: dict) -> None:
+    """Print the machine and all tables that the trainings allow."""
+    print(found["machine"])
+    print("\n".join(["", *(f"- {name}: `{' '.join(words)}`" for name, words in found["sets"].items() if words), ""]))
+    if DEFAULT in found["sets"]:
+        print(
+            markdown_table([*_HEADER, *_SCORES], [line for scene in found["scenes"] for line in _against(found, scene)])
+        )
+        print(f"\n{_means(found)}")
+    if budgets := {name: float(given) for name, words in found["sets"].items() if (given := _given(words))}:
+        print(f"\n{_beside_fronts(found, budgets)}")
+
+
+def _given(words: Sequence[str]) -> str:
+    """The seconds that a set's options give; nothing for a part of the default's."""
+    after = "".join(words[words.index(BUDGET) + 1 :][:1]) if BUDGET in words else ""
+    return "" if "%" in after else after
+
+
+def _ends(found: dict, scene: str, name: str) -> list[dict]:
+    """The ends of a set's trainings, of the seeds that have one."""
+    return [one["end"] | one for one in found["scenes"][scene].get(name, {}).values() if one]
+
+
+def _against(found: dict, scene: str) -> list[list[str]]:
+    """A row for each set: what it costs and how well it ends, beside the default."""
+    rows = []
+    default = _ends(found, scene, DEFAULT)
+    for name in found["sets"]:
+        ends = _ends(found, scene, name)
+        if not ends:
+            continue
+        seconds = statistics.fmean(end["seconds"] for end in ends)
+        part = f"{seconds / statistics.fmean(end['seconds'] for end in default):.2f}" if default else ""
+        rows.append([
+            scene,
+            name,
+            f"{len(ends)}",
+            _shown([end["iteration"] for end in ends], ",.0f"),
+            _shown([end["seconds"] for end in ends], ".2f"),
+            part,
+            _shown([end["gaussians"] for end in ends], ",.0f"),
+            f"{statistics.fmean(end['ply_bytes'] for end in ends) / 1e6:.1f}",
+            _shown([end["test_psnr"] for end in ends], ".2f"),
+            f"{gain(found, scene, name):+.2f}" if default else "",
+            f"{statistics.fmean(_best(end['curve']) for end in ends):.2f}",
+            f"{statistics.fmean(end['train_psnr'] for end in ends):.2f}",
+        ])  # fmt: skip
+    return rows
+
+
+def gain(found: dict, scene: str, name: str) -> float:
+    """What the mean test PSNR (dB) of a set is above the default's."""
+    ours, theirs = (statistics.fmean(end["test_psnr"] for end in _ends(found, scene, one)) for one in (name, DEFAULT))
+    return ours - theirs
+
+
+def _best(curve: Sequence[dict]) -> float:
+    return max(row["test_psnr"] for row in curve if row["whole"])
+
+
+def _shown(values: Sequence[float], form: str) -> str:
+    deviation = f" ± {statistics.stdev(values):{form}}" if len(values) > 1 else ""
+    return f"{statistics.fmean(values):{form}}{deviation}"
+
+
+def _means(found: dict) -> str:
+    """A table of the mean gain over the scenes that have a set."""
+    rows = []
+    for name in found["sets"]:
+        scenes = [scene for scene in found["scenes"] if _ends(found, scene, name) and _ends(found, scene, DEFAULT)]
+        if scenes and name != DEFAULT:
+            gains = [gain(found, scene, name) for scene in scenes]
+            rows.append([name, f"{len(scenes)}", f"{statistics.fmean(gains):+.2f}", f"{min(gains):+.2f}"])
+    return markdown_table(["options", "scenes", "mean of more than adc (dB)", "least"], rows)
+
+
+def _beside_fronts(found: dict, budgets: dict[str, float]) -> str:
+    """A table of time budgets (seconds): PSNR at their end, and the best of the sets without one at that time."""
+    rows = []
+    for scene in found["scenes"]:
+        for name, given in budgets.items():
+            ends = _ends(found, scene, name)
+            if not ends:
+                continue
+            fixed = {
+                other: statistics.fmean(at(end["curve"], given) for end in _ends(found, scene, other))
+                for other in found["sets"]
+                if BUDGET not in found["sets"][other] and _ends(found, scene, other)
+            }
+            if not fixed:
+                continue
+            best = max(fixed, key=fixed.__getitem__)
+            ours = statistics.fmean(end["test_psnr"] for end in ends)
+            rows.append([
+                scene,
+                name,
+                f"{len(ends)}",
+                _shown([end["seconds"] for end in ends], ".2f"),
+                _shown([end["iteration"] for end in ends], ",.0f"),
+                _shown([end["gaussians"] for end in ends], ",.0f"),
+                _shown([end["test_psnr"] for end in ends], ".2f"),
+                f"{fixed[best]:.2f}",
+                best,
+                f"{ours - fixed[best]:+.2f}",
+            ])  # fmt: skip
+    costs = ["scene", "options", "seeds", "seconds", "iterations", "Gaussians"]
+    return markdown_table([*costs, "test PSNR (dB)", "best fixed one then", "options of that", "more"], rows)
+
+
+def at(curve: Sequence[dict], seconds: float) -> float:
+    """Test PSNR (dB) of a curve at a time: between two points on the line between them, after the end that of the end.
+
+    Only points that score all test views count. Before the first one it is minus infinity.
+    """
+    rows = [row for row in curve if row["whole"]]
+    before = [row for row in rows if row["seconds"] <= seconds]
+    after = [row for row in rows if row["seconds"] > seconds]
+    if not before:
+        return -math.inf
+    if not after:
+        return before[-1]["test_psnr"]
+    one, two = before[-1], after[0]
+    part = (seconds - one["seconds"]) / (two["seconds"] - one["seconds"])
+    return one["test_psnr"] + part * (two["test_psnr"] - one["test_psnr"])
+
+
+def joined(files: Sequence[dict]) -> dict:
+    """One record of several: sets and scenes of all."""
+    machines = dict.fromkeys(one["machine"] for one in files)
+    whole = {"machine": "\n".join(machines), "sets": {}, "scenes": {}}
+    for one in files:
+        whole["sets"] |= one["sets"]
+        for scene, sets in one["scenes"].items():
+            for name, seeds in sets.items():
+                whole["scenes"].setdefault(scene, {}).setdefault(name, {}).update(seeds)
+    return whole
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("files", type=Path, nargs="+", help="trainings.json of benchmarks.strategies.trainings")
+    print_tables(joined([json.loads(path.read_text()) for path in parser.parse_args().files]))
+
+
+if __name__ == "__main__":
+    run_cli(main)

@@ -1,0 +1,52 @@
+"""Errors of compiled operators: torch's stable interface has one type for all, and the packages raise what is meant."""
+
+from pathlib import Path
+
+import pytest
+import torch
+from diff_gaussian_rasterization.backend import OPERATORS
+from fused_ssim.backend import OPERATORS as SSIM
+
+SUBMODULES = Path(__file__).resolve().parents[1] / "submodules"
+RAW = torch.ops.diff_gaussian_rasterization
+HUGE = 1 << 24
+TORCH = tuple(int(part) for part in torch.__version__.split(".")[:2])
+
+
+@pytest.mark.parametrize(("arguments", "error"), [((None, torch.eye(4)), TypeError), (2 * [torch.eye(4)], ValueError)])
+def test_a_message_names_the_error_that_is_raised(arguments, error):
+    with pytest.raises(RuntimeError, match=f"^{error.__name__}: positions must be") as raw:
+        RAW.mark_visible(*arguments)
+    with pytest.raises(error) as meant:
+        OPERATORS.mark_visible(*arguments)
+    assert f"{error.__name__}: {meant.value}" == str(raw.value)
+
+
+def test_other_errors_stay_as_they_are():
+    with pytest.raises(RuntimeError, match="^the background must be 3 float32, got "):
+        SSIM.composite(torch.zeros(4, 2, 2, dtype=torch.uint8), torch.zeros(4))
+    with pytest.raises(RuntimeError, match="expected at most 2"):  # torch's own
+        SSIM.composite(*[torch.zeros(3)] * 3)
+
+
+@pytest.mark.skipif(TORCH < (2, 13), reason="torch before 2.13 does not tell")
+def test_too_little_memory_has_the_type_that_torch_has_for_it():
+    one = torch.zeros(1)
+    image = one.expand(HUGE, HUGE), one.expand(HUGE, HUGE)  # two PiB, of which four bytes are there
+    with pytest.raises(torch.OutOfMemoryError, match="allocate"):
+        SSIM.photometric(*image, 0.2, False)
+
+
+def test_every_operator_has_a_function():
+    for namespace, functions in (("diff_gaussian_rasterization", OPERATORS), ("fused_ssim", SSIM)):
+        names = [name for name in torch._C._dispatch_get_all_op_names() if name.startswith(f"{namespace}::")]
+        assert {name.partition("::")[2] for name in names} == vars(functions).keys()
+        for name, function in vars(functions).items():
+            assert function.default is getattr(getattr(torch.ops, namespace), name).default
+
+
+@pytest.mark.parametrize("name", ["operators.py", "first_order.py"])
+def test_copies_of_a_module_are_equal(name):
+    """Each package stands alone."""
+    copies = list(SUBMODULES.glob(f"*/*/{name}"))
+    assert len(copies) > 1 and len({path.read_text() for path in copies}) == 1
