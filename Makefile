@@ -1,5 +1,6 @@
 # make demo   a scene made, trained, rendered and scored
 # make test   lint, format check, C++ tests, pytest
+# make test-aarch64, test-windows, test-macos   the C++ tests, built for another platform and run under an emulator
 # make test-browser   the tests that need Chromium, which is installed first where Debian's package manager may be used
 # make test-foreign   the tests by programs of npm that read our exports; they skip without npm
 # make format rewrites what the format check would complain about
@@ -27,7 +28,7 @@ CXX_SOURCES := $(shell find submodules benchmarks -name build -prune -o \( -name
 sources = $(shell find submodules/common submodules/$(1) \( -name build -o -name tests -o -name emulation \) -prune -o \
             \( -name '*.cpp' -o -name '*.cu*' -o -name '*.h' -o -name '*.py' -o -name '*.toml' \) -print)
 
-.PHONY: install demo test test-browser test-foreign lint format cpp-test docs wheels gate clean
+.PHONY: install demo test test-aarch64 test-windows test-macos test-browser test-foreign lint format cpp-test docs wheels gate clean
 .NOTPARALLEL:
 
 install: $(EXTENSIONS:%=$(VENV)/.built-%)
@@ -54,6 +55,9 @@ output/demo_scene: | install
 
 test: install lint cpp-test
 	$(BIN)/python -m pytest -m 'not browser' --numprocesses auto --maxprocesses 4 --dist worksteal
+
+test-aarch64 test-windows test-macos:
+	$(PYTHON) .ci/cross.py $(@:test-%=%)
 
 test-browser: install
 	tests/browser/install.sh

@@ -22,7 +22,7 @@ EXTENSIONS = ("diff-gaussian-rasterization", "fused-ssim", "simple-knn")
 
 def requirements() -> list[str]:
     """Read requirements.txt. If torch is installed, do not pin torch and torchvision, so that it stays."""
-    lines = (ROOT / "requirements.txt").read_text().splitlines()
+    lines = (ROOT / "requirements.txt").read_text(encoding="utf-8").splitlines()
     lines = [line for line in lines if line and not line.startswith("#")]
     if find_spec("torch"):
         fitting = {"torch": "torch>={}.{}".format(*OLDEST_TORCH), "torchvision": "torchvision"}

@@ -9,6 +9,7 @@ import platform
 import re
 import shutil
 import subprocess
+import sys
 from pathlib import Path
 
 from diagnosis.lines import Line
@@ -62,7 +63,10 @@ def extensions_load() -> bool:
 
 def _required() -> list[str]:
     text = (ROOT / "requirements.txt").read_text(encoding="utf-8")
-    return list(dict.fromkeys(re.findall(r"^([A-Za-z0-9_-]+)==", text, re.MULTILINE)))
+    names = dict.fromkeys(re.findall(r"^([A-Za-z0-9_-]+)==", text, re.MULTILINE))
+    if sys.platform == "linux" and platform.machine() != "x86_64":
+        names.pop("pycolmap", None)  # has no wheel there; COLMAP models are read without it
+    return list(names)
 
 
 def _version(name: str) -> str | None:

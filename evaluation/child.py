@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import os
+import queue
 import re
-import selectors
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -57,28 +58,42 @@ def run_child(command: Sequence[str], **environment: str) -> Finished:
         # The child inherits only the folder's lock, which is then kept as long as the child lives.
         child = subprocess.Popen(command, stderr=subprocess.PIPE, start_new_session=True, close_fds=False,
                                  env=os.environ | environment)  # fmt: skip
+        chunks: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+        reader = threading.Thread(target=_read, args=(child, chunks), daemon=True)
+        reader.start()
         try:
-            handed_on = False
-            with selectors.DefaultSelector() as selector:
-                selector.register(child.stderr, selectors.EVENT_READ)
-                while True:
-                    if interrupt.requested and not handed_on:
-                        handed_on = True
-                        child.send_signal(signal.SIGTERM if interrupt.requested is Terminated else signal.SIGINT)
-                    if selector.select(_LOOK):
-                        if not (chunk := os.read(child.stderr.fileno(), 1 << 16)):
-                            break
-                        tail.add(chunk)
-                        _show(chunk)
+            handed_on, chunk = False, None
+            while chunk != b"":
+                if interrupt.requested and not handed_on:
+                    handed_on = True
+                    _hand_on(interrupt.requested, child)
+                with contextlib.suppress(queue.Empty):
+                    chunk = chunks.get(timeout=_LOOK)
+                    tail.add(chunk)
+                    _show(chunk)
             status = child.wait()
         finally:
             if child.poll() is None:
                 child.kill()
                 child.wait()
-            child.stderr.close()
+            reader.join(_LOOK)  # longer only if a program that the child has started holds the pipe
+            if not reader.is_alive():
+                child.stderr.close()
         requested = interrupt.requested
     cpu = None if cpu_before is None else _children_cpu_seconds() - cpu_before
     return Finished(status, tail.lines, time.perf_counter() - start, cpu, requested)
+
+
+def _read(child: subprocess.Popen, chunks: queue.SimpleQueue[bytes]) -> None:
+    """Read a child's messages to their end, an empty chunk. Windows cannot wait for a pipe with a time limit."""
+    while chunk := os.read(child.stderr.fileno(), 1 << 16):
+        chunks.put(chunk)
+    chunks.put(b"")
+
+
+def _hand_on(interrupt: type[KeyboardInterrupt], child: subprocess.Popen) -> None:
+    if os.name != "nt":  # there Ctrl-C has reached the child as well, and no other signal can be sent
+        child.send_signal(signal.SIGTERM if interrupt is Terminated else signal.SIGINT)
 
 
 def _children_cpu_seconds() -> float | None:

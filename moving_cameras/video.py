@@ -1,7 +1,6 @@
 """H.264 videos from frames that come one by one, written by the ffmpeg of the package imageio-ffmpeg."""
 
 import contextlib
-import os
 import re
 import subprocess
 import tempfile
@@ -11,6 +10,7 @@ from typing import IO
 
 import numpy as np
 
+from utils.host.session import own_session
 from utils.system_utils import UserError, atomic_write
 
 # Of x264, 0 to 51, smaller is better. At 16 a render keeps 35 dB and more; what is lost is colour at edges, as yuv420p
@@ -83,7 +83,7 @@ def video_writer(path: Path, width: int, height: int, fps: int) -> Iterator[Vide
         # In a session of its own Ctrl-C does not reach it; it is ended below.
         streams = {"stdin": subprocess.PIPE, "stdout": subprocess.DEVNULL, "stderr": said}
         try:
-            process = subprocess.Popen(command, **streams, start_new_session=os.name == "posix")
+            process = subprocess.Popen(command, **streams, **own_session())
         except OSError as error:
             raise UserError(
                 f"cannot start {program} ({error.strerror}); `pip install --force-reinstall imageio-ffmpeg` brings it "

@@ -13,6 +13,7 @@ from pathlib import Path
 
 from records.curve_figure import draw_curve
 from records.error_curve import Row
+from utils.host.session import own_session
 
 _ROOT = Path(__file__).resolve().parents[1]
 
@@ -35,7 +36,7 @@ class CurveDrawer:
         with contextlib.suppress(OSError):
             self._process = subprocess.Popen(
                 command, cwd=_ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, encoding="utf-8",
-                start_new_session=True,  # Ctrl-C is for the training, which ends this process if need be
+                **own_session(),  # Ctrl-C is for the training, which ends this process if need be
             )  # fmt: skip
 
     def draw(self, path: Path, rows: list[Row], title: str) -> None:

@@ -4,6 +4,7 @@ import importlib.util
 import os
 import re
 import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -11,6 +12,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 WORKFLOWS = sorted((ROOT / ".github" / "workflows").glob("*.yml"))
 SCRIPTS = sorted(path for path in (ROOT / ".ci").iterdir() if path.suffix == "")
+HIDDEN = {"-fvisibility=hidden", "-fvisibility-inlines-hidden"}
 TEXT = "\n".join(path.read_text(encoding="utf-8") for path in WORKFLOWS)
 
 
@@ -110,10 +112,26 @@ def test_cuda_sources_are_all_compiled(tmp_path):
     assert subprocess.run([ROOT / ".ci" / "compile_cuda"], env=environment, capture_output=True).returncode != 0
 
 
-def test_tests_without_make_install_the_same():
-    spec = importlib.util.spec_from_file_location("test_without_make", ROOT / ".ci" / "test_without_make.py")
-    module = importlib.util.module_from_spec(spec)
+def test_emulated_platforms_take_the_builders_flags():
+    cross, builder = (_loaded(ROOT / path) for path in (".ci/cross.py", "submodules/common/build_extension.py"))
+    assert {isa: list(flags) for isa, flags in cross.ARM64.items()} == builder.ARM64_ISAS
+    assert set(cross.FLAGS) - {"-Werror", "-pthread"} == set(builder.CXX_FLAGS) - {"-fPIC"} - HIDDEN
+    assert {path.stem for name in cross.EXTENSIONS for path in cross.tests(name)} == {
+        path.stem for path in ROOT.glob("submodules/*/csrc/tests/**/*.cpp") if "emulated" not in path.stem
+    }
+    offered = re.search(r"platform: \[(.+)\]", TEXT)[1].split(", ")
+    assert sorted(offered) == sorted(cross.TARGETS)
+
+
+def _loaded(path: Path):
+    spec = importlib.util.spec_from_file_location(path.stem, path)
+    module = sys.modules[path.stem] = importlib.util.module_from_spec(spec)  # where dataclasses look for it
     spec.loader.exec_module(module)
+    return module
+
+
+def test_tests_without_make_install_the_same():
+    module = _loaded(ROOT / ".ci" / "test_without_make.py")
     made = re.search(r"^EXTENSIONS := (.+)$", (ROOT / "Makefile").read_text(), re.MULTILINE)
     assert list(module.EXTENSIONS) == made[1].split()
     first, *built, tests = module.commands(Path("python"), ["-x"])

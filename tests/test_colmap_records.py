@@ -1,6 +1,7 @@
 """Single files of a COLMAP model against pycolmap, for all of its camera models, and what is said of broken files."""
 
 import io
+import shutil
 import struct
 from pathlib import Path
 
@@ -27,6 +28,8 @@ from scene.colmap_loader import (
     read_points3D_text,
     rotmat2qvec,
 )
+from scene.pictures import pycolmap_import
+from scene.readers import colmap_model
 from utils.system_utils import UserError
 
 MODELS = [model for model in pycolmap.CameraModelId.__members__.values() if int(model) >= 0]
@@ -116,6 +119,36 @@ def test_points_are_those_of_pycolmap(model, folder, suffix):
     wanted = {tuple(point.xyz): (tuple(point.color), point.error) for point in model.points3D.values()}
     got = {tuple(xyz): (tuple(rgb), error) for xyz, rgb, (error,) in zip(xyzs, rgbs, errors, strict=True)}
     assert got == wanted
+
+
+@pytest.mark.parametrize("suffix", ["bin", "txt"])
+def test_without_pycolmap_a_model_has_the_same_views_and_points(folder, tmp_path, monkeypatch, suffix):
+    for name in ("cameras", "images", "points3D"):
+        shutil.copy(folder / f"{name}.{suffix}", tmp_path)
+    wanted = colmap_model.read_model(tmp_path)
+    monkeypatch.setattr(colmap_model, "has_pycolmap", lambda: False)
+    monkeypatch.setattr(colmap_model, "import_pycolmap", lambda: pytest.fail("pycolmap was imported"))
+    got = colmap_model.read_model(tmp_path)
+    assert [view[:3] for view in got.views] == [view[:3] for view in wanted.views]
+    for one, other in zip(got.views, wanted.views, strict=True):
+        np.testing.assert_allclose(one.rotation, other.rotation, atol=1e-15)
+        np.testing.assert_array_equal(one.translation, other.translation)
+    np.testing.assert_array_equal(got.points, wanted.points)
+    np.testing.assert_array_equal(got.colors, wanted.colors)
+    assert got.points.dtype == wanted.points.dtype and got.colors.dtype == wanted.colors.dtype
+
+
+def test_without_pycolmap_what_is_missing_is_said(tmp_path, monkeypatch):
+    (tmp_path / "cameras.txt").write_text("1 PINHOLE 8 6 9 9 4 3\n")
+    (tmp_path / "points3D.txt").write_text("")
+    monkeypatch.setattr(colmap_model, "has_pycolmap", lambda: False)
+    for line, fault in (("1 1 0 0 0 0 0 0 7 a.png", "no camera 7"), ("1 0 0 0 0 0 0 0 1 a.png", "no rotation")):
+        (tmp_path / "images.txt").write_text(f"{line}\n\n")
+        with pytest.raises(UserError, match=f"the photo a.png has {fault}"):
+            colmap_model.read_model(tmp_path)
+    monkeypatch.setattr(pycolmap_import, "has_pycolmap", lambda: False)
+    with pytest.raises(UserError, match="pycolmap is not installed, .*undistort the photos on another machine"):
+        pycolmap_import.import_pycolmap()
 
 
 def test_an_empty_model_has_no_records(tmp_path):

@@ -70,6 +70,15 @@ def test_missing_packages_end_it(monkeypatch, colmap_scene, capsys):
     assert "photos" not in out
 
 
+@pytest.mark.parametrize(("system", "machine", "missed"), [("linux", "aarch64", False), ("darwin", "arm64", True)])
+def test_pycolmap_is_missed_only_where_it_has_a_wheel(monkeypatch, system, machine, missed):
+    monkeypatch.setattr(environment.sys, "platform", system)
+    monkeypatch.setattr(environment.platform, "machine", lambda: machine)
+    monkeypatch.setattr(environment, "_version", lambda name: None if name == "pycolmap" else "1.0")
+    (line,) = environment.check_packages()
+    assert bool(line.finding) == missed
+
+
 def _sources(root: Path, version: str = "0.1.0") -> Path:
     """A repository with the installed Python part of simple-knn."""
     package = root / "submodules" / "simple-knn" / "simple_knn"

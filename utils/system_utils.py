@@ -4,6 +4,7 @@ import contextlib
 import os
 import re
 import sys
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -26,6 +27,9 @@ __all__ = [
 ]
 
 _ITERATION_FOLDER = re.compile(r"iteration_(\d+)")
+# Windows' errors while another program, such as a virus scanner, has a file open; Linux has no such error.
+_IN_USE = {5, 32, 33}  # access denied, sharing violation, lock violation
+_PATIENCE = 2.0  # seconds for it to close the file
 
 
 class UserError(Exception):
@@ -131,7 +135,7 @@ def atomic_write(path: str | os.PathLike, every_rank: bool = False) -> Iterator[
     temporary = target.with_name(f".{target.stem}.{os.getpid()}.tmp{target.suffix}")
     try:
         yield temporary
-        os.replace(temporary, target)
+        _replace(temporary, target)
     except BaseException as error:
         with contextlib.suppress(OSError):
             temporary.unlink()
@@ -141,6 +145,17 @@ def atomic_write(path: str | os.PathLike, every_rank: bool = False) -> Iterator[
                 f"cannot write {target} ({reason}); free space, fix the permissions, or choose another place"
             ) from error
         raise
+
+
+def _replace(temporary: Path, target: Path) -> None:
+    end = time.monotonic() + _PATIENCE
+    while True:
+        try:
+            return os.replace(temporary, target)
+        except OSError as error:
+            if getattr(error, "winerror", None) not in _IN_USE or time.monotonic() > end:
+                raise
+        time.sleep(0.05)
 
 
 def mkdir_p(folder_path: str | os.PathLike) -> None:

@@ -34,7 +34,12 @@ def read_extrinsics_binary(path: str | os.PathLike) -> dict[int, Image]:
 
 def read_points3D_binary(path: str | os.PathLike) -> Points:
     """Positions (N,3), colours (N,3) to 255 and errors (N,1) of a points3D.bin in its order, all float64."""
-    return points_of(list(_binary_records(Path(path), "point", _point)))
+    return points_of([values for _, *values in read_point_rows_binary(path)])
+
+
+def read_point_rows_binary(path: str | os.PathLike) -> list[tuple]:
+    """Id, position, colour and error of each point of a points3D.bin, in its order."""
+    return list(_binary_records(Path(path), "point", _point))
 
 
 def read_colmap_bin_array(path: str | os.PathLike) -> np.ndarray:
@@ -127,6 +132,6 @@ def _image(content: _Bytes) -> Image:
 
 
 def _point(content: _Bytes) -> tuple:
-    _, *values, seen = content.take(_POINT)
+    *values, seen = content.take(_POINT)
     content.skip(8 * seen)
     return tuple(values)

@@ -1,4 +1,4 @@
-"""COLMAP models through pycolmap, as plain records."""
+"""COLMAP models as plain records: through pycolmap, or without it where it is not installed."""
 
 import sys
 from pathlib import Path
@@ -7,9 +7,11 @@ from typing import NamedTuple
 import numpy as np
 
 from scene.pictures.lens import Lens
-from scene.pictures.pycolmap_import import import_pycolmap
+from scene.pictures.pycolmap_import import has_pycolmap, import_pycolmap
+from scene.readers import colmap_binary, colmap_text
 from scene.readers.colmap_faults import NAMES, describe
 from scene.readers.colmap_lengths import check_lengths
+from scene.readers.colmap_records import qvec2rotmat
 from utils.system_utils import UserError
 
 
@@ -66,6 +68,8 @@ def find_model(scene: Path) -> tuple[Path, ColmapModel]:
 
 def read_model(folder: Path) -> ColmapModel:
     """Read a binary model, or a text model if that is missing or broken. UserError when neither can be read."""
+    if not has_pycolmap():
+        return _read_plainly(folder)
     pycolmap = import_pycolmap()
     errors = []
     for suffix, read in (("bin", "read_binary"), ("txt", "read_text")):
@@ -89,6 +93,29 @@ def _unreadable(folder: Path, faults: list[str]) -> UserError:
         f"cannot read the COLMAP model in {folder} ({'; '.join(faults)}); fix that, or copy all three files again "
         "from where they were made"
     )
+
+
+def _read_plainly(folder: Path) -> ColmapModel:
+    if _has_model(folder, "bin"):
+        cameras = colmap_binary.read_intrinsics_binary(folder / "cameras.bin")
+        images = colmap_binary.read_extrinsics_binary(folder / "images.bin")
+        rows = colmap_binary.read_point_rows_binary(folder / "points3D.bin")
+    else:
+        cameras = colmap_text.read_intrinsics_text(folder / "cameras.txt")
+        images = colmap_text.read_extrinsics_text(folder / "images.txt")
+        rows = colmap_text.read_point_rows_text(folder / "points3D.txt")
+    views = []
+    for _, image in sorted(images.items()):
+        camera = cameras.get(image.camera_id)
+        length = float(np.linalg.norm(image.qvec))
+        if camera is None or not (length > 0 and np.isfinite([*image.qvec, *image.tvec]).all()):
+            what = f"no camera {image.camera_id}" if camera is None else "no rotation and translation"
+            raise _unreadable(folder, [f"the photo {image.name} has {what}"])
+        lens = Lens(camera.model, tuple(camera.params.tolist()), camera.width, camera.height)
+        rotation = qvec2rotmat(image.qvec / length)
+        views.append(ColmapView(image.name, image.camera_id, lens, rotation, image.tvec))
+    table = np.array([values for _, *values, _ in sorted(rows)], dtype=np.float64).reshape(-1, 6)
+    return ColmapModel(views, table[:, :3].copy(), table[:, 3:].astype(np.uint8))
 
 
 class Sightings(NamedTuple):

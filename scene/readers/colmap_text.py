@@ -50,14 +50,20 @@ def read_extrinsics_text(path: str | os.PathLike) -> dict[int, Image]:
 
 def read_points3D_text(path: str | os.PathLike) -> Points:
     """Positions (N,3), colours (N,3) to 255 and errors (N,1) of a points3D.txt in its order, all float64."""
+    return points_of([values for _, *values in read_point_rows_text(path)])
+
+
+def read_point_rows_text(path: str | os.PathLike) -> list[tuple]:
+    """Id, position, colour and error of each point of a points3D.txt, in its order."""
     rows = []
     for number, line in _data_lines(Path(path)):
         try:
-            x, y, z, red, green, blue, error = (float(word) for word in line.split(maxsplit=8)[1:8])
+            id, *values = line.split(maxsplit=8)[:8]
+            x, y, z, red, green, blue, error = map(float, values)
+            rows.append((int(id), x, y, z, red, green, blue, error))
         except ValueError as fault:
             raise _bad_line(path, number, "id, position, colour and error of a point", fault) from fault
-        rows.append((x, y, z, red, green, blue, error))
-    return points_of(rows)
+    return rows
 
 
 def _data_lines(path: Path, keep_next: bool = False) -> Iterator[tuple[int, str]]:

@@ -13,6 +13,7 @@ import numpy as np
 from scene.pictures.decode import picture_size
 from scene.pictures.masks import Mask
 from scene.pictures.store import Decodable
+from utils.files.relative import relative_to
 from utils.graphics_utils import BasicPointCloud, camera_center, focal2fov, fov2focal
 from utils.system_utils import UserError
 
@@ -206,9 +207,12 @@ def exposure_names(cameras: Sequence[CameraInfo]) -> list[str]:
     if not shared:
         return names
     paths = [Path(getattr(camera, "image_path", None) or "") for camera in cameras]
-    folder = os.path.commonpath([path.parent for path in paths if path.name] or [""])
+    try:
+        folder = os.path.commonpath([path.parent for path in paths if path.name] or [""])
+    except ValueError:  # drives of Windows
+        folder = ""
     return [
-        Path(os.path.relpath(path, folder)).as_posix() if name in shared and path.name else name
+        relative_to(path, folder).as_posix() if name in shared and path.name else name
         for name, path in zip(names, paths, strict=True)
     ]
 

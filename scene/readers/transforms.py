@@ -24,6 +24,7 @@ from scene.readers.start_cloud import (
 )
 from scene.readers.transforms_lens import lens_of
 from utils.files.image_files import SUFFIXES
+from utils.files.relative import relative_to
 from utils.system_utils import UserError
 
 SPLITS = ("train_filenames", "val_filenames", "test_filenames")
@@ -156,7 +157,7 @@ def _cameras(file: _CameraFile, masks: MaskOptions, suffixes: Sequence[str], by_
 
 
 def _relative(path: Path, folder: Path) -> str:
-    return Path(os.path.relpath(path, folder)).as_posix()
+    return relative_to(path, folder).as_posix()
 
 
 def _masks(file: _CameraFile, names: list[str], masks: MaskOptions) -> list[Mask | None]:

@@ -33,10 +33,12 @@ OLDEST_TORCH = (2, 10)  # the first whose stable interface has all that csrc/tor
 OLDEST_ARCHITECTURE = 80  # reductions over a warp in one instruction
 COMMON_INCLUDE = Path(__file__).resolve().parent / "include"
 # No -ffast-math: NaN, infinities and the order of sums matter. Nobody reads errno or traps.
-CXX_FLAGS = ["-O3", "-std=c++17", "-fPIC", "-Wall", "-Wextra", "-fno-math-errno", "-fno-trapping-math"]
+CXX_FLAGS = ["-O3", "-std=c++17", "-Wall", "-Wextra", "-fno-math-errno", "-fno-trapping-math"]
+CXX_FLAGS += [] if sys.platform == "win32" else ["-fPIC"]
 # Symbols stay inside: the three libraries hold templates of the same names.
 CXX_FLAGS += ["-fvisibility=hidden", "-fvisibility-inlines-hidden"]
 X86_ISAS = {"baseline": [], "avx2": ["-march=x86-64-v3"], "avx512": ["-march=x86-64-v4", "-mprefer-vector-width=512"]}
+ARM64_ISAS = {"baseline": ["-DGS_PLAIN", "-ffp-contract=off"], "neon": []}
 
 
 def setup_extension(name: str, package: str, root: Path) -> None:
@@ -116,6 +118,9 @@ def compilations(torch: ModuleType, cxx: list[str], nvcc: str | None, csrc: Path
     if platform.machine() in ("x86_64", "AMD64"):
         compile_cxx.append("-DGS_X86")
         isas = X86_ISAS
+    elif platform.machine() in ("aarch64", "arm64", "ARM64"):
+        compile_cxx.append("-DGS_ARM64")
+        isas = ARM64_ISAS
     ops_flags = ["-isystem", str(Path(torch.__file__).parent / "include")]
     ops_flags += [f"-DTORCH_TARGET_VERSION={target_version(OLDEST_TORCH)}"]
     kernels = sorted((csrc / "cuda").glob("*.cu")) if nvcc else []
@@ -186,9 +191,13 @@ def import_torch() -> ModuleType:
 
 
 def find_compiler() -> list[str]:
-    """The C++ compiler's command: CXX, else c++, g++ or clang++ on PATH."""
+    """The C++ compiler's command: CXX, else c++, g++ or clang++ on PATH.
+
+    On Windows only LLVM's clang++: MSVC has no vectors like those of gs/simd.h, and GCC does not link with torch.
+    """
     wanted = shlex.split(os.environ.get("CXX", ""))
-    for command in [wanted] if wanted else [["c++"], ["g++"], ["clang++"]]:
+    usual = [["clang++"]] if sys.platform == "win32" else [["c++"], ["g++"], ["clang++"]]
+    for command in [wanted] if wanted else usual:
         if shutil.which(command[0]):
             return command
     what = f"the C++ compiler {wanted[0]} (CXX)" if wanted else "a C++ compiler"

@@ -24,6 +24,8 @@ def device_name(device: torch.device) -> str:
 
 def instruction_set() -> str:
     """Instruction set that the CPU backends use here; the environment variable GS_ISA narrows it."""
+    if platform.machine() in ("aarch64", "arm64", "ARM64"):
+        return "baseline" if os.environ.get("GS_ISA") == "baseline" else "neon"
     capability = {"AVX512": "avx512", "AVX2": "avx2"}.get(torch.backends.cpu.get_cpu_capability(), "baseline")
     order = ["baseline", "avx2", "avx512"]
     wanted = os.environ.get("GS_ISA", capability)

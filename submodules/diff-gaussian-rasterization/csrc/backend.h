@@ -2,6 +2,7 @@
 // The functions that every backend offers, and the callbacks through which they get memory.
 #include "data.h"
 #include "gs/cuda_queue.h"
+#include "gs/isa.h"
 #include "gs/parallel.h"
 
 namespace gs {
@@ -69,17 +70,12 @@ void add_noise(const Executor&, const NoiseInput&);
   void project_vjp_step(const Executor&, const Scene<T>&, const int32_t* tile_counts, const T* moments, \
                         const GaussianStep<T>&);
 
-namespace baseline {
-GS_CPU_BACKEND
-}
-#ifdef GS_X86
-namespace avx2 {
-GS_CPU_BACKEND
-}
-namespace avx512 {
-GS_CPU_BACKEND
-}
-#endif
+#define GS_DECLARE(isa) \
+  namespace isa {       \
+  GS_CPU_BACKEND        \
+  }
+GS_EACH_ISA(GS_DECLARE)
+#undef GS_DECLARE
 namespace cuda {
 GS_BACKEND(Queue)
 void observe(const Queue&, const ObserveInput&);

@@ -23,11 +23,7 @@ void l1_ssim_vjp_cuda(const L1SsimVjpCuda&, const Queue&);
   void l1_ssim_vjp_cpu(const L1SsimVjp<float>&, const Executor&);  \
   void l1_ssim_vjp_cpu(const L1SsimVjp<double>&, const Executor&); \
   }
-GS_DECLARE(baseline)
-#ifdef GS_X86
-GS_DECLARE(avx2)
-GS_DECLARE(avx512)
-#endif
+GS_EACH_ISA(GS_DECLARE)
 #undef GS_DECLARE
 
 }  // namespace gs

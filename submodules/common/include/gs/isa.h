@@ -15,16 +15,37 @@
   }                \
   }
 
+// GS_NEON: 64-bit Arm, with vectors of its own. GS_PLAIN takes them away, for its baseline: no instruction of one
+// machine alone, and each product rounded (the compiler's flag), so its results have the bits of x86-64's baseline.
+#if defined(__ARM_NEON) && defined(__aarch64__) && !defined(GS_PLAIN)
+#define GS_NEON
+#endif
+// GS_FUSES: a product and a sum are one instruction, rounded once.
+#if defined(__FMA__) || defined(GS_NEON)
+#define GS_FUSES
+#endif
+
+// GS_EACH_ISA(use): use(isa) for each instruction set of the library. The builder defines GS_X86 or GS_ARM64.
+#if defined(GS_X86)
+#define GS_EACH_ISA(use) use(baseline) use(avx2) use(avx512)
+#elif defined(GS_ARM64)
+#define GS_EACH_ISA(use) use(baseline) use(neon)
+#else
+#define GS_EACH_ISA(use) use(baseline)
+#endif
+
 namespace gs {
 
-enum class Isa { baseline, avx2, avx512 };
+enum class Isa { baseline, avx2, avx512, neon };
 
 // The widest instruction set of this machine, or a narrower one that the environment variable GS_ISA names, to compare
 // them. Internal linkage, for the reason above.
 static inline Isa best_isa() {
   static const Isa isa = [] {
     Isa found = Isa::baseline;
-#ifdef GS_X86
+#if defined(GS_ARM64)
+    found = Isa::neon;  // every 64-bit Arm has it
+#elif defined(GS_X86)
     // x86-64-v3 and v4 by their parts: compilers before GCC 12 and Clang 16 do not know the levels' names.
     if (__builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma") && __builtin_cpu_supports("bmi2"))
       found = Isa::avx2;
@@ -43,11 +64,14 @@ static inline Isa best_isa() {
 }  // namespace gs
 
 // Calls gs::<isa>::fn(...) for the instruction set of this machine.
-#ifdef GS_X86
+#if defined(GS_X86)
 #define GS_DISPATCH(fn, ...)                                             \
   (::gs::best_isa() == ::gs::Isa::avx512 ? ::gs::avx512::fn(__VA_ARGS__) \
    : ::gs::best_isa() == ::gs::Isa::avx2 ? ::gs::avx2::fn(__VA_ARGS__)   \
                                          : ::gs::baseline::fn(__VA_ARGS__))
+#elif defined(GS_ARM64)
+#define GS_DISPATCH(fn, ...) \
+  (::gs::best_isa() == ::gs::Isa::neon ? ::gs::neon::fn(__VA_ARGS__) : ::gs::baseline::fn(__VA_ARGS__))
 #else
 #define GS_DISPATCH(fn, ...) ::gs::baseline::fn(__VA_ARGS__)
 #endif

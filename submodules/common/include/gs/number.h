@@ -12,6 +12,13 @@
 #include "gs/simd.h"
 #endif
 
+// Of scalars, these truths are bools, for which clang would have && instead of &.
+#ifdef __clang__
+#if __has_warning("-Wbitwise-instead-of-logical")
+#pragma clang diagnostic ignored "-Wbitwise-instead-of-logical"
+#endif
+#endif
+
 GS_ISA_BEGIN
 
 template <class V>

@@ -5,9 +5,12 @@
 #include <cstring>
 #include <limits>
 
+#include "gs/fused_lanes.h"
 #include "gs/isa.h"
 
-#ifdef __SSE2__
+#if defined(GS_NEON)
+#include <arm_neon.h>
+#elif defined(__SSE2__)
 #include <immintrin.h>
 #endif
 
@@ -58,6 +61,9 @@ struct Simd {
 #elif defined(__SSE2__)
     if constexpr (sizeof(T) == 4) return (Vec)_mm_sqrt_ps((__m128)v);
     return (Vec)_mm_sqrt_pd((__m128d)v);
+#elif defined(GS_NEON)
+    if constexpr (sizeof(T) == 4) return (Vec)vsqrtq_f32((float32x4_t)v);
+    return (Vec)vsqrtq_f64((float64x2_t)v);
 #else
     for (int i = 0; i < kLanes; ++i) v[i] = std::sqrt(v[i]);
     return v;
@@ -74,6 +80,9 @@ struct Simd {
 #elif defined(__AVX__)
     if constexpr (sizeof(T) == 4) return (Vec)_mm256_ceil_ps((__m256)v);
     return (Vec)_mm256_ceil_pd((__m256d)v);
+#elif defined(GS_NEON)
+    if constexpr (sizeof(T) == 4) return (Vec)vrndpq_f32((float32x4_t)v);
+    return (Vec)vrndpq_f64((float64x2_t)v);
 #else
     for (int i = 0; i < kLanes; ++i) v[i] = std::ceil(v[i]);
     return v;
@@ -82,12 +91,8 @@ struct Simd {
 
   // a b + c, fused wherever the instruction set can: a compiler would choose which of two products it fuses.
   static Vec multiply_add(Vec a, Vec b, Vec c) {
-#if defined(__AVX512F__)
-    if constexpr (sizeof(T) == 4) return (Vec)_mm512_fmadd_ps((__m512)a, (__m512)b, (__m512)c);
-    return (Vec)_mm512_fmadd_pd((__m512d)a, (__m512d)b, (__m512d)c);
-#elif defined(__FMA__)
-    if constexpr (sizeof(T) == 4) return (Vec)_mm256_fmadd_ps((__m256)a, (__m256)b, (__m256)c);
-    return (Vec)_mm256_fmadd_pd((__m256d)a, (__m256d)b, (__m256d)c);
+#ifdef GS_FUSES
+    return fused_lanes(a, b, c);
 #else
     return a * b + c;
 #endif
@@ -102,6 +107,8 @@ struct Simd {
 #endif
 #if defined(__SSE2__)
     if constexpr (kBytes == 16) return _mm_movemask_epi8((__m128i)m) != 0;
+#elif defined(GS_NEON)
+    if constexpr (kBytes == 16) return vmaxvq_u32((uint32x4_t)m) != 0;
 #endif
     return bits(m) != 0;
   }
@@ -119,6 +126,9 @@ struct Simd {
 #if defined(__SSE2__)
     if constexpr (kBytes == 16 && sizeof(T) == 4) return uint32_t(_mm_movemask_ps((__m128)m));
     if constexpr (kBytes == 16 && sizeof(T) == 8) return uint32_t(_mm_movemask_pd((__m128d)m));
+#elif defined(GS_NEON)
+    if constexpr (kBytes == 16 && sizeof(T) == 4) return vaddvq_u32((uint32x4_t)m & uint32x4_t{1, 2, 4, 8});
+    if constexpr (kBytes == 16 && sizeof(T) == 8) return uint32_t(vaddvq_u64((uint64x2_t)m & uint64x2_t{1, 2}));
 #endif
     uint32_t found = 0;
     for (int i = 0; i < kLanes; ++i) found |= uint32_t(m[i] != 0) << i;

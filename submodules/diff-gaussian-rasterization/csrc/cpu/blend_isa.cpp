@@ -161,7 +161,7 @@ bool mark_strip(const Chunk<T, kChunk>& chunk, const Strip<T>& strip, const int3
     const M reached = row_exponent(terms, row_u(terms, x)) >= threshold;
     if (!S::any(reached)) return true;
     __atomic_store_n(decisive + instances[k], true, __ATOMIC_RELAXED);
-    threshold = reached & (last <= typename S::Int(position + k)) ? never : threshold;
+    threshold = (reached & (last <= typename S::Int(position + k))) ? never : threshold;
     return open = S::any(threshold < never);
   });
   S::store(threshold_of_tile + at, threshold);

@@ -73,7 +73,7 @@ GS_HD Truth<V> project_splat(const Camera<T>& cam, const Gaussian<V>& gaussian, 
   visible &= finite(Vec3<V>{splat.x, splat.y, f.l12}) & (f.l11 > 0) & (f.l22 > 0) & (f.a + f.c < T(kMaxVariance));
   if (!any(visible)) return visible;
   const Integer<V> wide = footprint_radius(f);
-  radius = visible & radius_on_image(splat.x, splat.y, wide, cam.width, cam.height) ? wide : radius;
+  radius = (visible & radius_on_image(splat.x, splat.y, wide, cam.width, cam.height)) ? wide : radius;
   const V log2_opacity = gaussian.log2_opacity + (antialiasing ? binary_log(f.compensation) : V{});
   splat.log2_opacity = log2_opacity < T(kMaxLog2Opacity) ? log2_opacity : all<V>(kMaxLog2Opacity);
   return visible & (splat.log2_opacity >= T(kLog2MinAlpha) - T(1e-3));  // the margin of tile_rect

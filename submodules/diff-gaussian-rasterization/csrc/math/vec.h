@@ -45,7 +45,7 @@ template <class T>
 GS_HD T multiply_add(T a, T b, T c) {
 #if defined(__CUDA_ARCH__)
   return std::fma(a, b, c);
-#elif defined(__FMA__)
+#elif defined(GS_FUSES)
   if constexpr (std::is_floating_point_v<T>)
     return std::fma(a, b, c);
   else

@@ -27,10 +27,11 @@ void test_philox() {
 }
 
 void test_portable_functions() {
-  for (double x = -700; x <= 700; x += 0.0731)
-    CHECK_NEAR(double(gs::portable::exp(x) / std::exp((long double)x)), 1, 4 * 0x1p-53);
   CHECK(gs::portable::exp(701) == gs::portable::exp(700) && gs::portable::exp(-INFINITY) == gs::portable::exp(-700));
   CHECK(std::isnan(gs::portable::exp(std::numeric_limits<double>::quiet_NaN())));
+  if (!gs::kLongDoubleIsWider) return;
+  for (double x = -700; x <= 700; x += 0.0731)
+    CHECK_NEAR(double(gs::portable::exp(x) / std::exp((long double)x)), 1, 4 * 0x1p-53);
   for (double x = 1e-300; x < 1e300; x *= 1.37) {
     const double wanted = double(std::log((long double)x));
     CHECK_NEAR(gs::portable::log(x), wanted, 1e-15 * std::fmax(1, std::abs(wanted)));
