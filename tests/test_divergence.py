@@ -116,7 +116,7 @@ def test_any_number_of_threads_marks_the_same(step):
 def test_guards_that_do_not_fit_are_named(step):
     state, gradient = _state(torch.float32, rows=4)
     stopped = torch.zeros(1, dtype=torch.int64)
-    with pytest.raises(RuntimeError, match="a guarded step needs the loss, one Float on cpu"):
+    with pytest.raises(RuntimeError, match="a guarded step needs the loss, one torch.float32 on cpu"):
         step(state, gradient, torch.tensor(0.5).double(), stopped, 1)
     with pytest.raises(RuntimeError, match="a guarded step needs the loss"):
         step(state, gradient, None, stopped, 1)
