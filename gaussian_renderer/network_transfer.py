@@ -1,5 +1,6 @@
 """Messages over a viewer's connection, with limits of time and length so that no viewer can hold training for good."""
 
+import math
 import select
 import socket
 import struct
@@ -9,6 +10,7 @@ SILENCE = 1.0  # seconds without a byte, within a message either way
 LONGEST = 10.0  # seconds of a message in all
 LARGEST = 1 << 16  # bytes of a request; the viewer's have about 1,000
 _PART = 1 << 20  # bytes handed to the system at once
+_LOOK = 0.5  # seconds of a wait without a look at signals; one that comes just before a wait does not end it
 
 
 # The system asks a silent viewer for a sign of life, so that one whose machine is gone does not hold a paused training.
@@ -37,10 +39,19 @@ def readable(sock: socket.socket, seconds: float | None = 0.0) -> bool:
 
     None: wait without end. Takes less than a microsecond if it need not wait.
     """
+    left = math.inf if seconds is None else seconds
+    while left > _LOOK:
+        if _readable(sock, _LOOK):
+            return True
+        left -= _LOOK
+    return _readable(sock, left)
+
+
+def _readable(sock: socket.socket, seconds: float) -> bool:
     if hasattr(select, "poll"):
         poll = select.poll()
         poll.register(sock, select.POLLIN)
-        return bool(poll.poll(None if seconds is None else 1000 * seconds))
+        return bool(poll.poll(1000 * seconds))
     return bool(select.select([sock], [], [], seconds)[0])
 
 

@@ -1,5 +1,6 @@
 """Time of the host in a step of training, by function, of the ranks that run this or of one process.
 
+    python -m benchmarks.parallel.host --workload XL --gaussians 20000
     torchrun --standalone --nproc_per_node 2 -m benchmarks.parallel.host --workload XL --gaussians 20000
 
 Of rank 0, by Python's profiler, which makes each call a little slower; the time of a step without it comes first. With

@@ -49,7 +49,7 @@ class WorkloadRun(Run):
         images = SimpleNamespace(ahead=0)
         self.scene = SimpleNamespace(cameras_extent=_EXTENT, images=images, prefetch=lambda _: None, model_path=".")
         self.views = ViewOrder(cameras, self.opt.seed, views, here.rank if views > 1 else 0)
-        self.resolution = Resolution((), self.pace.length, images)
+        self.resolution = Resolution(self.pace, images)
         self.background = torch.zeros(3, device=self.device)
         self.objective = Objective(self.opt)
         self.density = density_control(self)
