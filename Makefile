@@ -21,7 +21,7 @@ CHECK_PYTHON := import sys; sys.exit(sys.version_info < (3, 10) and "Python 3.10
 EXTENSIONS := simple-knn fused-ssim diff-gaussian-rasterization
 CXX_TESTS := $(patsubst submodules/%.cpp,build/%,$(wildcard submodules/*/csrc/tests/*.cpp))
 CORES := $(shell getconf _NPROCESSORS_ONLN)
-CXX_TEST_FLAGS := -std=c++17 -O1 -g -Wall -Wextra -Werror -fsanitize=address,undefined -fno-sanitize-recover=all -pthread
+CXX_TEST_FLAGS := -std=c++17 -O1 -g1 -Wall -Wextra -Werror -fsanitize=address,undefined -fno-sanitize-recover=all -pthread
 
 CXX_SOURCES := $(shell find submodules benchmarks -name build -prune -o \( -name '*.cpp' -o -name '*.cu*' -o -name '*.h' \) -print)
 # What the extension $(1) is built from.
