@@ -10,7 +10,7 @@ import struct
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from types import SimpleNamespace
@@ -407,7 +407,16 @@ def test_ctrl_c_stops_a_training_that_waits_for_its_viewer(colmap_scene, tmp_pat
     assert network_gui.listener is None and network_gui.conn is None
 
 
+@pytest.fixture
+def _interruptible() -> Iterator[None]:
+    """Ctrl-C interrupts, also where the tests were started in the background of a shell, which ignores it."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
 @pytest.mark.parametrize("end", ["leaves", "lets go", "Ctrl-C"])
+@pytest.mark.usefixtures("_interruptible")
 def test_keep_alive_holds_a_finished_training(colmap_scene, tmp_path, capsys, end):
     out = tmp_path / "out"
 
