@@ -15,6 +15,7 @@ if mine and fault == "code":
 # ruff: noqa: E402
 import utils.host.early  # noqa: F401  isort: skip  (as train.py begins)
 import signal
+import time
 from collections.abc import Callable
 
 import torch
@@ -27,6 +28,15 @@ from utils.system_utils import UserError, run_cli
 
 utils.ranks.watch.PATIENCE = 3.0
 prepare = Run.prepare
+beat = utils.ranks.watch.Watch.beat
+
+
+def _long_beat(watch: utils.ranks.watch.Watch) -> None:
+    """As with a slow store. A process that ends while its watch asks the store aborts."""
+    beat(watch)
+    until = time.monotonic() + 0.5
+    while watch.is_alive() and time.monotonic() < until:
+        watch._board.read("here")
 
 
 def _raise(error: Exception) -> Callable[[Run], None]:
@@ -80,5 +90,6 @@ def _main() -> None:
 
 
 Run.prepare = _prepare
+utils.ranks.watch.Watch.beat = _long_beat
 if __name__ == "__main__":
     run_cli(_main, several=True)

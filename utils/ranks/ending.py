@@ -64,11 +64,6 @@ class Ending:
         """Whether the caller is the first to end this rank."""
         return self._begun.acquire(blocking=False)
 
-    @property
-    def begun(self) -> bool:
-        """Whether it has begun."""
-        return self._begun.locked()
-
     def finish(self, end: End, board: Board | None = None) -> tuple[int, bool]:
         """Tell the others, and see how they end. Returns the exit status, and whether it is this rank that spoke.
 

@@ -59,19 +59,20 @@ def run_together(main: Callable[[], object], outcome: Callable[[Callable[[], obj
     if watch.ranks:
         watch.ranks.leave(end.kind == DONE)
     status, spoke = ending.finish(end)
+    at_once = not watch.leave() or status and watch.ranks and watch.ranks.by_gpu
     if error is not None and spoke:
         quiet.unhush()
-        if watch.ranks and watch.ranks.by_gpu:
-            traceback.print_exception(error)
-        else:
+        if not at_once:
             raise error
-    if watch.ranks and watch.ranks.by_gpu and status:
+        traceback.print_exception(error)
+    if at_once:
         _leave_at_once(status)
     return status
 
 
 def _leave_at_once(status: int) -> NoReturn:
-    """End without Python's own end, which would wait for kernels of NCCL that wait for a rank that is gone."""
+    """End without Python's own end, which would wait for kernels of NCCL that wait for a rank that is gone, and abort
+    if the watch still waits for the store."""
     for stream in (sys.stdout, sys.stderr):
         stream.flush()
     os._exit(status)

@@ -15,6 +15,7 @@ _SILENT = 12.0  # seconds without a beat after which a rank is gone
 _GRACE = 6.0  # seconds for the main thread to end by itself, as it does where a collective call fails
 _GRACE_AT_WORK = 20.0  # if it is writing
 _GRACE_HANGING = 1.0  # if others have seen that a rank hangs, perhaps this one
+_PATIENCE_FOR_STORE = 2.0  # seconds for an answer of the store
 PATIENCE = 15.0  # seconds in a collective call of a step that another rank does not come to, at least
 _MULTIPLE = 10  # of the longest such call so far, for steps that take as long
 
@@ -25,6 +26,7 @@ class Watch(threading.Thread):
     def __init__(self, rank: int, size: int, ending: Ending) -> None:
         super().__init__(name="watch over ranks", daemon=True)
         self._board, self._ending = Board(rank, size), ending
+        self._over = threading.Event()
         self.ranks: WatchedRanks | None = None
         self._number = 0
         self._seen: dict[int, tuple[int, float]] = {}  # by rank: the number of its last beat, and when it came
@@ -38,10 +40,9 @@ class Watch(threading.Thread):
         self._board.post("beat", [self._number, ranks.calls if ranks else 0, bool(ranks and ranks.expected)])
 
     def run(self) -> None:
-        """Look until this rank ends."""
-        while not self._ending.begun:
-            before = time.monotonic()
-            time.sleep(_BEAT)
+        """Look until `leave`."""
+        before = time.monotonic()
+        while not self._over.wait(_BEAT):
             try:
                 self.beat()
                 end = self._look(time.monotonic() - before)
@@ -49,6 +50,13 @@ class Watch(threading.Thread):
                 end = End(LOST, 1, "error: torchrun has ended")
             if end is not None:
                 self._end(end)
+            before = time.monotonic()
+
+    def leave(self) -> bool:
+        """End this thread. Whether it has ended: Python may not end before it, as that would abort the process."""
+        self._over.set()
+        self.join(_PATIENCE_FOR_STORE)
+        return not self.is_alive()
 
     def _look(self, took: float) -> End | None:
         """How this rank has to end, if the main thread does not see to it."""
