@@ -20,6 +20,7 @@ DOCS_VENV := .venv-docs
 CHECK_PYTHON := import sys; sys.exit(sys.version_info < (3, 10) and "Python 3.10 or newer is needed: make PYTHON=...")
 EXTENSIONS := simple-knn fused-ssim diff-gaussian-rasterization
 CXX_TESTS := $(patsubst submodules/%.cpp,build/%,$(wildcard submodules/*/csrc/tests/*.cpp))
+CXX_TEST_OBJECTS := $(patsubst submodules/%.cpp,build/%.o,$(wildcard submodules/*/csrc/cpu/*.cpp))
 CORES := $(shell getconf _NPROCESSORS_ONLN)
 CXX_TEST_FLAGS := -std=c++17 -O1 -g1 -Wall -Wextra -Werror -fsanitize=address,undefined -fno-sanitize-recover=all -pthread
 
@@ -78,25 +79,35 @@ format: $(VENV)/.requirements
 	$(BIN)/ruff format .
 	$(BIN)/clang-format -i $(CXX_SOURCES)
 
-# A process a core builds a test and runs it; the longest take minutes.
+# A process a core builds an object or a test; a test that is built is run at once. The longest take minutes.
+in_parallel = printf '%s\n' $(1) | xargs -P $(CORES) -I TARGET sh -c '$(MAKE) --no-print-directory TARGET $(2)'
 cpp-test:
-	@printf '%s\n' $(CXX_TESTS) | xargs -P $(CORES) -I TEST sh -c '$(MAKE) --no-print-directory TEST && TEST'
+	@$(call in_parallel,$(CXX_TEST_OBJECTS))
+	@$(call in_parallel,$(CXX_TESTS),&& TARGET)
 
-build/%: submodules/%.cpp $$(call sources,$$(firstword $$(subst /, ,$$*))) $$(wildcard submodules/$$(dir $$*)*.h)
+# Compiles $< of the submodule $(1); more flags follow.
+compile_test = $(CXX) $(CXX_TEST_FLAGS) -Isubmodules/$(1)/csrc -Isubmodules/common/include $<
+# The submodule of build/SUBMODULE/..., and its objects.
+submodule = $(firstword $(subst /, ,$(1)))
+objects = $(filter build/$(1)/%,$(CXX_TEST_OBJECTS))
+
+build/%.o: submodules/%.cpp $$(call sources,$$(call submodule,$$*))
 	@mkdir -p $(@D)
-	$(CXX) $(CXX_TEST_FLAGS) -Isubmodules/$(firstword $(subst /, ,$*))/csrc -Isubmodules/common/include \
-	    $< $(wildcard submodules/$(firstword $(subst /, ,$*))/csrc/cpu/*.cpp) -o $@
+	$(call compile_test,$(call submodule,$*)) -c -o $@
+
+build/%: submodules/%.cpp $$(call objects,$$(call submodule,$$*)) $$(wildcard submodules/$$(dir $$*)*.h)
+	@mkdir -p $(@D)
+	$(call compile_test,$(call submodule,$*)) $(call objects,$(call submodule,$*)) -o $@
 
 # CUDA kernels on the CPU: the .cu files, rewritten as C++, instead of a GPU.
 EMULATION := submodules/common/emulation
 build/%/csrc/tests/test_cuda_emulated: submodules/%/csrc/tests/test_cuda_emulated.cpp $(wildcard $(EMULATION)/*) \
-                                       $$(call sources,$$*) $$(wildcard submodules/$$*/csrc/tests/*.h)
+                                       $$(call objects,$$*) $$(wildcard submodules/$$*/csrc/tests/*.h)
 	@mkdir -p $(@D)/emulated
 	rm -f $(@D)/emulated/*
 	$(PYTHON) $(EMULATION)/translate.py $(@D)/emulated $(wildcard submodules/$*/csrc/cuda/*.cu*)
-	$(CXX) $(CXX_TEST_FLAGS) -Wno-unknown-pragmas -I$(@D)/emulated -Isubmodules/$*/csrc -Isubmodules/$*/csrc/cuda -I$(EMULATION) \
-	    -Isubmodules/common/include $< $(@D)/emulated/*.cpp $(EMULATION)/emulation.cpp \
-	    $(wildcard submodules/$*/csrc/cpu/*.cpp) -o $@
+	$(call compile_test,$*) -Wno-unknown-pragmas -I$(@D)/emulated -Isubmodules/$*/csrc/cuda -I$(EMULATION) \
+	    $(@D)/emulated/*.cpp $(EMULATION)/emulation.cpp $(call objects,$*) -o $@
 
 wheels: $(VENV)/.requirements
 	.ci/wheels $(BIN)/python

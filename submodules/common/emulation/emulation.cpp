@@ -56,6 +56,7 @@ struct Grid {
 #endif
 };
 Grid grid_state;
+std::mt19937 generator;  // of shuffled orders
 
 void to_scheduler(Thread& self, bool for_good) {
 #ifdef GS_ASAN
@@ -89,6 +90,8 @@ void give_turn(unsigned index) {
   __sanitizer_start_switch_fiber(&grid_state.fake_stack, thread.stack.get(), kStack);
 #endif
   swapcontext(&grid_state.scheduler, &thread.context);
+  thread.context.uc_stack.ss_size =
+      0;  // or ASan clears its shadow of the whole stack at each switch, not the first alone
 #ifdef GS_ASAN
   __sanitizer_finish_switch_fiber(grid_state.fake_stack, nullptr, nullptr);
 #endif
@@ -133,21 +136,22 @@ unsigned present() {
   return lanes;
 }
 
+// Sets a thread to the first line of the kernel.
+void begin(Thread& thread) {
+  getcontext(&thread.context);
+  thread.context.uc_stack.ss_sp = thread.stack.get();
+  thread.context.uc_stack.ss_size = kStack;
+  thread.context.uc_link = nullptr;
+  makecontext(&thread.context, &start, 0);
+  thread.runnable = true;
+  thread.waits_for = Meeting::none;
+  thread.votes = 0;
+}
+
 void run_block(const std::function<void()>& body) {
-  static std::mt19937 generator(1);
   grid_state.body = &body;
   const unsigned count = grid_state.count;
-  for (unsigned i = 0; i < count; ++i) {
-    Thread& thread = grid_state.threads[i];
-    getcontext(&thread.context);
-    thread.context.uc_stack.ss_sp = thread.stack.get();
-    thread.context.uc_stack.ss_size = kStack;
-    thread.context.uc_link = nullptr;
-    makecontext(&thread.context, &start, 0);
-    thread.runnable = true;
-    thread.waits_for = Meeting::none;
-    thread.votes = 0;
-  }
+  for (unsigned i = 0; i < count; ++i) begin(grid_state.threads[i]);
   std::fill(grid_state.votes, grid_state.votes + 3, false);
   for (Warp& warp : grid_state.warps) std::fill(warp.turn, warp.turn + 32, 0);
   std::vector<unsigned> turns(count);
@@ -184,6 +188,8 @@ void run_grid(dim3 grid, dim3 block, size_t shared, const std::function<void()>&
     run_block(body);
   }
 }
+
+void restart() { generator.seed(1); }
 
 void* dynamic_shared() { return grid_state.shared.data(); }
 

@@ -37,6 +37,9 @@ void meet(Meeting meeting, const char* what);
 // the next meeting but one.
 const uint64_t* exchange(uint64_t mine, const char* what, unsigned mask);
 int lane();
+// Makes shuffled orders begin anew.
+void restart();
+
 // Tells whether `mine` is true in any thread of the block.
 bool any_of_block(bool mine);
 

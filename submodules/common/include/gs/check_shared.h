@@ -14,7 +14,8 @@
 namespace gs {
 
 // Runs all tests, each in one of two processes, whichever is free; returns the exit status. Give long ones first.
-inline int run_shared(const char* name, std::initializer_list<void (*)()> tests) {
+// before: makes random numbers begin anew, so that those of a test do not depend on who has run the others.
+inline int run_shared(const char* name, void (*before)(), std::initializer_list<void (*)()> tests) {
   void* memory = mmap(nullptr, sizeof(std::atomic<size_t>), PROT_READ | PROT_WRITE, MAP_SHARED | MAP_ANONYMOUS, -1, 0);
   if (memory == MAP_FAILED) return 1;
   auto& next = *new (memory) std::atomic<size_t>(0);
@@ -22,6 +23,7 @@ inline int run_shared(const char* name, std::initializer_list<void (*)()> tests)
   while (true) {
     const size_t k = next++;
     if (k >= tests.size()) break;
+    before();
     tests.begin()[k]();
   }
   if (other == 0) std::exit(failures() ? 1 : 0);
