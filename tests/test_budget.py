@@ -29,6 +29,7 @@ from scene.gaussians.shards import WHOLE
 from scene.readers.point_cloud import write_point_cloud
 from training.error_maps import error_map
 from training.error_scores import ErrorScores
+from training.objective import Objective
 from training.pacing.pace import Block, Paced, Schedule
 from training.strategies import budget
 from utils.exact.counter_rng import Stream
@@ -98,7 +99,7 @@ def test_scores_are_those_of_a_slow_sum_over_pixels(case):
         of_half = camera.columns.stop / WIDTH
     expected = np.zeros(len(gaussians))
     for row, column in np.argwhere(counting):
-        pixel = np.clip(image[:, row, column], 0, 1) - camera.photo[:, row, column].numpy() / 255.0
+        pixel = image[:, row, column] - camera.photo[:, row, column].numpy() / 255.0
         expected += weights[:, row, column] * np.abs(pixel).mean() * of_half / counting.sum()
     assert (expected > 1e-6).sum() >= 8
     np.testing.assert_allclose(scores.numpy(), expected, rtol=2e-4, atol=1e-7)
@@ -135,7 +136,7 @@ def test_views_are_joined_by_sum_or_maximum():
 
 def _pair() -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     generator = torch.Generator().manual_seed(2)
-    image = 0.6 + 0.4 * torch.randn(3, 33, 41, generator=generator)  # some values are clamped
+    image = 0.6 + 0.4 * torch.randn(3, 33, 41, generator=generator)  # some values lie outside of [0, 1]
     target = torch.randint(0, 256, (3, 33, 41), dtype=torch.uint8, generator=generator)
     return image, target, torch.rand(1, 33, 41, generator=generator) > 0.3
 
@@ -144,7 +145,7 @@ def _pair() -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
 def test_errors_of_pixels_add_up_to_the_loss(columns):
     image, target, mask = _pair()
     for kind, weight in (("loss", 0.3), ("l1", 0.0)):
-        total, _ = photometric_loss(image, target, weight, None, columns)
+        total, _ = photometric_loss(image, target, weight, None, columns, clamp=False)
         torch.testing.assert_close(error_map(kind, image, target, 0.3, None, columns).sum(), total, rtol=1e-5, atol=0)
     for kind in ("l1", "squared", "loss"):
         errors = error_map(kind, image, target, 0.3, mask, columns)
@@ -153,7 +154,7 @@ def test_errors_of_pixels_add_up_to_the_loss(columns):
         if columns is not None:
             counts[..., 20:] = False
         assert torch.equal(errors > 0, counts)
-    squared = ((image.clamp(0, 1) - target / 255) ** 2).mean()
+    squared = ((image - target / 255) ** 2).mean()
     torch.testing.assert_close(error_map("squared", image, target, 0.3).sum(), squared, rtol=1e-5, atol=0)
 
 
@@ -162,7 +163,7 @@ def test_similarity_is_that_of_scikit_image():
     target = target.float() / 255
     ours = error_map("loss", image, target, 1.0)[0] * image[0].numel()
     _, theirs = structural_similarity(
-        image.clamp(0, 1).double().numpy(), target.double().numpy(), gaussian_weights=True, sigma=1.5, data_range=1.0,
+        image.double().numpy(), target.double().numpy(), gaussian_weights=True, sigma=1.5, data_range=1.0,
         use_sample_covariance=False, channel_axis=0, full=True,
     )  # fmt: skip
     inner = slice(5, -5), slice(5, -5)
@@ -373,6 +374,22 @@ def counts(monkeypatch) -> list[tuple[int, int]]:
 
     monkeypatch.setattr(budget.BudgetControl, "after_step", note)
     return found
+
+
+@pytest.mark.parametrize(("strategy", "clamped"), [("adc", True), ("budget", False), ("mcmc", False)])
+def test_the_loss_sees_what_is_brighter_than_white(colmap_scene, tmp_path, monkeypatch, strategy, clamped):
+    """Unlike the reference's. Else Gaussians brighter than a white background float before it, and hide test views."""
+    call, gradients = Objective.__call__, []
+
+    def with_a_bright_image(objective, package, step):
+        bright = torch.full_like(package["render"], 1.5).requires_grad_()
+        gradients.append(torch.autograd.grad(call(objective, package | {"render": bright}, step).total, bright)[0])
+        return call(objective, package, step)
+
+    monkeypatch.setattr(Objective, "__call__", with_a_bright_image)
+    options = "--iterations", "2", "--strategy", strategy, "--plain_step", "--disable_viewer", "--quiet"
+    train.main(["-s", str(colmap_scene), "-m", str(tmp_path / "out"), *options])
+    assert gradients and all(bool(gradient.any()) != clamped for gradient in gradients)
 
 
 def test_the_cap_is_reached_and_held(colmap_scene, tmp_path, counts):

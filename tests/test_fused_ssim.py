@@ -169,16 +169,16 @@ def test_opcheck(train: bool, dtype: torch.dtype) -> None:
     library.opcheck(torch.ops.fused_ssim.l1_ssim_vjp, (img1.detach(), img2, torch.rand_like(img2), one, one))
 
 
-def loss_in_parts(image: Tensor, target: Tensor, weight: float) -> tuple[Tensor, Tensor]:
+def loss_in_parts(image: Tensor, target: Tensor, weight: float, clamp: bool = True) -> tuple[Tensor, Tensor]:
     """Compute fused_photometric_loss by torch around fused_l1_ssim."""
-    l1, ssim = fused_l1_ssim(image.clamp(0, 1), target)
+    l1, ssim = fused_l1_ssim(image.clamp(0, 1) if clamp else image, target)
     return (1 - weight) * l1 + weight * (1 - ssim), l1
 
 
-def loss_and_gradient(function, image: Tensor, target: Tensor, weight: float) -> list[Tensor]:
+def loss_and_gradient(function, image: Tensor, target: Tensor, weight: float, *clamp: bool) -> list[Tensor]:
     """Loss, L1 and the gradient of three times the loss."""
     image = image.detach().requires_grad_()
-    loss, l1 = function(image, target, weight)
+    loss, l1 = function(image, target, weight, *clamp)
     return [loss.detach(), l1.detach(), torch.autograd.grad(3 * loss, image)[0]]
 
 
@@ -200,6 +200,10 @@ def test_photometric_loss_is_its_parts_to_the_bit(weight: float, as_bytes: bool,
     for got, wanted in zip(fused, loss_and_gradient(loss_in_parts, image, target, weight), strict=True):
         assert got.dtype == dtype and torch.equal(got, wanted)
     assert not fused[2][(image < 0) | (image > 1)].any()
+    free = loss_and_gradient(fused_photometric_loss, image, target, weight, False)
+    for got, wanted in zip(free, loss_and_gradient(loss_in_parts, image, target, weight, False), strict=True):
+        assert torch.equal(got, wanted)
+    assert free[2][(image < 0) | (image > 1)].any()
 
 
 def test_photometric_loss_agrees_with_reference() -> None:

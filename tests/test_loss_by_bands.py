@@ -33,24 +33,24 @@ def image_pair(height: int, width: int, dtype: torch.dtype, as_bytes: bool) -> t
     return image, photo if as_bytes else photo.to(dtype) / 255
 
 
-def _whole(image: Tensor, photo: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _whole(image: Tensor, photo: Tensor, clamp: bool = True) -> tuple[Tensor, Tensor, Tensor]:
     image = image.clone().requires_grad_()
-    loss, l1 = fused_photometric_loss(image, photo, 0.2)
+    loss, l1 = fused_photometric_loss(image, photo, 0.2, clamp)
     (0.7 * loss).backward()
     return loss.detach(), l1, image.grad
 
 
-def check_bands(height: int, borders: list[int], images: tuple[Tensor, Tensor]) -> None:
+def check_bands(height: int, borders: list[int], images: tuple[Tensor, Tensor], clamp: bool = True) -> None:
     """Bands of an image, of which each knows 10 rows of the others, against the whole."""
     image, photo = images
-    wanted, bands, sums = _whole(image, photo), Bands(borders, height, 0, image.device), []
+    wanted, bands, sums = _whole(image, photo, clamp), Bands(borders, height, 0, image.device), []
 
     def losses(rank: int, add: Callable[[Tensor], Tensor]) -> tuple[Tensor, ...]:
         around = slice(*bands.pixels(rank, REACH))
         known, seen = torch.full_like(image, torch.nan), torch.zeros_like(photo)
         known[:, around], seen[:, around] = image[:, around], photo[:, around]
         known.requires_grad_()
-        return *photometric_loss_by_bands(known, seen, 0.2, bands.pixels(rank), add), known
+        return *photometric_loss_by_bands(known, seen, 0.2, bands.pixels(rank), add, clamp), known
 
     def note(own: Tensor) -> Tensor:
         sums.append(own)
@@ -72,7 +72,8 @@ def check_bands(height: int, borders: list[int], images: tuple[Tensor, Tensor]) 
 @pytest.mark.parametrize("precision", [torch.float32, torch.float64])
 @pytest.mark.parametrize(("height", "width", "borders"), CASES)
 def test_bands_have_the_loss_and_the_gradient_of_the_whole_image(height, width, borders, precision, as_bytes):
-    check_bands(height, borders, image_pair(height, width, precision, as_bytes))
+    for clamp in (True, False):
+        check_bands(height, borders, image_pair(height, width, precision, as_bytes), clamp)
 
 
 @pytest.mark.parametrize("rows", [(0, 20), (8, 40), (16, 0), (0, 48), (-16, 16)])

@@ -19,9 +19,10 @@ class DensityControl:
     else, unless the iteration is one that `changes` names. most_gaussians: how many it lets there be, 0: any number.
     penalty: a part of the loss besides the objective, of which steps add the gradients; no loss that is told has it.
     absolute_gradients: whether the statistics take the lengths of absolute gradients (Ye et al. 2024); for the whole
-    run. ends: the iteration of the schedule from which it changes no rows. pace: tells how far the schedule is in an
-    iteration (training/pacing/pace.py). Rules that are windows of the schedule ask it; rules that count steps take the
-    iteration itself.
+    run. clamps: whether the loss takes renders clamped to [0, 1], as the reference's does; then Gaussians brighter than
+    white cost nothing before a white background. ends: the iteration of the schedule from which it changes no rows.
+    pace: tells how far the schedule is in an iteration (training/pacing/pace.py). Rules that are windows of the
+    schedule ask it; rules that count steps take the iteration itself.
     """
 
     fusable: ClassVar[bool] = False
@@ -29,6 +30,7 @@ class DensityControl:
     most_gaussians = 0
     penalty = NO_PENALTY
     absolute_gradients = False
+    clamps: ClassVar[bool] = True
     ends = math.inf
     pace: Pace = STEADY
 

@@ -21,7 +21,7 @@ def error_map(
     """Errors (1, H, W), at least 0, which are 0 where a pixel does not count.
 
     kind: l1, the mean of |image - target| over the channels; squared, that of its square; or loss, the error that
-    `photometric_loss` has the mean of. image (3, H, W) float32, clamped here; target, mask and columns as there. Each
+    `photometric_loss` has the mean of. image (3, H, W) float32, not clamped; target, mask and columns as there. Each
     error is divided by the number of pixels that count, as in that mean.
     """
     if target.dtype == torch.uint8:
@@ -32,7 +32,6 @@ def error_map(
         whole = torch.zeros_like(image[:1])
         whole[..., columns] = errors
         return whole
-    image = image.clamp(0, 1)
     if mask is None:
         return _mean(_errors(kind, image, target, lambda_dssim)) / image[0].numel()
     image, target = (torch.where(mask, x, 0.0) for x in (image, target))

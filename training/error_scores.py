@@ -14,7 +14,7 @@ from training.error_maps import error_map
 
 
 class ErrorScores:
-    """Scores Gaussians by views, as the loss of training sees them: exposure, clamp, mask and columns that count.
+    """Scores Gaussians by views, as the loss of training sees them: exposure, mask, columns that count, and no clamp.
 
     exposures: whether the photos' exposures are trained. opt: score_error is the kind of error (`error_map`), with
     lambda_dssim; score_join is "sum" or "max".
@@ -43,7 +43,7 @@ class ErrorScores:
         return sums[:, 0].to(torch.float64)
 
     def _error_of(self, image: Tensor, camera: Camera, background: Tensor) -> Tensor:
-        """The error (1, H, W) of a render of the view, (3, H, W) before exposure and clamp."""
+        """The error (1, H, W) of a render of the view, (3, H, W) before exposure."""
         target, mask = camera.ground_truth(background)
         if self._exposures and (name := camera.exposure_name or camera.image_name) is not None:
             image = apply_exposure(image, self._gaussians.get_exposure_from_name(name))

@@ -20,10 +20,13 @@ class Losses(NamedTuple):
 
 
 class Objective:
-    """`(1 - lambda_dssim) L1 + lambda_dssim (1 - SSIM)` (Kerbl et al. 2023, Eq. 7), and the weighted depth loss."""
+    """`(1 - lambda_dssim) L1 + lambda_dssim (1 - SSIM)` (Kerbl et al. 2023, Eq. 7), and the weighted depth loss.
 
-    def __init__(self, opt: argparse.Namespace) -> None:
-        self._lambda_dssim = opt.lambda_dssim
+    clamp: compare renders clamped to [0, 1].
+    """
+
+    def __init__(self, opt: argparse.Namespace, clamp: bool = True) -> None:
+        self._lambda_dssim, self._clamp = opt.lambda_dssim, clamp
 
     def takes_bands(self, step: Step) -> bool:
         """Whether the loss of a step needs of the image no more than each rank's band and what surrounds it."""
@@ -37,10 +40,9 @@ class Objective:
         camera = step.camera
         target, mask = camera.ground_truth(step.background)
         if (band := package.get("band")) is not None:
-            return Losses(
-                *photometric_loss_by_bands(package["render"], target, self._lambda_dssim, *band), depth=None, mask=None
-            )
-        total, l1 = photometric_loss(package["render"], target, self._lambda_dssim, mask, camera.columns)
+            total, l1 = photometric_loss_by_bands(package["render"], target, self._lambda_dssim, *band, self._clamp)
+            return Losses(total, l1, depth=None, mask=None)
+        total, l1 = photometric_loss(package["render"], target, self._lambda_dssim, mask, camera.columns, self._clamp)
         depth = None
         if step.depth_weight > 0:
             error = inverse_depth_loss(package["depth"], camera.inverse_depth, camera.columns, mask)

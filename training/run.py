@@ -95,8 +95,8 @@ class Run:
             check_views(plan.start, self.pace.views)
             report_changes(plan.start, argparse.Namespace(**vars(dataset), **self._training_options))
         self.background = torch.full((3,), 1.0 if dataset.white_background else 0.0, device=self.device)
-        self.objective = Objective(opt)
         self.density = density_control(self)
+        self.objective = Objective(opt, self.density.clamps)
         self._depth_weight = get_expon_lr_func(
             opt.depth_l1_weight_init, opt.depth_l1_weight_final, max_steps=opt.iterations
         )

@@ -96,21 +96,26 @@ def _ssim(
 
 
 def photometric_loss(
-    image: Tensor, target: Tensor, lambda_dssim: float, mask: Tensor | None = None, columns: slice | None = None
+    image: Tensor,
+    target: Tensor,
+    lambda_dssim: float,
+    mask: Tensor | None = None,
+    columns: slice | None = None,
+    clamp: bool = True,
 ) -> tuple[Tensor, Tensor]:
     """Loss (1 - lambda) L1 + lambda (1 - SSIM) (Kerbl et al. 2023, eq. 7), and its L1 part for the log.
 
-    Arguments as for `l1_and_ssim`, except that the image is clamped to [0, 1], so that values outside get no gradient.
+    Arguments as for `l1_and_ssim`. clamp: clamp the image to [0, 1] first, so that values outside get no gradient.
     columns: the columns that count, None: all. The others are cut off; each pixel keeps its weight in the whole image.
     """
     if columns is not None:
         cut = [None if x is None else x[..., columns].contiguous() for x in (image, target, mask)]
-        loss, l1 = photometric_loss(cut[0], cut[1], lambda_dssim, cut[2])
+        loss, l1 = photometric_loss(cut[0], cut[1], lambda_dssim, cut[2], clamp=clamp)
         share = len(range(image.shape[-1])[columns]) / image.shape[-1]
         return share * loss, l1
     if mask is None:
-        return fused_photometric_loss(image, target, lambda_dssim)
-    l1, similarity = l1_and_ssim(image.clamp(0, 1), target, mask)
+        return fused_photometric_loss(image, target, lambda_dssim, clamp)
+    l1, similarity = l1_and_ssim(image.clamp(0, 1) if clamp else image, target, mask)
     return (1.0 - lambda_dssim) * l1 + lambda_dssim * (1.0 - similarity), l1
 
 

@@ -42,6 +42,7 @@ class BudgetControl(DensityControl):
     """
 
     fusable = True
+    clamps = False
 
     def __init__(self, run: "Run") -> None:
         self._gaussians, self._opt = run.gaussians, run.opt

@@ -24,6 +24,7 @@ class MarkovChain(DensityControl):
     """The strategy of the MCMC paper, with the rules of scene/gaussians/relocation.py. It resets no opacities."""
 
     fusable = True
+    clamps = False
     queues = True
 
     def __init__(self, gaussians: GaussianModel, opt: argparse.Namespace) -> None:

@@ -15,7 +15,12 @@ REACH = 10  # rows beside a band that its gradient depends on: SSIM reads 5, and
 
 
 def photometric_loss_by_bands(
-    img1: Tensor, img2: Tensor, lambda_dssim: float, rows: tuple[int, int], add: Callable[[Tensor], Tensor]
+    img1: Tensor,
+    img2: Tensor,
+    lambda_dssim: float,
+    rows: tuple[int, int],
+    add: Callable[[Tensor], Tensor],
+    clamp: bool = True,
 ) -> tuple[Tensor, Tensor]:
     """`fused_photometric_loss` of the whole image, and its gradient in rows [first, end): the same bits as there.
 
@@ -25,24 +30,26 @@ def photometric_loss_by_bands(
     Raises what `fused_photometric_loss` raises, and ValueError for rows that are no band.
     """
     check_images(img1, img2, "same")
-    return _Banded.apply(img1, img2.detach(), float(lambda_dssim), rows, add)
+    return _Banded.apply(img1, img2.detach(), float(lambda_dssim), rows, add, clamp)
 
 
 class _Banded(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, img1: Tensor, img2: Tensor, lambda_dssim: float, rows: tuple[int, int], add: Callable):
-        sums, kept = OPERATORS.photometric_band(img1, img2, *rows)
+    def forward(
+        ctx: Any, img1: Tensor, img2: Tensor, lambda_dssim: float, rows: tuple[int, int], add: Callable, clamp: bool
+    ):
+        sums, kept = OPERATORS.photometric_band(img1, img2, *rows, clamp)
         loss, l1 = OPERATORS.photometric_of_sums(img1, add(sums), lambda_dssim)
         ctx.mark_non_differentiable(l1)
         ctx.set_materialize_grads(False)
         ctx.save_for_backward(img1, img2, kept)
-        ctx.lambda_dssim, ctx.rows = lambda_dssim, rows
+        ctx.lambda_dssim, ctx.rows, ctx.clamp = lambda_dssim, rows, clamp
         return loss, l1
 
     @staticmethod
     @first_order
-    def backward(ctx: Any, grad_loss: Tensor | None, *_: Any) -> tuple[Tensor | None, None, None, None, None]:
+    def backward(ctx: Any, grad_loss: Tensor | None, *_: Any) -> tuple[Tensor | None, None, None, None, None, None]:
         if grad_loss is None:
-            return None, None, None, None, None
-        gradient = OPERATORS.photometric_band_vjp(*ctx.saved_tensors, ctx.lambda_dssim, grad_loss, *ctx.rows)
-        return gradient, None, None, None, None
+            return None, None, None, None, None, None
+        gradient = OPERATORS.photometric_band_vjp(*ctx.saved_tensors, ctx.lambda_dssim, grad_loss, *ctx.rows, ctx.clamp)
+        return gradient, None, None, None, None, None

@@ -42,18 +42,20 @@ def fused_l1_ssim(img1: Tensor, img2: Tensor, padding: str = "same") -> tuple[Te
     return l1, ssim
 
 
-def fused_photometric_loss(img1: Tensor, img2: Tensor, lambda_dssim: float) -> tuple[Tensor, Tensor]:
+def fused_photometric_loss(
+    img1: Tensor, img2: Tensor, lambda_dssim: float, clamp: bool = True
+) -> tuple[Tensor, Tensor]:
     """The loss (1 - lambda) L1 + lambda (1 - SSIM) of Kerbl et al. 2023, eq. 7, and its L1: two scalars.
 
-    Compares img1 clamped to [0, 1] with img2; images and errors are those of `fused_ssim` with padding "same". As with
-    torch's clamp, img1 receives no gradient where it lies outside [0, 1]. The L1 has no gradient. Nothing is kept for
-    the gradient unless img1 needs one.
+    Images and errors are those of `fused_ssim` with padding "same". With clamp, img1 is clamped to [0, 1] first; as
+    with torch's clamp, it receives no gradient where it lies outside. The L1 has no gradient. Nothing is kept for the
+    gradient unless img1 needs one.
     """
     check_images(img1, img2, "same")
     train = torch.is_grad_enabled() and img1.requires_grad
     if train and not torch.compiler.is_compiling():  # torch.compile knows the operator
-        return _Photometric.apply(img1, img2, float(lambda_dssim), True)[:2]
-    return OPERATORS.photometric(img1, img2.detach(), float(lambda_dssim), train)[:2]
+        return _Photometric.apply(img1, img2, float(lambda_dssim), True, clamp)[:2]
+    return OPERATORS.photometric(img1, img2.detach(), float(lambda_dssim), train, clamp)[:2]
 
 
 def composite(picture: Tensor, background: Tensor) -> Tensor:
@@ -130,12 +132,16 @@ library.register_autograd("fused_ssim::l1_ssim", _backward, setup_context=_setup
 
 
 @library.register_fake("fused_ssim::photometric")
-def _photometric_fake(img1: Tensor, img2: Tensor, lambda_dssim: float, train: bool) -> tuple[Tensor, Tensor, Tensor]:
+def _photometric_fake(
+    img1: Tensor, img2: Tensor, lambda_dssim: float, train: bool, clamp: bool = True
+) -> tuple[Tensor, Tensor, Tensor]:
     return _l1_ssim_fake(img1, img2, False, train)
 
 
 @library.register_fake("fused_ssim::photometric_vjp")
-def _photometric_vjp_fake(img1: Tensor, img2: Tensor, kept: Tensor, lambda_dssim: float, grad_loss: Tensor) -> Tensor:
+def _photometric_vjp_fake(
+    img1: Tensor, img2: Tensor, kept: Tensor, lambda_dssim: float, grad_loss: Tensor, clamp: bool = True
+) -> Tensor:
     return img1.new_empty(img1.shape)
 
 
@@ -145,18 +151,18 @@ def _composite_fake(picture: Tensor, background: Tensor) -> Tensor:
 
 
 def _setup_photometric(ctx, inputs: tuple, output: tuple[Tensor, Tensor, Tensor]) -> None:
-    img1, img2, ctx.lambda_dssim, _ = inputs
+    img1, img2, ctx.lambda_dssim, _, ctx.clamp = inputs
     ctx.mark_non_differentiable(output[1], output[2])
     ctx.set_materialize_grads(False)
     ctx.save_for_backward(img1, img2, output[2])
 
 
 @first_order
-def _photometric_backward(ctx, grad_loss: Tensor | None, *_) -> tuple[Tensor | None, None, None, None]:
+def _photometric_backward(ctx, grad_loss: Tensor | None, *_) -> tuple[Tensor | None, None, None, None, None]:
     if grad_loss is None:
-        return None, None, None, None
-    gradient = OPERATORS.photometric_vjp(*ctx.saved_tensors, ctx.lambda_dssim, grad_loss)
-    return gradient, None, None, None
+        return None, None, None, None, None
+    gradient = OPERATORS.photometric_vjp(*ctx.saved_tensors, ctx.lambda_dssim, grad_loss, ctx.clamp)
+    return gradient, None, None, None, None
 
 
 # For callers of the operator itself, and for torch.compile.

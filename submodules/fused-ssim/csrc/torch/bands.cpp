@@ -38,7 +38,8 @@ void check_sums(const Tensor& sums, const Tensor& img1) {
 }
 
 // The sums of a band, and what its backward needs.
-std::tuple<Tensor, Tensor> photometric_band(const Tensor& img1_, const Tensor& img2_, int64_t first, int64_t end) {
+std::tuple<Tensor, Tensor> photometric_band(const Tensor& img1_, const Tensor& img2_, int64_t first, int64_t end,
+                                            bool clamp) {
   check_images(img1_, img2_, false);
   const gs::RowRange rows = band(img1_, first, end);
   const Tensor img1 = packed(img1_), img2 = packed(img2_);
@@ -46,7 +47,7 @@ std::tuple<Tensor, Tensor> photometric_band(const Tensor& img1_, const Tensor& i
   with_scalar(img1, [&](auto zero) {
     using T = decltype(zero);
     const gs::L1Ssim<T> args{
-        image_pair<T>(img1, img2, true), false, nullptr, nullptr, write<T>(kept), &rows, write<double>(sums)};
+        image_pair<T>(img1, img2, clamp), false, nullptr, nullptr, write<T>(kept), &rows, write<double>(sums)};
     GS_DISPATCH(l1_ssim_cpu, args, gs::torch_executor());
   });
   return {sums, kept};
@@ -59,7 +60,7 @@ std::tuple<Tensor, Tensor> photometric_of_sums(const Tensor& img1, const Tensor&
   return with_scalar(img1, [&](auto zero) {
     using T = decltype(zero);
     Means means{};
-    const gs::L1SsimMeans<T> args{image_pair<T>(img1, img1, true), read<double>(sums), &means.l1, &means.ssim};
+    const gs::L1SsimMeans<T> args{image_pair<T>(img1, img1, false), read<double>(sums), &means.l1, &means.ssim};
     GS_DISPATCH(l1_ssim_means_cpu, args);
     return std::tuple(scalar(photometric_loss<T>(means, lambda), img1), scalar(T(means.l1), img1));
   });
@@ -67,21 +68,21 @@ std::tuple<Tensor, Tensor> photometric_of_sums(const Tensor& img1, const Tensor&
 
 // The gradient of the image in the rows of a band; it has any values in the others.
 Tensor photometric_band_vjp(const Tensor& img1, const Tensor& img2, const Tensor& kept, double lambda,
-                            const Tensor& grad_loss, int64_t first, int64_t end) {
+                            const Tensor& grad_loss, int64_t first, int64_t end, bool clamp) {
   check_images(img1, img2, false);
   const gs::RowRange rows = band(img1, first, end);
-  return photometric_rows_vjp(img1, img2, kept, lambda, grad_loss, &rows);
+  return photometric_rows_vjp(img1, img2, kept, clamp, lambda, grad_loss, &rows);
 }
 
 #ifdef GS_CUDA
 std::tuple<Tensor, Tensor> photometric_band_on_cuda(const Tensor& img1_, const Tensor& img2_, int64_t first,
-                                                    int64_t end) {
+                                                    int64_t end, bool clamp) {
   check_images_cuda(img1_, img2_, false);
   const gs::RowRange rows = band(img1_, first, end);
   gs::TorchQueue queue(img1_.device());
   const Tensor img1 = packed(img1_), img2 = packed(img2_);
   Tensor kept = empty(kept_shape(img1, rows), img1), sums = no_sums(img1);
-  gs::L1SsimCuda args{image_pair<float>(img1, img2, true), false, nullptr, nullptr, write<float>(kept)};
+  gs::L1SsimCuda args{image_pair<float>(img1, img2, clamp), false, nullptr, nullptr, write<float>(kept)};
   args.rows = &rows, args.sums = write<double>(sums);
   gs::l1_ssim_cuda(args, queue.queue());
   return {sums, kept};
@@ -92,7 +93,7 @@ std::tuple<Tensor, Tensor> photometric_of_sums_on_cuda(const Tensor& img1, const
   check_sums(sums, img1);
   gs::TorchQueue queue(img1.device());
   Tensor loss = empty({}, img1), l1 = empty({}, img1);
-  gs::L1SsimCuda args{image_pair<float>(img1, img1, true),
+  gs::L1SsimCuda args{image_pair<float>(img1, img1, false),
                       false,
                       write<float>(l1),
                       nullptr,
@@ -106,23 +107,25 @@ std::tuple<Tensor, Tensor> photometric_of_sums_on_cuda(const Tensor& img1, const
 }
 
 Tensor photometric_band_vjp_on_cuda(const Tensor& img1, const Tensor& img2, const Tensor& kept, double lambda,
-                                    const Tensor& grad_loss, int64_t first, int64_t end) {
+                                    const Tensor& grad_loss, int64_t first, int64_t end, bool clamp) {
   check_images_cuda(img1, img2, false);
   const gs::RowRange rows = band(img1, first, end);
-  return vjp_on_cuda(img1, img2, kept, true, grad_loss, float(1 - lambda), grad_loss, -float(lambda), &rows);
+  return vjp_on_cuda(img1, img2, kept, clamp, grad_loss, float(1 - lambda), grad_loss, -float(lambda), &rows);
 }
 #endif
 
 }  // namespace
 
 GS_OPERATORS(fused_ssim, m) {
-  m.define("photometric_band(Tensor image, Tensor target, int first, int end) -> (Tensor sums, Tensor kept)",
-           GS_BOTH(photometric_band));
+  m.define(
+      "photometric_band(Tensor image, Tensor target, int first, int end, bool clamp=True) -> (Tensor sums, Tensor "
+      "kept)",
+      GS_BOTH(photometric_band));
   m.define("photometric_of_sums(Tensor image, Tensor sums, float lambda_dssim) -> (Tensor loss, Tensor l1)",
            GS_BOTH(photometric_of_sums));
   m.define(
       "photometric_band_vjp(Tensor image, Tensor target, Tensor kept, float lambda_dssim, Tensor grad_loss, int first,"
-      " int end) -> Tensor grad_image",
+      " int end, bool clamp=True) -> Tensor grad_image",
       GS_BOTH(photometric_band_vjp));
 }
 

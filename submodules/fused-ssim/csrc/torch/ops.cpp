@@ -27,13 +27,13 @@ Tensors3 l1_ssim(const Tensor& img1_, const Tensor& img2_, bool valid, bool trai
   });
 }
 
-Tensors3 photometric(const Tensor& img1_, const Tensor& img2_, double lambda, bool train) {
+Tensors3 photometric(const Tensor& img1_, const Tensor& img2_, double lambda, bool train, bool clamp) {
   check_images(img1_, img2_, false);
   const Tensor img1 = packed(img1_), img2 = packed(img2_);
   Tensor gradient = empty_kept(img1, train);
   return with_scalar(img1, [&](auto zero) {
     using T = decltype(zero);
-    const Means means = means_of(image_pair<T>(img1, img2, true), false, gradient);
+    const Means means = means_of(image_pair<T>(img1, img2, clamp), false, gradient);
     return Tensors3(scalar(photometric_loss<T>(means, lambda), img1), scalar(T(means.l1), img1), gradient);
   });
 }
@@ -50,8 +50,8 @@ Tensor l1_ssim_vjp(const Tensor& img1, const Tensor& img2, const Tensor& kept, c
 }
 
 Tensor photometric_vjp(const Tensor& img1, const Tensor& img2, const Tensor& kept, double lambda,
-                       const Tensor& grad_loss) {
-  return photometric_rows_vjp(img1, img2, kept, lambda, grad_loss, nullptr);
+                       const Tensor& grad_loss, bool clamp) {
+  return photometric_rows_vjp(img1, img2, kept, clamp, lambda, grad_loss, nullptr);
 }
 
 #ifdef GS_CUDA
@@ -67,13 +67,13 @@ Tensors3 l1_ssim_on_cuda(const Tensor& img1_, const Tensor& img2_, bool valid, b
   return {l1, ssim, kept};
 }
 
-Tensors3 photometric_on_cuda(const Tensor& img1_, const Tensor& img2_, double lambda, bool train) {
+Tensors3 photometric_on_cuda(const Tensor& img1_, const Tensor& img2_, double lambda, bool train, bool clamp) {
   check_images_cuda(img1_, img2_, false);
   gs::TorchQueue queue(img1_.device());
   const Tensor img1 = packed(img1_), img2 = packed(img2_);
   Tensor loss = empty({}, img1), l1 = empty({}, img1);
   Tensor kept = empty_kept(img1, train);
-  gs::l1_ssim_cuda({image_pair<float>(img1, img2, true), false, write<float>(l1), nullptr,
+  gs::l1_ssim_cuda({image_pair<float>(img1, img2, clamp), false, write<float>(l1), nullptr,
                     train ? write<float>(kept) : nullptr, write<float>(loss), float(1 - lambda), float(lambda)},
                    queue.queue());
   return {loss, l1, kept};
@@ -85,8 +85,8 @@ Tensor l1_ssim_vjp_on_cuda(const Tensor& img1, const Tensor& img2, const Tensor&
 }
 
 Tensor photometric_vjp_on_cuda(const Tensor& img1, const Tensor& img2, const Tensor& kept, double lambda,
-                               const Tensor& grad_loss) {
-  return vjp_on_cuda(img1, img2, kept, true, grad_loss, float(1 - lambda), grad_loss, -float(lambda));
+                               const Tensor& grad_loss, bool clamp) {
+  return vjp_on_cuda(img1, img2, kept, clamp, grad_loss, float(1 - lambda), grad_loss, -float(lambda));
 }
 
 #endif
@@ -122,11 +122,11 @@ GS_OPERATORS(fused_ssim, m) {
   m.define("l1_ssim_vjp(Tensor img1, Tensor img2, Tensor kept, Tensor grad_l1, Tensor grad_ssim) -> Tensor grad_img1",
            GS_BOTH(l1_ssim_vjp));
   m.define(
-      "photometric(Tensor image, Tensor target, float lambda_dssim, bool train)"
+      "photometric(Tensor image, Tensor target, float lambda_dssim, bool train, bool clamp=True)"
       " -> (Tensor loss, Tensor l1, Tensor kept)",
       GS_BOTH(photometric));
   m.define(
-      "photometric_vjp(Tensor image, Tensor target, Tensor kept, float lambda_dssim, Tensor grad_loss)"
+      "photometric_vjp(Tensor image, Tensor target, Tensor kept, float lambda_dssim, Tensor grad_loss, bool clamp=True)"
       " -> Tensor grad_image",
       GS_BOTH(photometric_vjp));
   m.define("composite(Tensor picture, Tensor background) -> Tensor", TORCH_BOX(&composite));

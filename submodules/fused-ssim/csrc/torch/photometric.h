@@ -93,15 +93,15 @@ Tensor vjp(const Tensor& img1_, const Tensor& img2_, const Tensor& kept_, bool c
   return grad_img1;
 }
 
-inline Tensor photometric_rows_vjp(const Tensor& img1, const Tensor& img2, const Tensor& kept, double lambda,
-                                   const Tensor& grad_loss, const gs::RowRange* rows) {
+inline Tensor photometric_rows_vjp(const Tensor& img1, const Tensor& img2, const Tensor& kept, bool clamp,
+                                   double lambda, const Tensor& grad_loss, const gs::RowRange* rows) {
   check_images(img1, img2, false);
   check_kept(kept, img1, rows ? *rows : all_rows(img1));
   check_scalar(grad_loss, img1);
   return with_scalar(img1, [&](auto zero) {
     using T = decltype(zero);
     const T grad = value_of<T>(grad_loss);
-    return vjp<T>(img1, img2, kept, true, grad * T(1 - lambda), grad * -T(lambda), rows);
+    return vjp<T>(img1, img2, kept, clamp, grad * T(1 - lambda), grad * -T(lambda), rows);
   });
 }
 
