@@ -22,8 +22,10 @@ def _render(*arguments, clamp: bool = True, **named) -> dict[str, Tensor]:
     return render(*arguments, **named)
 
 
-def _loss(image: Tensor, target: Tensor, weight: float, mask: None, columns: None) -> tuple[Tensor, Tensor]:
-    assert image.min() >= 0 and image.max() <= 1 and mask is columns is None
+def _loss(
+    image: Tensor, target: Tensor, weight: float, mask: None, columns: None, clamp: bool
+) -> tuple[Tensor, Tensor]:
+    assert image.min() >= 0 and image.max() <= 1 and mask is columns is None and clamp
     l1, ssim = fused_l1_ssim(image, target)
     return (1.0 - weight) * l1 + weight * (1.0 - ssim), l1
 
