@@ -25,8 +25,8 @@ def photometric_loss_by_bands(
     """`fused_photometric_loss` of the whole image, and its gradient in rows [first, end): the same bits as there.
 
     img1, img2: (..., H, W), of which only these rows and REACH more on either side count. add: sums a tensor of float64
-    over all processes, whose bands make up the image; each number is 0 on all but one. Other rows of the gradient have
-    any values.
+    over all processes, whose bands make up the image; each number is 0 on all but one. clamp: as there. Other rows of
+    the gradient have any values.
     Raises what `fused_photometric_loss` raises, and ValueError for rows that are no band.
     """
     check_images(img1, img2, "same")
