@@ -238,7 +238,7 @@ def test_messages() -> None:
     # The operator itself checks inputs that bypass the Python function.
     with pytest.raises(RuntimeError, match="img1 must be float32 on a GPU"):
         torch.ops.fused_ssim.l1_ssim(image.double(), image.double(), False, False)
-    with pytest.raises(RuntimeError, match=r"kept must be \[3, 1, 20, 408\]"):
+    with pytest.raises(RuntimeError, match=r"kept must be \(3, 1, 20, 408\)"):
         torch.ops.fused_ssim.l1_ssim_vjp(image, image, image, torch.ones(()), torch.ones(()))
     kept = torch.ops.fused_ssim.l1_ssim(image, image, False, True)[2]
     with pytest.raises(RuntimeError, match="gradients must be float32"):

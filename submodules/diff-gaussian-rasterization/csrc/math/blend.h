@@ -38,7 +38,9 @@ struct RowTerms {
 template <class V, class Y>
 GS_HD RowTerms<V> row_terms(const LocalSplat<V>& s, Y y) {
   const V v = s.l22 * (y - s.y);
-  return {s.log2_opacity - v * v, s.l11, s.l12 * (y - float(kTileCentre)) + s.u, v};
+  // Fused by name: where v * v is also used by itself, a compiler would round it first, and a backward would have other
+  // exponents than its forward.
+  return {multiply_add(-v, v, s.log2_opacity), s.l11, s.l12 * (y - float(kTileCentre)) + s.u, v};
 }
 
 // T: V or its scalar.

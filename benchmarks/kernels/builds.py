@@ -1,0 +1,129 @@
+"""Milliseconds of the rasterizer's calls in two builds by turns, on the CPU or a GPU.
+
+    python -m benchmarks.kernels.builds OLD NEW     # folders that hold an installed diff_gaussian_rasterization each
+    python -m benchmarks.kernels.builds OLD NEW --device cpu
+
+Each build has a process of its own, and only one works at a time. A turn is the median of several calls, each on an
+idle device, host included. Figures are medians over the turns, the ratio that of the two builds' turns side by side.
+"""
+
+import argparse
+import os
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import torch
+
+from benchmarks.harness.environment import describe, print_table
+from benchmarks.workloads.splat_scenes import frustum
+from utils.system_utils import UserError, run_cli
+
+#            splats  width height median pixel sigma
+WORKLOADS = {"S": (5_000, 200, 200, 2.4), "M": (50_000, 400, 400, 2.4), "L": (300_000, 800, 800, 1.7)}
+GPU_WORKLOADS = ("S", "M", "L")  # those of benchmarks/peers/published.py
+CPU_CALLS = {"S": 40, "M": 10, "L": 3}  # of a turn
+GPU_CALLS, WARM_UPS = 40, 5
+STEPS = ("forward", "+ backward", "step")
+
+
+class Build:
+    """A process with the rasterizer of one folder, which times calls when it is asked to."""
+
+    def __init__(self, folder: str, device: str) -> None:
+        path = os.pathsep.join(filter(None, [folder, os.environ.get("PYTHONPATH")]))
+        self._folder = folder
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", "benchmarks.kernels.builds", folder, folder, "--device", device, "--serve"],
+            env={**os.environ, "PYTHONPATH": path},
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+
+    def milliseconds(self, workload: str, step: str) -> float:
+        """The median time of a turn of calls."""
+        self._process.stdin.write(f"{workload},{step}\n")
+        self._process.stdin.flush()
+        if answer := self._process.stdout.readline():
+            return float(answer)
+        raise UserError(f"the rasterizer of {self._folder} failed: see above")
+
+    def end(self) -> None:
+        self._process.stdin.close()
+        self._process.wait()
+
+
+def serve(device: str) -> None:
+    """Answer each line "workload,step" with milliseconds."""
+    from benchmarks.harness.calls import Calls  # the build that this process got
+    from benchmarks.peers import published
+
+    made: dict[str, dict[str, Callable[[], object]]] = {}
+    for line in sys.stdin:
+        workload, step = line.strip().split(",")
+        if workload not in made:
+            sizes = published.WORKLOADS if device == "cuda" else WORKLOADS
+            made[workload] = Calls(frustum(*sizes[workload], device=device)).steps()
+        turn = _on_gpu if device == "cuda" else _on_cpu
+        print(turn(made[workload][step], workload), flush=True)
+
+
+def _on_cpu(run: Callable[[], object], workload: str) -> float:
+    times = []
+    for _ in range(1 + CPU_CALLS[workload]):
+        start = time.perf_counter()
+        run()
+        times.append(time.perf_counter() - start)
+    return 1e3 * statistics.median(times[1:])
+
+
+def _on_gpu(run: Callable[[], object], workload: str) -> float:
+    times = []
+    begin, end = torch.cuda.Event(enable_timing=True), torch.cuda.Event(enable_timing=True)
+    for _ in range(WARM_UPS + GPU_CALLS):
+        torch.cuda.synchronize()
+        begin.record()
+        run()
+        end.record()
+        end.synchronize()
+        times.append(begin.elapsed_time(end))
+    return statistics.median(times[WARM_UPS:])
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    add = parser.add_argument
+    add("old", help="folder with a diff_gaussian_rasterization, as pip install --target makes it")
+    add("new", help="another one")
+    add("--device", choices=["cpu", "cuda"], help="default: cuda if there is a GPU")
+    add("--workloads", nargs="+", choices=GPU_WORKLOADS, default=list(GPU_WORKLOADS), help="default: all")
+    add("--rounds", type=int, default=9, help="turns of each build (default: 9)")
+    add("--serve", action="store_true", help=argparse.SUPPRESS)
+    args = parser.parse_args()
+    device = args.device or ("cuda" if torch.cuda.is_available() else "cpu")
+    if args.serve:
+        serve(device)
+        return
+    for folder in (args.old, args.new):
+        if not (Path(folder) / "diff_gaussian_rasterization").is_dir():
+            raise UserError(f"{folder} holds no diff_gaussian_rasterization: install one with pip install --target")
+    print(describe(device))
+    builds = [Build(folder, device) for folder in (args.old, args.new)]
+    rows = []
+    for workload in args.workloads:
+        for step in STEPS:
+            turns = [[build.milliseconds(workload, step) for build in builds] for _ in range(1 + args.rounds)][1:]
+            old, new = (statistics.median(times) for times in zip(*turns, strict=True))
+            ratio = statistics.median(new / old for old, new in turns)
+            rows.append([workload, step, f"{old:.3f}", f"{new:.3f}", f"{ratio:.3f}"])
+    for build in builds:
+        build.end()
+    print_table(["workload", "ms", args.old, args.new, "new / old"], rows)
+
+
+if __name__ == "__main__":
+    run_cli(main)
