@@ -246,10 +246,11 @@ def test_messages() -> None:
 
 
 @pytest.mark.parametrize(
-    ("height", "width", "borders"), [(70, 33, [0, 1, 1, 3, 5]), (97, 600, [0, 0, 4, 7]), (1060, 1600, [0, 20, 67])]
+    ("height", "width", "borders"),
+    [(70, 33, [0, 1, 1, 3, 5]), (97, 600, [0, 0, 4, 7]), (960, 538, [0, 30, 60]), (1060, 1600, [0, 20, 67])],
 )
 @pytest.mark.parametrize("as_bytes", [True, False], ids=["bytes", "floats"])
 def test_bands_have_the_loss_and_the_gradient_of_the_whole_image(height, width, borders, as_bytes):
-    """The last image is so large that blocks of the forward have 16 rows."""
+    """The last image is so large that blocks of the forward have 16 rows; a band of the third by itself is small."""
     images = render_and_photo(height, width, torch.float32, as_bytes)
     check_bands(height, borders, tuple(image.cuda() for image in images))

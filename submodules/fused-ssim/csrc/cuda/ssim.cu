@@ -197,11 +197,12 @@ void l1_ssim_vjp(const L1SsimVjpCuda& args, const Queue& queue) {
   check_launch("l1_ssim_vjp_kernel");
 }
 
-// Lower tiles read more rows for each of theirs, but a small image needs them to fill a large GPU.
+// Lower tiles read more rows for each of theirs, but a small image needs them to fill a large GPU. A compiler may fuse
+// products otherwise for them, so a band takes those of its image.
 template <class Source>
 void l1_ssim_vjp(const L1SsimVjpCuda& args, const Queue& queue) {
   const auto& images = args.images;
-  const int64_t tiles = Tiles::of(16, images.planes, band_of(images, args.rows), images.width).count;
+  const int64_t tiles = Tiles::of(16, images.planes, {0, images.height}, images.width).count;
   tiles < kManyTiles / 2 ? l1_ssim_vjp<8, Source>(args, queue) : l1_ssim_vjp<16, Source>(args, queue);
 }
 
