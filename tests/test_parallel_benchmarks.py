@@ -8,7 +8,7 @@ import pytest
 import torch
 from processes import in_ranks
 
-from benchmarks.parallel import host, steps, workload
+from benchmarks.parallel import host, spill, steps, workload
 from benchmarks.parallel.stages import Stages
 from benchmarks.parallel.table import best, ratios
 
@@ -64,3 +64,11 @@ def test_the_host_is_profiled_by_step():
     (calls,) = [calls for name, calls, _ in rows if name.startswith("take (steps/fused.py")]
     assert calls == "1.0"
     assert [float(row[2]) for row in rows] == sorted((float(row[2]) for row in rows), reverse=True)
+
+
+def test_spilled_trainings_have_the_digest_of_others():
+    found = [
+        spill.train(argparse.Namespace(**SMALL, iterations=iterations, cap=0, spill=spilled))["digest"]
+        for iterations, spilled in ((8, False), (8, True), (9, False))
+    ]
+    assert found[0] == found[1] != found[2]

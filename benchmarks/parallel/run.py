@@ -1,5 +1,6 @@
 """A training of a workload by the ranks of this process, by the code of train.py, without a scene folder."""
 
+import argparse
 from types import SimpleNamespace
 
 import torch
@@ -8,6 +9,7 @@ import train
 from benchmarks.parallel.workload import Workload
 from records.training_log import Stopwatch
 from scene.gaussian_model import GaussianModel
+from scene.spilled_model import SpilledGaussians
 from training.loss_watch import LossWatch
 from training.objective import Objective
 from training.pacing.choose import pace_of
@@ -30,13 +32,14 @@ class WorkloadRun(Run):
     """A run whose scene is a workload. Gaussians are observed, and none is added or removed.
 
     steps: how many it takes; in the last one the optimisers rest. still: with learning rates of 0, which have the
-    arithmetic of a step but leave the scene as it is, so that every step does the same work.
+    arithmetic of a step but leave the scene as it is, so that every step does the same work. spill: as the option.
     """
 
-    def __init__(self, workload: Workload, parallel: str, steps: int, still: bool) -> None:
+    def __init__(self, workload: Workload, parallel: str, steps: int, still: bool, spill: bool = False) -> None:
         here = ranks()
         views = here.size if parallel == "views" else 1
         words = ["-s", ".", "--iterations", str(steps * views), "--densify_from_iter", "10000", *_STILL * still]
+        words += ["--spill"] * spill
         _, self.dataset, self.opt, self.pipe = train.parse(words)
         self.plan = Plan([], [], [], None, -1, False, parallel=parallel)
         self.lost = self.first_iteration = 0
@@ -62,8 +65,8 @@ class WorkloadRun(Run):
         self.losses, self.clock = LossWatch(), Stopwatch()
 
 
-def _model(workload: Workload, opt: object, device: torch.device) -> GaussianModel:
-    model = GaussianModel(3)
+def _model(workload: Workload, opt: argparse.Namespace, device: torch.device) -> GaussianModel:
+    model = (SpilledGaussians if opt.spill else GaussianModel)(3)
     model.divide(ranks())
     model.set_rows(workload.rows(ranks().rank, ranks().size, device))
     model.active_sh_degree, model.spatial_lr_scale = 3, _EXTENT
