@@ -55,6 +55,10 @@ SCHEMAS = [
     f"{GRADIENTS}",
     f"blend_rows({BACKWARD}, Tensor layers, bool absolute=False) -> (Tensor rows, Tensor counts)",
     f"rows_vjp({SCENE}, {ROWS}, bool[9] wanted, bool absolute=False) -> {GRADIENTS}",
+    "pack_splats_(Tensor(a!) packed, Tensor splats, Tensor depths, Tensor rects, Tensor tile_counts, Tensor gaussians) "
+    "-> ()",
+    "unpack_splats(Tensor packed, Tensor like) -> (Tensor splats, Tensor depths, Tensor rects, Tensor tile_counts)",
+    "move_runs(Tensor rows, Tensor counts, Tensor places) -> Tensor",
     f"rasterize_vjp_step_({STEPPED_SCENE}, {BACKWARD}, Tensor tile_counts, Tensor layers, {STEP}) -> ()",
     f"rows_vjp_step_({STEPPED_SCENE}, {ROWS}, {STEP}) -> ()",
     "step_now_(Tensor(a!) now, int[] attributes, Tensor(b!)[] steps, float[] rates, float beta1, float beta2, "

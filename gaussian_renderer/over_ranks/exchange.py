@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from itertools import accumulate
 
 import torch
+from diff_gaussian_rasterization.backend import OPERATORS
 from torch import Tensor
 
 from gaussian_renderer.over_ranks.bands import Bands
@@ -22,7 +23,9 @@ class Sent:
     gaussians: Tensor  # (n,), ascending for each rank, rank after rank
     sizes: list[int]  # records for each rank
     received: list[int]
-    places: Tensor | None  # (n,) int64, ascending by Gaussian and then by rank; None if the records lie in this order
+    places: (
+        Tensor | None
+    )  # (n,) int32: of records in the order of Gaussians, then ranks; None if they lie in this order
 
 
 def find_records(ranks: Ranks, reached: Tensor) -> tuple[Tensor, Tensor, list[int], list[int]]:
@@ -44,24 +47,23 @@ def send_splats(ranks: Ranks, bands: Bands, splats: tuple[Tensor, ...]) -> tuple
     """
     reached = bands.reached(*splats[2:])
     rank, gaussian, sizes, received = find_records(ranks, reached)
-    # Gaussians are numbered without those that no band gets, so that memory is for records only.
-    numbers = reached.any(0).cumsum(0, dtype=torch.int32).index_select(0, gaussian)
-    places = rank.add(numbers, alpha=ranks.size)
-    rows = ranks.send(_packed(splats, gaussian), sizes, received)[0]
-    return _unpacked(rows, splats), Sent(gaussian, sizes, received, places)
+    upto = reached.T.to(torch.int32, memory_format=torch.contiguous_format).view(-1).cumsum_(0)
+    places = upto.index_select(0, rank.add(gaussian, alpha=ranks.size)).sub_(1)
+    rows = ranks.send(_packed([splats], gaussian, [len(gaussian)]), sizes, received)[0]
+    return OPERATORS.unpack_splats(rows, splats[0]), Sent(gaussian, sizes, received, places)
 
 
 def send_views(ranks: Ranks, views: Sequence[tuple[Tensor, ...]]) -> tuple[tuple[Tensor, ...], Sent]:
     """Send what has tiles in view r to rank r; receive this rank's, in the order of ranks.
 
-    views: for each, tensors with a row for each of the rank's N Gaussians, the last one tile counts. The records are
-    those of Gaussian v N + i for Gaussian i of view v.
+    views: for each, tensors as of `send_splats`. The records are those of Gaussian v N + i for Gaussian i of view v, of
+    the rank's N Gaussians.
     """
     reached = torch.stack([tensors[-1] for tensors in views]) > 0
     view, gaussian, sizes, received = find_records(ranks, reached)
-    packed = [_packed(tensors, own) for tensors, own in zip(views, gaussian.split(sizes), strict=True)]
-    rows = ranks.send(torch.cat(packed), sizes, received)[0]
-    return _unpacked(rows, views[0]), Sent(gaussian.add(view, alpha=reached.shape[1]), sizes, received, None)
+    rows = ranks.send(_packed(views, gaussian, sizes), sizes, received)[0]
+    records = gaussian.add(view, alpha=reached.shape[1])
+    return OPERATORS.unpack_splats(rows, views[0][0]), Sent(records, sizes, received, None)
 
 
 def return_rows(ranks: Ranks, sent: Sent, count: int, rows: Tensor, counts: Tensor) -> tuple[Tensor, Tensor, list[int]]:
@@ -73,14 +75,11 @@ def return_rows(ranks: Ranks, sent: Sent, count: int, rows: Tensor, counts: Tens
     """
     own = ranks.send(counts, sent.received, sent.sizes)[0]
     total = torch.zeros(count, dtype=torch.int32, device=rows.device).index_add_(0, sent.gaussians, own)
-    shifts = None if sent.places is None else _shifts(own, sent.places, ranks.size)  # found before the host waits
     sums = _sums(torch.cat((own, counts)), [*sent.sizes, *sent.received])
     lengths, sizes = sums[: ranks.size], sums[ranks.size :]
     arrived = ranks.send(rows, sizes, lengths)[0]
-    if shifts is not None:
-        places = torch.arange(len(arrived), device=rows.device)
-        places += shifts.repeat_interleave(own, output_size=len(arrived))
-        arrived = torch.empty_like(arrived).index_copy_(0, places, arrived)
+    if sent.places is not None:
+        arrived = OPERATORS.move_runs(arrived, own, sent.places)
     return arrived, total, lengths
 
 
@@ -95,27 +94,10 @@ def _sums(counts: Tensor, sizes: Sequence[int]) -> list[int]:
     return [end - begin for begin, end in zip(upto, upto[1:], strict=False)]
 
 
-def _shifts(counts: Tensor, places: Tensor, each: int) -> Tensor:
-    """How far the rows of each record move to come into the order of places: (n,) int32.
-
-    counts: (n,), rows of each record; places: (n,), different numbers below (n + 1) * each.
-    """
-    by_place = counts.new_zeros((len(counts) + 1) * each).index_copy_(0, places, counts)
-    ends = by_place.cumsum(0, dtype=torch.int32).index_select(0, places)
-    return ends.sub_(counts.cumsum(0, dtype=torch.int32))
-
-
-def _packed(tensors: tuple[Tensor, ...], indices: Tensor) -> Tensor:
-    """Rows of words of 32 bits."""
-    return torch.cat([t.index_select(0, indices).view(len(indices), _columns(t)).view(torch.int32) for t in tensors], 1)
-
-
-def _unpacked(rows: Tensor, like: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
-    parts = rows.split([_columns(t) * t.element_size() // 4 for t in like], 1)
-    return tuple(
-        part.contiguous().view(t.dtype).view(len(rows), *t.shape[1:]) for part, t in zip(parts, like, strict=True)
-    )
-
-
-def _columns(t: Tensor) -> int:
-    return t.shape[1:].numel()
+def _packed(views: Sequence[tuple[Tensor, ...]], gaussians: Tensor, sizes: Sequence[int]) -> Tensor:
+    """A row of words of 32 bits for each Gaussian, of which the first sizes[0] are of the first view, and so on."""
+    words = sum(t.shape[1:].numel() * t.element_size() for t in views[0]) // 4
+    rows = torch.empty(len(gaussians), words, dtype=torch.int32, device=gaussians.device)
+    for part, splats, own in zip(rows.split(sizes), views, gaussians.split(sizes), strict=True):
+        OPERATORS.pack_splats_(part, *splats, own)
+    return rows

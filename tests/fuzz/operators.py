@@ -27,6 +27,7 @@ def sound_calls() -> dict[str, Call]:
     layers = torch.zeros(5 * 256)  # as a GPU makes them of few instances
     planes = [torch.ones_like(image), torch.ones_like(transmittance), torch.ones_like(plane)]
     rows = ops.blend_rows(*state, *planes, layers)
+    packed = torch.zeros(len(counts), 16, dtype=torch.int32)
     wanted = [True, True, True, True, True, False, False, True, True]
     lists = [[torch.rand(3, 3), torch.rand(2, 5)] for _ in range(4)]
     guard = [torch.rand(()), torch.zeros(1, dtype=torch.int64), 3]
@@ -39,6 +40,9 @@ def sound_calls() -> dict[str, Call]:
         "project": (ops.project, scene),
         "bin": (ops.bin, [splats, depths, rects, counts, height, width, True]),
         "blend": (ops.blend, [splats, instances, ranges, background, height, width, True, True]),
+        "pack_splats_": (ops.pack_splats_, [packed, splats, depths, rects, counts, torch.arange(len(counts))]),
+        "unpack_splats": (ops.unpack_splats, [packed, splats]),
+        "move_runs": (ops.move_runs, [*rows, torch.arange(len(counts), dtype=torch.int32).flip(0)]),
         "blend_vjp": (ops.blend_vjp, [*state, *planes]),
         "blend_rows": (ops.blend_rows, [*state, *planes, layers, True]),
         "rows_vjp": (ops.rows_vjp, [*scene, splats, counts, *rows, wanted]),

@@ -59,6 +59,9 @@ struct RowMemory {
 void observe(const Executor&, const ObserveInput&);
 void split_positions(const Executor&, const SplitInput&);
 void add_noise(const Executor&, const NoiseInput&);
+void pack_splats(const Executor&, const PackInput&);
+void unpack_splats(const Executor&, const UnpackInput&);
+void move_runs(const Executor&, const MoveInput&);
 
 // What else the CPU offers. sum_rows: the rest of blend_vjp after blend_rows. project_vjp_step: project_vjp, and every
 // Gaussian's step as soon as its gradients are known.
@@ -81,6 +84,9 @@ GS_BACKEND(Queue)
 void observe(const Queue&, const ObserveInput&);
 void split_positions(const Queue&, const SplitInput&);
 void add_noise(const Queue&, const NoiseInput&);
+void pack_splats(const Queue&, const PackInput&);
+void unpack_splats(const Queue&, const UnpackInput&);
+void move_runs(const Queue&, const MoveInput&);
 // Allocates the gradients; called while the GPU is busy, so that the host's work costs no time.
 struct GradientMemory {
   SceneGradient<float> (*take)(void* context);

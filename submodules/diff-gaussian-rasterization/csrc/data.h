@@ -204,6 +204,35 @@ struct NoiseInput {
   int64_t first = 0;       // index of the first one, which decides its random numbers
 };
 
+// A row of words of 32 bits for each splat, as processes send them: its values, its depth, its number of tiles and its
+// rectangle, those of Projected. `wide` words make a value: 1 of float32, 2 of float64, on the CPU alone.
+constexpr int packed_words(int wide) { return 11 * wide + 5; }
+
+struct PackInput {
+  int64_t count;
+  int wide;
+  const int64_t* gaussians;                              // (count) the rows of the next four to pack
+  const int32_t *splats, *depths, *tile_counts, *rects;  // (N, 10 wide), (N, wide), (N) and (N, 4)
+  int32_t* packed;                                       // (count, packed_words), written
+};
+
+struct UnpackInput {
+  int64_t count;
+  int wide;
+  const int32_t* packed;
+  int32_t *splats, *depths, *tile_counts, *rects;  // (count, 10 wide) and so on, written
+};
+
+// Runs of rows that lie side by side, to come into another order.
+struct MoveInput {
+  int64_t runs, rows;     // all rows of all runs
+  int words;              // of a row: 10 or 12 on a GPU
+  const int32_t* counts;  // (runs) rows of each run
+  const int32_t* places;  // (runs) its number in the new order
+  const int32_t* from;    // (rows, words)
+  int32_t* to;            // (rows, words), written
+};
+
 // Weights of a Gaussian's opacity and of each of its scales in the loss (math/penalty.h).
 template <class T>
 struct Penalty {

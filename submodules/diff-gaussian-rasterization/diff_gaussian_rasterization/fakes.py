@@ -117,6 +117,18 @@ def _(means, *_):
     return means.new_empty((means.shape[0], 3))
 
 
+@_fake("unpack_splats")
+def _(packed, like):
+    count = packed.shape[0]
+    floats = like.new_empty((count, SPLAT_VALUES)), like.new_empty((count,))
+    return *floats, packed.new_empty((count, 4)), packed.new_empty((count,))
+
+
+@_fake("move_runs")
+def _(rows, *_):
+    return rows.new_empty(rows.shape)
+
+
 @_fake("in_host_memory")
 def _(values):
     return torch.empty_like(values)
@@ -131,5 +143,6 @@ def _(values):
 @_fake("step_now_")
 @_fake("add_noise_")
 @_fake("penalise_")
+@_fake("pack_splats_")
 def _(*_args, **_keywords):
     return None

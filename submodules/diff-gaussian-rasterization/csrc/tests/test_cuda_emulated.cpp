@@ -4,6 +4,7 @@
 
 #include "backend_run.h"
 #include "emulated_queue.h"
+#include "exchange_run.h"
 #include "front_first.cuh"
 #include "gs/check_shared.h"
 #include "long_lists.h"
@@ -541,6 +542,41 @@ void test_split_positions() {
   }
 }
 
+void test_packed_splats() {
+  for (const gs::emulation::Order order : gs::emulation::kOrders)
+    for (const int64_t n : {0, 1, 63, 64, 700}) {
+      gs::emulation::order = order;
+      gs::emulation::Memory memory;
+      const SomeSplats splats(200, n);
+      const std::vector<int32_t> wanted = pack(gs::serial_executor(), splats), got = pack(memory.queue(), splats);
+      CHECK(got == wanted);
+      CHECK(unpack(memory.queue(), got) == unpack(gs::serial_executor(), got));
+      if (n) CHECK(got != std::vector<int32_t>(got.size(), -77));
+    }
+}
+
+void test_moved_runs() {
+  for (const gs::emulation::Order order : gs::emulation::kOrders)
+    for (const int words : {10, 12})
+      for (const std::vector<int32_t>& counts : counts_of_runs()) {
+        gs::emulation::order = order;
+        gs::emulation::Memory memory;
+        const SomeRuns runs(counts, words);
+        const std::vector<int32_t> wanted = move(gs::serial_executor(), runs), got = move(memory.queue(), runs);
+        CHECK(got == wanted && std::count(got.begin(), got.end(), -77) == 0);
+      }
+}
+
+// What the CPU refuses stays within memory on a GPU.
+void test_runs_that_do_not_fit() {
+  for (const auto& [run, count, place] : {std::tuple{3, 1000, 3}, {3, -1000, 3}, {3, 0, 3}, {3, 5, 5000}, {3, 5, -1}}) {
+    gs::emulation::Memory memory;
+    SomeRuns runs(std::vector<int32_t>(300, 2), 10);
+    runs.counts[run] = count, runs.places[run] = place;
+    CHECK(move(memory.queue(), runs).size() == runs.rows.size());
+  }
+}
+
 // Noise has the CPU's bits; a halted queue, and a guard that has stopped, leave the means alone.
 void test_noise() {
   for (const int64_t n : {0, 1, 255, 700}) {
@@ -753,6 +789,9 @@ int main() {
                          test_step_guard,
                          test_observe,
                          test_split_positions,
+                         test_packed_splats,
+                         test_moved_runs,
+                         test_runs_that_do_not_fit,
                          test_noise,
                          test_given_covariances_and_colors});
 }

@@ -1,0 +1,140 @@
+// The ops of what processes exchange: splats packed into rows of words, and gradient rows in another order.
+
+#include <limits>
+#include <tuple>
+#include <vector>
+
+#include "backward.h"
+#include "math/absolute.h"
+#include "math/splat.h"
+
+namespace gs::ops {
+
+namespace {
+
+using gs::baseline::kAbsoluteValues, gs::baseline::kGradientValues, gs::baseline::kSplatValues;
+
+// Words of 32 bits of a value. float64 is packed on the CPU alone.
+int words_of_value(const Tensor& values) {
+  GS_CHECK(values.is_cpu() || has_dtype(values, ScalarType::Float), kFloatAlone);
+  return has_dtype(values, ScalarType::Float) ? 1 : 2;
+}
+
+const int32_t* words(const Tensor& t) { return static_cast<const int32_t*>(t.const_data_ptr()); }
+int32_t* words_to_write(const Tensor& t) { return static_cast<int32_t*>(t.mutable_data_ptr()); }
+
+// Runs a backend's function on the device of the tensor `like`, as GS_RUN does one of a precision.
+#ifdef GS_CUDA
+#define GS_RUN_WORDS(like, fn, in)         \
+  if ((like).is_cuda()) {                  \
+    gs::TorchQueue queue((like).device()); \
+    gs::cuda::fn(queue.queue(), in);       \
+  } else {                                 \
+    gs::fn(gs::torch_executor(), in);      \
+  }
+#else
+#define GS_RUN_WORDS(like, fn, in) gs::fn(gs::torch_executor(), in)
+#endif
+
+// Only on the CPU, as reading indices from a GPU waits for it. There they are the caller's concern.
+void check_indices(const Tensor& gaussians, int64_t count) {
+  if (!gaussians.is_cpu()) return;
+  const int64_t* indices = read<int64_t>(gaussians);
+  for (int64_t i = 0; i < gaussians.size(0); ++i)
+    GS_CHECK_VALUE(indices[i] >= 0 && indices[i] < count, "gaussians must be from 0 to ", count - 1, ", got ",
+                   indices[i]);
+}
+
+// Packs some Gaussians' splats into rows, which may be a part of a larger tensor.
+void pack_splats_op(Tensor& packed_rows, const Tensor& splats, const Tensor& depths, const Tensor& rects,
+                    const Tensor& tile_counts, const Tensor& gaussians) {
+  check_splats(splats);
+  const Device device = splats.device();
+  const int64_t n = splats.size(0);
+  check_tensor(depths, "depths", splats.scalar_type(), device, {n});
+  check_tensor(rects, "rects", ScalarType::Int, device, {n, 4});
+  check_counts(tile_counts, n, device);
+  check_tensor(gaussians, "gaussians", ScalarType::Long, device, {-1});
+  const int wide = words_of_value(splats);
+  check_tensor(packed_rows, "packed", ScalarType::Int, device, {gaussians.size(0), gs::packed_words(wide)});
+  GS_CHECK_VALUE(packed_rows.is_contiguous(), "packed must be contiguous");
+  const Tensor values = packed(splats), at = packed(depths), boxes = packed(rects), counts = packed(tile_counts);
+  const Tensor indices = packed(gaussians);
+  check_indices(indices, n);
+  const gs::PackInput in{indices.size(0), wide,          read<int64_t>(indices), words(values),
+                         words(at),       words(counts), words(boxes),           write<int32_t>(packed_rows)};
+  GS_RUN_WORDS(splats, pack_splats, in);
+}
+
+// The rest of the way. like: has the dtype of the splats that were packed.
+std::tuple<Tensor, Tensor, Tensor, Tensor> unpack_splats_op(const Tensor& packed_rows, const Tensor& like) {
+  check_given(like, "like");
+  GS_CHECK_TYPE(is_floating(like.scalar_type()), "like must be float32 or float64, got ", like.scalar_type());
+  const int wide = words_of_value(like);
+  check_tensor(packed_rows, "packed", ScalarType::Int, like.device(), {-1, gs::packed_words(wide)});
+  const Tensor rows = packed(packed_rows);
+  const int64_t n = rows.size(0);
+  Tensor splats = empty({n, kSplatValues}, like), depths = empty({n}, like);
+  Tensor rects = empty<int32_t>({n, 4}, like), tile_counts = empty<int32_t>({n}, like);
+  const gs::UnpackInput in{n,
+                           wide,
+                           read<int32_t>(rows),
+                           words_to_write(splats),
+                           words_to_write(depths),
+                           write<int32_t>(tile_counts),
+                           write<int32_t>(rects)};
+  GS_RUN_WORDS(like, unpack_splats, in);
+  return {splats, depths, rects, tile_counts};
+}
+
+// Whether the runs have all rows, and each a place of its own; only on the CPU.
+void check_runs(const Tensor& counts, const Tensor& places, int64_t rows) {
+  if (!counts.is_cpu()) return;
+  const int32_t *lengths = read<int32_t>(counts), *order = read<int32_t>(places);
+  const int64_t n = counts.size(0);
+  std::vector<bool> taken(n);
+  int64_t sum = 0;
+  for (int64_t i = 0; i < n; ++i) {
+    GS_CHECK_VALUE(lengths[i] >= 0, "counts must be 0 or more, got ", lengths[i], " of run ", i);
+    GS_CHECK_VALUE(order[i] >= 0 && order[i] < n && !taken[order[i]], "places must be the numbers from 0 to ", n - 1,
+                   " in any order, got ", order[i], " of run ", i);
+    sum += lengths[i], taken[order[i]] = true;
+  }
+  GS_CHECK_VALUE(sum == rows, "counts add up to ", sum, ", but there are ", rows, " rows");
+}
+
+// Gradient rows in another order of their runs. On a GPU bad counts and places are not refused; rows without a run of
+// their own stay undefined then.
+Tensor move_runs_op(const Tensor& rows, const Tensor& counts, const Tensor& places) {
+  check_given(rows, "rows");
+  GS_CHECK_TYPE(is_floating(rows.scalar_type()), "rows must be float32 or float64, got ", rows.scalar_type());
+  GS_CHECK_VALUE(
+      rows.dim() == 2 && (rows.size(1) == kGradientValues || rows.size(1) == kGradientValues + kAbsoluteValues),
+      "rows must be (R, ", kGradientValues, ") or (R, ", kGradientValues + kAbsoluteValues, "), got ", rows.sizes());
+  check_tensor(counts, "counts", ScalarType::Int, rows.device(), {-1});
+  check_tensor(places, "places", ScalarType::Int, rows.device(), {counts.size(0)});
+  GS_CHECK(rows.size(0) <= std::numeric_limits<int32_t>::max(), rows.size(0), " rows are more than 2^31 - 1");
+  const int wide = words_of_value(rows);
+  const Tensor from = packed(rows), lengths = packed(counts), order = packed(places);
+  check_runs(lengths, order, rows.size(0));
+  Tensor to = empty(rows.sizes(), rows);
+  const gs::MoveInput in{lengths.size(0),      from.size(0), int(wide * from.size(1)), read<int32_t>(lengths),
+                         read<int32_t>(order), words(from),  words_to_write(to)};
+  GS_RUN_WORDS(rows, move_runs, in);
+  return to;
+}
+
+}  // namespace
+
+GS_OPERATORS(diff_gaussian_rasterization, m) {
+  m.define(
+      "pack_splats_(Tensor(a!) packed, Tensor splats, Tensor depths, Tensor rects, Tensor tile_counts, "
+      "Tensor gaussians) -> ()",
+      TORCH_BOX(&pack_splats_op));
+  m.define(
+      "unpack_splats(Tensor packed, Tensor like) -> (Tensor splats, Tensor depths, Tensor rects, Tensor tile_counts)",
+      TORCH_BOX(&unpack_splats_op));
+  m.define("move_runs(Tensor rows, Tensor counts, Tensor places) -> Tensor", TORCH_BOX(&move_runs_op));
+}
+
+}  // namespace gs::ops

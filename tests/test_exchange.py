@@ -1,0 +1,165 @@
+"""The operators of what ranks exchange, against their plain formulation in torch: the same bits."""
+
+import pytest
+import torch
+from diff_gaussian_rasterization.fakes import ABSOLUTE_VALUES, MOMENT_VALUES, SPLAT_VALUES
+from rasterizer_tools import BOTH_AND_GPU, ops
+from torch import Tensor, library
+
+Splats = tuple[Tensor, ...]  # splats, depths, rects, tile_counts
+LARGE = 20_000  # more than a thread of the CPU takes at once, and no multiple of anything
+
+
+def some_splats(count: int, device: str, dtype: torch.dtype) -> Splats:
+    """Any bits, so that NaNs of all kinds are among the values."""
+    generator = torch.Generator().manual_seed(count)
+
+    def words(*shape: int) -> Tensor:
+        return torch.randint(-(2**31), 2**31, shape, generator=generator, dtype=torch.int64).to(torch.int32)
+
+    wide = dtype.itemsize // 4
+    splats, depths = words(count, SPLAT_VALUES * wide).view(dtype), words(count, wide).view(dtype).view(count)
+    return tuple(t.to(device) for t in (splats, depths, words(count, 4), words(count)))
+
+
+def packed_by_torch(splats: Splats, gaussians: Tensor) -> Tensor:
+    values, depths, rects, tile_counts = (t.index_select(0, gaussians).view(-1, t[:1].numel()) for t in splats)
+    return torch.cat([t.view(torch.int32) for t in (values, depths, tile_counts, rects)], 1)
+
+
+def pack(splats: Splats, gaussians: Tensor) -> Tensor:
+    wide = splats[0].dtype.itemsize // 4
+    packed = torch.full((len(gaussians), 11 * wide + 5), 77, dtype=torch.int32, device=gaussians.device)
+    ops.pack_splats_(packed, *splats, gaussians)
+    return packed
+
+
+def same_bits(one: Tensor, other: Tensor) -> bool:
+    return one.dtype == other.dtype and torch.equal(
+        one.reshape(-1).view(torch.int32), other.reshape(-1).view(torch.int32)
+    )
+
+
+@BOTH_AND_GPU
+@pytest.mark.parametrize("chosen", [0, 1, 7, LARGE])
+def test_splats_are_packed_and_unpacked(chosen, device, dtype):
+    splats = some_splats(LARGE // 2, device, dtype)
+    gaussians = torch.randint(LARGE // 2, (chosen,), generator=torch.Generator().manual_seed(1)).to(device)
+    packed = pack(splats, gaussians)
+    assert torch.equal(packed, packed_by_torch(splats, gaussians))
+    strided = torch.stack((gaussians, gaussians), 1)[:, 0]
+    assert torch.equal(pack(splats, strided), packed)
+    unpacked = ops.unpack_splats(packed, splats[0])
+    for values, whole in zip(unpacked, splats, strict=True):
+        assert values.shape == (chosen, *whole.shape[1:]) and same_bits(values, whole.index_select(0, gaussians))
+
+
+@BOTH_AND_GPU
+def test_a_part_of_rows_is_packed(device, dtype):
+    splats = some_splats(50, device, dtype)
+    gaussians = torch.arange(50, device=device)
+    rows = torch.full_like(pack(splats, gaussians), -77)
+    ops.pack_splats_(rows[10:30], *splats, gaussians[10:30])
+    assert torch.equal(rows[10:30], packed_by_torch(splats, gaussians[10:30]))
+    assert (rows[:10] == -77).all() and (rows[30:] == -77).all()
+    assert ops.unpack_splats(pack(some_splats(0, device, dtype), gaussians[:0]), splats[0])[2].shape == (0, 4)
+
+
+def moved_by_torch(rows: Tensor, counts: Tensor, places: Tensor) -> Tensor:
+    ends = torch.empty_like(counts).index_copy_(0, places.long(), counts).cumsum(0).index_select(0, places.long())
+    shifts = ends - counts.cumsum(0)
+    to = torch.arange(len(rows), device=rows.device) + shifts.repeat_interleave(counts)
+    return torch.empty_like(rows).index_copy_(0, to, rows)
+
+
+def some_counts(kind: str) -> Tensor:
+    generator = torch.Generator().manual_seed(5)
+    counts = torch.randint(4, (5_000,), generator=generator, dtype=torch.int32)
+    if kind == "giants":
+        counts[[0, 1700, 4999]] = torch.tensor([9_000, 4_001, 3], dtype=torch.int32)
+    elif kind == "hardly any":
+        counts *= torch.rand(5_000, generator=generator) < 0.01
+    return {"none": counts[:0], "one": counts[:1].fill_(3), "no rows": counts.fill_(0)}.get(kind, counts)
+
+
+@BOTH_AND_GPU
+@pytest.mark.parametrize("values", [MOMENT_VALUES, MOMENT_VALUES + ABSOLUTE_VALUES])
+@pytest.mark.parametrize("kind", ["none", "one", "no rows", "hardly any", "many", "giants"])
+def test_runs_move(kind, values, device, dtype):
+    counts = some_counts(kind).to(device)
+    rows = torch.randn(int(counts.sum()), values, generator=torch.Generator().manual_seed(2)).to(device, dtype)
+    shuffled = torch.randperm(len(counts), generator=torch.Generator().manual_seed(3)).to(device)
+    # As ranks get them: in order in each of three parts, which lie in each other.
+    merged = torch.cat([torch.arange(len(counts), device=device)[rank::3] for rank in range(3)])
+    for places in (shuffled, merged, merged.sort().values):
+        places = places.int()
+        assert torch.equal(ops.move_runs(rows, counts, places), moved_by_torch(rows, counts, places))
+    assert torch.equal(ops.move_runs(rows, counts, places), rows)
+    wide = torch.cat((rows, rows), 1)[:, values:]
+    assert torch.equal(ops.move_runs(wide, counts, places), rows)
+
+
+def test_any_number_of_threads_gives_the_same_bits():
+    before, counts = torch.get_num_threads(), some_counts("giants")
+    places = torch.randperm(len(counts)).int()
+    rows, splats, gaussians = (
+        torch.randn(int(counts.sum()), 12),
+        some_splats(9_000, "cpu", torch.float32),
+        places.long(),
+    )
+    try:
+        for threads in (1, 3):
+            torch.set_num_threads(threads)
+            assert torch.equal(ops.move_runs(rows, counts, places), moved_by_torch(rows, counts, places))
+            assert torch.equal(pack(splats, gaussians), packed_by_torch(splats, gaussians))
+    finally:
+        torch.set_num_threads(before)
+
+
+@BOTH_AND_GPU
+def test_opcheck(device, dtype):
+    splats, gaussians = some_splats(9, device, dtype), torch.tensor([2, 8, 3], device=device)
+    packed = pack(splats, gaussians)
+    plain = [t if t.dtype == torch.int32 else torch.rand_like(t) for t in splats]  # NaNs are not equal
+    library.opcheck(ops.pack_splats_.default, (packed, *plain, gaussians))
+    library.opcheck(ops.unpack_splats.default, (pack(plain, gaussians), plain[0]))
+    counts, places = (torch.tensor(x, dtype=torch.int32, device=device) for x in ([2, 0, 3], [2, 0, 1]))
+    library.opcheck(ops.move_runs.default, (torch.rand(5, 10, device=device, dtype=dtype), counts, places))
+
+
+def test_wrong_splats_are_named():
+    splats, gaussians = some_splats(9, "cpu", torch.float32), torch.tensor([2, 8, 3])
+    packed = pack(splats, gaussians)
+
+    def refused(error: type, match: str, rows: Tensor, gaussians: Tensor = gaussians) -> None:
+        with pytest.raises(error, match=match):
+            ops.pack_splats_(rows, *splats, gaussians)
+
+    refused(ValueError, r"packed must be \(3, 16\)", packed[1:])
+    refused(TypeError, "packed must be torch.int32", packed.float())
+    refused(ValueError, "packed must be contiguous", packed.T.contiguous().T)
+    refused(TypeError, "gaussians must be torch.int64", packed, gaussians.int())
+    refused(ValueError, "gaussians must be from 0 to 8, got 9", packed, torch.tensor([2, 9, 3]))
+    refused(ValueError, "gaussians must be from 0 to 8, got -1", packed, torch.tensor([2, 1, -1]))
+    with pytest.raises(ValueError, match=r"packed must be \(-1, 27\)"):
+        ops.unpack_splats(packed, splats[0].double())
+    with pytest.raises(TypeError, match="like must be float32 or float64, got torch.int32"):
+        ops.unpack_splats(packed, splats[2])
+
+
+def test_wrong_runs_are_named():
+    rows = torch.rand(5, 10)
+
+    def refused(error: type, match: str, counts: list, places: list, rows: Tensor = rows) -> None:
+        with pytest.raises(error, match=match):
+            ops.move_runs(rows, torch.tensor(counts, dtype=torch.int32), torch.tensor(places, dtype=torch.int32))
+
+    refused(ValueError, r"rows must be \(R, 10\) or \(R, 12\), got \(5, 11\)", [5], [0], torch.rand(5, 11))
+    refused(TypeError, "rows must be float32 or float64", [5], [0], rows.int())
+    refused(ValueError, r"places must be \(2,\)", [3, 2], [0])
+    refused(ValueError, "counts add up to 4, but there are 5 rows", [3, 1], [0, 1])
+    refused(ValueError, "counts must be 0 or more, got -1 of run 1", [6, -1], [0, 1])
+    for place in (0, 2, -1):
+        refused(
+            ValueError, f"places must be the numbers from 0 to 1 in any order, got {place} of run 1", [3, 2], [0, place]
+        )
