@@ -10,6 +10,7 @@ from fused_ssim import BAND_ROWS, REACH, fused_photometric_loss, photometric_los
 from processes import in_ranks
 from torch import Tensor
 
+from gaussian_renderer.over_ranks import bands
 from gaussian_renderer.over_ranks.band import surroundings, whole_image
 from gaussian_renderer.over_ranks.bands import Bands, KnownBands, find_bands, row_widths, tile_rows
 from utils.ranks.ranks import Ranks, ranks
@@ -137,7 +138,7 @@ class _Others(Ranks):
 
     def table(self, values: Tensor) -> Tensor:
         self.told += 1
-        return torch.stack([row_widths(rects, 97) for rects in self._rects])
+        return torch.stack([row_widths(rects, torch.ones(len(rects)), 97) for rects in self._rects])
 
 
 @pytest.mark.parametrize("rows", [1, 3, 7])
@@ -151,10 +152,10 @@ def test_bands_have_about_equal_loads(rows):
     tile_counts = torch.arange(50) % 5  # the first rectangle and every fifth one after it do not count
     reaching = rects[0]
     rects[0] = rects[0][tile_counts > 0]
-    bands = find_bands(_Others(rects), reaching, tile_counts, 97, 40)
-    assert bands.borders[0] == 0 and bands.borders[-1] == tile_rows(97) == 7 and sorted(bands.borders) == bands.borders
-    reached = bands.reached(reaching, tile_counts).tolist()
-    for (first, end), of_band in zip(pairwise(bands.borders), reached, strict=True):
+    found = find_bands(_Others(rects), reaching, tile_counts, 97, 40)
+    assert found.borders[0] == 0 and found.borders[-1] == tile_rows(97) == 7 and sorted(found.borders) == found.borders
+    reached = found.reached(reaching, tile_counts).tolist()
+    for (first, end), of_band in zip(pairwise(found.borders), reached, strict=True):
         assert of_band == [
             count > 0 and top < end and bottom > first and first < end
             for (_, top, _, bottom), count in zip(reaching.tolist(), tile_counts.tolist(), strict=True)
@@ -162,15 +163,31 @@ def test_bands_have_about_equal_loads(rows):
     rows_of_tiles = torch.zeros(7)
     for left, top, right, bottom in torch.cat(rects).tolist():
         rows_of_tiles[top:bottom] += right - left
-    loads = [rows_of_tiles[first:end].sum() for first, end in pairwise(bands.borders)]
+    loads = [rows_of_tiles[first:end].sum() for first, end in pairwise(found.borders)]
     assert max(loads) < 0.75 * sum(loads)
+
+
+def test_of_many_splats_a_sample_gives_the_bands(monkeypatch):
+    generator = torch.Generator().manual_seed(5)
+    top = torch.randint(60, (20_000,), generator=generator)
+    rects = torch.stack((torch.zeros_like(top), top, 1 + top % 3, top + 1 + top % 4), 1).int()
+    tile_counts = torch.randint(2, (20_000,), generator=generator)
+    rects[tile_counts == 0] = 1 << 30  # undefined
+    whole = row_widths(rects, tile_counts, 1000)
+    assert torch.equal(whole, row_widths(rects[tile_counts > 0], torch.ones(int(tile_counts.sum())), 1000))
+    monkeypatch.setattr(bands, "_SAMPLE", 4000)
+    part = row_widths(rects, tile_counts, 1000)
+    assert not torch.equal(part, whole)
+    ends = [widths.cumsum(0)[:-1].cumsum(0) / widths.cumsum(0)[:-1].sum() for widths in (whole, part)]
+    assert (ends[0] - ends[1]).abs().max() < 0.03
+    assert abs(int(part.cumsum(0).sum()) / int(whole.cumsum(0).sum()) - 1) < 0.1
 
 
 def test_bands_of_a_view_are_kept_for_some_visits():
     rects = torch.tensor([[0, 0, 1, 1]] * 9, dtype=torch.int32)
     ranks, known, counts = _Others([rects, rects, rects]), KnownBands(), torch.ones(9, dtype=torch.int32)
     found = [known.find("a", ranks, rects, counts, 97, 40) for _ in range(8)]
-    assert ranks.told == 1 and all(bands is found[0] for bands in found)
+    assert ranks.told == 1 and all(one is found[0] for one in found)
     assert known.find("b", ranks, rects, counts, 97, 40) is not found[0] and ranks.told == 2
     assert known.find("a", ranks, rects, counts, 90, 40) is not found[0] and ranks.told == 3
     assert known.find("a", ranks, rects, counts, 97, 40) is not found[0] and ranks.told == 4

@@ -34,7 +34,8 @@ struct Scene {
   Image image;
 };
 
-// What binning reads of a splat. It fits one memory sector, because binning reads splats in depth order.
+// What binning reads of a splat. It fits one memory sector, because binning reads splats in depth order. On a GPU
+// binning makes records that it was not given.
 struct alignas(16) TileRecord {
   uint64_t reached;         // a bit for each tile of a rectangle of at most 64, row by row; else the number reached
   uint16_t x0, y0, x1, y1;  // empty where the splat reaches no tile

@@ -12,6 +12,7 @@
 #include "ahead.cuh"
 #include "host_numbers.cuh"
 #include "instances.cuh"
+#include "make_records.cuh"
 
 namespace gs {
 namespace cuda {
@@ -149,10 +150,11 @@ void find_slots(const Queue& queue, int64_t n, const Projected<float>& in, Splat
   });
 }
 
-// Emits the instances and sorts them by tile. order: the splats by depth. room: for at least all instances.
+// Emits the instances and sorts them by tile. order: the splats by depth. room: for at least all instances. last_read:
+// memory to release once the instances are emitted, or null.
 template <class Key>
 void bin_with(const Queue& queue, int64_t n, const Projected<float>& in, const int32_t* order, Image image,
-              int64_t room, const Binned& out) {
+              int64_t room, const void* last_read, const Binned& out) {
   const int64_t tiles = tiles_of(image);
   const cudaStream_t stream = stream_of(queue);
   const int64_t blocks = (room + kEmitted - 1) / kEmitted;
@@ -174,6 +176,7 @@ void bin_with(const Queue& queue, int64_t n, const Projected<float>& in, const i
     emit_kernel<Key><<<unsigned(blocks), kEmitThreads, 0, stream>>>(queue.halted, n, order, lined, offsets, first, in,
                                                                     image, keys, owners);
     check_launch("emit");
+    if (last_read) queue.release(queue.context, last_read);
     with_memory(queue, [&](void* memory, size_t& bytes) {
       return cub::DeviceRadixSort::SortPairs(memory, bytes, keys, sorted_keys, owners, out.instances, room, 0,
                                              bits_for(tiles + 1), stream);
@@ -188,7 +191,11 @@ void bin_with(const Queue& queue, int64_t n, const Projected<float>& in, const i
 }  // namespace
 
 template <>
-void bin<float>(const Queue& queue, int64_t count, const Projected<float>& in, Image image, const BinMemory& memory) {
+void bin<float>(const Queue& queue, int64_t count, const Projected<float>& given, Image image,
+                const BinMemory& memory) {
+  Projected<float> in = given;
+  TileRecord* made = nullptr;
+  if (count && !in.records && has_records(image)) in.records = made = make_records(queue, count, in, image);
   int64_t instances = 0, slots = 0;
   const int32_t* order = nullptr;
   if (count) {
@@ -212,7 +219,7 @@ void bin<float>(const Queue& queue, int64_t count, const Projected<float>& in, I
   const Binned out = memory.take(memory.context, instances, slots);
   const int64_t tiles = tiles_of(image);
   const auto run = tiles < 1 << 16 ? bin_with<uint16_t> : bin_with<uint32_t>;
-  run(queue, count, in, order, image, instances, out);
+  run(queue, count, in, order, image, instances, made, out);
 }
 
 }  // namespace cuda

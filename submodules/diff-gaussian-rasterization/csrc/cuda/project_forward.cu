@@ -5,6 +5,7 @@
 #include "../math/scene_row.h"
 #include "sh_rows.cuh"
 #include "splat_row.cuh"
+#include "tile_record.cuh"
 #include "tiles.cuh"
 
 namespace gs {
@@ -54,11 +55,8 @@ __global__ void __launch_bounds__(kThreads)
   out.radii[i] = radius;
   out.tile_counts[i] = count;
   out.depths[i] = count ? depth : INFINITY;
-  if (out.records) {
-    if (!count) rect = {0, 0, 0, 0}, mask = 0;  // a shape with tiles may still have a colour that is not finite
-    const uint64_t reached = (rect.x1 - rect.x0) * (rect.y1 - rect.y0) <= 64 ? mask : uint64_t(count);
-    out.records[i] = {reached, uint16_t(rect.x0), uint16_t(rect.y0), uint16_t(rect.x1), uint16_t(rect.y1)};
-  }
+  // A shape with tiles may still have a colour that is not finite: then `count` is 0.
+  if (out.records) out.records[i] = tile_record(rect, count, mask);
   if (!count) return;
   if (out.rects) reinterpret_cast<int4*>(out.rects)[i] = make_int4(rect.x0, rect.y0, rect.x1, rect.y1);
   store_splat(out.splats, i, splat);

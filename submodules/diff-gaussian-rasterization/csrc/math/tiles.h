@@ -19,6 +19,12 @@ using TileRect = Rect<int32_t>;
 GS_HD int tile_count(int pixels) { return (pixels + kTile - 1) / kTile; }
 GS_HD int64_t tiles_of(Image image) { return int64_t(tile_count(image.width)) * tile_count(image.height); }
 
+// Whether a TileRecord can hold the rectangles of an image.
+GS_HD bool has_records(Image image) {
+  constexpr int kMostTiles = 0xffff;
+  return tile_count(image.width) <= kMostTiles && tile_count(image.height) <= kMostTiles;
+}
+
 template <class T>
 GS_HD Integer<T> clamped_floor(T value, int limit) {
   const T below = value < Scalar<T>(limit) ? value : all<T>(limit);

@@ -117,7 +117,7 @@ void test_long_lists() {
 
 // A host that runs ahead: with enough room, exactly or more, the bits are those of a host that waits. With less room in
 // one of the lists, the step halts, says what it needs and leaves the gradients alone, and so does every later step.
-void check_ahead(Parameters<float>& p, gs::Image image, bool absolute) {
+void check_ahead(Parameters<float>& p, gs::Image image, bool absolute, bool records) {
   const Result<float> wanted = run_emulated(p, image, false, true, gs::emulation::Order::forward, absolute);
   constexpr int kReports = 4;
   int32_t halted = 0;
@@ -131,7 +131,7 @@ void check_ahead(Parameters<float>& p, gs::Image image, bool absolute) {
     const gs::Ahead ahead{&halted, &needed, &done, room, reports, kReports};
     report = reports + 5 * ((done + 1) % kReports);
     std::fill_n(report, 5, -1);
-    return run(queue, p, image, false, true, &ahead, absolute);
+    return run(queue, p, image, false, records, &ahead, absolute);
   };
   constexpr int64_t plenty = 20000;
   go({plenty, plenty, plenty});
@@ -167,9 +167,9 @@ void check_ahead(Parameters<float>& p, gs::Image image, bool absolute) {
 void test_ahead() {
   Parameters<float> p(300);
   for (int k = 0; k < 3; ++k) p.scales[3 * 17 + k] = 1;
-  check_ahead(p, gs::Image{330, 70}, false);
+  for (const bool records : {true, false}) check_ahead(p, gs::Image{330, 70}, false, records);
   p = two_long_lists(900);
-  check_ahead(p, kTwoTiles, true);
+  check_ahead(p, kTwoTiles, true, true);
 }
 
 // Checks that several orders give the same bits, and these bits against the rule and against the CPU. Every output may
@@ -293,29 +293,48 @@ bool same_slots(const gs::SplatSlots& a, const gs::SplatSlots& b) {
   return a.first == b.first && a.skipped == b.skipped && a.wide == b.wide;
 }
 
-// Binning alone, of splats over a thousand tiles among small ones: more tiles than 16 bits count, records or
-// rectangles, with slots and without.
-void test_lists() {
+// Checks that binning alone gives the CPU's lists, of records or of rectangles, with slots and without.
+void check_bins(Parameters<float>& p, gs::Image image) {
   using gs::emulation::Order;
+  const gs::Scene<float> scene = scene_of(p, image, false);
+  const Bins<float> cpu = bin_scene(gs::serial_executor(), scene, true, false, true);
+  for (const Order order : {Order::forward, Order::backward, Order::shuffled})
+    for (const bool slots : {false, true})
+      for (const auto& [rects, records] : {std::pair{true, true}, std::pair{true, false}, std::pair{false, true}}) {
+        if (records && !has_records(image)) continue;
+        gs::emulation::order = order;
+        gs::emulation::Memory memory;
+        const Bins<float> got = bin_scene(memory.queue(), scene, rects, records, slots);
+        CHECK(got.instances == cpu.instances && got.ranges == cpu.ranges);
+        CHECK(got.slots.size() == (slots ? cpu.slots.size() : 0));
+        CHECK(std::equal(got.slots.begin(), got.slots.end(), cpu.slots.begin(), same_slots));
+        CHECK(got.slot_count == (slots ? cpu.slot_count : 0));
+      }
+}
+
+// Splats over a thousand tiles among small and culled ones: no splats, none with a tile, more tiles than 16 bits count.
+void test_lists() {
   for (const gs::Image image : {gs::Image{330, 70}, gs::Image{1040, 1024}, gs::Image{4112, 4096}})
     for (const int64_t count : {0, 1, 150}) {
       Parameters<float> p(count);
       for (int64_t i = 20; i < count; i += 40)
         for (int k = 0; k < 3; ++k) p.scales[3 * i + k] = image.width > 4000 ? -1.5f : 0;
-      const gs::Scene<float> scene = scene_of(p, image, false);
-      const Bins<float> cpu = bin_scene(gs::serial_executor(), scene, true, false, true);
-      for (const Order order : {Order::forward, Order::backward, Order::shuffled})
-        for (const bool slots : {false, true})
-          for (const auto& [rects, records] : {std::pair{true, true}, std::pair{true, false}, std::pair{false, true}}) {
-            gs::emulation::order = order;
-            gs::emulation::Memory memory;
-            const Bins<float> got = bin_scene(memory.queue(), scene, rects, records, slots);
-            CHECK(got.instances == cpu.instances && got.ranges == cpu.ranges);
-            CHECK(got.slots.size() == (slots ? cpu.slots.size() : 0));
-            CHECK(std::equal(got.slots.begin(), got.slots.end(), cpu.slots.begin(), same_slots));
-            CHECK(got.slot_count == (slots ? cpu.slot_count : 0));
-          }
+      for (int64_t i = 3; i < count; i += 7) p.means[3 * i + 2] = -1;
+      check_bins(p, image);
     }
+  Parameters<float> behind(40);
+  for (int64_t i = 0; i < behind.count; ++i) behind.means[3 * i + 2] = -1;
+  check_bins(behind, gs::Image{330, 70});
+}
+
+// An image of more tiles across than a record can count, with a splat at its right end.
+void test_lists_without_records() {
+  constexpr gs::Image wide{16 * 70000, 16};
+  CHECK(has_records(gs::Image{16 * 65535, 16 * 65535}) && !has_records(gs::Image{1, 16 * 65535 + 1}));
+  Parameters<float> p(60);
+  for (float& scale : p.scales) scale -= 3;
+  p.means[0] = 0.59f * 4, p.means[1] = 0, p.means[2] = 4;
+  check_bins(p, wide);
 }
 
 void test_sparse_adam() {
@@ -774,6 +793,7 @@ int main() {
                         {test_rows,
                          test_gaussian_step,
                          test_lists,
+                         test_lists_without_records,
                          test_ahead,
                          test_pixels_that_end_in_every_chunk,
                          test_against_cpu,

@@ -14,7 +14,7 @@ namespace gs::ops {
 
 namespace {
 
-using gs::baseline::kSplatValues, gs::baseline::layer_values, gs::baseline::tile_count, gs::baseline::tiles_of;
+using gs::baseline::has_records, gs::baseline::kSplatValues, gs::baseline::layer_values, gs::baseline::tiles_of;
 
 struct ProjectedTensors {
   Tensor splats, depths, rects, tile_counts, radii;
@@ -39,8 +39,7 @@ ProjectedTensors project(const SceneTensors& in, bool rects) {
   out.depths = empty({n}, like);
   out.tile_counts = empty<int32_t>({n}, like);
   out.radii = empty<int32_t>({n}, like);
-  const int most_tiles = tile_count(std::max(in.image().width, in.image().height));
-  const bool records = most_tiles <= std::numeric_limits<uint16_t>::max();
+  const bool records = has_records(in.image());
   if (rects || !records) out.rects = empty<int32_t>({n, 4}, like);
   if (records) out.records = empty<uint8_t>({n, int64_t(sizeof(gs::TileRecord))}, like);
   with_scalar(in.dtype(), [&](auto zero) {

@@ -1,0 +1,36 @@
+#pragma once
+// Makes the records of splats that come with rectangles alone, the same as projection makes.
+#include "splat_row.cuh"
+#include "tile_record.cuh"
+#include "tiles.cuh"
+
+namespace gs {
+namespace cuda {
+
+constexpr int kRecordThreads = 128;
+
+// A thread takes a splat; a warp shares the tests of its tiles.
+__global__ void __launch_bounds__(kRecordThreads)
+    make_records_kernel(const int32_t* halted, int64_t n, Projected<float> in, Image image, TileRecord* records) {
+  if (is_halted(halted)) return;
+  const int64_t i = int64_t(blockIdx.x) * kRecordThreads + threadIdx.x;
+  Reached reached = {};
+  Splat<float> shape = {};
+  if (i < n) reached = reached_by(in, int32_t(i));
+  if (reached.count) shape = load_shape(in.splats, i);
+  uint64_t mask;
+  const int32_t count = warp_count_tiles(shape, reached.rect, image, mask);
+  if (i < n) records[i] = tile_record(reached.rect, count, mask);
+}
+
+// in: without records, of an image with has_records.
+inline TileRecord* make_records(const Queue& queue, int64_t n, const Projected<float>& in, Image image) {
+  TileRecord* records = queue.array<TileRecord>(n);
+  make_records_kernel<<<blocks_for(n, kRecordThreads), kRecordThreads, 0, stream_of(queue)>>>(queue.halted, n, in,
+                                                                                              image, records);
+  check_launch("make_records");
+  return records;
+}
+
+}  // namespace cuda
+}  // namespace gs
