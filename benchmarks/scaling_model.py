@@ -23,7 +23,7 @@ SPILLED = 3 * SH_REST  # with its moments
 HELD = PARAMETERS + MOMENTS + STATISTICS
 # Bytes of a Gaussian that projection leaves until the step ends: splat, depth, rectangle, tile count, radius.
 PROJECTED = 40 + 4 + 16 + 4 + 4
-TILE_RECORD = 16  # while projection runs
+TILE_RECORD = 16  # while projection runs, and again on a rank that bins what it received
 REACHED = 2  # for each band: whether it is reached, while records are chosen
 RECORD = 40 + 4 + 16 + 4  # of a visible Gaussian, sent to each band that it reaches
 COUNT = 4  # of gradient rows, sent back for each record
@@ -239,7 +239,8 @@ def step_bytes(scene: Workload, gpus: int) -> float:
         splats, arrived = records, RECORD * records
     # Packed and joined, received, unpacked: at most three at once, of which the last becomes `arrived`.
     exchange = 2 * arrived
-    binning = (BIN_SPLAT + SLOTS_SPLAT) * splats + BIN_INSTANCE * instances
+    made = TILE_RECORD if gpus > 1 else 0
+    binning = (BIN_SPLAT + SLOTS_SPLAT + made) * splats + BIN_INSTANCE * instances
     lists = SLOTS_SPLAT * splats + INSTANCE * instances + SLOT * scene.slots * share
     rows, chosen = ROW * processed, 0.0
     if gpus > 1:
