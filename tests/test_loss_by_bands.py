@@ -132,13 +132,13 @@ class _Others(Ranks):
 
     size = 3
 
-    def __init__(self, rects: list[Tensor]) -> None:
-        self._rects = rects
+    def __init__(self, rects: list[Tensor], height: int = 97) -> None:
+        self._rects, self._height = rects, height
         self.told = 0
 
     def table(self, values: Tensor) -> Tensor:
         self.told += 1
-        return torch.stack([row_widths(rects, torch.ones(len(rects)), 97) for rects in self._rects])
+        return torch.stack([row_widths(rects, torch.ones(len(rects)), self._height) for rects in self._rects])
 
 
 @pytest.mark.parametrize("rows", [1, 3, 7])
@@ -181,6 +181,20 @@ def test_of_many_splats_a_sample_gives_the_bands(monkeypatch):
     ends = [widths.cumsum(0)[:-1].cumsum(0) / widths.cumsum(0)[:-1].sum() for widths in (whole, part)]
     assert (ends[0] - ends[1]).abs().max() < 0.03
     assert abs(int(part.cumsum(0).sum()) / int(whole.cumsum(0).sum()) - 1) < 0.1
+
+
+def test_ranks_weigh_by_their_splats_whether_they_take_a_sample_or_not(monkeypatch):
+    generator = torch.Generator().manual_seed(6)
+    rects = []
+    for count, first in ((20_000, 0), (3_999, 60), (0, 0)):
+        top = first + torch.randint(37, (count,), generator=generator)
+        rects.append(torch.stack((torch.zeros_like(top), top, 1 + top % 3, top + 1 + top % 4), 1).int())
+    found = []
+    for sample in (1 << 16, 4_000):
+        monkeypatch.setattr(bands, "_SAMPLE", sample)
+        ranks = _Others(rects, height=1600)
+        found.append(find_bands(ranks, rects[0], torch.ones(20_000), 1600, 40).borders)
+    assert all(abs(one - other) <= 1 for one, other in zip(*found, strict=True)) and found[0][2] < 40
 
 
 def test_bands_of_a_view_are_kept_for_some_visits():
