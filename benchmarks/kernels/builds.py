@@ -5,6 +5,7 @@
 
 Each build has a process of its own, and only one works at a time. A turn is the median of several calls, each on an
 idle device, host included. Figures are medians over the turns, the ratio that of the two builds' turns side by side.
+Processes are started several times, as the place of their memory alone changes a call by up to a tenth.
 """
 
 import argparse
@@ -94,6 +95,18 @@ def _on_gpu(run: Callable[[], object], workload: str) -> float:
     return statistics.median(times[WARM_UPS:])
 
 
+def measure(args: argparse.Namespace, device: str, workload: str) -> list[dict[str, list[float]]]:
+    """Turns of new processes: milliseconds of each step by both builds."""
+    builds = [Build(folder, device) for folder in (args.old, args.new)]
+    turns = [
+        {step: [build.milliseconds(workload, step) for build in builds] for step in STEPS}
+        for _ in range(1 + args.rounds)
+    ]
+    for build in builds:
+        build.end()
+    return turns[1:]
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     add = parser.add_argument
@@ -101,7 +114,8 @@ def main() -> None:
     add("new", help="another one")
     add("--device", choices=["cpu", "cuda"], help="default: cuda if there is a GPU")
     add("--workloads", nargs="+", choices=GPU_WORKLOADS, default=list(GPU_WORKLOADS), help="default: all")
-    add("--rounds", type=int, default=9, help="turns of each build (default: 9)")
+    add("--starts", type=int, default=5, help="of each build's process (default: 5)")
+    add("--rounds", type=int, default=5, help="turns of each of them (default: 5)")
     add("--serve", action="store_true", help=argparse.SUPPRESS)
     args = parser.parse_args()
     device = args.device or ("cuda" if torch.cuda.is_available() else "cpu")
@@ -112,16 +126,13 @@ def main() -> None:
         if not (Path(folder) / "diff_gaussian_rasterization").is_dir():
             raise UserError(f"{folder} holds no diff_gaussian_rasterization: install one with pip install --target")
     print(describe(device))
-    builds = [Build(folder, device) for folder in (args.old, args.new)]
     rows = []
     for workload in args.workloads:
+        turns = [turn for _ in range(args.starts) for turn in measure(args, device, workload)]
         for step in STEPS:
-            turns = [[build.milliseconds(workload, step) for build in builds] for _ in range(1 + args.rounds)][1:]
-            old, new = (statistics.median(times) for times in zip(*turns, strict=True))
-            ratio = statistics.median(new / old for old, new in turns)
+            old, new = (statistics.median(turn[step][build] for turn in turns) for build in range(2))
+            ratio = statistics.median(turn[step][1] / turn[step][0] for turn in turns)
             rows.append([workload, step, f"{old:.3f}", f"{new:.3f}", f"{ratio:.3f}"])
-    for build in builds:
-        build.end()
     print_table(["workload", "ms", args.old, args.new, "new / old"], rows)
 
 
