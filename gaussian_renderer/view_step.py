@@ -63,6 +63,8 @@ def draw(
     if (ranks := ranks_of(gaussians)).several:
         find = bands and partial(bands.find, camera.uid)
         view = draw_view(ranks, scene, background, want_depth, train=True, find=find)
+        if bands:
+            bands.drawn(camera.uid, view.last)
         view = surroundings(view) if by_bands else whole_image(view)
         depth = view.inverse_depth if want_depth else None
         return Drawn(view.color, depth, view.radii, scene, view=view, band=view.band if by_bands else None)

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from gaussian_renderer.over_ranks import bands
 from gaussian_renderer.over_ranks.band import surroundings, whole_image
-from gaussian_renderer.over_ranks.bands import Bands, KnownBands, find_bands, row_widths, tile_rows
+from gaussian_renderer.over_ranks.bands import Bands, KnownBands, find_bands, row_processed, row_widths, tile_rows
 from utils.ranks.ranks import Ranks, ranks
 
 # Height, width, and the rows of tiles where bands begin and the last one ends.
@@ -138,11 +138,13 @@ class _Others(Ranks):
 
     def table(self, values: Tensor) -> Tensor:
         self.told += 1
-        return torch.stack([row_widths(rects, torch.ones(len(rects)), self._height) for rects in self._rects])
+        widths = torch.stack([row_widths(rects, torch.ones(len(rects)), self._height) for rects in self._rects])
+        return torch.stack((widths, values[1] * torch.tensor([[1], [0], [0]])), 1)
 
 
 @pytest.mark.parametrize("rows", [1, 3, 7])
-def test_bands_have_about_equal_loads(rows):
+def test_bands_have_about_equal_loads(rows, monkeypatch):
+    monkeypatch.setattr(bands, "_TILE_COST", 8)
     generator = torch.Generator().manual_seed(rows)
     rects = []
     for count in (50, 0, 9):
@@ -183,12 +185,31 @@ def test_of_many_splats_a_sample_gives_the_bands(monkeypatch):
     assert abs(int(part.cumsum(0).sum()) / int(whole.cumsum(0).sum()) - 1) < 0.1
 
 
+def test_bands_follow_what_an_earlier_visit_has_processed():
+    rects = torch.tensor([[0, 0, 2, 60]], dtype=torch.int32)
+    last = torch.zeros(953, 40, dtype=torch.int32)  # of 60 x 3 tiles, the last ones cut off
+    last[70:100, 3] = 40_000  # in three rows of tiles
+    last[75, 39] = 100
+    processed = row_processed(last, range(4, 60))
+    assert processed.nonzero().flatten().tolist() == [4, 5, 6] and processed[4:7].tolist() == [40_100, 40_000, 40_000]
+    assert not row_processed(last, range(7, 60)).any() and not row_processed(last, range(6, 6)).any()
+    ranks, counts = _Others([rects] * 3, height=953), torch.ones(1)
+    assert find_bands(ranks, rects, counts, 953, 40).borders == [0, 20, 40, 60]
+    assert find_bands(ranks, rects, counts, 953, 40, processed).borders == [0, 5, 6, 60]
+    known = KnownBands()
+    for visit in range(16):
+        borders = known.find("a", ranks, rects, counts, 953, 40).borders
+        known.drawn("a", last)
+        assert borders == ([0, 20, 40, 60] if visit < 8 else [0, 5, 6, 60])
+
+
 def test_ranks_weigh_by_their_splats_whether_they_take_a_sample_or_not(monkeypatch):
     generator = torch.Generator().manual_seed(6)
     rects = []
     for count, first in ((20_000, 0), (3_999, 60), (0, 0)):
         top = first + torch.randint(37, (count,), generator=generator)
         rects.append(torch.stack((torch.zeros_like(top), top, 1 + top % 3, top + 1 + top % 4), 1).int())
+    monkeypatch.setattr(bands, "_TILE_COST", 8)
     found = []
     for sample in (1 << 16, 4_000):
         monkeypatch.setattr(bands, "_SAMPLE", sample)
@@ -203,5 +224,5 @@ def test_bands_of_a_view_are_kept_for_some_visits():
     found = [known.find("a", ranks, rects, counts, 97, 40) for _ in range(8)]
     assert ranks.told == 1 and all(one is found[0] for one in found)
     assert known.find("b", ranks, rects, counts, 97, 40) is not found[0] and ranks.told == 2
-    assert known.find("a", ranks, rects, counts, 90, 40) is not found[0] and ranks.told == 3
+    assert known.find("a", ranks, rects, counts, 100, 40) is not found[0] and ranks.told == 3
     assert known.find("a", ranks, rects, counts, 97, 40) is not found[0] and ranks.told == 4

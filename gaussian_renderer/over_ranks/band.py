@@ -39,6 +39,11 @@ class View:
     layers: Tensor
 
     @property
+    def last(self) -> Tensor:
+        """(H, W), where lists end in the rows of the band."""
+        return self.state[-2]
+
+    @property
     def band(self) -> Band:
         return Band(self.bands.pixels(self.ranks.rank), self.ranks.added)
 

@@ -1,16 +1,20 @@
 """The division of an image's rows of tiles into bands, one for each rank."""
 
 from collections.abc import Hashable, Sequence
+from dataclasses import dataclass
 from functools import cached_property
 
 import torch
+import torch.nn.functional as F
 from diff_gaussian_rasterization.fakes import TILE
 from fused_ssim import REACH
 from torch import Tensor
 
 from utils.ranks.ranks import Ranks
 
-_TILE_COST = 8  # of a tile without instances, in instances
+# Work in units of a rectangle's width in a row: of an instance that the backward reads, and of a tile without any. They
+# follow from the times of one GPU's stages (docs/inside/scaling.md).
+_PROCESSED_COST, _TILE_COST = 11, 1500
 _VISITS = 8  # of a view, for which its bands are kept
 _SAMPLE = 1 << 16  # splats of a rank, about, by which bands are found
 _NOWHERE = 1 << 30  # a row of tiles that no rectangle reaches
@@ -26,6 +30,11 @@ class Bands:
     def __init__(self, borders: Sequence[int], height: int, rank: int, device: torch.device) -> None:
         self.borders, self.height = list(borders), height
         self._rank, self._device = rank, device
+
+    @property
+    def own(self) -> range:
+        """The rows of tiles of this rank's band."""
+        return range(*self.borders[self._rank : self._rank + 2])
 
     def pixels(self, rank: int, reach: int = 0) -> tuple[int, int]:
         """The rows of pixels of a band, first and end, and `reach` more on either side, unless it is empty."""
@@ -87,18 +96,45 @@ def row_widths(rects: Tensor, tile_counts: Tensor, height: int) -> Tensor:
     return steps.index_add_(0, torch.cat((top, bottom)).clamp_(0, rows), torch.cat((wide, -wide)))
 
 
-def find_bands(ranks: Ranks, rects: Tensor, tile_counts: Tensor, height: int, width: int) -> Bands:
+def row_processed(last: Tensor, rows: range) -> Tensor:
+    """How many instances the backward reads in each row of tiles: (all rows + 1,) int64, 0 but in `rows`.
+
+    last: (H, W), the position behind the last instance of a pixel in its tile's list.
+    """
+    height, width = last.shape
+    total = torch.zeros(tile_rows(height) + 1, dtype=torch.int64, device=last.device)
+    own = last[TILE * rows.start : TILE * rows.stop]
+    padded = F.pad(own, (0, -width % TILE, 0, TILE * len(rows) - len(own)))
+    tiles = padded.view(len(rows), TILE, padded.shape[1] // TILE, TILE)
+    if len(rows):
+        total[rows.start : rows.stop] = tiles.amax((1, 3)).sum(1)
+    return total
+
+
+def find_bands(
+    ranks: Ranks, rects: Tensor, tile_counts: Tensor, height: int, width: int, processed: Tensor | None = None
+) -> Bands:
     """Bands of about equal loads. rects: (N, 4), of the rank's own Gaussians, which count where tile_counts (N,) do.
 
-    A splat is as much work as its rectangle is wide, in each of its rows.
+    A splat is as much work as its rectangle is wide, in each of its rows. processed: `row_processed` of the rank's
+    band in an earlier visit; given by all ranks or by none.
     """
-    widths = ranks.table(row_widths(rects, tile_counts, height)).sum(0).cpu().cumsum(0)
-    total = widths[:-1] + _TILE_COST * tile_rows(width)
+    widths = row_widths(rects, tile_counts, height)
+    loads = torch.stack((widths, torch.zeros_like(widths) if processed is None else processed))
+    widths, processed = ranks.table(loads).sum(0).cpu()
+    total = widths.cumsum(0)[:-1] + _PROCESSED_COST * processed[:-1] + _TILE_COST * tile_rows(width)
     ends = total.cumsum(0)
     shares = torch.arange(1, ranks.size) * int(ends[-1]) // ranks.size
     # A row belongs to the band in which its middle lies.
     cuts = torch.searchsorted(2 * ends - total, 2 * shares)
     return Bands([0, *cuts.tolist(), len(total)], height, ranks.rank, rects.device)
+
+
+@dataclass
+class _Visits:
+    bands: Bands
+    count: int = 0
+    processed: Tensor | None = None  # in the last visit before bands are found anew
 
 
 class KnownBands:
@@ -108,13 +144,20 @@ class KnownBands:
     """
 
     def __init__(self) -> None:
-        self._kept: dict[Hashable, tuple[Bands, int]] = {}
+        self._kept: dict[Hashable, _Visits] = {}
 
     def find(self, view: Hashable, ranks: Ranks, rects: Tensor, tile_counts: Tensor, height: int, width: int) -> Bands:
         """`find_bands`, or the bands of an earlier visit of the view."""
         key = view, height, width
-        bands, visits = self._kept.get(key, (None, _VISITS))
-        if visits >= _VISITS:
-            bands, visits = find_bands(ranks, rects, tile_counts, height, width), 0
-        self._kept[key] = bands, visits + 1
-        return bands
+        kept = self._kept.get(key)
+        if kept is None or kept.count >= _VISITS:
+            processed = kept and kept.processed
+            kept = self._kept[key] = _Visits(find_bands(ranks, rects, tile_counts, height, width, processed))
+        kept.count += 1
+        return kept.bands
+
+    def drawn(self, view: Hashable, last: Tensor) -> None:
+        """Take what a visit of the view that `find` was asked for has processed. last: as of `row_processed`."""
+        kept = self._kept[(view, *last.shape)]
+        if kept.count == _VISITS:
+            kept.processed = row_processed(last, kept.bands.own)
