@@ -3,9 +3,9 @@
     python -m benchmarks.parallel.spill --gaussians 20000000 --cap 16
     CUDA_VISIBLE_DEVICES= python -m benchmarks.parallel.spill --gaussians 20000 --size 320 180 --iterations 20
 
-The scene is the city of benchmarks.parallel.steps. Three trainings, each in a process of its own: without a cap,
-without one by --spill, and with the cap by --spill and without. A training that does not fit says so. Digests are of
-all parameters after the last step. On a CPU there is no cap.
+The scene is the city of benchmarks.parallel.steps, with views of a part of its image, so that they see less. Four
+trainings, each in a process of its own: as usual and by --spill, both without the cap and with it. A training that does
+not fit says so. Digests are of all parameters after the last step. On a CPU there is no cap.
 """
 
 import argparse
@@ -14,6 +14,7 @@ import json
 import subprocess
 import sys
 import time
+from dataclasses import replace
 
 import torch
 
@@ -66,7 +67,8 @@ def train(args: argparse.Namespace) -> dict[str, float | str]:
     if args.cap and device.type == "cuda":
         total = torch.cuda.get_device_properties(device).total_memory
         torch.cuda.set_per_process_memory_fraction(min(args.cap * 2**30 / total, 1.0))
-    run = WorkloadRun(CITY.changed(args.gaussians, args.size), "tiles", args.iterations, still=False, spill=args.spill)
+    workload = replace(CITY.changed(args.gaussians, args.size), crop=args.crop)
+    run = WorkloadRun(workload, "tiles", args.iterations, still=False, spill=args.spill)
     clock = Clock(args.iterations)
     run.begin()
     run_training(run, [DivergenceWatch(run), clock])
@@ -91,6 +93,7 @@ def main() -> None:
     add = parser.add_argument
     add("--gaussians", type=int, default=CITY.gaussians, help="default: 20 M")
     add("--size", type=int, nargs=2, metavar=("WIDTH", "HEIGHT"), help="of the image (default: 3840 2160)")
+    add("--crop", type=int, default=3, help="views of the middle one in so many parts across and down (default: 3)")
     add("--iterations", type=int, default=60, help="default: 60")
     add("--cap", type=float, default=16.0, help="GiB of the GPU that a capped training may take (default: 16)")
     add("--alone", action="store_true", help=argparse.SUPPRESS)

@@ -25,13 +25,17 @@ _NAMES = {"xyz": "means", "f_dc": "sh_dc", "f_rest": "sh_rest", "opacity": "opac
 
 @dataclass(frozen=True)
 class Workload:
-    """A scene of so many Gaussians, whose median size is sigma_px, and an image size."""
+    """A scene of so many Gaussians, whose median size is sigma_px, and an image size.
+
+    crop: of width and height, of which the image only has the middle one in so many parts; so a view sees less.
+    """
 
     name: str
     gaussians: int
     width: int
     height: int
     sigma_px: float
+    crop: int = 1
 
     def changed(self, gaussians: int | None, size: tuple[int, int] | None) -> "Workload":
         """The same with another number of Gaussians or another image size."""
@@ -39,7 +43,7 @@ class Workload:
         return replace(self, gaussians=gaussians or self.gaussians, width=width, height=height)
 
     def __str__(self) -> str:
-        return f"{self.name}, {self.gaussians / 1e6:g} M, {self.width}x{self.height}"
+        return f"{self.name}, {self.gaussians / 1e6:g} M, {self.width // self.crop}x{self.height // self.crop}"
 
     def rows(self, rank: int, size: int, device: torch.device) -> dict[str, Tensor]:
         """The Gaussians of a rank, by the model's names, the same for every number of ranks."""
@@ -62,10 +66,11 @@ class Workload:
 
     def cameras(self) -> list[Camera]:
         """VIEWS cameras. In XL all see the same, those of the city stand around it. All have the same photo."""
-        fovy = focal2fov(fov2focal(FOV, self.width), self.height)
-        size, photo = (self.width, self.height), InMemory(_photo(self.width, self.height))
+        size = self.width // self.crop, self.height // self.crop
+        fovx, fovy = (focal2fov(fov2focal(FOV, self.width), pixels) for pixels in size)
+        photo = InMemory(_photo(*size))
         poses = [look(i) if self.name == "city" else (np.eye(3), np.zeros(3)) for i in range(VIEWS)]
-        return [Camera(View(i, 0, *pose, FOV, fovy, f"{i}", size, photo)) for i, pose in enumerate(poses)]
+        return [Camera(View(i, 0, *pose, fovx, fovy, f"{i}", size, photo)) for i, pose in enumerate(poses)]
 
 
 XL = Workload("XL", *WORKLOADS["XL"])
