@@ -85,6 +85,18 @@ def test_a_baseline_is_kept_by_kind(tmp_path):
     assert read == {"CPU one": RECORD, "GPU two": RECORD | {"commit": "c" * 40}}
 
 
+def test_scenes_of_one_commit_are_kept_together(tmp_path):
+    path = tmp_path / "gate.json"
+    more = RECORD | {"scenes": {"d": STORED}}
+    baseline.write_baseline(path, "kind", RECORD)
+    baseline.write_baseline(path, "kind", more)
+    assert baseline.read_baseline(path, "kind", ["a", "b", "c"], 1000) == RECORD
+    assert baseline.read_baseline(path, "kind", ["d"], 1000) == more
+    baseline.write_baseline(path, "kind", more | {"commit": "e" * 40})
+    with pytest.raises(UserError, match="is of d at 1000 iterations"):
+        baseline.read_baseline(path, "kind", ["a", "b", "c"], 1000)
+
+
 @pytest.mark.parametrize(
     ("content", "scenes", "iterations", "complaint"),
     [

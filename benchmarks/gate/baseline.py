@@ -30,7 +30,7 @@ def machine_kind() -> str:
 def read_baseline(path: Path, kind: str, scenes: list[str], iterations: int) -> dict[str, Any]:
     """Return the record of a kind: `commit`, `iterations`, and for each of `scenes` its trainings.
 
-    UserError if there is none, if it is broken, or if it is of other scenes or iterations.
+    The file may have more scenes. UserError if there is no record, if it is broken, or of other scenes or iterations.
     """
     again = f"write it at a commit that is known to be good: python -m benchmarks.gate --write --baseline {path}"
     try:
@@ -44,18 +44,24 @@ def read_baseline(path: Path, kind: str, scenes: list[str], iterations: int) -> 
         raise UserError(f"{path} has no baseline of this kind of machine ({kind}); {again}")
     if not _is_whole(record):
         raise UserError(f"{path} has a broken baseline for {kind}; restore the file, or {again}")
-    if sorted(record["scenes"]) != sorted(scenes) or record["iterations"] != iterations:
+    if not set(scenes) <= set(record["scenes"]) or record["iterations"] != iterations:
         there, here = ", ".join(sorted(record["scenes"])), ", ".join(sorted(scenes))
         raise UserError(
             f"the baseline for {kind} is of {there} at {record['iterations']} iterations, not of {here} at "
             f"{iterations}; {again}"
         )
-    return record
+    return record | {"scenes": {name: record["scenes"][name] for name in scenes}}
 
 
 def write_baseline(path: Path, kind: str, record: dict[str, Any]) -> None:
-    """Store the record of a kind beside those of other kinds, whole or not at all."""
+    """Store the record of a kind beside those of other kinds, whole or not at all.
+
+    Scenes that are stored of the same commit and number of iterations stay beside its own.
+    """
     records = read_json(path) if path.exists() else {}
+    before = records.get(kind, {})
+    if all(before.get(key) == record[key] for key in ("commit", "iterations")):
+        record = record | {"scenes": before["scenes"] | record["scenes"]}
     write_json(path, records | {kind: record})
 
 
