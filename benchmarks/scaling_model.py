@@ -24,10 +24,10 @@ HELD = PARAMETERS + MOMENTS + STATISTICS
 # Bytes of a Gaussian that projection leaves until the step ends: splat, depth, rectangle, tile count, radius.
 PROJECTED = 40 + 4 + 16 + 4 + 4
 TILE_RECORD = 16  # while projection runs, and again on a rank that bins what it received
-REACHED = 2  # for each band: whether it is reached, while records are chosen
+REACHED = 1 + 4  # for each band: whether it is reached, and the record's number, while records are chosen
 RECORD = 40 + 4 + 16 + 4  # of a visible Gaussian, sent to each band that it reaches
 COUNT = 4  # of gradient rows, sent back for each record
-PLACE = 8  # of a record for each band, while its rows are put in order
+PLACE, MARK = 12, 4  # of a record and of a row, while rows are put in order
 ROW = 40  # of gradients, sent back for each processed instance; 48 with absolute gradients
 BIN_SPLAT, SLOTS_SPLAT = 44, 16  # of a record while binning: keys, orders, offsets and memory of the sort; its slots
 BIN_INSTANCE, INSTANCE = 18, 4  # while binning: keys twice, splats twice, memory of the sort; afterwards
@@ -244,7 +244,7 @@ def step_bytes(scene: Workload, gpus: int) -> float:
     lists = SLOTS_SPLAT * splats + INSTANCE * instances + SLOT * scene.slots * share
     rows, chosen = ROW * processed, 0.0
     if gpus > 1:
-        rows = max(3 * rows, rows + PLACE * gpus * records)  # made, received, put in order
+        rows = 3 * rows + MARK * processed + PLACE * records  # made, received, put in order
         chosen = REACHED * gpus
     return PROJECTED + max(TILE_RECORD, chosen, arrived + max(exchange, binning, lists + rows))
 

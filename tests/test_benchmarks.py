@@ -6,12 +6,14 @@ import math
 import sys
 from pathlib import Path
 
+import diff_gaussian_rasterization
 import pytest
 
 from benchmarks import scaling_model
 from benchmarks.harness.calls import Stages
 from benchmarks.harness.page import replace_tables
 from benchmarks.harness.timing import short_name
+from benchmarks.kernels import builds
 from benchmarks.kernels.fragments import TILE, fragments, processed_per_tile
 from benchmarks.kernels.host_ops import NODE, calls_per_iteration, operator_calls
 from benchmarks.kernels.seen_share import SHARES, Ring, measure
@@ -143,3 +145,13 @@ def test_two_ranks_send_each_other_half_of_what_a_view_sees():
     whole = scaling_model.tiles_traffic(scene, 2, scaling_model.WHOLE_IMAGE)
     assert whole == sent | {"image": 12 * 32 * 64 / 2}
     assert scaling_model.tiles_traffic(scene, 1) == dict.fromkeys(sent, 0)
+
+
+def test_two_builds_take_turns(monkeypatch, capsys):
+    folder = str(Path(diff_gaussian_rasterization.__file__).parents[1])
+    words = ["builds", folder, folder, "--device", "cpu", "--workloads", "S", "--starts", "1", "--rounds", "1"]
+    monkeypatch.setattr(sys, "argv", words)
+    builds.main()
+    rows = [line.split("|")[1:-1] for line in capsys.readouterr().out.splitlines() if line.startswith("| S ")]
+    assert [row[1].strip() for row in rows] == list(builds.STEPS)
+    assert all(0.2 < float(row[4]) < 5 and float(row[2]) > 0.05 for row in rows)

@@ -138,7 +138,8 @@ class _Others(Ranks):
 
     def table(self, values: Tensor) -> Tensor:
         self.told += 1
-        widths = torch.stack([row_widths(rects, torch.ones(len(rects)), self._height) for rects in self._rects])
+        others = [row_widths(rects, torch.ones(len(rects)), self._height) for rects in self._rects[1:]]
+        widths = torch.stack((values[0], *others))
         return torch.stack((widths, values[1] * torch.tensor([[1], [0], [0]])), 1)
 
 

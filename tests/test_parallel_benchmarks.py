@@ -68,7 +68,7 @@ def test_the_host_is_profiled_by_step():
 
 def test_spilled_trainings_have_the_digest_of_others():
     found = [
-        spill.train(argparse.Namespace(**SMALL, crop=1, iterations=iterations, cap=0, spill=spilled))["digest"]
+        spill.train(argparse.Namespace(**SMALL, crop=2, iterations=iterations, cap=0, spill=spilled))["digest"]
         for iterations, spilled in ((8, False), (8, True), (9, False))
     ]
     assert found[0] == found[1] != found[2]

@@ -15,6 +15,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 import torch
@@ -24,8 +25,8 @@ from benchmarks.workloads.splat_scenes import frustum
 from utils.system_utils import UserError, run_cli
 
 #            splats  width height median pixel sigma
-WORKLOADS = {"S": (5_000, 200, 200, 2.4), "M": (50_000, 400, 400, 2.4), "L": (300_000, 800, 800, 1.7)}
-GPU_WORKLOADS = ("S", "M", "L")  # those of benchmarks/peers/published.py
+CPU_WORKLOADS = {"S": (5_000, 200, 200, 2.4), "M": (50_000, 400, 400, 2.4), "L": (300_000, 800, 800, 1.7)}
+NAMES = ("S", "M", "L")  # on a GPU those of benchmarks/peers/published.py
 CPU_CALLS = {"S": 40, "M": 10, "L": 3}  # of a turn
 GPU_CALLS, WARM_UPS = 40, 5
 STEPS = ("forward", "+ backward", "step")
@@ -47,10 +48,11 @@ class Build:
 
     def milliseconds(self, workload: str, step: str) -> float:
         """The median time of a turn of calls."""
-        self._process.stdin.write(f"{workload},{step}\n")
-        self._process.stdin.flush()
-        if answer := self._process.stdout.readline():
-            return float(answer)
+        with suppress(BrokenPipeError):
+            self._process.stdin.write(f"{workload},{step}\n")
+            self._process.stdin.flush()
+            if answer := self._process.stdout.readline():
+                return float(answer)
         raise UserError(f"the rasterizer of {self._folder} failed: see above")
 
     def end(self) -> None:
@@ -67,7 +69,7 @@ def serve(device: str) -> None:
     for line in sys.stdin:
         workload, step = line.strip().split(",")
         if workload not in made:
-            sizes = published.WORKLOADS if device == "cuda" else WORKLOADS
+            sizes = published.WORKLOADS if device == "cuda" else CPU_WORKLOADS
             made[workload] = Calls(frustum(*sizes[workload], device=device)).steps()
         turn = _on_gpu if device == "cuda" else _on_cpu
         print(turn(made[workload][step], workload), flush=True)
@@ -113,7 +115,7 @@ def main() -> None:
     add("old", help="folder with a diff_gaussian_rasterization, as pip install --target makes it")
     add("new", help="another one")
     add("--device", choices=["cpu", "cuda"], help="default: cuda if there is a GPU")
-    add("--workloads", nargs="+", choices=GPU_WORKLOADS, default=list(GPU_WORKLOADS), help="default: all")
+    add("--workloads", nargs="+", choices=NAMES, default=list(NAMES), help="default: all")
     add("--starts", type=int, default=5, help="of each build's process (default: 5)")
     add("--rounds", type=int, default=5, help="turns of each of them (default: 5)")
     add("--serve", action="store_true", help=argparse.SUPPRESS)

@@ -83,7 +83,7 @@ def cells(words: list[str]) -> list[str]:
     if done.returncode:
         why = done.stderr.strip().splitlines()[-1:] or [f"status {done.returncode}"]
         print(f"{' '.join(words)}: {why[0]}", file=sys.stderr)
-        return ["-", "-", "does not fit" if "memory" in why[0] else "failed"]
+        return ["-", "-", "does not fit" if "out of memory" in why[0] else "failed"]
     found = json.loads(done.stdout.splitlines()[-1])
     return [f"{found['ms']:.1f}", f"{found['gib']:.2f}", found["digest"]]
 

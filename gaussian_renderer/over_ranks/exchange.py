@@ -23,9 +23,7 @@ class Sent:
     gaussians: Tensor  # (n,), ascending for each rank, rank after rank
     sizes: list[int]  # records for each rank
     received: list[int]
-    places: (
-        Tensor | None
-    )  # (n,) int32: of records in the order of Gaussians, then ranks; None if they lie in this order
+    places: Tensor | None  # (n,) int32, by Gaussian, then by rank; None: as the records lie
 
 
 def find_records(ranks: Ranks, reached: Tensor) -> tuple[Tensor, Tensor, list[int], list[int]]:
