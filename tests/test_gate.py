@@ -207,7 +207,7 @@ def test_the_stored_file_fits_the_code():
     if not baseline.FILE.is_file():
         pytest.skip("no baseline is stored yet")
     for kind, record in json.loads(baseline.FILE.read_text()).items():
-        names = list(record["scenes"])
-        assert sorted(names) in (sorted(trainings.REAL), sorted(trainings.MADE))
         iterations = gate.ITERATIONS["cpu" if kind.startswith("CPU ") else "cuda"]
-        assert baseline.read_baseline(baseline.FILE, kind, names, iterations) == record
+        for names in (list(trainings.REAL), list(trainings.MADE)):  # any clone of the repository can make the second
+            found = baseline.read_baseline(baseline.FILE, kind, names, iterations)
+            assert found["scenes"] == {name: record["scenes"][name] for name in names}
