@@ -13,7 +13,6 @@ import os
 import statistics
 import subprocess
 import sys
-import time
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
@@ -21,6 +20,7 @@ from pathlib import Path
 import torch
 
 from benchmarks.harness.environment import describe, print_table
+from benchmarks.harness.timing import cpu_milliseconds
 from benchmarks.workloads.splat_scenes import frustum
 from utils.system_utils import UserError, run_cli
 
@@ -71,20 +71,11 @@ def serve(device: str) -> None:
         if workload not in made:
             sizes = published.WORKLOADS if device == "cuda" else CPU_WORKLOADS
             made[workload] = Calls(frustum(*sizes[workload], device=device)).steps()
-        turn = _on_gpu if device == "cuda" else _on_cpu
-        print(turn(made[workload][step], workload), flush=True)
+        run = made[workload][step]
+        print(_on_gpu(run) if device == "cuda" else cpu_milliseconds(run, CPU_CALLS[workload]), flush=True)
 
 
-def _on_cpu(run: Callable[[], object], workload: str) -> float:
-    times = []
-    for _ in range(1 + CPU_CALLS[workload]):
-        start = time.perf_counter()
-        run()
-        times.append(time.perf_counter() - start)
-    return 1e3 * statistics.median(times[1:])
-
-
-def _on_gpu(run: Callable[[], object], workload: str) -> float:
+def _on_gpu(run: Callable[[], object]) -> float:
     times = []
     begin, end = torch.cuda.Event(enable_timing=True), torch.cuda.Event(enable_timing=True)
     for _ in range(WARM_UPS + GPU_CALLS):

@@ -37,6 +37,15 @@ void check_counts(const Tensor& tile_counts, int64_t count, Device device) {
   check_tensor(tile_counts, "tile_counts", ScalarType::Int, device, {count});
 }
 
+void check_projected(const Tensor& splats, const Tensor& depths, const Tensor& rects, const Tensor& tile_counts) {
+  check_splats(splats);
+  const Device device = splats.device();
+  const int64_t n = splats.size(0);
+  check_tensor(depths, "depths", splats.scalar_type(), device, {n});
+  check_tensor(rects, "rects", ScalarType::Int, device, {n, 4});
+  check_counts(tile_counts, n, device);
+}
+
 Tensor background_like(const Tensor& background, const Tensor& splats) {
   check_precise(background, "background", {3});
   return converted(background, splats);

@@ -21,6 +21,8 @@ namespace gs::ops {
 void check_splats(const Tensor& splats);
 void check_lists(const Tensor& instances, const Tensor& ranges, const Tensor& splats, gs::Image image);
 void check_counts(const Tensor& tile_counts, int64_t count, Device device);
+// What projection gives to binning.
+void check_projected(const Tensor& splats, const Tensor& depths, const Tensor& rects, const Tensor& tile_counts);
 // The size of the image whose `last` this is.
 gs::Image image_of(const Tensor& last, const Tensor& splats);
 Tensor background_like(const Tensor& background, const Tensor& splats);

@@ -48,19 +48,15 @@ void check_indices(const Tensor& gaussians, int64_t count) {
 // Packs some Gaussians' splats into rows, which may be a part of a larger tensor.
 void pack_splats_op(Tensor& packed_rows, const Tensor& splats, const Tensor& depths, const Tensor& rects,
                     const Tensor& tile_counts, const Tensor& gaussians) {
-  check_splats(splats);
+  check_projected(splats, depths, rects, tile_counts);
   const Device device = splats.device();
-  const int64_t n = splats.size(0);
-  check_tensor(depths, "depths", splats.scalar_type(), device, {n});
-  check_tensor(rects, "rects", ScalarType::Int, device, {n, 4});
-  check_counts(tile_counts, n, device);
   check_tensor(gaussians, "gaussians", ScalarType::Long, device, {-1});
   const int wide = words_of_value(splats);
   check_tensor(packed_rows, "packed", ScalarType::Int, device, {gaussians.size(0), gs::packed_words(wide)});
   GS_CHECK_VALUE(packed_rows.is_contiguous(), "packed must be contiguous");
   const Tensor values = packed(splats), at = packed(depths), boxes = packed(rects), counts = packed(tile_counts);
   const Tensor indices = packed(gaussians);
-  check_indices(indices, n);
+  check_indices(indices, splats.size(0));
   const gs::PackInput in{indices.size(0), wide,          read<int64_t>(indices), words(values),
                          words(at),       words(counts), words(boxes),           write<int32_t>(packed_rows)};
   GS_RUN_WORDS(splats, pack_splats, in);

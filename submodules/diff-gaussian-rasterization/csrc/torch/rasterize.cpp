@@ -128,12 +128,7 @@ Tensors5 project_op(SCENE_PARAMETERS) {
 
 Tensors4 bin_op(const Tensor& splats, const Tensor& depths, const Tensor& rects, const Tensor& tile_counts,
                 int64_t height, int64_t width, bool train) {
-  check_splats(splats);
-  const Device device = splats.device();
-  const int64_t n = splats.size(0);
-  check_tensor(depths, "depths", splats.scalar_type(), device, {n});
-  check_tensor(rects, "rects", ScalarType::Int, device, {n, 4});
-  check_counts(tile_counts, n, device);
+  check_projected(splats, depths, rects, tile_counts);
   ProjectedTensors p;
   p.splats = packed(splats), p.depths = packed(depths), p.rects = packed(rects);
   p.tile_counts = p.radii = packed(tile_counts);
