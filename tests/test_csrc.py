@@ -55,6 +55,7 @@ SCHEMAS = [
     f"{GRADIENTS}",
     f"blend_rows({BACKWARD}, Tensor layers, bool absolute=False) -> (Tensor rows, Tensor counts)",
     f"rows_vjp({SCENE}, {ROWS}, bool[9] wanted, bool absolute=False) -> {GRADIENTS}",
+    f"rows_vjp_add_({SCENE}, {ROWS}, Tensor(a!)[] sums, bool absolute=False) -> ()",
     "pack_splats_(Tensor(a!) packed, Tensor splats, Tensor depths, Tensor rects, Tensor tile_counts, Tensor gaussians) "
     "-> ()",
     "unpack_splats(Tensor packed, Tensor like) -> (Tensor splats, Tensor depths, Tensor rects, Tensor tile_counts)",

@@ -76,6 +76,10 @@ class Forward:
         splats, _, _, tile_counts, _ = self.projected
         return ops.rows_vjp(*self.scene, splats, tile_counts, *rows, wanted, absolute)
 
+    def add_rows_vjp(self, rows: Rows, sums: list[Tensor], absolute: bool) -> None:
+        splats, _, _, tile_counts, _ = self.projected
+        ops.rows_vjp_add_(*self.scene, splats, tile_counts, *rows, sums, absolute)
+
     def lists_vjp(self, absolute: bool, wanted: list[bool] = WANTED) -> tuple[Tensor, ...]:
         state = self.state(self.lists, self.blended)
         return ops.rasterize_vjp(*self.scene, *state, self.projected[3], self.blended[4], wanted, absolute)
@@ -144,6 +148,88 @@ def test_rows_give_the_gradients_of_the_lists(kind, depth, absolute, device, dty
 
 @BOTH_AND_GPU
 @SCENES
+@ABSOLUTE
+def test_gradients_are_added_to_those_of_another_view(kind, absolute, device, dtype):
+    forward = Forward.of(*scene_of(kind, device, dtype), True)
+    rows, seen = forward.rows(absolute), forward.projected[3] > 0
+    for wanted in ([name in ("means", "sh_rest") for name in schema.GRADIENTS], WANTED):
+        found, expected = forward.rows_vjp(rows, absolute, wanted), []
+        sums = [torch.full_like(gradient, 0.3) for gradient in found]
+        for name, before, gradient in zip(schema.GRADIENTS, sums, found, strict=True):
+            after = before.clone()
+            after[: len(gradient)][seen[: len(gradient)]] += gradient[seen[: len(gradient)]]
+            if name == "means2d" and absolute and len(gradient):
+                after[:, 2] = gradient[:, 2]  # lengths have no place in a sum
+            expected.append(after)
+        forward.add_rows_vjp(rows, sums, absolute)
+        # Another kernel may round products in another way.
+        close = [
+            torch.allclose(*pair, rtol=1e-5, atol=1e-6, equal_nan=True) for pair in zip(sums, expected, strict=True)
+        ]
+        assert all(close), dict(zip(schema.GRADIENTS, close, strict=True))
+        if device == "cpu":
+            assert all(same_bits(*pair) for pair in zip(sums, expected, strict=True))
+
+
+@BOTH_AND_GPU
+def test_gradients_without_bands_of_sh_are_added(device, dtype):
+    raw, camera = scene_of("many", device, dtype)
+    forward = Forward.of(raw | {"sh_rest": raw["sh_rest"][:, :0]}, camera._replace(sh_degree=0), False)
+    rows = forward.rows(False)
+    sums = [gradient.clone() for gradient in forward.rows_vjp(rows, False)]
+    forward.add_rows_vjp(rows, sums, False)
+    assert sums[-1].shape == (300, 0, 3)
+    for twice, once in zip(sums, forward.rows_vjp(rows, False), strict=True):
+        torch.testing.assert_close(twice, 2 * once, rtol=1e-5, atol=1e-6)
+
+
+@BOTH_AND_GPU
+def test_gradients_of_covariances_and_colors_are_added(device, dtype):
+    raw, camera = scene_of("many", device, dtype)
+    forward, count = Forward.of(raw, camera, False), len(raw["means"])
+    generator = torch.Generator().manual_seed(4)
+    covariances = torch.zeros(count, 6, dtype=dtype)
+    covariances[:, [0, 3, 5]] = 0.01 + 0.05 * torch.rand(count, 3, generator=generator, dtype=dtype)
+    scene = list(forward.scene)
+    scene[2:8] = (
+        None,
+        None,
+        covariances.to(device),
+        torch.rand(count, 3, generator=generator).to(device, dtype),
+        None,
+        None,
+    )
+    scene[1], scene[-1] = torch.full((count, 1), 0.6, device=device, dtype=dtype), False
+    splats, depths, rects, tile_counts, _ = ops.project(*scene)
+    lists = ops.bin(splats, depths, rects, tile_counts, HEIGHT, WIDTH, True)
+    _, transmittance, _, last, layers = ops.blend(splats, *lists[:2], forward.background, HEIGHT, WIDTH, False, True)
+    state = (splats, *lists, forward.background, last, transmittance, forward.planes[0], None, None)
+    given = (*scene, splats, tile_counts, *ops.blend_rows(*state, layers))
+    found = ops.rows_vjp(*given, [name in ("means", "cov3d", "colors") for name in schema.GRADIENTS])
+    sums = [gradient.clone() for gradient in found]
+    ops.rows_vjp_add_(*given, sums)
+    for twice, once in zip(sums, found, strict=True):
+        torch.testing.assert_close(twice, 2 * once, rtol=1e-5, atol=1e-6)
+    assert all(found[place].count_nonzero() > 100 for place in (0, 5, 6))
+
+
+def test_wrong_sums_are_named():
+    forward = Forward.of(*scene_of("many", "cpu", torch.float32), False)
+    rows = forward.rows(False)
+    sums = list(forward.rows_vjp(rows, False))
+
+    def refused(error: type, match: str, sums: list[Tensor]) -> None:
+        with pytest.raises(error, match=match):
+            forward.add_rows_vjp(rows, sums, False)
+
+    refused(ValueError, "sums must have 9 tensors, got 8", sums[:8])
+    refused(ValueError, r"the sum of means must be \(300, 3\)", [sums[0][1:], *sums[1:]])
+    refused(TypeError, "the sum of sh_rest must be torch.float32", [*sums[:8], sums[8].double()])
+    refused(ValueError, "the sum of means must be contiguous", [sums[0].T.contiguous().T, *sums[1:]])
+
+
+@BOTH_AND_GPU
+@SCENES
 @DEPTH
 @ABSOLUTE
 def test_bands_give_the_rows_of_the_image(kind, depth, absolute, device, dtype):
@@ -189,6 +275,8 @@ def test_opcheck(absolute, device, dtype):
     library.opcheck(ops.blend_rows.default, (*state, forward.blended[4], absolute))
     splats, _, _, tile_counts, _ = forward.projected
     library.opcheck(ops.rows_vjp.default, (*forward.scene, splats, tile_counts, *rows, WANTED, absolute))
+    sums = list(forward.rows_vjp(rows, absolute))
+    library.opcheck(ops.rows_vjp_add_.default, (*forward.scene, splats, tile_counts, *rows, sums, absolute))
     assert rows.rows.shape[1] == fakes.MOMENT_VALUES + (fakes.ABSOLUTE_VALUES if absolute else 0)
 
 

@@ -26,8 +26,9 @@ from utils.system_utils import UserError, run_cli
 
 #            splats  width height median pixel sigma
 CPU_WORKLOADS = {"S": (5_000, 200, 200, 2.4), "M": (50_000, 400, 400, 2.4), "L": (300_000, 800, 800, 1.7)}
-NAMES = ("S", "M", "L")  # on a GPU those of benchmarks/peers/published.py
-CPU_CALLS = {"S": 40, "M": 10, "L": 3}  # of a turn
+TINY = {"XS": (20, 32, 32, 2.4)}  # the host's part of a call, and little else
+NAMES = ("XS", "S", "M", "L")  # on a GPU the others are those of benchmarks/peers/published.py
+CPU_CALLS = {"XS": 300, "S": 40, "M": 10, "L": 3}  # of a turn
 GPU_CALLS, WARM_UPS = 40, 5
 STEPS = ("forward", "+ backward", "step")
 
@@ -69,7 +70,7 @@ def serve(device: str) -> None:
     for line in sys.stdin:
         workload, step = line.strip().split(",")
         if workload not in made:
-            sizes = published.WORKLOADS if device == "cuda" else CPU_WORKLOADS
+            sizes = TINY | (published.WORKLOADS if device == "cuda" else CPU_WORKLOADS)
             made[workload] = Calls(frustum(*sizes[workload], device=device)).steps()
         run = made[workload][step]
         print(_on_gpu(run) if device == "cuda" else cpu_milliseconds(run, CPU_CALLS[workload]), flush=True)

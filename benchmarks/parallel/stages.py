@@ -33,7 +33,7 @@ STAGES = {
     "loss": [(FusedStep, "measure"), (ViewsStep, "backward")],
     "backward of blend": [(OPERATORS, "blend_rows")],
     "rows back": [(band, "return_rows"), (views, "return_rows")],
-    "backward of projection": [(OPERATORS, "rows_vjp")],
+    "backward of projection": [(OPERATORS, "rows_vjp"), (OPERATORS, "rows_vjp_add_")],
     "Adam": [(GaussianModel, "step")],
     "backward of projection, Adam": [(OPERATORS, "rows_vjp_step_")],
     "backward, Adam": [(OPERATORS, "rasterize_vjp_step_")],

@@ -85,18 +85,18 @@ class _Views(torch.autograd.Function):
         gaussians = ctx.saved_tensors
         needed = dict(zip(Gaussians._fields, ctx.needs_input_grad[5:], strict=True), means2d=ctx.needs_input_grad[4])
         wanted = [needed[name] for name in GRADIENTS]
-        sums, screen = [], []
-        for view, (own, own_counts) in enumerate(_by_view(ctx.ranks, ctx.sent, len(gaussians[0]), rows, counts)):
+        count = len(gaussians[0])
+        screen = gaussians[0].new_zeros(ctx.ranks.size, count if needed["means2d"] else 0, 3)
+        for view, (own, own_counts) in enumerate(_by_view(ctx.ranks, ctx.sent, count, rows, counts)):
             arguments = *gaussians, *ctx.cameras[view], *ctx.own[view], own, own_counts
-            found = dict(zip(GRADIENTS, OPERATORS.rows_vjp(*arguments, wanted, absolute), strict=True))
-            screen.append(found.pop("means2d"))
-            if sums:
-                torch._foreach_add_(sums, list(found.values()))
+            if view == 0:
+                sums = dict(zip(GRADIENTS, OPERATORS.rows_vjp(*arguments, wanted, absolute), strict=True))
+                screen[0] = sums["means2d"]
             else:
-                sums, names = list(found.values()), list(found)
-        by_name = dict(zip(names, sums, strict=True))
-        of_inputs = [by_name[name] if needed[name] else None for name in Gaussians._fields]
-        return None, None, None, None, torch.stack(screen) if needed["means2d"] else None, *of_inputs
+                sums["means2d"] = screen[view]
+                OPERATORS.rows_vjp_add_(*arguments, list(sums.values()), absolute)
+        of_inputs = [sums[name] if needed[name] else None for name in Gaussians._fields]
+        return None, None, None, None, screen if needed["means2d"] else None, *of_inputs
 
 
 def _by_view(ranks: Ranks, sent: Sent, count: int, rows: Tensor, counts: Tensor) -> list[tuple[Tensor, Tensor]]:

@@ -29,6 +29,7 @@ def sound_calls() -> dict[str, Call]:
     rows = ops.blend_rows(*state, *planes, layers)
     packed = torch.zeros(len(counts), 16, dtype=torch.int32)
     wanted = [True, True, True, True, True, False, False, True, True]
+    sums = list(ops.rows_vjp(*scene, splats, counts, *rows, wanted))
     lists = [[torch.rand(3, 3), torch.rand(2, 5)] for _ in range(4)]
     guard = [torch.rand(()), torch.zeros(1, dtype=torch.int64), 3]
     adam = [*lists, [torch.tensor(1.0), torch.tensor(7.0)], [0.1, 0.2], 0.9, 0.99, 1e-8, [2, -1], *guard]
@@ -46,6 +47,7 @@ def sound_calls() -> dict[str, Call]:
         "blend_vjp": (ops.blend_vjp, [*state, *planes]),
         "blend_rows": (ops.blend_rows, [*state, *planes, layers, True]),
         "rows_vjp": (ops.rows_vjp, [*scene, splats, counts, *rows, wanted]),
+        "rows_vjp_add_": (ops.rows_vjp_add_, [*scene, splats, counts, *rows, sums]),
         "rows_vjp_step_": (ops.rows_vjp_step_, [*scene, splats, counts, *rows, *_step(raw), *guard]),
         "project_vjp": (ops.project_vjp, [*scene, counts, ops.blend_vjp(*state, *planes), wanted]),
         "rasterize": (ops.rasterize, [torch.zeros(3, 3), *scene, background, True, True]),

@@ -52,7 +52,7 @@ struct Projected {
 };
 
 // Gradients of the inputs that have one, in the order of Input in torch/scene.h; null where not wanted. Every row is
-// written.
+// written; or those of Gaussians that were seen are added to what is there, and no other is touched.
 template <class T>
 struct SceneGradient {
   T* means;
@@ -64,6 +64,7 @@ struct SceneGradient {
   T* colors;
   T* sh_dc;
   T* sh_rest;
+  bool adds = false;
 };
 
 // The slots (math/slots.h) of a splat: one for each tile of its rectangle, row by row. A culled splat has none.

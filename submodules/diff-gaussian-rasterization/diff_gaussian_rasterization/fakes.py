@@ -144,5 +144,6 @@ def _(values):
 @_fake("add_noise_")
 @_fake("penalise_")
 @_fake("pack_splats_")
+@_fake("rows_vjp_add_")
 def _(*_args, **_keywords):
     return None

@@ -1,6 +1,8 @@
 // The backward of projection, and of the whole rasterizer. A thread takes a Gaussian.
 #include <cuda_runtime.h>
 
+#include <type_traits>
+
 #include "../backend.h"
 #include "../math/scene_row.h"
 #include "gaussian_step.cuh"
@@ -48,10 +50,22 @@ __device__ void write_values(const float* values, int count, float* rows, int64_
     for (int k = 0; k < count; ++k) rows[count * i + k] = values[k];
 }
 
+__device__ void add_values(const float* rows, int count, int64_t i, float* values) {
+  if (rows)
+    for (int k = 0; k < count; ++k) values[k] = rows[count * i + k] + values[k];
+}
+
 __device__ void write_gradient(const RowGradient& g, int64_t i, const SceneGradient<float>& out) {
   write_values(g.means, 3, out.means, i), write_values(g.means2d, 3, out.means2d, i);
   write_values(&g.opacity, 1, out.opacities, i), write_values(g.scales, 3, out.scales, i);
   write_values(g.rotation, 4, out.rotations, i), write_values(g.sh_dc, 3, out.sh_dc, i);
+}
+
+// Adds row i of `sums`. All of it is read before any is written, as loads do not pass stores.
+__device__ void add_gradient(const SceneGradient<float>& sums, int64_t i, RowGradient& g) {
+  add_values(sums.means, 3, i, g.means), add_values(sums.means2d, 3, i, g.means2d);
+  add_values(sums.opacities, 1, i, &g.opacity), add_values(sums.scales, 3, i, g.scales);
+  add_values(sums.rotations, 4, i, g.rotation), add_values(sums.sh_dc, 3, i, g.sh_dc);
 }
 
 __device__ void write_gradient(const RowGradient& g, const WarpGradients& to) {
@@ -61,15 +75,36 @@ __device__ void write_gradient(const RowGradient& g, const WarpGradients& to) {
   to.opacities()[lane] = g.opacity;
 }
 
+// What rows of cov3d and colors were, while project_vjp_row writes theirs: nine values in shared memory.
+struct RowBefore {
+  static constexpr int kFloats = 9;
+  float* values;
+
+  __device__ void keep(const SceneGradient<float>& row) const {
+    for (int k = 0; row.cov3d && k < 6; ++k) values[k] = row.cov3d[k];
+    for (int k = 0; row.colors && k < 3; ++k) values[6 + k] = row.colors[k];
+  }
+  __device__ void add_to(const SceneGradient<float>& row) const {
+    for (int k = 0; row.cov3d && k < 6; ++k) row.cov3d[k] = values[k] + row.cov3d[k];
+    for (int k = 0; row.colors && k < 3; ++k) row.colors[k] = values[6 + k] + row.colors[k];
+  }
+};
+
+// In place of steps, which are not wanted: gradients are added to what is in memory.
+struct Addition : StepParameters {};
+
 // Computes gradients, and either writes them or takes the Gaussians' steps. It is one kernel for both, because a
 // compiler may fuse other products in another, and both must go the same way to the last bit. Step: StepParameters or
-// PenalisedStep, between which nothing differs but a call.
+// PenalisedStep, between which nothing differs but a call; or Addition, whose code would cost these registers, and
+// whose sums may therefore differ by rounding.
 template <class Source, class Step>
 __global__ void __launch_bounds__(kThreads)
     project_vjp_kernel(const int32_t* halted, Scene<float> s, Source source, SceneGradient<float> out,
                        const __grid_constant__ Step step) {
   if (is_halted(halted)) return;
+  constexpr bool kAdds = std::is_same_v<Step, Addition>;
   constexpr int kStage = SlotSums::kStage > WarpGradients::kFloats ? SlotSums::kStage : WarpGradients::kFloats;
+  static_assert(32 * RowBefore::kFloats <= kStage, "a warp has memory for the rows of its lanes");
   __shared__ Camera<float> camera;
   __shared__ __align__(16) float rest[kThreads * kRest];
   __shared__ __align__(16) float stage[kThreads / 32 * kStage];
@@ -89,10 +124,13 @@ __global__ void __launch_bounds__(kThreads)
   RowGradient g = {};
   const SceneGradient<float> mine = g.pointers(out, i);
   if (seen) {
+    const RowBefore before{warp_stage + RowBefore::kFloats * (threadIdx.x & 31)};
+    if (kAdds) before.keep(mine);
     // Writes the row even if it is not wanted: a null pointer would be tested for every band.
     project_vjp_row(s, camera, SceneRow<float>{s, i}, m, row, row, mine, 0);
+    if (kAdds) before.add_to(mine);
   } else if (i < s.count) {
-    zero_row(mine.cov3d, 0, 6), zero_row(mine.colors, 0, 3);
+    if (!kAdds) zero_row(mine.cov3d, 0, 6), zero_row(mine.colors, 0, 3);
     for (int k = 0; k < 3 * s.rest_bands; ++k) row[k] = 0;
   }
   if (first >= s.count) return;
@@ -104,8 +142,12 @@ __global__ void __launch_bounds__(kThreads)
     step_gaussians<kRest>(step, first, s.count, gradients, warp_rows);
     return;
   }
-  if (i < s.count) write_gradient(g, i, out);
-  if (out.sh_rest)
+  if (kAdds && seen) add_gradient(out, i, g);
+  if (kAdds ? seen : i < s.count) write_gradient(g, i, out);
+  if (!out.sh_rest) return;
+  if (kAdds)
+    add_rows(warp_rows, first, __ballot_sync(kWarp, seen), 3 * s.rest_bands, out.sh_rest);
+  else
     write_rows(warp_rows, first, int(s.count - first < 32 ? s.count - first : 32), 3 * s.rest_bands, out.sh_rest);
 }
 
@@ -115,6 +157,15 @@ void launch_project_vjp(const Queue& queue, const Scene<float>& s, const Source&
   project_vjp_kernel<<<blocks_for(s.count, kThreads), kThreads, 0, stream_of(queue)>>>(queue.halted, s, source, out,
                                                                                        step);
   check_launch("project_vjp");
+}
+
+template <class Source>
+void launch_gradients(const Queue& queue, const Scene<float>& s, const Source& source,
+                      const SceneGradient<float>& out) {
+  if (out.adds)
+    launch_project_vjp(queue, s, source, out, Addition{});
+  else
+    launch_project_vjp(queue, s, source, out, StepParameters{});
 }
 
 void launch_step(const Queue& queue, const Scene<float>& s, const SlotSums& source, const GaussianStep<float>& step) {
@@ -130,14 +181,14 @@ void launch_step(const Queue& queue, const Scene<float>& s, const SlotSums& sour
 template <>
 void project_vjp<float>(const Queue& queue, const Scene<float>& s, const int32_t* tile_counts, const float* moments,
                         const SceneGradient<float>& out) {
-  if (s.count) launch_project_vjp(queue, s, StoredMoments{moments, tile_counts}, out, StepParameters{});
+  if (s.count) launch_gradients(queue, s, StoredMoments{moments, tile_counts}, out);
 }
 
 void rasterize_vjp(const Queue& queue, const Scene<float>& s, const BlendInput<float>& in,
                    const BlendGradient<float>& g, const GradientMemory& memory) {
   if (!s.count) return;
   const SlotSums source{fill_rows(queue, in, g), g.slots};
-  launch_project_vjp(queue, s, source, memory.take(memory.context), StepParameters{});
+  launch_gradients(queue, s, source, memory.take(memory.context));
 }
 
 void rasterize_vjp_step(const Queue& queue, const Scene<float>& s, const BlendInput<float>& in,
@@ -149,7 +200,7 @@ void rows_vjp(const Queue& queue, const Scene<float>& s, const SplatRows<float>&
               const GradientMemory& memory) {
   if (!s.count) return;
   const SlotSums source = sums_of(queue, in, to);
-  launch_project_vjp(queue, s, source, memory.take(memory.context), StepParameters{});
+  launch_gradients(queue, s, source, memory.take(memory.context));
 }
 
 void rows_vjp_step(const Queue& queue, const Scene<float>& s, const SplatRows<float>& in, const RowSums<float>& to,

@@ -629,17 +629,28 @@ void emulated_gradients(const gs::Queue& queue, const Rendered& r, const gs::Sce
   gs::cuda::rasterize_vjp(queue, r.scene, r.input, r.backward, {take, &copy});
 }
 
+// Gradients from rows, once written and once added to numbers, are the same.
+std::vector<float> gradients_from_rows(const gs::Queue& queue, const Rendered& r, const KeptRows& rows,
+                                       float* lengths) {
+  const auto take = [](void* to) { return *static_cast<const gs::SceneGradient<float>*>(to); };
+  GradientRowsInMemory gradient(r.scene.count), sums(r.scene.count);
+  std::fill(sums.memory.begin(), sums.memory.end(), 0.25f);
+  sums.pointers.adds = true;
+  for (GradientRowsInMemory* to : {&gradient, &sums})
+    gs::cuda::rows_vjp(queue, r.scene, rows.given(r), {r.splats.data(), r.scene.image, nullptr, lengths},
+                       {take, &to->pointers});
+  for (size_t k = 0; k < sums.memory.size(); ++k) CHECK(sums.memory[k] == 0.25f + gradient.memory[k]);
+  return gradient.memory;
+}
+
 // Gradients of the emulated backward, from rows or from the lists.
 std::vector<float> gradients_from(const gs::Queue& queue, const Rendered& r, const KeptRows* rows, float* lengths) {
+  if (rows) return gradients_from_rows(queue, r, *rows, lengths);
   GradientRowsInMemory gradient(r.scene.count);
   const auto take = [](void* to) { return *static_cast<const gs::SceneGradient<float>*>(to); };
   gs::BlendGradient<float> g = r.backward;
   g.absolute = lengths;
-  if (rows)
-    gs::cuda::rows_vjp(queue, r.scene, rows->given(r), {r.splats.data(), r.scene.image, nullptr, lengths},
-                       {take, &gradient.pointers});
-  else
-    gs::cuda::rasterize_vjp(queue, r.scene, r.input, g, {take, &gradient.pointers});
+  gs::cuda::rasterize_vjp(queue, r.scene, r.input, g, {take, &gradient.pointers});
   return gradient.memory;
 }
 

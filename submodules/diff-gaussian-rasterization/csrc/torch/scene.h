@@ -3,6 +3,7 @@
 // SCENE_PARAMETERS and SCENE_ARGUMENTS, to Input, to the table of rows and the constructor in scene.cpp, and to the
 // structs of data.h.
 #include <array>
+#include <cstddef>
 #include <tuple>
 #include <utility>
 
@@ -96,10 +97,11 @@ class SceneTensors {
   gs::Image image_;
 };
 
-// Owns the gradients of the inputs; those not wanted have no rows.
+// Owns the gradients of the inputs; those not wanted have no rows. They are new, or `sums` that gradients are added to.
 class SceneGradients {
  public:
   SceneGradients(const SceneTensors& in, const Wanted& wanted);
+  SceneGradients(const SceneTensors& in, List<Tensor> sums);
 
   template <class T>
   gs::SceneGradient<T> pointers() {
@@ -110,12 +112,14 @@ class SceneGradients {
  private:
   template <class T, size_t... kInput>
   gs::SceneGradient<T> pointers(std::index_sequence<kInput...>) {
-    static_assert(sizeof(gs::SceneGradient<T>) == kInputs * sizeof(T*), "SceneGradient and Input have the same fields");
-    return {(wanted_[kInput] ? write<T>(tensors_[kInput]) : nullptr)...};
+    static_assert(offsetof(gs::SceneGradient<T>, adds) == kInputs * sizeof(T*),
+                  "SceneGradient and Input have the same fields");
+    return {(wanted_[kInput] ? write<T>(tensors_[kInput]) : nullptr)..., adds_};
   }
 
   Wanted wanted_;
   InputTensors tensors_;
+  bool adds_;
 };
 
 }  // namespace gs::ops
