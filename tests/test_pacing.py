@@ -284,7 +284,7 @@ def test_strategies_grow_within_windows_of_the_schedule(colmap_scene, tmp_path, 
     assert strategy == "mcmc" or counts[-1] == 5000
 
 
-@pytest.mark.parametrize(("steps", "factor"), [(60, math.sqrt(2)), (3, 5.0), (240, 1.0)])
+@pytest.mark.parametrize(("steps", "factor"), [(60, 2.0), (12, 2 * math.sqrt(10)), (3, 8.0), (240, 1.0)])
 def test_few_steps_have_larger_rates(colmap_scene, tmp_path, monkeypatch, steps, factor):
     path, rates, begins = tmp_path / "few.json", [], ProgressBar.begins
     write_schedule(path, Schedule(120, [Block(steps, 0.0, 1 / steps, 0.0)], steps, 9.0, levels=()))
@@ -297,9 +297,20 @@ def test_few_steps_have_larger_rates(colmap_scene, tmp_path, monkeypatch, steps,
     words = ["-s", colmap_scene, "-m", tmp_path / "out", "-r", 24, "--no_curve", "--test_iterations", -1]
     train.main([*map(str, words), "--schedule", str(path), "--iterations", "120", "--plain_step"])
     assert len(rates) == steps
-    before, later = rates[0], rates[-1]  # the first one is told before its rates are set
+    before, later = rates[0], rates[steps // 2]  # those of an iteration are set after it is told
     assert [later[n] / before[n] for n in ("f_dc", "opacity", "scaling", "rotation")] == pytest.approx([factor] * 4)
     assert later["xyz"] < 1.01 * before["xyz"]
+
+
+@pytest.mark.parametrize(("steps", "factor"), [(50, 2.0), (100, 1.0), (400, 1.0)])
+def test_rates_fall_to_a_tenth_at_the_end(steps, factor):
+    pace = Paced(Schedule(100, [Block(steps, 0.0, 1 / steps, 0.0)], steps, 9.0, levels=()))
+    factors = [pace.rate_factor(iteration) for iteration in range(1, steps + 1)]
+    held = int(0.7 * steps)
+    assert factors[:held] == pytest.approx([factor] * held) and factors[-1] == pytest.approx(0.1 * factor)
+    falling = factors[held:]
+    assert falling == sorted(falling, reverse=True) and falling[0] > 0.98 * factor
+    assert pace.rate_factor(int(0.85 * steps)) == pytest.approx(0.55 * factor, abs=0.05 * factor)
 
 
 def _timed(monkeypatch: pytest.MonkeyPatch, cost: Callable[[int], float]) -> None:

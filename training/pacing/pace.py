@@ -10,7 +10,10 @@ from bisect import bisect_left
 from collections.abc import Sequence
 from typing import NamedTuple
 
-MOST_RATE = 5.0  # what 1,000 steps for 30,000 were best with, about
+LONGER = 2.0  # times the root of the stride, at most
+MOST_RATE = 8.0  # about the best for 1,300 iterations in place of 30,000 (docs/results/tried.md)
+SETTLING = 0.7  # part of the schedule from which on steps get shorter
+LEAST_RATE = 0.1  # part of a rate that is left at the end
 Levels = Sequence[tuple[float, float]]  # part of the schedule that is done (0 to 1), and factor of sizes from then on
 
 PYRAMID: Levels = ((0.0, 4.0), (0.1, 2.0), (0.25, 1.0))
@@ -118,8 +121,14 @@ class Paced(Pace):
         return self._block(iteration)[1].step * self.length
 
     def rate_factor(self, iteration: int) -> float:
-        """The root of `stride`, 1 to MOST_RATE: few steps have to be longer ones."""
-        return min(max(math.sqrt(self.stride(iteration)), 1.0), MOST_RATE)
+        """Few steps have to be longer ones: `stride`, but at most LONGER times its root and MOST_RATE, and at least 1.
+
+        Towards the end all get shorter, smoothly, down to LEAST_RATE of that, so that the Gaussians settle.
+        """
+        stride = self.stride(iteration)
+        longer = min(stride, LONGER * math.sqrt(stride), MOST_RATE)
+        late = min(max(self.progress(iteration) - SETTLING, 0.0) / (1.0 - SETTLING), 1.0)
+        return max(longer, 1.0) * (1.0 - (1.0 - LEAST_RATE) * late * late * (3.0 - 2.0 * late))
 
     def known(self, planned: Sequence[int]) -> list[int]:
         return [self.ends] if self.ends is not None and self.length in planned else []
