@@ -29,6 +29,7 @@ from records.curve_schedule import CurveSchedule, subset_size
 from records.error_curve import COLUMNS, Row, best_test, continue_curve, read_curve, whole_sets, write_curve
 from records.training_log import TrainingLog
 from training import objective
+from training.observers.report import Report
 from utils.host import process
 from utils.loss_utils import ssim
 from utils.system_utils import UserError
@@ -431,7 +432,8 @@ class TestTraining:
         assert said[0].startswith(log[-1]["lines"][0])
 
     def test_a_row_tells_of_the_model_saved_at_its_iteration(self, colmap_scene, tmp_path, monkeypatch):
-        out = tmp_path / "out"
+        out, measured = tmp_path / "out", Report.measured
+        monkeypatch.setattr(Report, "measured", lambda *words: (time.sleep(0.005), measured(*words)))  # after the curve
         _train(colmap_scene, out, "--save_iterations", 30, "--test_iterations", 30, iterations=60)
         row = next(row for row in read_curve(out / "error_vs_time.csv") if row["iteration"] == 30)
         monkeypatch.setattr(sys, "argv", ["render.py", "-m", str(out), "--iteration", "30", "--quiet"])

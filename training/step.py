@@ -10,7 +10,7 @@ from scene.cameras import Camera
 
 @dataclass(slots=True)
 class Step:
-    """One iteration, counted from 1. Run.steps makes it; only `due`, `record`, `stopping` and the end change later.
+    """One iteration, counted from 1. Run.steps makes it; only the fields `due` to `stopping` and its end change later.
 
     An observer that is asked before those that save may end the training with this iteration (`end`), in `measured`.
     """
@@ -24,6 +24,7 @@ class Step:
     started: float  # seconds of training before it
     due: bool = False  # the model is read, written or changed, so every loss so far must be checked first
     record: dict[str, float] | None = None  # what train_log.json gets of this iteration; None: no record
+    scored_at: float | None = None  # seconds of training when the curve scored it, for all records of the same score
     stopping: type[KeyboardInterrupt] | None = None  # raised once the step is complete
     span: range = None  # iterations of the schedule that it stands for (training/pacing), itself by default
 

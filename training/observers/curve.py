@@ -54,7 +54,7 @@ class Curve(Observer):
 
     def measured(self, step: Step, losses: Losses) -> None:
         if self._due or step.last:
-            self._seconds = self._run.clock.seconds
+            self._seconds = step.scored_at = self._run.clock.seconds
             with self._run.clock.paused("scoring"):
                 self._recorder.add(self._point(step), self._seconds, self._run.gaussians.total, step.iteration)
 

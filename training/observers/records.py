@@ -16,8 +16,8 @@ class Records(Observer):
     def measured(self, step: Step, losses: Losses) -> None:
         if step.record is None:
             return
-        run, seconds = self._run, self._run.clock.seconds
-        self._seconds = seconds
+        run = self._run
+        self._seconds = seconds = run.clock.seconds if step.scored_at is None else step.scored_at
         with run.clock.paused("saving"):
             run.log.add(step.iteration, seconds, gaussians=run.gaussians.total, loss=run.losses.mean, **step.record)
 
