@@ -194,6 +194,25 @@ def test_every_instruction_set_is_in_the_library(tmp_path: Path) -> None:
         assert library.lanes_neon() == 5
 
 
+def test_the_library_has_the_same_bytes_wherever_it_is_built(tmp_path: Path) -> None:
+    kernel = """
+        #define NAME_(isa) place_##isa
+        #define NAME(isa) NAME_(isa)
+        extern "C" __attribute__((visibility("default"))) const char* NAME(GS_ISA)() { return __FILE__; }"""
+    libraries = []
+    for name in ("one", "another_one"):
+        folder = tmp_path / name / "toy"
+        folder.mkdir(parents=True)
+        write_extension(folder, kernel)
+        done = build_extension(folder)
+        assert done.returncode == 0, done.stderr
+        libraries.append(folder / "toy" / "_backend.so")
+    assert libraries[0].read_bytes() == libraries[1].read_bytes()
+    place = ctypes.CDLL(str(libraries[0])).place_baseline
+    place.restype = ctypes.c_char_p
+    assert place() == b"./toy/csrc/cpu/kernel_isa.cpp"
+
+
 def test_compile_error_ends_without_traceback(tmp_path: Path) -> None:
     write_extension(tmp_path, "int broken() { return no_such_name; }")
     done = build_extension(tmp_path)

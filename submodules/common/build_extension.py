@@ -113,7 +113,10 @@ class BuildBackends(build_ext):
 
 def compilations(torch: ModuleType, cxx: list[str], nvcc: str | None, csrc: Path, objects: Path) -> list[Compilation]:
     """All that is compiled for one library. nvcc: None for a build without CUDA."""
-    compile_cxx = [*cxx, *CXX_FLAGS, f"-I{csrc}", f"-I{COMMON_INCLUDE}"]
+    headers = Path(torch.__file__).parent / "include"
+    # Messages name files without the folders of this machine, so that every machine builds the same bytes.
+    places = [f"-ffile-prefix-map={folder}={name}" for folder, name in ((csrc.parents[1], "."), (headers, "torch"))]
+    compile_cxx = [*cxx, *CXX_FLAGS, *places, f"-I{csrc}", f"-I{COMMON_INCLUDE}"]
     isas = {"baseline": []}
     if platform.machine() in ("x86_64", "AMD64"):
         compile_cxx.append("-DGS_X86")
@@ -121,7 +124,7 @@ def compilations(torch: ModuleType, cxx: list[str], nvcc: str | None, csrc: Path
     elif platform.machine() in ("aarch64", "arm64", "ARM64"):
         compile_cxx.append("-DGS_ARM64")
         isas = ARM64_ISAS
-    ops_flags = ["-isystem", str(Path(torch.__file__).parent / "include")]
+    ops_flags = ["-isystem", str(headers)]
     ops_flags += [f"-DTORCH_TARGET_VERSION={target_version(OLDEST_TORCH)}"]
     kernels = sorted((csrc / "cuda").glob("*.cu")) if nvcc else []
     if kernels:
@@ -143,7 +146,10 @@ def compilations(torch: ModuleType, cxx: list[str], nvcc: str | None, csrc: Path
         compile_cuda = [nvcc, "-O3", "-std=c++17", "-Xcompiler", "-fPIC,-fvisibility=hidden"]
         at_hand = [torch.cuda.get_device_capability(k) for k in range(torch.cuda.device_count())]
         compile_cuda += [*architecture_flags(nvcc, at_hand), f"-I{csrc}", f"-I{COMMON_INCLUDE}"]
-        plan += [Compilation(compile_cuda, source, objects / f"{source.stem}.cu.o") for source in kernels]
+        for source in kernels:
+            # The names of what is local depend on the seed and on the source's path, not on chance.
+            command = [*compile_cuda, "-objtemp", f"-frandom-seed={source.stem}"]
+            plan.append(Compilation(command, source, objects / f"{source.stem}.cu.o"))
     return plan
 
 
