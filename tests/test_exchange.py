@@ -141,6 +141,10 @@ def test_wrong_splats_are_named():
     refused(TypeError, "gaussians must be torch.int64", packed, gaussians.int())
     refused(ValueError, "gaussians must be from 0 to 8, got 9", packed, torch.tensor([2, 9, 3]))
     refused(ValueError, "gaussians must be from 0 to 8, got -1", packed, torch.tensor([2, 1, -1]))
+    moved = torch.zeros(49, dtype=torch.int32)[1:].view(3, 16)
+    refused(ValueError, "packed must begin at a multiple of 16 bytes", moved)
+    with pytest.raises(ValueError, match="packed must begin at a multiple of 16 bytes"):
+        ops.unpack_splats(moved, splats[0])
     with pytest.raises(ValueError, match=r"packed must be \(-1, 27\)"):
         ops.unpack_splats(packed, splats[0].double())
     with pytest.raises(TypeError, match="like must be float32 or float64, got torch.int32"):
@@ -156,6 +160,7 @@ def test_wrong_runs_are_named():
 
     refused(ValueError, r"rows must be \(R, 10\) or \(R, 12\), got \(5, 11\)", [5], [0], torch.rand(5, 11))
     refused(TypeError, "rows must be float32 or float64", [5], [0], rows.int())
+    refused(ValueError, "rows must begin at a multiple of 8 bytes", [4], [0], torch.rand(41)[1:].view(4, 10))
     refused(ValueError, r"places must be \(2,\)", [3, 2], [0])
     refused(ValueError, "counts add up to 4, but there are 5 rows", [3, 1], [0, 1])
     refused(ValueError, "counts must be 0 or more, got -1 of run 1", [6, -1], [0, 1])

@@ -159,8 +159,7 @@ void launch_project_vjp(const Queue& queue, const Scene<float>& s, const Source&
   check_launch("project_vjp");
 }
 
-template <class Source>
-void launch_gradients(const Queue& queue, const Scene<float>& s, const Source& source,
+void launch_gradients(const Queue& queue, const Scene<float>& s, const SlotSums& source,
                       const SceneGradient<float>& out) {
   if (out.adds)
     launch_project_vjp(queue, s, source, out, Addition{});
@@ -181,7 +180,7 @@ void launch_step(const Queue& queue, const Scene<float>& s, const SlotSums& sour
 template <>
 void project_vjp<float>(const Queue& queue, const Scene<float>& s, const int32_t* tile_counts, const float* moments,
                         const SceneGradient<float>& out) {
-  if (s.count) launch_gradients(queue, s, StoredMoments{moments, tile_counts}, out);
+  if (s.count) launch_project_vjp(queue, s, StoredMoments{moments, tile_counts}, out, StepParameters{});
 }
 
 void rasterize_vjp(const Queue& queue, const Scene<float>& s, const BlendInput<float>& in,
