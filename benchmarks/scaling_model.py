@@ -208,8 +208,9 @@ def views_step(scene: Workload, machine: Machine) -> dict[str, float]:
     parts = stages(scene.gaussians, scene.seen, scene.seen, scene.instances, scene.processed, scene.pixels)
     parts["project"] += 0.026 * (gpus - 1)  # all views, of a shard each
     del parts["project_vjp, Adam"]
-    # project_vjp of every view of a shard, and the sum of gradients: two read, one written.
-    parts["project_vjp"] = 0.19 * scene.seen / 1e6 + 1e3 * 3 * PARAMETERS * scene.gaussians / MEMORY
+    # project_vjp of every view of a shard. The first writes all gradients, the others read and write those they change.
+    summed = scene.gaussians / gpus + 2 * scene.seen * (gpus - 1) / gpus
+    parts["project_vjp"] = 0.19 * scene.seen / 1e6 + 1e3 * PARAMETERS * summed / MEMORY
     parts["Adam"] = 0.534 * n / gpus
     sent = sum(views_traffic(scene, gpus).values())
     parts["copies"] = 1e3 * 8 * sent / MEMORY
