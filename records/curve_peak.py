@@ -7,9 +7,14 @@ from records.error_curve import Row, best_test, whole_sets
 CLEAR = 0.1  # dB between best and last point; points of a settled training differed by up to 0.07
 
 
-def schedules_follow_length(depths: bool, train_test_exp: bool, resolution_schedule: str = "none") -> bool:
-    """Whether a schedule follows --iterations: depth loss's weight, exposures' learning rate, or views' sizes."""
-    return depths or train_test_exp or resolution_schedule != "none"
+def schedules_follow_length(
+    depths: bool, train_test_exp: bool, resolution_schedule: str = "none", rates: bool = False
+) -> bool:
+    """Whether a schedule follows --iterations: depth loss's weight, exposures' learning rate, or views' sizes.
+
+    rates: whether the other learning rates do.
+    """
+    return depths or train_test_exp or resolution_schedule != "none" or rates
 
 
 def peak_advice(

@@ -322,6 +322,7 @@ class TestPeak:
         assert schedules_follow_length(depths=True, train_test_exp=False)
         assert schedules_follow_length(depths=False, train_test_exp=True)
         assert schedules_follow_length(depths=False, train_test_exp=False, resolution_schedule="pyramid")
+        assert schedules_follow_length(depths=False, train_test_exp=False, rates=True)
         line = peak_advice(list(self.ROWS), {7000}, 30_000, follows_length=True)
         assert "ends with that model" not in line
         assert "; --save_iterations 2000 saves that model during the training; --iterations 2000 --position_lr" in line
@@ -430,6 +431,13 @@ class TestTraining:
                          capfd.readouterr().out, re.MULTILINE)  # fmt: skip
         log = json.loads((tmp_path / "out" / "train_log.json").read_text())
         assert said[0].startswith(log[-1]["lines"][0])
+
+    @pytest.mark.parametrize("strategy", ["adc", "mcmc", "budget"])
+    def test_the_advice_knows_whose_rates_follow_the_length(self, colmap_scene, tmp_path, monkeypatch, strategy):
+        given, finish = [], CurveRecorder.finish
+        monkeypatch.setattr(CurveRecorder, "finish", lambda *words: (given.append(words[-1]), finish(*words)))
+        _train(colmap_scene, tmp_path / "out", "--strategy", strategy, "--max_num_splats", 400, iterations=20)
+        assert given == [strategy == "budget"]
 
     def test_a_row_tells_of_the_model_saved_at_its_iteration(self, colmap_scene, tmp_path, monkeypatch):
         out, measured = tmp_path / "out", Report.measured

@@ -23,7 +23,7 @@ from training.observers import target
 from training.observers.progress import ProgressBar
 from training.observers.schedule import ScheduleFile
 from training.pacing.clocked import Clocked
-from training.pacing.pace import Block, Pace, Paced, Schedule
+from training.pacing.pace import Block, Pace, Paced, Schedule, Settling
 from training.pacing.resolution import Resolution
 from training.pacing.schedule_file import read_schedule, write_schedule
 from utils.system_utils import UserError
@@ -286,20 +286,46 @@ def test_strategies_grow_within_windows_of_the_schedule(colmap_scene, tmp_path, 
 
 @pytest.mark.parametrize(("steps", "factor"), [(60, 2.0), (12, 2 * math.sqrt(10)), (3, 8.0), (240, 1.0)])
 def test_few_steps_have_larger_rates(colmap_scene, tmp_path, monkeypatch, steps, factor):
-    path, rates, begins = tmp_path / "few.json", [], ProgressBar.begins
+    path = tmp_path / "few.json"
     write_schedule(path, Schedule(120, [Block(steps, 0.0, 1 / steps, 0.0)], steps, 9.0, levels=()))
+    rates = _rates(monkeypatch, colmap_scene, tmp_path / "out", "--schedule", path, "--iterations", 120)
+    assert len(rates) == steps
+    before, later = rates[0], rates[steps // 2]  # those of an iteration are set after it is told
+    assert [later[n] / before[n] for n in ("f_dc", "opacity", "scaling", "rotation")] == pytest.approx([factor] * 4)
+    assert later["xyz"] < 1.01 * before["xyz"]
+
+
+@pytest.mark.parametrize(("strategy", "factor"), [("adc", 1.0), ("mcmc", 1.0), ("budget", 8.0)])
+def test_the_budget_has_larger_rates_in_few_iterations_without_a_clock_too(
+    colmap_scene, tmp_path, monkeypatch, strategy, factor
+):
+    words = "--strategy", strategy, "--max_num_splats", 500, "--iterations", 20
+    rates = _rates(monkeypatch, colmap_scene, tmp_path / "out", *words)
+    assert rates[10]["opacity"] / rates[0]["opacity"] == pytest.approx(factor)
+    assert rates[10]["xyz"] < 1.01 * rates[0]["xyz"]
+    assert (rates[-1]["opacity"] < 0.3 * rates[10]["opacity"]) == (strategy == "budget")
+
+
+def _rates(monkeypatch: pytest.MonkeyPatch, scene: Path, out: Path, *words: object) -> list[dict[str, float]]:
+    """Learning rates of a training before each iteration sets its own."""
+    rates, begins = [], ProgressBar.begins
 
     def note(self, step) -> None:
         rates.append({group["name"]: group["lr"] for group in self._run.gaussians.optimizer.param_groups})
         begins(self, step)
 
     monkeypatch.setattr(ProgressBar, "begins", note)
-    words = ["-s", colmap_scene, "-m", tmp_path / "out", "-r", 24, "--no_curve", "--test_iterations", -1]
-    train.main([*map(str, words), "--schedule", str(path), "--iterations", "120", "--plain_step"])
-    assert len(rates) == steps
-    before, later = rates[0], rates[steps // 2]  # those of an iteration are set after it is told
-    assert [later[n] / before[n] for n in ("f_dc", "opacity", "scaling", "rotation")] == pytest.approx([factor] * 4)
-    assert later["xyz"] < 1.01 * before["xyz"]
+    every = "-s", scene, "-m", out, "-r", 24, "--no_curve", "--test_iterations", -1, "--plain_step", *words
+    train.main([*map(str, every)])
+    return rates
+
+
+@pytest.mark.parametrize(("steps", "factor"), [(7000, 2 * math.sqrt(30 / 7)), (15_000, 2.0), (60_000, 1.0)])
+def test_steps_that_follow_the_number_of_iterations(steps, factor):
+    pace = Settling(steps)
+    assert pace.rate_factor(1) == pace.rate_factor(int(0.7 * steps)) == pytest.approx(factor)
+    assert pace.rate_factor(int(0.85 * steps)) == pytest.approx(0.55 * factor, abs=0.01 * factor)
+    assert pace.rate_factor(steps) == pytest.approx(0.1 * factor)
 
 
 @pytest.mark.parametrize(("steps", "factor"), [(50, 2.0), (100, 1.0), (400, 1.0)])

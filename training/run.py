@@ -25,7 +25,6 @@ from training.loss_watch import LossWatch
 from training.memory_estimate import announce_memory
 from training.objective import Objective
 from training.pacing import schedule_file
-from training.pacing.batched import Batched
 from training.pacing.choose import pace_of, resolution_of
 from training.pacing.pace import Paced
 from training.plan import Plan
@@ -214,8 +213,8 @@ class Run:
     def set_rates(self, step: Step) -> None:
         """Set the learning rates of a step, which may be one that is repeated."""
         self.gaussians.update_learning_rate(self.pace.nominal(step.iteration))
-        if isinstance(self.pace, (Paced, Batched)):
-            self.gaussians.scale_rates(self.pace.rate_factor(step.iteration))
+        if (factor := self.pace.rate_factor(step.iteration)) is not None:
+            self.gaussians.scale_rates(factor)
 
     def _decode_ahead(self, iteration: int) -> None:
         ahead = self.scene.images.ahead

@@ -9,7 +9,7 @@ from records.curve_recorder import CurveRecorder, evenly_spread
 from scene.cameras import Camera
 from training.objective import Losses
 from training.observer import Error, Observer
-from training.pacing.pace import Paced
+from training.pacing.pace import Paced, Settling
 from training.run import Run
 from training.step import Step
 from utils.system_utils import saved_iterations
@@ -65,6 +65,8 @@ class Curve(Observer):
         run = self._run
         there = saved_iterations(Path(run.scene.model_path) / "point_cloud")
         saved, lr_max_steps = {*run.pace.known(run.plan.save)} & {*there}, run.opt.position_lr_max_steps
-        follows_length = schedules_follow_length(bool(run.dataset.depths), run.dataset.train_test_exp, run.pace.sizes)
+        follows_length = schedules_follow_length(
+            bool(run.dataset.depths), run.dataset.train_test_exp, run.pace.sizes, isinstance(run.pace, Settling)
+        )
         steady = not isinstance(run.pace, Paced)
         self._recorder.finish(self._seconds, saved, lr_max_steps if steady else None, follows_length)

@@ -9,7 +9,7 @@ from scene.cameras import Camera
 from scene.pictures.store import ImageStore
 from training.pacing.batched import Batched
 from training.pacing.clocked import Clocked
-from training.pacing.pace import PYRAMID, Block, Levels, Pace, Paced, Schedule
+from training.pacing.pace import PYRAMID, Block, Levels, Pace, Paced, Schedule, Settling
 from training.pacing.resolution import Resolution
 from training.pacing.schedule_file import NAME, covers, read_schedule
 from training.pacing.spectrum import levels_of
@@ -47,7 +47,7 @@ def _chosen(opt: argparse.Namespace, checkpoint: str | None, first_iteration: in
     if not opt.time_budget:
         if path and covers(path, first_iteration):
             _tell_of_budget(checkpoint, first_iteration, opt.iterations)
-        return Pace(opt.iterations)
+        return Settling(opt.iterations) if opt.strategy == "budget" else Pace(opt.iterations)
     if not path:
         return Clocked(Schedule(opt.iterations, [], None, opt.time_budget, opt.resolution_schedule))
     return Clocked(_before(path, checkpoint, opt, first_iteration)._replace(time_budget=opt.time_budget))

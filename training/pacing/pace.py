@@ -10,6 +10,7 @@ from bisect import bisect_left
 from collections.abc import Sequence
 from typing import NamedTuple
 
+USUAL = 30_000  # iterations that the default learning rates are for
 LONGER = 2.0  # times the root of the stride, at most
 MOST_RATE = 8.0  # about the best for 1,300 iterations in place of 30,000 (docs/results/tried.md)
 SETTLING = 0.7  # part of the schedule from which on steps get shorter
@@ -53,9 +54,9 @@ class Pace:
         """Iterations of the schedule that one of the run stands for, at that place."""
         return 1.0
 
-    def rate_factor(self, iteration: int) -> float:
-        """Factor of the learning rates that have no schedule."""
-        return 1.0
+    def rate_factor(self, iteration: int) -> float | None:
+        """Factor of the learning rates that have no schedule. None: they are left as they are."""
+        return None
 
     def is_last(self, iteration: int) -> bool:
         """Whether a run that is not stopped ends with this iteration."""
@@ -71,6 +72,25 @@ class Pace:
 
 
 STEADY = Pace(0)  # of no length, for those who only ask what an iteration stands for
+
+
+class Settling(Pace):
+    """The steady pace with learning rates that follow the number of iterations, and fall at the end."""
+
+    def rate_factor(self, iteration: int) -> float:
+        return longer_steps(USUAL / self.length, iteration / self.length)
+
+
+def longer_steps(stride: float, progress: float) -> float:
+    """Factor of learning rates where an iteration stands for `stride` of those that the rates are for.
+
+    Few steps have to be longer ones: `stride`, but at most LONGER times its root and MOST_RATE, and at least 1. Towards
+    the end all get shorter, smoothly, down to LEAST_RATE of that, so that the Gaussians settle. progress: part of the
+    schedule that is done, 0 to 1.
+    """
+    longer = min(stride, LONGER * math.sqrt(stride), MOST_RATE)
+    late = min(max(progress - SETTLING, 0.0) / (1.0 - SETTLING), 1.0)
+    return max(longer, 1.0) * (1.0 - (1.0 - LEAST_RATE) * late * late * (3.0 - 2.0 * late))
 
 
 class Block(NamedTuple):
@@ -121,14 +141,7 @@ class Paced(Pace):
         return self._block(iteration)[1].step * self.length
 
     def rate_factor(self, iteration: int) -> float:
-        """Few steps have to be longer ones: `stride`, but at most LONGER times its root and MOST_RATE, and at least 1.
-
-        Towards the end all get shorter, smoothly, down to LEAST_RATE of that, so that the Gaussians settle.
-        """
-        stride = self.stride(iteration)
-        longer = min(stride, LONGER * math.sqrt(stride), MOST_RATE)
-        late = min(max(self.progress(iteration) - SETTLING, 0.0) / (1.0 - SETTLING), 1.0)
-        return max(longer, 1.0) * (1.0 - (1.0 - LEAST_RATE) * late * late * (3.0 - 2.0 * late))
+        return longer_steps(self.stride(iteration), self.progress(iteration))
 
     def known(self, planned: Sequence[int]) -> list[int]:
         return [self.ends] if self.ends is not None and self.length in planned else []
