@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 USUAL = 30_000  # iterations that the default learning rates are for
-LONGER = 2.0  # times the root of the stride, at most
+LONGER = 2.0  # times the root of the stride
 MOST_RATE = 8.0  # about the best for 1,300 iterations in place of 30,000 (docs/results/tried.md)
 SETTLING = 0.7  # part of the schedule from which on steps get shorter
 LEAST_RATE = 0.1  # part of a rate that is left at the end
@@ -84,13 +84,13 @@ class Settling(Pace):
 def longer_steps(stride: float, progress: float) -> float:
     """Factor of learning rates where an iteration stands for `stride` of those that the rates are for.
 
-    Few steps have to be longer ones: `stride`, but at most LONGER times its root and MOST_RATE, and at least 1. Towards
-    the end all get shorter, smoothly, down to LEAST_RATE of that, so that the Gaussians settle. progress: part of the
+    Few steps have to be longer ones: LONGER times the root of `stride`, at most MOST_RATE and at least 1. Towards the
+    end all get shorter, smoothly, down to LEAST_RATE of that, so that the Gaussians settle. progress: part of the
     schedule that is done, 0 to 1.
     """
-    longer = min(stride, LONGER * math.sqrt(stride), MOST_RATE)
+    longer = max(min(LONGER * math.sqrt(stride), MOST_RATE), 1.0)
     late = min(max(progress - SETTLING, 0.0) / (1.0 - SETTLING), 1.0)
-    return max(longer, 1.0) * (1.0 - (1.0 - LEAST_RATE) * late * late * (3.0 - 2.0 * late))
+    return longer * (1.0 - (1.0 - LEAST_RATE) * late * late * (3.0 - 2.0 * late))
 
 
 class Block(NamedTuple):
