@@ -15,7 +15,7 @@ from setuptools import setup
 ROOT = Path(__file__).resolve().parent
 sys.path.insert(0, str(ROOT / "submodules" / "common"))
 
-from build_extension import OLDEST_TORCH, VERSION, cuda_major, extension_options, find_nvcc  # noqa: E402
+from build_extension import OLDEST_TORCH, VERSION, cuda_version, extension_options, find_nvcc  # noqa: E402
 
 EXTENSIONS = ("diff-gaussian-rasterization", "fused-ssim", "simple-knn")
 
@@ -32,7 +32,7 @@ def requirements() -> list[str]:
 
 def version() -> str:
     """Tell a wheel with CUDA kernels from one without."""
-    return f"{VERSION}+cu{cuda_major(find_nvcc(None))}" if os.environ.get("GS_CUDA") == "1" else VERSION
+    return f"{VERSION}+cu{cuda_version(find_nvcc(None))[0]}" if os.environ.get("GS_CUDA") == "1" else VERSION
 
 
 setup(

@@ -41,6 +41,11 @@ BOTH_AND_GPU = pytest.mark.parametrize(("device", "dtype"), [_param(k, *place) f
 DTYPES_AND_GPU = pytest.mark.parametrize("dtype", [_param(k, place) for k, place in _PLACES.items()], indirect=True)
 
 
+def moved_by_a_word(t: Tensor) -> Tensor:
+    """The same values, which begin at no multiple of 8 bytes."""
+    return torch.cat((t.new_zeros(1), t.reshape(-1)))[1:].view(t.shape)
+
+
 class Error(NamedTuple):
     """Largest and median difference of a tensor, over the largest value of its reference."""
 

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import pytest
 import torch
 from diff_gaussian_rasterization import GaussianRasterizationSettings, fakes, schema
-from rasterizer_tools import BOTH_AND_GPU, few, ops, scene_arguments
+from rasterizer_tools import BOTH_AND_GPU, CPU_AND_GPU, few, moved_by_a_word, ops, scene_arguments
 from torch import Tensor, library
 
 from benchmarks.workloads.splat_scenes import PARAMETERS, frustum, on_device, settings
@@ -249,6 +249,22 @@ def test_a_band_has_the_pixels_of_the_image(kind, depth, device, dtype):
         _, blended = forward.blend_band(top, bottom)
         for got, whole in zip(blended[:4], forward.blended[:4], strict=True):
             assert same_bits(got[..., 16 * top : 16 * bottom, :], whole[..., 16 * top : 16 * bottom, :])
+
+
+@CPU_AND_GPU
+def test_inputs_may_begin_at_any_word(device):
+    forward = Forward.of(*scene_of("many", device, torch.float32), depth=True)
+    rows = forward.rows(False)
+    gradients, by_lists = forward.rows_vjp(rows, False), forward.lists_vjp(False)
+    forward.projected = tuple(map(moved_by_a_word, forward.projected))
+    lists = ops.bin(*forward.projected[:4], HEIGHT, WIDTH, True)
+    assert all(same_bits(a, b) for a, b in zip(lists[:2], forward.lists[:2], strict=True))
+    assert all(same_bits(a, b) for a, b in zip(forward.blend_band(0, DOWN)[1], forward.blended, strict=True))
+    forward.blended = (*forward.blended[:4], moved_by_a_word(forward.blended[4]))
+    assert same_bits(forward.rows(False).rows, rows.rows)
+    again = forward.rows_vjp(Rows(moved_by_a_word(rows.rows), rows.counts), False)
+    assert all(same_bits(a, b) for a, b in zip(again, gradients, strict=True))
+    assert all(same_bits(a, b) for a, b in zip(forward.lists_vjp(False), by_lists, strict=True))
 
 
 def test_any_number_of_threads_gives_the_same_bits():

@@ -14,6 +14,7 @@ from pathlib import Path
 from types import ModuleType, SimpleNamespace
 
 import pytest
+import torch
 
 ROOT = Path(__file__).resolve().parent.parent
 COMMON = ROOT / "submodules" / "common"
@@ -126,6 +127,16 @@ class TestCudaSwitch:
         wrapper.write_text(f'#!/bin/sh\nexec {nvcc} "$@"\n')
         wrapper.chmod(0o755)
         assert builder.toolkit_root(str(wrapper)) == (tmp_path / "cuda").resolve()
+
+    @pytest.mark.parametrize(("release", "seeded"), [("12.8", False), ("12.9", True), ("13.0", True)])
+    def test_only_an_nvcc_that_knows_seeds_gets_one(
+        self, builder: ModuleType, tmp_path: Path, release: str, seeded: bool
+    ) -> None:
+        nvcc = str(fake_nvcc(tmp_path, release))
+        csrc = ROOT / "submodules" / "simple-knn" / "csrc"
+        plan = builder.compilations(torch, ["c++"], nvcc, csrc, tmp_path)
+        kernels = [one for one in plan if one.source.suffix == ".cu"]
+        assert kernels and all((f"-frandom-seed={one.source.stem}" in one.command) == seeded for one in kernels)
 
     def test_architectures(self, builder: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
         nvcc = str(fake_nvcc(tmp_path))

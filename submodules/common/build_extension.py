@@ -31,6 +31,7 @@ from setuptools.command.build_py import build_py
 VERSION = (Path(__file__).resolve().parents[2] / "version.txt").read_text(encoding="utf-8").strip()
 OLDEST_TORCH = (2, 10)  # the first whose stable interface has all that csrc/torch calls
 OLDEST_ARCHITECTURE = 80  # reductions over a warp in one instruction
+SEEDED_CUDA = (12, 9)  # the first whose nvcc knows -frandom-seed
 COMMON_INCLUDE = Path(__file__).resolve().parent / "include"
 # No -ffast-math: NaN, infinities and the order of sums matter. Nobody reads errno or traps.
 CXX_FLAGS = ["-O3", "-std=c++17", "-Wall", "-Wextra", "-fno-math-errno", "-fno-trapping-math"]
@@ -148,7 +149,8 @@ def compilations(torch: ModuleType, cxx: list[str], nvcc: str | None, csrc: Path
         compile_cuda += [*architecture_flags(nvcc, at_hand), f"-I{csrc}", f"-I{COMMON_INCLUDE}"]
         for source in kernels:
             # The names of what is local depend on the seed and on the source's path, not on chance.
-            command = [*compile_cuda, "-objtemp", f"-frandom-seed={source.stem}"]
+            seed = [f"-frandom-seed={source.stem}"] if cuda_version(nvcc) >= SEEDED_CUDA else []
+            command = [*compile_cuda, "-objtemp", *seed]
             plan.append(Compilation(command, source, objects / f"{source.stem}.cu.o"))
     return plan
 
@@ -223,7 +225,7 @@ def find_nvcc(torch_cuda: str | None) -> str | None:
         place = f"in CUDA_HOME ({home})" if home else "on PATH"
         fail(f"GS_CUDA=1 but there is no nvcc {place}: install it, or unset GS_CUDA to build for the CPU only")
     if nvcc and not switch:
-        major = cuda_major(nvcc)
+        major, _ = cuda_version(nvcc)
         if major > int(torch_cuda.split(".")[0]):
             fail(
                 f"{nvcc} is of CUDA {major} but torch was built with CUDA {torch_cuda}, whose driver may be too "
@@ -233,10 +235,10 @@ def find_nvcc(torch_cuda: str | None) -> str | None:
     return nvcc
 
 
-def cuda_major(nvcc: str) -> int:
-    """The major version of the toolkit, 13 for one."""
-    release = re.search(r"release (\d+)\.", run([nvcc, "--version"]))
-    return int(release[1]) if release else fail(f"{nvcc} does not tell its version: set CUDA_HOME to a toolkit")
+def cuda_version(nvcc: str) -> tuple[int, int]:
+    """The version of the toolkit, (13, 0) for example."""
+    release = re.search(r"release (\d+)\.(\d+)", run([nvcc, "--version"]))
+    return (int(release[1]), int(release[2])) if release else fail(f"{nvcc} does not tell its version: set CUDA_HOME")
 
 
 def toolkit_root(nvcc: str) -> Path:

@@ -74,7 +74,7 @@ void BlendBackward::take_layers(const Tensor& layers) {
   const int64_t wanted = layer_values(image_, instances_.size(0), depth_.defined());
   GS_CHECK_VALUE(!layers.size(0) || layers.size(0) >= wanted, "layers must have ", wanted, " values, got ",
                  layers.size(0));
-  layers_ = packed(layers);
+  layers_ = aligned(layers, 4);
 }
 
 Tensor BlendBackward::plane(const MaybeTensor& t, int64_t channels) const {

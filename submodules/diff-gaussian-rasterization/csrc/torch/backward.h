@@ -41,7 +41,7 @@ class BlendBackward {
                 const Tensor& slots, const Tensor& background, const Tensor& last, const Tensor& transmittance,
                 const Tensor& grad_color, const MaybeTensor& grad_transmittance, const MaybeTensor& grad_inverse_depth)
       : image_(checked(splats, instances, ranges, splat_slots, slots, last, transmittance, grad_color)),
-        splats_(packed(splats)),
+        splats_(aligned(splats, 2)),
         instances_(packed(instances)),
         ranges_(packed(ranges)),
         splat_slots_(packed(splat_slots)),

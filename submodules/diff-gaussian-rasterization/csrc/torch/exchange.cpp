@@ -24,14 +24,6 @@ int words_of_value(const Tensor& values) {
 const int32_t* words(const Tensor& t) { return static_cast<const int32_t*>(t.const_data_ptr()); }
 int32_t* words_to_write(const Tensor& t) { return static_cast<int32_t*>(t.mutable_data_ptr()); }
 
-// GPUs move several words of float32 at a time.
-void check_begin(const Tensor& t, const char* name, int words_at_once) {
-  if (has_dtype(t, ScalarType::Double)) return;
-  const auto address = reinterpret_cast<uintptr_t>(t.const_data_ptr());
-  GS_CHECK_VALUE(address % (4 * words_at_once) == 0, name, " must begin at a multiple of ", 4 * words_at_once,
-                 " bytes");
-}
-
 // Runs a backend's function on the device of the tensor `like`, as GS_RUN does one of a precision.
 #ifdef GS_CUDA
 #define GS_RUN_WORDS(like, fn, in)         \
@@ -63,10 +55,11 @@ void pack_splats_op(Tensor& packed_rows, const Tensor& splats, const Tensor& dep
   const int wide = words_of_value(splats);
   check_tensor(packed_rows, "packed", ScalarType::Int, device, {gaussians.size(0), gs::packed_words(wide)});
   GS_CHECK_VALUE(packed_rows.is_contiguous(), "packed must be contiguous");
-  const Tensor values = packed(splats), at = packed(depths), boxes = packed(rects), counts = packed(tile_counts);
+  const auto begin = reinterpret_cast<uintptr_t>(packed_rows.const_data_ptr());
+  GS_CHECK_VALUE(wide > 1 || begin % 16 == 0, "packed must begin at a multiple of 16 bytes");
+  const Tensor values = aligned(splats, 2), at = packed(depths), boxes = aligned(rects, 2);
+  const Tensor counts = packed(tile_counts);
   const Tensor indices = packed(gaussians);
-  if (wide == 1) check_begin(packed_rows, "packed", 4);
-  check_begin(values, "splats", 2), check_begin(boxes, "rects", 2);
   check_indices(indices, splats.size(0));
   const gs::PackInput in{indices.size(0), wide,          read<int64_t>(indices), words(values),
                          words(at),       words(counts), words(boxes),           write<int32_t>(packed_rows)};
@@ -79,8 +72,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> unpack_splats_op(const Tensor& packed
   GS_CHECK_TYPE(is_floating(like.scalar_type()), "like must be float32 or float64, got ", like.scalar_type());
   const int wide = words_of_value(like);
   check_tensor(packed_rows, "packed", ScalarType::Int, like.device(), {-1, gs::packed_words(wide)});
-  const Tensor rows = packed(packed_rows);
-  if (wide == 1) check_begin(rows, "packed", 4);
+  const Tensor rows = aligned(packed_rows, 4);
   const int64_t n = rows.size(0);
   Tensor splats = empty({n, kSplatValues}, like), depths = empty({n}, like);
   Tensor rects = empty<int32_t>({n, 4}, like), tile_counts = empty<int32_t>({n}, like);
@@ -123,8 +115,7 @@ Tensor move_runs_op(const Tensor& rows, const Tensor& counts, const Tensor& plac
   check_tensor(places, "places", ScalarType::Int, rows.device(), {counts.size(0)});
   GS_CHECK(rows.size(0) <= std::numeric_limits<int32_t>::max(), rows.size(0), " rows are more than 2^31 - 1");
   const int wide = words_of_value(rows);
-  const Tensor from = packed(rows), lengths = packed(counts), order = packed(places);
-  check_begin(from, "rows", 2);
+  const Tensor from = aligned(rows, 2), lengths = packed(counts), order = packed(places);
   check_runs(lengths, order, rows.size(0));
   Tensor to = empty(rows.sizes(), rows);
   const gs::MoveInput in{lengths.size(0),      from.size(0), int(wide * from.size(1)), read<int32_t>(lengths),

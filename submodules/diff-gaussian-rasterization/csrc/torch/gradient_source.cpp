@@ -34,9 +34,9 @@ Rows::Rows(const SceneTensors& scene, ROWS_PARAMETERS, bool absolute, bool lengt
   check_tensor(counts, "counts", ScalarType::Int, scene.device(), {scene.count()});
   GS_CHECK(rows.size(0) <= std::numeric_limits<int32_t>::max(), rows.size(0), " rows are more than 2^31 - 1");
   GS_CHECK(rows.is_cpu() || scene.dtype() == ScalarType::Float, kFloatAlone);
-  splats_ = packed(splats), counts_ = packed(counts);
+  splats_ = aligned(splats, 2), counts_ = packed(counts);
   Tensor given = rows;
-  rows_ = packed(lengths ? given : torch::stable::narrow(given, 1, 0, kGradientValues));
+  rows_ = aligned(lengths ? given : torch::stable::narrow(given, 1, 0, kGradientValues), 2);
   if (rows.is_cpu()) check_sum();  // reading counts from a GPU waits for it
 }
 

@@ -130,7 +130,7 @@ Tensors4 bin_op(const Tensor& splats, const Tensor& depths, const Tensor& rects,
                 int64_t height, int64_t width, bool train) {
   check_projected(splats, depths, rects, tile_counts);
   ProjectedTensors p;
-  p.splats = packed(splats), p.depths = packed(depths), p.rects = packed(rects);
+  p.splats = aligned(splats, 2), p.depths = packed(depths), p.rects = aligned(rects, 4);
   p.tile_counts = p.radii = packed(tile_counts);
   const BinnedTensors b = bin(p, checked_image(height, width), train);
   return {b.instances, b.ranges, b.splat_slots, b.slots};
@@ -142,7 +142,7 @@ Tensors5 blend_op(const Tensor& splats, const Tensor& instances, const Tensor& r
   const gs::Image image = checked_image(height, width);
   check_lists(instances, ranges, splats, image);
   const BlendedTensors b =
-      blend(packed(splats), packed(instances), packed(ranges), background, image, inverse_depth, train);
+      blend(aligned(splats, 2), packed(instances), packed(ranges), background, image, inverse_depth, train);
   return {b.color, b.transmittance, b.inverse_depth, b.last, b.layers};
 }
 
@@ -179,7 +179,7 @@ Tensor decisive_op(const Tensor& splats, const Tensor& instances, const Tensor& 
   const gs::Image image = image_of(last, splats);
   check_lists(instances, ranges, splats, image);
   Tensor decisive = torch::stable::new_zeros(splats, {splats.size(0)}, ScalarType::Bool);
-  const Tensor rows = packed(splats), no_background = torch::stable::new_zeros(splats, {3});
+  const Tensor rows = aligned(splats, 2), no_background = torch::stable::new_zeros(splats, {3});
   const Tensor lists = packed(instances), bounds = packed(ranges), ends = packed(last);
   with_scalar(rows.scalar_type(), [&](auto zero) {
     using T = decltype(zero);
