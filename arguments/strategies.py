@@ -176,7 +176,8 @@ PACE_OPTIONS: tuple[Option, ...] = (
         "time_budget",
         0.0,
         "seconds of training that the run takes, without scoring and saving, to 3 %; 0: no budget. It goes through the "
-        "whole schedule of --iterations in them, in fewer or more iterations, and writes schedule.json",
+        "whole schedule of --iterations in them, in fewer or more iterations, with learning rates that follow their "
+        "number, and writes schedule.json",
         "ours",
         check=at_least(0),
     ),
@@ -210,7 +211,8 @@ _STRATEGY = Option(
     "adc",
     "how many Gaussians there are, and where. adc: adaptive density control, the method's own; mcmc: Gaussians that "
     "nobody sees are moved to others, and positions get noise; budget: growth to --max_num_splats Gaussians, where the "
-    "error is; 0: one for 64 training pixels, 100,000 to 1,000,000, or fewer if --time_budget allows few iterations",
+    "error is; 0: one for 64 training pixels, 100,000 to 1,000,000, or fewer if --time_budget allows few iterations. "
+    "budget multiplies the rates of colour, opacity, scale and rotation: the fewer --iterations, the more",
     "ours",
     check=one_of("adc", "mcmc", "budget"),
 )

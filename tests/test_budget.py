@@ -426,7 +426,8 @@ def test_resume_equals_uninterrupted_and_the_plain_step_changes_nothing(colmap_s
     assert _train(colmap_scene, tmp_path / "d", *more[:-1], 6).read_bytes() != whole.read_bytes()
 
 
-@pytest.mark.parametrize("more", [["--optimizer_type", "sparse_adam", "--opacity_lr", 0.003],
+# So short a training multiplies rates by 8. At 0.2, with sparse Adam, Gaussians vanish faster than they double.
+@pytest.mark.parametrize("more", [["--optimizer_type", "sparse_adam", "--opacity_lr", 0.0125],
                                   ["--train_test_exp", "--eval"],
                                   ["--score_error", "loss", "--score_join", "max", "--score_power", 2]])  # fmt: skip
 def test_with_other_options(colmap_scene, tmp_path, more):
@@ -457,7 +458,7 @@ def test_any_number_of_threads_gives_the_same_bytes(colmap_scene, tmp_path):
 
 def test_an_empty_model_is_an_error(colmap_scene, tmp_path):
     with pytest.raises(UserError, match="no Gaussian was left after the densification of iteration 20: .*--prune_opac"):
-        _train(colmap_scene, tmp_path / "out", "--prune_opacity", 0.5, "--opacity_lr", 0.003)
+        _train(colmap_scene, tmp_path / "out", "--prune_opacity", 0.5, "--opacity_lr", 0.003)  # times 8
 
 
 def test_the_default_budget_follows_the_pixels():

@@ -82,7 +82,7 @@ class Settling(Pace):
 
 
 def longer_steps(stride: float, progress: float) -> float:
-    """Factor of learning rates where an iteration stands for `stride` of those that the rates are for.
+    """Factor of learning rates where an iteration stands for `stride` of the USUAL ones.
 
     Few steps have to be longer ones: LONGER times the root of `stride`, at most MOST_RATE and at least 1. Towards the
     end all get shorter, smoothly, down to LEAST_RATE of that, so that the Gaussians settle. progress: part of the
@@ -141,7 +141,7 @@ class Paced(Pace):
         return self._block(iteration)[1].step * self.length
 
     def rate_factor(self, iteration: int) -> float:
-        return longer_steps(self.stride(iteration), self.progress(iteration))
+        return longer_steps(USUAL * self._block(iteration)[1].step, self.progress(iteration))
 
     def known(self, planned: Sequence[int]) -> list[int]:
         return [self.ends] if self.ends is not None and self.length in planned else []
