@@ -212,7 +212,7 @@ _STRATEGY = Option(
     "how many Gaussians there are, and where. adc: adaptive density control, the method's own; mcmc: Gaussians that "
     "nobody sees are moved to others, and positions get noise; budget: growth to --max_num_splats Gaussians, where the "
     "error is; 0: one for 64 training pixels, 100,000 to 1,000,000, or fewer if --time_budget allows few iterations. "
-    "budget multiplies the rates of colour, opacity, scale and rotation: the fewer --iterations, the more",
+    "budget has larger learning rates of colour, opacity, scale and rotation, the fewer --iterations there are",
     "ours",
     check=one_of("adc", "mcmc", "budget"),
 )

@@ -147,11 +147,12 @@ def compilations(torch: ModuleType, cxx: list[str], nvcc: str | None, csrc: Path
         compile_cuda = [nvcc, "-O3", "-std=c++17", "-Xcompiler", "-fPIC,-fvisibility=hidden"]
         at_hand = [torch.cuda.get_device_capability(k) for k in range(torch.cuda.device_count())]
         compile_cuda += [*architecture_flags(nvcc, at_hand), f"-I{csrc}", f"-I{COMMON_INCLUDE}"]
+        # nvcc then names local symbols by the source's path and the seed, instead of by chance.
+        compile_cuda.append("-objtemp")
+        seeded = cuda_version(nvcc) >= SEEDED_CUDA
         for source in kernels:
-            # The names of what is local depend on the seed and on the source's path, not on chance.
-            seed = [f"-frandom-seed={source.stem}"] if cuda_version(nvcc) >= SEEDED_CUDA else []
-            command = [*compile_cuda, "-objtemp", *seed]
-            plan.append(Compilation(command, source, objects / f"{source.stem}.cu.o"))
+            seed = [f"-frandom-seed={source.stem}"] if seeded else []
+            plan.append(Compilation([*compile_cuda, *seed], source, objects / f"{source.stem}.cu.o"))
     return plan
 
 
