@@ -93,7 +93,10 @@ def step(
     absolute &= observe
     further = {"now": now, "absolute": absolute, **adam.penalties()}
     if (view := drawn.view) is not None:
+        # Ranks wait for each other's rows. Meanwhile the memory has time for Gaussians that get none.
+        further["unseen_stepped"] = adam.step_unseen(view.tile_counts)
         rows = gradient_rows(view, (image_gradient, None, depth_gradient), absolute)
+        adam.join()
         OPERATORS.rows_vjp_step_(
             *drawn.scene, view.splats, view.tile_counts, *rows, drawn.radii, *adam.arguments(observe), **further
         )

@@ -10,6 +10,7 @@ from torch import Tensor
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.adam import GaussianAdam
 from scene.gaussians.penalty import NO_PENALTY, Penalty
+from scene.gaussians.side_stream import SideStream
 from scene.gaussians.sparse_adam import SparseGaussianAdam
 
 # In the operator's order (gs::Stepped).
@@ -24,6 +25,7 @@ class FusedAdam:
     def __init__(self, gaussians: GaussianModel, penalty: Penalty = NO_PENALTY) -> None:
         self._gaussians = gaussians
         self._penalty = penalty
+        self._aside = SideStream()
 
     @staticmethod
     def takes(gaussians: GaussianModel) -> bool:
@@ -59,6 +61,27 @@ class FusedAdam:
         """The operator's last arguments, which change with the number of Gaussians."""
         each = self._penalty.of_each(self._gaussians.total)
         return {"opacity_penalty": each.opacity, "scale_penalty": each.scale}
+
+    def step_unseen(self, tile_counts: Tensor) -> bool:
+        """Let the SH bands of Gaussians without tiles take the step that comes, beside what a GPU is told to do next.
+
+        Returns whether they do: not if nothing is to step, or if the optimiser is sparse. Call `join` before the others
+        take theirs, which must leave these out.
+        """
+        rest = [one for one in self._stepping() if _STEPPED[one.attribute] == "f_rest"]
+        if self._sparse or not rest:
+            return False
+        (param, state, rate, columns), guard = rest[0][1:], self._gaussians.optimizer.guard
+        given = guard.arguments if guard else ()
+        with self._aside.aside(tile_counts, *given[:1]):
+            averages = state["exp_avg"], state["exp_avg_sq"]
+            numbers = rate, *self._constants(), columns, *given
+            OPERATORS.step_unseen_(param, *averages, state["step"], tile_counts, *numbers)
+        return True
+
+    def join(self) -> None:
+        """Let what a GPU is told to do next wait for `step_unseen`."""
+        self._aside.join()
 
     def write_now(self, now: Tensor, iteration: int) -> None:
         """Write what the next step stands for, (NOW_WORDS,) int64 on the CPU, and advance the step counters.
