@@ -24,7 +24,6 @@ HELD = PARAMETERS + MOMENTS + STATISTICS
 # Bytes of a Gaussian that projection leaves until the step ends: splat, depth, rectangle, tile count, radius.
 PROJECTED = 40 + 4 + 16 + 4 + 4
 TILE_RECORD = 16  # while projection runs, and again on a rank that bins what it received
-REACHED = 1 + 4  # for each band: whether it is reached, and the record's number, while records are chosen
 RECORD = 40 + 4 + 16 + 4  # of a visible Gaussian, sent to each band that it reaches
 COUNT = 4  # of gradient rows, sent back for each record
 PLACE, MARK = 12, 4  # of a record and of a row, while rows are put in order
@@ -111,8 +110,8 @@ class Design:
     operators: int  # small ones, whatever the number of ranks
 
 
-AS_WRITTEN = Design("as written", False, 4, 7, 50)  # operators that compute or copy, counted
-WHOLE_IMAGE = Design("whole image", True, 4, 6, 50)
+AS_WRITTEN = Design("as written", False, 4, 7, 42)  # operators that compute or copy, counted
+WHOLE_IMAGE = Design("whole image", True, 4, 6, 42)
 LEAN = Design("lean", False, 0, 4, 0)
 DESIGNS = (AS_WRITTEN, WHOLE_IMAGE, LEAN)
 
@@ -243,11 +242,10 @@ def step_bytes(scene: Workload, gpus: int) -> float:
     made = TILE_RECORD if gpus > 1 else 0
     binning = (BIN_SPLAT + SLOTS_SPLAT + made) * splats + BIN_INSTANCE * instances
     lists = SLOTS_SPLAT * splats + INSTANCE * instances + SLOT * scene.slots * share
-    rows, chosen = ROW * processed, 0.0
+    rows = ROW * processed
     if gpus > 1:
         rows = 3 * rows + MARK * processed + PLACE * records  # made, received, put in order
-        chosen = REACHED * gpus
-    return PROJECTED + max(TILE_RECORD, chosen, arrived + max(exchange, binning, lists + rows))
+    return PROJECTED + max(TILE_RECORD, arrived + max(exchange, binning, lists + rows))
 
 
 def peak_bytes(scene: Workload, gpus: int, spill: bool = False) -> float:

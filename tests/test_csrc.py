@@ -59,6 +59,9 @@ SCHEMAS = [
     "pack_splats_(Tensor(a!) packed, Tensor splats, Tensor depths, Tensor rects, Tensor tile_counts, Tensor gaussians) "
     "-> ()",
     "unpack_splats(Tensor packed, Tensor like) -> (Tensor splats, Tensor depths, Tensor rects, Tensor tile_counts)",
+    "count_records(Tensor rects, Tensor tile_counts, Tensor limits) -> Tensor",
+    "list_records(Tensor rects, Tensor tile_counts, Tensor limits, Tensor counts, int total) -> "
+    "(Tensor gaussians, Tensor places)",
     "move_runs(Tensor rows, Tensor counts, Tensor places) -> Tensor",
     f"rasterize_vjp_step_({STEPPED_SCENE}, {BACKWARD}, Tensor tile_counts, Tensor layers, {STEP}) -> ()",
     f"rows_vjp_step_({STEPPED_SCENE}, {ROWS}, {STEP}, bool unseen_stepped=False) -> ()",

@@ -65,6 +65,59 @@ def test_a_part_of_rows_is_packed(device, dtype):
     assert ops.unpack_splats(pack(some_splats(0, device, dtype), gaussians[:0]), splats[0])[2].shape == (0, 4)
 
 
+def reach_of(kind: str, device: str) -> tuple[Tensor, Tensor, Tensor]:
+    """Rectangles, tile counts and the limits of bands, of which one is empty."""
+    count = {"none": 0, "one": 1}.get(kind, LARGE)
+    generator = torch.Generator().manual_seed(count)
+    rects = torch.randint(-(2**31), 2**31, (count, 4), generator=generator, dtype=torch.int64)
+    rects[:, 1] = torch.randint(0, 20, (count,), generator=generator)
+    rects[:, 3] = rects[:, 1] + torch.randint(1, 4, (count,), generator=generator)
+    tile_counts = torch.randint(0, 3, (count,), generator=generator)
+    if kind == "unseen":
+        tile_counts.zero_()
+    first, end = ([0, 7, 2**30, 8], [7, 8, -1, 24]) if kind != "many bands" else (range(24), range(1, 25))
+    limits = torch.tensor([[*first], [*end]])
+    return tuple(t.to(device, torch.int32) for t in (rects, tile_counts, limits))
+
+
+def recorded_by_torch(rects: Tensor, tile_counts: Tensor, limits: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Records by band, Gaussian of each record, and its number by Gaussian and then by band."""
+    first, end = limits[:, :, None]
+    reached = (rects[:, 1] < end) & (rects[:, 3] > first) & (tile_counts > 0)
+    band, gaussian = reached.nonzero().unbind(1)
+    numbers = reached.T.reshape(-1).cumsum(0) - 1
+    return reached.sum(1), gaussian, numbers[band + len(reached) * gaussian].int()
+
+
+@CPU_AND_GPU
+@pytest.mark.parametrize("kind", ["none", "one", "unseen", "some", "many bands"])
+def test_records_are_counted_and_listed(kind, device):
+    reach = reach_of(kind, device)
+    numbers, gaussians, places = recorded_by_torch(*reach)
+    counts = ops.count_records(*reach)
+    assert torch.equal(counts[:-1].sum(1), numbers) and torch.equal(counts[-1], counts[:-1].sum(0))
+    found = ops.list_records(*reach, counts, len(gaussians))
+    assert torch.equal(found[0], gaussians) and torch.equal(found[1], places)
+    assert kind != "some" or len(gaussians) > LARGE / 2
+
+
+def test_wrong_records_are_named():
+    rects, tile_counts, limits = reach_of("some", "cpu")
+    counts = ops.count_records(rects, tile_counts, limits)
+    total = int(counts[-1].sum())
+    for error, match, given in (
+        (ValueError, r"tile_counts must be", (rects, tile_counts[1:], limits, counts, total)),
+        (ValueError, r"limits must be \(2, -1", (rects, tile_counts, limits[0], counts, total)),
+        (TypeError, "limits must be torch.int32", (rects, tile_counts, limits.long(), counts, total)),
+        (ValueError, r"counts must be \(5, 79", (rects, tile_counts, limits, counts[:-1], total)),
+        (ValueError, "not to 7", (rects, tile_counts, limits, counts, 7)),
+        (ValueError, "counts must be 0 or more, got -1", (rects, tile_counts, limits, counts.clone().fill_(-1), total)),
+        (RuntimeError, "from 0 to 2", (rects, tile_counts, limits, counts, 2**31)),
+    ):
+        with pytest.raises(error, match=match):
+            ops.list_records(*given)
+
+
 def moved_by_torch(rows: Tensor, counts: Tensor, places: Tensor) -> Tensor:
     ends = torch.empty_like(counts).index_copy_(0, places.long(), counts).cumsum(0).index_select(0, places.long())
     shifts = ends - counts.cumsum(0)
@@ -100,7 +153,7 @@ def test_runs_move(kind, values, device, dtype):
 
 
 def test_any_number_of_threads_gives_the_same_bits():
-    before, counts = torch.get_num_threads(), some_counts("giants")
+    before, counts, reach = torch.get_num_threads(), some_counts("giants"), reach_of("some", "cpu")
     places = torch.randperm(len(counts)).int()
     rows, splats, gaussians = (
         torch.randn(int(counts.sum()), 12),
@@ -112,6 +165,9 @@ def test_any_number_of_threads_gives_the_same_bits():
             torch.set_num_threads(threads)
             assert torch.equal(ops.move_runs(rows, counts, places), moved_by_torch(rows, counts, places))
             assert torch.equal(pack(splats, gaussians), packed_by_torch(splats, gaussians))
+            counted, (numbers, *lists) = ops.count_records(*reach), recorded_by_torch(*reach)
+            for one, other in zip(ops.list_records(*reach, counted, int(numbers.sum())), lists, strict=True):
+                assert torch.equal(one, other)
     finally:
         torch.set_num_threads(before)
 
@@ -123,6 +179,10 @@ def test_opcheck(device, dtype):
     plain = [t if t.dtype == torch.int32 else torch.rand_like(t) for t in splats]  # NaNs are not equal
     library.opcheck(ops.pack_splats_.default, (packed, *plain, gaussians))
     library.opcheck(ops.unpack_splats.default, (pack(plain, gaussians), plain[0]))
+    reach = reach_of("some", device)
+    recorded = ops.count_records(*reach)
+    library.opcheck(ops.count_records.default, reach)
+    library.opcheck(ops.list_records.default, (*reach, recorded, int(recorded[-1].sum())))
     counts, places = (torch.tensor(x, dtype=torch.int32, device=device) for x in ([2, 0, 3], [2, 0, 1]))
     library.opcheck(ops.move_runs.default, (torch.rand(5, 10, device=device, dtype=dtype), counts, places))
 

@@ -122,6 +122,9 @@ def test_the_fake_kernels_have_the_sizes_of_the_real_ones():
     color, transmittance, _, last, _ = ops.blend(splats, *lists[:2], camera.bg, 7, 18, False, True)
     moments = ops.blend_vjp(splats, *lists, camera.bg, last, transmittance, color, None, None)
     assert moments.shape[1] == fakes.MOMENT_VALUES
+    rects, limits = torch.zeros(fakes.RECORD_BLOCK + 1, 4, dtype=torch.int32), torch.zeros(2, 3, dtype=torch.int32)
+    for splats, blocks in ((fakes.RECORD_BLOCK, 1), (fakes.RECORD_BLOCK + 1, 2)):
+        assert ops.count_records(rects[:splats], rects[:splats, 0], limits).shape == (4, blocks)
 
 
 @pytest.mark.parametrize(

@@ -23,7 +23,7 @@ REST = "rest"
 STAGES = {
     "project": [(OPERATORS, "project")],
     "agree on bands": [(band, "find_bands"), (KnownBands, "find")],
-    "numbers of splats": [(exchange, "find_records")],
+    "numbers of splats": [(exchange, "agree_on_sizes")],
     "splats to bands": [(band, "send_splats")],
     "splats to views": [(views, "send_views")],
     "bin": [(OPERATORS, "bin")],

@@ -42,16 +42,11 @@ class Bands:
         first, end = (min(TILE * border, self.height) for border in self.borders[rank : rank + 2])
         return (max(first - reach, 0), min(end + reach, self.height)) if first < end else (first, end)
 
-    def reached(self, rects: Tensor, tile_counts: Tensor) -> Tensor:
-        """Which Gaussians reach which band: (size, N) bool. rects: (N, 4), which count where tile_counts (N,) do."""
-        first, end = self._limits
-        return (rects[:, 1] < end).logical_and_(rects[:, 3] > first).logical_and_(tile_counts > 0)
-
     @cached_property
-    def _limits(self) -> Tensor:
-        """Rows of tiles where each band begins and ends: (2, size, 1) int32; an empty band is nowhere."""
+    def limits(self) -> Tensor:
+        """Rows of tiles where each band begins and ends: (2, size) int32; an empty band is nowhere."""
         pairs = [(a, b) if a < b else (_NOWHERE, -1) for a, b in zip(self.borders, self.borders[1:], strict=False)]
-        return torch.tensor(pairs, dtype=torch.int32).T[:, :, None].to(self._device)
+        return torch.tensor(pairs, dtype=torch.int32).T.contiguous().to(self._device)
 
     @cached_property
     def halo(self) -> tuple["Rows", "Rows"]:

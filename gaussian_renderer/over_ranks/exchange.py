@@ -26,16 +26,10 @@ class Sent:
     places: Tensor | None  # (n,) int32, by Gaussian, then by rank; None: as the records lie
 
 
-def find_records(ranks: Ranks, reached: Tensor) -> tuple[Tensor, Tensor, list[int], list[int]]:
-    """The records that this rank sends, and how many it sends to and receives from each rank.
-
-    reached: (size, N) bool, which Gaussians each rank gets. Returns the rank and the Gaussian of each record, (n,)
-    int64, ascending by rank and then by Gaussian.
-    """
-    every = ranks.agree(reached.sum(1))
-    sizes, received = every[ranks.rank], [numbers[ranks.rank] for numbers in every]
-    rank, gaussian = torch.nonzero_static(reached, size=sum(sizes)).unbind(1)
-    return rank, gaussian, sizes, received
+def agree_on_sizes(ranks: Ranks, counts: Tensor) -> tuple[list[int], list[int]]:
+    """How many records this rank sends to each rank, and how many it receives. counts: (size, n), those to each."""
+    every = ranks.agree(counts.sum(1))
+    return every[ranks.rank], [numbers[ranks.rank] for numbers in every]
 
 
 def send_splats(ranks: Ranks, bands: Bands, splats: tuple[Tensor, ...]) -> tuple[tuple[Tensor, ...], Sent]:
@@ -43,12 +37,12 @@ def send_splats(ranks: Ranks, bands: Bands, splats: tuple[Tensor, ...]) -> tuple
 
     splats: tensors with a row for each Gaussian of the rank: splats, depths, rectangles (N, 4), tile counts (N,).
     """
-    reached = bands.reached(*splats[2:])
-    rank, gaussian, sizes, received = find_records(ranks, reached)
-    upto = reached.T.to(torch.int32, memory_format=torch.contiguous_format).view(-1).cumsum_(0)
-    places = upto.index_select(0, rank.add(gaussian, alpha=ranks.size)).sub_(1)
-    rows = ranks.send(_packed([splats], gaussian, [len(gaussian)]), sizes, received)[0]
-    return OPERATORS.unpack_splats(rows, splats[0]), Sent(gaussian, sizes, received, places)
+    reach = *splats[2:], bands.limits
+    counts = OPERATORS.count_records(*reach)
+    sizes, received = agree_on_sizes(ranks, counts[:-1])
+    gaussians, places = OPERATORS.list_records(*reach, counts, sum(sizes))
+    rows = ranks.send(_packed([splats], gaussians, [len(gaussians)]), sizes, received)[0]
+    return OPERATORS.unpack_splats(rows, splats[0]), Sent(gaussians, sizes, received, places)
 
 
 def send_views(ranks: Ranks, views: Sequence[tuple[Tensor, ...]]) -> tuple[tuple[Tensor, ...], Sent]:
@@ -58,7 +52,8 @@ def send_views(ranks: Ranks, views: Sequence[tuple[Tensor, ...]]) -> tuple[tuple
     the rank's N Gaussians.
     """
     reached = torch.stack([tensors[-1] for tensors in views]) > 0
-    view, gaussian, sizes, received = find_records(ranks, reached)
+    sizes, received = agree_on_sizes(ranks, reached)
+    view, gaussian = torch.nonzero_static(reached, size=sum(sizes)).unbind(1)
     rows = ranks.send(_packed(views, gaussian, sizes), sizes, received)[0]
     records = gaussian.add(view, alpha=reached.shape[1])
     return OPERATORS.unpack_splats(rows, views[0][0]), Sent(records, sizes, received, None)

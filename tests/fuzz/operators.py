@@ -28,6 +28,8 @@ def sound_calls() -> dict[str, Call]:
     planes = [torch.ones_like(image), torch.ones_like(transmittance), torch.ones_like(plane)]
     rows = ops.blend_rows(*state, *planes, layers)
     packed = torch.zeros(len(counts), 16, dtype=torch.int32)
+    reach = [rects, counts, torch.tensor([[0, 2], [2, 5]], dtype=torch.int32)]
+    recorded = ops.count_records(*reach)
     wanted = [True, True, True, True, True, False, False, True, True]
     sums = list(ops.rows_vjp(*scene, splats, counts, *rows, wanted))
     lists = [[torch.rand(3, 3), torch.rand(2, 5)] for _ in range(4)]
@@ -43,6 +45,8 @@ def sound_calls() -> dict[str, Call]:
         "blend": (ops.blend, [splats, instances, ranges, background, height, width, True, True]),
         "pack_splats_": (ops.pack_splats_, [packed, splats, depths, rects, counts, torch.arange(len(counts))]),
         "unpack_splats": (ops.unpack_splats, [packed, splats]),
+        "count_records": (ops.count_records, reach),
+        "list_records": (ops.list_records, [*reach, recorded, int(recorded[-1].sum())]),
         "move_runs": (ops.move_runs, [*rows, torch.arange(len(counts), dtype=torch.int32).flip(0)]),
         "blend_vjp": (ops.blend_vjp, [*state, *planes]),
         "blend_rows": (ops.blend_rows, [*state, *planes, layers, True]),

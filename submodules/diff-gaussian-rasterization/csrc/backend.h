@@ -64,6 +64,9 @@ void split_positions(const Executor&, const SplitInput&);
 void add_noise(const Executor&, const NoiseInput&);
 void pack_splats(const Executor&, const PackInput&);
 void unpack_splats(const Executor&, const UnpackInput&);
+// counts: (bands + 1, record_blocks), last those of all bands.
+void count_records(const Executor&, const RecordInput&, int32_t* counts);
+void list_records(const Executor&, const RecordInput&, const int32_t* counts, const RecordLists&);
 void move_runs(const Executor&, const MoveInput&);
 
 // What else the CPU offers. sum_rows: the rest of blend_vjp after blend_rows. project_vjp_step: project_vjp, and every
@@ -89,6 +92,8 @@ void split_positions(const Queue&, const SplitInput&);
 void add_noise(const Queue&, const NoiseInput&);
 void pack_splats(const Queue&, const PackInput&);
 void unpack_splats(const Queue&, const UnpackInput&);
+void count_records(const Queue&, const RecordInput&, int32_t* counts);
+void list_records(const Queue&, const RecordInput&, const int32_t* counts, const RecordLists&);
 void move_runs(const Queue&, const MoveInput&);
 // Allocates the gradients; called while the GPU is busy, so that the host's work costs no time.
 struct GradientMemory {

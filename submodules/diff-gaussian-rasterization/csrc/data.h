@@ -225,6 +225,25 @@ struct UnpackInput {
   int32_t *splats, *depths, *tile_counts, *rects;  // (count, 10 wide) and so on, written
 };
 
+// Which splats reach which bands of rows of tiles. A record is a splat for a band that it reaches.
+struct RecordInput {
+  int64_t count;
+  int bands;
+  const int32_t* rects;        // (N, 4), undefined where there are no tiles
+  const int32_t* tile_counts;  // (N)
+  const int32_t* limits;       // (2, bands): rows of tiles where each begins, and where it ends
+};
+
+struct RecordLists {
+  int64_t count;       // of all records
+  int64_t* gaussians;  // (count) written: ascending for each band, band after band
+  int32_t* places;     // (count) written: the record's number by splat, then by band
+};
+
+// Records are counted in blocks of so many splats.
+constexpr int64_t kRecordBlock = 256;
+constexpr int64_t record_blocks(int64_t count) { return (count + kRecordBlock - 1) / kRecordBlock; }
+
 // Runs of rows that lie side by side, to come into another order.
 struct MoveInput {
   int64_t runs, rows;     // all rows of all runs

@@ -8,11 +8,12 @@ from diff_gaussian_rasterization.schema import GRADIENTS, SCENE
 # A Gaussian's values in each input; a row of sh_rest depends on the number of bands.
 _ROWS = {"means": (3,), "means2d": (3,), "opacities": (1,), "scales": (3,), "rotations": (4,), "cov3d": (6,)}
 _ROWS |= {"colors": (3,), "sh_dc": (1, 3)}
-# These four are constants of csrc; tests/test_rasterizer_ops.py holds them to it.
+# These five are constants of csrc; tests/test_rasterizer_ops.py holds them to it.
 TILE = 16  # pixels
 SPLAT_VALUES = 10  # of a row of `splats`
 MOMENT_VALUES = 10  # of a row of `moments`, and of `rows`
 ABSOLUTE_VALUES = 2  # of a row of `rows` besides, for absolute gradients
+RECORD_BLOCK = 256  # splats whose records are counted together
 
 
 def _fake(name: str):
@@ -122,6 +123,16 @@ def _(packed, like):
     count = packed.shape[0]
     floats = like.new_empty((count, SPLAT_VALUES)), like.new_empty((count,))
     return *floats, packed.new_empty((count, 4)), packed.new_empty((count,))
+
+
+@_fake("count_records")
+def _(rects, tile_counts, limits):
+    return rects.new_empty((limits.shape[1] + 1, -(-rects.shape[0] // RECORD_BLOCK)))
+
+
+@_fake("list_records")
+def _(rects, tile_counts, limits, counts, total):
+    return rects.new_empty((total,), dtype=torch.int64), rects.new_empty((total,))
 
 
 @_fake("move_runs")

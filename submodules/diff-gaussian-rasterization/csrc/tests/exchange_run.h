@@ -45,6 +45,45 @@ std::vector<std::vector<int32_t>> unpack(const Where& where, const std::vector<i
   return to;
 }
 
+// Rectangles of splats, a quarter of them without tiles, and bands of which one is empty.
+struct SomeRects {
+  int64_t count;
+  std::vector<int32_t> rects, tile_counts, limits;
+
+  SomeRects(int64_t splats, int bands) : count(splats) {
+    const int rows = 4 * bands;
+    for (int64_t i = 0; i < splats; ++i) {
+      const int top = int(generator() % rows), high = i % 11 ? 1 + int(generator() % 3) : rows;
+      for (const int value : {0, top, 5, std::min(top + high, rows)}) rects.push_back(value);
+      tile_counts.push_back(generator() % 4 ? 5 : 0);
+    }
+    for (const int side : {0, 1})
+      for (int band = 0; band < bands; ++band)
+        limits.push_back(band == 1 ? (side ? -1 : 1 << 30) : 4 * (band + side) - (band == 2 && !side ? 4 : 0));
+  }
+  gs::RecordInput input() const {
+    return {count, int(limits.size() / 2), rects.data(), tile_counts.data(), limits.data()};
+  }
+};
+
+// The counts, and the lists that follow from them: Gaussians and places.
+struct SomeRecords {
+  std::vector<int32_t> counts, places;
+  std::vector<int64_t> gaussians;
+};
+template <class Where>
+SomeRecords records(const Where& where, const SomeRects& rects) {
+  using gs::count_records, gs::list_records, gs::cuda::count_records, gs::cuda::list_records;
+  const gs::RecordInput in = rects.input();
+  const int64_t blocks = gs::record_blocks(in.count);
+  SomeRecords out{std::vector<int32_t>((in.bands + 1) * blocks, -77), {}, {}};
+  count_records(where, in, out.counts.data());
+  const int64_t total = std::accumulate(out.counts.begin() + in.bands * blocks, out.counts.end(), int64_t(0));
+  out.places.assign(total, -77), out.gaussians.assign(total, -77);
+  list_records(where, in, out.counts.data(), {total, out.gaussians.data(), out.places.data()});
+  return out;
+}
+
 struct SomeRuns {
   std::vector<int32_t> counts, places, rows;
   int words;

@@ -574,6 +574,24 @@ void test_packed_splats() {
     }
 }
 
+void test_records() {
+  for (const gs::emulation::Order order : gs::emulation::kOrders)
+    for (const int bands : {1, 2, 3, 40})
+      for (const int64_t count : {0, 1, 255, 600}) {
+        gs::emulation::order = order;
+        gs::emulation::Memory memory;
+        const SomeRects rects(count, bands);
+        const SomeRecords wanted = records(gs::serial_executor(), rects), got = records(memory.queue(), rects);
+        CHECK(got.counts == wanted.counts && got.gaussians == wanted.gaussians && got.places == wanted.places);
+        CHECK(count < 255 || int64_t(got.places.size()) > count / 8);
+        // Counts that do not fit stay within memory.
+        std::vector<int32_t> many(got.counts.size(), 1 << 20);
+        std::vector<int64_t> gaussians(3, -77);
+        std::vector<int32_t> places(3, -77);
+        gs::cuda::list_records(memory.queue(), rects.input(), many.data(), {3, gaussians.data(), places.data()});
+      }
+}
+
 void test_moved_runs() {
   for (const gs::emulation::Order order : gs::emulation::kOrders)
     for (const int words : {10, 12})
@@ -822,6 +840,7 @@ int main() {
                          test_longest_first,
                          test_front_first,
                          test_catch_up,
+                         test_records,
                          test_sparse_adam,
                          test_adam,
                          test_step_guard,
