@@ -139,10 +139,15 @@ def _check_gradients(inputs: dict[str, Tensor | None]) -> None:
 
 
 def _setup_context(ctx, inputs, output):
+    ctx.mark_non_differentiable(*output[3:])
+    _keep(ctx, inputs, output)
+
+
+def _keep(ctx, inputs, output):
+    """Keep what the backward needs of the operator's inputs and output."""
     *inputs, absolute = (*inputs, False)[: len(INPUTS)]  # the dispatcher leaves a default out
     _, *scene, background, inverse_depth, train = inputs
     _, transmittance, _, _, splats, tile_counts, instances, ranges, splat_slots, slots, last, layers = output
-    ctx.mark_non_differentiable(*output[3:])
     ctx.set_materialize_grads(False)
     ctx.numbers, ctx.inverse_depth, ctx.train, ctx.absolute = scene[SCENE_TENSORS:], inverse_depth, train, absolute
     state = (splats, instances, ranges, splat_slots, slots, background, last, transmittance)
@@ -176,20 +181,34 @@ def _backward(ctx, grad_color, grad_transmittance, grad_inverse_depth, *_):
 library.register_autograd("diff_gaussian_rasterization::rasterize", _backward, setup_context=_setup_context)
 
 
+def _forward(*inputs):
+    with torch._C._AutoDispatchBelowAutograd():
+        return OPERATORS.rasterize(*inputs)
+
+
+class _Transformed(torch.autograd.Function):
+    """For the transforms of torch.func, which want a context that is set up behind the forward."""
+
+    forward = staticmethod(_forward)
+    setup_context = staticmethod(_setup_context)
+    backward = staticmethod(_backward)
+
+
 class _Rasterize(torch.autograd.Function):
-    """The same two functions, without the Python that the dispatcher runs in between."""
+    """The same, without the Python that the dispatcher runs in between, and with no more outputs than callers see."""
 
     @classmethod
     def apply(cls, *inputs):
         if torch._C._are_functorch_transforms_active():
-            return super().apply(*inputs)
+            return _Transformed.apply(*inputs)
         # torch's own `apply` inspects the signature in every call.
         return super(torch.autograd.Function, cls).apply(*inputs)
 
     @staticmethod
-    def forward(*inputs):
-        with torch._C._AutoDispatchBelowAutograd():
-            return OPERATORS.rasterize(*inputs)
+    def forward(ctx, *inputs):
+        output = _forward(*inputs)
+        _keep(ctx, inputs, output)
+        ctx.mark_non_differentiable(output[3])
+        return output[:4]
 
-    setup_context = staticmethod(_setup_context)
     backward = staticmethod(_backward)

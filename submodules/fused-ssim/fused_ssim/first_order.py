@@ -19,8 +19,10 @@ def first_order(backward: Callable[..., tuple]) -> Callable[..., tuple]:
 
     @functools.wraps(backward)
     def wrapper(ctx: Any, *gradients: Tensor | None) -> tuple:
+        if not torch.is_grad_enabled():
+            return backward(ctx, *gradients)  # there will be no second derivative
         # Transforms of torch.func ask for a graph in every first derivative, so there the rule of torch stays.
-        if torch.is_grad_enabled() and not torch._C._are_functorch_transforms_active():
+        if not torch._C._are_functorch_transforms_active():
             gradients = [None if values is None else values.detach().requires_grad_() for values in gradients]
         return once(ctx, *gradients)
 
