@@ -11,6 +11,8 @@ import signal
 import sys
 import threading
 
+from utils.host.kept_memory import keep_freed_memory
+
 _waiting = False  # whether the collector is
 
 
@@ -26,6 +28,7 @@ def prepare() -> None:
     _waiting = gc.isenabled()
     gc.disable()
     open_outputs()
+    keep_freed_memory()
 
 
 def imported() -> None:
