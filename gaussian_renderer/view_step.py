@@ -93,7 +93,7 @@ def step(
     absolute &= observe
     further = {"now": now, "absolute": absolute, **adam.penalties()}
     if (view := drawn.view) is not None:
-        # Ranks wait for each other's rows. Meanwhile the memory has time for Gaussians that get none.
+        # Gaussians without tiles get no gradient, so they need not wait for the rows of other ranks.
         further["unseen_stepped"] = adam.step_unseen(view.tile_counts)
         rows = gradient_rows(view, (image_gradient, None, depth_gradient), absolute)
         adam.join()

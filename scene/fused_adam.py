@@ -68,15 +68,14 @@ class FusedAdam:
         Returns whether they do: not if nothing is to step, or if the optimiser is sparse. Call `join` before the others
         take theirs, which must leave these out.
         """
-        rest = [one for one in self._stepping() if _STEPPED[one.attribute] == "f_rest"]
-        if self._sparse or not rest:
+        rest = next((one for one in self._stepping() if _STEPPED[one.attribute] == "f_rest"), None)
+        if self._sparse or rest is None:
             return False
-        (param, state, rate, columns), guard = rest[0][1:], self._gaussians.optimizer.guard
+        guard = self._gaussians.optimizer.guard
         given = guard.arguments if guard else ()
         with self._aside.aside(tile_counts, *given[:1]):
-            averages = state["exp_avg"], state["exp_avg_sq"]
-            numbers = rate, *self._constants(), columns, *given
-            OPERATORS.step_unseen_(param, *averages, state["step"], tile_counts, *numbers)
+            tensors = rest.param, rest.state["exp_avg"], rest.state["exp_avg_sq"], rest.state["step"]
+            OPERATORS.step_unseen_(*tensors, tile_counts, rest.rate, *self._constants(), rest.columns, *given)
         return True
 
     def join(self) -> None:

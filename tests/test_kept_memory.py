@@ -17,6 +17,7 @@ if sys.argv[1] == "kept":
 import ctypes, resource
 
 libc = ctypes.CDLL(None)
+libc.prctl(41, 1, 0, 0, 0)  # PR_SET_THP_DISABLE: with huge pages there would be few faults anyway
 libc.malloc.restype, libc.malloc.argtypes, libc.free.argtypes = ctypes.c_void_p, [ctypes.c_size_t], [ctypes.c_void_p]
 
 def step():

@@ -1,8 +1,8 @@
 """Memory that a process keeps for its next allocation, where glibc would give it back to the system.
 
-A step on the CPU frees as much as the next one takes. By default glibc gives that back as soon as 64 MB lie free at the
-end of its memory, or less, and the system then clears it anew. By chance of where things lie, this took up to a tenth
-of a training (1,055,901 page faults in place of 84,042 in 150 iterations of fox_full).
+A step on the CPU frees as much memory as the next one takes. By default, glibc gives memory back as soon as 64 MiB, or
+less, lie free at its end. The system then has to clear it for the next step. Whether that happens depends on chance. It
+took up to a tenth of a training (docs/results/tried.md).
 """
 
 import ctypes
@@ -10,7 +10,7 @@ import os
 
 _TRIM, _SEPARATE = -1, -3  # M_TRIM_THRESHOLD and M_MMAP_THRESHOLD of mallopt
 _KEPT = 256 << 20  # bytes that may lie free
-_LARGE = 32 << 20  # bytes from which on an allocation is given back as soon as it is freed; glibc takes no more
+_LARGE = 32 << 20  # bytes of an allocation that is given back as soon as it is freed; glibc allows no more
 
 
 def keep_freed_memory() -> None:

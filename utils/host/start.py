@@ -1,4 +1,5 @@
-"""Start of a command: Ctrl-C and garbage while its modules are imported, and outputs that are closed or refuse letters.
+"""Start of a command: Ctrl-C and garbage while its modules are imported, outputs that are closed or refuse letters, and
+memory that the process keeps.
 
 Importing torch makes half a million objects that stay. Python's collector would go through them several times meanwhile
 and once more at the end, which takes a third of the seconds of a process that does nothing else.

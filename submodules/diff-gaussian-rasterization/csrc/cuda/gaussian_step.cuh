@@ -13,8 +13,8 @@
 namespace gs {
 namespace cuda {
 
-// A tensor's rows. whole: all columns step, there are all rows of the warp, and 32 rows begin at a multiple of 16
-// bytes.
+// A tensor's rows. whole: all columns step, the warp has 32 rows (known in the kernel), and they begin at a multiple of
+// 16 bytes.
 struct SteppedRows {
   float *value, *mean, *square;
   int row, columns;

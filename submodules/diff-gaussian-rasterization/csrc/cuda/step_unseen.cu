@@ -1,5 +1,5 @@
-// Adam's step without a gradient of the rows whose Gaussians no view sees, beside other kernels: in several GPUs'
-// steps, where those wait for each other, the memory has time for it.
+// Adam's step without a gradient, of the rows of Gaussians that the view does not see. It runs beside the exchange
+// of several GPUs, in which a GPU's memory is mostly idle.
 #include <cuda_runtime.h>
 
 #include <algorithm>
