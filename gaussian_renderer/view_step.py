@@ -93,10 +93,7 @@ def step(
     absolute &= observe
     further = {"now": now, "absolute": absolute, **adam.penalties()}
     if (view := drawn.view) is not None:
-        # Gaussians without tiles get no gradient, so they need not wait for the rows of other ranks.
-        further["unseen_stepped"] = adam.step_unseen(view.tile_counts)
         rows = gradient_rows(view, (image_gradient, None, depth_gradient), absolute)
-        adam.join()
         OPERATORS.rows_vjp_step_(
             *drawn.scene, view.splats, view.tile_counts, *rows, drawn.radii, *adam.arguments(observe), **further
         )

@@ -10,7 +10,6 @@ from torch import Tensor
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.adam import GaussianAdam
 from scene.gaussians.penalty import NO_PENALTY, Penalty
-from scene.gaussians.side_stream import SideStream
 from scene.gaussians.sparse_adam import SparseGaussianAdam
 
 # In the operator's order (gs::Stepped).
@@ -25,7 +24,6 @@ class FusedAdam:
     def __init__(self, gaussians: GaussianModel, penalty: Penalty = NO_PENALTY) -> None:
         self._gaussians = gaussians
         self._penalty = penalty
-        self._aside = SideStream()
 
     @staticmethod
     def takes(gaussians: GaussianModel) -> bool:
@@ -61,26 +59,6 @@ class FusedAdam:
         """The operator's last arguments, which change with the number of Gaussians."""
         each = self._penalty.of_each(self._gaussians.total)
         return {"opacity_penalty": each.opacity, "scale_penalty": each.scale}
-
-    def step_unseen(self, tile_counts: Tensor) -> bool:
-        """Let the SH bands of Gaussians without tiles take the step that comes, beside what a GPU is told to do next.
-
-        Returns whether they do: not if nothing is to step, or if the optimiser is sparse. Call `join` before the others
-        take theirs, which must leave these out.
-        """
-        rest = next((one for one in self._stepping() if _STEPPED[one.attribute] == "f_rest"), None)
-        if self._sparse or rest is None:
-            return False
-        guard = self._gaussians.optimizer.guard
-        given = guard.arguments if guard else ()
-        with self._aside.aside(tile_counts, *given[:1]):
-            tensors = rest.param, rest.state["exp_avg"], rest.state["exp_avg_sq"], rest.state["step"]
-            OPERATORS.step_unseen_(*tensors, tile_counts, rest.rate, *self._constants(), rest.columns, *given)
-        return True
-
-    def join(self) -> None:
-        """Let what a GPU is told to do next wait for `step_unseen`."""
-        self._aside.join()
 
     def write_now(self, now: Tensor, iteration: int) -> None:
         """Write what the next step stands for, (NOW_WORDS,) int64 on the CPU, and advance the step counters.

@@ -64,7 +64,7 @@ SCHEMAS = [
     "(Tensor gaussians, Tensor places)",
     "move_runs(Tensor rows, Tensor counts, Tensor places) -> Tensor",
     f"rasterize_vjp_step_({STEPPED_SCENE}, {BACKWARD}, Tensor tile_counts, Tensor layers, {STEP}) -> ()",
-    f"rows_vjp_step_({STEPPED_SCENE}, {ROWS}, {STEP}, bool unseen_stepped=False) -> ()",
+    f"rows_vjp_step_({STEPPED_SCENE}, {ROWS}, {STEP}) -> ()",
     "step_now_(Tensor(a!) now, int[] attributes, Tensor(b!)[] steps, float[] rates, float beta1, float beta2, "
     "float eps, bool sparse, int iteration) -> ()",
     "mark_visible(Tensor means, Tensor view) -> Tensor",
@@ -73,9 +73,6 @@ SCHEMAS = [
     "float[] rates, float beta1, float beta2, float eps, int[] columns, Tensor? loss=None, Tensor(e!)? stopped=None, "
     "int iteration=0) -> ()",
     "sparse_adam_(Tensor(a!) value, Tensor gradient, Tensor(b!) exp_avg, Tensor(c!) exp_avg_sq, Tensor visible, "
-    "float lr, float beta1, float beta2, float eps, int columns=-1, Tensor? loss=None, Tensor(d!)? stopped=None, "
-    "int iteration=0) -> ()",
-    "step_unseen_(Tensor(a!) value, Tensor(b!) exp_avg, Tensor(c!) exp_avg_sq, Tensor step, Tensor tile_counts, "
     "float lr, float beta1, float beta2, float eps, int columns=-1, Tensor? loss=None, Tensor(d!)? stopped=None, "
     "int iteration=0) -> ()",
     "catch_up_(Tensor(a!) value, Tensor(b!) exp_avg, Tensor(c!) exp_avg_sq, Tensor taken, float[] rates, "

@@ -139,20 +139,6 @@ def step_from_rows(state: State, camera: GaussianRasterizationSettings, case: Ca
     ops.rows_vjp_step_(*scene, *given, radii, *rest_of(case, state, iteration), **named_rest_of(case))
 
 
-def step_unseen_first(state: State, camera: GaussianRasterizationSettings, case: Case, iteration: int) -> None:
-    """Take the same step from gradient rows, after the SH bands of Gaussians that the view does not see have theirs."""
-    arguments, radii = rendered(state, camera, case, iteration)
-    scene, given = scene_and_rows(arguments, case)
-    early = not case.sparse and 5 in case.attributes
-    if early:
-        assert (given[1] == 0).any() or len(radii) < 100
-        averages, rest = [of[5] for of in state.averages], state.values["sh_rest"]
-        numbers = RATES[5], *BETAS, EPS, case.columns, *case.guard(state, iteration)
-        ops.step_unseen_(rest, *averages, state.counters[5], given[1], *numbers)
-    further = named_rest_of(case) | {"unseen_stepped": early}
-    ops.rows_vjp_step_(*scene, *given, radii, *rest_of(case, state, iteration), **further)
-
-
 def scene_and_rows(arguments: tuple, case: Case) -> tuple[tuple, tuple]:
     """The arguments of the scene and of its rows, from those of a backward from lists."""
     *backward, counts, layers = arguments[len(schema.SCENE) :]
@@ -241,14 +227,13 @@ def test_it_has_the_bytes_of_the_plain_step(case, device, dtype):
     if dtype == torch.float64:
         case = replace(case, observed=False)
     start, camera = start_and_camera(case, 700, device, dtype)
-    plain, fused, from_rows, early = start.copy(), start.copy(), start.copy(), start.copy()
+    plain, fused, from_rows = start.copy(), start.copy(), start.copy()
     for iteration in (1, 2, 3):
         step_plainly(plain, camera, case, iteration)
         step_fused(fused, camera, case, iteration)
         step_from_rows(from_rows, camera, case, iteration)
-        step_unseen_first(early, camera, case, iteration)
-        for wanted, *others in zip(*(state.tensors() for state in (plain, fused, from_rows, early)), strict=True):
-            assert all(same_bytes(other, wanted) for other in others)
+        for one, other, third in zip(fused.tensors(), plain.tensors(), from_rows.tensors(), strict=True):
+            assert same_bytes(one, other) and same_bytes(third, other)
     if case.attributes and math.isfinite(case.loss):
         assert not torch.equal(fused.values["means"], start.values["means"])
     if case.guarded:
@@ -275,12 +260,11 @@ def test_sizes(n, bands, device, dtype):
     state, camera = start_and_camera(case, n, device, dtype)
     rest = state.values["sh_rest"][:, :bands].contiguous()
     start = State.start(state.values | {"sh_rest": rest})
-    plain, fused, from_rows, early = start.copy(), start.copy(), start.copy(), start.copy()
+    plain, fused, from_rows = start.copy(), start.copy(), start.copy()
     step_plainly(plain, camera, case, 1)
     step_fused(fused, camera, case, 1)
     step_from_rows(from_rows, camera, case, 1)
-    step_unseen_first(early, camera, case, 1)
-    for other in (fused, from_rows, early):
+    for other in (fused, from_rows):
         assert all(same_bytes(one, two) for one, two in zip(other.tensors(), plain.tensors(), strict=True))
 
 
@@ -309,9 +293,6 @@ def test_opcheck(device, dtype):
     library.opcheck(ops.rasterize_vjp_step_.default, (*arguments, radii, list(case.attributes), *rest))
     scene, given = scene_and_rows(arguments, case)
     library.opcheck(ops.rows_vjp_step_.default, (*scene, *given, radii, list(case.attributes), *rest))
-    averages = [of[5] for of in state.averages]
-    unseen = state.values["sh_rest"], *averages, state.counters[5], given[1], 0.1, *BETAS, EPS, -1
-    library.opcheck(ops.step_unseen_.default, (*unseen, *case.guard(state, 1)))
 
 
 def _refused(match: str, case: Case | None = None, error: type = RuntimeError, **changes) -> None:
@@ -368,17 +349,3 @@ def test_statistics_of_float64_are_refused():
     state, camera = start_and_camera(Case(), 4, "cpu", torch.float64)
     with pytest.raises(RuntimeError, match="statistics are of float32 Gaussians"):
         step_fused(state, camera, Case(), 1)
-
-
-def test_early_steps_that_cannot_be_are_refused():
-    case = Case(sparse=True)
-    state, camera = start_and_camera(case, 8, "cpu", torch.float32)
-    arguments, radii = rendered(state, camera, case, 1)
-    scene, given = scene_and_rows(arguments, case)
-    with pytest.raises(ValueError, match="take no sparse step"):
-        ops.rows_vjp_step_(*scene, *given, radii, *rest_of(case, state, 1), unseen_stepped=True)
-    rest, averages = state.values["sh_rest"], [of[5] for of in state.averages]
-    with pytest.raises(ValueError, match="tile_counts"):
-        ops.step_unseen_(rest, *averages, state.counters[5], given[1][:3], 0.1, *BETAS, EPS)
-    with pytest.raises(RuntimeError, match="counter"):
-        ops.step_unseen_(rest, *averages, state.counters[5].double(), given[1], 0.1, *BETAS, EPS)

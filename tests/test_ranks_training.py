@@ -7,11 +7,8 @@ from pathlib import Path
 import pytest
 import torch
 from processes import in_ranks
-from small_splats import splats
 
 import train
-from exports.plain_ply import write_plain_ply
-from training import run
 from training.steps.fused import FusedStep
 from utils.ranks import several
 from utils.ranks.ranks import ranks
@@ -57,7 +54,6 @@ def _train(scene: str, out: str, options: list[str]) -> tuple[list[bytes], list[
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(sys, "stdout", sys.stdout)  # training stamps it
-        patch.setattr(run, "SH_INTERVAL", 5)  # so that all SH bands take part
         patch.setattr(FusedStep, "measure", measured)
         patch.setattr(FusedStep, "advance", advanced)
         for name in COLLECTIVES:
@@ -75,14 +71,9 @@ def _train(scene: str, out: str, options: list[str]) -> tuple[list[bytes], list[
     [
         (3, ["-r", "96", "--strategy", "adc"], STEP),
         (2, ["-r", "50", "--eval", "--train_test_exp"], WHOLE_STEP),  # exposures need the whole image
-        (2, ["-r", "96", "--init_ply", "start.ply"], STEP),  # views see a part of them, and SH bands step
     ],
 )
-def test_ranks_train_as_one_process(colmap_scene, tmp_path, monkeypatch, size, options, cost):
-    monkeypatch.chdir(tmp_path)
-    start = splats(400)
-    start.means[:] *= 4
-    write_plain_ply("start.ply", start)
+def test_ranks_train_as_one_process(colmap_scene, tmp_path, size, options, cost):
     alone = _train(str(colmap_scene), str(tmp_path / "model"), options)
     found = in_ranks(size, _train, str(colmap_scene), str(tmp_path / "model"), options)
     assert found[0][2] == alone[2] and len(alone[0]) > 20

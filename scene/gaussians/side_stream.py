@@ -1,4 +1,4 @@
-"""A stream of its own for what a GPU does beside the steps."""
+"""A stream of its own for copies between a GPU and its host, beside the steps."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -8,7 +8,7 @@ from torch import Tensor
 
 
 class SideStream:
-    """Runs work beside the current stream of a GPU; on the CPU at once."""
+    """Runs copies beside the current stream of a GPU; on the CPU at once."""
 
     def __init__(self) -> None:
         self._stream: torch.cuda.Stream | None = None

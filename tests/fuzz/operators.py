@@ -64,17 +64,6 @@ def sound_calls() -> dict[str, Call]:
         "decisive": (ops.decisive, [splats, instances, ranges, last]),
         "adam_": (ops.adam_, adam),
         "sparse_adam_": (ops.sparse_adam_, [*sparse, *guard]),
-        "step_unseen_": (
-            ops.step_unseen_,
-            [
-                *sparse[:1],
-                *sparse[2:4],
-                torch.tensor(3.0),
-                torch.tensor([0, 2, 0], dtype=torch.int32),
-                *sparse[5:],
-                *guard,
-            ],
-        ),
         "run_ahead_": (ops.run_ahead_, [torch.zeros(5, dtype=torch.int64), [1, 1, 1], None]),  # refused: not on a GPU
         "step_now_": (ops.step_now_, _step_now()),
         "catch_up_": (

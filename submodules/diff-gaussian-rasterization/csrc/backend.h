@@ -49,9 +49,6 @@ struct RowMemory {
   /* Adam without bias correction on the visible rows, (rows); `step` is not read. */                \
   template <class T>                                                                                 \
   void sparse_adam(const Where&, const AdamInput<T>&, const bool* visible, const StepGuard<T>&);     \
-  /* Adam's step without a gradient of the rows whose tile count is 0, (rows). */                    \
-  template <class T>                                                                                 \
-  void step_unseen(const Where&, const AdamInput<T>&, const int32_t* counts, const StepGuard<T>&);   \
   /* Adam's steps without a gradient that rows have missed (MissedSteps), under no guard. */         \
   template <class T>                                                                                 \
   void catch_up(const Where&, const AdamInput<T>&, const MissedSteps<T>&);                           \

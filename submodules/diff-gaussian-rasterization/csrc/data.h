@@ -289,8 +289,6 @@ struct GaussianStep {
   bool sparse;            // only Gaussians of observed.radii above 0 take a step, and without bias correction
   ObserveInput observed;  // the view's gradients are not read; with max_radii null nothing is observed
   Penalty<T> penalty;     // whose gradients are added, where opacities and scales take steps
-  // Tile counts (N), or null: where they are 0, sh_rest took its step before (step_unseen).
-  const int32_t* unseen_stepped;
 };
 
 }  // namespace gs

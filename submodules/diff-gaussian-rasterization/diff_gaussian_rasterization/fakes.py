@@ -152,7 +152,6 @@ def _(values):
 @_fake("rasterize_vjp_step_")
 @_fake("rows_vjp_step_")
 @_fake("step_now_")
-@_fake("step_unseen_")
 @_fake("add_noise_")
 @_fake("penalise_")
 @_fake("pack_splats_")

@@ -1,4 +1,4 @@
-// Adam's steps, dense, sparse, unseen and missed, under a guard.
+// Adam's steps, dense, sparse and missed, under a guard.
 #include <algorithm>
 #include <vector>
 
@@ -132,21 +132,6 @@ void sparse_adam(const Executor& executor, const AdamInput<T>& in, const bool* v
 }
 
 template <class T>
-void step_unseen(const Executor& executor, const AdamInput<T>& in, const int32_t* counts, const StepGuard<T>& guard) {
-  constexpr int64_t kRows = 32;  // at a time
-  const AdamStep<T> step = adam_step_of(in, false);
-  const std::vector<T> zero(kRows * in.row);
-  bool finite = may_step(guard);
-  for_dynamic(executor, finite ? in.rows : 0, kRows, [&](int64_t begin, int64_t end) {
-    const bool mine = for_runs(
-        begin, end, [&](int64_t r) { return counts[r] == 0; },
-        [&](int64_t r, int64_t rows) { return adam_rows(step, in, zero.data(), r, rows, guard.stopped != nullptr); });
-    if (!mine) __atomic_store_n(&finite, false, __ATOMIC_RELAXED);
-  });
-  if (!finite && *guard.stopped == 0) *guard.stopped = guard.iteration;
-}
-
-template <class T>
 void catch_up(const Executor& executor, const AdamInput<T>& in, const MissedSteps<T>& missed) {
   static_assert(sizeof(AdamStep<T>) == 7 * sizeof(T), "AdamStep has seven numbers");
   const auto* steps = reinterpret_cast<const AdamStep<T>*>(missed.constants);
@@ -157,11 +142,10 @@ void catch_up(const Executor& executor, const AdamInput<T>& in, const MissedStep
   });
 }
 
-#define GS_INSTANTIATE(T)                                                                                  \
-  template bool adam_rows<T>(const AdamStep<T>&, const AdamInput<T>&, const T*, int64_t, int64_t, bool);   \
-  template void adam<T>(const Executor&, const AdamInput<T>*, int64_t, const StepGuard<T>&);               \
-  template void sparse_adam<T>(const Executor&, const AdamInput<T>&, const bool*, const StepGuard<T>&);    \
-  template void step_unseen<T>(const Executor&, const AdamInput<T>&, const int32_t*, const StepGuard<T>&); \
+#define GS_INSTANTIATE(T)                                                                                \
+  template bool adam_rows<T>(const AdamStep<T>&, const AdamInput<T>&, const T*, int64_t, int64_t, bool); \
+  template void adam<T>(const Executor&, const AdamInput<T>*, int64_t, const StepGuard<T>&);             \
+  template void sparse_adam<T>(const Executor&, const AdamInput<T>&, const bool*, const StepGuard<T>&);  \
   template void catch_up<T>(const Executor&, const AdamInput<T>&, const MissedSteps<T>&);
 GS_INSTANTIATE(float)
 GS_INSTANTIATE(double)

@@ -136,8 +136,9 @@ bool step_block(const GaussianStep<T>& in, const AdamStep<T>* steps, int64_t fir
       const T* from = gradient.of(a) + (begin - first) * to.row;
       return adam_rows(steps[a], to, from, begin, rows, in.guard.stopped != nullptr);
     };
-    const int32_t* left = in.sparse ? in.observed.radii : a == kStepShRest ? in.unseen_stepped : nullptr;
-    finite &= left ? for_runs(first, first + count, [&](int64_t i) { return left[i] > 0; }, take) : take(first, count);
+    finite &= in.sparse ? for_runs(
+                              first, first + count, [&](int64_t i) { return in.observed.radii[i] > 0; }, take)
+                        : take(first, count);
   }
   return finite;
 }

@@ -13,8 +13,7 @@
 namespace gs {
 namespace cuda {
 
-// A tensor's rows. whole: all columns step, the warp has 32 rows (known in the kernel), and they begin at a multiple of
-// 16 bytes.
+// A tensor's rows. whole: all columns step, and 32 rows begin at a multiple of 16 bytes.
 struct SteppedRows {
   float *value, *mean, *square;
   int row, columns;
@@ -29,7 +28,6 @@ struct StepParameters {
   SteppedRows rows[kStepped];
   StepGuard<float> guard;
   ObserveInput observed;
-  const int32_t* unseen_stepped;
 };
 
 // Of a step with a penalty. It is a type of its own, so that other steps have no code for it.
@@ -37,20 +35,14 @@ struct PenalisedStep : StepParameters {
   Penalty<float> penalty;
 };
 
-// Without constants.
-inline SteppedRows stepped_rows(const AdamInput<float>& from) {
-  bool whole = from.columns == from.row;
-  for (const float* p : {from.value, from.mean, from.square}) whole &= reinterpret_cast<uintptr_t>(p) % 16 == 0;
-  return {from.value, from.mean, from.square, int(from.row), int(from.columns), whole, {}};
-}
-
 inline StepParameters step_parameters(const GaussianStep<float>& in) {
   StepParameters out{};
-  out.wanted = true, out.now = in.now, out.guard = in.guard, out.observed = in.observed;
-  out.sparse = in.sparse, out.unseen_stepped = in.unseen_stepped;
+  out.wanted = true, out.now = in.now, out.sparse = in.sparse, out.guard = in.guard, out.observed = in.observed;
   for (int a = 0; a < kStepped; ++a) {
     const AdamInput<float>& from = in.attributes[a];
-    out.rows[a] = stepped_rows(from);
+    bool whole = from.columns == from.row;
+    for (const float* p : {from.value, from.mean, from.square}) whole &= reinterpret_cast<uintptr_t>(p) % 16 == 0;
+    out.rows[a] = {from.value, from.mean, from.square, int(from.row), int(from.columns), whole, {}};
     if (from.columns && !in.now)
       out.rows[a].constants = step_constants(in.sparse, from.lr, from.beta1, from.beta2, from.eps, from.step);
   }
@@ -89,45 +81,6 @@ __device__ inline bool step_whole_rows(SteppedRows to, bool guarded, int64_t fir
   return finite;
 }
 
-// The same for those of the rows that have a bit in `stepping`. 16 bytes may lie in two rows, of which one steps; the
-// other's values are written as they were.
-template <int kRow>
-__device__ inline bool step_some_rows(SteppedRows to, bool guarded, unsigned stepping, int64_t first,
-                                      const float* gradient) {
-  static_assert(kRow >= 4, "16 bytes lie in two rows at most");
-  constexpr int kCount = 8 * kRow, kAhead = 2;  // with 3, a block in five would find no registers
-  bool finite = true;
-  float4 *value = reinterpret_cast<float4*>(to.value + first * kRow),
-         *mean = reinterpret_cast<float4*>(to.mean + first * kRow),
-         *square = reinterpret_cast<float4*>(to.square + first * kRow);
-#pragma unroll 1
-  for (int k = threadIdx.x & 31; k < kCount; k += 32 * kAhead) {
-    float4 v[kAhead], m[kAhead], s[kAhead];
-    unsigned mine[kAhead];  // a bit for each of the four values
-#pragma unroll
-    for (int j = 0; j < kAhead; ++j) {
-      const int at = k + 32 * j, row = 4 * at / kRow, own = kRow * (row + 1) - 4 * at;  // values before the next row
-      mine[j] = 0;
-      if (at >= kCount) continue;
-      const unsigned head = own < 4 ? (1u << own) - 1 : 15u;
-      mine[j] = (stepping >> row & 1 ? head : 0u) | (own < 4 && stepping >> (row + 1) & 1 ? 15u & ~head : 0u);
-      if (mine[j]) v[j] = __ldcs(value + at), m[j] = __ldcs(mean + at), s[j] = __ldcs(square + at);
-    }
-#pragma unroll
-    for (int j = 0; j < kAhead; ++j) {
-      if (!mine[j]) continue;
-      const int at = k + 32 * j;
-      const float4 g = reinterpret_cast<const float4*>(gradient)[at];
-      if (mine[j] & 1) finite &= step_value(guarded, to.constants, g.x, v[j].x, m[j].x, s[j].x);
-      if (mine[j] & 2) finite &= step_value(guarded, to.constants, g.y, v[j].y, m[j].y, s[j].y);
-      if (mine[j] & 4) finite &= step_value(guarded, to.constants, g.z, v[j].z, m[j].z, s[j].z);
-      if (mine[j] & 8) finite &= step_value(guarded, to.constants, g.w, v[j].w, m[j].w, s[j].w);
-      __stcs(value + at, v[j]), __stcs(mean + at, m[j]), __stcs(square + at, s[j]);
-    }
-  }
-  return finite;
-}
-
 // Steps those of a warp's rows that have a bit in `stepping`. `gradient` has all 32 of them, `stride` floats apart; row
 // `first` of the tensor is the first. kRow: the values of a row, as is usual. Returns whether the lane's values took
 // their step.
@@ -135,10 +88,8 @@ template <int kRow>
 __device__ inline bool step_rows(SteppedRows to, bool guarded, unsigned stepping, int64_t first, const float* gradient,
                                  int stride) {
   if (!to.columns) return true;
-  if (to.whole && to.row == kRow && stride == kRow) {
-    if (stepping == kWarp) return step_whole_rows<kRow>(to, guarded, first, gradient);
-    if constexpr (kRow > 4) return step_some_rows<kRow>(to, guarded, stepping, first, gradient);
-  }
+  if (to.whole && to.row == kRow && stride == kRow && stepping == kWarp)
+    return step_whole_rows<kRow>(to, guarded, first, gradient);
   bool finite = true;
   for (int k = threadIdx.x & 31; k < 32 * to.columns; k += 32) {
     const int row = k / to.columns, column = k - row * to.columns;
@@ -189,7 +140,6 @@ __device__ __noinline__ void step_gaussians(const StepParameters& in, int64_t fi
   if (!begin_step(guard)) return;
   const auto rows = [&](Stepped attribute) {
     SteppedRows to = in.rows[attribute];
-    to.whole &= first + 32 <= count;
     if (in.now) {
       const float* c = in.now->constants[attribute];
       to.constants = {c[0], c[1], c[2], c[3], c[4], c[5], c[6]};
@@ -198,8 +148,6 @@ __device__ __noinline__ void step_gaussians(const StepParameters& in, int64_t fi
   };
   const int64_t i = first + (threadIdx.x & 31);
   const unsigned stepping = __ballot_sync(kWarp, i < count && (!in.sparse || in.observed.radii[i] > 0));
-  unsigned with_rest = stepping;
-  if (in.unseen_stepped) with_rest = __ballot_sync(kWarp, i < count && in.unseen_stepped[i] != 0);
   __syncwarp();  // all lanes have written their gradients
   const bool guarded = guard.stopped != nullptr;
   bool finite = step_rows<3>(rows(kStepMeans), guarded, stepping, first, g.means(), 3);
@@ -207,7 +155,7 @@ __device__ __noinline__ void step_gaussians(const StepParameters& in, int64_t fi
   finite &= step_rows<3>(rows(kStepScales), guarded, stepping, first, g.scales(), 3);
   finite &= step_rows<4>(rows(kStepRotations), guarded, stepping, first, g.rotations(), 4);
   finite &= step_rows<3>(rows(kStepShDc), guarded, stepping, first, g.sh_dc(), 3);
-  finite &= step_rows<kRest>(rows(kStepShRest), guarded, with_rest, first, rest, kRest);
+  finite &= step_rows<kRest>(rows(kStepShRest), guarded, stepping, first, rest, kRest);
   if (!finite) *guard.stopped = guard.iteration;  // every thread writes the same
 }
 

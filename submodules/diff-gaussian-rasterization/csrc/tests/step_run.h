@@ -1,7 +1,6 @@
 #pragma once
 // Gaussians that take a step from a backward: by the backward itself, or from gradients in memory, as a plain optimiser
 // and density control do. Both must give the same bits.
-#include <algorithm>
 #include <cstring>
 #include <memory>
 #include <vector>
@@ -163,17 +162,6 @@ inline gs::GaussianStep<float> gaussian_step(Stepping& s, const StepCase& how, c
   step.observed = s.observe(how, r.radii.data(), nullptr);
   step.penalty = how.penalty;
   return step;
-}
-
-// Lets sh_rest of the Gaussians that were not seen take its step before the others', if the step is one in which they
-// take one. Returns how many they were.
-template <class Where>
-int64_t step_unseen_before(const Where& where, const Rendered& r, gs::GaussianStep<float>& step) {
-  using gs::cuda::step_unseen, gs::GS_ISA::step_unseen;
-  if (step.sparse) return 0;
-  step.unseen_stepped = r.tile_counts.data();
-  step_unseen(where, step.attributes[gs::kStepShRest], r.tile_counts.data(), step.guard);
-  return std::count(r.tile_counts.begin(), r.tile_counts.end(), 0);
 }
 
 inline const StepCase kStepCases[] = {

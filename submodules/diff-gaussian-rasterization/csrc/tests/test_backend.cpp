@@ -136,13 +136,12 @@ void test_rows() {
 }
 
 // Steps taken inside the backward give the bits of steps from gradients in memory: several iterations, the last ones
-// after a step that was not finite. So do those in which Gaussians that were not seen go before.
+// after a step that was not finite.
 void test_gaussian_step() {
-  int64_t unseen = 0;
   for (const int64_t count : {0, 1, 130, 700})
     for (const StepCase& how : kStepCases) {
       const Stepping start{Parameters<float>(count)};
-      Stepping plain = start, fused = start, early = start;
+      Stepping plain = start, fused = start;
       for (int64_t iteration = 1; iteration <= 3; ++iteration) {
         const float gradient = iteration == 2 ? how.gradient : 1;
         const auto r = render(threads(), scene_of(plain.values, {40, 24}, count == 130), gradient);
@@ -154,16 +153,10 @@ void test_gaussian_step() {
         project_vjp_step(threads(), r->scene, r->tile_counts.data(), r->moments.data(),
                          gaussian_step(fused, how, *r, iteration));
         CHECK(fused.bytes() == plain.bytes());
-        r->scene = scene_of(early.values, r->scene.image, r->scene.antialiasing);
-        gs::GaussianStep<float> step = gaussian_step(early, how, *r, iteration);
-        unseen += step_unseen_before(threads(), *r, step);
-        project_vjp_step(threads(), r->scene, r->tile_counts.data(), r->moments.data(), step);
-        CHECK(early.bytes() == plain.bytes());
       }
       CHECK(count < 130 || (fused.stopped == 2) == (how.guarded && std::isnan(how.gradient)));
       CHECK(count < 130 || fused.values.means != start.values.means);
     }
-  CHECK(unseen > 0);
 }
 
 }  // namespace

@@ -128,12 +128,11 @@ void run(const SceneTensors& scene, const Source& source, const Tensor& lengths,
 
 // Takes the step of the Gaussians whose gradients come from what `source_of` makes of the scene.
 template <class SourceOf>
-void step_from(const SourceOf& source_of, bool unseen_stepped, SCENE_PARAMETERS, STEP_PARAMETERS) {
+void step_from(const SourceOf& source_of, SCENE_PARAMETERS, STEP_PARAMETERS) {
   const SceneTensors scene(SCENE_ARGUMENTS);
   GS_CHECK_VALUE(!cov3d && !colors, "a step needs scales, rotations, sh_dc and sh_rest, not cov3d or colors");
   check_tensor(radii, "radii", ScalarType::Int, scene.device(), {scene.count()});
   const auto source = source_of(scene);
-  GS_CHECK_VALUE(!unseen_stepped || !sparse, "unseen Gaussians take no sparse step, so they cannot have taken one");
   const StepLists lists{attributes, exp_avg, exp_avg_sq, steps, rates, columns, beta1, beta2, eps};
   lists.check();
   const bool penalised = opacity_penalty != 0 || scale_penalty != 0;
@@ -142,7 +141,6 @@ void step_from(const SourceOf& source_of, bool unseen_stepped, SCENE_PARAMETERS,
   with_scalar(scene.dtype(), [&](auto zero) {
     using T = decltype(zero);
     auto step = gaussian_step<T>({means, opacities, *scales, *rotations, *sh_dc, *sh_rest}, lists, sparse);
-    if (unseen_stepped) step.unseen_stepped = read<int32_t>(source.tile_counts());
     step.guard = step_guard<T>(means, loss, stopped, iteration);
     observe_in(step, pixels, max_radii, gradient_sums, views);
     step.now = step_now(now, scene);
@@ -158,16 +156,15 @@ void step_from(const SourceOf& source_of, bool unseen_stepped, SCENE_PARAMETERS,
 // iteration, and has advanced the counters. absolute: the statistics get the lengths of absolute gradients.
 void rasterize_vjp_step_op(SCENE_PARAMETERS, LISTS_PARAMETERS, STEP_PARAMETERS) {
   const auto lists = [&](const SceneTensors& scene) { return Lists(scene, LISTS_ARGUMENTS); };
-  step_from(lists, false, SCENE_ARGUMENTS, STEP_ARGUMENTS);
+  step_from(lists, SCENE_ARGUMENTS, STEP_ARGUMENTS);
 }
 
-// The same from the rows of blend_rows, as rows_vjp takes them. unseen_stepped: sh_rest has taken its step by
-// step_unseen_ where the tile count is 0.
-void rows_vjp_step_op(SCENE_PARAMETERS, ROWS_PARAMETERS, STEP_PARAMETERS, bool unseen_stepped) {
+// The same from the rows of blend_rows, as rows_vjp takes them.
+void rows_vjp_step_op(SCENE_PARAMETERS, ROWS_PARAMETERS, STEP_PARAMETERS) {
   const auto given = [&](const SceneTensors& scene) {
     return Rows(scene, ROWS_ARGUMENTS, absolute, absolute && max_radii);
   };
-  step_from(given, unseen_stepped, SCENE_ARGUMENTS, STEP_ARGUMENTS);
+  step_from(given, SCENE_ARGUMENTS, STEP_ARGUMENTS);
 }
 
 // Writes what the next step stands for, and advances the counters.
@@ -196,8 +193,7 @@ GS_OPERATORS(diff_gaussian_rasterization, m) {
   }
   m.define("rasterize_vjp_step_(" + scene + ", " LISTS_SCHEMA ", " STEP_SCHEMA ") -> ()",
            TORCH_BOX(&rasterize_vjp_step_op));
-  m.define("rows_vjp_step_(" + scene + ", " ROWS_SCHEMA ", " STEP_SCHEMA ", bool unseen_stepped=False) -> ()",
-           TORCH_BOX(&rows_vjp_step_op));
+  m.define("rows_vjp_step_(" + scene + ", " ROWS_SCHEMA ", " STEP_SCHEMA ") -> ()", TORCH_BOX(&rows_vjp_step_op));
   m.define(
       "step_now_(Tensor(a!) now, int[] attributes, Tensor(b!)[] steps, float[] rates, float beta1, float beta2, "
       "float eps, bool sparse, int iteration) -> ()",

@@ -1,5 +1,4 @@
-// The ops that change parameters and statistics in place: Adam, sparse Adam, Adam of unseen rows, and what density
-// control observes.
+// The ops that change parameters and statistics in place: Adam, sparse Adam, and what density control observes.
 #include "optim.h"
 
 #include <utility>
@@ -89,25 +88,6 @@ void sparse_adam_op(Tensor& value, const Tensor& gradient, Tensor& exp_avg, Tens
   });
 }
 
-// The rows of a tile count of 0 take the step behind the counter, without a gradient: the bits that adam_ gives them
-// with zeros. The counter stays.
-void step_unseen_op(Tensor& value, Tensor& exp_avg, Tensor& exp_avg_sq, const Tensor& step, const Tensor& tile_counts,
-                    double lr, double beta1, double beta2, double eps, int64_t columns, const MaybeTensor& loss,
-                    const MaybeTensor& stopped, int64_t iteration) {
-  check_moments(value, value, exp_avg, exp_avg_sq);
-  check_counter(step);
-  check_tensor(tile_counts, "tile_counts", ScalarType::Int, value.device(), {rows_of(value)});
-  if (value.numel() == 0) return;
-  const Tensor counts = packed(tile_counts);
-  with_scalar(value.scalar_type(), [&](auto zero) {
-    using T = decltype(zero);
-    gs::AdamInput<T> in = adam_input<T>(value, value, exp_avg, exp_avg_sq, columns);
-    in.lr = lr, in.beta1 = beta1, in.beta2 = beta2, in.eps = eps;
-    in.step = double(*read<float>(step)) + 1;
-    GS_RUN(T, value, step_unseen, in, read<int32_t>(counts), step_guard<T>(value, loss, stopped, iteration));
-  });
-}
-
 void observe_op(Tensor& max_radii, Tensor& gradient_sums, Tensor& views, const Tensor& radii, const Tensor& gradient) {
   check_statistics(max_radii, gradient_sums, views, radii);
   check_given(gradient, "gradient");
@@ -147,11 +127,6 @@ GS_OPERATORS(diff_gaussian_rasterization, m) {
       "float lr, float beta1, float beta2, float eps, int columns=-1, Tensor? loss=None, Tensor(d!)? stopped=None, "
       "int iteration=0) -> ()",
       TORCH_BOX(&sparse_adam_op));
-  m.define(
-      "step_unseen_(Tensor(a!) value, Tensor(b!) exp_avg, Tensor(c!) exp_avg_sq, Tensor step, Tensor tile_counts, "
-      "float lr, float beta1, float beta2, float eps, int columns=-1, Tensor? loss=None, Tensor(d!)? stopped=None, "
-      "int iteration=0) -> ()",
-      TORCH_BOX(&step_unseen_op));
   m.define(
       "observe_(Tensor(a!) max_radii, Tensor(b!) gradient_sums, Tensor(c!) views, Tensor radii, Tensor gradient) "
       "-> ()",
