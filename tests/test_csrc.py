@@ -60,8 +60,9 @@ SCHEMAS = [
     "-> ()",
     "unpack_splats(Tensor packed, Tensor like) -> (Tensor splats, Tensor depths, Tensor rects, Tensor tile_counts)",
     "count_records(Tensor rects, Tensor tile_counts, Tensor limits) -> Tensor",
-    "list_records(Tensor rects, Tensor tile_counts, Tensor limits, Tensor counts, int total) -> "
+    "list_records(Tensor rects, Tensor tile_counts, Tensor limits, Tensor counts, int room) -> "
     "(Tensor gaussians, Tensor places)",
+    "sum_runs(Tensor rows, Tensor counts, Tensor kept, int room) -> Tensor",
     "move_runs(Tensor rows, Tensor counts, Tensor places) -> Tensor",
     f"rasterize_vjp_step_({STEPPED_SCENE}, {BACKWARD}, Tensor tile_counts, Tensor layers, {STEP}) -> ()",
     f"rows_vjp_step_({STEPPED_SCENE}, {ROWS}, {STEP}) -> ()",

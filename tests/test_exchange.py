@@ -98,6 +98,11 @@ def test_records_are_counted_and_listed(kind, device):
     assert torch.equal(counts[:-1].sum(1), numbers) and torch.equal(counts[-1], counts[:-1].sum(0))
     found = ops.list_records(*reach, counts, len(gaussians))
     assert torch.equal(found[0], gaussians) and torch.equal(found[1], places)
+    for room in (len(gaussians) // 2, len(gaussians) + 7):
+        part = ops.list_records(*reach, counts, room)
+        assert len(part[0]) == len(part[1]) == room
+        for one, other in zip(part, found, strict=True):
+            assert torch.equal(one[: len(other)], other[:room])
     assert kind != "some" or len(gaussians) > LARGE / 2
 
 
@@ -110,9 +115,9 @@ def test_wrong_records_are_named():
         (ValueError, r"limits must be \(2, -1", (rects, tile_counts, limits[0], counts, total)),
         (TypeError, "limits must be torch.int32", (rects, tile_counts, limits.long(), counts, total)),
         (ValueError, r"counts must be \(5, 79", (rects, tile_counts, limits, counts[:-1], total)),
-        (ValueError, "not to 7", (rects, tile_counts, limits, counts, 7)),
+        (ValueError, "records by band, and to .* of all", (rects, tile_counts, limits, counts[[0, 1, 2, 3, 3]], total)),
         (ValueError, "counts must be 0 or more, got -1", (rects, tile_counts, limits, counts.clone().fill_(-1), total)),
-        (RuntimeError, "from 0 to 2", (rects, tile_counts, limits, counts, 2**31)),
+        (RuntimeError, "a room of 2147483648 is not from 0 to 2", (rects, tile_counts, limits, counts, 2**31)),
     ):
         with pytest.raises(error, match=match):
             ops.list_records(*given)
@@ -152,6 +157,44 @@ def test_runs_move(kind, values, device, dtype):
     assert torch.equal(ops.move_runs(wide, counts, places), rows)
 
 
+@BOTH_AND_GPU
+@pytest.mark.parametrize("values", [MOMENT_VALUES, MOMENT_VALUES + ABSOLUTE_VALUES])
+@pytest.mark.parametrize("kind", ["none", "one", "no rows", "hardly any", "many", "giants"])
+def test_runs_are_added_up(kind, values, device, dtype):
+    counts = some_counts(kind).to(device)
+    rows = torch.randn(int(counts.sum()), values, generator=torch.Generator().manual_seed(2)).to(device, dtype)
+    run = torch.arange(len(counts), device=device)
+    sums = torch.zeros(len(counts), values, device=device, dtype=torch.float64)
+    sums.index_add_(0, run.repeat_interleave(counts), rows.double())
+    found = ops.sum_runs(rows, counts, torch.ones_like(counts), len(counts) + 3)
+    assert found.shape == (len(counts) + 3, values) and found.dtype == dtype
+    torch.testing.assert_close(found[:-3].double(), sums, rtol=1e-5, atol=1e-4 if dtype == torch.float32 else 1e-9)
+    assert torch.equal(found[:-3][counts == 1], rows[(counts == 1).repeat_interleave(counts)])
+    # Some keep all rows, and some none.
+    kept = torch.where(run % 3 == 0, counts, (run % 3 == 1).int())
+    again = ops.sum_runs(rows, counts, kept, int(kept.sum()))
+    whole = ((run % 3 == 0) & (kept != 1)).repeat_interleave(kept)
+    assert torch.equal(again[whole], rows[((run % 3 == 0) & (kept != 1)).repeat_interleave(counts)])
+    assert torch.equal(again[~whole], found[:-3][kept == 1])
+    wide = torch.cat((rows, rows), 1)[:, values:]
+    assert torch.equal(ops.sum_runs(wide, counts, kept, int(kept.sum())), again)
+
+
+def test_wrong_sums_are_named():
+    def refused(error: type, match: str, counts: list, kept: list, room: int = 3, values: int = 10) -> None:
+        with pytest.raises(error, match=match):
+            numbers = (torch.tensor(of, dtype=torch.int32) for of in (counts, kept))
+            ops.sum_runs(torch.rand(5, values), *numbers, room)
+
+    refused(ValueError, r"rows must be \(R, 10\) or \(R, 12\), got \(5, 11\)", [5], [1], values=11)
+    refused(ValueError, r"kept must be \(2,\)", [3, 2], [1])
+    refused(ValueError, "counts add up to 4, but there are 5 rows", [3, 1], [1, 1])
+    refused(ValueError, "counts must be 0 or more, got -1 of run 1", [6, -1], [1, 1])
+    refused(ValueError, "kept must be 0, 1 or the run's count, got 2 of run 0", [3, 2], [2, 2])
+    refused(ValueError, "kept adds up to 4 rows, for which a room of 3 is too small", [3, 2], [3, 1])
+    refused(RuntimeError, "a room of -1 is not from 0 to 2", [3, 2], [1, 1], room=-1)
+
+
 def test_any_number_of_threads_gives_the_same_bits():
     before, counts, reach = torch.get_num_threads(), some_counts("giants"), reach_of("some", "cpu")
     places = torch.randperm(len(counts)).int()
@@ -160,11 +203,14 @@ def test_any_number_of_threads_gives_the_same_bits():
         some_splats(9_000, "cpu", torch.float32),
         places.long(),
     )
+    expected = ops.sum_runs(rows, counts, torch.ones_like(counts), len(counts))
     try:
         for threads in (1, 3):
             torch.set_num_threads(threads)
             assert torch.equal(ops.move_runs(rows, counts, places), moved_by_torch(rows, counts, places))
             assert torch.equal(pack(splats, gaussians), packed_by_torch(splats, gaussians))
+            sums = ops.sum_runs(rows, counts, torch.ones_like(counts), len(counts))
+            assert torch.equal(sums, expected)
             counted, (numbers, *lists) = ops.count_records(*reach), recorded_by_torch(*reach)
             for one, other in zip(ops.list_records(*reach, counted, int(numbers.sum())), lists, strict=True):
                 assert torch.equal(one, other)
@@ -184,6 +230,9 @@ def test_opcheck(device, dtype):
     library.opcheck(ops.count_records.default, reach)
     library.opcheck(ops.list_records.default, (*reach, recorded, int(recorded[-1].sum())))
     counts, places = (torch.tensor(x, dtype=torch.int32, device=device) for x in ([2, 0, 3], [2, 0, 1]))
+    library.opcheck(
+        ops.sum_runs.default, (torch.rand(5, 10, device=device, dtype=dtype), counts, counts.clamp_max(1), 2)
+    )
     library.opcheck(ops.move_runs.default, (torch.rand(5, 10, device=device, dtype=dtype), counts, places))
 
 
@@ -200,6 +249,8 @@ def test_inputs_may_begin_at_any_word(device):
     rows = torch.rand(5, 10, device=device)
     counts, places = (torch.tensor(x, dtype=torch.int32, device=device) for x in ([2, 0, 3], [2, 0, 1]))
     assert torch.equal(ops.move_runs(moved_by_a_word(rows), counts, places), ops.move_runs(rows, counts, places))
+    kept = counts.clamp_max(1)
+    assert torch.equal(ops.sum_runs(moved_by_a_word(rows), counts, kept, 2), ops.sum_runs(rows, counts, kept, 2))
 
 
 def test_wrong_splats_are_named():

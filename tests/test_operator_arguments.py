@@ -19,7 +19,7 @@ for outcome in outcomes():
     print("|".join(outcome), flush=True)
 """
 RASTERIZER = ("project", "bin", "blend", "blend_vjp", "project_vjp", "rasterize", "rasterize_vjp", "mark_visible")
-RASTERIZER += ("blend_rows", "rows_vjp", "pack_splats_", "unpack_splats", "move_runs")
+RASTERIZER += ("blend_rows", "rows_vjp", "pack_splats_", "unpack_splats", "move_runs", "sum_runs")
 NEEDLESS = ("means2d", "grad_transmittance", "grad_inverse_depth", "stopped", "words")  # tensors that may be None
 
 

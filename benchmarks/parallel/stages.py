@@ -32,7 +32,7 @@ STAGES = {
     "rows of the image": [(view_step, "surroundings"), (view_step, "whole_image")],
     "loss": [(FusedStep, "measure"), (ViewsStep, "backward")],
     "backward of blend": [(OPERATORS, "blend_rows")],
-    "rows back": [(band, "return_rows"), (views, "return_rows")],
+    "rows back": [(band, "return_rows"), (views, "return_sums")],
     "backward of projection": [(OPERATORS, "rows_vjp"), (OPERATORS, "rows_vjp_add_")],
     "Adam": [(GaussianModel, "step")],
     "backward of projection, Adam": [(OPERATORS, "rows_vjp_step_")],

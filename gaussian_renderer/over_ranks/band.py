@@ -35,6 +35,7 @@ class View:
     splats: Tensor  # (N, 10)
     tile_counts: Tensor  # (N,)
     sent: Sent
+    inside: Tensor  # (n,) bool of what was received: whether it reaches no other band
     state: tuple[Tensor, ...]  # of the band: splats, instances, ranges, splat_slots, slots, background, last, ...
     layers: Tensor
 
@@ -66,13 +67,14 @@ def draw_view(
     (splats, depths, rects, counts), sent = send_splats(ranks, bands, (own, depths, rects, tile_counts))
     instances, ranges, *slots = OPERATORS.bin(splats, depths, rects, counts, height, width, train)
     begin, end = bands.borders[ranks.rank : ranks.rank + 2]
+    inside = (rects[:, 1] >= begin) & (rects[:, 3] <= end)
     across = (len(ranges) - 1) // tile_rows(height)
     ranges = ranges.clamp(ranges[begin * across], ranges[end * across])  # lists of other bands become empty
     color, transmittance, inverse_depth, last, layers = OPERATORS.blend(
         splats, instances, ranges, background, height, width, want_depth, train
     )
     state = (splats, instances, ranges, *slots, background, last, transmittance)
-    return View(ranks, bands, color, inverse_depth, radii, own, tile_counts, sent, state, layers)
+    return View(ranks, bands, color, inverse_depth, radii, own, tile_counts, sent, inside, state, layers)
 
 
 def whole_image(view: View) -> View:
@@ -98,12 +100,12 @@ def surroundings(view: View) -> View:
 def gradient_rows(
     view: View, gradients: tuple[Tensor, Tensor | None, Tensor | None], absolute: bool
 ) -> tuple[Tensor, Tensor]:
-    """The gradient rows of the rank's own Gaussians, and how many each has, from the gradients of the image.
+    """Gradient rows of the rank's own Gaussians, and how many each has, from the gradients of the image.
 
     gradients: of colour, transmittance and inverse depth, (., H, W), of which the rows of the band count.
     """
     rows, counts = OPERATORS.blend_rows(*view.state, *gradients, view.layers, absolute)
-    return return_rows(view.ranks, view.sent, len(view.radii), rows, counts)[:2]
+    return return_rows(view.ranks, view.sent, len(view.radii), rows, counts, view.inside)
 
 
 def decisive_in(view: View) -> Tensor:

@@ -4,16 +4,20 @@ What a GPU computes is read by the host, which then waits, as rarely as can be: 
 send, and once how many gradient rows.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from itertools import accumulate
+from functools import partial
+from typing import NamedTuple
 
 import torch
 from diff_gaussian_rasterization.backend import OPERATORS
 from torch import Tensor
 
 from gaussian_renderer.over_ranks.bands import Bands
+from utils.host.read_later import read_later
 from utils.ranks.ranks import Ranks
+
+_ROOM = 1.25  # records for each Gaussian, of which views see a part and few reach two bands
 
 
 @dataclass(slots=True)
@@ -26,9 +30,14 @@ class Sent:
     places: Tensor | None  # (n,) int32, by Gaussian, then by rank; None: as the records lie
 
 
-def agree_on_sizes(ranks: Ranks, counts: Tensor) -> tuple[list[int], list[int]]:
-    """How many records this rank sends to each rank, and how many it receives. counts: (size, n), those to each."""
-    every = ranks.agree(counts.sum(1))
+def agree_on_sizes(
+    ranks: Ranks, counts: Tensor, meanwhile: Callable[[], None] = lambda: None
+) -> tuple[list[int], list[int]]:
+    """How many records this rank sends to each rank, and how many it receives.
+
+    counts: (size, n), those to each. meanwhile: queues what a GPU does until the host knows the sizes.
+    """
+    every = ranks.agree(counts.sum(1), meanwhile)
     return every[ranks.rank], [numbers[ranks.rank] for numbers in every]
 
 
@@ -39,8 +48,16 @@ def send_splats(ranks: Ranks, bands: Bands, splats: tuple[Tensor, ...]) -> tuple
     """
     reach = *splats[2:], bands.limits
     counts = OPERATORS.count_records(*reach)
-    sizes, received = agree_on_sizes(ranks, counts[:-1])
-    gaussians, places = OPERATORS.list_records(*reach, counts, sum(sizes))
+    lists: list[tuple[Tensor, Tensor]] = []
+
+    def list_records(room: int) -> None:
+        lists[:] = [OPERATORS.list_records(*reach, counts, room)]
+
+    room = int(_ROOM * len(splats[0]))
+    sizes, received = agree_on_sizes(ranks, counts[:-1], partial(list_records, room))
+    if (total := sum(sizes)) > room:
+        list_records(total)
+    gaussians, places = (numbers[:total] for numbers in lists[0])
     rows = ranks.send(_packed([splats], gaussians, [len(gaussians)]), sizes, received)[0]
     return OPERATORS.unpack_splats(rows, splats[0]), Sent(gaussians, sizes, received, places)
 
@@ -48,43 +65,81 @@ def send_splats(ranks: Ranks, bands: Bands, splats: tuple[Tensor, ...]) -> tuple
 def send_views(ranks: Ranks, views: Sequence[tuple[Tensor, ...]]) -> tuple[tuple[Tensor, ...], Sent]:
     """Send what has tiles in view r to rank r; receive this rank's, in the order of ranks.
 
-    views: for each, tensors as of `send_splats`. The records are those of Gaussian v N + i for Gaussian i of view v, of
-    the rank's N Gaussians.
+    views: for each, tensors as of `send_splats`.
     """
     reached = torch.stack([tensors[-1] for tensors in views]) > 0
     sizes, received = agree_on_sizes(ranks, reached)
-    view, gaussian = torch.nonzero_static(reached, size=sum(sizes)).unbind(1)
+    gaussian = torch.nonzero_static(reached, size=sum(sizes))[:, 1]
     rows = ranks.send(_packed(views, gaussian, sizes), sizes, received)[0]
-    records = gaussian.add(view, alpha=reached.shape[1])
-    return OPERATORS.unpack_splats(rows, views[0][0]), Sent(records, sizes, received, None)
+    return OPERATORS.unpack_splats(rows, views[0][0]), Sent(gaussian, sizes, received, None)
 
 
-def return_rows(ranks: Ranks, sent: Sent, count: int, rows: Tensor, counts: Tensor) -> tuple[Tensor, Tensor, list[int]]:
+def return_rows(
+    ranks: Ranks, sent: Sent, count: int, rows: Tensor, counts: Tensor, inside: Tensor
+) -> tuple[Tensor, Tensor]:
     """Send gradient rows back; receive those of the rank's own `count` Gaussians from all ranks.
 
-    rows: (R, V), those of a record side by side; counts (n,) int32: of each record here. Returns the same for the
-    rank's Gaussians, each with its rows in the order of ranks, which is that of its tiles; and how many rows came from
-    each rank.
+    rows: (R, V), those of a record side by side; counts (n,) int32: of each record here; inside (n,): whether no other
+    rank has rows of the record's Gaussian. Returns the same for the rank's Gaussians: the rows of each in the order of
+    ranks, which is that of its tiles; or one row, their sum, where one rank has them all.
     """
-    own = ranks.send(counts, sent.received, sent.sizes)[0]
-    total = torch.zeros(count, dtype=torch.int32, device=rows.device).index_add_(0, sent.gaussians, own)
-    sums = _sums(torch.cat((own, counts)), [*sent.sizes, *sent.received])
-    lengths, sizes = sums[: ranks.size], sums[ranks.size :]
-    arrived = ranks.send(rows, sizes, lengths)[0]
-    if sent.places is not None:
-        arrived = OPERATORS.move_runs(arrived, own, sent.places)
-    return arrived, total, lengths
+    arrived = _send_back(ranks, sent, rows, counts, torch.where(inside, counts.clamp_max(1), counts))
+    runs = len(sent.places)
+    ends = torch.arange(runs, runs + ranks.size, dtype=torch.int32, device=rows.device)
+    places = _with_last(sent.places.split(sent.sizes), ends)
+    moved = OPERATORS.move_runs(arrived.rows, torch.cat(arrived.counts), places)
+    total = torch.zeros(count, dtype=torch.int32, device=rows.device)
+    for own, of_rank in zip(sent.gaussians.split(sent.sizes), arrived.counts, strict=True):
+        total.index_add_(0, own, of_rank[:-1])
+    return moved[: sum(arrived.lengths)], total
 
 
-def _sums(counts: Tensor, sizes: Sequence[int]) -> list[int]:
-    """The sums of runs of counts, waiting once for a GPU."""
-    ends = list(accumulate(sizes))
-    if not ends[-1]:
-        return [0] * len(sizes)
-    last = torch.tensor([max(end - 1, 0) for end in ends]).to(counts.device, non_blocking=True)
-    upto = counts.cumsum(0).index_select(0, last).tolist()
-    upto = [0, *(number if end else 0 for number, end in zip(upto, ends, strict=True))]
-    return [end - begin for begin, end in zip(upto, upto[1:], strict=False)]
+def return_sums(ranks: Ranks, sent: Sent, count: int, rows: Tensor, counts: Tensor) -> list[tuple[Tensor, Tensor]]:
+    """Send back one gradient row for each record of `send_views` that has any, their sum; receive those of other ranks.
+
+    Returns for each view the rows of the rank's own `count` Gaussians, and how many each has: one or none.
+    """
+    arrived = _send_back(ranks, sent, rows, counts, counts.clamp_max(1))
+    views = zip(sent.gaussians.split(sent.sizes), arrived.counts, arrived.rows.split(arrived.padded), strict=True)
+    found = []
+    for (own, of_view, part), length in zip(views, arrived.lengths, strict=True):
+        total = torch.zeros(count, dtype=torch.int32, device=rows.device)
+        found.append((part[:length], total.index_add_(0, own, of_view[:-1])))
+    return found
+
+
+class _Arrived(NamedTuple):
+    """Rows from all ranks, by rank, of each an even number, so that all begin at a multiple of 16 bytes."""
+
+    rows: Tensor
+    counts: list[Tensor]  # int32 of each record that the rank got, and last one more row, of zeros, or none
+    lengths: list[int]  # without these
+    padded: list[int]  # with them
+
+
+def _send_back(ranks: Ranks, sent: Sent, rows: Tensor, counts: Tensor, kept: Tensor) -> _Arrived:
+    """Send what is kept of the rows of each record (`sum_runs` of the rasterizer).
+
+    Where rows begin at other places than multiples of 16 bytes, NCCL takes nearly twice as long.
+    """
+    by_rank = kept.split(sent.received)
+    odd = torch.stack([part.sum() for part in by_rank]).remainder(2).int()
+    kept = _with_last(by_rank, odd)
+    counts = _with_last(counts.split(sent.received), torch.zeros_like(odd))
+    received, sizes = ([n + 1 for n in of] for of in (sent.received, sent.sizes))
+    own = ranks.send(kept, received, sizes)[0].split(sizes)
+    sums = [part.sum() for part in (*own, *kept.split(received))]
+    numbers = read_later(torch.stack([*sums, *(part[-1].long() for part in own)]))
+    summed = OPERATORS.sum_runs(rows, counts, kept, len(rows) + ranks.size)  # before the host waits
+    found = numbers()
+    padded, to_send, rest = (found[part * ranks.size : (part + 1) * ranks.size] for part in range(3))
+    arrived = ranks.send(summed[: sum(to_send)], to_send, padded)[0]
+    return _Arrived(arrived, list(own), [n - one for n, one in zip(padded, rest, strict=True)], padded)
+
+
+def _with_last(parts: Sequence[Tensor], last: Tensor) -> Tensor:
+    """The parts one after the other, each with one number of `last` behind it."""
+    return torch.cat([piece for pair in zip(parts, last.split(1), strict=True) for piece in pair])
 
 
 def _packed(views: Sequence[tuple[Tensor, ...]], gaussians: Tensor, sizes: Sequence[int]) -> Tensor:

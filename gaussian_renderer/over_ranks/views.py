@@ -12,7 +12,7 @@ from diff_gaussian_rasterization.ops import scene_arguments
 from diff_gaussian_rasterization.schema import GRADIENTS
 from torch import Tensor
 
-from gaussian_renderer.over_ranks.exchange import Sent, return_rows, send_views
+from gaussian_renderer.over_ranks.exchange import return_sums, send_views
 from utils.ranks.ranks import Ranks
 
 
@@ -87,7 +87,7 @@ class _Views(torch.autograd.Function):
         wanted = [needed[name] for name in GRADIENTS]
         count = len(gaussians[0])
         screen = gaussians[0].new_zeros(ctx.ranks.size, count if needed["means2d"] else 0, 3)
-        for view, (own, own_counts) in enumerate(_by_view(ctx.ranks, ctx.sent, count, rows, counts)):
+        for view, (own, own_counts) in enumerate(return_sums(ctx.ranks, ctx.sent, count, rows, counts)):
             arguments = *gaussians, *ctx.cameras[view], *ctx.own[view], own, own_counts
             if view == 0:
                 sums = dict(zip(GRADIENTS, OPERATORS.rows_vjp(*arguments, wanted, absolute), strict=True))
@@ -97,9 +97,3 @@ class _Views(torch.autograd.Function):
                 OPERATORS.rows_vjp_add_(*arguments, list(sums.values()), absolute)
         of_inputs = [sums[name] if needed[name] else None for name in Gaussians._fields]
         return None, None, None, None, screen if needed["means2d"] else None, *of_inputs
-
-
-def _by_view(ranks: Ranks, sent: Sent, count: int, rows: Tensor, counts: Tensor) -> list[tuple[Tensor, Tensor]]:
-    """`return_rows` for each view by itself: as Gaussian i of view v, row v * count + i of all."""
-    all_rows, totals, lengths = return_rows(ranks, sent, count * ranks.size, rows, counts)
-    return list(zip(all_rows.split(lengths), totals.view(ranks.size, count).unbind(), strict=True))

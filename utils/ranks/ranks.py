@@ -5,7 +5,7 @@ torch is imported on first use: not every program needs it.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from typing import TYPE_CHECKING, TypeVar
 
@@ -58,11 +58,13 @@ class Ranks:
         """All ranks' values, in the order of ranks; any objects that pickle."""
         return [value]
 
-    def agree(self, numbers: Tensor) -> list[list[int]]:
+    def agree(self, numbers: Tensor, meanwhile: Callable[[], None] = lambda: None) -> list[list[int]]:
         """The whole numbers (n,) int64 of each rank, by rank; the host waits for them.
 
-        `flag` and what was posted go with them, so that these need no exchange of their own.
+        meanwhile: called before the host waits, to queue what a GPU does until the host goes on. `flag` and what was
+        posted go with them, so that these need no exchange of their own.
         """
+        meanwhile()
         return [numbers.tolist()]
 
     def post(self, *news: int) -> None:

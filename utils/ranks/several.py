@@ -1,11 +1,12 @@
 """Several processes that train together, by torch.distributed: gloo on CPUs, NCCL on GPUs."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 import torch.distributed as dist
 from torch import Tensor
 
+from utils.host.read_later import read_later
 from utils.ranks.ranks import Ranks, Value
 
 # Into one tensor. The older name warns where there is a newer one.
@@ -56,10 +57,12 @@ class SeveralRanks(Ranks):
         dist.all_gather_object(box, value, group=self._numbers)
         return box
 
-    def agree(self, numbers: Tensor) -> list[list[int]]:
+    def agree(self, numbers: Tensor, meanwhile: Callable[[], None] = lambda: None) -> list[list[int]]:
         news = torch.tensor(self._news, device=self._place) if any(self._news) else self._silence
         flag = self._silence[:1] if self.flag is None else self.flag.to(self._place)
-        found = self._table(torch.cat((numbers.to(self._place), flag, news))).tolist()
+        found = read_later(self._table(torch.cat((numbers.to(self._place), flag, news))))
+        meanwhile()
+        found = found()
         first = len(numbers)
         flags = [row[first] for row in found]
         if flags[self.rank] < max(flags):

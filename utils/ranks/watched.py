@@ -137,8 +137,8 @@ class WatchedRanks(SeveralRanks):
         return super().everyone(value)
 
     @_watched
-    def agree(self, numbers: Tensor) -> list[list[int]]:
-        return super().agree(numbers)
+    def agree(self, numbers: Tensor, meanwhile: Callable[[], None] = lambda: None) -> list[list[int]]:
+        return super().agree(numbers, meanwhile)
 
     @_watched
     def table(self, values: Tensor) -> Tensor:

@@ -65,6 +65,8 @@ void unpack_splats(const Executor&, const UnpackInput&);
 void count_records(const Executor&, const RecordInput&, int32_t* counts);
 void list_records(const Executor&, const RecordInput&, const int32_t* counts, const RecordLists&);
 void move_runs(const Executor&, const MoveInput&);
+template <class T>
+void sum_runs(const Executor&, const SumInput<T>&);
 
 // What else the CPU offers. sum_rows: the rest of blend_vjp after blend_rows. project_vjp_step: project_vjp, and every
 // Gaussian's step as soon as its gradients are known.
@@ -92,6 +94,7 @@ void unpack_splats(const Queue&, const UnpackInput&);
 void count_records(const Queue&, const RecordInput&, int32_t* counts);
 void list_records(const Queue&, const RecordInput&, const int32_t* counts, const RecordLists&);
 void move_runs(const Queue&, const MoveInput&);
+void sum_runs(const Queue&, const SumInput<float>&);
 // Allocates the gradients; called while the GPU is busy, so that the host's work costs no time.
 struct GradientMemory {
   SceneGradient<float> (*take)(void* context);

@@ -235,9 +235,9 @@ struct RecordInput {
 };
 
 struct RecordLists {
-  int64_t count;       // of all records
-  int64_t* gaussians;  // (count) written: ascending for each band, band after band
-  int32_t* places;     // (count) written: the record's number by splat, then by band
+  int64_t room;        // records without room are left out
+  int64_t* gaussians;  // (room) written: ascending for each band, band after band
+  int32_t* places;     // (room) written: the record's number by splat, then by band
 };
 
 // Records are counted in blocks of so many splats.
@@ -252,6 +252,17 @@ struct MoveInput {
   const int32_t* places;  // (runs) its number in the new order
   const int32_t* from;    // (rows, words)
   int32_t* to;            // (rows, words), written
+};
+
+// Runs of rows that lie side by side, some of which become one row each, the sum of theirs.
+template <class T>
+struct SumInput {
+  int64_t runs, rows, room;  // rows: all of all runs; room: rows of `to`
+  int values;                // of a row: 10 or 12
+  const int32_t* counts;     // (runs) rows of each run
+  const int32_t* kept;       // (runs) 1: their sum, also of no rows; 0: nothing; else all of them
+  const T* from;             // (rows, values)
+  T* to;                     // (room, values), written as far as `kept` goes
 };
 
 // Weights of a Gaussian's opacity and of each of its scales in the loss (math/penalty.h).

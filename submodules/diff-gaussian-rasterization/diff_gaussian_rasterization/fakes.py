@@ -131,8 +131,13 @@ def _(rects, tile_counts, limits):
 
 
 @_fake("list_records")
-def _(rects, tile_counts, limits, counts, total):
-    return rects.new_empty((total,), dtype=torch.int64), rects.new_empty((total,))
+def _(rects, tile_counts, limits, counts, room):
+    return rects.new_empty((room,), dtype=torch.int64), rects.new_empty((room,))
+
+
+@_fake("sum_runs")
+def _(rows, counts, kept, room):
+    return rows.new_empty((room, rows.shape[1]))
 
 
 @_fake("move_runs")

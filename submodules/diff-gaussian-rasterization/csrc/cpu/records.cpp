@@ -52,7 +52,7 @@ void list_records(const Executor& executor, const RecordInput& in, const int32_t
       for (int band = 0; band < in.bands; ++band) {
         if (!reaches(in, i, band)) continue;
         const int64_t at = next[band]++;
-        if (uint64_t(at) < uint64_t(to.count)) to.gaussians[at] = i, to.places[at] = int32_t(place);
+        if (uint64_t(at) < uint64_t(to.room)) to.gaussians[at] = i, to.places[at] = int32_t(place);
         ++place;
       }
   });

@@ -38,24 +38,18 @@ struct FilledRows {
 // rows if there may be many and the host does not run ahead.
 GradientRows fill_rows(const Queue& queue, const BlendInput<float>& in, const BlendGradient<float>& g);
 
-// Sums a splat's rows, in an order that depends on their number alone. The rows of a warp's splats lie side by side, so
-// they come through shared memory in whole lines. A splat near the camera has thousands of rows, which the whole warp
-// adds.
+// Sums the rows of a warp's splats, each in an order that depends on their number alone. The rows of neighbours lie
+// side by side, so they come through shared memory in whole lines. A splat near the camera has thousands of rows, which
+// the whole warp adds.
 template <int kValues>
-struct SlotSumsOf {
+struct WarpSums {
   static constexpr int kOwnRows = 48;
   static constexpr int kStaged = 32;                // rows at a time
   static constexpr int kStage = kStaged * kValues;  // floats of shared memory for each warp
-  RowsOf<kValues> rows;
-  const SplatSlots* slots;
 
-  __device__ bool seen(int64_t splat) const { return slots[splat + 1].first > slots[splat].first; }
-
-  // All lanes of a warp call this. Those whose splat is wanted get its sums, the others zeros.
-  __device__ void read(int64_t splat, bool wanted, float* sums, float* stage) const {
+  // All lanes of a warp call this, each with its own rows, from `begin` to `end`; there may be none.
+  __device__ static void add_up(const float* rows, unsigned begin, unsigned end, float* sums, float* stage) {
     const int lane = threadIdx.x & 31;
-    unsigned begin = 0, end = 0;  // instances are fewer than 2^31
-    if (wanted) begin = unsigned(rows.row(slots[splat].first)), end = unsigned(rows.row(slots[splat + 1].first));
     const bool many = end - begin > kOwnRows;
     for (int v = 0; v < kValues; ++v) sums[v] = 0;
 
@@ -64,7 +58,7 @@ struct SlotSumsOf {
       const bool open = !many && next < end;
       const unsigned first = __reduce_min_sync(kWarp, open ? next : ~0u);
       if (first == ~0u) break;
-      const float2* from = reinterpret_cast<const float2*>(rows.values + int64_t(kValues) * first);
+      const float2* from = reinterpret_cast<const float2*>(rows + int64_t(kValues) * first);
       const int pairs = kValues / 2 * int(last - first < kStaged ? last - first : kStaged);
       __syncwarp();  // every lane has added the rows before
       for (int k = lane; k < pairs; k += 32) reinterpret_cast<float2*>(stage)[k] = from[k];
@@ -78,7 +72,7 @@ struct SlotSumsOf {
       const unsigned stop = __shfl_sync(kWarp, end, owner);
       float part[kValues] = {};
       for (unsigned row = __shfl_sync(kWarp, begin, owner) + lane; row < stop; row += 32)
-        add(rows.values + int64_t(kValues) * row, part);
+        add(rows + int64_t(kValues) * row, part);
       for (int v = 0; v < kValues; ++v) {
         for (int step = 16; step; step /= 2) part[v] += __shfl_xor_sync(kWarp, part[v], step);
         if (lane == owner) sums[v] = part[v];
@@ -92,6 +86,23 @@ struct SlotSumsOf {
       const float2 pair = reinterpret_cast<const float2*>(row)[v];
       sums[2 * v] += pair.x, sums[2 * v + 1] += pair.y;
     }
+  }
+};
+
+// Sums the rows of splats by their slots.
+template <int kValues>
+struct SlotSumsOf {
+  static constexpr int kStage = WarpSums<kValues>::kStage;
+  RowsOf<kValues> rows;
+  const SplatSlots* slots;
+
+  __device__ bool seen(int64_t splat) const { return slots[splat + 1].first > slots[splat].first; }
+
+  // All lanes of a warp call this. Those whose splat is wanted get its sums, the others zeros.
+  __device__ void read(int64_t splat, bool wanted, float* sums, float* stage) const {
+    unsigned begin = 0, end = 0;  // instances are fewer than 2^31
+    if (wanted) begin = unsigned(rows.row(slots[splat].first)), end = unsigned(rows.row(slots[splat + 1].first));
+    WarpSums<kValues>::add_up(rows.values, begin, end, sums, stage);
   }
 };
 

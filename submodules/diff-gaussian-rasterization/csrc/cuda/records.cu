@@ -76,7 +76,7 @@ __global__ void __launch_bounds__(kThreads)
     for (int band = 0; band < count; ++band) {
       if (!reached.has(band)) continue;
       const int64_t at = int64_t(begins[(first + band) * blocks + blockIdx.x]) + reached.before(band);
-      if (uint64_t(at) < uint64_t(to.count)) to.gaussians[at] = i, to.places[at] = place;
+      if (uint64_t(at) < uint64_t(to.room)) to.gaussians[at] = i, to.places[at] = place;
       ++place;
     }
   }

@@ -1,5 +1,5 @@
 #pragma once
-// Splats packed and unpacked, and runs of rows moved, on the CPU or by the CUDA kernels.
+// Splats packed and unpacked, and runs of rows moved and added up, on the CPU or by the CUDA kernels.
 #include <algorithm>
 #include <numeric>
 #include <random>
@@ -101,6 +101,30 @@ std::vector<int32_t> move(const Where& where, const SomeRuns& r) {
   std::vector<int32_t> to(r.rows.size(), -77);
   move_runs(where, gs::MoveInput{int64_t(r.counts.size()), int64_t(r.rows.size()) / r.words, r.words, r.counts.data(),
                                  r.places.data(), r.rows.data(), to.data()});
+  return to;
+}
+
+// What is kept of runs of rows: all, their sum, or nothing.
+struct SomeSums {
+  std::vector<int32_t> counts, kept;
+  std::vector<float> rows;
+  int values;
+  int64_t room = 0;
+
+  SomeSums(const std::vector<int32_t>& of, int values_of_row) : counts(of), values(values_of_row) {
+    for (size_t i = 0; i < counts.size(); ++i) kept.push_back(i % 7 == 3 ? 0 : i % 5 == 2 ? counts[i] : 1);
+    for (int64_t k = 0; k < values * std::accumulate(counts.begin(), counts.end(), int64_t(0)); ++k)
+      rows.push_back(float(normal()));
+    room = std::accumulate(kept.begin(), kept.end(), int64_t(0)) + 2;
+  }
+};
+
+template <class Where>
+std::vector<float> sum(const Where& where, const SomeSums& s) {
+  using gs::sum_runs, gs::cuda::sum_runs;
+  std::vector<float> to(s.values * s.room, -77.0f);
+  sum_runs(where, gs::SumInput<float>{int64_t(s.counts.size()), int64_t(s.rows.size()) / s.values, s.room, s.values,
+                                      s.counts.data(), s.kept.data(), s.rows.data(), to.data()});
   return to;
 }
 

@@ -79,6 +79,19 @@ KeptRows rows_by_bands(const Where& where, const Rendered& r, int high, bool abs
   return out;
 }
 
+// In place of the rows of each splat, their sum.
+template <class Where>
+KeptRows summed(const Where& where, const KeptRows& in) {
+  using gs::sum_runs, gs::cuda::sum_runs;
+  KeptRows out{{}, in.counts, in.values};
+  for (int32_t& count : out.counts) count = std::min(count, 1);
+  const int64_t runs = in.counts.size(), room = std::accumulate(out.counts.begin(), out.counts.end(), int64_t(0));
+  out.rows.assign(room * in.values, NAN);
+  sum_runs(where, gs::SumInput<float>{runs, int64_t(in.rows.size()) / in.values, room, in.values, in.counts.data(),
+                                      out.counts.data(), in.rows.data(), out.rows.data()});
+  return out;
+}
+
 // Scenes of which splats have no rows, few or many: one lies over the whole image, and of the last scene none is seen.
 inline std::vector<Parameters<float>> scenes_for_rows() {
   std::vector<Parameters<float>> scenes;
@@ -88,7 +101,8 @@ inline std::vector<Parameters<float>> scenes_for_rows() {
   return scenes;
 }
 
-// Checks the rows of bands against those of the whole image, and `gradients_of` them against those of the lists.
+// Checks the rows of bands against those of the whole image, and `gradients_of` them and of their sums against those of
+// the lists.
 // gradients_of(r, rows or null for the lists, lengths of absolute gradients or null): means, ..., sh_rest.
 template <class Where, class GradientsOf>
 void check_rows(const Where& where, const gs::Scene<float>& scene, bool depth, bool layers,
@@ -105,7 +119,10 @@ void check_rows(const Where& where, const gs::Scene<float>& scene, bool depth, b
     std::vector<float> lengths[2];
     for (std::vector<float>& of : lengths) of.assign(absolute ? scene.count : 0, -77.0f);
     const auto to = [&](int which) { return absolute ? lengths[which].data() : nullptr; };
-    CHECK(gradients_of(*r, &whole, to(0)) == gradients_of(*r, static_cast<const KeptRows*>(nullptr), to(1)));
-    CHECK(lengths[0] == lengths[1]);
+    const auto wanted = gradients_of(*r, static_cast<const KeptRows*>(nullptr), to(1));
+    for (const KeptRows& rows : {whole, summed(where, whole)}) {
+      CHECK(gradients_of(*r, &rows, to(0)) == wanted);
+      CHECK(lengths[0] == lengths[1]);
+    }
   }
 }

@@ -604,6 +604,32 @@ void test_moved_runs() {
       }
 }
 
+// Sums of few rows have the CPU's bits but for its double precision; rows that are kept, all of them.
+void test_summed_runs() {
+  for (const gs::emulation::Order order : gs::emulation::kOrders)
+    for (const int values : {10, 12})
+      for (const std::vector<int32_t>& counts : counts_of_runs()) {
+        gs::emulation::order = order;
+        gs::emulation::Memory memory;
+        const SomeSums sums(counts, values);
+        const std::vector<float> wanted = sum(gs::serial_executor(), sums), got = sum(memory.queue(), sums);
+        for (size_t k = 0, run = 0, next = 0; run < counts.size(); ++run)
+          for (next += size_t(values) * sums.kept[run]; k < next; ++k)
+            CHECK(counts[run] == 1 || sums.kept[run] > 1 ? got[k] == wanted[k] : std::abs(got[k] - wanted[k]) < 1e-3);
+        CHECK(std::count(got.end() - 2 * values, got.end(), -77.0f) == 2 * values);
+      }
+}
+
+// What the CPU refuses stays within memory on a GPU.
+void test_sums_that_do_not_fit() {
+  for (const auto& [run, count, kept] : {std::tuple{3, 1000, 1}, {3, -1000, 1}, {3, 2, -5}, {3, 2, 9}, {299, 2, 9}}) {
+    gs::emulation::Memory memory;
+    SomeSums sums(std::vector<int32_t>(300, 2), 10);
+    sums.counts[run] = count, sums.kept[run] = kept;
+    CHECK(sum(memory.queue(), sums).size() == size_t(10 * sums.room));
+  }
+}
+
 // What the CPU refuses stays within memory on a GPU.
 void test_runs_that_do_not_fit() {
   for (const auto& [run, count, place] : {std::tuple{3, 1000, 3}, {3, -1000, 3}, {3, 0, 3}, {3, 5, 5000}, {3, 5, -1}}) {
@@ -842,6 +868,8 @@ int main() {
                          test_packed_splats,
                          test_moved_runs,
                          test_runs_that_do_not_fit,
+                         test_summed_runs,
+                         test_sums_that_do_not_fit,
                          test_noise,
                          test_given_covariances_and_colors});
 }

@@ -1,8 +1,10 @@
-// The ops of what processes exchange: splats packed into rows of words, and gradient rows in another order.
+// The ops of what processes exchange: splats packed into rows of words, and gradient rows added up and in another
+// order.
 
 #include <cstdint>
 #include <limits>
 #include <tuple>
+#include <type_traits>
 #include <vector>
 
 #include "backward.h"
@@ -87,6 +89,58 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> unpack_splats_op(const Tensor& packed
   return {splats, depths, rects, tile_counts};
 }
 
+// Values of a gradient row, with or without those of absolute gradients.
+void check_gradient_rows(const Tensor& rows) {
+  check_given(rows, "rows");
+  GS_CHECK_TYPE(is_floating(rows.scalar_type()), "rows must be float32 or float64, got ", rows.scalar_type());
+  GS_CHECK_VALUE(
+      rows.dim() == 2 && (rows.size(1) == kGradientValues || rows.size(1) == kGradientValues + kAbsoluteValues),
+      "rows must be (R, ", kGradientValues, ") or (R, ", kGradientValues + kAbsoluteValues, "), got ", rows.sizes());
+  GS_CHECK(rows.size(0) <= std::numeric_limits<int32_t>::max(), rows.size(0), " rows are more than 2^31 - 1");
+}
+
+// Whether the runs have all rows, and what is kept of them finds room; only on the CPU.
+void check_sums(const Tensor& counts, const Tensor& kept, int64_t rows, int64_t room) {
+  if (!counts.is_cpu()) return;
+  const int32_t *lengths = read<int32_t>(counts), *left = read<int32_t>(kept);
+  int64_t sums[2] = {0, 0};
+  for (int64_t i = 0; i < counts.size(0); ++i) {
+    GS_CHECK_VALUE(lengths[i] >= 0, "counts must be 0 or more, got ", lengths[i], " of run ", i);
+    GS_CHECK_VALUE(left[i] == 0 || left[i] == 1 || left[i] == lengths[i], "kept must be 0, 1 or the run's count, got ",
+                   left[i], " of run ", i);
+    sums[0] += lengths[i], sums[1] += left[i];
+  }
+  GS_CHECK_VALUE(sums[0] == rows, "counts add up to ", sums[0], ", but there are ", rows, " rows");
+  GS_CHECK_VALUE(sums[1] <= room, "kept adds up to ", sums[1], " rows, for which a room of ", room, " is too small");
+}
+
+// Runs of gradient rows of which each is kept, or becomes one row, its sum, which is of zeros if it has no rows; or is
+// left out. room: rows of the result, of which only those that `kept` adds up to are defined. On a GPU bad numbers are
+// not refused; rows that they would give stay undefined then.
+Tensor sum_runs_op(const Tensor& rows, const Tensor& counts, const Tensor& kept, int64_t room) {
+  check_gradient_rows(rows);
+  check_tensor(counts, "counts", ScalarType::Int, rows.device(), {-1});
+  check_tensor(kept, "kept", ScalarType::Int, rows.device(), {counts.size(0)});
+  GS_CHECK(room >= 0 && room <= std::numeric_limits<int32_t>::max(), "a room of ", room, " is not from 0 to 2^31 - 1");
+  words_of_value(rows);
+  const Tensor from = aligned(rows, 2), lengths = packed(counts), left = packed(kept);
+  check_sums(lengths, left, rows.size(0), room);
+  Tensor to = empty({room, rows.size(1)}, rows);
+  with_scalar(rows.scalar_type(), [&](auto zero) {
+    using T = decltype(zero);
+    const gs::SumInput<T> in{lengths.size(0),        from.size(0),        room,          int(from.size(1)),
+                             read<int32_t>(lengths), read<int32_t>(left), read<T>(from), write<T>(to)};
+    if (!rows.is_cuda()) return gs::sum_runs(gs::torch_executor(), in);
+#ifdef GS_CUDA
+    if constexpr (std::is_same_v<T, float>) {
+      gs::TorchQueue queue(rows.device());
+      gs::cuda::sum_runs(queue.queue(), in);
+    }
+#endif
+  });
+  return to;
+}
+
 // Whether the runs have all rows, and each a place of its own; only on the CPU.
 void check_runs(const Tensor& counts, const Tensor& places, int64_t rows) {
   if (!counts.is_cpu()) return;
@@ -106,14 +160,9 @@ void check_runs(const Tensor& counts, const Tensor& places, int64_t rows) {
 // Gradient rows in another order of their runs. On a GPU bad counts and places are not refused; rows without a run of
 // their own stay undefined then.
 Tensor move_runs_op(const Tensor& rows, const Tensor& counts, const Tensor& places) {
-  check_given(rows, "rows");
-  GS_CHECK_TYPE(is_floating(rows.scalar_type()), "rows must be float32 or float64, got ", rows.scalar_type());
-  GS_CHECK_VALUE(
-      rows.dim() == 2 && (rows.size(1) == kGradientValues || rows.size(1) == kGradientValues + kAbsoluteValues),
-      "rows must be (R, ", kGradientValues, ") or (R, ", kGradientValues + kAbsoluteValues, "), got ", rows.sizes());
+  check_gradient_rows(rows);
   check_tensor(counts, "counts", ScalarType::Int, rows.device(), {-1});
   check_tensor(places, "places", ScalarType::Int, rows.device(), {counts.size(0)});
-  GS_CHECK(rows.size(0) <= std::numeric_limits<int32_t>::max(), rows.size(0), " rows are more than 2^31 - 1");
   const int wide = words_of_value(rows);
   const Tensor from = aligned(rows, 2), lengths = packed(counts), order = packed(places);
   check_runs(lengths, order, rows.size(0));
@@ -134,6 +183,7 @@ GS_OPERATORS(diff_gaussian_rasterization, m) {
   m.define(
       "unpack_splats(Tensor packed, Tensor like) -> (Tensor splats, Tensor depths, Tensor rects, Tensor tile_counts)",
       TORCH_BOX(&unpack_splats_op));
+  m.define("sum_runs(Tensor rows, Tensor counts, Tensor kept, int room) -> Tensor", TORCH_BOX(&sum_runs_op));
   m.define("move_runs(Tensor rows, Tensor counts, Tensor places) -> Tensor", TORCH_BOX(&move_runs_op));
 }
 

@@ -48,7 +48,7 @@ Tensor count_records_op(const Tensor& rects, const Tensor& tile_counts, const Te
 }
 
 // Only on the CPU, as reading counts from a GPU waits for it.
-void check_total(const Tensor& counts, int64_t total) {
+void check_record_counts(const Tensor& counts) {
   if (!counts.is_cpu()) return;
   const int32_t* of = read<int32_t>(counts);
   const int64_t by_band = (counts.size(0) - 1) * counts.size(1), all = counts.numel();
@@ -57,22 +57,22 @@ void check_total(const Tensor& counts, int64_t total) {
     GS_CHECK_VALUE(of[k] >= 0, "counts must be 0 or more, got ", of[k]);
     sums[k >= by_band] += of[k];
   }
-  GS_CHECK_VALUE(sums[0] == total && sums[1] == total, "counts add up to ", sums[0], " and ", sums[1],
-                 " records, not to ", total);
+  GS_CHECK_VALUE(sums[0] == sums[1], "counts add up to ", sums[0], " records by band, and to ", sums[1],
+                 " of all bands");
 }
 
 // The Gaussian of each record, ascending for each band, band after band; and the record's number by Gaussian, then by
-// band. counts: of count_records. total: of records. On a GPU wrong counts and totals are not refused; the lists stay
-// undefined then.
+// band. counts: of count_records. room: of the lists, from which more records are left out. On a GPU wrong counts are
+// not refused; the lists stay undefined then.
 std::tuple<Tensor, Tensor> list_records_op(const Tensor& rects, const Tensor& tile_counts, const Tensor& limits,
-                                           const Tensor& counts, int64_t total) {
+                                           const Tensor& counts, int64_t room) {
   const Reach reach(rects, tile_counts, limits);
   check_tensor(counts, "counts", ScalarType::Int, rects.device(), reach.shape());
-  GS_CHECK(total >= 0 && total <= std::numeric_limits<int32_t>::max(), total, " records are not from 0 to 2^31 - 1");
+  GS_CHECK(room >= 0 && room <= std::numeric_limits<int32_t>::max(), "a room of ", room, " is not from 0 to 2^31 - 1");
   const Tensor given = packed(counts);
-  check_total(given, total);
-  Tensor gaussians = empty<int64_t>({total}, rects), places = empty<int32_t>({total}, rects);
-  const gs::RecordLists to{total, write<int64_t>(gaussians), write<int32_t>(places)};
+  check_record_counts(given);
+  Tensor gaussians = empty<int64_t>({room}, rects), places = empty<int32_t>({room}, rects);
+  const gs::RecordLists to{room, write<int64_t>(gaussians), write<int32_t>(places)};
 #ifdef GS_CUDA
   if (rects.is_cuda()) {
     gs::TorchQueue queue(rects.device());
@@ -89,7 +89,7 @@ std::tuple<Tensor, Tensor> list_records_op(const Tensor& rects, const Tensor& ti
 GS_OPERATORS(diff_gaussian_rasterization, m) {
   m.define("count_records(Tensor rects, Tensor tile_counts, Tensor limits) -> Tensor", TORCH_BOX(&count_records_op));
   m.define(
-      "list_records(Tensor rects, Tensor tile_counts, Tensor limits, Tensor counts, int total) -> "
+      "list_records(Tensor rects, Tensor tile_counts, Tensor limits, Tensor counts, int room) -> "
       "(Tensor gaussians, Tensor places)",
       TORCH_BOX(&list_records_op));
 }

@@ -1,0 +1,77 @@
+// Adds up runs of gradient rows before they go to other processes.
+#include <cuda_runtime.h>
+
+#include <cub/cub.cuh>
+
+#include "../backend.h"
+#include "gradient_rows.cuh"
+
+namespace gs {
+namespace cuda {
+
+using baseline::kAbsoluteValues, baseline::kGradientValues;
+
+namespace {
+
+constexpr int kThreads = 128, kRows = 32;  // new rows of a warp that go through shared memory
+
+__device__ inline void copy_pairs(const float* from, int64_t pairs, float* to) {
+  for (int64_t k = 0; k < pairs; ++k) reinterpret_cast<float2*>(to)[k] = reinterpret_cast<const float2*>(from)[k];
+}
+
+// A thread takes a run. The new rows of a warp lie side by side, so it writes them in whole lines, unless they are
+// many.
+template <int kValues>
+__global__ void __launch_bounds__(kThreads)
+    sum_runs_kernel(SumInput<float> in, const int32_t* begins, const int32_t* new_begins) {
+  using Sums = WarpSums<kValues>;
+  static_assert(Sums::kStage >= kRows * kValues, "a warp's new rows find room");
+  __shared__ __align__(16) float stages[kThreads / 32 * Sums::kStage];
+  const int lane = threadIdx.x & 31;
+  float* stage = stages + threadIdx.x / 32 * Sums::kStage;
+  const int64_t run = int64_t(blockIdx.x) * kThreads + threadIdx.x;
+  const bool mine = run < in.runs;
+  const int64_t count = mine ? in.counts[run] : 0, from = mine ? begins[run] : 0;
+  int64_t kept = mine ? in.kept[run] : 0;
+  const int64_t to = mine ? new_begins[run] : 0;
+  const bool fits = count >= 0 && from >= 0 && from + count <= in.rows && to >= 0 && to + kept <= in.room;
+  if (!fits || kept < 0 || (kept > 1 && kept > count)) kept = 0;
+  float sums[kValues];
+  Sums::add_up(in.from, kept == 1 ? unsigned(from) : 0, kept == 1 ? unsigned(from + count) : 0, sums, stage);
+
+  const unsigned first = __reduce_min_sync(kWarp, kept ? unsigned(to) : ~0u);
+  const unsigned end = __reduce_max_sync(kWarp, unsigned(kept ? to + kept : 0));
+  if (first >= end) return;
+  const bool staged = end - first <= kRows;
+  float* row = staged ? stage + kValues * (to - first) : in.to + kValues * to;
+  __syncwarp();  // every lane has added what lies there
+  if (kept == 1)
+    copy_pairs(sums, kValues / 2, row);
+  else if (kept)
+    copy_pairs(in.from + kValues * from, kValues / 2 * kept, row);
+  if (!staged) return;
+  __syncwarp();
+  float2* lines = reinterpret_cast<float2*>(in.to + int64_t(kValues) * first);
+  for (int k = lane; k < int(end - first) * kValues / 2; k += 32) lines[k] = reinterpret_cast<const float2*>(stage)[k];
+}
+
+}  // namespace
+
+void sum_runs(const Queue& queue, const SumInput<float>& in) {
+  if (!in.runs) return;
+  const cudaStream_t stream = stream_of(queue);
+  int32_t *begins = queue.array<int32_t>(in.runs), *new_begins = queue.array<int32_t>(in.runs);
+  const auto scan = [&](const int32_t* counts, int32_t* sums) {
+    with_memory(queue, [&](void* memory, size_t& bytes) {
+      return cub::DeviceScan::ExclusiveSum(memory, bytes, counts, sums, in.runs, stream);
+    });
+  };
+  scan(in.counts, begins), scan(in.kept, new_begins);
+  const auto sum = in.values == kGradientValues ? sum_runs_kernel<kGradientValues>
+                                                : sum_runs_kernel<kGradientValues + kAbsoluteValues>;
+  sum<<<blocks_for(in.runs, kThreads), kThreads, 0, stream>>>(in, begins, new_begins);
+  check_launch("sum_runs");
+}
+
+}  // namespace cuda
+}  // namespace gs
