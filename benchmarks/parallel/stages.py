@@ -111,7 +111,7 @@ def _sent(ranks: Ranks, rows: Tensor, sizes: list[int], *_: Any) -> int:
     return width * (sum(sizes) - sizes[ranks.rank])
 
 
-def _copies(ranks: Ranks, values: Tensor) -> int:
+def _copies(ranks: Ranks, values: Tensor, *_: Any) -> int:
     return (ranks.size - 1) * values.nbytes
 
 
