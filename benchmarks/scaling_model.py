@@ -26,8 +26,9 @@ PROJECTED = 40 + 4 + 16 + 4 + 4
 TILE_RECORD = 16  # while projection runs, and again on a rank that bins what it received
 RECORD = 40 + 4 + 16 + 4  # of a visible Gaussian, sent to each band that it reaches
 COUNT = 4  # of gradient rows, sent back for each record
-PLACE, MARK = 12, 4  # of a record and of a row, while rows are put in order
-ROW = 40  # of gradients, sent back for each processed instance; 48 with absolute gradients
+PLACE, MARK = 28, 4  # of a record and of a row, while rows are added up and put in order
+LISTED = 15  # of a Gaussian: room for the list of records, 12 bytes each, and a quarter more
+ROW = 40  # of gradients: the sum of a Gaussian's, sent back if it has any; 48 with absolute gradients
 BIN_SPLAT, SLOTS_SPLAT = 44, 16  # of a record while binning: keys, orders, offsets and memory of the sort; its slots
 BIN_INSTANCE, INSTANCE = 18, 4  # while binning: keys twice, splats twice, memory of the sort; afterwards
 SLOT = 0.25  # a bit, and its share of the prefix sums
@@ -60,6 +61,7 @@ class Workload:
     seen: float
     instances: float
     processed: float
+    returned: float  # seen Gaussians with a processed instance
     width: int
     height: int
     rows: float = 1.73  # rows of tiles of a rectangle
@@ -74,11 +76,12 @@ class Workload:
         return -(-self.height // TILE)
 
 
-# Measured: Gaussians, instances and processed instances of XL (docs/results/kernels.md); its rectangles were counted on
-# 200,000 splats of the same distribution. The others are assumed.
-XL = Workload("XL, 6 M, 1600x1060", 6e6, 5.86e6, 17.25e6, 2.69e6, 1600, 1060)
-LARGE = Workload("20 M, 3840x2160", 20e6, 10e6, 29.5e6, 9e6, 3840, 2160)
-CITY = Workload("a city, 200 M, 3840x2160", 200e6, 4e6, 11.8e6, 7.5e6, 3840, 2160)
+# Measured: Gaussians, instances and processed instances of XL (docs/results/kernels.md), and how many Gaussians these
+# are of (by the bytes of docs/results/several_gpus.md); its rectangles were counted on 200,000 splats of the same
+# distribution. The others are assumed; 0.485 Gaussians for each processed instance were measured on another city.
+XL = Workload("XL, 6 M, 1600x1060", 6e6, 5.86e6, 17.25e6, 2.69e6, 1.03e6, 1600, 1060)
+LARGE = Workload("20 M, 3840x2160", 20e6, 10e6, 29.5e6, 9e6, 4.37e6, 3840, 2160)
+CITY = Workload("a city, 200 M, 3840x2160", 200e6, 4e6, 11.8e6, 7.5e6, 3.64e6, 3840, 2160)
 SCENES = (XL, LARGE, CITY)
 
 
@@ -105,13 +108,13 @@ class Design:
 
     name: str
     whole_image: bool  # every rank gets it, and takes the whole loss; else a halo of HALO rows
-    waits: int  # of the host for numbers of the GPU
+    waits: int  # of the host for numbers of the GPU, which has nothing to do meanwhile
     calls: int  # collective ones (STEP and WHOLE_STEP of tests/test_ranks_training.py)
     operators: int  # small ones, whatever the number of ranks
 
 
-AS_WRITTEN = Design("as written", False, 4, 7, 42)  # operators that compute or copy, counted
-WHOLE_IMAGE = Design("whole image", True, 4, 6, 42)
+AS_WRITTEN = Design("as written", False, 2, 7, 42)  # operators that compute or copy, counted at commit 5418e62
+WHOLE_IMAGE = Design("whole image", True, 2, 6, 42)
 LEAN = Design("lean", False, 0, 4, 0)
 DESIGNS = (AS_WRITTEN, WHOLE_IMAGE, LEAN)
 
@@ -131,7 +134,7 @@ def tiles_traffic(scene: Workload, gpus: int, design: Design = AS_WRITTEN) -> di
     return {
         "records": RECORD * records,
         "image": IMAGE * scene.pixels * away if design.whole_image else halo,
-        "rows": ROW * scene.processed / gpus * away,
+        "rows": ROW * scene.returned / gpus * away,
         "counts": COUNT * records,
         "photo": PHOTO * scene.pixels * away,
     }
@@ -140,7 +143,7 @@ def tiles_traffic(scene: Workload, gpus: int, design: Design = AS_WRITTEN) -> di
 def views_traffic(scene: Workload, gpus: int) -> dict[str, float]:
     """Bytes that a rank sends to others in a step of --parallel views, which has a view for each rank."""
     away = (gpus - 1) / gpus
-    sizes = {"records": RECORD * scene.seen, "rows": ROW * scene.processed, "counts": COUNT * scene.seen}
+    sizes = {"records": RECORD * scene.seen, "rows": ROW * scene.returned, "counts": COUNT * scene.seen}
     return {name: size * away for name, size in sizes.items()}
 
 
@@ -233,6 +236,7 @@ def step_bytes(scene: Workload, gpus: int) -> float:
     share = scene.seen / scene.gaussians
     records = share * bands_crossed(scene, gpus)
     instances, processed = scene.instances / scene.gaussians, scene.processed / scene.gaussians
+    returned = scene.returned / scene.gaussians
     if gpus == 1:
         splats, arrived = 1.0, 0.0
     else:
@@ -244,8 +248,9 @@ def step_bytes(scene: Workload, gpus: int) -> float:
     lists = SLOTS_SPLAT * splats + INSTANCE * instances + SLOT * scene.slots * share
     rows = ROW * processed
     if gpus > 1:
-        rows = 3 * rows + MARK * processed + PLACE * records  # made, received, put in order
-    return PROJECTED + max(TILE_RECORD, arrived + max(exchange, binning, lists + rows))
+        # Made, and room for the sums; received and put in order.
+        rows = 2 * rows + (2 * ROW + MARK) * returned + PLACE * records
+    return PROJECTED + (LISTED if gpus > 1 else 0) + max(TILE_RECORD, arrived + max(exchange, binning, lists + rows))
 
 
 def peak_bytes(scene: Workload, gpus: int, spill: bool = False) -> float:
@@ -276,7 +281,8 @@ def stage_table() -> list[str]:
 
 def _like(share: float) -> Workload:
     """A scene of which a view sees a share, with XL's instances of a seen Gaussian."""
-    return Workload(f"{share:.0%}", 1e8, share * 1e8, 2.94 * share * 1e8, 0.46 * share * 1e8, 3840, 2160)
+    seen = share * 1e8
+    return Workload(f"{share:.0%}", 1e8, seen, 2.94 * seen, 0.46 * seen, 0.176 * seen, 3840, 2160)
 
 
 def peak_table() -> list[str]:

@@ -138,7 +138,7 @@ def test_the_model_of_scaling_agrees_with_stages_that_were_measured():
 
 
 def test_two_ranks_send_each_other_half_of_what_a_view_sees():
-    scene = scaling_model.Workload("", 100, 80, 200, 60, 32, 64, rows=1.0)
+    scene = scaling_model.Workload("", 100, 80, 200, 90, 60, 32, 64, rows=1.0)
     sent = scaling_model.tiles_traffic(scene, 2)
     photo = 3 * 32 * 64 / 2
     assert sent == {"records": 64 * 20, "image": 2 * 10 * 32 * 12, "rows": 40 * 15, "counts": 4 * 20, "photo": photo}
