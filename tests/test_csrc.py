@@ -63,6 +63,7 @@ SCHEMAS = [
     "list_records(Tensor rects, Tensor tile_counts, Tensor limits, Tensor counts, int room) -> "
     "(Tensor gaussians, Tensor places)",
     "sum_runs(Tensor rows, Tensor counts, Tensor kept, int room) -> Tensor",
+    "sum_parts(Tensor counts, int[] sizes) -> Tensor",
     "move_runs(Tensor rows, Tensor counts, Tensor places) -> Tensor",
     f"rasterize_vjp_step_({STEPPED_SCENE}, {BACKWARD}, Tensor tile_counts, Tensor layers, {STEP}) -> ()",
     f"rows_vjp_step_({STEPPED_SCENE}, {ROWS}, {STEP}) -> ()",

@@ -6,6 +6,10 @@ from diff_gaussian_rasterization.fakes import ABSOLUTE_VALUES, MOMENT_VALUES, SP
 from rasterizer_tools import BOTH_AND_GPU, CPU_AND_GPU, moved_by_a_word, ops
 from torch import Tensor, library
 
+from gaussian_renderer.over_ranks.exchange import Sent, return_rows
+from utils.host.read_later import read_later
+from utils.ranks.ranks import Ranks
+
 Splats = tuple[Tensor, ...]  # splats, depths, rects, tile_counts
 LARGE = 20_000  # more than a thread of the CPU takes at once, and no multiple of anything
 
@@ -193,6 +197,71 @@ def test_wrong_sums_are_named():
     refused(ValueError, "kept must be 0, 1 or the run's count, got 2 of run 0", [3, 2], [2, 2])
     refused(ValueError, "kept adds up to 4 rows, for which a room of 3 is too small", [3, 2], [3, 1])
     refused(RuntimeError, "a room of -1 is not from 0 to 2", [3, 2], [1, 1], room=-1)
+
+
+@CPU_AND_GPU
+def test_parts_are_added_up(device):
+    counts = torch.randint(9, (LARGE,), generator=torch.Generator().manual_seed(4), dtype=torch.int32).to(device)
+    counts[0] = 2**31 - 1
+    sizes = [5, 0, 1, LARGE - 7, 1]
+    found = ops.sum_parts(counts, sizes)
+    assert found.dtype == torch.int64 and found.tolist() == [int(part.sum()) for part in counts.split(sizes)]
+    assert ops.sum_parts(counts[:0], [0, 0]).tolist() == [0, 0] and len(ops.sum_parts(counts[:0], [])) == 0
+    assert torch.equal(ops.sum_parts(torch.stack((counts, counts), 1)[:, 0], sizes), found)
+    library.opcheck(ops.sum_parts.default, (counts, sizes))
+
+
+def test_wrong_parts_are_named():
+    with pytest.raises(ValueError, match="sizes add up to 4, but there are 5 counts"):
+        ops.sum_parts(torch.zeros(5, dtype=torch.int32), [3, 1])
+    with pytest.raises(ValueError, match="sizes must be 0 or more, got -1"):
+        ops.sum_parts(torch.zeros(5, dtype=torch.int32), [6, -1])
+    with pytest.raises(TypeError, match=r"counts must be torch.int32"):
+        ops.sum_parts(torch.zeros(5), [5])
+
+
+class _Both(Ranks):
+    """Two ranks in one: what it sends arrives here. sent: the sizes of what went to each."""
+
+    size = 2
+
+    def __init__(self) -> None:
+        self.sent: list[list[int]] = []
+
+    def send(self, rows: Tensor, sizes: list[int], counts: list[int] | None = None) -> tuple[Tensor, list[int]]:
+        self.sent.append(list(sizes))
+        return rows, list(sizes)
+
+
+@CPU_AND_GPU
+@pytest.mark.parametrize("counts", [[2, 0, 1, 5, 3], [0, 0, 1, 0, 0], [1, 1, 1, 1, 1], [0] * 5])
+def test_sums_come_back_in_even_numbers_and_rows_of_borders_as_they_are(counts, device):
+    """Gaussians 0 and 1 of the first rank's band, 1, 2 and 4 of the other's; number 1 reaches both."""
+    counts = torch.tensor(counts, dtype=torch.int32, device=device)
+    rows = torch.randn(int(counts.sum()), 10, generator=torch.Generator().manual_seed(2)).to(device)
+    gaussians = torch.tensor([0, 1, 1, 2, 4], device=device)
+    inside = torch.tensor([True, False, False, True, True], device=device)
+    places = torch.tensor([0, 1, 2, 3, 4], dtype=torch.int32, device=device)
+    ranks, sent = _Both(), Sent(gaussians, [2, 3], [2, 3], places)
+    returned, total = return_rows(ranks, sent, 5, rows, counts, inside)
+    assert ranks.sent[0] == [3, 4] and all(size % 2 == 0 for size in ranks.sent[1])
+    wanted = []
+    for part, whole in zip(rows.split(counts.tolist()), inside.tolist(), strict=True):
+        wanted.append(part.sum(0, keepdim=True)[: len(part)] if whole else part)
+    torch.testing.assert_close(returned, torch.cat(wanted))
+    per_record = torch.tensor([len(part) for part in wanted], dtype=torch.int32, device=device)
+    assert torch.equal(total, torch.zeros_like(counts).index_add_(0, gaussians, per_record))
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="torch finds no NVIDIA GPU")
+def test_numbers_are_read_before_later_work_is_done():
+    numbers, end = torch.arange(3, device="cuda"), torch.cuda.Event()
+    torch.cuda.synchronize()
+    read = read_later(numbers)
+    torch.cuda._sleep(2_000_000_000)
+    end.record()
+    assert read() == [0, 1, 2] and not end.query()
 
 
 def test_any_number_of_threads_gives_the_same_bits():

@@ -69,7 +69,7 @@ def send_views(ranks: Ranks, views: Sequence[tuple[Tensor, ...]]) -> tuple[tuple
     """
     reached = torch.stack([tensors[-1] for tensors in views]) > 0
     sizes, received = agree_on_sizes(ranks, reached)
-    gaussian = torch.nonzero_static(reached, size=sum(sizes))[:, 1]
+    gaussian = torch.nonzero_static(reached, size=sum(sizes))[:, 1].contiguous()
     rows = ranks.send(_packed(views, gaussian, sizes), sizes, received)[0]
     return OPERATORS.unpack_splats(rows, views[0][0]), Sent(gaussian, sizes, received, None)
 
@@ -79,19 +79,20 @@ def return_rows(
 ) -> tuple[Tensor, Tensor]:
     """Send gradient rows back; receive those of the rank's own `count` Gaussians from all ranks.
 
-    rows: (R, V), those of a record side by side; counts (n,) int32: of each record here; inside (n,): whether no other
-    rank has rows of the record's Gaussian. Returns the same for the rank's Gaussians: the rows of each in the order of
-    ranks, which is that of its tiles; or one row, their sum, where one rank has them all.
+    rows: (R, V), those of a record side by side; counts (n,) int32: of each record here; inside (n,): whether the
+    record reaches no other band, so that no other rank has rows of its Gaussian. Returns the same for the rank's
+    Gaussians: the rows of each in the order of ranks, which is that of its tiles; or one row, their sum, where the
+    record of a Gaussian lies in one band.
     """
     arrived = _send_back(ranks, sent, rows, counts, torch.where(inside, counts.clamp_max(1), counts))
     runs = len(sent.places)
     ends = torch.arange(runs, runs + ranks.size, dtype=torch.int32, device=rows.device)
     places = _with_last(sent.places.split(sent.sizes), ends)
-    moved = OPERATORS.move_runs(arrived.rows, torch.cat(arrived.counts), places)
-    total = torch.zeros(count, dtype=torch.int32, device=rows.device)
-    for own, of_rank in zip(sent.gaussians.split(sent.sizes), arrived.counts, strict=True):
-        total.index_add_(0, own, of_rank[:-1])
-    return moved[: sum(arrived.lengths)], total
+    moved = OPERATORS.move_runs(arrived.rows, arrived.counts, places)
+    nobody = torch.full((ranks.size,), count, device=rows.device)
+    own = _with_last(sent.gaussians.split(sent.sizes), nobody)
+    total = torch.zeros(count + 1, dtype=torch.int32, device=rows.device).index_add_(0, own, arrived.counts)
+    return moved[: sum(arrived.lengths)], total[:-1]
 
 
 def return_sums(ranks: Ranks, sent: Sent, count: int, rows: Tensor, counts: Tensor) -> list[tuple[Tensor, Tensor]]:
@@ -100,7 +101,8 @@ def return_sums(ranks: Ranks, sent: Sent, count: int, rows: Tensor, counts: Tens
     Returns for each view the rows of the rank's own `count` Gaussians, and how many each has: one or none.
     """
     arrived = _send_back(ranks, sent, rows, counts, counts.clamp_max(1))
-    views = zip(sent.gaussians.split(sent.sizes), arrived.counts, arrived.rows.split(arrived.padded), strict=True)
+    counts = arrived.counts.split([n + 1 for n in sent.sizes])
+    views = zip(sent.gaussians.split(sent.sizes), counts, arrived.rows.split(arrived.padded), strict=True)
     found = []
     for (own, of_view, part), length in zip(views, arrived.lengths, strict=True):
         total = torch.zeros(count, dtype=torch.int32, device=rows.device)
@@ -112,7 +114,7 @@ class _Arrived(NamedTuple):
     """Rows from all ranks, by rank, of each an even number, so that all begin at a multiple of 16 bytes."""
 
     rows: Tensor
-    counts: list[Tensor]  # int32 of each record that the rank got, and last one more row, of zeros, or none
+    counts: Tensor  # int32 of each record that a rank got, and behind them one more row, of zeros, or none
     lengths: list[int]  # without these
     padded: list[int]  # with them
 
@@ -122,19 +124,19 @@ def _send_back(ranks: Ranks, sent: Sent, rows: Tensor, counts: Tensor, kept: Ten
 
     Where rows begin at other places than multiples of 16 bytes, NCCL takes nearly twice as long.
     """
-    by_rank = kept.split(sent.received)
-    odd = torch.stack([part.sum() for part in by_rank]).remainder(2).int()
-    kept = _with_last(by_rank, odd)
+    odd = OPERATORS.sum_parts(kept, sent.received).remainder(2).int()
+    kept = _with_last(kept.split(sent.received), odd)
     counts = _with_last(counts.split(sent.received), torch.zeros_like(odd))
     received, sizes = ([n + 1 for n in of] for of in (sent.received, sent.sizes))
-    own = ranks.send(kept, received, sizes)[0].split(sizes)
-    sums = [part.sum() for part in (*own, *kept.split(received))]
-    numbers = read_later(torch.stack([*sums, *(part[-1].long() for part in own)]))
+    own = ranks.send(kept, received, sizes)[0]
+    more = torch.stack([part[-1] for part in own.split(sizes)])
+    sums = OPERATORS.sum_parts(own, sizes), OPERATORS.sum_parts(kept, received)
+    numbers = read_later(torch.cat((*sums, more.long())))
     summed = OPERATORS.sum_runs(rows, counts, kept, len(rows) + ranks.size)  # before the host waits
     found = numbers()
     padded, to_send, rest = (found[part * ranks.size : (part + 1) * ranks.size] for part in range(3))
     arrived = ranks.send(summed[: sum(to_send)], to_send, padded)[0]
-    return _Arrived(arrived, list(own), [n - one for n, one in zip(padded, rest, strict=True)], padded)
+    return _Arrived(arrived, own, [n - one for n, one in zip(padded, rest, strict=True)], padded)
 
 
 def _with_last(parts: Sequence[Tensor], last: Tensor) -> Tensor:

@@ -48,6 +48,7 @@ def sound_calls() -> dict[str, Call]:
         "count_records": (ops.count_records, reach),
         "list_records": (ops.list_records, [*reach, recorded, int(recorded[-1].sum())]),
         "sum_runs": (ops.sum_runs, [*rows, rows[1].clamp_max(1), len(rows[0])]),
+        "sum_parts": (ops.sum_parts, [rows[1], [1, 0, len(rows[1]) - 1]]),
         "move_runs": (ops.move_runs, [*rows, torch.arange(len(counts), dtype=torch.int32).flip(0)]),
         "blend_vjp": (ops.blend_vjp, [*state, *planes]),
         "blend_rows": (ops.blend_rows, [*state, *planes, layers, True]),

@@ -67,6 +67,8 @@ void list_records(const Executor&, const RecordInput&, const int32_t* counts, co
 void move_runs(const Executor&, const MoveInput&);
 template <class T>
 void sum_runs(const Executor&, const SumInput<T>&);
+// The sums of parts that lie one after the other; sizes: how many numbers each has, in the host's memory.
+void sum_parts(const int32_t* counts, const int64_t* sizes, int64_t parts, int64_t* sums);
 
 // What else the CPU offers. sum_rows: the rest of blend_vjp after blend_rows. project_vjp_step: project_vjp, and every
 // Gaussian's step as soon as its gradients are known.
@@ -95,6 +97,7 @@ void count_records(const Queue&, const RecordInput&, int32_t* counts);
 void list_records(const Queue&, const RecordInput&, const int32_t* counts, const RecordLists&);
 void move_runs(const Queue&, const MoveInput&);
 void sum_runs(const Queue&, const SumInput<float>&);
+void sum_parts(const Queue&, const int32_t* counts, const int64_t* sizes, int64_t parts, int64_t* sums);
 // Allocates the gradients; called while the GPU is busy, so that the host's work costs no time.
 struct GradientMemory {
   SceneGradient<float> (*take)(void* context);

@@ -140,6 +140,11 @@ def _(rows, counts, kept, room):
     return rows.new_empty((room, rows.shape[1]))
 
 
+@_fake("sum_parts")
+def _(counts, sizes):
+    return counts.new_empty((len(sizes),), dtype=torch.int64)
+
+
 @_fake("move_runs")
 def _(rows, *_):
     return rows.new_empty(rows.shape)

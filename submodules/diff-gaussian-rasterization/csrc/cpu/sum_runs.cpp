@@ -1,5 +1,6 @@
-// Adds up runs of gradient rows before they go to other processes.
+// Adds up runs of gradient rows before they go to other processes, and their numbers.
 #include <algorithm>
+#include <numeric>
 #include <vector>
 
 #include "../backend.h"
@@ -10,7 +11,7 @@ namespace gs {
 
 using baseline::kAbsoluteValues, baseline::kGradientValues;
 
-// The sums are those of sum_rows (blend_vjp_isa.cpp), which leave a single row as it is.
+// The sums are those of sum_rows (blend_vjp_isa.cpp), to which adding up a single row changes nothing.
 template <class T>
 void sum_runs(const Executor& executor, const SumInput<T>& in) {
   std::vector<int64_t> begins(in.runs + 1, 0), new_begins(in.runs + 1, 0);
@@ -30,6 +31,11 @@ void sum_runs(const Executor& executor, const SumInput<T>& in) {
       std::copy_n(sums, in.values, to);
     }
   });
+}
+
+void sum_parts(const int32_t* counts, const int64_t* sizes, int64_t parts, int64_t* sums) {
+  for (int64_t part = 0; part < parts; counts += sizes[part++])
+    sums[part] = std::accumulate(counts, counts + sizes[part], int64_t(0));
 }
 
 template void sum_runs<float>(const Executor&, const SumInput<float>&);

@@ -1,4 +1,4 @@
-// Adds up runs of gradient rows before they go to other processes.
+// Adds up runs of gradient rows before they go to other processes, and their numbers.
 #include <cuda_runtime.h>
 
 #include <cub/cub.cuh>
@@ -15,8 +15,10 @@ namespace {
 
 constexpr int kThreads = 128, kRows = 32;  // new rows of a warp that go through shared memory
 
-__device__ inline void copy_pairs(const float* from, int64_t pairs, float* to) {
-  for (int64_t k = 0; k < pairs; ++k) reinterpret_cast<float2*>(to)[k] = reinterpret_cast<const float2*>(from)[k];
+// One of `lanes` threads that copy side by side.
+__device__ inline void copy_pairs(const float* from, int64_t pairs, float* to, int lane = 0, int lanes = 1) {
+  for (int64_t k = lane; k < pairs; k += lanes)
+    reinterpret_cast<float2*>(to)[k] = reinterpret_cast<const float2*>(from)[k];
 }
 
 // A thread takes a run. The new rows of a warp lie side by side, so it writes them in whole lines, unless they are
@@ -36,23 +38,28 @@ __global__ void __launch_bounds__(kThreads)
   const int64_t to = mine ? new_begins[run] : 0;
   const bool fits = count >= 0 && from >= 0 && from + count <= in.rows && to >= 0 && to + kept <= in.room;
   if (!fits || kept < 0 || (kept > 1 && kept > count)) kept = 0;
-  float sums[kValues];
+  alignas(8) float sums[kValues];
   Sums::add_up(in.from, kept == 1 ? unsigned(from) : 0, kept == 1 ? unsigned(from + count) : 0, sums, stage);
 
   const unsigned first = __reduce_min_sync(kWarp, kept ? unsigned(to) : ~0u);
   const unsigned end = __reduce_max_sync(kWarp, unsigned(kept ? to + kept : 0));
   if (first >= end) return;
   const bool staged = end - first <= kRows;
-  float* row = staged ? stage + kValues * (to - first) : in.to + kValues * to;
+  float* new_rows = in.to + int64_t(kValues) * first;
+  float* written = staged ? stage : new_rows;
   __syncwarp();  // every lane has added what lies there
-  if (kept == 1)
-    copy_pairs(sums, kValues / 2, row);
-  else if (kept)
-    copy_pairs(in.from + kValues * from, kValues / 2 * kept, row);
+  if (kept == 1) copy_pairs(sums, kValues / 2, written + kValues * (to - first));
+  // A splat over the whole image has thousands of rows, so the whole warp copies each run.
+  for (unsigned left = __ballot_sync(kWarp, kept > 1); left; left &= left - 1) {
+    const int owner = __ffs(left) - 1;
+    const int rows = __shfl_sync(kWarp, int(kept), owner);
+    const unsigned source = __shfl_sync(kWarp, unsigned(from), owner), place = __shfl_sync(kWarp, unsigned(to), owner);
+    copy_pairs(in.from + int64_t(kValues) * source, int64_t(kValues / 2) * rows,
+               written + int64_t(kValues) * (place - first), lane, 32);
+  }
   if (!staged) return;
   __syncwarp();
-  float2* lines = reinterpret_cast<float2*>(in.to + int64_t(kValues) * first);
-  for (int k = lane; k < int(end - first) * kValues / 2; k += 32) lines[k] = reinterpret_cast<const float2*>(stage)[k];
+  copy_pairs(stage, kValues / 2 * (end - first), new_rows, lane, 32);
 }
 
 }  // namespace
@@ -71,6 +78,13 @@ void sum_runs(const Queue& queue, const SumInput<float>& in) {
                                                 : sum_runs_kernel<kGradientValues + kAbsoluteValues>;
   sum<<<blocks_for(in.runs, kThreads), kThreads, 0, stream>>>(in, begins, new_begins);
   check_launch("sum_runs");
+}
+
+void sum_parts(const Queue& queue, const int32_t* counts, const int64_t* sizes, int64_t parts, int64_t* sums) {
+  for (int64_t part = 0; part < parts; counts += sizes[part++])
+    with_memory(queue, [&](void* memory, size_t& bytes) {
+      return cub::DeviceReduce::Sum(memory, bytes, counts, sums + part, sizes[part], stream_of(queue));
+    });
 }
 
 }  // namespace cuda

@@ -112,7 +112,8 @@ struct SomeSums {
   int64_t room = 0;
 
   SomeSums(const std::vector<int32_t>& of, int values_of_row) : counts(of), values(values_of_row) {
-    for (size_t i = 0; i < counts.size(); ++i) kept.push_back(i % 7 == 3 ? 0 : i % 5 == 2 ? counts[i] : 1);
+    for (size_t i = 0; i < counts.size(); ++i)
+      kept.push_back(i % 7 == 3 ? 0 : i % 5 == 2 || (i && counts[i] > 400) ? counts[i] : 1);
     for (int64_t k = 0; k < values * std::accumulate(counts.begin(), counts.end(), int64_t(0)); ++k)
       rows.push_back(float(normal()));
     room = std::accumulate(kept.begin(), kept.end(), int64_t(0)) + 2;

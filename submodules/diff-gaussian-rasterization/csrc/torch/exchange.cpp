@@ -141,6 +141,29 @@ Tensor sum_runs_op(const Tensor& rows, const Tensor& counts, const Tensor& kept,
   return to;
 }
 
+// The sums of parts of the counts, of `sizes` numbers each, one after the other.
+Tensor sum_parts_op(const Tensor& counts, const Shape& sizes) {
+  check_given(counts, "counts");
+  check_tensor(counts, "counts", ScalarType::Int, counts.device(), {-1});
+  int64_t all = 0;
+  for (const int64_t size : sizes) {
+    GS_CHECK_VALUE(size >= 0, "sizes must be 0 or more, got ", size);
+    all += size;
+  }
+  GS_CHECK_VALUE(all == counts.size(0), "sizes add up to ", all, ", but there are ", counts.size(0), " counts");
+  const Tensor given = packed(counts);
+  Tensor sums = empty<int64_t>({int64_t(sizes.size())}, counts);
+#ifdef GS_CUDA
+  if (counts.is_cuda()) {
+    gs::TorchQueue queue(counts.device());
+    gs::cuda::sum_parts(queue.queue(), read<int32_t>(given), sizes.data(), sizes.size(), write<int64_t>(sums));
+    return sums;
+  }
+#endif
+  gs::sum_parts(read<int32_t>(given), sizes.data(), sizes.size(), write<int64_t>(sums));
+  return sums;
+}
+
 // Whether the runs have all rows, and each a place of its own; only on the CPU.
 void check_runs(const Tensor& counts, const Tensor& places, int64_t rows) {
   if (!counts.is_cpu()) return;
@@ -184,6 +207,7 @@ GS_OPERATORS(diff_gaussian_rasterization, m) {
       "unpack_splats(Tensor packed, Tensor like) -> (Tensor splats, Tensor depths, Tensor rects, Tensor tile_counts)",
       TORCH_BOX(&unpack_splats_op));
   m.define("sum_runs(Tensor rows, Tensor counts, Tensor kept, int room) -> Tensor", TORCH_BOX(&sum_runs_op));
+  m.define("sum_parts(Tensor counts, int[] sizes) -> Tensor", TORCH_BOX(&sum_parts_op));
   m.define("move_runs(Tensor rows, Tensor counts, Tensor places) -> Tensor", TORCH_BOX(&move_runs_op));
 }
 
