@@ -144,12 +144,22 @@ def some_counts(kind: str) -> Tensor:
     return {"none": counts[:0], "one": counts[:1].fill_(3), "no rows": counts.fill_(0)}.get(kind, counts)
 
 
+def some_runs(kind: str, values: int, device: str, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
+    """Numbers of rows, and the rows."""
+    counts = some_counts(kind)
+    rows = torch.randn(int(counts.sum()), values, generator=torch.Generator().manual_seed(2))
+    return counts.to(device), rows.to(device, dtype)
+
+
+VALUES = pytest.mark.parametrize("values", [MOMENT_VALUES, MOMENT_VALUES + ABSOLUTE_VALUES])
+RUNS = pytest.mark.parametrize("kind", ["none", "one", "no rows", "hardly any", "many", "giants"])
+
+
 @BOTH_AND_GPU
-@pytest.mark.parametrize("values", [MOMENT_VALUES, MOMENT_VALUES + ABSOLUTE_VALUES])
-@pytest.mark.parametrize("kind", ["none", "one", "no rows", "hardly any", "many", "giants"])
+@VALUES
+@RUNS
 def test_runs_move(kind, values, device, dtype):
-    counts = some_counts(kind).to(device)
-    rows = torch.randn(int(counts.sum()), values, generator=torch.Generator().manual_seed(2)).to(device, dtype)
+    counts, rows = some_runs(kind, values, device, dtype)
     shuffled = torch.randperm(len(counts), generator=torch.Generator().manual_seed(3)).to(device)
     # As ranks get them: in order in each of three parts, which lie in each other.
     merged = torch.cat([torch.arange(len(counts), device=device)[rank::3] for rank in range(3)])
@@ -162,11 +172,10 @@ def test_runs_move(kind, values, device, dtype):
 
 
 @BOTH_AND_GPU
-@pytest.mark.parametrize("values", [MOMENT_VALUES, MOMENT_VALUES + ABSOLUTE_VALUES])
-@pytest.mark.parametrize("kind", ["none", "one", "no rows", "hardly any", "many", "giants"])
+@VALUES
+@RUNS
 def test_runs_are_added_up(kind, values, device, dtype):
-    counts = some_counts(kind).to(device)
-    rows = torch.randn(int(counts.sum()), values, generator=torch.Generator().manual_seed(2)).to(device, dtype)
+    counts, rows = some_runs(kind, values, device, dtype)
     run = torch.arange(len(counts), device=device)
     sums = torch.zeros(len(counts), values, device=device, dtype=torch.float64)
     sums.index_add_(0, run.repeat_interleave(counts), rows.double())

@@ -48,15 +48,12 @@ def send_splats(ranks: Ranks, bands: Bands, splats: tuple[Tensor, ...]) -> tuple
     """
     reach = *splats[2:], bands.limits
     counts = OPERATORS.count_records(*reach)
+    list_records = partial(OPERATORS.list_records, *reach, counts)
     lists: list[tuple[Tensor, Tensor]] = []
-
-    def list_records(room: int) -> None:
-        lists[:] = [OPERATORS.list_records(*reach, counts, room)]
-
     room = int(_ROOM * len(splats[0]))
-    sizes, received = agree_on_sizes(ranks, counts[:-1], partial(list_records, room))
+    sizes, received = agree_on_sizes(ranks, counts[:-1], lambda: lists.append(list_records(room)))
     if (total := sum(sizes)) > room:
-        list_records(total)
+        lists = [list_records(total)]
     gaussians, places = (numbers[:total] for numbers in lists[0])
     rows = ranks.send(_packed([splats], gaussians, [len(gaussians)]), sizes, received)[0]
     return OPERATORS.unpack_splats(rows, splats[0]), Sent(gaussians, sizes, received, places)
@@ -122,7 +119,7 @@ class _Arrived(NamedTuple):
 def _send_back(ranks: Ranks, sent: Sent, rows: Tensor, counts: Tensor, kept: Tensor) -> _Arrived:
     """Send what is kept of the rows of each record (`sum_runs` of the rasterizer).
 
-    Where rows begin at other places than multiples of 16 bytes, NCCL takes nearly twice as long.
+    Rows that began at other places than multiples of 16 bytes took NCCL longer (docs/results/several_gpus.md).
     """
     odd = OPERATORS.sum_parts(kept, sent.received).remainder(2).int()
     kept = _with_last(kept.split(sent.received), odd)

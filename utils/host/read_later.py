@@ -9,7 +9,7 @@ from torch import Tensor
 def read_later(numbers: Tensor) -> Callable[[], list]:
     """Begin to copy numbers to the host. The result of this call returns them, and waits for nothing queued after it.
 
-    So a GPU has work while the host waits for the numbers and thinks about them.
+    So a GPU has work until the host has read the numbers and queued what depends on them.
     """
     if not numbers.is_cuda:
         return numbers.tolist
