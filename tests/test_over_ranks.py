@@ -1,5 +1,7 @@
 """A view by several processes: the image and all gradients of one process, to the bit."""
 
+import gc
+
 import pytest
 import torch
 from diff_gaussian_rasterization import rasterize
@@ -139,3 +141,32 @@ def test_a_batch_has_the_sum_of_the_gradients_of_its_views(size):
             values.grad = None
     for name, values in total.items():
         assert torch.equal(torch.cat([each[name] for each in found]), values), name
+
+
+def _tensors_left() -> dict[str, int]:
+    """Tensors that a view or a batch leaves behind, once nothing refers to its results."""
+    width, height, options = CASES[1]
+    renders = {
+        "one process": lambda: _render(rasterize, width, height, options, slice(None)),
+        "a view": lambda: _render(
+            lambda *x, **y: rasterize_over(ranks(), *x, **y), width, height, options, slice(None)
+        ),
+        "a batch": _render_views,
+    }
+    found = {}
+    for name, render in renders.items():
+        render()  # may fill caches
+        before = _tensors()
+        render()
+        found[name] = _tensors() - before
+    return found
+
+
+def _tensors() -> int:
+    gc.collect()
+    return sum(type(each) is Tensor for each in gc.get_objects())
+
+
+def test_a_view_over_ranks_leaves_nothing_behind():
+    for left in in_ranks(2, _tensors_left):
+        assert left == dict.fromkeys(left, 0)

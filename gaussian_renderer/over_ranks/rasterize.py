@@ -1,5 +1,6 @@
 """`rasterize` of diff_gaussian_rasterization over ranks, differentiable."""
 
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -51,7 +52,9 @@ class _OverRanks(torch.autograd.Function):
         ctx.mark_non_differentiable(view.radii)
         ctx.set_materialize_grads(False)
         if train:
-            ctx.view, ctx.want_depth, ctx.absolute = view, want_depth, absolute
+            # An output here would keep its own history alive, and with it all of this, for good.
+            kept = {name: getattr(view, name).detach() for name in ("color", "inverse_depth", "radii")}
+            ctx.view, ctx.want_depth, ctx.absolute = replace(view, **kept), want_depth, absolute
             ctx.numbers = scene[SCENE_TENSORS:]
             ctx.save_for_backward(*scene[:SCENE_TENSORS])
         return view.color, view.inverse_depth, view.radii
