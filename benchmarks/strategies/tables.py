@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from utils.files.markdown_table import markdown_table
-from utils.system_utils import run_cli
+from utils.system_utils import UserError, run_cli
 
 DEFAULT = "adc"
 BUDGET = "--time_budget"
@@ -149,14 +149,17 @@ def at(curve: Sequence[dict], seconds: float) -> float:
 
 
 def joined(files: Sequence[dict]) -> dict:
-    """One record of several: sets and scenes of all."""
+    """One record of several: sets and scenes of all. UserError if a set has other options in another file."""
     machines = dict.fromkeys(one["machine"] for one in files)
     whole = {"machine": "\n".join(machines), "sets": {}, "scenes": {}}
     for one in files:
-        whole["sets"] |= one["sets"]
+        for name, words in one["sets"].items():
+            if whole["sets"].setdefault(name, words) != words:
+                raise UserError(f"set {name} has other options in another file; give files of the same --sets")
         for scene, sets in one["scenes"].items():
             for name, seeds in sets.items():
-                whole["scenes"].setdefault(scene, {}).setdefault(name, {}).update(seeds)
+                ended = {seed: run for seed, run in seeds.items() if run}
+                whole["scenes"].setdefault(scene, {}).setdefault(name, {}).update(ended)
     return whole
 
 
