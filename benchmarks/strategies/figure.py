@@ -22,8 +22,6 @@ _TIMES = 300  # of a line
 _SHOWN = 5.0  # dB below the best of a scene
 _COLORS = {"adc": "tab:blue", "budget": "black", "mcmc": "tab:red"}  # of time budgets, by strategy
 
-Runs = dict[str, list[dict]]  # by set, each with the points of its curve that score all test views
-
 
 def draw(found: dict, path: Path, left_out: Sequence[str] = ()) -> None:
     """Draw the records of `benchmarks.strategies.tables.joined`. left_out: names of sets."""
@@ -60,8 +58,8 @@ def draw(found: dict, path: Path, left_out: Sequence[str] = ()) -> None:
         figure.savefig(temporary, dpi=90)
 
 
-def _runs(sets: dict, left_out: Sequence[str]) -> Runs:
-    """The trainings of a scene that have a point with all test views."""
+def _runs(sets: dict, left_out: Sequence[str]) -> dict[str, list[dict]]:
+    """The trainings of a scene by set, each with the points of its curve that score all test views; none without."""
     found = {}
     for name, seeds in sets.items():
         runs = [{"curve": [row for row in run["curve"] if row["whole"]]} for run in seeds.values() if run]

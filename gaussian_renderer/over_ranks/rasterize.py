@@ -52,7 +52,7 @@ class _OverRanks(torch.autograd.Function):
         ctx.mark_non_differentiable(view.radii)
         ctx.set_materialize_grads(False)
         if train:
-            # An output here would keep its own history alive, and with it all of this, for good.
+            # An output refers to ctx by its history. Kept here, it would be a cycle that nothing frees.
             kept = {name: getattr(view, name).detach() for name in ("color", "inverse_depth", "radii")}
             ctx.view, ctx.want_depth, ctx.absolute = replace(view, **kept), want_depth, absolute
             ctx.numbers = scene[SCENE_TENSORS:]
