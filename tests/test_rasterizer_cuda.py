@@ -23,18 +23,26 @@ def largest_error(got: torch.Tensor, wanted: torch.Tensor) -> float:
     return float((got.double() - wanted.double()).abs().max() / wanted.double().abs().max().clamp_min(1e-300))
 
 
-@pytest.mark.parametrize("antialiasing", [False, True], ids=["plain", "antialiased"])
+MIRRORED_AND_SHEARED = torch.eye(4, dtype=torch.float64)
+MIRRORED_AND_SHEARED[:3, :3] = torch.tensor([[-1.1, 0.2, 0.0], [0.1, 0.8, -0.1], [0.0, 0.15, 0.9]])
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [{}, {"antialiasing": True}, {"view": MIRRORED_AND_SHEARED}],
+    ids=["plain", "antialiased", "mirrored and sheared"],
+)
 @pytest.mark.parametrize("kind", KINDS)
-def test_errors_are_those_of_cpu_float(kind, antialiasing):
+def test_errors_are_those_of_cpu_float(kind, changes):
     scene = KINDS[kind]()
-    double = run(scene, "cpu", torch.float64, antialiasing=antialiasing)
+    double = run(scene, "cpu", torch.float64, **changes)
     # Rounding decides at cut-offs, so leave out, for all, pixels where CPU float is off by more than rounding.
-    cpu, gpu = (run(scene, device, antialiasing=antialiasing) for device in ("cpu", "cuda"))
+    cpu, gpu = (run(scene, device, **changes) for device in ("cpu", "cuda"))
     off = sum(((x["color"] - double["color"]).abs().amax(0) > 1e-4).int() for x in (cpu, gpu))
     keep = (off == 0)[None]
     assert keep.float().mean() > 0.99
-    double = run(scene, "cpu", torch.float64, keep, antialiasing=antialiasing)
-    cpu, gpu = (run(scene, device, keep=keep, antialiasing=antialiasing) for device in ("cpu", "cuda"))
+    double = run(scene, "cpu", torch.float64, keep, **changes)
+    cpu, gpu = (run(scene, device, keep=keep, **changes) for device in ("cpu", "cuda"))
     failed = {}
     for name in double:
         if name == "radii":

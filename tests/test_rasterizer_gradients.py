@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from rasterizer_tools import BOTH_AND_GPU, activated, few, on_device, ops, render, rigid, scene_arguments
+from rasterizer_tools import BOTH_AND_GPU, activated, few, on_device, ops, pick, render, rigid, scene_arguments
 
 from benchmarks.workloads.splat_scenes import settings
 from utils.sh_utils import RGB2SH
@@ -193,3 +193,20 @@ def test_the_antialiasing_factor_is_floored(side):
     got = inputs["scales"].grad.sum().item()
     assert got == pytest.approx(difference.item(), rel=1e-6, abs=1e-12)
     assert (got == 0) == (side < 1)
+
+
+@BOTH_AND_GPU
+@pytest.mark.parametrize("opacity", [0.0, -1e-9, -0.5, -1e30])
+def test_an_opacity_of_0_or_less_is_not_drawn(opacity, device, dtype):
+    """Interpolated and masked opacities fall below 0; a logarithm of such a value must not count as opaque."""
+    parameters, size = few(dtype=dtype)
+    splats = {name: values.to(device) for name, values in activated(parameters).items()}
+    camera = on_device(settings(**size), device)
+    mask = torch.tensor([1.0, 0.0, 1.0], device=device, dtype=dtype)[:, None]
+    masked = splats | {"opacities": torch.where(mask > 0, splats["opacities"], opacity).requires_grad_()}
+    out = render(masked, camera, raw=False)
+    without = render(pick(splats, [0, 2]), camera, raw=False)
+    assert torch.equal(out.color, without.color) and torch.equal(out.transmittance, without.transmittance)
+    out.color.sum().backward()
+    gradient = masked["opacities"].grad
+    assert gradient[1] == 0 and gradient[0] != 0 and gradient.isfinite().all()

@@ -10,13 +10,14 @@ import mpmath
 import pytest
 import torch
 from diff_gaussian_rasterization import reference
-from rasterizer_tools import gradients, leaves, render
+from rasterizer_tools import gradients, leaves, one_splat, render
 
 from benchmarks.accuracy import stability, stability_figure, training_ab
 from benchmarks.accuracy.stability import CPU_DOUBLE, CPU_FLOAT, CUDA_FLOAT, TEXTBOOK, Judged, beyond
 from benchmarks.accuracy.stability_figure import SWEEPS
 from benchmarks.accuracy.stability_needles import needle_error
 from benchmarks.accuracy.training_ab import KINDS, PIVOT
+from benchmarks.workloads.splat_scenes import settings
 from benchmarks.workloads.stability_cases import CASES, PLAIN, Case, long_needles
 
 BY_NAME = {case.name: case for case in CASES}
@@ -90,12 +91,32 @@ def test_the_oracle_itself_on_needles_a_million_pixels_long():
             return sum(_gaussian(pixel, *shape) for pixel in few) / (1 + mpmath.exp(-1))
 
         slopes = [float(mpmath.diff(functools.partial(total, k), scales[k])) for k in range(3)]
-    # QR is exact to 1e-16 times the condition of its matrix, 2e6; then come some ten operations on values of 1e6.
+    # The conic is exact to 1e-16 times length over width, 2e6; then come some ten operations on values of 1e6.
     wanted = torch.tensor(wanted, dtype=torch.float64)
     torch.testing.assert_close(alpha[rows, columns].detach(), wanted, rtol=1e-8, atol=0)
     alpha[[y for _, y in few], [x for x, _ in few]].sum().backward()
     slopes = torch.tensor(slopes, dtype=torch.float64)
     torch.testing.assert_close(inputs["scales"].grad[0], slopes, rtol=0, atol=1e-8 * float(slopes.abs().max()))
+
+
+@pytest.mark.parametrize("scale", [1e-10, 1e-14, 1e-18, 1e-25])
+def test_the_oracle_itself_on_tiny_scales(scale):
+    """Far below the dilation, alpha at a pixel hangs on the covariance C linearly: dC = 2 s (J R)(J R)^T ds."""
+    parameters = one_splat(0.02, -0.01, scale=scale, opacity=0.9)
+    parameters["rotations"] = torch.tensor([[0.8, 0.4, 0.4, -0.2]], dtype=torch.float64)
+    cam = settings(16, 16)
+    inputs = leaves(parameters)
+    alpha = 1 - render(inputs, cam, function=reference.render, raw=False).transmittance[0]
+    alpha[7, 7].backward()
+    with mpmath.workdps(80):
+
+        def value(k: int, s: mpmath.mpf) -> mpmath.mpf:
+            scales = [mpmath.log(s if axis == k else mpmath.mpf(scale)) for axis in range(3)]
+            return mpmath.mpf(0.9) * _gaussian((7, 7), *_mean_and_conic(parameters, cam, scales))
+
+        step = mpmath.mpf(scale) * mpmath.mpf(10) ** -20
+        slopes = [float((value(k, scale + step) - value(k, scale - step)) / (2 * step)) for k in range(3)]
+    torch.testing.assert_close(inputs["scales"].grad[0], torch.tensor(slopes, dtype=torch.float64), rtol=1e-12, atol=0)
 
 
 def _mean_and_conic(parameters: dict, cam, log_scales: list) -> tuple[mpmath.matrix, mpmath.matrix]:

@@ -60,7 +60,7 @@ class _OverRanks(torch.autograd.Function):
         return view.color, view.inverse_depth, view.radii
 
     @staticmethod
-    @first_order
+    @first_order("rasterize")
     def backward(ctx: Any, grad_color: Tensor | None, grad_depth: Tensor | None, _: None) -> tuple:
         scene, view = (*ctx.saved_tensors, *ctx.numbers), ctx.view
         if grad_color is None:

@@ -75,7 +75,7 @@ class _Views(torch.autograd.Function):
         return color, inverse_depth, radii
 
     @staticmethod
-    @first_order
+    @first_order("rasterize")
     def backward(ctx: Any, grad_color: Tensor | None, grad_depth: Tensor | None, _: None) -> tuple:
         want_depth, absolute = ctx.wants
         if grad_color is None:

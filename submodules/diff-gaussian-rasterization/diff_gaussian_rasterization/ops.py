@@ -8,7 +8,7 @@ from torch import Tensor, library
 import diff_gaussian_rasterization.fakes  # noqa: F401  (registers the fake kernels)
 from diff_gaussian_rasterization.backend import OPERATORS
 from diff_gaussian_rasterization.checks import check_finite, check_tensors
-from diff_gaussian_rasterization.first_order import first_order
+from diff_gaussian_rasterization.first_order import direct_apply, first_order, function_of, is_compiled, needs_function
 from diff_gaussian_rasterization.gaussians import Gaussians, lists_gaussians
 from diff_gaussian_rasterization.schema import GRADIENT_PLACES, INPUTS, SCENE_TENSORS
 from diff_gaussian_rasterization.settings import GaussianRasterizationSettings
@@ -45,22 +45,22 @@ def rasterize(
     0, or with want_absolute_gradient the length of the absolute gradient (Ye et al. 2024, AbsGS), per NDC unit:
     sqrt((sum |dL_p/dx|)^2 + (sum |dL_p/dy|)^2) over the pixels p, dL_p what p alone makes of the loss.
     raw: opacities are logits, scales are logarithms, and rotations have any length (zero means the identity).
-    Gaussians with a NaN or an infinite value are left out and receive zero gradients.
-    Second derivatives raise RuntimeError. Raises TypeError for None, other wrong types and dtypes, and ValueError for
-    wrong shapes, degrees and tangents. Raises RuntimeError for wrong sizes, and if the image needs more than 2^31 tile
-    instances.
+    Gaussians with a NaN or an infinite value, or with an opacity of 0 or less, are left out and receive zero gradients.
+    The view matrix is taken as it is: scaled, sheared and mirrored ones give the image of that linear map.
+    Second derivatives and derivatives in forward mode raise RuntimeError. Raises TypeError for None, other wrong types
+    and dtypes, and ValueError for wrong shapes, degrees and tangents. Raises RuntimeError for wrong sizes, and if the
+    image needs more than 2^31 tile instances.
     """
     gaussians = Gaussians(means, opacities, **others)
     try:
-        given = [values for values in (*gaussians, means2d) if values is not None]
-        train = torch.is_grad_enabled() and any([values.requires_grad for values in given])
+        train = needs_function(*gaussians, means2d)
         if settings.debug:
             for name, values in gaussians._asdict().items():
                 if values is not None:
                     check_finite(name, values)
         arguments = scene_arguments(gaussians, settings, raw)
         # torch.compile knows the operator, whose autograd is registered below.
-        function = _Rasterize.apply if train and not torch.compiler.is_compiling() else OPERATORS.rasterize
+        function = _apply if train and not is_compiled() else OPERATORS.rasterize
         out = function(means2d, *arguments, settings.bg, want_inverse_depth, train, want_absolute_gradient)
     except (AttributeError, TypeError, RuntimeError):
         _check_types(gaussians, settings, means2d)
@@ -154,7 +154,7 @@ def _keep(ctx, inputs, output):
     ctx.save_for_backward(*scene[:SCENE_TENSORS], *state, tile_counts, layers)
 
 
-@first_order
+@first_order("rasterize")
 def _backward(ctx, grad_color, grad_transmittance, grad_inverse_depth, *_):
     if not ctx.train:
         raise RuntimeError("this image was rasterized with train=False, so it has no backward")
@@ -181,34 +181,18 @@ def _backward(ctx, grad_color, grad_transmittance, grad_inverse_depth, *_):
 library.register_autograd("diff_gaussian_rasterization::rasterize", _backward, setup_context=_setup_context)
 
 
-def _forward(*inputs):
-    with torch._C._AutoDispatchBelowAutograd():
-        return OPERATORS.rasterize(*inputs)
-
-
-class _Transformed(torch.autograd.Function):
-    """For the transforms of torch.func, which want a context that is set up behind the forward."""
-
-    forward = staticmethod(_forward)
-    setup_context = staticmethod(_setup_context)
-    backward = staticmethod(_backward)
-
-
 class _Rasterize(torch.autograd.Function):
-    """The same, without the Python that the dispatcher runs in between, and with no more outputs than callers see."""
-
-    @classmethod
-    def apply(cls, *inputs):
-        if torch._C._are_functorch_transforms_active():
-            return _Transformed.apply(*inputs)
-        # torch's own `apply` inspects the signature in every call.
-        return super(torch.autograd.Function, cls).apply(*inputs)
+    """The same, with no more outputs than callers see."""
 
     @staticmethod
     def forward(ctx, *inputs):
-        output = _forward(*inputs)
+        with torch._C._AutoDispatchBelowAutograd():
+            output = OPERATORS.rasterize(*inputs)
         _keep(ctx, inputs, output)
         ctx.mark_non_differentiable(output[3])
         return output[:4]
 
     backward = staticmethod(_backward)
+
+
+_apply = direct_apply(_Rasterize, function_of(OPERATORS.rasterize, _setup_context, _backward))

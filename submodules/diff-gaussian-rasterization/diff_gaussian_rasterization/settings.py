@@ -18,7 +18,7 @@ class GaussianRasterizationSettings(NamedTuple):
     tanfovy: float
     bg: Tensor  # (3,)
     scale_modifier: float
-    viewmatrix: Tensor  # (4, 4) world to view, transposed
+    viewmatrix: Tensor  # (4, 4) world to view, transposed; a rigid motion, or any other invertible map
     projmatrix: Tensor  # (4, 4) world to clip, transposed
     sh_degree: int  # active degree, 0..3
     campos: Tensor  # (3,) world

@@ -47,7 +47,7 @@ class _Banded(torch.autograd.Function):
         return loss, l1
 
     @staticmethod
-    @first_order
+    @first_order("the photometric loss")
     def backward(ctx: Any, grad_loss: Tensor | None, *_: Any) -> tuple[Tensor | None, None, None, None, None, None]:
         if grad_loss is None:
             return None, None, None, None, None, None

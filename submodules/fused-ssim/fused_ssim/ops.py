@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, library
 
 from fused_ssim.backend import OPERATORS
-from fused_ssim.first_order import first_order
+from fused_ssim.first_order import direct_apply, first_order, function_of, is_compiled, needs_function
 
 WINDOW = 11  # pixels
 MAP_COLUMNS, MAP_ROW = 116, 408  # as in csrc/data.h
@@ -37,9 +37,10 @@ def fused_l1_ssim(img1: Tensor, img2: Tensor, padding: str = "same") -> tuple[Te
     kept for the gradient unless img1 needs one.
     """
     check_images(img1, img2, padding)
-    train = torch.is_grad_enabled() and img1.requires_grad
-    l1, ssim, _ = OPERATORS.l1_ssim(img1, img2.detach(), padding == "valid", train)
-    return l1, ssim
+    train = needs_function(img1)
+    # torch.compile knows the operators, whose autograd is registered below.
+    function = _apply_l1_ssim if train and not is_compiled() else OPERATORS.l1_ssim
+    return function(img1, img2.detach(), padding == "valid", train)[:2]
 
 
 def fused_photometric_loss(
@@ -52,10 +53,9 @@ def fused_photometric_loss(
     gradient unless img1 needs one.
     """
     check_images(img1, img2, "same")
-    train = torch.is_grad_enabled() and img1.requires_grad
-    if train and not torch.compiler.is_compiling():  # torch.compile knows the operator
-        return _Photometric.apply(img1, img2, float(lambda_dssim), True, clamp)[:2]
-    return OPERATORS.photometric(img1, img2.detach(), float(lambda_dssim), train, clamp)[:2]
+    train = needs_function(img1)
+    function = _apply_photometric if train and not is_compiled() else OPERATORS.photometric
+    return function(img1, img2.detach(), float(lambda_dssim), train, clamp)[:2]
 
 
 def composite(picture: Tensor, background: Tensor) -> Tensor:
@@ -122,7 +122,7 @@ def _setup_context(ctx, inputs: tuple, output: tuple[Tensor, Tensor, Tensor]) ->
     ctx.save_for_backward(img1, img2, output[2])
 
 
-@first_order
+@first_order("SSIM")
 def _backward(ctx, grad_l1: Tensor, grad_ssim: Tensor, _) -> tuple[Tensor, None, None, None]:
     img1, img2, kept = ctx.saved_tensors
     return OPERATORS.l1_ssim_vjp(img1, img2, kept, grad_l1, grad_ssim), None, None, None
@@ -157,7 +157,7 @@ def _setup_photometric(ctx, inputs: tuple, output: tuple[Tensor, Tensor, Tensor]
     ctx.save_for_backward(img1, img2, output[2])
 
 
-@first_order
+@first_order("the photometric loss")
 def _photometric_backward(ctx, grad_loss: Tensor | None, *_) -> tuple[Tensor | None, None, None, None, None]:
     if grad_loss is None:
         return None, None, None, None, None
@@ -168,21 +168,5 @@ def _photometric_backward(ctx, grad_loss: Tensor | None, *_) -> tuple[Tensor | N
 # For callers of the operator itself, and for torch.compile.
 library.register_autograd("fused_ssim::photometric", _photometric_backward, setup_context=_setup_photometric)
 
-
-class _Photometric(torch.autograd.Function):
-    """The same two functions, without the Python that the dispatcher runs in between."""
-
-    @classmethod
-    def apply(cls, *inputs):
-        if torch._C._are_functorch_transforms_active():
-            return super().apply(*inputs)
-        # torch's own `apply` inspects the signature in every call.
-        return super(torch.autograd.Function, cls).apply(*inputs)
-
-    @staticmethod
-    def forward(*inputs):
-        with torch._C._AutoDispatchBelowAutograd():
-            return OPERATORS.photometric(*inputs)
-
-    setup_context = staticmethod(_setup_photometric)
-    backward = staticmethod(_photometric_backward)
+_apply_l1_ssim = direct_apply(function_of(OPERATORS.l1_ssim, _setup_context, _backward))
+_apply_photometric = direct_apply(function_of(OPERATORS.photometric, _setup_photometric, _photometric_backward))

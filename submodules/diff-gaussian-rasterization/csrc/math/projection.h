@@ -38,13 +38,14 @@ GS_HD Perspective<V> perspective(const Camera<T>& cam, Vec3<V> view) {
   return p;
 }
 
-// M = J W R S and its minors. p1 x p2 = fx fy / z^2 (W^T (clamped ray, 1)), and the minor of columns i, j is its dot
-// product with axis_i x axis_j: no difference of large products, however thin the splat.
+// M = J W R S and its minors. p1 x p2 = fx fy / z^2 (clamped ray, 1) with the dual rows of W, which for a rotation is
+// W^T (clamped ray, 1). The minor of columns i, j is its dot product with axis_i x axis_j: no difference of large
+// products, however thin the splat.
 template <class T, class V>
 GS_HD Footprint<V> splat_footprint(const Camera<T>& cam, const Perspective<V>& p, const Axes<V>& axes) {
   const auto& d = axes.direction;
   const auto& s = axes.scale;
-  const Vec3<V> ray = cam.row_z + p.clamped_x * cam.row_x + p.clamped_y * cam.row_y;
+  const Vec3<V> ray = cam.dual_z + p.clamped_x * cam.dual_x + p.clamped_y * cam.dual_y;
   const V fx = cam.focal_x * p.inverse_z, fy = cam.focal_y * p.inverse_z;
   const Vec3<V> m1 = {s[0] * dot(p.p1, d[0]), s[1] * dot(p.p1, d[1]), s[2] * dot(p.p1, d[2])};
   const Vec3<V> m2 = {s[0] * dot(p.p2, d[0]), s[1] * dot(p.p2, d[1]), s[2] * dot(p.p2, d[2])};
@@ -75,7 +76,8 @@ GS_HD Truth<V> project_splat(const Camera<T>& cam, const Gaussian<V>& gaussian, 
   const Integer<V> wide = footprint_radius(f);
   radius = (visible & radius_on_image(splat.x, splat.y, wide, cam.width, cam.height)) ? wide : radius;
   const V log2_opacity = gaussian.log2_opacity + (antialiasing ? binary_log(f.compensation) : V{});
-  splat.log2_opacity = log2_opacity < T(kMaxLog2Opacity) ? log2_opacity : all<V>(kMaxLog2Opacity);
+  // An opacity below 0 has no logarithm: its NaN stays, and is not visible.
+  splat.log2_opacity = log2_opacity > T(kMaxLog2Opacity) ? all<V>(kMaxLog2Opacity) : log2_opacity;
   return visible & (splat.log2_opacity >= T(kLog2MinAlpha) - T(1e-3));  // the margin of tile_rect
 }
 

@@ -19,6 +19,7 @@ template <class T>
 struct Parameters {
   int64_t count;
   std::vector<T> means, opacities, scales, rotations, dc, rest;
+  T view[16] = {1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1}, full[16] = {};  // transposed
 
   explicit Parameters(int64_t n) : count(n) {
     for (int64_t i = 0; i < n; ++i) {
@@ -27,6 +28,23 @@ struct Parameters {
       for (int k = 0; k < 3; ++k) scales.push_back(T(0.7 * normal() - 3)), dc.push_back(T(normal()));
       for (int k = 0; k < 4; ++k) rotations.push_back(T(normal()));
       for (int k = 0; k < 45; ++k) rest.push_back(T(0.2 * normal()));
+    }
+    project_view();
+  }
+
+  // Turns the view, which is a rotation before, into one that mirrors, shears and scales.
+  void distort_view() {
+    const T linear[9] = {T(-1.1), T(0.2), 0, T(0.1), T(0.8), T(-0.1), 0, T(0.15), T(0.9)};
+    for (int i = 0; i < 9; ++i) view[4 * (i / 3) + i % 3] = linear[i];
+    project_view();
+  }
+
+  // The full projection of a camera that is 62 degrees wide.
+  void project_view() {
+    for (int row = 0; row < 4; ++row) {
+      const T* v = view + 4 * row;
+      full[4 * row] = v[0] / T(0.6), full[4 * row + 1] = v[1] / T(0.6);
+      full[4 * row + 2] = v[2] - T(0.01) * v[3], full[4 * row + 3] = v[2];
     }
   }
 
@@ -41,11 +59,9 @@ struct Result {
   int64_t instances;
 };
 
-// The scene of a camera at the origin, 62 degrees wide.
+// The scene of a camera at the origin.
 template <class T>
 gs::Scene<T> scene_of(Parameters<T>& p, gs::Image image, bool antialiasing) {
-  static const T view[16] = {1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1};
-  static const T full[16] = {T(1 / 0.6), 0, 0, 0, 0, T(1 / 0.6), 0, 0, 0, 0, 1, 1, 0, 0, T(-0.01), 0};
   static const T center[3] = {0, 0, 0};
   gs::Scene<T> scene = {};
   scene.count = p.count;
@@ -54,7 +70,7 @@ gs::Scene<T> scene_of(Parameters<T>& p, gs::Image image, bool antialiasing) {
   scene.sh_dc = p.dc.data(), scene.sh_rest = p.rest.data();
   scene.dc_stride = 3, scene.rest_stride = 45, scene.rest_bands = 15, scene.sh_degree = 3;
   scene.raw = true, scene.antialiasing = antialiasing, scene.scale_modifier = 1;
-  scene.view = view, scene.projection = full, scene.center = center;
+  scene.view = p.view, scene.projection = p.full, scene.center = center;
   scene.tan_x = scene.tan_y = 0.6, scene.image = image;
   return scene;
 }

@@ -75,6 +75,7 @@ void test_against_cpu() {
         Parameters<float> p(count);
         if (count == 300)  // one covers all tiles: a whole warp tests them
           for (int k = 0; k < 3; ++k) p.scales[3 * 17 + k] = 1;
+        if (count == 33) p.distort_view();
         if (count > 1) p.dc[3 * 20] = NAN, p.rest[45 * 21] = INFINITY;  // culled for their colours alone
         check_scene(p, image, antialiasing, antialiasing);
       }

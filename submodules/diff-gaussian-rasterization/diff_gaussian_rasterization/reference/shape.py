@@ -1,8 +1,9 @@
 """The shape of a Gaussian: its covariance in the world, and its ellipse on the image.
 
 The textbook's determinant, xx yy - xy xy, would leave float64 some four digits on needles a million pixels long.
-Ellipses are therefore kept as a triangular factor, which LAPACK's QR computes without squaring. Covariances given by
-the caller are squares already and are factored as they are.
+Ellipses are therefore kept as a triangular factor, from a determinant that is a sum of squares. QR would compute the
+same factor, but its derivative rounds next to the dilation: scales below 1e-13 would lose their gradients. Covariances
+given by the caller are squares already and are factored as they are.
 """
 
 from typing import NamedTuple
@@ -98,10 +99,12 @@ def _normalised(quaternions: Tensor) -> Tensor:
 
 def _factor(half: Tensor) -> Ellipses:
     """The ellipses of half half^T + 0.3 I, where half (N, 2, 3) is J W R S."""
-    dilation = DILATION**0.5 * torch.eye(2, dtype=half.dtype).expand(len(half), 2, 2)
-    R = torch.linalg.qr(torch.cat([half, dilation], 2).transpose(1, 2)).R
-    undilated = torch.linalg.cross(half[:, 0], half[:, 1]).square().sum(1)  # Cauchy-Binet: nothing cancels
-    return Ellipses(R[:, 0, 0], R[:, 0, 1], R[:, 1, 1], undilated)
+    across, down = half.unbind(1)
+    xx, xy, yy = (across * across).sum(1), (across * down).sum(1), (down * down).sum(1)
+    undilated = torch.linalg.cross(across, down).square().sum(1)  # Cauchy-Binet: nothing cancels
+    dilated = undilated + DILATION * (xx + yy) + DILATION**2
+    r11 = torch.sqrt(xx + DILATION)
+    return Ellipses(r11, xy / r11, torch.sqrt(dilated) / r11, undilated)
 
 
 def _factor_of_covariance(covariance: Tensor) -> Ellipses:
