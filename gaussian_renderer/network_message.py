@@ -9,6 +9,8 @@ import torch
 from torch import Tensor
 
 from scene.cameras import MiniCam
+from utils.graphics_utils import rigid_pose
+from utils.system_utils import UserError
 
 MOST_SIDE = 8192  # pixels
 MOST_PIXELS = 4096 * 4096  # of a frame
@@ -57,7 +59,8 @@ def decode(text: bytes) -> dict[str, Any]:
 def parse(message: dict[str, Any]) -> Request | None:
     """The request that a message holds; None if a resolution is 0, when no frame is wanted and no other field is read.
 
-    BadMessage for a field that is missing, of another type, not finite or out of range, and for a singular view matrix.
+    BadMessage for a field that is missing, of another type, not finite or out of range, and for a view matrix that is
+    singular, mirrored or sheared. A scale of it is divided out.
     """
     width, height = (_size(message, f"resolution_{axis}") for axis in "xy")
     if width == 0 or height == 0:
@@ -75,10 +78,19 @@ def parse(message: dict[str, Any]) -> Request | None:
     view, view_projection = (_matrix(message, name) for name in ("view_matrix", "view_projection_matrix"))
     view[:, 1:3] *= -1  # the viewer's y and z axes point the other way
     view_projection[:, 1] *= -1
+    _divide_scale_out(view)
     inverse, failed = torch.linalg.inv_ex(view)
     if failed or not inverse.isfinite().all():
         raise BadMessage("its view_matrix is singular")
     return Request(width, height, fov_x, fov_y, z_near, z_far, view, view_projection, scaling, **flags)
+
+
+def _divide_scale_out(view: Tensor) -> None:
+    try:
+        turn, shift = rigid_pose(view[:3, :3].numpy(), view[3, :3].numpy(), "the viewer")
+    except UserError as error:
+        raise BadMessage("its view_matrix is singular, sheared or mirrored") from error
+    view[:3, :3], view[3, :3] = torch.from_numpy(turn), torch.from_numpy(shift)
 
 
 def _field(message: dict[str, Any], name: str) -> Any:

@@ -49,7 +49,8 @@ class Camera(nn.Module):
 
     Made of a scene.views.view.View, or of the arguments of either release of the reference (scene/views/forms.py).
 
-    uid: index in its list; colmap_id: intrinsics id. R (3,3) camera-to-world, T (3,) world-to-camera, NumPy float64.
+    uid: index in its list; colmap_id: intrinsics id. R (3,3) camera-to-world, T (3,) world-to-camera, NumPy float64;
+    a scale of R is divided out of both, and UserError is raised where R is sheared or mirrored.
     FoVx, FoVy: radians. fx, fy, cx, cy: pixels at image_width x image_height, pixel centres at .5 (the rasterizer's
     integer pixel coordinates are half a pixel less). world_view_transform, projection_matrix, full_proj_transform:
     (4,4) float32, transposed; camera_center (3,) float32; all on `device`. trans, scale: moved the camera's centre c to

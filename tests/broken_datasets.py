@@ -411,6 +411,16 @@ def _(scene: Path) -> None:
     _transforms(scene, lambda content: content["frames"][1].update(transform_matrix=[[0.0] * 4] * 4))
 
 
+@fault("blender", "a transform_matrix is mirrored")
+def _(scene: Path) -> None:
+    _transforms(scene, lambda content: content["frames"][1]["transform_matrix"].__setitem__(2, [0.0, -1.0, 0.0, 0.0]))
+
+
+@fault("blender", "a transform_matrix is sheared")
+def _(scene: Path) -> None:
+    _transforms(scene, lambda content: content["frames"][1]["transform_matrix"][0].__setitem__(0, 1.5))
+
+
 @fault("blender", "a frame has no file_path")
 def _(scene: Path) -> None:
     _transforms(scene, lambda content: content["frames"][1].pop("file_path"))

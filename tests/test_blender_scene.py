@@ -3,12 +3,14 @@
 import argparse
 import json
 import math
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from PIL import Image
+from scipy.spatial.transform import Rotation
 from synthetic import FakeGaussians, folder_state
 
 from arguments import ModelParams
@@ -136,9 +138,46 @@ def _pose(row, values):
     return _with(change)
 
 
-def test_poses_that_carry_a_scale_are_taken(blender_scene):
-    _edit(blender_scene, lambda content: content["frames"][0].update(transform_matrix=np.diag([5, 5, 5, 1]).tolist()))
-    assert len(read_scene(blender_scene, "images", True).train_cameras) == 4
+def _turned(change):
+    """The scene with `change` of the 3x3 part of each pose, which gets the frame's index, too."""
+
+    def edit(content):
+        for index, frame in enumerate(content["frames"]):
+            pose = np.array(frame["transform_matrix"], dtype=np.float64)
+            pose[:3, :3] = change(pose[:3, :3], index)
+            frame["transform_matrix"] = pose.tolist()
+
+    return _with(edit)
+
+
+@pytest.mark.parametrize("scale", [2.0, 0.5, 1e-4, [4.0, 0.25, 1.0, 8.0], 5.0, 0.1])
+def test_a_scale_of_poses_is_divided_out(blender_scene, tmp_path, scale):
+    plain = Scene(_options(blender_scene, tmp_path / "plain"), FakeGaussians(), shuffle=False)
+    factors = np.broadcast_to(scale, 4)
+    _turned(lambda turn, index: turn * factors[index])(blender_scene)
+    scaled = Scene(_options(blender_scene, tmp_path / "scaled"), FakeGaussians(), shuffle=False)
+    exact = all(math.frexp(factor)[0] == 0.5 for factor in factors)
+    close = np.testing.assert_array_equal if exact else partial(np.testing.assert_allclose, atol=1e-14, rtol=1e-14)
+    for one, other in zip(plain.info.train_cameras, scaled.info.train_cameras, strict=True):
+        close(other.R, one.R)
+        close(other.T, one.T)
+    for one, other in zip(plain.getTrainCameras(), scaled.getTrainCameras(), strict=True):
+        torch.testing.assert_close(other.full_proj_transform, one.full_proj_transform, rtol=2e-7, atol=2e-7)
+    assert scaled.cameras_extent == pytest.approx(plain.cameras_extent, rel=1e-14)
+
+
+@pytest.mark.parametrize("digits", [3, 4, 8])
+def test_poses_that_were_rounded_are_taken(blender_scene, digits):
+    oblique = Rotation.from_rotvec([0.3, 0.8, -0.5]).as_matrix()
+    _turned(lambda turn, _: oblique @ turn)(blender_scene)
+    exact = _read(blender_scene).train_cameras
+    _turned(lambda turn, _: turn.round(digits))(blender_scene)
+    poses = json.loads((blender_scene / "transforms_train.json").read_text())["frames"]
+    for frame, camera, one in zip(poses, _read(blender_scene).train_cameras, exact, strict=True):
+        np.testing.assert_allclose(camera.R, one.R, atol=2 * 10.0**-digits)
+        if digits > 3:  # not changed at all
+            pose = np.array(frame["transform_matrix"]) @ np.diag([1.0, -1, -1, 1])
+            np.testing.assert_array_equal(camera.R, np.linalg.inv(pose)[:3, :3].T)
 
 
 @pytest.mark.parametrize(
@@ -163,7 +202,11 @@ def test_poses_that_carry_a_scale_are_taken(blender_scene):
         (_pose(3, [1, 2, 3, 4]), "the last row of transform_matrix must be 0 0 0 1"),
         (_pose(0, [1e30, 0, 0, 0]), "pose of r_0 has no rotation, but a matrix that stretches"),
         (_pose(0, [1, 0, 0, 1e30]), "camera of r_0 is more than 1e[+]12 from the origin"),
-        (_pose(1, [0, 9, 0, 0]), "pose of r_0 has no rotation, but a matrix that stretches"),
+        (_pose(1, [0, 9, 0, 0]), "pose of r_0 has no rotation, but a matrix that stretches by 0.1111 to 1;"),
+        (_pose(1, [0.01, 1, 0, 0]), "pose of r_0 has no rotation, but a matrix that stretches by 0.995 to 1.005;"),
+        (_pose(1, [0, -1, 0, 0]), "pose of r_0 is mirrored"),
+        (_turned(lambda turn, _: np.diag([1, 1, -2]) @ turn), "has no rotation"),
+        (_turned(lambda turn, _: np.diag([3, 3, -3]) @ turn), "pose of r_0 is mirrored"),
         (_with(lambda content: content.update(cx=1e30)), "principal point far outside"),
         (_with(lambda content: content.update(w=1e9)), "camera of r_0 has no usable size"),
     ],

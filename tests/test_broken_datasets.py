@@ -55,6 +55,8 @@ SAID = {
     "no frames are listed": "SCENE/transforms_train.json lists no frames",
     "a transform_matrix has three rows": "SCENE/transforms_train.json .*transform_matrix must be 4x4 .*got shape",
     "a transform_matrix can't be inverted": "SCENE/transforms_train.json .*[Ss]ingular",
+    "a transform_matrix is mirrored": "pose of r_1 is mirrored",
+    "a transform_matrix is sheared": "pose of r_1 has no rotation",
     "a frame has no file_path": r"frame 2 of SCENE/transforms_train\.json has no file_path",
     "the photo of a frame is missing": "1 of 4 photos .*are missing: SCENE/train/r_1.png",
 }

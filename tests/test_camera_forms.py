@@ -4,6 +4,7 @@ import copy
 import inspect
 import math
 import pickle
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +22,7 @@ from scene.pictures.masks import Mask
 from scene.pictures.store import ImageStore
 from scene.readers.info import CameraInfo
 from scene.views.of_info import view_of_info
+from utils.system_utils import UserError
 
 WIDTH, HEIGHT = 40, 24
 R = Rotation.from_euler("xyz", [20, -35, 60], degrees=True).as_matrix()
@@ -86,6 +88,51 @@ def test_both_forms_have_the_references_attributes(newer, trans, scale):
     assert camera.alpha_mask.all() and camera.mask is None and camera.columns is None
     assert camera.invdepthmap is None and camera.depth_mask is None and camera.depth_reliable is False
     assert isinstance(camera, torch.nn.Module) and not list(camera.parameters())
+
+
+def _by_record(**changes) -> Camera:
+    values = {"uid": 3, "R": R, "T": T, "FovY": FOV_Y, "FovX": FOV_X, "width": WIDTH, "height": HEIGHT}
+    info = CameraInfo(**{**values, **changes}, image_name="a", image=_photo())
+    return Camera(view_of_info(info, 3, (WIDTH, HEIGHT)))
+
+
+MAKERS = {"newer": _newer, "older": partial(_older, torch.zeros(3, HEIGHT, WIDTH)), "record": _by_record}
+
+
+@pytest.mark.parametrize("scale", [2.0, 0.25, 3.0, 1e-5])
+@pytest.mark.parametrize("make", MAKERS.values(), ids=MAKERS)
+def test_a_scale_of_the_pose_is_divided_out(make, scale):
+    plain, scaled = make(), make(R=scale * R, T=scale * T)
+    for name in MATRICES:
+        torch.testing.assert_close(getattr(scaled, name), getattr(plain, name), rtol=2e-7, atol=2e-7)
+    same = np.testing.assert_array_equal if scale in (2.0, 0.25) else partial(np.testing.assert_allclose, rtol=1e-14)
+    same(scaled.R, R)
+    same(scaled.T, T)
+
+
+@pytest.mark.parametrize("rounded", [R.astype(np.float32), R.round(4), R * 1.00005, [row.tolist() for row in R]])
+@pytest.mark.parametrize("make", MAKERS.values(), ids=MAKERS)
+def test_a_rounded_rotation_is_taken_as_it_is(make, rounded):
+    assert make(R=rounded).R is rounded
+
+
+@pytest.mark.parametrize(
+    ("matrix", "said"),
+    [
+        (R * [1, 1, -1], "mirrored"),
+        (-2 * R, "mirrored"),
+        (R * [1, 1, 1.01], "stretches by 1 to 1.01;"),
+        (R + [[0, 0.01, 0], [0, 0, 0], [0, 0, 0]], "stretches by 0.99"),
+        (R * 0, "stretches by 0 to 0;"),
+        (R * 1e7, "stretches by 1e[+]07"),
+        (R * np.nan, "not finite"),
+    ],
+)
+@pytest.mark.parametrize("make", MAKERS.values(), ids=MAKERS)
+def test_a_pose_without_a_rotation_is_refused_by_name(make, matrix, said):
+    with pytest.raises(UserError, match=f"pose of a(.png)? .*{said}") as error:
+        make(R=matrix)
+    assert "\n" not in str(error.value) and "; " in str(error.value)
 
 
 def test_arguments_by_position():

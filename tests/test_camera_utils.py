@@ -58,6 +58,13 @@ def test_a_record_of_the_reference_becomes_a_camera(record):
         assert torch.equal(getattr(camera, name), getattr(given, name))
     assert camera.projection_matrix[2, 0] == camera.projection_matrix[2, 1] == 0
     assert not camera.depth_reliable and camera.columns is None
+
+
+def test_a_scale_in_a_record_of_the_reference_is_divided_out(record):
+    scaled = record._replace(R=4 * record.R, T=4 * record.T)
+    one, other = (camera_utils.loadCam(_args(), 3, info, 1.0) for info in (record, scaled))
+    assert torch.equal(one.full_proj_transform, other.full_proj_transform)
+    assert camera_utils.camera_to_JSON(3, scaled) == camera_utils.camera_to_JSON(3, record)
     assert camera_utils.loadCam(_args(), 3, record, 2.0).image_width == 10
     with pytest.raises(UserError, match="none.png"):
         camera_utils.loadCam(_args(), 3, record._replace(image_path="none.png"), 1.0)

@@ -9,6 +9,7 @@ import numpy as np
 import pycolmap
 import pytest
 from scipy.spatial.transform import Rotation
+from synthetic import make_colmap_scene
 
 from scene import colmap_loader
 from scene.colmap_loader import (
@@ -28,6 +29,7 @@ from scene.colmap_loader import (
     read_points3D_text,
     rotmat2qvec,
 )
+from scene.dataset_readers import readColmapCameras
 from scene.pictures import pycolmap_import
 from scene.readers import colmap_model
 from utils.system_utils import UserError
@@ -138,6 +140,44 @@ def test_without_pycolmap_a_model_has_the_same_views_and_points(folder, tmp_path
     assert got.points.dtype == wanted.points.dtype and got.colors.dtype == wanted.colors.dtype
 
 
+@pytest.mark.parametrize("suffix", ["bin", "txt"])
+@pytest.mark.parametrize("has_pycolmap", [True, False])
+def test_quaternions_of_any_length_are_normalised(tmp_path, monkeypatch, suffix, has_pycolmap):
+    reconstruction = make_colmap_scene(tmp_path, views=3)
+    sparse = tmp_path / "sparse" / "0"
+    reconstruction.write_text(str(sparse))
+    lengths = {image.name: 0.3 * number for number, image in reconstruction.images.items()}
+    for name in ("cameras", "images", "points3D"):
+        (sparse / f"{name}.{'txt' if suffix == 'bin' else 'bin'}").unlink()
+    if suffix == "txt":
+        lines = (sparse / "images.txt").read_text().splitlines()
+        for place, line in enumerate(lines):
+            words = line.split()
+            if words[-1] in lengths:
+                turn = [repr(float(word) * lengths[words[-1]]) for word in words[1:5]]
+                lines[place] = " ".join([words[0], *turn, *words[5:]])
+        (sparse / "images.txt").write_text("\n".join(lines) + "\n")
+    else:
+        content = bytearray((sparse / "images.bin").read_bytes())
+        for name, length in lengths.items():
+            at = content.index(name.encode()) - 60  # before the translation and the camera's id
+            content[at : at + 32] = struct.pack(
+                "<4d", *(length * value for value in struct.unpack_from("<4d", content, at))
+            )
+        (sparse / "images.bin").write_bytes(content)
+    monkeypatch.setattr(colmap_model, "has_pycolmap", lambda: has_pycolmap)
+    wanted = {image.name: image.cam_from_world().matrix() for image in reconstruction.images.values()}
+    views = colmap_model.read_model(sparse).views
+    got = {view.name: np.column_stack([view.rotation, view.translation]) for view in views}
+    extrinsics = READERS["images"][suffix == "txt"](sparse / f"images.{suffix}")
+    intrinsics = READERS["cameras"][suffix == "txt"](sparse / f"cameras.{suffix}")
+    infos = readColmapCameras(extrinsics, intrinsics, None, str(tmp_path / "images"), "", [])
+    published = {info.image_name: np.column_stack([info.R.T, info.T]) for info in infos}
+    for name, pose in wanted.items():
+        np.testing.assert_allclose(got[name], pose, atol=1e-14)
+        np.testing.assert_allclose(published[name], pose, atol=1e-14)
+
+
 def test_without_pycolmap_what_is_missing_is_said(tmp_path, monkeypatch):
     (tmp_path / "cameras.txt").write_text("1 PINHOLE 8 6 9 9 4 3\n")
     (tmp_path / "points3D.txt").write_text("")
@@ -210,7 +250,9 @@ def test_quaternions_and_matrices():
     for rotation in Rotation.random(50, random_state=1):
         x, y, z, w = rotation.as_quat()
         wanted = np.array([w, x, y, z]) * (1 if w >= 0 else -1)
-        np.testing.assert_allclose(qvec2rotmat([w, x, y, z]), rotation.as_matrix(), atol=1e-14)
+        for length in (1.0, 3.0, 1e-3):
+            qvec = length * np.array([w, x, y, z])
+            np.testing.assert_allclose(qvec2rotmat(qvec), rotation.as_matrix(), atol=1e-14)
         np.testing.assert_allclose(rotmat2qvec(rotation.as_matrix()), wanted, atol=1e-12)
     # Half turns, where w is 0 and the trace is least.
     for axis in np.eye(3):
@@ -218,6 +260,7 @@ def test_quaternions_and_matrices():
         np.testing.assert_allclose(np.abs(rotmat2qvec(matrix)), [0, *axis], atol=1e-12)
     image = Image(1, np.array([1.0, 0, 0, 0]), np.zeros(3), 1, "a", np.zeros((0, 2)), np.zeros(0, np.int64))
     np.testing.assert_array_equal(image.qvec2rotmat(), np.eye(3))
+    assert np.isnan(qvec2rotmat(np.zeros(4))).any()
     assert Point3D._fields == ("id", "xyz", "rgb", "error", "image_ids", "point2D_idxs")
 
 

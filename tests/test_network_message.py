@@ -29,6 +29,18 @@ def test_a_request_has_the_camera_that_was_sent():
     assert (parsed.train, parsed.keep_alive, parsed.scaling_modifier) == (True, False, 0.5)
 
 
+def _of_view(factors: list[float]) -> dict[str, list[float]]:
+    """The message's view matrix with its first three columns times factors: all three are a scale."""
+    columns = [*factors, 1.0]
+    return {"view_matrix": [value * columns[place % 4] for place, value in enumerate(VALID["view_matrix"])]}
+
+
+def test_a_scale_of_the_view_is_divided_out():
+    parsed, scaled = (parse(VALID | changes).camera("cpu") for changes in ({}, _of_view([4.0, 4.0, 4.0])))
+    assert torch.equal(parsed.world_view_transform, scaled.world_view_transform)
+    assert torch.equal(parsed.camera_center, scaled.camera_center)
+
+
 @pytest.mark.parametrize("size", [(0, 16), (24, 0), (0, 0), (0, 10**6)])
 def test_without_a_size_no_other_field_is_read(size):
     assert parse({"resolution_x": size[0], "resolution_y": size[1], "train": "no"}) is None
@@ -67,6 +79,8 @@ def test_every_field_is_needed_and_has_its_type(name):
         {"view_matrix": [0.0] * 16},
         {"view_matrix": [1.0] * 16},
         {"view_matrix": [*VALID["view_matrix"][:15], 1e300]},
+        _of_view([1.0, -1.0, 1.0]),
+        _of_view([1.0, 1.01, 1.0]),
         {"view_matrix": VALID["view_matrix"][:15]},
         {"view_matrix": [*VALID["view_matrix"][:15], [1.0]]},
         {"view_projection_matrix": [*VALID["view_projection_matrix"], 1.0]},
@@ -94,7 +108,7 @@ def mutated(rng: random.Random) -> bytes:
     numbers = [0, -1, 1, 7, 1e-30, 1e30, -1e30, 3.1415926]
     wild = [*numbers, NAN, INF, 10**30, None, True, "", "a", [], {}, [0] * 16]
     for _ in range(rng.randint(1, 3)):
-        name = rng.choice([*FIELDS, "view_matrix", "view_projection_matrix"])
+        name = rng.choice([*FIELDS, "view_projection_matrix"])  # few changes of a view leave it a rotation
         if "matrix" in name and isinstance(message.get(name), list) and message[name] and rng.random() < 0.8:
             message[name][rng.randrange(len(message[name]))] = rng.choice(numbers if rng.random() < 0.9 else wild)
         elif rng.random() < 0.1:

@@ -220,6 +220,8 @@ def test_camera_file(camera_files, name, data, hold_out):
     if info is not None:
         for camera in info.train_cameras + info.test_cameras:
             assert np.isfinite([*camera.center, camera.fx, camera.fy, camera.cx, camera.cy]).all()
+            np.testing.assert_allclose(camera.R @ camera.R.T, np.eye(3), atol=0.01)
+            assert np.linalg.det(camera.R) > 0
             assert camera.fx > 0 and camera.fy > 0 and camera.width > 0 and camera.height > 0
         assert np.isfinite(info.extent) and info.extent > 0 and np.isfinite(info.point_cloud.points).all()
 

@@ -11,7 +11,7 @@ from scene.pictures.resolution import training_size
 from scene.readers.info import CameraInfo
 from scene.views.of_info import file_size, view_of_info
 from scene.views.view import half
-from utils.graphics_utils import camera_center, fov2focal
+from utils.graphics_utils import camera_center, fov2focal, rigid_pose
 
 __all__ = ["Camera", "cameraList_from_camInfos", "camera_to_JSON", "loadCam"]
 
@@ -58,13 +58,14 @@ def camera_to_JSON(id: int, camera: CameraInfo) -> dict[str, object]:
     camera: any object with R, T, FovX, FovY, width, height and image_name; its fx and fy count if it has them.
     """
     focal = {"fy": ("FovY", "height"), "fx": ("FovX", "width")}
+    R, T = rigid_pose(camera.R, camera.T, camera.image_name)
     return {
         "id": id,
         "img_name": camera.image_name,
         "width": camera.width,
         "height": camera.height,
-        "position": camera_center(camera.R, camera.T).tolist(),
-        "rotation": [row.tolist() for row in np.asarray(camera.R)],
+        "position": camera_center(R, T).tolist(),
+        "rotation": [row.tolist() for row in np.asarray(R)],
         **{
             name: getattr(camera, name, None) or fov2focal(getattr(camera, fov), getattr(camera, size))
             for name, (fov, size) in focal.items()

@@ -7,7 +7,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from utils.system_utils import UserError
+
 _NOT_MOVED = np.zeros(3)
+_ROUNDED = 1e-4  # largest departure from scale 1 that is left alone: poses written with four decimals have it
+_SHEARED = 3e-3  # largest ratio of stretches, less 1, that is taken: poses written with three decimals have 2.1e-3
+_SCALED = 1e6  # largest scale, and 1 over the smallest; beyond lie damaged files
 
 
 class BasicPointCloud(NamedTuple):
@@ -19,6 +24,31 @@ class BasicPointCloud(NamedTuple):
     points: np.ndarray
     colors: np.ndarray
     normals: np.ndarray
+
+
+def rigid_pose(R: np.ndarray, t: np.ndarray, name: str) -> tuple[np.ndarray, np.ndarray]:
+    """A pose without the scale that some programs put into it: R and t as `world_to_camera` takes them.
+
+    R is a rotation times a scale. Both are divided by it, which changes neither the camera's centre nor its image. A
+    scale within rounding of 1 leaves them as they are. UserError, naming the photo: R is mirrored, sheared or no
+    rotation at all, or a number is not finite.
+    """
+    matrix, shift = np.asarray(R, dtype=np.float64), np.asarray(t, dtype=np.float64)
+    if not (np.isfinite(matrix).all() and np.isfinite(shift).all()):
+        raise UserError(f"the pose of {name} is not finite; take the photo out of the scene")
+    stretch = np.linalg.svd(matrix, compute_uv=False)
+    if not (stretch[0] <= (1 + _SHEARED) * stretch[2] and 1 / _SCALED <= stretch[0] <= _SCALED):
+        raise UserError(
+            f"the pose of {name} has no rotation, but a matrix that stretches by {stretch[2]:.4g} to "
+            f"{stretch[0]:.4g}; export the cameras again, or take the photo out of the scene"
+        )
+    if np.linalg.det(matrix) < 0:
+        raise UserError(
+            f"the pose of {name} is mirrored, as its determinant is negative; negate one coordinate of all cameras and "
+            "points, or swap two, so that the axes are right-handed"
+        )
+    scale = float(f"{stretch.mean():.6g}")  # of 2 R exactly 2, so that both give the same bits
+    return (R, t) if abs(scale - 1) <= _ROUNDED else (matrix / scale, shift / scale)
 
 
 def world_to_camera(R: np.ndarray, t: np.ndarray, translate: np.ndarray = _NOT_MOVED, scale: float = 1.0) -> np.ndarray:

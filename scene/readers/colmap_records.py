@@ -4,9 +4,12 @@ Training reads whole models through pycolmap (colmap_model.py). These are for co
 with colmap_binary.py and colmap_text.py.
 """
 
+import math
 from typing import NamedTuple
 
 import numpy as np
+
+_ROUNDED = 1e-12  # departure of a quaternion's length from 1 that double precision leaves
 
 
 class CameraModel(NamedTuple):
@@ -92,7 +95,10 @@ def points_of(rows: list[tuple]) -> Points:
 
 
 def qvec2rotmat(qvec: np.ndarray) -> np.ndarray:
-    """Rotation (3,3) of a unit quaternion w x y z."""
+    """Rotation (3,3) of a quaternion w x y z of any length; NaN for one of zeros."""
+    length = math.hypot(*map(float, qvec))
+    if abs(length - 1) > _ROUNDED:
+        qvec = np.asarray(qvec) / length if length else np.full(4, np.nan)
     w, x, y, z = (float(value) for value in qvec)
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     return np.eye(3) + 2 * (w * cross + cross @ cross)

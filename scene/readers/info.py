@@ -14,7 +14,7 @@ from scene.pictures.decode import picture_size
 from scene.pictures.masks import Mask
 from scene.pictures.store import Decodable
 from utils.files.relative import relative_to
-from utils.graphics_utils import BasicPointCloud, camera_center, focal2fov, fov2focal
+from utils.graphics_utils import BasicPointCloud, camera_center, focal2fov, fov2focal, rigid_pose
 from utils.system_utils import UserError
 
 HOLD = 8  # every 8th photo by name is a test view (Mip-NeRF 360's split)
@@ -70,10 +70,10 @@ class CameraInfo(_LikeNamedTuple):
     """One view. The fields up to is_test are the reference's; the others are given by name.
 
     uid: COLMAP's camera (intrinsics) id, or the frame's index. R (3,3): camera-to-world rotation; T (3,):
-    world-to-camera translation. FovY, FovX: opening angles in radians of a frustum of the image's size. depth_params,
-    depth_path: scale, offset and the scene's median scale (med_scale) of an inverse depth map, and its file; None and
-    "" without a map. image_name: COLMAP's full name, or the file's stem. width, height: of the image that the
-    intrinsics belong to. is_test: a held-out view.
+    world-to-camera translation; both without a scale (`rigid_pose`). FovY, FovX: opening angles in radians of a frustum
+    of the image's size. depth_params, depth_path: scale, offset and the scene's median scale (med_scale) of an inverse
+    depth map, and its file; None and "" without a map. image_name: COLMAP's full name, or the file's stem. width,
+    height: of the image that the intrinsics belong to. is_test: a held-out view.
 
     fx, fy, cx, cy: pixels of that image, pixel centres at .5. Either FovX and FovY or fx and fy must be given; the
     others follow from them. Where they disagree, fx and fy count. The principal point is the middle by default.
@@ -112,6 +112,8 @@ class CameraInfo(_LikeNamedTuple):
     )
 
     def __post_init__(self) -> None:
+        for name, value in zip("RT", rigid_pose(self.R, self.T, self.image_name), strict=True):
+            object.__setattr__(self, name, value)
         for fov, focal, center, side in _AXES:
             size, angle, length = getattr(self, side), getattr(self, fov), getattr(self, focal)
             if not size or (angle is None and length is None):

@@ -12,13 +12,10 @@ from scene.pictures.lens import Lens, Pinhole, pinhole_of
 from scene.pictures.masks import Mask
 from scene.pictures.undistortion import Photo, undistort
 from scene.readers.info import CameraInfo
+from utils.graphics_utils import rigid_pose
 from utils.system_utils import UserError
 
-# Bounds on poses, beyond which lie damaged files. At 1e12 a double has steps of 1e-4. Some programs scale their poses,
-# by one factor for all axes.
-FARTHEST = 1e12
-SCALED = 1e6
-SKEWED = 2.0
+FARTHEST = 1e12  # from the origin, beyond which lie damaged files; there a double has steps of 1e-4
 
 
 class SourceView(NamedTuple):
@@ -39,8 +36,7 @@ def make_cameras(views: Sequence[SourceView], ignore_alpha: bool) -> list[Camera
     ignore_alpha: transparent pixels of a photo do not count. UserError names the view that cannot be used.
     """
     pinholes = [pinhole_of(view.lens, view.name) for view in views]
-    for view in views:
-        _check_pose(view)
+    views = [_posed(view) for view in views]
     sizes = [picture_size(view.path) for view in views]
     _warn_of_other_shapes(views, sizes)
     for view, size in zip(views, sizes, strict=True):
@@ -86,21 +82,16 @@ def camera_of(
     )
 
 
-def _check_pose(view: SourceView) -> None:
-    if not (np.isfinite(view.rotation).all() and np.isfinite(view.translation).all()):
-        raise UserError(f"the pose of {view.name} is not finite; take the photo out of the scene")
-    center = view.rotation.T @ view.translation
-    if np.abs(view.translation).max() > FARTHEST or np.abs(center).max() > FARTHEST:
+def _posed(view: SourceView) -> SourceView:
+    """The view with a rotation in its pose. UserError for a pose that is none."""
+    turn, translation = rigid_pose(view.rotation.T, view.translation, view.name)
+    center = turn @ translation
+    if np.abs(translation).max() > FARTHEST or np.abs(center).max() > FARTHEST:
         raise UserError(
             f"the camera of {view.name} is more than {FARTHEST:g} from the origin; take the photo out of the scene, or "
             "move the scene to its origin"
         )
-    stretch = np.linalg.svd(view.rotation, compute_uv=False)
-    if not (stretch[0] <= SKEWED * stretch[2] and 1 / SCALED <= stretch[0] <= SCALED):
-        raise UserError(
-            f"the pose of {view.name} has no rotation, but a matrix that stretches by {stretch[2]:.3g} to "
-            f"{stretch[0]:.3g}; export the cameras again, or take the photo out of the scene"
-        )
+    return view._replace(rotation=turn.T, translation=translation)
 
 
 def _check_mask(view: SourceView, size: tuple[int, int]) -> None:

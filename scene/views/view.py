@@ -8,6 +8,7 @@ import numpy as np
 from scene.pictures.in_memory import InMemory
 from scene.pictures.masks import Mask
 from scene.pictures.store import Size, Source
+from utils.graphics_utils import rigid_pose
 
 
 @dataclass
@@ -17,8 +18,8 @@ class View:
     size: (width, height) in pixels. source: the photo. mask: of the pixels that count, None: all do. ignore_alpha:
     transparent pixels do not count. depth: inverse depth, 1 / world units. depth_reliable: train on it. columns: those
     that count in loss and scores (scene/half_images.py), None: all. offset: principal point minus image centre in NDC.
-    trans, scale: as `utils.graphics_utils.world_to_camera` takes them. data_device: of the pictures, as --data_device.
-    The rest: as the attributes of scene.cameras.Camera.
+    R, T: without a scale (`utils.graphics_utils.rigid_pose`). trans, scale: as `world_to_camera` takes them.
+    data_device: of the pictures, as --data_device. The rest: as the attributes of scene.cameras.Camera.
     """
 
     uid: int
@@ -40,6 +41,9 @@ class View:
     trans: np.ndarray = field(default_factory=lambda: np.zeros(3))
     scale: float = 1.0
     data_device: str = "cuda"
+
+    def __post_init__(self) -> None:
+        self.R, self.T = rigid_pose(self.R, self.T, self.image_name)
 
 
 def half(width: int, of_test_view: bool) -> slice:

@@ -131,5 +131,5 @@ def _check(info: SceneInfo) -> None:
         values = [*camera.center, *camera.T, camera.fx, camera.fy, camera.cx, camera.cy, *np.ravel(projection)]
         assert np.isfinite(np.array(values, dtype=np.float32)).all(), f"camera {camera.image_name} is not finite"
         assert min(camera.fx, camera.fy, camera.width, camera.height) > 0
-        turned = camera.R @ camera.R.T
-        assert np.isfinite(turned).all() and turned.trace() > 0, f"camera {camera.image_name} has no rotation"
+        is_rotation = np.allclose(camera.R @ camera.R.T, np.eye(3), rtol=0, atol=0.01) and np.linalg.det(camera.R) > 0
+        assert is_rotation, f"camera {camera.image_name} has no rotation"
