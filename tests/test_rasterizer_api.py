@@ -2,6 +2,7 @@
 
 import inspect
 
+import numpy as np
 import pytest
 import torch
 from diff_gaussian_rasterization import (
@@ -64,6 +65,17 @@ def test_settings_are_the_references_tuple():
     assert torch.equal(call(splats, by_place)[0], call(splats, camera)[0])
     with pytest.raises(TypeError):
         GaussianRasterizationSettings(*camera[:11])
+
+
+@pytest.mark.parametrize("name", ["prefiltered", "debug", "antialiasing", "inverse_depth"])
+def test_flags_of_the_settings_are_checked(name):
+    splats, camera = scene()
+    for flag in (True, 1, np.True_, torch.tensor(True), torch.ones(1, dtype=torch.int32)):
+        image = call(splats, camera._replace(**{name: flag}))[0]
+        assert torch.equal(image, call(splats, camera._replace(**{name: True}))[0])
+    for wrong in ("no", "False", "", 2, [True], torch.ones(2), float("nan")):
+        with pytest.raises(TypeError, match=f"{name} must be True or False"):
+            call(splats, camera._replace(**{name: wrong}))
 
 
 def test_settings_of_2023_give_two_results():

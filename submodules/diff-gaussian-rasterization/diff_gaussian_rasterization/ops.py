@@ -7,12 +7,13 @@ from torch import Tensor, library
 
 import diff_gaussian_rasterization.fakes  # noqa: F401  (registers the fake kernels)
 from diff_gaussian_rasterization.backend import OPERATORS
-from diff_gaussian_rasterization.checks import check_finite, check_tensors
+from diff_gaussian_rasterization.checks import check_finite, check_flags, check_tensors
 from diff_gaussian_rasterization.first_order import direct_apply, first_order, function_of, is_compiled, needs_function
 from diff_gaussian_rasterization.gaussians import Gaussians, lists_gaussians
 from diff_gaussian_rasterization.schema import GRADIENT_PLACES, INPUTS, SCENE_TENSORS
 from diff_gaussian_rasterization.settings import GaussianRasterizationSettings
 
+_FLAGS = ("prefiltered", "debug", "antialiasing", "inverse_depth")
 _OPACITIES = INPUTS.index("opacities")
 
 
@@ -53,12 +54,12 @@ def rasterize(
     """
     gaussians = Gaussians(means, opacities, **others)
     try:
+        arguments = scene_arguments(gaussians, settings, raw)
         train = needs_function(*gaussians, means2d)
         if settings.debug:
             for name, values in gaussians._asdict().items():
                 if values is not None:
                     check_finite(name, values)
-        arguments = scene_arguments(gaussians, settings, raw)
         # torch.compile knows the operator, whose autograd is registered below.
         function = _apply if train and not is_compiled() else OPERATORS.rasterize
         out = function(means2d, *arguments, settings.bg, want_inverse_depth, train, want_absolute_gradient)
@@ -108,6 +109,7 @@ def mark_visible(positions: Tensor, view: Tensor) -> Tensor:
 
 def scene_arguments(gaussians: Gaussians, settings: GaussianRasterizationSettings, raw: bool) -> tuple:
     """Puts Gaussians and camera into the order of the operators' arguments (`schema.SCENE`)."""
+    check_flags({name: getattr(settings, name) for name in _FLAGS})  # the text "no" would count as True
     center = settings.campos  # (3,); code of 2023 also gives a row (1, 3)
     return (
         *gaussians,
