@@ -66,7 +66,9 @@ class Option:
         return {int: "N", float: "X", str: "TEXT"}.get(type(self.default))
 
     def verify(self, value: Value) -> None:
-        """Raise UserError if the value is not finite or fails the option's check."""
+        """Raise UserError if the value is not finite, no boolean for a flag, or fails the option's check."""
+        if isinstance(self.default, bool) and value not in (False, True):
+            raise UserError(f"--{self.name} must be True or False, got {value!r}")
         if isinstance(value, float) and not math.isfinite(value):
             raise UserError(f"--{self.name} must be a finite number, got {value}")
         wanted = self.check(value) if self.check else None

@@ -20,6 +20,7 @@ from scene.cameras import Camera, MiniCam
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.exposure import apply_exposure
 from scene.gaussians.parameters import GaussianParameters
+from utils.general_utils import check_flags
 from utils.sh_utils import eval_sh
 
 
@@ -55,9 +56,11 @@ def render(
     Gaussians with radius > 0, or None without want_visibility, which saves waiting for a GPU; `radii` (N,) int32
     pixels; `depth` inverse depth (1, H, W), or None unless want_depth.
     Without want_inactive_bands, get_features_rest gets no gradient at the active degree 0, instead of zeros.
+    Raises TypeError for a flag that is neither True nor False, such as the text "no".
     """
     if torch.is_tensor(separate_sh):
         separate_sh, override_color = False, separate_sh
+    check_flags(use_trained_exp=use_trained_exp, clamp=clamp)
     xyz = pc.get_xyz
     geometry, raw = _geometry(pc, pipe.compute_cov3D_python, scaling_modifier)
     colors = _colors(pc, pipe.convert_SHs_python, viewpoint_camera, separate_sh, override_color)
@@ -73,9 +76,7 @@ def render(
         raw=raw,
         **(geometry | colors),
     )
-    color = result.color
-    if use_trained_exp and (name := _photo(viewpoint_camera)) is not None:
-        color = apply_exposure(color, pc.get_exposure_from_name(name))
+    color = _exposed(result.color, viewpoint_camera, pc) if use_trained_exp else result.color
     return {
         "render": color.clamp(0, 1) if clamp else color,
         "viewspace_points": viewspace_points,
@@ -154,10 +155,10 @@ def rasterizer_settings(
     )
 
 
-def _photo(camera: Camera | MiniCam) -> str | None:
-    """The name by which the exposure of a view is known, None for a view without a photo."""
+def _exposed(color: Tensor, camera: Camera | MiniCam, pc: GaussianModel) -> Tensor:
     name = getattr(camera, "exposure_name", None)
-    return getattr(camera, "image_name", None) if name is None else name
+    name = getattr(camera, "image_name", None) if name is None else name
+    return color if name is None else apply_exposure(color, pc.get_exposure_from_name(name))
 
 
 def _geometry(pc: GaussianModel, in_python: bool, scaling_modifier: float) -> tuple[dict[str, Tensor], bool]:
@@ -166,6 +167,7 @@ def _geometry(pc: GaussianModel, in_python: bool, scaling_modifier: float) -> tu
     The kernels are faster and give the same bits for any number of threads. They take activated values of a model that
     has activations of its own, or is of another class, even one that hands every other name on to a model of ours.
     """
+    check_flags(compute_cov3D_python=in_python)
     if in_python:
         return {"opacities": pc.get_opacity, "cov3d": pc.get_covariance(scaling_modifier)}, False
     if isinstance(pc, GaussianParameters) and pc.kernels_activate:
@@ -176,6 +178,7 @@ def _geometry(pc: GaussianModel, in_python: bool, scaling_modifier: float) -> tu
 def _colors(
     pc: GaussianModel, in_python: bool, camera: Camera | MiniCam, separate_sh: bool, override_color: Tensor | None
 ) -> dict[str, Tensor]:
+    check_flags(convert_SHs_python=in_python, separate_sh=separate_sh)
     if override_color is not None:
         return {"colors": override_color}
     if in_python:

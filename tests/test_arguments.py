@@ -3,6 +3,7 @@
 import argparse
 import json
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -209,6 +210,17 @@ def test_short_forms_and_unique_prefixes():
 def test_absurd_values_name_their_option(option, value):
     with pytest.raises(UserError, match=f"^--{option} "):
         _parse(f"--{option}={value}")
+
+
+@pytest.mark.parametrize("group", [ModelParams, PipelineParams, OptimizationParams])
+def test_flags_are_booleans(group):
+    extract = group(argparse.ArgumentParser()).extract
+    for name in (option.name for option in group.options if isinstance(option.default, bool)):
+        for flag in (True, 1, np.True_, 0, None):
+            assert getattr(extract(argparse.Namespace(**{name: flag})), name) == bool(flag)
+        for wrong in ("no", "True", "", 2, []):
+            with pytest.raises(UserError, match=f"^--{name} must be True or False, got "):
+                extract(argparse.Namespace(**{name: wrong}))
 
 
 def test_points_to_start_from_are_named_once():

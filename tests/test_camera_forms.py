@@ -161,6 +161,9 @@ def test_what_is_neither_form_is_refused():
         Camera(7, R, T, FOV_X, FOV_Y, image=torch.zeros(3, 2, 2), image_name="a", uid=0)
     with pytest.raises(TypeError, match="unknown"):
         _newer(unknown=1)
+    for flag in ("train_test_exp", "is_test_dataset", "is_test_view"):
+        with pytest.raises(TypeError, match=f"{flag} must be True or False, got 'no'"):
+            _newer(**{flag: "no"})
 
 
 KINDS = {

@@ -3,6 +3,7 @@
 import argparse
 import math
 
+import numpy as np
 import pytest
 import torch
 from gaussians import GROUPS, model, pipeline
@@ -117,6 +118,24 @@ def test_screen_points_are_zeros_with_a_gradient_of_their_own_in_every_render(ca
         assert points.shape == (20, 3) and not points.any() and points.is_leaf
         gradients.append(points.grad)
     assert gradients[0].any() and torch.equal(2 * gradients[0], gradients[1])
+
+
+@pytest.mark.parametrize("name", ["convert_SHs_python", "compute_cov3D_python"])
+def test_flags_of_the_pipeline_are_checked(camera, name):
+    options = pipeline()
+    setattr(options, name, "no")
+    with pytest.raises(TypeError, match=f"{name} must be True or False, got 'no'"):
+        render(camera, model(3), options, BLACK)
+
+
+@pytest.mark.parametrize("name", ["separate_sh", "use_trained_exp", "clamp"])
+def test_flags_of_a_call_are_checked(camera, name):
+    for flag in (1, np.True_, torch.tensor(True)):
+        if not (name == "separate_sh" and torch.is_tensor(flag)):  # which is override_color in 2023's form
+            render(camera, model(3), pipeline(), BLACK, **{name: flag})
+    for wrong in ("no", 2, []):
+        with pytest.raises(TypeError, match=f"{name} must be True or False, got"):
+            render(camera, model(3), pipeline(), BLACK, **{name: wrong})
 
 
 def test_values_outside_are_clamped_and_get_no_gradient(camera):

@@ -12,6 +12,13 @@ from PIL import Image
 from torch import Tensor
 
 
+def check_flags(**flags: object) -> None:
+    """TypeError naming the first value that is not True, False, 1, 0, None, or a tensor."""
+    for name, value in flags.items():
+        if not torch.is_tensor(value) and value not in (None, False, True):
+            raise TypeError(f"{name} must be True or False, got {value!r:.80}")
+
+
 def inverse_sigmoid(x: Tensor) -> Tensor:
     """Logit of x in (0, 1), any shape: log(x / (1 - x))."""
     return torch.log(x / (1 - x))

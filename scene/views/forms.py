@@ -13,6 +13,7 @@ from scene.pictures.decode import pixels_of
 from scene.pictures.in_memory import InMemory
 from scene.readers.depth_maps import depth_fit, resize
 from scene.views.view import View, half
+from utils.general_utils import check_flags
 
 _NOT_MOVED = np.array([0.0, 0.0, 0.0])
 
@@ -40,8 +41,9 @@ def view_of_2024(
 
     resolution: (width, height) that the image is resized to, its alpha included. invdepthmap: (h,w) or (h,w,C), whose
     first channel counts, resized bilinearly. depth_params: as `depth_fit` takes them. train_test_exp: only a half of a
-    test view (is_test_view) counts, by the list it is in (is_test_dataset).
+    test view (is_test_view) counts, by the list it is in (is_test_dataset). TypeError for flags that are no booleans.
     """
+    check_flags(train_test_exp=train_test_exp, is_test_dataset=is_test_dataset, is_test_view=is_test_view)
     size = int(resolution[0]), int(resolution[1])
     fit = depth_fit(depth_params)
     depth: InMemory | None = None
