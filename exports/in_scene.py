@@ -2,7 +2,6 @@
 
 import argparse
 import copy
-import tempfile
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,6 +13,7 @@ from exports.selection import drawable, selected
 from exports.splats import Splats
 from scene import Scene
 from scene.gaussian_model import GaussianModel
+from utils.graphics_utils import BasicPointCloud
 from utils.ranks.ranks import ALONE, Ranks
 from utils.sh_utils import C0
 from utils.system_utils import UserError
@@ -36,12 +36,11 @@ def scene_with(
     splats = selected(splats, drawable(splats))
     if not len(splats):
         raise UserError(f"{path} has no Gaussians that are drawn; give another model")
-    with tempfile.TemporaryDirectory() as folder:  # so that the scene moves the points into its frame, as it does any
-        points = Path(folder) / "points.npz"
-        colors = np.clip(splats.sh[:, 0] * C0 + 0.5, 0, 1)
-        np.savez(points, points=splats.means.astype(np.float64) + splats.world_offset, colors=colors)
-        options.init_pcd_path = str(points)
-        scene = Scene(options, gaussians, shuffle=shuffle, start=False, sharing=sharing)
+    points = splats.means.astype(np.float64) + splats.world_offset
+    colors = np.clip(splats.sh[:, 0] * C0 + 0.5, 0, 1).astype(np.float32)
+    # The scene moves them into its frame, as it does any points.
+    options.init_pcd_path = BasicPointCloud(points, colors, np.zeros_like(colors))
+    scene = Scene(options, gaussians, shuffle=shuffle, start=False, sharing=sharing)
     means = np.ascontiguousarray(scene.info.point_cloud.points, dtype=np.float32)
     return scene, replace(splats, means=means, world_offset=tuple(scene.info.offset.tolist()))
 

@@ -3,14 +3,13 @@
 import os
 import shutil
 import subprocess
-import tempfile
 import zipfile
 from pathlib import Path
 from urllib.parse import quote
 
 from exports.plain_ply import write_plain_ply
 from exports.splats import Splats
-from utils.system_utils import UserError, atomic_write
+from utils.system_utils import UserError, atomic_write, temporary_folder
 
 PROGRAM = "splat-transform"
 # The program clusters the SH bands from a random start and has no option for a seed, so it gets a Math.random with one
@@ -31,8 +30,8 @@ def write_sog(path: str | os.PathLike, splats: Splats) -> None:
     program = find_program(path)
     if not len(splats):
         raise UserError(f"{path} would have no splats, which {PROGRAM} does not write; choose another format")
-    with tempfile.TemporaryDirectory() as folder, atomic_write(path) as temporary:
-        model, packed = Path(folder) / "model.ply", Path(folder) / "model.sog"
+    with temporary_folder() as folder, atomic_write(path) as temporary:
+        model, packed = folder / "model.ply", folder / "model.sog"
         write_plain_ply(model, splats)
         # Without a GPU, as its results differ from machine to machine.
         command = [program, "--quiet", "--overwrite", "--gpu", "cpu", str(model), str(packed)]

@@ -5,7 +5,6 @@ of the model, in COLMAP's axes, and the prim turns them half around x.
 """
 
 import os
-import tempfile
 import zipfile
 from pathlib import Path
 from types import ModuleType
@@ -14,7 +13,7 @@ import numpy as np
 
 from exports.selection import opacities
 from exports.splats import Splats
-from utils.system_utils import UserError, atomic_write
+from utils.system_utils import UserError, atomic_write, temporary_folder
 
 PRIM = "/World/Splats"
 
@@ -22,8 +21,8 @@ PRIM = "/World/Splats"
 def write_usdz(path: str | os.PathLike, splats: Splats) -> None:
     """Write the file, whole or not at all. UserError without a usd-core that has the schema."""
     usd = find_pxr(path)
-    with tempfile.TemporaryDirectory() as folder, atomic_write(path) as temporary:
-        layer = Path(folder) / "splats.usdc"
+    with temporary_folder() as folder, atomic_write(path) as temporary:
+        layer = folder / "splats.usdc"
         try:
             _write_stage(usd, str(layer), splats)
             done = usd.UsdUtils.CreateNewUsdzPackage(usd.Sdf.AssetPath(str(layer)), str(temporary))
@@ -31,7 +30,7 @@ def write_usdz(path: str | os.PathLike, splats: Splats) -> None:
             done = False
         if not done or not _is_whole(temporary):
             raise UserError(
-                f"cannot write {path}; free space there and in {tempfile.gettempdir()}, fix the permissions, or choose "
+                f"cannot write {path}; free space there and in {folder.parent}, fix the permissions, or choose "
                 "another place"
             )
 

@@ -14,12 +14,11 @@ import json
 import shutil
 import subprocess
 import tarfile
-import tempfile
 from argparse import ArgumentParser
 from collections.abc import Sequence
 from pathlib import Path
 
-from utils.system_utils import UserError, atomic_write, run_cli
+from utils.system_utils import UserError, atomic_write, run_cli, temporary_folder
 
 ROOT = Path(__file__).resolve().parents[1]
 FOLDER = ROOT / "exports" / "viewer"
@@ -36,8 +35,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     record = json.loads(RECORD.read_text(encoding="utf-8"))
     if not shutil.which("npm"):
         raise UserError("npm is not installed; install Node 20 or later, which brings it")
-    with tempfile.TemporaryDirectory() as temporary:
-        folder = Path(temporary)
+    with temporary_folder() as folder:
         package = _unpacked(record, folder)
         minifier = _minifier(record, folder)
         files = {"LICENSE": (package / "LICENSE").read_bytes()}

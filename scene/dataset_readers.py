@@ -64,7 +64,7 @@ def read_scene(
     source_path: str | os.PathLike,
     images: str,
     hold_out: bool,
-    init_pcd_path: str = "",
+    init_pcd_path: str | BasicPointCloud = "",
     want_cloud: bool = True,
     init_type: str = SFM,
     masks: MaskOptions = NO_MASKS,
@@ -73,9 +73,9 @@ def read_scene(
     """Read the dataset in a folder, of any kind. UserError says what was looked for and what was found.
 
     images: folder of the photos (COLMAP only). hold_out: keep a test set apart, else all views train.
-    init_pcd_path: file of points to start from instead of the dataset's own. Without one, init_type decides: "sfm" (the
-    dataset's points) or "random". want_cloud: False reads no points, for a model that exists already.
-    offset: (3,) of that model's frame (scene/readers/world_offset.py); None: computed for this scene.
+    init_pcd_path: points, or a file of them, to start from instead of the dataset's own. Without one, init_type
+    decides: "sfm" (the dataset's points) or "random". want_cloud: False reads no points, for a model that exists
+    already. offset: (3,) of that model's frame (scene/readers/world_offset.py); None: computed for this scene.
     Photos of distorting lenses are undistorted into the user's cache folder; nothing else is written.
     """
     folder = Path(source_path)

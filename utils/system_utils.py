@@ -4,6 +4,7 @@ import contextlib
 import os
 import re
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -24,6 +25,7 @@ __all__ = [
     "run_cli",
     "saved_iterations",
     "searchForMaxIteration",
+    "temporary_folder",
 ]
 
 _ITERATION_FOLDER = re.compile(r"iteration_(\d+)")
@@ -166,6 +168,20 @@ def mkdir_p(folder_path: str | os.PathLike) -> None:
         raise UserError(
             f"cannot create the folder {folder_path} ({error.strerror}); choose another place, or fix its permissions"
         ) from error
+
+
+@contextlib.contextmanager
+def temporary_folder() -> Iterator[Path]:
+    """Yield a folder for temporary files, and delete it afterwards. UserError where none can be made."""
+    try:
+        folder = tempfile.TemporaryDirectory()
+    except OSError as error:
+        raise UserError(
+            f"cannot make a temporary folder ({error}); free space there, or name another place in the environment "
+            "variable TMPDIR"
+        ) from error
+    with folder as name:
+        yield Path(name)
 
 
 def saved_iterations(folder: str | os.PathLike) -> list[int]:

@@ -20,9 +20,9 @@ _GREY = 127 / 255
 
 
 class StartOptions(NamedTuple):
-    """The user's choice: a file of points (empty: none), else SFM (the scene's points) or RANDOM points."""
+    """The user's choice: points or a file of them (empty: none), else SFM (the scene's points) or RANDOM points."""
 
-    path: str = ""
+    points: str | BasicPointCloud = ""
     kind: str = SFM
 
 
@@ -40,8 +40,10 @@ def choose_start(
     options: StartOptions, own: Callable[[], StartCloud | None], random: Callable[[], BasicPointCloud], lacking: str
 ) -> StartCloud:
     """The start cloud. own: reads the scene's points, if it has any; lacking: start of the message when it has none."""
-    if options.path:
-        path = Path(options.path)
+    if isinstance(options.points, BasicPointCloud):
+        return StartCloud(options.points, None)
+    if options.points:
+        path = Path(options.points)
         return StartCloud(read_point_cloud(path), path if is_ply(path) else None)
     if options.kind == RANDOM:
         return StartCloud(random(), None)
