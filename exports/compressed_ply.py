@@ -5,6 +5,9 @@ colour; a splat has each as a part of that range: position and scale in 11, 10 a
 and opacity in 8 each, and its quaternion as the index of the largest component (2 bits) and the others (10 bits each,
 of a range of +-sqrt(1/2)). SH coefficients of the range +-4 are in the element sh, 8 bits each, channel by channel.
 Axes are those of the model.
+
+Splats that lie far from the others would coarsen the steps of their chunk, so they have chunks of their own. The chunk
+before is filled up with padding: splats without opacity whose positions, scales and colours are all zero bits.
 """
 
 import os
@@ -12,12 +15,11 @@ import os
 import numpy as np
 from plyfile import PlyData, PlyElement, PlyParseError
 
-from exports.packing import from_bits, morton_order, smallest_three, to_bits, whole_quaternions
+from exports.packing import from_bits, morton_order, smallest_three, spread, to_bits, whole_quaternions
 from exports.plain_ply import comments, says_antialiasing, stored_offset
 from exports.selection import logits, opacities, selected
 from exports.splats import Splats
-from utils.files.ply_header import header_lines
-from utils.files.ply_rows import check_rows
+from utils.files.ply_header import header_lines, read_elements
 from utils.sh_utils import C0
 from utils.system_utils import UserError, atomic_write
 
@@ -25,6 +27,8 @@ CHUNK = 256
 SH_RANGE = 8.0  # coefficients from -4 to 4
 _LOG_SCALES = 20.0  # beyond this, readers clamp
 _PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
+_VISIBLE = ("packed_position", "packed_scale", "packed_color")  # all zero in padding
+_FAR = 10.0  # usual distances from the middle, of positions or of colours
 _RANGES = {"": "xyz", "scale_": "xyz", "color": "rgb"}  # groups of a chunk's columns
 
 
@@ -35,7 +39,15 @@ def is_compressed_ply(path: str | os.PathLike) -> bool:
 
 def write_compressed_ply(path: str | os.PathLike, splats: Splats) -> None:
     """Write the file, whole or not at all."""
-    splats = selected(splats, morton_order(splats.means))
+    packed = packed_ply(splats)
+    with atomic_write(path) as temporary:
+        packed.write(str(temporary))
+
+
+def packed_ply(splats: Splats) -> PlyData:
+    """The tables of the file and its comments."""
+    order, padding = _in_chunks(splats)
+    splats = selected(splats, order)
     count = len(splats)
     first = np.arange(0, count, CHUNK)
     chunk_of = np.arange(count) // CHUNK
@@ -51,13 +63,33 @@ def write_compressed_ply(path: str | os.PathLike, splats: Splats) -> None:
     vertex["packed_scale"] = _three(parts["scale_"])
     red, green, blue = to_bits(parts["color"], 8).T
     vertex["packed_color"] = red << 24 | green << 16 | blue << 8 | to_bits(opacities(splats), 8)
+    for name in _VISIBLE:
+        vertex[name][padding] = 0
     elements = [_table("chunk", ranges, "<f4"), PlyElement.describe(vertex, "vertex")]
     if splats.sh_degree:
         codes = np.floor((splats.sh[:, 1:] / np.float32(SH_RANGE) + np.float32(0.5)) * 256)  # float64 would take GBs
         codes = codes.clip(0, 255).astype(np.uint8).transpose(0, 2, 1).reshape(count, 3 * (splats.sh.shape[1] - 1))
         elements.append(_table("sh", [([f"f_rest_{i}" for i in range(codes.shape[1])], codes)], "u1"))
-    with atomic_write(path) as temporary:
-        PlyData(elements, byte_order="<", comments=comments(splats)).write(str(temporary))
+    return PlyData(elements, byte_order="<", comments=comments(splats))
+
+
+def _in_chunks(splats: Splats) -> tuple[np.ndarray, np.ndarray]:
+    """Indices of the splats in the order of the file, and which of them are padding.
+
+    Those within _FAR usual distances come first, then those within _FAR times that, and so on.
+    """
+    shells = np.zeros(len(splats))
+    for values in (splats.means, splats.sh[:, 0]):
+        _, distances, usual = spread(values)
+        shells = np.maximum(shells, np.ceil(np.log(np.maximum(distances / usual, 1)) / np.log(_FAR)) - 1)
+    order, padding = np.zeros(0, np.int64), np.zeros(0, bool)
+    for shell in np.unique(shells):
+        missing = -len(order) % CHUNK
+        own = np.flatnonzero(shells == shell)
+        own = own[morton_order(splats.means[own])]
+        order = np.concatenate([order, np.repeat(order[-1:], missing), own])
+        padding = np.concatenate([padding, np.ones(missing, bool), np.zeros(len(own), bool)])
+    return order, padding
 
 
 def _grouped(splats: Splats) -> dict[str, np.ndarray]:
@@ -94,10 +126,12 @@ def _rotations(wxyz: np.ndarray) -> np.ndarray:
 
 
 def read_compressed_ply(path: str | os.PathLike) -> Splats:
-    """Read a file of this format, also without ranges of colours, as older ones are. UserError if it is damaged."""
+    """Read a file of this format, also without ranges of colours, as older ones are; padding is left out.
+
+    UserError if it is damaged.
+    """
     try:
-        check_rows(path)
-        ply = PlyData.read(os.fspath(path))
+        ply = read_elements(path)
         chunks, vertex = ply["chunk"].data, ply["vertex"].data
         packed = [np.asarray(vertex[name]).astype(np.uint32) for name in _PACKED]
         chunk_of = np.arange(len(vertex)) // CHUNK
@@ -116,7 +150,9 @@ def read_compressed_ply(path: str | os.PathLike) -> Splats:
     sh = np.concatenate([((color - 0.5) / C0).astype(np.float32)[:, None], rest], axis=1)
     alpha = logits(from_bits(packed[3], 8), 1 / 255)
     values = (x.astype(np.float32) for x in (position, log_scales, rotations, alpha, sh))
-    return Splats(*values, antialiasing=says_antialiasing(path), world_offset=stored_offset(path))
+    whole = Splats(*values, antialiasing=says_antialiasing(path), world_offset=stored_offset(path))
+    shown = np.any([vertex[name] for name in _VISIBLE], axis=0)
+    return whole if shown.all() else selected(whole, shown)
 
 
 def _parts(codes: np.ndarray) -> np.ndarray:

@@ -2,17 +2,17 @@
 
 import base64
 import gzip
+import io
 import json
 import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import jinja2
 import numpy as np
 
-from exports.compressed_ply import write_compressed_ply
+from exports.compressed_ply import packed_ply
 from exports.splats import Splats
 from exports.upright import turn_upright, turned, up_of
 from exports.vendor import FOLDER, RECORD, VIEWER
@@ -113,10 +113,9 @@ def _embedded(content: Any) -> str:
 
 
 def _packed_model(splats: Splats) -> str:
-    with TemporaryDirectory() as folder:
-        file = Path(folder) / _NAME
-        write_compressed_ply(file, splats)
-        packed = _packed(file.read_bytes())
+    content = io.BytesIO()
+    packed_ply(splats).write(content)
+    packed = _packed(content.getbuffer())
     if len(packed) > LONGEST:
         raise UserError(
             f"a page of {len(splats):,} Gaussians of SH degree {splats.sh_degree} would have {len(packed) / 1e6:.0f} "

@@ -50,6 +50,18 @@ def _spread(x: np.ndarray) -> np.ndarray:
     return x
 
 
+def spread(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+    """The middle (3,) of values (N, 3), their distances (N,) from it, and the usual distance; medians, float64.
+
+    Values in the middle itself do not count for the usual distance, which is 1 if there are no others.
+    """
+    values = values.astype(np.float64)
+    middle = np.median(values, axis=0) if len(values) else np.zeros(3)
+    distances = np.linalg.norm(values - middle, axis=1)
+    apart = distances[distances > 0]
+    return middle, distances, float(np.median(apart)) if len(apart) else 1.0
+
+
 def smallest_three(quaternions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Index (N,) of the largest component of unit quaternions (N, 4), and the other three, in order, float64.
 

@@ -10,7 +10,9 @@ import torch
 from exports.splats import Splats
 from scene.gaussians.ply import offset_comments, read_ply, read_vertices, write_ply
 from scene.readers.world_offset import origin_near
+from utils.files.model_json import LARGEST_OFFSET
 from utils.files.ply_header import header_lines
+from utils.system_utils import UserError
 
 AXES = "axes x right, y down, z forward (COLMAP)"
 
@@ -36,15 +38,28 @@ def says_antialiasing(path: str | os.PathLike) -> bool:
 
 
 def stored_offset(path: str | os.PathLike) -> tuple[float, float, float]:
-    """World coordinates of a PLY's origin: those of our comment world_offset, zero without a finite one."""
+    """World coordinates of a PLY's origin: those of our comment world_offset, zero without a finite one.
+
+    UserError if they are too large.
+    """
     for line in header_lines(path):
         words = line.split()
         if words[:2] == ["comment", "world_offset"] and len(words) == 5:
             with contextlib.suppress(ValueError):
                 offset = tuple(float(word) for word in words[2:])
                 if all(map(math.isfinite, offset)):
-                    return offset
+                    return _checked(offset, path)
     return 0.0, 0.0, 0.0
+
+
+def _checked(offset: tuple[float, float, float], path: str | os.PathLike) -> tuple[float, float, float]:
+    farthest = max(map(abs, offset))
+    if farthest > LARGEST_OFFSET:
+        raise UserError(
+            f"{path} lies {farthest:.3g} from the origin of its world, and {LARGEST_OFFSET:g} is the most; correct its "
+            "positions and its comment world_offset"
+        )
+    return offset
 
 
 def write_plain_ply(path: str | os.PathLike, splats: Splats) -> None:
@@ -70,7 +85,7 @@ def read_plain_ply(path: str | os.PathLike) -> Splats:
     offset = stored_offset(path)
     if any(line.split() in (["property", "double", "x"], ["property", "float64", "x"]) for line in header_lines(path)):
         rows["xyz"], origin = _near_origin(path, rows["xyz"])
-        offset = tuple((origin + offset).tolist())
+        offset = _checked(tuple((origin + offset).tolist()), path)
     sh = torch.cat([torch.from_numpy(rows["f_dc"]), torch.from_numpy(rows["f_rest"])], dim=1).numpy()
     values = (rows["xyz"], rows["scaling"], rows["rotation"], rows["opacity"][:, 0], sh)
     return Splats(*values, antialiasing=says_antialiasing(path), world_offset=offset)

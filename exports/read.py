@@ -3,6 +3,8 @@
 import os
 from pathlib import Path
 
+import numpy as np
+
 from exports.compressed_ply import is_compressed_ply, read_compressed_ply
 from exports.plain_ply import read_plain_ply
 from exports.selection import tidy
@@ -23,10 +25,11 @@ def is_point_cloud(path: str | os.PathLike) -> bool:
     if not lines:
         with open(path, "rb") as file:
             return not file.read(4).startswith((b"NGSP", b"\x1f\x8b"))
-    names = {line.split()[-1] for line in lines if line.startswith("property")}
+    names = {words[-1] for words in map(str.split, lines) if words[:1] == ["property"]}
     return not names & {"f_dc_0", "opacity", "scale_0", "rot_0", "packed_position"}
 
 
+@np.errstate(over="ignore", invalid="ignore")  # what float32 cannot hold becomes Inf or NaN, which is not drawn
 def read_splats(path: str | os.PathLike) -> Splats:
     """The Gaussians of a file. UserError if it is missing, damaged, or of another format."""
     if not os.path.isfile(path):

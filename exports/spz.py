@@ -12,14 +12,16 @@ import os
 import struct
 import sys
 import zlib
+from dataclasses import replace
 from types import ModuleType
 
 import numpy as np
 
 from exports.half_turn import half_turned
-from exports.packing import morton_order, smallest_three, to_bytes, whole_quaternions
+from exports.packing import morton_order, smallest_three, spread, to_bytes, whole_quaternions
 from exports.selection import logits, opacities, selected
 from exports.splats import Splats
+from utils.files.packed import check_packed_rows
 from utils.system_utils import UserError, atomic_write
 
 MAGIC = 0x5053474E
@@ -29,6 +31,7 @@ _ANTIALIASED = 1
 _COLOR = 0.15  # colours are 0.5 + 0.15 SH0, so that those beyond [0, 1] fit
 _MOST_BITS = 20  # of a position's fraction
 _LARGEST_POSITION = (1 << 23) - 1
+_FARTHEST = 1000.0  # usual distances from the middle; no move within the model shows how far it is beyond
 _LEVEL = 3  # of zstd; level 19 takes 70 times as long and saves 2 %
 _SIZES = (9, 1, 3, 3, 4)  # bytes a splat of each stream, before SH
 
@@ -36,8 +39,11 @@ _SIZES = (9, 1, 3, 3, 4)  # bytes a splat of each stream, before SH
 def write_spz(path: str | os.PathLike, splats: Splats) -> None:
     """Write version 4, whole or not at all. UserError without the package zstandard."""
     zstandard = find_zstandard(path)
+    splats = _drawn_in(splats)
     splats = half_turned(selected(splats, morton_order(splats.means)))
     farthest = float(np.abs(splats.means).max(initial=0))
+    if farthest > _LARGEST_POSITION:
+        raise UserError(f"{path} can hold positions to {_LARGEST_POSITION:,}, not {farthest:.3g}; end --to with .ply")
     bits = int(np.clip(np.floor(np.log2(_LARGEST_POSITION / max(farthest, 1e-30))), 0, _MOST_BITS))
     compressor = zstandard.ZstdCompressor(level=_LEVEL)
     streams = [s.tobytes() for s in (_positions(splats.means, bits), *_bytes(splats), _rotations(splats.rotations))]
@@ -49,6 +55,28 @@ def write_spz(path: str | os.PathLike, splats: Splats) -> None:
     header = _HEADER.pack(MAGIC, 4, len(splats), splats.sh_degree, bits, flags, len(streams), _HEADER.size)
     with atomic_write(path) as temporary:
         temporary.write_bytes(header + table + b"".join(packed))
+
+
+def _drawn_in(splats: Splats) -> Splats:
+    """The splats, of which the farthest are nearer and smaller, so that they look the same from the middle.
+
+    All positions have the same steps, which one splat far away would make coarse. It is told which splats change.
+    """
+    middle, distances, usual = spread(splats.means)
+    limit = _FARTHEST * usual
+    far = distances > limit
+    if not far.any():
+        return splats
+    print(
+        f"warning: {far.sum()} of {len(splats)} Gaussians lie more than {limit:.3g} from the middle of the model; SPZ "
+        "would round all others for them, so they are written at that distance, and smaller; --crop leaves them out",
+        file=sys.stderr,
+    )
+    means, log_scales = splats.means.copy(), splats.log_scales.copy()
+    part = (limit / distances[far])[:, None]
+    means[far] = middle + (means[far] - middle) * part
+    log_scales[far] += np.log(part)
+    return replace(splats, means=means, log_scales=log_scales)
 
 
 def find_zstandard(path: str | os.PathLike) -> ModuleType:
@@ -96,6 +124,7 @@ def _read_zstd(content: bytes, path: str | os.PathLike) -> Splats:
     magic, version, count, degree, bits, flags, streams, table = _HEADER.unpack_from(content)
     if magic != MAGIC or version != 4:
         raise ValueError(f"no version that this program knows: {version}" if magic == MAGIC else "no magic number")
+    _check_header(count, degree, len(content))
     zstandard = find_zstandard(path)
     sizes = [size * count for size in (*_SIZES, 3 * ((degree + 1) ** 2 - 1))]
     begin, parts = table + 16 * streams, []
@@ -119,17 +148,26 @@ def _read_gzip(content: bytes) -> Splats:
     magic, version, count, degree, bits, flags, _ = _HEADER_GZIP.unpack(stream.read(_HEADER_GZIP.size))
     if magic != MAGIC or version not in (2, 3):
         raise ValueError(f"no version that this program knows: {version}" if magic == MAGIC else "no magic number")
+    _check_header(count, degree, len(content))
     sizes = [*_SIZES[:4], 3 if version == 2 else 4, 3 * ((degree + 1) ** 2 - 1)]
     parts = [stream.read(size * count) for size in sizes]  # no more than that, however much is packed
     stream.read(1)  # at the end it checks the sum
     return _splats(parts, count, degree, bits, flags, version)
 
 
+def _check_header(count: int, degree: int, size: int) -> None:
+    if degree > 4:
+        raise ValueError(f"SH bands of degree {degree}, of at most 4")
+    check_packed_rows(count, size)
+
+
 def _splats(parts: list[bytes], count: int, degree: int, bits: int, flags: int, version: int) -> Splats:
     sizes = (*_SIZES[:4], 3 if version == 2 else 4)
     table = [np.frombuffer(part, np.uint8).reshape(count, size) for part, size in zip(parts, sizes, strict=False)]
     coefficients = (degree + 1) ** 2 - 1
-    rest = np.frombuffer(parts[5], np.uint8).reshape(count, coefficients, 3)[:, :15].astype(np.float32) / 128 - 1
+    rest = np.frombuffer(parts[5], np.uint8).reshape(count, coefficients, 3)[:, :15].astype(np.float32)
+    rest /= 128  # in place, as these are most of the memory
+    rest -= 1
     if degree > 3:
         print(f"warning: SH bands of degree {degree} are left out; models have at most degree 3", file=sys.stderr)
     wide = np.zeros((count, 3, 4), np.uint8)
@@ -139,7 +177,7 @@ def _splats(parts: list[bytes], count: int, degree: int, bits: int, flags: int, 
     sh = np.concatenate([base.astype(np.float32)[:, None], rest], axis=1)
     alpha = logits(table[1].reshape(count) / 255.0, 1 / 255)
     values = (means, table[3] / 16.0 - 10, _read_rotations(table[4]), alpha, sh)
-    means, scales, rotations, alpha, sh = (x.astype(np.float32) for x in values)
+    means, scales, rotations, alpha, sh = (x.astype(np.float32, copy=False) for x in values)
     return half_turned(Splats(means, scales, rotations, alpha, sh, bool(flags & _ANTIALIASED)))
 
 

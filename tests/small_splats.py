@@ -1,4 +1,8 @@
-"""Splats for tests of exports: random ones, few ones, and such with extreme values."""
+"""Splats for tests of exports: random ones, such with extreme values, and very many in a file of few bytes."""
+
+import gzip
+import struct
+from collections.abc import Iterator
 
 import numpy as np
 
@@ -29,3 +33,25 @@ def extreme_splats(degree: int = 3) -> Splats:
     some.rotations[:4] = np.eye(4, dtype=np.float32)
     some.rotations[4:] = -np.eye(4, dtype=np.float32)
     return tidy(some)
+
+
+def empty_spz(version: int, count: int, degree: int = 0) -> bytes:
+    """An SPZ file of version 3 or 4 with splats that are all zero bits, which pack to a thousandth and less."""
+    sizes = [9 * count, count, 3 * count, 3 * count, 4 * count, 3 * ((degree + 1) ** 2 - 1) * count]
+    if version == 3:
+        header = struct.pack("<IIIBBBB", 0x5053474E, 3, count, degree, 12, 0, 0)
+        return gzip.compress(header) + b"".join(map(gzip.compress, _zeros(sum(sizes))))
+    import zstandard
+
+    packed = []
+    for size in sizes[: 6 if degree else 5]:
+        compressor = zstandard.ZstdCompressor().compressobj(size=size)
+        packed.append(b"".join(map(compressor.compress, _zeros(size))) + compressor.flush())
+    table = b"".join(struct.pack("<QQ", len(p), size) for p, size in zip(packed, sizes, strict=False))
+    header = struct.pack("<IIIBBBBI12x", 0x5053474E, 4, count, degree, 12, 0, len(packed), 32)
+    return header + table + b"".join(packed)
+
+
+def _zeros(size: int) -> Iterator[bytes]:
+    """Pieces of so many zero bytes."""
+    return (bytes(min(1 << 20, size - begin)) for begin in range(0, size, 1 << 20))

@@ -14,6 +14,7 @@ import pytest
 import torch
 from small_splats import splats
 from test_exports import PACKAGES
+from test_exports_extremes import cube, moved
 
 from benchmarks.exports.read_back import read_back, read_by_splat_transform
 from benchmarks.exports.sizes import decibels, renders
@@ -123,6 +124,13 @@ def test_we_read_what_splat_transform_writes(tmp_path, ending, options):
     read = read_back(packed)
     assert read.antialiasing and read.sh_degree == 2
     assert _loss(some, half_turned(read) if ending == ".spz" else read) >= COMPRESSED
+
+
+@pytest.mark.parametrize("ending", [".compressed.ply", ".spz"])
+def test_splat_transform_finds_the_others_of_a_far_gaussian_where_they_are(tmp_path, ending):
+    some = cube(1e6)
+    read = read_by_splat_transform(_written(tmp_path, ending, some))
+    assert moved(some, half_turned(read) if ending == ".spz" else read).max() < 0.002
 
 
 @pytest.mark.parametrize("ending", [".glb", ".usdz"])

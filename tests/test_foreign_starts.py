@@ -137,6 +137,14 @@ def test_an_exported_model_keeps_its_world_offset(tmp_path, colmap_scene):
         assert read_splats(tmp_path / "again.ply").world_offset == (1.0, -2.0, 3.0)
 
 
+def test_an_origin_too_far_is_told_of_by_the_name_of_the_file(tmp_path, colmap_scene):
+    gaussians = model_of(splats(30, 0))
+    gaussians.world_offset = (1e300, 0.0, 0.0)
+    gaussians.save_ply(tmp_path / "mine.ply")
+    with pytest.raises(UserError, match=r"mine.ply lies 1e\+300 from the origin of its world"):
+        _train(colmap_scene, tmp_path / "out", "--init_ply", tmp_path / "mine.ply")
+
+
 def test_two_starts_contradict_each_other(tmp_path):
     for argv, said in (
         (["--init_ply", "a.ply", "--init_pcd_path", "b.ply"], "--init_pcd_path b.ply and --init_ply a.ply both name"),

@@ -6,6 +6,7 @@ import torch
 from gaussians import model, parameters
 from plyfile import PlyData, PlyElement
 
+from exports.read import read_splats
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.ply import stored_sh_degree
 from scene.readers.point_cloud import read_point_cloud
@@ -140,17 +141,56 @@ def test_a_failed_write_leaves_no_file(tmp_path, monkeypatch):
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("count", ["1" + "0" * 40, "4000000000", "9" * 500])
+PROMISES = r"is not a \S+ PLY file \(its header promises .* rows of an element, and it has \d+ bytes\)"
+
+
+@pytest.mark.parametrize("count", ["1" + "0" * 40, "4000000000", "+4_000_000_000", "9" * 500])
 @pytest.mark.parametrize("kind", ["binary_little_endian", "ascii"])
 def test_a_header_that_promises_more_rows_than_the_file_has(tmp_path, kind, count):
     model(2).save_ply(tmp_path / "a.ply")
     content = (tmp_path / "a.ply").read_bytes().replace(b"element vertex 2", f"element vertex {count}".encode())
     (tmp_path / "a.ply").write_bytes(content.replace(b"binary_little_endian", kind.encode()))
-    for read in (stored_sh_degree, _loaded):
-        with pytest.raises(
-            UserError, match=r"is not a complete PLY file \(its header promises .* vertices, and it has"
-        ):
+    for read in (stored_sh_degree, _loaded, read_splats):
+        with pytest.raises(UserError, match=PROMISES):
             read(tmp_path / "a.ply")
+
+
+JUNK = "element junk 1000000000000\nproperty {}\n"
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("\n", "\r"),
+        ("\n", "\r\n"),
+        ("ply\n", "ply\ncomment end_header\n"),
+        ("element vertex", "element\vvertex"),
+        ("element vertex", "\t element vertex"),
+        ("property", " property"),
+        ("element vertex 1", JUNK.format("double q") + "element vertex 1"),
+        ("end_header", JUNK.format("double q") + "end_header"),
+        ("end_header", JUNK.format("list uchar int q") + "end_header"),
+        ("element vertex 1", "element junk -1000000000000\nproperty int q\nelement vertex 100000000000"),
+    ],
+)
+def test_rows_are_counted_however_the_header_is_written(tmp_path, old, new):
+    header, path = "ply\nformat ascii 1.0\nelement vertex 1\nproperty double x\nend_header\n", tmp_path / "a.ply"
+    many = header if "junk" in new else header.replace("vertex 1", "vertex 100000000000")
+    path.write_bytes((many.replace(old, new) + "0\n").encode())
+    for read in (stored_sh_degree, _loaded, read_splats, read_point_cloud):
+        with pytest.raises(UserError, match=PROMISES):
+            read(path)
+
+
+@pytest.mark.parametrize("end", ["\n", "\r", "\r\n"])
+@pytest.mark.parametrize("last", ["", "end"])
+def test_a_file_as_long_as_its_header_says_is_read(tmp_path, end, last):
+    """With the shortest of rows, any end of lines, and without the end of the last one."""
+    lines = ["ply", "format ascii 1.0", "comment end_header", "element vertex 2"]
+    lines += [*(f"property uchar {name}" for name in ("x", "y", "z", "red", "green", "blue")), "end_header"]
+    lines += ["1 2 3 0 0 0"] * 2
+    (tmp_path / "a.ply").write_bytes((end.join(lines) + (end if last else "")).encode())
+    assert read_point_cloud(tmp_path / "a.ply").points.tolist() == [[1, 2, 3]] * 2
 
 
 def test_rows_without_columns_are_no_reason_for_a_traceback(tmp_path):

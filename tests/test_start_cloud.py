@@ -1,5 +1,8 @@
 """The cloud that training starts from: files of points of several formats, and random points in the cameras' views."""
 
+import tracemalloc
+import zipfile
+
 import numpy as np
 import pytest
 import torch
@@ -75,12 +78,44 @@ def test_bad_files(tmp_path, name, content, said):
 
 
 @pytest.mark.parametrize(
-    "arrays", [{"a": POINTS}, {"points": POINTS[:, :2]}, {"points": POINTS, "colors": BYTES[:1]}, {"points": [{}, {}]}]
+    "arrays",
+    [
+        *({"a": POINTS}, {"points": POINTS[:, :2]}, {"points": POINTS, "colors": BYTES[:1]}, {"points": [{}, {}]}),
+        {"points": np.zeros((5_000_000, 3), np.int8)},
+        {"points": POINTS, "colors": np.zeros((5_000_000, 3), np.int8)},
+        {"points": np.zeros((1, 3), "V30000000")},
+        {"points": POINTS + 0j},
+    ],
 )
 def test_bad_arrays(tmp_path, arrays):
-    np.savez(tmp_path / "a.npz", **{name: np.array(value) for name, value in arrays.items()})
+    """Also those that pack to a few bytes, of which little is unpacked."""
+    np.savez_compressed(tmp_path / "a.npz", **{name: np.array(value) for name, value in arrays.items()})
+    tracemalloc.start()
+    with pytest.raises(UserError, match="not a readable npz .*save points and colors .* by numpy.savez"):
+        read_point_cloud(tmp_path / "a.npz")
+    most = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert most < 2_000_000
+
+
+def test_an_array_of_a_long_header_is_refused_before_it_is_unpacked(tmp_path):
+    """NumPy unpacks as many bytes as its format 2 says, up to 4 GiB."""
+    with zipfile.ZipFile(tmp_path / "a.npz", "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("points.npy", b"\x93NUMPY\x02\x00" + (20_000_000).to_bytes(4, "little") + bytes(20_000_000))
+    tracemalloc.start()
     with pytest.raises(UserError, match="not a readable npz"):
         read_point_cloud(tmp_path / "a.npz")
+    most = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert most < 2_000_000
+
+
+def test_points_that_pack_well_are_read(tmp_path):
+    """A lattice of one colour takes 3 bytes a point, and 65,536 equal points take next to nothing."""
+    lattice = np.stack(np.meshgrid(*[np.arange(50)] * 3), axis=-1).reshape(-1, 3)
+    for points in (lattice, np.zeros((65_536, 3))):
+        np.savez_compressed(tmp_path / "a.npz", points=points, colors=np.full(points.shape, 0.5))
+        np.testing.assert_array_equal(read_point_cloud(tmp_path / "a.npz").points, points)
 
 
 def test_a_scene_starts_from_such_a_file(colmap_scene, tmp_path):

@@ -6,12 +6,11 @@ from collections.abc import Collection, Iterable, Iterator, Sequence
 
 import numpy as np
 import torch
-from plyfile import PlyData, PlyParseError
+from plyfile import PlyParseError
 from torch import Tensor
 
 from scene.gaussians.attributes import Rows, attributes
-from utils.files.ply_header import check_header
-from utils.files.ply_rows import check_rows
+from utils.files.ply_header import read_elements
 from utils.ranks.gathering import in_order
 from utils.ranks.ranks import ALONE, Ranks
 from utils.ranks.ranks import ranks as all_ranks
@@ -87,6 +86,7 @@ def _degree(names: Iterable[str]) -> int | None:
     return next((degree for degree in range(4) if 3 * ((degree + 1) ** 2 - 1) == rest), None)
 
 
+@np.errstate(over="ignore")  # doubles that float32 cannot hold become Inf
 def read_ply(path: str | os.PathLike, sh_degree: int | None) -> Rows:
     """Read a Gaussian PLY of any tool: any order of properties, scalar type and encoding.
 
@@ -140,9 +140,7 @@ def read_vertices(path: str | os.PathLike) -> np.ndarray:
     if not os.path.isfile(path):
         raise UserError(f"no file {path}; give the point_cloud.ply of a trained model")
     try:
-        check_header(path)
-        check_rows(path)
-        return PlyData.read(os.fspath(path))["vertex"].data
+        return read_elements(path)["vertex"].data
     except (PlyParseError, ValueError, OverflowError) as error:
         raise UserError(f"{path} is not a complete PLY file ({error}); save or download it again") from error
     except KeyError as error:

@@ -1,5 +1,6 @@
 """Coloured point clouds in files: PLY, npz and text are read, PLY is written."""
 
+import io
 import os
 import warnings
 import zipfile
@@ -9,7 +10,8 @@ from pathlib import Path
 import numpy as np
 from plyfile import PlyData, PlyElement, PlyParseError
 
-from utils.files.ply_header import check_header
+from utils.files.packed import check_packed_rows
+from utils.files.ply_header import read_elements
 from utils.graphics_utils import BasicPointCloud
 from utils.system_utils import UserError, atomic_write
 
@@ -18,6 +20,8 @@ _NPZ_FAULTS = (
     *(ValueError, TypeError, OSError, EOFError, KeyError, MemoryError, zipfile.BadZipFile, zlib.error),
     *(NotImplementedError, RuntimeError),
 )
+_LONGEST_HEADER = 1 << 14  # bytes; those of arrays of numbers have 128, and NumPy would unpack up to 4 GiB
+_NEEDS = "it needs an array points (N,3), and may have colors (N,3)"
 _POSITION = ("x", "y", "z")
 _NORMAL = ("nx", "ny", "nz")
 _COLOR = ("red", "green", "blue")
@@ -56,6 +60,7 @@ def storePly(path: str | os.PathLike, xyz: np.ndarray, rgb: np.ndarray) -> None:
     write_point_cloud(Path(path), np.asarray(xyz), np.clip(np.asarray(rgb), 0, 255).astype(np.uint8))
 
 
+@np.errstate(over="ignore")  # doubles that float32 cannot hold become Inf, which is refused
 def _read(path: Path) -> BasicPointCloud:
     """The cloud with colours as exact as the file has them."""
     if not os.path.isfile(path):  # Path.is_file raises an error for a name that is too long
@@ -82,8 +87,7 @@ def _begins_with(path: Path, magic: bytes) -> bool:
 
 def _read_ply(path: Path) -> BasicPointCloud:
     try:
-        check_header(path)
-        ply = PlyData.read(str(path))
+        ply = read_elements(path)
     except (PlyParseError, ValueError, OverflowError, OSError, EOFError, MemoryError) as error:
         raise UserError(f"{path} is not a readable PLY file ({error}); export the point cloud again") from error
     vertices = ply["vertex"].data if "vertex" in ply else np.zeros(0, dtype=[])
@@ -107,17 +111,29 @@ def _read_npz(path: Path) -> np.ndarray:
     try:
         with np.load(path, allow_pickle=False) as arrays:
             points, colors = (
-                next((arrays[name] for name in names if name in arrays), None)
+                next((_read_array(arrays, name, os.path.getsize(path)) for name in names if name in arrays), None)
                 for names in (("points", "xyz"), ("colors", "rgb"))
             )
-        parts = [np.asarray(part, np.float64) for part in (points, colors) if part is not None]
-        if points is None or any(part.ndim != 2 or part.shape[1] != 3 for part in parts):
-            raise ValueError("it needs an array points (N,3), and may have colors (N,3)")
-        return np.concatenate(parts, axis=1)
+        if points is None:
+            raise ValueError(_NEEDS)
+        return np.concatenate([points] if colors is None else [points, colors], axis=1)
     except _NPZ_FAULTS as error:
         raise UserError(
-            f"{path} is not a readable npz file of points ({error}); save points and colors (N,3)"
+            f"{path} is not a readable npz file of points ({error}); save points and colors (N,3) by numpy.savez"
         ) from error
+
+
+def _read_array(arrays: np.lib.npyio.NpzFile, name: str, size: int) -> np.ndarray:
+    """An array (N,3) of an npz file of `size` bytes, float64. ValueError before memory is taken for another one."""
+    with arrays.zip.open(f"{name}.npy") as file:
+        member = io.BytesIO(file.read(_LONGEST_HEADER))
+        first = np.lib.format.read_magic(member) == (1, 0)
+        read_header = np.lib.format.read_array_header_1_0 if first else np.lib.format.read_array_header_2_0
+        shape, _, kind = read_header(member)
+    if len(shape) != 2 or shape[1] != 3 or kind.kind not in "biuf":
+        raise ValueError(_NEEDS)
+    check_packed_rows(shape[0], size)
+    return arrays[name].astype(np.float64, copy=False)
 
 
 def _read_text(path: Path) -> np.ndarray:

@@ -9,7 +9,7 @@ from collections import Counter
 
 from fuzz.sandbox import Sandbox
 
-KINDS = ("colmap", "transforms", "cloud", "ply", "checkpoint", "picture", "options", "rasterizer")
+KINDS = ("colmap", "transforms", "cloud", "ply", "splats", "checkpoint", "picture", "options", "rasterizer")
 
 
 def main() -> int:

@@ -7,6 +7,7 @@ KINDS = {
     "transforms": files.Transforms,
     "cloud": files.Cloud,
     "ply": models.Ply,
+    "splats": models.Splats,
     "checkpoint": models.Checkpoint,
     "picture": pictures.Picture,
     "options": options.Options,

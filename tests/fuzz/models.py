@@ -1,11 +1,15 @@
-"""Cases of trained models: PLY files, checkpoints."""
+"""Cases of trained models: PLY files, exports, checkpoints."""
 
+import gzip
 import random
 from pathlib import Path
 
 import torch
 from gaussians import model, options, take_steps
+from small_splats import empty_spz, splats
 
+from exports.formats import format_of
+from exports.read import read_splats
 from fuzz.damage import changed, damaged, damaged_text
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.checkpoint import load_checkpoint, save_checkpoint
@@ -38,6 +42,28 @@ class Ply:
         counts = {len(gaussians), *(len(rows) for rows in gaussians.rows().values())}
         assert len(counts) == 1, "attributes differ in length"
         _render(gaussians)
+
+
+class Splats:
+    """An export is damaged, or a few bytes that promise and pack very many splats."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder, self._whole = folder, []
+        for ending in (".compressed.ply", ".splat", ".spz"):
+            path = folder / f"whole{ending}"
+            format_of(path).write(path, splats(20, 1))
+            self._whole.append((ending, path.read_bytes()))
+        self._whole += [(".spz", empty_spz(version, 12_000_000)) for version in (3, 4)]
+        unpacked = gzip.decompress(empty_spz(3, 20, 1))
+        self._whole.append((".spz", gzip.compress(unpacked, 0)))  # whose header can be damaged
+
+    def run(self, rng: random.Random) -> None:
+        ending, whole = rng.choice(self._whole)
+        head = min(len(whole), rng.choice((48, 2000, len(whole))))
+        path = self._folder / f"damaged{ending}"
+        path.write_bytes(damaged(rng, whole[:head]) + whole[head:])
+        read = read_splats(path)
+        assert len({len(read), *map(len, (read.log_scales, read.rotations, read.opacity_logits, read.sh))}) == 1
 
 
 class Checkpoint:

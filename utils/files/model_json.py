@@ -4,7 +4,6 @@ arguments/stored.py says which options are in it.
 """
 
 import os
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +12,7 @@ from utils.system_utils import UserError
 
 NAME = "model.json"
 OFFSET = "world_offset"  # (3,) world coordinates of the origin of the model's frame (scene/readers/world_offset.py)
+LARGEST_OFFSET = 1e15  # beyond, the steps of doubles are larger than 0.1
 
 
 def read_model_json(model_path: str | os.PathLike) -> dict[str, Any]:
@@ -30,8 +30,10 @@ def read_model_json(model_path: str | os.PathLike) -> dict[str, Any]:
     if not isinstance(record, dict) or not isinstance(record.get("antialiasing", False), bool):
         raise UserError(f"{path}: antialiasing must be true or false; restore the file, or remove it")
     offset = record.get(OFFSET, [0, 0, 0])
-    if not isinstance(offset, list) or len(offset) != 3 or not all(_is_finite(value) for value in offset):
-        raise UserError(f"{path}: {OFFSET} must be three numbers, got {offset!r:.40}; restore the file")
+    if not isinstance(offset, list) or len(offset) != 3 or not all(_fits(value) for value in offset):
+        raise UserError(
+            f"{path}: {OFFSET} must be three numbers to {LARGEST_OFFSET:g}, got {offset!r:.40}; restore the file"
+        )
     return record
 
 
@@ -40,5 +42,5 @@ def write_model_json(model_path: str | os.PathLike, record: dict[str, Any]) -> N
     write_json(Path(model_path) / NAME, record)
 
 
-def _is_finite(value: Any) -> bool:
-    return type(value) in (int, float) and abs(value) <= sys.float_info.max
+def _fits(value: Any) -> bool:
+    return type(value) in (int, float) and abs(value) <= LARGEST_OFFSET
