@@ -161,8 +161,7 @@ def test_splats_that_pack_well_are_read(tmp_path):
 @pytest.mark.parametrize("ending", [".usdz", ".sog", ".compressed.ply"])
 def test_without_a_temporary_folder_an_export_says_so(tmp_path, ending, monkeypatch, capsys):
     source = _write(tmp_path, ".ply", splats(5), "source")
-    monkeypatch.setattr(tempfile, "tempdir", None)
-    monkeypatch.setattr(tempfile, "_candidate_tempdir_list", lambda: [str(tmp_path / "absent")])
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "absent"))
     monkeypatch.setattr("shutil.which", lambda name, **_: name)
     if ending == ".usdz":
         pytest.importorskip("pxr", reason="the extra [export] is not installed")
