@@ -212,12 +212,12 @@ def test_parts_that_do_not_fit_end_in_a_sentence(tmp_path):
         "not a pair": torch.zeros(2),
         "entries": ([1, 2], 3),
         "the iteration is -5": (good, -5),
-        "the iteration is 'x'": (good, "x"),
+        "the iteration is a str": (good, "x"),
         "the iteration is 2.5": (good, 2.5),
         "SH degree is 7": (_changed(good, 0, 7), 1),
         "SH degree is -3": (_changed(good, 0, -3), 1),
-        "SH degree is 'x'": (_changed(good, 0, "x"), 1),
-        "extent of the scene is 'x'": (_changed(good, 11, "x"), 1),
+        "SH degree is a str": (_changed(good, 0, "x"), 1),
+        "extent of the scene is a str": (_changed(good, 11, "x"), 1),
         "extent of the scene is nan": (_changed(good, 11, float("nan")), 1),
         "no Gaussians": (empty, 1),
         "float32": (_changed(good, 1, good[1].double()), 1),
@@ -257,9 +257,7 @@ def test_one_flipped_bit_anywhere_is_noticed(tmp_path):
         lengths = whole[part.header_offset + 26 : part.header_offset + 30]  # of name and padding, each in two bytes
         place = part.header_offset + 30 + lengths[0] + lengths[2] + 256 * lengths[3] + part.file_size // 2
         path.write_bytes(whole[:place] + bytes([whole[place] ^ 16]) + whole[place + 1 :])
-        with pytest.raises(
-            UserError, match=r"chkpnt1.pth is damaged: its part '\.?data/\w+' does not have the checksum"
-        ):
+        with pytest.raises(UserError, match="chkpnt1.pth is damaged: a part of it does not have the checksum"):
             load_checkpoint(path)
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("chkpnt1/data.pkl", bytes(1 << 20))
@@ -286,7 +284,7 @@ def test_tensors_that_are_not_in_the_file_are_refused(tmp_path, unreal, place):
     else:
         content = _changed(content, place, unreal(content[place]))
     torch.save((content, 7), tmp_path / "chkpnt7.pth")
-    with pytest.raises(UserError, match="a tensor is sparse, has no values, or repeats the same ones"):
+    with pytest.raises(UserError, match="objects other than whole tensors, numbers and text"):
         load_checkpoint(tmp_path / "chkpnt7.pth")
 
 

@@ -1,5 +1,7 @@
 """A share of the random cases of `python -m tests.fuzz`, and proof that it notices what it looks for."""
 
+import mmap
+import random
 import subprocess
 import sys
 import tempfile
@@ -7,6 +9,8 @@ from pathlib import Path
 
 import pytest
 from fuzz import worker
+from fuzz.crafted_pickles import CRAFTED
+from fuzz.pickles import Hostile
 from fuzz.sandbox import Sandbox
 
 from utils.system_utils import UserError
@@ -19,6 +23,15 @@ def test_random_cases_end_in_a_result_or_a_sentence():
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout + done.stderr
     assert " 0 findings (colmap " in done.stdout
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="measures itself in /proc")
+@pytest.mark.parametrize("what", sorted(CRAFTED))
+def test_every_crafted_file_of_torch_ends_in_a_sentence_or_plain_values(tmp_path, what):
+    hostile = Hostile(tmp_path)
+    hostile.run = lambda rng: hostile.load(CRAFTED[what](rng))
+    finding, _, _ = worker._run(hostile, random.Random(what))
+    assert finding is None
 
 
 class _Case:
@@ -40,12 +53,14 @@ def _raise(error: BaseException) -> None:
         (lambda _: _raise(UserError("two\nlines")), "a message of several lines"),
         (lambda _: _raise(KeyError("x")), "KeyError: 'x'"),
         (lambda _: _raise(SystemExit(3)), "exit status 3"),
-        (lambda _: b"x" * (90 << 20), "took "),
+        (lambda _: mmap.mmap(-1, 90 << 20).read(), "MiB"),  # not from memory that the process has kept
+        (lambda _: sum(range(50_000_000)), " s"),
     ],
 )
 def test_findings(run, said, monkeypatch):
     monkeypatch.setattr(worker, "MOST", 50 << 20)
-    finding = worker._finding(_Case(run), None)
+    monkeypatch.setattr(_Case, "seconds", 0.3, raising=False)
+    finding, _, _ = worker._run(_Case(run), None)
     assert finding is None if said is None else said in finding
 
 

@@ -171,15 +171,30 @@ def test_lpips_takes_the_cached_weights(weights, tmp_path, monkeypatch):
         assert distance(*images, unit_range=True) == judge(images[:1], images[1:]).item()
 
 
+def test_downloaded_weights_are_kept_with_a_checked_digest(weights, tmp_path, monkeypatch):
+    file, _ = weights["alex"]
+
+    def download(url, to, hash_prefix):
+        assert url.endswith(f"-{hash_prefix}.pth") and len(hash_prefix) == 8
+        Path(to).write_bytes(file.read_bytes())
+
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
+    monkeypatch.setattr(torch.hub, "download_url_to_file", download)
+    monkeypatch.setattr(lpips_utils, "_network_failed", False)
+    PerceptualDistance("alex", [], torch.device("cpu"))
+    (kept,) = (tmp_path / "hub" / "checkpoints").iterdir()
+    assert kept.read_bytes() == file.read_bytes()
+
+
 def test_lpips_without_weights_is_refused_after_one_attempt(tmp_path, monkeypatch):
     attempts = []
 
-    def refuse(url, **_):
+    def refuse(url, *_, **__):
         attempts.append(url)
         raise OSError("no network")
 
     monkeypatch.setenv("TORCH_HOME", str(tmp_path))
-    monkeypatch.setattr(torch.hub, "load_state_dict_from_url", refuse)
+    monkeypatch.setattr(torch.hub, "download_url_to_file", refuse)
     monkeypatch.setattr(lpips_utils, "_network_failed", False)
     for net, name in (("vgg", "vgg16"), ("alex", "alexnet")):
         with pytest.raises(LpipsUnavailable, match=f"put .*{name}.* at {tmp_path}/hub/checkpoints/{name}"):
@@ -210,6 +225,7 @@ def test_lpips_weights_of_the_wrong_kind(weights, tmp_path):
     assert "torchvision's vgg16 or alexnet" in refused({"something": torch.zeros(3)})
     assert "features.28.weight" in refused({name: value for name, value in vgg.items() if "28.weight" not in name})
     assert "list" in refused([1, 2])
+    assert "which are never run" in refused({"features.0.weight": bytearray(9)})
     assert "alexnet" in refused(vgg, "alex")
     (tmp_path / "garbage.pth").write_bytes(b"no weights at all")
     for file in ("garbage.pth", "missing.pth"):
@@ -328,7 +344,7 @@ def test_without_the_package_lpips_one_line_says_so(tmp_path, run, monkeypatch):
 def test_no_download_is_tried_where_the_environment_forbids_it(tmp_path, monkeypatch):
     monkeypatch.setenv("TORCH_HOME", str(tmp_path))
     monkeypatch.setenv("GS_DOWNLOAD", "0")
-    monkeypatch.setattr(torch.hub, "load_state_dict_from_url", lambda *_, **__: pytest.fail("it was tried"))
+    monkeypatch.setattr(torch.hub, "download_url_to_file", lambda *_, **__: pytest.fail("it was tried"))
     monkeypatch.setattr(lpips_utils, "_network_failed", False)
     with pytest.raises(LpipsUnavailable, match="its weights are missing; put "):
         PerceptualDistance("vgg", [], torch.device("cpu"))

@@ -18,6 +18,7 @@ from types import ModuleType
 import torch
 from torch import library, nn
 
+from utils.files.tensor_files import read_tensors
 from utils.system_utils import UserError
 
 NETS = {"alex": "alexnet", "vgg": "vgg16", "squeeze": "squeezenet1_1"}  # backbones, and torchvision's names for them
@@ -122,11 +123,13 @@ def _features_from_files(net: str, files: list[Path]) -> dict[str, torch.Tensor]
 
 def _load_state(file: Path) -> dict[str, torch.Tensor]:
     try:
-        state = torch.load(file, map_location="cpu", weights_only=True)
+        state = read_tensors(file, legacy=True)  # torchvision's own files are older than torch 1.6
     except FileNotFoundError:
         raise UserError(f"no such file: {file} (--lpips_weights)") from None
-    except Exception as error:  # torch raises many kinds for damaged files and for pickles of other objects
-        raise UserError(f"{file} is not a readable state dict of plain tensors ({type(error).__name__})") from error
+    except ValueError as error:
+        raise UserError(
+            f"{file} is not a state dict of torchvision: {error}; give --lpips_weights one that torch has written"
+        ) from error
     if not isinstance(state, dict):
         raise UserError(f"{file} holds a {type(state).__name__}, wanted a state dict in torchvision's format")
     return state
@@ -137,33 +140,31 @@ def _features_from_cache(net: str) -> dict[str, torch.Tensor]:
     models = importlib.import_module("torchvision.models")
     url = models.get_model_weights(NETS[net]).IMAGENET1K_V1.url
     cached = Path(torch.hub.get_dir()) / "checkpoints" / url.rsplit("/", 1)[1]
-    if cached.is_file():
-        return _load_state(cached)
-    state = _download(url)
-    if state is None:
+    if not cached.is_file() and not _download(url, cached):
         raise LpipsUnavailable(
             f"its weights are missing; put {url} at {cached}, or name the file with --lpips_weights of metrics.py"
         )
-    return state
+    return _load_state(cached)
 
 
-def _download(url: str) -> dict[str, torch.Tensor] | None:
-    """Download a state dict into torch's cache.
+def _download(url: str, file: Path) -> bool:
+    """Download a file whose name ends in the first digits of its SHA-256.
 
-    None if that fails, and at once if it has failed before or the environment forbids it (GS_DOWNLOAD=0).
+    False if that fails, and at once if it has failed before or the environment forbids it (GS_DOWNLOAD=0).
     """
     global _network_failed
     if _network_failed or os.environ.get("GS_DOWNLOAD") == "0":
-        return None
+        return False
     before = socket.getdefaulttimeout()
     socket.setdefaulttimeout(_DOWNLOAD_TIMEOUT)
     try:
-        return torch.hub.load_state_dict_from_url(url, map_location="cpu", check_hash=True)
+        file.parent.mkdir(parents=True, exist_ok=True)
+        torch.hub.download_url_to_file(url, str(file), hash_prefix=file.stem.rpartition("-")[2])
     except (OSError, RuntimeError, http.client.HTTPException):  # no network, refused, or a damaged download
         _network_failed = True
-        return None
     finally:
         socket.setdefaulttimeout(before)
+    return not _network_failed
 
 
 _network_failed = False

@@ -9,7 +9,10 @@ from collections import Counter
 
 from fuzz.sandbox import Sandbox
 
-KINDS = ("colmap", "transforms", "cloud", "ply", "splats", "checkpoint", "picture", "options", "rasterizer")
+KINDS = (
+    *("colmap", "transforms", "cloud", "ply", "splats", "checkpoint", "pickle", "crafted"),
+    *("picture", "options", "rasterizer"),
+)
 
 
 def main() -> int:
@@ -36,4 +39,6 @@ def main() -> int:
                 print(f"FINDING: python -m tests.fuzz 60 {args.seed} --only {kind} {number}\n{finding}\n", flush=True)
     counts = ", ".join(f"{kind} {count:,}" for kind, count in done.items())
     print(f"{done.total():,} cases in {time.monotonic() - begin:.0f} s, {findings} findings ({counts})")
+    for kind, (more, seconds) in sandbox.worst.items():
+        print(f"{kind}: at most {more >> 20} MiB and {seconds:.2f} s of the processor for a case")
     return 1 if findings else 0

@@ -1,6 +1,6 @@
 """The kinds of cases, by name."""
 
-from fuzz import files, models, options, pictures, rasterizer
+from fuzz import files, models, options, pickles, pictures, rasterizer
 
 KINDS = {
     "colmap": files.Colmap,
@@ -9,6 +9,8 @@ KINDS = {
     "ply": models.Ply,
     "splats": models.Splats,
     "checkpoint": models.Checkpoint,
+    "pickle": pickles.Mutated,
+    "crafted": pickles.Crafted,
     "picture": pictures.Picture,
     "options": options.Options,
     "rasterizer": rasterizer.Rasterizer,

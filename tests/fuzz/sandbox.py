@@ -20,6 +20,7 @@ class Sandbox:
     def __init__(self, seed: int) -> None:
         self._seed = seed
         self._child: subprocess.Popen | None = None
+        self.worst: dict[str, tuple[int, float]] = {}  # by kind: most bytes and seconds that a case has added
 
     def __enter__(self) -> "Sandbox":
         return self
@@ -43,7 +44,9 @@ class Sandbox:
             log = Path(self._folder.name, "log").read_text(errors="replace")[-2000:]
             self._end()
             return f"hangs for more than {CASE} s" if answer is None else f"ended with {_status(status)}\n{log}"
-        return json.loads(answer)
+        finding, more, seconds = json.loads(answer)
+        self.worst[kind] = tuple(map(max, self.worst.get(kind, (0, 0.0)), (more, seconds)))
+        return finding
 
     def _begin(self) -> None:
         self._folder = tempfile.TemporaryDirectory(prefix="fuzz")

@@ -4,10 +4,12 @@ python -m fuzz.worker SEED FOLDER
 """
 
 import json
+import math
 import os
 import random
 import resource
 import sys
+import time
 import traceback
 from pathlib import Path
 
@@ -23,7 +25,7 @@ ROOM = 3 << 30  # that it can address: more than it may, so that an excess shows
 
 
 def main() -> None:
-    """Answer every line of stdin with a line of JSON: null, or words about the finding."""
+    """Answer every line of stdin with a line of JSON: a finding or null, the bytes added, the processor's seconds."""
     seed, folder = sys.argv[1], Path(sys.argv[2])
     answers = os.fdopen(os.dup(1), "w")
     log = os.open(folder / "log", os.O_WRONLY | os.O_CREAT | os.O_APPEND)
@@ -39,9 +41,9 @@ def main() -> None:
     for line in sys.stdin:
         kind, number = line.split()
         os.truncate(log, 0)
-        finding = _finding(kinds[kind], random.Random(f"{seed} {kind} {number}"))
+        answer = _run(kinds[kind], random.Random(f"{seed} {kind} {number}"))
         sys.stdout.flush()
-        print(json.dumps(finding), file=answers, flush=True)
+        print(json.dumps(answer), file=answers, flush=True)
 
 
 def _made(folder: Path) -> Path:
@@ -49,9 +51,19 @@ def _made(folder: Path) -> Path:
     return folder
 
 
-def _finding(kind: object, rng: random.Random) -> str | None:
+def _run(kind: object, rng: random.Random) -> tuple[str | None, int, float]:
     Path("/proc/self/clear_refs").write_text("5")  # the peak begins anew
-    before = _memory("VmRSS")
+    before, begin = _memory("VmRSS"), time.process_time()
+    finding = _finding(kind, rng)
+    more, seconds = max(_memory("VmHWM") - before, 0), time.process_time() - begin
+    if more > getattr(kind, "most", MOST):
+        finding = finding or f"took {more >> 20} MiB"
+    if seconds > getattr(kind, "seconds", math.inf):
+        finding = finding or f"took {seconds:.1f} s"
+    return finding, more, seconds
+
+
+def _finding(kind: object, rng: random.Random) -> str | None:
     try:
         kind.run(rng)
     except UserError as error:
@@ -62,8 +74,7 @@ def _finding(kind: object, rng: random.Random) -> str | None:
             return f"exit status {error.code}"
     except BaseException:
         return traceback.format_exc()[-3000:]
-    more = _memory("VmHWM") - before
-    return f"took {more >> 20} MiB" if more > MOST else None
+    return None
 
 
 def _memory(name: str) -> int:
