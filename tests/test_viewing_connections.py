@@ -2,8 +2,10 @@
 
 import http.client
 import math
+import secrets
 import select
 import socket
+import time
 from types import SimpleNamespace
 
 import pytest
@@ -22,7 +24,9 @@ from viewing import server as servers  # noqa: E402
 from viewing.connections import is_wanted  # noqa: E402
 from viewing.options import Address  # noqa: E402
 
-VALUES = {"text": "a", "number": 1.0, "whole": 1, "switch": False, "vector": (0.0, 0.0, 0.0)}
+VALUES = {
+    "text": "a", "number": 1.0, "whole": 1, "switch": False, "vector": (0.0, 0.0, 0.0), "nested": ((0, 1), (2, 3)),
+}  # fmt: skip
 CAMERA = {
     "type": "ViewerCameraMessage", "wxyz": [1, 0, 0, 0], "position": [0, 0.5, 0], "fov": 0.8, "near": 0.01, "far": 9,
     "image_height": 64, "image_width": 96, "look_at": [0, 0, 0], "up_direction": [0, -1, 0],
@@ -45,7 +49,7 @@ def _update(uuid: object, value: object, **more: object) -> dict[str, object]:
     "message",
     [
         CAMERA, CLICK, _update("text", "b"), _update("number", 2), _update("whole", 3), _update("switch", True),
-        _update("vector", [1, 2.5, 3]),
+        _update("vector", [1, 2.5, 3]), _update("whole", -(2**53)), _update("nested", [[1, 2], [2**53, 4]]),
     ],
 )  # fmt: skip
 def test_what_a_browser_sends_is_heard(message):
@@ -59,12 +63,15 @@ def test_what_a_browser_sends_is_heard(message):
             {"position": [0.0, 0.0]}, {"position": "abc"}, {"position": [[1], [2], [3]]}, {"wxyz": [1.0, 0.0, 0.0]},
             {"position": [math.nan] * 3}, {"position": [1e300, 0, 0]}, {"fov": math.inf}, {"fov": None},
             {"image_width": math.inf}, {"image_width": "x"}, {"up_direction": [1]}, {"more": 1},
+            {"up_direction": [0, 0, 0]}, {"up_direction": [0, 1e-200, 0]},
         )],
         CLICK | {"name": 5}, CLICK | {"ray_origin": []},
         *[_update(uuid, value) for uuid, value in (
             ("text", 1), ("text", ["a"]), ("number", "1"), ("number", math.nan), ("number", math.inf), ("number", True),
             ("whole", [1]), ("switch", 1), ("switch", "yes"), ("vector", []), ("vector", [1, 2]), ("vector", [1] * 4),
-            ("vector", "123"), ("vector", [1, 2, math.nan]), ("vector", 1), ("none", 1), (5, 1),
+            ("vector", "123"), ("vector", [1, 2, math.nan]), ("vector", 1), ("none", 1), (5, 1), ("number", 1e300),
+            ("whole", 1e300), ("whole", 2**53 + 1), ("whole", -(2**63)), ("vector", [1e300, 0, 0]),
+            ("nested", [[1, 2], [1e300, 4]]), ("nested", [1, 2]),
         )],
         _update("number", 1, removed=True), _update("number", 1) | {"updates": {"update_cb": [5]}},
         _update("number", 1) | {"updates": 5}, {"type": "ShareUrlRequest"}, {"type": 5}, {"type": "Message"}, {}, [], 5,
@@ -148,6 +155,44 @@ def test_many_connections_leave_the_process_its_files(served, monkeypatch):
     wait_for(lambda: _status(port) == 200)
 
 
+def test_who_asks_for_nothing_does_not_keep_others_out(served, monkeypatch):
+    """The oldest goes that has said nothing, then the oldest that waits for an answer; an open page stays."""
+    monkeypatch.setattr(connections, "MOST", 4)
+    port = served.server.get_port()
+    with Client(served.url) as page:
+        page.look()
+        silent = [socket.create_connection(("127.0.0.1", port), LIMIT) for _ in range(10)]
+        for _ in range(5):
+            assert _status(port) == 200
+        wait_for(lambda: len(select.select(silent, [], [], 0)[0]) >= 7)
+        page.look((0.0, 0.0, -5.0))
+        wait_for(lambda: [c for c in served.server.get_clients().values() if c.camera.position[2] == -5.0])
+        for one in silent:
+            one.close()
+
+
+@pytest.mark.parametrize("pings", [True, False], ids=["pings", "is silent"])
+def test_a_browser_that_does_not_read_is_let_go(served, monkeypatch, capfd, caplog, pings):
+    """Answers to its pings pile up without a limit of websockets, and the ping that would miss it waits behind them."""
+    monkeypatch.setattr(connections, "PATIENCE", LIMIT if pings else 0.5)
+    monkeypatch.setattr(connections, "UNREAD", (1 << 18) if pings else (1 << 30))
+    port = served.server.get_port()
+    with socket.socket() as one:
+        one.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+        one.settimeout(LIMIT)
+        one.connect(("127.0.0.1", port))
+        one.sendall(_opening(port))
+        shown = served.server.gui.add_text("much", secrets.token_hex(0 if pings else 4 << 20))
+        frames = 2000 * (b"\x89\xfd" + bytes(4 + 125)) if pings else b"\x8a\x80" + bytes(4)  # pings, or a pong
+        with pytest.raises(ConnectionError):
+            for _ in range(10_000):
+                one.sendall(frames)
+                time.sleep(0 if pings else 0.01)
+        shown.remove()
+    assert _status(port) == 200
+    assert capfd.readouterr().err == "" and not caplog.records
+
+
 def test_nonsense_is_refused_without_a_word(served, capfd):
     port = served.server.get_port()
     for raw in (b"\r\n\r\n", b"\x16\x03\x01" * 50 + b"\n", b"POST / HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n", b""):
@@ -157,6 +202,16 @@ def test_nonsense_is_refused_without_a_word(served, capfd):
             one.recv(1000)
     assert _status(port) == 200
     assert capfd.readouterr().err == ""
+
+
+def _opening(port: int) -> bytes:
+    """A request for a websocket."""
+    asks = [
+        "GET / HTTP/1.1", f"Host: 127.0.0.1:{port}", "Upgrade: websocket", "Connection: Upgrade",
+        "Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==", "Sec-WebSocket-Version: 13",
+        f"Sec-WebSocket-Protocol: viser-v{viser.__version__}", "", "",
+    ]  # fmt: skip
+    return "\r\n".join(asks).encode()
 
 
 def _status(port: int) -> int | None:
@@ -174,13 +229,8 @@ def test_a_browser_that_answers_nothing_does_not_hold_the_end(monkeypatch):
     monkeypatch.setitem(serve.__init__.__kwdefaults__, "close_timeout", 3600)  # which is not to be waited for
     own = servers.serve(Address("127.0.0.1", 0), "test")
     port = own.server.get_port()
-    asks = [
-        "GET / HTTP/1.1", f"Host: 127.0.0.1:{port}", "Upgrade: websocket", "Connection: Upgrade",
-        "Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==", "Sec-WebSocket-Version: 13",
-        f"Sec-WebSocket-Protocol: viser-v{viser.__version__}", "", "",
-    ]  # fmt: skip
     with socket.create_connection(("127.0.0.1", port), LIMIT) as one:
-        one.sendall("\r\n".join(asks).encode())
+        one.sendall(_opening(port))
         assert b"101" in one.recv(100)
         servers.stop(own.server)  # which itself waits for a thread that is held for seconds only
         wait_for(lambda: not own.server._websock_server._server_thread.is_alive())

@@ -3,6 +3,7 @@
 import argparse
 import contextlib
 import http.client
+import math
 import re
 import socket
 import sys
@@ -31,6 +32,7 @@ from viewing.gate import is_loopback  # noqa: E402
 from viewing.options import Address  # noqa: E402
 from viewing.page import Page  # noqa: E402
 from viewing.saved import answer  # noqa: E402
+from viewing.scene_cameras import center  # noqa: E402
 
 ANY = Address("127.0.0.1", 0)
 
@@ -275,6 +277,32 @@ def test_hostile_messages_neither_stop_the_page_nor_make_large_pictures(page):
     settings = page.settings()
     assert settings.scaling == 1.0 and settings.background == (1.0, 0.0, 0.0)
     page.view.scaling.value, page.view.mode.value, page.view.background.value = 1.0, "Colour", (0, 0, 0)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        *({"size": size} for size in ((0, 64), (96, 0), (0, 0), (-5, 1e18))),
+        {"position": (0.0, 0.0, 0.0)},  # which is what it looks at
+        {"position": (1e18, 0.0, 0.0)},
+    ],
+    ids=str,
+)
+def test_a_browser_of_any_window_and_place_goes_to_a_camera(page, capfd, wrong):
+    name = next(iter(page.photos._cameras.by_name))
+    page.photos.camera.value = next(reversed(page.photos._cameras.by_name))
+    with Client(page.url) as client:
+        client.look(**wrong)
+        wait_for(page.server.get_clients)
+        client.send("GuiUpdateMessage", uuid=page.photos.camera._impl.uuid, updates={"value": name})
+        place = center(page.photos._cameras.by_name[name])
+        heard = {}
+        while not {"SetCameraPositionMessage", "SetCameraFovMessage"} <= heard.keys():
+            heard |= {message["type"]: message for message in client.messages() if not message.get("initial")}
+        assert heard["SetCameraPositionMessage"]["position"] == pytest.approx(place)
+        assert 0 < heard["SetCameraFovMessage"]["fov"] < math.pi
+    wait_for(lambda: not page.watchers.any)
+    assert "Traceback" not in capfd.readouterr().err
 
 
 def test_a_crop_box_that_many_drag_is_drawn_once(page, capfd):

@@ -4,6 +4,8 @@ viser sets whatever attribute of a control a message names, keeps files that nob
 connections as come. Each of these could end a training.
 """
 
+import asyncio
+import contextlib
 import logging
 import math
 from collections.abc import Callable
@@ -12,10 +14,15 @@ from typing import Annotated, Any
 import msgspec
 from websockets.asyncio.connection import Connection
 from websockets.asyncio.server import ServerConnection
+from websockets.protocol import State
 
 MOST = 64  # connections at a time, those that have not said anything yet among them
 LARGEST = 1 << 16  # bytes of a message; a browser's have some hundred
+UNREAD = 8 << 20  # bytes that may wait for a browser to read them when more are to be sent; a frame has fewer
+PATIENCE = 60.0  # seconds in which a browser has to read what was sent
 _GOODBYE = 0.5  # seconds that the end waits for a browser that does not answer
+_LEAST_UP = 1e-6  # length of a camera's upward direction; without one, viser cannot move the camera
+_LARGEST_NUMBER = 2**53  # of a control. Up to it, floats are exact, and its whole numbers can be sent to others
 
 _Number = Annotated[float, msgspec.Meta(ge=-1e18, le=1e18)]  # finite, and so is its square in float32
 _Three = tuple[_Number, _Number, _Number]
@@ -56,7 +63,7 @@ _DECODER = msgspec.msgpack.Decoder(_Camera | _Control | _Click)
 
 
 def is_wanted(message: bytes | str, control: Callable[[str], Any]) -> bool:
-    """Whether viser may get a message: a camera, a click, or a value of the kind that its control has.
+    """Whether viser may get a message: a camera that stands upright, a click, or a value of its control's kind.
 
     control: viser's handle of the control with an id, or None.
     """
@@ -64,26 +71,28 @@ def is_wanted(message: bytes | str, control: Callable[[str], Any]) -> bool:
         decoded = _DECODER.decode(message)
     except (msgspec.MsgspecError, TypeError, ValueError, RecursionError):
         return False
-    if not isinstance(decoded, _Control):
+    if isinstance(decoded, _Camera):
+        return math.hypot(*decoded.up_direction) > _LEAST_UP
+    if isinstance(decoded, _Click):
         return True
     handle = control(decoded.uuid)
     return handle is not None and not handle.disabled and _has_kind(decoded.updates.value, handle.value)
 
 
 def _has_kind(value: Any, present: Any) -> bool:
-    """Whether a value is of the kind of a control's present one; numbers are finite, vectors have its length."""
+    """Whether a value is of the kind of a control's present one; numbers are bounded, vectors have its length."""
     if isinstance(present, bool | str):
         return isinstance(value, type(present))
     if isinstance(present, tuple):
         return isinstance(value, list) and len(value) == len(present) and all(map(_has_kind, value, present))
-    return type(value) in (int, float) and math.isfinite(value)
+    return type(value) in (int, float) and abs(value) <= _LARGEST_NUMBER
 
 
 class Connections:
-    """The connections of one server. control: as for `is_wanted`."""
+    """The connections of one server, `present` in the order in which they came. control: as for `is_wanted`."""
 
     def __init__(self) -> None:
-        self.open = 0
+        self.present: dict[_Checked, None] = {}
         self.control: Callable[[str], Any] = lambda uuid: None
 
     def options(self) -> dict[str, Any]:
@@ -98,23 +107,53 @@ class Connections:
         connection.owner = self
         return connection
 
+    def has_room(self) -> bool:
+        """Whether one more connection may come. For it, the oldest goes that has opened no websocket.
+
+        One that has not even asked for anything goes before those that have.
+        """
+        if len(self.present) < MOST:
+            return True
+        unfinished = [one for one in self.present if one.state is not State.OPEN]
+        if unfinished:
+            oldest = min(unfinished, key=lambda one: one.request is not None)
+            del self.present[oldest]
+            oldest.transport.abort()
+        return bool(unfinished)
+
 
 class _Checked(ServerConnection):
-    """A connection that counts, and that hands on only what is wanted."""
+    """A connection that counts, that hands on only what is wanted, and that ends if its browser does not read."""
 
     owner: Connections
 
     def connection_made(self, transport: Any) -> None:
-        self.owner.open += 1
-        if self.owner.open <= MOST:
+        if self.owner.has_room():
+            self.owner.present[self] = None
             super().connection_made(transport)
         else:
             Connection.connection_made(self, transport)  # without the task that would read a request
             transport.abort()
 
     def connection_lost(self, exc: Exception | None) -> None:
-        self.owner.open -= 1
+        self.owner.present.pop(self, None)
         super().connection_lost(exc)
+
+    def send_data(self) -> None:
+        for data in self.protocol.data_to_send():
+            if self.transport.get_write_buffer_size() > UNREAD:
+                self.transport.abort()
+            if self.transport.is_closing():
+                return  # asyncio would log each further write
+            if data:
+                self.transport.write(data)
+            else:
+                with contextlib.suppress(OSError):
+                    self.transport.write_eof()
+
+    async def drain(self) -> None:
+        # Not for ever: also the ping that would find out that nobody is there waits here.
+        await asyncio.wait_for(super().drain(), PATIENCE)
 
     async def recv(self, decode: bool | None = None) -> bytes | str:
         while True:

@@ -1,5 +1,6 @@
 """The tab with the scene's cameras: jump to one, and compare its photo with the render."""
 
+import contextlib
 from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING
@@ -7,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from viewing.in_turn import in_turn
+from viewing.poses import window_of
 from viewing.scene_cameras import SceneCameras, center, fov_of_canvas
 from viewing.settings import COMPARISONS, Settings
 
@@ -49,12 +51,13 @@ class PhotosTab:
         camera = self._cameras.by_name.get(name)
         if client is None or camera is None:
             return
-        place = center(camera)
+        place, (width, height) = center(camera), window_of(client.camera)
         with client.atomic():
-            client.camera.position = place
+            with contextlib.suppress(ValueError):  # of a browser that says that it looks at its own place
+                client.camera.position = place
             client.camera.look_at = place + camera.R[:, 2] * self._cameras.depth(camera)
             client.camera.up_direction = self._cameras.up_at(camera)
-            client.camera.fov = fov_of_canvas(camera, client.camera.aspect)
+            client.camera.fov = fov_of_canvas(camera, width / height)
 
     def _draw(self) -> None:
         from viser.transforms import SO3

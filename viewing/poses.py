@@ -18,6 +18,10 @@ def pose_of(camera: "viser.CameraHandle") -> Pose | None:
     fov, length = float(camera.fov), math.hypot(*wxyz)
     if not all(map(math.isfinite, (*position, *wxyz, fov))) or not 0 < fov < math.pi or not 1e-6 < length < 1e6:
         return None
+    return Pose(tuple(position), tuple(x / length for x in wxyz), fov, *window_of(camera))
+
+
+def window_of(camera: "viser.CameraHandle") -> tuple[int, int]:
+    """Width and height, in pixels, of a browser's window; sides that cannot be drawn count as the nearest that can."""
     width, height = (min(max(int(side), 1), _WIDEST) for side in (camera.image_width, camera.image_height))
-    width, height = max(width, height // _SLIMMEST), max(height, width // _SLIMMEST)
-    return Pose(tuple(position), tuple(x / length for x in wxyz), fov, width, height)
+    return max(width, height // _SLIMMEST), max(height, width // _SLIMMEST)
