@@ -45,13 +45,14 @@ def test_work_goes_on_when_the_terminal_is_closed(tmp_path):
 
 
 def test_a_second_hangup_is_not_impatience():
+    before = signal.getsignal(signal.SIGHUP)
     with DeferredInterrupt() as interrupt:
         for _ in range(2):
             os.kill(os.getpid(), signal.SIGHUP)
         assert interrupt.requested is Terminated
         with pytest.raises(KeyboardInterrupt):
             os.kill(os.getpid(), signal.SIGINT)
-    assert signal.getsignal(signal.SIGHUP) == signal.SIG_DFL
+    assert signal.getsignal(signal.SIGHUP) == before
 
 
 def test_nohup_is_respected():

@@ -2,6 +2,7 @@
 
 import json
 import os
+import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -13,6 +14,7 @@ import pytest
 import torch
 from gaussians import model, pipeline
 from PIL import Image
+from waiting import LIMIT, wait_for
 
 from moving_cameras import video
 from moving_cameras.keyframes import CameraPath, Keyframe
@@ -397,6 +399,20 @@ def test_an_interrupted_video_leaves_nothing(tmp_path):
             writer.write(frame)
         raise KeyboardInterrupt
     assert started[0].returncode is not None and list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("sent", ["SIGTERM", "SIGHUP"])
+def test_a_command_that_is_told_to_end_leaves_no_file(out, sent):
+    words = ["--path", "ellipse", "--seconds", "3600", "--quiet"]
+    with subprocess.Popen([sys.executable, "render.py", "-m", str(out), *words], cwd=ROOT, stderr=-1) as process:
+        try:
+            wait_for(lambda: written(out / "videos"))
+            process.send_signal(getattr(signal, sent))
+            said = process.communicate(timeout=LIMIT)[1].decode()
+        finally:
+            process.kill()
+    assert process.returncode == 143 and said.endswith("terminated\n") and "Traceback" not in said
+    assert written(out / "videos") == []
 
 
 def test_names_that_ffmpeg_would_take_for_something_else(tmp_path, monkeypatch, decoder):

@@ -43,6 +43,32 @@ def test_run_cli_says_one_line_and_exits(error, status, said, capsys):
     assert capsys.readouterr() == ("", said)
 
 
+@pytest.mark.parametrize(
+    ("sent", "status", "said"),
+    [
+        (["SIGINT"], 130, "interrupted\n"),
+        (["SIGTERM", "SIGTERM"], 143, "terminated\n"),
+        (["SIGHUP", "SIGHUP", "SIGTERM"], 143, "terminated\n"),  # as a terminal, its shell and a user may do
+    ],
+)
+def test_signals_leave_no_half_written_file(tmp_path, sent, status, said):
+    script = (
+        "import os, signal, sys\n"
+        "from utils.system_utils import atomic_write, run_cli\n"
+        "def main():\n"
+        "    with atomic_write(sys.argv[1]) as path:\n"
+        "        path.write_text('half')\n"
+        "        try:\n"
+        "            os.kill(os.getpid(), getattr(signal, sys.argv[2]))\n"
+        "        finally:\n"
+        "            [os.kill(os.getpid(), getattr(signal, name)) for name in sys.argv[3:]]\n"
+        "run_cli(main)\n"
+    )
+    command = [sys.executable, "-c", script, str(tmp_path / "file"), *sent]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (status, said) and list(tmp_path.iterdir()) == []
+
+
 def test_run_cli_leaves_bugs_their_traceback():
     with pytest.raises(ZeroDivisionError):
         run_cli(lambda: 1 / 0)

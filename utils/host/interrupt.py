@@ -1,9 +1,10 @@
-"""Ctrl-C, SIGTERM and SIGHUP, deferred until the program can stop cleanly."""
+"""Ctrl-C, SIGTERM and SIGHUP as exceptions, at once or deferred until the program can stop cleanly."""
 
 import contextlib
 import os
 import signal
 import threading
+from collections.abc import Iterable
 from types import FrameType, TracebackType
 
 _HANGUP = getattr(signal, "SIGHUP", None)  # Windows has none
@@ -16,6 +17,7 @@ class Terminated(KeyboardInterrupt):
 _ERRORS = {signal.SIGINT: KeyboardInterrupt, signal.SIGTERM: Terminated}
 if _HANGUP is not None:
     _ERRORS[_HANGUP] = Terminated
+_ENDS = tuple(signum for signum, error in _ERRORS.items() if error is Terminated)
 
 
 class DeferredInterrupt:
@@ -51,6 +53,29 @@ class DeferredInterrupt:
         elif self.requested:
             raise _ERRORS[signum]
         self.requested = self.requested or _ERRORS[signum]
+
+
+def raise_on_signals() -> None:
+    """Let SIGTERM and SIGHUP raise Terminated, as Ctrl-C raises KeyboardInterrupt, so that no half-done file is left.
+
+    Signals that are ignored or handled stay so. Only the main thread may call this.
+    """
+    for signum in _ENDS:
+        if signal.getsignal(signum) == signal.SIG_DFL:
+            signal.signal(signum, _terminate)
+
+
+def ignore(signals: Iterable[int] = tuple(_ERRORS)) -> None:
+    """Ignore these signals from now on."""
+    for signum in signals:
+        signal.signal(signum, signal.SIG_IGN)
+
+
+def _terminate(signum: int, frame: FrameType | None) -> None:
+    ignore(_ENDS)  # several senders may tell one process to end, and what follows removes half-done files
+    if signum == _HANGUP:
+        _leave_closed_terminal()
+    raise Terminated
 
 
 def _leave_closed_terminal() -> None:

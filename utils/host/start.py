@@ -12,6 +12,7 @@ import signal
 import sys
 import threading
 
+from utils.host.interrupt import raise_on_signals
 from utils.host.kept_memory import keep_freed_memory
 
 _waiting = False  # whether the collector is
@@ -33,7 +34,7 @@ def prepare() -> None:
 
 
 def imported() -> None:
-    """Call when all is imported: Ctrl-C raises KeyboardInterrupt again, and garbage is collected, but for the imports.
+    """Call when all is imported: signals raise exceptions from now on, and garbage is collected, but for the imports.
 
     Without `prepare`, as where other code calls this, its garbage is its own.
     """
@@ -42,8 +43,10 @@ def imported() -> None:
         gc.freeze()
         gc.enable()
         _waiting = False
-    if threading.current_thread() is threading.main_thread() and signal.getsignal(signal.SIGINT) is signal.SIG_DFL:
-        signal.signal(signal.SIGINT, signal.default_int_handler)
+    if threading.current_thread() is threading.main_thread():
+        if signal.getsignal(signal.SIGINT) is signal.SIG_DFL:
+            signal.signal(signal.SIGINT, signal.default_int_handler)
+        raise_on_signals()
     open_outputs()
 
 

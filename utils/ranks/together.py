@@ -1,21 +1,18 @@
 """A command that several ranks run together, started by torchrun: joining, and ending with one sentence."""
 
 import os
-import signal
 import sys
 import threading
 import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from types import FrameType
 from typing import NoReturn
 
 import torch
 import torch.distributed as dist
 
-from utils.host import torchrun
+from utils.host import interrupt, torchrun
 from utils.host.device import compute_device
-from utils.host.interrupt import Terminated
 from utils.host.threads import cores
 from utils.ranks import quiet
 from utils.ranks.alike import refuse_differences
@@ -37,7 +34,6 @@ def run_together(main: Callable[[], object], outcome: Callable[[Callable[[], obj
     """
     rank, size = torchrun.rank(), torchrun.size()
     quiet.hush(rank == 0)
-    signal.signal(signal.SIGTERM, _terminate)
     try:
         board = Board(rank, size)
     except UserError as error:
@@ -50,9 +46,9 @@ def run_together(main: Callable[[], object], outcome: Callable[[Callable[[], obj
     end = error = None
     try:
         end, error = _ended(lambda: outcome(lambda: _join_and_run(main, board, watch, ending)))
-        _ignore_signals()
+        interrupt.ignore()
     except KeyboardInterrupt:  # torchrun ends the others when one has ended, also where that was being told
-        _ignore_signals()
+        interrupt.ignore()
         end = end or _end_of(143, "terminated")
     if not ending.begin():
         threading.Event().wait()  # the watch ends this process
@@ -93,16 +89,6 @@ def _ended(run: Callable[[], tuple[int, str]]) -> tuple[End, BaseException | Non
 def _end_of(status: int, line: str) -> End:
     kind = DONE if status == 0 else SIGNAL if status in _SIGNALS else FAULT
     return End(kind, status, line)
-
-
-def _terminate(signum: int, frame: FrameType | None) -> None:
-    signal.signal(signal.SIGTERM, signal.SIG_IGN)
-    raise Terminated
-
-
-def _ignore_signals() -> None:
-    for one in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(one, signal.SIG_IGN)
 
 
 def _join_and_run(main: Callable[[], object], board: Board, watch: Watch, ending: Ending) -> None:
