@@ -2,7 +2,6 @@
 
 import random
 import sys
-import time
 from collections.abc import Callable, Container, Sequence
 from pathlib import Path
 from typing import TypeVar
@@ -16,6 +15,7 @@ from records.curve_schedule import CurveSchedule, subset_size
 from records.error_curve import COLUMNS, FIGURE, NAME, SUBSET, Row, write_curve
 from records.training_log import SHORT, TrainingLog
 from utils.host.process import wall_seconds
+from utils.host.running import running_seconds
 from utils.host.threads import cores
 from utils.ranks.ranks import ranks
 from utils.system_utils import UserError
@@ -126,9 +126,9 @@ class CurveRecorder:
 
     @staticmethod
     def _seconds(call: Callable[[], object]) -> float:
-        start = time.perf_counter()
+        start = running_seconds()
         call()
-        return time.perf_counter() - start
+        return running_seconds() - start
 
     def _load_all(self) -> None:
         self._load([view for of_set in self._views.values() for view in of_set])

@@ -3,13 +3,13 @@
 import math
 import os
 import sys
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from utils.files.json_files import read_json, write_json
 from utils.host.process import peak_memory_mib, wall_seconds
+from utils.host.running import running_seconds
 from utils.ranks.ranks import ranks
 from utils.system_utils import UserError, compute_device
 
@@ -19,29 +19,29 @@ _FINITE = ("loss", "peak_memory_mib", "wall_seconds", "max_num_splats", "default
 
 
 class Stopwatch:
-    """Seconds since its construction, without those inside `paused()`, where it stands still.
+    """Seconds since its construction, without those inside `paused()` or of a stopped process, where it stands still.
 
     spent: the seconds inside, by their purpose. Of a pause in another one, they count for the inner purpose.
     """
 
     def __init__(self) -> None:
-        self._start = time.perf_counter()
+        self._start = running_seconds()
         self._stopped: float | None = None  # when the outermost pause began
         self.spent: dict[str, float] = {}
 
     @property
     def seconds(self) -> float:
-        return (time.perf_counter() if self._stopped is None else self._stopped) - self._start
+        return (running_seconds() if self._stopped is None else self._stopped) - self._start
 
     @contextmanager
     def paused(self, purpose: str) -> Iterator[None]:
-        before, outer, others = time.perf_counter(), self._stopped, sum(self.spent.values())
+        before, outer, others = running_seconds(), self._stopped, sum(self.spent.values())
         self._stopped = before if outer is None else outer
         try:
             with ranks().busy():
                 yield
         finally:
-            taken = time.perf_counter() - before
+            taken = running_seconds() - before
             inner = sum(self.spent.values()) - others
             self.spent[purpose] = self.spent.get(purpose, 0.0) + taken - inner
             self._stopped = outer
@@ -52,9 +52,9 @@ class Stopwatch:
 class TrainingLog:
     """Records of one model folder, written whole after each addition.
 
-    A record has `iteration`; `seconds` of training, without evaluation and saving; `wall_seconds` since the process
-    started; `peak_memory_mib`, the most so far; `gaussians`; `loss`, a running mean; and for each set tested
-    `<set>_l1`, `<set>_psnr`. Seconds and memory include the runs that were resumed. The last record also has
+    A record has `iteration`; `seconds` of training, without evaluation, saving and a stopped process; `wall_seconds`
+    since the process started; `peak_memory_mib`, the most so far; `gaussians`; `loss`, a running mean; and for each set
+    tested `<set>_l1`, `<set>_psnr`. Seconds and memory include the runs that were resumed. The last record also has
     `gaussians_left_out`, those that the last save does not have, the costs of the curve (curve_recorder.py), the
     seconds of this process by what they were spent on (training/observers/records.py), `iterations_planned`,
     `strategy`, and `max_num_splats` or `default_budget` (what_to_try.py), and `lines`, what training said at its end.

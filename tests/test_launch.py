@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 import torch
 from launching import OPTIONS, ROOT, Launched, command, environment, launch, outputs
+from waiting import wait_for
 
 import train
 from training.agreement import _ROOMS
@@ -125,14 +126,19 @@ def test_a_signal_to_one_rank_stops_all_after_one_iteration(colmap_scene, tmp_pa
     assert [record["iteration"] for record in records] == [5, 6, 8]
 
 
-def test_a_signal_to_torchrun_saves_one_checkpoint(colmap_scene, tmp_path):
+@pytest.mark.parametrize("stopped", [False, True], ids=["", "after all ranks were stopped"])
+def test_a_signal_to_torchrun_saves_one_checkpoint(colmap_scene, tmp_path, stopped):
+    """Ranks that were all stopped, as on a laptop that sleeps, go on, although one of them continues first."""
     options = ("-s", str(colmap_scene), "-m", str(tmp_path / "out"), *OPTIONS, "--no_curve", "--iterations", "100000")
     line = command(tmp_path / "logs", 2, "none 0 0", *options)
     with subprocess.Popen(line, cwd=tmp_path, env=environment(), stdout=-3, stderr=-3) as process:
         try:
-            deadline = time.monotonic() + 60
-            while not (tmp_path / "out" / "chkpnt5.pth").exists() and time.monotonic() < deadline:
-                time.sleep(0.05)
+            wait_for(lambda: (tmp_path / "out" / "chkpnt5.pth").exists())
+            if stopped:
+                time.sleep(3)  # until each knows that the others are in a step
+                ranks = _stop_and_continue(process.pid)
+                time.sleep(3)
+                assert all(Path(f"/proc/{rank}").exists() for rank in ranks)
             process.send_signal(signal.SIGINT)
             status = process.wait(60)
         finally:
@@ -142,6 +148,20 @@ def test_a_signal_to_torchrun_saves_one_checkpoint(colmap_scene, tmp_path):
     text = "".join(done.stderr)
     assert text.count("interrupted") == 1 and text.count("resume with --start_checkpoint") == 1
     assert len(list((tmp_path / "out").glob("chkpnt*.pth"))) == 2
+
+
+def _stop_and_continue(process: int) -> list[int]:
+    """Stop the children of a process for longer than ranks wait for each other. The last then waits for the first."""
+    ranks = [int(rank) for rank in Path(f"/proc/{process}/task/{process}/children").read_text().split()]
+    assert len(ranks) == 2
+    for rank in ranks:
+        os.kill(rank, signal.SIGSTOP)
+        time.sleep(0.5)
+    time.sleep(4)
+    for rank in reversed(ranks):
+        os.kill(rank, signal.SIGCONT)
+        time.sleep(1.5)
+    return ranks
 
 
 def test_a_restarted_training_goes_on_from_its_newest_checkpoint(colmap_scene, tmp_path):

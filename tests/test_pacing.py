@@ -122,6 +122,19 @@ def test_progress_follows_the_seconds_that_are_left():
         assert halfway[0] == pytest.approx(10.0, abs=0.7), name
 
 
+@pytest.mark.parametrize(
+    ("at", "lost", "total"), [(200, 3.0, 10.0), (300, 6.5, 13.0), (300, 15.0, 21.5), (980, 5, 14.9)]
+)
+def test_lost_seconds_do_not_make_an_iteration_do_more_than_twice_its_part(capsys, at, lost, total):
+    """Its part is a thousandth, as it takes 0.01 s of 10. What is left undone then takes half of its usual seconds."""
+    pace = _fresh(30_000, 10.0)
+    last, seconds = _run(pace, lambda t, n: 0.01 + lost * (t == at))
+    assert max(pace.stride(t) for t in range(1, last + 1)) <= 2 * 30_000 / 1000 * 1.001
+    assert pace.nominal(last) == 30_000 and len(pace.blocks) < 420
+    assert seconds == pytest.approx(total, abs=0.1)
+    assert capsys.readouterr().err.count("so long that the training needs about") == (total > 10)
+
+
 def test_an_iteration_that_takes_longer_than_the_budget_is_followed_by_the_last(capsys):
     pace = _fresh(30_000, 1.0)
     assert _run(pace, lambda t, n: 5.0) == (2, 10.0)

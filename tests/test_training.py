@@ -314,7 +314,7 @@ def test_a_damaged_log_is_no_reason_to_stop(tmp_path, capsys, content):
 
 def test_a_stopwatch_pauses_also_when_something_fails(monkeypatch):
     now = [100.0]
-    monkeypatch.setattr(time, "perf_counter", lambda: now[0])
+    monkeypatch.setattr("records.training_log.running_seconds", lambda: now[0])
     clock = Stopwatch()
     now[0] += 2
     with pytest.raises(ZeroDivisionError), clock.paused("saving"):
@@ -329,7 +329,7 @@ def test_a_stopwatch_pauses_also_when_something_fails(monkeypatch):
 
 def test_a_stopwatch_stands_still_in_a_pause_and_counts_one_in_another_once(monkeypatch):
     now = [100.0]
-    monkeypatch.setattr(time, "perf_counter", lambda: now[0])
+    monkeypatch.setattr("records.training_log.running_seconds", lambda: now[0])
     clock = Stopwatch()
     now[0] += 2
     with clock.paused("viewing"):
@@ -418,7 +418,7 @@ def test_tensorboard_gets_the_references_tags(colmap_scene, tmp_path, monkeypatc
 
 def test_seconds_leave_evaluation_and_saving_out(colmap_scene, tmp_path, monkeypatch):
     later, clock = [0.0], time.perf_counter  # seconds that a clock of this test's own is ahead
-    monkeypatch.setattr(time, "perf_counter", lambda: clock() + later[0])
+    monkeypatch.setattr("records.training_log.running_seconds", lambda: clock() + later[0])
 
     def slow(*_: object) -> dict[str, float]:
         later[0] += 1000

@@ -1,5 +1,7 @@
 """A pace that follows the clock, so that a run takes the seconds it was given (--time_budget)."""
 
+import math
+import statistics
 import sys
 
 from tqdm import tqdm
@@ -12,6 +14,8 @@ _MOST_GROWTH = 2  # of a block over the one before, while the first iterations a
 _KNOWN = 1 / 50  # of the budget, after which the speed says how many iterations there may be
 SHORT = 6.0  # iterations of the schedule for each one, from which on smaller views at first gain more than they lose
 _LAST = 1.5  # blocks; if no more are left, they are one
+_MOST_SHARE = 2  # times the part of the schedule that an iteration does where no seconds are lost
+_TOLD = 1.02  # times the budget, from which on a run says that it takes longer
 
 
 class Clocked(Paced):
@@ -19,8 +23,9 @@ class Clocked(Paced):
 
     A block of iterations does as large a part of what is left of the schedule as it will take of the seconds that are
     left, at the speed of the blocks before it. So seconds that were lost, by a slow start or by another program, are
-    taken from all that is left. Seconds are those of training, with those of the runs that this one resumes, whose
-    blocks are in the schedule.
+    taken from all that is left. Where so many were lost that iterations would do more than _MOST_SHARE times their
+    usual part, the run takes longer than its budget. Seconds are those of training, with those of the runs that this
+    one resumes, whose blocks are in the schedule.
     """
 
     def __init__(self, schedule: Schedule) -> None:
@@ -30,8 +35,10 @@ class Clocked(Paced):
             self.sizes = "none"
         self._budget = schedule.time_budget
         self._speed: float | None = None  # seconds of an iteration
+        self._speeds: list[float] = []  # of the last three blocks
         self._measured = 0  # blocks of this run
         self._first = self.blocks[-1].last if self.blocks else 0
+        self._told = False
 
     def reach(self, iteration: int, seconds: float) -> None:
         if not self.blocks or iteration > self.blocks[-1].last:
@@ -53,6 +60,8 @@ class Clocked(Paced):
         self._measured += 1
         # The first iteration loads kernels and photos, so it is no measure of the others.
         self._speed = speed if self._measured <= 2 else (self._speed + speed) / 2
+        if self._measured > 1:
+            self._speeds = [*self._speeds[-2:], speed]
 
     def _choose_sizes(self, done: int, seconds: float) -> None:
         """Take smaller views if few iterations are possible: from the next one on, and all of that is recorded."""
@@ -66,15 +75,16 @@ class Clocked(Paced):
     def _decide(self, seconds: float) -> None:
         """Add the block that comes next."""
         before = self.blocks[-1].last if self.blocks else 0
-        done, left = self.progress(before), self._budget - seconds
-        count, final = self._count(left)
+        done = self.progress(before)
+        iterations = self._iterations(seconds, 1.0 - done)
+        count, final = self._count(iterations)
         if final:
             step = (1.0 - done) / count
             self.ends = before + count
         elif self._speed is None:
             step = min(1.0 / self.length, (1.0 - done) / 2)
         else:
-            step = (1.0 - done) * min(self._speed / left, 0.5 / count)
+            step = (1.0 - done) * min(1.0 / iterations, 0.5 / count)
         self.blocks.append(Block(before + count, done, step, round(seconds, 6)))
         if final and self._measured <= 1:
             tqdm.write(
@@ -83,13 +93,29 @@ class Clocked(Paced):
                 file=sys.stderr,
             )
 
-    def _count(self, left: float) -> tuple[int, bool]:
-        """Iterations of the next block, and whether the run ends with it."""
-        if left <= 0:
+    def _iterations(self, seconds: float, undone: float) -> float:
+        """Iterations that the run has yet to take, infinite where no speed is known. undone: part of the schedule."""
+        left = max(self._budget - seconds, 0.0)
+        if self._speed is None:
+            return math.inf if left else 0.0
+        if not self._speeds:
+            return left / self._speed
+        if not self._told and seconds + undone * self._budget / _MOST_SHARE > _TOLD * self._budget:
+            self._told = True
+            tqdm.write(
+                "warning: some iterations took so long that the training needs about "
+                f"{seconds + undone * self._budget / _MOST_SHARE:.0f} s, not the {self._budget:g} s of --time_budget",
+                file=sys.stderr,
+            )
+        usual = statistics.median_low(self._speeds) / self._budget  # part of the schedule, of an iteration
+        return max(left / self._speed, math.ceil(undone / (_MOST_SHARE * usual)))
+
+    def _count(self, iterations: float) -> tuple[int, bool]:
+        """Iterations of the next block, and whether the run ends with it. iterations: that are left."""
+        if iterations == 0.0:
             return 1, True
         if self._speed is None:
             return 1, False
-        iterations = left / self._speed
         if self._measured == 1:
             return 1, iterations < 0.5
         previous = self.blocks[-1].last - self._last(len(self.blocks) - 1)

@@ -5,6 +5,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 
+from utils.host.running import running_seconds
 from utils.ranks import quiet
 from utils.ranks.board import Board, is_gone
 from utils.ranks.quiet import names
@@ -89,11 +90,11 @@ class Ending:
 
     def _others(self, board: Board, end: End) -> tuple[dict[int, End], list[int]]:
         """The ends of all ranks that have ended, and those that are gone."""
-        before, started = board.read("beat"), time.monotonic()
+        before, started = board.read("beat"), running_seconds()
         people = board.read("here")
         while True:
             ends = {rank: End(**one) for rank, one in board.read("end").items()}
-            waited = time.monotonic() - started
+            waited = running_seconds() - started
             missing = [rank for rank in range(board.size) if rank not in ends]
             gone = [rank for rank in missing if rank in people and is_gone(people[rank])]
             if waited > _SILENT:

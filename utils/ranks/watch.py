@@ -3,8 +3,8 @@
 import os
 import sys
 import threading
-import time
 
+from utils.host.running import running_seconds
 from utils.ranks.board import Board, is_gone
 from utils.ranks.ending import DONE, HANG, LOST, NO_WORD, End, Ending
 from utils.ranks.quiet import names
@@ -41,16 +41,16 @@ class Watch(threading.Thread):
 
     def run(self) -> None:
         """Look until `leave`."""
-        before = time.monotonic()
+        before = running_seconds()
         while not self._over.wait(_BEAT):
             try:
                 self.beat()
-                end = self._look(time.monotonic() - before)
+                end = self._look(running_seconds() - before)
             except RuntimeError:
                 end = End(LOST, 1, "error: torchrun has ended")
             if end is not None:
                 self._end(end)
-            before = time.monotonic()
+            before = running_seconds()
 
     def leave(self) -> bool:
         """End this thread. Whether it has ended: Python may not end before it, as that would abort the process."""
@@ -59,10 +59,11 @@ class Watch(threading.Thread):
         return not self.is_alive()
 
     def _look(self, took: float) -> End | None:
-        """How this rank has to end, if the main thread does not see to it."""
-        now, beats = time.monotonic(), self._board.read("beat")
+        """How this rank has to end, if the main thread does not see to it. took: seconds that the store has taken."""
+        # Seconds in which this process ran: one that was stopped, as all ranks may have been, has waited for nobody.
+        now, beats = running_seconds(), self._board.read("beat")
         for rank, (number, _, _) in beats.items():
-            if self._seen.get(rank, (0, 0.0))[0] != number or took > _SILENT / 2:  # this process may have been stopped
+            if self._seen.get(rank, (0, 0.0))[0] != number or took > _SILENT / 2:  # no rank could leave a note
                 self._seen[rank] = number, now
         ends = self._board.read("end")
         people = self._board.read("here")

@@ -1,7 +1,6 @@
 """Ranks whose collective calls are watched, so that one that fails or never returns ends in a sentence."""
 
 import contextlib
-import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from datetime import timedelta
@@ -13,6 +12,7 @@ import torch.distributed as dist
 from torch import Tensor
 
 from utils.host.memory import is_out_of_memory
+from utils.host.running import running_seconds
 from utils.ranks import quiet
 from utils.ranks.ranks import Value
 from utils.ranks.several import SeveralRanks
@@ -36,7 +36,7 @@ def _watched(call: Callable[..., Any]) -> Callable[..., Any]:
         if self._called is not None:  # one call in another
             return call(self, *args, **named)
         self.calls += 1
-        self._called = time.monotonic()
+        self._called = running_seconds()
         try:
             result = call(self, *args, **named)
             self._note_queued()
@@ -48,7 +48,7 @@ def _watched(call: Callable[..., Any]) -> Callable[..., Any]:
             raise RankLost(str(error)) from error
         finally:
             if self.prompt:
-                self.longest = max(self.longest, time.monotonic() - self._called)
+                self.longest = max(self.longest, running_seconds() - self._called)
             self._called = None
 
     return wrapped
@@ -90,7 +90,7 @@ class WatchedRanks(SeveralRanks):
 
     @property
     def waiting_since(self) -> float | None:
-        """The monotonic time when the collective call began that this rank, or its GPU, waits for; None if none."""
+        """When, of `running_seconds`, the collective call began that this rank, or its GPU, waits for; None if none."""
         called, queued = self._called, self._queued
         if called is not None or queued is None:
             return called

@@ -1,0 +1,54 @@
+"""A clock that stands still while this process does: stopped, as by Ctrl-Z, or on a machine that sleeps."""
+
+import threading
+import time
+
+_TICK = 0.25  # seconds
+# Seconds without a tick after which the process was stopped, unless the main thread has worked meanwhile: it may keep
+# others from Python's lock. On a busy machine ticks come late, but by much less.
+_STOPPED = 2.0
+_WORKED = 2 * _TICK  # seconds of work that do not fit into the time between a tick and a stop
+
+
+class _Running(threading.Thread):
+    def __init__(self) -> None:
+        super().__init__(name="ticks", daemon=True)
+        self._lock = threading.Lock()
+        self._seconds, self._before, self._worked = 0.0, time.monotonic(), _worked()
+
+    def seconds(self) -> float:
+        with self._lock:
+            now, worked = time.monotonic(), _worked()
+            passed = now - self._before
+            if passed < _STOPPED or worked - self._worked > _WORKED:
+                self._seconds += passed
+            self._before, self._worked = now, worked
+            return self._seconds
+
+    def run(self) -> None:
+        while True:
+            time.sleep(_TICK)
+            self.seconds()
+
+
+def _worked() -> float:
+    """CPU seconds of the main thread; of all threads where the system does not tell."""
+    try:
+        return time.clock_gettime(time.pthread_getcpuclockid(threading.main_thread().ident))
+    except (AttributeError, OSError):
+        return time.process_time()
+
+
+_clock: _Running | None = None
+
+
+def running_seconds() -> float:
+    """Seconds in which this process was not stopped. Only differences have a meaning; the first call starts a thread.
+
+    Stops of less than 2 seconds count as running.
+    """
+    global _clock
+    if _clock is None or not _clock.is_alive():  # in a process that was forked it is not
+        _clock = _Running()
+        _clock.start()
+    return _clock.seconds()
