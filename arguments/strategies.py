@@ -70,7 +70,7 @@ MCMC_OPTIONS: tuple[Option, ...] = (
         500_000.0,
         "mcmc: factor of the noise that moves Gaussians in every step, times the learning rate of positions",
         _PAPER,
-        check=at_least(0),
+        check=within(0, 1e9),
     ),
     Option(
         "mcmc_gate_steepness",

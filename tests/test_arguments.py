@@ -190,6 +190,7 @@ def test_short_forms_and_unique_prefixes():
         ("mcmc_parts", "52"),
         ("mcmc_noise", "-1"),
         ("mcmc_noise", "inf"),
+        ("mcmc_noise", "1e300"),
         ("mcmc_gate_steepness", "-1"),
         ("mcmc_gate_steepness", "10001"),
         ("mcmc_gate_opacity", "1.5"),
