@@ -36,7 +36,7 @@ class StageRecord:
             try:
                 self._record = read_json(path)
                 done = {name: entry["done"] and entry["made_from"] for name, entry in self._record.items()}
-            except (ValueError, KeyError, TypeError, AttributeError) as error:
+            except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
                 raise UserError(
                     f"{path} is damaged; remove the folder {path.parent} to convert from the beginning"
                 ) from error

@@ -165,7 +165,7 @@ def _check_registered(source: Path) -> list[Line]:
         report = read_json(path)
         placed, photos = int(report["registered"]), int(report["photos"])
         advice = [str(line) for line in report["advice"]]
-    except (ValueError, KeyError, TypeError):
+    except (OSError, ValueError, KeyError, TypeError):
         return [Line(f"{path} is damaged", "remove it, or run convert.py again")]
     if photos and placed / photos < REGISTERED:
         remedy = advice[0].rpartition("; ")[2] if advice else "take more photos that overlap"

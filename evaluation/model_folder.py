@@ -15,6 +15,7 @@ from arguments.stored import read_model_json, read_training_options
 from records.curve_peak import schedules_follow_length
 from utils.files.image_files import UNREADABLE, open_render
 from utils.files.json_files import read_json
+from utils.files.plain_files import plain
 from utils.system_utils import UserError, saved_iterations
 
 SCHEDULE = "schedule.json"  # of a training whose iterations followed the clock
@@ -29,7 +30,7 @@ def count_gaussians(model: Path, iteration: int) -> int:
     """Read the number of Gaussians of a saved iteration from the header of its PLY."""
     ply = ply_file(model, iteration)
     try:
-        with ply.open("rb") as file:
+        with open(plain(ply), "rb") as file:
             header = file.read(4096).split(b"end_header")[0]
     except OSError as error:
         raise UserError(f"cannot read {ply} ({error.strerror}); train the model again") from error

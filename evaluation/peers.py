@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from utils.files.plain_files import plain
 from utils.system_utils import UserError, atomic_write
 
 REQUIRED = ("seconds", "test_psnr")
@@ -26,7 +27,7 @@ def read_peer(path: Path) -> list[PeerRow]:
     for anything else.
     """
     try:
-        with path.open(encoding="utf-8", newline="") as file:
+        with open(plain(path), encoding="utf-8", newline="") as file:
             lines = [line for line in csv.reader(file, strict=True) if line]
         header = [name.strip() for name in lines[0]] if lines else []
         if missing := [name for name in REQUIRED if name not in header]:

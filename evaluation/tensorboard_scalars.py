@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
+from utils.files.plain_files import plain
 from utils.system_utils import UserError
 
 _VARINT, _EIGHT, _BYTES, _FOUR = 0, 1, 2, 5  # kinds of fields
@@ -33,7 +34,7 @@ def read_scalars(folder: Path) -> dict[str, list[Scalar]]:
     found: dict[str, dict[int, Scalar]] = {}
     for path in sorted(folder.glob("events.out.tfevents.*")):
         try:
-            scalars = [pair for content in _records(path.read_bytes()) for pair in _scalars(content)]
+            scalars = [pair for content in _records(plain(path).read_bytes()) for pair in _scalars(content)]
         except (OSError, TypeError, ValueError, struct.error) as error:
             raise UserError(f"the TensorBoard files in {folder} are damaged ({error}); train again") from error
         for tag, scalar in scalars:

@@ -8,6 +8,7 @@ import sys
 from collections.abc import Iterable
 from pathlib import Path
 
+from utils.files.plain_files import plain
 from utils.system_utils import UserError, atomic_write
 
 NAME = "error_vs_time.csv"
@@ -30,7 +31,7 @@ def read_curve(path: str | os.PathLike) -> list[Row]:
     each set that were scored, the same ones in all such rows; None: all. UserError if the file is missing or damaged.
     """
     try:
-        with open(path, encoding="utf-8", newline="") as file:
+        with open(plain(path), encoding="utf-8", newline="") as file:
             lines = list(csv.reader(file, strict=True))
         if not lines or lines[0] not in _HEADERS:
             raise ValueError("its columns are different")

@@ -126,7 +126,7 @@ def _load_state(file: Path) -> dict[str, torch.Tensor]:
         state = read_tensors(file, legacy=True)  # torchvision's own files are older than torch 1.6
     except FileNotFoundError:
         raise UserError(f"no such file: {file} (--lpips_weights)") from None
-    except ValueError as error:
+    except (OSError, ValueError) as error:
         raise UserError(
             f"{file} is not a state dict of torchvision: {error}; give --lpips_weights one that torch has written"
         ) from error

@@ -21,6 +21,7 @@ from scene.pictures.lens import Lens, Pinhole, Undistortion, shown_pixels, undis
 from scene.pictures.masks import TRANSPARENT, Mask
 from scene.pictures.pycolmap_import import import_pycolmap
 from utils.files.image_files import open_image
+from utils.files.plain_files import plain
 from utils.files.temporary_files import remove_temporary_files
 from utils.host.cache_folder import cache_folder
 from utils.host.threads import threads
@@ -109,7 +110,7 @@ def _key(photo: Photo, version: str) -> str:
     for path in (photo.path, photo.mask.path if photo.mask else None):
         if path is not None:
             try:
-                content = path.read_bytes()
+                content = plain(path).read_bytes()
             except OSError as error:
                 raise UserError(f"cannot read {path} ({error.strerror}); fix its permissions") from error
             digest.update(len(content).to_bytes(8, "little") + content)

@@ -2,13 +2,15 @@
 
 import os
 
+from utils.files.plain_files import plain
+
 _HEAD = 256
 
 
 def not_the_file(path: str | os.PathLike) -> str | None:
     """Words for a file that is empty, a Git LFS pointer or a web page; None for any other file."""
     try:
-        with open(path, "rb") as file:
+        with open(plain(path), "rb") as file:
             head = file.read(_HEAD)
     except OSError:
         return None

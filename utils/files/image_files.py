@@ -6,6 +6,8 @@ from pathlib import Path
 
 from PIL import Image
 
+from utils.files.plain_files import plain
+
 MOST_PIXELS = 1 << 28  # 16384 a side, the largest training size; Pillow's default limit is lower
 UNREADABLE = (
     *(OSError, SyntaxError, ValueError, EOFError, Image.DecompressionBombError),
@@ -19,7 +21,7 @@ FORMATS = ("PNG", "JPEG", "TIFF", "BMP", "WEBP", "GIF", "PPM", "JPEG2000", "TGA"
 
 def open_image(path: Path) -> Image.Image:
     """Open an image file of one of FORMATS; its pixels are read later. Raises one of UNREADABLE if that fails."""
-    return Image.open(path, formats=FORMATS)
+    return Image.open(plain(path), formats=FORMATS)
 
 
 def open_render(path: Path) -> Image.Image:

@@ -25,7 +25,7 @@ def read_model_json(model_path: str | os.PathLike) -> dict[str, Any]:
         return {}
     try:
         record = read_json(path)
-    except (ValueError, RecursionError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise UserError(f"{path} is not JSON; restore it, or remove it and pass --antialiasing yourself") from error
     if not isinstance(record, dict) or not isinstance(record.get("antialiasing", False), bool):
         raise UserError(f"{path}: antialiasing must be true or false; restore the file, or remove it")

@@ -6,6 +6,7 @@ import numpy as np
 from PIL import Image, PngImagePlugin
 
 from utils.files.image_files import UNREADABLE
+from utils.files.plain_files import plain
 from utils.system_utils import UserError, atomic_write
 
 SCALE = "scale"  # key of the text chunk: value = pixel * scale
@@ -29,7 +30,7 @@ def write_plane(path: str | os.PathLike, values: np.ndarray, largest: float | No
 def read_plane(path: str | os.PathLike) -> np.ndarray:
     """Read what `write_plane` wrote: (H, W) float64, each within half a step. UserError for a file that is no plane."""
     try:
-        with Image.open(path) as image:
+        with Image.open(plain(path)) as image:
             return np.asarray(image, dtype=np.float64) * float(image.text[SCALE])
     except (*UNREADABLE, AttributeError, KeyError, ValueError) as error:
         raise UserError(f"cannot read {path} as a plane of numbers ({error}); render.py writes such files") from error

@@ -16,6 +16,7 @@ from typing import Any, BinaryIO, NamedTuple
 
 import torch
 
+from utils.files.plain_files import plain
 from utils.files.plain_pickle import MOST_BYTES, Machine, plain_dict
 from utils.system_utils import UserError
 
@@ -52,9 +53,7 @@ def read_tensors(
     checksums, and ValueError for anything else that torch.save has not written, or that holds other objects. No words
     of the file are part of a message.
     """
-    if os.path.exists(path) and not os.path.isfile(path):
-        raise ValueError("it is not a regular file")
-    with open(path, "rb") as file:
+    with open(plain(path), "rb") as file:
         try:
             if file.read(len(_ZIP)) == _ZIP:
                 return _read_archive(file, torch.device(device), mapped)

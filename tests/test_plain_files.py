@@ -1,0 +1,105 @@
+"""Refusals, in a sentence, of what a user or a dataset names that is no file, or a text without end."""
+
+import contextlib
+import os
+import signal
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from arguments import read_cfg_args, read_model_json
+from evaluation.configs import read_configs
+from evaluation.peers import read_peer
+from moving_cameras.keyframes import read_camera_path
+from moving_cameras.request import path_maker
+from records.error_curve import read_curve
+from records.training_log import read_log
+from scene.dataset_readers import read_scene
+from scene.gaussians.checkpoint import load_checkpoint
+from scene.gaussians.exposure import read_pretrained
+from scene.pictures.decode import picture_size
+from scene.readers.point_cloud import read_point_cloud
+from training.pacing.schedule_file import read_schedule
+from utils.files.plain_files import MOST
+from utils.files.plane_files import read_plane
+from utils.lpips_utils import _load_state
+from utils.system_utils import UserError
+
+pytestmark = pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="this system has no named pipes")
+IN_A_FOLDER = {
+    "cfg_args": read_cfg_args,
+    "exposure.json": read_pretrained,
+    "transforms.json": lambda folder: read_scene(folder, "images", False),
+}
+TEXTS = {
+    "a camera path": read_camera_path,
+    "--path": lambda path: path_maker(str(path)),
+    "option sets": lambda path: read_configs(path, None),
+    "a schedule": read_schedule,
+}
+FILES = TEXTS | {
+    "a peer's curve": read_peer,
+    "a curve": read_curve,
+    "a photo": picture_size,
+    "a plane": read_plane,
+    "LPIPS weights": _load_state,
+    "a point cloud": read_point_cloud,
+    "a checkpoint": load_checkpoint,
+}
+
+
+@contextlib.contextmanager
+def _soon() -> Iterator[None]:
+    """Fail what waits or reads for ever."""
+
+    def late(*_: object) -> None:
+        pytest.fail("it waits or reads without end")  # which is no Exception, so nobody takes it for a refusal
+
+    before = signal.signal(signal.SIGALRM, late)
+    signal.alarm(20)
+    try:
+        yield
+    finally:
+        signal.alarm(0)
+        signal.signal(signal.SIGALRM, before)
+
+
+def _endless(path: Path, kind: str) -> Path:
+    if kind == "pipe":
+        os.mkfifo(path)
+    elif kind == "device":
+        path.symlink_to("/dev/zero")
+    else:
+        path.touch()
+        os.truncate(path, MOST + 1)
+    return path
+
+
+@pytest.mark.parametrize("kind", ["pipe", "device"])
+@pytest.mark.parametrize("what", [*FILES, *IN_A_FOLDER])
+def test_what_is_no_file_is_refused_at_once(tmp_path, what, kind):
+    with _soon(), pytest.raises(UserError) as refused:
+        if what in FILES:
+            FILES[what](_endless(tmp_path / "given", kind))
+        else:
+            IN_A_FOLDER[what](_endless(tmp_path / what, kind).parent)
+    assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize("what", [*TEXTS, "cfg_args", "exposure.json", "transforms.json"])
+def test_a_text_of_any_size_is_not_read(tmp_path, what):
+    with _soon(), pytest.raises(UserError) as refused:
+        if what in TEXTS:
+            TEXTS[what](_endless(tmp_path / "given", "large"))
+        else:
+            IN_A_FOLDER[what](_endless(tmp_path / what, "large").parent)
+    assert "more than 256 MiB" in str(refused.value) or what == "cfg_args"
+
+
+def test_records_of_a_model_are_no_pipes(tmp_path):
+    """A model folder without them is one of another program."""
+    for name in ("model.json", "train_log.json"):
+        _endless(tmp_path / name, "pipe")
+    with _soon():
+        assert read_model_json(tmp_path) == {} and read_log(tmp_path / "train_log.json") == []
