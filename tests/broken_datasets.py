@@ -1,7 +1,4 @@
-"""Small scenes with one fault each, and the reader's messages for them.
-
-PYTHONPATH=.:tests python -m broken_datasets > docs/inside/broken_datasets.md
-"""
+"""Small scenes with one fault each, and the reader's messages for them."""
 
 import argparse
 import contextlib
@@ -9,7 +6,6 @@ import io
 import json
 import os
 import shutil
-import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -74,33 +70,6 @@ def make_masters(folder: Path) -> dict[str, Path]:
     make_colmap_scene(folder / "colmap", views=9)
     make_blender_scene(folder / "blender")
     return {"colmap": folder / "colmap", "blender": folder / "blender"}
-
-
-INTRODUCTION = """\
-# Broken datasets and their messages
-
-Each row has one fault and the message that `train.py` prints for it before it exits with status 2. SCENE stands for the
-folder given with `-s`. The script `tests/broken_datasets.py` makes the faults and writes this page:
-
-    PYTHONPATH=.:tests python -m broken_datasets > docs/inside/broken_datasets.md
-"""
-
-
-def main() -> None:
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        masters = make_masters(folder)
-        print(INTRODUCTION)
-        print("| # | fault | message |\n|---|---|---|")
-        for number, entry in enumerate(FAULTS, start=1):
-            work = folder / str(number)
-            work.mkdir()
-            try:
-                text = message(entry, masters, work)
-            except AssertionError:
-                text = "(none: it is taken)"
-            text = text.replace("|", "\\|")
-            print(f"| {number} | {entry.what} | {text} |")
 
 
 def _sparse(scene: Path) -> Path:
@@ -429,7 +398,3 @@ def _(scene: Path) -> None:
 @fault("blender", "the photo of a frame is missing")
 def _(scene: Path) -> None:
     (scene / "train" / "r_1.png").unlink()
-
-
-if __name__ == "__main__":
-    main()

@@ -16,11 +16,12 @@ SHORT = {
     "Scene": "scene.Scene",
     "Camera": "scene.cameras.Camera",
 }
-ABSENT, VALUE = "–", "yes"
+ABSENT, VALUE, SAME = "–", "yes", "="
+LISTS = {"Values of both releases": (VALUE, VALUE), "Values of 2024 alone": (ABSENT, VALUE)}
 
 
 class Name(NamedTuple):
-    """A row of the page."""
+    """A row of the page, or a name of a block or list on it."""
 
     name: str
     release2023: str
@@ -28,8 +29,16 @@ class Name(NamedTuple):
 
 
 def _rows() -> list[Name]:
-    rows = re.findall(r"^\| `([\w.]+)` \| (.+?) \| (.+?) \|", PAGE.read_text(encoding="utf-8"), re.MULTILINE)
-    return [Name(name, *(cell.strip("`") for cell in cells)) for name, *cells in rows]
+    page = PAGE.read_text(encoding="utf-8")
+    found = []
+    for name, first, second in re.findall(r"^\| `([\w.]+)` \| (.+?) \| (.+?) \|", page, re.MULTILINE):
+        found.append(Name(name, first.strip("`"), (first if second == SAME else second).strip("`")))
+    for block in re.findall(r"^```text\n(.*?)^```$", page, re.MULTILINE | re.DOTALL):
+        found += [Name(name, cell, cell) for name, cell in re.findall(r"^([\w.]+)(\(.*\))$", block, re.MULTILINE)]
+    for title, cells in LISTS.items():
+        for names in re.findall(rf"^{title}: (.+?)\.$", page, re.MULTILINE | re.DOTALL):
+            found += [Name(name, *cells) for name in re.findall(r"`([\w.]+)`", names)]
+    return found
 
 
 def _resolve(dotted: str) -> object:
