@@ -12,7 +12,7 @@ from arguments.groups import ModelParams
 from arguments.param_group import Value
 from utils.files import model_json
 from utils.files.model_json import OFFSET
-from utils.files.plain_files import read_text
+from utils.files.plain_files import plain_text
 from utils.host.version import VERSION
 from utils.system_utils import UserError, atomic_write
 
@@ -43,7 +43,7 @@ def read_cfg_args(model_path: str | os.PathLike) -> dict[str, Value]:
         raise UserError(f"no cfg_args in {model_path}; pass the folder that train.py wrote as -m")
     broken = f"{path} is not one line Namespace(name=value, ...) of plain values; restore it or train again"
     try:
-        call = ast.parse(read_text(path).strip(), mode="eval").body
+        call = ast.parse(plain_text(path).strip(), mode="eval").body
     except (OSError, SyntaxError, ValueError, RecursionError, MemoryError) as error:
         raise UserError(broken) from error
     if not (isinstance(call, ast.Call) and isinstance(call.func, ast.Name) and call.func.id == "Namespace"):

@@ -9,7 +9,7 @@ import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from utils.files.plain_files import read_text
+from utils.files.plain_files import plain_text
 from utils.system_utils import UserError
 
 LONGEST = 100  # bytes of a name, which is also part of a figure's name
@@ -32,7 +32,7 @@ def read_configs(path: Path, parse: Parse | None) -> dict[str, tuple[str, ...]]:
     if not path.is_file() and str(path) in shipped():
         path = SHIPPED / f"{path}.json"
     try:
-        content = json.loads(read_text(path), object_pairs_hook=_no_duplicates)
+        content = json.loads(plain_text(path), object_pairs_hook=_no_duplicates)
     except OSError as error:
         raise UserError(
             f"cannot read {path} ({error.strerror}); --configs takes a JSON file {_SHAPE}, or {' or '.join(shipped())}"

@@ -21,7 +21,7 @@ from typing import Any
 
 from evaluation.peers import PeerRow, write_peer
 from evaluation.tensorboard_scalars import Scalar, read_scalars
-from utils.files.plain_files import read_text
+from utils.files.plain_files import plain_text
 from utils.system_utils import UserError, run_cli
 
 WITH_PAUSES = (
@@ -82,7 +82,7 @@ def from_gsplat(folder: Path) -> list[PeerRow]:
 
 def _json(path: Path) -> dict[str, Any]:
     try:
-        return json.loads(read_text(path))
+        return json.loads(plain_text(path))
     except (OSError, ValueError) as error:
         raise UserError(f"{path} cannot be read ({error}); train again") from error
 
@@ -93,7 +93,7 @@ def from_log(path: Path) -> list[PeerRow]:
     Training begins after the last line before the first score. UserError if there are no scores.
     """
     try:
-        lines = read_text(path, errors="replace").splitlines()
+        lines = plain_text(path, errors="replace").splitlines()
     except OSError as error:
         raise UserError(f"cannot read {path} ({error.strerror}); give a saved console output") from error
     rows: dict[int, PeerRow] = {}

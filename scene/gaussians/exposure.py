@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from scene.gaussians.adam import GaussianAdam
 from scene.gaussians.trainable import trainable
-from utils.files.plain_files import read_text
+from utils.files.plain_files import plain_text
 from utils.general_utils import get_expon_lr_func
 from utils.host.device import compute_device
 from utils.ranks.ranks import Ranks
@@ -165,7 +165,7 @@ def read_pretrained(folder: str | os.PathLike) -> dict[str, Tensor] | None:
 def _read(path: Path) -> dict[str, Any]:
     """The table of an exposure.json; UserError for a file that has none."""
     try:
-        table = json.loads(read_text(path))
+        table = json.loads(plain_text(path))
     except OSError as error:
         raise UserError(f"cannot read {path} ({error.strerror}); {_REMEDY}") from error
     except (ValueError, RecursionError) as error:

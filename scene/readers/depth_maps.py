@@ -17,7 +17,7 @@ from scene.readers import colmap_model
 from scene.readers.info import CameraInfo, SceneInfo
 from utils.files.image_files import UNREADABLE, open_image
 from utils.files.listing import some
-from utils.files.plain_files import read_text
+from utils.files.plain_files import plain_text
 from utils.host.cache_folder import cache_folder
 from utils.system_utils import UserError
 
@@ -198,7 +198,7 @@ def _with_colmap_maps(cameras: Sequence[CameraInfo], scene: Path, folder: Path) 
 def _read_params(path: Path, make: str) -> dict[str, dict[str, float]]:
     """Parameters as in `CameraInfo.depth_params`, by photo name without extension."""
     try:
-        table = json.loads(read_text(path))
+        table = json.loads(plain_text(path))
         params = {name: {key: float(entry[key]) for key in ("scale", "offset")} for name, entry in table.items()}
         if not np.isfinite([list(entry.values()) for entry in params.values()]).all():
             raise ValueError("a number is not finite")

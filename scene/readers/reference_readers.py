@@ -23,7 +23,7 @@ from scene.readers.point_cloud import fetchPly, write_point_cloud
 from scene.readers.source_views import SourceView, camera_of, make_cameras
 from scene.readers.transforms import read_blender, read_frames, read_nerfstudio
 from utils.files.image_files import SUFFIXES
-from utils.files.plain_files import read_text
+from utils.files.plain_files import plain_text
 from utils.host.cache_folder import cache_folder
 from utils.system_utils import UserError
 
@@ -197,7 +197,7 @@ def _test_views(views: Sequence[CameraInfo], folder: Path, hold: int) -> set[int
 
 def _listed_names(path: Path) -> set[str]:
     try:
-        return set(read_text(path).splitlines())
+        return set(plain_text(path).splitlines())
     except (OSError, UnicodeDecodeError) as error:
         raise UserError(
             f"cannot read the names of the test photos in {path} ({error}); write them there, one a line, or give an "

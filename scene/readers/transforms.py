@@ -24,7 +24,7 @@ from scene.readers.start_cloud import (
 )
 from scene.readers.transforms_lens import lens_of
 from utils.files.image_files import SUFFIXES
-from utils.files.plain_files import read_text
+from utils.files.plain_files import plain_text
 from utils.files.relative import relative_to
 from utils.system_utils import UserError
 
@@ -110,7 +110,7 @@ def read_nerfstudio(
 
 def _read(path: Path) -> _CameraFile:
     try:
-        content = json.loads(read_text(path))
+        content = json.loads(plain_text(path))
         listed = list(content["frames"])
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise _no_camera_file(path, error) from error

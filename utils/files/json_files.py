@@ -4,13 +4,13 @@ import json
 from pathlib import Path
 from typing import Any
 
-from utils.files.plain_files import read_text
+from utils.files.plain_files import plain_text
 from utils.system_utils import atomic_write
 
 
 def read_json(path: Path) -> Any:
     """Content of a file. OSError if it cannot be read; ValueError or RecursionError if it is not JSON."""
-    return json.loads(read_text(path))
+    return json.loads(plain_text(path))
 
 
 def write_json(path: Path, content: Any, sort_keys: bool = True) -> None:

@@ -21,7 +21,7 @@ def plain(path: Name) -> Name:
     return path
 
 
-def read_text(path: str | os.PathLike, errors: str = "strict") -> str:
+def plain_text(path: str | os.PathLike, errors: str = "strict") -> str:
     """The UTF-8 text of a file. OSError if it cannot be read, or has more than MOST bytes; ValueError for other bytes.
 
     errors: as for `open`.
