@@ -251,8 +251,6 @@ def _(scene: Path) -> None:
 @fault("colmap", "a photo of a camera that is not in cameras.txt")
 def _(scene: Path) -> None:
     _as_text(scene, "images.txt", _replace_at(8, "77"))
-    for name in ("rigs.txt", "frames.txt"):
-        (_sparse(scene) / name).unlink(missing_ok=True)
 
 
 @fault("colmap", "a point that is not finite")

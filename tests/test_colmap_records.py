@@ -124,25 +124,48 @@ def test_points_are_those_of_pycolmap(model, folder, suffix):
 
 
 @pytest.mark.parametrize("suffix", ["bin", "txt"])
-def test_without_pycolmap_a_model_has_the_same_views_and_points(folder, tmp_path, monkeypatch, suffix):
-    for name in ("cameras", "images", "points3D"):
+@pytest.mark.parametrize("whole", [True, False])
+def test_a_models_views_and_points_are_those_of_pycolmap(model, folder, tmp_path, suffix, whole):
+    """To the bit, and whether the rigs and frames of COLMAP 4 are there or not."""
+    for name in ("cameras", "images", "points3D", "rigs", "frames")[: 5 if whole else 3]:
         shutil.copy(folder / f"{name}.{suffix}", tmp_path)
-    wanted = colmap_model.read_model(tmp_path)
-    monkeypatch.setattr(colmap_model, "has_pycolmap", lambda: False)
-    monkeypatch.setattr(colmap_model, "import_pycolmap", lambda: pytest.fail("pycolmap was imported"))
-    got = colmap_model.read_model(tmp_path)
-    assert [view[:3] for view in got.views] == [view[:3] for view in wanted.views]
-    for one, other in zip(got.views, wanted.views, strict=True):
-        np.testing.assert_allclose(one.rotation, other.rotation, atol=1e-15)
-        np.testing.assert_array_equal(one.translation, other.translation)
-    np.testing.assert_array_equal(got.points, wanted.points)
-    np.testing.assert_array_equal(got.colors, wanted.colors)
-    assert got.points.dtype == wanted.points.dtype and got.colors.dtype == wanted.colors.dtype
+    _assert_equal(colmap_model.read_model(tmp_path), model)
+
+
+def _assert_equal(got: colmap_model.ColmapModel, wanted: pycolmap.Reconstruction) -> None:
+    assert len(got.views) == wanted.num_reg_images() > 0
+    for view, image_id in zip(got.views, sorted(wanted.reg_image_ids()), strict=True):
+        image = wanted.images[image_id]
+        camera, pose = wanted.cameras[image.camera_id], image.cam_from_world().matrix()
+        assert (view.name, view.camera_id) == (image.name, image.camera_id)
+        assert view.lens == (camera.model_name, tuple(camera.params), camera.width, camera.height)
+        np.testing.assert_array_equal(np.column_stack([view.rotation, view.translation]), pose)
+    points = [wanted.points3D[point_id] for point_id in sorted(wanted.points3D)]
+    np.testing.assert_array_equal(got.points, [point.xyz for point in points])
+    np.testing.assert_array_equal(got.colors, [point.color for point in points])
+    assert (got.points.dtype, got.colors.dtype) == (np.float64, np.uint8)
 
 
 @pytest.mark.parametrize("suffix", ["bin", "txt"])
-@pytest.mark.parametrize("has_pycolmap", [True, False])
-def test_quaternions_of_any_length_are_normalised(tmp_path, monkeypatch, suffix, has_pycolmap):
+def test_rigs_of_several_cameras_and_frames_without_a_pose(tmp_path, suffix):
+    options = pycolmap.SyntheticDatasetOptions()
+    options.num_rigs, options.num_cameras_per_rig, options.num_frames_per_rig, options.num_points3D = 2, 3, 4, 50
+    wanted = pycolmap.synthesize_dataset(options)
+    wanted.deregister_frame(wanted.reg_frame_ids()[0])
+    (wanted.write_binary if suffix == "bin" else wanted.write_text)(str(tmp_path))
+    _assert_equal(colmap_model.read_model(tmp_path), pycolmap.Reconstruction(str(tmp_path)))
+
+
+@pytest.mark.parametrize("kind", ["bin", "txt"])
+@pytest.mark.parametrize("name", ["fox_tiny", "monstree_mixed", "bonsai_small"])
+def test_real_models_are_those_of_pycolmap(shared_dir, tmp_path, name, kind):
+    wanted = pycolmap.Reconstruction(str(shared_dir / "scenes" / name / "sparse" / "0"))
+    (wanted.write_binary if kind == "bin" else wanted.write_text)(str(tmp_path))
+    _assert_equal(colmap_model.read_model(tmp_path), wanted)
+
+
+@pytest.mark.parametrize("suffix", ["bin", "txt"])
+def test_quaternions_of_any_length_are_normalised(tmp_path, suffix):
     reconstruction = make_colmap_scene(tmp_path, views=3)
     sparse = tmp_path / "sparse" / "0"
     reconstruction.write_text(str(sparse))
@@ -165,7 +188,6 @@ def test_quaternions_of_any_length_are_normalised(tmp_path, monkeypatch, suffix,
                 "<4d", *(length * value for value in struct.unpack_from("<4d", content, at))
             )
         (sparse / "images.bin").write_bytes(content)
-    monkeypatch.setattr(colmap_model, "has_pycolmap", lambda: has_pycolmap)
     wanted = {image.name: image.cam_from_world().matrix() for image in reconstruction.images.values()}
     views = colmap_model.read_model(sparse).views
     got = {view.name: np.column_stack([view.rotation, view.translation]) for view in views}
@@ -178,14 +200,7 @@ def test_quaternions_of_any_length_are_normalised(tmp_path, monkeypatch, suffix,
         np.testing.assert_allclose(published[name], pose, atol=1e-14)
 
 
-def test_without_pycolmap_what_is_missing_is_said(tmp_path, monkeypatch):
-    (tmp_path / "cameras.txt").write_text("1 PINHOLE 8 6 9 9 4 3\n")
-    (tmp_path / "points3D.txt").write_text("")
-    monkeypatch.setattr(colmap_model, "has_pycolmap", lambda: False)
-    for line, fault in (("1 1 0 0 0 0 0 0 7 a.png", "no camera 7"), ("1 0 0 0 0 0 0 0 1 a.png", "no rotation")):
-        (tmp_path / "images.txt").write_text(f"{line}\n\n")
-        with pytest.raises(UserError, match=f"the photo a.png has {fault}"):
-            colmap_model.read_model(tmp_path)
+def test_without_pycolmap_what_needs_it_is_said(monkeypatch):
     monkeypatch.setattr(pycolmap_import, "has_pycolmap", lambda: False)
     with pytest.raises(UserError, match="pycolmap is not installed, .*undistort the photos on another machine"):
         pycolmap_import.import_pycolmap()
@@ -211,7 +226,7 @@ def test_a_file_cut_anywhere_is_refused_by_name(folder, tmp_path, name, what):
     path = tmp_path / f"{name}.bin"
     for size in [*range(0, len(whole), 37), len(whole) - 1]:
         path.write_bytes(whole[:size])
-        with pytest.raises(UserError, match=f"{name}.bin ends within {what} .* copy it again"):
+        with pytest.raises(UserError, match=f"{name}.bin (ends within {what}|is empty).*; copy the file again"):
             READERS[name][0](path)
 
 

@@ -17,12 +17,13 @@ import torch
 from gaussians import model, options, take_steps
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from synthetic import make_blender_scene
+from synthetic import make_blender_scene, make_colmap_scene
 
 from arguments import ModelParams, read_cfg_args, read_model_json, write_cfg_args, write_model_json
 from scene.dataset_readers import read_scene
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.checkpoint import load_checkpoint, save_checkpoint
+from scene.readers.colmap_model import read_model, read_sightings
 from scene.readers.point_cloud import read_point_cloud, write_point_cloud
 from utils.system_utils import UserError
 
@@ -186,6 +187,36 @@ def test_model_json(folder, data):
         path.write_text(json.dumps(data.draw(changed(json.loads(path.read_text()), JSON))))
     record = ends_well(lambda: read_model_json(folder))
     assert record is None or np.isfinite(record.get("world_offset", 0.0)).all()
+
+
+@pytest.fixture(scope="module")
+def colmap_files(folder) -> dict[str, Path]:
+    """COLMAP models by the kind of their files."""
+    model = make_colmap_scene(folder / "colmap", views=3)
+    for suffix, write in (("bin", model.write_binary), ("txt", model.write_text)):
+        (folder / suffix).mkdir()
+        write(str(folder / suffix))
+    return {suffix: folder / suffix for suffix in ("bin", "txt")}
+
+
+@pytest.mark.parametrize("suffix", ["bin", "txt"])
+@pytest.mark.parametrize("name", ["cameras", "images", "points3D"])
+@FUZZ
+@given(data=st.data())
+def test_colmap_model(colmap_files, name, suffix, data):
+    path = colmap_files[suffix] / f"{name}.{suffix}"
+    whole = path.read_bytes()
+    try:
+        path.write_bytes(data.draw(damaged(whole)))
+        model = ends_well(lambda: read_model(path.parent))
+        sightings = ends_well(lambda: read_sightings(path.parent, suffix))
+    finally:
+        path.write_bytes(whole)
+    if model is not None:
+        assert model.points.shape == model.colors.shape and model.colors.dtype == np.uint8
+        assert all(view.rotation.shape == (3, 3) and view.translation.shape == (3,) for view in model.views)
+    if sightings is not None:
+        assert all(len(seen.pixels) == len(seen.depths) for seen in sightings)
 
 
 @pytest.fixture(scope="module")

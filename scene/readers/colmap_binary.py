@@ -11,13 +11,16 @@ from typing import BinaryIO, TypeVar
 
 import numpy as np
 
-from scene.readers.colmap_records import CAMERA_MODEL_IDS, Camera, Image, Points, points_of
+from scene.readers.colmap_records import CAMERA_MODEL_IDS, Camera, Image, Points, PointTable
+from utils.files.file_kinds import not_the_file
 from utils.system_utils import UserError
 
 _COUNT = struct.Struct("<Q")
 _CAMERA = struct.Struct("<iiQQ")
 _IMAGE = struct.Struct("<i7di")
-_POINT = struct.Struct("<Q3d3BdQ")
+_POINT = np.dtype([("id", "<i8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8"), ("seen", "<u8")])
+_SEEN = _POINT.fields["seen"][1]  # its place in the record
+_TRACK = 8  # bytes for each photo that sees a point
 _POINT_2D = np.dtype([("x", "<f8"), ("y", "<f8"), ("id", "<i8")])
 _Record = TypeVar("_Record")
 
@@ -32,14 +35,36 @@ def read_extrinsics_binary(path: str | os.PathLike) -> dict[int, Image]:
     return {image.id: image for image in _binary_records(Path(path), "photo", _image)}
 
 
+def read_poses_binary(path: str | os.PathLike) -> dict[int, Image]:
+    """Photos of an images.bin by their ids, without their 2D points."""
+    return {image.id: image for image in _binary_records(Path(path), "photo", _pose)}
+
+
 def read_points3D_binary(path: str | os.PathLike) -> Points:
     """Positions (N,3), colours (N,3) to 255 and errors (N,1) of a points3D.bin in its order, all float64."""
-    return points_of([values for _, *values in read_point_rows_binary(path)])
+    return read_point_table_binary(path).published()
 
 
-def read_point_rows_binary(path: str | os.PathLike) -> list[tuple]:
-    """Id, position, colour and error of each point of a points3D.bin, in its order."""
-    return list(_binary_records(Path(path), "point", _point))
+def read_point_table_binary(path: str | os.PathLike) -> PointTable:
+    """Points of a points3D.bin."""
+    content, count, at, starts = Path(path).read_bytes(), 1, _COUNT.size, []
+    try:
+        (count,) = _COUNT.unpack_from(content)
+        while len(starts) < count:
+            (seen,) = _COUNT.unpack_from(content, at + _SEEN)
+            starts.append(at)
+            at += _POINT.itemsize + _TRACK * seen
+        if at > len(content):
+            raise struct.error
+    except (struct.error, OverflowError) as error:
+        whole = len(starts) - (at > len(content))
+        raise _cut_short(path, "point", whole + 1, count) from error
+    if not starts:
+        return PointTable(*(np.zeros(0, _POINT)[name] for name in ("id", "xyz", "rgb", "error")))
+    # Records of one length at every byte of the file, of which those at the starts are real.
+    anywhere = np.ndarray((len(content) - _POINT.itemsize + 1,), _POINT, content, strides=(1,))
+    rows = anywhere[starts]
+    return PointTable(rows["id"], rows["xyz"], rows["rgb"], rows["error"])
 
 
 def read_colmap_bin_array(path: str | os.PathLike) -> np.ndarray:
@@ -107,14 +132,18 @@ def _binary_records(path: Path, what: str, read: Callable[[_Bytes], _Record]) ->
     except UnicodeDecodeError as error:
         raise UserError(f"the name of {what} {number} in {path} is not UTF-8; rename it in plain letters") from error
     except (struct.error, ValueError, OverflowError) as error:
-        raise UserError(
-            f"{path} ends within {what} {number} of {count}, or is no such file; copy it again from where it was made"
-        ) from error
+        raise _cut_short(path, what, number, count) from error
     except KeyError as error:
         raise UserError(
             f"{what} {number} in {path} has the unknown camera model {error}; convert the model with a COLMAP that "
             "knows it"
         ) from error
+
+
+def _cut_short(path: str | os.PathLike, what: str, number: int, count: int) -> UserError:
+    fault = not_the_file(path)
+    fault = f"is {fault}" if fault else f"ends within {what} {number:,} of {count:,}, or is no such file"
+    return UserError(f"{path} {fault}; copy the file again from where it was made")
 
 
 def _camera(content: _Bytes) -> Camera:
@@ -124,14 +153,19 @@ def _camera(content: _Bytes) -> Camera:
 
 
 def _image(content: _Bytes) -> Image:
-    id, *pose, camera_id = content.take(_IMAGE)
-    name = content.text()
+    image = _head(content)
     points = content.array(_POINT_2D, content.take(_COUNT)[0])
     xys = np.column_stack([points["x"], points["y"]])
-    return Image(id, np.array(pose[:4]), np.array(pose[4:]), camera_id, name, xys, points["id"].copy())
+    return image._replace(xys=xys, point3D_ids=points["id"].copy())
 
 
-def _point(content: _Bytes) -> tuple:
-    *values, seen = content.take(_POINT)
-    content.skip(8 * seen)
-    return tuple(values)
+def _pose(content: _Bytes) -> Image:
+    image = _head(content)
+    content.skip(_POINT_2D.itemsize * content.take(_COUNT)[0])
+    return image
+
+
+def _head(content: _Bytes) -> Image:
+    id, *pose, camera_id = content.take(_IMAGE)
+    name = content.text()
+    return Image(id, np.array(pose[:4]), np.array(pose[4:]), camera_id, name, np.zeros((0, 2)), np.zeros(0, np.int64))

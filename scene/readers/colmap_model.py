@@ -1,4 +1,7 @@
-"""COLMAP models as plain records: through pycolmap, or without it where it is not installed."""
+"""COLMAP models as plain records.
+
+rigs and frames of COLMAP 4 are not read: its images file has the poses that follow from them.
+"""
 
 import sys
 from pathlib import Path
@@ -7,12 +10,26 @@ from typing import NamedTuple
 import numpy as np
 
 from scene.pictures.lens import Lens
-from scene.pictures.pycolmap_import import has_pycolmap, import_pycolmap
-from scene.readers import colmap_binary, colmap_text
-from scene.readers.colmap_faults import NAMES, describe
-from scene.readers.colmap_lengths import check_lengths
-from scene.readers.colmap_records import qvec2rotmat
+from scene.readers.colmap_binary import (
+    read_extrinsics_binary,
+    read_intrinsics_binary,
+    read_point_table_binary,
+    read_poses_binary,
+)
+from scene.readers.colmap_records import Camera, Image, PointTable, qvec2rotmat
+from scene.readers.colmap_text import (
+    read_extrinsics_text,
+    read_intrinsics_text,
+    read_point_table_text,
+    read_poses_text,
+)
 from utils.system_utils import UserError
+
+_READERS = {
+    "bin": (read_intrinsics_binary, read_poses_binary, read_extrinsics_binary, read_point_table_binary),
+    "txt": (read_intrinsics_text, read_poses_text, read_extrinsics_text, read_point_table_text),
+}
+_AGAIN = "copy all three files of the model again from where they were made"
 
 
 class ColmapView(NamedTuple):
@@ -68,54 +85,46 @@ def find_model(scene: Path) -> tuple[Path, ColmapModel]:
 
 def read_model(folder: Path) -> ColmapModel:
     """Read a binary model, or a text model if that is missing or broken. UserError when neither can be read."""
-    if not has_pycolmap():
-        return _read_plainly(folder)
-    pycolmap = import_pycolmap()
     errors = []
-    for suffix, read in (("bin", "read_binary"), ("txt", "read_text")):
-        if not _has_model(folder, suffix):
-            continue
-        model = pycolmap.Reconstruction()
-        try:
-            if suffix == "bin":
-                check_lengths(folder)
-            getattr(model, read)(str(folder))
-            return _records(model, {} if suffix == "bin" else _spaced_names(folder / "images.txt", model))
-        except UnicodeDecodeError:
-            errors.append(f".{suffix}: photo names are not UTF-8 (rename the photos in plain letters)")
-        except (ValueError, RuntimeError, LookupError, MemoryError) as error:
-            errors.append(describe(folder, suffix, error))
-    raise _unreadable(folder, errors)
+    for suffix in _READERS:
+        if _has_model(folder, suffix):
+            try:
+                return _read_model(folder, suffix)
+            except UserError as error:
+                errors.append(error)
+    raise errors[0] if errors else UserError(f"no COLMAP model in {folder}; copy the whole model there")
 
 
-def _unreadable(folder: Path, faults: list[str]) -> UserError:
-    return UserError(
-        f"cannot read the COLMAP model in {folder} ({'; '.join(faults)}); fix that, or copy all three files again "
-        "from where they were made"
-    )
-
-
-def _read_plainly(folder: Path) -> ColmapModel:
-    if _has_model(folder, "bin"):
-        cameras = colmap_binary.read_intrinsics_binary(folder / "cameras.bin")
-        images = colmap_binary.read_extrinsics_binary(folder / "images.bin")
-        rows = colmap_binary.read_point_rows_binary(folder / "points3D.bin")
-    else:
-        cameras = colmap_text.read_intrinsics_text(folder / "cameras.txt")
-        images = colmap_text.read_extrinsics_text(folder / "images.txt")
-        rows = colmap_text.read_point_rows_text(folder / "points3D.txt")
+def _read_model(folder: Path, suffix: str) -> ColmapModel:
+    cameras, images, points = _records(folder, suffix)
     views = []
     for _, image in sorted(images.items()):
-        camera = cameras.get(image.camera_id)
-        length = float(np.linalg.norm(image.qvec))
-        if camera is None or not (length > 0 and np.isfinite([*image.qvec, *image.tvec]).all()):
-            what = f"no camera {image.camera_id}" if camera is None else "no rotation and translation"
-            raise _unreadable(folder, [f"the photo {image.name} has {what}"])
+        camera = cameras[image.camera_id]
         lens = Lens(camera.model, tuple(camera.params.tolist()), camera.width, camera.height)
-        rotation = qvec2rotmat(image.qvec / length)
-        views.append(ColmapView(image.name, image.camera_id, lens, rotation, image.tvec))
-    table = np.array([values for _, *values, _ in sorted(rows)], dtype=np.float64).reshape(-1, 6)
-    return ColmapModel(views, table[:, :3].copy(), table[:, 3:].astype(np.uint8))
+        views.append(ColmapView(image.name, image.camera_id, lens, qvec2rotmat(image.qvec), image.tvec))
+    order = np.argsort(points.ids, kind="stable")
+    return ColmapModel(views, points.xyz[order], points.rgb[order].astype(np.uint8))
+
+
+def _records(
+    folder: Path, suffix: str, with_2d_points: bool = False
+) -> tuple[dict[int, Camera], dict[int, Image], PointTable]:
+    """The contents of a model's three files. UserError where one cannot be read or a photo's camera is missing."""
+    read_cameras, read_poses, read_photos, read_points = _READERS[suffix]
+    read_images = read_photos if with_2d_points else read_poses
+    try:
+        cameras = read_cameras(folder / f"cameras.{suffix}")
+        images = read_images(folder / f"images.{suffix}")
+        points = read_points(folder / f"points3D.{suffix}")
+    except OSError as error:
+        raise UserError(f"cannot read {error.filename} ({error.strerror}); fix its permissions, or {_AGAIN}") from error
+    for image in images.values():
+        if image.camera_id not in cameras:
+            raise UserError(
+                f"the photo {image.name} in {folder / f'images.{suffix}'} has the camera {image.camera_id}, which is "
+                f"not in cameras.{suffix}; {_AGAIN}"
+            )
+    return cameras, images, points
 
 
 class Sightings(NamedTuple):
@@ -129,32 +138,25 @@ class Sightings(NamedTuple):
 
 
 def read_sightings(folder: Path, suffix: str) -> list[Sightings]:
-    """Sightings of all registered photos of a model in .bin or .txt files. UserError when it cannot be read."""
+    """Sightings of all photos of a model in .bin or .txt files. UserError when it cannot be read."""
     if not _has_model(folder, suffix):
         raise UserError(f"no COLMAP model in {folder} as .{suffix}; choose the other kind with --model_type")
-    model = import_pycolmap().Reconstruction()
-    try:
-        if suffix == "bin":
-            check_lengths(folder)
-        (model.read_binary if suffix == "bin" else model.read_text)(str(folder))
-    except (ValueError, RuntimeError, IndexError, MemoryError) as error:
-        raise _unreadable(folder, [describe(folder, suffix, error)]) from error
+    cameras, images, points = _records(folder, suffix, with_2d_points=True)
+    order = np.argsort(points.ids, kind="stable")
+    ids, positions = points.ids[order], points.xyz[order]
     sightings = []
-    for image_id in sorted(model.reg_image_ids()):
-        image = model.images[image_id]
-        camera = model.cameras[image.camera_id]
-        seen = [point for point in image.points2D if point.has_point3D()]
-        points = np.array([model.points3D[point.point3D_id].xyz for point in seen], dtype=np.float64).reshape(-1, 3)
-        pose = image.cam_from_world().matrix()
-        sightings.append(
-            Sightings(
-                name=image.name,
-                width=int(camera.width),
-                height=int(camera.height),
-                pixels=np.array([point.xy for point in seen], dtype=np.float64).reshape(-1, 2),
-                depths=points @ pose[2, :3] + pose[2, 3],
+    for _, image in sorted(images.items()):
+        seen = image.point3D_ids >= 0
+        wanted = image.point3D_ids[seen]
+        places = np.searchsorted(ids, wanted)
+        if (places == np.searchsorted(ids, wanted, side="right")).any():
+            raise UserError(
+                f"the photo {image.name} in {folder / f'images.{suffix}'} sees a point that is not in "
+                f"points3D.{suffix}; {_AGAIN}"
             )
-        )
+        camera = cameras[image.camera_id]
+        depths = positions[places] @ qvec2rotmat(image.qvec)[2] + image.tvec[2]
+        sightings.append(Sightings(image.name, camera.width, camera.height, image.xys[seen], depths))
     return sightings
 
 
@@ -164,44 +166,4 @@ def points_file(folder: Path) -> Path:
 
 
 def _has_model(folder: Path, suffix: str) -> bool:
-    return all((folder / f"{name}.{suffix}").is_file() for name in NAMES)
-
-
-def _spaced_names(path: Path, model) -> dict[int, str]:
-    """Names with spaces in an images.txt, by image id: the format allows them, but pycolmap 4.2.1 cuts them off."""
-    names = {}
-    for line in path.read_text(encoding="utf-8").splitlines():
-        fields = line.split(maxsplit=9)  # id, quaternion, translation, camera id, name; or else 2D points
-        if len(fields) == 10 and " " in fields[9].rstrip() and fields[0].isdigit():
-            image_id = int(fields[0])
-            if image_id in model.images and model.images[image_id].name == fields[9].split()[0]:
-                names[image_id] = fields[9].rstrip()
-    return names
-
-
-def _records(model, spaced_names: dict[int, str]) -> ColmapModel:
-    views = []
-    for image_id in sorted(model.reg_image_ids()):
-        image = model.images[image_id]
-        camera = model.cameras[image.camera_id]
-        pose = image.cam_from_world().matrix()
-        views.append(
-            ColmapView(
-                name=spaced_names.get(image_id, image.name),
-                camera_id=image.camera_id,
-                lens=Lens(
-                    camera.model_name,
-                    tuple(float(value) for value in camera.params),
-                    int(camera.width),
-                    int(camera.height),
-                ),
-                rotation=pose[:, :3],
-                translation=pose[:, 3],
-            )
-        )
-    points = [model.points3D[point_id] for point_id in sorted(model.points3D)]
-    return ColmapModel(
-        views,
-        np.array([point.xyz for point in points], dtype=np.float64).reshape(-1, 3),
-        np.array([point.color for point in points], dtype=np.uint8).reshape(-1, 3),
-    )
+    return all((folder / f"{name}.{suffix}").is_file() for name in ("cameras", "images", "points3D"))

@@ -1,8 +1,4 @@
-"""Records with COLMAP's own names for cameras, photos and points, and its camera models and quaternions.
-
-Training reads whole models through pycolmap (colmap_model.py). These are for code that reads single files of a model,
-with colmap_binary.py and colmap_text.py.
-"""
+"""Records with COLMAP's own names for cameras, photos and points, and its camera models and quaternions."""
 
 import math
 from typing import NamedTuple
@@ -88,20 +84,34 @@ class Point3D(NamedTuple):
 Points = tuple[np.ndarray, np.ndarray, np.ndarray]  # positions (N,3), colours (N,3) to 255, errors (N,1), float64
 
 
-def points_of(rows: list[tuple]) -> Points:
-    """The columns of rows of position, colour and error."""
-    table = np.array(rows, dtype=np.float64).reshape(-1, 7)
-    return table[:, :3].copy(), table[:, 3:6].copy(), table[:, 6:].copy()
+class PointTable(NamedTuple):
+    """Points in the order of their file: ids (N,) int64, xyz (N,3), rgb (N,3) to 255, errors (N,) in pixels."""
+
+    ids: np.ndarray
+    xyz: np.ndarray
+    rgb: np.ndarray
+    errors: np.ndarray
+
+    def published(self) -> Points:
+        """The columns but the ids, in the form of the reference."""
+        return self.xyz.copy(), self.rgb.astype(np.float64), self.errors[:, None].copy()
 
 
 def qvec2rotmat(qvec: np.ndarray) -> np.ndarray:
-    """Rotation (3,3) of a quaternion w x y z of any length; NaN for one of zeros."""
-    length = math.hypot(*map(float, qvec))
-    if abs(length - 1) > _ROUNDED:
-        qvec = np.asarray(qvec) / length if length else np.full(4, np.nan)
-    w, x, y, z = (float(value) for value in qvec)
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    return np.eye(3) + 2 * (w * cross + cross @ cross)
+    """Rotation (3,3) of a quaternion w x y z of any length; NaN for one of zeros. Rounded as COLMAP's own is."""
+    w, x, y, z = map(float, qvec)
+    length = math.hypot(w, x, y, z)
+    if not abs(length - 1) <= _ROUNDED:
+        w, x, y, z = (value / length if length else math.nan for value in (w, x, y, z))
+    x2, y2, z2 = 2 * x, 2 * y, 2 * z
+    xx, yy, zz = x2 * x, y2 * y, z2 * z
+    return np.array(
+        [
+            [1 - (yy + zz), y2 * x - z2 * w, z2 * x + y2 * w],
+            [y2 * x + z2 * w, 1 - (xx + zz), z2 * y - x2 * w],
+            [z2 * x - y2 * w, z2 * y + x2 * w, 1 - (xx + yy)],
+        ]
+    )
 
 
 def rotmat2qvec(R: np.ndarray) -> np.ndarray:
