@@ -16,7 +16,7 @@ import torch
 
 from arguments import ModelParams, OptimizationParams, OptionParser, PipelineParams, write_cfg_args, write_model_json
 from gaussian_renderer import network_gui
-from records.event_writer import EventWriter, tensorboard_is_installed
+from records.event_writer import EventWriter as SummaryWriter
 from training.agreement import agree_on_options
 from training.launch import add_launch_options, viewers
 from training.loop import run_training
@@ -31,7 +31,6 @@ from utils.system_utils import UserError, mkdir_p, run_cli
 from viewing.options import Address
 from viewing.server import checked_address
 
-SummaryWriter = EventWriter if tensorboard_is_installed() else None
 __all__ = ["main", "parse", "prepare_output_and_logger", "training", "training_report"]
 
 
@@ -80,10 +79,11 @@ def prepare_output_and_logger(args: argparse.Namespace, **kept: Any) -> Any | No
     mkdir_p(args.model_path)
     write_cfg_args(args.model_path, args)
     write_model_json(args.model_path, args, **kept)
-    if SummaryWriter is None:
-        print("TensorBoard is not installed: no event file")
+    try:
+        return SummaryWriter(args.model_path)
+    except ImportError:
+        print("TensorBoard is not installed: no event file (pip install tensorboard brings it)")
         return None
-    return SummaryWriter(args.model_path)
 
 
 def _parser() -> tuple[argparse.ArgumentParser, ModelParams, OptimizationParams, PipelineParams]:

@@ -78,7 +78,7 @@ def absent() -> list[list[str]]:
         ["curve recording (--no_curve)", f"files: {len(curves)}; {loaded('matplotlib')}", _import_cost("matplotlib")],
         [no_test_photos, f"decoded: {len(tests)} of 2", "3 bytes a pixel"],
         ["viewer", f"sockets bound: {len(seen['binds'])}", ""],
-        ["TensorBoard (its files are written without it)", loaded("tensorboard"), ""],
+        ["TensorBoard", f"{loaded('tensorboard')} (yes wherever it is installed)", ""],
         ["LPIPS, outside metrics.py", loaded("lpips"), ""],
         ["alpha of opaque photos, pixels beyond training size", f"bytes kept: {extra}", ""],
         ["double kernels", "entered with float64 tensors only", f"{doubles} of {library:,} bytes on disk"],

@@ -118,7 +118,7 @@ def _start(scene: Path, out: Path, prepare: Callable[[], Any]) -> int:
             newest = 50
         if newest:
             words += ["--start_checkpoint", str(out / f"chkpnt{newest}.pth")]
-        train.SummaryWriter = None
+        train.SummaryWriter = lambda folder: None
         torch.set_num_threads(1)
         train.main(words)
         status = 0

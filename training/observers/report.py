@@ -67,10 +67,10 @@ class Report(Observer):
             step.record = (step.record or {}) | scores
 
     def ended(self, error: Error) -> None:
-        if error is not None:
-            return
         if self._writer:
             self._writer.close()
+        if error is not None:
+            return
         log, opt = self._run.log, self._run.opt
         options = {PLANNED: opt.iterations, STRATEGY: opt.strategy}
         if opt.strategy == "adc":  # the others are meant to reach their number
