@@ -10,12 +10,12 @@ from broken_datasets import FAULTS, Fault, make_masters, message
 SAID = {
     "no -s given": "no scene folder given",
     "the folder given with -s does not exist": "no scene folder SCENE/garden",
-    "-s names a file": r"cameras\.bin is a file; .*, SCENE",
+    "-s names a file": r"SCENE/sparse/0/cameras\.bin is a file; give -s .*, SCENE$",
     "the folder is empty": "SCENE is not a scene: .*found nothing",
-    "photos only, nothing was reconstructed": "SCENE is not a scene: .*found images;",
-    "-s names the folder of the photos": "SCENE/images is not a scene: .*found Right, left",
-    "-s names the folder of the model": "SCENE/sparse/0 is not a scene: .*found cameras.bin",
-    "-s names the folder around the scene": "SCENE is not a scene: .*found garden",
+    "photos only, nothing was reconstructed": "not a scene: .*found images;.* run python convert.py -s SCENE first$",
+    "-s names the folder of the photos": "images is not a scene: .*found Right, left; give -s SCENE, which is a scene$",
+    "-s names the folder of the model": "0 is not a scene: .*found cameras.bin.*; give -s SCENE, which is a scene$",
+    "-s names the folder around the scene": "not a scene: .*found garden; give -s a scene in it: SCENE/garden$",
     "the output folder lies in the scene": "the output folder SCENE/output lies in the scene folder",
     "sparse/0 is empty": "no COLMAP model in SCENE/sparse/0.*found sparse/0;",
     "images.bin is missing": "no COLMAP model in SCENE/sparse/0(?!.*sparse/0/images.bin).*sparse/0/cameras.bin",
@@ -23,7 +23,7 @@ SAID = {
     "cameras.bin is cut short": "SCENE/sparse/0/cameras.bin ends within camera 1 of 1",
     "images.bin is cut short": r"SCENE/sparse/0/images\.bin ends within photo 9 of 9",
     "points3D.bin is cut short": r"SCENE/sparse/0/points3D\.bin ends within point 292 of 300",
-    "cameras.bin is empty": r"SCENE/sparse/0/cameras\.bin is empty",
+    "cameras.bin is empty": r"^SCENE/sparse/0/cameras\.bin is empty; copy the file again from where it was made$",
     "images.bin is an error page that was downloaded": r"SCENE/sparse/0/images\.bin is a web page",
     "the model registers no photo": "COLMAP model in SCENE/sparse/0 has no registered photo",
     "a word where cameras.txt needs a number": r"line 4 of SCENE/sparse/0/cameras\.txt .*wide",
@@ -34,10 +34,10 @@ SAID = {
     "a pose that is not finite": "pose of .*png is not finite",
     "a photo of a camera that is not in cameras.txt": r"SCENE/sparse/0/images\.txt has the camera 77",
     "a point that is not finite": r"line 4 of SCENE/sparse/0/points3D\.txt .*nan",
-    "the folder images is missing": r"no folder SCENE/images,.*-i",
-    "-i names a folder that is not there": r"no folder SCENE/images_4,.*-i",
+    "the folder images is missing": r"there is no folder SCENE/images,.*-i",
+    "-i names a folder that is not there": r"there is no folder SCENE/images_4,.*-i$",
     "one photo is missing": "1 of 9 photos .*are missing: SCENE/images/left/v02.png",
-    "the photos were converted to another format": "9 of 9 photos .*are missing: SCENE/images/Right/V03.png",
+    "the photos were converted to another format": r"9 of 9 photos .*Right/V03.png.*\(Right/V03.jpg is there instead\)",
     "a photo is a link to nothing": r"1 of 9 photos .* missing: SCENE/images/left/v02.png \(it is there, but",
     "a photo is cut short": "cannot read SCENE/images/left/v02.png .*truncated",
     "a photo is empty": r"SCENE/images/left/v02\.png is empty",
@@ -53,11 +53,11 @@ SAID = {
     "transforms_train.json has no camera_angle_x": "SCENE/transforms_train.json has neither camera_angle_x",
     "camera_angle_x is in degrees": "camera_angle_x in SCENE/transforms_train.json .*got 40.0.*radians",
     "no frames are listed": "SCENE/transforms_train.json lists no frames",
-    "a transform_matrix has three rows": "SCENE/transforms_train.json .*transform_matrix must be 4x4 .*got shape",
-    "a transform_matrix can't be inverted": "SCENE/transforms_train.json .*[Ss]ingular",
+    "a transform_matrix has three rows": r"^frame 2 \(./train/r_1\) of SCENE/.* must be 4x4 .*got shape",
+    "a transform_matrix can't be inverted": r"^frame 2 \(./train/r_1\) of SCENE/transforms_train.json .*[Ss]ingular",
     "a transform_matrix is mirrored": "pose of r_1 is mirrored",
     "a transform_matrix is sheared": "pose of r_1 has no rotation",
-    "a frame has no file_path": r"frame 2 of SCENE/transforms_train\.json has no file_path",
+    "a frame has no file_path": r"^frame 2 of SCENE/transforms_train\.json has no file_path",
     "the photo of a frame is missing": "1 of 4 photos .*are missing: SCENE/train/r_1.png",
 }
 
@@ -80,29 +80,6 @@ def test_one_sentence_that_names_the_thing_and_the_remedy(fault, masters, tmp_pa
     # The remedy follows the semicolon.
     what, semicolon, remedy = text.rpartition("; ")
     assert semicolon and len(what) > 15 and len(remedy.split()) >= 3, text
-
-
-@pytest.mark.parametrize(
-    ("what", "said"),
-    [
-        ("-s names a file", r"SCENE/sparse/0/cameras.bin is a file; give -s .*, SCENE$"),
-        ("photos only, nothing was reconstructed", r"run python convert.py -s SCENE first$"),
-        ("-s names the folder of the photos", r"; give -s SCENE, which is a scene$"),
-        ("-s names the folder of the model", r"; give -s SCENE, which is a scene$"),
-        ("-s names the folder around the scene", r"; give -s a scene in it: SCENE/garden$"),
-        ("cameras.bin is empty", r"cameras.bin is empty; copy the file again from where it was made$"),
-        ("the folder images is missing", r"there is no folder SCENE/images,"),
-        ("-i names a folder that is not there", r"there is no folder SCENE/images_4,.*-i$"),
-        ("the photos were converted to another format", r"\(Right/V03.jpg is there instead\)"),
-        ("a photo is a Git LFS pointer", r"git lfs pull"),
-        ("a transform_matrix has three rows", r"^frame 2 \(./train/r_1\) of SCENE/transforms_train.json"),
-        ("a transform_matrix can't be inverted", r"^frame 2 \(./train/r_1\) of SCENE/transforms_train.json"),
-        ("a frame has no file_path", r"^frame 2 of SCENE/transforms_train.json has no file_path"),
-    ],
-)
-def test_what_is_told_of_it(what, said, masters, tmp_path):
-    (fault,) = (fault for fault in FAULTS if fault.what == what)
-    assert re.search(said, message(fault, masters, tmp_path))
 
 
 def test_a_sound_scene_is_taken(masters, tmp_path):
