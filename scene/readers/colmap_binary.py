@@ -59,11 +59,9 @@ def read_point_table_binary(path: str | os.PathLike) -> PointTable:
     except (struct.error, OverflowError) as error:
         whole = len(starts) - (at > len(content))
         raise _cut_short(path, "point", whole + 1, count) from error
-    if not starts:
-        return PointTable(*(np.zeros(0, _POINT)[name] for name in ("id", "xyz", "rgb", "error")))
-    # Records of one length at every byte of the file, of which those at the starts are real.
-    anywhere = np.ndarray((len(content) - _POINT.itemsize + 1,), _POINT, content, strides=(1,))
-    rows = anywhere[starts]
+    # A view has a record at every byte of the file; those at the starts are real.
+    places = len(content) - _POINT.itemsize + 1
+    rows = np.ndarray((places,), _POINT, content, strides=(1,))[starts] if starts else np.zeros(0, _POINT)
     return PointTable(rows["id"], rows["xyz"], rows["rgb"], rows["error"])
 
 
