@@ -24,7 +24,7 @@ CXX_TEST_OBJECTS := $(patsubst submodules/%.cpp,build/%.o,$(wildcard submodules/
 CORES := $(shell getconf _NPROCESSORS_ONLN)
 CXX_TEST_FLAGS := -std=c++17 -O1 -g1 -Wall -Wextra -Werror -fsanitize=address,undefined -fno-sanitize-recover=all -pthread
 
-CXX_SOURCES := $(shell find submodules benchmarks -name build -prune -o \( -name '*.cpp' -o -name '*.cu*' -o -name '*.h' \) -print)
+CXX_SOURCES := $(shell find submodules -name build -prune -o \( -name '*.cpp' -o -name '*.cu*' -o -name '*.h' \) -print)
 # What the extension $(1) is built from.
 sources = $(shell find submodules/common submodules/$(1) \( -name build -o -name tests -o -name emulation \) -prune -o \
             \( -name '*.cpp' -o -name '*.cu*' -o -name '*.h' -o -name '*.py' -o -name '*.toml' \) -print)

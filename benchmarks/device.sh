@@ -4,7 +4,7 @@
 #
 #   benchmarks/device.sh test                      GPU tests, then the rasterizer's CPU tests
 #   benchmarks/device.sh sanitize                  memcheck and racecheck of the GPU tests on small scenes
-#   benchmarks/device.sh kernels [OPTION...]       python3 -m benchmarks.kernels.rasterizer OPTION... (--peers gsplat)
+#   benchmarks/device.sh kernels [OPTION...]       python3 -m benchmarks.kernels.rasterizer OPTION...
 #   benchmarks/device.sh accuracy                  python3 -m benchmarks.accuracy.oracle --json OUT/accuracy.json;
 #                                                  benchmarks.accuracy.figure draws it on a machine with matplotlib
 #   benchmarks/device.sh train SCENE [OPTION...]   python3 -m benchmarks.scenes.training SCENE OPTION...
@@ -23,8 +23,7 @@ out=${OUT:-build/device/out}
 site=$PWD/build/device/site
 mkdir -p "$out" "$site"
 export PYTHONPATH=$site PYTHONUNBUFFERED=1 PATH=$PATH:${CUDA_HOME:-/usr/local/cuda}/bin
-# gsplat compiles its kernels on first use.
-export MAX_JOBS=${MAX_JOBS:-$(nproc)} TORCH_EXTENSIONS_DIR=$PWD/build/device/torch_extensions
+export MAX_JOBS=${MAX_JOBS:-$(nproc)}
 
 say() { printf '\n== %s (%d s)\n' "$1" "$SECONDS"; }
 
@@ -102,7 +101,7 @@ describe() {
 import importlib.metadata
 import platform
 
-names = "torch numpy scipy pillow tqdm plyfile scikit-image lpips pycolmap pytest hypothesis setuptools ninja gsplat"
+names = "torch numpy scipy pillow tqdm plyfile scikit-image lpips pycolmap pytest hypothesis setuptools ninja"
 versions = [f"Python {platform.python_version()}"]
 for name in names.split():
     try:
@@ -149,7 +148,7 @@ part() {
 
 ranks() {
   local count=$1 scene=$2 name status=0
-  local launch=(python3 -m torch.distributed.run --standalone --nproc_per_node "$count" -m)
+  local steps=(python3 -m benchmarks.parallel.steps)
   shift 2
   # One host: gloo needs no network.
   export GLOO_SOCKET_IFNAME=${GLOO_SOCKET_IFNAME:-lo} NCCL_DEBUG=${NCCL_DEBUG:-WARN}
@@ -162,15 +161,15 @@ ranks() {
           tests/test_ranks_gpu.py || status=1
         ;;
       scene)
-        part 150 "a scene by ranks" python3 -m benchmarks.parallel.training "$scene" --ranks "$count" \
-          --parallel tiles views --test_iterations 7000 --no_curve --limit 60 || status=1
+        part 150 "a scene by ranks" python3 -m benchmarks.scenes.training "$scene" \
+          "$(mktemp -d build/device/models.XXXX)/models" --seeds 0 --ranks 1 "$count" --iterations 7000 || status=1
         ;;
       steps)
-        part 210 "steps by ranks" python3 -m benchmarks.parallel.table --ranks "$count" --limit 75 || status=1
+        part 210 "steps by ranks" "${steps[@]}" --ranks 1 "$count" --limit 75 || status=1
         ;;
       memory)
-        part 60 "memory of one process" python3 -m benchmarks.parallel.memory || status=1
-        part 90 "memory of ranks" "${launch[@]}" benchmarks.parallel.memory --train 50000000 || status=1
+        part 150 "memory of ranks" "${steps[@]}" --ranks 1 "$count" --parallel tiles --workload city \
+          --gaussians 5000000 20000000 --blocks 1 --rounds 1 || status=1
         ;;
       *) say "no part is named $name" && status=2 ;;
     esac

@@ -1,24 +1,32 @@
-"""Benchmarks: counts against plain loops, short names of kernels, `-h` of every command."""
+"""Benchmarks: every command on a tiny case, and what their tables and figures make of numbers."""
 
 import ast
 import importlib
+import json
 import math
 import sys
+from collections import Counter
+from functools import partial
 from pathlib import Path
 
 import diff_gaussian_rasterization
 import pytest
+import torch
+from PIL import Image
+from torch.profiler import ProfilerActivity, profile
 
-from benchmarks import scaling_model
-from benchmarks.harness.calls import Stages
-from benchmarks.harness.page import replace_tables
-from benchmarks.harness.timing import short_name
-from benchmarks.kernels import builds
-from benchmarks.kernels.fragments import TILE, fragments, processed_per_tile
-from benchmarks.kernels.host_ops import NODE, calls_per_iteration, operator_calls
+import train
+from benchmarks.accuracy import figure, oracle
+from benchmarks.accuracy.runs import CPU_DOUBLE, CPU_FLOAT, CUDA_FLOAT
+from benchmarks.harness.calls import by_stage
+from benchmarks.harness.timing import GpuTime, short_name
+from benchmarks.kernels import builds, rasterizer
 from benchmarks.kernels.seen_share import SHARES, Ring, measure
-from benchmarks.scenes import step_profile
-from benchmarks.workloads.splat_scenes import frustum
+from benchmarks.parallel import steps, workload
+from benchmarks.scenes import step_profile, training
+from benchmarks.strategies.figure import draw
+from benchmarks.strategies.tables import at, joined
+from utils.system_utils import UserError
 
 BENCHMARKS = Path(__file__).resolve().parents[1] / "benchmarks"
 MODULES = sorted(path for path in BENCHMARKS.glob("*/*.py") if path.name != "__init__.py")
@@ -29,23 +37,14 @@ def _name(path: Path) -> str:
     return f"benchmarks.{path.parent.name}.{path.stem}"
 
 
-def test_fragments_are_those_of_a_loop_over_pixels():
-    scene = frustum(150, 40, 27, 4.0, seed=3)
-    stages = Stages(scene)
-    rows, instances, last = stages.splats.double().tolist(), stages.instances.tolist(), stages.last
-    blended, pixels, across = 0, scene.width * scene.height, -(-scene.width // TILE)
-    for y in range(scene.height):
-        for x in range(scene.width):
-            begin = int(stages.ranges[y // TILE * across + x // TILE])
-            for index in instances[begin : begin + int(last[y, x])]:
-                mean_x, mean_y, l11, l12, l22, log2_opacity = rows[index][:6]
-                u, v = l11 * (x - mean_x) + l12 * (y - mean_y), l22 * (y - mean_y)
-                blended += log2_opacity - u * u - v * v >= -math.log2(255)
-    counted = fragments(stages.splats, stages.instances, stages.ranges, last)
-    assert counted["blended"] == blended / pixels > 5
-    assert counted["blended"] < counted["8x4"] < counted["8x8"] < counted["16x8"] < counted["16x16"]
-    # Instances are exact, so each one reaches its tile.
-    assert counted["16x16"] == int(processed_per_tile(last).sum()) * TILE * TILE / pixels
+@pytest.mark.parametrize("path", COMMANDS, ids=_name)
+def test_every_command_answers_h_and_shows_how_it_is_run(path, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", [path.name, "-h"])
+    with pytest.raises(SystemExit) as stopped:
+        importlib.import_module(_name(path)).main()
+    assert stopped.value.code == 0
+    assert capsys.readouterr().out.startswith(f"usage: {path.name} [-h]")
+    assert f"python -m {_name(path).removesuffix('.__main__')} " in ast.get_docstring(ast.parse(path.read_text()))
 
 
 @pytest.mark.parametrize(
@@ -61,14 +60,81 @@ def test_short_names(name, short):
     assert short_name(name) == short
 
 
-def test_an_iteration_makes_few_calls(colmap_scene):
+def test_kernels_belong_to_the_stage_that_began():
+    names = ["fill", "project_kernel", "sort", "blend_kernel", "l1_ssim_kernel", "l1_ssim_vjp_kernel", "mark"]
+    stages = [stage for stage, _, _ in by_stage([(name, 1.0) for name in [*names, "project_vjp_kernel"]])]
+    assert stages == ["project", "project", "bin", "blend", "loss", "loss", "blend_vjp", "step"]
+
+
+def _calls(iterations: int, options: list[str], out: Path) -> Counter[str]:
+    """Calls of a training by name: operators, and steps of autograd as "node"."""
+    stdout = sys.stdout
+    try:
+        with profile(activities=[ProfilerActivity.CPU]) as profiled:
+            train.main(
+                ["-m", str(out), "--iterations", str(iterations), "--test_iterations", "-1", "--quiet", *options]
+            )
+    finally:
+        sys.stdout = stdout  # training silences it
+    node = "autograd::engine::evaluate_function"
+    names = ("node" if event.name.startswith(node) else event.name for event in profiled.events())
+    ours = ("aten::", "diff_gaussian_rasterization::", "fused_ssim::", "node")
+    return Counter(name for name in names if name.startswith(ours))
+
+
+def test_an_iteration_makes_few_calls(colmap_scene, tmp_path):
     """Each call slows a step that is bound by the host, so this test must notice added calls."""
-    calls = calls_per_iteration("-s", str(colmap_scene), "-r", "24")
+    options = ["-s", str(colmap_scene), "-r", "24"]
+    found = _calls(25, options, tmp_path / "long")
+    found.subtract(_calls(5, options, tmp_path / "short"))
+    calls = {name: count / 20 for name, count in found.items()}
     for op in ("rasterize", "rasterize_vjp_step_"):
         assert calls[f"diff_gaussian_rasterization::{op}"] == 1, op
     assert calls["fused_ssim::photometric"] == calls["fused_ssim::photometric_vjp"] == 1
-    assert calls[NODE] <= 2  # the loss, and the image that it is differentiated by
-    assert operator_calls(calls) <= 70  # and some 20 for the order of the views, drawn once an epoch of 17
+    assert calls.pop("node") <= 2  # the loss, and the image that it is differentiated by
+    assert sum(calls.values()) <= 70  # and some 20 for the order of the views, drawn once an epoch of 17
+
+
+def _rows(said: str, first: str) -> list[list[str]]:
+    lines = [line for line in said.splitlines() if line.startswith(f"| {first}")]
+    return [[cell.strip() for cell in line.split("|")[1:-1]] for line in lines]
+
+
+def test_the_kernels_are_timed(monkeypatch, capsys):
+    monkeypatch.setitem(rasterizer.CPU_WORKLOADS, "S", (300, 40, 27, 2.4))
+    words = ["rasterizer", "--device", "cpu", "--workloads", "S", "--threads", "1", "--repeats", "1"]
+    monkeypatch.setattr(sys, "argv", words)
+    rasterizer.main()
+    (row,) = _rows(capsys.readouterr().out, "0 k, 40x27")
+    assert all(float(cell) >= 0 for cell in row[2:9])
+    monkeypatch.setattr(sys, "argv", [*words[:3], "--workloads", "M+"])
+    with pytest.raises(UserError, match="M\\+: on this device there are S, M, L, wide"):
+        rasterizer.main()
+
+
+def test_tables_of_a_gpu_have_stages_memory_and_marks(monkeypatch, capsys):
+    launched = [("project_kernel", 0.25), ("sort", 0.5), ("blend_kernel", 1.0), ("blend_kernel", 0.125)]
+    times = dict.fromkeys(("forward", "+ backward", "step"), GpuTime(0.82, launched))
+    monkeypatch.setattr(rasterizer, "measure_on_gpu", lambda name: rasterizer.Measured(name, times, [20.0, 70.0]))
+    rasterizer.print_gpu(["S", "M"])
+    said = capsys.readouterr().out
+    assert ["blend", "1.125", "1.125"] in _rows(said, "blend ") and ["bin", "0.500", "0.500"] in _rows(said, "bin ")
+    assert _rows(said, "S ") == [
+        ["S", "20", "29", "50", "70", "133", "54", "70"],
+        ["S", "forward", "0.820", "1.875", "0.41", "1.11", "2.00", "0.18"],
+        ["S", "+ backward", "0.820", "1.875", "1.16", "2.47", "0.71", "0.42"],
+        ["S", "step", "0.820", "1.875", "1.21", "2.95", "0.68", "0.50"],
+    ]
+
+
+def test_two_builds_take_turns(monkeypatch, capsys):
+    folder = str(Path(diff_gaussian_rasterization.__file__).parents[1])
+    words = ["builds", folder, folder, "--device", "cpu", "--workloads", "S", "--starts", "1", "--rounds", "1"]
+    monkeypatch.setattr(sys, "argv", words)
+    builds.main()
+    rows = _rows(capsys.readouterr().out, "S ")
+    assert [row[1] for row in rows] == list(builds.STEPS)
+    assert all(0.2 < float(row[4]) < 5 and float(row[2]) > 0.05 for row in rows)
 
 
 @pytest.mark.parametrize("share", SHARES)
@@ -83,75 +149,134 @@ def test_a_row_for_each_share():
     assert all(float(row[1]) > 0 for row in rows)
 
 
-@pytest.mark.parametrize("path", COMMANDS, ids=_name)
-def test_every_command_answers_h(path, monkeypatch, capsys):
-    monkeypatch.setattr(sys, "argv", [path.name, "-h"])
-    with pytest.raises(SystemExit) as stopped:
-        importlib.import_module(_name(path)).main()
-    assert stopped.value.code == 0
-    assert capsys.readouterr().out.startswith(f"usage: {path.name} [-h]")
-
-
-@pytest.mark.parametrize("path", COMMANDS, ids=_name)
-def test_every_command_shows_how_it_is_run(path):
-    assert f"python -m {_name(path).removesuffix('.__main__')} " in ast.get_docstring(ast.parse(path.read_text()))
-
-
 def test_the_profile_of_a_step_adds_up_kernels_by_name():
     kernels = {
         "void gs::cuda::(anonymous namespace)::blend_kernel<true>(int const*, gs::BlendInput<float>)": 3.0,
         "void gs::cuda::(anonymous namespace)::blend_kernel<false>(int const*, gs::BlendInput<float>)": 2.0,
-        "void at::native::vectorized_elementwise_kernel<4, at::native::FillFunctor<float>>(int)": 1.0,
         "Memcpy HtoD (Pinned -> Device)": 4.0,
     }
     run = {"kernels": kernels, "counts": dict.fromkeys(kernels, 1.5)}
-    sums = step_profile._by_name(run)
-    assert sums["blend_kernel"] == (5.0, 3.0) and sums["vectorized_elementwise_kernel"] == (1.0, 1.5)
-    assert step_profile._kernels(run) == 6.0  # a copy from the host runs beside the kernels
+    assert step_profile.by_name(run)["blend_kernel"] == (5.0, 3.0)
+    assert step_profile.kernels_of(run) == 5.0  # a copy from the host runs beside the kernels
 
 
-def test_the_page_on_scaling_has_the_tables_of_the_model():
-    page = (BENCHMARKS.parent / "docs" / "inside" / "scaling.md").read_text(encoding="utf-8")
-    for name, lines in scaling_model.tables().items():
-        assert f"<!-- begin {name} -->" in page
-        assert replace_tables(page, name, lines) == page, name
+def test_runs_of_a_seed_are_compared(capsys):
+    run = {"seconds": 1.0, "process": 2.0, "PSNR": 30.0, "SSIM": 0.9, "Gaussians": 1000, "bytes": 9}
+    runs = [run | {"seed": seed, "ranks": ranks, "hash": f"{seed}"} for seed in (0, 1) for ranks in (1, 2)]
+    training.print_runs([*runs, runs[0] | {"hash": "other"}])
+    said = capsys.readouterr().out
+    assert said.endswith("seed 0, 3 runs: the PLYs are DIFFERENT\nseed 1, 2 runs: the PLYs are the same\n")
+    assert _rows(said, "mean")[1][1:3] == ["2", "1.0 (0.0)"]
 
 
-def test_the_model_of_scaling_sends_the_bytes_of_the_code():
-    projected = Stages(frustum(9, 40, 27, 4.0)).calls["project"]()
-    sizes = [tensor[:1].nbytes for tensor in projected]
-    assert sum(sizes[:4]) == scaling_model.RECORD
-    assert sum(sizes) == scaling_model.PROJECTED
+SMALL = {"gaussians": 1000, "size": (64, 40)}
 
 
-def test_the_model_of_scaling_agrees_with_stages_that_were_measured():
-    """M+, L and XL of docs/results/kernels.md: project, bin, blend, blend_vjp."""
-    measured = {
-        (1e6, 4.41e6, 1.68e6): (0.112, 0.270, 0.295, 0.665),
-        (3e6, 10.03e6, 2.22e6): (0.287, 0.569, 0.346, 0.816),
-        (6e6, 17.25e6, 2.69e6): (0.544, 0.985, 0.388, 0.953),
-    }
-    for (n, instances, processed), wanted in measured.items():
-        parts = scaling_model.stages(n, n, n, instances, processed, 1600 * 1060)
-        got = [parts[name] for name in ("project", "bin", "blend", "blend_vjp")]
-        assert got == pytest.approx(wanted, rel=0.02)
+@pytest.mark.parametrize("name", ["XL", "city"])
+def test_ranks_draw_together_what_one_process_draws(name, monkeypatch):
+    monkeypatch.setattr(workload, "_PIECE", 300)
+    scene = workload.ALL[name].changed(**SMALL)
+    whole = scene.rows(0, 1, torch.device("cpu"))
+    parts = [scene.rows(rank, 3, torch.device("cpu")) for rank in range(3)]
+    for attribute, values in whole.items():
+        assert len(values) == 1000 and torch.equal(torch.cat([part[attribute] for part in parts]), values)
 
 
-def test_two_ranks_send_each_other_half_of_what_a_view_sees():
-    scene = scaling_model.Workload("", 100, 80, 200, 90, 60, 32, 64, rows=1.0)
-    sent = scaling_model.tiles_traffic(scene, 2)
-    photo = 3 * 32 * 64 / 2
-    assert sent == {"records": 64 * 20, "image": 2 * 10 * 32 * 12, "rows": 40 * 15, "counts": 4 * 20, "photo": photo}
-    whole = scaling_model.tiles_traffic(scene, 2, scaling_model.WHOLE_IMAGE)
-    assert whole == sent | {"image": 12 * 32 * 64 / 2}
-    assert scaling_model.tiles_traffic(scene, 1) == dict.fromkeys(sent, 0)
+def test_steps_of_ranks_and_of_a_spilled_model_stand_beside_those_of_one_process(monkeypatch, capsys):
+    words = ["--size", "64", "40", "--rounds", "1", "--warm_up", "2", "--blocks", "2"]
+    words += ["--workload", "city", "--gaussians", "1000", "--crop", "2"]
+    monkeypatch.setattr(sys, "argv", ["steps", "--ranks", "1", "2", "--parallel", "views", *words])
+    steps.main()
+    rows = _rows(capsys.readouterr().out, "city")
+    assert [row[1:4] for row in rows] == [["1", "", "gpu"], ["2", "views", "gpu"]]
+    assert rows[0][7] == "1.00" and float(rows[1][7]) > 0
+    monkeypatch.setattr(sys, "argv", ["steps", "--model", "gpu", "spill", "--learn", *words])
+    steps.main()
+    rows = _rows(capsys.readouterr().out, "city")
+    assert rows[0][-1] == rows[1][-1] != ""
 
 
-def test_two_builds_take_turns(monkeypatch, capsys):
-    folder = str(Path(diff_gaussian_rasterization.__file__).parents[1])
-    words = ["builds", folder, folder, "--device", "cpu", "--workloads", "S", "--starts", "1", "--rounds", "1"]
-    monkeypatch.setattr(sys, "argv", words)
-    builds.main()
-    rows = [line.split("|")[1:-1] for line in capsys.readouterr().out.splitlines() if line.startswith("| S ")]
-    assert [row[1].strip() for row in rows] == list(builds.STEPS)
-    assert all(0.2 < float(row[4]) < 5 and float(row[2]) > 0.05 for row in rows)
+def test_bytes_of_a_gaussian_are_those_of_a_line():
+    def found(millions: int, mib: float) -> dict:
+        own = {"ms": [1.0], "peak": mib, "last": 2 * mib, "digest": "", "memory": 2**40}
+        case = {"workload": "city", "ranks": 1, "parallel": "tiles", "model": "gpu", "learn": False}
+        return case | {"name": "", "gaussians": millions * 2**20, "by_rank": [own]}
+
+    said = steps.bytes_each([found(1, 1000), found(3, 2000), found(2, 9999)])
+    assert said[0].startswith("city, 1 ranks,  gpu: 500 bytes a Gaussian before the last step, so 2")
+    assert said[1].startswith("city, 1 ranks,  gpu: 1000 bytes a Gaussian in the last step, so 1")
+
+
+def test_error_is_of_the_largest_reference_value():
+    assert oracle.error(*torch.tensor([[1.0, 2.5, -4.0], [1.0, 2.0, -5.0]]).double()) == (0.2, 0.1)
+
+
+def test_runs_agree_with_the_oracle_and_are_reported_and_drawn(monkeypatch, capsys, tmp_path):
+    monkeypatch.setattr(oracle, "KINDS", {k: partial(v, 40, 30, 20) for k, v in oracle.KINDS.items()})
+    assert {kernel.name for kernel in (CPU_FLOAT, CPU_DOUBLE, CUDA_FLOAT)} == figure.COLORS.keys()
+    assert oracle.TIMED_SIZES.keys() == oracle.KINDS.keys()
+    records, runs = oracle.measure(times=False)
+    for record in records:
+        bound = 1e-6 if record["kernel"] == "CPU float64" else 1e-3  # far from both, so that a mix-up shows
+        assert {name for name, (largest, median) in record["errors"].items() if not median <= largest < bound} == set()
+    assert max(record["errors"]["color"][0] for record in records if "float32" in record["kernel"]) > 1e-8
+    oracle.print_errors(records)
+    said = capsys.readouterr().out
+    assert said.count("| d screen mean ") == 2 and "ordinary, CPU float64" in said
+    # Without a GPU the double kernel replaces it, so that every ratio is zero; then the float kernel.
+    for kernel, ratio in ((CPU_DOUBLE, "0.00"), (CPU_FLOAT, "1.00")):
+        oracle.print_ratios(runs | {(case, CUDA_FLOAT): runs[case, kernel] for case in oracle.CASES})
+        assert f"where either error exceeds 1e-06: {ratio} (at most 3 wanted)" in capsys.readouterr().out
+    pytest.importorskip("matplotlib")
+    measured = {"machines": ["a machine"], "timed sizes": oracle.TIMED_SIZES}
+    figure.draw(measured | {"records": [r | {"milliseconds": 70.0} for r in records]}, tmp_path / "accuracy.png")
+    with Image.open(tmp_path / "accuracy.png") as image:
+        assert image.size == (1650, 1100)
+
+
+def _run(*points: tuple[float, float], whole: bool = True) -> dict:
+    """A training with a curve of seconds and PSNR."""
+    curve = [{"iteration": 1, "seconds": x, "gaussians": 9, "test_psnr": y, "whole": whole} for x, y in points]
+    return {"end": curve[-1], "curve": curve, "ply_bytes": 1}
+
+
+def _file(sets: dict[str, dict[str, dict | None]], scene: str = "a", **options: list[str]) -> dict:
+    return {"machine": "m", "sets": {name: [] for name in sets} | options, "scenes": {scene: sets}}
+
+
+def test_a_curve_between_its_points():
+    curve = [*_run((1, 20), (3, 24))["curve"], *_run((2, 99), whole=False)["curve"]]
+    assert [at(curve, seconds) for seconds in (0.5, 2, 9)] == [-math.inf, pytest.approx(22), 24]
+
+
+def test_files_of_trainings_are_joined():
+    ended = _file({"adc": {"0": _run((1, 20)), "1": None}})
+    failed = _file({"adc": {"0": None, "1": _run((1, 21))}})
+    for files in ([ended, failed], [failed, ended]):
+        found = joined(json.loads(json.dumps(files)))["scenes"]["a"]["adc"]
+        assert {seed: run["end"]["test_psnr"] for seed, run in found.items()} == {"0": 20, "1": 21}
+    with pytest.raises(UserError, match="set adc has other options"):
+        joined([_file({"adc": {}}), _file({"adc": {}}, adc=["--iterations", "7000"])])
+
+
+def test_a_figure_of_whatever_trainings_there_are(tmp_path, monkeypatch):
+    drawn = []
+    monkeypatch.setattr(
+        "matplotlib.figure.Figure.savefig", lambda figure, path, **_: drawn.append(figure) or path.touch()
+    )
+    many = {f"set{number}": {"0": _run((1, 20), (5, 20 + number))} for number in range(11)}
+    clock = {"5s": {"0": _run((5, 30)), "1": _run((5, 31))}, "9s": {"0": None}}
+    files = [
+        _file(many | clock, **dict.fromkeys(clock, ["--strategy", "mcmc", "--time_budget", "5"])),
+        _file({"set0": {"0": _run((2, 18))}, "set1": {"0": _run((2, 18), whole=False)}}, "b"),
+        _file({"set0": {"0": None}}, "nothing"),
+        _file({"set0": {"0": _run((1, 10), (2, 11)), "1": _run((4, 10), (5, 11))}}, "c"),  # at no time both
+    ]
+    draw(joined(files), tmp_path / "figure.png", ["set10"])
+    panels = drawn[0].axes
+    assert [panel.get_title() for panel in panels] == ["a", "b", "c", ""]
+    assert panels[0].get_legend_handles_labels()[1] == [*(f"set{number}" for number in range(10)), "mcmc by the clock"]
+    assert (tmp_path / "figure.png").exists()
+    with pytest.raises(UserError, match="no training is left"):
+        draw(joined([_file({"adc": {"0": _run((1, 20))}})]), tmp_path / "none.png", ["adc"])
+    assert not (tmp_path / "none.png").exists()

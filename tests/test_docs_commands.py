@@ -16,14 +16,11 @@ COMMANDS = sorted({command for page in PAGES for command in commands(page)})
 PROGRAMS = sorted({command.program for command in COMMANDS})
 # Programs that hand words which they do not know to train.py.
 FORWARDING = (
-    "benchmarks.kernels.host_ops",
-    "benchmarks.scenes.camera_models",
     "benchmarks.scenes.step_profile",
     "benchmarks.scenes.training",
-    "benchmarks.viewing.share",
 )
 # Flags of other programs.
-FOREIGN = {"--peers", "--eval_steps", "--save_steps", "--nnodes", "--shutdown_timeout"}
+FOREIGN = {"--eval_steps", "--save_steps", "--nnodes", "--shutdown_timeout"}
 
 
 @functools.cache

@@ -28,10 +28,6 @@ def _worse(found: list[dict[str, float]]) -> list[str]:
     return [row.name for row in judge_quality("a", STORED, found) if not row.passed]
 
 
-def test_the_same_numbers_pass():
-    assert _worse(_found()) == [] and _worse(STORED) == []
-
-
 @pytest.mark.parametrize(
     ("name", "just_passes", "just_fails"),
     [
@@ -47,11 +43,8 @@ def test_three_deviations_are_allowed(name, just_passes, just_fails):
     assert _worse(_found(**{name: just_fails})) == [name]
 
 
-def test_better_is_never_worse():
+def test_better_passes_and_what_is_not_a_number_does_not():
     assert _worse(_found(PSNR=40.0, SSIM=0.99, Gaussians=10, bytes=620)) == []
-
-
-def test_what_is_not_a_number_does_not_pass():
     assert _worse(_found(PSNR=math.nan)) == ["PSNR"]
     assert not judge_time("a", [(math.nan, 1.0)]).passed
 
@@ -71,20 +64,6 @@ def test_time_may_rise_by_a_tenth(pairs, ratio, passed):
     assert (round(row.found, 4), row.passed) == (ratio, passed)
 
 
-def test_the_table_names_what_is_worse():
-    (row, *_) = judge_quality("a", STORED, _found(PSNR=29.0))
-    assert row.cells() == ["a", "PSNR", "30.000", "29.000", "-1.000", "0.474", "WORSE"]
-
-
-def test_a_baseline_is_kept_by_kind(tmp_path):
-    path = tmp_path / "gate.json"
-    baseline.write_baseline(path, "CPU one", RECORD)
-    baseline.write_baseline(path, "GPU two", RECORD | {"commit": "b" * 40})
-    baseline.write_baseline(path, "GPU two", RECORD | {"commit": "c" * 40})
-    read = {kind: baseline.read_baseline(path, kind, ["b", "a", "c"], 1000) for kind in ("CPU one", "GPU two")}
-    assert read == {"CPU one": RECORD, "GPU two": RECORD | {"commit": "c" * 40}}
-
-
 def test_scenes_of_one_commit_are_kept_together(tmp_path):
     path = tmp_path / "gate.json"
     more = RECORD | {"scenes": {"d": STORED}}
@@ -102,12 +81,10 @@ def test_scenes_of_one_commit_are_kept_together(tmp_path):
     [
         (None, "abc", 1000, "has no baseline of this kind of machine"),
         ("{", "abc", 1000, "is not JSON"),
-        ("[]", "abc", 1000, "has no baseline of this kind of machine"),
         (json.dumps({"other": RECORD}), "abc", 1000, "has no baseline of this kind of machine"),
         (json.dumps({"kind": RECORD}), "abd", 1000, "is of a, b, c at 1000 iterations, not of a, b, d at 1000"),
         (json.dumps({"kind": RECORD}), "abc", 30, "is of a, b, c at 1000 iterations, not of a, b, c at 30"),
         (json.dumps({"kind": RECORD | {"commit": "--output=x"}}), "abc", 1000, "broken baseline"),
-        (json.dumps({"kind": RECORD | {"scenes": {"a": STORED[:1]}}}), "a", 1000, "broken baseline"),
         (json.dumps({"kind": RECORD | {"scenes": {"a": [{"PSNR": 1.0}] * 2}}}), "a", 1000, "broken baseline"),
     ],
 )

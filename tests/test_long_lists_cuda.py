@@ -1,5 +1,6 @@
 """Lists that several blocks of a GPU share. These wait for each other, so each test has a process and a deadline."""
 
+import math
 import subprocess
 import sys
 from pathlib import Path
@@ -10,7 +11,7 @@ from diff_gaussian_rasterization.schema import GRADIENTS
 from rasterizer_tools import GPU_MARKS, error, scene_arguments
 from torch import Tensor
 
-from benchmarks.workloads.splat_scenes import PARAMETERS, heap, on_device, settings
+from benchmarks.workloads.splat_scenes import FOV, PARAMETERS, SplatScene, on_device, settings
 
 pytestmark = [*GPU_MARKS]
 OPS = torch.ops.diff_gaussian_rasterization
@@ -23,6 +24,30 @@ import utils.host.openmp
 import test_long_lists_cuda
 """
 WANTED = [name in (*PARAMETERS, "means2d") for name in GRADIENTS]
+
+
+def heap(
+    n: int = 200_000, width: int = 400, height: int = 400, seed: int = 0, device: torch.device | str = "cpu"
+) -> SplatScene:
+    """Draw small Gaussians in a cube that covers the middle of the image, densest at its centre, as of an object.
+
+    Some tiles have lists of thousands, most have few or none. With the default numbers, the longest has some 7,100, of
+    which half are processed; of all instances 92 % are. The median size is 1.2 px.
+    """
+    g = torch.Generator().manual_seed(seed)  # the same on every device
+    uniform = 2 * torch.rand(n, 3, generator=g) - 1
+    means = 1.2 * uniform.sign() * uniform.abs() ** 1.3 + torch.tensor([0.0, 0.0, 4.2])
+    focal = width / (2 * math.tan(FOV / 2))
+    size = torch.log(1.2 * means[:, 2] / focal) + 0.6 * torch.randn(n, generator=g)
+    parameters = {
+        "means": means,
+        "opacities": 1.2 * torch.randn(n, 1, generator=g) - 3,
+        "scales": size[:, None] + (torch.rand(n, 3, generator=g) - 0.5) * math.log(5.0),
+        "rotations": torch.randn(n, 4, generator=g),
+        "sh_dc": 0.8 * torch.randn(n, 1, 3, generator=g),
+        "sh_rest": 0.1 * torch.randn(n, 15, 3, generator=g),
+    }
+    return SplatScene(parameters, width, height).to(device)
 
 
 class View:

@@ -7,11 +7,11 @@ import numpy as np
 import pycolmap
 import pytest
 import torch
+from lenses import DISTORTED, DISTORTIONS, colmap_camera, make_lens
 from PIL import Image
 from synthetic import FakeGaussians, folder_state, make_colmap_scene
 from test_colmap_scene import _options, _read
 
-from benchmarks.workloads.lenses import DISTORTED, DISTORTIONS, colmap_camera, make_lens
 from scene import Scene
 from scene.pictures.lens import WIDEST, Lens, pinhole_of, shown_pixels, undistortion
 from scene.pictures.masks import TRANSPARENT, Mask

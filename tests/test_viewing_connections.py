@@ -13,12 +13,12 @@ import pytest
 viser = pytest.importorskip("viser", reason="viser is not installed: pip install '.[viewer]'")
 
 import msgspec  # noqa: E402
+from viser_client import Client  # noqa: E402
 from waiting import LIMIT, wait_for  # noqa: E402
 from websockets.asyncio.server import serve  # noqa: E402
 from websockets.exceptions import ConnectionClosed  # noqa: E402
 from websockets.sync.client import connect  # noqa: E402
 
-from benchmarks.workloads.viser_client import Client  # noqa: E402
 from viewing import connections  # noqa: E402
 from viewing import server as servers  # noqa: E402
 from viewing.connections import is_wanted  # noqa: E402

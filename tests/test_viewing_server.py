@@ -19,11 +19,11 @@ from synthetic import make_colmap_scene
 
 viser = pytest.importorskip("viser", reason="viser is not installed: pip install '.[viewer]'")
 
+from viser_client import Client  # noqa: E402
 from waiting import LIMIT, wait_for  # noqa: E402
 from websockets.exceptions import InvalidStatus  # noqa: E402
 
 from arguments import ModelParams  # noqa: E402
-from benchmarks.workloads.viser_client import Client  # noqa: E402
 from scene import Scene  # noqa: E402
 from utils.system_utils import UserError  # noqa: E402
 from viewing import server as servers  # noqa: E402

@@ -14,10 +14,10 @@ import pytest
 pytest.importorskip("viser", reason="viser is not installed: pip install '.[viewer]'")
 
 from rasterizer_tools import CPU_AND_GPU  # noqa: E402
+from viser_client import Client  # noqa: E402
 from waiting import wait_for  # noqa: E402
 
 import train  # noqa: E402
-from benchmarks.workloads.viser_client import Client  # noqa: E402
 from scene.gaussians.checkpoint import load_checkpoint  # noqa: E402
 from training.observers import page as observed  # noqa: E402
 from utils.system_utils import UserError  # noqa: E402

@@ -4,15 +4,15 @@ python -m benchmarks.accuracy.figure accuracy.json docs/accuracy.png
 """
 
 import argparse
-import importlib.util
 import json
 from pathlib import Path
 
-from utils.system_utils import UserError, atomic_write, run_cli
+from benchmarks.harness.environment import require_matplotlib
+from utils.system_utils import atomic_write, run_cli
 
 COLORS = {"CPU float32": "tab:blue", "CPU float64": "tab:green", "CUDA float32": "tab:red"}
 MARKERS = {
-    "image": "o",
+    "color": "o",
     "d means": "s",
     "d opacities": "D",
     "d scales": "^",
@@ -21,14 +21,6 @@ MARKERS = {
     "d sh_rest": ">",
     "d screen mean": "h",
 }
-
-
-def require_matplotlib() -> None:
-    """Raise UserError if matplotlib is missing."""
-    if importlib.util.find_spec("matplotlib") is None:
-        raise UserError(
-            "drawing needs matplotlib: `pip install matplotlib`, or use --json here and draw on another machine"
-        )
 
 
 def draw(measured: dict, path: Path) -> None:
@@ -58,14 +50,8 @@ def draw(measured: dict, path: Path) -> None:
         panel.set_xlabel(f"ms, forward + backward, {splats:,} splats at {width}x{height}")
     kernels = dict.fromkeys(r["kernel"] for r in records)
     handles = [Line2D([], [], color=COLORS[kernel], linewidth=4, label=kernel) for kernel in kernels]
-    handles += [
-        Line2D([], [], color="gray", marker="o", linestyle="", label="fast exponential"),
-        Line2D([], [], color="gray", marker="o", markerfacecolor="white", linestyle="", label="exact exponential"),
-        Line2D([], [], color="gray", marker="_", linestyle="", label="median, unless 0 (above it: largest)"),
-    ]
-    handles += [
-        Line2D([], [], color="black", marker=marker, linestyle="", label=name) for name, marker in MARKERS.items()
-    ]
+    handles.append(Line2D([], [], color="gray", marker="_", linestyle="", label="median, unless 0 (above it: largest)"))
+    handles += [Line2D([], [], color="black", marker=mark, linestyle="", label=name) for name, mark in MARKERS.items()]
     figure.legend(handles=handles, loc="outside lower center", ncols=7)
     figure.suptitle("Error against run time of the rasterizer\n" + "\n".join(measured["machines"]), fontsize=10)
     with atomic_write(path) as temporary:
@@ -78,14 +64,13 @@ def _draw_record(panel, record: dict, apart: float) -> None:
     apart: ratio of the positions of neighbours on the logarithmic axis.
     """
     color = COLORS[record["kernel"]]
-    face = color if record["exponential"] == "fast" else "white"
     for i, (name, marker) in enumerate(MARKERS.items()):
         x = record["milliseconds"] * apart ** (i - (len(MARKERS) - 1) / 2)
         largest, median = record["errors"][name]
         if median > 0:
             panel.plot([x, x], [median, largest], color=color, linewidth=0.6, alpha=0.5)
             panel.plot(x, median, marker="_", color=color, markersize=5)
-        panel.plot(x, largest, marker=marker, color=color, markerfacecolor=face, markersize=5, linestyle="")
+        panel.plot(x, largest, marker=marker, color=color, markersize=5, linestyle="")
 
 
 def main() -> None:

@@ -1,6 +1,6 @@
 """Figure of error and milliseconds against condition: axis ratio, length in pixels, depth.
 
-    python -m benchmarks.accuracy.stability_figure docs/stability.png [--json FILE]
+    python -m benchmarks.accuracy.stability_figure docs/stability.png
 
 Ours and the textbook's formulas (workloads/textbook.py), in float32 and float64, on stiff Gaussians among ordinary
 ones. Errors are those of benchmarks.accuracy.stability: of the stiff part, the worst of the planes and the worst of all
@@ -10,7 +10,6 @@ on 75 x 53 px, so they are mostly overhead, and show whether a stiff case costs 
 """
 
 import argparse
-import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
@@ -18,11 +17,10 @@ from typing import NamedTuple
 import torch
 from tqdm import tqdm
 
-from benchmarks.accuracy.figure import require_matplotlib
-from benchmarks.accuracy.stability import CPU_DOUBLE, CPU_FLOAT, TEXTBOOK, Judged, Result
-from benchmarks.harness.environment import describe
+from benchmarks.accuracy.runs import CPU_DOUBLE, CPU_FLOAT, TEXTBOOK
+from benchmarks.accuracy.stability import ROUNDING, Judged, Result
+from benchmarks.harness.environment import describe, require_matplotlib
 from benchmarks.workloads.stability_cases import PLAIN, Case, Problem, at_depths, needles, needles_of
-from utils.files.json_files import write_json
 from utils.system_utils import atomic_write, run_cli
 
 TEXTBOOK_DOUBLE = TEXTBOOK._replace(name="textbook float64", dtype=torch.float64)
@@ -32,7 +30,7 @@ STYLES = {
     CPU_DOUBLE.name: {"color": "#0072B2", "marker": "o", "linestyle": "--", "markerfacecolor": "white"},
     TEXTBOOK.name: {"color": "#D55E00", "marker": "s"},
     TEXTBOOK_DOUBLE.name: {"color": "#D55E00", "marker": "s", "linestyle": "--", "markerfacecolor": "white"},
-    "one rounding": {"color": "gray", "linewidth": 3, "alpha": 0.4},
+    ROUNDING: {"color": "gray", "linewidth": 3, "alpha": 0.4},
 }
 ROWS = {"image": "error of the image", "gradients": "error of the gradients", "milliseconds": "ms, forward + backward"}
 
@@ -67,7 +65,7 @@ def measure(sweep: Sweep) -> list[dict]:
     points = []
     for value in tqdm(sweep.values, desc=sweep.name, leave=False):
         judged = Judged(Case("sweep", f"{sweep.name} {value}", sweep.make(value), PLAIN, cut=sweep.cut(value)))
-        point: dict = {"value": value, "one rounding": _numbers(judged.one_rounding())}
+        point: dict = {"value": value, ROUNDING: _numbers(judged.one_rounding())}
         for backend in BACKENDS:
             point[backend.name] = _numbers(judged.result(backend)) | {"milliseconds": judged.milliseconds(backend)}
         points.append(point)
@@ -80,7 +78,7 @@ def draw(path: Path, measured: dict[str, list[dict]], title: str) -> None:
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(14, 11), layout="constrained")
-    panels = figure.subplots(len(ROWS), len(measured), sharex="col", sharey="row")
+    panels = figure.subplots(len(ROWS), len(measured), sharex="col", sharey="row", squeeze=False)
     for column, (name, points) in enumerate(measured.items()):
         for row, (key, label) in enumerate(ROWS.items()):
             panel = panels[row][column]
@@ -101,25 +99,15 @@ def draw(path: Path, measured: dict[str, list[dict]], title: str) -> None:
         figure.savefig(temporary, dpi=100, metadata={"Software": None})
 
 
-def _plain(value: object) -> object:
-    if isinstance(value, dict):
-        return {name: _plain(part) for name, part in value.items()}
-    return "inf" if isinstance(value, float) and not math.isfinite(value) else value
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("figure", type=Path, help="image file to write")
-    parser.add_argument("--json", type=Path, help="also write the numbers to this file (default: none)")
     args = parser.parse_args()
     require_matplotlib()
     machine = describe()
     print(machine)
     measured = {sweep.name: measure(sweep) for sweep in SWEEPS}
     draw(args.figure, measured, machine)
-    if args.json:
-        points = {name: {"points": [_plain(point) for point in line]} for name, line in measured.items()}
-        write_json(args.json, {"machine": machine, "sweeps": points})
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """Sizes of a model in each file format, seconds to write it, and what the format loses.
 
-    python -m benchmarks.exports.sizes MODEL.ply [--write docs/guide/exports.md]
+    python -m benchmarks.exports.sizes MODEL.ply
 
 The loss is the PSNR between renders of the model and of what is read back from the file: one mean squared error over 5
 views around the model's middle, float32 and unrounded. Those of a format without SH bands change with the view.
@@ -16,8 +16,7 @@ from torch import Tensor
 
 from arguments import OptionParser, PipelineParams
 from benchmarks.exports.read_back import read_back
-from benchmarks.harness.environment import describe, print_table, table
-from benchmarks.harness.page import check_marks, write_tables
+from benchmarks.harness.environment import describe, print_table
 from benchmarks.workloads.orbit import orbit
 from exports.formats import FORMATS
 from exports.of_model import model_of
@@ -28,7 +27,6 @@ from gaussian_renderer import render
 from scene.cameras import MiniCam
 from utils.system_utils import UserError, compute_device, run_cli
 
-PART = "sizes"  # of the page
 VIEWS, SIDE = 5, 256
 
 
@@ -80,16 +78,11 @@ def measure(model: Path) -> list[list[str]]:
 def main() -> None:
     parser = OptionParser(description=__doc__.splitlines()[0])
     parser.add_argument("model", type=Path, help="model in a file that export.py --ply reads")
-    parser.add_argument("--write", type=Path, metavar="PAGE", help="write the table into this page (default: none)")
     args = parser.parse_args()
-    if args.write:
-        check_marks(args.write, PART)
     header = ["format", "bytes a Gaussian", "of the PLY", "seconds", "dB to the model"]
     rows = measure(args.model)
     print(describe(compute_device()))
     print_table(header, rows)
-    if args.write:
-        write_tables(args.write, PART, [describe(compute_device()), "", *table(header, rows)])
 
 
 if __name__ == "__main__":

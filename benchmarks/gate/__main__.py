@@ -71,9 +71,7 @@ def main() -> None:
     """Run the command line. Exit status 1 if something is worse."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0], allow_abbrev=False)
     parser.add_argument("--write", action="store_true", help="store the numbers of this commit instead of comparing")
-    parser.add_argument(
-        "--baseline", type=Path, default=FILE, help="the stored numbers (default: benchmarks/gate.json)"
-    )
+    parser.add_argument("--baseline", type=Path, default=FILE, help="stored numbers (default: benchmarks/gate.json)")
     parser.add_argument("--iterations", type=int, help="of each training (default: 1000, on a GPU 7000)")
     args = parser.parse_args()
     device = compute_device()

@@ -1,21 +1,22 @@
 """The rasterizer's calls on one scene, as training makes them, for timing."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
+import fused_ssim  # noqa: F401  (registers its operators)
 import torch
-from diff_gaussian_rasterization import Gaussians, rasterize
+from diff_gaussian_rasterization import GaussianRasterizationSettings, Gaussians, rasterize
 from diff_gaussian_rasterization.ops import scene_arguments
-from diff_gaussian_rasterization.optim import adam_
 from diff_gaussian_rasterization.schema import GRADIENTS
 from torch import Tensor
 
 from benchmarks.workloads.splat_scenes import PARAMETERS, SplatScene
 
 OPS = torch.ops.diff_gaussian_rasterization
+TILE = 16  # pixels
 
 
 class Calls:
-    """Forward alone, with backward, and with a dense Adam step, on raw parameters as in training."""
+    """Forward alone, with backward, and a step of training, on raw parameters as in training."""
 
     def __init__(self, scene: SplatScene, dtype: torch.dtype = torch.float32, antialiasing: bool = False) -> None:
         self.scene = scene
@@ -23,7 +24,7 @@ class Calls:
         self.settings = scene.settings(dtype, antialiasing=antialiasing)
         self.means2d = torch.zeros_like(self.leaves["means"], requires_grad=True)
         self.gradient = image_gradient(scene).to(dtype)
-        self._moments: list[list[Tensor]] = []
+        self._training: TrainingStep | None = None
 
     def render(self) -> Tensor:
         """Return the image, (3, H, W)."""
@@ -40,15 +41,10 @@ class Calls:
         self.render().backward(self.gradient)
 
     def step(self) -> None:
-        """Do a step with learning rate 0, which has the arithmetic of a step but leaves the scene as it was."""
-        self.with_backward()
-        if not self._moments:
-            self._moments = [[torch.zeros_like(t) for t in self.leaves.values()] for _ in range(2)]
-        values = list(self.leaves.values())
-        counters, n = [torch.zeros(()) for _ in values], len(values)
-        with torch.no_grad():
-            gradients = [t.grad for t in values]
-            adam_(values, gradients, *self._moments, counters, [0.0] * n, 0.9, 0.999, 1e-15, [-1] * n)
+        """Do a step of training, which leaves the scene as it was."""
+        if self._training is None:
+            self._training = TrainingStep(self.scene)
+        self._training.take(self.settings)
 
     def clear(self) -> None:
         """Drop the gradients, as zero_grad(set_to_none=True) does."""
@@ -57,6 +53,53 @@ class Calls:
 
     def steps(self) -> dict[str, Callable[[], object]]:
         return {"forward": self.forward, "+ backward": self.with_backward, "step": self.step}
+
+
+class TrainingStep:
+    """Forward, L1 + D-SSIM against a random photo, and the backward with Adam and statistics, as training takes it.
+
+    Learning rates are 0, so that every step meets the same Gaussians.
+    """
+
+    @torch.no_grad()
+    def __init__(self, scene: SplatScene) -> None:
+        self._gaussians = {name: scene.parameters[name] for name in PARAMETERS}
+        values, device = self._gaussians.values(), scene.parameters["means"].device
+        generator = torch.Generator().manual_seed(1)
+        self._photo = torch.rand(3, scene.height, scene.width, generator=generator).to(device)
+        averages = [[torch.full_like(value, 1e-6) for value in values] for _ in range(2)]
+        self._adam = *averages, [torch.zeros(()) for _ in range(6)], [0.0] * 6, 0.9, 0.999, 1e-15, [-1] * 6
+        self._statistics = [torch.zeros(len(scene.parameters["means"]), device=device) for _ in range(3)]
+        self._one = torch.ones((), device=device)
+
+    @torch.no_grad()
+    def take(self, camera: GaussianRasterizationSettings) -> Tensor:
+        """Take the step of a view. Returns the tiles of each Gaussian."""
+        scene = scene_arguments(Gaussians(**self._gaussians), camera, True)
+        out = OPS.rasterize(None, *scene, camera.bg, False, True)
+        color, transmittance, _, radii, splats, tiles, *lists, last, layers = out
+        _, _, kept = torch.ops.fused_ssim.photometric(color, self._photo, 0.2, True)
+        gradient = torch.ops.fused_ssim.photometric_vjp(color, self._photo, kept, 0.2, self._one)
+        state = splats, *lists, camera.bg, last, transmittance, gradient, None, None, tiles, layers, radii
+        OPS.rasterize_vjp_step_(*scene, *state, list(range(6)), *self._adam, False, *self._statistics)
+        return tiles
+
+
+# Of a training step: kernels that begin a stage, and those behind which another one begins.
+BEGINS = {"project_kernel": "project", "blend_kernel": "blend", "blend_chunks_kernel": "blend"}
+BEGINS |= {"l1_ssim_kernel": "loss", "project_vjp_kernel": "step"}
+FOLLOWING = {"project_kernel": "bin", "l1_ssim_vjp_kernel": "blend_vjp"}
+STAGES = ("project", "bin", "blend", "loss", "blend_vjp", "step")
+
+
+def by_stage(launched: Iterable[tuple[str, float]]) -> list[tuple[str, str, float]]:
+    """Return stage, name and time of each kernel of training steps."""
+    stage, result = "project", []
+    for name, milliseconds in launched:
+        stage = BEGINS.get(name, stage)
+        result.append((stage, name, milliseconds))
+        stage = FOLLOWING.get(name, stage)
+    return result
 
 
 class Stages:
@@ -76,6 +119,9 @@ class Stages:
         state = (self.splats, self.instances, self.ranges, *slots, settings.bg, self.last)
         state += (transmittance, image_gradient(scene), None, None)
         moments = OPS.blend_vjp(*state)
+        padded = torch.nn.functional.pad(self.last, (0, -scene.width % TILE, 0, -scene.height % TILE))
+        # Of each tile, the instances up to the last one that a pixel blends.
+        self.processed = int(padded.unfold(0, TILE, TILE).unfold(1, TILE, TILE).amax((2, 3)).sum())
         self.calls: dict[str, Callable[[], object]] = {
             "project": lambda: OPS.project(*arguments),
             "bin": lambda: OPS.bin(*projected[:4], *size, True),

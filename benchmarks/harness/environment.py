@@ -1,11 +1,14 @@
-"""Description of the machine for the head of a table, and printing of tables."""
+"""Device and description of the machine, for the head of a table, and printing of tables."""
 
+import argparse
+import importlib.util
 import platform
 
 import torch
 
 from utils.files.markdown_table import markdown_table
 from utils.host.machine import commit, cpu_name, gpu_name, instruction_set
+from utils.system_utils import UserError, compute_device
 
 
 def describe(device: torch.device | str = "cpu") -> str:
@@ -17,11 +20,25 @@ def describe(device: torch.device | str = "cpu") -> str:
     return f"{cpu_name()}, {torch.get_num_threads()} threads, {instruction_set()}, {python}, commit {commit()}"
 
 
-def table(header: list[str], rows: list[list[str]]) -> list[str]:
-    """Return the lines of a Markdown table with every column aligned to the left."""
-    return markdown_table(header, rows, right=False).splitlines()
-
-
 def print_table(header: list[str], rows: list[list[str]]) -> None:
-    """Print the lines of `table`."""
-    print("\n".join(table(header, rows)))
+    """Print a Markdown table with every column aligned to the left."""
+    print(markdown_table(header, rows, right=False).rstrip("\n"), flush=True)
+
+
+def add_device(parser: argparse.ArgumentParser) -> None:
+    """Add --device, which `chosen_device` reads."""
+    parser.add_argument("--device", choices=["cpu", "cuda"], help="default: cuda if there is a GPU and CUDA kernels")
+
+
+def chosen_device(args: argparse.Namespace) -> str:
+    """Return "cpu" or "cuda"; UserError if a GPU is asked for and none can be used."""
+    found = compute_device().type
+    if args.device == "cuda" and found != "cuda":
+        raise UserError("--device cuda needs a visible GPU and the rasterizer built with CUDA (GS_CUDA=1)")
+    return args.device or found
+
+
+def require_matplotlib() -> None:
+    """Raise UserError if matplotlib is missing."""
+    if importlib.util.find_spec("matplotlib") is None:
+        raise UserError("drawing needs matplotlib: pip install matplotlib, or draw on another machine")

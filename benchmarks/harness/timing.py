@@ -8,21 +8,10 @@ from dataclasses import dataclass
 
 import torch
 from torch.autograd import DeviceType
-from torch.autograd.profiler_util import FunctionEvent
 from torch.profiler import ProfilerActivity, profile
 
 WARM_UPS, REPEATS = 20, 50  # on a GPU
 _PROFILED = 10  # calls
-_WAITS = ("cudaStreamSynchronize", "cudaEventSynchronize", "cudaMemcpy")
-
-
-@dataclass
-class Kernel:
-    """Consecutive launches of one kernel; copies and fills count as kernels."""
-
-    name: str
-    launches: int
-    milliseconds: float
 
 
 @dataclass
@@ -30,14 +19,12 @@ class GpuTime:
     """Median milliseconds of a call that starts on an idle device."""
 
     events: float  # between CUDA events around the call; includes gaps in which the device waits for the host
-    wall: float  # by the host's clock, until the device is done
-    launched: list[Kernel]  # in order
-    waits: int  # times that the host waits for the device within the call
+    launched: list[tuple[str, float]]  # name and milliseconds of each kernel in order; copies and fills count, too
 
     @property
     def kernels(self) -> float:
         """Milliseconds in which the device runs kernels."""
-        return sum(kernel.milliseconds for kernel in self.launched)
+        return sum(milliseconds for _, milliseconds in self.launched)
 
 
 def cpu_milliseconds(run: Callable[[], object], repeats: int) -> float:
@@ -51,66 +38,38 @@ def cpu_milliseconds(run: Callable[[], object], repeats: int) -> float:
     return 1e3 * statistics.median(times)
 
 
-def gpu_time(run: Callable[[], object]) -> GpuTime:
-    """Return medians over REPEATS calls after WARM_UPS calls."""
-    for _ in range(WARM_UPS):
-        run()
-    events, walls = [], []
+def gpu_milliseconds(run: Callable[[], object], warm_ups: int = WARM_UPS, repeats: int = REPEATS) -> float:
+    """Return the median time of a call by events, each on an idle device."""
+    times = []
     begin, end = torch.cuda.Event(enable_timing=True), torch.cuda.Event(enable_timing=True)
-    for _ in range(REPEATS):
+    for _ in range(warm_ups + repeats):
         torch.cuda.synchronize()
-        start = time.perf_counter()
         begin.record()
         run()
         end.record()
-        torch.cuda.synchronize()
-        walls.append(1e3 * (time.perf_counter() - start))
-        events.append(begin.elapsed_time(end))
-    launched, waits = _profile(run, _PROFILED) or _profile(run, 1)
-    return GpuTime(statistics.median(events), statistics.median(walls), launched, waits)
+        end.synchronize()
+        times.append(begin.elapsed_time(end))
+    return statistics.median(times[warm_ups:])
 
 
-def _profile(run: Callable[[], object], calls: int) -> tuple[list[Kernel], int] | None:
-    """Return kernels, with mean times, and waits of a call; None if the calls launched different kernels."""
-
-    def several() -> None:
-        for _ in range(calls):
-            run()
-
-    events = _events(several)
-    launched = _launched(events)
-    per_call = len(launched) // calls
-    names = [name for name, _ in launched[:per_call]]
-    if [name for name, _ in launched] != names * calls:
-        return None
-    result: list[Kernel] = []
-    for i, name in enumerate(names):
-        milliseconds = statistics.mean(ms for _, ms in launched[i::per_call])
-        if result and result[-1].name == name:
-            result[-1].launches += 1
-            result[-1].milliseconds += milliseconds
-        else:
-            result.append(Kernel(name, 1, milliseconds))
-    return result, sum(e.name in _WAITS for e in events) // calls
+def gpu_time(run: Callable[[], object]) -> GpuTime:
+    """Return the median over REPEATS calls after WARM_UPS calls, and the kernels of a call, means over some calls."""
+    events = gpu_milliseconds(run)
+    calls = [launches(run) for _ in range(_PROFILED)]
+    same = [call for call in calls if [name for name, _ in call] == [name for name, _ in calls[0]]]
+    means = [(of[0][0], statistics.mean(ms for _, ms in of)) for of in zip(*same, strict=True)]
+    return GpuTime(events, means)
 
 
 def launches(run: Callable[[], object]) -> list[tuple[str, float]]:
     """Return name and milliseconds of each kernel that a call runs on the device, in order."""
-    return _launched(_events(run))
-
-
-def _events(run: Callable[[], object]) -> list[FunctionEvent]:
-    """Return the profiler's events of a call, in order."""
     torch.cuda.synchronize()
     with profile(activities=[ProfilerActivity.CPU, ProfilerActivity.CUDA]) as trace:
         run()
         torch.cuda.synchronize()
-    return sorted(trace.events(), key=lambda e: e.time_range.start)
-
-
-def _launched(events: list[FunctionEvent]) -> list[tuple[str, float]]:
-    on_device = (e for e in events if e.device_type == DeviceType.CUDA)
-    return [(short_name(e.name), e.time_range.elapsed_us() / 1e3) for e in on_device]
+    on_device = [event for event in trace.events() if event.device_type == DeviceType.CUDA]
+    on_device.sort(key=lambda event: event.time_range.start)
+    return [(short_name(event.name), event.time_range.elapsed_us() / 1e3) for event in on_device]
 
 
 def peak_mib(run: Callable[[], object], clear: Callable[[], None]) -> float:

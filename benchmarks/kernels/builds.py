@@ -18,17 +18,13 @@ from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
-import torch
-
-from benchmarks.harness.environment import describe, print_table
-from benchmarks.harness.timing import cpu_milliseconds
-from benchmarks.workloads.splat_scenes import frustum
+from benchmarks.harness.environment import add_device, chosen_device, describe, print_table
+from benchmarks.harness.timing import cpu_milliseconds, gpu_milliseconds
+from benchmarks.workloads.splat_scenes import CPU_WORKLOADS, GPU_WORKLOADS, frustum
 from utils.system_utils import UserError, run_cli
 
-#            splats  width height median pixel sigma
-CPU_WORKLOADS = {"S": (5_000, 200, 200, 2.4), "M": (50_000, 400, 400, 2.4), "L": (300_000, 800, 800, 1.7)}
 TINY = {"XS": (20, 32, 32, 2.4)}  # the host's part of a call, and little else
-NAMES = ("XS", "S", "M", "L")  # on a GPU the others are those of benchmarks/peers/published.py
+NAMES = ("XS", "S", "M", "L")
 CPU_CALLS = {"XS": 300, "S": 40, "M": 10, "L": 3}  # of a turn
 GPU_CALLS, WARM_UPS = 40, 5
 KEEP_MEMORY = {"MALLOC_TRIM_THRESHOLD_": str(2**34), "MALLOC_MMAP_MAX_": "0"}  # of glibc
@@ -66,29 +62,17 @@ class Build:
 def serve(device: str) -> None:
     """Answer each line "workload,step" with milliseconds."""
     from benchmarks.harness.calls import Calls  # the build that this process got
-    from benchmarks.peers import published
 
     made: dict[str, dict[str, Callable[[], object]]] = {}
     for line in sys.stdin:
         workload, step = line.strip().split(",")
         if workload not in made:
-            sizes = TINY | (published.WORKLOADS if device == "cuda" else CPU_WORKLOADS)
+            sizes = TINY | (GPU_WORKLOADS if device == "cuda" else CPU_WORKLOADS)
             made[workload] = Calls(frustum(*sizes[workload], device=device)).steps()
         run = made[workload][step]
-        print(_on_gpu(run) if device == "cuda" else cpu_milliseconds(run, CPU_CALLS[workload]), flush=True)
-
-
-def _on_gpu(run: Callable[[], object]) -> float:
-    times = []
-    begin, end = torch.cuda.Event(enable_timing=True), torch.cuda.Event(enable_timing=True)
-    for _ in range(WARM_UPS + GPU_CALLS):
-        torch.cuda.synchronize()
-        begin.record()
-        run()
-        end.record()
-        end.synchronize()
-        times.append(begin.elapsed_time(end))
-    return statistics.median(times[WARM_UPS:])
+        gpu = device == "cuda"
+        took = gpu_milliseconds(run, WARM_UPS, GPU_CALLS) if gpu else cpu_milliseconds(run, CPU_CALLS[workload])
+        print(took, flush=True)
 
 
 def measure(args: argparse.Namespace, device: str, workload: str) -> list[dict[str, list[float]]]:
@@ -108,13 +92,13 @@ def main() -> None:
     add = parser.add_argument
     add("old", help="folder with a diff_gaussian_rasterization, as pip install --target makes it")
     add("new", help="another one")
-    add("--device", choices=["cpu", "cuda"], help="default: cuda if there is a GPU")
+    add_device(parser)
     add("--workloads", nargs="+", choices=NAMES, default=list(NAMES), help="default: all")
     add("--starts", type=int, default=5, help="of each build's process (default: 5)")
     add("--rounds", type=int, default=5, help="turns of each of them (default: 5)")
     add("--serve", action="store_true", help=argparse.SUPPRESS)
     args = parser.parse_args()
-    device = args.device or ("cuda" if torch.cuda.is_available() else "cpu")
+    device = chosen_device(args)
     if args.serve:
         serve(device)
         return

@@ -1,110 +1,133 @@
-"""Run time of the rasterizer on seeded workloads, beside the amount of work, on a CPU or a GPU.
+"""Run time of the rasterizer on seeded workloads, on a CPU or a GPU.
 
     python -m benchmarks.kernels.rasterizer                  # on the GPU if there is one and the build has CUDA
     python -m benchmarks.kernels.rasterizer --device cpu
-    python -m benchmarks.kernels.rasterizer --peers gsplat   # also time another implementation in the same run
 
 Milliseconds are medians. An instance is a splat in a tile. Processed instances are those that the backward reads: in
-each tile, those up to the last one that a pixel of the tile blends.
+each tile, those up to the last one that a pixel of the tile blends. A GPU's tables also have peak memory, and stages
+and kernels of a step; beside them stand the figures of kernels/published.py.
 """
 
 import argparse
-from collections.abc import Callable
+from dataclasses import dataclass
 
 import torch
-from diff_gaussian_rasterization import reference
 
-from benchmarks.harness.calls import Calls, Stages
-from benchmarks.harness.environment import describe, print_table
-from benchmarks.harness.timing import cpu_milliseconds
-from benchmarks.kernels.fragments import TILE, processed_per_tile
-from benchmarks.kernels.gpu import measure_on_gpu
-from benchmarks.peers.published import WORKLOADS
-from benchmarks.workloads.splat_scenes import SplatScene, frustum
-from utils.system_utils import UserError, compute_device, run_cli
+from benchmarks.harness.calls import STAGES, TILE, Calls, Stages, by_stage
+from benchmarks.harness.environment import add_device, chosen_device, describe, print_table
+from benchmarks.harness.timing import REPEATS, WARM_UPS, GpuTime, cpu_milliseconds, gpu_time, peak_mib
+from benchmarks.kernels import published
+from benchmarks.workloads.splat_scenes import CPU_WORKLOADS, GPU_WORKLOADS, SplatScene, frustum
+from utils.system_utils import UserError, run_cli
 
-#                splats  width height median pixel sigma
-CPU_WORKLOADS = [(50_000, 400, 400, 2.4), (300_000, 800, 800, 1.7), (5_000, 400, 400, 8.0)]
-ORACLE_WORKLOAD = (1_000, 100, 100, 2.4)
+CPU_STAGES = ("project", "bin", "blend", "blend_vjp", "project_vjp")
 
 
-def measure(scene: SplatScene, repeats: int) -> dict[str, float]:
-    """Measure on the CPU: milliseconds of forward, forward + backward and each stage, and the amount of work."""
+def measure_on_cpu(scene: SplatScene, repeats: int) -> dict[str, float]:
+    """Return the milliseconds of forward, forward + backward and each stage, and the amount of work."""
     calls, stages = Calls(scene), Stages(scene)
-    runs: dict[str, Callable[[], object]] = {"forward": calls.forward, "+ backward": calls.with_backward}
-    result = {name: cpu_milliseconds(run, repeats) for name, run in runs.items()}
+    result = {"forward": cpu_milliseconds(calls.forward, repeats)}
+    result["+ backward"] = cpu_milliseconds(calls.with_backward, repeats)
     with torch.no_grad():
         result |= {name: cpu_milliseconds(run, repeats) for name, run in stages.calls.items()}
-    result["instances"] = len(stages.instances)
-    result["processed"] = int(processed_per_tile(stages.last).sum())
-    return result
+    return result | {"instances": len(stages.instances), "processed": stages.processed}
 
 
-def compare_oracle(repeats: int) -> list[str]:
-    """Return a row with the oracle's and our milliseconds, forward and with backward, on the small workload."""
-    scene = frustum(*ORACLE_WORKLOAD)
-    ours = measure(scene, repeats)
-    leaves, settings = scene.leaves(torch.float64), scene.settings(torch.float64)
-    means2d = torch.zeros_like(leaves["means"], requires_grad=True)
-    named = {name: leaves[name] for name in ("scales", "rotations", "sh_dc", "sh_rest")}
-
-    def forward() -> torch.Tensor:
-        return reference.render(leaves["means"], means2d, leaves["opacities"], settings, raw=True, **named).color
-
-    with torch.no_grad():
-        alone = cpu_milliseconds(forward, 3)
-    both = cpu_milliseconds(lambda: forward().sum().backward(), 3)
-    row = [_name(ORACLE_WORKLOAD), f"{alone:.0f} / {both:.0f}"]
-    row.append(f"{ours['forward']:.2f} / {ours['+ backward']:.2f}")
-    return [*row, f"{alone / ours['forward']:.0f} / {both / ours['+ backward']:.0f}"]
-
-
-def measure_on_cpu(thread_counts: list[int], repeats: int) -> None:
-    """Print times and rates of the stages, then the oracle's times. Evaluations: processed instances x 256 pixels."""
-    stages = ["forward", "+ backward", "project", "bin", "blend", "blend_vjp", "project_vjp"]
-    header = ["splats, image, sigma", "threads", *stages, "instances", "processed"]
-    header += ["G evaluations/s/core forward", "backward"]
+def print_cpu(names: list[str], thread_counts: list[int], repeats: int) -> None:
+    """Print times and rates. Evaluations: processed instances x 256 pixels."""
+    header = ["splats, image, sigma", "threads", "forward", "+ backward", *CPU_STAGES, "instances", "processed"]
     rows = []
-    for workload in CPU_WORKLOADS:
-        scene = frustum(*workload)
+    for n, width, height, sigma in (CPU_WORKLOADS[name] for name in names):
+        scene = frustum(n, width, height, sigma)
         for threads in dict.fromkeys(thread_counts):
             torch.set_num_threads(threads)
-            m = measure(scene, repeats)
-            evaluations = m["processed"] * TILE * TILE / threads / 1e6
-            row = [_name(workload), str(threads), *(f"{m[stage]:.1f}" for stage in stages)]
-            row += [f"{m['instances'] / 1e3:.0f} k", f"{m['processed'] / 1e3:.0f} k"]
-            rows.append([*row, f"{evaluations / m['blend']:.2f}", f"{evaluations / m['blend_vjp']:.2f}"])
-    print_table(header, rows)
-    print()
-    oracle_header = ["", "the oracle, ms forward / + backward", "ours, ms", "ratio"]
-    print_table(oracle_header, [compare_oracle(repeats)])
+            found = measure_on_cpu(scene, repeats)
+            evaluations = found["processed"] * TILE * TILE / threads / 1e6
+            row = [f"{n // 1000} k, {width}x{height}, {sigma} px", str(threads)]
+            row += [f"{found[name]:.1f}" for name in header[2:9]]
+            row += [f"{found[name] / 1e3:.0f} k" for name in ("instances", "processed")]
+            rows.append([*row, *(f"{evaluations / found[name]:.2f}" for name in ("blend", "blend_vjp"))])
+    print_table([*header, "G evaluations/s/core forward", "backward"], rows)
 
 
-def _name(workload: tuple) -> str:
-    n, width, height, sigma = workload
-    return f"{n // 1000} k, {width}x{height}, {sigma} px"
+@dataclass
+class Measured:
+    """A workload on a GPU: times by step, and peak memory above the inputs of forward and + backward, MiB."""
+
+    name: str
+    times: dict[str, GpuTime]
+    memory: list[float]
+
+    def kernels(self) -> list[tuple[str, str, float]]:
+        """Return stage, name and milliseconds of the kernels of a step, in order."""
+        return by_stage(self.times["step"].launched)
+
+
+def measure_on_gpu(name: str) -> Measured:
+    """Measure a workload by name."""
+    calls = Calls(frustum(*GPU_WORKLOADS[name], device="cuda"))
+    # Memory first: Adam's averages would not count, but the memory that they leave in the pool could.
+    memory = [peak_mib(run, calls.clear) for run in (calls.forward, calls.with_backward)]
+    times = {step: gpu_time(run) for step, run in calls.steps().items()}
+    del calls
+    torch.cuda.empty_cache()
+    return Measured(name, times, memory)
+
+
+def print_gpu(names: list[str]) -> None:
+    """Measure the workloads and print every table."""
+    found = [measure_on_gpu(name) for name in names]
+    for workload in found:
+        print(f"\nKernels of a step in order, {workload.name}")
+        print_table(["stage", "kernel", "ms"], [[stage, name, f"{ms:.4f}"] for stage, name, ms in workload.kernels()])
+    print("\nStages of a step, ms of kernels")
+    sums = {(w.name, stage): sum(ms for of, _, ms in w.kernels() if of == stage) for w in found for stage in STAGES}
+    print_table(["", *names], [[stage, *(f"{sums[name, stage]:.3f}" for name in names)] for stage in STAGES])
+    print("\nPeak memory above the inputs, gradients included, MiB")
+    header = ["workload", "forward", "Faster-GS", "gsplat", "+ backward", "Faster-GS", "gsplat", "mark"]
+    print_table(header, [_memory_row(workload) for workload in found])
+    print(f"\nMs: medians of {REPEATS} calls after {WARM_UPS}, each on an idle device. Call: events around the call,")
+    print("host included. Kernels: the device's own work.")
+    header = ["workload", "", "call", "kernels", "Faster-GS", "gsplat", "call / Faster-GS"]
+    print_table([*header, "mark for kernels"], [row for workload in found for row in _time_rows(workload)])
+
+
+def _memory_row(workload: Measured) -> list[str]:
+    row = [workload.name]
+    for i, own in enumerate(workload.memory):
+        others = [of.get(workload.name) for of in (published.FASTER_GS_MEMORY, published.GSPLAT_MEMORY)]
+        row += [f"{own:.0f}", *(str(other[i]) if other else "" for other in others)]
+    return [*row, str(published.MEMORY_MARKS[workload.name])]
+
+
+def _time_rows(workload: Measured) -> list[list[str]]:
+    rows = []
+    for i, step in enumerate(published.STEPS):
+        time = workload.times[step]
+        theirs, gsplat, mark = (of[workload.name][i] for of in (published.FASTER_GS, published.GSPLAT, published.MARKS))
+        row = [workload.name, step, f"{time.events:.3f}", f"{time.kernels:.3f}", f"{theirs:.2f}", f"{gsplat:.2f}"]
+        rows.append([*row, f"{time.events / theirs:.2f}", f"{mark:.2f}"])
+    return rows
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     add = parser.add_argument
-    add("--device", choices=["cpu", "cuda"], help="default: cuda if there is a GPU and the build has CUDA")
-    add("--workloads", nargs="+", choices=list(WORKLOADS), default=list(WORKLOADS), help="GPU: names (default: all)")
-    add("--peers", nargs="+", choices=["gsplat"], default=[], help="GPU: other implementations to time as well")
+    add_device(parser)
+    add("--workloads", nargs="+", help=f"CPU: of {', '.join(CPU_WORKLOADS)}; GPU: of {', '.join(GPU_WORKLOADS)}")
     add("--threads", type=int, nargs="+", default=[1, torch.get_num_threads()], help="CPU: numbers of threads to use")
     add("--repeats", type=int, default=9, help="CPU: number of timed calls (default: 9)")
     args = parser.parse_args()
-    found = compute_device().type
-    if args.device == "cuda" and found != "cuda":
-        raise UserError("--device cuda needs a visible GPU and the rasterizer built with CUDA (GS_CUDA=1)")
-    device = args.device or found
-    if args.peers and device == "cpu":
-        raise UserError("--peers needs --device cuda: the other implementations have no CPU side")
+    device = chosen_device(args)
+    known = GPU_WORKLOADS if device == "cuda" else CPU_WORKLOADS
+    names = args.workloads or list(known)
+    if unknown := [name for name in names if name not in known]:
+        raise UserError(f"--workloads {unknown[0]}: on this device there are {', '.join(known)}")
     print(describe(device))
     if device == "cuda":
-        measure_on_gpu(args.workloads, args.peers)
+        print_gpu(names)
     else:
-        measure_on_cpu(args.threads, args.repeats)
+        print_cpu(names, args.threads, args.repeats)
 
 
 if __name__ == "__main__":

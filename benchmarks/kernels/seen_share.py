@@ -11,59 +11,31 @@ rounds.
 import argparse
 import math
 import time
-from collections import defaultdict
 
-import fused_ssim  # noqa: F401  (registers its operators)
-import torch
-from diff_gaussian_rasterization import GaussianRasterizationSettings, Gaussians
-from diff_gaussian_rasterization.ops import scene_arguments
-from torch import Tensor
+from diff_gaussian_rasterization import GaussianRasterizationSettings
 
-from benchmarks.harness.environment import describe, print_table
+from benchmarks.harness.calls import STAGES, TrainingStep, by_stage
+from benchmarks.harness.environment import add_device, chosen_device, describe, print_table
 from benchmarks.harness.timing import launches
 from benchmarks.workloads.ring_of_clusters import ring_of_clusters, view_of_share
-from benchmarks.workloads.splat_scenes import PARAMETERS
-from utils.system_utils import UserError, compute_device, run_cli
+from utils.system_utils import run_cli
 
-OPS = torch.ops.diff_gaussian_rasterization
 SIZES = {"cuda": (2_000_000, 1600, 1060), "cpu": (50_000, 400, 265)}  # Gaussians, width, height
 SHARES = [0.02, 0.05, 0.1, 0.2, 0.4, 0.7, 1.0]
 _TURN = math.pi * (3 - math.sqrt(5))  # from view to view: they never meet, however many there are
 _ROUNDS = 2
-# Kernels that begin a stage, and those behind which another one begins.
-_BEGINS = {"project_kernel": "project", "blend_kernel": "blend", "l1_ssim_kernel": "loss", "project_vjp_kernel": "step"}
-_NEXT = {"project_kernel": "bin", "l1_ssim_vjp_kernel": "blend_vjp"}
-STAGES = ("project", "bin", "blend", "loss", "blend_vjp", "step")
 
 
 class Ring:
-    """The scene in training. Learning rates are 0, so that every step meets the same Gaussians."""
+    """The scene in training."""
 
-    @torch.no_grad()
     def __init__(self, n: int, width: int, height: int, device: str) -> None:
         self.scene = ring_of_clusters(n, width, height, device=device)
-        self.values = {name: self.scene.parameters[name] for name in PARAMETERS}
-        self.target = torch.rand(3, height, width, generator=torch.Generator().manual_seed(1)).to(device)
-        averages = [[torch.full_like(value, 1e-6) for value in self.values.values()] for _ in range(2)]
-        self._adam = *averages, [torch.zeros(()) for _ in range(6)], [0.0] * 6, 0.9, 0.999, 1e-15, [-1] * 6
-        self._statistics = [torch.zeros(n, device=device) for _ in range(3)]
-        self._one = torch.ones((), device=device)
+        self.step = TrainingStep(self.scene).take
 
     def views(self, share: float, count: int) -> list[GaussianRasterizationSettings]:
         """Return views from all sides that see a share of the Gaussians."""
         return [view_of_share(self.scene, share, turn * _TURN) for turn in range(count)]
-
-    @torch.no_grad()
-    def step(self, camera: GaussianRasterizationSettings) -> Tensor:
-        """Take the step of a view. Returns the tiles of each Gaussian."""
-        scene = scene_arguments(Gaussians(**self.values), camera, True)
-        out = OPS.rasterize(None, *scene, camera.bg, False, True)
-        color, transmittance, _, radii, splats, tiles, *lists, last, layers = out
-        _, _, kept = torch.ops.fused_ssim.photometric(color, self.target, 0.2, True)
-        gradient = torch.ops.fused_ssim.photometric_vjp(color, self.target, kept, 0.2, self._one)
-        state = splats, *lists, camera.bg, last, transmittance, gradient, None, None, tiles, layers, radii
-        OPS.rasterize_vjp_step_(*scene, *state, list(range(6)), *self._adam, False, *self._statistics)
-        return tiles
 
     def seen(self, views: list[GaussianRasterizationSettings]) -> float:
         """Return the mean share of the Gaussians that have tiles in a view."""
@@ -77,16 +49,13 @@ def milliseconds(ring: Ring, views: list[GaussianRasterizationSettings]) -> dict
         for view in views:
             ring.step(view)
 
-    if not ring.target.is_cuda:
+    if not ring.scene.parameters["means"].is_cuda:
         start = time.perf_counter()
         run()
         return {"total": 1e3 * (time.perf_counter() - start) / len(views)}
-    took: dict[str, float] = defaultdict(float)
-    stage = "project"
-    for name, spent in launches(run):
-        stage = _BEGINS.get(name, stage)
+    took = dict.fromkeys(STAGES, 0.0)
+    for stage, _, spent in by_stage(launches(run)):
         took[stage] += spent / len(views)
-        stage = _NEXT.get(name, stage)
     return took | {"total": sum(took.values())}
 
 
@@ -103,13 +72,10 @@ def measure(device: str, size: tuple[int, int, int], views: int) -> list[list[st
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--device", choices=["cpu", "cuda"], help="default: cuda if there is a GPU and CUDA kernels")
+    add_device(parser)
     parser.add_argument("--views", type=int, default=48, help="of each share (default: 48)")
     args = parser.parse_args()
-    found = compute_device().type
-    if args.device == "cuda" and found != "cuda":
-        raise UserError("--device cuda needs a visible GPU and the rasterizer built with CUDA (GS_CUDA=1)")
-    device = args.device or found
+    device = chosen_device(args)
     n, width, height = SIZES[device]
     print(f"{describe(device)}\n{n:,} Gaussians, {width}x{height}, {args.views} views a row, ms a step:")
     print_table(["seen", *(STAGES if device == "cuda" else ()), "total"], measure(device, SIZES[device], args.views))

@@ -1,19 +1,29 @@
-"""Steps of training by the ranks that run this, or by one process: time, where it goes, bytes sent, and memory.
+"""Steps of training by one process and by several ranks of one host, side by side: time, and memory of each rank.
 
-    python -m benchmarks.parallel.steps --workload XL
-    torchrun --standalone --nproc_per_node 2 -m benchmarks.parallel.steps --workload XL --parallel tiles
+    python -m benchmarks.parallel.steps --ranks 1 2
+    python -m benchmarks.parallel.steps --ranks 1 2 --workload city --gaussians 5000000 10000000 20000000
+    python -m benchmarks.parallel.steps --workload city --crop 3 --model gpu spill --learn --cap 16
 
 A step is that of train.py: draw, loss against a photo, Adam. XL is the workload of the other benchmarks; city has 20 M
-Gaussians at 3840x2160, a plane of blocks seen from above, which each rank draws for itself. Learning rates are 0, so
-that all steps do the same. By themselves, steps are timed in blocks, at whose ends the GPU is waited for. Then come
-steps with marks around their stages, which are a little slower. One process has no stages inside the rasterizer.
-`benchmarks.parallel.table` runs this with several numbers of ranks.
+Gaussians at 3840x2160, a plane of blocks seen from above, which each rank draws for itself. Every combination of the
+options is a case, measured by processes of its own; in each round all cases take a turn, and the best round of each
+counts. Steps are timed in blocks, at whose ends the GPU is waited for; the median of the slowest rank is shown.
+
+Learning rates are 0, so that all steps do the same. With --learn they are those of train.py; the table then has digests
+of all parameters after the last step, by rank. The last step of a training needs most memory, since it writes
+gradients as steps do that add or remove Gaussians. Several numbers of Gaussians give the bytes of one, by a line
+through the least and the largest, and how many fit into 92 % of the GPUs.
 """
 
 import argparse
-import gc
+import hashlib
+import itertools
 import json
+import subprocess
+import sys
+import tempfile
 import time
+from dataclasses import replace
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -22,8 +32,8 @@ import torch
 
 from benchmarks.harness.environment import describe, print_table
 from benchmarks.parallel.run import WorkloadRun
-from benchmarks.parallel.stages import STAGES, Stages
-from benchmarks.parallel.workload import ALL, Workload
+from benchmarks.parallel.workload import ALL
+from scene.gaussian_model import GaussianModel
 from training.loop import run_training
 from training.observer import Observer
 from training.observers.divergence import DivergenceWatch
@@ -32,94 +42,88 @@ from utils.host.process import peak_memory_mib
 from utils.ranks.ranks import ranks
 from utils.system_utils import UserError, compute_device, run_cli
 
-MIB = 2**20
-_LINK_BYTES, _LINK_CALLS = 2**28, 10  # to each rank; on a GPU
+ROOT = Path(__file__).resolve().parents[2]
+HEADER = ["workload", "ranks", "shared", "model", "ms a step", "blocks", "images/s", "times the first",
+          "peak GiB by rank", "in the last step"]  # fmt: skip
+_BLOCK = 5  # steps
+_PIECE = 1 << 20  # Gaussians that are copied to the host at a time
+_USABLE = 0.92  # of a GPU
 
 
 class Timing(Observer):
-    """Times blocks of steps after a warm-up, and then marks the stages of as many steps as are left."""
+    """Times blocks of steps after a warm-up."""
 
-    def __init__(self, device: torch.device, warm_up: int, block: int, blocks: int) -> None:
-        self._device, self._first, self._block, self._blocks = device, warm_up, block, blocks
+    def __init__(self, device: torch.device, warm_up: int) -> None:
+        self._device, self._first = device, warm_up
         self._ends: list[float] = []
-        self.stages = Stages(device)
-        self._watching = None
-        self.staged = 0
-        self.peak_mib = 0.0
+        self.peak_mib = 0.0  # before the last step
 
     def due(self, step: Step) -> bool:
-        # One process then takes its steps one by one, and not as a recorded graph.
-        return self._watching is not None and not ranks().several
+        return False
 
     def begins(self, step: Step) -> None:
-        if step.last and self._watching is not None:
-            self._watching.__exit__(None, None, None)
+        if step.last:
+            self.peak_mib = peak_memory_mib(self._device) or 0.0
 
     def stepped(self, step: Step) -> None:
         done = step.iteration - self._first
-        if self._watching is None and done >= 0 and done % self._block == 0:
-            synchronize(self._device)
+        if done >= 0 and done % _BLOCK == 0 and not step.last:
+            if self._device.type == "cuda":
+                torch.cuda.synchronize(self._device)
             self._ends.append(time.perf_counter())
-            if len(self._ends) > self._blocks:
-                self.peak_mib = peak_memory_mib(self._device) or 0.0
-                self._watching = self.stages.watching(ranks())
-                self._watching.__enter__()
-        elif self._watching is not None and not step.last:
-            self.stages.mark()
-            self.staged += 1
 
     @property
     def milliseconds(self) -> list[float]:
         """Of a step, by block."""
-        return [1e3 * (end - begin) / self._block for begin, end in zip(self._ends, self._ends[1:], strict=False)]
+        return [1e3 * (end - begin) / _BLOCK for begin, end in itertools.pairwise(self._ends)]
 
 
-def synchronize(device: torch.device) -> None:
-    """Wait for the GPU, if there is one."""
-    if device.type == "cuda":
-        torch.cuda.synchronize(device)
+def digest(gaussians: GaussianModel) -> str:
+    """The beginning of the SHA-256 of a rank's parameters."""
+    found = hashlib.sha256()
+    for name in ("xyz", "f_dc", "f_rest", "opacity", "scaling", "rotation"):
+        for piece in gaussians.raw(name).detach().split(_PIECE):
+            found.update(piece.cpu().numpy().tobytes())
+    return found.hexdigest()[:16]
 
 
-def measure(workload: Workload, parallel: str, args: argparse.Namespace) -> dict[str, Any]:
-    """Take steps; returns what rank 0 needs to know of all ranks."""
+def measure(case: dict[str, Any]) -> dict[str, Any]:
+    """Take the steps of a case in this process, one of its ranks; returns the case and what was found by rank."""
     device, here = compute_device(), ranks()
-    steps = args.warm_up + args.block * args.blocks + args.staged + 1
-    run = WorkloadRun(workload, parallel, steps, still=True)
+    if case["cap"] and device.type == "cuda":
+        total = torch.cuda.get_device_properties(device).total_memory
+        torch.cuda.set_per_process_memory_fraction(min(case["cap"] * 2**30 / total, 1.0))
+    workload = replace(ALL[case["workload"]].changed(case["gaussians"], case["size"]), crop=case["crop"])
+    steps = case["warm_up"] + _BLOCK * case["blocks"] + 1
+    spill = case["model"] == "spill"
+    run = WorkloadRun(workload, case["parallel"], steps, still=not case["learn"], spill=spill)
     if device.type == "cuda":
         torch.cuda.empty_cache()
         torch.cuda.reset_peak_memory_stats()
-    timing = Timing(device, args.warm_up, args.block, args.blocks)
+    timing = Timing(device, case["warm_up"])
     run.begin()
     run_training(run, [DivergenceWatch(run), timing])
-    spent = {stage: ms / timing.staged for stage, ms in timing.stages.milliseconds().items()}
-    sent = {stage: count / timing.staged for stage, count in timing.stages.bytes.items()}
-    own = {"ms": timing.milliseconds, "stages": spent, "sent": sent, "peak_mib": timing.peak_mib}
-    views = here.size if parallel == "views" else 1
-    return {
-        "workload": str(workload),
-        "parallel": parallel if here.several else "one process",
-        "ranks": here.size,
-        "views": views,
-        "by_rank": here.everyone(own),
-    }
+    own = {"ms": timing.milliseconds, "peak": timing.peak_mib, "last": peak_memory_mib(device) or 0.0}
+    own["digest"] = digest(run.gaussians) if case["learn"] else ""
+    own["memory"] = torch.cuda.mem_get_info()[1] if device.type == "cuda" else 0
+    count = workload.gaussians
+    return case | {"name": str(workload), "gaussians": count, "by_rank": here.everyone(own)}
 
 
-def link_speed() -> float:
-    """Bytes a second that a rank sends in an exchange of much with all others; 0 of one process."""
-    here, device = ranks(), compute_device()
-    if not here.several:
-        return 0.0
-    each = _LINK_BYTES if device.type == "cuda" else _LINK_BYTES // 16
-    rows, sizes = torch.zeros(here.size * each, dtype=torch.uint8, device=device), [each] * here.size
-    seconds = []
-    for _ in range(_LINK_CALLS + 1):
-        synchronize(device)
-        here.anyone(False)
-        start = time.perf_counter()
-        here.send(rows, sizes, sizes)
-        synchronize(device)
-        seconds.append(time.perf_counter() - start)
-    return each * (here.size - 1) / median(seconds[1:])
+def launch(case: dict[str, Any], limit: float) -> dict[str, Any] | None:
+    """Measure a case in processes of its own; None if they fail or take longer than `limit` seconds (on stderr)."""
+    start = [sys.executable, "-m"]
+    if case["ranks"] > 1:
+        start += ["torch.distributed.run", "--standalone", f"--nproc_per_node={case['ranks']}", "-m"]
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "found.json"
+        line = [*start, "benchmarks.parallel.steps", "--case", json.dumps(case), "--found", str(path)]
+        with subprocess.Popen(line, cwd=ROOT, stdout=2) as process:  # the table is alone on stdout
+            try:
+                process.wait(limit)
+            except subprocess.TimeoutExpired:
+                process.terminate()  # torchrun ends its ranks
+        return json.loads(path.read_text(encoding="utf-8")) if path.exists() else None
 
 
 def milliseconds(found: dict[str, Any]) -> float:
@@ -127,73 +131,98 @@ def milliseconds(found: dict[str, Any]) -> float:
     return max(median(own["ms"]) for own in found["by_rank"])
 
 
-def summary(found: dict[str, Any], link: float) -> list[str]:
-    """Cells of a measurement: ranks, what they share, ms, spread, images, bytes, the links' part, memory."""
+def row(case: dict[str, Any], found: dict[str, Any] | None, first: dict[str, Any] | None) -> list[str]:
+    """A row of the table. first: the first case of the same scene; found: None of a case without a result."""
+    cells = [f"{case['ranks']}", case["parallel"] if case["ranks"] > 1 else "", case["model"]]
+    if found is None:
+        return [case["workload"], *cells, "failed", *[""] * (len(HEADER) - 5 + case["learn"])]
     step, every = milliseconds(found), found["by_rank"]
     spread = [ms for own in every for ms in own["ms"]]
-    sent = max(sum(own["sent"].values()) for own in every)
+    images = _views(found) / step
+    cells += [f"{step:.3f}", f"{min(spread):.3f} to {max(spread):.3f}", f"{1e3 * images:.1f}"]
+    cells.append(f"{images * milliseconds(first) / _views(first):.2f}")
+    cells += [" ".join(f"{own[name] / 1024:.2f}" for own in every) for name in ("peak", "last")]
+    return [found["name"], *cells] + [" ".join(own["digest"] for own in every)] * case["learn"]
+
+
+def _views(found: dict[str, Any]) -> int:
+    return found["ranks"] if found["parallel"] == "views" else 1
+
+
+def bytes_each(results: list[dict[str, Any]]) -> list[str]:
+    """Sentences on the memory of a Gaussian, from cases that differ in their number of Gaussians alone."""
+    groups: dict[str, list[dict[str, Any]]] = {}
+    for found in results:
+        name = " ".join([f"{found['workload']}, {found['ranks']} ranks,", *row(found, None, None)[2:4]])
+        groups.setdefault(name, []).append(found)
+    said = []
+    for name, group in groups.items():
+        least, most = (pick(group, key=lambda found: found["gaussians"]) for pick in (min, max))
+        if least["gaussians"] == most["gaussians"]:
+            continue
+        for key, when in (("peak", "before the last step"), ("last", "in the last step")):
+            low, high = (2**20 * max(own[key] for own in found["by_rank"]) for found in (least, most))
+            each = (high - low) / (most["gaussians"] - least["gaussians"])  # on one rank
+            said.append(f"{name}: {each * most['ranks']:.0f} bytes a Gaussian {when}")
+            if each > 0 and (memory := most["by_rank"][0]["memory"]):
+                said[-1] += f", so {(_USABLE * memory - low) / each / 1e6 + least['gaussians'] / 1e6:.0f} M fit"
+    return said
+
+
+def cases(args: argparse.Namespace) -> list[dict[str, Any]]:
+    """Every combination of the options."""
+    same = {name: getattr(args, name) for name in ("size", "crop", "cap", "learn", "warm_up", "blocks")}
     return [
-        found["workload"],
-        f"{found['ranks']}",
-        found["parallel"],
-        f"{step:.3f}",
-        f"{min(spread):.3f} to {max(spread):.3f}",
-        f"{1e3 * found['views'] / step:.1f}",
-        f"{sent / MIB:.2f}",
-        f"{1e3 * sent / link:.3f}" if link else "-",
-        " ".join(f"{own['peak_mib'] / 1024:.2f}" for own in every),
+        same | {"workload": workload, "gaussians": count, "ranks": number, "parallel": shared, "model": model}
+        for workload in args.workload
+        for count in args.gaussians
+        for number in args.ranks
+        for shared in (args.parallel if number > 1 else ["tiles"])
+        for model in args.model
     ]
 
 
-SUMMARY = ["workload", "ranks", "shared", "ms a step", "blocks", "images/s", "MiB sent", "ms at the links' limit",
-           "peak GiB by rank"]  # fmt: skip
-
-
-def stage_rows(found: dict[str, Any]) -> list[list[str]]:
-    """Rows by stage: milliseconds, the mean over ranks and the range, and MiB sent by the rank that sends most."""
-    rows = []
-    for stage in STAGES:
-        spent = [own["stages"].get(stage, 0.0) for own in found["by_rank"]]
-        sent = max(own["sent"].get(stage, 0.0) for own in found["by_rank"])
-        if max(spent):
-            span = f"{min(spent):.3f} to {max(spent):.3f}"
-            rows.append([stage, f"{sum(spent) / len(spent):.3f}", span, f"{sent / MIB:.3f}" if sent else ""])
-    return rows
-
-
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """Add what a measurement can be given."""
+def options() -> argparse.ArgumentParser:
+    """The command's options."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     add = parser.add_argument
-    add("--workload", nargs="+", choices=list(ALL), default=list(ALL), help="default: all")
+    add("--ranks", type=int, nargs="+", default=[1], help="numbers of processes (default: 1)")
     add("--parallel", nargs="+", choices=["tiles", "views"], default=["tiles", "views"], help="default: both")
-    add("--gaussians", type=int, help="in place of the workload's")
+    add("--workload", nargs="+", choices=list(ALL), default=list(ALL), help="default: all")
+    add("--gaussians", type=int, nargs="+", default=[None], help="in place of the workload's")
     add("--size", type=int, nargs=2, metavar=("WIDTH", "HEIGHT"), help="of the image, in place of the workload's")
+    add("--crop", type=int, default=1, help="see the middle of so many parts across and down (default: 1)")
+    add("--model", nargs="+", choices=["gpu", "spill"], default=["gpu"], help="where it lies (default: gpu)")
+    add("--cap", type=float, default=0.0, help="GiB of a GPU that a process may take (default: all)")
+    add("--learn", action="store_true", help="train, and show digests of the parameters")
     add("--warm_up", type=int, default=24, help="steps (default: 24)")
-    add("--block", type=int, default=5, help="steps of a block (default: 5)")
-    add("--blocks", type=int, default=20, help="default: 20")
-    add("--staged", type=int, default=16, help="steps whose stages are timed (default: 16)")
+    add("--blocks", type=int, default=20, help=f"of {_BLOCK} steps each (default: 20)")
+    add("--rounds", type=int, default=2, help="turns of each case (default: 2)")
+    add("--limit", type=float, default=150.0, help="seconds of a case (default: 150)")
+    add("--case", type=json.loads, help=argparse.SUPPRESS)
+    add("--found", type=Path, help=argparse.SUPPRESS)
+    return parser
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    add_options(parser)
-    parser.add_argument("--json", type=Path, help="file for the numbers")
-    args = parser.parse_args()
-    if min(args.warm_up, args.block, args.blocks, args.staged) < 1:
-        raise UserError("--warm_up, --block, --blocks and --staged take numbers from 1 on")
-    print(describe(compute_device()))
-    link = link_speed()
-    print(f"{ranks().size} ranks" + (f", links {link / 1e9:.1f} GB/s a rank" if link else ""), flush=True)
-    results = []
-    for name in args.workload:
-        for parallel in args.parallel if ranks().several else ["tiles"]:
-            results.append(measure(ALL[name].changed(args.gaussians, args.size), parallel, args))
-            gc.collect()
-            print_table(SUMMARY, [summary(results[-1], link)])
-            print_table(["stage", "ms", "over ranks", "MiB sent"], stage_rows(results[-1]))
-            print(flush=True)
-    if args.json and ranks().first:
-        args.json.write_text(json.dumps({"link": link, "results": results}), encoding="utf-8")
+    args = options().parse_args()
+    if args.case:
+        found = measure(args.case)
+        if ranks().first:
+            args.found.write_text(json.dumps(found), encoding="utf-8")
+        return
+    if min(*args.ranks, args.crop, args.warm_up, args.blocks, args.rounds) < 1:
+        raise UserError("--ranks, --crop, --warm_up, --blocks and --rounds take numbers from 1 on")
+    print(describe(compute_device()), flush=True)
+    every = cases(args)
+    turns = [[launch(case, args.limit) for case in every] for _ in range(args.rounds)]
+    best = [min(filter(None, of), key=milliseconds, default=None) for of in zip(*turns, strict=True)]
+    rows = []
+    for case, found in zip(every, best, strict=True):
+        first = next((one for one in best if found and one and one["name"] == found["name"]), None)
+        rows.append(row(case, found, first))
+    print_table(HEADER + ["parameters"] * args.learn, rows)
+    print("\n".join(bytes_each([found for found in best if found])))
 
 
 if __name__ == "__main__":

@@ -7,9 +7,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from benchmarks.peers.published import WORKLOADS
 from benchmarks.workloads.city import city, look
-from benchmarks.workloads.splat_scenes import FOV, frustum
+from benchmarks.workloads.splat_scenes import FOV, GPU_WORKLOADS, frustum
 from scene.cameras import Camera
 from scene.gaussians.shards import bound
 from scene.pictures.in_memory import InMemory
@@ -73,7 +72,7 @@ class Workload:
         return [Camera(View(i, 0, *pose, fovx, fovy, f"{i}", size, photo)) for i, pose in enumerate(poses)]
 
 
-XL = Workload("XL", *WORKLOADS["XL"])
+XL = Workload("XL", *GPU_WORKLOADS["XL"])
 CITY = Workload("city", 20_000_000, 3840, 2160, 1.1)
 ALL = {workload.name: workload for workload in (XL, CITY)}
 

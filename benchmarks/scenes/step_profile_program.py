@@ -53,20 +53,15 @@ class Probe:
             os._exit(0)  # what a training does at its end does not belong here
 
     def _sums(self) -> dict:
-        kernels, calls, counts = Counter(), Counter(), Counter()
+        kernels, counts, calls = Counter(), Counter(), Counter()
         for event in self._profile.events():
             if event.device_type == torch.autograd.DeviceType.CUDA:
                 kernels[event.name] += event.time_range.elapsed_us() / self._count
                 counts[event.name] += 1 / self._count
             elif event.name.startswith("cu"):
                 calls[event.name] += 1 / self._count
-        return {
-            "kernels": kernels,
-            "counts": counts,
-            "launches": sum(calls[name] for name in LAUNCHES),
-            "waits": sum(calls[name] for name in WAITS),
-            "calls": calls,
-        }
+        launches, waits = (sum(calls[name] for name in names) for names in (LAUNCHES, WAITS))
+        return {"kernels": kernels, "counts": counts, "launches": launches, "waits": waits}
 
 
 def main() -> None:

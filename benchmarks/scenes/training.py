@@ -1,9 +1,10 @@
-"""Training runs, one per seed, scored on the held-out views as in published tables.
+"""Training runs, one per seed and number of ranks, scored on the held-out views as in published tables.
 
     python -m benchmarks.scenes.training SCENE OUT --seeds 0 1 2 --iterations 7000
+    python -m benchmarks.scenes.training SCENE OUT --seeds 0 --ranks 1 2 --iterations 7000
 
 Other options go to train.py unchanged. Training seconds do not include loading, tests and saving. Scores are those of
-metrics.py, from 8-bit images. A seed given twice shows whether the same command gives the same bytes.
+metrics.py, from 8-bit images. A seed given twice, or trained by several ranks, shows whether the bytes are the same.
 """
 
 import argparse
@@ -40,10 +41,11 @@ def seconds_of(model: Path) -> float:
     return json.loads((model / "train_log.json").read_text())[-1]["seconds"]
 
 
-def train(scene: Path, model: Path, seed: int, options: list[str]) -> dict:
+def train(scene: Path, model: Path, seed: int, options: list[str], ranks: int = 1) -> dict:
     """Train, render and score one model; return seconds, PSNR (dB), SSIM, Gaussians, bytes and a hash of the PLY."""
-    arguments = ["-s", str(scene), "-m", str(model), "--eval", "--seed", str(seed)]
-    process = run("train.py", *arguments, "--test_iterations", "-1", "--no_curve", *options)
+    words = ["-s", str(scene), "-m", str(model), "--eval", "--seed", str(seed), "--test_iterations", "-1", "--no_curve"]
+    launcher = ["-m", "torch.distributed.run", "--standalone", f"--nproc_per_node={ranks}"] if ranks > 1 else []
+    process = run(*launcher, "train.py", *words, *options)
     run("render.py", "-m", str(model), "--skip_train")
     run("metrics.py", "-m", str(model))
     record = json.loads((model / "train_log.json").read_text())[-1]
@@ -52,6 +54,7 @@ def train(scene: Path, model: Path, seed: int, options: list[str]) -> dict:
     ply = model / "point_cloud" / f"iteration_{iteration}" / "point_cloud.ply"
     return {
         "seed": seed,
+        "ranks": ranks,
         "seconds": seconds_of(model),
         "process": process,
         "PSNR": scores["PSNR"],
@@ -62,38 +65,45 @@ def train(scene: Path, model: Path, seed: int, options: list[str]) -> dict:
     }
 
 
+COLUMNS = {"seconds": ".1f", "process": ".1f", "PSNR": ".2f", "SSIM": ".4f", "Gaussians": ",.0f"}
+
+
+def print_runs(runs: list[dict]) -> None:
+    """Print a row for each run, means and deviations, and whether runs of one seed have the same bytes."""
+    cells = [[f"{run[key]:{form}}" for key, form in COLUMNS.items()] for run in runs]
+    rows = [[f"{r['seed']}", f"{r['ranks']}", *row, r["hash"]] for r, row in zip(runs, cells, strict=True)]
+    for ranks in dict.fromkeys(run["ranks"] for run in runs):
+        values = [[run[key] for run in runs if run["ranks"] == ranks] for key in COLUMNS]
+        if len(values[0]) > 1:
+            both = [(statistics.mean(column), statistics.stdev(column)) for column in values]
+            means = [f"{mean:{form}} ({sd:{form}})" for (mean, sd), form in zip(both, COLUMNS.values(), strict=True)]
+            rows.append(["mean (standard deviation)", f"{ranks}", *means, ""])
+    print_table(["seed", "ranks", "training s", "process s", "PSNR dB", "SSIM", "Gaussians", "PLY sha256"], rows)
+    for seed in sorted({run["seed"] for run in runs}):
+        hashes = [run["hash"] for run in runs if run["seed"] == seed]
+        if len(hashes) > 1:
+            same = "the same" if len(set(hashes)) == 1 else "DIFFERENT"
+            print(f"seed {seed}, {len(hashes)} runs: the PLYs are {same}")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("scene", type=Path, help="a COLMAP or a Blender scene")
     parser.add_argument("out", type=Path, help="new folder for the models")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2], help="one run each (default: 0 1 2)")
+    parser.add_argument("--ranks", type=int, nargs="+", default=[1], help="numbers of processes (default: 1)")
     args, options = parser.parse_known_args()
     if args.out.exists():
         raise UserError(f"{args.out} exists; name a new folder")
     print(describe(compute_device()))
     print("train.py -s", args.scene.name, "--eval", *options, flush=True)
     runs = []
-    for number, seed in enumerate(args.seeds):
-        runs.append(train(args.scene.resolve(), args.out.resolve() / f"run{number}_seed{seed}", seed, options))
-        print(json.dumps(runs[-1]), flush=True)
-    rows = [
-        [str(r["seed"]), f"{r['seconds']:.1f}", f"{r['process']:.1f}", f"{r['PSNR']:.2f}", f"{r['SSIM']:.4f}"]
-        + [f"{r['Gaussians'] / 1e3:.1f} k", r["hash"]]
-        for r in runs
-    ]
-    if len(runs) > 1:
-        rows.append(["mean (standard deviation)"])
-        columns = [("seconds", 1, 1), ("process", 1, 1), ("PSNR", 1, 2), ("SSIM", 1, 4), ("Gaussians", 1e-3, 1)]
-        for key, scale, digits in columns:
-            values = [scale * r[key] for r in runs]
-            rows[-1].append(f"{statistics.mean(values):.{digits}f} ({statistics.stdev(values):.{digits}f})")
-        rows[-1].append("")
-    print_table(["seed", "training s", "process s", "PSNR dB", "SSIM", "Gaussians", "PLY sha256"], rows)
-    for seed in sorted({r["seed"] for r in runs}):
-        hashes = [r["hash"] for r in runs if r["seed"] == seed]
-        if len(hashes) > 1:
-            same = "the same" if len(set(hashes)) == 1 else "DIFFERENT"
-            print(f"seed {seed}, {len(hashes)} runs: the PLYs are {same}")
+    for seed in args.seeds:
+        for ranks in args.ranks:
+            model = args.out.resolve() / f"run{len(runs)}_seed{seed}_ranks{ranks}"
+            runs.append(train(args.scene.resolve(), model, seed, options, ranks))
+            print(json.dumps(runs[-1]), flush=True)
+    print_runs(runs)
 
 
 if __name__ == "__main__":

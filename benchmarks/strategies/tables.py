@@ -17,8 +17,8 @@ from utils.system_utils import UserError, run_cli
 
 DEFAULT = "adc"
 BUDGET = "--time_budget"
-_HEADER = ["scene", "options", "seeds", "iterations", "seconds", "of adc's", "Gaussians", "MB"]
-_SCORES = ["test PSNR (dB)", "more than adc", "best of its curve", "train PSNR"]
+_COSTS = ["scene", "options", "seeds", "iterations", "seconds", "Gaussians"]
+_SCORES = ["seconds of adc's", "MB", "test PSNR (dB)", "more than adc", "best of its curve", "train PSNR"]
 
 
 def print_tables(found: dict) -> None:
@@ -26,9 +26,8 @@ def print_tables(found: dict) -> None:
     print(found["machine"])
     print("\n".join(["", *(f"- {name}: `{' '.join(words)}`" for name, words in found["sets"].items() if words), ""]))
     if DEFAULT in found["sets"]:
-        print(
-            markdown_table([*_HEADER, *_SCORES], [line for scene in found["scenes"] for line in _against(found, scene)])
-        )
+        rows = [row for scene in found["scenes"] for row in _against(found, scene)]
+        print(markdown_table([*_COSTS, *_SCORES], rows))
         print(f"\n{_means(found)}")
     if budgets := {name: float(given) for name, words in found["sets"].items() if (given := _given(words))}:
         print(f"\n{_beside_fronts(found, budgets)}")
@@ -45,41 +44,34 @@ def _ends(found: dict, scene: str, name: str) -> list[dict]:
     return [one["end"] | one for one in found["scenes"][scene].get(name, {}).values() if one]
 
 
+def _costs(ends: list[dict]) -> list[str]:
+    forms = {"iteration": ",.0f", "seconds": ".2f", "gaussians": ",.0f"}
+    return [f"{len(ends)}", *(_shown([end[key] for end in ends], form) for key, form in forms.items())]
+
+
+def _mean(ends: list[dict], key: str) -> float:
+    return statistics.fmean(end[key] for end in ends)
+
+
 def _against(found: dict, scene: str) -> list[list[str]]:
     """A row for each set: what it costs and how well it ends, beside the default."""
     rows = []
     default = _ends(found, scene, DEFAULT)
     for name in found["sets"]:
-        ends = _ends(found, scene, name)
-        if not ends:
-            continue
-        seconds = statistics.fmean(end["seconds"] for end in ends)
-        part = f"{seconds / statistics.fmean(end['seconds'] for end in default):.2f}" if default else ""
-        rows.append([
-            scene,
-            name,
-            f"{len(ends)}",
-            _shown([end["iteration"] for end in ends], ",.0f"),
-            _shown([end["seconds"] for end in ends], ".2f"),
-            part,
-            _shown([end["gaussians"] for end in ends], ",.0f"),
-            f"{statistics.fmean(end['ply_bytes'] for end in ends) / 1e6:.1f}",
-            _shown([end["test_psnr"] for end in ends], ".2f"),
-            f"{gain(found, scene, name):+.2f}" if default else "",
-            f"{statistics.fmean(_best(end['curve']) for end in ends):.2f}",
-            f"{statistics.fmean(end['train_psnr'] for end in ends):.2f}",
-        ])  # fmt: skip
+        if ends := _ends(found, scene, name):
+            part = f"{_mean(ends, 'seconds') / _mean(default, 'seconds'):.2f}" if default else ""
+            more = f"{gain(found, scene, name):+.2f}" if default else ""
+            best = statistics.fmean(max(row["test_psnr"] for row in end["curve"] if row["whole"]) for end in ends)
+            row = [scene, name, *_costs(ends), part, f"{_mean(ends, 'ply_bytes') / 1e6:.1f}"]
+            row += [_shown([end["test_psnr"] for end in ends], ".2f"), more, f"{best:.2f}"]
+            rows.append([*row, f"{_mean(ends, 'train_psnr'):.2f}"])
     return rows
 
 
 def gain(found: dict, scene: str, name: str) -> float:
     """What the mean test PSNR (dB) of a set is above the default's."""
-    ours, theirs = (statistics.fmean(end["test_psnr"] for end in _ends(found, scene, one)) for one in (name, DEFAULT))
+    ours, theirs = (_mean(_ends(found, scene, one), "test_psnr") for one in (name, DEFAULT))
     return ours - theirs
-
-
-def _best(curve: Sequence[dict]) -> float:
-    return max(row["test_psnr"] for row in curve if row["whole"])
 
 
 def _shown(values: Sequence[float], form: str) -> str:
@@ -104,31 +96,17 @@ def _beside_fronts(found: dict, budgets: dict[str, float]) -> str:
     for scene in found["scenes"]:
         for name, given in budgets.items():
             ends = _ends(found, scene, name)
-            if not ends:
-                continue
             fixed = {
-                other: statistics.fmean(at(end["curve"], given) for end in _ends(found, scene, other))
-                for other in found["sets"]
-                if BUDGET not in found["sets"][other] and _ends(found, scene, other)
+                other: statistics.fmean(at(end["curve"], given) for end in ended)
+                for other, words in found["sets"].items()
+                if BUDGET not in words and (ended := _ends(found, scene, other))
             }
-            if not fixed:
-                continue
-            best = max(fixed, key=fixed.__getitem__)
-            ours = statistics.fmean(end["test_psnr"] for end in ends)
-            rows.append([
-                scene,
-                name,
-                f"{len(ends)}",
-                _shown([end["seconds"] for end in ends], ".2f"),
-                _shown([end["iteration"] for end in ends], ",.0f"),
-                _shown([end["gaussians"] for end in ends], ",.0f"),
-                _shown([end["test_psnr"] for end in ends], ".2f"),
-                f"{fixed[best]:.2f}",
-                best,
-                f"{ours - fixed[best]:+.2f}",
-            ])  # fmt: skip
-    costs = ["scene", "options", "seeds", "seconds", "iterations", "Gaussians"]
-    return markdown_table([*costs, "test PSNR (dB)", "best fixed one then", "options of that", "more"], rows)
+            if ends and fixed:
+                best = max(fixed, key=fixed.__getitem__)
+                psnr = _shown([end["test_psnr"] for end in ends], ".2f")
+                more = f"{_mean(ends, 'test_psnr') - fixed[best]:+.2f}"
+                rows.append([scene, name, *_costs(ends), psnr, f"{fixed[best]:.2f}", best, more])
+    return markdown_table([*_COSTS, "test PSNR (dB)", "best fixed one then", "options of that", "more"], rows)
 
 
 def at(curve: Sequence[dict], seconds: float) -> float:

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from benchmarks.workloads.splat_scenes import FOV
+from benchmarks.workloads.splat_scenes import FOV, Draw
 
 SIDE = 16.0  # of the square, world units
 _CELL = 0.4  # a house and half of the streets around it
@@ -21,18 +21,11 @@ _DOWN = math.pi / 4
 def city(n: int, width: int, sigma_px: float, seed: int, device: torch.device | str) -> dict[str, Tensor]:
     """Draw n Gaussians of the city: raw parameters by name, as in a SplatScene.
 
-    They lie in no order. sigma_px: median size in the middle of an image of that width. Sizes are log-normal (0.8),
-    axes within a factor of 5, opacities sigmoid(1.5 normal). A view of `look` sees some half of them.
+    They lie in no order. sigma_px: median size in the middle of an image of that width. Sizes are log-normal (0.8).
+    A view of `look` sees some half of them.
     """
-    g = torch.Generator(device).manual_seed(seed)
-
-    def uniform(*shape: int) -> Tensor:
-        return torch.rand(*shape, generator=g, device=device)
-
-    def normal(*shape: int) -> Tensor:
-        return torch.randn(*shape, generator=g, device=device)
-
-    ground, within = SIDE * uniform(n, 2), uniform(n, 3)
+    draw = Draw(seed, device)
+    ground, within = SIDE * draw.uniform(n, 2), draw.uniform(n, 3)
     cell = (ground / _CELL).floor()
     height = _HIGHEST * ((cell[:, 0] * 12.9898 + cell[:, 1] * 78.233).sin() * 43758.5).remainder(1.0)
     place = ground / _CELL - cell - 0.5
@@ -42,15 +35,8 @@ def city(n: int, width: int, sigma_px: float, seed: int, device: torch.device | 
     onto = torch.where(within[:, 1:2] < 0.5, place.new_tensor([1.0, 0.0]), place.new_tensor([0.0, 1.0]))
     place = torch.where(wall[:, None], torch.where(onto > 0, half * place.sign(), place), place)
     up = torch.where(wall, height * within[:, 2], torch.where(house, height, 0.0))
-    size = math.log(sigma_px * _DEPTH / (width / (2 * math.tan(FOV / 2)))) + 0.8 * normal(n)
-    return {
-        "means": torch.cat([(cell + place + 0.5) * _CELL - SIDE / 2, up[:, None]], 1),
-        "opacities": 1.5 * normal(n, 1),
-        "scales": size[:, None] + (uniform(n, 3) - 0.5) * math.log(5.0),
-        "rotations": normal(n, 4),
-        "sh_dc": 0.8 * normal(n, 1, 3),
-        "sh_rest": 0.1 * normal(n, 15, 3),
-    }
+    size = math.log(sigma_px * _DEPTH / (width / (2 * math.tan(FOV / 2)))) + 0.8 * draw.normal(n)
+    return {"means": torch.cat([(cell + place + 0.5) * _CELL - SIDE / 2, up[:, None]], 1)} | draw.appearance(size)
 
 
 def look(side: int) -> tuple[np.ndarray, np.ndarray]:

@@ -6,7 +6,7 @@ import torch
 from diff_gaussian_rasterization import GaussianRasterizationSettings
 from torch import Tensor
 
-from benchmarks.workloads.splat_scenes import FOV, SplatScene, on_device, settings
+from benchmarks.workloads.splat_scenes import FOV, Draw, SplatScene, on_device, settings
 
 RADIUS = 10.0
 CLUSTERS = 60
@@ -19,31 +19,15 @@ def ring_of_clusters(n: int, width: int, height: int, seed: int = 0, device: tor
     """Draw Gaussians in clusters that stand in a ring around the origin, in the plane of x and z.
 
     Rows are in random order, as in a model that has been densified many times. Sizes and opacities are those of
-    `splat_scenes.frustum`. Numbers are drawn on `device`; a GPU's differ from the CPU's.
+    `splat_scenes.frustum`.
     """
-    g = torch.Generator(device).manual_seed(seed)
-
-    def uniform(*shape: int) -> Tensor:
-        return torch.rand(*shape, generator=g, device=device)
-
-    def normal(*shape: int) -> Tensor:
-        return torch.randn(*shape, generator=g, device=device)
-
-    cluster = torch.randint(CLUSTERS, (n,), generator=g, device=device)
-    angles = 2 * math.pi * (torch.arange(CLUSTERS, device=device) + uniform(CLUSTERS)) / CLUSTERS
-    heights = 4 * uniform(CLUSTERS) - 2
+    draw = Draw(seed, device)
+    cluster = torch.randint(CLUSTERS, (n,), generator=draw.generator, device=device)
+    angles = 2 * math.pi * (torch.arange(CLUSTERS, device=device) + draw.uniform(CLUSTERS)) / CLUSTERS
+    heights = 4 * draw.uniform(CLUSTERS) - 2
     centers = torch.stack([RADIUS * angles.sin(), heights, RADIUS * angles.cos()], -1)
-    focal = width / (2 * math.tan(FOV / 2))
-    size = math.log(SIGMA_PX * RADIUS / focal) + 0.8 * normal(n, 1)
-    parameters = {
-        "means": centers[cluster] + 0.5 * normal(n, 3),
-        "opacities": 1.5 * normal(n, 1),
-        "scales": size + (uniform(n, 3) - 0.5) * math.log(5.0),
-        "rotations": normal(n, 4),
-        "sh_dc": 0.8 * normal(n, 1, 3),
-        "sh_rest": 0.1 * normal(n, 15, 3),
-    }
-    return SplatScene(parameters, width, height)
+    size = math.log(SIGMA_PX * RADIUS / (width / (2 * math.tan(FOV / 2)))) + 0.8 * draw.normal(n)
+    return SplatScene({"means": centers[cluster] + 0.5 * draw.normal(n, 3)} | draw.appearance(size), width, height)
 
 
 def view_of_share(

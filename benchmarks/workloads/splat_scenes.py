@@ -9,6 +9,20 @@ from torch import Tensor
 
 PARAMETERS = ("means", "opacities", "scales", "rotations", "sh_dc", "sh_rest")
 FOV = math.radians(60)
+# Arguments of `frustum`: splats, width, height, median pixel sigma.
+GPU_WORKLOADS = {
+    "S": (100_000, 800, 800, 2.4),
+    "M": (1_000_000, 1000, 1000, 1.4),
+    "M+": (1_000_000, 1600, 1060, 1.7),
+    "L": (3_000_000, 1600, 1060, 1.3),
+    "XL": (6_000_000, 1600, 1060, 1.1),
+}
+CPU_WORKLOADS = {
+    "S": (5_000, 200, 200, 2.4),
+    "M": (50_000, 400, 400, 2.4),
+    "L": (300_000, 800, 800, 1.7),
+    "wide": (5_000, 400, 400, 8.0),
+}
 
 
 @dataclass
@@ -86,63 +100,42 @@ def on_device(camera: GaussianRasterizationSettings, device: torch.device | str)
     return camera._replace(**{k: v.to(device) for k, v in camera._asdict().items() if isinstance(v, Tensor)})
 
 
+class Draw:
+    """Seeded numbers on a device; a GPU's differ from the CPU's."""
+
+    def __init__(self, seed: int, device: torch.device | str) -> None:
+        self.generator, self._device = torch.Generator(device).manual_seed(seed), device
+
+    def uniform(self, *shape: int) -> Tensor:
+        return torch.rand(*shape, generator=self.generator, device=self._device)
+
+    def normal(self, *shape: int) -> Tensor:
+        return torch.randn(*shape, generator=self.generator, device=self._device)
+
+    def appearance(self, size: Tensor) -> dict[str, Tensor]:
+        """Parameters but means, of logarithmic sizes (n,): axes within a factor of 5, opacities sigmoid(1.5 normal)."""
+        n = len(size)
+        scales, rotations = size[:, None] + (self.uniform(n, 3) - 0.5) * math.log(5.0), self.normal(n, 4)
+        colors = {"sh_dc": (0.8, 1), "sh_rest": (0.1, 15)}
+        drawn = {"opacities": 1.5 * self.normal(n, 1), "scales": scales, "rotations": rotations}
+        return drawn | {name: factor * self.normal(n, count, 3) for name, (factor, count) in colors.items()}
+
+
 def frustum(
     n: int, width: int, height: int, sigma_px: float, seed: int = 0, device: torch.device | str = "cpu"
 ) -> SplatScene:
     """Draw Gaussians uniformly in the frustum at depths 2 to 10.
 
-    The median size is sigma_px, sizes are log-normal (0.8), axes within a factor of 5, opacities sigmoid(1.5 normal).
-    Numbers are drawn on `device`; a GPU's differ from the CPU's. On a GPU with seed 0, this order of draws gives
-    the tensors that the other implementations in published.py were measured on.
+    The median size is sigma_px, sizes are log-normal (0.8). On a GPU with seed 0, this order of draws gives the tensors
+    that the other implementations in kernels/published.py were measured on.
     """
-    g = torch.Generator(device).manual_seed(seed)
-
-    def uniform(*shape: int) -> Tensor:
-        return torch.rand(*shape, generator=g, device=device)
-
-    def normal(*shape: int) -> Tensor:
-        return torch.randn(*shape, generator=g, device=device)
-
+    draw = Draw(seed, device)
     focal = width / (2 * math.tan(FOV / 2))
-    z = 2 + 8 * uniform(n)
-    x = (2 * uniform(n) - 1) * 1.02 * (width / (2 * focal)) * z
-    y = (2 * uniform(n) - 1) * 1.02 * (height / (2 * focal)) * z
-    size = torch.log(sigma_px * z / focal) + 0.8 * normal(n)
-    aspect = (uniform(n, 3) - 0.5) * math.log(5.0)
-    rotations = normal(n, 4)
-    parameters = {
-        "means": torch.stack([x, y, z], -1),
-        "opacities": 1.5 * normal(n, 1),
-        "scales": size[:, None] + aspect,
-        "rotations": rotations,
-        "sh_dc": 0.8 * normal(n, 1, 3),
-        "sh_rest": 0.1 * normal(n, 15, 3),
-    }
-    return SplatScene(parameters, width, height)
-
-
-def heap(
-    n: int = 200_000, width: int = 400, height: int = 400, seed: int = 0, device: torch.device | str = "cpu"
-) -> SplatScene:
-    """Draw small Gaussians in a cube that covers the middle of the image, densest at its centre, as of an object.
-
-    Some tiles have lists of thousands, most have few or none. With the default numbers, the longest has some 7,100, of
-    which half are processed; of all instances 92 % are. The median size is 1.2 px.
-    """
-    g = torch.Generator().manual_seed(seed)  # the same on every device
-    uniform = 2 * torch.rand(n, 3, generator=g) - 1
-    means = 1.2 * uniform.sign() * uniform.abs() ** 1.3 + torch.tensor([0.0, 0.0, 4.2])
-    focal = width / (2 * math.tan(FOV / 2))
-    size = torch.log(1.2 * means[:, 2] / focal) + 0.6 * torch.randn(n, generator=g)
-    parameters = {
-        "means": means,
-        "opacities": 1.2 * torch.randn(n, 1, generator=g) - 3,
-        "scales": size[:, None] + (torch.rand(n, 3, generator=g) - 0.5) * math.log(5.0),
-        "rotations": torch.randn(n, 4, generator=g),
-        "sh_dc": 0.8 * torch.randn(n, 1, 3, generator=g),
-        "sh_rest": 0.1 * torch.randn(n, 15, 3, generator=g),
-    }
-    return SplatScene(parameters, width, height).to(device)
+    z = 2 + 8 * draw.uniform(n)
+    x = (2 * draw.uniform(n) - 1) * 1.02 * (width / (2 * focal)) * z
+    y = (2 * draw.uniform(n) - 1) * 1.02 * (height / (2 * focal)) * z
+    size = torch.log(sigma_px * z / focal) + 0.8 * draw.normal(n)
+    return SplatScene({"means": torch.stack([x, y, z], -1)} | draw.appearance(size), width, height)
 
 
 def ordinary(n: int = 2000, width: int = 203, height: int = 117) -> SplatScene:

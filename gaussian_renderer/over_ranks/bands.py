@@ -12,9 +12,9 @@ from torch import Tensor
 
 from utils.ranks.ranks import Ranks
 
-# Work in units of a rectangle's width in a row: of an instance that the backward reads, and of a tile besides. By the
-# stages of one GPU (docs/inside/scaling.md) a width, with 3.43 to a splat of 2.94 instances, takes 0.02 to 0.045 us, an
-# instance 0.38 us and its row about 0.1, and a tile of 256 pixels 68 us, all for a thousand.
+# Work in units of a rectangle's width in a row: of an instance that the backward reads, and of a tile besides. On
+# one GPU a width, with 3.43 to a splat of 2.94 instances, takes 0.02 to 0.045 us, an instance 0.38 us and its row about
+# 0.1, and a tile of 256 pixels 68 us, all for a thousand.
 _PROCESSED_COST, _TILE_COST = 11, 1500
 _VISITS = 8  # of a view, for which its bands are kept
 _SAMPLE = 1 << 16  # splats of a rank, about, by which bands are found

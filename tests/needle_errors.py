@@ -1,13 +1,6 @@
-"""Errors along needles, by their length: of the exponent, and of the gradient of the 2D covariance.
-
-The exponent is log2 of alpha. It is computed from the rendered transmittance of one needle at a time, so it is what a
-user sees; the reference is the oracle. The gradient is measured without the rounding of the inputs: the float32 splats
-that `project` returned count as exact, and the reference is autograd in float64 on the definition of the image, with
-their means and covariances.
-"""
+"""Errors along needles, by their length: of the exponent, and of the gradient of the 2D covariance."""
 
 import math
-from typing import NamedTuple
 
 import torch
 from diff_gaussian_rasterization import Gaussians, rasterize, reference
@@ -15,33 +8,20 @@ from diff_gaussian_rasterization.ops import scene_arguments
 from torch import Tensor
 
 from benchmarks.workloads import textbook
-from benchmarks.workloads.stability_cases import long_needles
 
-_OPS = torch.ops.diff_gaussian_rasterization
-_HALF_LOG2E = 0.5 / math.log(2)
+OPS = torch.ops.diff_gaussian_rasterization
 
 
-class NeedleError(NamedTuple):
-    """Errors of our kernels and of the textbook formulas in float32, on needles of sigma low to high px."""
+def exponent_errors(parameters: dict[str, Tensor], camera) -> tuple[float, float]:
+    """The largest error of log2 of alpha, of ours and of the textbook's formulas in float32, against the oracle.
 
-    low: float
-    high: float
-    exponent: float  # largest, log2 units
-    textbook_exponent: float
-    gradient: float  # median over needles of |difference| / |reference| of (xx, xy, yy)
-    textbook_gradient: float
-
-
-def needle_error(low: float, high: float, count: int = 20) -> NeedleError:
-    """Measure `count` needles of sigma low to high px."""
-    make, camera = long_needles(count, low, high)
-    parameters = make(torch.Generator().manual_seed(int(low)))
-    exponents = [_exponents(parameters, camera, f) for f in (reference.render, rasterize, textbook.render)]
-    wanted, ours, theirs = exponents
+    It is computed from the rendered transmittance of one needle at a time, so it is what a user sees.
+    """
+    wanted, *found = [_exponents(parameters, camera, f) for f in (reference.render, rasterize, textbook.render)]
     # Alpha must not be near the cut-off, nor so near 1 that 1 - T loses digits. At alpha 0.01, 1 - T rounds by 1e-5.
     seen = (wanted > math.log2(0.01)) & (wanted < math.log2(0.97))
-    largest = [float((e - wanted)[seen].abs().nan_to_num(nan=math.inf, posinf=math.inf).max()) for e in (ours, theirs)]
-    return NeedleError(low, high, *largest, *_gradient_errors(parameters, camera))
+    ours, theirs = (float((e - wanted)[seen].abs().nan_to_num(nan=math.inf, posinf=math.inf).max()) for e in found)
+    return ours, theirs
 
 
 def _exponents(parameters: dict[str, Tensor], camera, render) -> Tensor:
@@ -56,29 +36,33 @@ def _exponents(parameters: dict[str, Tensor], camera, render) -> Tensor:
     return torch.stack(rows)
 
 
-def _gradient_errors(parameters: dict[str, Tensor], camera) -> tuple[float, float]:
+def gradient_errors(parameters: dict[str, Tensor], camera) -> tuple[float, float]:
+    """The median over needles of |difference| / |reference| of the covariance's gradient, ours and the textbook's.
+
+    Without the rounding of the inputs: the float32 splats that `project` returned count as exact, and the reference is
+    autograd in float64 on the definition of the image, with their means and covariances.
+    """
     height, width = camera.image_height, camera.image_width
-    arguments = scene_arguments(Gaussians(**parameters), camera, raw=True)
-    splats, depths, rects, counts, _ = _OPS.project(*arguments)
+    splats, depths, rects, counts, _ = OPS.project(*scene_arguments(Gaussians(**parameters), camera, raw=True))
     order = torch.argsort(torch.where(counts > 0, depths, math.inf), stable=True)[: int((counts > 0).sum())]
     l11, l12, l22 = splats[order, 2:5].double().unbind(1)
     xx, xy, yy = 1 / l11**2 + (l12 / (l11 * l22)) ** 2, -l12 / (l11 * l22**2), 1 / l22**2
-    covariance = _HALF_LOG2E * torch.stack([xx, xy, yy], 1)
+    covariance = 0.5 / math.log(2) * torch.stack([xx, xy, yy], 1)
     wanted, weights = _definition(splats[order].double(), covariance, height, width)
 
-    instances, ranges, *slots = _OPS.bin(splats, depths, rects, counts, height, width, True)
+    instances, ranges, *slots = OPS.bin(splats, depths, rects, counts, height, width, True)
     background = torch.zeros(3)
-    _, transmittance, _, last, _ = _OPS.blend(splats, instances, ranges, background, height, width, False, True)
+    _, transmittance, _, last, _ = OPS.blend(splats, instances, ranges, background, height, width, False, True)
     state = (splats, instances, ranges, *slots, background, last, transmittance)
-    quu, quv, qvv = _OPS.blend_vjp(*state, weights.float(), None, None)[order, 3:6].double().unbind(1)
+    quu, quv, qvv = OPS.blend_vjp(*state, weights.float(), None, None)[order, 3:6].double().unbind(1)
     uu, uv = quu * l11, quv * l11  # gradient of a symmetric matrix, 2 ln2^2 L^T W2 L; xy stands for two entries
     vu, vv = quu * l12 + quv * l22, quv * l12 + qvv * l22
     ours = 2 * math.log(2) ** 2 * torch.stack([l11 * uu, 2 * (l12 * uu + l22 * uv), l12 * vu + l22 * vv], 1)
 
     rounded = covariance.float()
-    reference_of_theirs, _ = _definition(splats[order].double(), rounded.double(), height, width, weights)
+    of_theirs, _ = _definition(splats[order].double(), rounded.double(), height, width, weights)
     theirs, _ = _definition(splats[order], rounded, height, width, weights)
-    return _median_error(ours, wanted), _median_error(theirs, reference_of_theirs)
+    return _median_error(ours, wanted), _median_error(theirs, of_theirs)
 
 
 def _definition(
@@ -115,6 +99,3 @@ def _median_error(got: Tensor, wanted: Tensor) -> float:
     counted = size > 1e-6 * size.max()
     errors = (got.double() - wanted).norm(dim=1)[counted] / size[counted]
     return float(errors.nan_to_num(nan=math.inf, posinf=math.inf).median())
-
-
-LENGTHS = ((30.0, 100.0), (100.0, 300.0), (300.0, 1000.0), (1000.0, 2000.0))

@@ -1,1 +1,0 @@
-"""Benchmarks of the web page: frames, delays, and what they take from a training."""
