@@ -97,9 +97,18 @@ def _is_module(name: str) -> bool:
     return path.with_suffix(".py").is_file() or (path / "__init__.py").is_file()
 
 
-def _imports(path: Path) -> Iterator[str]:
+def _for_types(tree: ast.Module) -> set[ast.AST]:
+    """What stands under `if TYPE_CHECKING:`, which no program runs."""
+    tests = [node for node in ast.walk(tree) if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING"]
+    return {inner for node in tests for part in node.body for inner in ast.walk(part)}
+
+
+def _imports(path: Path, types: bool = True) -> Iterator[str]:
     """The project's modules that a file imports; `from a import b` counts as a.b where that is a module."""
+    ignored = set() if types else _for_types(_tree(path))
     for node in ast.walk(_tree(path)):
+        if node in ignored:
+            continue
         if isinstance(node, ast.Import):
             names = [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
@@ -116,6 +125,15 @@ def test_a_module_imports_only_rooms_below_it(path):
     allowed = (room, *MAY_IMPORT[room])
     wrong = [name for name in _imports(path) if not any(_within(name, prefix) for prefix in allowed)]
     assert not wrong, f"{_module(path)} imports {wrong}; {room} may import {allowed}"
+
+
+def test_no_modules_import_each_other():
+    modules = {_module(path): path for path in _python() if _module(path).split(".")[0] in (*ROOMS, *COMMANDS)}
+    graph = {module: set(_imports(path, types=False)) - {module} for module, path in modules.items()}
+    while free := [module for module, names in graph.items() if not names & graph.keys()]:
+        for module in free:
+            del graph[module]
+    assert not graph, "these import each other, or import such modules"
 
 
 def test_tests_import_only_workloads_of_the_benchmarks_that_they_do_not_test():

@@ -11,6 +11,7 @@ from pathlib import Path
 
 from utils.host import start, torchrun
 from utils.host.device import compute_device
+from utils.host.errors import UserError, first_line
 from utils.host.interrupt import Terminated
 from utils.host.memory import is_out_of_memory, shortage
 from utils.ranks.ranks import ranks
@@ -32,15 +33,6 @@ _ITERATION_FOLDER = re.compile(r"iteration_(\d+)")
 # Windows' errors while another program, such as a virus scanner, has a file open; Linux has no such error.
 _IN_USE = {5, 32, 33}  # access denied, sharing violation, lock violation
 _PATIENCE = 2.0  # seconds for it to close the file
-
-
-class UserError(Exception):
-    """An error that the user can fix. Its text is one sentence that names the fault and the remedy."""
-
-
-def first_line(error: BaseException) -> str:
-    """What an error says, in one line of at most 200 characters; its type if it says nothing."""
-    return next(iter(str(error).splitlines()), "")[:200] or type(error).__name__
 
 
 def run_cli(main: Callable[[], object], several: bool = False) -> None:

@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 
 from utils.files.listing import some
-from utils.system_utils import UserError
+from utils.host.errors import UserError
 
 _SHORT = 60  # letters of a value that a message shows
 

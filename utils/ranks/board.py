@@ -11,7 +11,7 @@ from typing import Any
 import torch.distributed as dist
 
 from utils.host import torchrun
-from utils.system_utils import UserError, first_line
+from utils.host.errors import UserError, first_line
 
 _STATE = 2  # of the fields of /proc/PID/stat, from 1 on after the name
 _WAIT = timedelta(minutes=10)  # for the store itself, as long as torchrun starts on another host

@@ -13,6 +13,7 @@ import torch.distributed as dist
 
 from utils.host import interrupt, torchrun
 from utils.host.device import compute_device
+from utils.host.errors import UserError, first_line
 from utils.host.threads import cores
 from utils.ranks import quiet
 from utils.ranks.alike import refuse_differences
@@ -21,7 +22,6 @@ from utils.ranks.ending import DONE, FAULT, LOST, NO_WORD, SIGNAL, End, Ending
 from utils.ranks.ranks import using
 from utils.ranks.watch import Watch
 from utils.ranks.watched import TIMEOUT, RankLost, WatchedRanks
-from utils.system_utils import UserError, first_line
 
 _SIGNALS = (130, 143)  # exit statuses
 
