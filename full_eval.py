@@ -42,6 +42,12 @@ EXPOSURE = (
     "--exposure_lr_init", "0.001", "--exposure_lr_final", "0.0001", "--exposure_lr_delay_steps", "5000",
     "--exposure_lr_delay_mult", "0.001", "--train_test_exp",
 )  # fmt: skip
+_SHORT_FOR = {  # flags: words for train.py that they stand for, and help
+    "use_depth": (("-d", "depths2/"), "supervise with inverse depth maps: train.py -d depths2/"),
+    "use_expcomp": (EXPOSURE, "exposure compensation: train.py --train_test_exp and its learning rates"),
+    "fast": (("--optimizer_type", "sparse_adam"), "train.py --optimizer_type sparse_adam"),
+    "aa": (("--antialiasing",), "train and render with --antialiasing"),
+}
 
 
 def _parser() -> ArgumentParser:
@@ -76,10 +82,8 @@ def _parser() -> ArgumentParser:
         "again (default: none)")  # fmt: skip
     add("--html_models", **flag,
         help="write each model into models/ beside the report, as one HTML file with a viewer")  # fmt: skip
-    add("--use_depth", **flag, help="supervise with inverse depth maps: train.py -d depths2/")
-    add("--use_expcomp", **flag, help="exposure compensation: train.py --train_test_exp and its learning rates")
-    add("--fast", **flag, help="train.py --optimizer_type sparse_adam")
-    add("--aa", **flag, help="train and render with --antialiasing")
+    for name, (_, text) in _SHORT_FOR.items():
+        add(f"--{name}", **flag, help=text)
     return parser
 
 
@@ -104,14 +108,8 @@ def _plan(args: Namespace, more: Sequence[str]) -> list[Run]:
     parse = None if args.skip_training else _parse_for_training
     check_options(more, "after --", parse)
     configs = read_configs(args.configs, parse) if args.configs else {}
-    common = [
-        *(("-d", "depths2/") if args.use_depth else ()),
-        *(EXPOSURE if args.use_expcomp else ()),
-        *(("--optimizer_type", "sparse_adam") if args.fast else ()),
-        *(("--antialiasing",) if args.aa else ()),
-        *(() if args.iterations is None else ("--iterations", str(args.iterations))),
-        *more,
-    ]
+    common = [word for name, (words, _) in _SHORT_FOR.items() if getattr(args, name) for word in words]
+    common += [*([] if args.iterations is None else ["--iterations", str(args.iterations)]), *more]
     if args.seeds and any(word.split("=")[0] == "--seed" for word in (*common, *sum(configs.values(), ()))):
         raise UserError("--seed is given twice; omit it when --seeds is given")
     runs = plan_runs(_scenes(args), args.output_path.resolve(), common, configs, args.seeds)
@@ -131,7 +129,7 @@ def _parse_for_training(words: Sequence[str]) -> None:
 def _carry_out(runs: Sequence[Run], args: Namespace, failures: dict[Run, Failure]) -> None:
     """Carry out every run; note and print a failure, and continue with the next run."""
     facts = {} if args.skip_training else machine()
-    options = ("--antialiasing",) if args.aa else ()
+    options = _SHORT_FOR["aa"][0] if args.aa else ()
     download = True
     for number, run in enumerate(runs, 1):
         print(f"[{number}/{len(runs)}] {run.title}", flush=True)

@@ -1,6 +1,6 @@
 """Command-line options, and their storage in a model folder."""
 
-from arguments.groups import ModelParams, OptimizationParams, PipelineParams
+from arguments.groups import OPTIONS, ModelParams, OptimizationParams, PipelineParams
 from arguments.param_group import GroupParams, OptionParser, ParamGroup
 from arguments.stored import (
     VERSION,
@@ -9,13 +9,13 @@ from arguments.stored import (
     read_cfg_args,
     read_model_json,
     read_stored_options,
-    read_training_options,
     warn_of_background,
     write_cfg_args,
     write_model_json,
 )
 
 __all__ = [
+    "OPTIONS",
     "VERSION",
     "GroupParams",
     "ModelParams",
@@ -28,7 +28,6 @@ __all__ = [
     "read_cfg_args",
     "read_model_json",
     "read_stored_options",
-    "read_training_options",
     "warn_of_background",
     "write_cfg_args",
     "write_model_json",

@@ -4,7 +4,17 @@ import argparse
 import os
 from collections.abc import Collection
 
-from arguments.param_group import GroupParams, Option, OptionTable, above, at_least, one_of, within
+from arguments.param_group import (
+    CFG_ARGS,
+    MODEL_JSON,
+    GroupParams,
+    Option,
+    OptionTable,
+    above,
+    at_least,
+    one_of,
+    within,
+)
 from arguments.strategies import STRATEGY_OPTIONS
 from utils.system_utils import UserError
 
@@ -18,124 +28,62 @@ def _tolerance(value: float) -> str | None:
 
 
 class ModelParams(OptionTable):
-    """Options of the data, the output folder and the SH degree. The `stored` ones make up `cfg_args`."""
+    """Options of the data, the output folder and the SH degree. Those of CFG_ARGS make up that file."""
 
     title = "model"
+    # fmt: off
     options = (
-        Option(
-            "sh_degree",
-            3,
-            "highest degree, 0 to 3, of the spherical harmonics that make colour depend on the view; higher: more "
-            "view-dependent detail, more memory",
-            "paper",
-            check=within(0, 3),
-            stored=True,
+        Option("sh_degree", 3, origin="paper", check=within(0, 3), stored=CFG_ARGS, compared=False,
             loaded="that of the saved PLY",
-        ),
-        Option(
-            "source_path",
-            "",
-            "scene folder (COLMAP, Blender or nerfstudio)",
-            "none, must be given",
-            short="s",
-            stored=True,
-        ),
-        Option(
-            "model_path",
-            "",
-            "folder of the model",
-            "a new one under ./output, named after OAR_JOB_ID or at random, as in the reference",
-            short="m",
-            stored=True,
-            loaded="none, must be given",
-        ),
-        Option(
-            "images", "images", "folder of the photos inside the scene folder (COLMAP only)", short="i", stored=True
-        ),
-        Option(
-            "depths",
-            "",
-            "folder of inverse depth maps inside the scene folder, PNGs with the photos' names; they stabilise regions "
-            "that few photos show; empty: no depth supervision",
-            short="d",
-            stored=True,
-        ),
-        Option(
-            "resolution",
-            -1,
-            "1, 2, 4, 8: divide the size of the photos by this; -1: keep their size, but at most 1600 pixels wide; any "
-            "other value: width in pixels",
-            short="r",
-            check=_resolution,
-            stored=True,
-        ),
-        Option("white_background", False, "white background instead of black", short="w", stored=True),
-        Option(
-            "train_test_exp",
-            False,
-            "train a colour correction of each photo, for photos of different exposure; this trains on the left halves "
-            "of the test photos too, and only right halves are scored and rendered",
-            stored=True,
-        ),
-        Option(
-            "data_device",
-            "cuda",
-            "device that holds the images, as 8-bit values. With cpu, or if they would take more than a quarter of the "
-            "GPU's free memory, pinned memory of the CPU holds them and they are copied ahead of their use. Without a "
-            "usable GPU, cuda means the CPU",
-            stored=True,
-        ),
-        Option("eval", False, "hold out a test set: every 8th photo by name, or Blender's test frames", stored=True),
-        Option(
-            "init_pcd_path",
-            "",
-            "file of points to start from instead of the scene's own: PLY, npz (points, colors), or text whose lines "
-            "are x y z or x y z red green blue",
-            "ours",
-        ),
-        Option(
-            "init_ply",
-            "",
-            "model to start from, with its Gaussians' shapes and colours: PLY or compressed PLY of any tool, SPZ or "
-            ".splat; a point cloud is taken as by --init_pcd_path",
-            "ours",
-        ),
-        Option(
-            "init_type",
-            "sfm",
-            "points to start from without --init_pcd_path and --init_ply. sfm: the scene's own; random: grey points in "
-            "the cameras' frusta, or in the reference's cube for Blender scenes",
-            "ours",
-            check=one_of("sfm", "random"),
-        ),
-        Option(
-            "masks",
-            "",
-            "folder of mask files inside the scene folder, or an absolute path; black is masked. A mask has its "
-            "photo's name, with .png appended or with another suffix. Empty: the masks that a nerfstudio scene names",
-            "ours",
-            remembered=True,
-        ),
-        Option("invert_masks", False, "white is masked instead of black", "ours", remembered=True),
-        Option(
-            "mask_meaning",
-            "auto",
-            "meaning of pixels masked by mask files or by the photos' alpha. ignore: leave them out of loss and "
-            "scores; transparent: they show the background; auto: ignore for mask files, transparent for alpha",
-            "ours",
-            check=one_of("auto", "ignore", "transparent"),
-            remembered=True,
-        ),
-        Option(
-            "images_to_load",
-            0,
-            "largest number of decoded images (photos, masks and depth maps) kept in memory, 0: all. The one unused "
-            "for longest goes. Every photo still trains, with the same result; up to 32 that come next are decoded "
-            "ahead",
-            "ours",
-            check=at_least(0),
-        ),
+            help="highest degree, 0 to 3, of the spherical harmonics that make colour depend on the view; higher: "
+                 "more view-dependent detail, more memory"),
+        Option("source_path", "", origin="none, must be given", short="s", stored=CFG_ARGS,
+            help="scene folder (COLMAP, Blender or nerfstudio)"),
+        Option("model_path", "",
+            origin="a new one under ./output, named after OAR_JOB_ID or at random, as in the reference", short="m",
+            stored=CFG_ARGS, compared=False, loaded="none, must be given",
+            help="folder of the model"),
+        Option("images", "images", short="i", stored=CFG_ARGS,
+            help="folder of the photos inside the scene folder (COLMAP only)"),
+        Option("depths", "", short="d", stored=CFG_ARGS,
+            help="folder of inverse depth maps inside the scene folder, PNGs with the photos' names; they stabilise "
+                 "regions that few photos show; empty: no depth supervision"),
+        Option("resolution", -1, short="r", check=_resolution, stored=CFG_ARGS,
+            help="1, 2, 4, 8: divide the size of the photos by this; -1: keep their size, but at most 1600 pixels "
+                 "wide; any other value: width in pixels"),
+        Option("white_background", False, "white background instead of black", short="w", stored=CFG_ARGS),
+        Option("train_test_exp", False, stored=CFG_ARGS, compared=False,
+            help="train a colour correction of each photo, for photos of different exposure; this trains on the left "
+                 "halves of the test photos too, and only right halves are scored and rendered"),
+        Option("data_device", "cuda", stored=CFG_ARGS, compared=False,
+            help="device that holds the images, as 8-bit values. With cpu, or if they would take more than a quarter "
+                 "of the GPU's free memory, pinned memory of the CPU holds them and they are copied ahead of their "
+                 "use. Without a usable GPU, cuda means the CPU"),
+        Option("eval", False, stored=CFG_ARGS,
+            help="hold out a test set: every 8th photo by name, or Blender's test frames"),
+        Option("init_pcd_path", "", origin="ours",
+            help="file of points to start from instead of the scene's own: PLY, npz (points, colors), or text whose "
+                 "lines are x y z or x y z red green blue"),
+        Option("init_ply", "", origin="ours",
+            help="model to start from, with its Gaussians' shapes and colours: PLY or compressed PLY of any tool, SPZ "
+                 "or .splat; a point cloud is taken as by --init_pcd_path"),
+        Option("init_type", "sfm", origin="ours", check=one_of("sfm", "random"),
+            help="points to start from without --init_pcd_path and --init_ply. sfm: the scene's own; random: grey "
+                 "points in the cameras' frusta, or in the reference's cube for Blender scenes"),
+        Option("masks", "", origin="ours", stored=MODEL_JSON,
+            help="folder of mask files inside the scene folder, or an absolute path; black is masked. A mask has its "
+                 "photo's name, with .png appended or with another suffix. Empty: the masks that a nerfstudio scene "
+                 "names"),
+        Option("invert_masks", False, "white is masked instead of black", "ours", stored=MODEL_JSON),
+        Option("mask_meaning", "auto", origin="ours", check=one_of("auto", "ignore", "transparent"), stored=MODEL_JSON,
+            help="meaning of pixels masked by mask files or by the photos' alpha. ignore: leave them out of loss and "
+                 "scores; transparent: they show the background; auto: ignore for mask files, transparent for alpha"),
+        Option("images_to_load", 0, origin="ours", check=at_least(0),
+            help="largest number of decoded images (photos, masks and depth maps) kept in memory, 0: all. The one "
+                 "unused for longest goes. Every photo still trains, with the same result; up to 32 that come next "
+                 "are decoded ahead"),
     )
+    # fmt: on
 
     def __init__(self, parser: argparse.ArgumentParser, sentinel: bool = False, without: Collection[str] = ()) -> None:
         self._add_table(parser, sentinel, without)
@@ -143,10 +91,8 @@ class ModelParams(OptionTable):
     def extract(self, args: argparse.Namespace) -> GroupParams:
         """Do as OptionTable.extract, and make source_path absolute. UserError for contradictory options."""
         values = super().extract(args)
-        names = [name for name in ("init_pcd_path", "init_ply") if getattr(values, name, "")]
-        starts = [f"--{name} {getattr(values, name)}" for name in names]
-        if getattr(values, "init_type", "") == "random":
-            starts.insert(0, "--init_type random")
+        given = {name: getattr(values, name, "") for name in ("init_type", "init_pcd_path", "init_ply")}
+        starts = [f"--{name} {value}" for name, value in given.items() if value not in ("", "sfm")]
         if len(starts) > 1:
             raise UserError(f"{' and '.join(starts[:2])} both name the points to start from; leave one out")
         if getattr(values, "source_path", ""):
@@ -155,20 +101,18 @@ class ModelParams(OptionTable):
 
 
 class PipelineParams(OptionTable):
-    """Options of rendering. They are not part of `cfg_args`; `model.json` remembers antialiasing."""
+    """Options of rendering. None is part of `cfg_args`."""
 
     title = "pipeline"
+    # fmt: off
     options = (
         Option("convert_SHs_python", False, "evaluate spherical harmonics in PyTorch; slower, for experiments"),
         Option("compute_cov3D_python", False, "compute 3D covariances in PyTorch; slower, for experiments"),
         Option("debug", False, "check the inputs and outputs of every kernel; slower"),
-        Option(
-            "antialiasing",
-            False,
-            "keep the total weight of splats smaller than a pixel, so that views from other distances look right",
-            loaded="that of the model",
-        ),
+        Option("antialiasing", False, stored=MODEL_JSON,
+            help="keep the total weight of splats smaller than a pixel, so that views from other distances look right"),
     )
+    # fmt: on
 
     def __init__(self, parser: argparse.ArgumentParser, sentinel: bool = False, without: Collection[str] = ()) -> None:
         self._add_table(parser, sentinel, without)
@@ -178,153 +122,72 @@ class OptimizationParams(OptionTable):
     """Options of the optimisation: its length, its learning rates, and the control of the number of Gaussians."""
 
     title = "optimisation"
+    # fmt: off
     options = (
         Option("iterations", 30_000, "training steps, one photo each", "paper", check=within(1, 2**31 - 1)),
-        Option(
-            "position_lr_init",
-            0.00016,
-            "learning rate of positions at the start, times the scene extent",
-            "paper",
-            check=at_least(0),
-        ),
-        Option(
-            "position_lr_final",
-            0.0000016,
-            "learning rate of positions at position_lr_max_steps, times the scene extent",
-            "paper",
-            check=at_least(0),
-        ),
-        Option(
-            "position_lr_delay_mult",
-            0.01,
-            "no effect, there are no delay steps; kept for old commands",
-            check=at_least(0),
-        ),
-        Option(
-            "position_lr_max_steps",
-            30_000,
-            "step at which the learning rate of positions reaches its final value; independent of --iterations",
-            check=at_least(1),
-        ),
-        Option(
-            "feature_lr",
-            0.0025,
-            "learning rate of the base colour; that of the view-dependent bands is 1/20 of it",
-            "paper",
-            check=at_least(0),
-        ),
-        Option(
-            "opacity_lr",
-            0.025,
-            "learning rate of the opacity logits; higher: Gaussians fade in and out faster",
-            "newest reference; 0.05 in the 2023 release",
-            check=at_least(0),
-        ),
+        Option("position_lr_init", 0.00016, origin="paper", check=at_least(0),
+            help="learning rate of positions at the start, times the scene extent"),
+        Option("position_lr_final", 0.0000016, origin="paper", check=at_least(0),
+            help="learning rate of positions at position_lr_max_steps, times the scene extent"),
+        Option("position_lr_delay_mult", 0.01, check=at_least(0),
+            help="no effect, there are no delay steps; kept for old commands"),
+        Option("position_lr_max_steps", 30_000, check=at_least(1),
+            help="step at which the learning rate of positions reaches its final value; independent of --iterations"),
+        Option("feature_lr", 0.0025, origin="paper", check=at_least(0),
+            help="learning rate of the base colour; that of the view-dependent bands is 1/20 of it"),
+        Option("opacity_lr", 0.025, origin="newest reference; 0.05 in the 2023 release", check=at_least(0),
+            help="learning rate of the opacity logits; higher: Gaussians fade in and out faster"),
         Option("scaling_lr", 0.005, "learning rate of the logarithms of the scales", check=at_least(0)),
         Option("rotation_lr", 0.001, "learning rate of the quaternions", check=at_least(0)),
-        Option(
-            "exposure_lr_init", 0.01, "learning rate of exposures (--train_test_exp) at the start", check=at_least(0)
-        ),
+        Option("exposure_lr_init", 0.01, check=at_least(0),
+            help="learning rate of exposures (--train_test_exp) at the start"),
         Option("exposure_lr_final", 0.001, "learning rate of exposures in the last step", check=at_least(0)),
-        Option(
-            "exposure_lr_delay_steps",
-            0,
-            "steps at the start over which the learning rate of exposures rises to its normal value",
-            check=at_least(0),
-        ),
-        Option(
-            "exposure_lr_delay_mult",
-            0.0,
-            "factor of the learning rate of exposures at step 0, where that rise begins",
-            check=within(0, 1),
-        ),
-        Option(
-            "percent_dense",
-            0.01,
-            "size that decides densification, as a fraction of the scene extent: smaller Gaussians are cloned, larger "
-            "ones split",
-            check=at_least(0),
-        ),
-        Option(
-            "lambda_dssim",
-            0.2,
-            "weight of 1 - SSIM in the loss; the weight of the L1 term is 1 minus this",
-            "paper",
-            check=within(0, 1),
-        ),
+        Option("exposure_lr_delay_steps", 0, check=at_least(0),
+            help="steps at the start over which the learning rate of exposures rises to its normal value"),
+        Option("exposure_lr_delay_mult", 0.0, check=within(0, 1),
+            help="factor of the learning rate of exposures at step 0, where that rise begins"),
+        Option("percent_dense", 0.01, check=at_least(0),
+            help="size that decides densification, as a fraction of the scene extent: smaller Gaussians are cloned, "
+                 "larger ones split"),
+        Option("lambda_dssim", 0.2, origin="paper", check=within(0, 1),
+            help="weight of 1 - SSIM in the loss; the weight of the L1 term is 1 minus this"),
         Option("densification_interval", 100, "steps between densifications", "paper", check=at_least(1)),
-        Option(
-            "opacity_reset_interval",
-            3000,
-            "steps between resets of all opacities to at most 0.01",
-            "paper",
-            check=at_least(1),
-        ),
+        Option("opacity_reset_interval", 3000, origin="paper", check=at_least(1),
+            help="steps between resets of all opacities to at most 0.01"),
         Option("densify_from_iter", 500, "densification starts after this step", check=at_least(0)),
         Option("densify_until_iter", 15_000, "densification ends before this step", "paper", check=at_least(0)),
-        Option(
-            "densify_grad_threshold",
-            0.0002,
-            "screen-space gradient (per NDC unit) that makes a Gaussian clone or split; lower: more Gaussians",
-            "paper",
-            check=above(0),
-        ),
+        Option("densify_grad_threshold", 0.0002, origin="paper", check=above(0),
+            help="screen-space gradient (per NDC unit) that makes a Gaussian clone or split; lower: more Gaussians"),
         Option("depth_l1_weight_init", 1.0, "weight of the depth loss (--depths) at the start", check=at_least(0)),
         Option("depth_l1_weight_final", 0.01, "weight of the depth loss in the last step", check=at_least(0)),
-        Option(
-            "random_background",
-            False,
-            "a new random background in every step, so that no Gaussian imitates a fixed one",
-        ),
-        Option(
-            "optimizer_type",
-            "default",
-            "default: Adam on all Gaussians; sparse_adam: Adam without bias correction, only on the Gaussians that the "
-            "view sees, which is faster if views see little of the scene",
-            check=one_of("default", "sparse_adam"),
-        ),
-        Option(
-            "spill",
-            False,
-            "keep the SH bands above 0 and their averages of Adam, three quarters of a Gaussian, in the memory of the "
-            "host, and bring those that a view sees to the GPU: for more Gaussians than the GPU holds, slower and with "
-            "the same result",
-            "ours",
-        ),
-        Option(
-            "max_num_splats",
-            0,
-            "largest number of Gaussians, 0: no limit, 1,000,000 with mcmc, or with budget what --strategy says; near "
-            "it, adc densifies only those with the largest gradients. adc and mcmc keep a start with more, budget "
-            "removes what is too many",
-            "ours",
-            check=at_least(0),
-        ),
-        Option(
-            "keep_unseen",
-            False,
-            "also save the Gaussians that nobody sees. Without this the last save leaves out those that no training "
-            "view and no view between neighbouring ones depends on: training views at their training size stay the "
-            "same, views from elsewhere may change",
-            "ours",
-        ),
-        Option(
-            "prune_sh",
-            0.0,
-            "in the last save, drop the highest SH bands that change no colour (0 to 1) by more than this; 0: drop "
-            "bands that are zero throughout, -1: drop none. The sh_degree in cfg_args follows",
-            "ours",
-            check=_tolerance,
-        ),
-        Option(
-            "seed",
-            0,
-            "seed of every random choice; the same seed gives the same bytes",
-            "ours, and the reference's fixed seed",
-            check=within(0, 2**63 - 1),
-        ),
+        Option("random_background", False,
+            help="a new random background in every step, so that no Gaussian imitates a fixed one"),
+        Option("optimizer_type", "default", check=one_of("default", "sparse_adam"), stored=MODEL_JSON,
+            help="default: Adam on all Gaussians; sparse_adam: Adam without bias correction, only on the Gaussians "
+                 "that the view sees, which is faster if views see little of the scene"),
+        Option("spill", False, origin="ours",
+            help="keep the SH bands above 0 and their averages of Adam, three quarters of a Gaussian, in the memory "
+                 "of the host, and bring those that a view sees to the GPU: for more Gaussians than the GPU holds, "
+                 "slower and with the same result"),
+        Option("max_num_splats", 0, origin="ours", check=at_least(0),
+            help="largest number of Gaussians, 0: no limit, 1,000,000 with mcmc, or with budget what --strategy says; "
+                 "near it, adc densifies only those with the largest gradients. adc and mcmc keep a start with more, "
+                 "budget removes what is too many"),
+        Option("keep_unseen", False, origin="ours",
+            help="also save the Gaussians that nobody sees. Without this the last save leaves out those that no "
+                 "training view and no view between neighbouring ones depends on: training views at their training "
+                 "size stay the same, views from elsewhere may change"),
+        Option("prune_sh", 0.0, origin="ours", check=_tolerance,
+            help="in the last save, drop the highest SH bands that change no colour (0 to 1) by more than this; 0: "
+                 "drop bands that are zero throughout, -1: drop none. The sh_degree in cfg_args follows"),
+        Option("seed", 0, origin="ours, and the reference's fixed seed", check=within(0, 2**63 - 1), stored=MODEL_JSON,
+            help="seed of every random choice; the same seed gives the same bytes"),
         *STRATEGY_OPTIONS,
     )
+    # fmt: on
 
     def __init__(self, parser: argparse.ArgumentParser, sentinel: bool = False, without: Collection[str] = ()) -> None:
         self._add_table(parser, sentinel, without)
+
+
+OPTIONS = (*ModelParams.options, *PipelineParams.options, *OptimizationParams.options)

@@ -6,9 +6,11 @@ from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
+from utils.files import model_json
 from utils.system_utils import UserError
 
 Value = bool | int | float | str
+CFG_ARGS, MODEL_JSON = "cfg_args", model_json.NAME  # files of a model folder: the reference's, and ours
 
 
 @dataclass(frozen=True)
@@ -18,8 +20,9 @@ class Option:
     name, short: long name (also the attribute) and one-letter form; default: its type is the option's type.
     help: effect, may be empty. origin: source of the default; "ours..." for options that the reference does not have.
     check: returns None for a valid value, else a description of valid values.
-    stored: written to `cfg_args`. remembered: written to `model.json`, for render.py.
-    loaded: what a command that loads a model takes if the option is not given; empty: what the model was trained with.
+    stored: the file of the model folder that keeps it; empty: none. compared: whether a resumed run warns if its value
+    is not the stored one.
+    loaded: what a command that loads a model takes if the option is not given; empty: the stored value.
     """
 
     name: str
@@ -28,8 +31,8 @@ class Option:
     origin: str = "reference"
     short: str | None = None
     check: Callable[[Any], str | None] | None = None
-    stored: bool = False
-    remembered: bool = False
+    stored: str = ""
+    compared: bool = True
     loaded: str = ""
 
     @property
@@ -58,7 +61,7 @@ class Option:
 
     def _shown_default(self, sentinel: bool) -> str:
         """Text about what counts if the option is not given. sentinel: by a command that loads a model."""
-        if sentinel and (self.loaded or self.stored or self.remembered):
+        if sentinel and (self.loaded or self.stored):
             return self.loaded or "that of the model"
         return f"{self._shown()}; {self.origin}"
 

@@ -4,21 +4,21 @@ import argparse
 import ast
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from arguments.groups import ModelParams
-from arguments.param_group import Value
+from arguments.groups import OPTIONS, ModelParams
+from arguments.param_group import CFG_ARGS, MODEL_JSON, Value
 from utils.files import model_json
 from utils.files.model_json import OFFSET
 from utils.files.plain_files import plain_text
 from utils.host.version import VERSION
 from utils.system_utils import UserError, atomic_write
 
-_STORED = {option.name: option.default for option in ModelParams.options if option.stored}
-_REMEMBERED = {option.name: option.default for option in ModelParams.options if option.remembered}
-_OF_TRAINING = ("antialiasing", "optimizer_type", "seed", "strategy", "resolution_schedule")
+_IN_CFG_ARGS = {option.name: option.default for option in OPTIONS if option.stored == CFG_ARGS}
+_IN_MODEL_JSON = {option.name: option.default for option in OPTIONS if option.stored == MODEL_JSON}
+_OF_MODEL = {option.name for option in ModelParams.options if option.stored == MODEL_JSON}
 
 
 def write_cfg_args(model_path: str | os.PathLike, args: argparse.Namespace) -> None:
@@ -26,9 +26,9 @@ def write_cfg_args(model_path: str | os.PathLike, args: argparse.Namespace) -> N
 
     Those that `args` lacks have their default.
     """
-    line = repr(argparse.Namespace(**{name: getattr(args, name, default) for name, default in _STORED.items()}))
-    with atomic_write(Path(model_path) / "cfg_args") as path:
-        path.write_text(line, encoding="utf-8")
+    values = {name: getattr(args, name, default) for name, default in _IN_CFG_ARGS.items()}
+    with atomic_write(Path(model_path) / CFG_ARGS) as path:
+        path.write_text(repr(argparse.Namespace(**values)), encoding="utf-8")
 
 
 def read_cfg_args(model_path: str | os.PathLike) -> dict[str, Value]:
@@ -36,7 +36,7 @@ def read_cfg_args(model_path: str | os.PathLike) -> dict[str, Value]:
 
     UserError if the file is missing or is anything but `Namespace(name=literal, ...)`.
     """
-    path = Path(model_path) / "cfg_args"
+    path = Path(model_path) / CFG_ARGS
     if not Path(model_path).is_dir():
         raise UserError(f"no such model folder: {model_path}; pass the folder that train.py wrote as -m")
     if not path.is_file():
@@ -46,51 +46,46 @@ def read_cfg_args(model_path: str | os.PathLike) -> dict[str, Value]:
         call = ast.parse(plain_text(path).strip(), mode="eval").body
     except (OSError, SyntaxError, ValueError, RecursionError, MemoryError) as error:
         raise UserError(broken) from error
-    if not (isinstance(call, ast.Call) and isinstance(call.func, ast.Name) and call.func.id == "Namespace"):
+    named = isinstance(call, ast.Call) and isinstance(call.func, ast.Name) and call.func.id == "Namespace"
+    if not named or call.args or any(keyword.arg is None for keyword in call.keywords):
         raise UserError(broken)
-    if call.args or any(keyword.arg is None for keyword in call.keywords):
-        raise UserError(broken)
-    values = {}
-    for keyword in call.keywords:
-        try:
-            value = ast.literal_eval(keyword.value)
-        except (ValueError, TypeError, RecursionError, MemoryError) as error:
-            raise UserError(broken) from error
-        if keyword.arg in _STORED:
-            wanted = type(_STORED[keyword.arg])
-            if type(value) is not wanted:
-                raise UserError(f"{path}: {keyword.arg} must be {wanted.__name__}, got {value!r}; restore the file")
-            values[keyword.arg] = value
-    return values
+    try:
+        values = {keyword.arg: ast.literal_eval(keyword.value) for keyword in call.keywords}
+    except (ValueError, TypeError, RecursionError, MemoryError) as error:
+        raise UserError(broken) from error
+    stored = {name: value for name, value in values.items() if name in _IN_CFG_ARGS}
+    _check_types(path, stored, _IN_CFG_ARGS)
+    return stored
+
+
+def _check_types(path: Path, values: Mapping[str, Any], defaults: Mapping[str, Value]) -> None:
+    for name, default in defaults.items():
+        if name in values and type(values[name]) is not type(default):
+            wanted = type(default).__name__
+            raise UserError(f"{path}: {name} must be {wanted}, got {values[name]!r}; restore the file")
 
 
 def write_model_json(
     model_path: str | os.PathLike,
     args: argparse.Namespace | None = None,
     *,
-    antialiasing: bool | None = None,
-    seed: int | None = None,
     world_offset: Sequence[float] = (0.0, 0.0, 0.0),
-    **of_training: Value,
+    **more: Value,
 ) -> None:
-    """Write `model.json`, the options that cfg_args has no place for, with sorted keys.
+    """Write `model.json`, what cfg_args has no place for, with sorted keys.
 
-    args: model options; those that differ from their default are written. antialiasing, seed: None: those of `args`, or
-    False and 0. world_offset: world coordinates of the origin of the model's frame (scene/readers/world_offset.py);
-    zero writes no entry. of_training: other options of the training, by name.
+    args: options; of those that belong here all are written that it has, but model options only where they differ from
+    their default. world_offset: world coordinates of the origin of the model's frame (scene/readers/world_offset.py);
+    zero writes no entry. more: further entries, which win.
     """
-    record = {
-        "antialiasing": getattr(args, "antialiasing", False) if antialiasing is None else antialiasing,
-        "seed": getattr(args, "seed", 0) if seed is None else seed,
-        "version": VERSION,
-    }
-    for name, default in _REMEMBERED.items():
-        if (value := getattr(args, name, default)) != default:
+    record: dict[str, Any] = {"version": VERSION}
+    for name, default in _IN_MODEL_JSON.items():
+        value = getattr(args, name, None)
+        if value is not None and not (name in _OF_MODEL and value == default):
             record[name] = value
-    record |= of_training
     if any(world_offset):
         record[OFFSET] = list(world_offset)
-    model_json.write_model_json(model_path, record)
+    model_json.write_model_json(model_path, record | more)
 
 
 def add_to_model_json(model_path: str | os.PathLike, **entries: Any) -> None:
@@ -101,30 +96,19 @@ def add_to_model_json(model_path: str | os.PathLike, **entries: Any) -> None:
 def read_model_json(model_path: str | os.PathLike) -> dict[str, Any]:
     """Do as utils.files.model_json.read_model_json; UserError also for an option of the wrong type."""
     record = model_json.read_model_json(model_path)
-    for name, default in _REMEMBERED.items():
-        if type(record.get(name, default)) is not type(default):
-            path = Path(model_path) / model_json.NAME
-            raise UserError(f"{path}: {name} must be {type(default).__name__}, got {record[name]!r}; restore the file")
+    _check_types(Path(model_path) / MODEL_JSON, record, _IN_MODEL_JSON)
     return record
 
 
 def read_stored_options(model_path: str | os.PathLike) -> dict[str, Value]:
-    """Read the model options that a model folder has, in cfg_args and model.json. UserError as in both readers."""
-    stored, record = read_cfg_args(model_path), read_model_json(model_path)
-    return stored | {name: record[name] for name in _REMEMBERED if name in record}
+    """Read the options that a model folder has, in cfg_args and model.json. UserError as in both readers.
 
-
-def read_training_options(model_path: str | os.PathLike) -> dict[str, Any]:
-    """Read all options of its training that a model folder has.
-
-    These are the ones of cfg_args and, if there is a model.json, masks and what training.run.Run.kept adds.
-    UserError as in both readers.
+    A model.json that lacks a model option stands for its default.
     """
     stored, record = read_cfg_args(model_path), read_model_json(model_path)
     if record:
-        stored |= {name: record.get(name, default) for name, default in _REMEMBERED.items()}
-        stored |= {name: record[name] for name in _OF_TRAINING if name in record}
-    return stored
+        stored |= {name: _IN_MODEL_JSON[name] for name in _OF_MODEL}
+    return stored | {name: record[name] for name in _IN_MODEL_JSON if name in record}
 
 
 def get_combined_args(parser: argparse.ArgumentParser, argv: Sequence[str] | None = None) -> argparse.Namespace:
@@ -138,15 +122,10 @@ def get_combined_args(parser: argparse.ArgumentParser, argv: Sequence[str] | Non
     args = parser.parse_args(argv)
     if not getattr(args, "model_path", None):
         raise UserError("no model folder given; pass it as -m")
-    typed = {name: value for name, value in vars(args).items() if value is not None}
-    is_new = getattr(args, "ply", None) and not (Path(args.model_path) / "cfg_args").is_file()
+    typed = {name: value for name, value in vars(args).items() if value is not None and value is not False}
+    is_new = getattr(args, "ply", None) and not (Path(args.model_path) / CFG_ARGS).is_file()
     stored = {} if is_new else read_stored_options(args.model_path)
-    combined = argparse.Namespace(**{**vars(args), **stored, **typed})
-    combined.typed_sh_degree = typed.get("sh_degree")
-    if hasattr(args, "antialiasing"):
-        remembered = read_model_json(args.model_path).get("antialiasing", False)
-        combined.antialiasing = bool(args.antialiasing) or remembered
-    return combined
+    return argparse.Namespace(**vars(args) | stored | typed, typed_sh_degree=typed.get("sh_degree"))
 
 
 def warn_of_background(options: argparse.Namespace) -> None:

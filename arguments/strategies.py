@@ -1,220 +1,88 @@
 """Options of the strategies: how many Gaussians there are, and where, and how a run is paced."""
 
-from arguments.param_group import Option, above, at_least, one_of, within
+from arguments.param_group import MODEL_JSON, Option, above, at_least, one_of, within
 
-ADC_OPTIONS: tuple[Option, ...] = (
-    Option(
-        "absgrad",
-        False,
-        "adc: densify by the sum of the pixels' absolute gradients (AbsGS), which do not cancel out where a large "
-        "Gaussian covers fine detail; absgrad_threshold then stands for densify_grad_threshold",
-        "ours",
-    ),
-    Option(
-        "absgrad_threshold",
-        0.0008,
-        "adc: absolute screen-space gradient (per NDC unit) that makes a Gaussian clone or split, with --absgrad; "
-        "lower: more Gaussians",
-        "ours, as gsplat recommends",
-        check=above(0),
-    ),
-    Option(
-        "split",
-        "sample",
-        "adc: where the two children of a split Gaussian are. sample: at random, as by its density, each 1.6 times "
-        "smaller; long_axis: on both sides along its longest axis, which keeps its mean and covariance",
-        "ours",
-        check=one_of("sample", "long_axis"),
-    ),
-)
+_PAPER = "ours, from the MCMC paper"
+_RELEASED = "ours, from the release of the MCMC paper"
 
 
 def _between(value: float) -> str | None:
     return None if 0 < value < 1 else "between 0 and 1, and neither of them"
 
 
-_PAPER = "ours, from the MCMC paper"
-_RELEASED = "ours, from the release of the MCMC paper"
+# fmt: off
+STRATEGY_OPTIONS: tuple[Option, ...] = (
+    Option("strategy", "adc", origin="ours", check=one_of("adc", "mcmc", "budget"), stored=MODEL_JSON,
+        help="how many Gaussians there are, and where. adc: adaptive density control, the method's own; mcmc: "
+             "Gaussians that nobody sees are moved to others, and positions get noise; budget: growth to "
+             "--max_num_splats Gaussians, where the error is; 0: one for 64 training pixels, 100,000 to 1,000,000, or "
+             "fewer if --time_budget allows few iterations. budget has larger learning rates of colour, opacity, scale "
+             "and rotation, the fewer --iterations there are"),
 
-MCMC_OPTIONS: tuple[Option, ...] = (
-    Option(
-        "mcmc_until_iter",
-        25_000,
-        "mcmc: relocation and growth end before this step; --densify_until_iter has no effect then",
-        _RELEASED,
-        check=at_least(0),
-    ),
-    Option(
-        "mcmc_growth",
-        0.05,
-        "mcmc: growth in every densification, as a part of the number of Gaussians",
-        _PAPER,
-        check=within(0, 1),
-    ),
-    Option(
-        "mcmc_min_opacity",
-        0.005,
-        "mcmc: a Gaussian of this opacity or less is moved to another one",
-        _PAPER,
-        check=_between,
-    ),
-    Option(
-        "mcmc_parts",
-        51,
-        "mcmc: largest number of parts for which opacity and scales of a divided Gaussian are corrected",
-        _PAPER,
-        check=within(2, 51),
-    ),
-    Option(
-        "mcmc_noise",
-        500_000.0,
-        "mcmc: factor of the noise that moves Gaussians in every step, times the learning rate of positions",
-        _PAPER,
-        check=within(0, 1e9),
-    ),
-    Option(
-        "mcmc_gate_steepness",
-        100.0,
-        "mcmc: k of the factor sigmoid(-k (opacity - t)) of that noise; higher: less noise of opaque Gaussians",
-        _PAPER,
-        check=within(0, 10_000),
-    ),
-    Option(
-        "mcmc_gate_opacity",
-        0.005,
-        "mcmc: t of that factor, the opacity with half of the noise",
-        _PAPER,
-        check=within(0, 1),
-    ),
-    Option(
-        "mcmc_opacity_reg",
-        0.01,
-        "mcmc: weight of the mean opacity in the loss; higher: more Gaussians fade and are moved",
-        _PAPER,
-        check=at_least(0),
-    ),
-    Option(
-        "mcmc_scale_reg",
-        0.01,
-        "mcmc: weight of the mean scale (world units) in the loss; higher: smaller Gaussians",
-        _PAPER,
-        check=at_least(0),
-    ),
-    Option(
-        "mcmc_init_opacity",
-        0.5,
-        "mcmc: opacity of the Gaussians that are made from points",
-        _RELEASED,
-        check=_between,
-    ),
-    Option(
-        "mcmc_init_scale",
-        0.1,
-        "mcmc: scale of the Gaussians that are made from points, as a part of the distance to their neighbours",
-        _RELEASED,
-        check=above(0),
-    ),
+    Option("absgrad", False, origin="ours",
+        help="adc: densify by the sum of the pixels' absolute gradients (AbsGS), which do not cancel out where a "
+             "large Gaussian covers fine detail; absgrad_threshold then stands for densify_grad_threshold"),
+    Option("absgrad_threshold", 0.0008, origin="ours, as gsplat recommends", check=above(0),
+        help="adc: absolute screen-space gradient (per NDC unit) that makes a Gaussian clone or split, with "
+             "--absgrad; lower: more Gaussians"),
+    Option("split", "sample", origin="ours", check=one_of("sample", "long_axis"),
+        help="adc: where the two children of a split Gaussian are. sample: at random, as by its density, each 1.6 "
+             "times smaller; long_axis: on both sides along its longest axis, which keeps its mean and covariance"),
+
+    Option("mcmc_until_iter", 25_000, origin=_RELEASED, check=at_least(0),
+        help="mcmc: relocation and growth end before this step; --densify_until_iter has no effect then"),
+    Option("mcmc_growth", 0.05, origin=_PAPER, check=within(0, 1),
+        help="mcmc: growth in every densification, as a part of the number of Gaussians"),
+    Option("mcmc_min_opacity", 0.005, origin=_PAPER, check=_between,
+        help="mcmc: a Gaussian of this opacity or less is moved to another one"),
+    Option("mcmc_parts", 51, origin=_PAPER, check=within(2, 51),
+        help="mcmc: largest number of parts for which opacity and scales of a divided Gaussian are corrected"),
+    Option("mcmc_noise", 500_000.0, origin=_PAPER, check=within(0, 1e9),
+        help="mcmc: factor of the noise that moves Gaussians in every step, times the learning rate of positions"),
+    Option("mcmc_gate_steepness", 100.0, origin=_PAPER, check=within(0, 10_000),
+        help="mcmc: k of the factor sigmoid(-k (opacity - t)) of that noise; higher: less noise of opaque Gaussians"),
+    Option("mcmc_gate_opacity", 0.005, origin=_PAPER, check=within(0, 1),
+        help="mcmc: t of that factor, the opacity with half of the noise"),
+    Option("mcmc_opacity_reg", 0.01, origin=_PAPER, check=at_least(0),
+        help="mcmc: weight of the mean opacity in the loss; higher: more Gaussians fade and are moved"),
+    Option("mcmc_scale_reg", 0.01, origin=_PAPER, check=at_least(0),
+        help="mcmc: weight of the mean scale (world units) in the loss; higher: smaller Gaussians"),
+    Option("mcmc_init_opacity", 0.5, origin=_RELEASED, check=_between,
+        help="mcmc: opacity of the Gaussians that are made from points"),
+    Option("mcmc_init_scale", 0.1, origin=_RELEASED, check=above(0),
+        help="mcmc: scale of the Gaussians that are made from points, as a part of the distance to their neighbours"),
+
+    Option("growth_power", 1.0, origin="ours; 2 in Taming 3DGS", check=above(0),
+        help="budget: how early the Gaussians multiply. The part of the densifications that is left, to this power, "
+             "is the part of the growth to --max_num_splats that is left; 1: evenly, higher: earlier"),
+    Option("score_views", 10, origin="ours", check=at_least(1),
+        help="budget: training views, drawn anew in each densification, whose error says where Gaussians are added"),
+    Option("score_error", "l1", origin="ours", check=one_of("l1", "squared", "loss"),
+        help="budget: error of a pixel. l1: mean absolute difference of the channels; squared: mean squared "
+             "difference; loss: that of the loss, L1 and SSIM"),
+    Option("score_join", "sum", origin="ours", check=one_of("sum", "max"),
+        help="budget: how scores of several views become one. sum, or max: the largest"),
+    Option("score_power", 1.0, origin="ours", check=within(0, 100),  # beyond, most chances are 0
+        help="budget: Gaussians are drawn for splitting with a chance that grows as their score to this power; "
+             "higher: only the worst, 0: any that draws an error"),
+    Option("opacity_decay", 0.98, origin="ours", check=within(0.5, 1),
+        help="budget: factor of all opacities after each densification, so that useless Gaussians fade; 1: none"),
+    Option("prune_opacity", 0.005, origin="ours, and adaptive density control's", check=within(0, 0.5),
+        help="budget: Gaussians of a lower opacity are removed, every densification_interval steps"),
+
+    Option("time_budget", 0.0, origin="ours", check=at_least(0),
+        help="seconds of training that the run takes, without scoring and saving, to 3 %; 0: no budget. It goes "
+             "through the whole schedule of --iterations in them, in fewer or more iterations, with learning rates "
+             "that follow their number, and writes schedule.json"),
+    Option("resolution_schedule", "auto", origin="ours", check=one_of("auto", "none", "pyramid", "spectrum"),
+        stored=MODEL_JSON,
+        help="smaller views at first, so that the first iterations take less time. pyramid: a quarter of the size up "
+             "to 10 % of the schedule, half of it up to 25 %; spectrum: sizes by how fine the photos' detail is; "
+             "auto: pyramid where --time_budget leaves no more than an iteration for 6 of the schedule, else none"),
+    Option("target_psnr", 0.0, origin="ours", check=at_least(0),
+        help="stop, and save, once the mean PSNR (dB) of the test views (--eval) is at least this; 0: no target. They "
+             "are scored every 100 iterations, or every 20 times their number if that is more"),
+    Option("schedule", "", origin="ours",
+        help="schedule.json of a run with --time_budget: train as that run did, without looking at the clock"),
 )
-
-BUDGET_OPTIONS: tuple[Option, ...] = (
-    Option(
-        "growth_power",
-        1.0,
-        "budget: how early the Gaussians multiply. The part of the densifications that is left, to this power, is the "
-        "part of the growth to --max_num_splats that is left; 1: evenly, higher: earlier",
-        "ours; 2 in Taming 3DGS",
-        check=above(0),
-    ),
-    Option(
-        "score_views",
-        10,
-        "budget: training views, drawn anew in each densification, whose error says where Gaussians are added",
-        "ours",
-        check=at_least(1),
-    ),
-    Option(
-        "score_error",
-        "l1",
-        "budget: error of a pixel. l1: mean absolute difference of the channels; squared: mean squared difference; "
-        "loss: that of the loss, L1 and SSIM",
-        "ours",
-        check=one_of("l1", "squared", "loss"),
-    ),
-    Option(
-        "score_join",
-        "sum",
-        "budget: how scores of several views become one. sum, or max: the largest",
-        "ours",
-        check=one_of("sum", "max"),
-    ),
-    Option(
-        "score_power",
-        1.0,
-        "budget: Gaussians are drawn for splitting with a chance that grows as their score to this power; higher: only "
-        "the worst, 0: any that draws an error",
-        "ours",
-        check=within(0, 100),  # beyond, the chances of most would be too small a number
-    ),
-    Option(
-        "opacity_decay",
-        0.98,
-        "budget: factor of all opacities after each densification, so that useless Gaussians fade; 1: none",
-        "ours",
-        check=within(0.5, 1),
-    ),
-    Option(
-        "prune_opacity",
-        0.005,
-        "budget: Gaussians of a lower opacity are removed, every densification_interval steps",
-        "ours, and adaptive density control's",
-        check=within(0, 0.5),
-    ),
-)
-
-PACE_OPTIONS: tuple[Option, ...] = (
-    Option(
-        "time_budget",
-        0.0,
-        "seconds of training that the run takes, without scoring and saving, to 3 %; 0: no budget. It goes through the "
-        "whole schedule of --iterations in them, in fewer or more iterations, with learning rates that follow their "
-        "number, and writes schedule.json",
-        "ours",
-        check=at_least(0),
-    ),
-    Option(
-        "resolution_schedule",
-        "auto",
-        "smaller views at first, so that the first iterations take less time. pyramid: a quarter of the size up to "
-        "10 % of the schedule, half of it up to 25 %; spectrum: sizes by how fine the photos' detail is; auto: pyramid "
-        "where --time_budget leaves no more than an iteration for 6 of the schedule, else none",
-        "ours",
-        check=one_of("auto", "none", "pyramid", "spectrum"),
-    ),
-    Option(
-        "target_psnr",
-        0.0,
-        "stop, and save, once the mean PSNR (dB) of the test views (--eval) is at least this; 0: no target. They are "
-        "scored every 100 iterations, or every 20 times their number if that is more",
-        "ours",
-        check=at_least(0),
-    ),
-    Option(
-        "schedule",
-        "",
-        "schedule.json of a run with --time_budget: train as that run did, without looking at the clock",
-        "ours",
-    ),
-)
-
-_STRATEGY = Option(
-    "strategy",
-    "adc",
-    "how many Gaussians there are, and where. adc: adaptive density control, the method's own; mcmc: Gaussians that "
-    "nobody sees are moved to others, and positions get noise; budget: growth to --max_num_splats Gaussians, where the "
-    "error is; 0: one for 64 training pixels, 100,000 to 1,000,000, or fewer if --time_budget allows few iterations. "
-    "budget has larger learning rates of colour, opacity, scale and rotation, the fewer --iterations there are",
-    "ours",
-    check=one_of("adc", "mcmc", "budget"),
-)
-
-STRATEGY_OPTIONS = (_STRATEGY, *ADC_OPTIONS, *MCMC_OPTIONS, *BUDGET_OPTIONS, *PACE_OPTIONS)
+# fmt: on

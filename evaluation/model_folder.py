@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from arguments.stored import read_model_json, read_training_options
+from arguments.stored import read_model_json, read_stored_options
 from records.curve_peak import schedules_follow_length
 from utils.files.image_files import UNREADABLE, open_render
 from utils.files.json_files import read_json
@@ -56,7 +56,7 @@ def shorter_ends_there(model: Path) -> bool:
     if (model / SCHEDULE).is_file():
         return False
     try:
-        options = read_training_options(model)
+        options = read_stored_options(model)
     except UserError:
         return False
     return not schedules_follow_length(

@@ -20,18 +20,18 @@ from utils.system_utils import UserError
 
 
 def scene_with(
-    path: str, options: argparse.Namespace, gaussians: GaussianModel, shuffle: bool = False, sharing: Ranks = ALONE
+    path: str | None, options: argparse.Namespace, gaussians: GaussianModel, sharing: Ranks = ALONE
 ) -> tuple[Scene, Splats | None]:
     """A scene whose points are a file's, and the file's splats in the scene's frame; None for a point cloud.
 
-    The model stays empty. options: the model options. Positions in the file are those of the world, unless our comment
-    world_offset tells their origin. sharing: as of Scene. UserError for a file without splats that are drawn, and as
-    from Scene.
+    The model stays empty. path: None or empty: the points are the dataset's own. options: the model options. Positions
+    in the file are those of the world, unless our comment world_offset tells their origin. sharing: as of Scene.
+    UserError for a file without splats that are drawn, and as from Scene.
     """
     options = copy.copy(options)
-    if is_point_cloud(path):
-        options.init_pcd_path = path
-        return Scene(options, gaussians, shuffle=shuffle, start=False, sharing=sharing), None
+    if not path or is_point_cloud(path):
+        options.init_pcd_path = path or getattr(options, "init_pcd_path", "")
+        return Scene(options, gaussians, shuffle=False, start=False, sharing=sharing), None
     splats = read_splats(path)
     splats = selected(splats, drawable(splats))
     if not len(splats):
@@ -40,7 +40,7 @@ def scene_with(
     colors = np.clip(splats.sh[:, 0] * C0 + 0.5, 0, 1).astype(np.float32)
     # The scene moves them into its frame, as it does any points.
     options.init_pcd_path = BasicPointCloud(points, colors, np.zeros_like(colors))
-    scene = Scene(options, gaussians, shuffle=shuffle, start=False, sharing=sharing)
+    scene = Scene(options, gaussians, shuffle=False, start=False, sharing=sharing)
     means = np.ascontiguousarray(scene.info.point_cloud.points, dtype=np.float32)
     return scene, replace(splats, means=means, world_offset=tuple(scene.info.offset.tolist()))
 

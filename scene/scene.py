@@ -6,7 +6,7 @@ import random
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -14,7 +14,6 @@ import scene
 from scene.cameras import Camera
 from scene.dataset_readers import read_by_callback, read_scene
 from scene.half_images import mark_halves, train_on_all
-from scene.options import option
 from scene.pictures.masks import MaskOptions, refuse_nothing_to_ignore
 from scene.pictures.store import ImageStore, Picture, picture_device
 from scene.readers.depth_maps import with_depth_maps
@@ -49,7 +48,7 @@ class SceneGaussians(Protocol):
 class Scene:
     """Views and model of one run.
 
-    args: model options, as ModelParams.extract gives them; those of scene/options.py may be missing. load_iteration:
+    args: model options, as ModelParams.extract gives them; the reference's of 2023 suffice. load_iteration:
     None calls `create_gaussians` and `write_inputs`, unless `start` is False, which leaves them to the caller; -1 loads
     the last saved iteration, N that one. shuffle: mix the order of the views (always the same way). resolution_scales:
     factors by which views are made smaller, one list of cameras each. train_cameras, test_cameras: these lists by
@@ -70,13 +69,13 @@ class Scene:
         self.model_path = args.model_path
         self.gaussians = gaussians
         self.loaded_iter = None if load_iteration is None else find_iteration(self.model_path, load_iteration)
-        self._halves = option(args, "train_test_exp")
+        self._halves = bool(getattr(args, "train_test_exp", False))
         self.info = self._read(args)
         self.cameras_extent = self.info.extent
 
         device = compute_device()
         place = picture_device(args.data_device, device)
-        self.images = ImageStore(option(args, "images_to_load"), place, device, sharing)
+        self.images = ImageStore(getattr(args, "images_to_load", None) or 0, place, device, sharing)
         self.train_cameras = {scale: self._cameras(args, scale, shuffle, False) for scale in resolution_scales}
         self.test_cameras = {scale: self._cameras(args, scale, shuffle, True) for scale in resolution_scales}
         self.images.plan(self._pictures(self.train_cameras), self._pictures(self.test_cameras))
@@ -93,20 +92,19 @@ class Scene:
         fresh = self.loaded_iter is None
         if fresh:
             _refuse_dataset_folder(args)
-        depths = option(args, "depths")
+        depths = getattr(args, "depths", None) or ""
         info = read_by_callback(args.source_path, args.images, args.white_background, depths, args.eval, self._halves)
         if info is not None:
             return info
-        masks = MaskOptions(*(option(args, name) for name in ("masks", "invert_masks", "mask_meaning")))
+        masks = MaskOptions(**_given(args, folder="masks", invert="invert_masks", meaning="mask_meaning"))
         info = read_scene(
             args.source_path,
             args.images,
             args.eval,
-            option(args, "init_pcd_path"),
             want_cloud=fresh,
-            init_type=option(args, "init_type"),
             masks=masks,
             offset=None if fresh else read_model_json(self.model_path).get(OFFSET, (0, 0, 0)),
+            **_given(args, init_pcd_path="init_pcd_path", init_type="init_type"),
         )
         if fresh:
             views = info.train_cameras + info.test_cameras
@@ -199,6 +197,12 @@ class Scene:
     def _pictures(self, lists: dict[float, list[Camera]]) -> list[Picture]:
         cameras = [camera for cameras in lists.values() for camera in cameras]
         return [p for camera in cameras if getattr(camera, "images", None) is self.images for p in camera.pictures]
+
+
+def _given(args: argparse.Namespace, **names: str) -> dict[str, Any]:
+    """Options that `args` has, by other names; code written for the reference lacks those that we added."""
+    values = {name: getattr(args, option, None) for name, option in names.items()}
+    return {name: value for name, value in values.items() if value is not None}
 
 
 def _refuse_dataset_folder(args: argparse.Namespace) -> None:

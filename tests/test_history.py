@@ -11,7 +11,7 @@ import pytest
 from synthetic import folder_state
 
 import train
-from arguments import read_model_json, read_training_options, write_cfg_args, write_model_json
+from arguments import read_model_json, read_stored_options, write_cfg_args, write_model_json
 from records.error_curve import COLUMNS, read_curve, write_curve
 from training.history import check_folder, continue_records
 from utils.system_utils import UserError
@@ -197,10 +197,10 @@ def test_another_scene_is_told(whole, colmap_scene, tmp_path, capfd):
 
 def test_what_a_folder_does_not_tell_is_not_missed(tmp_path):
     write_cfg_args(tmp_path, argparse.Namespace(**MODEL_OPTIONS))
-    assert read_training_options(tmp_path) == MODEL_OPTIONS  # a model of the reference, which writes no model.json
+    assert read_stored_options(tmp_path) == MODEL_OPTIONS  # a model of the reference, which writes no model.json
     write_model_json(tmp_path, argparse.Namespace(masks="m"), antialiasing=True, seed=2)
     told = {"masks": "m", "invert_masks": False, "mask_meaning": "auto", "antialiasing": True, "seed": 2}
-    assert read_training_options(tmp_path) == MODEL_OPTIONS | told
+    assert read_stored_options(tmp_path) == MODEL_OPTIONS | told
 
 
 def test_points_to_start_from_are_not_counted_when_a_checkpoint_has_others(colmap_scene, tmp_path, capfd):

@@ -26,7 +26,7 @@ MAY_IMPORT = {
     "utils.ranks": ("utils",),
     "utils.exact": ("utils.ranks",),
     "utils.files": ("utils",),
-    "utils.camera_utils": ("scene.cameras", "scene.views", "scene.options", "scene.pictures", "scene.readers", "utils"),
+    "utils.camera_utils": ("scene.cameras", "scene.views", "scene.pictures", "scene.readers", "utils"),
     "utils.make_depth_scale": ("scene.readers.depth_scale", "utils"),  # a command of the reference
     "arguments": ("utils",),
     "records": ("utils",),
@@ -36,7 +36,6 @@ MAY_IMPORT = {
     "scene.gaussians": ("utils",),
     "scene.gaussian_model": ("scene.gaussians", "scene.readers.info", "utils"),
     "scene.dataset_readers": ("scene.readers", "scene.pictures", "utils"),
-    "scene.options": (),
     "scene.views": ("scene.readers.depth_maps", "scene.readers.info", "scene.pictures", "utils"),
     "scene.cameras": ("scene.views", "scene.pictures", "utils"),
     "scene": ("utils",),  # not arguments: a client's own package of that name may be found first

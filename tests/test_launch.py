@@ -15,7 +15,6 @@ from launching import OPTIONS, ROOT, Launched, command, environment, launch, out
 from waiting import wait_for
 
 import train
-from training.agreement import _ROOMS
 
 SECONDS = ("seconds", "wall_seconds", "peak_memory_mib")
 
@@ -26,28 +25,26 @@ def _files(folder: Path) -> list[str]:
 
 
 def _train(scene: Path, out: Path, *options: str) -> None:
-    train.main(["-s", str(scene), "-m", str(out), *OPTIONS, *options, "--disable_viewer", "--quiet"])
+    train.main(_words(scene, out, *options, "--disable_viewer", "--quiet"))
+
+
+def _words(scene: Path, out: Path, *options: str) -> list[str]:
+    return ["-s", str(scene), "-m", str(out), *OPTIONS, *options]
 
 
 def _fault(scene: Path, folder: Path, fault: str, **more) -> Launched:
-    return launch(
-        folder / "logs",
-        fault,
-        "-s",
-        str(scene),
-        "-m",
-        str(folder / "out"),
-        *OPTIONS,
-        "--no_curve",
-        "--plain_step",
-        **more,
-    )
+    return launch(folder / "logs", fault, *_words(scene, folder / "out", "--no_curve", "--plain_step"), **more)
+
+
+def _assert_interrupted(done: Launched) -> None:
+    text = "".join(done.stderr)
+    assert done.status != 0 and done.errors == []
+    assert text.count("interrupted") == 1 and text.count("resume with --start_checkpoint") == 1
 
 
 def test_several_ranks_write_the_files_of_one_and_speak_with_one_voice(colmap_scene, tmp_path):
     _train(colmap_scene, tmp_path / "one", "--eval")
-    options = ("-s", str(colmap_scene), "-m", str(tmp_path / "out"), *OPTIONS, "--eval")
-    done = launch(tmp_path / "logs", "warning 1 0", *options)
+    done = launch(tmp_path / "logs", "warning 1 0", *_words(colmap_scene, tmp_path / "out", "--eval"))
     assert done.status == 0
     one, out = tmp_path / "one", tmp_path / "out"
     assert _files(one) == _files(out)
@@ -118,9 +115,7 @@ def test_no_rank_goes_on_after_one_has_stopped(colmap_scene, tmp_path):
 
 def test_a_signal_to_one_rank_stops_all_after_one_iteration(colmap_scene, tmp_path):
     done = _fault(colmap_scene, tmp_path, "interrupt 1 7")
-    assert done.status != 0 and done.errors == []
-    text = "".join(done.stderr)
-    assert text.count("interrupted") == 1 and text.count("resume with --start_checkpoint") == 1
+    _assert_interrupted(done)
     assert [path.name for path in sorted((tmp_path / "out").glob("chkpnt*.pth"))] == ["chkpnt5.pth", "chkpnt8.pth"]
     records = json.loads((tmp_path / "out" / "train_log.json").read_text())
     assert [record["iteration"] for record in records] == [5, 6, 8]
@@ -129,8 +124,8 @@ def test_a_signal_to_one_rank_stops_all_after_one_iteration(colmap_scene, tmp_pa
 @pytest.mark.parametrize("stopped", [False, True], ids=["", "after all ranks were stopped"])
 def test_a_signal_to_torchrun_saves_one_checkpoint(colmap_scene, tmp_path, stopped):
     """Ranks that were all stopped, as on a laptop that sleeps, go on, although one of them continues first."""
-    options = ("-s", str(colmap_scene), "-m", str(tmp_path / "out"), *OPTIONS, "--no_curve", "--iterations", "100000")
-    line = command(tmp_path / "logs", 2, "none 0 0", *options)
+    words = _words(colmap_scene, tmp_path / "out", "--no_curve", "--iterations", "100000")
+    line = command(tmp_path / "logs", 2, "none 0 0", *words)
     with subprocess.Popen(line, cwd=tmp_path, env=environment(), stdout=-3, stderr=-3) as process:
         try:
             wait_for(lambda: (tmp_path / "out" / "chkpnt5.pth").exists())
@@ -144,9 +139,7 @@ def test_a_signal_to_torchrun_saves_one_checkpoint(colmap_scene, tmp_path, stopp
         finally:
             process.kill()
     done = outputs(tmp_path / "logs", 2, status)
-    assert done.status != 0 and done.errors == []
-    text = "".join(done.stderr)
-    assert text.count("interrupted") == 1 and text.count("resume with --start_checkpoint") == 1
+    _assert_interrupted(done)
     assert len(list((tmp_path / "out").glob("chkpnt*.pth"))) == 2
 
 
@@ -178,33 +171,29 @@ def test_a_restarted_training_goes_on_from_its_newest_checkpoint(colmap_scene, t
         assert (tmp_path / "one" / name).read_bytes() == (tmp_path / "out" / name).read_bytes()
 
 
-def test_ranks_with_other_options_are_refused(colmap_scene, tmp_path):
-    done = _fault(colmap_scene, tmp_path, "options 1 0")
-    assert done.status != 0
-    assert done.errors == [
-        "error: rank 1 differs from rank 0 in --random_background (True, not False); start all ranks with the same "
-        "command"
-    ]
-    assert not (tmp_path / "out").exists()
-
-
-def test_ranks_with_other_code_are_refused(colmap_scene, tmp_path):
+@pytest.mark.parametrize(
+    ("fault", "differs"),
+    [
+        ("options 1 0", "--random_background (True, not False); start all ranks with the same command"),
+        ("code 1 0", "training/density.py; give all ranks the same files"),
+    ],
+)
+def test_ranks_with_other_options_or_other_code_are_refused(colmap_scene, tmp_path, fault, differs):
     other = tmp_path / "other"
-    for room in (*_ROOMS, "viewing", "moving_cameras"):
-        shutil.copytree(ROOT / room, other / room, dirs_exist_ok=True)
+    for room in {path.parent for path in ROOT.glob("*/__init__.py")} | {ROOT / "utils"}:
+        shutil.copytree(room, other / room.name)
     shutil.copy(ROOT / "train.py", other)
     with (other / "training" / "density.py").open("a") as file:
         file.write("# changed\n")
-    done = _fault(colmap_scene, tmp_path, "code 1 0", OTHER_CODE=str(other))
-    assert done.errors == ["error: rank 1 differs from rank 0 in training/density.py; give all ranks the same files"]
+    done = _fault(colmap_scene, tmp_path, fault, OTHER_CODE=str(other))
+    assert done.status != 0 and done.errors == [f"error: rank 1 differs from rank 0 in {differs}"]
     assert not (tmp_path / "out").exists()
 
 
 def test_ranks_keep_the_pace_of_the_first(colmap_scene, tmp_path):
-    done = launch(
-        tmp_path / "logs", "none 0 0", "-s", str(colmap_scene), "-m", str(tmp_path / "out"), "--iterations", "3000",
-        "--eval", "--time_budget", "2", "--target_psnr", "90", "-r", "2", "--test_iterations", "-1",
-    )  # fmt: skip
+    paced = ("--iterations", "3000", "--eval", "--time_budget", "2", "--target_psnr", "90", "--test_iterations", "-1")
+    words = ["-s", str(colmap_scene), "-m", str(tmp_path / "out"), "-r", "2", *paced]
+    done = launch(tmp_path / "logs", "none 0 0", *words)
     assert done.status == 0 and done.errors == []
     schedule = json.loads((tmp_path / "out" / "schedule.json").read_text())
     records = json.loads((tmp_path / "out" / "train_log.json").read_text())

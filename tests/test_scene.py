@@ -22,7 +22,6 @@ from arguments import ModelParams
 from scene import Scene
 from scene.dataset_readers import read_scene, sceneLoadTypeCallbacks
 from scene.gaussian_model import GaussianModel
-from scene.options import DEFAULTS, option
 from training import run
 from utils.files.model_json import OFFSET
 from utils.system_utils import UserError
@@ -35,14 +34,6 @@ OF_2024 = {**OF_2023, "depths": "", "train_test_exp": False}
 
 def _args(folder: Path, out: Path, values: dict[str, object] = OF_2024, **changes: object) -> SimpleNamespace:
     return SimpleNamespace(source_path=str(folder), model_path=str(out), **{**values, **changes})
-
-
-def test_defaults_are_those_of_the_command_line():
-    options = ModelParams(argparse.ArgumentParser()).extract(argparse.Namespace())
-    assert DEFAULTS.items() <= vars(options).items()
-    needed = {"source_path", "model_path", *OF_2023}
-    assert vars(options).keys() - DEFAULTS.keys() == needed  # the options of 2023
-    assert option(SimpleNamespace(masks=None), "masks") == "" and option(SimpleNamespace(masks="m"), "masks") == "m"
 
 
 @pytest.mark.parametrize("values", [OF_2023, OF_2024])

@@ -16,7 +16,7 @@ import torch
 from plyfile import PlyData
 
 import train
-from arguments import read_training_options
+from arguments import read_stored_options
 from records.training_log import Stopwatch, TrainingLog
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.adam import GaussianAdam
@@ -361,12 +361,27 @@ def test_the_output_folder_is_made_for_other_code_too(tmp_path, monkeypatch, opt
                               white_background=True, data_device="cuda", eval=True, **options)  # fmt: skip
     assert train.prepare_output_and_logger(args) is _Writer.last
     assert args.model_path == "./output/a_long_job"
-    stored = read_training_options(args.model_path)
+    stored = read_stored_options(args.model_path)
     assert stored["white_background"] and stored["source_path"] == "/s" and stored["train_test_exp"] is False
-    assert (stored["seed"], stored["antialiasing"]) == (options.get("seed", 0), options.get("antialiasing", False))
+    for name in ("seed", "antialiasing"):
+        assert stored.get(name) == options.get(name)
     args.model_path = "out"
     train.prepare_output_and_logger(args, seed=7)
-    assert read_training_options("out")["seed"] == 7
+    assert read_stored_options("out")["seed"] == 7
+
+
+def test_training_is_called_as_the_references(colmap_scene, tmp_path):
+    """Iterations by position; further options by the names of the command line, and no others."""
+    out = tmp_path / "out"
+    words = ["-s", str(colmap_scene), "-m", str(out), "--iterations", "3", "-r", "24", "--eval"]
+    _, dataset, opt, pipe = train.parse(words)
+    with pytest.raises(TypeError, match="no option --record_curve"):
+        train.training(dataset, opt, pipe, [], [], [], None, record_curve=False)
+    assert not out.exists()
+    train.training(dataset, opt, pipe, [-1], [2, 3], [2], None, -1, no_curve=True)
+    saved = {path.name for path in out.glob("point_cloud/*")} | {path.name for path in out.glob("*.pth")}
+    assert saved == {"iteration_2", "iteration_3", "chkpnt2.pth"}
+    assert not (out / "error_vs_time.csv").exists()
 
 
 def test_a_late_reset_is_announced(colmap_scene, tmp_path, capfd):

@@ -7,19 +7,13 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from arguments import read_model_json, read_training_options
+from arguments import OPTIONS, read_model_json, read_stored_options
 from records import training_log
 from records.error_curve import Row, continue_curve
 from records.training_log import TrainingLog
 from utils.system_utils import UserError, saved_iterations
 
 VIEWS = "views_per_iteration"  # entry of model.json, where it is not 1
-
-# Options that change what is learnt. Others are checked elsewhere (train_test_exp, sh_degree), or change nothing.
-_TOLD = (
-    "source_path", "images", "depths", "resolution", "white_background", "eval", "masks", "invert_masks",
-    "mask_meaning", "antialiasing", "optimizer_type", "seed", "strategy", "resolution_schedule",
-)  # fmt: skip
 
 
 def check_folder(
@@ -31,8 +25,7 @@ def check_folder(
     """
     folder = Path(model_path)
     saved = saved_iterations(folder / "point_cloud")
-    goes_on = checkpoint is not None and _same_place(Path(checkpoint).parent, folder)
-    if not goes_on and (saved or any(folder.glob("chkpnt*.pth"))):
+    if not lies_in(checkpoint, folder) and (saved or any(folder.glob("chkpnt*.pth"))):
         trained_on = _options_of(folder).get("source_path")
         if trained_on and not _same_place(trained_on, source_path):
             raise UserError(
@@ -49,6 +42,11 @@ def check_folder(
         )
 
 
+def lies_in(checkpoint: str | None, folder: str | os.PathLike) -> bool:
+    """Whether a checkpoint, if there is one, lies in a model folder."""
+    return checkpoint is not None and _same_place(Path(checkpoint).parent, folder)
+
+
 def check_views(checkpoint: str, views: int) -> None:
     """UserError if the run that wrote a checkpoint had another number of views in each iteration than this run."""
     then = read_model_json(str(Path(checkpoint).parent)).get(VIEWS, 1)
@@ -63,12 +61,12 @@ def check_views(checkpoint: str, views: int) -> None:
 def report_changes(checkpoint: str, now: argparse.Namespace) -> None:
     """Warn if the run that wrote a checkpoint had other options than this run, `now`.
 
-    now: model options, antialiasing, and those of `Run.kept`. Options that the checkpoint's folder does not record are
-    not compared.
+    now: all options. Those that the checkpoint's folder does not record are not compared.
     """
     folder = Path(checkpoint).parent
     then = _options_of(folder)
-    changed = [name for name in _TOLD if name in then and not _equal(name, then[name], getattr(now, name))]
+    names = [option.name for option in OPTIONS if option.compared and option.name in then]
+    changed = [name for name in names if not _equal(name, then[name], getattr(now, name))]
     if changed:
         before, after = (" ".join(_typed(n, of[n]) for n in changed) for of in (then, vars(now)))
         print(f"warning: {folder} was trained with {before}, this run has {after}", file=sys.stderr)
@@ -98,7 +96,7 @@ def continue_records(model_path: str, checkpoint: str | None, first_iteration: i
 def _options_of(folder: Path) -> dict[str, object]:
     """Training options that a folder records; none if they cannot be read, as in a folder without a model."""
     with contextlib.suppress(UserError, OSError):
-        return read_training_options(folder)
+        return read_stored_options(folder)
     return {}
 
 

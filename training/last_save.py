@@ -4,38 +4,27 @@ import argparse
 import dataclasses
 import math
 
-from torch import Tensor
-
 from arguments import add_to_model_json, write_cfg_args
 from gaussian_renderer.scored_views import ScoredViews
 from gaussian_renderer.trimming import change_on_views, trim
-from scene import Scene
 from training.left_out import LeftOut
+from training.run import Run
 
 
-def save_last(
-    scene: Scene,
-    dataset: argparse.Namespace,
-    opt: argparse.Namespace,
-    pipe: argparse.Namespace,
-    background: Tensor,
-    scored: bool,
-    iteration: int,
-) -> LeftOut:
+def save_last(run: Run, scored: bool, iteration: int) -> LeftOut:
     """Save the finished model without what it does not need, and record in model.json what was left out.
 
     scored: whether to compute the change in PSNR, which is cheap if the test photos are in memory. iteration: the last.
     """
-    trained = scene.gaussians
+    scene, trained, opt, halves = run.scene, run.scene.gaussians, run.opt, run.dataset.train_test_exp
     trained.optimizer.zero_grad(set_to_none=True)  # room for the trimmed copy
-    trimmed = trim(trained, scene.getTrainCameras(), pipe, opt.keep_unseen, opt.prune_sh, iteration)
+    trimmed = trim(trained, scene.getTrainCameras(), run.pipe, opt.keep_unseen, opt.prune_sh, iteration)
     final, test = trimmed.gaussians, scene.getTestCameras()
     change = {}
     if test and (trimmed.unseen > trimmed.search.faint or trimmed.cut_bounds[final.max_sh_degree] > 0):
-        views = ScoredViews(pipe, background, dataset.train_test_exp)
-        change = change_on_views(trained, final, test, views, scored)
+        change = change_on_views(trained, final, test, ScoredViews(run.pipe, run.background, halves), scored)
     scene.save(iteration, final)
-    write_cfg_args(scene.model_path, argparse.Namespace(**vars(dataset) | {"sh_degree": final.max_sh_degree}))
+    write_cfg_args(scene.model_path, argparse.Namespace(**vars(run.dataset) | {"sh_degree": final.max_sh_degree}))
     kept_pixels, file_pixels = scene.training_pixels()
     left_out = LeftOut(
         gaussians=trained.total,

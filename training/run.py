@@ -1,7 +1,6 @@
 """A training run: scene, model, objective and density control, made and checked before a file is written."""
 
 import argparse
-import os
 from collections.abc import Iterator
 from itertools import count
 from pathlib import Path
@@ -11,23 +10,21 @@ import torch
 from torch import Tensor
 
 from exports.in_scene import scene_with, start_from
+from exports.splats import Splats
 from records.training_log import Stopwatch
-from scene import Scene
 from scene.cameras import Camera
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.checkpoint import load_checkpoint
-from scene.options import option
 from scene.spilled_model import SpilledGaussians
 from training.agreement import agree_on_scene
 from training.checks import check_exposures, check_scene, check_target, warn_of_fewer, warn_of_late_reset
-from training.history import VIEWS, check_folder, check_views, continue_records, report_changes
+from training.history import VIEWS, check_folder, check_views, continue_records, lies_in, report_changes
 from training.loss_watch import LossWatch
 from training.memory_estimate import announce_memory
 from training.objective import Objective
 from training.pacing import schedule_file
 from training.pacing.choose import pace_of, resolution_of
 from training.pacing.pace import Paced
-from training.plan import Plan
 from training.restart import resumed
 from training.step import Step
 from training.strategies.choose import density_control
@@ -37,7 +34,7 @@ from utils.general_utils import get_expon_lr_func
 from utils.host.interrupt import DeferredInterrupt
 from utils.host.process import seconds_since_start
 from utils.ranks.ranks import ALONE, ranks
-from utils.system_utils import UserError, compute_device
+from utils.system_utils import compute_device
 
 SH_INTERVAL = 1000  # iterations between raises of the active SH degree
 
@@ -45,54 +42,47 @@ SH_INTERVAL = 1000  # iterations between raises of the active SH degree
 class Run:
     """The objects that the loop and its observers share.
 
-    scene, gaussians, views (by iteration), objective, density, pace; dataset, opt, pipe: the options; background: (3,)
-    of the scene; first_iteration: done before this run. From `begin` on: log, rows (of the curve so far), losses
-    (running mean of the total) and clock (seconds of training). lost: steps that an error has taken back. first_done:
-    seconds from the process's start to the end of its first iteration, None if the system does not say. interrupt: a
-    signal that asks the loop to stop; an observer that waits has to look at it.
+    scene, gaussians, views (by iteration), objective, density, pace; dataset, opt, pipe, launch: the options; start: a
+    chkpntN.pth that is resumed, or None; background: (3,) of the scene; first_iteration: done before this run. From
+    `begin` on: log, rows (of the curve so far), losses (running mean of the total) and clock (seconds of training).
+    lost: steps that an error has taken back. first_done: seconds from the process's start to the end of its first
+    iteration, None if the system does not say. interrupt: a signal that asks the loop to stop; an observer that waits
+    has to look at it.
     """
 
     first_done: float | None = None
 
     def __init__(
-        self, dataset: argparse.Namespace, opt: argparse.Namespace, pipe: argparse.Namespace, plan: Plan
+        self, dataset: argparse.Namespace, opt: argparse.Namespace, pipe: argparse.Namespace, launch: argparse.Namespace
     ) -> None:
-        """Read and check everything that can be refused; nothing is written. UserError for what is refused."""
-        plan = plan._replace(start=resumed(plan.start, dataset.model_path, opt.iterations))
-        self.dataset, self.opt, self.pipe, self.plan = dataset, opt, pipe, plan
+        """Read and check everything that can be refused; nothing is written. UserError for what is refused.
+
+        launch: the options of training/launch.py.
+        """
+        self.dataset, self.opt, self.pipe, self.launch = dataset, opt, pipe, launch
+        self.start = resumed(launch.start_checkpoint, dataset.model_path, opt.iterations)
         self.lost = 0
         self.interrupt = DeferredInterrupt()
         self.device = compute_device()
         place = "cpu" if ranks().several or opt.spill else self.device  # a part of it is kept there
-        capture, self.first_iteration = load_checkpoint(plan.start, place) if plan.start else (None, 0)
-        views = ranks().size if plan.parallel == "views" else 1
-        if opt.spill and views > 1:
-            raise UserError("--spill takes one view in each iteration; use --parallel tiles")
-        self.pace = pace_of(opt, plan.start, self.first_iteration, views)
+        capture, self.first_iteration = load_checkpoint(self.start, place) if self.start else (None, 0)
+        views = ranks().size if launch.parallel == "views" else 1
+        self.pace = pace_of(opt, self.start, self.first_iteration, views)
         warn_of_late_reset(opt, dataset.white_background, self.pace)
         kind = SpilledGaussians if opt.spill else GaussianModel
         self.gaussians = kind(dataset.sh_degree, opt.optimizer_type)
         self.gaussians.divide(ranks())
         sharing = ranks() if views == 1 else ALONE  # all ranks read the same pictures in the same order
-        init_ply = option(dataset, "init_ply")
-        if init_ply and not plan.start:
-            self.scene, self._first = scene_with(init_ply, dataset, self.gaussians, sharing=sharing)
-        else:
-            scene = Scene(dataset, self.gaussians, shuffle=False, start=False, sharing=sharing)
-            self.scene, self._first = scene, None
+        init_ply = None if self.start else getattr(dataset, "init_ply", None)
+        self.scene, first = scene_with(init_ply, dataset, self.gaussians, sharing=sharing)
         check_scene(self.scene.info)
         check_target(opt.target_psnr, len(self.scene.getTestCameras()))
-        place = ranks().rank if self.pace.views > 1 else 0
-        agree_on_scene(self.scene, plan.start)  # before a picture is shared
-        self.views = ViewOrder(self.scene.getTrainCameras(), opt.seed, self.pace.views, place)
+        agree_on_scene(self.scene, self.start)  # before a picture is shared
+        self.views = ViewOrder(self.scene.getTrainCameras(), opt.seed, views, ranks().rank if views > 1 else 0)
         self.resolution = resolution_of(opt, self.pace, self.scene.getTrainCameras(), self.scene.images)
         self._decode_ahead(self.first_iteration + 1)
-        from_points = self._start(capture)
-        saves = [] if opt.target_psnr else self.pace.known(plan.save)  # a target may come before any of them
-        check_folder(dataset.model_path, dataset.source_path, saves, plan.start, self.first_iteration)
-        if plan.start:
-            check_views(plan.start, self.pace.views)
-            report_changes(plan.start, argparse.Namespace(**vars(dataset), **self._training_options))
+        self._begin_model(capture, first)
+        self._check_records()
         self.background = torch.full((3,), 1.0 if dataset.white_background else 0.0, device=self.device)
         self.density = density_control(self)
         self.objective = Objective(opt, self.density.clamps)
@@ -101,53 +91,55 @@ class Run:
         )
         self.density.pace = self.pace
         warn_of_fewer(self.density, opt, self.gaussians.total, self.first_iteration + 1)
-        if from_points:
+        if capture is None and first is None:
             self.density.started()
         ranks().tell_notes()
 
-    def _start(self, capture: tuple | None) -> bool:
-        """Start the model from the dataset's points, from a file's Gaussians, or from the state of a checkpoint.
-
-        Returns whether it was the points.
-        """
-        from_points = capture is None and self._first is None
-        if capture is None:
-            if self._first is None:
-                self.scene.create_gaussians()
-            else:
-                start_from(self._first, self.scene, self.gaussians)
-                self._first = None
-            self.gaussians.training_setup(self.opt)
-        else:
+    def _begin_model(self, capture: tuple | None, first: Splats | None) -> None:
+        """Start the model from the state of a checkpoint, from a file's splats, or from the dataset's points."""
+        if capture is not None:
             self.gaussians.start_exposures(self.scene.info.train_cameras)
             self.gaussians.restore(capture, self.opt)
-            check_exposures(self.gaussians, self.dataset.train_test_exp, self.plan.start)
+            check_exposures(self.gaussians, self.dataset.train_test_exp, self.start)
+        else:
+            if first is None:
+                self.scene.create_gaussians()
+            else:
+                start_from(first, self.scene, self.gaussians)
+            self.gaussians.training_setup(self.opt)
         self.gaussians.limit_columns()
         if (views := self.pace.views) > 1:
             self.gaussians.optimizer.set_betas(0.9**views, 0.999**views)
-        return from_points
+
+    def _check_records(self) -> None:
+        """Compare this run with those before it, in its folder and beside its checkpoint."""
+        dataset, start = self.dataset, self.start
+        # A target may come before any of the iterations that are planned.
+        saves = [] if self.opt.target_psnr else self.pace.known(self.launch.save_iterations)
+        check_folder(dataset.model_path, dataset.source_path, saves, start, self.first_iteration)
+        if start:
+            check_views(start, self.pace.views)
+            report_changes(start, self.options)
 
     @property
-    def _training_options(self) -> dict[str, Any]:
-        options = {name: getattr(self.opt, name) for name in ("optimizer_type", "seed", "strategy")}
-        options["resolution_schedule"] = self.pace.sizes
-        if self.pace.views > 1:
-            options[VIEWS] = self.pace.views
-        return {"antialiasing": self.pipe.antialiasing} | options
+    def options(self) -> argparse.Namespace:
+        """All options of the three groups; resolution_schedule is the one in force."""
+        groups = vars(self.dataset) | vars(self.opt) | vars(self.pipe)
+        return argparse.Namespace(**groups | {"resolution_schedule": self.pace.sizes})
 
     @property
-    def kept(self) -> dict[str, Any]:
-        """Entries of model.json besides the model options (`write_model_json`)."""
-        return self._training_options | {"world_offset": self.gaussians.world_offset}
+    def entries(self) -> dict[str, Any]:
+        """Entries of model.json besides the options (`write_model_json`)."""
+        views = {VIEWS: self.pace.views} if self.pace.views > 1 else {}
+        return {"world_offset": self.gaussians.world_offset} | views
 
     def begin(self) -> None:
         """Write the inputs into the output folder, print the memory estimate, start or continue the log."""
-        folder, start = self.scene.model_path, self.plan.start
+        folder, start = self.scene.model_path, self.start
         if not start or not (Path(folder) / "cameras.json").exists():
             self.scene.write_inputs()
         if not isinstance(self.pace, Paced) and ranks().first:
-            goes_on = start and os.path.realpath(Path(start).parent) == os.path.realpath(folder)
-            schedule_file.leave_schedule(Path(folder), self.first_iteration if goes_on else 0)
+            schedule_file.leave_schedule(Path(folder), self.first_iteration if lies_in(start, folder) else 0)
         density = self.density
         announce_memory(self.scene, self.gaussians, density.most_gaussians, density.absolute_gradients)
         self.log, self.rows = continue_records(folder, start, self.first_iteration)
@@ -206,7 +198,7 @@ class Run:
         for _ in range(self._raises_degree(step.iteration)):
             self.gaussians.oneupSHdegree()
             self.gaussians.limit_columns()
-        if step.iteration - 1 == self.plan.debug_from:
+        if step.iteration - 1 == self.launch.debug_from:
             self.pipe.debug = True
         self._decode_ahead(step.iteration)
 

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 import numpy as np
 
 from scene.cameras import Camera
-from scene.options import option
 from scene.pictures.resolution import training_size
 from scene.readers.info import CameraInfo
 from scene.views.of_info import file_size, view_of_info
@@ -33,7 +32,7 @@ def loadCam(
     size = training_size(*file_size(cam_info), args.resolution, resolution_scale)
     view = view_of_info(cam_info, id, size, is_nerf_synthetic)
     view.data_device = args.data_device
-    if option(args, "train_test_exp") and getattr(cam_info, "is_test", False):
+    if getattr(args, "train_test_exp", False) and getattr(cam_info, "is_test", False):
         view.columns = half(size[0], is_test_dataset)
     return Camera(view)
 

@@ -14,7 +14,6 @@ from training.loss_watch import LossWatch
 from training.objective import Objective
 from training.pacing.choose import pace_of
 from training.pacing.resolution import Resolution
-from training.plan import Plan
 from training.run import Run
 from training.strategies.choose import density_control
 from training.view_order import ViewOrder
@@ -39,9 +38,8 @@ class WorkloadRun(Run):
         here = ranks()
         views = here.size if parallel == "views" else 1
         words = ["-s", ".", "--iterations", str(steps * views), "--densify_from_iter", "10000", *_STILL * still]
-        words += ["--spill"] * spill
-        _, self.dataset, self.opt, self.pipe = train.parse(words)
-        self.plan = Plan([], [], [], None, -1, False, parallel=parallel)
+        words += ["--parallel", parallel, *["--spill"] * spill]
+        self.launch, self.dataset, self.opt, self.pipe = train.parse(words)
         self.lost = self.first_iteration = 0
         self.interrupt, self.device = DeferredInterrupt(), compute_device()
         self.pace = pace_of(self.opt, None, 0, views)

@@ -11,9 +11,10 @@ from pathlib import Path
 from synthetic import make_blender_scene
 
 import train
-from arguments import read_cfg_args, read_model_json
+from arguments import ModelParams, OptimizationParams, PipelineParams, read_cfg_args, read_model_json
 from evaluation.configs import read_configs
 from fuzz.damage import changed, damaged
+from training.launch import add_launch_options
 
 _WORDS = (
     *("-1", "0", "1", "2", "3", "7", "0.5", "-0.1", "1e-9", "1e9", "nan", "inf", "-inf", "1e400", "9" * 30, "x", ""),
@@ -33,7 +34,7 @@ class Options:
             train.main(self._words([]))
         out = (self._folder / "out").rename(self._folder / "records")
         self._records = {name: (out / name).read_bytes() for name in ("cfg_args", "model.json")}
-        self._options = [action for action in train._parser()[0]._actions if action.dest not in _LEFT_OUT]
+        self._options = [action for action in _parser()._actions if action.dest not in _LEFT_OUT]
 
     def run(self, rng: random.Random) -> None:
         what = rng.choice(("words", "words", "words", "configs", "records"))
@@ -66,6 +67,13 @@ class Options:
     def _words(self, more: list[str]) -> list[str]:
         places = ["-s", str(self._folder / "scene"), "-m", str(self._folder / "out")]
         return [*places, "--iterations", "3", "--quiet", *more]
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser()
+    for add in (ModelParams, OptimizationParams, PipelineParams, add_launch_options):
+        add(parser)
+    return parser
 
 
 def _value(rng: random.Random, action: argparse.Action) -> str:

@@ -28,7 +28,7 @@ class Curve(Observer):
             run.rows,
             run.log,
             run.opt.iterations,
-            run.plan.test,
+            run.launch.test_iterations,
             {"test": test, "train": evenly_spread(trained, len(test))},
             lambda cameras: self._load(cameras, views),
             lambda cameras: views.scores(cameras, run.gaussians),
@@ -64,7 +64,7 @@ class Curve(Observer):
             return
         run = self._run
         there = saved_iterations(Path(run.scene.model_path) / "point_cloud")
-        saved, lr_max_steps = {*run.pace.known(run.plan.save)} & {*there}, run.opt.position_lr_max_steps
+        saved, lr_max_steps = {*run.pace.known(run.launch.save_iterations)} & {*there}, run.opt.position_lr_max_steps
         follows_length = schedules_follow_length(
             bool(run.dataset.depths), run.dataset.train_test_exp, run.pace.sizes, isinstance(run.pace, Settling)
         )

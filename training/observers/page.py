@@ -11,6 +11,7 @@ from training.run import Run
 from training.step import Step
 from utils.system_utils import UserError
 from viewing.budget import MOVING, STILL, Budget
+from viewing.options import Address
 from viewing.page import Page
 from viewing.requests import Requests
 from viewing.training_tab import TrainingTab
@@ -28,11 +29,10 @@ class PageObserver(Observer):
     """
 
     def __init__(self, run: Run, checkpoints: Checkpoints) -> None:
-        """Start the page at run.plan.viewer. UserError as from `Page`."""
+        """Start the page at the address of --viewer. UserError as from `Page`."""
         self._run, self._checkpoints = run, checkpoints
-        self._page = Page(
-            run.plan.viewer, run.scene, run.pipe, run.dataset.white_background, run.dataset.train_test_exp
-        )
+        address = Address(run.launch.viewer_host, run.launch.viewer)
+        self._page = Page(address, run.scene, run.pipe, run.dataset.white_background, run.dataset.train_test_exp)
         self._requests = Requests(self._page.watchers.wake)
         with self._page.tabs.add_tab("Training"):
             self._tab = TrainingTab(self._page.server, self._requests)

@@ -36,7 +36,7 @@ class Report(Observer):
         self._later: list[tuple[Step, Losses, float]] = []
 
     def due(self, step: Step) -> bool:
-        return self._report is not training_report or step.takes(self._run.plan.test)
+        return self._report is not training_report or step.takes(self._run.launch.test_iterations)
 
     def measured(self, step: Step, losses: Losses) -> None:
         seconds = self._run.clock.seconds - step.started
@@ -44,7 +44,7 @@ class Report(Observer):
             self._later.append((step, losses, seconds))
         if step.due:
             with self._run.clock.paused("scoring"):
-                if step.takes(self._run.plan.test):
+                if step.takes(self._run.launch.test_iterations):
                     self._run.scene.prefetch(self._run.scene.getTestCameras())
                 for one in self._read():
                     self._tell(*one)
@@ -58,7 +58,7 @@ class Report(Observer):
 
     def _tell(self, step: Step, l1: Tensor, total: Tensor, seconds: float) -> None:
         run = self._run
-        tested = [step.iteration if t in step.span else -1 for t in run.plan.test]
+        tested = [step.iteration if t in step.span else -1 for t in run.launch.test_iterations]
         scores = self._report(
             self._writer, step.iteration, l1, total, l1_loss, seconds, tested,
             run.scene, render, (run.pipe, run.background), run.dataset.train_test_exp,

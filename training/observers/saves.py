@@ -28,10 +28,10 @@ class Saves(Observer):
         self._left_out: LeftOut | None = None
 
     def due(self, step: Step) -> bool:
-        return step.takes(self._run.plan.save)
+        return step.takes(self._run.launch.save_iterations)
 
     def measured(self, step: Step, losses: Losses) -> None:
-        if not step.takes(self._run.plan.save):
+        if not step.takes(self._run.launch.save_iterations):
             return
         run = self._run
         step.record = step.record or {}
@@ -39,9 +39,7 @@ class Saves(Observer):
             run.gaussians.check_finite(step.iteration)
             tqdm.write(f"[ITER {step.iteration}] Saving Gaussians", file=sys.stdout)
             if step.last:
-                self._left_out = save_last(
-                    run.scene, run.dataset, run.opt, run.pipe, run.background, self._test_in_memory, step.iteration
-                )
+                self._left_out = save_last(run, self._test_in_memory, step.iteration)
                 step.record["gaussians_left_out"] = self._left_out.unseen
             else:
                 run.scene.save(step.iteration)
@@ -59,10 +57,10 @@ class Checkpoints(Observer):
         self._watch = watch
 
     def due(self, step: Step) -> bool:
-        return step.takes(self._run.plan.checkpoint)
+        return step.takes(self._run.launch.checkpoint_iterations)
 
     def stepped(self, step: Step) -> None:
-        if step.stopping or step.takes(self._run.plan.checkpoint):
+        if step.stopping or step.takes(self._run.launch.checkpoint_iterations):
             self.save(step)
 
     def save(self, step: Step) -> None:

@@ -24,8 +24,8 @@ from utils.ranks.ranks import ranks
 
 def standard_observers(run: Run, writer: Any | None, report: Callable[..., dict[str, float]]) -> list[Observer]:
     """The observers of every training. writer: TensorBoard's, or None. report: `training_report`."""
-    with_curve = run.plan.record_curve and bool(run.scene.getTestCameras())
-    test_in_memory = with_curve or run.opt.iterations in run.plan.test
+    with_curve = not run.launch.no_curve and bool(run.scene.getTestCameras())
+    test_in_memory = with_curve or run.opt.iterations in run.launch.test_iterations
     watch = DivergenceWatch(run)
     checkpoints = Checkpoints(run, watch)
     return [
@@ -41,5 +41,5 @@ def standard_observers(run: Run, writer: Any | None, report: Callable[..., dict[
         MemoryGuard(run),  # from `measured` to `stepped` the model changes; otherwise it is whole
         checkpoints,  # writes the whole state after the step
         *([ScheduleFile(run)] if isinstance(run.pace, Paced) else []),
-        *([PageObserver(run, checkpoints)] if run.plan.viewer else []),  # last: may let the training wait
+        *([PageObserver(run, checkpoints)] if run.launch.viewer is not None else []),  # last: may let the training wait
     ]

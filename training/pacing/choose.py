@@ -37,6 +37,8 @@ def _batched(opt: argparse.Namespace, views: int) -> Pace:
     for name in ("schedule", "time_budget"):
         if getattr(opt, name):
             raise UserError(f"--{name} and --parallel views both give the pace of a run; leave one out")
+    if opt.spill:
+        raise UserError("--spill takes one view in each iteration; use --parallel tiles")
     return Batched(opt.iterations, views)
 
 

@@ -27,7 +27,7 @@ def step_taker(run: Run) -> Taker:
         return ViewsStep(run)
     if isinstance(run.gaussians, SpilledGaussians):
         return SpilledStep(run)
-    if run.plan.plain_step or torch.is_anomaly_enabled() or not FusedStep.suits(run):
+    if run.launch.plain_step or torch.is_anomaly_enabled() or not FusedStep.suits(run):
         return PlainStep(run)
     runs_ahead = run.device.type == "cuda" and not ranks().several  # ranks tell each other numbers in each step
     return AheadStep(run) if runs_ahead else FusedStep(run)
