@@ -23,14 +23,12 @@ from typing import Any
 import utils.host.openmp  # noqa: F401  isort: skip  (before torch)
 
 from evaluation import stages
-from evaluation.blocks import Table
 from evaluation.configs import check_options, read_configs, shipped
 from evaluation.document import cheapest_table, result_blocks
-from evaluation.earlier import joined, joined_peers, read_earlier
 from evaluation.machine import machine
 from evaluation.peers import peers_of
 from evaluation.report import make_report, write_report
-from evaluation.results import read_run
+from evaluation.results import joined, joined_peers, read_earlier, read_run
 from evaluation.runs import Run, check_folders, check_nesting, check_outside_scenes, plan_runs
 from evaluation.scenes import SceneEntry, check_names, dataset_scenes, finished_scenes, folder_scenes
 from evaluation.stages import Failure, StageFailed
@@ -159,23 +157,23 @@ def _report(
     models = {os.path.relpath(run.model, output) for run in runs}
     scored = any(result["final_iteration"] is not None for result in results if result["model"] in models)
     if not scored:
-        stays = f"; the report of an earlier call stays: {output / 'report.html'}" if earlier.scored else ""
+        stays = f"; the report of an earlier call stays: {output / 'report.html'}" if earlier["scored"] else ""
         print(f"nothing was scored{stays}", file=sys.stderr)
-        if earlier.scored:
+        if earlier["scored"]:
             return False
     scenes = {result["scene"] for result in results}
-    report = make_report(command, results, joined_peers(earlier, peers, scenes), earlier.commands)
+    report = make_report(command, results, joined_peers(earlier, peers, scenes), earlier["commands"])
     write_report(report, output)
     for block in result_blocks(report["summary"]) if report["summary"] else []:
-        print(_text(block) if isinstance(block, Table) else f"\n{block}")
+        print(f"\n{block}" if isinstance(block, str) else _text(block))
     for scene, rows in report["cheapest"].items():
         print(f"\n{scene}: cheapest option set for a given error\n{_text(cheapest_table(rows))}")
     print(f"\nreport: {output / 'report.html'}")
     return scored
 
 
-def _text(table: Table) -> str:
-    return markdown_table(table.header, table.rows)
+def _text(table: dict[str, Any]) -> str:
+    return markdown_table(table["header"], table["rows"])
 
 
 def main(argv: Sequence[str] | None = None) -> None:

@@ -5,6 +5,7 @@ Imports only the standard library until the packages are known to be installed.
 
 import importlib
 import importlib.metadata
+import math
 import platform
 import re
 import shutil
@@ -28,26 +29,19 @@ _TOLERANCE = 1e-5
 
 def check_packages() -> list[Line]:
     """Packages of requirements.txt: whether they are installed, in any version."""
-    missing, versions = [], []
-    for name in _required():
-        found = _version(name)
-        missing += [] if found else [name]
-        versions += [f"{name} {found}"] if found else []
-    if missing:
+    versions = {name: _version(name) for name in _required()}
+    if missing := [name for name, found in versions.items() if not found]:
         return [Line(f"packages are missing: {', '.join(missing)}", f"run `{_INSTALL}`")]
-    return [Line(f"Python {platform.python_version()}, {', '.join(versions)}")]
+    found = ", ".join(f"{name} {version}" for name, version in versions.items())
+    return [Line(f"Python {platform.python_version()}, {found}")]
 
 
 def check_build() -> list[Line]:
     """torch and its CUDA, the extensions and their versions; torch must be installed."""
     import torch
 
-    lines = _check_gpu(torch)
-    for name, package in EXTENSIONS.items():
-        lines += _check_extension(name, package)
-    if extensions_load():
-        lines += _check_rasterizer(torch)
-    return lines
+    lines = [_check_gpu(torch), *(_check_extension(name, package) for name, package in EXTENSIONS.items())]
+    return [*lines, _check_rasterizer(torch)] if extensions_load() else lines
 
 
 def extensions_load() -> bool:
@@ -76,23 +70,18 @@ def _version(name: str) -> str | None:
         return None
 
 
-def _check_gpu(torch) -> list[Line]:
+def _check_gpu(torch) -> Line:
     if torch.cuda.is_available():
         name, (major, minor) = torch.cuda.get_device_name(), torch.cuda.get_device_capability()
-        return [Line(f"GPU {name}, compute capability {major}.{minor}, CUDA {torch.version.cuda} of torch")]
-    gpu = _nvidia_gpu()
-    if gpu and torch.version.cuda is None:
-        return [
-            Line(f"{gpu} is there, but torch {torch.__version__} has no CUDA", f"install torch with CUDA: {_INSTALL}")
-        ]
-    if gpu:
-        return [
-            Line(
-                f"{gpu} is there, but torch (CUDA {torch.version.cuda}) cannot use it",
-                "update the driver, and check whether CUDA_VISIBLE_DEVICES hides it",
-            )
-        ]
-    return [Line("no NVIDIA GPU; everything runs on the CPU")]
+        return Line(f"GPU {name}, compute capability {major}.{minor}, CUDA {torch.version.cuda} of torch")
+    if not (gpu := _nvidia_gpu()):
+        return Line("no NVIDIA GPU; everything runs on the CPU")
+    if torch.version.cuda is None:
+        return Line(
+            f"{gpu} is there, but torch {torch.__version__} has no CUDA", f"install torch with CUDA: {_INSTALL}"
+        )
+    remedy = "update the driver, and check whether CUDA_VISIBLE_DEVICES hides it"
+    return Line(f"{gpu} is there, but torch (CUDA {torch.version.cuda}) cannot use it", remedy)
 
 
 def _nvidia_gpu() -> str:
@@ -107,83 +96,65 @@ def _nvidia_gpu() -> str:
     return done.stdout.split("(UUID")[0].strip() if done.returncode == 0 else ""
 
 
-def _check_extension(name: str, package: str) -> list[Line]:
-    again = f"run `pip install ./submodules/{name}`"
+def _check_extension(name: str, package: str) -> Line:
+    extension, again = f"the extension {name}", f"run `pip install ./submodules/{name}`"
     installed = _version(name) or _version(WHOLE)
     if installed is None:
-        return [Line(f"the extension {name} is not installed", again)]
+        return Line(f"{extension} is not installed", again)
     wanted = (ROOT / "version.txt").read_text(encoding="utf-8").strip()
     if installed.partition("+")[0] != wanted:
-        return [Line(f"the extension {name} is version {installed}, but this code is {wanted}", again)]
+        return Line(f"{extension} is version {installed}, but this code is {wanted}", again)
     try:
-        module = importlib.import_module(package)
+        folder = Path(importlib.import_module(package).__file__).parent
     except ImportError as error:
-        return [Line(f"the extension {name} does not load ({error})", again)]
-    folder = Path(module.__file__).parent
+        return Line(f"{extension} does not load ({error})", again)
     sources = ROOT / "submodules" / name / package
     paths = [path.relative_to(sources) for path in sorted(sources.rglob("*.py"))]
-    stale = [str(path) for path in paths if _differ(sources / path, folder / path)]
-    if stale:
-        return [Line(f"the extension {name} was installed from other sources than these ({', '.join(stale)})", again)]
-    return [Line(f"extension {name} {installed}")]
+    if stale := [str(path) for path in paths if _differ(sources / path, folder / path)]:
+        return Line(f"{extension} was installed from other sources than these ({', '.join(stale)})", again)
+    return Line(f"extension {name} {installed}")
 
 
 def _differ(source: Path, installed: Path) -> bool:
     return not installed.is_file() or source.read_bytes() != installed.read_bytes()
 
 
-def _check_rasterizer(torch) -> list[Line]:
+def _check_rasterizer(torch) -> Line:
     """One splat against the float64 oracle, on every device that training could use."""
     import diff_gaussian_rasterization as rasterizer
     from diff_gaussian_rasterization import reference
 
+    from utils.graphics_utils import getProjectionMatrix
     from utils.system_utils import compute_device
 
-    device = compute_device()
+    device, again = compute_device(), "pip install --force-reinstall"
     if torch.cuda.is_available() and device.type != "cuda":
-        return [
-            Line(
-                "the rasterizer was built without CUDA, so the GPU is not used",
-                "set CUDA_HOME to a CUDA toolkit of torch's version and run `pip install --force-reinstall "
-                "./submodules/diff-gaussian-rasterization ./submodules/fused-ssim ./submodules/simple-knn`",
-            )
-        ]
+        every = " ".join(f"./submodules/{name}" for name in EXTENSIONS)
+        remedy = f"set CUDA_HOME to a CUDA toolkit of torch's version and run `{again} {every}`"
+        return Line("the rasterizer was built without CUDA, so the GPU is not used", remedy)
+    projection = getProjectionMatrix(0.01, 100.0, 2 * math.atan(0.75), 2 * math.atan(0.5)).T.contiguous()
     settings = rasterizer.GaussianRasterizationSettings(
         image_height=20, image_width=30, tanfovx=0.75, tanfovy=0.5, bg=torch.tensor([0.1, 0.2, 0.3]),
-        scale_modifier=1.0, viewmatrix=torch.eye(4), projmatrix=_projection(torch), sh_degree=0,
+        scale_modifier=1.0, viewmatrix=torch.eye(4), projmatrix=projection, sh_degree=0,
         campos=torch.zeros(3), prefiltered=False, debug=False, antialiasing=False,
     )  # fmt: skip
     splat = {
         "means": torch.tensor([[0.3, -0.1, 2.0]]),
+        "means2d": torch.zeros(1, 3),
         "opacities": torch.tensor([[0.8]]),
         "scales": torch.tensor([[0.4, 0.2, 0.3]]),
-        "rotations": torch.tensor([[0.8, 0.2, 0.4, -0.3]]),
+        "rotations": torch.nn.functional.normalize(torch.tensor([[0.8, 0.2, 0.4, -0.3]])),
         "colors": torch.tensor([[0.9, 0.5, 0.1]]),
     }
-    splat["rotations"] = torch.nn.functional.normalize(splat["rotations"])
-    oracle = reference.render(**splat, means2d=torch.zeros(1, 3), settings=settings)
+    oracle = reference.render(**splat, settings=settings)
     moved = {name: tensor.to(device) for name, tensor in splat.items()}
     tensors = {name: value.to(device) for name, value in settings._asdict().items() if torch.is_tensor(value)}
     try:
-        ours = rasterizer.rasterize(
-            **moved, means2d=torch.zeros(1, 3, device=device), settings=settings._replace(**tensors)
-        ).color.cpu()
+        ours = rasterizer.rasterize(**moved, settings=settings._replace(**tensors)).color.cpu()
     except RuntimeError as error:
-        first = str(error).splitlines()[0]
-        return [
-            Line(f"the rasterizer fails on {device} ({first})", "install it again: pip install --force-reinstall .")
-        ]
+        return Line(f"the rasterizer fails on {device} ({str(error).splitlines()[0]})", f"install it again: {again} .")
     error = float((ours - oracle.color).abs().max())
     if not error < _TOLERANCE:
-        remedy = "install it again: pip install --force-reinstall ./submodules/diff-gaussian-rasterization"
-        return [Line(f"the rasterizer on {device} is {error:.1e} off the oracle", remedy)]
-    return [Line(f"rasterizer on {device} agrees with its float64 oracle to {error:.0e}")]
-
-
-def _projection(torch):
-    """Transposed projection of the test view: openings 0.75 and 0.5 (tangents), near 0.01, far 100."""
-    near, far = 0.01, 100.0
-    matrix = torch.zeros(4, 4)
-    matrix[0, 0], matrix[1, 1] = 1 / 0.75, 1 / 0.5
-    matrix[2, 2], matrix[3, 2], matrix[2, 3] = far / (far - near), -far * near / (far - near), 1.0
-    return matrix
+        remedy = f"install it again: {again} ./submodules/diff-gaussian-rasterization"
+        return Line(f"the rasterizer on {device} is {error:.1e} off the oracle", remedy)
+    return Line(f"rasterizer on {device} agrees with its float64 oracle to {error:.0e}")

@@ -3,8 +3,9 @@
 import argparse
 import contextlib
 import io
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -12,7 +13,6 @@ import torch
 from arguments import ModelParams, PipelineParams, read_model_json, read_stored_options
 from diagnosis.dataset import check_dataset
 from diagnosis.lines import Line, from_error
-from diagnosis.values import only_reset, wrong_positions, wrong_sizes
 from gaussian_renderer import render
 from gaussian_renderer.scored_views import ScoredViews
 from records.error_curve import NAME as CURVE
@@ -30,6 +30,10 @@ from utils.system_utils import UserError, compute_device
 # Densification prunes below 0.005 and a reset leaves 0.01: a model of such a median has not recovered.
 FAINT = 0.02
 UNRECOVERED = 0.2  # median within 500 iterations of a reset
+RESET = (0.005, 0.0101)  # opacities after a reset to at most 0.01, which is below float32's 0.01; less is pruned
+RESET_SHARE = 0.95
+SIZES = (1e-6, 1.0)  # extents: medians of trained models are 1e-4 to 0.1
+SPREADS = (0.01, 100.0)  # extents: from an object amid far cameras to a landscape beyond near ones
 BINS = (0.0, 0.01, 0.05, 0.2, 0.5, 0.9, 1.0)
 HUGE = 1.0  # extents: one standard deviation of a splat as large as the whole scene
 HUGE_SHARE = 0.01
@@ -56,18 +60,15 @@ def check_model(model_path: str, iteration: int, source: str | None = None, imag
         options, scene = _load(model_path, stored, iteration)
     except UserError as error:
         return [from_error(error)]
-    gaussians = scene.gaussians
+    gaussians, extent = scene.gaussians, scene.cameras_extent
     name = f"iteration {scene.loaded_iter}"
     if not len(gaussians):
         return [Line(f"{name} has no Gaussians, so renders show the background", "train it again")]
-    degree = gaussians.max_sh_degree
-    lines = [Line(f"{name}, {len(gaussians)} Gaussians of SH degree {degree}"), *check_values(gaussians)]
-    if any(line.finding for line in lines):
-        return lines
-    if wrong := wrong_sizes(gaussians, scene.cameras_extent):
-        return [*lines, wrong]
-    lines += check_shapes(gaussians, scene.cameras_extent) + check_renders(scene, options, stored)
-    return lines + check_training(Path(model_path))
+    lines = [Line(f"{name}, {len(gaussians)} Gaussians of SH degree {gaussians.max_sh_degree}")]
+    if wrong := [*_not_finite(gaussians)] or [*_wrong_sizes(gaussians, extent)]:
+        return [*lines, *wrong]
+    shapes = [_opacities(gaussians), _sizes(gaussians, extent)]
+    return [*lines, *shapes, _renders(scene, options, stored), *check_training(Path(model_path))]
 
 
 def check_training(model: Path) -> list[Line]:
@@ -89,7 +90,7 @@ def _load(model_path: str, stored: dict[str, Any], iteration: int) -> tuple[argp
         return options, load_saved(options, iteration)
 
 
-def check_values(gaussians: GaussianModel) -> list[Line]:
+def _not_finite(gaussians: GaussianModel) -> Iterator[Line]:
     """NaN and infinities among the parameters."""
     shapes = gaussians.raw_geometry()
     raw = {
@@ -99,59 +100,82 @@ def check_values(gaussians: GaussianModel) -> list[Line]:
         "rotation": shapes["rotations"],
         "colour": gaussians.get_features,
     }
-    lines = []
     for name, values in raw.items():
-        bad = int((~torch.isfinite(values)).flatten(1).any(dim=1).sum())
-        if bad:
-            lines.append(
-                Line(
-                    f"{bad} of {len(values)} Gaussians have a {name} that is not finite",
-                    "resume from an earlier checkpoint, or train again, with lower learning rates",
-                )
-            )
-    return lines
+        if bad := int((~torch.isfinite(values)).flatten(1).any(dim=1).sum()):
+            text = f"{bad} of {len(values)} Gaussians have a {name} that is not finite"
+            yield Line(text, "resume from an earlier checkpoint, or train again, with lower learning rates")
 
 
-def check_shapes(gaussians: GaussianModel, extent: float) -> list[Line]:
-    """Histogram of the opacities, and sizes against the extent of the cameras."""
+def _wrong_sizes(gaussians: GaussianModel, extent: float) -> Iterator[Line]:
+    """Sizes that are all far too small or too large for the cameras."""
+    median = float(gaussians.get_scaling.detach().max(dim=1).values.median()) / extent
+    low, high = SIZES
+    if not low <= median <= high:
+        text = f"the Gaussians are too {'small' if median < low else 'large'} for these cameras"
+        remedy = "check what wrote or changed the PLY: scales are natural logarithms, in the units of the cameras"
+        yield Line(f"{text}: their median size is {median:.2g} extents", remedy)
+
+
+def _wrong_values(gaussians: GaussianModel, extent: float) -> Iterator[Line]:
+    """Positions in other units than the cameras', and opacities as a reset leaves them, with no training after it."""
+    points, opacity = gaussians.get_xyz.detach(), gaussians.get_opacity.detach()
+    spread = float((points - points.median(dim=0).values).norm(dim=1).median()) / extent
+    if not SPREADS[0] <= spread <= SPREADS[1]:
+        remedy = (
+            "check whether the model belongs to this dataset (-s), and what scaled the PLY: both need the same units"
+        )
+        yield Line(f"the positions of the Gaussians spread over {spread:.2g} extents of the cameras", remedy)
+    share = float(((opacity >= RESET[0]) & (opacity <= RESET[1])).float().mean())
+    if share >= RESET_SHARE:
+        text = f"{share:.0%} of the opacities are near 0.01, as a reset leaves them, and nothing was trained after it"
+        remedy = "check an earlier iteration, or train some 1000 iterations beyond the reset (--opacity_reset_interval)"
+        yield Line(text, remedy)
+
+
+def _opacities(gaussians: GaussianModel) -> Line:
     opacity = gaussians.get_opacity.detach().flatten().cpu().numpy()
-    counts, _ = np.histogram(opacity, bins=BINS)
-    shares = ", ".join(
-        f"{low:g}-{high:g} {count / len(opacity):.0%}" for low, high, count in zip(BINS, BINS[1:], counts, strict=False)
-    )
-    lines = [Line(f"opacities: {shares}; median {np.median(opacity):.2f}")]
+    parts = zip(BINS, BINS[1:], np.histogram(opacity, bins=BINS)[0] / len(opacity), strict=False)
+    shares = ", ".join(f"{low:g}-{high:g} {share:.0%}" for low, high, share in parts)
+    return Line(f"opacities: {shares}; median {np.median(opacity):.2f}")
+
+
+def _sizes(gaussians: GaussianModel, extent: float) -> Line:
+    """Sizes against the extent of the cameras."""
     largest = gaussians.get_scaling.detach().max(dim=1).values.cpu().numpy()
     huge = float((largest > HUGE * extent).mean())
-    if huge > HUGE_SHARE:
-        lines.append(
-            Line(
-                f"{huge:.1%} of the Gaussians are larger than the extent of the cameras ({extent:.3g})",
-                "remove far points from the start cloud, and check the poses",
-            )
-        )
-    else:
-        lines.append(
-            Line(f"sizes: median {np.median(largest) / extent:.2g}, largest {largest.max() / extent:.2g} extents")
-        )
-    return lines
+    if huge <= HUGE_SHARE:
+        return Line(f"sizes: median {np.median(largest) / extent:.2g}, largest {largest.max() / extent:.2g} extents")
+    text = f"{huge:.1%} of the Gaussians are larger than the extent of the cameras ({extent:.3g})"
+    return Line(text, "remove far points from the start cloud, and check the poses")
 
 
-def check_renders(scene: Scene, options: argparse.Namespace, stored: dict[str, Any]) -> list[Line]:
+def _renders(scene: Scene, options: argparse.Namespace, stored: dict[str, Any]) -> Line:
     """Line about a few training views, rendered small: close to their photos, or else the likeliest reason."""
     views = _looked_at(scene)
     means = _means(views, scene, options)
     if means is None:
-        return [Line("no pixel of the inspected training views counts", "check --masks and --invert_masks")]
-    brightness, truth, coverage, drawn, score = means
-    if brightness < BLACK and truth < BLACK:
-        return [Line("the photos themselves are black", "inspect them; if they are transparent, train with -w")]
-    if brightness >= BLACK and score >= BAD_PSNR:
-        return [Line(f"{len(views)} training views rendered {_WIDTH} pixels wide: PSNR {score:.1f} dB")]
-    black = brightness < BLACK
-    text = "renders of the training views are black" if black else f"training views have a PSNR of only {score:.1f} dB"
-    if wrong := _wrong_values(scene) or _other_background(scene, options, stored, score):
-        return [wrong._replace(text=f"{text}: {wrong.text}")]
-    return [_why_black(scene, views, coverage, drawn) if black else Line(text, _why_bad(scene, stored))]
+        return Line("no pixel of the inspected training views counts", "check --masks and --invert_masks")
+    black = means.render < BLACK
+    if black and means.photo < BLACK:
+        return Line("the photos themselves are black", "inspect them; if they are transparent, train with -w")
+    if not black and means.psnr >= BAD_PSNR:
+        return Line(f"{len(views)} training views rendered {_WIDTH} pixels wide: PSNR {means.psnr:.1f} dB")
+    text = "renders of the training views are black"
+    text = text if black else f"training views have a PSNR of only {means.psnr:.1f} dB"
+    wrong = next(_wrong_values(scene.gaussians, scene.cameras_extent), None)
+    wrong = wrong or _other_background(scene, options, stored, means.psnr)
+    wrong = wrong or (_why_black(scene, views, means) if black else Line("", _why_bad(scene, stored)))
+    return wrong._replace(text=f"{text}: {wrong.text}" if wrong.text else text)
+
+
+class Means(NamedTuple):
+    """Means over views: render, photo and PSNR (dB) of scored pixels; shares of covered pixels and drawn Gaussians."""
+
+    render: float
+    photo: float
+    coverage: float
+    drawn: float
+    psnr: float
 
 
 def _looked_at(scene: Scene) -> list[Camera]:
@@ -159,14 +183,10 @@ def _looked_at(scene: Scene) -> list[Camera]:
     return cameras[:: max(1, len(cameras) // _VIEWS)][:_VIEWS]
 
 
-def _means(cameras: list[Camera], scene: Scene, options: argparse.Namespace) -> tuple[float, ...] | None:
-    """Means of `_measure` over the views of which some pixel counts; None if there are none."""
+def _means(cameras: list[Camera], scene: Scene, options: argparse.Namespace) -> Means | None:
+    """Means over the views of which some pixel counts (masks, half images); None if there are none."""
     measured = [values for camera in cameras if (values := _measure(camera, scene, options))]
-    return tuple(float(np.mean(values)) for values in zip(*measured, strict=True)) if measured else None
-
-
-def _wrong_values(scene: Scene) -> Line | None:
-    return wrong_positions(scene.gaussians, scene.cameras_extent) or only_reset(scene.gaussians)
+    return Means(*(float(np.mean(values)) for values in zip(*measured, strict=True))) if measured else None
 
 
 def _other_background(scene: Scene, options: argparse.Namespace, stored: dict[str, Any], score: float) -> Line | None:
@@ -174,68 +194,46 @@ def _other_background(scene: Scene, options: argparse.Namespace, stored: dict[st
     white = not options.white_background
     other_options, other = _load(scene.model_path, stored | {"white_background": white}, scene.loaded_iter)
     means = _means(_looked_at(other), other, other_options)
-    if means is None or means[-1] < max(BAD_PSNR, score + _CLEARLY):
+    if means is None or means.psnr < max(BAD_PSNR, score + _CLEARLY):
         return None
     name = "white" if white else "black"
-    return Line(
-        f"over {name} it is {means[-1]:.1f} dB",
-        f"the model was trained on {name}: set white_background={white} in {scene.model_path}/cfg_args"
-        + ("" if white else ", and render without -w"),
-    )
+    remedy = f"the model was trained on {name}: set white_background={white} in {scene.model_path}/cfg_args"
+    return Line(f"over {name} it is {means.psnr:.1f} dB", remedy + ("" if white else ", and render without -w"))
 
 
-def _measure(
-    camera: Camera, scene: Scene, options: argparse.Namespace
-) -> tuple[float, float, float, float, float] | None:
-    """Means of render and photo, share of the image that is covered, share of Gaussians drawn, PSNR in dB.
-
-    Means and PSNR are of the scored pixels (masks, half images); None if there are none.
-    """
+def _measure(camera: Camera, scene: Scene, options: argparse.Namespace) -> tuple[float, ...] | None:
+    """Return the `Means` of one view; None if no pixel of it counts."""
     gaussians = scene.gaussians
     pipe = PipelineParams(argparse.ArgumentParser()).extract(argparse.Namespace())
     pipe.antialiasing = read_model_json(scene.model_path).get("antialiasing", False)
     background = torch.full((3,), 1.0 if options.white_background else 0.0, device=compute_device())
     views = ScoredViews(pipe, background, options.train_test_exp)
-    mask = views.mask(camera)
-    if mask is not None and not mask.any():
-        return None
     with torch.no_grad():
-        image, target = (
-            pixels_that_count(x, mask) for x in (views.image(camera, gaussians), as_float(views.target(camera)))
-        )
-        black = torch.zeros_like(gaussians.get_xyz)
-        silhouette = render(
-            camera, gaussians, pipe, torch.ones_like(background), override_color=black, want_depth=False
-        )
+        image, target, mask = views.compared(camera, gaussians)
+        if mask is not None and not mask.any():
+            return None
+        image, target = (pixels_that_count(x, mask) for x in (image, as_float(target)))
+        black, white = torch.zeros_like(gaussians.get_xyz), torch.ones_like(background)
+        silhouette = render(camera, gaussians, pipe, white, override_color=black, want_depth=False)
     ratio = min(float(psnr(image, target).mean()), 99.0)
     drawn = float((silhouette["radii"] > 0).float().mean())
     return float(image.mean()), float(target.mean()), 1 - float(silhouette["render"].mean()), drawn, ratio
 
 
-def _why_black(scene: Scene, cameras: list[Camera], coverage: float, drawn: float) -> Line:
+def _why_black(scene: Scene, cameras: list[Camera], means: Means) -> Line:
     gaussians = scene.gaussians
-    text = "renders of the training views are black: "
-    if drawn < 0.01:
+    if means.drawn < 0.01:
         depths = torch.cat([_depths(camera, gaussians.get_xyz) for camera in cameras])
-        near = float(((depths > 0) & (depths < NEAREST)).float().mean())
-        if near > 0.5:
-            return Line(
-                f"{text}most Gaussians are nearer than {NEAREST} and never drawn",
-                "scale cameras and points of the scene by 10 or more and train again",
-            )
-        return Line(
-            f"{text}no Gaussian is in view, because the cameras face away",
-            "check the poses (x right, y down, z forward) and whether the model belongs to this dataset",
-        )
-    if coverage < 0.1 or float(gaussians.get_opacity.detach().median()) < FAINT:
-        return Line(
-            f"{text}the Gaussians are almost transparent",
-            "check the poses, and lower --opacity_lr; in a PLY of another program opacities must be logits",
-        )
-    return Line(
-        f"{text}the Gaussians themselves are black",
-        "check whether the training photos are black (transparent ones need -w), and check --feature_lr",
-    )
+        if float(((depths > 0) & (depths < NEAREST)).float().mean()) > 0.5:
+            text = f"most Gaussians are nearer than {NEAREST} and never drawn"
+            return Line(text, "scale cameras and points of the scene by 10 or more and train again")
+        remedy = "check the poses (x right, y down, z forward) and whether the model belongs to this dataset"
+        return Line("no Gaussian is in view, because the cameras face away", remedy)
+    if means.coverage < 0.1 or float(gaussians.get_opacity.detach().median()) < FAINT:
+        remedy = "check the poses, and lower --opacity_lr; in a PLY of another program opacities must be logits"
+        return Line("the Gaussians are almost transparent", remedy)
+    remedy = "check whether the training photos are black (transparent ones need -w), and check --feature_lr"
+    return Line("the Gaussians themselves are black", remedy)
 
 
 def _depths(camera: Camera, points: torch.Tensor) -> torch.Tensor:
@@ -247,15 +245,13 @@ def _why_bad(scene: Scene, stored: dict[str, Any]) -> str:
     faint = float(scene.gaussians.get_opacity.detach().median()) < UNRECOVERED
     if faint and RESET_INTERVAL <= iteration < 15_000 and iteration % RESET_INTERVAL < 500:
         return "this iteration is shortly after opacities were reset; check a later one"
-    if wrong := [line for line in check_shapes(scene.gaussians, scene.cameras_extent) if line.finding]:
-        return wrong[0].remedy
+    if (sizes := _sizes(scene.gaussians, scene.cameras_extent)).finding:
+        return sizes.remedy
     if iteration < FEW_ITERATIONS:
         return f"train longer, {FEW_ITERATIONS} iterations at least"
-    problems = [
-        line for line in check_dataset(stored.get("source_path", ""), stored.get("images", "images")) if line.finding
-    ]
-    if problems:
-        return f"the dataset has problems ({problems[0].text}): {problems[0].remedy}"
+    dataset = check_dataset(stored.get("source_path", ""), stored.get("images", "images"))
+    if problem := next((line for line in dataset if line.finding), None):
+        return f"the dataset has problems ({problem.text}): {problem.remedy}"
     if len(scene.gaussians) < FEW_GAUSSIANS:
         return f"there are only {len(scene.gaussians)} Gaussians; lower --densify_grad_threshold, or give more points"
     return "train with the default learning rates; if that does not help, the poses are wrong: reconstruct the scene"

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import queue
 import re
 import signal
 import subprocess
@@ -51,26 +50,23 @@ def run_child(command: Sequence[str], **environment: str) -> Finished:
     for the child, since train.py saves a checkpoint, and sets `interrupt`. A second signal kills the child and raises.
     """
     start, cpu_before = time.perf_counter(), _children_cpu_seconds()
-    tail = _Tail()
     # The child gets its own session. Otherwise the terminal's Ctrl-C would reach it twice, directly and through us, and
     # train.py stops at once on the second one.
     with DeferredInterrupt() as interrupt:
         # The child inherits only the folder's lock, which is then kept as long as the child lives.
         child = subprocess.Popen(command, stderr=subprocess.PIPE, start_new_session=True, close_fds=False,
                                  env=os.environ | environment)  # fmt: skip
-        chunks: queue.SimpleQueue[bytes] = queue.SimpleQueue()
-        reader = threading.Thread(target=_read, args=(child, chunks), daemon=True)
+        tail = bytearray()
+        # Windows cannot wait for a pipe with a time limit.
+        reader = threading.Thread(target=_read, args=(child, tail), daemon=True)
         reader.start()
         try:
-            handed_on, chunk = False, None
-            while chunk != b"":
+            handed_on = False
+            while reader.is_alive():
                 if interrupt.requested and not handed_on:
                     handed_on = True
                     _hand_on(interrupt.requested, child)
-                with contextlib.suppress(queue.Empty):
-                    chunk = chunks.get(timeout=_LOOK)
-                    tail.add(chunk)
-                    _show(chunk)
+                reader.join(_LOOK)
             status = child.wait()
         finally:
             if child.poll() is None:
@@ -81,14 +77,22 @@ def run_child(command: Sequence[str], **environment: str) -> Finished:
                 child.stderr.close()
         requested = interrupt.requested
     cpu = None if cpu_before is None else _children_cpu_seconds() - cpu_before
-    return Finished(status, tail.lines, time.perf_counter() - start, cpu, requested)
+    return Finished(status, _lines(tail), time.perf_counter() - start, cpu, requested)
 
 
-def _read(child: subprocess.Popen, chunks: queue.SimpleQueue[bytes]) -> None:
-    """Read a child's messages to their end, an empty chunk. Windows cannot wait for a pipe with a time limit."""
+def _read(child: subprocess.Popen, tail: bytearray) -> None:
+    """Show a child's messages, and keep their end."""
     while chunk := os.read(child.stderr.fileno(), 1 << 16):
-        chunks.put(chunk)
-    chunks.put(b"")
+        tail[:] = (tail + chunk)[-(1 << 16) :]
+        with contextlib.suppress(OSError):
+            sys.stderr.write(chunk.decode("utf-8", "replace"))
+            sys.stderr.flush()
+
+
+def _lines(tail: bytearray) -> list[str]:
+    """The last lines, without progress bars, which redraw their line with carriage returns."""
+    lines = (line.rsplit("\r", 1)[-1] for line in tail.decode("utf-8", "replace").split("\n"))
+    return [line.rstrip() for line in lines if line.strip() and not re.search(r"\d+%\|", line)][-LINES:]
 
 
 def _hand_on(interrupt: type[KeyboardInterrupt], child: subprocess.Popen) -> None:
@@ -102,25 +106,3 @@ def _children_cpu_seconds() -> float | None:
         return None
     usage = resource.getrusage(resource.RUSAGE_CHILDREN)
     return usage.ru_utime + usage.ru_stime
-
-
-def _show(chunk: bytes) -> None:
-    with contextlib.suppress(OSError):
-        sys.stderr.write(chunk.decode("utf-8", "replace"))
-        sys.stderr.flush()
-
-
-class _Tail:
-    """The last lines of a stream, without progress bars, which redraw their line with carriage returns."""
-
-    def __init__(self) -> None:
-        self._text = b""
-
-    def add(self, chunk: bytes) -> None:
-        self._text = (self._text + chunk)[-(1 << 16) :]
-
-    @property
-    def lines(self) -> list[str]:
-        lines = (line.rsplit("\r", 1)[-1] for line in self._text.decode("utf-8", "replace").split("\n"))
-        kept = [line.rstrip() for line in lines if line.strip() and not re.search(r"\d+%\|", line)]
-        return kept[-LINES:]

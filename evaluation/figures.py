@@ -1,44 +1,54 @@
-"""Figures of the report: error against time of a scene, and its worst test views."""
+"""Figures of the report: error against time of a scene, and its Pareto fronts."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from evaluation.contact_sheet import contact_sheet
-from evaluation.model_folder import counted_picture
-from evaluation.printable import printable
-from evaluation.tradeoff import pareto_front
+from evaluation.contact_sheet import printable
+from evaluation.option_sets import COSTS, pareto_front
+from records.curve_figure import HOLLOW, Value, dissimilarity, plain_log_axis, points, psnr
 from records.error_curve import SUBSET, Row, whole_sets
-from records.plain_log_axis import plain_log_axis
 from utils.system_utils import atomic_write
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-
-HOLLOW = {"fillstyle": "none", "linewidth": 0.6, "markersize": 4}  # points of subsets
-WIDEST = 480  # largest width, in pixels, of an image on a sheet
-
+    from matplotlib.figure import Figure
 
 Point = tuple[float, float]
-Value = Callable[[Row, str], float | None]
 STYLES = ("-", "-.", ":")
+MARKERS = "osD"  # with ten colours they tell thirty sets apart
 PEER_MARKERS = "xs^vDP*"
-
-
-def _psnr(row: Row, views: str) -> float | None:
-    return row[f"{views}_psnr"]
-
-
-def _dissimilarity(row: Row, views: str) -> float | None:
-    ssim = row[f"{views}_ssim"]
-    return None if ssim is None else 1 - ssim
+LABELS = {
+    "seconds": "seconds of training, without scoring and saving",
+    "gaussians": "Gaussians, as trained",
+    "ply_mb": "megabytes of the PLY",
+}
 
 
 def _gap(row: Row, views: str) -> float | None:
     both = row["train_psnr"], row["test_psnr"]
     return None if None in both else both[0] - both[1]
+
+
+def _panels(count: int, title: str) -> tuple[Figure, Sequence[Axes]]:
+    from matplotlib.figure import Figure  # imported here because only a report needs it
+
+    figure = Figure(figsize=(6 * count, 4.8), layout="constrained")
+    figure.suptitle(printable(title))
+    return figure, figure.subplots(1, count)
+
+
+def _label(axes: Axes, x: str, y: str) -> None:
+    axes.set(xscale="log", xlabel=x, ylabel=y)
+    plain_log_axis(axes.xaxis)
+    axes.grid(True, which="both", alpha=0.3)
+
+
+def _save(figure: Figure, path: Path) -> None:
+    with atomic_write(path) as temporary:
+        figure.savefig(temporary, dpi=110, metadata={"Software": None})
 
 
 def draw_curves(path: Path, scene: str, runs: Sequence[dict[str, Any]], peers: Sequence[dict[str, Any]] = ()) -> bool:
@@ -50,35 +60,25 @@ def draw_curves(path: Path, scene: str, runs: Sequence[dict[str, Any]], peers: S
     own, and in no front. They are not in the third panel, as the gap between two subsets is mostly chance.
     peers: curves of other programs, in grey; they are no part of the front.
     """
-    from matplotlib.figure import Figure  # imported here because only a report needs it
-
     runs = [run for run in runs if any(row["test_psnr"] is not None for row in run["curve"])]
     if not runs:
         return False
     several = len({run["config"] for run in runs}) > 1
-    panels = [(_psnr, "PSNR of the test views (dB)", -1), (_dissimilarity, "1 - SSIM of the test views", 1)]
-    if several and any(_points(whole_sets(run["curve"]), _gap, "") for run in runs):
+    panels = [(psnr, "PSNR of the test views (dB)", -1), (dissimilarity, "1 - SSIM of the test views", 1)]
+    if several and any(points(whole_sets(run["curve"]), _gap, "") for run in runs):
         panels.append((_gap, "PSNR of the training views above the test views (dB)", 0))
-    figure = Figure(figsize=(6 * len(panels), 4.8), layout="constrained")
-    figure.suptitle(f"{printable(scene)}: error against time")
-    for axes, (value, label, sign) in zip(figure.subplots(1, len(panels)), panels, strict=True):
-        every = _draw_runs(axes, runs, value, several)
-        if several and sign and every:
-            draw_front(axes, every, sign)
+    figure, every = _panels(len(panels), f"{scene}: error against time")
+    for axes, (value, label, sign) in zip(every, panels, strict=True):
+        ours = _draw_runs(axes, runs, value, several)
+        if several and sign and ours:
+            draw_front(axes, ours, sign)
         theirs = _draw_peers(axes, peers, value)
-        drawn = every + theirs
-        seconds = "seconds of training, without scoring and saving" + (
-            " (other programs: as they count)" if theirs else ""
-        )
-        axes.set(xscale="log", xlabel=seconds, ylabel=label)
-        plain_log_axis(axes.xaxis)
-        if value is _dissimilarity and drawn and all(number > 0 for _, number in drawn):
+        _label(axes, LABELS["seconds"] + (" (other programs: as they count)" if theirs else ""), label)
+        if value is dissimilarity and ours + theirs:
             axes.set_yscale("log")
             plain_log_axis(axes.yaxis)
-        axes.grid(True, which="both", alpha=0.3)
         axes.legend(fontsize="small")
-    with atomic_write(path) as temporary:
-        figure.savefig(temporary, dpi=110, metadata={"Software": None})
+    _save(figure, path)
     return True
 
 
@@ -90,78 +90,73 @@ def _draw_runs(axes: Axes, runs: Sequence[dict[str, Any]], value: Value, several
         index = configs.index(run["config"])
         first = run is next(other for other in runs if other["config"] == run["config"])
         whole, part = whole_sets(run["curve"]), [row for row in run["curve"] if row.get(SUBSET) is not None]
-        points = _points(whole, value, "test")
+        ours = points(whole, value, "test")
         name = run["config"] or ("no option set" if several else "test")
         style = {"color": f"C{index % 10}", "linestyle": STYLES[index // 10 % len(STYLES)], "linewidth": 1.2}
         if run["apart"]:
             name, style["alpha"] = f"{name} (other ground truth)", 0.4
         else:
-            every += points
-        axes.plot(*_columns(points), marker=".", label=name if first else None, **style)
-        if value is not _gap and (few := _points(part, value, "test")):
-            label = "a subset of the test views" if run is runs[0] else None
-            axes.plot(*_columns(few), marker="o", label=label, **style | HOLLOW)
-        if not several and (train := _points(whole, value, "train")):
-            style |= {"linestyle": "--", "alpha": 0.6}
-            axes.plot(*_columns(train), label="train" if first else None, **style)
-            axes.plot(*_columns(_points(part, value, "train")), marker="o", **style | HOLLOW)
+            every += ours
+        axes.plot(*_columns(ours), marker=".", label=name if first else None, **style)
+        hollow = style | HOLLOW | {"marker": "o"}
+        if value is not _gap and (few := points(part, value, "test")):
+            axes.plot(*_columns(few), label="a subset of the test views" if run is runs[0] else None, **hollow)
+        if not several and (train := points(whole, value, "train")):
+            axes.plot(*_columns(train), label="train" if first else None, **style | {"linestyle": "--", "alpha": 0.6})
+            axes.plot(*_columns(points(part, value, "train")), **hollow | {"linestyle": "--", "alpha": 0.6})
     return every
-
-
-def draw_front(axes: Axes, points: Sequence[Point], sign: int) -> None:
-    """Mark the Pareto front. sign: 1 if a lower number is better, -1 if a higher one is."""
-    front = [points[i] for i in pareto_front([(seconds, sign * number) for seconds, number in points])]
-    axes.plot(
-        *_columns(_stairs(front)), color="black", linewidth=0.6, marker="o", markevery=2, markerfacecolor="none",
-        markersize=8, label="Pareto front",
-    )  # fmt: skip
 
 
 def _draw_peers(axes: Axes, peers: Sequence[dict[str, Any]], value: Value) -> list[Point]:
     every: list[Point] = []
     for index, peer in enumerate(peers):
-        points = _points(peer["curve"], value, "test")
-        marker = PEER_MARKERS[index % len(PEER_MARKERS)]
-        if points:
-            axes.plot(*_columns(points), color="0.35", linestyle="--", marker=marker, markersize=5, linewidth=1.2,
-                      label=f"{printable(peer['name'])} (another program)")  # fmt: skip
-        every += points
+        if theirs := points(peer["curve"], value, "test"):
+            axes.plot(
+                *_columns(theirs), color="0.35", linestyle="--", marker=PEER_MARKERS[index % len(PEER_MARKERS)],
+                markersize=5, linewidth=1.2, label=f"{printable(peer['name'])} (another program)",
+            )  # fmt: skip
+        every += theirs
     return every
 
 
-def _points(curve: Sequence[Row], value: Value, views: str) -> list[Point]:
-    pairs = ((row["seconds"], value(row, views)) for row in curve)
-    return [(seconds, number) for seconds, number in pairs if seconds > 0 and number is not None]
+def draw_front(axes: Axes, points: Sequence[Point], sign: int) -> None:
+    """Mark the Pareto front. sign: 1 if a lower number is better, -1 if a higher one is.
+
+    Between each two points lies a corner, unmarked: matplotlib places its legend clear of these, but not of lines that
+    it draws with drawstyle "steps".
+    """
+    front = [points[i] for i in pareto_front([(seconds, sign * number) for seconds, number in points])]
+    corners = [(after[0], before[1]) for before, after in zip(front, front[1:], strict=False)]
+    stairs = [point for pair in zip(front, corners, strict=False) for point in pair] + front[-1:]
+    axes.plot(
+        *_columns(stairs), color="black", linewidth=0.6, marker="o", markevery=2, markerfacecolor="none", markersize=8,
+        label="Pareto front",
+    )  # fmt: skip
 
 
 def _columns(points: Sequence[Point]) -> tuple[list[float], list[float]]:
     return [x for x, _ in points], [y for _, y in points]
 
 
-def _stairs(points: Sequence[Point]) -> list[Point]:
-    """Return the points with a corner between each two, so that every second one is a point.
+def draw_fronts(path: Path, scene: str, found: Mapping[str, Any], names: Sequence[str]) -> bool:
+    """Draw PSNR against each cost, where each option set ended.
 
-    Matplotlib places its legend clear of these, but not of lines that it draws with drawstyle "steps".
+    found: the scene's `fronts` in report.json. names: all option sets of the scene, which colours follow, so that they
+    are those of the curves. A point is the mean over the seeds, a bar the standard deviation; the front goes
+    through the means.
     """
-    corners = [(after[0], before[1]) for before, after in zip(points, points[1:], strict=False)]
-    return [point for pair in zip(points, corners, strict=False) for point in pair] + list(points[-1:])
-
-
-def draw_worst_views(path: Path, run: dict[str, Any], output: Path) -> bool:
-    """Draw a run's worst test views with ground truth, render and amplified error; return False if it has none.
-
-    Pixels that do not count are white in the images and black in the error.
-    """
-    folder = output / run["model"] / "test" / f"ours_{run['final_iteration']}"
-    if not run["worst_views"]:
-        return False
-    rows = [
-        (
-            f"{view['picture']}: {view['PSNR']:.2f} dB",
-            *(counted_picture(folder, side, view["file"]) for side in ("gt", "renders")),
-        )
-        for view in run["worst_views"]
-    ]
-    with atomic_write(path) as temporary:
-        contact_sheet(rows, WIDEST).save(temporary)
+    figure, every = _panels(len(COSTS), f"{scene}: where each option set ended")
+    for axes, cost in zip(every, COSTS, strict=True):
+        ends = []
+        for name, point in found["sets"].items():
+            index, x, y = names.index(name), point[cost], point["PSNR"]
+            ends.append((x["mean"], y["mean"]))
+            axes.errorbar(
+                *ends[-1], xerr=x["std"], yerr=y["std"], label=printable(name), color=f"C{index % 10}",
+                marker=MARKERS[index // 10 % len(MARKERS)], markersize=5, linewidth=1, capsize=2,
+            )  # fmt: skip
+        draw_front(axes, ends, -1)
+        _label(axes, LABELS[cost], "PSNR of the test views (dB)")
+    figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside right upper", fontsize="small")
+    _save(figure, path)
     return True

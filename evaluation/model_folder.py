@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import re
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -12,13 +13,23 @@ import numpy as np
 from PIL import Image
 
 from arguments.stored import read_model_json, read_stored_options
-from records.curve_peak import schedules_follow_length
+from records.training_log import NAME as LOG
+from records.training_log import read_log
+from records.what_to_try import schedules_follow_length
 from utils.files.image_files import UNREADABLE, open_render
 from utils.files.json_files import read_json
 from utils.files.plain_files import plain
 from utils.system_utils import UserError, saved_iterations
 
 SCHEDULE = "schedule.json"  # of a training whose iterations followed the clock
+
+
+def json_or_none(path: Path) -> Any | None:
+    """Read a JSON file; None if it is missing or not JSON."""
+    try:
+        return read_json(path)
+    except (OSError, ValueError, RecursionError):
+        return None
 
 
 def ply_file(model: Path, iteration: int) -> Path:
@@ -84,14 +95,11 @@ def training_seconds(model: Path, iteration: int) -> float | None:
 
 def logged(model: Path, warn: bool = False) -> dict[int, dict[str, Any]]:
     """Read the records of train_log.json by their iterations; none without the file, or if it is damaged."""
-    log = model / "train_log.json"
-    if not log.is_file():
-        return {}
     try:
-        return {int(record["iteration"]): record | {"seconds": float(record["seconds"])} for record in read_json(log)}
-    except (OSError, KeyError, ValueError, TypeError, RecursionError) as error:
+        return {record["iteration"]: record for record in read_log(model / LOG)}
+    except UserError as error:
         if warn:
-            print(f"{log} is damaged ({type(error).__name__}), so the training time is unknown", file=sys.stderr)
+            print(f"warning: {error}", file=sys.stderr)
         return {}
 
 
@@ -106,26 +114,24 @@ def trained_iterations(model: Path) -> list[int]:
 
 def closing_lines(model: Path) -> list[str]:
     """Read what train.py said at its end: costs of the curve, what it left out; none if it logged nothing."""
-    try:
-        return [str(line) for line in read_json(model / "train_log.json")[-1].get("lines", [])]
-    except (OSError, IndexError, AttributeError, ValueError, TypeError, KeyError):
-        return []
+    lines = next(reversed(logged(model).values()), {}).get("lines")
+    return list(map(str, lines)) if isinstance(lines, list) else []
 
 
 def picture(file: Path) -> Image.Image:
     """Read a render or a ground truth, RGB."""
-    try:
-        with open_render(file) as image:
-            return image.convert("RGB")
-    except UNREADABLE as error:
-        raise UserError(f"{file} is missing or damaged; run render.py and metrics.py again") from error
+    return _opened(file, lambda image: image.convert("RGB"))
 
 
 def picture_size(file: Path) -> tuple[int, int]:
     """Read width and height in pixels from the file's header."""
+    return _opened(file, lambda image: image.size)
+
+
+def _opened(file: Path, read: Callable[[Image.Image], Any]) -> Any:
     try:
         with open_render(file) as image:
-            return image.size
+            return read(image)
     except UNREADABLE as error:
         raise UserError(f"{file} is missing or damaged; run render.py and metrics.py again") from error
 
@@ -135,7 +141,7 @@ def view_names(folder: Path) -> list[str]:
     return sorted(file.name for file in folder.glob("*.png") if not file.name.startswith("."))
 
 
-def mask_of(method: Path, name: str) -> np.ndarray | None:
+def _mask(method: Path, name: str) -> np.ndarray | None:
     """Read which pixels of a view count for metrics.py, (H, W) bool; None: all. method: the folder `ours_N`."""
     file = method / "masks" / name
     return np.asarray(picture(file))[..., 0] > 0 if file.is_file() else None
@@ -143,18 +149,23 @@ def mask_of(method: Path, name: str) -> np.ndarray | None:
 
 def counted_picture(method: Path, side: str, name: str) -> Image.Image:
     """Read a view's `gt` or `renders`, RGB, white where pixels do not count. method: the folder `ours_N`."""
-    image, mask = picture(method / side / name), mask_of(method, name)
+    image, mask = picture(method / side / name), _mask(method, name)
     if mask is None:
         return image
     return Image.fromarray(np.where(mask[..., None], np.asarray(image), np.uint8(255)))
 
 
-def picture_name(cameras: Any, file: str) -> str:
-    """Return the photo's name of a rendered test view. cameras: content of cameras.json, which has test views first."""
-    try:
-        return str(cameras[int(Path(file).stem)]["img_name"])
-    except (ValueError, IndexError, KeyError, TypeError):
-        return file
+def picture_namer(model: Path) -> Callable[[str], str]:
+    """Return a function that names the photo of a rendered test view, by cameras.json, which has test views first."""
+    cameras = json_or_none(model / "cameras.json")
+
+    def name(file: str) -> str:
+        try:
+            return str(cameras[int(Path(file).stem)]["img_name"])
+        except (ValueError, IndexError, KeyError, TypeError):
+            return file
+
+    return name
 
 
 def ground_truth_digest(model: Path, method: str) -> str:
@@ -168,7 +179,7 @@ def ground_truth_digest(model: Path, method: str) -> str:
         image = picture(folder / "gt" / name)
         digest.update(f"{image.width}x{image.height}".encode())
         digest.update(np.asarray(image).tobytes())
-        if (mask := mask_of(folder, name)) is not None:
+        if (mask := _mask(folder, name)) is not None:
             digest.update(b"mask")
             digest.update(mask.tobytes())
     return digest.hexdigest()

@@ -53,23 +53,14 @@ def from_gsplat(folder: Path) -> list[PeerRow]:
     stats = folder / "stats" if (folder / "stats").is_dir() else folder
     rows = []
     for path in stats.glob("val_step*.json"):
-        step = re.fullmatch(r"val_step(\d+)", path.stem)
-        saved = stats / f"train_step{step[1]}_rank0.json" if step else None
-        if saved is None or not saved.is_file():
+        saved = stats / f"{path.stem.replace('val', 'train', 1)}_rank0.json"
+        if not saved.is_file():
             continue
         scores, costs = _json(path), _json(saved)
         try:
-            rows.append(
-                {
-                    "iteration": int(step[1]) + 1,
-                    "seconds": float(costs["ellipse_time"]),
-                    "gaussians": int(costs["num_GS"]),
-                    "peak_memory_mib": 1024 * float(costs["mem"]),
-                    "test_psnr": float(scores["psnr"]),
-                    "test_ssim": float(scores["ssim"]),
-                    "test_lpips": float(scores["lpips"]),
-                }
-            )
+            row = {"iteration": int(path.stem.removeprefix("val_step")) + 1, "seconds": float(costs["ellipse_time"])}
+            row |= {"gaussians": int(costs["num_GS"]), "peak_memory_mib": 1024 * float(costs["mem"])}
+            rows.append(row | {f"test_{name}": float(scores[name]) for name in ("psnr", "ssim", "lpips")})
         except (KeyError, TypeError, ValueError) as error:
             raise UserError(f"{path} or {saved.name} lacks a number ({error}); train again") from error
     if not rows:

@@ -32,19 +32,15 @@ def compare(
     for table in published_tables():
         for row in rows:
             run = next(run for run in runs if (run["scene"], run["config"]) == (row["scene"], row["config"]))
-            iteration = None if row["open_ended"] else row["iteration"]
-            theirs = table["scenes"].get(row["scene"], {}).get(str(iteration))
+            theirs = table["scenes"].get(row["scene"], {}).get(str(None if row["open_ended"] else row["iteration"]))
             if theirs and row["group"] in table["groups"] and _meets(run, table.get("requires", {})):
                 ours = {name: row[name]["mean"] for name in COMPARED}
-                compared.append(_comparison(table, row, row["scene"], ours, theirs, run["added_options"]))
+                compared.append(_comparison(table, row | ours, row["scene"], theirs, run))
         for mean in means:
             theirs = table["means"].get(mean["group"], {}).get(str(mean["iteration"]))
             if theirs:
                 run = next(run for run in runs if (run["group"], run["config"]) == (mean["group"], mean["config"]))
-                ours = {name: mean[name] for name in COMPARED}
-                compared.append(
-                    _comparison(table, mean, f"mean of {mean['group']}", ours, theirs, run["added_options"])
-                )
+                compared.append(_comparison(table, mean, f"mean of {mean['group']}", theirs, run))
     return compared
 
 
@@ -57,18 +53,12 @@ def _meets(run: dict[str, Any], wanted: dict[str, Any]) -> bool:
 
 
 def _comparison(
-    table: dict[str, Any], row: dict[str, Any], scene: str, ours: dict, theirs: dict, added: Sequence[str] | None
+    table: dict[str, Any], ours: dict[str, Any], scene: str, theirs: dict[str, float], run: dict[str, Any]
 ) -> dict[str, Any]:
     numbers = {
         name: {"difference": ours[name] - theirs[name], "ours": ours[name], "published": theirs[name]}
         for name in COMPARED
         if name in theirs and ours[name] is not None
     }
-    return {
-        "config": row["config"],
-        "iteration": row["iteration"],
-        "numbers": numbers,
-        "other_options": added,
-        "scene": scene,
-        "table": table["name"],
-    }
+    facts = {"config": ours["config"], "iteration": ours["iteration"], "other_options": run["added_options"]}
+    return facts | {"numbers": numbers, "scene": scene, "table": table["name"]}

@@ -14,10 +14,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from evaluation.blocks import Table
 from evaluation.document import result_blocks
 from evaluation.machine import one_line
-from evaluation.markdown import table_text
+from evaluation.pages import table_text
 from utils.files.json_files import read_json
 from utils.system_utils import UserError, atomic_write, run_cli
 
@@ -28,7 +27,7 @@ PAGE = Path("docs/results/training.md")
 
 def results_text(report: Mapping[str, Any]) -> str:
     """The table of a report, the options of its runs, and the machine and commit of its trainings."""
-    parts = [table_text(block) if isinstance(block, Table) else block for block in result_blocks(report["summary"])]
+    parts = [block if isinstance(block, str) else table_text(block) for block in result_blocks(report["summary"])]
     options = {run["config"] or "": list(run["added_options"] or ()) for run in report["runs"]}
     if any(options.values()):
         parts.append(_options_text(options))

@@ -1,20 +1,22 @@
-"""Plan of the runs: each trains a scene with one option set and one seed into its own model folder."""
+"""Plan of the runs: each trains a scene with one option set and one seed into its own model folder, with a record."""
 
 from __future__ import annotations
 
 import argparse
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from arguments import OptimizationParams
-from evaluation.record import NAME as RECORD
-from evaluation.record import Record
 from evaluation.scenes import SceneEntry
+from utils.files.json_files import read_json, write_json
 from utils.system_utils import UserError
 
 _DEFAULT_ITERATIONS = next(option.default for option in OptimizationParams.options if option.name == "iterations")
 
+RECORD = "full_eval.json"  # in a model folder: finished stages with their inputs, machine and seconds
 ENDING = ("time_budget", "schedule", "target_psnr")  # options by which a training ends before or after --iterations
 
 
@@ -56,6 +58,49 @@ class Run:
             return None
         # Zeros alone, as in 0.0, mean that the option is off.
         return None if any(values[name].strip("0.") for name in ENDING) else values["iterations"]
+
+
+class Record:
+    """full_eval.py's record of a model folder: `key` (Run.key, None if others made the model) and finished stages."""
+
+    def __init__(self, model: Path) -> None:
+        self._path = model / RECORD
+        self._content: dict[str, Any] = {}
+        if self._path.is_file():
+            try:
+                content = read_json(self._path)
+                if not isinstance(content["stages"], dict) or not isinstance(content["key"], dict | None):
+                    raise ValueError
+                self._content = content
+            except (OSError, ValueError, KeyError, TypeError, RecursionError):
+                print(f"warning: {self._path} is damaged; its stages will be repeated", file=sys.stderr)
+
+    @property
+    def key(self) -> dict[str, Any] | None:
+        return self._content.get("key")
+
+    def stage(self, name: str) -> dict[str, Any] | None:
+        """Return the notes of a stage that succeeded; None if it did not."""
+        return self._content.get("stages", {}).get(name)
+
+    def start(self, key: dict[str, Any]) -> None:
+        """Note the key of the training that starts here; another key discards the old stages."""
+        if self.key != key:
+            self._content = {"key": key, "stages": {}}
+            self._write()
+
+    def note(self, name: str, **values: Any) -> None:
+        """Note that a stage succeeded, or that training was interrupted or failed."""
+        self._content.setdefault("key", None)
+        self._content.setdefault("stages", {})[name] = values
+        self._write()
+
+    def forget(self, name: str) -> None:
+        """Let a stage be repeated."""
+        self._content.get("stages", {}).pop(name, None)
+
+    def _write(self) -> None:
+        write_json(self._path, self._content)
 
 
 def plan_runs(

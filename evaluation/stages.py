@@ -6,19 +6,20 @@ import math
 import re
 import signal
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from evaluation.child import Finished, run_child
 from evaluation.model_folder import ground_truth_digest, load_scores, logged, ply_file, trained_iterations, view_names
-from evaluation.record import Record
-from evaluation.runs import Run
+from evaluation.runs import Record, Run
 from records import render_times
 from utils.system_utils import UserError, mkdir_p
 
 _ROOT = Path(__file__).resolve().parents[1]
+_OFFLINE = {"GS_DOWNLOAD": "0"}
 
 
 @dataclass(frozen=True)
@@ -53,9 +54,9 @@ def train(run: Run, machine: dict[str, Any]) -> None:
     if _trained(run, record):
         return
     record.start(run.key)
-    interrupted = _interrupted(run, record)
-    checkpoint = interrupted and run.model / interrupted["checkpoint"]
-    before = _spent(interrupted)
+    before = record.stage("train_interrupted") or {}
+    before = before if before.get("checkpoint") in [path.name for path in _checkpoints(run)] else {}
+    checkpoint = run.model / before["checkpoint"] if before else None
     resume = ("--start_checkpoint", str(checkpoint)) if checkpoint else ()
     command = _script("train.py", "-s", str(run.scene.source), "-m", str(run.model), "--disable_viewer", "--quiet")
     command += [*run.options, *resume]
@@ -66,7 +67,9 @@ def train(run: Run, machine: dict[str, Any]) -> None:
     if done.status:
         left = [path for path, stamp in _checkpoints(run).items() if stamp != there.get(path)]
         if left:
-            _note_stop(record, done, max(left, key=_iteration_of), spent)
+            stopped = done.interrupt and done.status in (128 + signal.SIGINT, 128 + signal.SIGTERM)
+            name = max(left, key=_iteration_of).name
+            record.note("train_interrupted" if stopped else "train_failed", checkpoint=name, **spent)
     _expect_success("train", command, done)
     iterations = trained_iterations(run.model)
     if (run.iterations or max(logged(run.model), default=None)) not in iterations:
@@ -75,17 +78,13 @@ def train(run: Run, machine: dict[str, Any]) -> None:
     _stop_if_asked(done)
 
 
-def _spent(interrupted: dict[str, Any] | None) -> dict[str, float | None]:
-    """Return the seconds of the parts of a training before it was interrupted; CPU seconds None if not known."""
-    if interrupted is None:
-        return {"wall_seconds": 0.0, "cpu_seconds": 0.0}
-    return {"wall_seconds": interrupted["wall_seconds"], "cpu_seconds": interrupted.get("cpu_seconds")}
-
-
-def _sum(before: dict[str, float | None], done: Finished) -> dict[str, float | None]:
-    cpu = None if None in (before["cpu_seconds"], done.cpu_seconds) else before["cpu_seconds"] + done.cpu_seconds
-    wall = before["wall_seconds"] + done.seconds
-    return {"wall_seconds": round(wall, 3), "cpu_seconds": None if cpu is None else round(cpu, 3)}
+def _sum(before: dict[str, Any], done: Finished) -> dict[str, float | None]:
+    """Return the seconds of a training with those of its parts before; CPU seconds None if not known."""
+    sums = {}
+    for name, seconds in (("wall_seconds", done.seconds), ("cpu_seconds", done.cpu_seconds)):
+        earlier = before.get(name) if before else 0.0
+        sums[name] = None if None in (earlier, seconds) else round(earlier + seconds, 3)
+    return sums
 
 
 def _trained(run: Run, record: Record) -> bool:
@@ -105,18 +104,6 @@ def _iteration_of(checkpoint: Path) -> int:
     return int(checkpoint.stem[6:])
 
 
-def _note_stop(record: Record, done: Finished, checkpoint: Path, spent: dict[str, float | None]) -> None:
-    """Note the checkpoint of a training that was stopped or failed, and its seconds including earlier parts."""
-    stopped = done.interrupt and done.status in (128 + signal.SIGINT, 128 + signal.SIGTERM)
-    record.note("train_interrupted" if stopped else "train_failed", checkpoint=checkpoint.name, **spent)
-
-
-def _interrupted(run: Run, record: Record) -> dict[str, Any] | None:
-    """Return the notes of an interrupt whose checkpoint still exists; None if there are none."""
-    noted = record.stage("train_interrupted") or {}
-    return noted if noted.get("checkpoint") in [path.name for path in _checkpoints(run)] else None
-
-
 def _from_where(checkpoint: Path | None, record: Record) -> str:
     if checkpoint:
         return f" from {checkpoint.name}"
@@ -128,30 +115,48 @@ def _from_where(checkpoint: Path | None, record: Record) -> str:
     return ""
 
 
+def _saved(run: Run, stage: str) -> list[int]:
+    if iterations := trained_iterations(run.model):
+        return iterations
+    raise StageFailed(Failure(stage, [], [f"{run.model} has no saved iteration; train it first"]))
+
+
+def _source(run: Run) -> tuple[str, ...]:
+    return ("-s", str(run.scene.source)) if run.scene.source else ()
+
+
+def _once(
+    record: Record, name: str, say: str, command: list[str], wanted: dict[str, Any],
+    found: Callable[[], dict[str, Any] | None], also: Callable[[], dict[str, Any]] = dict, **environment: str,
+) -> None:  # fmt: skip
+    """Run a command, unless its stage is noted as done with what is wanted and what is found.
+
+    found: tells of the stage's files, None where they are missing; also: what is noted besides.
+    """
+    noted, there = record.stage(name), found()
+    if noted and there is not None and {key: noted.get(key) for key in wanted | there} == wanted | there:
+        return
+    _say(say)
+    done, stage = run_child(command, **environment), name.partition("_")[0]
+    _expect_success(stage, command, done)
+    there = found()
+    if there is None:
+        raise StageFailed(Failure(stage, command, ["the scene has no test views, so there is nothing to score"]))
+    record.note(name, **wanted, **there, **also(), wall_seconds=round(done.seconds, 3))
+    _stop_if_asked(done)
+
+
 def render(run: Run, options: Sequence[str]) -> None:
     """Render the test views of every saved iteration, except those already rendered from the same model.
 
     options: more words for render.py.
     """
-    record = Record(run.model)
-    iterations = trained_iterations(run.model)
-    if not iterations:
-        raise StageFailed(Failure("render", [], [f"{run.model} has no saved iteration; train it first"]))
-    source = ("-s", str(run.scene.source)) if run.scene.source else ()
-    for iteration in iterations:
+    for iteration in _saved(run, "render"):
+        command = _script("render.py", "-m", str(run.model), *_source(run), "--iteration", str(iteration))
+        command += ["--skip_train", "--eval", "--quiet", *options]
         wanted = {"model": _stamp(ply_file(run.model, iteration)), "options": list(options)}
-        done = record.stage(f"render_{iteration}")
-        if done and {key: done[key] for key in wanted} == wanted and _rendered(run.model, iteration) == done["views"]:
-            continue
-        command = _script("render.py", "-m", str(run.model), *source, "--iteration", str(iteration), "--skip_train")
-        command += ["--eval", "--quiet", *options]
-        _say(f"rendering iteration {iteration}")
-        finished = run_child(command)
-        _expect_success("render", command, finished)
-        if not (views := _rendered(run.model, iteration)):
-            raise StageFailed(Failure("render", command, ["the scene has no test views, so there is nothing to score"]))
-        record.note(f"render_{iteration}", **wanted, views=views, wall_seconds=round(finished.seconds, 3))
-        _stop_if_asked(finished)
+        say = f"rendering iteration {iteration}"
+        _once(Record(run.model), f"render_{iteration}", say, command, wanted, partial(_rendered, run.model, iteration))
 
 
 def _stamp(file: Path) -> list[int]:
@@ -160,11 +165,11 @@ def _stamp(file: Path) -> list[int]:
     return [state.st_size, state.st_mtime_ns]
 
 
-def _rendered(model: Path, iteration: int) -> int:
-    """Return the number of rendered views; 0 if a render or a ground truth is missing."""
+def _rendered(model: Path, iteration: int) -> dict[str, int] | None:
+    """Return the number of rendered `views`; None if there are none, or a render or a ground truth is missing."""
     folder = model / "test" / f"ours_{iteration}"
     renders, truth = view_names(folder / "renders"), view_names(folder / "gt")
-    return len(renders) if renders == truth else 0
+    return {"views": len(renders)} if renders and renders == truth else None
 
 
 def score(run: Run, download: bool = True) -> bool:
@@ -173,23 +178,21 @@ def score(run: Run, download: bool = True) -> bool:
     download: whether it may try to download the weights of LPIPS; return whether another run may. A try without an
     answer takes 10 seconds.
     """
-    record = Record(run.model)
-    iterations = trained_iterations(run.model)
-    methods = [f"ours_{iteration}" for iteration in iterations if _rendered(run.model, iteration)]
+    record, model = Record(run.model), run.model
+    methods = [f"ours_{iteration}" for iteration in trained_iterations(model) if _rendered(model, iteration)]
     if not methods:
-        raise StageFailed(Failure("metrics", [], [f"{run.model} has no rendered test views; render them first"]))
-    renders = {method: _times_stamp(run.model, method) for method in methods}
-    done = record.stage("metrics")
-    if done and done["renders"] == renders and None not in renders.values() and _scored(run.model, methods):
+        raise StageFailed(Failure("metrics", [], [f"{model} has no rendered test views; render them first"]))
+    renders = {method: _times_stamp(model, method) for method in methods}
+    if None in renders.values() or not _scored(model, methods):
+        record.forget("metrics")
+    before = record.stage("metrics")
+    _once(
+        record, "metrics", "scoring", _script("metrics.py", "-m", str(model)), {"renders": renders}, dict,
+        lambda: {"ground_truth_sha256": ground_truth_digest(model, methods[-1])}, **({} if download else _OFFLINE),
+    )  # fmt: skip
+    if record.stage("metrics") is before:
         return download
-    command = _script("metrics.py", "-m", str(run.model))
-    _say("scoring")
-    finished = run_child(command) if download else run_child(command, GS_DOWNLOAD="0")
-    _expect_success("metrics", command, finished)
-    truth = ground_truth_digest(run.model, methods[-1])
-    record.note("metrics", ground_truth_sha256=truth, renders=renders, wall_seconds=round(finished.seconds, 3))
-    _stop_if_asked(finished)
-    return download and load_scores(run.model, methods[-1])[0].get("LPIPS") is not None
+    return download and load_scores(model, methods[-1])[0].get("LPIPS") is not None
 
 
 def page_file(model: Path, output: Path) -> Path:
@@ -202,24 +205,13 @@ def page(run: Run, output: Path, options: Sequence[str]) -> None:
 
     options: more words for export.py.
     """
-    record = Record(run.model)
-    iterations = trained_iterations(run.model)
-    if not iterations:
-        raise StageFailed(Failure("html", [], [f"{run.model} has no saved iteration; train it first"]))
-    file = page_file(run.model, output)
-    wanted = {"model": _stamp(ply_file(run.model, iterations[-1])), "options": list(options)}
-    done = record.stage("html")
-    if done and {key: done[key] for key in wanted} == wanted and file.is_file():
-        return
-    source = ("-s", str(run.scene.source)) if run.scene.source else ()
+    last, file = _saved(run, "html")[-1], page_file(run.model, output)
     mkdir_p(file.parent)
-    last = "--iteration", str(iterations[-1])
-    command = _script("export.py", "-m", str(run.model), *source, *last, "--to", str(file), *options)
-    _say("writing the model as a page")
-    finished = run_child(command)
-    _expect_success("html", command, finished)
-    record.note("html", **wanted, wall_seconds=round(finished.seconds, 3))
-    _stop_if_asked(finished)
+    command = _script("export.py", "-m", str(run.model), *_source(run), "--iteration", str(last))
+    command += ["--to", str(file), *options]
+    wanted = {"model": _stamp(ply_file(run.model, last)), "options": list(options)}
+    say = "writing the model as a page"
+    _once(Record(run.model), "html", say, command, wanted, lambda: {} if file.is_file() else None)
 
 
 def _times_stamp(model: Path, method: str) -> list[int] | None:
@@ -230,11 +222,9 @@ def _times_stamp(model: Path, method: str) -> list[int] | None:
 
 def _scored(model: Path, methods: Sequence[str]) -> bool:
     try:
-        for method in methods:
-            load_scores(model, method)
+        return all(load_scores(model, method) for method in methods)
     except UserError:
         return False
-    return True
 
 
 def _say(what: str) -> None:

@@ -18,7 +18,7 @@ import diagnosis.model
 import doctor
 from arguments import ModelParams, read_cfg_args, write_cfg_args, write_model_json
 from diagnosis import environment
-from diagnosis.dataset import check_cloud, check_dataset, check_extent, check_lenses, points_in_views
+from diagnosis.dataset import check_cloud, check_dataset, check_extent, check_lenses
 from diagnosis.lines import Line
 from diagnosis.model import check_model
 from gaussian_renderer import render
@@ -93,7 +93,7 @@ def _sources(root: Path, version: str = "0.1.0") -> Path:
 
 def test_extensions_that_do_not_fit(monkeypatch, tmp_path):
     def check() -> list[str]:
-        return problems(environment._check_extension("simple-knn", "simple_knn"))
+        return problems([environment._check_extension("simple-knn", "simple_knn")])
 
     package = _sources(tmp_path)
     monkeypatch.setattr(environment, "ROOT", tmp_path)
@@ -110,13 +110,13 @@ def test_extensions_that_do_not_fit(monkeypatch, tmp_path):
 
 
 def test_the_rasterizer_is_tried(monkeypatch):
-    (line,) = environment._check_rasterizer(torch)
+    line = environment._check_rasterizer(torch)
     assert not line.finding and "agrees with its float64 oracle" in line.text
     right = diff_gaussian_rasterization.rasterize
     monkeypatch.setattr(
         diff_gaussian_rasterization, "rasterize", lambda **k: (r := right(**k))._replace(color=r.color + 1e-4)
     )
-    (line,) = environment._check_rasterizer(torch)
+    line = environment._check_rasterizer(torch)
     assert line.finding and "1.0e-04 off the oracle" in line.text
 
 
@@ -124,9 +124,9 @@ def test_a_gpu_that_is_not_used(monkeypatch):
     monkeypatch.setattr(environment, "_nvidia_gpu", lambda: "GPU 0: H100")
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     monkeypatch.setattr(torch.version, "cuda", None)
-    assert "H100 is there, but torch" in problems(environment._check_gpu(torch))[0]
+    assert "H100 is there, but torch" in problems([environment._check_gpu(torch)])[0]
     monkeypatch.setattr(torch.version, "cuda", "13.0")
-    assert "update the driver" in problems(environment._check_gpu(torch))[0]
+    assert "update the driver" in problems([environment._check_gpu(torch)])[0]
 
 
 @pytest.fixture
@@ -137,34 +137,27 @@ def info(colmap_scene):
 
 def test_the_synthetic_scene_is_sound(info):
     assert problems(check_extent(info)) == problems(check_lenses(info.train_cameras)) == []
-    few = problems(check_cloud(info))
-    assert len(few) == 1 and "only 300 points" in few[0]
-    # pycolmap projects its synthetic points into the images that see them.
-    seen = points_in_views(info.train_cameras, info.point_cloud.points)
-    assert seen.any(axis=0).mean() > 0.9
+    (few,) = problems(check_cloud(info))
+    assert "only 300 points" in few
 
 
-def test_scale(info):
+def _with_cameras(info, change, extent: float | None = None):
+    """The scene with changed cameras. change(index, camera): the fields to replace."""
+    cameras = [dataclasses.replace(camera, **change(i, camera)) for i, camera in enumerate(info.train_cameras)]
+    radius = {"radius": info.extent if extent is None else extent}
+    return dataclasses.replace(info, train_cameras=cameras, nerf_normalization=radius)
+
+
+def test_cameras_that_stand_or_look_oddly(info):
     for factor, remedy in ((1e-3, "by 1000;"), (1e3, "by 0.001;")):
-        cameras = [dataclasses.replace(camera, T=camera.T * factor) for camera in info.train_cameras]
-        scaled = dataclasses.replace(info, train_cameras=cameras, nerf_normalization={"radius": info.extent * factor})
+        scaled = _with_cameras(info, lambda _, camera, f=factor: {"T": camera.T * f}, info.extent * factor)
         assert remedy in problems(check_extent(scaled))[0]
-
-
-def test_stray_cameras(info):
-    cameras = list(info.train_cameras)
-    cameras[3] = dataclasses.replace(cameras[3], T=cameras[3].T + 200)
-    (line,) = problems(
-        check_extent(dataclasses.replace(info, train_cameras=cameras, nerf_normalization={"radius": 50.0}))
-    )
-    assert f"1 cameras are more than 10 times as far out as usual ({cameras[3].image_name})" in line
-    cameras = [dataclasses.replace(c, T=-c.R.T @ np.ones(3)) for c in info.train_cameras]
-    (line,) = problems(check_extent(dataclasses.replace(info, train_cameras=cameras)))
+    name = info.train_cameras[3].image_name
+    (line,) = problems(check_extent(_with_cameras(info, lambda i, c: {"T": c.T + 200 * (i == 3)}, 50.0)))
+    assert f"1 cameras are more than 10 times as far out as usual ({name})" in line
+    (line,) = problems(check_extent(_with_cameras(info, lambda _, c: {"T": -c.R.T @ np.ones(3)})))
     assert "all cameras stand in one place" in line
-
-
-def test_odd_lenses(info):
-    cameras = [dataclasses.replace(info.train_cameras[0], fx=5000.0), *info.train_cameras[1:]]
+    cameras = _with_cameras(info, lambda i, camera: {"fx": camera.fx if i else 5000.0}).train_cameras
     assert "1 cameras have odd opening angles" in problems(check_lenses(cameras))[0]
 
 
@@ -175,15 +168,15 @@ def _with_cloud(info, points: np.ndarray):
 def test_points_and_cameras_that_do_not_meet(info):
     many = np.random.default_rng(0).normal(scale=0.2, size=(2000, 3)).astype(np.float32)
     assert problems(check_cloud(_with_cloud(info, many))) == []
-    around = [dataclasses.replace(c, R=c.R @ np.diag([-1.0, 1.0, -1.0]), T=np.diag([-1.0, 1.0, -1.0]) @ c.T)
-              for c in info.train_cameras]  # fmt: skip
-    turned = dataclasses.replace(_with_cloud(info, many), train_cameras=around)
-    assert (
-        "100% of the points are in no photo -> poses and points do not belong together"
-        in problems(check_cloud(turned))[0]
-    )
-    one = dataclasses.replace(_with_cloud(info, many), train_cameras=[around[0], *info.train_cameras[1:]])
-    assert f"1 cameras have hardly any point in view ({around[0].image_name})" in problems(check_cloud(one))[0]
+    half_turn = np.diag([-1.0, 1.0, -1.0])
+    for turned, said in (
+        (99, "100% of the points are in no photo -> poses and points do not belong together"),
+        (1, f"1 cameras have hardly any point in view ({info.train_cameras[0].image_name})"),
+    ):
+        around = _with_cameras(
+            info, lambda i, c, n=turned: {"R": c.R @ half_turn, "T": half_turn @ c.T} if i < n else {}
+        )
+        assert said in problems(check_cloud(_with_cloud(around, many)))[0]
     far = many.copy()
     far[::20] = 1e5
     assert "5.0% of the points are more than 100 extents away" in problems(check_cloud(_with_cloud(info, far)))[0]
@@ -192,22 +185,16 @@ def test_points_and_cameras_that_do_not_meet(info):
 def test_what_readers_say_becomes_a_line(colmap_scene, tmp_path):
     (picture, *_) = sorted((colmap_scene / "images" / "left").iterdir())
     Image.new("RGB", (96, 70)).save(picture)
-    first = check_dataset(str(colmap_scene), "images")[0]
-    assert (
-        str(first).startswith("note    1 of 17 photos do not have the aspect ratio of their camera")
-        and not first.finding
-    )
+    first = str(check_dataset(str(colmap_scene), "images")[0])
+    assert first.startswith("note    1 of 17 photos do not have the aspect ratio of their camera")
     picture.unlink()
     (line,) = check_dataset(str(colmap_scene), "images")
     assert line.finding and "are missing" in line.text and "-i" in line.remedy
 
 
 def test_what_convert_noted(colmap_scene):
-    report = {
-        "registered": 17,
-        "photos": 30,
-        "advice": ["13 of 30 photos were left out; take more photos between them"],
-    }
+    advice = ["13 of 30 photos were left out; take more photos between them"]
+    report = {"registered": 17, "photos": 30, "advice": advice}
     path = colmap_scene / "convert_report.json"
     path.write_text(json.dumps(report))
     said = problems(check_dataset(str(colmap_scene), "images"))
@@ -239,62 +226,33 @@ def model(colmap_scene, tmp_path):
     return write
 
 
-def _nan(gaussians):
-    gaussians._scaling[5, 1] = np.nan
+def filled(**columns: float):
+    """A change that fills columns of the Gaussians."""
+    return lambda gaussians: [getattr(gaussians, f"_{name}").fill_(value) for name, value in columns.items()]
 
 
-def _transparent(gaussians):
-    gaussians._opacity.fill_(-7)
-
-
-def _elsewhere(gaussians):
-    gaussians._xyz += 500
-
-
-def _black(gaussians):
-    gaussians._opacity.fill_(3)
-    gaussians._features_dc.fill_(-5)
-
-
-def _huge(gaussians):
-    gaussians._scaling[:50] = 3
-
-
-def _just_reset(gaussians):
-    gaussians._opacity.fill_(float(np.log(0.01 / 0.99)))
-
-
-def _tiny(gaussians):
-    gaussians._scaling.fill_(float(np.log(1e-9)))
-
-
-def _vast(gaussians):
-    gaussians._scaling.fill_(float(np.log(1e4)))
-
-
-def _spread(gaussians):
-    gaussians._xyz *= 1e4
-
-
-def _shrunk(gaussians):
-    gaussians._xyz *= 1e-4
+def moved(factor: float, offset: float = 0.0):
+    return lambda gaussians: gaussians._xyz.mul_(factor).add_(offset)
 
 
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        (_nan, "1 of 300 Gaussians have a scale that is not finite -> resume from an earlier checkpoint"),
-        (_transparent, "renders of the training views are black: the Gaussians are almost transparent -> "),
-        (_elsewhere, "black: no Gaussian is in view, because the cameras face away -> check the poses"),
-        (_black, "black: the Gaussians themselves are black -> check whether the training photos"),
-        (_huge, "16.7% of the Gaussians are larger than the extent of the cameras"),
-        (_just_reset, "100% of the opacities are near 0.01, as a reset leaves them, and nothing was trained after it"),
-        (_tiny, "the Gaussians are too small for these cameras: their median size is "),
-        (_vast, "the Gaussians are too large for these cameras: their median size is "),
-        (_spread, "the positions of the Gaussians spread over "),
-        (_shrunk, "the positions of the Gaussians spread over "),
+        (lambda gaussians: gaussians._scaling[5, 1].fill_(np.nan),
+         "1 of 300 Gaussians have a scale that is not finite -> resume from an earlier checkpoint"),
+        (filled(opacity=-7), "renders of the training views are black: the Gaussians are almost transparent -> "),
+        (moved(1, 500), "black: no Gaussian is in view, because the cameras face away -> check the poses"),
+        (filled(opacity=3, features_dc=-5), "black: the Gaussians themselves are black -> check whether the training"),
+        (lambda gaussians: gaussians._scaling[:50].fill_(3),
+         "16.7% of the Gaussians are larger than the extent of the cameras"),
+        (filled(opacity=np.log(0.01 / 0.99)),
+         "100% of the opacities are near 0.01, as a reset leaves them, and nothing was trained after it"),
+        (filled(scaling=np.log(1e-9)), "the Gaussians are too small for these cameras: their median size is "),
+        (filled(scaling=np.log(1e4)), "the Gaussians are too large for these cameras: their median size is "),
+        (moved(1e4), "the positions of the Gaussians spread over "),
+        (moved(1e-4), "the positions of the Gaussians spread over "),
     ],
-)
+)  # fmt: skip
 def test_models_with_a_fault(model, change, said):
     found = problems(check_model(model(change, iteration=2000), -1))
     assert any(said in text for text in found)
@@ -320,21 +278,40 @@ def _half_black(gaussians):
     gaussians._features_dc[::2] = -5
 
 
-def test_a_model_of_the_other_background(model, colmap_scene, monkeypatch):
-    """Photos with alpha that are a model's own renders on black, transparent where they are black."""
-    monkeypatch.setattr(diagnosis.model, "_WIDTH", WIDTH)
-    folder = Path(model(_half_black))
-    scene = load_saved(ModelParams(argparse.ArgumentParser()).extract(argparse.Namespace(**read_cfg_args(folder))), -1)
+def _photograph(folder: Path, change, **options) -> None:
+    """Let the photos of a model's scene be its own renders on black, after change(pixels) to them, (H, W, 3) uint8."""
+    stored = _options(folder)
+    scene = load_saved(stored, -1)
     for camera in scene.getTrainCameras():
         with torch.no_grad():
-            image = render(camera, scene.gaussians, pipeline(), torch.zeros(3))["render"].clamp(0, 1)
-        pixels = (image.permute(1, 2, 0) * 255).round().to(torch.uint8).numpy()
-        alpha = np.where(pixels.max(axis=2, keepdims=True) > 4, 255, 0).astype(np.uint8)
-        Image.fromarray(np.concatenate([pixels, alpha], axis=2)).save(colmap_scene / "images" / camera.image_name)
+            image = render(camera, scene.gaussians, pipeline(), torch.zeros(3), **options)["render"].clamp(0, 1)
+        pixels = (image.permute(1, 2, 0) * 255).round().to(torch.uint8).numpy().copy()
+        Image.fromarray(change(pixels)).save(Path(stored.source_path) / "images" / camera.image_name)
+
+
+def _options(folder: Path, **changed) -> argparse.Namespace:
+    """A model's options; changed ones are stored."""
+    options = ModelParams(argparse.ArgumentParser()).extract(argparse.Namespace(**read_cfg_args(folder) | changed))
+    if changed:
+        write_cfg_args(folder, options)
+    return options
+
+
+def _mask(scene: Path, mask: np.ndarray) -> None:
+    """Give all photos of a scene a mask (H, W) uint8."""
+    for camera in read_scene(scene, "images", hold_out=False).train_cameras:
+        path = scene / "masks" / camera.image_name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        Image.fromarray(mask).save(path)
+
+
+def test_a_model_of_the_other_background(model, colmap_scene, monkeypatch):
+    """The photos have alpha, and are transparent where they are black."""
+    monkeypatch.setattr(diagnosis.model, "_WIDTH", WIDTH)
+    folder = Path(model(_half_black))
+    _photograph(folder, lambda x: np.dstack([x, np.where(x.max(axis=2) > 4, 255, 0).astype(np.uint8)]))
     assert problems(check_model(str(folder), -1)) == []
-    options = ModelParams(argparse.ArgumentParser()).extract(argparse.Namespace(**read_cfg_args(folder)))
-    options.white_background = True
-    write_cfg_args(folder, options)
+    _options(folder, white_background=True)
     (line,) = problems(check_model(str(folder), -1))
     assert "over black it is " in line and "the model was trained on black: set white_background=False" in line
     assert line.endswith("render without -w")
@@ -356,43 +333,23 @@ def test_models_that_have_not_converged(model):
     assert lines[0].text == "iteration 7, 300 Gaussians of SH degree 3"
     assert "opacities: 0-0.01 0%, 0.01-0.05 0%, 0.05-0.2 100%" in lines[1].text
     assert any("PSNR of only" in text and "train longer, 3000 iterations" in text for text in problems(lines))
-    assert any(
-        "shortly after opacities were reset" in text for text in problems(check_model(model(iteration=6100), 6100))
-    )
-    assert any(
-        "the dataset has problems (only 17 photos)" in text
-        for text in problems(check_model(model(iteration=20000), -1))
-    )
+    assert "shortly after opacities were reset" in str(problems(check_model(model(iteration=6100), 6100)))
+    assert "the dataset has problems (only 17 photos)" in str(problems(check_model(model(iteration=20000), -1)))
 
 
-def _opaque(gaussians):
-    gaussians._opacity.fill_(3)
-
-
-@pytest.mark.parametrize("kind", ["masked", "halves"])
-def test_only_what_is_scored_is_looked_at(model, colmap_scene, monkeypatch, kind):
+@pytest.mark.parametrize("halves", [False, True])
+def test_only_what_is_scored_is_looked_at(model, colmap_scene, monkeypatch, halves):
     """Photos whose right halves are a model's own renders, and whose left halves are nonsense."""
     monkeypatch.setattr(diagnosis.model, "_WIDTH", WIDTH)
-    folder, halves = Path(model(_opaque)), kind == "halves"
-    options = ModelParams(argparse.ArgumentParser()).extract(argparse.Namespace(**read_cfg_args(folder)))
-    options.train_test_exp = halves
-    write_cfg_args(folder, options)
-    names = [camera.image_name for camera in read_scene(colmap_scene, "images", hold_out=False).train_cameras]
+    folder = Path(model(filled(opacity=3)))
     if halves:
+        _options(folder, train_test_exp=True)
+        names = [camera.image_name for camera in read_scene(colmap_scene, "images", hold_out=False).train_cameras]
         brighter = [[0.5, 0.0, 0.0, 0.3], [0.0, 0.5, 0.0, 0.3], [0.0, 0.0, 0.5, 0.3]]
         (folder / "exposure.json").write_text(json.dumps(dict.fromkeys(names, brighter)))
-    scene = load_saved(options, -1)
-    for camera in scene.getTrainCameras():
-        with torch.no_grad():
-            package = render(camera, scene.gaussians, pipeline(), torch.zeros(3), use_trained_exp=halves)
-        pixels = (package["render"].permute(1, 2, 0) * 255).round().to(torch.uint8).numpy().copy()
-        pixels[:, : WIDTH // 2] = 255 - pixels[:, : WIDTH // 2]
-        Image.fromarray(pixels).save(colmap_scene / "images" / camera.image_name)
-        mask = np.full((HEIGHT, WIDTH), 255, np.uint8)
-        mask[:, : WIDTH // 2] = 0
-        path = colmap_scene / "masks" / camera.image_name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        Image.fromarray(mask).save(path)
+    right = np.arange(WIDTH) >= WIDTH // 2
+    _photograph(folder, lambda x: np.where(right[:, None], x, 255 - x), use_trained_exp=halves)
+    _mask(colmap_scene, np.where(right, 255, 0).astype(np.uint8)[None].repeat(HEIGHT, axis=0))
     if not halves:
         assert any("PSNR of only" in text for text in problems(check_model(str(folder), -1)))
         write_model_json(folder, argparse.Namespace(masks="masks"), antialiasing=False, seed=0)
@@ -405,11 +362,8 @@ def test_only_what_is_scored_is_looked_at(model, colmap_scene, monkeypatch, kind
 
 
 def test_views_of_which_nothing_counts(model, colmap_scene):
-    folder = model(_opaque)
-    for camera in read_scene(colmap_scene, "images", hold_out=False).train_cameras:
-        path = colmap_scene / "masks" / camera.image_name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        Image.fromarray(np.zeros((HEIGHT, WIDTH), np.uint8)).save(path)
+    folder = model(filled(opacity=3))
+    _mask(colmap_scene, np.zeros((HEIGHT, WIDTH), np.uint8))
     write_model_json(folder, argparse.Namespace(masks="masks"), antialiasing=False, seed=0)
     (said,) = problems(check_model(folder, -1))
     assert "no pixel of the inspected training views counts -> check --masks" in said

@@ -9,13 +9,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from evaluation import published
-from evaluation.report import _cheapest
-from evaluation.results import _peak
+from evaluation.option_sets import cheapest, gaussians_to_reach, pareto_front, seconds_to_reach
 from evaluation.results_page import BEGIN, END, replace_results, results_text
 from evaluation.scenes import DATASETS
 from evaluation.summary import QUANTITIES, spread, summarise
-from evaluation.tradeoff import cheapest, gaussians_to_reach, levels, pareto_front, seconds_to_reach
 from records.error_curve import COLUMNS
+from records.what_to_try import peak
 from utils.files.markdown_table import markdown_table
 from utils.system_utils import UserError
 
@@ -28,12 +27,6 @@ def curve(*points: tuple[float, float | None, float]) -> list[dict]:
     ]
 
 
-def test_pareto_front_of_known_points():
-    points = [(3, 1), (1, 5), (2, 5), (2, 4), (4, 1), (3, 1)]
-    assert pareto_front(points) == [1, 3, 0]
-    assert pareto_front([]) == []
-
-
 @given(st.lists(st.tuples(st.integers(0, 9), st.integers(0, 9)), max_size=30))
 def test_pareto_front_is_what_nothing_beats(points):
     front = pareto_front(points)
@@ -42,11 +35,11 @@ def test_pareto_front_is_what_nothing_beats(points):
         return any(q != point and q[0] <= point[0] and q[1] <= point[1] for q in points)
 
     assert {points[i] for i in front} == {point for point in points if not beaten(point)}
-    assert len({points[i] for i in front}) == len(front)
+    assert len({points[i] for i in front}) == len(front) and front == sorted(front, key=lambda i: points[i])
 
 
 def test_seconds_to_reach_between_points():
-    rows = curve((1, 10, 100), (4, None, 100), (100, 20, 300), (200, 19, 250), (300, 30, 400))
+    rows = curve((1, 10, 100), (100, 20, 300), (200, 19, 250), (300, 30, 400))
     assert seconds_to_reach(rows, 9) == 1
     assert seconds_to_reach(rows, 20) == 100
     assert seconds_to_reach(rows, 15) == 100  # too far from the point before to interpolate
@@ -57,12 +50,14 @@ def test_seconds_to_reach_between_points():
 
 
 def test_cheapest_wants_every_seed_and_takes_the_mean():
-    curves = {
+    sets = {
         "slow": [curve((10, 20, 50), (100, 30.07, 60)), curve((10, 20, 50), (100, 30.07, 60))],
         "fast": [curve((1, 20, 80), (2, 29, 90)), curve((3, 20, 70), (30, 28, 90))],
     }
+    curves = {name: [{"curve": rows} for rows in seeds] for name, seeds in sets.items()}
     rows = {row["psnr"]: row for row in cheapest(curves)}
-    assert list(rows) == [30.0, 29.9, 29.8, 29.5, 29.0, 28.0, 27.0, 25.0, 22.0] == levels(curves)
+    assert cheapest({}) == [] == cheapest({"a": [{"curve": []}], "b": [{"curve": curve((1, None, 2))}]})
+    assert list(rows) == [30.0, 29.9, 29.8, 29.5, 29.0, 28.0, 27.0, 25.0, 22.0]
     assert rows[29.0]["seconds"]["config"] == "slow" and set(rows[29.0]["seconds"]["all"]) == {"slow"}
     assert rows[28.0]["seconds"]["config"] == "fast" and set(rows[28.0]["seconds"]["all"]) == {"slow", "fast"}
     assert rows[28.0]["seconds"]["value"] == pytest.approx((2 ** (8 / 9) + 30) / 2)
@@ -70,24 +65,13 @@ def test_cheapest_wants_every_seed_and_takes_the_mean():
     assert rows[28.0]["gaussians"] == {"all": {"slow": 60, "fast": 90}, "config": "slow", "std": 0.0, "value": 60}
 
 
-def test_subsets_are_in_no_table_and_no_peak(tmp_path):
+def test_subsets_are_no_peak():
     part = [row | {"subset": 2} for row in curve((1, 35, 10), (2, 36, 10))]
     whole = [row | {"iteration": row["iteration"] + 2} for row in curve((3, 20, 10), (4, 20.05, 10))]
-    rising = [*curve((2.5, 18, 10)), *whole]
-    runs = [
-        {"scene": "s", "config": name, "failure": None, "apart": False, "curve": part + rising} for name in ("a", "b")
-    ]
-    assert max(row["psnr"] for row in _cheapest(runs)["s"]) == 20.0
     late = [row | {"iteration": 9, "subset": 2, "test_psnr": 1.0} for row in part[:1]]
-    assert _peak(part + whole + late, tmp_path) is None
-    assert _peak(part + whole[::-1], tmp_path) is None  # 0.05 dB is not clear
-    assert _peak(part, tmp_path) is None
-    lost = [*whole, whole[0] | {"iteration": 8, "test_psnr": 19.0}]
-    assert _peak(part + lost, tmp_path)["iteration"] == 4
-
-
-def test_cheapest_of_nothing():
-    assert cheapest({}) == [] == cheapest({"a": [[]], "b": [curve((1, None, 2))]})
+    assert peak(part + whole + late) is peak(part + whole[::-1]) is peak(part) is None  # 0.05 dB is not clear
+    best, lost = peak([*part, *whole, whole[0] | {"iteration": 8, "test_psnr": 19.0}])
+    assert best["iteration"] == 4 and lost == pytest.approx(1.05)
 
 
 def test_spread():

@@ -25,10 +25,8 @@ import full_eval
 from arguments import write_cfg_args
 from evaluation import report as report_module
 from evaluation import results_page, stages
-from evaluation.comparisons import comparisons
-from evaluation.contact_sheet import GAIN, GAP, HEADER
-from evaluation.figures import draw_curves, draw_worst_views
-from evaluation.front_figure import draw_fronts
+from evaluation.contact_sheet import GAIN, GAP, HEADER, comparisons, draw_worst_views
+from evaluation.figures import draw_curves, draw_fronts
 from evaluation.model_folder import SCHEDULE, shorter_ends_there
 from evaluation.results_page import BEGIN, END
 from evaluation.runs import Run
@@ -49,7 +47,7 @@ def _stand_ins(monkeypatch):
     monkeypatch.setattr(stages, "_ROOT", STAND_INS)
     monkeypatch.setattr(full_eval, "machine", lambda: MACHINE)
     monkeypatch.setattr(report_module, "draw_curves", lambda *_: False)  # half a second each; see `figures`
-    monkeypatch.setattr(report_module, "draw_fronts", lambda path, *_: Image.new("RGB", (9, 9)).save(path))
+    monkeypatch.setattr(report_module, "draw_fronts", lambda path, *_: not Image.new("RGB", (9, 9)).save(path))
 
 
 @pytest.fixture
@@ -247,19 +245,23 @@ def _start(scenes: Path, words: list[str]) -> subprocess.Popen:
     return process
 
 
+def _interrupt(process: subprocess.Popen, sent: signal.Signals, status: int) -> None:
+    """Send a signal to the whole group, as from a terminal on Ctrl-C or when it is closed."""
+    try:
+        os.killpg(process.pid, sent)
+        said = process.communicate(timeout=2 * LIMIT)[1]
+    finally:
+        process.kill()
+    assert process.returncode == status, said
+
+
 def test_a_checkpoint_beyond_the_iterations_is_resumed_where_the_training_decides_its_end(
     scenes, tmp_path, any_options
 ):
     out = tmp_path / "out"
     words = ["--scenes", str(scenes / "attic"), "--output_path", str(out), "--iterations", "40"]
     words += ["--", "--time_budget", "20"]
-    process = _start(scenes, words)
-    try:
-        process.send_signal(signal.SIGINT)
-        said = process.communicate(timeout=2 * LIMIT)[1]
-    finally:
-        process.kill()
-    assert process.returncode == 130, said
+    _interrupt(_start(scenes, words), signal.SIGINT, 130)
     assert run(*words)["runs"][0]["final_iteration"] == 43
     assert calls(scenes)[-2][-2:] == ["--start_checkpoint", str(out / "attic" / "chkpnt41.pth")]
 
@@ -268,13 +270,7 @@ def test_a_checkpoint_beyond_the_iterations_is_resumed_where_the_training_decide
 def test_a_signal_reaches_the_training_and_the_next_call_resumes_it(scenes, tmp_path, sent, status):
     out = tmp_path / "out"
     words = ["--scenes", str(scenes / "attic"), str(scenes / "brick"), "--output_path", str(out), "--iterations", "40"]
-    process = _start(scenes, words)
-    try:
-        os.killpg(process.pid, sent)  # to the whole group, as from a terminal on Ctrl-C or when it is closed
-        said = process.communicate(timeout=2 * LIMIT)[1]
-    finally:
-        process.kill()
-    assert process.returncode == status, said
+    _interrupt(_start(scenes, words), sent, status)
     report = report_of(out)
     assert [run["finished"] for run in report["runs"]] == [False, False] and not report["runs"][0]["failure"]
     assert "Not finished: attic; brick." in (out / "report.md").read_text()
@@ -330,12 +326,7 @@ def test_an_interrupts_checkpoint_stays_the_one_to_go_on_from(scenes, tmp_path):
     """After an interrupt left a checkpoint at 5, a failure leaves a later one at 9 in the same folder."""
     out = tmp_path / "out"
     words = ["--scenes", str(scenes / "attic"), "--output_path", str(out), "--iterations", "40"]
-    process = _start(scenes, words)
-    try:
-        process.send_signal(signal.SIGINT)
-        process.communicate(timeout=2 * LIMIT)
-    finally:
-        process.kill()
+    _interrupt(_start(scenes, words), signal.SIGINT, 130)
     before = json.loads((out / "attic" / "full_eval.json").read_text())["stages"]["train_interrupted"]["wall_seconds"]
     (scenes / "attic" / "full").touch()
     with pytest.raises(SystemExit):
@@ -394,42 +385,39 @@ def test_the_last_iteration_as_far_as_options_tell_it(tmp_path, words, last):
     assert Run(SceneEntry("attic", "scenes", None), None, None, tmp_path, words, ()).iterations == last
 
 
-def test_a_schedule_that_was_recorded_is_no_reason_for_fewer_iterations(tmp_path):
+def test_what_a_model_folder_tells_beside_its_scores(scenes, tmp_path):
+    """Gaussians left out, the split, what training said: from files of train.py, some of which may be missing."""
+    out, model = tmp_path / "out", tmp_path / "out" / "attic"
+    words = ["--scenes", scenes / "attic", "--output_path", out, "--iterations", 40]
+    (first,) = run(*words)["runs"]
+    assert first["lines"] == [] and first["split"] == "the data set's own"  # photo_0 and photo_1 of nine
+    left_out = {"antialiasing": False, "left_out": {"gaussians": 17000, "unseen": 1000}}
+    (model / "model.json").write_text(json.dumps(left_out))
+    names = ["photo_0", "photo_8", *(f"photo_{i}" for i in range(1, 8))]
+    (model / "cameras.json").write_text(json.dumps([{"img_name": name} for name in names]))
+    records = json.loads((model / "train_log.json").read_text())
+    records[-1]["lines"] = ["Curve of 14 points", "Saved 9 of 10 Gaussians"]
+    (model / "train_log.json").write_text(json.dumps(records))
+    (second,) = run(*words)["runs"]
+    values = second["iterations"]["40"]
+    assert (values["gaussians"], values["gaussians_saved"]) == (17000, 16000)
+    assert second["split"] == "every 8th by name" and second["lines"] == records[-1]["lines"]
+    text = (out / "report.md").read_text()
+    assert "17,000" in text and "16,000" not in text and "Gaussians are counted as trained" in text
+    assert "every 8th by name" in text and "attic: Curve of 14 points. Saved 9 of 10 Gaussians." in text
+    left_out["left_out"]["unseen"] = 999  # belongs to another model: it does not add up with the PLY's rows
+    (model / "model.json").write_text(json.dumps(left_out))
+    (model / "cameras.json").unlink()
+    (third,) = run(*words)["runs"]
+    assert third["iterations"]["40"]["gaussians"] == 16000 and third["split"] is None
     write_cfg_args(tmp_path, argparse.Namespace())
-    assert shorter_ends_there(tmp_path)
+    assert shorter_ends_there(tmp_path)  # as a schedule of --iterations does not
     (tmp_path / SCHEDULE).touch()
     assert not shorter_ends_there(tmp_path)
 
 
-def test_trained_gaussians_are_reported_and_those_saved_beside(scenes, tmp_path):
-    out = tmp_path / "out"
-    words = ["--scenes", scenes / "attic", "--output_path", out, "--iterations", 40]
-    run(*words)
-    left_out = {"antialiasing": False, "left_out": {"gaussians": 17000, "unseen": 1000}}
-    (out / "attic" / "model.json").write_text(json.dumps(left_out))
-    report = run(*words)
-    values = report["runs"][0]["iterations"]["40"]
-    assert (values["gaussians"], values["gaussians_saved"]) == (17000, 16000)
-    text = (out / "report.md").read_text()
-    assert "17,000" in text and "16,000" not in text and "Gaussians are counted as trained" in text
-    left_out["left_out"]["unseen"] = 999  # belongs to another model: it does not add up with the PLY's rows
-    (out / "attic" / "model.json").write_text(json.dumps(left_out))
-    assert run(*words)["runs"][0]["iterations"]["40"]["gaussians"] == 16000
-
-
-def test_the_split_is_what_the_views_say(scenes, tmp_path):
-    out = tmp_path / "out"
-    words = ["--scenes", scenes / "attic", "--output_path", out, "--iterations", 40]
-    assert run(*words)["runs"][0]["split"] == "the data set's own"  # photo_0 and photo_1 of nine
-    names = ["photo_0", "photo_8", *(f"photo_{i}" for i in range(1, 8))]
-    (out / "attic" / "cameras.json").write_text(json.dumps([{"img_name": name} for name in names]))
-    assert run(*words)["runs"][0]["split"] == "every 8th by name"
-    assert "every 8th by name" in (out / "report.md").read_text()
-    (out / "attic" / "cameras.json").unlink()
-    assert run(*words)["runs"][0]["split"] is None
-
-
-def test_masks_are_part_of_the_ground_truth_and_blank_on_the_sheet(scenes, tmp_path):
+def test_seeds_of_different_ground_truth(scenes, tmp_path):
+    """A mask alone is another ground truth: a warning, no mean of the scores, blank pixels on the sheet."""
     out = tmp_path / "out"
     words = ["--scenes", scenes / "attic", "--output_path", out, "--iterations", 40, "--seeds", 0, 1]
     assert run(*words)["warnings"] == []
@@ -440,7 +428,11 @@ def test_masks_are_part_of_the_ground_truth_and_blank_on_the_sheet(scenes, tmp_p
     mask.save(method / "masks" / "00001.png")
     (out / "attic" / "seed_1" / "results.json").unlink()
     report = run(*words)
-    assert "different ground truth" in report["warnings"][0] and "masks" in report["warnings"][0]
+    assert len(report["warnings"]) == 1 and "different ground truth" in report["warnings"][0]
+    assert report["warnings"][0] in (out / "report.md").read_text()
+    (row,) = report["summary"]
+    assert not row["one_ground_truth"] and row["PSNR"] == {"mean": None, "std": None, "values": [23.0, 23.1]}
+    assert row["seconds"]["mean"] == 16.0
     view = report["runs"][1]
     assert view["worst_views"][0]["file"] == "00001.png"
     assert draw_worst_views(tmp_path / "sheet.png", view, out)
@@ -450,67 +442,53 @@ def test_masks_are_part_of_the_ground_truth_and_blank_on_the_sheet(scenes, tmp_p
     assert masked == [(255,) * 3, (255,) * 3, (0,) * 3] and plain == [(90,) * 3, (90,) * 3, (0,) * 3]
 
 
-def test_the_legend_leaves_the_pareto_front_free(tmp_path, monkeypatch):
+@pytest.fixture
+def drawn(monkeypatch) -> list[Figure]:
+    """The figures that are saved."""
     figures, plain = [], Figure.savefig
     monkeypatch.setattr(Figure, "savefig", lambda self, *a, **k: (figures.append(self), plain(self, *a, **k)))
-    names = ("seconds", "test_psnr", "test_ssim")
+    return figures
+
+
+def _curve(*rows: tuple) -> list[dict]:
+    names = ("seconds", "test_psnr", "test_ssim", "train_psnr", "train_ssim", "subset")
+    return [dict.fromkeys(COLUMNS) | dict(zip(names, row, strict=False)) for row in rows]
+
+
+def test_the_legend_leaves_the_pareto_front_free(tmp_path, drawn):
     curves = {
-        "base": [(0.3, 15.0, 0.7), (2.8, 29.0, 0.945)],
-        "fast start": [(0.3, 21.0, 0.8), (3.3, 29.5, 0.95)],
-    } | {f"set {i}": [(0.31, 15.0, 0.7), (2.9, 28.5, 0.94)] for i in range(6)}  # fmt: skip
-    runs = [
-        {
-            "apart": False,
-            "config": config,
-            "curve": [dict.fromkeys(COLUMNS) | dict(zip(names, row, strict=True)) for row in curve],
-        }
-        for config, curve in curves.items()
-    ]
+        "base": _curve((0.3, 15.0, 0.7), (2.8, 29.0, 0.945)),
+        "fast start": _curve((0.3, 21.0, 0.8), (3.3, 29.5, 0.95)),
+    } | {f"set {i}": _curve((0.31, 15.0, 0.7), (2.9, 28.5, 0.94)) for i in range(6)}  # fmt: skip
+    runs = [{"apart": False, "config": config, "curve": curve} for config, curve in curves.items()]
     assert draw_curves(tmp_path / "curves.png", "attic", runs)
-    left, right = figures[0].axes
-    fronts = [next(line for line in axes.lines if line.get_label() == "Pareto front") for axes in (left, right)]
+    fronts = [next(line for line in axes.lines if line.get_label() == "Pareto front") for axes in drawn[0].axes]
     assert fronts[0].get_xydata().tolist() == [[0.3, 21.0], [2.8, 21.0], [2.8, 29.0], [3.3, 29.0], [3.3, 29.5]]
     assert fronts[0].get_markevery() == 2  # corners are not marked
-    for axes, front in zip((left, right), fronts, strict=True):
-        drawn = front.get_path().transformed(front.get_transform())
-        assert not drawn.intersects_bbox(axes.get_legend().get_window_extent(), filled=False)
+    for axes, front in zip(drawn[0].axes, fronts, strict=True):
+        line = front.get_path().transformed(front.get_transform())
+        assert not line.intersects_bbox(axes.get_legend().get_window_extent(), filled=False)
 
 
-def test_points_of_subsets_are_hollow_and_in_no_front(tmp_path, monkeypatch):
-    figures, plain = [], Figure.savefig
-    monkeypatch.setattr(Figure, "savefig", lambda self, *a, **k: (figures.append(self), plain(self, *a, **k)))
-    names = ("seconds", "test_psnr", "test_ssim", "train_psnr", "train_ssim", "subset")
-    rows = [(0.3, 35.0, 0.9, 36.0, 0.9, 2), (1.0, 36.0, 0.95, 37.0, 0.9, 2), (2.0, 20.0, 0.8, 21.0, 0.8, None)]
-    curve = [dict(zip(names, row, strict=True)) for row in rows]
-    unfinished = curve[:2]
+def test_points_of_subsets_are_hollow_and_in_no_front(tmp_path, drawn):
+    curve = _curve((0.3, 35.0, 0.9, 36.0, 0.9, 2), (1.0, 36.0, 0.95, 37.0, 0.9, 2), (2.0, 20.0, 0.8, 21.0, 0.8, None))
     for runs in (
         [{"config": None, "apart": False, "curve": curve}],
-        [{"config": name, "apart": False, "curve": rows} for name, rows in (("a", curve), ("b", unfinished))],
+        [{"config": name, "apart": False, "curve": rows} for name, rows in (("a", curve), ("b", curve[:2]))],
     ):
         assert draw_curves(tmp_path / "curves.png", "attic", runs)
-        lines = figures[-1].axes[0].lines
-        assert figures[-1].axes[0].get_ylabel() == "PSNR of the test views (dB)"
-        hollow = [line.get_xydata().tolist() for line in lines if line.get_fillstyle() == "none"]
+        axes = drawn[-1].axes
+        assert axes[0].get_ylabel() == "PSNR of the test views (dB)"
+        hollow = [line.get_xydata().tolist() for line in axes[0].lines if line.get_fillstyle() == "none"]
         assert [[0.3, 35.0], [1.0, 36.0]] in hollow
-        assert [[2.0, 20.0]] in [line.get_xydata().tolist() for line in lines if line.get_fillstyle() == "full"]
-        if len(runs) == 1:
-            assert [[0.3, 36.0], [1.0, 37.0]] in hollow  # the training views
-    (front,) = (line for line in lines if line.get_label() == "Pareto front")
+        assert ([[0.3, 36.0], [1.0, 37.0]] in hollow) == (len(runs) == 1)  # the training views
+        filled = [line.get_xydata().tolist() for line in axes[0].lines if line.get_fillstyle() == "full"]
+        assert [[2.0, 20.0]] in filled
+    (front,) = (line for line in axes[0].lines if line.get_label() == "Pareto front")
     assert front.get_xydata().tolist() == [[2.0, 20.0]]
-    gap = figures[-1].axes[2].lines  # the difference of two subsets is mostly chance
-    assert [line.get_xydata().tolist() for line in gap] == [[[2.0, 1.0]], []]
-
-
-def test_the_report_repeats_what_training_said_at_its_end(scenes, tmp_path):
-    words = ("--scenes", scenes / "attic", "--output_path", tmp_path / "out", "--iterations", 40)
-    assert run(*words)["runs"][0]["lines"] == []
-    log = tmp_path / "out" / "attic" / "train_log.json"
-    records = json.loads(log.read_text())
-    records[-1]["lines"] = ["Curve of 14 points", "Saved 9 of 10 Gaussians"]
-    log.write_text(json.dumps(records))
-    assert run(*words)["runs"][0]["lines"] == ["Curve of 14 points", "Saved 9 of 10 Gaussians"]
-    for name in ("report.md", "report.html"):
-        assert "attic: Curve of 14 points. Saved 9 of 10 Gaussians." in (tmp_path / "out" / name).read_text()
+    # The gap between training and test views has a panel of its own, without the difference of two subsets.
+    assert axes[2].get_ylabel() == "PSNR of the training views above the test views (dB)"
+    assert [line.get_xydata().tolist() for line in axes[2].lines] == [[[2.0, 1.0]], []]
 
 
 def test_seeds_and_option_sets(figures, scenes, tmp_path, capsys, monkeypatch):
@@ -610,17 +588,6 @@ def test_refused_option_sets(scenes, tmp_path, text, sentence):
         run("--scenes", scenes / "attic", "--output_path", tmp_path / "out", "--configs", configs)
 
 
-def test_different_ground_truth_is_pointed_out(scenes, tmp_path):
-    out = tmp_path / "out"
-    command = ("--scenes", scenes / "attic", "--output_path", out, "--iterations", 40, "--seeds", 0, 1)
-    assert run(*command)["warnings"] == []
-    Image.new("RGB", (120, 80)).save(out / "attic" / "seed_1" / "test" / "ours_40" / "gt" / "00000.png")
-    (out / "attic" / "seed_1" / "results.json").unlink()
-    report = run(*command)
-    assert len(report["warnings"]) == 1 and "different ground truth" in report["warnings"][0]
-    assert report["warnings"][0] in (out / "report.md").read_text()
-
-
 def test_damaged_files_do_not_cost_the_report(scenes, tmp_path, capsys):
     out = tmp_path / "out"
     names = ("cloud", "curve", "fine", "picture", "scores")
@@ -640,15 +607,14 @@ def test_damaged_files_do_not_cost_the_report(scenes, tmp_path, capsys):
     assert (out / "report.html").exists()
 
 
-def test_option_sets_of_another_ground_truth_stand_apart(figures, scenes, tmp_path, monkeypatch):
+def test_option_sets_of_another_ground_truth_stand_apart(figures, scenes, tmp_path, drawn):
     out, configs = tmp_path / "out", tmp_path / "configs.json"
     configs.write_text('{"base": ["--sh_degree", 1], "best": [], "flat": ["--sh_degree", 0]}')
     command = ("--scenes", scenes / "attic", "--output_path", out, "--iterations", 40, "--configs", configs)
     assert run(*command)["cheapest"]["attic"][0]["seconds"]["config"] == "best"
     Image.new("RGB", (120, 80)).save(out / "attic" / "best" / "test" / "ours_40" / "gt" / "00000.png")
     (out / "attic" / "best" / "results.json").unlink()
-    drawn, plain = [], Figure.savefig
-    monkeypatch.setattr(Figure, "savefig", lambda self, *a, **k: (drawn.append(self), plain(self, *a, **k)))
+    drawn.clear()
     report = run(*command)
     assert [run["apart"] for run in report["runs"]] == [False, True, False]
     assert {name for row in report["cheapest"]["attic"] for name in row["seconds"]["all"]} == {"base", "flat"}
@@ -659,30 +625,6 @@ def test_option_sets_of_another_ground_truth_stand_apart(figures, scenes, tmp_pa
     assert "best (other ground truth)" in lines
     apart = {tuple(point) for point in lines["best (other ground truth)"].get_xydata()}
     assert not apart & {tuple(point) for point in lines["Pareto front"].get_xydata()}
-
-
-def test_seeds_of_different_ground_truth_have_no_mean(scenes, tmp_path):
-    out = tmp_path / "out"
-    command = ("--scenes", scenes / "attic", "--output_path", out, "--iterations", 40, "--seeds", 0, 1)
-    run(*command)
-    Image.new("RGB", (120, 80)).save(out / "attic" / "seed_1" / "test" / "ours_40" / "gt" / "00000.png")
-    (out / "attic" / "seed_1" / "results.json").unlink()
-    (row,) = run(*command)["summary"]
-    assert not row["one_ground_truth"] and row["PSNR"] == {"mean": None, "std": None, "values": [23.0, 23.1]}
-    assert row["seconds"]["mean"] == 16.0
-
-
-def test_the_gap_to_the_training_views_is_a_panel_of_option_sets(figures, scenes, tmp_path, monkeypatch):
-    drawn, plain = [], Figure.savefig
-    monkeypatch.setattr(Figure, "savefig", lambda self, *a, **k: (drawn.append(self), plain(self, *a, **k)))
-    configs = tmp_path / "configs.json"
-    configs.write_text('{"base": [], "sh1": ["--sh_degree", 1]}')
-    run("--scenes", scenes / "attic", "--output_path", tmp_path / "out", "--iterations", 40, "--configs", configs)
-    panel = drawn[0].axes[2]
-    assert panel.get_ylabel() == "PSNR of the training views above the test views (dB)"
-    base, small = panel.lines  # and no line of points that score a subset of the views
-    assert base.get_ydata().tolist() == pytest.approx([14.5, 12.0, 7.0])  # 30 dB on training views, 23 on test views
-    assert small.get_ydata().tolist() == pytest.approx([16.5, 14.0, 9.0])
 
 
 def test_a_call_that_scores_nothing_says_so_and_keeps_a_good_report(scenes, tmp_path, capsys):
@@ -771,51 +713,15 @@ def test_names_stay_names_in_the_report(figures, scenes, tmp_path, name):
         assert image.width > 300
 
 
-def _browser() -> str | None:
-    names = ("chromium", "chromium-browser", "google-chrome", "chrome-headless-shell")
-    return next((path for name in names if (path := shutil.which(name))), None)
-
-
-# Appended to a copy of the report.
-PROBE = """<script>addEventListener("load", () => {
-  const images = [...document.images];
-  document.body.dataset.probe = images.length + " images, " +
-    images.filter(image => image.complete && image.naturalWidth > 0).length + " loaded";
-})</script></body>"""
-
-
-def test_html_opens_in_a_browser_and_needs_nothing_else(figures, scenes, tmp_path):
-    out = tmp_path / "out"
-    (scenes / "brick" / "broken").touch()
-    with pytest.raises(SystemExit):
-        run("--scenes", scenes / "attic", scenes / "brick", "--output_path", out, "--iterations", 40)
-    html = (out / "report.html").read_text()
-    assert "http:" not in html and "https:" not in html
-    assert all(part.startswith("data:image/") for part in html.split('src="')[1:])
-    browser = _browser()
-    if browser is None:
-        pytest.skip("no Chromium on PATH")
-    probed = tmp_path / "probed.html"
-    probed.write_text(html.replace("</body>", PROBE))
-    command = [
-        browser, "--headless=new", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage", "--no-first-run",
-        f"--user-data-dir={tmp_path / 'profile'}", "--enable-logging=stderr", "--v=0", "--dump-dom", probed.as_uri(),
-    ]  # fmt: skip
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
-    assert 'data-probe="8 images, 8 loaded"' in done.stdout, done.stderr
-    assert "CONSOLE" not in done.stderr
-
-
 def test_each_test_view_has_photo_render_and_error_in_the_page(scenes, tmp_path):
     out = tmp_path / "out"
     run("--scenes", scenes / "attic", "--output_path", out, "--iterations", 40)
-    (page,) = re.findall(r"<h2>attic</h2>(.*)<h2>", (out / "report.html").read_text(), re.DOTALL)
+    html = (out / "report.html").read_text()
+    assert "http:" not in html and "https:" not in html  # needs nothing else
+    assert all(part.startswith("data:image/") for part in html.split('src="')[1:])
+    (page,) = re.findall(r"<h2>attic</h2>(.*)<h2>", html, re.DOTALL)
     figures = re.findall(r'<figure class="comparison">.*?</figure>', page, re.DOTALL)
-    assert ["photo_0.jpg: 24.00 dB" in figures[0], "photo_1.jpg: 22.00 dB" in figures[1], len(figures)] == [
-        True,
-        True,
-        2,
-    ]
+    assert len(figures) == 2 and "photo_0.jpg: 24.00 dB" in figures[0] and "photo_1.jpg: 22.00 dB" in figures[1]
     for figure in figures:
         pictures = re.findall(r'src="data:image/jpeg;base64,([^"]+)" alt="(\w+)"', figure)
         assert [alt for _, alt in pictures] == ["photo", "render", "error"]
@@ -830,7 +736,7 @@ def test_each_test_view_has_photo_render_and_error_in_the_page(scenes, tmp_path)
 def test_the_report_has_a_bounded_number_of_views(scenes, tmp_path, monkeypatch):
     out = tmp_path / "out"
     (attic,) = run("--scenes", scenes / "attic", "--output_path", out, "--iterations", 40)["runs"]
-    assert [view.caption[:11] for view in comparisons(attic, out, 1)] == ["photo_0.jpg"]
+    assert [view["text"][:11] for view in comparisons(attic, out, 1)] == ["photo_0.jpg"]
     monkeypatch.setattr(report_module, "OF_A_REPORT", 2)
     run("--scenes", scenes / "attic", scenes / "brick", "--output_path", out, "--iterations", 40)
     assert (out / "report.html").read_text().count('<figure class="comparison">') == 2

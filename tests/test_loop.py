@@ -173,8 +173,7 @@ def test_a_signal_while_the_curve_is_drawn_ends_the_program_at_once(colmap_scene
     def draw(*_: object) -> None:
         os.kill(os.getpid(), signal.SIGINT)
 
-    pytest.importorskip("matplotlib")  # once it is imported, the curve is drawn here
-    monkeypatch.setattr("records.curve_drawer.draw_curve", draw)
+    monkeypatch.setattr("records.curve_figure.CurveDrawer.finish", draw)
     before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore it
     try:
         with pytest.raises(KeyboardInterrupt):

@@ -9,14 +9,10 @@ from matplotlib.figure import Figure
 import train
 from evaluation import configs
 from evaluation.configs import read_configs, shipped
-from evaluation.document import document, result_blocks
-from evaluation.front_figure import draw_fronts
-from evaluation.fronts import fronts
-from evaluation.ground_truth import stand_apart
-from evaluation.option_sets import comparable_sets, default_set
-from evaluation.reached import reached, round_levels
+from evaluation.document import document, front_table, reached_table, result_blocks
+from evaluation.figures import draw_fronts
+from evaluation.option_sets import comparable_sets, default_set, fronts, reached, round_levels, stand_apart
 from evaluation.report import make_report
-from evaluation.set_sections import front_table, reached_table
 from evaluation.summary import QUANTITIES
 from records.error_curve import COLUMNS
 from utils.system_utils import UserError
@@ -96,22 +92,22 @@ def test_seconds_gaussians_and_megabytes_to_reach_a_level():
 
 def test_the_table_says_what_is_not_reached():
     table = reached_table(reached(comparable_sets(_runs(), "attic")))
-    assert table.header[:4] == ["options", "final PSNR (dB)", "32.0 dB", "31.5 dB"]
-    assert table.header[4] == "31.20 dB (final PSNR of adc)"
-    adc, fast, small = table.rows
+    assert table["header"][:4] == ["options", "final PSNR (dB)", "32.0 dB", "31.5 dB"]
+    assert table["header"][4] == "31.20 dB (final PSNR of adc)"
+    adc, fast, small = table["rows"]
     assert adc[:3] == ["adc", "31.20 ± 0.28", "not reached"] and adc[4] == "\u2265 38.1 ± 2.7 s (300; 0.0 MB)"
     assert fast[6] == "10.0 ± 0.0 s (400; 0.0 MB), 0.50 of adc's" and small[5] == "not reached"
     assert adc[5] == "36.4 ± 5.1 s (300; 0.0 MB)"  # the end of one seed, and between points of the other
     runs = _runs()
     runs[-1]["curve"][-1]["test_psnr"] = 31.1
-    small = reached_table(reached(comparable_sets(runs, "attic"))).rows[2]
+    small = reached_table(reached(comparable_sets(runs, "attic")))["rows"][2]
     assert small[-2].startswith("1 of 2 seeds: ") and "adc's" not in small[-2]
 
 
 def test_equal_seeds_reach_their_own_mean():
     """The mean of three equal numbers may be a bit above them."""
-    psnr = 29.839999999999996
-    runs = [_run(name, seed, [(1, 20.0, 1), (2, psnr, 2)]) for name in ("base", "other") for seed in range(3)]
+    curve = [(1, 20.0, 1), (2, 29.839999999999996, 2)]
+    runs = [_run(name, seed, curve) for name in ("base", "other") for seed in range(3)]
     cells = reached(comparable_sets(runs, "attic"))["sets"]["other"]["cells"]
     assert [cell["reached"] for cell in cells] == [3] * len(cells)
 
@@ -128,11 +124,6 @@ def test_what_cannot_be_compared_is_left_out():
     assert fronts(comparable_sets(runs, "attic")) is not None  # these numbers are of metrics.py
 
 
-def test_the_default_set_is_found_by_its_name():
-    assert default_set({"fast": [], "defaults": [], "adc": []}) == "adc"
-    assert default_set({"fast": [], "defaults": []}) == "defaults" and default_set({"x": [], "y": []}) == "x"
-
-
 def test_fronts_say_who_beats_whom():
     found = fronts(comparable_sets(_runs(), "attic"))
     # fast: 20 s, 32.2 dB, 500; adc: 40 s, 31.2 dB, 300; small: 50 s, 30.4 dB, 70.
@@ -141,7 +132,7 @@ def test_fronts_say_who_beats_whom():
     }  # fmt: skip
     assert found["beaten"]["gaussians"] == dict.fromkeys(("adc", "fast", "small"))
     assert found["beaten"]["ply_mb"] == dict.fromkeys(("adc", "fast", "small"))
-    adc, fast, _ = front_table(found).rows
+    adc, fast, _ = front_table(found)["rows"]
     assert adc[:4] == ["adc", "31.20 ± 0.28", "40.0 ± 0.0", "no: fast"] and fast[3] == "yes"
 
 
@@ -149,10 +140,10 @@ def test_a_set_within_the_spread_is_called_so():
     runs = _runs()[:2] + [_run("near", seed, [(seconds, 31.25, 300)]) for seed, seconds in ((0, 36), (1, 43.5))]
     found = fronts(comparable_sets(runs, "attic"))
     assert found["beaten"]["seconds"] == {"adc": {"by": "near", "clearly": False}, "near": None}
-    assert front_table(found).rows[0][3] == "no: near, within the spread"
+    assert front_table(found)["rows"][0][3] == "no: near, within the spread"
     one = fronts(comparable_sets([runs[0], _run("near", 0, [(39, 31.25, 300)])], "attic"))
     assert one["beaten"]["seconds"]["adc"] == {"by": "near", "clearly": None}
-    assert front_table(one).rows[0][3] == "no: near"
+    assert front_table(one)["rows"][0][3] == "no: near"
     twins = fronts(comparable_sets([runs[0], runs[0] | {"config": "twin"}], "attic"))
     assert twins["beaten"]["seconds"] == {"adc": None, "twin": None}
 
@@ -160,21 +151,17 @@ def test_a_set_within_the_spread_is_called_so():
 def test_the_figure_has_a_point_and_a_bar_for_each_set(tmp_path, monkeypatch):
     drawn, plain = [], Figure.savefig
     monkeypatch.setattr(Figure, "savefig", lambda self, *a, **k: (drawn.append(self), plain(self, *a, **k)))
-    draw_fronts(
-        tmp_path / "fronts.png", "attic", fronts(comparable_sets(_runs(), "attic")), ["apart", "adc", "fast", "small"]
-    )
-    assert (tmp_path / "fronts.png").stat().st_size > 10_000
+    found = fronts(comparable_sets(_runs(), "attic"))
+    assert draw_fronts(tmp_path / "fronts.png", "attic", found, ["apart", "adc", "fast", "small"])
     seconds, gaussians, megabytes = drawn[0].axes
     assert megabytes.get_xlabel() == "megabytes of the PLY"
     marked = [bar.lines[0].get_xydata().tolist()[0] for bar in seconds.containers]
     assert marked == [[40, pytest.approx(31.2)], [20, pytest.approx(32.2)], [50, pytest.approx(30.4)]]
     assert [bar.lines[0].get_color() for bar in seconds.containers] == ["C1", "C2", "C3"]  # as in the other figure
     assert all(len(bar.lines[2]) == 2 for bar in seconds.containers)  # of both numbers
-    fronts_drawn = [
-        next(line for line in axes.lines if line.get_label() == "Pareto front") for axes in (seconds, gaussians)
-    ]
-    assert fronts_drawn[0].get_xydata()[::2].tolist() == [[20, pytest.approx(32.2)]]
-    assert [x for x, _ in fronts_drawn[1].get_xydata()[::2]] == [70, 300, 500]
+    for axes, costs in ((seconds, [20]), (gaussians, [70, 300, 500])):
+        (front,) = (line for line in axes.lines if line.get_label() == "Pareto front")
+        assert [x for x, _ in front.get_xydata()[::2]] == costs
 
 
 def _other(run: dict, **change) -> dict:
@@ -206,7 +193,7 @@ def test_a_set_that_stands_apart_is_told_why(change, why):
     report = make_report(["full_eval.py"], runs)
     assert "small" not in str(report["reached"]) and "small" not in str(report["fronts"])
     _, title, table = result_blocks(report["summary"])
-    assert f"attic, small: {why}." in title and "small" in [row[1] for row in table.rows]
+    assert f"attic, small: {why}." in title and "small" in [row[1] for row in table["rows"]]
 
 
 def test_seeds_of_different_ground_truth_are_told_so():
@@ -216,13 +203,12 @@ def test_seeds_of_different_ground_truth_are_told_so():
 
 
 def test_the_report_has_both_sections():
-    sections = {section.title: section.blocks for section in document(make_report(["x"], _runs()), {}, {})}
+    sections = dict(document(make_report(["x"], _runs()), {}, {}))
     blocks = sections["Seconds to reach a test PSNR"]
     assert blocks[0] == "attic, compared with adc:" and "linear in the logarithm of the seconds" in blocks[2]
-    assert "over the seeds" in blocks[3]
-    assert sections["Pareto fronts of option sets"][0] == "attic"
-    plain = {section.title for section in document(make_report(["x"], _runs()[:2]), {}, {})}
-    assert not plain & {"Seconds to reach a test PSNR", "Pareto fronts of option sets"}
+    assert "over the seeds" in blocks[3] and sections["Pareto fronts of option sets"][0] == "attic"
+    plain = dict(document(make_report(["x"], _runs()[:2]), {}, {}))
+    assert not plain.keys() & {"Seconds to reach a test PSNR", "Pareto fronts of option sets"}
 
 
 def test_seeds_that_end_by_themselves_share_a_row():
@@ -238,9 +224,9 @@ def test_seeds_that_end_by_themselves_share_a_row():
     assert row["iterations"] == [20, 40] and row["iteration"] == 30 and row["seeds"] == [0, 1]
     assert row["PSNR"]["values"] == [22.0, 24.0]
     (table,) = result_blocks(report["summary"])
-    cells = dict(zip(table.header, table.rows[-1], strict=True))
+    cells = dict(zip(table["header"], table["rows"][-1], strict=True))
     assert cells["iteration"] == "20 to 40"
-    said = next(section for section in document(report, {}, {}) if section.title == "Results").blocks
+    said = dict(document(report, {}, {}))["Results"]
     assert any("end by themselves" in block for block in said if isinstance(block, str))
 
 
@@ -252,7 +238,8 @@ def test_shipped_sets_are_options_of_training(tmp_path, monkeypatch):
         rows = [line.split("|")[1] for line in GUIDE.read_text().splitlines() if line.startswith("| `")]
         described = {name for row in rows for name in row.split("`")[1::2]}
         assert set(sets) <= described, f"{GUIDE.name} does not tell what these are for"
-    assert default_set(read_configs(Path("strategies"), None)) == "adc"
+    assert default_set(read_configs(Path("strategies"), None)) == "adc" == default_set({"defaults": [], "adc": []})
+    assert default_set({"fast": [], "defaults": []}) == "defaults" and default_set({"x": [], "y": []}) == "x"
     assert read_configs(Path("strategies"), None)["adc"] == ()
     monkeypatch.chdir(tmp_path)
     (tmp_path / "strategies").write_text(json.dumps({"mine": []}))  # a file comes first

@@ -75,19 +75,17 @@ def test_a_peer_belongs_to_a_scene(tmp_path):
 def test_a_peer_is_drawn_beside_ours_and_is_in_no_front(tmp_path, monkeypatch):
     figures, plain = [], Figure.savefig
     monkeypatch.setattr(Figure, "savefig", lambda self, *a, **k: (figures.append(self), plain(self, *a, **k)))
-    curve = [
-        dict.fromkeys(OURS) | {"seconds": s, "test_psnr": p, "test_ssim": p / 30} for s, p in ((1.0, 20.0), (9, 25))
-    ]
+    points = (1.0, 20.0, 0.6), (9.0, 25.0, 0.8)
+    curve = [dict.fromkeys(OURS) | dict(zip(("seconds", "test_psnr", "test_ssim"), row, strict=True)) for row in points]
     runs = [{"apart": False, "config": name, "curve": curve} for name in ("base", "sh1")]
     best = [dict.fromkeys(COLUMNS) | {"seconds": 0.5, "test_psnr": 40.0}]  # would be the whole front
     assert draw_curves(tmp_path / "a.png", "attic", runs, [{"name": "other", "curve": best}])
     left, right = figures[0].axes
-    lines = {line.get_label(): line for line in left.lines}
-    assert lines["other (another program)"].get_xydata().tolist() == [[0.5, 40.0]]
-    assert [0.5, 40.0] not in lines["Pareto front"].get_xydata().tolist()
-    assert left.get_xlabel().endswith("(other programs: as they count)")
-    assert not right.get_xlabel().endswith("(other programs: as they count)")
-    assert "other (another program)" not in [line.get_label() for line in right.lines]  # it has no SSIM
+    lines = {line.get_label(): line.get_xydata().tolist() for line in left.lines}
+    assert lines["other (another program)"] == [[0.5, 40.0]] and [0.5, 40.0] not in lines["Pareto front"]
+    said = [axes.get_xlabel().endswith("(other programs: as they count)") for axes in (left, right)]
+    assert said == [True, False]  # it has no SSIM
+    assert "other (another program)" not in [line.get_label() for line in right.lines]
 
 
 def _result_of_gsplat(folder: Path) -> Path:
@@ -193,12 +191,10 @@ def test_event_files_that_are_cut_or_empty(tmp_path):
     whole = file.read_bytes()
     file.write_bytes(whole[:-3])
     assert len(read_scalars(folder)["iter_time"]) == 119
-    file.write_bytes(b"")
-    with pytest.raises(UserError, match="have no iter_time"):
-        peer_curve.from_events(folder)
-    file.write_bytes(whole[:12] + b"\xff" * (len(whole) - 12))
-    with pytest.raises(UserError, match="are damaged"):
-        peer_curve.from_events(folder)
+    for content, sentence in ((b"", "have no iter_time"), (whole[:12] + b"\xff" * (len(whole) - 12), "are damaged")):
+        file.write_bytes(content)
+        with pytest.raises(UserError, match=sentence):
+            peer_curve.from_events(folder)
 
 
 def test_the_command(tmp_path, monkeypatch, capsys):

@@ -29,88 +29,76 @@ def _curve(test: list[float], train_views: list[float], gaussians: tuple[int, ..
 RISING = [20.0, 24.0, 26.0, 28.0]
 
 
-def test_a_healthy_training_is_told_nothing():
-    assert what_to_try(_curve(RISING, RISING), [{"iteration": 8000, "iterations_planned": 8000}]) == []
-    assert what_to_try([], []) == [] and what_to_try(_curve(RISING, RISING)[:1], []) == []
-
-
-def test_test_views_that_fall_while_training_views_rise():
-    (said,) = what_to_try(_curve([20.0, 24.0, 23.0, 22.5], RISING), [])
-    assert said.startswith("After iteration 4000 the test views lost 1.50 dB while the training views gained 4.00 dB")
-    assert "try --strategy mcmc or budget with fewer Gaussians (--max_num_splats 4000, half as many as now), a" in said
-    both_fall = [20.0, 29.0, 28.0, 27.0]
-    assert what_to_try(_curve([20.0, 24.0, 23.0, 22.5], both_fall), []) == []  # a reset, or rates too high
-    assert what_to_try(_curve([20.0, 24.0, 23.9, 23.95], [20.0, 24.0, 26.0, 28.0]), [])[0].startswith("The last 40.0")
+FALLING = [20.0, 24.0, 23.0, 22.5]
+LATE = [20.0, 27.95, 28.0, 28.02]
+FLAT = (1000, 1000, 900, 900)
+CAPPED = (1000, 3970, 3999, 3998)
+OF_BUDGET = {"iteration": 8000, "strategy": "budget"}
+OF_MCMC = {"iteration": 8000, "strategy": "mcmc"}
 
 
 @pytest.mark.parametrize(
-    ("strategy", "end", "other"),
-    [("mcmc", "--mcmc_until_iter", "try fewer"), ("budget", "--densify_until_iter", "try --strategy mcmc, fewer")],
+    ("test", "train_views", "gaussians", "record", "parts"),
+    [
+        (FALLING, RISING, COUNTS, {}, [
+            "After iteration 4000 the test views lost 1.50 dB while the training views gained 4.00 dB",
+            "try --strategy mcmc or budget with fewer Gaussians (--max_num_splats 4000, half as many as now), a"]),
+        (FALLING, RISING, COUNTS, OF_MCMC, ["try fewer Gaussians (--max_num_splats 4000, half as many as now), a"]),
+        (FALLING, RISING, COUNTS, OF_BUDGET, ["try --strategy mcmc, fewer Gaussians (--max_num_splats 4000, half as"]),
+        (FALLING, RISING, CAPPED, {"max_num_splats": 4000}, ["it overfits"]),  # a higher cap is no remedy
+        (FALLING, RISING, COUNTS, {"default_budget": 3200}, ["it overfits"]),
+        (RISING, RISING, CAPPED, {"max_num_splats": 4000}, [
+            "From iteration 4000 on there was no room for more Gaussians (--max_num_splats 4000)",
+            "test views changed by +4.00 dB; try --strategy budget with the same number", "or a higher one"]),
+        (RISING, RISING, FLAT, {}, [
+            "The number of Gaussians never rose from one scoring to the next (1000 at first, 900 at",
+            "--densify_grad_threshold"]),
+        (RISING, RISING, FLAT, OF_MCMC, ["try a higher --max_num_splats", "_from_iter and --mcmc_until_iter leave"]),
+        (RISING, RISING, FLAT, OF_BUDGET, ["try a higher --max_num_splats", "and --densify_until_iter leave"]),
+        (RISING, RISING, COUNTS, {"default_budget": 3200}, [
+            "There are 8000 Gaussians, 2.5 times as many as --strategy budget takes for these photos (3200)"]),
+        ([20.0, 24.0, 23.9, 23.95], RISING, COUNTS, {}, ["The last 40.0 of 80.0 s"]),
+        (LATE, RISING, COUNTS, {}, ["try --iterations 4000 --position_lr_max_steps 4000"]),
+    ],
+)  # fmt: skip
+def test_what_is_seen_is_told_with_options_to_try(test, train_views, gaussians, record, parts):
+    (said,) = what_to_try(_curve(test, train_views, gaussians), [record])
+    assert said.startswith(parts[0]) or parts[0] in said
+    for part in parts:
+        assert part in said
+
+
+@pytest.mark.parametrize(
+    ("test", "train_views", "gaussians", "record"),
+    [
+        (RISING, RISING, COUNTS, {"iteration": 8000, "iterations_planned": 8000}),
+        (FALLING, [20.0, 29.0, 28.0, 27.0], COUNTS, {}),  # both fall: a reset, or rates too high
+        (RISING, RISING, CAPPED, {"max_num_splats": 5000}),
+        (RISING, RISING, (100_000, 30_000, 50_000, 60_000), {}),  # from a random start, most are removed first
+        (RISING, RISING, COUNTS, {"default_budget": 4001}),
+        (LATE, RISING, COUNTS, {"iteration": 8000, "iterations_planned": 30_000}),  # a time budget ended it
+        ([20.0, 27.95, 28.0, 28.2], RISING, COUNTS, {}),
+    ],
 )
-def test_other_strategies_are_told_of_their_own_options(strategy, end, other):
-    log = [{"iteration": 8000, "strategy": strategy}]
-    (said,) = what_to_try(_curve([20.0, 24.0, 23.0, 22.5], RISING), log)
-    assert f"{other} Gaussians (--max_num_splats 4000, half as many as now), a lower" in said
-    (said,) = what_to_try(_curve(RISING, RISING, (1000, 1000, 900, 900)), log)
-    assert "try a higher --max_num_splats" in said and f"--densify_from_iter and {end} leave" in said
-    assert "threshold" not in said
+def test_a_healthy_training_is_told_nothing(test, train_views, gaussians, record):
+    assert what_to_try(_curve(test, train_views, gaussians), [record]) == []
 
 
-def test_subsets_tell_nothing_of_scores():
-    rows = _curve([20.0, 24.0, 23.0, 22.5], RISING)
-    for row in rows[:3]:
-        row["subset"] = 2
-    assert what_to_try(rows, []) == []
-
-
-def test_gaussians_at_their_cap():
-    rows = _curve(RISING, RISING, (1000, 3970, 3999, 3998))
-    (said,) = what_to_try(rows, [{"iteration": 8000, "max_num_splats": 4000}])
-    assert said.startswith("From iteration 4000 on there was no room for more Gaussians (--max_num_splats 4000)")
-    assert (
-        "test views changed by +4.00 dB; try --strategy budget with the same number" in said
-        and "or a higher one" in said
-    )
-    assert what_to_try(rows, [{"iteration": 8000, "max_num_splats": 5000}]) == []
-    overfitting = _curve([20.0, 24.0, 23.0, 22.5], RISING, (1000, 3970, 3999, 3998))
-    (said,) = what_to_try(overfitting, [{"iteration": 8000, "max_num_splats": 4000}])
-    assert "a higher one" not in said
-
-
-def test_no_densification():
-    (said,) = what_to_try(_curve(RISING, RISING, (1000, 1000, 900, 900)), [])
-    assert said.startswith("The number of Gaussians never rose from one scoring to the next (1000 at first, 900 at")
-    assert "--densify_grad_threshold" in said
-    # From a random start, most Gaussians are removed before others are made.
-    assert what_to_try(_curve(RISING, RISING, (100_000, 30_000, 50_000, 60_000)), []) == []
+def test_short_curves_and_subsets_tell_nothing():
+    assert what_to_try([], []) == [] and what_to_try(_curve(RISING, RISING)[:1], []) == []
     short = [row | {"iteration": row["iteration"] // 10} for row in _curve(RISING, RISING, (1000,) * 4)]
     assert what_to_try(short, []) == []
+    rows = _curve(FALLING, RISING)
+    assert what_to_try([*(row | {"subset": 2} for row in rows[:3]), rows[3]], []) == []
 
 
-def test_far_more_gaussians_than_a_budget_takes():
-    rows = _curve(RISING, RISING)
-    (said,) = what_to_try(rows, [{"iteration": 8000, "default_budget": 3200}])
-    assert said.startswith(
-        "There are 8000 Gaussians, 2.5 times as many as --strategy budget takes for these photos (3200)"
-    )
-    assert what_to_try(rows, [{"iteration": 8000, "default_budget": 4001}]) == []
-    (said,) = what_to_try(_curve([20.0, 24.0, 23.0, 22.5], RISING), [{"iteration": 8000, "default_budget": 3200}])
-    assert "it overfits" in said
-
-
-def test_seconds_that_buy_nothing():
-    rows = _curve([20.0, 27.95, 28.0, 28.02], RISING)
+def test_slower_iterations_towards_the_end_are_told():
+    rows = _curve(LATE, RISING)
     for row, seconds in zip(rows, (5.0, 20.0, 50.0, 80.0), strict=True):
         row["seconds"] = seconds
-    rows.insert(0, rows[0] | {"iteration": 100, "seconds": 0.2})
-    rows.insert(1, rows[0] | {"iteration": 900, "seconds": 1.8})
-    (said,) = what_to_try(rows, [{"iteration": 8000, "iterations_planned": 8000}])
+    rows[:0] = [rows[0] | {"iteration": 100, "seconds": 0.2}, rows[0] | {"iteration": 900, "seconds": 1.8}]
+    (said,) = what_to_try(rows, [])
     assert said.startswith("The last 30.0 of 80.0 s changed the test views by +0.02 dB, at 15 ms an iteration after 2")
-    assert "try --iterations 6000 --position_lr_max_steps 6000" in said
-    # With a time budget, or a score to reach, the iterations are not the user's choice.
-    assert what_to_try(rows, [{"iteration": 8000, "iterations_planned": 30_000}]) == []
-    rows[-1]["test_psnr"] = 28.2
-    assert what_to_try(rows, []) == []
 
 
 def test_every_option_named_is_one_of_training():

@@ -14,8 +14,7 @@ from gaussians import pipeline
 from html_scene import SIZE, balls, cameras
 from PIL import Image
 
-from evaluation.blocks import Comparison, Section
-from evaluation.html import to_html
+from evaluation.pages import to_html
 from exports.html import write_html
 from exports.of_model import model_of
 from gaussian_renderer import render
@@ -160,8 +159,8 @@ def flat(*colour: int) -> bytes:
 
 @pytest.fixture
 def report(tmp_path) -> Path:
-    view = Comparison("a view", flat(200, 0, 0), flat(0, 0, 200), flat(0, 200, 0))
-    (tmp_path / "report.html").write_text(to_html("Report", [Section("scene", [view])]))
+    view = {"photo": flat(200, 0, 0), "render": flat(0, 0, 200), "error": flat(0, 200, 0), "text": "a view"}
+    (tmp_path / "report.html").write_text(to_html("Report", [("scene", [view])]))
     return tmp_path / "report.html"
 
 

@@ -4,8 +4,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from gaussian_renderer.scored_views import ScoredViews
-from records.curve_peak import schedules_follow_length
 from records.curve_recorder import CurveRecorder, evenly_spread
+from records.what_to_try import schedules_follow_length
 from scene.cameras import Camera
 from training.objective import Losses
 from training.observer import Error, Observer
@@ -16,7 +16,7 @@ from utils.system_utils import saved_iterations
 
 
 class Curve(Observer):
-    """Scores all test views, and as many training views, when the schedule says so; draws the curve at the end."""
+    """Scores test views, and as many training views, in planned iterations; draws the curve at the end."""
 
     def __init__(self, run: Run) -> None:
         self._run = run
@@ -33,7 +33,7 @@ class Curve(Observer):
             lambda cameras: self._load(cameras, views),
             lambda cameras: views.scores(cameras, run.gaussians),
             run.device,
-            run.pace.nominal(run.first_iteration),
+            not isinstance(run.pace, Paced),
         )
         self._due = False
         self._seconds = 0.0
@@ -44,19 +44,16 @@ class Curve(Observer):
             views.load(camera)
 
     def due(self, step: Step) -> bool:
-        self._due = bool(step.span) and self._recorder.due(self._point(step), self._run.clock.seconds)
+        first = self._run.pace.nominal(self._run.first_iteration)
+        self._due = self._recorder.due(step.span, first, self._run.clock.seconds)
         return self._due
-
-    def _point(self, step: Step) -> int:
-        """The iteration of the schedule that a step's score is one of."""
-        points = [iteration for iteration in step.span if self._recorder.is_point(iteration)]
-        return (points or step.span)[-1]
 
     def measured(self, step: Step, losses: Losses) -> None:
         if self._due or step.last:
             self._seconds = step.scored_at = self._run.clock.seconds
+            point = self._recorder.point(step.span) or step.span[-1]
             with self._run.clock.paused("scoring"):
-                self._recorder.add(self._point(step), self._seconds, self._run.gaussians.total, step.iteration)
+                self._recorder.add(point, self._seconds, self._run.gaussians.total, step.iteration)
 
     def ended(self, error: Error) -> None:
         if error is not None:
