@@ -33,7 +33,7 @@ from exports.in_scene import load_file
 from gaussian_renderer.memory_errors import memory_errors_explained
 from gaussian_renderer.scored_views import ScoredViews
 from gaussian_renderer.view_planes import PLANES, view_planes
-from moving_cameras.options import add_path_options, wants_path
+from moving_cameras.request import add_path_options, path_request, wants_path
 from records import render_times
 from scene.cameras import Camera
 from scene.gaussian_model import GaussianModel
@@ -197,7 +197,6 @@ def main() -> None:
     warn_of_background(options)
     if wants_path(args):
         from moving_cameras.render_path import render_path  # SciPy takes a while to import
-        from moving_cameras.request import path_request
 
         request = path_request(args)
         scene, background = _loaded(options, args.iteration, args.typed_sh_degree, args.ply, pipeline)

@@ -15,7 +15,7 @@ from scene.saved_model import load_saved
 from utils.general_utils import safe_state
 from utils.system_utils import UserError, run_cli
 from viewing.options import PORT, add_host_option
-from viewing.saved import serve_saved
+from viewing.page import serve_saved
 from viewing.server import checked_address
 
 

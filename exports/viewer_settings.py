@@ -9,9 +9,8 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from moving_cameras.focus import focus_point
 from moving_cameras.moments import TimedPath
-from moving_cameras.poses import Poses
+from moving_cameras.poses import Poses, focus_point
 
 BOOKMARKS = 25  # the viewer's own limit of annotations
 _TITLE = 60  # and of letters in their titles

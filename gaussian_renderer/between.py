@@ -6,7 +6,6 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
-from gaussian_renderer.free_view import rotation_matrix
 from scene.cameras import ZFAR, ZNEAR, Camera, MiniCam
 from utils.graphics_utils import focal2fov, projection, world_to_camera
 
@@ -22,11 +21,14 @@ def neighbours(cameras: Sequence[Camera], nearest: int = NEAREST) -> list[tuple[
     all pairs. Each camera is paired with its `nearest` ones. The minimum spanning tree comes on top, so that groups of
     cameras far from each other are joined, too. Memory: some 50 bytes for each two cameras.
     """
+    from scipy.sparse.csgraph import minimum_spanning_tree  # SciPy takes a while to import
+
     count = len(cameras)
     if count < 2:
         return []
     distances = _distances(cameras)
-    pairs = {(min(i, j), max(i, j)) for i, j in _tree(distances)}
+    tree = minimum_spanning_tree(1 + distances)  # a weight of 0 would be no edge
+    pairs = {(min(i, j), max(i, j)) for i, j in np.argwhere(tree.toarray()).tolist()}
     np.fill_diagonal(distances, np.inf)
     for i, order in enumerate(np.argsort(distances, axis=1, kind="stable")[:, : min(nearest, count - 1)].tolist()):
         pairs |= {(min(i, j), max(i, j)) for j in order}
@@ -47,21 +49,6 @@ def _distances(cameras: Sequence[Camera]) -> np.ndarray:
     return total
 
 
-def _tree(distances: np.ndarray) -> list[tuple[int, int]]:
-    """Edges of the minimum spanning tree (Prim's algorithm)."""
-    outside = np.ones(len(distances), dtype=bool)
-    outside[0] = False
-    nearest, parent = distances[0].copy(), np.zeros(len(distances), dtype=int)
-    edges = []
-    while outside.any():
-        new = int(np.where(outside, nearest, np.inf).argmin())
-        edges.append((int(parent[new]), new))
-        outside[new] = False
-        closer = distances[new] < nearest
-        nearest, parent = np.where(closer, distances[new], nearest), np.where(closer, new, parent)
-    return edges
-
-
 def views_between(first: Camera, second: Camera) -> list[MiniCam]:
     """A view at each of FRACTIONS of the way between two cameras, WIDER than they are.
 
@@ -72,10 +59,12 @@ def views_between(first: Camera, second: Camera) -> list[MiniCam]:
 
 
 def _between(first: Camera, second: Camera, fraction: float) -> MiniCam:
+    from scipy.spatial.transform import Rotation, Slerp
+
     def mixed(one: float, other: float) -> float:
         return (1 - fraction) * one + fraction * other
 
-    turn = _slerp(first.R, second.R, fraction)
+    turn = Slerp([0, 1], Rotation.from_matrix([first.R, second.R]))(fraction).as_matrix()
     center = mixed(_center(first), _center(second))
     width, height = (
         math.ceil(WIDER * max(getattr(first, side), getattr(second, side))) for side in ("image_width", "image_height")
@@ -92,30 +81,3 @@ def _between(first: Camera, second: Camera, fraction: float) -> MiniCam:
 
 def _center(camera: Camera) -> np.ndarray:
     return -camera.R @ camera.T
-
-
-def _slerp(first: np.ndarray, second: np.ndarray, fraction: float) -> np.ndarray:
-    """Rotation at a fraction of the way, by quaternions (Shoemake 1985), along the shorter arc."""
-    one, other = _quaternion(first), _quaternion(second)
-    if one @ other < 0:
-        other = -other
-    angle = math.acos(min(1.0, float(one @ other)))
-    if angle < 1e-6:
-        mixed = (1 - fraction) * one + fraction * other
-    else:
-        mixed = math.sin((1 - fraction) * angle) * one + math.sin(fraction * angle) * other
-    return rotation_matrix(mixed / np.linalg.norm(mixed))
-
-
-def _quaternion(turn: np.ndarray) -> np.ndarray:
-    """Unit quaternion wxyz of a rotation matrix: the eigenvector of Bar-Itzhack 2000, stable for every angle."""
-    m = turn
-    k = np.array(
-        [
-            [m[0, 0] + m[1, 1] + m[2, 2], m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]],
-            [m[2, 1] - m[1, 2], m[0, 0] - m[1, 1] - m[2, 2], m[0, 1] + m[1, 0], m[0, 2] + m[2, 0]],
-            [m[0, 2] - m[2, 0], m[0, 1] + m[1, 0], m[1, 1] - m[0, 0] - m[2, 2], m[1, 2] + m[2, 1]],
-            [m[1, 0] - m[0, 1], m[0, 2] + m[2, 0], m[1, 2] + m[2, 1], m[2, 2] - m[0, 0] - m[1, 1]],
-        ]
-    )
-    return np.linalg.eigh(k)[1][:, -1]

@@ -2,6 +2,7 @@
 
 import json
 import math
+import sys
 from dataclasses import dataclass
 from typing import Any
 
@@ -120,13 +121,9 @@ def _number(message: dict[str, Any], name: str) -> float:
 def _finite(value: Any, name: str) -> float:
     if type(value) not in (int, float):
         raise BadMessage(f"its {name} is not a number")
-    try:
-        number = float(value)
-    except OverflowError as error:
-        raise BadMessage(f"its {name} is not finite") from error
-    if not math.isfinite(number):
+    if not abs(value) <= sys.float_info.max:  # also a whole number that no float can hold
         raise BadMessage(f"its {name} is not finite")
-    return number
+    return float(value)
 
 
 def _matrix(message: dict[str, Any], name: str) -> Tensor:

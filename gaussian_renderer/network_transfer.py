@@ -1,10 +1,12 @@
 """Messages over a viewer's connection, with limits of time and length so that no viewer can hold training for good."""
 
+import contextlib
 import math
 import select
 import socket
 import struct
 import time
+from collections.abc import Iterator
 
 SILENCE = 1.0  # seconds without a byte, within a message either way
 LONGEST = 10.0  # seconds of a message in all
@@ -48,11 +50,11 @@ def readable(sock: socket.socket, seconds: float | None = 0.0) -> bool:
 
 
 def _readable(sock: socket.socket, seconds: float) -> bool:
-    if hasattr(select, "poll"):
-        poll = select.poll()
-        poll.register(sock, select.POLLIN)
-        return bool(poll.poll(1000 * seconds))
-    return bool(select.select([sock], [], [], seconds)[0])
+    if not hasattr(select, "poll"):
+        return bool(select.select([sock], [], [], seconds)[0])
+    poll = select.poll()
+    poll.register(sock, select.POLLIN)
+    return bool(poll.poll(1000 * seconds))
 
 
 def receive_message(conn: socket.socket) -> bytes:
@@ -81,11 +83,8 @@ def _receive(conn: socket.socket, count: int, end: float) -> bytes:
     """So many bytes, or fewer if the connection ends before."""
     received = bytearray()
     while len(received) < count:
-        _limit(conn, end)
-        try:
+        with _limited(conn, end):
             part = conn.recv(count - len(received))
-        except OSError as error:
-            raise ViewerLost(_reason(error, end)) from error
         if not part:
             break
         received += part
@@ -95,27 +94,21 @@ def _receive(conn: socket.socket, count: int, end: float) -> bytes:
 def _send(conn: socket.socket, data: bytes | memoryview, end: float) -> None:
     rest = memoryview(data).cast("B")
     while rest:
-        _limit(conn, end)
-        try:
+        with _limited(conn, end):
             rest = rest[conn.send(rest[:_PART]) :]
-        except OSError as error:
-            raise ViewerLost(_reason(error, end)) from error
 
 
-def _limit(conn: socket.socket, end: float) -> None:
-    left = end - time.monotonic()
-    if left <= 0:
-        raise ViewerLost(_too_long())
-    conn.settimeout(min(SILENCE, left))
-
-
-def _too_long() -> str:
-    return f"its message took more than {LONGEST:g} s"
-
-
-def _reason(error: OSError, end: float) -> str:
-    if not isinstance(error, TimeoutError):
-        return error.strerror or str(error)
-    if time.monotonic() >= end:
-        return _too_long()
-    return f"it was silent for {SILENCE:g} s in the middle of a message"
+@contextlib.contextmanager
+def _limited(conn: socket.socket, end: float) -> Iterator[None]:
+    """Within it, one call may take SILENCE seconds, and none once `end` is reached; a failure is a ViewerLost."""
+    try:
+        left = end - time.monotonic()
+        if left <= 0:
+            raise TimeoutError
+        conn.settimeout(min(SILENCE, left))
+        yield
+    except TimeoutError as error:
+        silent = f"it was silent for {SILENCE:g} s in the middle of a message"
+        raise ViewerLost(f"its message took more than {LONGEST:g} s" if time.monotonic() >= end else silent) from error
+    except OSError as error:
+        raise ViewerLost(error.strerror or str(error)) from error

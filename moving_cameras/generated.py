@@ -6,44 +6,18 @@ from collections.abc import Callable
 import numpy as np
 from scipy.interpolate import PchipInterpolator
 
-from moving_cameras.focus import focus_point
+from moving_cameras.interpolated import SECONDS, Interpolated
 from moving_cameras.keyframes import Keyframe
 from moving_cameras.moments import TimedPath
-from moving_cameras.order import spread_along, visiting_order
-from moving_cameras.poses import Poses, facing, keyframe, unit
-from moving_cameras.spline import PoseSpline, without_repeats
+from moving_cameras.poses import Poses, facing, focus_point, keyframe, unit
 from utils.system_utils import UserError
 
-SECONDS = 10.0  # of a path for which no other time is asked
-KEYS_A_SECOND = 3  # cameras that `interpolate` passes at most: a path through every hand-held photo would shake
-_LARGEST_GAP = math.radians(120)  # between cameras around the focus: over it, no picture shows what is seen from there
+_LARGEST_GAP = math.radians(120)  # between cameras around the focus: over it, no image shows what is seen from there
 _LEAST_SWAY = math.radians(10)
 _TILT = 0.8  # cosine of the angle between the cameras' plane and their up, from which the plane is believed
-_OVERHEAD = 0.1  # sine of the angle between line of sight and up, below which the picture would spin
+_OVERHEAD = 0.1  # sine of the angle between line of sight and up, below which the image would spin
 _ONE_WAY = 0.7  # length of the mean optical axis, from which cameras face one way
 _SAMPLES = 720
-
-
-class Interpolated:
-    """A camera that passes through the training cameras, at constant speed (`PoseSpline`)."""
-
-    closed = False
-
-    def __init__(self, poses: Poses, seconds: float = SECONDS) -> None:
-        self.seconds = seconds
-        ordered = poses[visiting_order(poses)]
-        self.keys = without_repeats(ordered[spread_along(ordered, max(2, round(KEYS_A_SECOND * seconds)))])
-        if len(self.keys) < 2:
-            raise UserError(
-                "--path interpolate needs two training cameras with different poses, and the scene has "
-                "one; write keyframes into a file and pass that as --path"
-            )
-        self._spline = PoseSpline(self.keys)
-
-    def at(self, seconds: float) -> Keyframe:
-        """The pose at a moment between 0 and `seconds`."""
-        position, wxyz, fov = self._spline.at(seconds / self.seconds)
-        return Keyframe(seconds, tuple(position.tolist()), tuple(wxyz.tolist()), fov)
 
 
 class Ellipse:

@@ -1,4 +1,4 @@
-"""Poses of many cameras as arrays, their mean axes, and the pose that looks at a point."""
+"""Poses of many cameras as arrays, the point that they look at, and the pose that looks at a point."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,6 +10,8 @@ from moving_cameras.keyframes import Keyframe
 from scene.cameras import Camera
 
 SAME_PLACE = 1e-6  # of the distance from the origin, or of 1: float32 tells no smaller distances apart
+# Mean squared sine of the angles between the axes, about, below which no point is found: 1.8 degrees.
+PARALLEL = 1e-3
 
 
 @dataclass(frozen=True)
@@ -83,3 +85,19 @@ def facing(forward: np.ndarray, up: np.ndarray) -> np.ndarray:
 def keyframe(seconds: float, position: np.ndarray, turn: np.ndarray, fov: float) -> Keyframe:
     """A pose with a turn (3,3) as a Keyframe."""
     return Keyframe(seconds, tuple(position.tolist()), tuple(to_wxyz(Rotation.from_matrix(turn)).tolist()), float(fov))
+
+
+def focus_point(poses: Poses) -> np.ndarray | None:
+    """The point (3,) nearest to all optical axes, None if these are parallel or most cameras look away from it.
+
+    Least squares: the sum of (I - d d^T) (x - c) over the axes from c along d is zero (Traa, "Least-squares
+    intersection of lines", 2013).
+    """
+    axes = poses.forward
+    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
+    matrix, side = across.mean(axis=0), (across @ poses.positions[:, :, None]).mean(axis=0)[:, 0]
+    if np.linalg.eigvalsh(matrix)[0] < PARALLEL:
+        return None
+    point = np.linalg.solve(matrix, side)
+    ahead = ((point - poses.positions) * axes).sum(axis=1)
+    return point if np.median(ahead) > 0 else None

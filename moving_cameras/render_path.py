@@ -1,9 +1,7 @@
 """Rendering of a camera path into a video, frame by frame."""
 
 import argparse
-import contextlib
 import math
-from collections.abc import Iterator
 from pathlib import Path
 
 import torch
@@ -12,12 +10,11 @@ from tqdm import tqdm
 from gaussian_renderer import render
 from gaussian_renderer.free_view import free_view
 from gaussian_renderer.memory_errors import memory_errors_explained
-from moving_cameras.keyframes import Keyframe
 from moving_cameras.moments import frame_count, frame_moment
 from moving_cameras.poses import poses_of
 from moving_cameras.request import PathRequest
 from moving_cameras.video import video_writer
-from scene.cameras import Camera, MiniCam
+from scene.cameras import Camera
 from scene.scene import Scene
 from utils.files.numbered_pngs import remove_leftovers, save_png, to_bytes
 from utils.system_utils import UserError
@@ -38,17 +35,19 @@ def render_path(scene: Scene, pipe: argparse.Namespace, background: torch.Tensor
     width, height = request.size or even_size(cameras[0])
     count = frame_count(path, request.fps)
     folder = Path(scene.model_path) / "videos" / f"ours_{scene.loaded_iter}"
-    video, pictures = folder / f"{request.name}.mp4", folder / request.name
-    remove_leftovers(pictures, count if request.frames else 0)
+    video, images = folder / f"{request.name}.mp4", folder / request.name
+    remedy = "pass a smaller --size" if request.size else "lower --resolution (-r), or pass a smaller --size"
+    remove_leftovers(images, count if request.frames else 0)
     with video_writer(video, width, height, request.fps) as writer:
         for number in tqdm(range(count), desc=f"Rendering {request.name}", unit="frame"):
-            view = _view(path.at(frame_moment(path, request.fps, number)), width, height, background.device)
-            with _explained(scene, view, request):
-                image = render(view, scene.gaussians, pipe, background, want_depth=False, want_visibility=False)
-                pixels = to_bytes(image["render"])
+            pose = path.at(frame_moment(path, request.fps, number))
+            view = free_view(width, height, math.radians(pose.fov), pose.position, pose.wxyz, background.device)
+            with memory_errors_explained(scene.gaussians, [view], remedy):
+                drawn = render(view, scene.gaussians, pipe, background, want_depth=False, want_visibility=False)
+                pixels = to_bytes(drawn["render"])
             writer.write(pixels.numpy())
             if request.frames:
-                save_png(pixels.permute(2, 0, 1), pictures / f"{number:05d}.png")
+                save_png(pixels.permute(2, 0, 1), images / f"{number:05d}.png")
     seconds, size = count / request.fps, video.stat().st_size / 1e6
     print(f"{video}: {count} frames of {width} x {height}, {seconds:.2f} s, {size:.2f} MB")
     return video
@@ -58,14 +57,3 @@ def even_size(camera: Camera) -> tuple[int, int]:
     """Width and height of a view, odd ones a pixel smaller, as yuv420p needs even ones."""
     width, height = int(camera.image_width), int(camera.image_height)
     return max(2, width - width % 2), max(2, height - height % 2)
-
-
-def _view(pose: Keyframe, width: int, height: int, device: torch.device) -> MiniCam:
-    return free_view(width, height, math.radians(pose.fov), pose.position, pose.wxyz, device)
-
-
-@contextlib.contextmanager
-def _explained(scene: Scene, view: MiniCam, request: PathRequest) -> Iterator[None]:
-    remedy = "pass a smaller --size" if request.size else "lower --resolution (-r), or pass a smaller --size"
-    with memory_errors_explained(scene.gaussians, [view], remedy):
-        yield

@@ -1,22 +1,47 @@
-"""Request for a video along a path, made from the options of render.py and checked before a model is loaded."""
+"""Options of render.py for a camera path, and the request that they make, checked before a model is loaded."""
 
 import argparse
 import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from moving_cameras.generated import GENERATED, SECONDS
 from moving_cameras.keyframes import read_camera_path
-from moving_cameras.moments import KeyframePath, TimedPath
-from moving_cameras.poses import Poses
 from moving_cameras.video import find_ffmpeg
 from utils.system_utils import UserError
+
+if TYPE_CHECKING:
+    from moving_cameras.moments import TimedPath
+    from moving_cameras.poses import Poses
 
 FPS = 30
 MOST_FPS = 240
 LARGEST_SIDE = 16384  # of x264
 LEAST_SECONDS, MOST_SECONDS = 0.1, 3600
+_WITH_PATH = ("fps", "size", "seconds", "frames")
+_WITHOUT_PATH = ("depth", "alpha")
+
+
+def add_path_options(parser: argparse.ArgumentParser) -> None:
+    """Add --path and what goes with it to a parser."""
+    group = parser.add_argument_group("Camera path")
+    kinds = "interpolate, ellipse, spiral, or a JSON file of keyframes"
+    group.add_argument("--path", metavar="PATH", help=f"write a video along {kinds}, and no views (default: none)")
+    group.add_argument("--fps", type=int, metavar="N", help="frames a second (default: 30)")
+    size = "width and height, even (default: that of the first training camera, made even)"
+    group.add_argument("--size", type=int, nargs=2, metavar=("W", "H"), help=size)
+    group.add_argument("--seconds", type=float, metavar="S", help="of a path that is no file (default: 10)")
+    group.add_argument("--frames", action="store_true", help="write each frame as PNG, too (default: off)")
+
+
+def wants_path(args: argparse.Namespace) -> bool:
+    """Whether --path was given. UserError for options that do not go with it, or with its lack."""
+    for name in _WITHOUT_PATH if args.path is not None else _WITH_PATH:
+        if getattr(args, name) not in (None, False):
+            kind, remedy = ("the train and test views", "or --path") if args.path else ("a path", "or pass --path, too")
+            raise UserError(f"--{name} is for {kind}; leave it out, {remedy}")
+    return args.path is not None
 
 
 @dataclass(frozen=True)
@@ -28,7 +53,7 @@ class PathRequest:
     """
 
     name: str
-    make: Callable[[Poses], TimedPath]
+    make: Callable[["Poses"], "TimedPath"]
     fps: int = FPS
     size: tuple[int, int] | None = None
     frames: bool = False
@@ -45,7 +70,7 @@ def path_request(args: argparse.Namespace) -> PathRequest:
     size = None if args.size is None else _checked_size(*args.size)
     make = path_maker(args.path, args.seconds)
     find_ffmpeg()
-    return PathRequest(args.path if args.path in GENERATED else Path(args.path).stem, make, fps, size, args.frames)
+    return PathRequest(Path(args.path).stem, make, fps, size, args.frames)
 
 
 def _checked_size(width: int, height: int) -> tuple[int, int]:
@@ -59,11 +84,14 @@ def _checked_size(width: int, height: int) -> tuple[int, int]:
     return width, height
 
 
-def path_maker(path: str, seconds: float | None = None) -> Callable[[Poses], TimedPath]:
+def path_maker(path: str, seconds: float | None = None) -> Callable[["Poses"], "TimedPath"]:
     """What makes the path that --path names, from the training cameras' poses. UserError for a wrong one.
 
     seconds: how long a generated path takes; None: 10.
     """
+    from moving_cameras.generated import GENERATED, SECONDS  # SciPy takes a while to import
+    from moving_cameras.moments import KeyframePath
+
     if path in GENERATED:
         seconds = SECONDS if seconds is None else seconds
         if not LEAST_SECONDS <= seconds <= MOST_SECONDS:

@@ -15,21 +15,17 @@ from synthetic import make_colmap_scene
 from arguments import ModelParams
 from gaussian_renderer import render
 from gaussian_renderer.free_view import free_view
-from gaussian_renderer.walked import gaussians_walked
+from gaussian_renderer.view_planes import blend_depth
 from moving_cameras.keyframes import read_camera_path
 from scene import Scene
 from scene.gaussian_model import GaussianModel
 from utils.system_utils import UserError
 from viewing import settings as names
-from viewing.budget import MOVING, STILL, Budget
-from viewing.frames import LONGEST, Frames
-from viewing.model_part import inside, shown_part
-from viewing.path_tab import PathTab
-from viewing.poses import pose_of
+from viewing.frames import LONGEST, Frames, inside, shown_part
 from viewing.scene_cameras import SceneCameras, canvas, center, fov_of_canvas
-from viewing.settings import Pose, Settings
-from viewing.view_tab import first_box
-from viewing.watchers import STILL_AFTER, Watchers
+from viewing.settings import Pose, Settings, pose_of
+from viewing.tabs import PathTab, first_box
+from viewing.watchers import MOVING, STILL, STILL_AFTER, Budget, Watchers
 
 FRONT = Pose((0.0, 0.0, -4.0), (1.0, 0.0, 0.0, 0.0), 0.8, 96, 64)
 PLAIN = Settings()
@@ -107,33 +103,25 @@ def test_modes_show_what_they_say(gaussians):
 
 def test_the_count_of_a_pixel_is_that_of_its_tiles_list_up_to_the_last_one_blended(gaussians):
     view = free_view(96, 64, FRONT.fov, FRONT.position, FRONT.wxyz, "cpu")
-    walked = gaussians_walked(view, gaussians, pipeline())
+    counts = blend_depth(view, gaussians, pipeline())
     with torch.no_grad():
-        drawn = render(view, gaussians, pipeline(), torch.zeros(3), override_color=torch.ones(200, 3))
-    assert walked.shape == (64, 96) and walked.dtype == torch.int32
-    assert torch.equal(walked > 0, drawn["render"][0] > 0)
-    assert 0 < walked.max() <= 200
-    one = model(1)
-    assert gaussians_walked(view, one, pipeline()).max() == 1
+        drawn = render(view, gaussians, pipeline(), torch.zeros(3), override_color=torch.ones(200, 3))["render"]
+    assert torch.equal(counts > 0, drawn[0] > 0) and 0 < counts.max() <= 200
+    assert blend_depth(view, model(1), pipeline()).max() == 1
 
 
 def test_the_crop_box_leaves_gaussians_out_and_the_model_alone(gaussians):
     before = {name: values.clone() for name, values in parameters(gaussians).items()}
     box = (1.0, 1.0, 0.0), (-1.0, -0.2, -1.0)  # opposite corners in any order
     drawn = _frames(gaussians).draw(replace(PLAIN, crop=box), FRONT, coarse=False)
-    keep = inside(gaussians.get_xyz, *box)
-    xyz = gaussians.get_xyz
-    assert torch.equal(
-        keep,
-        (xyz[:, 0].abs() <= 1) & (xyz[:, 1] >= -0.2) & (xyz[:, 1] <= 1) & (xyz[:, 2].abs() <= 1) & (xyz[:, 2] <= 0),
-    )
+    x, y, z = gaussians.get_xyz.T
+    keep = (x.abs() <= 1) & (y >= -0.2) & (y <= 1) & (z >= -1) & (z <= 0)
     assert 0 < keep.sum() < 200
     np.testing.assert_array_equal(drawn, _render(gaussians.part(keep, 3), FRONT))
     assert len(gaussians) == 200 and gaussians.optimizer is not None
     for name, values in parameters(gaussians).items():
         assert torch.equal(values, before[name]), name
-    nothing = _frames(gaussians).draw(replace(PLAIN, crop=((9.0,) * 3, (8.0,) * 3)), FRONT, coarse=False)
-    assert not nothing.any()
+    assert not _frames(gaussians).draw(replace(PLAIN, crop=((9.0,) * 3, (8.0,) * 3)), FRONT, coarse=False).any()
 
 
 def test_the_sh_degree_of_a_frame_is_not_that_of_the_model(gaussians):
@@ -218,25 +206,22 @@ def test_frames_take_no_more_than_their_share_of_the_time(share, cost):
 
 
 def test_a_browser_that_moves_gets_coarse_frames_and_then_a_sharp_one():
-    clock = Clock()
-    watchers = Watchers(clock)
+    watchers = Watchers(clock := Clock())
     assert not watchers.any and watchers.next() is None
     watchers.moved(7, FRONT)
     first = watchers.next()
-    assert watchers.any and not first.coarse and first.urgent and first.asked == clock.now
+    assert watchers.any and first.urgent and not first.coarse
+    watchers.moved(7, replace(FRONT, fov=0.9))
     watchers.drew(first)
-    assert watchers.next() is None
+    assert watchers.next().pose.fov == 0.9  # it moved while the frame was drawn
     clock.now += 1
     watchers.moved(7, replace(FRONT, fov=0.7))
-    moving = watchers.next()
-    assert moving.coarse and moving.urgent and moving.pose.fov == 0.7
-    watchers.drew(moving)
-    assert watchers.next() is None
-    clock.now += STILL_AFTER + 0.01
-    still = watchers.next()
-    assert not still.coarse and still.urgent
-    watchers.drew(still)
-    assert watchers.next() is None
+    for wait, coarse in ((0, True), (STILL_AFTER + 0.01, False)):
+        clock.now += wait
+        wish = watchers.next()
+        assert wish.coarse == coarse and wish.urgent and wish.pose.fov == 0.7
+        watchers.drew(wish)
+        assert watchers.next() is None
     watchers.left(7)
     assert not watchers.any
 
@@ -258,15 +243,6 @@ def test_a_model_that_changes_is_shown_to_all_who_look_and_nobody_waits_for_it()
     watchers.drew(watchers.next(6), 6)
     watchers.changed()
     assert watchers.next(6).urgent
-
-
-def test_a_movement_while_a_frame_is_drawn_asks_for_another():
-    watchers = Watchers(Clock())
-    watchers.moved(1, FRONT)
-    wish = watchers.next()
-    watchers.moved(1, replace(FRONT, fov=0.5))
-    watchers.drew(wish)
-    assert watchers.next().pose.fov == 0.5
 
 
 def test_what_a_browser_sends_is_checked():
@@ -335,6 +311,8 @@ def _client(**changes: object) -> SimpleNamespace:
 
 def test_a_recorded_path_is_read_by_what_renders_it(path_tab, tmp_path):
     path_tab.add(_client())
+    with pytest.raises(UserError, match="at least 2 keyframes"):
+        path_tab.save("short")
     path_tab.seconds.value = 1.5
     path_tab.add(_client(position=[4, 5, 6]))
     path_tab.add(_client(position=[math.nan] * 3))  # cannot be drawn, so is no keyframe
@@ -343,7 +321,6 @@ def test_a_recorded_path_is_read_by_what_renders_it(path_tab, tmp_path):
     assert [frame.position for frame in path.keyframes] == [(1.0, 2.0, 3.0), (4.0, 5.0, 6.0)]
     assert math.isclose(path.keyframes[0].fov, math.degrees(1.0)) and path.keyframes[0].wxyz == (0.0, 1.0, 0.0, 0.0)
     assert [file.name for file in tmp_path.rglob("*.json")] == ["fly_1-a.json"]
-    assert PathTab(SimpleNamespace(gui=Gui()), tmp_path).name.value == "path1"
 
 
 @pytest.mark.parametrize("name", ["", "..", "../a", "a/b", "a\\b", "/etc/x", "a.json", "a\0b", "ä", "a\n", "x" * 65])
@@ -353,9 +330,3 @@ def test_no_name_leads_out_of_the_folder(path_tab, tmp_path, name):
     with pytest.raises(UserError, match="the name of a path"):
         path_tab.save(name)
     assert not list(tmp_path.rglob("*"))
-
-
-def test_a_path_needs_two_views(path_tab):
-    path_tab.add(_client())
-    with pytest.raises(UserError, match="at least 2 keyframes"):
-        path_tab.save("short")

@@ -1,6 +1,5 @@
 """Messages and connections that browsers, and programs that pretend to be one, may have with the viewer's page."""
 
-import http.client
 import math
 import secrets
 import select
@@ -13,7 +12,7 @@ import pytest
 viser = pytest.importorskip("viser", reason="viser is not installed: pip install '.[viewer]'")
 
 import msgspec  # noqa: E402
-from viser_client import Client  # noqa: E402
+from viser_client import Client, get  # noqa: E402
 from waiting import LIMIT, wait_for  # noqa: E402
 from websockets.asyncio.server import serve  # noqa: E402
 from websockets.exceptions import ConnectionClosed  # noqa: E402
@@ -21,7 +20,7 @@ from websockets.sync.client import connect  # noqa: E402
 
 from viewing import connections  # noqa: E402
 from viewing import server as servers  # noqa: E402
-from viewing.connections import is_wanted  # noqa: E402
+from viewing.connections import is_accepted  # noqa: E402
 from viewing.options import Address  # noqa: E402
 
 VALUES = {
@@ -53,7 +52,7 @@ def _update(uuid: object, value: object, **more: object) -> dict[str, object]:
     ],
 )  # fmt: skip
 def test_what_a_browser_sends_is_heard(message):
-    assert is_wanted(msgspec.msgpack.encode(message), _control)
+    assert is_accepted(msgspec.msgpack.encode(message), _control)
 
 
 @pytest.mark.parametrize(
@@ -80,17 +79,14 @@ def test_what_a_browser_sends_is_heard(message):
     ],
 )  # fmt: skip
 def test_nothing_else_is_heard(message):
-    assert not is_wanted(msgspec.msgpack.encode(message), _control)
+    assert not is_accepted(msgspec.msgpack.encode(message), _control)
 
 
-@pytest.mark.parametrize("raw", [b"", b"\xff" * 10, "text", b"\x80", b"\x91" * 60_000, b"a" * 100])
-def test_what_is_no_message_is_not_heard(raw):
-    assert not is_wanted(raw, _control)
-
-
-def test_a_control_that_only_shows_something_takes_no_value():
+def test_what_is_no_message_is_not_heard_and_what_only_shows_something_takes_no_value():
+    for raw in (b"", b"\xff" * 10, "text", b"\x80", b"\x91" * 60_000, b"a" * 100):
+        assert not is_accepted(raw, _control), raw[:20]
     message = msgspec.msgpack.encode(_update("text", "b"))
-    assert not is_wanted(message, lambda uuid: SimpleNamespace(value="a", disabled=True))
+    assert not is_accepted(message, lambda uuid: SimpleNamespace(value="a", disabled=True))
 
 
 @pytest.fixture(scope="module")
@@ -101,7 +97,7 @@ def served():
 
 
 def _attack(client: Client, uuid: str) -> None:
-    """All that once made viser's controls raise in the thread that trains."""
+    """All that once made viser's controls raise in the thread that trains, and a wish for a tunnel to the outside."""
     for update in ({"update_cb": [5]}, {"sync_cb": 5}, {"gui_api": 5}, {"removed": True}, {"uuid": 5}):
         client.send("GuiUpdateMessage", uuid=uuid, updates=update)
     client.send(
@@ -109,9 +105,12 @@ def _attack(client: Client, uuid: str) -> None:
         source_component_uuid=uuid, transfer_uuid="t", filename="f", mime_type="m", part_count=1, size_bytes=3,
     )  # fmt: skip
     client.send("FileTransferPart", source_component_uuid=uuid, transfer_uuid="t", part_index=0, content=b"abc")
+    client.send("ShareUrlRequest")
 
 
-def test_no_message_takes_a_control_from_the_program(served, capfd):
+def test_no_message_takes_a_control_from_the_program_or_opens_a_tunnel(served, monkeypatch, capfd):
+    opened = []
+    monkeypatch.setattr(viser._viser, "ViserTunnel", lambda *_: opened.append(1))
     heard = served.server.gui.add_checkbox("heard", False)
     shown, field = served.server.gui.add_text("Iteration", "0", disabled=True), served.server.gui.add_number("n", 1.0)
     with Client(served.url) as client:
@@ -124,7 +123,7 @@ def test_no_message_takes_a_control_from_the_program(served, capfd):
         client.send("GuiUpdateMessage", uuid=heard._impl.uuid, updates={"value": True})
         wait_for(lambda: heard.value)
     shown.value, field.value = "17", 2.0
-    assert (shown.value, field.value) == ("17", 2.0)
+    assert (shown.value, field.value) == ("17", 2.0) and not opened
     said = capfd.readouterr()
     assert "Traceback" not in said.err and "warn" not in said.err.lower()
 
@@ -152,7 +151,7 @@ def test_many_connections_leave_the_process_its_files(served, monkeypatch):
     assert 1 <= answers.count(b"HTTP/1.1 200") == len(answers) <= 4  # one of an earlier test may still be there
     for one in taken:
         one.close()
-    wait_for(lambda: _status(port) == 200)
+    wait_for(lambda: get(port)[0] == 200)
 
 
 def test_who_asks_for_nothing_does_not_keep_others_out(served, monkeypatch):
@@ -163,7 +162,7 @@ def test_who_asks_for_nothing_does_not_keep_others_out(served, monkeypatch):
         page.look()
         silent = [socket.create_connection(("127.0.0.1", port), LIMIT) for _ in range(10)]
         for _ in range(5):
-            assert _status(port) == 200
+            assert get(port)[0] == 200
         wait_for(lambda: len(select.select(silent, [], [], 0)[0]) >= 7)
         page.look((0.0, 0.0, -5.0))
         wait_for(lambda: [c for c in served.server.get_clients().values() if c.camera.position[2] == -5.0])
@@ -189,7 +188,7 @@ def test_a_browser_that_does_not_read_is_let_go(served, monkeypatch, capfd, capl
                 one.sendall(frames)
                 time.sleep(0 if pings else 0.01)
         shown.remove()
-    assert _status(port) == 200
+    assert get(port)[0] == 200
     assert capfd.readouterr().err == "" and not caplog.records
 
 
@@ -200,7 +199,7 @@ def test_nonsense_is_refused_without_a_word(served, capfd):
             one.sendall(raw)
             one.shutdown(socket.SHUT_WR)
             one.recv(1000)
-    assert _status(port) == 200
+    assert get(port)[0] == 200
     assert capfd.readouterr().err == ""
 
 
@@ -212,17 +211,6 @@ def _opening(port: int) -> bytes:
         f"Sec-WebSocket-Protocol: viser-v{viser.__version__}", "", "",
     ]  # fmt: skip
     return "\r\n".join(asks).encode()
-
-
-def _status(port: int) -> int | None:
-    asked = http.client.HTTPConnection("127.0.0.1", port, timeout=LIMIT)
-    try:
-        asked.request("GET", "/")
-        return asked.getresponse().status
-    except OSError:
-        return None
-    finally:
-        asked.close()
 
 
 def test_a_browser_that_answers_nothing_does_not_hold_the_end(monkeypatch):

@@ -6,7 +6,7 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -140,42 +140,37 @@ def test_watching_changes_no_byte_of_the_model(colmap_scene, tmp_path, monkeypat
 
 def test_nothing_is_drawn_while_nobody_looks(colmap_scene, tmp_path, monkeypatch):
     asked = []
-    watched = Watched(
-        monkeypatch, {5: lambda w: monkeypatch.setattr(w.page.watchers, "next", lambda *_: asked.append(1))}
-    )
+    monkeypatch.setattr("viewing.watchers.Watchers.next", lambda *_: asked.append(1))
+    watched = Watched(monkeypatch, {})
     _train(colmap_scene, tmp_path / "out", "--no_curve")
     assert not watched.frames and not asked
     assert "viewing_seconds" not in json.loads((tmp_path / "out/train_log.json").read_text())[-1]
 
 
-def test_a_paused_training_waits_takes_single_steps_and_goes_on(colmap_scene, tmp_path, monkeypatch):
-    reached: list[int] = []
+def test_a_paused_training_waits_takes_single_steps_and_shows_how_it_goes(colmap_scene, tmp_path, monkeypatch):
+    monkeypatch.setattr(observed, "_NUMBERS_EVERY", 0.0)
+    reached, seen = [], []
 
     def drive(watched: Watched) -> None:
-        def note() -> None:
+        step, resume = watched.requests.step, watched.requests.resume
+
+        def reach() -> None:
             reached.append(int(watched.page.iteration.value))
 
-        step, resume = watched.requests.step, watched.requests.resume
-        watched.pause(_after(0.3, note, step), _after(0.3, note, step), _after(0.3, note, resume))
-
-    watched = Watched(monkeypatch, {10: Watched.connect, 30: drive})
-    _train(colmap_scene, tmp_path / "out", "--no_curve")
-    assert reached == watched.paused == [30, 31, 32]
-
-
-def test_a_pause_does_not_make_the_training_look_slow(colmap_scene, tmp_path, monkeypatch):
-    monkeypatch.setattr(observed, "_NUMBERS_EVERY", 0.0)
-    seen: list[float] = []
-
-    def pause(watched: Watched) -> None:
-        watched.pause(_after(0.3, watched.requests.resume))
+        watched.pause(_after(0.3, reach, step), _after(0.3, reach, step), _after(0.3, reach, resume))
 
     def note(watched: Watched) -> None:
-        seen.append(float(watched.observer._tab.speed.value))
+        tab = watched.observer._tab
+        seen.append((int(watched.page.iteration.value), float(tab.speed.value), len(tab.curve.data[0])))
 
-    watched = Watched(monkeypatch, {2: Watched.connect, 29: note, 30: pause, 31: note, 32: note})
-    _train(colmap_scene, tmp_path / "out", "--no_curve")
-    assert len(seen) == 3 and min(seen) > 0 and watched.paused == [30]
+    watched = Watched(monkeypatch, {2: Watched.connect, 30: drive, 33: note, 34: note, 60: note, 115: note})
+    _train(colmap_scene, tmp_path / "out", "--test_iterations", *range(10, 120, 10))
+    assert reached == watched.paused == [30, 31, 32]
+    iterations, speeds, points = zip(*seen, strict=True)
+    assert iterations == (32, 33, 59, 114) and min(speeds) > 0 and 1 < points[2] < points[3]
+    tab = watched.observer._tab
+    seconds, psnr = tab.curve.data
+    assert (seconds[1:] >= seconds[:-1]).all() and tab.curve.visible and 5 < psnr.mean() < 60 and float(tab.loss.value)
 
 
 def test_stop_saves_a_checkpoint_that_can_be_resumed(colmap_scene, tmp_path, monkeypatch, capfd):
@@ -190,7 +185,8 @@ def test_stop_saves_a_checkpoint_that_can_be_resumed(colmap_scene, tmp_path, mon
     assert resumed.read_bytes() == _train(colmap_scene, tmp_path / "alone", viewer=False).read_bytes()
 
 
-def test_a_pause_before_the_stop_is_no_time_of_training(colmap_scene, tmp_path, monkeypatch):
+@pytest.mark.parametrize("end", ["stop", "signal"])
+def test_a_paused_training_that_ends_is_saved_and_the_pause_is_no_time_of_it(colmap_scene, tmp_path, monkeypatch, end):
     before: list[float] = []
     leap, clock = [0.0], time.perf_counter
     monkeypatch.setattr("records.training_log.running_seconds", lambda: clock() + leap[0])
@@ -200,7 +196,7 @@ def test_a_pause_before_the_stop_is_no_time_of_training(colmap_scene, tmp_path, 
 
         def stop() -> None:
             leap[0] = 1000.0  # seconds
-            watched.requests.stop()
+            watched.requests.stop() if end == "stop" else os.kill(os.getpid(), signal.SIGINT)
 
         watched.pause(stop)
 
@@ -209,57 +205,28 @@ def test_a_pause_before_the_stop_is_no_time_of_training(colmap_scene, tmp_path, 
         _train(colmap_scene, tmp_path / "out", "--no_curve")
     log = json.loads((tmp_path / "out/train_log.json").read_text())
     assert before[0] < log[-1]["seconds"] < before[0] + 500
-
-
-def test_a_signal_ends_a_paused_training_and_saves_it(colmap_scene, tmp_path, monkeypatch):
-    Watched(monkeypatch, {12: lambda watched: watched.pause(lambda: os.kill(os.getpid(), signal.SIGINT))})
-    with pytest.raises(KeyboardInterrupt):
-        _train(colmap_scene, tmp_path / "out", "--no_curve")
     assert (tmp_path / "out/chkpnt12.pth").exists()
 
 
-def test_a_checkpoint_that_cannot_be_written_ends_no_training(colmap_scene, tmp_path, monkeypatch, capfd):
+def test_neither_a_checkpoint_nor_a_frame_that_fails_ends_a_training(colmap_scene, tmp_path, monkeypatch, capfd):
     told = []
 
     def save(watched: Watched) -> None:
         watched.page.tell = lambda title, body: told.append((title, body))
         watched.requests.save()
 
-    Watched(monkeypatch, {10: save, 20: lambda watched: watched.requests.save()})
-    (tmp_path / "out/chkpnt10.pth").mkdir(parents=True)
-    expected = _train(colmap_scene, tmp_path / "alone", "--no_curve", viewer=False).read_bytes()
-    assert _train(colmap_scene, tmp_path / "out", "--no_curve").read_bytes() == expected
-    assert (tmp_path / "out/chkpnt20.pth").is_file()
-    assert [title for title, _ in told] == ["Not saved", "Saved", "The training is done"]
-    assert "warning: cannot write" in capfd.readouterr().err
-
-
-def test_a_frame_that_cannot_be_drawn_ends_no_training(colmap_scene, tmp_path, monkeypatch, capfd):
-    watched = Watched(monkeypatch, {5: Watched.connect})
-
     def broken(*_: object) -> None:
         raise RuntimeError("no memory for a frame")
 
+    watched = Watched(monkeypatch, {5: Watched.connect, 10: save, 20: save})
     monkeypatch.setattr("viewing.frames.Frames.draw", broken)
-    assert _train(colmap_scene, tmp_path / "out", "--no_curve").exists()
-    assert watched.frames and capfd.readouterr().err.count("no memory for a frame") == 1
-
-
-def test_the_curve_and_the_numbers_grow(colmap_scene, tmp_path, monkeypatch):
-    monkeypatch.setattr(observed, "_NUMBERS_EVERY", 0.0)
-    seen: Iterator[tuple[int, ...]] = []
-
-    def note(watched: Watched) -> None:
-        seen.append((int(watched.page.iteration.value), len(watched.observer._tab.curve.data[0])))
-
-    watched = Watched(monkeypatch, {2: Watched.connect, 60: note, 115: note})
-    _train(colmap_scene, tmp_path / "out", "--test_iterations", *range(10, 120, 10))
-    assert [iteration for iteration, _ in seen] == [59, 114]
-    assert 1 < seen[0][1] < seen[1][1]
-    tab = watched.observer._tab
-    seconds, psnr = tab.curve.data
-    assert (seconds[1:] >= seconds[:-1]).all() and tab.curve.visible and 5 < psnr.mean() < 60
-    assert float(tab.loss.value) > 0 and float(tab.speed.value) > 0
+    (tmp_path / "out/chkpnt10.pth").mkdir(parents=True)
+    expected = _train(colmap_scene, tmp_path / "alone", "--no_curve", viewer=False).read_bytes()
+    assert _train(colmap_scene, tmp_path / "out", "--no_curve").read_bytes() == expected
+    assert (tmp_path / "out/chkpnt20.pth").is_file() and watched.frames
+    assert [title for title, _ in told] == ["Not saved", "Saved", "The training is done"]
+    said = capfd.readouterr().err
+    assert "warning: cannot write" in said and said.count("no memory for a frame") == 1
 
 
 def test_a_wrong_address_is_refused_before_a_file_is_written(colmap_scene, tmp_path):

@@ -1,6 +1,9 @@
 """A client of a viser server without a browser, written from what viser's server sends and takes."""
 
+import http.client
 import io
+import socket
+from http.client import HTTPMessage
 from typing import Any
 
 import msgspec.msgpack
@@ -65,3 +68,14 @@ class Client:
             message = self.until("BackgroundImageMessage", timeout)
         with Image.open(io.BytesIO(message["rgb_data"])) as image:
             return np.asarray(image.convert("RGB"))
+
+
+def get(port: int, path: str = "/", **headers: str) -> tuple[int, HTTPMessage, bytes]:
+    """Status, headers and body of a request whose path and headers are sent as they are."""
+    given = {"Host": f"127.0.0.1:{port}"} | {name.replace("_", "-"): value for name, value in headers.items()}
+    lines = [f"GET {path} HTTP/1.1", *(f"{name}: {value}" for name, value in given.items())]
+    with socket.create_connection(("127.0.0.1", port), _PATIENCE) as asked:
+        asked.sendall("\r\n".join([*lines, "", ""]).encode("latin-1"))
+        answered = http.client.HTTPResponse(asked)
+        answered.begin()
+        return answered.status, answered.headers, answered.read()

@@ -62,7 +62,7 @@ class _Click(msgspec.Struct, forbid_unknown_fields=True, tag_field="type", tag="
 _DECODER = msgspec.msgpack.Decoder(_Camera | _Control | _Click)
 
 
-def is_wanted(message: bytes | str, control: Callable[[str], Any]) -> bool:
+def is_accepted(message: bytes | str, control: Callable[[str], Any]) -> bool:
     """Whether viser may get a message: a camera that stands upright, a click, or a value of its control's kind.
 
     control: viser's handle of the control with an id, or None.
@@ -89,7 +89,7 @@ def _has_kind(value: Any, present: Any) -> bool:
 
 
 class Connections:
-    """The connections of one server, `present` in the order in which they came. control: as for `is_wanted`."""
+    """The connections of one server, `present` in the order in which they came. control: as for `is_accepted`."""
 
     def __init__(self) -> None:
         self.present: dict[_Checked, None] = {}
@@ -123,7 +123,7 @@ class Connections:
 
 
 class _Checked(ServerConnection):
-    """A connection that counts, that hands on only what is wanted, and that ends if its browser does not read."""
+    """A connection that counts, that hands on only what is accepted, and that ends if its browser does not read."""
 
     owner: Connections
 
@@ -158,7 +158,7 @@ class _Checked(ServerConnection):
     async def recv(self, decode: bool | None = None) -> bytes | str:
         while True:
             message = await super().recv(decode)
-            if is_wanted(message, self.owner.control):
+            if is_accepted(message, self.owner.control):
                 return message
 
 

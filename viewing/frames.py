@@ -1,6 +1,7 @@
-"""The picture of a frame: what the settings ask for, from a pose."""
+"""The image of a frame: what the settings ask for, from a pose."""
 
 import argparse
+import copy
 from dataclasses import replace
 
 import numpy as np
@@ -9,15 +10,13 @@ from torch import Tensor
 
 from gaussian_renderer import render
 from gaussian_renderer.free_view import free_view
-from gaussian_renderer.view_planes import view_planes
-from gaussian_renderer.walked import gaussians_walked
+from gaussian_renderer.view_planes import blend_depth, view_planes
 from scene.cameras import Camera, MiniCam
 from scene.gaussian_model import GaussianModel
 from utils.image_utils import as_float
-from viewing import tints
-from viewing.model_part import shown_part
+from viewing import colormaps
 from viewing.scene_cameras import SceneCameras, canvas
-from viewing.settings import ALONE, BESIDE, COLOUR, COUNT, DEPTH, ERROR, OPACITY, Pose, Settings
+from viewing.settings import ALONE, BESIDE, COLOUR, COUNT, DEPTH, ERROR, OPACITY, Pose, Settings, Vector
 
 LONGEST = 1600  # pixels of a frame's longer side, at most
 COARSE = 2  # a frame of a moving camera has a quarter of the pixels
@@ -26,7 +25,7 @@ _LINE = 2  # pixels of the slider's line
 
 
 class Frames:
-    """Draws frames of a model. with_exposures: as `use_trained_exp` of `render`, for a picture beside its photo.
+    """Draws frames of a model. with_exposures: as `use_trained_exp` of `render`, for an image beside its photo.
 
     Used by one thread. Nothing of the model changes.
     """
@@ -64,59 +63,79 @@ class Frames:
         scale = min(1.0, LONGEST / max(pose.width, pose.height)) / (COARSE if coarse else 1)
         width, height = (max(1, round(side * scale)) for side in (pose.width, pose.height))
         view = free_view(width, height, pose.fov, pose.position, pose.wxyz, self._gaussians.get_xyz.device)
-        return self._picture(settings, view)
+        return self._image(settings, view)
 
     def _pair(self, settings: Settings, camera: Camera) -> tuple[Tensor, Tensor]:
-        """The photo and the picture beside it, (3, H, W) in [0, 1]."""
+        """The photo and the image beside it, (3, H, W) in [0, 1]."""
         photo = as_float(camera.target(self._background(settings)))
-        return photo, self._picture(settings, camera, photo)
+        return photo, self._image(settings, camera, photo)
 
     def _background(self, settings: Settings) -> Tensor:
         return self._gaussians.get_xyz.new_tensor(settings.background)
 
-    def _picture(self, settings: Settings, view: Camera | MiniCam, photo: Tensor | None = None) -> Tensor:
-        """The mode's picture (3, H, W) in [0, 1]. Without a photo there is no error, and the colour is drawn."""
+    def _image(self, settings: Settings, view: Camera | MiniCam, photo: Tensor | None = None) -> Tensor:
+        """The mode's image (3, H, W) in [0, 1]. Without a photo there is no error, and the colour is drawn."""
         part = shown_part(self._gaussians, settings)
         if settings.mode == COUNT:
-            return tints.tinted_counts(gaussians_walked(view, part, self._pipe, settings.scaling))
+            return colormaps.count_colors(blend_depth(view, part, self._pipe, settings.scaling))
         if settings.mode in (DEPTH, OPACITY):
             planes = view_planes(view, part, self._pipe, settings.scaling)
-            return tints.tinted_depth(**planes) if settings.mode == DEPTH else planes["alpha"].expand(3, -1, -1)
+            return colormaps.depth_colors(**planes) if settings.mode == DEPTH else planes["alpha"].expand(3, -1, -1)
         exposed = self._with_exposures and photo is not None
         options = {"want_depth": False, "want_visibility": False, "use_trained_exp": exposed}
         colour = render(view, part, self._pipe, self._background(settings), settings.scaling, **options)["render"]
-        return tints.error_of(photo, colour) if settings.mode == ERROR and photo is not None else colour
+        return colormaps.error_image(photo, colour) if settings.mode == ERROR and photo is not None else colour
 
 
-def _composed(settings: Settings, photo: Tensor, picture: Tensor) -> Tensor:
+def _composed(settings: Settings, photo: Tensor, image: Tensor) -> Tensor:
     if settings.comparison == ALONE:
-        return picture
+        return image
     if settings.comparison == BESIDE:
-        panels = [photo, picture]
+        panels = [photo, image]
         if settings.mode == COLOUR:
-            panels.append(tints.error_of(photo, picture))
+            panels.append(colormaps.error_image(photo, image))
         return torch.cat(panels, dim=2)
     width = photo.shape[2]
     column = round(min(max(settings.slider, 0.0), 1.0) * width)
-    composed = torch.cat([photo[:, :, :column], picture[:, :, column:]], dim=2)
+    composed = torch.cat([photo[:, :, :column], image[:, :, column:]], dim=2)
     if 0 < column < width:
         composed[:, :, max(0, column - _LINE // 2) : column + _LINE // 2] = 1.0
     return composed
 
 
-def _fitted(picture: Tensor, pose: Pose) -> Tensor:
-    """The picture in the middle of a canvas of the window's aspect, not larger than LONGEST."""
-    shrink = max(picture.shape[1:]) / LONGEST
+def _fitted(image: Tensor, pose: Pose) -> Tensor:
+    """The image in the middle of a canvas of the window's aspect, not larger than LONGEST."""
+    shrink = max(image.shape[1:]) / LONGEST
     if shrink > 1:
-        size = [max(1, round(side / shrink)) for side in picture.shape[1:]]
-        picture = torch.nn.functional.interpolate(picture[None], size, mode="area")[0]
-    height, width = picture.shape[1:]
+        size = [max(1, round(side / shrink)) for side in image.shape[1:]]
+        image = torch.nn.functional.interpolate(image[None], size, mode="area")[0]
+    height, width = image.shape[1:]
     wide, high = canvas(width, height, pose.width / pose.height)
-    fitted = picture.new_full((3, high, wide), _BORDER)
+    fitted = image.new_full((3, high, wide), _BORDER)
     top, left = (high - height) // 2, (wide - width) // 2
-    fitted[:, top : top + height, left : left + width] = picture
+    fitted[:, top : top + height, left : left + width] = image
     return fitted
 
 
-def _bytes(picture: Tensor) -> np.ndarray:
-    return (picture.clamp(0, 1) * 255 + 0.5).to(torch.uint8).permute(1, 2, 0).contiguous().cpu().numpy()
+def _bytes(image: Tensor) -> np.ndarray:
+    return (image.clamp(0, 1) * 255 + 0.5).to(torch.uint8).permute(1, 2, 0).contiguous().cpu().numpy()
+
+
+@torch.no_grad()
+def shown_part(gaussians: GaussianModel, settings: Settings) -> GaussianModel:
+    """The Gaussians in the crop box, with the SH degree of the settings at most."""
+    degree = min(settings.sh_degree, gaussians.active_sh_degree)
+    if settings.crop is not None:
+        part = gaussians.part(inside(gaussians.get_xyz, *settings.crop), gaussians.max_sh_degree)
+    elif degree == gaussians.active_sh_degree:
+        return gaussians
+    else:
+        part = copy.copy(gaussians)  # shares the tensors
+    part.active_sh_degree = degree
+    return part
+
+
+def inside(positions: Tensor, one: Vector, other: Vector) -> Tensor:
+    """(N,) bool: which positions (N, 3) lie in the box with these opposite corners."""
+    corners = positions.new_tensor([one, other])
+    return ((positions >= corners.amin(0)) & (positions <= corners.amax(0))).all(1)

@@ -1,4 +1,4 @@
-"""The page: its server, its tabs, and the browsers that watch."""
+"""The page: its server, its tabs and the browsers that watch; and the page of a saved model."""
 
 import argparse
 import sys
@@ -10,17 +10,14 @@ import numpy as np
 from tqdm import tqdm
 
 from scene.scene import Scene
+from utils.host.interrupt import DeferredInterrupt
 from utils.system_utils import first_line
 from viewing import server as servers
 from viewing.frames import LONGEST, Frames
 from viewing.options import Address
-from viewing.path_tab import PathTab
-from viewing.photos_tab import PhotosTab
-from viewing.poses import pose_of
 from viewing.scene_cameras import SceneCameras, center
-from viewing.settings import Settings
-from viewing.texts import as_utf8
-from viewing.view_tab import ViewTab
+from viewing.settings import Settings, as_utf8, pose_of
+from viewing.tabs import PathTab, PhotosTab, ViewTab
 from viewing.watchers import Watchers, Wish
 
 if TYPE_CHECKING:
@@ -28,13 +25,14 @@ if TYPE_CHECKING:
 
 _SENT = 0.1  # seconds in which a message is sent
 _COARSE_QUALITY, _FULL_QUALITY = 70, 95  # of the JPEG
+_BETWEEN = 1 / 60  # seconds from frame to frame, at least
+_WAIT = 0.5  # seconds until a signal is noticed
 
 
 class Page:
     """A web page that shows the model of a scene. watchers: who looks, and which frame comes next.
 
-    tabs: the group of tabs, to which others can be added. latency: seconds from a change to the sent picture, of the
-    last frames.
+    tabs: the group of tabs, to which others can be added.
     """
 
     def __init__(
@@ -45,7 +43,6 @@ class Page:
         self._cameras = SceneCameras(scene.getTrainCameras(), scene.getTestCameras())
         self._frames = Frames(gaussians, self._cameras, pipe, with_exposures)
         self.watchers = Watchers()
-        self.latency: list[float] = []
         self._fault = ""  # the last one that was told
         self.server, self.url = servers.serve(address, as_utf8(Path(scene.model_path).resolve().name))
         gui = self.server.gui
@@ -94,9 +91,20 @@ class Page:
     def fulfil(self, wish: Wish, version: int = 0) -> None:
         """Draw and send the frame of a wish. One that cannot be drawn ends nothing. version: of the model."""
         try:
-            self.send(wish, self.draw(wish, version))
+            self.watchers.drew(wish, version)
+            image = self._frames.draw(self.settings(), wish.pose, wish.coarse, version)
+            client = self.server.get_clients().get(wish.client)
+            if client is not None:  # it has not left
+                self._send(client, image, wish.coarse)
         except Exception as error:  # memory, a photo that is gone
             self._tell_fault(wish, first_line(error))
+
+    @staticmethod
+    def _send(client: "viser.ClientHandle", image: np.ndarray, coarse: bool) -> None:
+        if not coarse and max(image.shape) <= LONGEST // 2:
+            image = image.repeat(2, axis=0).repeat(2, axis=1)  # JPEG halves the resolution of colours
+        quality = _COARSE_QUALITY if coarse else _FULL_QUALITY
+        client.scene.set_background_image(image, "jpeg", jpeg_quality=quality)
 
     def _tell_fault(self, wish: Wish, fault: str) -> None:
         if fault == self._fault:
@@ -106,23 +114,6 @@ class Page:
         client = self.server.get_clients().get(wish.client)
         if client is not None:
             client.add_notification("No picture", as_utf8(fault), color="red")
-
-    def draw(self, wish: Wish, version: int = 0) -> np.ndarray:
-        """The frame (H, W, 3) uint8 of a wish, which then is fulfilled. version: of the model."""
-        self.watchers.drew(wish, version)
-        return self._frames.draw(self.settings(), wish.pose, wish.coarse, version)
-
-    def send(self, wish: Wish, image: np.ndarray) -> None:
-        """Send a drawn frame to its browser, if that has not left."""
-        client = self.server.get_clients().get(wish.client)
-        if client is None:
-            return
-        if not wish.coarse and max(image.shape) <= LONGEST // 2:
-            image = image.repeat(2, axis=0).repeat(2, axis=1)  # JPEG halves the resolution of colours
-        quality = _COARSE_QUALITY if wish.coarse else _FULL_QUALITY
-        client.scene.set_background_image(image, "jpeg", jpeg_quality=quality)
-        if wish.asked is not None:
-            self.latency = [*self.latency[-999:], time.perf_counter() - wish.asked]
 
     def show_numbers(self, iteration: int, gaussians: int) -> None:
         """Show the iteration and the number of Gaussians."""
@@ -140,3 +131,27 @@ class Page:
     def stop(self) -> None:
         """Stop to listen."""
         servers.stop(self.server)
+
+
+def serve_saved(address: Address, scene: Scene, pipe: argparse.Namespace, white: bool, with_exposures: bool) -> None:
+    """Serve the page until a signal comes, and raise that. white, with_exposures: as for `Page`."""
+    page = Page(address, scene, pipe, white, with_exposures)
+    try:
+        with DeferredInterrupt() as interrupt:
+            while not interrupt.requested:
+                answer(page)
+        raise interrupt.requested
+    finally:
+        page.stop()
+
+
+def answer(page: Page) -> bool:
+    """Draw and send the next frame that somebody waits for, or wait a little. Whether there was one."""
+    wish = page.watchers.next()
+    if wish is None:
+        page.watchers.wait(_WAIT if not page.watchers.any else _BETWEEN)
+        return False
+    began = time.perf_counter()
+    page.fulfil(wish)
+    time.sleep(max(0.0, began + _BETWEEN - time.perf_counter()))
+    return True

@@ -7,8 +7,7 @@ import numpy as np
 
 from gaussian_renderer.free_view import rotation_matrix
 from scene.cameras import Camera
-from viewing.settings import Pose, Vector
-from viewing.texts import as_utf8
+from viewing.settings import Pose, Vector, as_utf8
 
 _NEAR = 1e-3  # of the scene's size: a page's camera that close stands at the scene's camera
 _TURNED = 2e-3  # radians
@@ -19,8 +18,7 @@ class SceneCameras:
     """by_name: the cameras, training ones first, with names such as `train 3: IMG_0007`."""
 
     def __init__(self, train: Sequence[Camera], test: Sequence[Camera]) -> None:
-        from moving_cameras.focus import focus_point  # SciPy takes a while to import
-        from moving_cameras.poses import poses_of
+        from moving_cameras.poses import focus_point, poses_of  # SciPy takes a while to import
 
         sets = {"train": train, "test": test}
         self.by_name: dict[str, Camera] = {
@@ -72,13 +70,13 @@ def center(camera: Camera) -> np.ndarray:
 
 
 def canvas(width: int, height: int, aspect: float) -> tuple[int, int]:
-    """The smallest (width, height) of an aspect in which a picture fits."""
+    """The smallest (width, height) of an aspect in which an image fits."""
     if width < aspect * height:
         return max(width, round(height * aspect)), height
     return width, max(height, round(width / aspect))
 
 
 def fov_of_canvas(camera: Camera, aspect: float) -> float:
-    """Vertical opening angle, radians, of a window of this aspect that shows all of a camera's picture."""
+    """Vertical opening angle, radians, of a window of this aspect that shows all of a camera's image."""
     _, height = canvas(camera.image_width, camera.image_height, aspect)
     return 2 * math.atan(math.tan(camera.FoVy / 2) * height / camera.image_height)

@@ -1,4 +1,4 @@
-"""The start of a viser server behind the gate, without its own messages."""
+"""The start of a viser server behind the authorization, without its own messages."""
 
 import contextlib
 import errno
@@ -18,7 +18,7 @@ from viewing.options import Address
 if TYPE_CHECKING:
     import viser
 
-_TRIED = 100  # ports, from the wanted one on
+_TRIED = 100  # ports, from the requested one on
 _TAKEN = errno.EADDRINUSE
 
 
@@ -41,25 +41,25 @@ def checked_address(host: str, port: int | None) -> Address | None:
 
 
 def serve(address: Address, label: str) -> Served:
-    """Start a server, at the next free port if the wanted one is taken, and say on stderr where it listens.
+    """Start a server, at the next free port if the requested one is taken, and say on stderr where it listens.
 
     UserError without viser, and for an address that cannot be listened at.
     """
     viser = _import_viser()
-    from viewing.gate import Gate
+    from viewing.auth import Auth
 
     # A browser may leave at any moment, also while a frame is drawn for it.
     warnings.filterwarnings("ignore", r"Queued a \w+ on a closed connection", UserWarning)
     port = _free_port(address)
-    gate = Gate(address.host)
-    with gate.in_front_of_viser(), contextlib.redirect_stdout(io.StringIO()):
+    auth = Auth(address.host)
+    with auth.in_front_of_viser(), contextlib.redirect_stdout(io.StringIO()):
         server = viser.ViserServer(address.host, port, label=label, verbose=False)
-    if not gate.stands:
+    if not auth.stands:
         stop(server)
         raise UserError("this release of viser cannot be guarded; install the one that setup.py names: '.[viewer]'")
-    gate.connections.control = server.gui._gui_input_handle_from_uuid.get
+    auth.connections.control = server.gui._gui_input_handle_from_uuid.get
     server.gui.configure_theme(show_logo=False, show_share_button=False)
-    return Served(server, _announce(address, server.get_port(), gate.token))
+    return Served(server, _announce(address, server.get_port(), auth.token))
 
 
 def stop(server: "viser.ViserServer") -> None:
@@ -100,10 +100,10 @@ def _free_port(address: Address) -> int:
 
 def _announce(address: Address, port: int, token: str | None) -> str:
     """Say where the page is, and who can reach it; its address."""
-    host, wanted = address
+    host, requested = address
     shown = socket.gethostname() if host in ("0.0.0.0", "::", "") else f"[{host}]" if ":" in host else host
     url = f"http://{shown}:{port}/" + ("" if token is None else f"?token={token}")
-    taken = f" (port {wanted} is taken)" if wanted not in (0, port) else ""
+    taken = f" (port {requested} is taken)" if requested not in (0, port) else ""
     tqdm.write(f"viewer: {url}{taken}", file=sys.stderr)  # a progress bar may be there
     if token is not None:
         tqdm.write(

@@ -1,18 +1,81 @@
-"""The tab that controls a training and shows how it goes."""
+"""The tab that controls a training and shows how it goes, and the requests that its buttons make."""
 
 import math
-from collections.abc import Sequence
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from viewing.in_turn import in_turn
-from viewing.requests import Requests
+from viewing.tabs import serialized
 
 if TYPE_CHECKING:
     import viser
 
 _NO_CURVE = "There is no curve yet: it needs test views (`--eval`), and two scorings of them."
+
+
+class Requests:
+    """What the page's buttons have asked for. asked: called after each request.
+
+    any: whether there is something to do in this iteration. Every method may be called from any thread.
+    """
+
+    def __init__(self, asked: Callable[[], None]) -> None:
+        self._asked = asked
+        self._lock = threading.Lock()
+        self._steps = 0
+        self._checkpoint = False
+        self.paused = False
+        self.stopped = False
+        self.any = False  # read without the lock, in every iteration
+
+    @contextmanager
+    def _changing(self) -> Iterator[None]:
+        with self._lock:
+            yield
+            self.any = self.paused or self._checkpoint or self.stopped
+            self._asked()
+
+    def pause(self) -> None:
+        """Wait after this iteration, until `resume` or `step`."""
+        with self._changing():
+            self.paused = True
+
+    def resume(self) -> None:
+        """Go on, and forget steps that were asked for."""
+        with self._changing():
+            self.paused, self._steps = False, 0
+
+    def step(self) -> None:
+        """Take one iteration, then wait. A training that is not paused waits after its next one."""
+        with self._changing():
+            self._steps += self.paused
+            self.paused = True
+
+    def save(self) -> None:
+        """Save a checkpoint after this iteration."""
+        with self._changing():
+            self._checkpoint = True
+
+    def stop(self) -> None:
+        """Save a checkpoint after this iteration, and end."""
+        with self._changing():
+            self.stopped = True
+
+    def take_step(self) -> bool:
+        """Whether a paused training may take one iteration; if so, that request is fulfilled."""
+        with self._changing():
+            taken = self._steps > 0
+            self._steps -= taken
+        return taken
+
+    def take_checkpoint(self) -> bool:
+        """Whether to save a checkpoint; if so, that request is fulfilled."""
+        with self._changing():
+            taken, self._checkpoint = self._checkpoint, False
+        return taken
 
 
 class TrainingTab:
@@ -36,8 +99,8 @@ class TrainingTab:
             visible=False,
         )
         self._rows = 0
-        self.pause.on_click(in_turn(lambda _: self._turn()))
-        step.on_click(in_turn(lambda _: (requests.step(), self._label())))
+        self.pause.on_click(serialized(lambda _: self._turn()))
+        step.on_click(serialized(lambda _: (requests.step(), self._label())))
         save.on_click(lambda _: requests.save())
         stop.on_click(lambda _: requests.stop())
 

@@ -1,22 +1,46 @@
-"""The browsers that watch: where their cameras stand, and which of them gets the next frame."""
+"""When to draw: the browsers that watch, the next frame of them, and a training's share of time for frames."""
 
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from viewing.settings import Pose
 
+STILL = 0.15  # share of the time for frames while no camera moves
+MOVING = 0.30  # while somebody moves one, or changes what is shown
+_BETWEEN = 1 / 30  # seconds from frame to frame, at least
 STILL_AFTER = 0.25  # seconds without a movement
+
+
+class Budget:
+    """Says when the next frame may be drawn, so that drawing never takes more than a share of the time.
+
+    After a frame that took c seconds, the next one waits until c is the requested share of the time since that frame
+    began. clock: seconds.
+    """
+
+    def __init__(self, clock: Callable[[], float] = time.perf_counter) -> None:
+        self._clock = clock
+        self._began = -float("inf")
+        self._cost = 0.0
+
+    def allows(self, share: float) -> bool:
+        """Whether a frame may begin now, if all of them may take `share` of the time."""
+        return self._clock() - self._began >= max(self._cost / share, _BETWEEN)
+
+    def spent(self, began: float, seconds: float) -> None:
+        """Note a frame that began at `began` and took `seconds`."""
+        self._began, self._cost = began, seconds
 
 
 @dataclass
 class Watcher:
-    """A browser. asked: the first change that its last frame does not show, None: it shows all. Times in seconds."""
+    """A browser. asked: whether its last frame does not show a change. Times in seconds."""
 
     pose: Pose
     moved: float
-    asked: float | None
+    asked: bool
     sharp: bool = False  # whether its last frame had all pixels
     version: int = -1  # of the model, in its last frame
     drawn: float = -float("inf")
@@ -24,13 +48,12 @@ class Watcher:
 
 @dataclass(frozen=True)
 class Wish:
-    """A frame to draw. urgent: somebody waits for it. asked: since when, None: nobody does."""
+    """A frame to draw. urgent: somebody waits for it."""
 
     client: int
     pose: Pose
     coarse: bool
     urgent: bool
-    asked: float | None
 
 
 class Watchers:
@@ -48,11 +71,10 @@ class Watchers:
         with self._changed:
             known = self._watchers.get(client)
             if known is None:
-                # The first picture is one of a camera that stands still.
-                self._watchers[client] = Watcher(pose, now - STILL_AFTER, now)
+                # The first image is one of a camera that stands still.
+                self._watchers[client] = Watcher(pose, now - STILL_AFTER, True)
             elif pose != known.pose:
-                known.pose, known.moved = pose, now
-                known.asked = now if known.asked is None else known.asked
+                known.pose, known.moved, known.asked = pose, now, True
             self.any = True
             self._changed.notify_all()
 
@@ -68,7 +90,7 @@ class Watchers:
         now = self._clock()
         with self._changed:
             for watcher in self._watchers.values():
-                watcher.asked = now if watcher.asked is None else watcher.asked
+                watcher.asked = True
                 watcher.moved = now if dragging else watcher.moved
             self._changed.notify_all()
 
@@ -96,14 +118,10 @@ class Watchers:
     @staticmethod
     def _wish(client: int, watcher: Watcher, now: float, version: int) -> Wish | None:
         moving = now - watcher.moved < STILL_AFTER
-        wish = Wish(client, watcher.pose, moving, watcher.asked is not None, watcher.asked)
-        if wish.urgent:
-            return wish
-        if moving:
-            return None
-        if not watcher.sharp:
-            return replace(wish, urgent=True)
-        return wish if watcher.version != version else None
+        urgent = watcher.asked or not (moving or watcher.sharp)
+        if urgent or not moving and watcher.version != version:
+            return Wish(client, watcher.pose, moving, urgent)
+        return None
 
     def drew(self, wish: Wish, version: int = 0) -> None:
         """A wish's frame is about to be drawn: changes from now on ask for another one."""
@@ -113,4 +131,4 @@ class Watchers:
                 watcher.drawn = self._clock()
                 watcher.sharp, watcher.version = not wish.coarse, version
                 if watcher.pose == wish.pose:
-                    watcher.asked = None
+                    watcher.asked = False

@@ -1,9 +1,14 @@
 """Answers to the remote viewer that is connected to a training."""
 
-from gaussian_renderer import network_gui
-from gaussian_renderer.network_frame import frame_bytes
+import argparse
+
+import torch
+from torch import Tensor
+
+from gaussian_renderer import network_gui, render
 from gaussian_renderer.network_message import Request
 from gaussian_renderer.network_transfer import ViewerLost
+from scene.gaussian_model import GaussianModel
 from training.objective import Losses
 from training.observer import Error, Observer
 from training.run import Run
@@ -76,3 +81,22 @@ class NetworkViewer(Observer):
             fault = f"its frame cannot be rendered ({first_line(error)})"
             network_gui.disconnect(fault)
             raise ViewerLost(fault) from error
+
+
+@torch.no_grad()
+def frame_bytes(request: Request, gaussians: GaussianModel, pipe: argparse.Namespace, background: Tensor) -> memoryview:
+    """RGB bytes (H, W, 3) of the model as `render` shows it: 255 times the colour, truncated.
+
+    pipe: options of the training, which stay as they are; for the frame, the request's two switches count instead.
+    """
+    switches = {"convert_SHs_python": request.shs_python, "compute_cov3D_python": request.rot_scale_python}
+    image = render(
+        request.camera(background.device),
+        gaussians,
+        argparse.Namespace(**vars(pipe) | switches),
+        background,
+        request.scaling_modifier,
+        want_depth=False,
+        want_visibility=False,
+    )["render"]
+    return memoryview((image * 255).byte().permute(1, 2, 0).contiguous().cpu().numpy())

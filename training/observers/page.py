@@ -10,12 +10,10 @@ from training.observers.saves import Checkpoints
 from training.run import Run
 from training.step import Step
 from utils.system_utils import UserError
-from viewing.budget import MOVING, STILL, Budget
 from viewing.options import Address
 from viewing.page import Page
-from viewing.requests import Requests
-from viewing.training_tab import TrainingTab
-from viewing.watchers import Wish
+from viewing.training_tab import Requests, TrainingTab
+from viewing.watchers import MOVING, STILL, Budget, Wish
 
 _NUMBERS_EVERY = 0.5  # seconds
 _WAIT = 0.2  # seconds until a paused training notices a signal

@@ -10,7 +10,7 @@ _SAMPLE = 20_000  # pixels that the quantiles are taken from
 _STOPS = ((0.00, 0.00, 0.05), (0.25, 0.05, 0.42), (0.70, 0.18, 0.38), (0.97, 0.50, 0.16), (0.99, 1.00, 0.70))
 
 
-def tinted(values: Tensor) -> Tensor:
+def colored(values: Tensor) -> Tensor:
     """Colours (3, H, W) of values (H, W) in [0, 1], linear between the stops; others are clamped."""
     stops = torch.tensor(_STOPS, dtype=values.dtype, device=values.device)
     place = values.clamp(0, 1) * (len(_STOPS) - 1)
@@ -18,7 +18,7 @@ def tinted(values: Tensor) -> Tensor:
     return torch.lerp(stops[below], stops[below + 1], (place - below)[..., None]).permute(2, 0, 1)
 
 
-def tinted_depth(depth: Tensor, alpha: Tensor) -> Tensor:
+def depth_colors(depth: Tensor, alpha: Tensor) -> Tensor:
     """Colours (3, H, W) of the planes of `view_planes`, (1, H, W) each; depth is inverse: near is bright.
 
     Where less than half of a pixel is covered there is no depth, and the colour is black.
@@ -30,14 +30,14 @@ def tinted_depth(depth: Tensor, alpha: Tensor) -> Tensor:
         return torch.zeros_like(alpha).expand(3, -1, -1)
     known = known[:: max(1, len(known) // _SAMPLE)]
     far, near = torch.quantile(known, torch.tensor([_FEW, _MOST], dtype=known.dtype, device=known.device))
-    return torch.where(there, tinted((values - far) / (near - far).clamp_min(1e-9)), 0.0)
+    return torch.where(there, colored((values - far) / (near - far).clamp_min(1e-9)), 0.0)
 
 
-def tinted_counts(counts: Tensor) -> Tensor:
-    """Colours (3, H, W) of counts (H, W): linear, the largest of the picture is the brightest."""
-    return tinted(counts.float() / counts.max().clamp_min(1))
+def count_colors(counts: Tensor) -> Tensor:
+    """Colours (3, H, W) of counts (H, W): linear, the largest of the image is the brightest."""
+    return colored(counts.float() / counts.max().clamp_min(1))
 
 
-def error_of(photo: Tensor, render: Tensor) -> Tensor:
+def error_image(photo: Tensor, render: Tensor) -> Tensor:
     """The difference (3, H, W) of two images in [0, 1], times ERROR_GAIN."""
     return ((photo - render).abs() * ERROR_GAIN).clamp(0, 1)

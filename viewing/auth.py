@@ -1,4 +1,4 @@
-"""The gate in front of the page: which requests viser gets to see."""
+"""Authorization in front of the page: which requests viser gets to see."""
 
 import hmac
 import http
@@ -31,7 +31,7 @@ def is_loopback(host: str) -> bool:
         return False
 
 
-class Gate:
+class Auth:
     """Refuses every request, for a file or for a websocket, that may not come in.
 
     A page of another origin may not ask. On a loopback address, the request must name a loopback host. So no page that
@@ -83,7 +83,7 @@ class Gate:
 
     @contextmanager
     def in_front_of_viser(self) -> Iterator[None]:
-        """Inside, a viser server that starts gets this gate. `stands` tells whether one did."""
+        """Inside, a viser server that starts is guarded by it. `stands` tells whether one did."""
         plain = websocket_server.serve
 
         def serve(*arguments: Any, process_request: Callable, **options: Any) -> Any:
