@@ -17,12 +17,13 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from conversion.backends import LENS_MODELS, Backend, Program, Pycolmap, Settings
+from conversion.colmap import LENS_MODELS, Program, Pycolmap, Settings
 from conversion.layout import FEWEST, Layout, find_photos, refuse_foreign_results, scene_folder
 from conversion.programs import refuse_while_working
 from conversion.report import summary
-from conversion.stages import Stage, StageRecord
-from conversion.steps import (
+from conversion.stages import (
+    Stage,
+    StageRecord,
     model_state,
     photo_stage,
     reconstruction_stages,
@@ -49,7 +50,7 @@ def convert(layout: Layout, settings: Settings, args: argparse.Namespace) -> Non
         program = "--skip_matching: the model that was in distorted/sparse"
         made_from = [names, model_state(layout)]
     else:
-        backend = _backend(args.colmap_executable, settings)
+        backend = Program(args.colmap_executable, settings) if args.colmap_executable else Pycolmap()
         program, made_from = backend.identity, None
         stages = [photo_stage(layout, names, masks)]
         stages += reconstruction_stages(layout, backend, settings, masks is not None)
@@ -86,16 +87,6 @@ def _video(layout: Layout, record: StageRecord, args: argparse.Namespace) -> Sta
             "video in another folder"
         )
     return video_stage(layout, video, args.video_frames)
-
-
-def _backend(executable: str, settings: Settings) -> Backend:
-    return Program(executable, settings) if executable else Pycolmap()
-
-
-def _check_camera(name: str) -> None:
-    """Raise UserError for a lens model that COLMAP does not have or cannot undistort."""
-    if name not in LENS_MODELS:
-        raise UserError(f"--camera {name} is not a supported lens model; choose one of {', '.join(LENS_MODELS)}")
 
 
 def main(argv: Sequence[str] | None = None) -> None:
@@ -137,7 +128,8 @@ def main(argv: Sequence[str] | None = None) -> None:
         if getattr(args, option) < least:
             raise UserError(f"--{option} must be at least {least}, got {getattr(args, option)}")
     layout = Layout(scene_folder(args.source_path, made=bool(args.video)))
-    _check_camera(args.camera)
+    if args.camera not in LENS_MODELS:
+        raise UserError(f"--camera {args.camera} is not a supported lens model; choose one of {', '.join(LENS_MODELS)}")
     matcher = args.matcher or ("sequential" if args.video else "exhaustive")
     convert(layout, Settings(args.camera, args.max_num_features, matcher, args.mapper, args.no_gpu), args)
 

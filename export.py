@@ -14,6 +14,7 @@ if __name__ == "__main__":
 import argparse
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -22,12 +23,10 @@ import numpy as np
 import torch
 
 from arguments import ModelParams, OptionParser, PipelineParams, get_combined_args
-from exports.formats import FORMATS, Format, format_of
-from exports.of_model import splats_of
-from exports.plain_ply import stored_offset
-from exports.read import READABLE, read_splats
-from exports.selection import drawable, opacities, selected, tidy, with_sh_degree, within_box
-from exports.splats import Splats
+from exports.formats import FORMATS, READABLE, Format, format_of, read_splats
+from exports.in_scene import splats_of
+from exports.ply import stored_offset
+from exports.splats import Splats, drawable, opacities, selected, tidy, with_sh_degree, within_box
 from gaussian_renderer.importance import blending_weights, most_important
 from gaussian_renderer.scored_views import ScoredViews
 from gaussian_renderer.trimming import change_on_views
@@ -53,7 +52,7 @@ def load(args: argparse.Namespace, options: argparse.Namespace, want_views: bool
         if want_views:
             raise UserError(f"--max_splats and pages need training views, which {args.ply} has not; give a model by -m")
         splats = read_splats(args.ply)
-        return (Splats(**{**vars(splats), "antialiasing": True}) if args.antialiasing else splats), None
+        return replace(splats, antialiasing=splats.antialiasing or bool(args.antialiasing)), None
     if want_views:
         options.images_to_load = 1  # each photo is used once or twice
         scene = load_saved(options, args.iteration)

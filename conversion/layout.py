@@ -1,6 +1,5 @@
 """Paths of a conversion, and checks of the folder that is given, with messages that name the fix."""
 
-from dataclasses import dataclass
 from pathlib import Path
 
 from utils.files.image_files import SUFFIXES
@@ -12,66 +11,20 @@ _VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mts")
 FEWEST = 3
 
 
-@dataclass(frozen=True)
 class Layout:
     """Paths of one conversion: `input`, the photos, which are only read; `work`, intermediate results; the scene."""
 
-    scene: Path
-
-    @property
-    def input(self) -> Path:
-        return self.scene / "input"
-
-    @property
-    def work(self) -> Path:
-        return self.scene / "distorted"
-
-    @property
-    def photos(self) -> Path:
-        """Folder of the photos for COLMAP: upright, in formats that it reads."""
-        return self.work / "photos"
-
-    @property
-    def masks(self) -> Path:
-        return self.work / "masks"
-
-    @property
-    def database(self) -> Path:
-        return self.work / "database.db"
-
-    @property
-    def calibrated(self) -> Path:
-        """A copy of the database; global mapping writes its estimates of focal lengths into it."""
-        return self.work / "calibrated.db"
-
-    @property
-    def models(self) -> Path:
-        """Folder with one sub-folder per model of the mapper: 0, 1, ..."""
-        return self.work / "sparse"
-
-    @property
-    def undistorted(self) -> Path:
-        return self.work / "undistorted"
-
-    @property
-    def log(self) -> Path:
-        return self.work / "colmap.log"
-
-    @property
-    def stages(self) -> Path:
-        return self.work / "stages.json"
-
-    @property
-    def report(self) -> Path:
-        return self.scene / "convert_report.json"
-
-    @property
-    def images(self) -> Path:
-        return self.scene / "images"
-
-    @property
-    def sparse(self) -> Path:
-        return self.scene / "sparse"
+    def __init__(self, scene: Path) -> None:
+        self.scene = scene
+        self.input, self.images, self.sparse = scene / "input", scene / "images", scene / "sparse"
+        self.report = scene / "convert_report.json"
+        self.work = work = scene / "distorted"
+        self.photos = work / "photos"  # for COLMAP: upright, in formats that it reads
+        self.masks, self.undistorted = work / "masks", work / "undistorted"
+        self.models = work / "sparse"  # one sub-folder per model of the mapper: 0, 1, ...
+        self.database = work / "database.db"
+        self.calibrated = work / "calibrated.db"  # a copy, into which global mapping writes its focal lengths
+        self.log, self.stages = work / "colmap.log", work / "stages.json"
 
     def resized(self, factor: int) -> Path:
         return self.scene / f"images_{factor}"

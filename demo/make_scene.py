@@ -17,11 +17,9 @@ import numpy as np
 from PIL import Image
 from tqdm import tqdm
 
-from demo.colmap_model import write_model
 from demo.objects import demo_scene
-from demo.surface_points import MIN_TRACK, sample_points
-from demo.tracer import View, render_view
-from demo.views import ring_views
+from demo.points import MIN_TRACK, sample_points, write_model
+from demo.tracer import View, render_view, ring_views
 from utils.host.threads import cores
 from utils.system_utils import UserError, mkdir_p, run_cli
 
@@ -83,27 +81,18 @@ def make_scene(out: Path, views: int, width: int, height: int, points: int, seed
 
 def main() -> None:
     parser = ArgumentParser(prog="python -m demo.make_scene", description="Make the ray-traced demo scene.")
-    parser.add_argument("out", type=Path, help="folder to make, with images/ and sparse/0")
-    parser.add_argument("--views", type=int, default=60, help="number of photos, on three rings (60)")
-    parser.add_argument(
-        "--size",
-        type=int,
-        nargs=2,
-        default=(400, 300),
-        metavar=("W", "H"),
-        help="size of the photos in pixels (400 300)",
-    )
-    parser.add_argument("--points", type=int, default=8000, help="surface points to try; a few are dropped (8000)")
-    parser.add_argument("--seed", type=int, default=0, help="seed of the cameras' jitter and of the points (0)")
+    add = parser.add_argument
+    add("out", type=Path, help="folder to make, with images/ and sparse/0")
+    add("--views", type=int, default=60, help="number of photos, on three rings (60)")
+    add("--size", type=int, nargs=2, default=(400, 300), metavar=("W", "H"),
+        help="size of the photos in pixels (400 300)")  # fmt: skip
+    add("--points", type=int, default=8000, help="surface points to try; a few are dropped (8000)")
+    add("--seed", type=int, default=0, help="seed of the cameras' jitter and of the points (0)")
     args = parser.parse_args()
-    for option, value, least in (
-        ("--views", args.views, 3),
-        ("--size", min(args.size), 16),
-        ("--points", args.points, 1),
-        ("--seed", args.seed, 0),
-    ):
+    for option, least in (("views", 3), ("size", 16), ("points", 1), ("seed", 0)):
+        value = np.min(getattr(args, option))
         if value < least:
-            raise UserError(f"{option} must be at least {least}, got {value}")
+            raise UserError(f"--{option} must be at least {least}, got {value}")
     count = make_scene(args.out, args.views, *args.size, args.points, args.seed)
     print(f"{args.out}: {args.views} photos of {args.size[0]}x{args.size[1]} pixels, {count} points")
 

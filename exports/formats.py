@@ -1,13 +1,22 @@
-"""Table of the formats that export.py writes, by the ending of the file's name."""
+"""The formats of files: those that export.py writes, by the ending of a name, and those that are read, by content."""
 
 import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import import_module
+from pathlib import Path
 from typing import Any
 
-from exports.splats import Splats
+import numpy as np
+
+from exports.ply import is_compressed_ply, read_compressed_ply, read_plain_ply
+from exports.splats import Splats, tidy
+from exports.spz import read_spz
+from exports.web import read_splat
+from utils.files.ply_header import header_lines
 from utils.system_utils import UserError
+
+READABLE = "PLY, compressed PLY, SPZ or .splat"
 
 
 @dataclass(frozen=True)
@@ -38,13 +47,13 @@ class Format:
 
 # An ending that ends with another one comes before it.
 FORMATS = (
-    Format(".compressed.ply", ("exports.compressed_ply", "write_compressed_ply"), "PlayCanvas, SuperSplat"),
-    Format(".ply", ("exports.plain_ply", "write_plain_ply"), "float32, everything kept"),
-    Format(".splat", ("exports.splat", "write_splat"), "antimatter15, 32 bytes a splat, no SH bands"),
+    Format(".compressed.ply", ("exports.ply", "write_compressed_ply"), "PlayCanvas, SuperSplat"),
+    Format(".ply", ("exports.ply", "write_plain_ply"), "float32, everything kept"),
+    Format(".splat", ("exports.web", "write_splat"), "antimatter15, 32 bytes a splat, no SH bands"),
     Format(".spz", ("exports.spz", "write_spz"), "Niantic, version 4", needs="find_zstandard"),
-    Format(".sog", ("exports.sog", "write_sog"), "PlayCanvas, through splat-transform", needs="find_program"),
-    Format(".glb", ("exports.glb", "write_glb"), "glTF with KHR_gaussian_splatting, float32"),
-    Format(".usdz", ("exports.usdz", "write_usdz"), "OpenUSD, float32", needs="find_pxr"),
+    Format(".sog", ("exports.web", "write_sog"), "PlayCanvas, through splat-transform", needs="find_program"),
+    Format(".glb", ("exports.scene_formats", "write_glb"), "glTF with KHR_gaussian_splatting, float32"),
+    Format(".usdz", ("exports.scene_formats", "write_usdz"), "OpenUSD, float32", needs="find_pxr"),
     Format(".html", ("exports.html", "write_scene_html"), "a page with a viewer", of_scene=True),
 )
 
@@ -57,3 +66,34 @@ def format_of(path: str | os.PathLike) -> Format:
             return entry
     endings = ", ".join(entry.ending for entry in FORMATS)
     raise UserError(f"the format of {path} is unknown; end its name with one of {endings}")
+
+
+def is_point_cloud(path: str | os.PathLike) -> bool:
+    """Whether a file has points instead of splats: a PLY without their properties, or a file of another kind."""
+    if not os.path.isfile(path) or Path(path).suffix.lower() in (".splat", ".spz"):
+        return False
+    lines = header_lines(path)
+    if not lines:
+        with open(path, "rb") as file:
+            return not file.read(4).startswith((b"NGSP", b"\x1f\x8b"))
+    names = {words[-1] for words in map(str.split, lines) if words[:1] == ["property"]}
+    return not names & {"f_dc_0", "opacity", "scale_0", "rot_0", "packed_position"}
+
+
+@np.errstate(over="ignore", invalid="ignore")  # what float32 cannot hold becomes Inf or NaN, which is not drawn
+def read_splats(path: str | os.PathLike) -> Splats:
+    """The Gaussians of a file. UserError if it is missing, damaged, or of another format."""
+    if not os.path.isfile(path):
+        raise UserError(f"no file {path}; give a model as {READABLE}")
+    try:
+        with open(path, "rb") as file:
+            begin = file.read(4)
+    except OSError as error:
+        raise UserError(f"cannot read {path} ({error.strerror}); fix its permissions") from error
+    if begin.startswith(b"ply"):
+        return tidy(read_compressed_ply(path) if is_compressed_ply(path) else read_plain_ply(path))
+    if begin == b"NGSP" or begin.startswith(b"\x1f\x8b"):
+        return tidy(read_spz(path))
+    if Path(path).suffix.lower() == ".splat":  # it has no sign of its own
+        return tidy(read_splat(path))
+    raise UserError(f"{path} is no model that this program reads; give {READABLE}")

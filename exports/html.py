@@ -7,16 +7,14 @@ import json
 import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
 
 import jinja2
 import numpy as np
 
-from exports.compressed_ply import packed_ply
+from exports.ply import packed_ply
 from exports.splats import Splats
-from exports.upright import turn_upright, turned, up_of
 from exports.vendor import FOLDER, RECORD, VIEWER
-from exports.viewer_settings import settings
+from exports.viewer_world import settings, turn_upright, turned, up_of
 from moving_cameras.moments import TimedPath
 from moving_cameras.poses import Poses, poses_of
 from scene.cameras import Camera
@@ -48,17 +46,20 @@ def write_html(
     poses = poses_of(cameras)
     turn = turn_upright(up_of(poses))
     names = [str(camera.image_name) for camera in cameras]
+    # The median distance of the Gaussians from the first camera.
+    distance = float(np.median(np.linalg.norm(splats.means - poses.positions[0], axis=1))) if len(splats) else 1.0
     page = {
         "antialiasing": splats.antialiasing,
         "name": _NAME,
-        "settings": settings(poses, names, turn, camera_path, background, _distance(splats, poses)),
+        "settings": settings(poses, names, turn, camera_path, background, distance),
     }
     content = _template().render(
         background=", ".join(f"{255 * value:.0f}" for value in background),
         css=(FOLDER / "viewer.css").read_text(encoding="utf-8"),
         licence=(FOLDER / "LICENSE").read_text(encoding="utf-8"),
         model=_packed_model(turned(splats, turn)),
-        page=_embedded(page),
+        # No text in the JSON may end the script element that it stands in.
+        page=json.dumps(page, allow_nan=False).replace("<", "\\u003c"),
         record=read_json(RECORD),
         title=Path(path).stem if title is None else title,
         viewer=_in_base64((FOLDER / VIEWER).read_bytes()),
@@ -86,11 +87,6 @@ def write_scene_html(
     write_html(path, splats, cameras, camera_path, background=background)
 
 
-def _distance(splats: Splats, poses: Poses) -> float:
-    """Median distance of the Gaussians from the first camera."""
-    return float(np.median(np.linalg.norm(splats.means - poses.positions[0], axis=1))) if len(splats) else 1.0
-
-
 def _template() -> jinja2.Template:
     loader = jinja2.FileSystemLoader(Path(__file__).parent)
     environment = jinja2.Environment(
@@ -99,23 +95,14 @@ def _template() -> jinja2.Template:
     return environment.get_template("page.html.jinja")
 
 
-def _packed(content: bytes) -> str:
-    return _in_base64(gzip.compress(content, mtime=0))
-
-
 def _in_base64(content: bytes) -> str:
     return base64.b64encode(content).decode()
-
-
-def _embedded(content: Any) -> str:
-    """JSON that cannot end the script element it stands in."""
-    return json.dumps(content, allow_nan=False).replace("<", "\\u003c")
 
 
 def _packed_model(splats: Splats) -> str:
     content = io.BytesIO()
     packed_ply(splats).write(content)
-    packed = _packed(content.getbuffer())
+    packed = _in_base64(gzip.compress(content.getbuffer(), mtime=0))
     if len(packed) > LONGEST:
         raise UserError(
             f"a page of {len(splats):,} Gaussians of SH degree {splats.sh_degree} would have {len(packed) / 1e6:.0f} "

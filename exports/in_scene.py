@@ -1,4 +1,7 @@
-"""Splats of a file in a scene: the start of a training, or other people's models in our views."""
+"""Splats, models and scenes: the splats of a model, and a file's Gaussians as a model, also in a scene's frame.
+
+A file's Gaussians are the start of a training, or other people's models in our views.
+"""
 
 import argparse
 import copy
@@ -6,17 +9,59 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import torch
 
-from exports.of_model import fill_model, model_of
-from exports.read import is_point_cloud, read_splats
-from exports.selection import drawable, selected
-from exports.splats import Splats
+from exports.formats import is_point_cloud, read_splats
+from exports.ply import columns_of
+from exports.splats import Splats, base_colors, drawable, selected
 from scene import Scene
 from scene.gaussian_model import GaussianModel
+from scene.gaussians.attributes import attributes
+from utils.general_utils import inverse_sigmoid
 from utils.graphics_utils import BasicPointCloud
 from utils.ranks.ranks import ALONE, Ranks
-from utils.sh_utils import C0
 from utils.system_utils import UserError
+
+
+@torch.no_grad()
+def splats_of(gaussians: GaussianModel, antialiasing: bool = False) -> Splats:
+    """The Gaussians of a model, on the CPU. Other activations than ours are undone, as files hold logits and logs."""
+    if gaussians.kernels_activate:
+        raw = gaussians.raw_geometry()
+        scales, logits = raw["scales"], raw["opacities"]
+    else:
+        scales, logits = gaussians.get_scaling.log(), inverse_sigmoid(gaussians.get_opacity)
+    values = (gaussians.get_xyz, scales, gaussians.get_rotation, logits[:, 0], gaussians.get_features)
+    means, scales, rotations, logits, sh = (x.detach().float().cpu().contiguous().numpy() for x in values)
+    return Splats(means, scales, rotations, logits, sh, antialiasing, gaussians.world_offset)
+
+
+def model_of(splats: Splats, sh_degree: int | None = None) -> GaussianModel:
+    """A model, on the device that computes, whose SH bands are all active. sh_degree: of the model, None: the splats'.
+
+    Bands that the splats lack are zero; those above sh_degree are left out.
+    """
+    degree = splats.sh_degree if sh_degree is None else sh_degree
+    gaussians = GaussianModel(degree)
+    fill_model(gaussians, splats)
+    return gaussians
+
+
+def fill_model(gaussians: GaussianModel, splats: Splats) -> None:
+    """Give a model these Gaussians, with the bands that it has. The splats' bands become active.
+
+    Attributes that splats do not have get the values of new Gaussians.
+    """
+    columns = columns_of(splats)
+    bands = (gaussians.max_sh_degree + 1) ** 2 - 1
+    rest = columns["f_rest"][:, :bands]
+    columns["f_dc"] = columns["f_dc"].contiguous()
+    columns["f_rest"] = torch.nn.functional.pad(rest, (0, 0, 0, bands - rest.shape[1])).contiguous()
+    for name, attribute in attributes(gaussians.max_sh_degree).items():
+        if name not in columns:
+            columns[name] = torch.full((len(splats), *attribute.shape), attribute.start)
+    gaussians.take_whole(columns)
+    gaussians.active_sh_degree = min(gaussians.max_sh_degree, splats.sh_degree)
 
 
 def scene_with(
@@ -37,7 +82,7 @@ def scene_with(
     if not len(splats):
         raise UserError(f"{path} has no Gaussians that are drawn; give another model")
     points = splats.means.astype(np.float64) + splats.world_offset
-    colors = np.clip(splats.sh[:, 0] * C0 + 0.5, 0, 1).astype(np.float32)
+    colors = np.clip(base_colors(splats), 0, 1)
     # The scene moves them into its frame, as it does any points.
     options.init_pcd_path = BasicPointCloud(points, colors, np.zeros_like(colors))
     scene = Scene(options, gaussians, shuffle=False, start=False, sharing=sharing)

@@ -2,13 +2,29 @@
 
 import numpy as np
 
+from exports.splats import Splats, base_colors, opacities
+
 _MORTON_BITS = 21  # a coordinate
 
 
-def to_bits(values: np.ndarray, bits: int) -> np.ndarray:
-    """Values in [0, 1] as unsigned integers of so many bits, uint32, rounded to the nearest; others are clamped."""
-    most = (1 << bits) - 1
-    return np.clip(np.floor(np.asarray(values, np.float64) * most + 0.5), 0, most).astype(np.uint32)
+def pack(parts: np.ndarray, *bits: int) -> np.ndarray:
+    """Values (N, K) in [0, 1] in K fields of so many bits, uint32 (N,); the first is highest, others are clamped."""
+    codes = np.zeros(len(parts), np.uint32)
+    for values, size in zip(parts.T, bits, strict=True):
+        most = (1 << size) - 1
+        rounded = np.floor(np.asarray(values, np.float64) * most + 0.5)
+        codes = codes << np.uint32(size) | np.clip(rounded, 0, most).astype(np.uint32)
+    return codes
+
+
+def unpack(codes: np.ndarray, *bits: int) -> np.ndarray:
+    """The values (N, K) in [0, 1] of `pack`, float64; bits above the fields do not count."""
+    fields = []
+    for size in reversed(bits):
+        most = (1 << size) - 1
+        fields.append((codes & np.uint32(most)) / most)
+        codes = codes >> np.uint32(size)
+    return np.stack(fields[::-1], axis=1)
 
 
 def to_bytes(values: np.ndarray) -> np.ndarray:
@@ -18,10 +34,9 @@ def to_bytes(values: np.ndarray) -> np.ndarray:
     return np.clip(rounded, 0, 255, out=rounded).astype(np.uint8)
 
 
-def from_bits(codes: np.ndarray, bits: int) -> np.ndarray:
-    """The values in [0, 1] of the lowest `bits` bits of integers."""
-    most = (1 << bits) - 1
-    return (codes & np.uint32(most)) / most
+def rgba_bytes(splats: Splats) -> np.ndarray:
+    """Colours of SH band 0 with opacities, (N, 4) uint8."""
+    return to_bytes(255 * np.concatenate([base_colors(splats), opacities(splats)[:, None]], axis=1))
 
 
 def morton_order(points: np.ndarray) -> np.ndarray:

@@ -1,8 +1,23 @@
-"""A model's values as every format takes them."""
+"""A model's values as every format takes them, and choices among them."""
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
+
+from utils.sh_utils import C0
+
+_LARGEST = 80.0  # of a logarithm of a scale; exp(89) is infinite in float32
+# Sign of each SH coefficient under y -> -y, z -> -z: each basis function is a polynomial of x y z, in the order of
+# utils/sh_utils.py.
+SH_SIGNS = np.float32(
+    [
+        1,
+        *(-1, -1, 1),  # y, z, x
+        *(-1, 1, 1, -1, 1),  # xy, yz, 2zz-xx-yy, xz, xx-yy
+        *(-1, 1, -1, -1, 1, -1, 1),  # y(3xx-yy), xyz, y(4zz-xx-yy), z(...), x(4zz-xx-yy), z(xx-yy), x(xx-3yy)
+    ]
+)
 
 
 @dataclass(frozen=True)
@@ -29,3 +44,68 @@ class Splats:
     @property
     def sh_degree(self) -> int:
         return round(self.sh.shape[1] ** 0.5) - 1
+
+
+def selected(splats: Splats, which: np.ndarray) -> Splats:
+    """The splats of a mask (N,) bool, or of indices in their order."""
+    names = ("means", "log_scales", "rotations", "opacity_logits", "sh")
+    return replace(splats, **{name: np.ascontiguousarray(getattr(splats, name)[which]) for name in names})
+
+
+def with_sh_degree(splats: Splats, degree: int) -> Splats:
+    """The splats without SH bands above a degree; they never get more bands than they have."""
+    return replace(splats, sh=np.ascontiguousarray(splats.sh[:, : (degree + 1) ** 2]))
+
+
+def drawable(splats: Splats) -> np.ndarray:
+    """(N,) bool: the splats that the rasterizer draws. Infinite logits are opacities 0 and 1, all else is finite."""
+    tables = splats.means, splats.log_scales, splats.rotations, splats.sh.reshape(len(splats), 3 * splats.sh.shape[1])
+    finite = [np.isfinite(table).all(axis=1) for table in tables]
+    return np.logical_and.reduce([*finite, ~np.isnan(splats.opacity_logits)])
+
+
+def within_box(splats: Splats, box: Sequence[float]) -> np.ndarray:
+    """(N,) bool: the splats whose centre lies in a box x0 y0 z0 x1 y1 z1 of the means' frame."""
+    low, high = np.asarray(box[:3]), np.asarray(box[3:])
+    return ((splats.means >= low) & (splats.means <= high)).all(axis=1)
+
+
+def tidy(splats: Splats) -> Splats:
+    """The splats with values that every format can hold: rotations of length 1, logs of scales of at most 80."""
+    lengths = np.linalg.norm(splats.rotations, axis=1, keepdims=True)
+    known = lengths > 1e-12
+    rotations = np.where(known, splats.rotations / np.where(known, lengths, 1), np.float32([1, 0, 0, 0]))
+    scales = np.clip(splats.log_scales, -_LARGEST, _LARGEST)
+    return replace(splats, rotations=rotations.astype(np.float32), log_scales=scales.astype(np.float32))
+
+
+def half_turned(splats: Splats) -> Splats:
+    """The splats turned by half a turn about x, from COLMAP's axes to OpenGL's (x right, y up, z back), or back.
+
+    The turn is a rotation, so shapes and colours stay the same.
+    """
+    return replace(
+        splats,
+        means=splats.means * np.float32([1, -1, -1]),
+        rotations=splats.rotations * np.float32([1, 1, -1, -1]),
+        sh=splats.sh * SH_SIGNS[: splats.sh.shape[1], None],
+    )
+
+
+def base_colors(splats: Splats) -> np.ndarray:
+    """RGB (N,3) float32 of SH band 0; [0, 1] is what can be shown."""
+    return splats.sh[:, 0] * C0 + 0.5
+
+
+def opacities(splats: Splats) -> np.ndarray:
+    """Opacities (N,) float64 in [0, 1]."""
+    return 1 / (1 + np.exp(-np.clip(splats.opacity_logits.astype(np.float64), -700, 700)))
+
+
+def logits(values: np.ndarray, step: float) -> np.ndarray:
+    """Logits (float32) of opacities in [0, 1] that were rounded to multiples of `step`.
+
+    0 and 1 become a quarter of a step away, so that they are finite.
+    """
+    inner = np.clip(np.asarray(values, np.float64), step / 4, 1 - step / 4)
+    return np.log(inner / (1 - inner)).astype(np.float32)

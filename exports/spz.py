@@ -14,26 +14,35 @@ import sys
 import zlib
 from dataclasses import replace
 from types import ModuleType
+from typing import NamedTuple
 
 import numpy as np
 
-from exports.half_turn import half_turned
 from exports.packing import morton_order, smallest_three, spread, to_bytes, whole_quaternions
-from exports.selection import logits, opacities, selected
-from exports.splats import Splats
+from exports.splats import Splats, half_turned, logits, opacities, selected
 from utils.files.packed import check_packed_rows
 from utils.system_utils import UserError, atomic_write
 
 MAGIC = 0x5053474E
-_HEADER = struct.Struct("<IIIBBBBI12x")
-_HEADER_GZIP = struct.Struct("<IIIBBBB")
+_HEADER = struct.Struct("<IIIBBBB")  # magic, version, splats, SH degree, bits of a fraction, flags, streams
+_HEADER_END = struct.Struct("<I12x")  # of version 4: where the table of streams begins
 _ANTIALIASED = 1
 _COLOR = 0.15  # colours are 0.5 + 0.15 SH0, so that those beyond [0, 1] fit
 _MOST_BITS = 20  # of a position's fraction
 _LARGEST_POSITION = (1 << 23) - 1
 _FARTHEST = 1000.0  # usual distances from the middle; no move within the model shows how far it is beyond
 _LEVEL = 3  # of zstd; level 19 takes 70 times as long and saves 2 %
-_SIZES = (9, 1, 3, 3, 4)  # bytes a splat of each stream, before SH
+
+
+class _Header(NamedTuple):
+    """The fields that all versions have, after the magic number."""
+
+    version: int
+    count: int
+    degree: int
+    bits: int
+    flags: int
+    streams: int
 
 
 def write_spz(path: str | os.PathLike, splats: Splats) -> None:
@@ -45,14 +54,22 @@ def write_spz(path: str | os.PathLike, splats: Splats) -> None:
     if farthest > _LARGEST_POSITION:
         raise UserError(f"{path} can hold positions to {_LARGEST_POSITION:,}, not {farthest:.3g}; end --to with .ply")
     bits = int(np.clip(np.floor(np.log2(_LARGEST_POSITION / max(farthest, 1e-30))), 0, _MOST_BITS))
-    compressor = zstandard.ZstdCompressor(level=_LEVEL)
-    streams = [s.tobytes() for s in (_positions(splats.means, bits), *_bytes(splats), _rotations(splats.rotations))]
+    tables = [
+        _fixed_point(splats.means, bits),
+        to_bytes(opacities(splats) * 255),
+        to_bytes((splats.sh[:, 0].astype(np.float64) * _COLOR + 0.5) * 255),
+        to_bytes((splats.log_scales.astype(np.float64) + 10) * 16),
+        _rotation_codes(splats.rotations),
+    ]
     if splats.sh_degree:  # readers refuse an empty stream
-        streams.append(to_bytes(splats.sh[:, 1:] * 128 + 128).tobytes())
+        tables.append(to_bytes(splats.sh[:, 1:] * 128 + 128))
+    streams = [table.tobytes() for table in tables]
+    compressor = zstandard.ZstdCompressor(level=_LEVEL)
     packed = [compressor.compress(stream) for stream in streams]
     table = b"".join(struct.pack("<QQ", len(p), len(s)) for p, s in zip(packed, streams, strict=True))
     flags = _ANTIALIASED if splats.antialiasing else 0
-    header = _HEADER.pack(MAGIC, 4, len(splats), splats.sh_degree, bits, flags, len(streams), _HEADER.size)
+    header = _HEADER.pack(MAGIC, 4, len(splats), splats.sh_degree, bits, flags, len(streams))
+    header += _HEADER_END.pack(_HEADER.size + _HEADER_END.size)
     with atomic_write(path) as temporary:
         temporary.write_bytes(header + table + b"".join(packed))
 
@@ -88,22 +105,12 @@ def find_zstandard(path: str | os.PathLike) -> ModuleType:
     return zstandard
 
 
-def _positions(means: np.ndarray, bits: int) -> np.ndarray:
+def _fixed_point(means: np.ndarray, bits: int) -> np.ndarray:
     fixed = np.clip(np.round(means.astype(np.float64) * 2**bits), -_LARGEST_POSITION, _LARGEST_POSITION)
     return fixed.astype("<i4").view(np.uint8).reshape(-1, 3, 4)[:, :, :3]
 
 
-def _bytes(splats: Splats) -> tuple[np.ndarray, ...]:
-    """Opacities, colours and scales."""
-    color = (splats.sh[:, 0].astype(np.float64) * _COLOR + 0.5) * 255
-    return (
-        to_bytes(opacities(splats) * 255),
-        to_bytes(color),
-        to_bytes((splats.log_scales.astype(np.float64) + 10) * 16),
-    )
-
-
-def _rotations(wxyz: np.ndarray) -> np.ndarray:
+def _rotation_codes(wxyz: np.ndarray) -> np.ndarray:
     largest, three = smallest_three(np.roll(wxyz, -1, axis=1))
     size = np.floor(np.abs(three) * np.sqrt(2) * 511 + 0.5).clip(0, 511).astype(np.uint32)
     first, second, third = (size | (three < 0).astype(np.uint32) << 9).T
@@ -120,16 +127,32 @@ def read_spz(path: str | os.PathLike) -> Splats:
         raise UserError(f"{path} is not a complete SPZ file ({error}); save or download it again") from error
 
 
+def _header(content: bytes, versions: tuple[int, ...], size: int) -> _Header:
+    """The header at the start of unpacked bytes. size: bytes of the file. ValueError unless it can be what it says."""
+    magic, *fields = _HEADER.unpack_from(content)
+    header = _Header(*fields)
+    if magic != MAGIC or header.version not in versions:
+        known = f"no version that this program knows: {header.version}"
+        raise ValueError(known if magic == MAGIC else "no magic number")
+    if header.degree > 4:
+        raise ValueError(f"SH bands of degree {header.degree}, of at most 4")
+    check_packed_rows(header.count, size)
+    return header
+
+
+def _widths(header: _Header) -> list[int]:
+    """Bytes a splat of each stream: positions, opacities, colours, scales, rotations, SH bands."""
+    return [9, 1, 3, 3, 3 if header.version == 2 else 4, 3 * ((header.degree + 1) ** 2 - 1)]
+
+
 def _read_zstd(content: bytes, path: str | os.PathLike) -> Splats:
-    magic, version, count, degree, bits, flags, streams, table = _HEADER.unpack_from(content)
-    if magic != MAGIC or version != 4:
-        raise ValueError(f"no version that this program knows: {version}" if magic == MAGIC else "no magic number")
-    _check_header(count, degree, len(content))
+    header = _header(content, (4,), len(content))
+    (table,) = _HEADER_END.unpack_from(content, _HEADER.size)
     zstandard = find_zstandard(path)
-    sizes = [size * count for size in (*_SIZES, 3 * ((degree + 1) ** 2 - 1))]
-    begin, parts = table + 16 * streams, []
-    for index, size in enumerate(sizes):
-        packed, whole = struct.unpack_from("<QQ", content, table + 16 * index) if index < streams else (0, 0)
+    begin, parts = table + 16 * header.streams, []
+    for index, width in enumerate(_widths(header)):
+        size = width * header.count
+        packed, whole = struct.unpack_from("<QQ", content, table + 16 * index) if index < header.streams else (0, 0)
         if whole != size:
             raise ValueError(f"stream {index} promises {whole} bytes instead of {size}")
         try:
@@ -140,45 +163,38 @@ def _read_zstd(content: bytes, path: str | os.PathLike) -> Splats:
         except zstandard.ZstdError as error:
             raise ValueError(f"stream {index}: {error}") from error
         begin += packed
-    return _splats(parts, count, degree, bits, flags, version)
+    return _splats(parts, header)
 
 
 def _read_gzip(content: bytes) -> Splats:
     stream = gzip.GzipFile(fileobj=io.BytesIO(content))
-    magic, version, count, degree, bits, flags, _ = _HEADER_GZIP.unpack(stream.read(_HEADER_GZIP.size))
-    if magic != MAGIC or version not in (2, 3):
-        raise ValueError(f"no version that this program knows: {version}" if magic == MAGIC else "no magic number")
-    _check_header(count, degree, len(content))
-    sizes = [*_SIZES[:4], 3 if version == 2 else 4, 3 * ((degree + 1) ** 2 - 1)]
-    parts = [stream.read(size * count) for size in sizes]  # no more than that, however much is packed
+    header = _header(stream.read(_HEADER.size), (2, 3), len(content))
+    parts = [
+        stream.read(width * header.count) for width in _widths(header)
+    ]  # no more than that, however much is packed
     stream.read(1)  # at the end it checks the sum
-    return _splats(parts, count, degree, bits, flags, version)
+    return _splats(parts, header)
 
 
-def _check_header(count: int, degree: int, size: int) -> None:
-    if degree > 4:
-        raise ValueError(f"SH bands of degree {degree}, of at most 4")
-    check_packed_rows(count, size)
-
-
-def _splats(parts: list[bytes], count: int, degree: int, bits: int, flags: int, version: int) -> Splats:
-    sizes = (*_SIZES[:4], 3 if version == 2 else 4)
-    table = [np.frombuffer(part, np.uint8).reshape(count, size) for part, size in zip(parts, sizes, strict=False)]
-    coefficients = (degree + 1) ** 2 - 1
-    rest = np.frombuffer(parts[5], np.uint8).reshape(count, coefficients, 3)[:, :15].astype(np.float32)
+def _splats(parts: list[bytes], header: _Header) -> Splats:
+    count, degree = header.count, header.degree
+    tables = [
+        np.frombuffer(part, np.uint8).reshape(count, width) for part, width in zip(parts, _widths(header), strict=True)
+    ]
+    positions, alpha, color, scales, rotations, rest = tables
+    rest = rest.reshape(count, (degree + 1) ** 2 - 1, 3)[:, :15].astype(np.float32)
     rest /= 128  # in place, as these are most of the memory
     rest -= 1
     if degree > 3:
         print(f"warning: SH bands of degree {degree} are left out; models have at most degree 3", file=sys.stderr)
     wide = np.zeros((count, 3, 4), np.uint8)
-    wide[:, :, 1:] = table[0].reshape(count, 3, 3)
-    means = (wide.view("<i4")[:, :, 0] >> 8) / 2.0**bits
-    base = (table[2] / 255.0 - 0.5) / _COLOR
+    wide[:, :, 1:] = positions.reshape(count, 3, 3)
+    means = (wide.view("<i4")[:, :, 0] >> 8) / 2.0**header.bits
+    base = (color / 255.0 - 0.5) / _COLOR
     sh = np.concatenate([base.astype(np.float32)[:, None], rest], axis=1)
-    alpha = logits(table[1].reshape(count) / 255.0, 1 / 255)
-    values = (means, table[3] / 16.0 - 10, _read_rotations(table[4]), alpha, sh)
-    means, scales, rotations, alpha, sh = (x.astype(np.float32, copy=False) for x in values)
-    return half_turned(Splats(means, scales, rotations, alpha, sh, bool(flags & _ANTIALIASED)))
+    values = (means, scales / 16.0 - 10, _read_rotations(rotations), logits(alpha[:, 0] / 255.0, 1 / 255), sh)
+    values = (x.astype(np.float32, copy=False) for x in values)
+    return half_turned(Splats(*values, bool(header.flags & _ANTIALIASED)))
 
 
 def _read_rotations(table: np.ndarray) -> np.ndarray:

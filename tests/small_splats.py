@@ -3,11 +3,24 @@
 import gzip
 import struct
 from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
+import pytest
 
-from exports.selection import tidy
-from exports.splats import Splats
+from exports.formats import format_of
+from exports.splats import Splats, tidy
+
+_PACKAGES = {".spz": "zstandard", ".usdz": "pxr"}
+
+
+def written(folder: Path, ending: str, some: Splats, name: str = "model") -> Path:
+    """The file of some splats in the format of an ending; skips without the package that it needs."""
+    if ending in _PACKAGES:
+        pytest.importorskip(_PACKAGES[ending], reason="the extra [export] is not installed")
+    path = folder / (name + ending)
+    format_of(path).write(path, some)
+    return path
 
 
 def splats(count: int, degree: int = 3, seed: int = 0, antialiasing: bool = False) -> Splats:

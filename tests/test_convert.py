@@ -10,6 +10,7 @@ import subprocess
 import sys
 import threading
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -23,14 +24,20 @@ from waiting import LIMIT, wait_for
 
 import convert
 from conversion import programs, report
-from conversion.backends import LENS_MODELS, Program, Pycolmap, Settings
-from conversion.database import count_rows, forget_matches, most_features, partners
+from conversion.colmap import (
+    LENS_MODELS,
+    Program,
+    Pycolmap,
+    Settings,
+    count_rows,
+    forget_matches,
+    most_features,
+    partners,
+)
 from conversion.layout import Layout
-from conversion.photos import check_photos, find_masks, prepare_photos
+from conversion.photos import check_photos, extract_frames, find_masks, prepare_photos, sharpness
 from conversion.programs import refuse_while_working, run_programs
-from conversion.stages import Stage, StageRecord
-from conversion.steps import reconstruction_stages
-from conversion.video import extract_frames, sharpness
+from conversion.stages import Stage, StageRecord, reconstruction_stages
 from scene.dataset_readers import read_scene
 from utils.system_utils import UserError
 
@@ -168,108 +175,85 @@ def test_photos_that_share_nothing(tmp_path):
     assert not (tmp_path / "images").exists()
 
 
-def _photos_themselves(scene: Path) -> list[str]:
-    return [str(scene / "input")]
-
-
-def _photos_beside(scene: Path) -> list[str]:
+def _photos_beside(scene: Path) -> None:
     for path in sorted((scene / "input").iterdir()):
         path.rename(scene / path.name)
     (scene / "input").rmdir()
-    return [str(scene)]
 
 
-def _called_images(scene: Path) -> list[str]:
-    (scene / "input").rename(scene / "images")
-    return [str(scene)]
-
-
-def _empty(scene: Path) -> list[str]:
-    (scene / "input").rename(scene / "elsewhere")
-    return [str(scene)]
-
-
-def _few(scene: Path) -> list[str]:
+def _few(scene: Path) -> None:
     for path in sorted((scene / "input").iterdir())[1:]:
         path.unlink()
     (scene / "input" / "walk.mp4").touch()
-    return [str(scene)]
 
 
-def _phone(scene: Path) -> list[str]:
-    (scene / "input" / "IMG_1.HEIC").touch()
-    return [str(scene)]
-
-
-def _cut(scene: Path) -> list[str]:
+def _cut(scene: Path) -> None:
     path = scene / "input" / "photo_01.png"
     path.write_bytes(path.read_bytes()[:-40])
-    return [str(scene)]
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("words", "change", "said"),
     [
-        (_photos_themselves, r"room/input is the folder of the photos itself; pass its parent folder as -s: .*room$"),
-        (_photos_beside, r"no folder input in .*room, but 3 photos directly in it; make .*input, move them there"),
-        (_called_images, r"no folder input in .*room; rename its folder images to input"),
-        (_empty, r"no folder input in .*room; make it and put the photos there, or pass a video as --video"),
-        (_few, r"^1 photos .* in .*input; at least 3 are needed.*move walk.mp4 elsewhere and pass it as --video"),
-        (_phone, r"1 files in .* format that cannot be read, the first is IMG_1.HEIC; convert them to JPEG or PNG"),
-        (_cut, r"cannot read .*photo_01.png"),
-        (lambda scene: [str(scene / "nowhere")], r"no folder .*nowhere; make it, put the photos into a folder input"),
-        (lambda scene: [f"'{scene}'"], r"contains quotes: '.*room'; pass /.*room, quoted only once for the shell"),
-        (lambda scene: [str(scene), "of", "mine"], r"unexpected argument of; quote paths.*room of mine'"),
+        ("-s {}", _photos_beside, r"no folder input in .*room, but 3 photos directly in it; make .*input, move them"),
+        ("-s {}", lambda scene: (scene / "input").rename(scene / "images"), r"rename its folder images to input"),
+        ("-s {}", lambda scene: (scene / "input").rename(scene / "else"), r"make it and put the photos there, or pass"),
         (
-            lambda scene: [str(scene / "input" / "photo_00.png")],
-            r"photo_00.png is a file; pass the folder that contains",
+            "-s {}",
+            _few,
+            r"^1 photos .* in .*input; at least 3 are needed.*move walk.mp4 elsewhere and pass it as",
         ),
         (
-            lambda scene: [str(scene), "--camera", "PINHOLEY"],
-            r"--camera PINHOLEY is not a supported lens model.*OPENCV_FISHEYE",
+            "-s {}",
+            lambda scene: (scene / "input" / "1.HEIC").touch(),
+            r"1 files in .* cannot be read, .* is 1.HEIC",
         ),
-        (
-            lambda scene: [str(scene), "--camera", "EQUIRECTANGULAR"],
-            r"EQUIRECTANGULAR is not a supported lens model",
-        ),
-        (lambda scene: [str(scene), "--mask_path", "no"], r"no folder of masks 'no'; pass an existing folder"),
-        (lambda scene: [str(scene), "--mask_path", ""], r"no folder of masks ''; pass an existing folder"),
-        (lambda scene: [str(scene), "--mask_path", str(scene)], r"none of 3 photos has a mask .*photo_00.png.png"),
-        (lambda scene: [str(scene), "--max_num_features", "0"], r"--max_num_features must be at least 100, got 0"),
-        (lambda scene: [str(scene), "--skip_matching"], r"--skip_matching needs a COLMAP model in .*distorted/sparse"),
-        (lambda scene: [str(scene), "--video", "walk.mp4"], r"no video walk.mp4; pass an existing file"),
-        (lambda scene: [str(scene), "--video", __file__], r"input already has files, and the frames would be mixed"),
-        (lambda scene: [str(scene), "--colmap_executable", "/no/colmap"], r"cannot run --colmap_executable /no/colmap"),
+        ("-s {}", _cut, r"cannot read .*photo_01.png"),
+        ("-s {}/input", None, r"room/input is the folder of the photos itself; pass its parent folder as -s: .*room$"),
+        ("-s {}/nowhere", None, r"no folder .*nowhere; make it, put the photos into a folder input"),
+        ("-s '{}'", None, r"contains quotes: '.*room'; pass /.*room, quoted only once for the shell"),
+        ("-s {} of mine", None, r"unexpected argument of; quote paths.*room of mine'"),
+        ("-s {}/input/photo_00.png", None, r"photo_00.png is a file; pass the folder that contains"),
+        ("-s {} --camera PINHOLEY", None, r"--camera PINHOLEY is not a supported lens model.*OPENCV_FISHEYE"),
+        ("-s {} --camera EQUIRECTANGULAR", None, r"EQUIRECTANGULAR is not a supported lens model"),
+        ("-s {} --mask_path no", None, r"no folder of masks 'no'; pass an existing folder"),
+        ("-s {} --mask_path=", None, r"no folder of masks ''; pass an existing folder"),
+        ("-s {} --mask_path {}", None, r"none of 3 photos has a mask .*photo_00.png.png"),
+        ("-s {} --max_num_features 0", None, r"--max_num_features must be at least 100, got 0"),
+        ("-s {} --skip_matching", None, r"--skip_matching needs a COLMAP model in .*distorted/sparse"),
+        ("-s {} --video walk.mp4", None, r"no video walk.mp4; pass an existing file"),
+        (f"-s {{}} --video {__file__}", None, r"input already has files, and the frames would be mixed"),
+        ("-s {} --colmap_executable /no/colmap", None, r"cannot run --colmap_executable /no/colmap"),
     ],
 )
-def test_slips_get_one_sentence(tmp_path, change, said):
+def test_slips_get_one_sentence(tmp_path, words, change, said):
     scene = tmp_path / "room"
     (scene / "input").mkdir(parents=True)
     for number in range(3):
         Image.new("RGB", (40, 30)).save(scene / "input" / f"photo_{number:02d}.png")
+    if change:
+        change(scene)
     with pytest.raises(UserError, match=said) as error:
-        convert.main(["-s", *change(scene)])
+        convert.main([word.replace("{}", str(scene)) for word in words.split()])
     assert "\n" not in str(error.value)
     assert not (scene / "sparse").exists()
-
-
-def _stages(done: list[str], fail: str = "", **made_from: int) -> list[Stage]:
-    def work(name: str) -> None:
-        done.append(name)
-        if name == fail:
-            raise KeyboardInterrupt
-
-    return [
-        Stage(name, value, lambda name=name: done.append(f"-{name}"), lambda name=name: work(name), name == "b")
-        for name, value in made_from.items()
-    ]
 
 
 def test_stages_are_redone_from_the_first_that_changed(tmp_path):
     def run(fail: str = "", **made_from: int) -> list[str]:
         done: list[str] = []
+
+        def work(name: str) -> None:
+            done.append(name)
+            if name == fail:
+                raise KeyboardInterrupt
+
+        stages = [
+            Stage(name, value, partial(done.append, f"-{name}"), partial(work, name), resumable=name == "b")
+            for name, value in made_from.items()
+        ]
         try:
-            kept = StageRecord(tmp_path / "stages.json").run(_stages(done, fail, **made_from))
+            kept = StageRecord(tmp_path / "stages.json").run(stages)
             return [*(f"={name}" for name in kept), *done]
         except KeyboardInterrupt:
             return [*done, "stopped"]
@@ -288,16 +272,16 @@ def test_stages_are_redone_from_the_first_that_changed(tmp_path):
 
 def test_a_finished_scene_stays_until_the_next_one_is_there(copy, monkeypatch):
     def scene() -> dict:
-        return {
-            name: state
-            for name, state in folder_state(copy).items()
-            if Path(name).parts[0] not in ("input", "distorted")
-        }
+        own = ("input", "distorted")
+        return {name: state for name, state in folder_state(copy).items() if Path(name).parts[0] not in own}
 
     def refused(said: str, *options: str) -> None:
         with pytest.raises(UserError, match=said):
             convert.main(["-s", str(copy), "--no_gpu", *options])
         assert scene() == before
+
+    def fail(*_: object) -> None:
+        raise UserError("no model")
 
     before, work = scene(), folder_state(copy / "distorted")
     assert {"images", "images_2", "sparse"} <= {Path(name).parts[0] for name in before}
@@ -310,17 +294,12 @@ def test_a_finished_scene_stays_until_the_next_one_is_there(copy, monkeypatch):
     (copy / "masks").rmdir()
     assert folder_state(copy / "distorted") == work
     # A later failure keeps the scene too, and the record still knows that convert.py made it.
-
-    def fail(*_: object) -> None:
-        raise UserError("no model")
-
     for owner, name in ((Pycolmap, "mapping"), (report, "refuse_nothing")):
         with monkeypatch.context() as patch:
             patch.setattr(owner, name, fail)
             refused("no model", "--mapper", "global")
     convert.main(["-s", str(copy), "--no_gpu"])
-    after = scene()
-    assert after and not any(Path(name).parts[0].startswith("images_") for name in after)
+    assert scene() and not list(copy.glob("images_*"))
 
 
 def test_looks_into_the_database(copy):
@@ -353,50 +332,46 @@ def test_ctrl_c_ends_the_program_that_works(tmp_path):
         os.kill(int(told.read_text()), 0)
 
 
-def _killed_while(tmp_path: Path, command: list[str]) -> None:
-    """Call run_programs with this command in a process that is killed once the command has written to the log."""
+def _killed_while(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, script: str, *words: str) -> Path:
+    """Call run_programs with a script in a process that is killed once the script has written to the log; the log."""
     code = (
         "import sys; from pathlib import Path; from conversion.programs import run_programs; "
         "run_programs([sys.argv[2:]], Path(sys.argv[1]), 'Waiting', 1, lambda: 0)"
     )
-    log = tmp_path / "log"
-    caller = subprocess.Popen([sys.executable, "-c", code, str(log), *command], cwd=ROOT, stderr=subprocess.DEVNULL)
+    log, python = tmp_path / "log", [sys.executable, "-c"]
+    command = [*python, code, str(log), *python, script, *words]
+    caller = subprocess.Popen(command, cwd=ROOT, stderr=subprocess.DEVNULL)
     wait_for(lambda: log.is_file() and log.read_text().endswith("\n"))
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(programs, "_ORPHAN_PATIENCE", 0.0)
-        with pytest.raises(
-            UserError, match="another convert.py, or a program that a killed one had started, still wor"
-        ):
-            refuse_while_working(log)
+    monkeypatch.setattr(programs, "_ORPHAN_PATIENCE", 0.0)
+    with pytest.raises(UserError, match="another convert.py, or a program that a killed one had started, still works"):
+        refuse_while_working(log)
     caller.kill()
     caller.wait()
+    return log
 
 
 def test_a_killed_caller_leaves_no_worker(tmp_path, monkeypatch):
-    monkeypatch.setattr(programs, "_ORPHAN_PATIENCE", LIMIT)
     (tmp_path / "job.json").write_text('{"step": "wait"}')
-    code = (
+    script = (
         "import sys, time; sys.path.insert(0, 'conversion'); import worker; "
         "worker.STEPS['wait'] = lambda job: (print('at work', flush=True), time.sleep(600)); "
         "worker.main(sys.argv[1])"
     )
-    _killed_while(tmp_path, [sys.executable, "-c", code, str(tmp_path / "job.json")])
+    log = _killed_while(tmp_path, monkeypatch, script, str(tmp_path / "job.json"))
     # The lock tells whether the worker ended. Its process id does not, as there may be no process to reap it.
-    refuse_while_working(tmp_path / "log")
+    monkeypatch.setattr(programs, "_ORPHAN_PATIENCE", LIMIT)
+    refuse_while_working(log)
 
 
 def test_programs_that_outlive_a_killed_caller_are_waited_for(tmp_path, monkeypatch):
     script = "import os, time; print(os.getpid(), flush=True); time.sleep(600)"
-    _killed_while(tmp_path, [sys.executable, "-c", script])
-    log = tmp_path / "log"
-    pid = int(log.read_text())
-    monkeypatch.setattr(programs, "_ORPHAN_PATIENCE", 0.5)
+    log = _killed_while(tmp_path, monkeypatch, script)
     try:
         for run in (refuse_while_working, lambda log: run_programs([["true"]], log, "Next", 1, lambda: 0)):
             with pytest.raises(UserError, match="still works in .*; wait for it or end it"):
                 run(log)
     finally:
-        os.kill(pid, signal.SIGKILL)
+        os.kill(int(log.read_text()), signal.SIGKILL)
     monkeypatch.setattr(programs, "_ORPHAN_PATIENCE", LIMIT)
     refuse_while_working(log)
 
@@ -430,14 +405,9 @@ def test_gpu_options_have_the_names_of_the_colmap_that_is_there(tmp_path, prefix
     assert first[-2:] == second[-2:] == [f"--{prefix}Extraction.use_gpu", "0"]
     assert Path(second[second.index("--image_list_path") + 1]).read_text() == "c.png\nd.png\n"
     assert first[first.index("--ImageReader.mask_path") + 1] == str(layout.masks)
-    (match,) = program.matching(layout, SETTINGS)
-    assert match[1:] == [
-        "exhaustive_matcher",
-        "--database_path",
-        str(layout.database),
-        f"--{prefix}Matching.use_gpu",
-        "0",
-    ]
+    ((_, *match),) = program.matching(layout, SETTINGS)
+    database = ["--database_path", str(layout.database)]
+    assert match == ["exhaustive_matcher", *database, f"--{prefix}Matching.use_gpu", "0"]
     (mapper,) = program.mapping(layout, SETTINGS)
     assert mapper[1] == "mapper" and mapper[-2:] == ["--Mapper.ba_global_function_tolerance", "1e-06"]
 
@@ -508,35 +478,28 @@ def test_every_lens_model_but_the_spherical_one_can_be_asked_for():
     assert {*LENS_MODELS, "INVALID", "EQUIRECTANGULAR"} == set(pycolmap.CameraModelId.__members__)
 
 
-def test_masks_of_another_size(tmp_path):
-    layout = Layout(tmp_path / "scene")
-    layout.input.mkdir(parents=True)
-    Image.new("RGB", (40, 30)).save(layout.input / "a.png")
-    (tmp_path / "masks").mkdir()
-    Image.new("L", (30, 40)).save(tmp_path / "masks" / "a.png")
-    assert find_masks(["a.png", "b.png"], tmp_path / "masks") == {"a.png": tmp_path / "masks" / "a.png"}
-    with pytest.raises(UserError, match="mask .*a.png has 30 x 40 pixels, but its photo a.png has 40 x 30"):
-        check_photos(layout, ["a.png"], tmp_path / "masks")
+@pytest.mark.parametrize("mask", ["a.jpg.png", "a.jpg", "a.png"])
+def test_masks_have_the_names_of_their_photos(tmp_path, mask):
+    (tmp_path / mask).touch()
+    assert find_masks(["a.jpg", "b.jpg"], tmp_path) == {"a.jpg": tmp_path / mask}
 
 
 def test_photos_and_masks_that_can_not_be_used_are_named_at_once(tmp_path):
     layout, names = Layout(tmp_path / "scene"), [f"{letter}.jpg" for letter in "abcde"]
+    masks, exif = tmp_path / "masks", Image.Exif()
     layout.input.mkdir(parents=True)
-    (tmp_path / "masks").mkdir()
+    masks.mkdir()
+    exif[0x0112] = 6
     for name in names:
-        exif = Image.Exif()
-        exif[0x0112] = 6
         Image.new("RGB", (40, 30)).save(layout.input / name, exif=exif)
-        Image.new("L", (30, 40)).save(tmp_path / "masks" / f"{name}.png")
-    check_photos(layout, names, tmp_path / "masks")
-    whole = (layout.input / "b.jpg").read_bytes()
-    (layout.input / "b.jpg").write_bytes(whole[:-60])
+        Image.new("L", (30, 40)).save(masks / f"{name}.png")
+    check_photos(layout, names, masks)
+    (layout.input / "b.jpg").write_bytes((layout.input / "b.jpg").read_bytes()[:-60])
     (layout.input / "c.jpg").write_bytes(b"<html>")
-    Image.new("L", (40, 30)).save(tmp_path / "masks" / "e.jpg.png")
-    with pytest.raises(
-        UserError, match="^3 of 5 photos cannot be used: .*b.jpg.*c.jpg.*mask .*e.jpg.png has 40"
-    ) as error:
-        check_photos(layout, names, tmp_path / "masks")
+    Image.new("L", (40, 30)).save(masks / "e.jpg.png")
+    said = "^3 of 5 photos cannot be used: .*b.jpg.*c.jpg.*mask .*e.jpg.png has 40 x 30 pixels, but its photo e.jpg has"
+    with pytest.raises(UserError, match=said) as error:
+        check_photos(layout, names, masks)
     assert "\n" not in str(error.value) and "a.jpg" not in str(error.value) and "d.jpg" not in str(error.value)
 
 
@@ -550,7 +513,7 @@ def _model(registered: int, points: int = 5000, track: float = 5.0, error: float
         ([_model(40)], []),
         (
             [_model(38)],
-            [r"2 of 40 photos were left out \(038, 039\), and 1 of them match no other photo; .*--matcher exhaustive"],
+            [r"2 of 40 photos were left out \(038, 039\), and 1 of them match no .*--matcher exhaustive"],
         ),
         (
             [_model(25), _model(15, first=25)],
@@ -559,7 +522,7 @@ def _model(registered: int, points: int = 5000, track: float = 5.0, error: float
         ([_model(40), _model(12)], []),
         (
             [_model(40, points=900)],
-            ["only 900 points; .*needs 1000; use larger or more photos, or --max_num_features 16384$"],
+            ["only 900 points; .*1000; use larger .* photos, or --max_num_features 16384$"],
         ),
         ([_model(40, track=2.4)], ["in 2.4 photos on average, so the photos overlap little"]),
         ([_model(40, error=2.0)], ["mean reprojection error is 2.0 pixels"]),
@@ -567,11 +530,10 @@ def _model(registered: int, points: int = 5000, track: float = 5.0, error: float
 )
 def test_advice(models, said):
     photos = [f"{i:03d}" for i in range(40)]
-    matches = dict.fromkeys(photos[:39], 3)
-    lines = report.advice(models, photos, matches, "sequential", 8192)
+    lines = report.advice(models, photos, dict.fromkeys(photos[:39], 3), "sequential", 8192)
     assert len(lines) == len(said)
-    for line, wanted in zip(lines, said, strict=True):
-        assert re.search(wanted, line), line
+    for line, expected in zip(lines, said, strict=True):
+        assert re.search(expected, line), line
 
 
 class _Decoder(SimpleNamespace):
@@ -599,14 +561,6 @@ def test_the_sharpest_frame_of_each_span_is_taken(tmp_path, monkeypatch):
         assert sharpness(np.asarray(Image.open(path))) == pytest.approx(sharpness(noise), rel=0.1)
     extract_frames(Path("any.mp4"), tmp_path / "..", 100)
     assert len(list(tmp_path.parent.glob("frame_*.jpg"))) == 9
-
-
-def test_a_video_without_decoder(tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
-    video = tmp_path / "walk.mp4"
-    video.touch()
-    with pytest.raises(UserError, match="--video needs the package imageio-ffmpeg; `pip install imageio-ffmpeg`"):
-        convert.main(["-s", str(tmp_path), "--video", str(video)])
 
 
 def test_a_video_makes_its_scene_folder(tmp_path, monkeypatch):

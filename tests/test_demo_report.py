@@ -1,6 +1,7 @@
 """The demo's report: its table and sheet, and a message for every missing or damaged part of a model."""
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -33,12 +34,9 @@ def model(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def run(model, monkeypatch):
-    def command() -> None:
-        monkeypatch.setattr("sys.argv", ["report", str(model)])
-        report.main()
-
-    return command
+def run(model, monkeypatch) -> Callable[[], None]:
+    monkeypatch.setattr("sys.argv", ["report", str(model)])
+    return report.main
 
 
 @pytest.mark.filterwarnings("error::ResourceWarning")

@@ -12,17 +12,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from small_splats import splats
-from test_exports import PACKAGES
+from small_splats import splats, written
 from test_exports_extremes import cube, moved
 
 from benchmarks.exports.read_back import read_back, read_by_splat_transform
 from benchmarks.exports.sizes import decibels, renders
 from benchmarks.workloads.orbit import orbit
-from exports.formats import format_of
-from exports.half_turn import half_turned
-from exports.selection import with_sh_degree
-from exports.splats import Splats
+from exports.splats import Splats, half_turned, with_sh_degree
 
 FOREIGN = Path(__file__).parent / "foreign"
 FLOAT, COMPRESSED = 60, 35  # dB that a format keeps at least
@@ -46,14 +42,6 @@ def _scene(degree: int, antialiasing: bool = False) -> Splats:
     return some
 
 
-def _written(folder: Path, ending: str, some: Splats) -> Path:
-    if ending in PACKAGES:
-        pytest.importorskip(PACKAGES[ending], reason="the extra [export] is not installed")
-    path = folder / f"model{ending}"
-    format_of(path).write(path, some)
-    return path
-
-
 def _loss(some: Splats, read: Splats) -> float:
     """PSNR of the renders from 5 views, of which none may be empty."""
     cameras = orbit(some.means, 5, 64)
@@ -66,7 +54,7 @@ def _loss(some: Splats, read: Splats) -> float:
 @pytest.mark.parametrize("ending", [".ply", ".compressed.ply", ".splat", ".spz", ".sog"])
 def test_splat_transform_reads_what_we_wrote(tmp_path, ending, degree):
     some = _scene(degree, antialiasing=degree == 2)
-    path = _written(tmp_path, ending, some)
+    path = written(tmp_path, ending, some)
     read = read_by_splat_transform(path)
     if ending == ".spz":
         read = half_turned(read)  # this program does not convert between the axes of SPZ and PLY
@@ -84,16 +72,16 @@ def test_splat_transform_reads_what_we_wrote(tmp_path, ending, degree):
 def test_a_sog_file_has_the_same_bytes_each_time(tmp_path, monkeypatch):
     """Although the program starts from random clusters and writes the time."""
     some = splats(COUNT + 88, 3)  # clusters shared by chance
-    first = _written(tmp_path, ".sog", some).read_bytes()
+    first = written(tmp_path, ".sog", some).read_bytes()
     time.sleep(2)  # the resolution of a date in a ZIP file
     monkeypatch.setenv("NODE_OPTIONS", "--no-warnings")  # options of the user's stay
-    assert _written(tmp_path, ".sog", some).read_bytes() == first
+    assert written(tmp_path, ".sog", some).read_bytes() == first
 
 
 @pytest.mark.parametrize("degree", [0, 1, 3])
 def test_adobes_spz_reads_what_we_wrote(tmp_path, degree):
     some = _scene(degree, antialiasing=True)
-    path = _written(tmp_path, ".spz", some)
+    path = written(tmp_path, ".spz", some)
     target = tmp_path / "read.json"
     subprocess.run(["node", FOREIGN / "read_spz.mjs", path, target], check=True, capture_output=True)
     read = json.loads(target.read_text())
@@ -119,7 +107,7 @@ def test_adobes_spz_reads_what_we_wrote(tmp_path, degree):
 )
 def test_we_read_what_splat_transform_writes(tmp_path, ending, options):
     some = _scene(2, antialiasing=True)
-    plain, packed = _written(tmp_path, ".ply", some), tmp_path / f"theirs{ending}"
+    plain, packed = written(tmp_path, ".ply", some), tmp_path / f"theirs{ending}"
     subprocess.run(["splat-transform", "--quiet", *options, plain, packed], check=True, capture_output=True)
     read = read_back(packed)
     assert read.antialiasing and read.sh_degree == 2
@@ -129,20 +117,20 @@ def test_we_read_what_splat_transform_writes(tmp_path, ending, options):
 @pytest.mark.parametrize("ending", [".compressed.ply", ".spz"])
 def test_splat_transform_finds_the_others_of_a_far_gaussian_where_they_are(tmp_path, ending):
     some = cube(1e6)
-    read = read_by_splat_transform(_written(tmp_path, ending, some))
+    read = read_by_splat_transform(written(tmp_path, ending, some))
     assert moved(some, half_turned(read) if ending == ".spz" else read).max() < 0.002
 
 
 @pytest.mark.parametrize("ending", [".glb", ".usdz"])
 def test_float_formats_lose_nothing(tmp_path, ending):
     some = _scene(3)
-    assert _loss(some, read_back(_written(tmp_path, ending, some))) >= FLOAT
+    assert _loss(some, read_back(written(tmp_path, ending, some))) >= FLOAT
 
 
 @pytest.mark.parametrize("count", [0, 1, 50])
 def test_khronos_validator_accepts_glb(tmp_path, count):
     """The validator knows no attributes of the extension, and names each an invalid one; nothing else may be wrong."""
-    path = _written(tmp_path, ".glb", splats(count, 1))
+    path = written(tmp_path, ".glb", splats(count, 1))
     done = subprocess.run(["node", FOREIGN / "check_gltf.mjs", path], check=True, capture_output=True, text=True)
     report = json.loads(done.stdout)
     of_extension = "/meshes/0/primitives/0/attributes/KHR_gaussian_splatting:"

@@ -3,7 +3,6 @@
 import argparse
 import math
 import types
-from collections.abc import Callable
 
 import pytest
 import torch
@@ -20,6 +19,7 @@ from utils.system_utils import UserError
 WIDTH, HEIGHT = 41, 27
 BLACK = torch.zeros(3)
 CLOSE = {"rtol": 0, "atol": 5e-6}  # activations in the kernels and in PyTorch are rounded differently
+UPRIGHT = torch.tensor([[1.0, 0, 0, 0]]).repeat(40, 1)
 OLD = argparse.Namespace(convert_SHs_python=False, compute_cov3D_python=False, debug=False)  # the 2023 release's
 
 
@@ -68,22 +68,18 @@ def test_points_on_the_screen_have_gradients_while_anything_trains():
 # Models
 
 
-class Foreign:
+def _foreign(gaussians: GaussianModel, degree: int) -> object:
     """Another project's model, with what the reference's renderer reads."""
-
-    active_sh_degree = 3
-
-    def __init__(self, gaussians: GaussianModel) -> None:
-        self._of = gaussians
-
-    get_xyz = property(lambda self: self._of._xyz)
-    get_features = property(lambda self: torch.cat((self._of._features_dc, self._of._features_rest), dim=1))
-    get_opacity = property(lambda self: torch.sigmoid(self._of._opacity))
-    get_scaling = property(lambda self: torch.exp(self._of._scaling))
-    get_rotation = property(lambda self: nn.functional.normalize(self._of._rotation))
-
-    def get_covariance(self, scaling_modifier: float = 1) -> Tensor:
-        return self._of.get_covariance(scaling_modifier)
+    of = {
+        "get_xyz": lambda _: gaussians._xyz,
+        "get_features": lambda _: torch.cat((gaussians._features_dc, gaussians._features_rest), dim=1),
+        "get_opacity": lambda _: torch.sigmoid(gaussians._opacity),
+        "get_scaling": lambda _: torch.exp(gaussians._scaling),
+        "get_rotation": lambda _: nn.functional.normalize(gaussians._rotation),
+    }
+    methods = {"get_covariance": lambda _, scaling_modifier=1: gaussians.get_covariance(scaling_modifier)}
+    properties = {name: property(getter) for name, getter in of.items()}
+    return type("Foreign", (), {"active_sh_degree": degree, **properties, **methods})()
 
 
 @pytest.mark.parametrize("degree", [0, 1, 3])
@@ -91,17 +87,15 @@ class Foreign:
 def test_any_class_with_the_getters_is_rendered(degree, in_python):
     ours = model(40)
     ours.active_sh_degree = degree
-    foreign = Foreign(ours)
-    foreign.active_sh_degree = degree
     weights = torch.randn(3, HEIGHT, WIDTH, generator=torch.Generator().manual_seed(0))
-    gradients = []
     pipe = argparse.Namespace(convert_SHs_python=in_python, compute_cov3D_python=in_python, debug=False)
-    images = [_image(pc, pipe=pipe, scaling_modifier=0.8, separate_sh=False) for pc in (ours, foreign)]
-    torch.testing.assert_close(*images, **CLOSE)
-    for image in images:
-        (image * weights).sum().backward()
+    images, gradients = [], []
+    for pc in (ours, _foreign(ours, degree)):
+        images.append(_image(pc, pipe=pipe, scaling_modifier=0.8, separate_sh=False))
+        (images[-1] * weights).sum().backward()
         gradients.append({name: getattr(ours, field).grad for name, field in GROUPS.items()})
         ours.optimizer.zero_grad(set_to_none=True)
+    torch.testing.assert_close(*images, **CLOSE)
     for name, gradient in gradients[1].items():
         if gradients[0][name] is not None:
             assert (gradients[0][name] - gradient).abs().max() <= 1e-5 * gradient.abs().max(), name
@@ -117,81 +111,51 @@ class Wrapped:
         return getattr(self._of, name)
 
 
-def test_a_wrapper_is_rendered_by_its_own_getters():
-    class Tiny(Wrapped):
-        get_scaling = property(lambda self: torch.full_like(self._scaling, 0.05))
-
-    class Black(Wrapped):
-        get_features = property(lambda self: torch.zeros(len(self._xyz), 16, 3))
-
-    gaussians, tiny, black = model(40), model(40), model(40)
-    with torch.no_grad():
-        tiny._scaling.fill_(math.log(0.05))
-        black._features_dc.zero_()
-        black._features_rest.zero_()
-    for wrapper, wanted in ((Wrapped, gaussians), (Tiny, tiny), (Black, black)):
-        torch.testing.assert_close(_image(wrapper(gaussians)), _image(wanted), **CLOSE)
-
-
-class Opaque(GaussianModel):
-    get_opacity = property(lambda self: torch.ones_like(self._opacity))
-
-
-class Round(GaussianModel):
-    get_scaling = property(lambda self: torch.full_like(self._scaling, 0.05))
-
-
-class Upright(GaussianModel):
-    get_rotation = property(lambda self: torch.tensor([1.0, 0, 0, 0]).expand(len(self), 4).contiguous())
-
-
-class Grey(GaussianModel):
-    get_features = property(lambda self: torch.zeros(len(self), 16, 3))
-
-
 def _own_activations(gaussians: GaussianModel) -> None:
     gaussians.scaling_activation = nn.functional.softplus
     gaussians.scaling_inverse_activation = lambda x: x + torch.log(-torch.expm1(-x))
 
 
-CHANGES = {
-    "opacity": (Opaque, lambda rows: rows | {"opacity": torch.full_like(rows["opacity"], 30.0)}),
-    "scales": (Round, lambda rows: rows | {"scaling": torch.full_like(rows["scaling"], math.log(0.05))}),
-    "rotations": (Upright, lambda rows: rows | {"rotation": torch.tensor([[1.0, 0, 0, 0]]).expand(40, 4).clone()}),
-    "features": (Grey, lambda rows: rows | {"f_dc": rows["f_dc"] * 0, "f_rest": rows["f_rest"] * 0}),
+CHANGES = {  # a getter that is overridden, and the columns of a model that looks the same
+    "get_opacity": (lambda self: torch.ones(40, 1), {"opacity": torch.full((40, 1), 30.0)}),
+    "get_scaling": (lambda self: torch.full((40, 3), 0.05), {"scaling": torch.full((40, 3), math.log(0.05))}),
+    "get_rotation": (lambda self: UPRIGHT.clone(), {"rotation": UPRIGHT}),
+    "get_features": (
+        lambda self: torch.zeros(40, 16, 3),
+        {"f_dc": torch.zeros(40, 1, 3), "f_rest": torch.zeros(40, 15, 3)},
+    ),
 }
 
 
+@pytest.mark.parametrize("wrapped", [False, True])
 @pytest.mark.parametrize("name", CHANGES)
-def test_overridden_getters_are_what_is_rendered(name):
-    kind, change = CHANGES[name]
-    gaussians, wanted = model(40), model(40)
-    plain = _image(wanted)
-    wanted.set_rows(change(parameters(wanted)))
-    gaussians.__class__ = kind
+def test_overridden_getters_are_what_is_rendered(name, wrapped):
+    getter, columns = CHANGES[name]
+    gaussians, expected = model(40), model(40)
+    plain = _image(expected)
+    expected.set_rows(parameters(expected) | columns)
+    client = type("Client", (Wrapped if wrapped else GaussianModel,), {name: property(getter)})
+    if wrapped:
+        torch.testing.assert_close(_image(Wrapped(gaussians)), plain, **CLOSE)
+        gaussians = client(gaussians)
+    else:
+        gaussians.__class__ = client
     image = _image(gaussians)
-    torch.testing.assert_close(image, _image(wanted), **CLOSE)
+    torch.testing.assert_close(image, _image(expected), **CLOSE)
     assert (image - plain).abs().max() > 0.01
 
 
-def test_getters_of_single_bands_count_where_the_reference_reads_them():
-    class Tinted(GaussianModel):
-        get_features_dc = property(lambda self: torch.ones_like(self._features_dc))
-
+def test_a_getter_replaced_in_the_class_is_seen_at_once(monkeypatch):
+    """Those of single bands count where the reference reads them."""
     gaussians = model(40)
     plain = _image(gaussians)
-    gaussians.__class__ = Tinted
+    with monkeypatch.context() as patch:
+        patch.setattr(GaussianModel, "get_opacity", property(lambda self: 0.5 * torch.sigmoid(self._opacity)))
+        assert (_image(gaussians) - plain).abs().max() > 0.01
+    assert torch.equal(_image(gaussians), plain)
+    monkeypatch.setattr(GaussianModel, "get_features_dc", property(lambda self: torch.ones_like(self._features_dc)))
     assert torch.equal(_image(gaussians), plain)
     assert not torch.equal(_image(gaussians, separate_sh=True), plain)
-
-
-def test_a_getter_replaced_in_the_class_is_seen_at_once(monkeypatch):
-    gaussians = model(40)
-    plain = _image(gaussians)
-    monkeypatch.setattr(GaussianModel, "get_opacity", property(lambda self: 0.5 * torch.sigmoid(self._opacity)))
-    assert (_image(gaussians) - plain).abs().max() > 0.01
-    monkeypatch.undo()
-    assert torch.equal(_image(gaussians), plain)
 
 
 def test_replaced_activations_are_what_is_rendered():
@@ -231,42 +195,31 @@ def test_density_control_follows_replaced_activations():
 
 
 def test_activations_have_the_references_names_and_forms():
-    gaussians = model(10)
-    x = torch.tensor([[0.3, 0.6]])
+    gaussians, x = model(10), torch.tensor([[0.3, 0.6]])
     assert gaussians.scaling_activation is torch.exp and gaussians.scaling_inverse_activation is torch.log
     assert gaussians.opacity_activation is torch.sigmoid and gaussians.inverse_opacity_activation is inverse_sigmoid
-    torch.testing.assert_close(gaussians.inverse_opacity_activation(gaussians.opacity_activation(x)), x)
     assert torch.equal(gaussians.rotation_activation(x), nn.functional.normalize(x))
     packed = gaussians.covariance_activation(gaussians.get_scaling, 1.5, gaussians._rotation)
     assert torch.equal(packed, gaussians.get_covariance(1.5)) and packed.shape == (10, 6)
-
-    class Client(GaussianModel):
-        def setup_functions(self) -> None:
-            super().setup_functions()
-            self.opacity_activation = torch.relu
-
-    client = Client(1)
-    client.create_from_pcd(cloud(5), 1.0)
-    assert torch.equal(client.get_opacity, torch.relu(client._opacity)) and client.kernels_activate is False
+    gaussians.opacity_activation = torch.relu
+    assert torch.equal(gaussians.get_opacity, torch.relu(gaussians._opacity)) and not gaussians.kernels_activate
 
 
 def test_statistics_are_plain_attributes():
-    class Bare(GaussianModel):
-        def __init__(self) -> None:
-            self.max_radii2D = torch.empty(0)
-            self.xyz_gradient_accum = torch.empty(0)
-            self.denom = torch.empty(0)
-            self.exposure_mapping = {"a": 0}
-            self.tmp_radii = None
-
-    bare = Bare()
-    assert bare.statistics.denom is bare.denom and bare.exposure_mapping == {"a": 0}
     gaussians = model(10)
     gaussians.denom = torch.full((10, 1), 3.0)
     assert gaussians.statistics.denom is gaussians.denom and "denom" in vars(gaussians)
     del gaussians.xyz_gradient_accum
     gaussians.prune_points(torch.arange(10) < 4)
     assert len(gaussians) == len(gaussians.denom) == 6 and not hasattr(gaussians, "xyz_gradient_accum")
+
+    class Bare(GaussianModel):
+        def __init__(self) -> None:
+            self.max_radii2D = self.xyz_gradient_accum = self.denom = torch.empty(0)
+            self.exposure_mapping, self.tmp_radii = {"a": 0}, None
+
+    bare = Bare()
+    assert bare.statistics.denom is bare.denom and bare.exposure_mapping == {"a": 0}
 
 
 # Loops
@@ -314,28 +267,15 @@ def test_a_loop_as_the_reference_writes_it(kind, tmp_path):
     save_checkpoint(tmp_path / "chkpnt30.pth", gaussians.capture(), 30)
 
 
-def _raise_by_hand(gaussians: GaussianModel) -> None:
-    gaussians.oneupSHdegree()
-    gaussians.active_sh_degree = 3
-
-
-def _restore_and_raise(gaussians: GaussianModel) -> None:
-    gaussians.oneupSHdegree()
-    gaussians.restore(gaussians.capture(), options())
-    gaussians.active_sh_degree = 3
-
-
-def _raise_and_lower(gaussians: GaussianModel) -> None:
-    gaussians.oneupSHdegree()
-    gaussians.active_sh_degree = 0
-
-
-@pytest.mark.parametrize("change", [_raise_by_hand, _restore_and_raise, _raise_and_lower, GaussianModel.oneupSHdegree])
+@pytest.mark.parametrize(("restored", "degree"), [(False, 3), (True, 3), (False, 0), (False, 1)])
 @pytest.mark.parametrize("kind", ["default", "sparse_adam"])
-def test_every_band_with_a_gradient_trains(kind, change):
+def test_every_band_with_a_gradient_trains(kind, restored, degree):
     """Whatever set the degree, and whatever reads the coefficients, such as a regulariser."""
     gaussians = model(20, active=False, optimizer_type=kind)
-    change(gaussians)
+    gaussians.oneupSHdegree()
+    if restored:
+        gaussians.restore(gaussians.capture(), options())
+    gaussians.active_sh_degree = degree
     before = parameters(gaussians)["f_rest"]
     for _ in range(2):
         gaussians._features_rest.square().sum().backward()
@@ -364,50 +304,36 @@ def test_options_of_the_2023_release_are_enough():
     assert keyword.spatial_lr_scale == 1.5
 
 
-def _fine_tuned(gaussians: GaussianModel) -> None:
+@pytest.mark.parametrize("change", ["slice", "transpose", "plain", "load"])
+def test_tensors_assigned_from_outside_train(change, tmp_path):
+    gaussians = model(20)
+    if change == "slice":
+        gaussians.max_sh_degree = gaussians.active_sh_degree = 2
+        gaussians._features_rest = gaussians._features_rest[:, :8]
+    elif change == "transpose":
+        gaussians._xyz = nn.Parameter(gaussians._xyz.detach().T.contiguous().T)
+    elif change == "plain":
+        gaussians._scaling = gaussians.scaling_inverse_activation(gaussians.get_scaling * 0.5)
+        gaussians._opacity = gaussians._opacity.detach() * 0.9
+    else:
+        gaussians.save_ply(tmp_path / "a.ply")
+        gaussians = GaussianModel(3)
+        gaussians.load_ply(tmp_path / "a.ply")
+        assert all(getattr(gaussians, field).is_contiguous() for field in GROUPS.values())
+        gaussians.spatial_lr_scale = 1.0
+    held = gaussians._xyz
     gaussians.training_setup(options())
     before = parameters(gaussians)
     _image(gaussians).sum().backward()
     gaussians.optimizer.step()
     for name, values in parameters(gaussians).items():
         assert not torch.equal(values, before[name]), name
-
-
-def _sliced(gaussians: GaussianModel) -> None:
-    gaussians.max_sh_degree = gaussians.active_sh_degree = 2
-    gaussians._features_rest = gaussians._features_rest[:, :8]
-
-
-def _transposed(gaussians: GaussianModel) -> None:
-    gaussians._xyz = nn.Parameter(gaussians._xyz.detach().T.contiguous().T)
-
-
-def _plain(gaussians: GaussianModel) -> None:
-    gaussians._scaling = gaussians.scaling_inverse_activation(gaussians.get_scaling * 0.5)
-    gaussians._opacity = gaussians._opacity.detach() * 0.9
-
-
-@pytest.mark.parametrize("change", [_sliced, _transposed, _plain])
-def test_tensors_assigned_from_outside_train(change: Callable, tmp_path):
-    gaussians = model(20)
-    change(gaussians)
-    held = gaussians._xyz
-    _fine_tuned(gaussians)
     assert gaussians._xyz is held  # parameters stay the same objects
     gaussians.prune_points(torch.arange(20) < 3)
     gaussians.save_ply(tmp_path / "a.ply")
     again = GaussianModel(gaussians.max_sh_degree)
     again.load_ply(tmp_path / "a.ply")
     assert torch.equal(again._features_rest, gaussians._features_rest)
-
-
-def test_a_loaded_ply_is_fine_tuned(tmp_path):
-    model(20).save_ply(tmp_path / "a.ply")
-    gaussians = GaussianModel(3)
-    gaussians.load_ply(tmp_path / "a.ply")
-    assert all(getattr(gaussians, field).is_contiguous() for field in GROUPS.values())
-    gaussians.spatial_lr_scale = 1.0
-    _fine_tuned(gaussians)
 
 
 def test_the_degree_follows_what_is_assigned(tmp_path):
@@ -480,16 +406,15 @@ def test_an_override_gets_as_many_arguments_as_there_are_values(radii):
 
 
 def test_without_a_seed_torchs_generator_decides():
-    def children() -> Tensor:
+    children = []
+    for seed in (5, None, 5):
+        if seed is not None:
+            torch.manual_seed(seed)
         gaussians = _ready()
         gaussians.densify_and_prune(0.5, 0.005, 20.0, None)
-        return gaussians.get_xyz.detach()
-
-    torch.manual_seed(5)
-    first, second = children(), children()
-    torch.manual_seed(5)
-    assert torch.equal(first, children())
-    assert first.shape == second.shape and not torch.equal(first, second)
+        children.append(gaussians.get_xyz.detach())
+    assert torch.equal(children[0], children[2]) and children[0].shape == children[1].shape
+    assert not torch.equal(children[0], children[1])
 
 
 def test_three_children_are_smaller_than_two():

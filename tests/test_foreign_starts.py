@@ -3,25 +3,24 @@
 import json
 import re
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from plyfile import PlyData, PlyElement
-from small_splats import splats
+from small_splats import splats, written
 
 import export
 import render
 import train
-from exports.formats import format_of
-from exports.of_model import model_of
-from exports.read import is_point_cloud, read_splats
-from exports.selection import with_sh_degree
+from exports.formats import format_of, is_point_cloud, read_splats
+from exports.in_scene import model_of, splats_of
 from gaussian_renderer.importance import blending_weights, most_important
 from moving_cameras.keyframes import CameraPath, Keyframe
 from scene.gaussian_model import GaussianModel
-from scene.gaussians.ply import read_ply
+from scene.gaussians.ply import read_ply, stored_sh_degree
 from scene.readers.point_cloud import read_point_cloud
 from scene.saved_model import load_saved
 from utils.system_utils import UserError
@@ -79,31 +78,22 @@ def _export_options(*argv: object) -> tuple:
 def _train(scene: Path, out: Path, *argv: object) -> GaussianModel:
     train.main(["-s", str(scene), "-m", str(out), "--iterations", "1", "--no_curve", "--keep_unseen",
                 "--prune_sh", "-1", *map(str, argv)])  # fmt: skip
-    gaussians = GaussianModel(3)
-    gaussians.load_ply(out / "point_cloud/iteration_1/point_cloud.ply")
+    path = out / "point_cloud/iteration_1/point_cloud.ply"
+    gaussians = GaussianModel(stored_sh_degree(path))
+    gaussians.load_ply(path)
     return gaussians
 
 
-@pytest.mark.parametrize("ending", [".ply", ".compressed.ply", ".splat", ".spz"])
-def test_training_starts_from_the_gaussians_of_a_file(tmp_path, colmap_scene, ending):
-    """The last iteration takes no step, so one iteration saves the start."""
-    if ending == ".spz":
-        pytest.importorskip("zstandard", reason="the extra [export] is not installed")
-    path = tmp_path / f"start{ending}"
-    format_of(path).write(path, splats(30, 2))
-    gaussians = _train(colmap_scene, tmp_path / "out", "--init_ply", path)
-    wanted = model_of(read_splats(path), 3)
-    for name in ("xyz", "f_dc", "f_rest", "opacity", "scaling", "rotation"):
-        torch.testing.assert_close(gaussians.raw(name), wanted.raw(name), rtol=0, atol=1e-6)
+@pytest.mark.parametrize(
+    ("ending", "degree"), [(".ply", 3), (".ply", 1), (".compressed.ply", 3), (".splat", 3), (".spz", 3)]
+)
+def test_training_starts_from_the_gaussians_of_a_file(tmp_path, colmap_scene, ending, degree):
+    """The last iteration takes no step, so one iteration saves the start; bands above the model's are left out."""
+    path = written(tmp_path, ending, splats(30, 2))
+    started = splats_of(_train(colmap_scene, tmp_path / "out", "--init_ply", path, "--sh_degree", degree))
+    for name, values in vars(splats_of(model_of(read_splats(path), degree))).items():
+        np.testing.assert_allclose(getattr(started, name), values, rtol=0, atol=1e-6)
     assert len(read_point_cloud(tmp_path / "out/input.ply").points) == 30
-
-
-def test_a_start_of_more_bands_than_the_model_loses_them(tmp_path, colmap_scene):
-    path = tmp_path / "start.ply"
-    format_of(path).write(path, splats(30, 3))
-    _train(colmap_scene, tmp_path / "out", "--init_ply", path, "--sh_degree", 1)
-    saved = read_splats(tmp_path / "out/point_cloud/iteration_1/point_cloud.ply")
-    np.testing.assert_allclose(saved.sh, with_sh_degree(splats(30, 3), 1).sh)
 
 
 def test_a_point_cloud_is_one_by_either_option(tmp_path, colmap_scene):
@@ -115,12 +105,12 @@ def test_a_point_cloud_is_one_by_either_option(tmp_path, colmap_scene):
 
 
 def test_a_start_relative_to_a_world_offset_is_moved_back(tmp_path, colmap_scene):
-    gaussians = model_of(splats(30, 0))
-    gaussians.world_offset = (1.0, -2.0, 3.0)
-    gaussians.save_ply(tmp_path / "start.ply")
-    started = _train(colmap_scene, tmp_path / "out", "--init_ply", tmp_path / "start.ply")
-    moved = gaussians.get_xyz + torch.tensor([1.0, -2.0, 3.0])
-    torch.testing.assert_close(started.get_xyz, moved, rtol=0, atol=1e-6)
+    path = written(tmp_path, ".ply", start := replace(splats(30, 0), world_offset=(1.0, -2.0, 3.0)))
+    started = _train(colmap_scene, tmp_path / "out", "--init_ply", path)
+    np.testing.assert_allclose(started.get_xyz.detach(), start.means + [1.0, -2.0, 3.0], rtol=0, atol=1e-6)
+    written(tmp_path, ".ply", replace(start, world_offset=(1e300, 0.0, 0.0)))
+    with pytest.raises(UserError, match=r"model.ply lies 1e\+300 from the origin of its world"):
+        _train(colmap_scene, tmp_path / "out", "--init_ply", path)
 
 
 def test_an_exported_model_keeps_its_world_offset(tmp_path, colmap_scene):
@@ -137,21 +127,10 @@ def test_an_exported_model_keeps_its_world_offset(tmp_path, colmap_scene):
         assert read_splats(tmp_path / "again.ply").world_offset == (1.0, -2.0, 3.0)
 
 
-def test_an_origin_too_far_is_told_of_by_the_name_of_the_file(tmp_path, colmap_scene):
-    gaussians = model_of(splats(30, 0))
-    gaussians.world_offset = (1e300, 0.0, 0.0)
-    gaussians.save_ply(tmp_path / "mine.ply")
-    with pytest.raises(UserError, match=r"mine.ply lies 1e\+300 from the origin of its world"):
-        _train(colmap_scene, tmp_path / "out", "--init_ply", tmp_path / "mine.ply")
-
-
-def test_two_starts_contradict_each_other(tmp_path):
-    for argv, said in (
-        (["--init_ply", "a.ply", "--init_pcd_path", "b.ply"], "--init_pcd_path b.ply and --init_ply a.ply both name"),
-        (["--init_ply", "a.ply", "--init_type", "random"], "--init_type random and --init_ply a.ply both name"),
-    ):
-        with pytest.raises(UserError, match=said):
-            train.parse(["-s", "x", *argv])
+@pytest.mark.parametrize("other", ["--init_pcd_path b.ply", "--init_type random"])
+def test_two_starts_contradict_each_other(other):
+    with pytest.raises(UserError, match=f"{other} and --init_ply a.ply both name"):
+        train.parse(["-s", "x", "--init_ply", "a.ply", *other.split()])
 
 
 def test_render_draws_a_file_in_the_views_of_a_scene(tmp_path, colmap_scene, monkeypatch):
@@ -195,33 +174,24 @@ def test_export_chooses_what_it_writes(tmp_path, colmap_scene, capsys):
 
 
 @pytest.mark.parametrize(
-    ("argv", "said"),
+    ("words", "said"),
     [
-        (["--ply", "a.ply", "-m", "out"], "both name the model to write"),
-        (["--ply", "a.ply", "--min_opacity", "2"], "--min_opacity must be from 0 to 1, got 2.0"),
-        (["--ply", "a.ply", "--max_splats", "-1"], "--max_splats must be 0"),
-        (["--ply", "a.ply", "--crop", "1", "0", "0", "0", "1", "1"], "--crop takes the smaller corner first"),
-        (["--ply", "a.ply", "--max_splats", "5"], "need training views"),
-        (["--ply", "absent.ply"], "no file absent.ply; give a model as PLY"),
-        ([], "no model folder given"),
-        (
-            ["--ply", "a.ply", "--to", "b.splat", "--path", "ellipse"],
-            "--path is the animation of a page; leave it out for .sp",
-        ),
-        (
-            ["--ply", "a.ply", "--to", "b.html", "--path", "elipse"],
-            "--path must be interpolate, ellipse, spiral or a file",
-        ),
-        (["--ply", "a.ply", "--to", "b.html"], "pages need training views, which a.ply has not"),
-        (
-            ["--ply", "a.ply", "--to", "b.obj"],
-            "the format of b.obj is unknown; end its name with one of .compressed.ply",
-        ),
+        ("--ply a.ply -m out", "both name the model to write"),
+        ("--ply a.ply --min_opacity 2", "--min_opacity must be from 0 to 1, got 2.0"),
+        ("--ply a.ply --max_splats -1", "--max_splats must be 0"),
+        ("--ply a.ply --crop 1 0 0 0 1 1", "--crop takes the smaller corner first"),
+        ("--ply a.ply --max_splats 5", "need training views"),
+        ("--ply absent.ply", "no file absent.ply; give a model as PLY"),
+        ("", "no model folder given"),
+        ("--ply a.ply --to b.splat --path ellipse", "--path is the animation of a page; leave it out for .sp"),
+        ("--ply a.ply --to b.html --path elipse", "--path must be interpolate, ellipse, spiral or a file"),
+        ("--ply a.ply --to b.html", "pages need training views, which a.ply has not"),
+        ("--ply a.ply --to b.obj", "the format of b.obj is unknown; end its name with one of .compressed.ply"),
     ],
 )
-def test_export_refuses(argv, said):
+def test_export_refuses(words, said):
     with pytest.raises(UserError, match=said):
-        export.export(*_export_options("--to", "b.ply", *argv))
+        export.export(*_export_options("--to", "b.ply", *words.split()))
 
 
 @pytest.mark.parametrize("name", ["interpolate", "tour.json"])

@@ -6,7 +6,7 @@ import torch
 from gaussians import model, parameters
 from plyfile import PlyData, PlyElement
 
-from exports.read import read_splats
+from exports.formats import read_splats
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.ply import stored_sh_degree
 from scene.readers.point_cloud import read_point_cloud

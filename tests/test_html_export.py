@@ -6,6 +6,7 @@ import hashlib
 import json
 import math
 import re
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 from types import SimpleNamespace
@@ -18,11 +19,10 @@ from html_scene import CENTRE, FOV, SIZE, UP, balls, cameras
 from scipy.spatial.transform import Rotation
 
 from exports import html, vendor
-from exports.compressed_ply import read_compressed_ply
 from exports.html import write_html, write_scene_html
-from exports.of_model import model_of
-from exports.upright import turn_upright, turned, up_of
-from exports.viewer_settings import BOOKMARKS, lean, settings
+from exports.in_scene import model_of
+from exports.ply import read_compressed_ply
+from exports.viewer_world import BOOKMARKS, lean, settings, turn_upright, turned, up_of
 from gaussian_renderer import render
 from gaussian_renderer.free_view import free_view
 from moving_cameras.generated import Ellipse
@@ -48,6 +48,7 @@ class Page(HTMLParser):
         super().__init__()
         self.tags: list[tuple[str, dict]] = []
         self.texts: dict[str, str] = {}
+        self.comments = ""
         self._open = ""
         self.feed(path.read_text(encoding="utf-8"))
 
@@ -57,6 +58,9 @@ class Page(HTMLParser):
 
     def handle_endtag(self, tag):
         self._open = ""
+
+    def handle_comment(self, data):
+        self.comments += data
 
     def handle_data(self, data):
         self.texts[self._open] = self.texts.get(self._open, "") + data
@@ -77,6 +81,10 @@ def rendered(splats, camera) -> np.ndarray:
         return render(camera, model_of(splats), pipeline(), torch.zeros(3))["render"].numpy()
 
 
+def _settings(path: Path) -> dict:
+    return json.loads(Page(path).texts["page"])["settings"]
+
+
 def test_vendored_files_are_those_of_the_record():
     record = json.loads(vendor.RECORD.read_text())
     files = {path.name: path.read_bytes() for path in vendor.FOLDER.iterdir() if path != vendor.RECORD}
@@ -88,15 +96,12 @@ def test_vendored_files_are_those_of_the_record():
 
 
 def test_vendor_writes_nothing_that_differs_from_the_record(tmp_path, monkeypatch):
-    package = tmp_path / "package"
-    package.mkdir()
-    (package / "LICENSE").write_text("other")
-    monkeypatch.setattr(vendor, "ROOT", tmp_path)
-    monkeypatch.setattr(vendor, "FOLDER", tmp_path / "viewer")
-    monkeypatch.setattr(vendor.shutil, "which", lambda _: "npm")
-    monkeypatch.setattr(vendor, "_unpacked", lambda *_: package)
-    monkeypatch.setattr(vendor, "_minifier", lambda *_: Path("esbuild"))
-    monkeypatch.setattr(vendor, "_output", lambda *_: b"code")
+    (tmp_path / "LICENSE").write_text("other")
+    replaced = {"ROOT": tmp_path, "FOLDER": tmp_path / "viewer", "_unpacked": lambda *_: tmp_path}
+    replaced |= {"_minifier": lambda *_: Path("esbuild"), "_output": lambda *_: b"code"}
+    for name, value in replaced.items():
+        monkeypatch.setattr(vendor, name, value)
+    monkeypatch.setattr("shutil.which", lambda _: "npm")
     digest = hashlib.sha256(b"other").hexdigest()
     with pytest.raises(UserError, match=f'the files differ from those of .*"LICENSE": "{digest}"'):
         vendor.main([])
@@ -126,12 +131,6 @@ def test_the_page_refers_to_nothing_outside(page):
     }  # fmt: skip
 
 
-def test_the_page_carries_the_viewers_licence(tmp_path):
-    path = tmp_path / "balls.html"
-    write_html(path, balls(each=2), cameras())
-    assert (vendor.FOLDER / "LICENSE").read_text() in path.read_text()
-
-
 @pytest.mark.parametrize("name", ["</script><script>alert(1)</script>", "<!--<script>", "a & b ' \" ü", "caf\udce9"])
 def test_names_stay_names(tmp_path, name):
     views = cameras()
@@ -145,11 +144,11 @@ def test_names_stay_names(tmp_path, name):
     assert page.texts["title"] == shown and content["settings"]["annotations"][0]["title"] == name
 
 
-def test_a_page_is_named_by_its_file_and_has_its_background(page):
-    assert page.texts["title"] == "balls"
+def test_a_page_has_the_name_of_its_file_its_background_and_the_viewers_licence(page):
     content = json.loads(page.texts["page"])
+    assert page.texts["title"] == "balls" and "rgb(255, 128, 0)" in page.texts["style"]
     assert content["settings"]["background"]["color"] == [1.0, 0.5, 0.0] and content["antialiasing"] is False
-    assert "rgb(255, 128, 0)" in page.texts["style"]
+    assert (vendor.FOLDER / "LICENSE").read_text() in page.comments
 
 
 def test_the_model_in_the_page_is_upright(page, tmp_path):
@@ -171,8 +170,7 @@ def test_a_turned_model_looks_the_same_from_a_turned_camera():
     other = free_view(*SIZE, math.radians(FOV), turn @ pose.positions[0], wxyz, "cpu")
     before, after = rendered(splats, camera), rendered(turned(splats, turn), other)
     assert before.max() > 0.5 and 10 * math.log10(1 / np.square(before - after).mean()) > 80
-    unturned = turned(splats, turn).sh * 0 + splats.sh
-    wrong = rendered(type(splats)(**{**vars(turned(splats, turn)), "sh": unturned}), other)
+    wrong = rendered(replace(turned(splats, turn), sh=splats.sh), other)
     assert 10 * math.log10(1 / np.square(before - wrong).mean()) < 40
 
 
@@ -190,7 +188,7 @@ def test_up_is_where_the_horizons_are_level():
 def test_the_turn_upright_is_a_rotation(up):
     turn = turn_upright(np.array(up, float))
     assert turn @ up == pytest.approx([0, -1, 0], abs=1e-9)
-    assert np.linalg.det(turn) == pytest.approx(1) and turn @ turn.T == pytest.approx(np.eye(3), abs=1e-9)
+    assert Rotation.from_matrix(turn).as_matrix() == pytest.approx(turn, abs=1e-9)
 
 
 def test_lean_completes_the_viewers_angles():
@@ -247,11 +245,9 @@ def test_the_animation_follows_the_camera_path():
 
 def test_cameras_that_look_past_each_other_have_targets_ahead():
     turns = np.stack([facing(np.array([math.sin(a), 0.0, math.cos(a)]), np.array([0.0, -1.0, 0.0])) for a in range(6)])
-    outwards = Poses(turns[:, :, 2] * 2, turns, np.full(6, 60.0))
-    content = settings(outwards, [""] * 6, np.eye(3), None, (0, 0, 0))
+    content = settings(Poses(turns[:, :, 2] * 2, turns, np.full(6, 60.0)), [""] * 6, np.eye(3), None, (0, 0, 0))
     for mark, turn in zip(content["annotations"], turns, strict=True):
-        pose = mark["camera"]["initial"]
-        towards = np.subtract(pose["target"], pose["position"])
+        towards = np.subtract(*(mark["camera"]["initial"][name] for name in ("target", "position")))
         assert towards / np.linalg.norm(towards) == pytest.approx(turn[:, 2] * [-1, -1, 1])
 
 
@@ -259,28 +255,27 @@ def test_a_lone_camera_turns_about_the_model(tmp_path):
     """Not about a point before its lens, from where a viewer's user gets nowhere."""
     splats, views = balls(each=50), cameras(1)
     write_html(tmp_path / "page.html", splats, views)
-    content = json.loads(Page(tmp_path / "page.html").texts["page"])["settings"]["cameras"][0]["initial"]
-    wanted = np.median(np.linalg.norm(splats.means - poses_of(views).positions[0], axis=1))
-    assert math.dist(content["position"], content["target"]) == pytest.approx(wanted)
+    camera = _settings(tmp_path / "page.html")["cameras"][0]["initial"]
+    distance = np.median(np.linalg.norm(splats.means - poses_of(views).positions[0], axis=1))
+    assert math.dist(camera["position"], camera["target"]) == pytest.approx(distance)
 
 
 def test_the_page_of_a_scene(tmp_path):
     scene = SimpleNamespace(getTrainCameras=cameras)
     write_scene_html(tmp_path / "scene.html", balls(each=2), scene, white_background=True, make_path=Ellipse)
-    content = json.loads(Page(tmp_path / "scene.html").texts["page"])["settings"]
+    content = _settings(tmp_path / "scene.html")
     assert content["background"]["color"] == [1.0, 1.0, 1.0] and content["startMode"] == "animTrack"
 
 
-def test_a_page_that_no_browser_could_read_is_not_written(tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    ("views", "said"),
+    [
+        (cameras(), "a page of 600 Gaussians of SH degree 1 would have .* --max_splats or --sh_deg"),
+        ([], "a page needs at least one training camera"),
+    ],
+)
+def test_a_page_that_nobody_could_use_is_not_written(tmp_path, monkeypatch, views, said):
     monkeypatch.setattr(html, "LONGEST", 1000)
-    with pytest.raises(
-        UserError, match="a page of 600 Gaussians of SH degree 1 would have .* --max_splats or --sh_deg"
-    ):
-        write_html(tmp_path / "page.html", balls(), cameras())
-    assert not list(tmp_path.iterdir())
-
-
-def test_a_page_needs_a_camera(tmp_path):
-    with pytest.raises(UserError, match="a page needs at least one training camera"):
-        write_html(tmp_path / "page.html", balls(each=2), [])
+    with pytest.raises(UserError, match=said):
+        write_html(tmp_path / "page.html", balls(), views)
     assert not list(tmp_path.iterdir())

@@ -9,11 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
-from exports.read import read_splats
-from exports.selection import logits
-from exports.sog import PROGRAM
-from exports.splats import Splats
-from exports.usdz import PRIM
+from exports.formats import read_splats
+from exports.scene_formats import PRIM
+from exports.splats import Splats, logits
+from exports.web import PROGRAM
 from utils.system_utils import UserError
 
 

@@ -16,7 +16,7 @@ from PIL import Image
 
 from evaluation.pages import to_html
 from exports.html import write_html
-from exports.of_model import model_of
+from exports.in_scene import model_of
 from gaussian_renderer import render
 from moving_cameras.generated import Ellipse
 from moving_cameras.poses import poses_of

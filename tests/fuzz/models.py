@@ -8,8 +8,7 @@ import torch
 from gaussians import model, options, take_steps
 from small_splats import empty_spz, splats
 
-from exports.formats import format_of
-from exports.read import read_splats
+from exports.formats import format_of, read_splats
 from fuzz.damage import changed, damaged, damaged_text
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.checkpoint import load_checkpoint, save_checkpoint

@@ -1,12 +1,18 @@
-"""Commands of the long steps: those of pycolmap (worker.py), or those of a COLMAP program that the user names."""
+"""COLMAP as convert.py uses it: the commands of its long steps, and queries of its database, also while it writes.
 
+The commands are those of pycolmap (worker.py), or those of a COLMAP program that the user names.
+"""
+
+import contextlib
 import json
+import sqlite3
 import subprocess
 import sys
+from collections import Counter
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from conversion.layout import Layout
 from utils.system_utils import UserError, atomic_write
@@ -20,6 +26,7 @@ LENS_MODELS = (
     *("OPENCV_FISHEYE", "THIN_PRISM_FISHEYE", "RAD_TAN_THIN_PRISM_FISHEYE", "EUCM"),
 )
 _WORKER = Path(__file__).with_name("worker.py")
+_PAIR = 2147483647  # COLMAP: pair_id = smaller image_id * this + larger image_id
 
 
 @dataclass(frozen=True)
@@ -37,18 +44,6 @@ def _mapped(layout: Layout, settings: Settings) -> Path:
     return layout.calibrated if settings.mapper == "global" else layout.database
 
 
-class Backend(Protocol):
-    """Commands of each step. groups: lists of photo names; the photos of a list have one size and share a camera."""
-
-    identity: str  # program and version; the results of another program are not resumed
-
-    def features(self, layout: Layout, settings: Settings, groups: list[list[str]], masks: bool) -> list[Command]: ...
-
-    def matching(self, layout: Layout, settings: Settings) -> list[Command]: ...
-
-    def mapping(self, layout: Layout, settings: Settings) -> list[Command]: ...
-
-
 def worker_command(layout: Layout, step: str, **job: Any) -> Command:
     """Return the command for one step of worker.py. The job is passed in a file, since there can be many photos."""
     path = layout.work / "jobs" / f"{step}.json"
@@ -58,37 +53,37 @@ def worker_command(layout: Layout, step: str, **job: Any) -> Command:
 
 
 class Pycolmap:
-    """The pycolmap package, which the project requires anyway."""
+    """The pycolmap package, which the project requires anyway.
+
+    identity: program and version; the results of another program are not resumed. groups: lists of photo names; the
+    photos of a list have one size and share a camera.
+    """
 
     def __init__(self) -> None:
         self.identity = f"pycolmap {version('pycolmap')}"
 
     def features(self, layout: Layout, settings: Settings, groups: list[list[str]], masks: bool) -> list[Command]:
-        job = {
-            "groups": groups,
-            "masks": str(layout.masks) if masks else "",
-            "camera": settings.camera,
-            "max_num_features": settings.max_num_features,
-        }
-        return [self._command(layout, settings, "features", **job)]
+        job = {"groups": groups, "masks": str(layout.masks) if masks else ""}
+        job |= {"camera": settings.camera, "max_num_features": settings.max_num_features}
+        return self._commands(layout, settings, "features", **job)
 
     def matching(self, layout: Layout, settings: Settings) -> list[Command]:
-        return [self._command(layout, settings, "matching", matcher=settings.matcher)]
+        return self._commands(layout, settings, "matching", matcher=settings.matcher)
 
     def mapping(self, layout: Layout, settings: Settings) -> list[Command]:
         job = {"models": str(layout.models), "mapper": settings.mapper, "tolerance": TOLERANCE}
-        job["database"] = str(_mapped(layout, settings))
-        return [self._command(layout, settings, "mapping", **job)]
+        return self._commands(layout, settings, "mapping", database=str(_mapped(layout, settings)), **job)
 
     @staticmethod
-    def _command(layout: Layout, settings: Settings, step: str, **job: Any) -> Command:
+    def _commands(layout: Layout, settings: Settings, step: str, **job: Any) -> list[Command]:
         common = {"database": str(layout.database), "photos": str(layout.photos), "no_gpu": settings.no_gpu}
-        return worker_command(layout, step, **{**common, **job})
+        return [worker_command(layout, step, **{**common, **job})]
 
 
 class Program:
-    """A COLMAP program. Before any step runs, its own help gives the names of options that differ between versions.
+    """A COLMAP program, with the methods of Pycolmap.
 
+    Before any step runs, its own help gives the names of options that differ between versions.
     UserError if it cannot be run, is not COLMAP, or lacks a command that the settings need.
     """
 
@@ -108,7 +103,8 @@ class Program:
         self._gpu_for_features = [self._known("feature_extractor", *names), switch]
         names = "--FeatureMatching.use_gpu", "--SiftMatching.use_gpu"
         self._gpu_for_matching = [self._known(self._matcher, *names), switch]
-        if settings.mapper == "global" and not all(map(self._has, ("view_graph_calibrator", "global_mapper"))):
+        commands = ("view_graph_calibrator", "global_mapper") if settings.mapper == "global" else ()
+        if any(self._output(command, "-h") is None for command in commands):
             raise UserError(
                 f"{executable} ({self.identity}) has no global_mapper; use --mapper incremental, or omit "
                 "--colmap_executable to use pycolmap's global mapper"
@@ -147,9 +143,6 @@ class Program:
     def _start(self, name: str, database: Path) -> Command:
         return [self._executable, name, "--database_path", str(database)]
 
-    def _has(self, name: str) -> bool:
-        return self._output(name, "-h") is not None
-
     def _known(self, name: str, *options: str) -> str:
         """Return the first of the options that the help of a command lists. UserError if it lists none."""
         text = self._output(name, "-h") or ""
@@ -172,3 +165,57 @@ class Program:
                 "to use pycolmap"
             ) from error
         return done.stdout + done.stderr if done.returncode == 0 else None
+
+
+Backend = Pycolmap | Program
+
+
+def count_rows(database: Path, table: str) -> int:
+    """Count the rows of a table; 0 while it does not exist or is locked."""
+    rows = _query(database, f"SELECT COUNT(*) FROM {table}")
+    return rows[0][0] if rows else 0
+
+
+def most_features(database: Path) -> int:
+    """Return the largest number of features of a photo."""
+    rows = _query(database, "SELECT MAX(rows) FROM keypoints")
+    return (rows[0][0] or 0) if rows else 0
+
+
+def forget_matches(database: Path) -> None:
+    """Empty the tables that matching fills; keep the features."""
+    if not database.is_file():
+        return
+    # A database that was interrupted before it had tables has no matches.
+    with contextlib.suppress(sqlite3.OperationalError), contextlib.closing(sqlite3.connect(database)) as connection:
+        connection.execute("DELETE FROM matches")
+        connection.execute("DELETE FROM two_view_geometries")
+        connection.commit()
+
+
+def copy_database(database: Path, target: Path) -> None:
+    """Copy a database, including changes that are still in its log."""
+    target.unlink(missing_ok=True)
+    with contextlib.closing(sqlite3.connect(database)) as source, contextlib.closing(sqlite3.connect(target)) as copy:
+        source.backup(copy)
+
+
+def partners(database: Path) -> dict[str, int]:
+    """Count, for every photo, the other photos with which its matches passed the geometric check."""
+    names = dict(_query(database, "SELECT image_id, name FROM images"))
+    counts = Counter({name: 0 for name in names.values()})
+    for (pair,) in _query(database, "SELECT pair_id FROM two_view_geometries WHERE rows > 0"):
+        for image in divmod(pair, _PAIR):
+            if image in names:
+                counts[names[image]] += 1
+    return dict(counts)
+
+
+def _query(database: Path, statement: str) -> list[tuple]:
+    if not database.is_file():
+        return []
+    with contextlib.suppress(sqlite3.Error):
+        connection = sqlite3.connect(f"{database.absolute().as_uri()}?mode=ro", uri=True, timeout=1)
+        with contextlib.closing(connection):
+            return connection.execute(statement).fetchall()
+    return []

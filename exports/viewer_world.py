@@ -1,22 +1,79 @@
-"""Settings of the vendored viewer: cameras, bookmarks and animation, in its axes (x right, y up, z backwards).
+"""The vendored viewer's world: the turn that puts a model upright, and the settings of cameras and animation.
 
-The form is that of its settings.json, version 2 (docs/api.md and dist/settings.d.ts of the npm package).
+The viewer's axes are x right, y up, z backwards, and its camera has no roll. The form of the settings is that of its
+settings.json, version 2 (docs/api.md and dist/settings.d.ts of the npm package).
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import torch
 from scipy.spatial.transform import Rotation
 
+from exports.splats import Splats
 from moving_cameras.moments import TimedPath
 from moving_cameras.poses import Poses, focus_point
+from utils.sh_utils import sh_basis
 
+UP = np.array([0.0, -1.0, 0.0])  # of the turned model, as in a usual capture
+_MEAN_UP = 0.01  # weight of the mean up beside the cameras' horizons
+_DIRECTIONS = 64  # more than the 25 coefficients that they determine
 BOOKMARKS = 25  # the viewer's own limit of annotations
 _TITLE = 60  # and of letters in their titles
 _KEYS_A_SECOND = 10
 _MOST_KEYS = 1000
 _VIEWER_AXES = np.diag([-1.0, -1.0, 1.0])  # the viewer turns each model by half a turn about z
+_OFF = {"enabled": False}
+_NO_EFFECTS = {  # the viewer's post effects
+    "sharpness": {**_OFF, "amount": 0},
+    "bloom": {**_OFF, "intensity": 0.1, "blurLevel": 2},
+    "grading": {**_OFF, "brightness": 1, "contrast": 1, "saturation": 1, "tint": [1, 1, 1]},
+    "vignette": {**_OFF, "intensity": 0.5, "inner": 0.3, "outer": 0.75, "curvature": 1},
+    "fringing": {**_OFF, "intensity": 0.5},
+}
+
+
+def up_of(poses: Poses) -> np.ndarray:
+    """The direction (3,), of length 1, that is up for most cameras: the one in which their rolls are least.
+
+    A level camera has its x axis at right angles to up, however far it looks down. So up is the eigenvector of the
+    least eigenvalue of the mean of x x^T; where cameras face one way and leave it open, their mean up decides.
+    """
+    mean, across = poses.up, poses.turns[:, :, 0]
+    mean = mean / max(float(np.linalg.norm(mean)), 1e-9)
+    matrix = across.T @ across / len(poses) + _MEAN_UP * (np.eye(3) - np.outer(mean, mean))
+    up = np.linalg.eigh(matrix)[1][:, 0]
+    return up if up @ mean >= 0 else -up
+
+
+def turn_upright(up: np.ndarray) -> np.ndarray:
+    """The least rotation (3,3) that takes a direction to UP."""
+    axis, cosine = np.cross(up, UP), float(up @ UP)
+    sine = float(np.linalg.norm(axis))
+    axis = axis / sine if sine > 1e-9 else np.array([0.0, 0.0, 1.0])
+    return Rotation.from_rotvec(axis * np.arctan2(sine, cosine)).as_matrix()
+
+
+def turned(splats: Splats, turn: np.ndarray) -> Splats:
+    """The same Gaussians in a world turned by a rotation (3,3); its offset is not kept."""
+    rotation = Rotation.from_matrix(turn) * Rotation.from_quat(np.roll(splats.rotations, -1, axis=1))
+    return replace(
+        splats,
+        means=(splats.means @ turn.T).astype(np.float32),
+        rotations=np.roll(rotation.as_quat(), 1, axis=1).astype(np.float32),
+        sh=np.einsum("jk,nkc->njc", _sh_turn(splats.sh_degree, turn).astype(np.float32), splats.sh),
+        world_offset=(0.0, 0.0, 0.0),
+    )
+
+
+def _sh_turn(degree: int, turn: np.ndarray) -> np.ndarray:
+    """The matrix (K,K) of SH coefficients: the new function at a direction d is the old one at turn^T d."""
+    directions = torch.randn(_DIRECTIONS, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    directions = torch.nn.functional.normalize(directions)
+    new, old = sh_basis(degree, directions), sh_basis(degree, directions @ torch.from_numpy(turn))
+    return torch.linalg.lstsq(new, old).solution.numpy()
 
 
 def settings(
@@ -43,7 +100,7 @@ def settings(
         "tonemapping": "none",
         "highPrecisionRendering": False,
         "background": {"color": list(background)},
-        "postEffectSettings": _no_effects(),
+        "postEffectSettings": _NO_EFFECTS,
         "animTracks": [] if path is None else [_track(path, axes, float(np.median(depths)))],
         "cameras": [{"initial": cameras[0]}],
         "annotations": [_bookmark(names[n], cameras[n], lean(axes @ poses.turns[n])) for n in marked],
@@ -108,16 +165,4 @@ def _track(path: TimedPath, axes: np.ndarray, depth: float) -> dict[str, Any]:
                 "fov": [look["fov"] for look in looks],
             },
         },
-    }
-
-
-def _no_effects() -> dict[str, Any]:
-    """The viewer's post effects, all off."""
-    off = {"enabled": False}
-    return {
-        "sharpness": {**off, "amount": 0},
-        "bloom": {**off, "intensity": 0.1, "blurLevel": 2},
-        "grading": {**off, "brightness": 1, "contrast": 1, "saturation": 1, "tint": [1, 1, 1]},
-        "vignette": {**off, "intensity": 0.5, "inner": 0.3, "outer": 0.75, "curvature": 1},
-        "fringing": {**off, "intensity": 0.5},
     }
