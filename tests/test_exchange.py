@@ -4,7 +4,7 @@ import pytest
 import torch
 from diff_gaussian_rasterization.fakes import ABSOLUTE_VALUES, MOMENT_VALUES, SPLAT_VALUES
 from rasterizer_tools import BOTH_AND_GPU, CPU_AND_GPU, moved_by_a_word, ops
-from torch import Tensor, library
+from torch import Tensor
 
 from gaussian_renderer.over_ranks.exchange import Sent, return_rows
 from utils.host.read_later import read_later
@@ -110,23 +110,6 @@ def test_records_are_counted_and_listed(kind, device):
     assert kind != "some" or len(gaussians) > LARGE / 2
 
 
-def test_wrong_records_are_named():
-    rects, tile_counts, limits = reach_of("some", "cpu")
-    counts = ops.count_records(rects, tile_counts, limits)
-    total = int(counts[-1].sum())
-    for error, match, given in (
-        (ValueError, r"tile_counts must be", (rects, tile_counts[1:], limits, counts, total)),
-        (ValueError, r"limits must be \(2, -1", (rects, tile_counts, limits[0], counts, total)),
-        (TypeError, "limits must be torch.int32", (rects, tile_counts, limits.long(), counts, total)),
-        (ValueError, r"counts must be \(5, 79", (rects, tile_counts, limits, counts[:-1], total)),
-        (ValueError, "records by band, and to .* of all", (rects, tile_counts, limits, counts[[0, 1, 2, 3, 3]], total)),
-        (ValueError, "counts must be 0 or more, got -1", (rects, tile_counts, limits, counts.clone().fill_(-1), total)),
-        (RuntimeError, "a room of 2147483648 is not from 0 to 2", (rects, tile_counts, limits, counts, 2**31)),
-    ):
-        with pytest.raises(error, match=match):
-            ops.list_records(*given)
-
-
 def moved_by_torch(rows: Tensor, counts: Tensor, places: Tensor) -> Tensor:
     ends = torch.empty_like(counts).index_copy_(0, places.long(), counts).cumsum(0).index_select(0, places.long())
     shifts = ends - counts.cumsum(0)
@@ -193,21 +176,6 @@ def test_runs_are_added_up(kind, values, device, dtype):
     assert torch.equal(ops.sum_runs(wide, counts, kept, int(kept.sum())), again)
 
 
-def test_wrong_sums_are_named():
-    def refused(error: type, match: str, counts: list, kept: list, room: int = 3, values: int = 10) -> None:
-        with pytest.raises(error, match=match):
-            numbers = (torch.tensor(of, dtype=torch.int32) for of in (counts, kept))
-            ops.sum_runs(torch.rand(5, values), *numbers, room)
-
-    refused(ValueError, r"rows must be \(R, 10\) or \(R, 12\), got \(5, 11\)", [5], [1], values=11)
-    refused(ValueError, r"kept must be \(2,\)", [3, 2], [1])
-    refused(ValueError, "counts add up to 4, but there are 5 rows", [3, 1], [1, 1])
-    refused(ValueError, "counts must be 0 or more, got -1 of run 1", [6, -1], [1, 1])
-    refused(ValueError, "kept must be 0, 1 or the run's count, got 2 of run 0", [3, 2], [2, 2])
-    refused(ValueError, "kept adds up to 4 rows, for which a room of 3 is too small", [3, 2], [3, 1])
-    refused(RuntimeError, "a room of -1 is not from 0 to 2", [3, 2], [1, 1], room=-1)
-
-
 @CPU_AND_GPU
 def test_parts_are_added_up(device):
     counts = torch.randint(9, (LARGE,), generator=torch.Generator().manual_seed(4), dtype=torch.int32).to(device)
@@ -217,16 +185,6 @@ def test_parts_are_added_up(device):
     assert found.dtype == torch.int64 and found.tolist() == [int(part.sum()) for part in counts.split(sizes)]
     assert ops.sum_parts(counts[:0], [0, 0]).tolist() == [0, 0] and len(ops.sum_parts(counts[:0], [])) == 0
     assert torch.equal(ops.sum_parts(torch.stack((counts, counts), 1)[:, 0], sizes), found)
-    library.opcheck(ops.sum_parts.default, (counts, sizes))
-
-
-def test_wrong_parts_are_named():
-    with pytest.raises(ValueError, match="sizes add up to 4, but there are 5 counts"):
-        ops.sum_parts(torch.zeros(5, dtype=torch.int32), [3, 1])
-    with pytest.raises(ValueError, match="sizes must be 0 or more, got -1"):
-        ops.sum_parts(torch.zeros(5, dtype=torch.int32), [6, -1])
-    with pytest.raises(TypeError, match=r"counts must be torch.int32"):
-        ops.sum_parts(torch.zeros(5), [5])
 
 
 class _Both(Ranks):
@@ -273,47 +231,6 @@ def test_numbers_are_read_before_later_work_is_done():
     assert read() == [0, 1, 2] and not end.query()
 
 
-def test_any_number_of_threads_gives_the_same_bits():
-    before, counts, reach = torch.get_num_threads(), some_counts("giants"), reach_of("some", "cpu")
-    places = torch.randperm(len(counts)).int()
-    rows, splats, gaussians = (
-        torch.randn(int(counts.sum()), 12),
-        some_splats(9_000, "cpu", torch.float32),
-        places.long(),
-    )
-    expected = ops.sum_runs(rows, counts, torch.ones_like(counts), len(counts))
-    try:
-        for threads in (1, 3):
-            torch.set_num_threads(threads)
-            assert torch.equal(ops.move_runs(rows, counts, places), moved_by_torch(rows, counts, places))
-            assert torch.equal(pack(splats, gaussians), packed_by_torch(splats, gaussians))
-            sums = ops.sum_runs(rows, counts, torch.ones_like(counts), len(counts))
-            assert torch.equal(sums, expected)
-            counted, (numbers, *lists) = ops.count_records(*reach), recorded_by_torch(*reach)
-            for one, other in zip(ops.list_records(*reach, counted, int(numbers.sum())), lists, strict=True):
-                assert torch.equal(one, other)
-    finally:
-        torch.set_num_threads(before)
-
-
-@BOTH_AND_GPU
-def test_opcheck(device, dtype):
-    splats, gaussians = some_splats(9, device, dtype), torch.tensor([2, 8, 3], device=device)
-    packed = pack(splats, gaussians)
-    plain = [t if t.dtype == torch.int32 else torch.rand_like(t) for t in splats]  # NaNs are not equal
-    library.opcheck(ops.pack_splats_.default, (packed, *plain, gaussians))
-    library.opcheck(ops.unpack_splats.default, (pack(plain, gaussians), plain[0]))
-    reach = reach_of("some", device)
-    recorded = ops.count_records(*reach)
-    library.opcheck(ops.count_records.default, reach)
-    library.opcheck(ops.list_records.default, (*reach, recorded, int(recorded[-1].sum())))
-    counts, places = (torch.tensor(x, dtype=torch.int32, device=device) for x in ([2, 0, 3], [2, 0, 1]))
-    library.opcheck(
-        ops.sum_runs.default, (torch.rand(5, 10, device=device, dtype=dtype), counts, counts.clamp_max(1), 2)
-    )
-    library.opcheck(ops.move_runs.default, (torch.rand(5, 10, device=device, dtype=dtype), counts, places))
-
-
 @CPU_AND_GPU
 def test_inputs_may_begin_at_any_word(device):
     splats = some_splats(9, device, torch.float32)
@@ -329,42 +246,3 @@ def test_inputs_may_begin_at_any_word(device):
     assert torch.equal(ops.move_runs(moved_by_a_word(rows), counts, places), ops.move_runs(rows, counts, places))
     kept = counts.clamp_max(1)
     assert torch.equal(ops.sum_runs(moved_by_a_word(rows), counts, kept, 2), ops.sum_runs(rows, counts, kept, 2))
-
-
-def test_wrong_splats_are_named():
-    splats, gaussians = some_splats(9, "cpu", torch.float32), torch.tensor([2, 8, 3])
-    packed = pack(splats, gaussians)
-
-    def refused(error: type, match: str, rows: Tensor, gaussians: Tensor = gaussians) -> None:
-        with pytest.raises(error, match=match):
-            ops.pack_splats_(rows, *splats, gaussians)
-
-    refused(ValueError, r"packed must be \(3, 16\)", packed[1:])
-    refused(TypeError, "packed must be torch.int32", packed.float())
-    refused(ValueError, "packed must be contiguous", packed.T.contiguous().T)
-    refused(TypeError, "gaussians must be torch.int64", packed, gaussians.int())
-    refused(ValueError, "gaussians must be from 0 to 8, got 9", packed, torch.tensor([2, 9, 3]))
-    refused(ValueError, "gaussians must be from 0 to 8, got -1", packed, torch.tensor([2, 1, -1]))
-    refused(ValueError, "packed must begin at a multiple of 16 bytes", moved_by_a_word(packed))
-    with pytest.raises(ValueError, match=r"packed must be \(-1, 27\)"):
-        ops.unpack_splats(packed, splats[0].double())
-    with pytest.raises(TypeError, match="like must be float32 or float64, got torch.int32"):
-        ops.unpack_splats(packed, splats[2])
-
-
-def test_wrong_runs_are_named():
-    rows = torch.rand(5, 10)
-
-    def refused(error: type, match: str, counts: list, places: list, rows: Tensor = rows) -> None:
-        with pytest.raises(error, match=match):
-            ops.move_runs(rows, torch.tensor(counts, dtype=torch.int32), torch.tensor(places, dtype=torch.int32))
-
-    refused(ValueError, r"rows must be \(R, 10\) or \(R, 12\), got \(5, 11\)", [5], [0], torch.rand(5, 11))
-    refused(TypeError, "rows must be float32 or float64", [5], [0], rows.int())
-    refused(ValueError, r"places must be \(2,\)", [3, 2], [0])
-    refused(ValueError, "counts add up to 4, but there are 5 rows", [3, 1], [0, 1])
-    refused(ValueError, "counts must be 0 or more, got -1 of run 1", [6, -1], [0, 1])
-    for place in (0, 2, -1):
-        refused(
-            ValueError, f"places must be the numbers from 0 to 1 in any order, got {place} of run 1", [3, 2], [0, place]
-        )

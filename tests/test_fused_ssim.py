@@ -1,10 +1,6 @@
-"""fused_ssim against float64 convolutions, scikit-image, finite differences and itself."""
+"""fused_ssim against float64 convolutions, scikit-image, finite differences, the CPU and itself."""
 
-import os
-import subprocess
-import sys
 from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 import torch
@@ -12,14 +8,14 @@ from fused_ssim import allowed_padding, fused_l1_ssim, fused_photometric_loss, f
 from fused_ssim.reference import l1_ssim, ssim_map
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from rasterizer_tools import BOTH_AND_GPU, CPU_AND_GPU, GPU_MARKS, moved_by_a_word
 from skimage.metrics import structural_similarity
-from torch import Tensor, library
-
-from utils.host.machine import instruction_set
+from torch import Tensor
 
 EPS = {torch.float32: 2**-24, torch.float64: 2**-53}
 LARGEST_SLOPE = 2 / 0.03**2  # of SSIM over a covariance; multiplies an error of the inputs or of the oracle
 both_dtypes = pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+on_a_gpu = pytest.mark.parametrize("device", [pytest.param("cuda", marks=GPU_MARKS)])
 both_paddings = pytest.mark.parametrize("padding", allowed_padding)
 
 
@@ -70,23 +66,66 @@ def with_gradient(function, img1: Tensor, img2: Tensor, padding: str) -> tuple[T
     return l1.detach(), ssim.detach(), gradient
 
 
-@both_dtypes
+def paddings(shape: tuple[int, ...]) -> list[str]:
+    return ["same", "valid"] if min(shape[-2:]) >= 11 else ["same"]
+
+
+def on_device(device: str, img1: Tensor, img2: Tensor, padding: str) -> list[Tensor]:
+    """The results of the device, on the CPU."""
+    results = with_gradient(fused_l1_ssim, img1.to(device), img2.to(device), padding)
+    assert all(result.device.type == device and result.dtype == img1.dtype for result in results)
+    return [result.cpu() for result in results]
+
+
+@BOTH_AND_GPU
 @pytest.mark.parametrize(("name", "shape"), CASES, ids=str)
-def test_agrees_with_reference(name: str, shape: tuple[int, ...], dtype: torch.dtype) -> None:
+def test_agrees_with_reference(name: str, shape: tuple[int, ...], device: str, dtype: torch.dtype) -> None:
     img1, img2 = image_pair(name, shape, dtype)
-    for padding in ["same", "valid"] if min(shape[-2:]) >= 11 else ["same"]:
-        l1, ssim, gradient = with_gradient(fused_l1_ssim, img1, img2, padding)
-        assert l1.dtype == ssim.dtype == gradient.dtype == dtype and l1.shape == ssim.shape == ()
+    for padding in paddings(shape):
+        l1, ssim, gradient = on_device(device, img1, img2, padding)
+        assert l1.shape == ssim.shape == ()
         wanted_l1, wanted_ssim, wanted_gradient = with_gradient(l1_ssim, img1.double(), img2.double(), padding)
         # Each pixel's difference is rounded once, and the mean once.
         assert abs(l1 - wanted_l1) <= 2 * EPS[dtype] * wanted_l1
         # A few roundings of numbers near 1, measured: 4.3 eps; also of the sums in double if all pixels are equal.
-        assert abs(ssim - wanted_ssim) <= 8 * EPS[dtype] + 50 * EPS[torch.float64]
+        assert abs(ssim - wanted_ssim) <= 8 * EPS[dtype] + (50 * EPS[dtype] if dtype == torch.float64 else 0)
         # Measured: 19 eps of the largest gradient for images in [0, 1]; the difference is rounded at the size of the
         # larger image. The oracle adds up terms of about 10 in size that may cancel.
         scale = wanted_gradient.abs().max() * max(1, img1.abs().max())
         error = (gradient - wanted_gradient).abs().max()
         assert error <= 40 * EPS[dtype] * scale + 100 * EPS[torch.float64]
+
+
+# Tiles of a plane are 8 or 16 rows by 116 columns (csrc/cuda/ssim_tile.h), by the number of pixels.
+CUTS = [(3, 16, 116), (3, 17, 117), (1, 45, 233), (3, 800, 800), (3, 1060, 1600), (600, 39, 3)]
+
+
+@on_a_gpu
+@pytest.mark.parametrize("as_bytes", [False, True], ids=["float", "bytes"])
+@pytest.mark.parametrize("shape", CUTS, ids=str)
+def test_agrees_with_the_cpu(shape: tuple[int, ...], as_bytes: bool, device: str) -> None:
+    img1, img2 = image_pair("noise", shape, torch.float32)
+    if as_bytes:
+        img2 = (255 * img2).to(torch.uint8)
+    for padding in paddings(shape):
+        results, wanted = on_device(device, img1, img2, padding), on_device("cpu", img1, img2, padding)
+        # Differences of pixels are the same floats; their double sums, in another order, are rounded once.
+        assert abs(results[0] - wanted[0]) <= 2 * EPS[torch.float32] * wanted[0]
+        assert abs(results[1] - wanted[1]) <= 8 * EPS[torch.float32]
+        assert (results[2] - wanted[2]).abs().max() <= 40 * EPS[torch.float32] * wanted[2].abs().max()
+
+
+@on_a_gpu
+@pytest.mark.parametrize("name", PAIRS)
+def test_both_gradients_add_up_as_on_the_cpu(name: str, device: str) -> None:
+    img1, img2 = image_pair(name, (3, 70, 131), torch.float32)
+    gradients = []
+    for place in (device, "cpu"):
+        x = img1.to(place).requires_grad_()
+        l1, ssim = fused_l1_ssim(x, img2.to(place))
+        gradients.append(torch.autograd.grad(0.8 * l1 - 0.2 * ssim, x)[0].cpu())
+    largest = gradients[1].abs().max() * max(1, img1.abs().max())
+    assert (gradients[0] - gradients[1]).abs().max() <= 40 * EPS[torch.float32] * largest
 
 
 def test_bright_images_keep_their_precision() -> None:
@@ -139,8 +178,9 @@ def test_gradcheck(padding: str) -> None:
     torch.autograd.gradcheck(lambda x: fused_l1_ssim(x, img2, padding), img1.requires_grad_())
 
 
-def test_l1_gradient_is_torchs() -> None:
-    img1, img2 = image_pair("noise", dtype=torch.float32)
+@CPU_AND_GPU
+def test_l1_gradient_is_torchs(device: str) -> None:
+    img1, img2 = (image.to(device) for image in image_pair("noise", dtype=torch.float32))
     img1[:, 3:9] = img2[:, 3:9]  # no gradient where both are equal
     gradients = []
     for l1 in (lambda x: fused_l1_ssim(x, img2)[0], lambda x: (x - img2).abs().mean()):
@@ -158,15 +198,6 @@ def test_gradients_of_both_add_up() -> None:
     both = torch.autograd.grad(0.8 * l1 + 0.2 * (1 - ssim), x, retain_graph=True)[0]
     one, other = (torch.autograd.grad(y, x, retain_graph=True)[0] for y in (l1, ssim))
     torch.testing.assert_close(both, 0.8 * one - 0.2 * other, rtol=0, atol=1e-15 * float(both.abs().max()))
-
-
-@both_dtypes
-@pytest.mark.parametrize("train", [False, True])
-def test_opcheck(train: bool, dtype: torch.dtype) -> None:
-    img1, img2 = image_pair("noise", (2, 12, 13), dtype)
-    library.opcheck(torch.ops.fused_ssim.l1_ssim, (img1.requires_grad_(train), img2, True, train))
-    one = torch.ones((), dtype=dtype)
-    library.opcheck(torch.ops.fused_ssim.l1_ssim_vjp, (img1.detach(), img2, torch.rand_like(img2), one, one))
 
 
 def loss_in_parts(image: Tensor, target: Tensor, weight: float, clamp: bool = True) -> tuple[Tensor, Tensor]:
@@ -190,20 +221,28 @@ def out_of_range(dtype: torch.dtype, as_bytes: bool = False) -> list[Tensor]:
     return [image, (255 * target).to(torch.uint8) if as_bytes else target]
 
 
-@both_dtypes
+@BOTH_AND_GPU
 @pytest.mark.parametrize("as_bytes", [False, True], ids=["float", "bytes"])
 @pytest.mark.parametrize("weight", [0.0, 0.2, 1.0])
-def test_photometric_loss_is_its_parts_to_the_bit(weight: float, as_bytes: bool, dtype: torch.dtype) -> None:
-    image, target = out_of_range(dtype, as_bytes)
-    assert ((image < 0) | (image > 1)).float().mean() > 0.3
-    fused = loss_and_gradient(fused_photometric_loss, image, target, weight)
-    for got, wanted in zip(fused, loss_and_gradient(loss_in_parts, image, target, weight), strict=True):
-        assert got.dtype == dtype and torch.equal(got, wanted)
-    assert not fused[2][(image < 0) | (image > 1)].any()
-    free = loss_and_gradient(fused_photometric_loss, image, target, weight, False)
-    for got, wanted in zip(free, loss_and_gradient(loss_in_parts, image, target, weight, False), strict=True):
-        assert torch.equal(got, wanted)
-    assert free[2][(image < 0) | (image > 1)].any()
+def test_photometric_loss_is_its_parts(weight: float, as_bytes: bool, device: str, dtype: torch.dtype) -> None:
+    on_cpu = out_of_range(dtype, as_bytes)
+    image, target = (tensor.to(device) for tensor in on_cpu)
+    outside = (image < 0) | (image > 1)
+    assert outside.float().mean() > 0.3
+    for clamp in (True, False):
+        fused = loss_and_gradient(fused_photometric_loss, image, target, weight, clamp)
+        loss, *rest = loss_and_gradient(loss_in_parts, image, target, weight, clamp)
+        assert all(torch.equal(*pair) for pair in zip(fused[1:], rest, strict=True))
+        assert all(got.dtype == dtype for got in fused) and fused[2][outside].any() != clamp
+        if device == "cpu":
+            assert torch.equal(fused[0], loss)
+            continue
+        assert abs(fused[0] - loss) <= 2 * EPS[dtype] * max(1, loss)  # the GPU fuses a product with the sum
+        if not clamp:
+            continue
+        wanted = loss_and_gradient(fused_photometric_loss, *on_cpu, weight, clamp)
+        assert abs(fused[0].cpu() - wanted[0]) <= 10 * EPS[dtype]
+        assert (fused[2].cpu() - wanted[2]).abs().max() <= 40 * EPS[dtype] * wanted[2].abs().max()
 
 
 def test_photometric_loss_agrees_with_reference() -> None:
@@ -235,16 +274,6 @@ def test_photometric_loss_gradcheck() -> None:
     torch.autograd.gradcheck(lambda x: fused_photometric_loss(x, target, 0.2)[0], image.requires_grad_())
 
 
-@both_dtypes
-@pytest.mark.parametrize("train", [False, True])
-def test_opcheck_photometric(train: bool, dtype: torch.dtype) -> None:
-    image, target = image_pair("noise", (2, 12, 13), dtype)
-    library.opcheck(torch.ops.fused_ssim.photometric, (image.requires_grad_(train), target, 0.2, train))
-    one = torch.ones((), dtype=dtype)
-    arguments = (image.detach(), target, torch.rand_like(target), 0.2, one)
-    library.opcheck(torch.ops.fused_ssim.photometric_vjp, arguments)
-
-
 def test_photometric_loss_keeps_nothing_it_does_not_need() -> None:
     image, target = out_of_range(torch.float32)
     loss, l1 = fused_photometric_loss(image, target, 0.2)
@@ -273,75 +302,69 @@ def test_bytes_are_their_value_over_255(padding: str, dtype: torch.dtype) -> Non
         assert torch.equal(one, other)
 
 
-@both_dtypes
+@BOTH_AND_GPU
 @pytest.mark.parametrize("value", [0.0, 0.5, 1.0])
-def test_equal_images(value: float, dtype: torch.dtype) -> None:
+def test_equal_images(value: float, device: str, dtype: torch.dtype) -> None:
     noise = image_pair("bright sky", dtype=dtype)[0]
-    for image in (torch.full((3, 20, 21), value, dtype=dtype), noise):
-        l1, ssim, gradient = with_gradient(fused_l1_ssim, image, image, "same")
+    for image in (torch.full((3, 20, 130), value, dtype=dtype), noise):
+        l1, ssim, gradient = on_device(device, image, image, "same")
         assert l1 == 0 and ssim == 1 and not gradient.any()
 
 
-def test_leading_dimensions_and_strides() -> None:
-    img1, img2 = image_pair("noise", (4, 20, 21), torch.float32)
+def all_bits(img1: Tensor, img2: Tensor) -> list[Tensor]:
+    img1 = img1.detach().requires_grad_()
+    l1, ssim = fused_l1_ssim(img1, img2)
+    return [l1.detach(), ssim.detach(), torch.autograd.grad(l1 + ssim, img1)[0].reshape(-1)]
 
-    def all_bits(img1: Tensor, img2: Tensor) -> list[Tensor]:
-        img1 = img1.detach().requires_grad_()
-        l1, ssim = fused_l1_ssim(img1, img2)
-        return [l1, ssim, torch.autograd.grad(l1 + ssim, img1)[0].reshape(-1)]
 
+@CPU_AND_GPU
+def test_leading_dimensions_and_strides(device: str) -> None:
+    img1, img2 = (image.to(device) for image in image_pair("noise", (4, 20, 21), torch.float32))
     wanted = all_bits(img1, img2)
     views = {
         "more dimensions": lambda x: x.reshape(2, 1, 2, 20, 21),
         "channels last": lambda x: x[None].to(memory_format=torch.channels_last),
         "transposed": lambda x: x.transpose(1, 2).contiguous().transpose(1, 2),
         "every other column": lambda x: x.repeat_interleave(2, dim=2)[:, :, ::2],
+        "off by one": moved_by_a_word,
     }
     for name, view in views.items():
         for got, bits in zip(all_bits(view(img1), view(img2)), wanted, strict=True):
             assert torch.equal(got, bits), name
     one_plane = fused_ssim(img1[0], img2[0])
     assert one_plane == fused_ssim(img1[:1], img2[:1])
+    one = torch.ones((), device=device)
+    kept = torch.ops.fused_ssim.l1_ssim(img1, img2, False, True)[2]
+    got = [torch.ops.fused_ssim.l1_ssim_vjp(img1, img2, k, one, one) for k in (kept, moved_by_a_word(kept))]
+    assert torch.equal(*got)
 
 
-@both_dtypes
-def test_number_of_threads_changes_no_bit(dtype: torch.dtype) -> None:
-    img1, img2 = image_pair("noise", (3, 201, 300), dtype)
-    results = []
-    for count in (1, 2, 3, 7):
-        torch.set_num_threads(count)
-        img1 = img1.detach().requires_grad_()
-        l1, ssim = fused_l1_ssim(img1, img2)
-        results.append([l1, ssim, torch.autograd.grad(0.8 * l1 - 0.2 * ssim, img1)[0]])
-    for other in results[1:]:
-        assert all(torch.equal(one, same) for one, same in zip(results[0], other, strict=True))
+@on_a_gpu
+def test_runs_on_the_current_stream(device: str) -> None:
+    img1, img2 = (image.to(device) for image in image_pair("noise", (3, 300, 400), torch.float32))
+    wanted = all_bits(img1, img2)
+    late1, late2 = torch.zeros_like(img1), torch.zeros_like(img2)
+    torch.cuda.synchronize()
+    stream = torch.cuda.Stream()
+    with torch.cuda.stream(stream):
+        torch.cuda._sleep(50_000_000)  # tens of milliseconds in which another stream would read the zeros
+        late1.copy_(img1)
+        late2.copy_(img2)
+        got = all_bits(late1, late2)
+    stream.synchronize()
+    assert all(torch.equal(one, other) for one, other in zip(got, wanted, strict=True))
 
 
-def test_instruction_sets_agree_to_rounding(tmp_path: Path) -> None:
-    """GS_ISA is read when the library loads, so narrower sets than the widest run in their own processes."""
-    pairs = [image_pair(name, dtype=dtype) for name in ("noise", "bright sky") for dtype in EPS]
-    torch.save(pairs, tmp_path / "pairs")
-    script = """
-import sys, torch
-from fused_ssim import fused_l1_ssim
-results = []
-for img1, img2 in torch.load(sys.argv[1]):
-    l1, ssim = fused_l1_ssim(img1.requires_grad_(), img2)
-    results.append([l1.detach(), ssim.detach(), torch.autograd.grad(ssim * img1.numel(), img1)[0]])
-torch.save(results, sys.argv[2])
-"""
-    widest = [with_gradient(fused_l1_ssim, *pair, "same") for pair in pairs]
-    for isa in ("baseline", "avx2"):
-        command = [sys.executable, "-c", script, str(tmp_path / "pairs"), str(tmp_path / isa)]
-        subprocess.run(command, env={**os.environ, "GS_ISA": isa}, check=True)
-        results = torch.load(tmp_path / isa)
-        for (l1, ssim, gradient), (wanted_l1, wanted_ssim, wanted_gradient) in zip(results, widest, strict=True):
-            eps = EPS[gradient.dtype]  # tolerances: as against the reference
-            assert abs(l1 - wanted_l1) <= 2 * eps and abs(ssim - wanted_ssim) <= 8 * eps
-            assert (gradient - wanted_gradient).abs().max() <= 40 * eps * wanted_gradient.abs().max()
-        if isa == "baseline" and instruction_set() != "baseline":
-            # This set has no fma: equal bits would mean that GS_ISA was ignored.
-            assert not torch.equal(results[0][2], widest[0][2])
+@on_a_gpu
+def test_does_not_wait_for_the_gpu(device: str) -> None:
+    image, target = (tensor.to(device) for tensor in image_pair("noise", (3, 30, 40), torch.float32))
+    for mode in ("default", "error"):
+        torch.cuda.set_sync_debug_mode(mode)
+        try:
+            all_bits(image, target)
+            loss_and_gradient(fused_photometric_loss, image, target, 0.2)
+        finally:
+            torch.cuda.set_sync_debug_mode("default")
 
 
 @settings(max_examples=30, deadline=None)
@@ -358,11 +381,12 @@ def test_properties(height: int, width: int, seed: int, contrast: float) -> None
     assert abs(ssim - fused_ssim(img1[[2, 0, 1]], img2[[2, 0, 1]])) <= EPS[torch.float32]
 
 
+@CPU_AND_GPU
 @pytest.mark.parametrize("value", [float("nan"), float("inf")])
-def test_a_pixel_that_is_not_finite_shows(value: float) -> None:
+def test_a_pixel_that_is_not_finite_shows(value: float, device: str) -> None:
     img1, img2 = image_pair("noise", dtype=torch.float32)
     img1[1, 39, 46] = value
-    l1, ssim = fused_l1_ssim(img1, img2)
+    l1, ssim = fused_l1_ssim(img1.to(device), img2.to(device))
     assert not l1.isfinite() and ssim.isnan()
 
 
@@ -375,16 +399,16 @@ def test_only_img1_has_a_gradient_and_only_when_wanted() -> None:
     assert not fused_ssim(img1.detach(), img2).requires_grad
     fused_ssim(img1, img2).backward()
     assert img1.grad is not None and img2.grad is None
-    nothing = torch.ops.fused_ssim.l1_ssim(img1.detach(), img2.detach(), False, False)[2]
-    assert nothing.numel() == 0
 
 
-def test_the_value_is_the_same_with_and_without_a_gradient() -> None:
-    img1, img2 = image_pair("noise", (3, 201, 300), torch.float32)
+@CPU_AND_GPU
+def test_the_value_is_the_same_with_and_without_a_gradient(device: str) -> None:
+    img1, img2 = (image.to(device) for image in image_pair("noise", (3, 201, 300), torch.float32))
     for padding in ("same", "valid"):
         plain = fused_l1_ssim(img1, img2, padding)
         trained = fused_l1_ssim(img1.clone().requires_grad_(), img2, padding)
         assert plain[0] == trained[0] and plain[1] == trained[1]
+    assert torch.ops.fused_ssim.l1_ssim(img1, img2, False, False)[2].numel() == 0
 
 
 IMAGE = torch.zeros(3, 20, 20)
@@ -409,6 +433,23 @@ def test_messages(img1: Tensor, img2: Tensor, padding: str, error: type[Exceptio
         fused_ssim(img1, img2, padding)
 
 
+@on_a_gpu
+def test_messages_of_a_gpu(device: str) -> None:
+    image = torch.zeros(3, 20, 20, device=device)
+    with pytest.raises(TypeError, match="img1 on cuda:0 must be float32, got torch.float64"):
+        fused_ssim(image.double(), image.double())
+    with pytest.raises(ValueError, match="same device, got img1 on cuda:0 and img2 on cpu"):
+        fused_ssim(image, image.cpu())
+    # The operator itself checks inputs that bypass the Python function.
+    with pytest.raises(RuntimeError, match="img1 must be float32 on a GPU"):
+        torch.ops.fused_ssim.l1_ssim(image.double(), image.double(), False, False)
+    with pytest.raises(RuntimeError, match=r"kept must be \(3, 1, 20, 408\)"):
+        torch.ops.fused_ssim.l1_ssim_vjp(image, image, image, torch.ones(()), torch.ones(()))
+    kept = torch.ops.fused_ssim.l1_ssim(image, image, False, True)[2]
+    with pytest.raises(RuntimeError, match="gradients must be float32"):
+        torch.ops.fused_ssim.l1_ssim_vjp(image, image, kept, torch.ones(()), torch.ones(()))
+
+
 def test_the_paddings_have_a_name() -> None:
     assert allowed_padding == ["same", "valid"]
     pair = image_pair("noise")
@@ -416,16 +457,19 @@ def test_the_paddings_have_a_name() -> None:
 
 
 _LOSSES = {
+    "both means": lambda one, two: sum(fused_l1_ssim(one, two)),
     "fused_ssim": lambda one, two: fused_ssim(one, two),
     "photometric": lambda one, two: fused_photometric_loss(one, two, 0.2)[0],
     "operator": lambda one, two: torch.ops.fused_ssim.photometric(one, two, 0.2, True)[0],
 }
 
 
+@CPU_AND_GPU
 @pytest.mark.parametrize("loss", _LOSSES.values(), ids=_LOSSES)
-def test_torch_compile_gives_the_same_gradients(loss):
-    one, two = torch.rand(3, 20, 20, requires_grad=True), torch.rand(3, 20, 20)
-    (expected,) = torch.autograd.grad(loss(one, two), one)
+def test_torch_compile_gives_the_same_values_and_gradients(loss, device):
+    one, two = (image.to(device) for image in image_pair("noise", (3, 20, 20), torch.float32))
+    one.requires_grad_()
     torch._dynamo.reset()
-    (compiled,) = torch.autograd.grad(torch.compile(loss, backend="aot_eager")(one, two), one)
-    assert torch.equal(compiled, expected)
+    values = [call(one, two) for call in (loss, torch.compile(loss, backend="aot_eager"))]
+    assert torch.equal(*values)
+    assert torch.equal(*(torch.autograd.grad(value, one)[0] for value in values))

@@ -5,9 +5,9 @@ from typing import NamedTuple
 
 import pytest
 import torch
-from diff_gaussian_rasterization import GaussianRasterizationSettings, fakes, schema
-from rasterizer_tools import BOTH_AND_GPU, CPU_AND_GPU, few, moved_by_a_word, ops, scene_arguments
-from torch import Tensor, library
+from diff_gaussian_rasterization import GaussianRasterizationSettings, schema
+from rasterizer_tools import BOTH_AND_GPU, CPU_AND_GPU, moved_by_a_word, ops, scene_arguments
+from torch import Tensor
 
 from benchmarks.workloads.splat_scenes import PARAMETERS, frustum, on_device, settings
 
@@ -213,21 +213,6 @@ def test_gradients_of_covariances_and_colors_are_added(device, dtype):
     assert all(found[place].count_nonzero() > 100 for place in (0, 5, 6))
 
 
-def test_wrong_sums_are_named():
-    forward = Forward.of(*scene_of("many", "cpu", torch.float32), False)
-    rows = forward.rows(False)
-    sums = list(forward.rows_vjp(rows, False))
-
-    def refused(error: type, match: str, sums: list[Tensor]) -> None:
-        with pytest.raises(error, match=match):
-            forward.add_rows_vjp(rows, sums, False)
-
-    refused(ValueError, "sums must have 9 tensors, got 8", sums[:8])
-    refused(ValueError, r"the sum of means must be \(300, 3\)", [sums[0][1:], *sums[1:]])
-    refused(TypeError, "the sum of sh_rest must be torch.float32", [*sums[:8], sums[8].double()])
-    refused(ValueError, "the sum of means must be contiguous", [sums[0].T.contiguous().T, *sums[1:]])
-
-
 @BOTH_AND_GPU
 @SCENES
 @DEPTH
@@ -266,57 +251,3 @@ def test_inputs_may_begin_at_any_word(device):
     again = forward.rows_vjp(Rows(moved_by_a_word(rows.rows), rows.counts), False)
     assert all(same_bits(a, b) for a, b in zip(again, gradients, strict=True))
     assert all(same_bits(a, b) for a, b in zip(forward.lists_vjp(False), by_lists, strict=True))
-
-
-def test_any_number_of_threads_gives_the_same_bits():
-    before, results = torch.get_num_threads(), []
-    try:
-        for threads in (1, 2, 3):
-            torch.set_num_threads(threads)
-            forward = Forward.of(*scene_of("giants", "cpu", torch.float32), True)
-            rows = forward.rows(True)
-            results.append([*rows, *forward.rows_vjp(rows, True)])
-    finally:
-        torch.set_num_threads(before)
-    for tensors in results[1:]:
-        assert all(same_bits(one, other) for one, other in zip(tensors, results[0], strict=True))
-
-
-@BOTH_AND_GPU
-@ABSOLUTE
-def test_opcheck(absolute, device, dtype):
-    raw, size = few(dtype=dtype)
-    raw, camera = {name: t.to(device) for name, t in raw.items()}, on_device(settings(**size), device)
-    forward = Forward.of(raw, camera, True)
-    state, rows = forward.state(forward.lists, forward.blended), forward.rows(absolute)
-    library.opcheck(ops.blend_rows.default, (*state, forward.blended[4], absolute))
-    splats, _, _, tile_counts, _ = forward.projected
-    library.opcheck(ops.rows_vjp.default, (*forward.scene, splats, tile_counts, *rows, WANTED, absolute))
-    sums = list(forward.rows_vjp(rows, absolute))
-    library.opcheck(ops.rows_vjp_add_.default, (*forward.scene, splats, tile_counts, *rows, sums, absolute))
-    assert rows.rows.shape[1] == fakes.MOMENT_VALUES + (fakes.ABSOLUTE_VALUES if absolute else 0)
-
-
-def test_wrong_rows_are_named():
-    forward = Forward.of(*scene_of("giants", "cpu", torch.float32), False)
-    rows, counts = forward.rows(False)
-    seen, unseen = int(counts.argmax()), int((forward.projected[3] == 0).nonzero()[0])
-
-    def refused(error: type, match: str, rows: Tensor = rows, counts: Tensor = counts, absolute: bool = False) -> None:
-        with pytest.raises(error, match=match):
-            forward.rows_vjp(Rows(rows, counts), absolute)
-
-    def moved(place: int, by: int) -> Tensor:
-        other = counts.clone()
-        other[place] += by
-        return other
-
-    refused(ValueError, r"rows must be \(-1, 12\)", absolute=True)
-    refused(ValueError, r"rows must be \(-1, 10\)", rows=rows[:, :9])
-    refused(TypeError, "rows must be torch.float32", rows=rows.double())
-    refused(ValueError, r"counts must be \(300,\)", counts=counts[1:])
-    refused(TypeError, "counts must be torch.int32", counts=counts.long())
-    refused(ValueError, f"counts add up to {len(rows) + 1}, but there are {len(rows)} rows", counts=moved(seen, 1))
-    refused(ValueError, f"there are {len(rows) - 1} rows", rows=rows[1:])
-    refused(ValueError, f"got 1 of splat {unseen}", counts=moved(unseen, 1))
-    refused(ValueError, f"got -1 of splat {unseen}", counts=moved(unseen, -1))

@@ -48,114 +48,93 @@ def fake_nvcc(folder: Path, release: str = "13.0") -> Path:
     return nvcc
 
 
-def test_missing_torch(builder: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "torch", None)
-    with pytest.raises(
-        SystemExit, match="^error: torch is not installed: run `pip install -r requirements.txt` first$"
-    ):
+@pytest.mark.parametrize(
+    ("installed", "words"),
+    [
+        (None, "torch is not installed: run `pip install -r requirements.txt` first$"),
+        (SimpleNamespace(__version__="2.9.1+cpu"), r"torch 2.9.1\+cpu is too old: 2.10 or newer is needed$"),
+    ],
+    ids=["missing", "old"],
+)
+def test_torch_that_does_not_serve(installed, words, builder, monkeypatch):
+    monkeypatch.setitem(sys.modules, "torch", installed)
+    with pytest.raises(SystemExit, match=f"^error: {words}"):
         builder.import_torch()
 
 
-def test_old_torch(builder: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "torch", SimpleNamespace(__version__="2.9.1+cpu"))
-    with pytest.raises(SystemExit, match="^error: torch 2.9.1.cpu is too old: 2.10 or newer is needed$"):
-        builder.import_torch()
-
-
-def test_missing_compiler(builder: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_missing_compiler(builder, monkeypatch, tmp_path):
     assert builder.find_compiler()
     monkeypatch.setenv("CXX", "ccache no-such-g++")
-    with pytest.raises(SystemExit, match="^error: the C\\+\\+ compiler ccache \\(CXX\\) was not found: install"):
+    with pytest.raises(SystemExit, match=r"^error: the C\+\+ compiler ccache \(CXX\) was not found: install"):
         builder.find_compiler()
     monkeypatch.delenv("CXX")
     monkeypatch.setenv("PATH", str(tmp_path))
-    with pytest.raises(SystemExit, match="^error: a C\\+\\+ compiler was not found: install g\\+\\+ or clang\\+\\+"):
+    with pytest.raises(SystemExit, match=r"^error: a C\+\+ compiler was not found: install g\+\+ or clang\+\+"):
         builder.find_compiler()
 
 
-class TestCudaSwitch:
-    """GS_CUDA, CUDA_HOME, PATH and torch's own CUDA decide; a visible GPU does not."""
+FOUND, HERE, ELSEWHERE = "found", {"CUDA_HOME": "cuda"}, {"CUDA_HOME": "nothing"}
 
-    def test_unset_follows_torch_and_nvcc(
-        self, builder: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-    ) -> None:
-        monkeypatch.setenv("PATH", "/bin:/usr/bin:" + str(tmp_path / "nothing"))
-        nvcc = fake_nvcc(tmp_path / "cuda")
-        monkeypatch.setenv("CUDA_HOME", str(tmp_path / "cuda"))
-        assert builder.find_nvcc("13.0") == str(nvcc)
-        assert builder.find_nvcc(None) is None
-        monkeypatch.setenv("CUDA_HOME", str(tmp_path / "nothing"))
-        assert builder.find_nvcc("13.0") is None
 
-    def test_off(self, builder: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-        fake_nvcc(tmp_path)
-        monkeypatch.setenv("CUDA_HOME", str(tmp_path))
-        monkeypatch.setenv("GS_CUDA", "0")
-        assert builder.find_nvcc("13.0") is None
+@pytest.mark.parametrize(
+    ("environment", "release", "of_torch", "expected"),
+    [
+        (HERE, "13.0", "13.0", FOUND),
+        (HERE, "13.0", None, None),
+        (ELSEWHERE, "13.0", "13.0", None),
+        (HERE | {"GS_CUDA": "0"}, "13.0", "13.0", None),
+        (ELSEWHERE | {"GS_CUDA": "1"}, "13.0", "13.0", "GS_CUDA=1 but there is no nvcc in CUDA_HOME"),
+        ({"PATH": "nothing", "GS_CUDA": "1"}, "13.0", "13.0", "GS_CUDA=1 but there is no nvcc on PATH"),
+        (HERE | {"GS_CUDA": "1"}, "13.0", None, FOUND),
+        (HERE | {"GS_CUDA": "1"}, "13.0", "12.8", FOUND),
+        (HERE, "13.2", "12.8", "nvcc is of CUDA 13 but torch was built with CUDA 12.8, whose driver may"),
+        (HERE, "13.2", "13.0", FOUND),
+        (HERE, "13.2", "14.0", FOUND),
+        ({"GS_CUDA": "yes"}, "13.0", "13.0", "GS_CUDA must be 0 or 1, not 'yes'$"),
+    ],
+)
+def test_variables_and_torchs_own_cuda_decide(environment, release, of_torch, expected, builder, monkeypatch, tmp_path):
+    """A visible GPU does not."""
+    nvcc = str(fake_nvcc(tmp_path / "cuda", release))
+    monkeypatch.setenv("PATH", "/bin:/usr/bin")
+    for name, value in environment.items():
+        monkeypatch.setenv(name, value if name == "GS_CUDA" else str(tmp_path / value))
+    if expected in (FOUND, None):
+        assert builder.find_nvcc(of_torch) == (nvcc if expected else None)
+        return
+    with pytest.raises(SystemExit, match=f"^error: .*{expected}"):
+        builder.find_nvcc(of_torch)
 
-    def test_on_without_nvcc(self, builder: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-        monkeypatch.setenv("GS_CUDA", "1")
-        monkeypatch.setenv("CUDA_HOME", str(tmp_path))
-        with pytest.raises(SystemExit, match="^error: GS_CUDA=1 but there is no nvcc in CUDA_HOME"):
-            builder.find_nvcc("13.0")
-        monkeypatch.delenv("CUDA_HOME")
-        monkeypatch.setenv("PATH", str(tmp_path))
-        with pytest.raises(SystemExit, match="^error: GS_CUDA=1 but there is no nvcc on PATH"):
-            builder.find_nvcc("13.0")
 
-    def test_on_with_a_cpu_torch(self, builder: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-        nvcc = fake_nvcc(tmp_path)
-        monkeypatch.setenv("GS_CUDA", "1")
-        monkeypatch.setenv("CUDA_HOME", str(tmp_path))
-        assert builder.find_nvcc(None) == builder.find_nvcc("12.8") == str(nvcc)
+def test_root_from_nvcc_behind_a_wrapper(builder, tmp_path):
+    nvcc = fake_nvcc(tmp_path / "cuda")
+    wrapper = tmp_path / "nvcc"
+    wrapper.write_text(f'#!/bin/sh\nexec {nvcc} "$@"\n')
+    wrapper.chmod(0o755)
+    assert builder.toolkit_root(str(wrapper)) == (tmp_path / "cuda").resolve()
 
-    def test_newer_than_torch(self, builder: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-        nvcc = fake_nvcc(tmp_path, "13.2")
-        monkeypatch.setenv("CUDA_HOME", str(tmp_path))
-        with pytest.raises(SystemExit, match="nvcc is of CUDA 13 but torch was built with CUDA 12.8, whose driver may"):
-            builder.find_nvcc("12.8")
-        assert builder.find_nvcc("13.0") == builder.find_nvcc("14.0") == str(nvcc)
 
-    def test_absurd_value(self, builder: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setenv("GS_CUDA", "yes")
-        with pytest.raises(SystemExit, match="^error: GS_CUDA must be 0 or 1, not 'yes'$"):
-            builder.find_nvcc("13.0")
+@pytest.mark.parametrize(("release", "seeded"), [("12.8", False), ("12.9", True), ("13.0", True)])
+def test_only_an_nvcc_that_knows_seeds_gets_one(release, seeded, builder, tmp_path):
+    nvcc, csrc = str(fake_nvcc(tmp_path, release)), ROOT / "submodules" / "simple-knn" / "csrc"
+    plan = builder.compilations(torch, ["c++"], nvcc, csrc, tmp_path)
+    kernels = [one for one in plan if one.source.suffix == ".cu"]
+    assert kernels and all((f"-frandom-seed={one.source.stem}" in one.command) == seeded for one in kernels)
 
-    def test_root_from_nvcc_behind_a_wrapper(self, builder: ModuleType, tmp_path: Path) -> None:
-        nvcc = fake_nvcc(tmp_path / "cuda")
-        wrapper = tmp_path / "nvcc"
-        wrapper.write_text(f'#!/bin/sh\nexec {nvcc} "$@"\n')
-        wrapper.chmod(0o755)
-        assert builder.toolkit_root(str(wrapper)) == (tmp_path / "cuda").resolve()
 
-    @pytest.mark.parametrize(("release", "seeded"), [("12.8", False), ("12.9", True), ("13.0", True)])
-    def test_only_an_nvcc_that_knows_seeds_gets_one(
-        self, builder: ModuleType, tmp_path: Path, release: str, seeded: bool
-    ) -> None:
-        nvcc = str(fake_nvcc(tmp_path, release))
-        csrc = ROOT / "submodules" / "simple-knn" / "csrc"
-        plan = builder.compilations(torch, ["c++"], nvcc, csrc, tmp_path)
-        kernels = [one for one in plan if one.source.suffix == ".cu"]
-        assert kernels and all((f"-frandom-seed={one.source.stem}" in one.command) == seeded for one in kernels)
+def test_architectures(builder, monkeypatch, tmp_path):
+    nvcc = str(fake_nvcc(tmp_path))
 
-    def test_architectures(self, builder: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-        nvcc = str(fake_nvcc(tmp_path))
+    def flags(*names: str, and_ptx: str) -> list[str]:
+        last = [f"-gencode=arch=compute_{and_ptx},code=[sm_{and_ptx},compute_{and_ptx}]"] if and_ptx else []
+        return [f"-gencode=arch=compute_{n},code=[sm_{n}]" for n in names] + last
 
-        def flags(*names: str) -> list[str]:
-            return [f"-gencode=arch=compute_{n},code=[sm_{n}]" for n in names]
-
-        assert builder.architecture_flags(nvcc, []) == [
-            *flags("80", "90", "100"),
-            "-gencode=arch=compute_120,code=[sm_120,compute_120]",
-        ]
-        assert builder.architecture_flags(nvcc, [(9, 0), (8, 6), (9, 0)]) == flags("86", "90")
-        with pytest.raises(SystemExit, match="^error: the CUDA backend needs compute capability 8.0 or newer, not 7.5"):
-            builder.architecture_flags(nvcc, [(7, 5)])
-        monkeypatch.setenv("TORCH_CUDA_ARCH_LIST", "8.6;9.0a+PTX")
-        assert builder.architecture_flags(nvcc, [(12, 0)]) == [
-            *flags("86"),
-            "-gencode=arch=compute_90a,code=[sm_90a,compute_90a]",
-        ]
+    assert builder.architecture_flags(nvcc, []) == flags("80", "90", "100", and_ptx="120")
+    assert builder.architecture_flags(nvcc, [(9, 0), (8, 6), (9, 0)]) == flags("86", "90", and_ptx="")
+    with pytest.raises(SystemExit, match="^error: the CUDA backend needs compute capability 8.0 or newer, not 7.5"):
+        builder.architecture_flags(nvcc, [(7, 5)])
+    monkeypatch.setenv("TORCH_CUDA_ARCH_LIST", "8.6;9.0a+PTX")
+    assert builder.architecture_flags(nvcc, [(12, 0)]) == flags("86", and_ptx="90a")
 
 
 def write_extension(folder: Path, kernel: str) -> None:
@@ -178,50 +157,40 @@ def build_extension(folder: Path) -> subprocess.CompletedProcess:
     return subprocess.run(command, cwd=folder, capture_output=True, text=True)
 
 
-def test_every_instruction_set_is_in_the_library(tmp_path: Path) -> None:
-    kernel = """
-        #define NAME_(isa) lanes_##isa
-        #define NAME(isa) NAME_(isa)
-        extern "C" __attribute__((visibility("default"))) int NAME(GS_ISA)() {
-        #if defined(__AVX512F__)
-          return 16;
-        #elif defined(__AVX2__)
-          return 8;
-        #elif defined(__aarch64__) && !defined(GS_PLAIN)
-          return 5;  // as wide as the baseline
-        #else
-          return 4;
-        #endif
-        }"""
-    write_extension(tmp_path, kernel)
-    done = build_extension(tmp_path)
-    assert done.returncode == 0, done.stderr
-    library = ctypes.CDLL(str(tmp_path / "toy" / "_backend.so"))
-    assert library.lanes_baseline() == 4
-    if platform.machine() in ("x86_64", "AMD64"):
-        assert library.lanes_avx2() == 8
-        assert library.lanes_avx512() == 16
-    if platform.machine() in ("aarch64", "arm64"):
-        assert library.lanes_neon() == 5
+KERNEL = """
+    #define NAME_(name, isa) name##_##isa
+    #define NAME(name, isa) NAME_(name, isa)
+    extern "C" __attribute__((visibility("default"))) const char* NAME(place, GS_ISA)() { return __FILE__; }
+    extern "C" __attribute__((visibility("default"))) int NAME(lanes, GS_ISA)() {
+    #if defined(__AVX512F__)
+      return 16;
+    #elif defined(__AVX2__)
+      return 8;
+    #elif defined(__aarch64__) && !defined(GS_PLAIN)
+      return 5;  // as wide as the baseline
+    #else
+      return 4;
+    #endif
+    }"""
+LANES = {"x86_64": {"avx2": 8, "avx512": 16}, "aarch64": {"neon": 5}}
+LANES |= {"AMD64": LANES["x86_64"], "arm64": LANES["aarch64"]}
 
 
-def test_the_library_has_the_same_bytes_wherever_it_is_built(tmp_path: Path) -> None:
-    kernel = """
-        #define NAME_(isa) place_##isa
-        #define NAME(isa) NAME_(isa)
-        extern "C" __attribute__((visibility("default"))) const char* NAME(GS_ISA)() { return __FILE__; }"""
+def test_a_library_has_every_instruction_set_and_the_same_bytes_wherever_it_is_built(tmp_path: Path) -> None:
     libraries = []
     for name in ("one", "another_one"):
         folder = tmp_path / name / "toy"
         folder.mkdir(parents=True)
-        write_extension(folder, kernel)
+        write_extension(folder, KERNEL)
         done = build_extension(folder)
         assert done.returncode == 0, done.stderr
         libraries.append(folder / "toy" / "_backend.so")
     assert libraries[0].read_bytes() == libraries[1].read_bytes()
-    place = ctypes.CDLL(str(libraries[0])).place_baseline
-    place.restype = ctypes.c_char_p
-    assert place() == b"./toy/csrc/cpu/kernel_isa.cpp"
+    library = ctypes.CDLL(str(libraries[0]))
+    library.place_baseline.restype = ctypes.c_char_p
+    assert library.place_baseline() == b"./toy/csrc/cpu/kernel_isa.cpp"
+    for isa, lanes in {"baseline": 4, **LANES.get(platform.machine(), {})}.items():
+        assert library[f"lanes_{isa}"]() == lanes
 
 
 def test_compile_error_ends_without_traceback(tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ import torch
 from diff_gaussian_rasterization.backend import OPERATORS
 from fused_ssim import BAND_ROWS, REACH, fused_photometric_loss, photometric_loss_by_bands
 from processes import in_ranks
+from rasterizer_tools import BOTH_AND_GPU, GPU_MARKS
 from torch import Tensor
 
 from gaussian_renderer.over_ranks import bands
@@ -24,6 +25,8 @@ CASES = [
     (40, 20, [0, 1, 2, 3]),  # the last band has 8 rows of pixels
     (33, 1, [0, 2, 3, 3]),  # the last band has one row
     (5, 130, [0, 0, 1]),
+    pytest.param(960, 538, [0, 30, 60], marks=GPU_MARKS),  # a band by itself is small
+    pytest.param(1060, 1600, [0, 20, 67], marks=GPU_MARKS),  # so large that blocks of the forward have 16 rows
 ]
 
 
@@ -71,11 +74,12 @@ def check_bands(height: int, borders: list[int], images: tuple[Tensor, Tensor], 
 
 
 @pytest.mark.parametrize("as_bytes", [True, False], ids=["bytes", "floats"])
-@pytest.mark.parametrize("precision", [torch.float32, torch.float64])
+@BOTH_AND_GPU
 @pytest.mark.parametrize(("height", "width", "borders"), CASES)
-def test_bands_have_the_loss_and_the_gradient_of_the_whole_image(height, width, borders, precision, as_bytes):
+def test_bands_have_the_loss_and_the_gradient_of_the_whole_image(height, width, borders, device, dtype, as_bytes):
+    images = tuple(image.to(device) for image in image_pair(height, width, dtype, as_bytes))
     for clamp in (True, False):
-        check_bands(height, borders, image_pair(height, width, precision, as_bytes), clamp)
+        check_bands(height, borders, images, clamp)
 
 
 @pytest.mark.parametrize("rows", [(0, 20), (8, 40), (16, 0), (0, 48), (-16, 16)])

@@ -61,25 +61,6 @@ def test_columns_left_out_are_not_touched(columns):
         torch.testing.assert_close(got[:, :columns], wanted[:, :columns], rtol=1e-5, atol=1e-6)
 
 
-@pytest.mark.parametrize("columns", [-1, 9])
-def test_any_number_of_threads_gives_the_same_bits(columns):
-    n, before = 40_000, torch.get_num_threads()
-    generator = torch.Generator().manual_seed(3)
-    start, gradient = torch.randn(n, 45, generator=generator), torch.randn(n, 45, generator=generator)
-    results = []
-    try:
-        for threads in (1, 2, 3):
-            torch.set_num_threads(threads)
-            state = [start.clone(), 0.1 * gradient, gradient**2]
-            adam(state[0], gradient, *state[1:], 0.1, BETAS, 1e-15, 7.0, columns)
-            results.append(state)
-    finally:
-        torch.set_num_threads(before)
-    for state in results[1:]:
-        for got, wanted in zip(state, results[0], strict=True):
-            assert torch.equal(got, wanted)
-
-
 def test_many_tensors_in_one_call_are_each_by_itself():
     """Twenty tensors, more than one launch on a GPU takes, each with its own rate, columns and counter."""
     generator = torch.Generator().manual_seed(4)
@@ -97,31 +78,3 @@ def test_many_tensors_in_one_call_are_each_by_itself():
     for got, wanted in zip(together, alone, strict=True):
         assert all(torch.equal(one, other) for one, other in zip(got, wanted, strict=True))
     assert [int(counter) for counter in counters] == list(range(1, len(shapes) + 1))
-
-
-def test_no_tensor_takes_a_step_when_one_does_not_fit():
-    good, bad = torch.ones(4, 3), torch.ones(4, 3)
-    moments = [torch.ones(4, 3) for _ in range(4)]
-    counters = [torch.tensor(2.0), torch.tensor(2.0)]
-    with pytest.raises(RuntimeError, match="shape, dtype and device of the parameter"):
-        gradients = [torch.ones(4, 3), torch.ones(3, 4)]
-        optim.adam_([good, bad], gradients, moments[:2], moments[2:], counters, [0.1] * 2, *BETAS, 1e-15, [-1] * 2)
-    assert all((t == 1).all() for t in (good, bad, *moments)) and all(c == 2 for c in counters)
-
-
-def test_wrong_arguments_are_named():
-    a, b = torch.zeros(4, 3), torch.zeros(4, 2)
-    with pytest.raises(RuntimeError, match="shape, dtype and device of the parameter"):
-        adam(a, b, a.clone(), a.clone(), 0.1, BETAS, 1e-15, 1.0)
-    with pytest.raises(RuntimeError, match="shape, dtype and device of the parameter"):
-        adam(a, a.double(), a.clone(), a.clone(), 0.1, BETAS, 1e-15, 1.0)
-    with pytest.raises(RuntimeError, match="must be contiguous"):
-        adam(torch.zeros(3, 4).T, a, a.clone(), a.clone(), 0.1, BETAS, 1e-15, 1.0)
-    with pytest.raises(RuntimeError, match="columns must be at most 3, got 4"):
-        adam(a, a.clone(), a.clone(), a.clone(), 0.1, BETAS, 1e-15, 1.0, 4)
-    empty = torch.zeros(0, 45)
-    adam(empty, empty.clone(), empty.clone(), empty.clone(), 0.1, BETAS, 1e-15, 1.0)
-    with pytest.raises(RuntimeError, match="for each of the 1 parameters, got 2"):
-        optim.adam_([a], [a.clone()], [a.clone()], [a.clone()], [torch.zeros(())], [0.1, 0.1], *BETAS, 1e-15, [-1])
-    with pytest.raises(RuntimeError, match="step counter must be one float32 on the CPU"):
-        optim.adam_([a], [a.clone()], [a.clone()], [a.clone()], [torch.ones(1).int()], [0.1], *BETAS, 1e-15, [-1])

@@ -22,6 +22,13 @@ from benchmarks.workloads.splat_scenes import settings
 COVARIANCE = torch.eye(3)[[0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]].repeat(3, 1)  # of three spheres
 
 
+NAMES = (
+    "image_height image_width tanfovx tanfovy bg scale_modifier viewmatrix projmatrix sh_degree campos prefiltered "
+    "debug antialiasing"
+)
+OUTPUTS = "color transmittance inverse_depth radii splats tile_counts instances ranges splat_slots slots last layers"
+
+
 def scene(n: int = 3, dtype: torch.dtype = torch.float32):
     raw, size = few(n, dtype=dtype)
     return activated(raw), settings(**size)
@@ -41,22 +48,7 @@ def call(splats, camera, **changes):
 
 
 def test_settings_are_the_references_tuple():
-    names = [
-        "image_height",
-        "image_width",
-        "tanfovx",
-        "tanfovy",
-        "bg",
-        "scale_modifier",
-        "viewmatrix",
-        "projmatrix",
-        "sh_degree",
-        "campos",
-        "prefiltered",
-        "debug",
-        "antialiasing",
-    ]
-    assert GaussianRasterizationSettings._fields[:13] == tuple(names)
+    assert GaussianRasterizationSettings._fields[:13] == tuple(NAMES.split())
     # Our fields follow and have defaults, so that the reference's 13 stay valid by position and by name. The last of
     # these has one because 2023 did not know it.
     assert set(GaussianRasterizationSettings._fields[12:]) == set(GaussianRasterizationSettings._field_defaults)
@@ -91,20 +83,17 @@ def test_settings_of_2023_give_two_results():
 
 def test_three_results():
     splats, camera = scene()
-    result = call(splats, camera)
+    result = call(leaves(splats), camera)
     assert isinstance(result, tuple) and len(result) == 3
     color, radii, inverse_depth = result
-    assert color.shape == (3, 7, 18) and color.dtype == torch.float32
+    assert color.shape == (3, 7, 18) and inverse_depth.shape == (1, 7, 18)
+    assert all(image.is_contiguous() and image.dtype == torch.float32 for image in (color, inverse_depth))
     assert radii.shape == (3,) and radii.dtype == torch.int32 and not radii.requires_grad
-    assert inverse_depth.shape == (1, 7, 18)
     assert call(splats, camera._replace(inverse_depth=False))[2] is None
-
-
-def test_by_place_in_the_references_order():
-    splats, camera = scene()
+    # By place, in the reference's order.
     sh = torch.cat([splats["sh_dc"], splats["sh_rest"]], 1)
     places = (splats["means"], torch.zeros(3, 3), splats["opacities"], sh, None, splats["scales"], splats["rotations"])
-    assert torch.equal(GaussianRasterizer(camera)(*places, None)[0], call(splats, camera)[0])
+    assert torch.equal(GaussianRasterizer(camera)(*places, None)[0], color)
 
 
 def test_the_class_and_the_function_agree():
@@ -210,12 +199,6 @@ def test_strided_inputs_give_the_same_bits():
     assert torch.equal(inputs["means"].grad, plain["means"].grad)
 
 
-def test_results_are_contiguous_float32():
-    splats, camera = scene()
-    for image in call(leaves(splats), camera)[::2]:
-        assert image.is_contiguous() and image.dtype == torch.float32
-
-
 def test_the_band_of_degree_0_may_come_apart():
     """As callers of the accelerated branch pass it: dc and the rest by keyword."""
     splats, camera = scene()
@@ -266,6 +249,15 @@ def test_screen_means_that_need_no_gradient_may_have_any_form():
         assert torch.equal(call(splats, camera, means2D=means2D)[0], wanted)
     with pytest.raises(ValueError, match=r"means2d must be \(3, 3\), got \(3, 2\)"):
         call(splats, camera, means2D=torch.zeros(3, 2, requires_grad=True))
+    for shape in ((2, 3), (3, 2)):
+        with pytest.raises(ValueError, match=r"means2d must be \(3, 3\), got"):
+            render(splats, camera, torch.zeros(shape), raw=False)
+    # Callers that need no gradient of theirs pass None.
+    inputs = leaves(splats)
+    image = call(inputs, camera, means2D=None)[0]
+    assert torch.equal(image, wanted)
+    image.sum().backward()
+    assert inputs["means"].grad.any()
 
 
 def test_empty_tensors_stand_for_none():
@@ -342,23 +334,16 @@ def test_other_types_than_tensors_are_named(as_other, grad):
             call(splats, camera, shs=as_other(torch.zeros(3, 16, 3)))
 
 
-def test_only_asked_gradients_are_made():
+def test_one_gradient_alone_is_that_among_all():
     splats, camera = scene()
+    everything = leaves(splats)
+    render(everything, camera, raw=False).color.sum().backward()
     for name in splats:
-        inputs = dict(splats)
-        inputs[name] = splats[name].clone().requires_grad_()
+        inputs = splats | {name: splats[name].clone().requires_grad_()}
         render(inputs, camera, raw=False).color.sum().backward()
-        everything = leaves(splats)
-        render(everything, camera, raw=False).color.sum().backward()
         assert torch.equal(inputs[name].grad, everything[name].grad)
-
-
-def test_torch_func_differentiates():
-    splats, camera = scene()
-    inputs = leaves(splats)
-    render(inputs, camera, raw=False).color.sum().backward()
     grad = torch.func.grad(lambda t: render(splats | {"means": t}, camera, raw=False).color.sum())(splats["means"])
-    assert torch.equal(grad, inputs["means"].grad)
+    assert torch.equal(grad, everything["means"].grad)
 
 
 def _outputs(splats, camera, train: bool, inverse_depth: bool = True):
@@ -369,25 +354,12 @@ def _outputs(splats, camera, train: bool, inverse_depth: bool = True):
 
 def test_nothing_is_kept_without_gradients():
     splats, camera = scene()
-    names = [
-        "color",
-        "transmittance",
-        "inverse_depth",
-        "radii",
-        "splats",
-        "tile_counts",
-        "instances",
-        "ranges",
-        "splat_slots",
-        "slots",
-        "last",
-        "layers",
-    ]
-    rendering = dict(zip(names, _outputs(splats, camera, False, False), strict=True))
+    rendering, training = (
+        dict(zip(OUTPUTS.split(), _outputs(splats, camera, train, train), strict=True)) for train in (False, True)
+    )
     for name in ("splat_slots", "last", "inverse_depth", "layers"):
         assert rendering[name].numel() == 0, name
     assert len(rendering["slots"]) == 0
-    training = dict(zip(names, _outputs(splats, camera, True), strict=True))
     assert len(training["instances"]) == training["ranges"][-1] == training["tile_counts"].sum()
     _, _, rects, counts, _ = ops.project(*scene_arguments(splats, camera, False))
     x0, y0, x1, y1 = torch.where(counts[:, None] > 0, rects, 0).T
@@ -405,21 +377,18 @@ def test_nothing_is_kept_without_gradients():
     assert render(splats, camera, raw=False).color.grad_fn is None
 
 
-def test_the_backward_of_a_rendering_says_what_is_wrong():
+def test_a_backward_that_has_nothing_to_go_on_says_what_is_wrong():
     splats, camera = scene()
-    inputs = leaves(splats)
-    color = _outputs(inputs, camera, False)[0]
     with pytest.raises(RuntimeError, match="train=False"):
-        color.sum().backward()
-
-
-def test_a_second_backward_of_a_freed_graph_is_torchs_own_error():
-    splats, camera = scene()
+        _outputs(leaves(splats), camera, False)[0].sum().backward()
     color = render(leaves(splats), camera, raw=False).color
     color.sum().backward(retain_graph=True)
     color.sum().backward()
-    with pytest.raises(RuntimeError, match="second time"):
+    with pytest.raises(RuntimeError, match="second time"):  # torch's own
         color.sum().backward()
+    debugged = render(leaves(splats), camera._replace(debug=True), raw=False).color
+    with pytest.raises(FloatingPointError, match="gradient of .* not finite"):
+        (debugged.sum() * float("inf")).backward()
 
 
 @pytest.mark.parametrize(
@@ -439,18 +408,16 @@ def test_a_second_backward_of_a_freed_graph_is_torchs_own_error():
         ("sh_rest", None, ValueError, "give sh_dc and sh_rest, or colors"),
         ("colors", torch.zeros(3, 3), ValueError, "give sh_dc and sh_rest, or colors"),
         ("cov3d", torch.zeros(3, 6), ValueError, "give scales and rotations, or cov3d"),
+        ("opacities", None, TypeError, "opacities must be a tensor, got None"),
     ],
 )
 def test_wrong_inputs_are_named(name, value, error, message):
     splats, camera = scene()
     with pytest.raises(error, match=message):
         render(splats | {name: value}, camera, torch.zeros(3, 3), raw=False)
-
-
-def test_raw_scales_are_asked_for_as_logarithms():
-    raw, size = few(dtype=torch.float32)
-    with pytest.raises(ValueError, match="logarithms"):
-        render(raw | {"scales": raw["scales"][:, :1]}, settings(**size))
+    if name == "scales":
+        with pytest.raises(error, match="logarithms" if value is not None else message):
+            render(few(dtype=torch.float32)[0] | {name: value}, camera, torch.zeros(3, 3))
 
 
 @pytest.mark.parametrize(
@@ -500,31 +467,3 @@ def test_torch_compile_gives_the_same_gradients(backend, fullgraph, recwarn):
     assert not any("Dynamo" in str(warning.message) for warning in recwarn)
     for name, values in expected.items():
         assert torch.equal(compiled[name].grad, values.grad), name
-
-
-@pytest.mark.parametrize("shape", [(2, 3), (3, 2)])
-def test_means2d_of_another_shape_is_named(shape):
-    splats, camera = scene()
-    with pytest.raises(ValueError, match=r"means2d must be \(3, 3\), got"):
-        rest = {k: v for k, v in splats.items() if k not in ("means", "opacities")}
-        rasterize(splats["means"], torch.zeros(shape), splats["opacities"], camera, **rest)
-
-
-def test_debug_names_a_gradient_that_is_not_finite():
-    splats, camera = scene()
-    inputs = leaves(splats)
-    out = render(inputs, camera._replace(debug=True), raw=False)
-    with pytest.raises(FloatingPointError, match="gradient of .* not finite"):
-        (out.color.sum() * float("inf")).backward()
-
-
-def test_screen_means_may_be_left_out():
-    """Callers that need no gradient of theirs pass None."""
-    splats, camera = scene()
-    images = [call(splats, camera, means2D=means2d)[0] for means2d in (torch.zeros_like(splats["means"]), None)]
-    assert torch.equal(*images)
-    inputs = leaves(splats)
-    call(inputs, camera, means2D=None)[0].sum().backward()
-    assert inputs["means"].grad.any()
-    with pytest.raises(TypeError, match="opacities must be a tensor, got None"):
-        call(splats, camera, opacities=None)

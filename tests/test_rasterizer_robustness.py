@@ -79,11 +79,9 @@ def test_extreme_finite_values_leave_everything_finite(raw, name, camera, device
 
 
 def test_a_zero_quaternion_counts_as_the_identity(camera):
-    parameters = scene(True)
     for value in (0.0, 1e-45):
-        zero = {k: t.clone() for k, t in parameters.items()}
+        zero, identity = scene(True), scene(True)
         zero["rotations"][VICTIM] = torch.tensor([0.0, value, 0.0, 0.0])
-        identity = {k: t.clone() for k, t in zero.items()}
         identity["rotations"][VICTIM] = torch.tensor([1.0, 0.0, 0.0, 0.0])
         got, wanted = gradients(zero, camera), gradients(identity, camera)
         assert torch.equal(got["color"], wanted["color"])
@@ -104,7 +102,7 @@ def test_the_length_of_a_raw_quaternion_does_not_matter(length, camera):
 @CPU_AND_GPU
 @pytest.mark.parametrize("logit", [-50.0, 50.0])
 def test_saturated_logits(logit, camera, device):
-    parameters = {k: t.clone() for k, t in scene(True).items()}
+    parameters = scene(True)
     parameters["opacities"][VICTIM] = logit
     got = gradients(parameters, camera, device)
     slope = got["d opacities"][VICTIM].abs().item()
@@ -116,7 +114,7 @@ def test_saturated_logits(logit, camera, device):
 
 
 def test_infinite_logits_are_opacities_of_one_and_zero(camera):
-    parameters = {k: t.clone() for k, t in scene(True).items()}
+    parameters = scene(True)
     for logit, opacity in ((math.inf, 1.0), (-math.inf, 0.0)):
         parameters["opacities"][VICTIM] = logit
         got = gradients(parameters, camera)
@@ -131,7 +129,7 @@ def test_infinite_logits_are_opacities_of_one_and_zero(camera):
 
 @pytest.mark.parametrize("scale", [1e-10, 1e6])
 def test_scales_from_points_to_worlds(scale, camera):
-    parameters = {k: t.clone() for k, t in scene(True).items()}
+    parameters = scene(True)
     parameters["scales"][VICTIM] = math.log(scale)
     got = gradients(parameters, camera._replace(antialiasing=False))
     assert all(t.isfinite().all() for t in got.values())
@@ -148,10 +146,9 @@ def test_scales_from_points_to_worlds(scale, camera):
 @pytest.mark.parametrize("axes", [(0,), (2,), (0, 1, 2)])
 def test_giants_are_drawn_or_culled_alike_in_both_precisions(axes, camera, device):
     """Their squares leave float32's range, where float64 went on drawing."""
-    parameters = scene(True)
     seen = []
     for exponent in (14, 15, 16, 17, 17.5, 18.5, 19, 20, 30, 38):
-        giant = {name: t.clone() for name, t in parameters.items()}
+        giant = scene(True)
         giant["scales"][VICTIM, list(axes)] = math.log(10) * exponent
         got = gradients(giant, camera, device)
         exact = gradients({name: t.double() for name, t in giant.items()}, camera)
@@ -162,7 +159,7 @@ def test_giants_are_drawn_or_culled_alike_in_both_precisions(axes, camera, devic
 
 
 def test_bright_coefficients(camera):
-    parameters = {k: t.clone() for k, t in scene(True).items()}
+    parameters = scene(True)
     parameters["sh_dc"][VICTIM] = 1e4
     parameters["sh_rest"][VICTIM] *= 1e4
     got = gradients(parameters, camera)
@@ -172,7 +169,7 @@ def test_bright_coefficients(camera):
 
 @CPU_AND_GPU
 def test_a_mean_on_the_cameras_centre_is_culled(camera, device):
-    parameters = {k: t.clone() for k, t in scene(True).items()}
+    parameters = scene(True)
     parameters["means"][VICTIM] = 0.0
     got = gradients(parameters, camera, device)
     assert got["radii"][VICTIM] == 0 and not got["d means"][VICTIM].any()
@@ -186,8 +183,7 @@ def test_a_mean_on_the_cameras_centre_is_culled(camera, device):
 
 @CPU_AND_GPU
 def test_a_degenerate_covariance_is_finite(camera, device):
-    parameters = scene(False)
     for values in ([0.0] * 6, [1, 1, 1, 1, 1, 1], [1e-3, 0, 0, -1e-3, 0, 1e-3], [1e-3, 1, 0, 1e-3, 0, 1e-3]):
-        bad = {k: t.clone() for k, t in parameters.items()}
+        bad = scene(False)
         bad["cov3d"][VICTIM] = torch.tensor(values, dtype=torch.float32)
         assert all(t.isfinite().all() for t in gradients(bad, camera, device, raw=False).values()), values

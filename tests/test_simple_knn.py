@@ -1,5 +1,6 @@
-"""distCUDA2 against SciPy's kd-tree and all pairs in float64."""
+"""distCUDA2 against SciPy's kd-tree, all pairs in float64, and on a GPU against the CPU."""
 
+import platform
 import shutil
 import subprocess
 import sys
@@ -12,13 +13,14 @@ import simple_knn
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from rasterizer_tools import CPU_AND_GPU, GPU_MARKS
 from scipy.spatial import cKDTree
 from simple_knn._C import distCUDA2
 from simple_knn.reference import mean_distance2
-from torch import library
 
 # Some eight rounded operations on each side; differences of coordinates are taken before squaring.
 RTOL = {torch.float32: 8 * 2**-24, torch.float64: 8 * 2**-53}
+on_a_gpu = pytest.mark.parametrize("device", [pytest.param("cuda", marks=GPU_MARKS)])
 both_dtypes = pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 
 
@@ -51,31 +53,42 @@ def cloud(name: str) -> torch.Tensor:
 CLOUDS = ["normal", "collinear", "planar", "duplicates", "all equal", "outliers", "large offset", "tiny"]
 
 
+def distances(points: torch.Tensor, device: str) -> torch.Tensor:
+    """The distances by the device, on the CPU; those of a GPU are compared with the CPU's."""
+    got = distCUDA2(points.to(device))
+    assert got.device.type == device and got.dtype == points.dtype and got.shape == points.shape[:1]
+    if device == "cuda":
+        wanted = distCUDA2(points)
+        if platform.machine() == "x86_64":  # elsewhere the compiler may fuse products with sums
+            assert torch.equal(got.cpu(), wanted)
+        torch.testing.assert_close(got.cpu(), wanted, rtol=RTOL[points.dtype], atol=0)
+    return got.cpu()
+
+
+@CPU_AND_GPU
 @both_dtypes
 @pytest.mark.parametrize("name", CLOUDS)
-def test_agrees_with_scipy(name: str, dtype: torch.dtype) -> None:
+def test_agrees_with_scipy(name: str, dtype: torch.dtype, device: str) -> None:
     points = cloud(name).to(dtype)
-    got = distCUDA2(points)
-    assert got.dtype == dtype
+    got = distances(points, device)
     # SciPy gives distances; their squares are rounded once more.
     torch.testing.assert_close(got.double(), by_scipy(points), rtol=RTOL[dtype] + 4 * 2**-53, atol=0)
 
 
+@CPU_AND_GPU
 @both_dtypes
-@pytest.mark.parametrize("count", [0, 1, 2, 3, 4, 5, 9, 40])
-def test_small_clouds_agree_with_all_pairs(count: int, dtype: torch.dtype) -> None:
+@pytest.mark.parametrize("count", [0, 1, 2, 3, 4, 5, 8, 9, 16, 17, 33, 40, 257])
+def test_small_clouds_agree_with_all_pairs(count: int, dtype: torch.dtype, device: str) -> None:
     points = cloud("normal")[:count].to(dtype)
-    got = distCUDA2(points)
-    assert got.shape == (count,)
-    torch.testing.assert_close(got.double(), mean_distance2(points), rtol=RTOL[dtype], atol=0)
+    torch.testing.assert_close(distances(points, device).double(), mean_distance2(points), rtol=RTOL[dtype], atol=0)
 
 
-def test_tiny_clouds_by_hand() -> None:
+@CPU_AND_GPU
+def test_tiny_clouds_by_hand(device: str) -> None:
     points = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 3, 0], [0, 0, 0]])
-    assert distCUDA2(points[:1]).tolist() == [0]
-    assert distCUDA2(points[:2]).tolist() == [1, 1]
-    assert distCUDA2(points[:3]).tolist() == [5, 5.5, 9.5]
-    torch.testing.assert_close(distCUDA2(points), torch.tensor([10 / 3, 4, 28 / 3, 10 / 3]))
+    for count, wanted in ((1, [0]), (2, [1, 1]), (3, [5, 5.5, 9.5])):
+        assert distances(points[:count], device).tolist() == wanted
+    torch.testing.assert_close(distances(points, device), torch.tensor([10 / 3, 4, 28 / 3, 10 / 3]))
 
 
 @given(
@@ -89,42 +102,41 @@ def test_any_cloud_agrees_with_all_pairs(rows: list[tuple[float, float, float]])
     torch.testing.assert_close(distCUDA2(points).double(), mean_distance2(points), rtol=RTOL[torch.float32], atol=0)
 
 
-def test_not_finite_points_are_apart() -> None:
-    points = cloud("normal")[:50].clone()
+@CPU_AND_GPU
+@both_dtypes
+def test_not_finite_points_are_apart(dtype: torch.dtype, device: str) -> None:
+    points = cloud("normal")[:500].to(dtype)
     points[7, 1] = float("nan")
-    points[20, 0] = float("inf")
+    points[[0, 20, 499], 0] = float("inf")
     good = points.isfinite().all(1)
-    got = distCUDA2(points)
-    assert got[~good].tolist() == [0, 0]
-    assert torch.equal(got[good], distCUDA2(points[good]))
+    got = distances(points, device)
+    assert got[~good].tolist() == [0] * 4
+    assert torch.equal(got[good], distances(points[good], device))
+    assert not distances(torch.full((70, 3), float("nan"), dtype=dtype), device).any()
 
 
-def test_overflow_stays_finite() -> None:
+@CPU_AND_GPU
+def test_overflow_stays_finite(device: str) -> None:
+    largest = torch.finfo(torch.float32).max
     points = torch.tensor([[1e30, 0, 0], [-1e30, 0, 0], [0, 2e38, 0], [0, -2e38, 0]])
-    assert (distCUDA2(points) == torch.finfo(torch.float32).max).all()
+    assert (distances(points, device) == largest).all()
+    assert distances(largest * torch.tanh(cloud("normal")), device).isfinite().all()
+    distances(cloud("normal").double() * 1e300, device)  # beyond the range of float, in which the tree is planned
 
 
-def test_order_of_points_does_not_matter() -> None:
-    points = cloud("duplicates")
-    order = torch.randperm(len(points), generator=torch.Generator().manual_seed(0))
-    assert torch.equal(distCUDA2(points[order]), distCUDA2(points)[order])
+@CPU_AND_GPU
+def test_order_of_points_does_not_matter(device: str) -> None:
+    points = torch.cat([cloud("normal"), cloud("duplicates"), cloud("outliers")]).to(device)
+    wanted = distCUDA2(points)
+    for seed in range(10 if device == "cuda" else 1):
+        order = torch.randperm(len(points), generator=torch.Generator().manual_seed(seed)).to(device)
+        assert torch.equal(distCUDA2(points), wanted)
+        assert torch.equal(distCUDA2(points[order]), wanted[order])
 
 
-def test_same_bits_for_any_number_of_threads() -> None:
-    points = torch.cat([cloud("normal"), cloud("duplicates"), cloud("outliers")])
-    before = torch.get_num_threads()
-    try:
-        results = []
-        for threads in (1, 2, 3, 7):
-            torch.set_num_threads(threads)
-            results.append(distCUDA2(points))
-    finally:
-        torch.set_num_threads(before)
-    assert all(torch.equal(result, results[0]) for result in results)
-
-
-def test_not_contiguous() -> None:
-    points = cloud("normal")
+@CPU_AND_GPU
+def test_not_contiguous(device: str) -> None:
+    points = cloud("normal").to(device)
     wanted = distCUDA2(points)
     assert torch.equal(distCUDA2(points.T.contiguous().T), wanted)
     assert torch.equal(distCUDA2(torch.cat([points, points], 1)[:, :3]), wanted)
@@ -141,27 +153,61 @@ def test_large_cloud_is_not_quadratic() -> None:
         assert time.process_time() - start < 10
 
 
-def test_opcheck() -> None:
-    for points in (cloud("normal")[:20], cloud("normal")[:0].double()):
-        library.opcheck(torch.ops.simple_knn.mean_distance2, (points,))
+@on_a_gpu
+def test_large_clouds(device: str) -> None:
+    near = torch.rand(200_000, 3, generator=torch.Generator().manual_seed(1))
+    plane = near * torch.tensor([1, 1, 1e-6])
+    for points in (near, torch.cat([near, near[:10] * 1e6]), plane, near.round(decimals=2)):
+        distances(points, device)
+
+
+@on_a_gpu
+def test_millions_take_no_time(device: str) -> None:
+    points = torch.randn(4_000_000, 3, device=device, generator=torch.Generator(device).manual_seed(1))
+    for many in (points, torch.cat([points, points[:100] * 1e6])):
+        distCUDA2(many[:1000])
+        torch.cuda.synchronize()
+        start = time.perf_counter()
+        got = distCUDA2(many)
+        torch.cuda.synchronize()
+        assert time.perf_counter() - start < 2  # all pairs would take minutes
+        some = torch.arange(0, len(many), 400_003, device=device)
+        nearest = torch.stack([(many - many[i]).double().square().sum(1).topk(4, largest=False)[0] for i in some])
+        torch.testing.assert_close(got[some].double(), nearest[:, 1:].mean(1), rtol=RTOL[torch.float32], atol=0)
+
+
+@on_a_gpu
+def test_runs_on_the_current_stream(device: str) -> None:
+    points = cloud("normal").to(device)
+    wanted = distCUDA2(points)
+    late = torch.zeros_like(points)
+    torch.cuda.synchronize()
+    stream = torch.cuda.Stream()
+    with torch.cuda.stream(stream):
+        torch.cuda._sleep(50_000_000)  # tens of milliseconds in which another stream would read the zeros
+        late.copy_(points)
+        got = distCUDA2(late)
+    stream.synchronize()
+    assert torch.equal(got, wanted)
 
 
 def test_has_no_gradient() -> None:
     assert not distCUDA2(torch.zeros(4, 3, requires_grad=True)).requires_grad
 
 
-def test_messages() -> None:
-    with pytest.raises(ValueError, match=r"points must be \(N, 3\), got \(5, 2\)"):
-        distCUDA2(torch.zeros(5, 2))
-    with pytest.raises(ValueError, match=r"points must be \(N, 3\), got \(3,\)"):
-        distCUDA2(torch.zeros(3))
-    with pytest.raises(TypeError, match=r"float32 or float64, got torch.int64"):
-        distCUDA2(torch.zeros(5, 3, dtype=torch.int64))
+@CPU_AND_GPU
+def test_messages(device: str) -> None:
+    for shape, shown in (((5, 2), r"\(5, 2\)"), ((3,), r"\(3,\)")):
+        with pytest.raises(ValueError, match=rf"points must be \(N, 3\), got {shown}"):
+            distCUDA2(torch.zeros(shape, device=device))
+    for dtype in (torch.int64, torch.float16):
+        with pytest.raises(TypeError, match=f"float32 or float64, got {dtype}"):
+            distCUDA2(torch.zeros(5, 3, device=device, dtype=dtype))
     # The operator itself checks inputs that bypass the Python function.
     with pytest.raises(RuntimeError, match=r"points must be \(N, 3\)"):
-        torch.ops.simple_knn.mean_distance2(torch.zeros(5, 2))
+        torch.ops.simple_knn.mean_distance2(torch.zeros(5, 2, device=device))
     with pytest.raises(RuntimeError, match="points must be float32 or float64"):
-        torch.ops.simple_knn.mean_distance2(torch.zeros(5, 3, dtype=torch.float16))
+        torch.ops.simple_knn.mean_distance2(torch.zeros(5, 3, device=device, dtype=torch.float16))
 
 
 def test_numpy_double_reference_is_itself_right() -> None:

@@ -53,39 +53,6 @@ def test_columns_left_out_are_not_touched(columns):
         assert columns == 0 or (old[seen, :columns] != new[seen, :columns]).all()
 
 
-def test_any_number_of_threads_gives_the_same_bits():
-    n, before = 20_000, torch.get_num_threads()
-    generator = torch.Generator().manual_seed(3)
-    start, gradient = torch.randn(n, 45, generator=generator), torch.randn(n, 45, generator=generator)
-    seen = torch.rand(n, generator=generator) < 0.3
-    results = []
-    try:
-        for threads in (1, 2, 3):
-            torch.set_num_threads(threads)
-            state = [start.clone(), 0.1 * gradient, gradient**2]
-            ops.sparse_adam_(state[0], gradient, *state[1:], seen, RATE, *BETAS, EPS)
-            results.append(state)
-    finally:
-        torch.set_num_threads(before)
-    for state in results[1:]:
-        for got, wanted in zip(state, results[0], strict=True):
-            assert torch.equal(got, wanted)
-
-
-def test_wrong_arguments_are_named():
-    a = torch.zeros(4, 3)
-    for seen in (torch.ones(3, dtype=torch.bool), torch.ones(4), torch.ones(4, 1, dtype=torch.bool)):
-        with pytest.raises(RuntimeError, match=r"visible must be \(4\) bool on cpu, got"):
-            ops.sparse_adam_(a, a.clone(), a.clone(), a.clone(), seen, RATE, *BETAS, EPS)
-    seen = torch.ones(4, dtype=torch.bool)
-    with pytest.raises(RuntimeError, match="shape, dtype and device of the parameter"):
-        ops.sparse_adam_(a, a[:, :2], a.clone(), a.clone(), seen, RATE, *BETAS, EPS)
-    with pytest.raises(RuntimeError, match="columns must be at most 3, got 4"):
-        ops.sparse_adam_(a, a.clone(), a.clone(), a.clone(), seen, RATE, *BETAS, EPS, 4)
-    empty = torch.zeros(0, 45)
-    ops.sparse_adam_(empty, empty.clone(), empty.clone(), empty.clone(), seen[:0], RATE, *BETAS, EPS)
-
-
 def _give_gradients(gaussians: GaussianModel, seed: int) -> None:
     generator = torch.Generator().manual_seed(seed)
     for name in GROUPS.values():

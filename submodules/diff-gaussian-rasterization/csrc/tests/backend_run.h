@@ -1,6 +1,7 @@
 #pragma once
 // A random scene, and a forward and a backward pass through a backend, for tests.
 #include <cmath>
+#include <memory>
 #include <numeric>
 #include <random>
 #include <vector>
@@ -75,35 +76,55 @@ gs::Scene<T> scene_of(Parameters<T>& p, gs::Image image, bool antialiasing) {
   return scene;
 }
 
-// Binning's results for a scene, on an Executor or a Queue. rects, records: whether projection gives them to binning,
-// which needs one of the two. slots: whether binning fills them.
+// A forward of a scene, and what its backward needs. Allocations are exact, so that a sanitizer sees an access outside.
 template <class T>
-struct Bins {
-  std::vector<int32_t> instances;
+struct RenderedOf {
+  std::vector<T> splats, depths, color, transmittance, inverse_depth, gradient, moments, layers;
+  std::vector<int32_t> rects, tile_counts, radii, last, instances;
+  std::vector<gs::TileRecord> records;
   std::vector<int64_t> ranges;
   std::vector<gs::SplatSlots> slots;
   int64_t slot_count = 0;
+  T background[3] = {T(0.1), T(0.2), T(0.3)};
+  gs::Scene<T> scene;
+  gs::BlendInput<T> input;
+  gs::BlendGradient<T> backward;
+
+  size_t pixels() const { return size_t(scene.image.width) * scene.image.height; }
 };
+using Rendered = RenderedOf<float>;
+
+// What is asked of projection and binning. rects, records: what projection gives to binning, which needs one of the
+// two. slots: whether binning fills them. ahead: as a host that runs ahead gives it.
+struct Asked {
+  bool rects = true, records = true, slots = true;
+  const gs::Ahead* ahead = nullptr;
+};
+
+// Projects and bins, on an Executor or a Queue.
 template <class T, class Where>
-Bins<T> bin_scene(const Where& where, const gs::Scene<T>& scene, bool rects, bool records, bool slots) {
+std::unique_ptr<RenderedOf<T>> bin_scene(const Where& where, const gs::Scene<T>& scene, const Asked& asked) {
   using gs::cuda::bin, gs::cuda::project, gs::GS_ISA::bin, gs::GS_ISA::project;
-  const size_t n = scene.count;
-  std::vector<T> splats(kSplatValues * n), depths(n);
-  std::vector<int32_t> rect(4 * n, 0x7fffffff), tile_counts(n), radii(n);  // undefined values must not be used
-  std::vector<gs::TileRecord> record(n);
-  const gs::Projected<T> projected = {splats.data(),      depths.data(), rects ? rect.data() : nullptr,
-                                      tile_counts.data(), radii.data(),  records ? record.data() : nullptr};
-  project(where, scene, projected);
-  Bins<T> out;
+  auto out = std::make_unique<RenderedOf<T>>();
+  RenderedOf<T>& r = *out;
   const gs::Image image = scene.image;
-  out.ranges.resize(size_t((image.width + 15) / 16) * ((image.height + 15) / 16) + 1);
-  out.slots.resize(slots ? n + 1 : 0);
-  const auto take = [](void* context, int64_t count, int64_t slot_count) {
-    Bins<T>& b = *static_cast<Bins<T>*>(context);
-    b.instances.resize(count), b.slot_count = slot_count;
-    return gs::Binned{b.instances.data(), b.ranges.data()};
+  const size_t n = scene.count;
+  r.scene = scene;
+  r.splats.resize(kSplatValues * n), r.depths.resize(n), r.tile_counts.resize(n), r.radii.resize(n);
+  r.rects.assign(4 * n, 0x7fffffff), r.records.resize(n);  // undefined values must not be used
+  r.ranges.resize(size_t((image.width + 15) / 16) * ((image.height + 15) / 16) + 1);
+  r.slots.resize(asked.slots ? n + 1 : 0);
+  const gs::Projected<T> projected = {
+      r.splats.data(),      r.depths.data(), asked.rects ? r.rects.data() : nullptr,
+      r.tile_counts.data(), r.radii.data(),  asked.records ? r.records.data() : nullptr};
+  project(where, scene, projected);
+  const auto take = [](void* context, int64_t count, int64_t slots) {
+    RenderedOf<T>& to = *static_cast<RenderedOf<T>*>(context);
+    to.instances.resize(count), to.slot_count = slots;
+    return gs::Binned{to.instances.data(), to.ranges.data()};
   };
-  bin(where, scene.count, projected, image, gs::BinMemory{take, &out, slots ? out.slots.data() : nullptr});
+  bin(where, scene.count, projected, image,
+      gs::BinMemory{take, &r, asked.slots ? r.slots.data() : nullptr, asked.ahead});
   return out;
 }
 
@@ -113,80 +134,75 @@ std::vector<T> memory_for_layers(const Where&, gs::Image image, int64_t instance
   return std::vector<T>(std::is_same_v<Where, gs::Queue> ? layer_values(image, instances, true) : 0, T(NAN));
 }
 
-// Forward and backward of the sum of all pixels of all planes, on an Executor or a Queue. Allocations are exact, so
-// that a sanitizer sees an access outside. On a Queue the forward gives its layers to the backward. The gradient holds
-// means, means2d, opacities, scales, rotations, dc, rest, one after the other. records: projection gives binning a
-// record of each splat besides its rectangle. ahead: as a host that runs ahead gives it; a gradient of a halted run is
-// -77. absolute: with the lengths of absolute gradients.
+// Projects, bins and blends; the gradient of every pixel's value is 1. On a Queue the forward gives its layers to the
+// backward.
+template <class T, class Where>
+std::unique_ptr<RenderedOf<T>> render(const Where& where, const gs::Scene<T>& scene, const Asked& asked = {}) {
+  using gs::cuda::blend, gs::GS_ISA::blend;
+  auto out = bin_scene(where, scene, asked);
+  RenderedOf<T>& r = *out;
+  const size_t pixels = r.pixels();
+  const int64_t room = int64_t(r.instances.size());
+  r.color.resize(3 * pixels), r.transmittance.resize(pixels), r.inverse_depth.resize(pixels), r.last.resize(pixels);
+  r.input = {r.splats.data(), r.instances.data(), r.ranges.data(), r.background, scene.image, room};
+  r.layers = memory_for_layers<T>(where, scene.image, room);
+  T* const layers = r.layers.empty() ? nullptr : r.layers.data();
+  blend(where, r.input,
+        gs::Blended<T>{r.color.data(), r.transmittance.data(), r.inverse_depth.data(), r.last.data(), layers});
+  r.gradient.assign(3 * pixels, T(1)), r.moments.resize(kGradientValues * scene.count);
+  const T* const g = r.gradient.data();
+  r.backward = {scene.count,      room,   r.slot_count, r.slots.data(), r.transmittance.data(), r.last.data(), g, g, g,
+                r.moments.data(), layers, asked.ahead};
+  return out;
+}
+
+// Gradients in memory: means, means2d, opacities, scales, rotations, sh_dc, sh_rest, one after the other; -77 before.
+template <class T>
+struct GradientsInMemory {
+  std::vector<T> memory;
+  gs::SceneGradient<T> pointers;
+  explicit GradientsInMemory(int64_t n) : memory(n * 62, T(-77)) {
+    T* g = memory.data();
+    pointers = {g, g + 3 * n, g + 6 * n, g + 7 * n, g + 10 * n, nullptr, nullptr, g + 14 * n, g + 17 * n};
+  }
+};
+
+// Checks the lists of a forward that was not halted.
+template <class T>
+void check_lists_of(const RenderedOf<T>& r, int64_t instances) {
+  CHECK(r.slot_count >= r.slots.back().first);
+  CHECK(instances == std::accumulate(r.tile_counts.begin(), r.tile_counts.end(), int64_t(0)));
+  CHECK(r.ranges.front() == 0 && r.ranges.back() == instances);
+  for (size_t t = 0; t + 1 < r.ranges.size(); ++t)
+    for (int64_t k = r.ranges[t] + 1; k < r.ranges[t + 1]; ++k) {
+      const int32_t a = r.instances[k - 1], b = r.instances[k];
+      CHECK(r.depths[a] < r.depths[b] || (r.depths[a] == r.depths[b] && a < b));
+    }
+}
+
+// Forward and backward of the sum of all pixels of all planes. records: projection gives binning a record of each splat
+// besides its rectangle. A gradient of a halted run is -77. absolute: with the lengths of absolute gradients.
 template <class T, class Where>
 Result<T> run(const Where& where, Parameters<T>& p, gs::Image image, bool antialiasing, bool records = false,
               const gs::Ahead* ahead = nullptr, bool absolute = false) {
-  using gs::cuda::bin, gs::cuda::blend, gs::cuda::blend_vjp, gs::cuda::project, gs::cuda::project_vjp;
-  using gs::cuda::mark_decisive, gs::GS_ISA::mark_decisive;
-  using gs::GS_ISA::bin, gs::GS_ISA::blend, gs::GS_ISA::blend_vjp, gs::GS_ISA::project, gs::GS_ISA::project_vjp;
-  const T background[3] = {T(0.1), T(0.2), T(0.3)};
-  const gs::Scene<T> scene = scene_of(p, image, antialiasing);
-  const size_t n = p.count, pixels = size_t(image.width) * image.height;
+  using gs::cuda::blend_vjp, gs::cuda::mark_decisive, gs::cuda::project_vjp;
+  using gs::GS_ISA::blend_vjp, gs::GS_ISA::mark_decisive, gs::GS_ISA::project_vjp;
+  const auto r = render(where, scene_of(p, image, antialiasing), Asked{true, records, true, ahead});
   Result<T> out;
-  std::vector<T> splats(kSplatValues * n), depths(n);
-  std::vector<int32_t> rects(4 * n, 0x7fffffff);
-  std::vector<gs::TileRecord> record(n);
-  out.tile_counts.resize(n), out.radii.resize(n);
-  const gs::Projected<T> projected = {splats.data(),          depths.data(),    rects.data(),
-                                      out.tile_counts.data(), out.radii.data(), records ? record.data() : nullptr};
-  project(where, scene, projected);
-
-  const size_t tiles = size_t((image.width + 15) / 16) * ((image.height + 15) / 16);
-  struct Lists {
-    std::vector<int32_t> instances;
-    std::vector<int64_t> ranges;
-    int64_t slot_count;
-  } lists{{}, std::vector<int64_t>(tiles + 1), 0};
-  std::vector<gs::SplatSlots> slots(n + 1);
-  const auto take = [](void* context, int64_t count, int64_t slots) {
-    Lists& l = *static_cast<Lists*>(context);
-    l.instances.resize(count), l.slot_count = slots;
-    return gs::Binned{l.instances.data(), l.ranges.data()};
-  };
-  bin(where, p.count, projected, image, gs::BinMemory{take, &lists, slots.data(), ahead});
-  auto& [instances, ranges, slot_count] = lists;
+  out.instances = ahead ? r->ranges.back() : int64_t(r->instances.size());
   const bool halted = ahead && *ahead->halted;
-  std::vector<int32_t> last(pixels);
-  out.instances = ahead ? ranges.back() : int64_t(instances.size());
-  CHECK(halted || slot_count >= slots.back().first);
-  CHECK(ahead || slot_count == slots.back().first);
-  CHECK(halted || out.instances == std::accumulate(out.tile_counts.begin(), out.tile_counts.end(), int64_t(0)));
-  CHECK(halted || (ranges.front() == 0 && ranges.back() == out.instances));
-  for (size_t t = 0; t < tiles && !halted; ++t)
-    for (int64_t k = ranges[t] + 1; k < ranges[t + 1]; ++k) {
-      const int32_t a = instances[k - 1], b = instances[k];
-      CHECK(depths[a] < depths[b] || (depths[a] == depths[b] && a < b));
-    }
-
-  out.color.resize(3 * pixels), out.transmittance.resize(pixels), out.depth.resize(pixels);
-  const int64_t room = int64_t(instances.size());
-  const gs::BlendInput<T> input = {splats.data(), instances.data(), ranges.data(), background, image, room};
-  std::vector<T> layers = memory_for_layers<T>(where, image, room);
-  blend(where, input,
-        gs::Blended<T>{out.color.data(), out.transmittance.data(), out.depth.data(), last.data(),
-                       layers.empty() ? nullptr : layers.data()});
-
+  CHECK(ahead || r->slot_count == r->slots.back().first);
+  if (!halted) check_lists_of(*r, out.instances);
   static_assert(sizeof(bool) == 1);
-  out.decisive.resize(n);
-  if (!halted) mark_decisive(where, input, last.data(), reinterpret_cast<bool*>(out.decisive.data()));
-
-  const std::vector<T> ones(3 * pixels, T(1));
-  std::vector<T> moments(kGradientValues * n);
-  out.absolute.assign(absolute ? n : 0, T(-77));
-  blend_vjp(
-      where, input,
-      gs::BlendGradient<T>{p.count, room, slot_count, slots.data(), out.transmittance.data(), last.data(), ones.data(),
-                           ones.data(), ones.data(), moments.data(), layers.empty() ? nullptr : layers.data(), ahead,
-                           absolute ? out.absolute.data() : nullptr});
-  out.gradient.assign(n * (3 + 3 + 1 + 3 + 4 + 3 + 45), T(-77));
-  T* g = out.gradient.data();
-  const gs::SceneGradient<T> gradient = {g,       g + 3 * n, g + 6 * n,  g + 7 * n, g + 10 * n,
-                                         nullptr, nullptr,   g + 14 * n, g + 17 * n};
-  project_vjp(where, scene, out.tile_counts.data(), moments.data(), gradient);
+  out.decisive.resize(p.count);
+  if (!halted) mark_decisive(where, r->input, r->last.data(), reinterpret_cast<bool*>(out.decisive.data()));
+  out.absolute.assign(absolute ? p.count : 0, T(-77));
+  if (absolute) r->backward.absolute = out.absolute.data();
+  blend_vjp(where, r->input, r->backward);
+  GradientsInMemory<T> gradient(p.count);
+  project_vjp(where, r->scene, r->tile_counts.data(), r->moments.data(), gradient.pointers);
+  out.gradient = std::move(gradient.memory), out.depth = std::move(r->inverse_depth);
+  out.color = std::move(r->color), out.transmittance = std::move(r->transmittance);
+  out.radii = std::move(r->radii), out.tile_counts = std::move(r->tile_counts);
   return out;
 }

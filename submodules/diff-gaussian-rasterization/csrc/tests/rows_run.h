@@ -107,7 +107,7 @@ inline std::vector<Parameters<float>> scenes_for_rows() {
 template <class Where, class GradientsOf>
 void check_rows(const Where& where, const gs::Scene<float>& scene, bool depth, bool layers,
                 const GradientsOf& gradients_of) {
-  const auto r = render(where, scene, 3);
+  const auto r = render_with(where, scene, 3);
   if (!depth) r->backward.inverse_depth = r->backward.transmittance_gradient = nullptr;
   if (!layers) r->backward.layers = nullptr;
   for (const bool absolute : {false, true}) {

@@ -1,8 +1,6 @@
 #pragma once
 // Gaussians that take a step from a backward: by the backward itself, or from gradients in memory, as a plain optimiser
 // and density control do. Both must give the same bits.
-#include <cstring>
-#include <memory>
 #include <vector>
 
 #include "backend_run.h"
@@ -73,63 +71,13 @@ struct Stepping {
   }
 };
 
-// A forward of the values, and what its backward needs.
-struct Rendered {
-  std::vector<float> splats, depths, color, transmittance, inverse_depth, gradient, moments, layers;
-  std::vector<int32_t> rects, tile_counts, radii, last, instances;
-  std::vector<gs::TileRecord> records;
-  std::vector<int64_t> ranges;
-  std::vector<gs::SplatSlots> slots;
-  int64_t slot_count = 0;
-  float background[3] = {0.1f, 0.2f, 0.3f};
-  gs::Scene<float> scene;
-  gs::BlendInput<float> input;
-  gs::BlendGradient<float> backward;
-};
+// A forward whose gradient is 1 but for one pixel in the middle.
 template <class Where>
-std::unique_ptr<Rendered> render(const Where& where, const gs::Scene<float>& scene, float gradient) {
-  using gs::cuda::bin, gs::cuda::blend, gs::cuda::project;
-  using gs::GS_ISA::bin, gs::GS_ISA::blend, gs::GS_ISA::project;
-  auto out = std::make_unique<Rendered>();
-  Rendered& r = *out;
-  const gs::Image image = scene.image;
-  const size_t n = scene.count, pixels = size_t(image.width) * image.height;
-  r.scene = scene;
-  r.splats.resize(kSplatValues * n), r.depths.resize(n), r.rects.resize(4 * n), r.tile_counts.resize(n);
-  r.radii.resize(n), r.records.resize(n), r.slots.resize(n + 1), r.moments.resize(kGradientValues * n);
-  const gs::Projected<float> projected = {r.splats.data(),      r.depths.data(), r.rects.data(),
-                                          r.tile_counts.data(), r.radii.data(),  r.records.data()};
-  project(where, r.scene, projected);
-  r.ranges.resize(size_t((image.width + 15) / 16) * ((image.height + 15) / 16) + 1);
-  const auto take = [](void* context, int64_t count, int64_t slots) {
-    Rendered& to = *static_cast<Rendered*>(context);
-    to.instances.resize(count), to.slot_count = slots;
-    return gs::Binned{to.instances.data(), to.ranges.data()};
-  };
-  bin(where, scene.count, projected, image, gs::BinMemory{take, &r, r.slots.data()});
-  r.color.resize(3 * pixels), r.transmittance.resize(pixels), r.inverse_depth.resize(pixels), r.last.resize(pixels);
-  r.input = {r.splats.data(), r.instances.data(), r.ranges.data(), r.background, image, int64_t(r.instances.size())};
-  r.layers = memory_for_layers<float>(where, image, int64_t(r.instances.size()));
-  float* const layers = r.layers.empty() ? nullptr : r.layers.data();
-  blend(where, r.input, {r.color.data(), r.transmittance.data(), r.inverse_depth.data(), r.last.data(), layers});
-  r.gradient.assign(3 * pixels, 1);
-  r.gradient[pixels / 2 + image.width / 2] = gradient;
-  r.backward = {
-      scene.count,   int64_t(r.instances.size()), r.slot_count,      r.slots.data(),    r.transmittance.data(),
-      r.last.data(), r.gradient.data(),           r.gradient.data(), r.gradient.data(), r.moments.data(),
-      layers};
+std::unique_ptr<Rendered> render_with(const Where& where, const gs::Scene<float>& scene, float gradient) {
+  auto out = render(where, scene);
+  out->gradient[out->pixels() / 2 + scene.image.width / 2] = gradient;
   return out;
 }
-
-// Gradients in memory: means, means2d, opacities, scales, rotations, sh_dc, sh_rest, one after the other.
-struct GradientRowsInMemory {
-  std::vector<float> memory;
-  gs::SceneGradient<float> pointers;
-  explicit GradientRowsInMemory(int64_t n) : memory(n * 62, -77.0f) {
-    float* g = memory.data();
-    pointers = {g, g + 3 * n, g + 6 * n, g + 7 * n, g + 10 * n, nullptr, nullptr, g + 14 * n, g + 17 * n};
-  }
-};
 
 // Takes an iteration's step from gradients in memory. fill writes them, from the render.
 template <class Where, class Fill>
@@ -138,7 +86,7 @@ void step_plainly(const Where& where, Stepping& s, const StepCase& how, const Re
   using gs::observe, gs::cuda::observe, gs::cuda::adam, gs::cuda::sparse_adam;
   using gs::cuda::penalise;
   using gs::GS_ISA::adam, gs::GS_ISA::penalise, gs::GS_ISA::sparse_adam;
-  GradientRowsInMemory gradient(s.values.count);
+  GradientsInMemory<float> gradient(s.values.count);
   const gs::SceneGradient<float>& g = gradient.pointers;
   fill(g);
   if (how.observed) observe(where, s.observe(how, r.radii.data(), g.means2d));

@@ -1,21 +1,12 @@
 // The whole CPU backend under the sanitizers: threads, sizes, gradients by differences, and poisoned scenes.
 #include <limits>
-#include <thread>
 
 #include "backend_run.h"
+#include "gs/check_threads.h"
 #include "rows_run.h"
 #include "step_run.h"
 
 namespace {
-
-gs::Executor threads() {
-  return {3, [](int64_t n, int64_t, const std::function<void(int64_t, int64_t)>& body) {
-            std::vector<std::thread> running;
-            for (int64_t i = 0; i < 3; ++i)
-              if (n * i / 3 < n * (i + 1) / 3) running.emplace_back([&, i] { body(n * i / 3, n * (i + 1) / 3); });
-            for (std::thread& thread : running) thread.join();
-          }};
-}
 
 template <class T>
 void check_finite(const std::vector<T>& values) {
@@ -27,12 +18,13 @@ void test_threads_and_sizes() {
   for (const gs::Image image : {gs::Image{1, 1}, gs::Image{16, 16}, gs::Image{17, 31}, gs::Image{70, 33}})
     for (int64_t count : {0, 1, 700}) {
       Parameters<T> p(count);
-      const Result<T> serial = run(gs::serial_executor(), p, image, true), parallel = run(threads(), p, image, true);
+      const Result<T> serial = run(gs::serial_executor(), p, image, true),
+                      parallel = run(gs::three_threads(), p, image, true);
       CHECK(serial.color == parallel.color && serial.transmittance == parallel.transmittance);
       CHECK(serial.depth == parallel.depth && serial.gradient == parallel.gradient);
       CHECK(serial.radii == parallel.radii && serial.instances == parallel.instances);
       CHECK(serial.decisive == parallel.decisive);
-      const Result<T> recorded = run(threads(), p, image, true, true);
+      const Result<T> recorded = run(gs::three_threads(), p, image, true, true);
       CHECK(serial.color == recorded.color && serial.gradient == recorded.gradient);
       for (int64_t i = 0; i < count; ++i) CHECK(!serial.decisive[i] || serial.tile_counts[i] > 0);
       check_finite(serial.color), check_finite(serial.gradient);
@@ -121,16 +113,16 @@ void test_poison() {
 void test_rows() {
   for (Parameters<float>& p : scenes_for_rows())
     for (const bool depth : {false, true})
-      check_rows(threads(), scene_of(p, {40, 70}, false), depth, false,
+      check_rows(gs::three_threads(), scene_of(p, {40, 70}, false), depth, false,
                  [](const Rendered& r, const KeptRows* rows, float* lengths) {
                    std::vector<float> moments(kGradientValues * r.scene.count, NAN);
                    gs::BlendGradient<float> g = r.backward;
                    g.moments = moments.data(), g.absolute = lengths;
                    if (rows)
-                     sum_rows(threads(), rows->given(r),
+                     sum_rows(gs::three_threads(), rows->given(r),
                               gs::RowSums<float>{r.splats.data(), r.scene.image, moments.data(), lengths});
                    else
-                     blend_vjp(threads(), r.input, g);
+                     blend_vjp(gs::three_threads(), r.input, g);
                    return moments;
                  });
 }
@@ -144,13 +136,13 @@ void test_gaussian_step() {
       Stepping plain = start, fused = start;
       for (int64_t iteration = 1; iteration <= 3; ++iteration) {
         const float gradient = iteration == 2 ? how.gradient : 1;
-        const auto r = render(threads(), scene_of(plain.values, {40, 24}, count == 130), gradient);
-        blend_vjp(threads(), r->input, r->backward);
-        step_plainly(threads(), plain, how, *r, iteration, [&](const gs::SceneGradient<float>& g) {
+        const auto r = render_with(gs::three_threads(), scene_of(plain.values, {40, 24}, count == 130), gradient);
+        blend_vjp(gs::three_threads(), r->input, r->backward);
+        step_plainly(gs::three_threads(), plain, how, *r, iteration, [&](const gs::SceneGradient<float>& g) {
           project_vjp(gs::serial_executor(), r->scene, r->tile_counts.data(), r->moments.data(), g);
         });
         r->scene = scene_of(fused.values, r->scene.image, r->scene.antialiasing);  // has the values of before that step
-        project_vjp_step(threads(), r->scene, r->tile_counts.data(), r->moments.data(),
+        project_vjp_step(gs::three_threads(), r->scene, r->tile_counts.data(), r->moments.data(),
                          gaussian_step(fused, how, *r, iteration));
         CHECK(fused.bytes() == plain.bytes());
       }

@@ -298,18 +298,18 @@ bool same_slots(const gs::SplatSlots& a, const gs::SplatSlots& b) {
 void check_bins(Parameters<float>& p, gs::Image image) {
   using gs::emulation::Order;
   const gs::Scene<float> scene = scene_of(p, image, false);
-  const Bins<float> cpu = bin_scene(gs::serial_executor(), scene, true, false, true);
+  const auto cpu = bin_scene(gs::serial_executor(), scene, {true, false, true});
   for (const Order order : {Order::forward, Order::backward, Order::shuffled})
     for (const bool slots : {false, true})
       for (const auto& [rects, records] : {std::pair{true, true}, std::pair{true, false}, std::pair{false, true}}) {
         if (records && !has_records(image)) continue;
         gs::emulation::order = order;
         gs::emulation::Memory memory;
-        const Bins<float> got = bin_scene(memory.queue(), scene, rects, records, slots);
-        CHECK(got.instances == cpu.instances && got.ranges == cpu.ranges);
-        CHECK(got.slots.size() == (slots ? cpu.slots.size() : 0));
-        CHECK(std::equal(got.slots.begin(), got.slots.end(), cpu.slots.begin(), same_slots));
-        CHECK(got.slot_count == (slots ? cpu.slot_count : 0));
+        const auto got = bin_scene(memory.queue(), scene, {rects, records, slots});
+        CHECK(got->instances == cpu->instances && got->ranges == cpu->ranges);
+        CHECK(got->slots.size() == (slots ? cpu->slots.size() : 0));
+        CHECK(std::equal(got->slots.begin(), got->slots.end(), cpu->slots.begin(), same_slots));
+        CHECK(got->slot_count == (slots ? cpu->slot_count : 0));
       }
 }
 
@@ -562,79 +562,68 @@ void test_split_positions() {
   }
 }
 
+// Checks something on a queue of its own, in every order of the threads.
+template <class Check>
+void in_every_order(const Check& check) {
+  for (const gs::emulation::Order order : gs::emulation::kOrders) {
+    gs::emulation::order = order;
+    gs::emulation::Memory memory;
+    check(memory.queue());
+  }
+}
+
 void test_packed_splats() {
-  for (const gs::emulation::Order order : gs::emulation::kOrders)
-    for (const int64_t n : {0, 1, 63, 64, 700}) {
-      gs::emulation::order = order;
-      gs::emulation::Memory memory;
+  for (const int64_t n : {0, 1, 63, 64, 700})
+    in_every_order([n](const gs::Queue& queue) {
       const SomeSplats splats(200, n);
-      const std::vector<int32_t> wanted = pack(gs::serial_executor(), splats), got = pack(memory.queue(), splats);
+      const std::vector<int32_t> wanted = pack(gs::serial_executor(), splats), got = pack(queue, splats);
       CHECK(got == wanted);
-      CHECK(unpack(memory.queue(), got) == unpack(gs::serial_executor(), got));
+      CHECK(unpack(queue, got) == unpack(gs::serial_executor(), got));
       if (n) CHECK(got != std::vector<int32_t>(got.size(), -77));
-    }
+    });
 }
 
 void test_records() {
-  for (const gs::emulation::Order order : gs::emulation::kOrders)
-    for (const int bands : {1, 2, 3, 40})
-      for (const int64_t count : {0, 1, 255, 600}) {
-        gs::emulation::order = order;
-        gs::emulation::Memory memory;
+  for (const int bands : {1, 2, 3, 40})
+    for (const int64_t count : {0, 1, 255, 600})
+      in_every_order([bands, count](const gs::Queue& queue) {
         const SomeRects rects(count, bands);
-        const SomeRecords wanted = records(gs::serial_executor(), rects), got = records(memory.queue(), rects);
+        const SomeRecords wanted = records(gs::serial_executor(), rects), got = records(queue, rects);
         CHECK(got.counts == wanted.counts && got.gaussians == wanted.gaussians && got.places == wanted.places);
         CHECK(count < 255 || int64_t(got.places.size()) > count / 8);
         // Counts that do not fit stay within memory.
-        std::vector<int32_t> many(got.counts.size(), 1 << 20);
+        std::vector<int32_t> many(got.counts.size(), 1 << 20), places(3, -77);
         std::vector<int64_t> gaussians(3, -77);
-        std::vector<int32_t> places(3, -77);
-        gs::cuda::list_records(memory.queue(), rects.input(), many.data(), {3, gaussians.data(), places.data()});
-      }
-}
-
-void test_moved_runs() {
-  for (const gs::emulation::Order order : gs::emulation::kOrders)
-    for (const int words : {10, 12})
-      for (const std::vector<int32_t>& counts : counts_of_runs()) {
-        gs::emulation::order = order;
-        gs::emulation::Memory memory;
-        const SomeRuns runs(counts, words);
-        const std::vector<int32_t> wanted = move(gs::serial_executor(), runs), got = move(memory.queue(), runs);
-        CHECK(got == wanted && std::count(got.begin(), got.end(), -77) == 0);
-      }
+        gs::cuda::list_records(queue, rects.input(), many.data(), {3, gaussians.data(), places.data()});
+      });
 }
 
 // Sums of few rows have the CPU's bits but for its double precision; rows that are kept, all of them.
-void test_summed_runs() {
-  for (const gs::emulation::Order order : gs::emulation::kOrders)
-    for (const int values : {10, 12})
-      for (const std::vector<int32_t>& counts : counts_of_runs()) {
-        gs::emulation::order = order;
-        gs::emulation::Memory memory;
+void test_runs() {
+  for (const int values : {10, 12})
+    for (const std::vector<int32_t>& counts : counts_of_runs())
+      in_every_order([values, &counts](const gs::Queue& queue) {
+        const SomeRuns runs(counts, values);
+        const std::vector<int32_t> moved = move(queue, runs);
+        CHECK(moved == move(gs::serial_executor(), runs) && std::count(moved.begin(), moved.end(), -77) == 0);
         const SomeSums sums(counts, values);
-        const std::vector<float> wanted = sum(gs::serial_executor(), sums), got = sum(memory.queue(), sums);
+        const std::vector<float> wanted = sum(gs::serial_executor(), sums), got = sum(queue, sums);
         for (size_t k = 0, run = 0, next = 0; run < counts.size(); ++run)
           for (next += size_t(values) * sums.kept[run]; k < next; ++k)
             CHECK(counts[run] == 1 || sums.kept[run] > 1 ? got[k] == wanted[k] : std::abs(got[k] - wanted[k]) < 1e-3);
         CHECK(std::count(got.end() - 2 * values, got.end(), -77.0f) == 2 * values);
-      }
-}
-
-// What the CPU refuses stays within memory on a GPU.
-void test_sums_that_do_not_fit() {
-  for (const auto& [run, count, kept] : {std::tuple{3, 1000, 1}, {3, -1000, 1}, {3, 2, -5}, {3, 2, 9}, {299, 2, 9}}) {
-    gs::emulation::Memory memory;
-    SomeSums sums(std::vector<int32_t>(300, 2), 10);
-    sums.counts[run] = count, sums.kept[run] = kept;
-    CHECK(sum(memory.queue(), sums).size() == size_t(10 * sums.room));
-  }
+      });
 }
 
 // What the CPU refuses stays within memory on a GPU.
 void test_runs_that_do_not_fit() {
+  gs::emulation::Memory memory;
+  for (const auto& [run, count, kept] : {std::tuple{3, 1000, 1}, {3, -1000, 1}, {3, 2, -5}, {3, 2, 9}, {299, 2, 9}}) {
+    SomeSums sums(std::vector<int32_t>(300, 2), 10);
+    sums.counts[run] = count, sums.kept[run] = kept;
+    CHECK(sum(memory.queue(), sums).size() == size_t(10 * sums.room));
+  }
   for (const auto& [run, count, place] : {std::tuple{3, 1000, 3}, {3, -1000, 3}, {3, 0, 3}, {3, 5, 5000}, {3, 5, -1}}) {
-    gs::emulation::Memory memory;
     SomeRuns runs(std::vector<int32_t>(300, 2), 10);
     runs.counts[run] = count, runs.places[run] = place;
     CHECK(move(memory.queue(), runs).size() == runs.rows.size());
@@ -667,23 +656,25 @@ void test_noise() {
   }
 }
 
+gs::SceneGradient<float> as_given(void* to) { return *static_cast<const gs::SceneGradient<float>*>(to); }
+
 // Gradients of the emulated backward, into memory.
-void emulated_gradients(const gs::Queue& queue, const Rendered& r, const gs::SceneGradient<float>& g) {
-  const auto take = [](void* to) { return *static_cast<const gs::SceneGradient<float>*>(to); };
-  gs::SceneGradient<float> copy = g;
-  gs::cuda::rasterize_vjp(queue, r.scene, r.input, r.backward, {take, &copy});
+void emulated_gradients(const gs::Queue& queue, const Rendered& r, gs::SceneGradient<float> g,
+                        float* lengths = nullptr) {
+  gs::BlendGradient<float> backward = r.backward;
+  backward.absolute = lengths;
+  gs::cuda::rasterize_vjp(queue, r.scene, r.input, backward, {as_given, &g});
 }
 
 // Gradients from rows, once written and once added to numbers, are the same.
 std::vector<float> gradients_from_rows(const gs::Queue& queue, const Rendered& r, const KeptRows& rows,
                                        float* lengths) {
-  const auto take = [](void* to) { return *static_cast<const gs::SceneGradient<float>*>(to); };
-  GradientRowsInMemory gradient(r.scene.count), sums(r.scene.count);
+  GradientsInMemory<float> gradient(r.scene.count), sums(r.scene.count);
   std::fill(sums.memory.begin(), sums.memory.end(), 0.25f);
   sums.pointers.adds = true;
-  for (GradientRowsInMemory* to : {&gradient, &sums})
+  for (GradientsInMemory<float>* to : {&gradient, &sums})
     gs::cuda::rows_vjp(queue, r.scene, rows.given(r), {r.splats.data(), r.scene.image, nullptr, lengths},
-                       {take, &to->pointers});
+                       {as_given, &to->pointers});
   for (size_t k = 0; k < sums.memory.size(); ++k) CHECK(sums.memory[k] == 0.25f + gradient.memory[k]);
   return gradient.memory;
 }
@@ -691,11 +682,8 @@ std::vector<float> gradients_from_rows(const gs::Queue& queue, const Rendered& r
 // Gradients of the emulated backward, from rows or from the lists.
 std::vector<float> gradients_from(const gs::Queue& queue, const Rendered& r, const KeptRows* rows, float* lengths) {
   if (rows) return gradients_from_rows(queue, r, *rows, lengths);
-  GradientRowsInMemory gradient(r.scene.count);
-  const auto take = [](void* to) { return *static_cast<const gs::SceneGradient<float>*>(to); };
-  gs::BlendGradient<float> g = r.backward;
-  g.absolute = lengths;
-  gs::cuda::rasterize_vjp(queue, r.scene, r.input, g, {take, &gradient.pointers});
+  GradientsInMemory<float> gradient(r.scene.count);
+  emulated_gradients(queue, r, gradient.pointers, lengths);
   return gradient.memory;
 }
 
@@ -743,7 +731,7 @@ void test_gaussian_step() {
         const float gradient = iteration == 2 ? how.gradient : 1;
         gs::emulation::Memory memory;
         gs::Queue queue = memory.queue();
-        const auto r = render(queue, scene_of(plain.values, {40, 24}, count == 33), gradient);
+        const auto r = render_with(queue, scene_of(plain.values, {40, 24}, count == 33), gradient);
         step_plainly(queue, plain, how, *r, iteration,
                      [&](const gs::SceneGradient<float>& g) { emulated_gradients(queue, *r, g); });
         r->scene = scene_of(fused.values, r->scene.image, r->scene.antialiasing);  // has the values of before that step
@@ -784,10 +772,10 @@ void test_given_covariances_and_colors() {
   scene.cov3d = covariances.data(), scene.colors = colors.data();
   gs::SceneGradient<float> g{};
   gs::emulation::Memory memory;
-  const auto r = render(memory.queue(), scene, 1);
+  const auto r = render(memory.queue(), scene);
   g.cov3d = got.data(), g.colors = got.data() + 50 * 6;
   emulated_gradients(memory.queue(), *r, g);
-  const auto cpu = render(gs::serial_executor(), scene, 1);
+  const auto cpu = render(gs::serial_executor(), scene);
   gs::GS_ISA::blend_vjp(gs::serial_executor(), cpu->input, cpu->backward);
   g.cov3d = wanted.data(), g.colors = wanted.data() + 50 * 6;
   gs::GS_ISA::project_vjp(gs::serial_executor(), scene, cpu->tile_counts.data(), cpu->moments.data(), g);
@@ -867,10 +855,8 @@ int main() {
                          test_observe,
                          test_split_positions,
                          test_packed_splats,
-                         test_moved_runs,
+                         test_runs,
                          test_runs_that_do_not_fit,
-                         test_summed_runs,
-                         test_sums_that_do_not_fit,
                          test_noise,
                          test_given_covariances_and_colors});
 }

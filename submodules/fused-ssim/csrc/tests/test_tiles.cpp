@@ -2,25 +2,16 @@
 #include <algorithm>
 #include <cmath>
 #include <random>
-#include <thread>
 #include <vector>
 
 #include "backend.h"
 #include "gs/check.h"
+#include "gs/check_threads.h"
 #include "math/ssim.h"
 
 namespace {
 
 using gs::GS_ISA::kRadius;
-
-gs::Executor threads() {
-  return {3, [](int64_t n, int64_t, const std::function<void(int64_t, int64_t)>& body) {
-            std::vector<std::thread> running;
-            for (int64_t i = 0; i < 3; ++i)
-              if (n * i / 3 < n * (i + 1) / 3) running.emplace_back([&, i] { body(n * i / 3, n * (i + 1) / 3); });
-            for (std::thread& thread : running) thread.join();
-          }};
-}
 
 struct Image {
   int64_t height, width;
@@ -86,7 +77,7 @@ void check_size(int64_t planes, int64_t height, int64_t width, bool valid) {
 
   const double kept_l1 = got_l1, kept_ssim = got_ssim;
   args.gradient = threaded.data();
-  gs::GS_ISA::l1_ssim_cpu(args, threads());
+  gs::GS_ISA::l1_ssim_cpu(args, gs::three_threads());
   CHECK(got_l1 == kept_l1 && got_ssim == kept_ssim && got == threaded);
   args.gradient = nullptr;  // other margins of the tiles must give the same value
   gs::GS_ISA::l1_ssim_cpu(args, gs::serial_executor());

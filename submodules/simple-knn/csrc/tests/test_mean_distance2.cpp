@@ -1,21 +1,13 @@
 // The kd-tree against all pairs, on clouds that are hard for a tree.
 #include <algorithm>
 #include <random>
-#include <thread>
 #include <vector>
 
 #include "backend.h"
 #include "gs/check.h"
+#include "gs/check_threads.h"
 
 namespace {
-
-gs::Executor three_threads() {
-  return {3, [](int64_t n, int64_t, const std::function<void(int64_t, int64_t)>& body) {
-            std::vector<std::thread> threads;
-            for (int64_t i = 0; i < n; ++i) threads.emplace_back([&body, i] { body(i, i + 1); });
-            for (std::thread& thread : threads) thread.join();
-          }};
-}
 
 // The definition, in the arithmetic of T.
 template <class T>
@@ -39,7 +31,7 @@ void check_cloud(const std::vector<T>& points) {
   const int64_t n = points.size() / 3;
   std::vector<T> serial(n), threaded(n);
   gs::mean_distance2_cpu(points.data(), n, serial.data(), gs::serial_executor());
-  gs::mean_distance2_cpu(points.data(), n, threaded.data(), three_threads());
+  gs::mean_distance2_cpu(points.data(), n, threaded.data(), gs::three_threads());
   CHECK(serial == threaded);
   for (int64_t i = 0; i < n; ++i) {
     const double wanted = all_pairs(points, i);
