@@ -120,7 +120,7 @@ def _shared() -> list[tuple[Tensor, ...]]:
     return found
 
 
-def test_ranks_send_each_other_what_a_loss_needs_and_wholeimage_pair():
+def test_ranks_send_each_other_what_a_loss_needs():
     found = in_ranks(4, _shared)
     for case, (height, _) in enumerate(OF_FOUR):
         image, photo = image_pair(height, 20, torch.float32, True)

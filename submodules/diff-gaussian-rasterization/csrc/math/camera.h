@@ -48,7 +48,7 @@ GS_HD Camera<T> make_camera(const T* view, const T* full, const T* center, doubl
   cam.dual_z = cross(cam.row_x, cam.row_y);
   const bool rotation = agree(cam.dual_x, cam.row_x) && agree(cam.dual_y, cam.row_y) && agree(cam.dual_z, cam.row_z);
   if (rotation) cam.dual_x = cam.row_x, cam.dual_y = cam.row_y, cam.dual_z = cam.row_z;
-  const Vec3<double> x = wide(cam.row_x), y = wide(cam.row_y), z = wide(cam.row_z);
+  const Vec3<double> x = wide(cam.row_x), y = wide(cam.row_y);
   const Vec3<double> dual_x = wide(cam.dual_x), dual_y = wide(cam.dual_y), dual_z = wide(cam.dual_z);
   const Vec3<double> clip_x = wide(column(full, 0)), clip_y = wide(column(full, 1));
   const T one = 1;  // over the determinant, from the products of each row and its dual
