@@ -128,6 +128,18 @@ def write_usdz(path: str | os.PathLike, splats: Splats) -> None:
                 f"cannot write {path}; free space there and in {folder.parent}, fix the permissions, or choose "
                 "another place"
             )
+        _forget_time(temporary)
+
+
+def _forget_time(package: Path) -> None:
+    """Give the one part of a package the first date that ZIP has, so that the same model has the same bytes."""
+    with zipfile.ZipFile(package) as archive:
+        (part,) = archive.infolist()
+        places = part.header_offset + 10, archive.start_dir + 12  # in the part's header, and in the directory
+    with open(package, "r+b") as file:
+        for place in places:
+            file.seek(place)
+            file.write(b"\0\0\x21\0")  # midnight, 1 January 1980
 
 
 def _is_whole(package: Path) -> bool:
