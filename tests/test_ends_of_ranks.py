@@ -1,6 +1,5 @@
 """Parts of a launch on several ranks that need no second process."""
 
-import argparse
 import io
 import os
 import subprocess
@@ -10,7 +9,6 @@ from pathlib import Path
 import pytest
 
 import train
-from training.launch import viewers
 from training.restart import newest_checkpoint, what_stands
 from utils.host import threads, torchrun
 from utils.ranks import quiet
@@ -57,13 +55,10 @@ def test_a_command_for_one_process_refuses_several(in_torchrun, capsys):
     assert several == ["train.py"]
 
 
-def test_a_page_is_refused_on_several_ranks_and_no_port_opened():
-    args = argparse.Namespace(ip="127.0.0.1", port=6009, disable_viewer=False)
-    assert viewers(args, None) == (("127.0.0.1", 6009), None)
-    with using(_Second()):
-        assert viewers(args, None) == (None, None)
-        with pytest.raises(UserError, match="--viewer needs a training of one process"):
-            viewers(args, ("127.0.0.1", 8080))
+def test_a_page_is_refused_on_several_ranks(monkeypatch):
+    monkeypatch.setattr(train, "agree_on_options", lambda args: None)  # there is no second process to agree with
+    with using(_Second()), pytest.raises(UserError, match="--viewer needs a training of one process"):
+        train.main(["-s", "scene", "--viewer", "8080"])
 
 
 def test_only_the_first_rank_writes(tmp_path):
