@@ -32,6 +32,7 @@ from scene.colmap_loader import (
 from scene.dataset_readers import readColmapCameras
 from scene.pictures import pycolmap_import
 from scene.readers import colmap_model
+from scene.readers.colmap_text import read_poses_text
 from utils.system_utils import UserError
 
 MODELS = [model for model in pycolmap.CameraModelId.__members__.values() if int(model) >= 0]
@@ -218,6 +219,15 @@ def test_a_last_photo_without_its_second_line_has_no_points(tmp_path):
     (tmp_path / "images.txt").write_text("1 1 0 0 0 0 0 0 7 a.png\n\n2 1 0 0 0 0 0 0 7 b.png")
     images = read_extrinsics_text(tmp_path / "images.txt")
     assert [(i.name, i.camera_id, i.xys.shape) for i in images.values()] == [("a.png", 7, (0, 2)), ("b.png", 7, (0, 2))]
+
+
+def test_photos_without_their_second_lines_are_refused(tmp_path):
+    """Else every second photo would be read as the points of the one before."""
+    lines = [f"{i} 1 0 0 0 {i} 0 0 1 a photo {i}.jpg" for i in (1, 2, 3, 4)]
+    (tmp_path / "images.txt").write_text("\n".join(lines))
+    for reader in (read_extrinsics_text, read_poses_text):
+        with pytest.raises(UserError, match="line 2"):
+            reader(tmp_path / "images.txt")
 
 
 @pytest.mark.parametrize(("name", "what"), [("cameras", "camera"), ("images", "photo"), ("points3D", "point")])

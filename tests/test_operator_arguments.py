@@ -110,7 +110,9 @@ def _named(call: Call, changes: dict[str, Any]) -> dict[str, Any]:
 
 
 @BOTH_AND_GPU
-@pytest.mark.parametrize(("name", "changes"), CHECKED, ids=str)
+@pytest.mark.parametrize(
+    ("name", "changes"), CHECKED, ids=lambda value: value if isinstance(value, str) else "-".join(value)
+)
 def test_opcheck(name, changes, device, dtype):
     if name in UNCOMPILED or (device == "cuda" and name in NOT_ON_GPU):
         pytest.skip("has no kernel for shapes alone, or its tensors lie on the CPU")

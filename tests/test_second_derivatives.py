@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+import torch.utils.checkpoint
 from fused_ssim import fused_ssim
 from fused_ssim.ops import fused_photometric_loss
 from rasterizer_tools import activated, few, ops, render, scene_arguments
@@ -95,6 +96,14 @@ def test_every_way_to_the_first_derivative_gives_the_same(function):
     ways += [func.vjp(function, x)[1](torch.ones(()))[0], autograd.functional.jacobian(function, x, create_graph=True)]
     for gradient in ways:
         assert gradient.any() and torch.equal(gradient, leaf.grad)
+
+
+def test_activation_checkpoints_allow_a_graph_of_the_gradient():
+    function, means = FUNCTIONS["square"]
+    leaf = means.clone().requires_grad_()
+    value = torch.utils.checkpoint.checkpoint(function, leaf, use_reentrant=False)
+    (gradient,) = autograd.grad(value, leaf, create_graph=True)
+    assert torch.equal(gradient, _gradient(function, means)[1])
 
 
 def test_a_tangent_elsewhere_is_no_reason_to_raise():

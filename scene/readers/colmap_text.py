@@ -51,10 +51,14 @@ def _images(path: Path, with_points: bool) -> dict[int, Image]:
             id, pose, camera_id, name = int(words[0]), np.array(words[1:8], dtype=np.float64), words[8], words[9]
             qvec, tvec, camera_id = pose[:4], pose[4:], int(camera_id)
             number, line = next(lines, (number, ""))
-            words = line.split() if with_points else []
+            words = line.split()
+            if not with_points:  # a line that was left out would make the next photo one of points
+                words = [*words[:3], *words[-3:]] if len(words) % 3 == 0 else words
             points = np.array(words, dtype=np.float64).reshape(-1, 3)
             # Not from the floats, which hold ids to 2^53 only.
             ids = np.array(words[2::3], dtype=np.int64)
+            if not with_points:
+                points, ids = points[:0], ids[:0]
         except (ValueError, IndexError, OverflowError) as error:
             wanted = "a photo's id, rotation, translation, camera id, name, or in the line after it x, y, id of points"
             raise _bad_line(path, number, wanted, error) from error
@@ -92,7 +96,7 @@ def _data_lines(path: Path, keep_next: bool = False) -> Iterator[tuple[int, str]
 
     keep_next: and of each line that follows one of these, whatever it is.
     """
-    with open(path, encoding="utf-8") as file:
+    with open(path, encoding="utf-8-sig") as file:
         lines = enumerate(file, start=1)
         try:
             for number, line in lines:

@@ -68,7 +68,11 @@ def raise_on_signals() -> None:
 def ignore(signals: Iterable[int] = tuple(_ERRORS)) -> None:
     """Ignore these signals from now on."""
     for signum in signals:
-        signal.signal(signum, signal.SIG_IGN)
+        signal.signal(signum, _pass_over)
+
+
+def _pass_over(signum: int, frame: FrameType | None) -> None:
+    """Do nothing. Programs that are started from now on do not inherit it, as they would signal.SIG_IGN."""
 
 
 def _terminate(signum: int, frame: FrameType | None) -> None:

@@ -76,6 +76,16 @@ class _Final(Function):
         raise RuntimeError(_REFUSAL.format(ctx.name))
 
 
+class _Unpacked:
+    """A context whose saved tensors are unpacked once, as activation checkpointing lets them be."""
+
+    def __init__(self, ctx: Any) -> None:
+        self._ctx, self.saved_tensors = ctx, ctx.saved_tensors
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._ctx, name)
+
+
 def first_order(name: str) -> Callable[[Callable[..., tuple]], Callable[..., tuple]]:
     """Makes the decorator of a backward whose results raise RuntimeError, with the name, when they are differentiated.
 
@@ -88,6 +98,7 @@ def first_order(name: str) -> Callable[[Callable[..., tuple]], Callable[..., tup
         def wrapper(ctx: Any, *gradients: Tensor | None) -> tuple:
             if not torch.is_grad_enabled():
                 return backward(ctx, *gradients)  # there will be no second derivative
+            ctx = _Unpacked(ctx)
             with torch.no_grad():
                 results = backward(ctx, *gradients)
             found = [values for values in results if values is not None]

@@ -1,7 +1,5 @@
 #pragma once
 // The camera: from the world to its view, and the constants of perspective.
-#include <limits>
-
 #include "constants.h"
 #include "vec.h"
 
@@ -25,7 +23,7 @@ struct Camera {
 // Whether two vectors agree within the rounding of a cross product of unit vectors.
 template <class T>
 GS_HD bool agree(Vec3<T> a, Vec3<T> b) {
-  constexpr T most = 4 * std::numeric_limits<T>::epsilon();
+  constexpr T most = T(sizeof(T) == sizeof(float) ? 0x1p-21 : 0x1p-50);  // 4 units in the last place of 1
   return magnitude(a.x - b.x) < most && magnitude(a.y - b.y) < most && magnitude(a.z - b.z) < most;
 }
 
