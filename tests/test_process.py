@@ -11,6 +11,7 @@ import pytest
 import torch
 
 import train
+from scene import Scene
 from scene.gaussians.adam import GaussianAdam
 from scene.gaussians.undecorated import undecorated
 from scene.pictures import store
@@ -115,13 +116,13 @@ def test_a_system_that_does_not_tell_when_a_process_started(colmap_scene, tmp_pa
 
 def test_pictures_are_decoded_while_the_model_is_made(colmap_scene, tmp_path, monkeypatch):
     kept = []
-    plain = training_run.Run._start
+    plain = Scene.create_gaussians
 
-    def start(run: training_run.Run, capture: tuple | None) -> None:
-        kept.append((len(run.scene.images), run.scene.images.ahead))
-        plain(run, capture)
+    def create(scene: Scene) -> None:
+        kept.append((len(scene.images), scene.images.ahead))
+        plain(scene)
 
-    monkeypatch.setattr(training_run.Run, "_start", start)
+    monkeypatch.setattr(Scene, "create_gaussians", create)
     _train(colmap_scene, tmp_path / "out", iterations=2)
     assert kept == [(2, kept[0][1])] and kept[0][1] >= 2  # as many as there are iterations
 
