@@ -49,10 +49,10 @@ demo: install output/demo_scene
 	$(BIN)/python train.py -s output/demo_scene -m output/demo --eval --iterations 1500 --test_iterations 1500
 	$(BIN)/python render.py -m output/demo --skip_train
 	$(BIN)/python metrics.py -m output/demo
-	$(BIN)/python -m demo.report output/demo
+	$(BIN)/python -m splatting.demo.report output/demo
 
 output/demo_scene: | install
-	$(BIN)/python -m demo.make_scene $@
+	$(BIN)/python -m splatting.demo.make_scene $@
 
 test: install lint cpp-test
 	$(BIN)/python -m pytest -m 'not browser' --numprocesses auto --maxprocesses 4 --dist worksteal

@@ -8,7 +8,7 @@ run resumes after the last finished stage, and repeats the stages that changed o
 """
 
 if __name__ == "__main__":
-    import utils.host.early  # noqa: F401  (before the other imports, which take a second)
+    import splatting.host.early  # noqa: F401  (before the other imports, which take a second)
 
 import argparse
 import json
@@ -17,11 +17,11 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from conversion.colmap import LENS_MODELS, Program, Pycolmap, Settings
-from conversion.layout import FEWEST, Layout, find_photos, refuse_foreign_results, scene_folder
-from conversion.programs import refuse_while_working
-from conversion.report import summary
-from conversion.stages import (
+from splatting.sfm.colmap import LENS_MODELS, Program, Pycolmap, Settings
+from splatting.sfm.layout import FEWEST, Layout, find_photos, refuse_foreign_results, scene_folder
+from splatting.sfm.programs import refuse_while_working
+from splatting.sfm.report import summary
+from splatting.sfm.stages import (
     Stage,
     StageRecord,
     model_state,

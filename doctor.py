@@ -6,15 +6,15 @@ Exit status: 0 no problems, 1 problems, 2 the checks could not run.
 """
 
 if __name__ == "__main__":
-    import utils.host.early  # noqa: F401  (before the other imports, which take a second)
+    import splatting.host.early  # noqa: F401  (before the other imports, which take a second)
 
 import argparse
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from diagnosis import environment
-from diagnosis.lines import Line
+from splatting.diagnosis import environment
+from splatting.diagnosis.lines import Line
 
 
 def diagnose(source: str | None, images: str | None, model: str | None, iteration: int) -> int:
@@ -26,7 +26,7 @@ def diagnose(source: str | None, images: str | None, model: str | None, iteratio
     lines = environment.check_packages()
     complete = not any(line.finding for line in lines)
     if complete:
-        import utils.host.openmp  # noqa: F401  isort: skip  (before torch)
+        import splatting.host.openmp  # noqa: F401  isort: skip  (before torch)
 
         lines += environment.check_build()
         complete = environment.extensions_load()
@@ -40,11 +40,11 @@ def diagnose(source: str | None, images: str | None, model: str | None, iteratio
         if folder is not None and not (folder and Path(folder).is_dir()):
             raise UserError(f"no folder {folder or repr(folder)}; pass an existing folder as {option}")
     if source is not None:
-        from diagnosis.dataset import check_dataset
+        from splatting.diagnosis.dataset import check_dataset
 
         problems += _show(f"dataset {source}", check_dataset(source, images or "images"))
     if model is not None:
-        from diagnosis.model import check_model
+        from splatting.diagnosis.model import check_model
 
         problems += _show(f"model {model}", check_model(model, iteration, source, images))
     return problems

@@ -3,13 +3,13 @@
 python export.py -m MODEL --to FILE [--iteration N] [--sh_degree D] [--crop X0 Y0 Z0 X1 Y1 Z1] [--max_splats N]
 python export.py --ply MODEL_OF_ANY_TOOL --to FILE
 
-The ending of FILE names the format; exports/formats.py has the table.
+The ending of FILE names the format; splatting/exports/formats.py has the table.
 """
 
 from __future__ import annotations
 
 if __name__ == "__main__":
-    import utils.host.early  # noqa: F401  (before the other imports, which take a second)
+    import splatting.host.early  # noqa: F401  (before the other imports, which take a second)
 
 import argparse
 import time
@@ -18,15 +18,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import utils.host.openmp  # noqa: F401  isort: skip  (before torch)
+import splatting.host.openmp  # noqa: F401  isort: skip  (before torch)
 import numpy as np
 import torch
 
 from arguments import ModelParams, OptionParser, PipelineParams, get_combined_args
-from exports.formats import FORMATS, READABLE, Format, format_of, read_splats
-from exports.in_scene import splats_of
-from exports.ply import stored_offset
-from exports.splats import Splats, drawable, opacities, selected, tidy, with_sh_degree, within_box
 from gaussian_renderer.importance import blending_weights, most_important
 from gaussian_renderer.scored_views import ScoredViews
 from gaussian_renderer.trimming import change_on_views
@@ -35,12 +31,16 @@ from scene.gaussians.ply import stored_sh_degree
 from scene.saved_iterations import find_iteration, saved_ply
 from scene.saved_model import load_saved
 from scene.scene import Scene
+from splatting.exports.formats import FORMATS, READABLE, Format, format_of, read_splats
+from splatting.exports.in_scene import splats_of
+from splatting.exports.ply import stored_offset
+from splatting.exports.splats import Splats, drawable, opacities, selected, tidy, with_sh_degree, within_box
 from utils.general_utils import safe_state
 from utils.system_utils import UserError, compute_device, run_cli
 
 if TYPE_CHECKING:  # SciPy takes a while to import
-    from moving_cameras.moments import TimedPath
-    from moving_cameras.poses import Poses
+    from splatting.camera_paths.moments import TimedPath
+    from splatting.camera_paths.poses import Poses
 
 
 def load(args: argparse.Namespace, options: argparse.Namespace, want_views: bool) -> tuple[Splats, Scene | None]:
@@ -126,7 +126,7 @@ def _path_maker(path: str | None, entry: Format) -> Callable[[Poses], TimedPath]
         return None
     if not entry.of_scene:
         raise UserError(f"--path is the animation of a page; leave it out for {entry.ending}, or end --to with .html")
-    from moving_cameras.request import path_maker
+    from splatting.camera_paths.request import path_maker
 
     return path_maker(path)
 

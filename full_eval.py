@@ -11,7 +11,7 @@ interruption, the same command resumes. Another command with the same output fol
 from __future__ import annotations
 
 if __name__ == "__main__":
-    import utils.host.early  # noqa: F401  (before the other imports, which take a second)
+    import splatting.host.early  # noqa: F401  (before the other imports, which take a second)
 
 import os
 import sys
@@ -20,20 +20,20 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import utils.host.openmp  # noqa: F401  isort: skip  (before torch)
+import splatting.host.openmp  # noqa: F401  isort: skip  (before torch)
 
-from evaluation import stages
-from evaluation.configs import check_options, read_configs, shipped
-from evaluation.document import cheapest_table, result_blocks
-from evaluation.machine import machine
-from evaluation.peers import peers_of
-from evaluation.report import make_report, write_report
-from evaluation.results import joined, joined_peers, read_earlier, read_run
-from evaluation.runs import Run, check_folders, check_nesting, check_outside_scenes, plan_runs
-from evaluation.scenes import SceneEntry, check_names, dataset_scenes, finished_scenes, folder_scenes
-from evaluation.stages import Failure, StageFailed
-from utils.files.lock import locked
-from utils.files.markdown_table import markdown_table
+from splatting.evaluation import stages
+from splatting.evaluation.configs import check_options, read_configs, shipped
+from splatting.evaluation.document import cheapest_table, result_blocks
+from splatting.evaluation.machine import machine
+from splatting.evaluation.peers import peers_of
+from splatting.evaluation.report import make_report, write_report
+from splatting.evaluation.results import joined, joined_peers, read_earlier, read_run
+from splatting.evaluation.runs import Run, check_folders, check_nesting, check_outside_scenes, plan_runs
+from splatting.evaluation.scenes import SceneEntry, check_names, dataset_scenes, finished_scenes, folder_scenes
+from splatting.evaluation.stages import Failure, StageFailed
+from splatting.files.lock import locked
+from splatting.files.markdown_table import markdown_table
 from utils.system_utils import UserError, mkdir_p, run_cli
 
 EXPOSURE = (
@@ -76,7 +76,8 @@ def _parser() -> ArgumentParser:
         "(default: once)")  # fmt: skip
     add("--peer", nargs=2, action="append", default=[], metavar=("NAME", "FILE"),
         help="draw another program's error against time beside ours, from a CSV file with the columns seconds and "
-        "test_psnr (`python -m evaluation.peer_curve` makes it); with several scenes NAME is SCENE/NAME; may be given "
+        "test_psnr (`python -m splatting.evaluation.peer_curve` makes it); with several "
+        "scenes NAME is SCENE/NAME; may be given "
         "again (default: none)")  # fmt: skip
     add("--html_models", **flag,
         help="write each model into models/ beside the report, as one HTML file with a viewer")  # fmt: skip

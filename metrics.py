@@ -9,7 +9,7 @@ and metrics_info.json, which states the convention of each number.
 from __future__ import annotations
 
 if __name__ == "__main__":
-    import utils.host.early  # noqa: F401  (before the other imports, which take a second)
+    import splatting.host.early  # noqa: F401  (before the other imports, which take a second)
 
 import math
 from argparse import ArgumentParser
@@ -17,16 +17,16 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import utils.host.openmp  # noqa: F401  isort: skip  (before torch)
+import splatting.host.openmp  # noqa: F401  isort: skip  (before torch)
 import numpy as np
 import torch
 from fused_ssim import fused_ssim
 from tqdm import tqdm
 
 from arguments import read_cfg_args
-from records.earlier_lpips import keep_lpips
-from utils.files.image_files import UNREADABLE, open_render
-from utils.files.json_files import write_json
+from splatting.evaluation.earlier_lpips import keep_lpips
+from splatting.files.image_files import UNREADABLE, open_render
+from splatting.files.json_files import write_json
 from utils.lpips_utils import MIN_SIDE, LpipsUnavailable, PerceptualDistance
 from utils.system_utils import UserError, compute_device, run_cli
 

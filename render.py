@@ -7,15 +7,15 @@ python render.py -s SCENE -m OUT --ply FILE
 Writes MODEL/{train,test}/ours_N/{renders,gt}/00000.png ..., numbered by the views' sorted order, masks/ for views of
 which not every pixel counts, and render_times.json beside these folders: the time of each view without I/O. The device
 is idle before the clock starts, and done when it stops. --depth and --alpha write inverse depth and alpha into folders
-of these names, 16-bit PNGs with their scale in a text chunk (utils/files/plane_files.py).
+of these names, 16-bit PNGs with their scale in a text chunk (splatting/files/plane_files.py).
 
-With --path, writes MODEL/videos/ours_N/NAME.mp4 instead (moving_cameras/render_path.py).
+With --path, writes MODEL/videos/ours_N/NAME.mp4 instead (splatting/camera_paths/render_path.py).
 """
 
 from __future__ import annotations
 
 if __name__ == "__main__":
-    import utils.host.early  # noqa: F401  (before the other imports, which take a second)
+    import splatting.host.early  # noqa: F401  (before the other imports, which take a second)
 
 import argparse
 import copy
@@ -23,24 +23,24 @@ import time
 from collections.abc import Collection
 from pathlib import Path
 
-import utils.host.openmp  # noqa: F401  isort: skip  (before torch)
+import splatting.host.openmp  # noqa: F401  isort: skip  (before torch)
 import torch
 from PIL import Image
 from tqdm import tqdm
 
 from arguments import ModelParams, OptionParser, PipelineParams, get_combined_args, warn_of_background
-from exports.in_scene import load_file
 from gaussian_renderer.memory_errors import memory_errors_explained
 from gaussian_renderer.scored_views import ScoredViews
 from gaussian_renderer.view_planes import PLANES, view_planes
-from moving_cameras.request import add_path_options, path_request, wants_path
-from records import render_times
 from scene.cameras import Camera
 from scene.gaussian_model import GaussianModel
 from scene.saved_model import load_saved
 from scene.scene import Scene
-from utils.files.numbered_pngs import remove_leftovers, save_png
-from utils.files.plane_files import write_plane
+from splatting.camera_paths.request import add_path_options, path_request, wants_path
+from splatting.evaluation import render_times
+from splatting.exports.in_scene import load_file
+from splatting.files.numbered_pngs import remove_leftovers, save_png
+from splatting.files.plane_files import write_plane
 from utils.general_utils import safe_state
 from utils.system_utils import UserError, atomic_write, compute_device, mkdir_p, run_cli
 
@@ -196,7 +196,7 @@ def main() -> None:
     safe_state(args.quiet)
     warn_of_background(options)
     if wants_path(args):
-        from moving_cameras.render_path import render_path  # SciPy takes a while to import
+        from splatting.camera_paths.render_path import render_path  # SciPy takes a while to import
 
         request = path_request(args)
         scene, background = _loaded(options, args.iteration, args.typed_sh_degree, args.ply, pipeline)

@@ -4,30 +4,30 @@ python train.py -s SCENE -m OUT --eval
 """
 
 if __name__ == "__main__":
-    import utils.host.early  # noqa: F401  (before the other imports, which take a second)
-    import utils.host.early_cuda  # noqa: F401  (while the others are imported)
+    import splatting.host.early  # noqa: F401  (before the other imports, which take a second)
+    import splatting.host.early_cuda  # noqa: F401  (while the others are imported)
 
 import argparse
 from collections.abc import Sequence
 from typing import Any
 
-import utils.host.openmp  # noqa: F401  isort: skip  (before torch)
+import splatting.host.openmp  # noqa: F401  isort: skip  (before torch)
 import torch
 
 from arguments import ModelParams, OptimizationParams, OptionParser, PipelineParams, write_cfg_args, write_model_json
 from gaussian_renderer import network_gui
-from records.event_writer import EventWriter as SummaryWriter
-from training.agreement import agree_on_options
-from training.launch import add_launch_options, launch_options
-from training.loop import run_training
-from training.observers.report import training_report
-from training.observers.standard import standard_observers
-from training.output_folder import new_folder, own_folder
-from training.run import Run
+from splatting.distributed.ranks import ranks
+from splatting.evaluation.event_writer import EventWriter as SummaryWriter
+from splatting.training.agreement import agree_on_options
+from splatting.training.launch import add_launch_options, launch_options
+from splatting.training.loop import run_training
+from splatting.training.observers.report import training_report
+from splatting.training.observers.standard import standard_observers
+from splatting.training.output_folder import new_folder, own_folder
+from splatting.training.run import Run
+from splatting.viewer.server import checked_address
 from utils.general_utils import safe_state
-from utils.ranks.ranks import ranks
 from utils.system_utils import UserError, mkdir_p, run_cli
-from viewing.server import checked_address
 
 __all__ = ["main", "parse", "prepare_output_and_logger", "train", "training", "training_report"]
 
@@ -37,7 +37,7 @@ def train(
 ) -> None:
     """Train from the options of the three groups; write model, checkpoints and log to dataset.model_path.
 
-    launch: the options of training/launch.py.
+    launch: the options of splatting/training/launch.py.
     """
     dataset.model_path = dataset.model_path or new_folder()
     print(f"Optimizing {dataset.model_path}")

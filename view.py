@@ -6,17 +6,17 @@ python view.py -m MODEL [--iteration N] [--port PORT]
 from __future__ import annotations
 
 if __name__ == "__main__":
-    import utils.host.early  # noqa: F401  (before the other imports, which take a second)
+    import splatting.host.early  # noqa: F401  (before the other imports, which take a second)
 
-import utils.host.openmp  # noqa: F401  isort: skip  (before torch)
+import splatting.host.openmp  # noqa: F401  isort: skip  (before torch)
 
 from arguments import ModelParams, OptionParser, PipelineParams, get_combined_args, warn_of_background
 from scene.saved_model import load_saved
+from splatting.viewer.options import PORT, add_host_option
+from splatting.viewer.page import serve_saved
+from splatting.viewer.server import checked_address
 from utils.general_utils import safe_state
 from utils.system_utils import UserError, run_cli
-from viewing.options import PORT, add_host_option
-from viewing.page import serve_saved
-from viewing.server import checked_address
 
 
 def main() -> None:

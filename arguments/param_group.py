@@ -6,7 +6,7 @@ from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-from utils.files import model_json
+from splatting.files import model_json
 from utils.system_utils import UserError
 
 Value = bool | int | float | str

@@ -10,10 +10,10 @@ from typing import Any
 
 from arguments.groups import OPTIONS, ModelParams
 from arguments.param_group import CFG_ARGS, MODEL_JSON, Value
-from utils.files import model_json
-from utils.files.model_json import OFFSET
-from utils.files.plain_files import plain_text
-from utils.host.version import VERSION
+from splatting.files import model_json
+from splatting.files.model_json import OFFSET
+from splatting.files.plain_files import plain_text
+from splatting.host.version import VERSION
 from utils.system_utils import UserError, atomic_write
 
 _IN_CFG_ARGS = {option.name: option.default for option in OPTIONS if option.stored == CFG_ARGS}
@@ -94,7 +94,7 @@ def add_to_model_json(model_path: str | os.PathLike, **entries: Any) -> None:
 
 
 def read_model_json(model_path: str | os.PathLike) -> dict[str, Any]:
-    """Do as utils.files.model_json.read_model_json; UserError also for an option of the wrong type."""
+    """Do as splatting.files.model_json.read_model_json; UserError also for an option of the wrong type."""
     record = model_json.read_model_json(model_path)
     _check_types(Path(model_path) / MODEL_JSON, record, _IN_MODEL_JSON)
     return record

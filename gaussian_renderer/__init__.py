@@ -5,7 +5,7 @@ import math
 from collections.abc import Callable
 from functools import cache, partial
 
-import utils.host.extensions  # noqa: F401  isort: skip  (before the extensions)
+import splatting.host.extensions  # noqa: F401  isort: skip  (before the extensions)
 import torch
 from diff_gaussian_rasterization import GaussianRasterizationSettings, decisive, rasterize
 from diff_gaussian_rasterization.backend import OPERATORS
@@ -13,13 +13,13 @@ from diff_gaussian_rasterization.gaussians import Gaussians
 from diff_gaussian_rasterization.ops import Rasterized, scene_arguments
 from torch import Tensor
 
-from gaussian_renderer.over_ranks.band import decisive_in, draw_view
-from gaussian_renderer.over_ranks.models import ranks_of
-from gaussian_renderer.over_ranks.rasterize import rasterize_over
 from scene.cameras import Camera, MiniCam
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.exposure import apply_exposure
 from scene.gaussians.parameters import GaussianParameters
+from splatting.distributed.rendering.band import decisive_in, draw_view
+from splatting.distributed.rendering.models import ranks_of
+from splatting.distributed.rendering.rasterize import rasterize_over
 from utils.general_utils import check_flags
 from utils.sh_utils import eval_sh
 

@@ -5,7 +5,7 @@ from collections.abc import Iterator, Sequence
 
 from scene.cameras import Camera, MiniCam
 from scene.gaussian_model import GaussianModel
-from utils.host.memory import is_out_of_memory, shortage
+from splatting.host.memory import is_out_of_memory, shortage
 from utils.system_utils import UserError
 
 

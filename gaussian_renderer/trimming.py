@@ -17,7 +17,7 @@ from gaussian_renderer.scored_views import ScoredViews
 from scene.cameras import Camera, MiniCam
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.sh_bands import cut_bounds, needed_degree
-from utils.ranks.selection import summed
+from splatting.distributed.selection import summed
 
 FAINT = -math.log(254) - 1e-4  # logit of opacity 1/255, below which no pixel draws a Gaussian, less some rounding
 WORTH = 0.01  # share of the Gaussians; fewer unseen ones stay, because leaving them out saves little and is a risk

@@ -17,12 +17,19 @@ from diff_gaussian_rasterization.ops import scene_arguments
 from torch import Tensor
 
 from gaussian_renderer import rasterizer_settings
-from gaussian_renderer.over_ranks.band import Band, View, draw_view, gradient_rows, surroundings, whole_image
-from gaussian_renderer.over_ranks.bands import KnownBands
-from gaussian_renderer.over_ranks.models import ranks_of
 from scene.cameras import Camera
 from scene.fused_adam import FusedAdam
 from scene.gaussian_model import GaussianModel
+from splatting.distributed.rendering.band import (
+    Band,
+    View,
+    draw_view,
+    gradient_rows,
+    surroundings,
+    whole_image,
+)
+from splatting.distributed.rendering.bands import KnownBands
+from splatting.distributed.rendering.models import ranks_of
 
 
 @dataclass(slots=True)

@@ -11,10 +11,10 @@ from diff_gaussian_rasterization.schema import GRADIENTS
 from torch import Tensor
 
 from gaussian_renderer import model_inputs, rasterizer_settings
-from gaussian_renderer.over_ranks.band import draw_view, gradient_rows, whole_image
-from gaussian_renderer.over_ranks.models import ranks_of
 from scene.cameras import Camera, MiniCam
 from scene.gaussian_model import GaussianModel
+from splatting.distributed.rendering.band import draw_view, gradient_rows, whole_image
+from splatting.distributed.rendering.models import ranks_of
 
 _ONLY_COLORS = [name == "colors" for name in GRADIENTS]
 

@@ -11,13 +11,13 @@ import torch
 from fused_ssim import composite
 from torch import Tensor, nn
 
-from scene.pictures.handing import AT_HAND, Handed
-from scene.pictures.in_memory import InMemory
-from scene.pictures.shrink import shrink_mask, shrink_photo, shrink_values
-from scene.pictures.store import ImageStore, Picture, Source, usable_device
+from scene.images.handing import AT_HAND, Handed
+from scene.images.in_memory import InMemory
+from scene.images.shrink import shrink_mask, shrink_photo, shrink_values
+from scene.images.store import ImageStore, Picture, Source, usable_device
 from scene.views.forms import SIGNATURE, view_of
+from splatting.host.device import compute_device
 from utils.graphics_utils import camera_center, fov2focal, projection, world_to_camera
-from utils.host.device import compute_device
 
 ZNEAR = 0.01  # ZNEAR and ZFAR only shape the clip depth and cull nothing
 ZFAR = 100.0

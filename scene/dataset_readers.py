@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from scene.pictures.masks import NO_MASKS, MaskOptions
+from scene.images.masks import NO_MASKS, MaskOptions
 from scene.readers.colmap import read_colmap
 from scene.readers.info import HOLD, CameraInfo, SceneInfo, scene_extent
 from scene.readers.point_cloud import fetchPly, storePly

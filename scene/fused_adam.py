@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
-import utils.host.extensions  # noqa: F401  isort: skip  (before the extensions)
+import splatting.host.extensions  # noqa: F401  isort: skip  (before the extensions)
 from diff_gaussian_rasterization.backend import OPERATORS
 from torch import Tensor
 

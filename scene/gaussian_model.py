@@ -24,9 +24,9 @@ from scene.gaussians.start import start_rows
 from scene.gaussians.trainable import trainable
 from scene.gaussians.whole import own_state, whole_state
 from scene.readers.info import exposure_names
+from splatting.host.device import compute_device
 from utils.general_utils import get_expon_lr_func, inverse_sigmoid
 from utils.graphics_utils import BasicPointCloud
-from utils.host.device import compute_device
 from utils.system_utils import UserError
 
 _OPTIMIZERS = {"default": GaussianAdam, "sparse_adam": SparseGaussianAdam}

@@ -14,17 +14,17 @@ import scene
 from scene.cameras import Camera
 from scene.dataset_readers import read_by_callback, read_scene
 from scene.half_images import mark_halves, train_on_all
-from scene.pictures.masks import MaskOptions, refuse_nothing_to_ignore
-from scene.pictures.store import ImageStore, Picture, picture_device
+from scene.images.masks import MaskOptions, refuse_nothing_to_ignore
+from scene.images.store import ImageStore, Picture, picture_device
 from scene.readers.depth_maps import with_depth_maps
 from scene.readers.info import CameraInfo, SceneInfo
 from scene.readers.point_cloud import write_point_cloud
 from scene.saved_iterations import find_iteration, saved_ply
 from scene.views.of_info import file_size
-from utils.files.model_json import OFFSET, read_model_json
+from splatting.distributed.ranks import ALONE, Ranks
+from splatting.files.model_json import OFFSET, read_model_json
+from splatting.host.device import compute_device
 from utils.graphics_utils import BasicPointCloud
-from utils.host.device import compute_device
-from utils.ranks.ranks import ALONE, Ranks
 from utils.system_utils import UserError, atomic_write
 
 

@@ -17,7 +17,7 @@ from synthetic import make_blender_scene, make_colmap_scene
 from arguments import ModelParams
 from scene import Scene
 from scene.gaussian_model import GaussianModel
-from training.checks import check_scene
+from splatting.training.checks import check_scene
 from utils.system_utils import UserError
 
 Options = dict[str, Any]

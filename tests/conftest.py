@@ -6,7 +6,7 @@ import signal
 from collections.abc import Iterator
 from pathlib import Path
 
-import utils.host.openmp  # noqa: F401  isort: skip  (before torch)
+import splatting.host.openmp  # noqa: F401  isort: skip  (before torch)
 import pytest
 import torch
 from synthetic import make_blender_scene, make_colmap_scene

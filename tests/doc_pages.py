@@ -13,7 +13,7 @@ PAGES = [
 ]
 FENCE = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 # Rooms with modules that are commands; other modules (pytest, pip) are not ours.
-ROOMS = ("benchmarks", "demo", "evaluation", "scene")
+ROOMS = ("benchmarks", "splatting", "scene")
 # What benchmarks/device.sh runs by its first word.
 DEVICE = {
     "kernels": "benchmarks.kernels.rasterizer",

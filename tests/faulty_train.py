@@ -13,25 +13,25 @@ if mine and fault == "code":
     sys.path.insert(0, os.environ["OTHER_CODE"])
 
 # ruff: noqa: E402
-import utils.host.early  # noqa: F401  isort: skip  (as train.py begins)
+import splatting.host.early  # noqa: F401  isort: skip  (as train.py begins)
 import signal
 import time
 from collections.abc import Callable
 
 import torch
 
+import splatting.distributed.watch
 import train
-import utils.ranks.watch
-from training.run import Run
-from training.step import Step
+from splatting.training.run import Run
+from splatting.training.step import Step
 from utils.system_utils import UserError, run_cli
 
-utils.ranks.watch.PATIENCE = 3.0
+splatting.distributed.watch.PATIENCE = 3.0
 prepare = Run.prepare
-beat = utils.ranks.watch.Watch.beat
+beat = splatting.distributed.watch.Watch.beat
 
 
-def _long_beat(watch: utils.ranks.watch.Watch) -> None:
+def _long_beat(watch: splatting.distributed.watch.Watch) -> None:
     """As with a slow store. A process that ends while its watch asks the store aborts."""
     beat(watch)
     until = time.monotonic() + 0.5
@@ -90,6 +90,6 @@ def _main() -> None:
 
 
 Run.prepare = _prepare
-utils.ranks.watch.Watch.beat = _long_beat
+splatting.distributed.watch.Watch.beat = _long_beat
 if __name__ == "__main__":
     run_cli(_main, several=True)

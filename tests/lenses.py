@@ -4,9 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from demo.tracer import View, normalize
-from scene.pictures.lens import Lens
-from scene.pictures.pycolmap_import import import_pycolmap
+from scene.images.lens import Lens
+from scene.images.pycolmap_import import import_pycolmap
+from splatting.demo.tracer import View, normalize
 
 # Extra parameters in COLMAP's order. At a focal length of 0.75 widths they move the corners by a twentieth or more.
 DISTORTIONS = {

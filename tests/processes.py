@@ -9,8 +9,8 @@ import torch
 import torch.distributed as dist
 import torch.multiprocessing as mp
 
-from utils.ranks.ranks import using
-from utils.ranks.several import SeveralRanks
+from splatting.distributed.ranks import using
+from splatting.distributed.several import SeveralRanks
 
 
 def in_ranks(size: int, function: Callable[..., Any], *args: Any) -> list[Any]:

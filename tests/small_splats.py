@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from exports.formats import format_of
-from exports.splats import Splats, tidy
+from splatting.exports.formats import format_of
+from splatting.exports.splats import Splats, tidy
 
 _PACKAGES = {".spz": "zstandard", ".usdz": "pxr"}
 

@@ -10,8 +10,8 @@ from rasterizer_tools import CPU_AND_GPU, ops
 from test_split_positions import _cross, _normal
 from torch import Tensor, library
 
-from utils.exact import portable_math
-from utils.exact.counter_rng import Stream
+from splatting.deterministic import portable_math
+from splatting.deterministic.counter_rng import Stream
 from utils.general_utils import build_rotation
 
 WHERE = {"seed": 3, "stream": Stream.NOISE, "iteration": 600}

@@ -27,13 +27,13 @@ from scene.gaussians.budgeted import count_after, fade, remove_useless, split_in
 from scene.gaussians.long_axis import long_axis_children
 from scene.gaussians.shards import WHOLE
 from scene.readers.point_cloud import write_point_cloud
-from training.error_maps import error_map
-from training.error_scores import ErrorScores
-from training.objective import Objective
-from training.pacing.pace import Block, Paced, Schedule
-from training.strategies import budget
-from utils.exact.counter_rng import Stream
-from utils.exact.weighted_choice import weighted_choice
+from splatting.deterministic.counter_rng import Stream
+from splatting.deterministic.weighted_choice import weighted_choice
+from splatting.training.error_maps import error_map
+from splatting.training.error_scores import ErrorScores
+from splatting.training.objective import Objective
+from splatting.training.schedule.pace import Block, Paced, Schedule
+from splatting.training.strategies import budget
 from utils.graphics_utils import getProjectionMatrix
 from utils.loss_utils import photometric_loss
 from utils.system_utils import UserError

@@ -18,8 +18,8 @@ from gaussian_renderer import render
 from gaussian_renderer.scored_views import ScoredViews
 from scene.cameras import Camera
 from scene.gaussians.exposure import Exposures
-from scene.pictures.masks import Mask
-from scene.pictures.store import ImageStore
+from scene.images.masks import Mask
+from scene.images.store import ImageStore
 from scene.readers.info import CameraInfo
 from scene.views.of_info import view_of_info
 from utils.system_utils import UserError
@@ -366,7 +366,7 @@ def test_a_copy_shares_the_photos_and_nothing_else(used, monkeypatch):
     used.note = [1]
     twin = copy.deepcopy(used)
     assert twin.images is used.images and twin.pictures == used.pictures and type(twin) is Camera
-    monkeypatch.setattr("scene.pictures.store.decode", lambda *_: pytest.fail("decoded again"))
+    monkeypatch.setattr("scene.images.store.decode", lambda *_: pytest.fail("decoded again"))
     assert torch.equal(twin.original_image, used.original_image) and torch.equal(twin.mask, used.mask)
     assert twin.original_image.data_ptr() != used.original_image.data_ptr()
     before = [copy.deepcopy(getattr(used, name)) for name in ("R", "T", *MATRICES)]
@@ -407,7 +407,7 @@ def test_a_pickle_leaves_the_photos_out(used):
 
 
 def test_a_shallow_copy_has_its_own_attributes(used, monkeypatch):
-    monkeypatch.setattr("scene.pictures.store.decode", lambda *_: pytest.fail("decoded again"))
+    monkeypatch.setattr("scene.images.store.decode", lambda *_: pytest.fail("decoded again"))
     twin = copy.copy(used)
     assert type(twin) is Camera and twin.images is used.images and twin.R is used.R
     assert twin.original_image.data_ptr() == used.original_image.data_ptr()  # tensors are shared, as by copy.copy

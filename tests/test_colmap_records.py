@@ -30,7 +30,7 @@ from scene.colmap_loader import (
     rotmat2qvec,
 )
 from scene.dataset_readers import readColmapCameras
-from scene.pictures import pycolmap_import
+from scene.images import pycolmap_import
 from scene.readers import colmap_model
 from scene.readers.colmap_text import read_poses_text
 from utils.system_utils import UserError

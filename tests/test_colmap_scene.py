@@ -19,7 +19,7 @@ from synthetic import CENTER, FOCAL, FakeGaussians, folder_state, make_colmap_sc
 from arguments import ModelParams
 from scene import Scene
 from scene.dataset_readers import read_scene, scene_extent
-from scene.pictures.store import picture_device
+from scene.images.store import picture_device
 from scene.readers import colmap_model
 from scene.readers.point_cloud import read_point_cloud, write_point_cloud
 from utils.system_utils import UserError
@@ -279,7 +279,7 @@ def test_picture_device_beside_a_gpu(capsys, monkeypatch):
 def test_png_can_be_written_after_pycolmap_was_imported(tmp_path):
     script = (
         "import sys\n"
-        "from scene.pictures.pycolmap_import import import_pycolmap\n"
+        "from scene.images.pycolmap_import import import_pycolmap\n"
         "import_pycolmap()\n"
         "from PIL import Image\n"
         "Image.effect_noise((64, 64), 50).convert('RGB').save(sys.argv[1])\n"
@@ -533,7 +533,7 @@ def test_poses_that_are_not_finite_are_named(colmap_scene, monkeypatch):
 
 def test_sigterm_stays_quiet_after_pycolmap_was_imported():
     script = (
-        "import os, signal\nfrom scene.pictures.pycolmap_import import import_pycolmap\n"
+        "import os, signal\nfrom scene.images.pycolmap_import import import_pycolmap\n"
         "import_pycolmap()\nos.kill(os.getpid(), signal.SIGTERM)\n"
     )
     command = [sys.executable, "-c", script]

@@ -23,8 +23,9 @@ from synthetic import folder_state
 from waiting import LIMIT, wait_for
 
 import convert
-from conversion import programs, report
-from conversion.colmap import (
+from scene.dataset_readers import read_scene
+from splatting.sfm import programs, report
+from splatting.sfm.colmap import (
     LENS_MODELS,
     Program,
     Pycolmap,
@@ -34,11 +35,10 @@ from conversion.colmap import (
     most_features,
     partners,
 )
-from conversion.layout import Layout
-from conversion.photos import check_photos, extract_frames, find_masks, prepare_photos, sharpness
-from conversion.programs import refuse_while_working, run_programs
-from conversion.stages import Stage, StageRecord, reconstruction_stages
-from scene.dataset_readers import read_scene
+from splatting.sfm.layout import Layout
+from splatting.sfm.photos import check_photos, extract_frames, find_masks, prepare_photos, sharpness
+from splatting.sfm.programs import refuse_while_working, run_programs
+from splatting.sfm.stages import Stage, StageRecord, reconstruction_stages
 from utils.system_utils import UserError
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -335,7 +335,7 @@ def test_ctrl_c_ends_the_program_that_works(tmp_path):
 def _killed_while(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, script: str, *words: str) -> Path:
     """Call run_programs with a script in a process that is killed once the script has written to the log; the log."""
     code = (
-        "import sys; from pathlib import Path; from conversion.programs import run_programs; "
+        "import sys; from pathlib import Path; from splatting.sfm.programs import run_programs; "
         "run_programs([sys.argv[2:]], Path(sys.argv[1]), 'Waiting', 1, lambda: 0)"
     )
     log, python = tmp_path / "log", [sys.executable, "-c"]

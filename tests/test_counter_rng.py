@@ -5,8 +5,8 @@ import pytest
 import torch
 from scipy import stats
 
-from utils.exact import portable_math
-from utils.exact.counter_rng import Stream, normal, permutation, philox, random_bits, uniform
+from splatting.deterministic import portable_math
+from splatting.deterministic.counter_rng import Stream, normal, permutation, philox, random_bits, uniform
 
 F = 0xFFFFFFFF
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from demo import report
+from splatting.demo import report
 from utils.system_utils import UserError
 
 RESULTS = {"ours_30": {"SSIM": 0.5, "PSNR": 20.0, "LPIPS": None}}

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from demo import make_scene as maker
-from demo.make_scene import make_scene
-from demo.objects import Box, Ground, Shape, Sphere, Torus, demo_scene
-from demo.tracer import render_view, ring_views
-from evaluation.contact_sheet import GAIN, GAP, HEADER, contact_sheet
+from splatting.demo import make_scene as maker
+from splatting.demo.make_scene import make_scene
+from splatting.demo.objects import Box, Ground, Shape, Sphere, Torus, demo_scene
+from splatting.demo.tracer import render_view, ring_views
+from splatting.evaluation.contact_sheet import GAIN, GAP, HEADER, contact_sheet
 from utils.system_utils import UserError
 
 ROOT = Path(__file__).parents[1]

@@ -14,17 +14,17 @@ from gaussians import pipeline
 from PIL import Image
 from synthetic import HEIGHT, WIDTH
 
-import diagnosis.model
 import doctor
+import splatting.diagnosis.model
 from arguments import ModelParams, read_cfg_args, write_cfg_args, write_model_json
-from diagnosis import environment
-from diagnosis.dataset import check_cloud, check_dataset, check_extent, check_lenses
-from diagnosis.lines import Line
-from diagnosis.model import check_model
 from gaussian_renderer import render
 from scene.dataset_readers import read_scene
 from scene.gaussian_model import GaussianModel
 from scene.saved_model import load_saved
+from splatting.diagnosis import environment
+from splatting.diagnosis.dataset import check_cloud, check_dataset, check_extent, check_lenses
+from splatting.diagnosis.lines import Line
+from splatting.diagnosis.model import check_model
 from utils.graphics_utils import BasicPointCloud
 from utils.system_utils import UserError
 
@@ -307,7 +307,7 @@ def _mask(scene: Path, mask: np.ndarray) -> None:
 
 def test_a_model_of_the_other_background(model, colmap_scene, monkeypatch):
     """The photos have alpha, and are transparent where they are black."""
-    monkeypatch.setattr(diagnosis.model, "_WIDTH", WIDTH)
+    monkeypatch.setattr(splatting.diagnosis.model, "_WIDTH", WIDTH)
     folder = Path(model(_half_black))
     _photograph(folder, lambda x: np.dstack([x, np.where(x.max(axis=2) > 4, 255, 0).astype(np.uint8)]))
     assert problems(check_model(str(folder), -1)) == []
@@ -340,7 +340,7 @@ def test_models_that_have_not_converged(model):
 @pytest.mark.parametrize("halves", [False, True])
 def test_only_what_is_scored_is_looked_at(model, colmap_scene, monkeypatch, halves):
     """Photos whose right halves are a model's own renders, and whose left halves are nonsense."""
-    monkeypatch.setattr(diagnosis.model, "_WIDTH", WIDTH)
+    monkeypatch.setattr(splatting.diagnosis.model, "_WIDTH", WIDTH)
     folder = Path(model(filled(opacity=3)))
     if halves:
         _options(folder, train_test_exp=True)

@@ -9,13 +9,13 @@ from pathlib import Path
 import pytest
 
 import train
-from training.restart import newest_checkpoint, what_stands
-from utils.host import threads, torchrun
-from utils.ranks import quiet
-from utils.ranks.alike import refuse_differences
-from utils.ranks.board import here, is_gone
-from utils.ranks.ending import DONE, FAULT, HANG, LOST, SIGNAL, End, verdict
-from utils.ranks.ranks import Ranks, using
+from splatting.distributed import quiet
+from splatting.distributed.alike import refuse_differences
+from splatting.distributed.board import here, is_gone
+from splatting.distributed.ending import DONE, FAULT, HANG, LOST, SIGNAL, End, verdict
+from splatting.distributed.ranks import Ranks, using
+from splatting.host import threads, torchrun
+from splatting.training.restart import newest_checkpoint, what_stands
 from utils.system_utils import UserError, atomic_write, run_cli
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -145,12 +145,14 @@ def test_a_training_of_one_process_loads_nothing_of_several(colmap_scene, tmp_pa
     code = (
         "import sys, train\n"
         "train.main(sys.argv[1:])\n"
-        "names = [n for n in sys.modules if n.startswith('utils.ranks.')]\n"
+        "names = [n for n in sys.modules if n.startswith('splatting.distributed.')]\n"
         "print('loaded', *sorted(names), file=sys.stderr)"
     )
     options = ["-s", str(colmap_scene), "-m", str(tmp_path / "out"), "--iterations", "2", "--disable_viewer"]
     done = subprocess.run([sys.executable, "-c", code, *options], cwd=ROOT, capture_output=True, text=True, check=True)
     loaded = done.stderr.splitlines()[-1].split()
-    assert loaded[0] == "loaded" and "utils.ranks.ranks" in loaded
-    assert not {f"utils.ranks.{name}" for name in ("several", "together", "watch", "watched", "board")} & {*loaded}
+    assert loaded[0] == "loaded" and "splatting.distributed.ranks" in loaded
+    assert not {f"splatting.distributed.{name}" for name in ("several", "together", "watch", "watched", "board")} & {
+        *loaded
+    }
     assert train.parse(options)[0].parallel == "tiles"

@@ -22,14 +22,22 @@ from skimage.metrics import peak_signal_noise_ratio
 import render
 import train
 from gaussian_renderer.scored_views import mean_scores
-from records.curve_figure import CurveDrawer, draw_curve
-from records.curve_recorder import CurveRecorder, curve_points, drawn, evenly_spread
-from records.error_curve import COLUMNS, Row, best_test, continue_curve, read_curve, whole_sets, write_curve
-from records.training_log import TrainingLog
-from records.what_to_try import peak_advice, schedules_follow_length
-from training import objective
-from training.observers.report import Report
-from utils.host import process
+from splatting.evaluation.curve_figure import CurveDrawer, draw_curve
+from splatting.evaluation.curve_recorder import CurveRecorder, curve_points, drawn, evenly_spread
+from splatting.evaluation.error_curve import (
+    COLUMNS,
+    Row,
+    best_test,
+    continue_curve,
+    read_curve,
+    whole_sets,
+    write_curve,
+)
+from splatting.evaluation.training_log import TrainingLog
+from splatting.evaluation.what_to_try import peak_advice, schedules_follow_length
+from splatting.host import process
+from splatting.training import objective
+from splatting.training.observers.report import Report
 from utils.loss_utils import ssim
 from utils.system_utils import UserError
 
@@ -317,7 +325,7 @@ class TestDrawer:
         assert drawer.finish() is None
         with Image.open(tmp_path / "Füße" / "error_vs_time.png") as image:
             assert min(image.size) > 400
-        code = "import sys; import records.curve_figure; print('torch' in sys.modules)"
+        code = "import sys; import splatting.evaluation.curve_figure; print('torch' in sys.modules)"
         done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
         assert done.stdout == "False\n"
 
@@ -348,7 +356,7 @@ class TestDrawer:
         command = [
             sys.executable,
             "-m",
-            "records.curve_figure",
+            "splatting.evaluation.curve_figure",
             *(tmp_path / f"error_vs_time.{end}" for end in ("csv", "png")),
             "x",
         ]
@@ -359,7 +367,7 @@ class TestDrawer:
     @pytest.mark.parametrize(("cores", "begun"), [(2, 100), (16, 80)])
     def test_it_gets_ready_shortly_before_the_end(self, tmp_path, monkeypatch, cores, begun):
         """Of 100 iterations, ten a second; not where it would take a core from training."""
-        monkeypatch.setattr("records.curve_recorder.cores", lambda: cores)
+        monkeypatch.setattr("splatting.evaluation.curve_recorder.cores", lambda: cores)
         said = []
         monkeypatch.setattr(CurveDrawer, "begin", lambda _: said.append("begin"))
         monkeypatch.setattr(CurveDrawer, "draw", lambda _: said.append("draw"))
@@ -517,7 +525,7 @@ import sys, time
 time.sleep(0.5)
 import torch
 import train
-from utils.host import process
+from splatting.host import process
 before = process.peak_memory_mib(torch.device("cpu"))
 torch.ones(300 * 2**20, dtype=torch.uint8)
 print(process.wall_seconds(), "matplotlib" in sys.modules, process.peak_memory_mib(torch.device("cpu")) - before)

@@ -8,14 +8,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from evaluation import published
-from evaluation.option_sets import cheapest, gaussians_to_reach, pareto_front, seconds_to_reach
-from evaluation.results_page import BEGIN, END, replace_results, results_text
-from evaluation.scenes import DATASETS
-from evaluation.summary import QUANTITIES, spread, summarise
-from records.error_curve import COLUMNS
-from records.what_to_try import peak
-from utils.files.markdown_table import markdown_table
+from splatting.evaluation import published
+from splatting.evaluation.error_curve import COLUMNS
+from splatting.evaluation.option_sets import cheapest, gaussians_to_reach, pareto_front, seconds_to_reach
+from splatting.evaluation.results_page import BEGIN, END, replace_results, results_text
+from splatting.evaluation.scenes import DATASETS
+from splatting.evaluation.summary import QUANTITIES, spread, summarise
+from splatting.evaluation.what_to_try import peak
+from splatting.files.markdown_table import markdown_table
 from utils.system_utils import UserError
 
 

@@ -9,12 +9,12 @@ import pytest
 import torch
 
 import train
-from evaluation.tensorboard_scalars import read_scalars
-from records.event_writer import EventWriter
-from training.objective import Losses
-from training.observers import progress
-from training.observers.report import Report
-from training.step import Step
+from splatting.evaluation.event_writer import EventWriter
+from splatting.evaluation.tensorboard_scalars import read_scalars
+from splatting.training.objective import Losses
+from splatting.training.observers import progress
+from splatting.training.observers.report import Report
+from splatting.training.step import Step
 
 
 def _train(scene: Path, out: Path, *more: str) -> None:

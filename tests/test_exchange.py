@@ -6,9 +6,9 @@ from diff_gaussian_rasterization.fakes import ABSOLUTE_VALUES, MOMENT_VALUES, SP
 from rasterizer_tools import BOTH_AND_GPU, CPU_AND_GPU, moved_by_a_word, ops
 from torch import Tensor
 
-from gaussian_renderer.over_ranks.exchange import Sent, return_rows
-from utils.host.read_later import read_later
-from utils.ranks.ranks import Ranks
+from splatting.distributed.ranks import Ranks
+from splatting.distributed.rendering.exchange import Sent, return_rows
+from splatting.host.read_later import read_later
 
 Splats = tuple[Tensor, ...]  # splats, depths, rects, tile_counts
 LARGE = 20_000  # more than a thread of the CPU takes at once, and no multiple of anything

@@ -15,15 +15,25 @@ from plyfile import PlyData
 from scipy.spatial import KDTree
 from small_splats import extreme_splats, splats, written
 
-from exports import scene_formats
-from exports.formats import FORMATS, format_of, read_splats
-from exports.in_scene import model_of, splats_of
-from exports.splats import Splats, drawable, half_turned, logits, opacities, selected, tidy, with_sh_degree, within_box
-from exports.viewer_world import turned
 from gaussian_renderer import render
 from gaussian_renderer.free_view import free_view, rotation_matrix
 from gaussian_renderer.importance import blending_weights, most_important
 from scene.export_world import export_world
+from splatting.exports import scene_formats
+from splatting.exports.formats import FORMATS, format_of, read_splats
+from splatting.exports.in_scene import model_of, splats_of
+from splatting.exports.splats import (
+    Splats,
+    drawable,
+    half_turned,
+    logits,
+    opacities,
+    selected,
+    tidy,
+    with_sh_degree,
+    within_box,
+)
+from splatting.exports.viewer_world import turned
 from utils.sh_utils import C0
 from utils.system_utils import UserError
 

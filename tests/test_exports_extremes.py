@@ -15,10 +15,10 @@ from plyfile import PlyData, PlyElement
 from scipy.spatial import KDTree
 from small_splats import empty_spz, splats, written
 
-from exports.formats import read_splats
-from exports.ply import CHUNK
-from exports.splats import Splats, selected
 from scene.gaussian_model import GaussianModel
+from splatting.exports.formats import read_splats
+from splatting.exports.ply import CHUNK
+from splatting.exports.splats import Splats, selected
 from utils.system_utils import UserError
 
 COUNT, FAR = 2000, 7  # splats, and the number of the one that lies apart

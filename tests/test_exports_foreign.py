@@ -18,7 +18,7 @@ from test_exports_extremes import cube, moved
 from benchmarks.exports.read_back import read_back, read_by_splat_transform
 from benchmarks.exports.sizes import decibels, renders
 from benchmarks.workloads.orbit import orbit
-from exports.splats import Splats, half_turned, with_sh_degree
+from splatting.exports.splats import Splats, half_turned, with_sh_degree
 
 FOREIGN = Path(__file__).parent / "foreign"
 FLOAT, COMPRESSED = 60, 35  # dB that a format keeps at least

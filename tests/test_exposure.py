@@ -15,7 +15,6 @@ from PIL import Image
 
 import render
 import train
-from records.error_curve import read_curve
 from scene.dataset_readers import CameraInfo, read_scene
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.checkpoint import EXPOSURES, load_checkpoint, save_checkpoint
@@ -23,6 +22,7 @@ from scene.gaussians.exposure import Exposures, apply_exposure, read_exposures
 from scene.half_images import train_on_all
 from scene.readers.info import exposure_names
 from scene.readers.point_cloud import write_point_cloud
+from splatting.evaluation.error_curve import read_curve
 from utils.loss_utils import inverse_depth_loss, l1_loss, photometric_loss, ssim
 from utils.system_utils import UserError
 

@@ -30,19 +30,8 @@ from scene.gaussians.checkpoint import load_checkpoint
 ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs" / "inside" / "extending.md"
 CODE = (
-    "arguments",
-    "exports",
-    "gaussian_renderer",
-    "moving_cameras",
-    "records",
-    "scene",
-    "training",
-    "utils",
-    "viewing",
-    "train.py",
-    "render.py",
-    "pyproject.toml",
-    "version.txt",
+    *("arguments", "gaussian_renderer", "splatting", "scene", "utils"),
+    *("train.py", "render.py", "pyproject.toml", "version.txt"),
 )
 TESTS = ("conftest.py", "gaussians.py", "synthetic.py", "test_densification.py")
 HOT, COLD, START = 0.9, 0.2, 0.5

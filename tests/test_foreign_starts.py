@@ -15,14 +15,14 @@ from small_splats import splats, written
 import export
 import render
 import train
-from exports.formats import format_of, is_point_cloud, read_splats
-from exports.in_scene import model_of, splats_of
 from gaussian_renderer.importance import blending_weights, most_important
-from moving_cameras.keyframes import CameraPath, Keyframe
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.ply import read_ply, stored_sh_degree
 from scene.readers.point_cloud import read_point_cloud
 from scene.saved_model import load_saved
+from splatting.camera_paths.keyframes import CameraPath, Keyframe
+from splatting.exports.formats import format_of, is_point_cloud, read_splats
+from splatting.exports.in_scene import model_of, splats_of
 from utils.system_utils import UserError
 
 

@@ -23,15 +23,15 @@ from waiting import LIMIT, wait_for
 
 import full_eval
 from arguments import write_cfg_args
-from evaluation import report as report_module
-from evaluation import results_page, stages
-from evaluation.contact_sheet import GAIN, GAP, HEADER, comparisons, draw_worst_views
-from evaluation.figures import draw_curves, draw_fronts
-from evaluation.model_folder import SCHEDULE, shorter_ends_there
-from evaluation.results_page import BEGIN, END
-from evaluation.runs import Run
-from evaluation.scenes import DATASETS, SceneEntry
-from records.error_curve import COLUMNS
+from splatting.evaluation import report as report_module
+from splatting.evaluation import results_page, stages
+from splatting.evaluation.contact_sheet import GAIN, GAP, HEADER, comparisons, draw_worst_views
+from splatting.evaluation.error_curve import COLUMNS
+from splatting.evaluation.figures import draw_curves, draw_fronts
+from splatting.evaluation.model_folder import SCHEDULE, shorter_ends_there
+from splatting.evaluation.results_page import BEGIN, END
+from splatting.evaluation.runs import Run
+from splatting.evaluation.scenes import DATASETS, SceneEntry
 from utils.system_utils import UserError
 
 ROOT = Path(__file__).parents[1]
@@ -235,7 +235,8 @@ def _start(scenes: Path, words: list[str]) -> subprocess.Popen:
     """Start full_eval.py in its own process group; return it once it trains attic, which waits for a signal."""
     (scenes / "attic" / "slow").touch()
     program = (
-        "import pathlib, sys; from evaluation import stages; import full_eval; from utils.system_utils import run_cli;"
+        "import pathlib, sys; from splatting.evaluation import stages;"
+        "import full_eval; from utils.system_utils import run_cli;"
         f"stages._ROOT = pathlib.Path({str(STAND_INS)!r}); full_eval.machine = dict;"
         "full_eval._parse_for_training = lambda words: None; run_cli(full_eval.main)"
     )

@@ -53,7 +53,7 @@ def _adam(values, gradients, means, squares, steps, rates, beta1, beta2, eps, co
 @pytest.mark.parametrize("background", [["--random_background"], ["-w"]], ids=["random", "white"])
 def test_fused_and_plain_steps_go_the_same_way(blender_scene, tmp_path, monkeypatch, background):
     monkeypatch.setattr(sys, "stdout", sys.stdout)  # training stamps it
-    monkeypatch.setattr("training.run.SH_INTERVAL", 25)
+    monkeypatch.setattr("splatting.training.run.SH_INTERVAL", 25)
     random = np.random.default_rng(0)
     write_point_cloud(blender_scene / "points3d.ply", random.uniform(-1, 1, (300, 3)), random.random((300, 3)))
     options = ["--densify_from_iter", "20", "--densification_interval", "20", "--densify_grad_threshold", "5e-5"]
@@ -61,8 +61,8 @@ def test_fused_and_plain_steps_go_the_same_way(blender_scene, tmp_path, monkeypa
     models = []
     for fused in (True, False):
         if not fused:
-            monkeypatch.setattr("training.steps.plain.render", _render)
-            monkeypatch.setattr("training.objective.photometric_loss", _loss)
+            monkeypatch.setattr("splatting.training.steps.plain.render", _render)
+            monkeypatch.setattr("splatting.training.objective.photometric_loss", _loss)
             monkeypatch.setattr(Camera, "target", _target)
             monkeypatch.setattr(GaussianModel, "observe", _observe)
             monkeypatch.setattr(adam, "adam_", _adam)

@@ -6,10 +6,10 @@ import torch
 from gaussians import model, parameters
 from plyfile import PlyData, PlyElement
 
-from exports.formats import read_splats
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.ply import stored_sh_degree
 from scene.readers.point_cloud import read_point_cloud
+from splatting.exports.formats import read_splats
 from utils.system_utils import UserError
 
 ORDER = (

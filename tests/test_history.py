@@ -12,8 +12,8 @@ from synthetic import folder_state
 
 import train
 from arguments import read_model_json, read_stored_options, write_cfg_args, write_model_json
-from records.error_curve import COLUMNS, read_curve, write_curve
-from training.history import check_folder, continue_records
+from splatting.evaluation.error_curve import COLUMNS, read_curve, write_curve
+from splatting.training.history import check_folder, continue_records
 from utils.system_utils import UserError
 
 CURVE, LOG = "error_vs_time.csv", "train_log.json"

@@ -14,51 +14,53 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 COMMANDS = ("train", "render", "metrics", "full_eval", "convert", "doctor", "export", "setup", "view")
-ROOMS = (
-    *("arguments", "benchmarks", "conversion", "demo", "diagnosis", "evaluation", "exports"),
-    *("gaussian_renderer", "lpipsPyTorch", "moving_cameras", "records", "scene", "training", "utils", "viewing"),
-)
+ROOMS = ("arguments", "benchmarks", "gaussian_renderer", "splatting", "lpipsPyTorch", "scene", "utils")
 CSRC = ROOT / "submodules"
 LONGEST = 60  # lines of a function
 # Most lines of code and of tests, without blanks, comments and docstrings, files of code, and words of Markdown. A new
 # capability that needs more says so in its commit, and what it let go.
-MOST = {"code": 36_100, "files": 555, "tests": 35_200, "words": 38_900}
+MOST = {"code": 36_102, "files": 555, "tests": 35_200, "words": 38_914}
 
-# What a room may import besides itself: prefixes of module names. The room of a module is its longest prefix here.
+# What a room may import besides itself and what serves them all: prefixes of module names. The room of a module is its
+# longest prefix here.
+BASE = ("utils", *(f"splatting.{name}" for name in ("deterministic", "distributed", "files", "host")))
 MAY_IMPORT = {
-    "utils": (),
-    "utils.host": (),
-    "utils.ranks": ("utils",),
-    "utils.exact": ("utils.ranks",),
-    "utils.files": ("utils",),
-    "utils.camera_utils": ("scene.cameras", "scene.views", "scene.pictures", "scene.readers", "utils"),
-    "utils.make_depth_scale": ("scene.readers.depth_scale", "utils"),  # a command of the reference
-    "arguments": ("utils",),
-    "records": ("utils",),
-    "lpipsPyTorch": ("utils",),  # a name of the reference
-    "scene.pictures": ("utils",),
-    "scene.readers": ("scene.pictures", "utils"),
-    "scene.gaussians": ("utils",),
-    "scene.gaussian_model": ("scene.gaussians", "scene.readers.info", "utils"),
-    "scene.dataset_readers": ("scene.readers", "scene.pictures", "utils"),
-    "scene.views": ("scene.readers.depth_maps", "scene.readers.info", "scene.pictures", "utils"),
-    "scene.cameras": ("scene.views", "scene.pictures", "utils"),
-    "scene": ("utils",),  # not arguments: a client's own package of that name may be found first
-    "gaussian_renderer": ("scene", "utils"),
-    "moving_cameras": ("gaussian_renderer", "scene", "utils"),
-    "exports": ("moving_cameras", "scene", "utils"),
-    "training": ("exports", "viewing.options", "gaussian_renderer", "scene", "records", "arguments", "utils"),
-    "viewing": ("moving_cameras", "gaussian_renderer", "scene", "utils"),
-    "training.observers": ("training", "viewing", "gaussian_renderer", "scene", "records", "arguments", "utils"),
-    "diagnosis": ("gaussian_renderer", "scene", "records", "arguments", "utils"),
-    "conversion": ("scene.readers", "scene.pictures", "utils"),
-    "evaluation": ("records", "arguments", "scene.saved_iterations", "scene.readers.info", "utils"),
-    "demo": ("evaluation", "arguments", "utils"),
-    "benchmarks": ("utils",),
-    "benchmarks.workloads": ("scene.cameras", "utils"),
-    "benchmarks.harness": ("benchmarks.workloads", "utils"),
-    "benchmarks.strategies": ("benchmarks.harness", "utils"),
+    **dict.fromkeys(BASE, ()),
+    "utils.camera_utils": ("scene.cameras", "scene.views", "scene.images", "scene.readers"),
+    "utils.make_depth_scale": ("scene.readers.depth_scale",),  # a command of the reference
+    "arguments": (),
+    "lpipsPyTorch": (),  # a name of the reference
+    "scene.images": (),
+    "scene.readers": ("scene.images",),
+    "scene.gaussians": (),
+    "scene.gaussian_model": ("scene.gaussians", "scene.readers.info"),
+    "scene.dataset_readers": ("scene.readers", "scene.images"),
+    "scene.views": ("scene.readers.depth_maps", "scene.readers.info", "scene.images"),
+    "scene.cameras": ("scene.views", "scene.images"),
+    "scene": (),  # not arguments: a client's own package of that name may be found first
+    "gaussian_renderer": ("scene",),
+    "splatting.distributed.rendering": ("gaussian_renderer", "scene"),
+    "splatting.camera_paths": ("gaussian_renderer", "scene"),
+    "splatting.exports": ("splatting.camera_paths", "scene"),
+    "splatting.evaluation": ("arguments", "scene.saved_iterations", "scene.readers.info"),
+    "splatting.training": (
+        *("splatting.evaluation", "splatting.exports", "splatting.viewer.options"),
+        *("arguments", "gaussian_renderer", "scene"),
+    ),
+    "splatting.viewer": ("splatting.camera_paths", "gaussian_renderer", "scene"),
+    "splatting.diagnosis": ("arguments", "gaussian_renderer", "splatting.evaluation", "scene"),
+    "splatting.sfm": ("scene.readers", "scene.images"),
+    "splatting.demo": ("arguments", "splatting.evaluation"),
+    "splatting": (),
+    "benchmarks": (),
+    "benchmarks.workloads": ("scene.cameras",),
+    "benchmarks.harness": ("benchmarks.workloads",),
+    "benchmarks.strategies": ("benchmarks.harness",),
 }
+MAY_IMPORT["splatting.training.observers"] = (
+    *("splatting.training", "splatting.viewer"),
+    *MAY_IMPORT["splatting.training"],
+)
 MEASURED = ("train", "render", "metrics", *(room for room in ROOMS if room != "benchmarks"))
 for room in ("kernels", "accuracy", "scenes", "exports", "parallel"):
     MAY_IMPORT[f"benchmarks.{room}"] = ("benchmarks.harness", "benchmarks.workloads", *MEASURED)
@@ -126,7 +128,7 @@ def _imports(path: Path, types: bool = True) -> Iterator[str]:
 @pytest.mark.parametrize("path", [path for path in _python() if path.relative_to(ROOT).parts[0] in ROOMS], ids=_module)
 def test_a_module_imports_only_rooms_below_it(path):
     room = _room(_module(path))
-    allowed = (room, *MAY_IMPORT[room])
+    allowed = (room, *BASE, *MAY_IMPORT[room])
     wrong = [name for name in _imports(path) if not any(_within(name, prefix) for prefix in allowed)]
     assert not wrong, f"{_module(path)} imports {wrong}; {room} may import {allowed}"
 
@@ -222,7 +224,11 @@ def test_functions_are_short_in_c_plus_plus():
 
 
 def test_files_of_the_loop_and_the_model_stay_on_a_page():
-    for name, most in {"training/loop.py": 60, "train.py": 140, "scene/gaussian_model.py": 300}.items():
+    for name, most in {
+        "splatting/training/loop.py": 60,
+        "train.py": 140,
+        "scene/gaussian_model.py": 300,
+    }.items():
         assert len((ROOT / name).read_text(encoding="utf-8").splitlines()) <= most, name
 
 

@@ -18,17 +18,17 @@ from gaussians import pipeline
 from html_scene import CENTRE, FOV, SIZE, UP, balls, cameras
 from scipy.spatial.transform import Rotation
 
-from exports import html, vendor
-from exports.html import write_html, write_scene_html
-from exports.in_scene import model_of
-from exports.ply import read_compressed_ply
-from exports.viewer_world import BOOKMARKS, lean, settings, turn_upright, turned, up_of
 from gaussian_renderer import render
 from gaussian_renderer.free_view import free_view
-from moving_cameras.generated import Ellipse
-from moving_cameras.keyframes import CameraPath, Keyframe
-from moving_cameras.moments import KeyframePath
-from moving_cameras.poses import Poses, facing, poses_of
+from splatting.camera_paths.generated import Ellipse
+from splatting.camera_paths.keyframes import CameraPath, Keyframe
+from splatting.camera_paths.moments import KeyframePath
+from splatting.camera_paths.poses import Poses, facing, poses_of
+from splatting.exports import html, vendor
+from splatting.exports.html import write_html, write_scene_html
+from splatting.exports.in_scene import model_of
+from splatting.exports.ply import read_compressed_ply
+from splatting.exports.viewer_world import BOOKMARKS, lean, settings, turn_upright, turned, up_of
 from utils.system_utils import UserError
 
 # Addresses in the viewer's code. It asks for none of them here: those of PlayCanvas and Khronos are in texts, SVG is a

@@ -13,8 +13,8 @@ from PIL import Image
 from waiting import wait_for
 
 import train
-from scene.pictures.decode import decode
-from scene.pictures.store import ImageStore
+from scene.images.decode import decode
+from scene.images.store import ImageStore
 from utils.system_utils import UserError
 
 SIZE = (6, 4)
@@ -72,7 +72,7 @@ class Decodings:
 @pytest.fixture
 def decodings(monkeypatch) -> Decodings:
     counting = Decodings()
-    monkeypatch.setattr("scene.pictures.store.decode", counting)
+    monkeypatch.setattr("scene.images.store.decode", counting)
     return counting
 
 
@@ -208,8 +208,8 @@ def test_what_is_kept_and_decoded_ahead_changes_no_bit(colmap_scene, tmp_path, m
 def test_a_gpu_keeps_what_fits_its_share(files, monkeypatch):
     """The rule alone: which device keeps, without one."""
     free = 4 * 10 * 4 * 6 * 4  # four times what ten RGBA pictures take
-    monkeypatch.setattr("scene.pictures.store.free_memory", lambda device: free)
-    monkeypatch.setattr("scene.pictures.store.DeviceCopies", lambda device: object())
+    monkeypatch.setattr("scene.images.store.free_memory", lambda device: free)
+    monkeypatch.setattr("scene.images.store.DeviceCopies", lambda device: object())
     for room, limit, kept in ((0, 0, "cuda"), (-1, 0, "cpu"), (-1, 9, "cuda"), (-2 * 4 * 96, 8, "cuda")):
         free = 3840 + room
         store = ImageStore(limit, "cuda", "cuda")
@@ -225,9 +225,9 @@ def test_floats_are_kept_where_there_is_room_for_them(files, monkeypatch):
     assert ImageStore(0).keeps_floats and not ImageStore(3).keeps_floats
     assert ImageStore(0, "cpu", "cuda").keeps_floats  # where --data_device cpu wants them
     share = 10 * 4 * 6 * 4 * 4  # of a GPU's free memory that ten RGBA pictures take if a quarter of it may be used
-    monkeypatch.setattr("scene.pictures.store.DeviceCopies", lambda device: object())
+    monkeypatch.setattr("scene.images.store.DeviceCopies", lambda device: object())
     for free, kept in ((4 * share, True), (4 * share - 1, False)):
-        monkeypatch.setattr("scene.pictures.store.free_memory", lambda device, free=free: free)
+        monkeypatch.setattr("scene.images.store.free_memory", lambda device, free=free: free)
         store = ImageStore(0, "cuda", "cuda")
         store.plan(_pictures(files))
         assert store.keep_on.type == "cuda" and store.keeps_floats == kept

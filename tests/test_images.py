@@ -7,9 +7,9 @@ import pytest
 import torch
 from PIL import Image
 
-from scene.pictures import resolution
-from scene.pictures.decode import decode, picture_size
-from scene.pictures.resolution import training_size
+from scene.images import resolution
+from scene.images.decode import decode, picture_size
+from scene.images.resolution import training_size
 from utils.system_utils import UserError
 
 

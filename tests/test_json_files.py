@@ -5,7 +5,7 @@ import os
 
 import pytest
 
-from utils.files.json_files import read_json, write_json
+from splatting.files.json_files import read_json, write_json
 
 
 def test_names_of_any_kind_come_back_and_stay_readable(tmp_path):

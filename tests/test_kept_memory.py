@@ -13,7 +13,7 @@ MIB = 20  # of a block; four of them are more than glibc keeps by itself
 PROGRAM = f"""
 import sys
 if sys.argv[1] == "kept":
-    import utils.host.early
+    import splatting.host.early
 import ctypes, resource
 
 libc = ctypes.CDLL(None)

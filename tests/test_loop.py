@@ -11,13 +11,13 @@ import pytest
 import torch
 
 import train
-from records.training_log import TrainingLog
-from training import loop
-from training.density import DensityControl
-from training.observer import Announcer, Observer
-from training.observers.standard import standard_observers
-from training.strategies import choose
-from training.strategies.adc import AdaptiveDensityControl
+from splatting.evaluation.training_log import TrainingLog
+from splatting.training import loop
+from splatting.training.density import DensityControl
+from splatting.training.observer import Announcer, Observer
+from splatting.training.observers.standard import standard_observers
+from splatting.training.strategies import choose
+from splatting.training.strategies.adc import AdaptiveDensityControl
 
 ITERATIONS = 24
 
@@ -173,7 +173,7 @@ def test_a_signal_while_the_curve_is_drawn_ends_the_program_at_once(colmap_scene
     def draw(*_: object) -> None:
         os.kill(os.getpid(), signal.SIGINT)
 
-    monkeypatch.setattr("records.curve_figure.CurveDrawer.finish", draw)
+    monkeypatch.setattr("splatting.evaluation.curve_figure.CurveDrawer.finish", draw)
     before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore it
     try:
         with pytest.raises(KeyboardInterrupt):

@@ -18,9 +18,9 @@ import metrics
 import render
 import train
 from scene import Scene
-from scene.pictures.decode import decode
-from scene.pictures.masks import IGNORE, TRANSPARENT, Mask
-from training.observers.masks import MaskWatch
+from scene.images.decode import decode
+from scene.images.masks import IGNORE, TRANSPARENT, Mask
+from splatting.training.observers.masks import MaskWatch
 from utils.image_utils import pixels_that_count
 from utils.loss_utils import photometric_loss
 from utils.system_utils import UserError

@@ -13,9 +13,9 @@ from test_steps import scene as scene  # a fixture
 import train
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.checkpoint import load_checkpoint
-from training.density import DensityControl
-from training.steps import ahead, run_ahead
-from training.strategies.mcmc import MarkovChain
+from splatting.training.density import DensityControl
+from splatting.training.steps import ahead, run_ahead
+from splatting.training.strategies.mcmc import MarkovChain
 from utils.system_utils import UserError
 
 # Within so few iterations no Gaussian fades, so the thresholds are at the opacities of the start.

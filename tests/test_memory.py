@@ -17,12 +17,12 @@ import train
 from gaussian_renderer import scored_views
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.checkpoint import load_checkpoint
-from scene.pictures import decode
-from training import memory_estimate
-from training.memory_estimate import training_bytes
-from training.steps import fused, plain, recorded
-from utils.host import memory
-from utils.host.memory import free_memory, gib, is_out_of_memory, shortage
+from scene.images import decode
+from splatting.host import memory
+from splatting.host.memory import free_memory, gib, is_out_of_memory, shortage
+from splatting.training import memory_estimate
+from splatting.training.memory_estimate import training_bytes
+from splatting.training.steps import fused, plain, recorded
 from utils.system_utils import UserError, run_cli
 
 ROOT = Path(__file__).parents[1]
@@ -139,7 +139,9 @@ def _failing(function, call: int, error: Exception):
     ids=["cpu", "gpu", "instances"],
 )
 def test_the_state_before_is_saved_and_goes_on_to_the_same_end(colmap_scene, tmp_path, monkeypatch, error, said):
-    monkeypatch.setattr("training.run.SH_INTERVAL", 5)  # so that the failing iteration is one that raises the degree
+    monkeypatch.setattr(
+        "splatting.training.run.SH_INTERVAL", 5
+    )  # so that the failing iteration is one that raises the degree
     with monkeypatch.context() as patch:
         patch.setattr(plain, "render", _failing(plain.render, 2, error))  # densification, and the raise of the degree
         with pytest.raises(UserError, match="training ran out of memory in iteration 5") as caught:
@@ -292,7 +294,7 @@ def test_render_decodes_only_what_it_renders(colmap_scene, tmp_path, monkeypatch
     _train(colmap_scene, tmp_path, "--eval")
     decoded = []
     monkeypatch.setattr(
-        "scene.pictures.store.decode", lambda path, size: decoded.append(path) or decode.decode(path, size)
+        "scene.images.store.decode", lambda path, size: decoded.append(path) or decode.decode(path, size)
     )
     monkeypatch.setattr(sys, "argv", ["render.py", "-m", str(tmp_path), "--skip_train"])
     render.main()

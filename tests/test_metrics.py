@@ -15,8 +15,8 @@ from PIL import Image
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 import metrics
+from splatting.files import image_files
 from utils import lpips_utils
-from utils.files import image_files
 from utils.lpips_utils import LpipsUnavailable, PerceptualDistance, import_lpips
 from utils.system_utils import UserError, compute_device, run_cli
 

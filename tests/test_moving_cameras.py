@@ -13,12 +13,12 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from gaussian_renderer import render
 from gaussian_renderer.free_view import free_view, rotation_matrix
-from moving_cameras.generated import GENERATED, Ellipse, Spiral
-from moving_cameras.interpolated import KEYS_A_SECOND, Interpolated, visiting_order
-from moving_cameras.keyframes import CameraPath, Keyframe, read_camera_path
-from moving_cameras.moments import KeyframePath, TimedPath, frame_count, frame_moment
-from moving_cameras.poses import Poses, facing, focus_point, poses_of
 from scene.cameras import Camera
+from splatting.camera_paths.generated import GENERATED, Ellipse, Spiral
+from splatting.camera_paths.interpolated import KEYS_A_SECOND, Interpolated, visiting_order
+from splatting.camera_paths.keyframes import CameraPath, Keyframe, read_camera_path
+from splatting.camera_paths.moments import KeyframePath, TimedPath, frame_count, frame_moment
+from splatting.camera_paths.poses import Poses, facing, focus_point, poses_of
 from utils.system_utils import UserError
 
 UP = np.array([0.0, -1.0, 0.0])  # of COLMAP's world, as usual captures have it

@@ -14,7 +14,7 @@ from synthetic import FakeGaussians, folder_state, make_colmap_scene
 from test_colmap_scene import _options, _read
 
 from scene import Scene
-from scene.pictures.lens import Lens
+from scene.images.lens import Lens
 from scene.readers.point_cloud import write_point_cloud
 from scene.readers.transforms_lens import lens_of
 from utils.system_utils import UserError

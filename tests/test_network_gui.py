@@ -27,8 +27,8 @@ import train
 from gaussian_renderer import network_gui, network_transfer, render
 from gaussian_renderer.free_view import free_view
 from scene.cameras import MiniCam
-from training.observer import Observer
-from training.observers.network_viewer import NetworkViewer
+from splatting.training.observer import Observer
+from splatting.training.observers.network_viewer import NetworkViewer
 from utils.system_utils import UserError
 
 ITERATIONS = 60
@@ -385,7 +385,7 @@ def test_a_frame_that_cannot_be_rendered_ends_the_connection(monkeypatch, capfd)
     def fail(*arguments: object) -> None:
         raise MemoryError("no room for\nthis")
 
-    monkeypatch.setattr("training.observers.network_viewer.frame_bytes", fail)
+    monkeypatch.setattr("splatting.training.observers.network_viewer.frame_bytes", fail)
     with Endless():
         viewer = Viewer(network_gui.port)
         viewer.say(valid())

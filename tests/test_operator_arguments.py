@@ -17,7 +17,7 @@ ROOT = Path(__file__).parents[1]
 REPORT = """
 import sys
 sys.path[:0] = ["tests", "."]
-import utils.host.openmp
+import splatting.host.openmp
 from fuzz.operators import outcomes
 for outcome in outcomes():
     print("|".join(outcome), flush=True)

@@ -7,14 +7,21 @@ import pytest
 from matplotlib.figure import Figure
 
 import train
-from evaluation import configs
-from evaluation.configs import read_configs, shipped
-from evaluation.document import document, front_table, reached_table, result_blocks
-from evaluation.figures import draw_fronts
-from evaluation.option_sets import comparable_sets, default_set, fronts, reached, round_levels, stand_apart
-from evaluation.report import make_report
-from evaluation.summary import QUANTITIES
-from records.error_curve import COLUMNS
+from splatting.evaluation import configs
+from splatting.evaluation.configs import read_configs, shipped
+from splatting.evaluation.document import document, front_table, reached_table, result_blocks
+from splatting.evaluation.error_curve import COLUMNS
+from splatting.evaluation.figures import draw_fronts
+from splatting.evaluation.option_sets import (
+    comparable_sets,
+    default_set,
+    fronts,
+    reached,
+    round_levels,
+    stand_apart,
+)
+from splatting.evaluation.report import make_report
+from splatting.evaluation.summary import QUANTITIES
 from utils.system_utils import UserError
 
 ROOT = Path(__file__).parents[1]

@@ -8,14 +8,14 @@ from pathlib import Path
 
 import pytest
 
-from training.output_folder import own_folder
-from utils.files.lock import locked
-from utils.files.temporary_files import remove_temporary_files
+from splatting.files.lock import locked
+from splatting.files.temporary_files import remove_temporary_files
+from splatting.training.output_folder import own_folder
 from utils.system_utils import UserError, atomic_write
 
 ROOT = Path(__file__).parents[1]
 HOLD = (
-    "import sys, time; from training.output_folder import own_folder\n"
+    "import sys, time; from splatting.training.output_folder import own_folder\n"
     "with own_folder(sys.argv[1]):\n"
     "    print('held', flush=True); time.sleep(600)"
 )
@@ -90,7 +90,7 @@ def test_the_names_of_temporary_files_are_known(tmp_path, monkeypatch, name):
     with atomic_write(tmp_path / name) as temporary:
         temporary.touch()
         assert not remove_temporary_files(tmp_path)  # this process lives
-        monkeypatch.setattr("utils.files.temporary_files._runs", lambda process: process != os.getpid())
+        monkeypatch.setattr("splatting.files.temporary_files._runs", lambda process: process != os.getpid())
         assert remove_temporary_files(tmp_path) == [temporary]
         temporary.touch()
 

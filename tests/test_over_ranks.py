@@ -15,9 +15,9 @@ from rasterizer_tools import leaves
 from torch import Tensor
 
 from benchmarks.workloads.splat_scenes import settings
-from gaussian_renderer.over_ranks.rasterize import rasterize_over
-from gaussian_renderer.over_ranks.views import rasterize_views
-from utils.ranks.ranks import ranks
+from splatting.distributed.ranks import ranks
+from splatting.distributed.rendering.rasterize import rasterize_over
+from splatting.distributed.rendering.views import rasterize_views
 
 SIZES = [2, 3]
 # Width, height, and what differs from an ordinary call.

@@ -13,19 +13,19 @@ import pytest
 import torch
 
 import train
-from records.training_log import Stopwatch
 from scene.gaussian_model import GaussianModel
 from scene.gaussians import density_rules as rules
 from scene.gaussians.checkpoint import load_checkpoint
-from training import loop
-from training.observer import Announcer
-from training.observers import target
-from training.observers.progress import ProgressBar
-from training.observers.schedule import ScheduleFile
-from training.pacing.clocked import Clocked
-from training.pacing.pace import Block, Pace, Paced, Schedule, Settling
-from training.pacing.resolution import Resolution
-from training.pacing.schedule_file import read_schedule, write_schedule
+from splatting.evaluation.training_log import Stopwatch
+from splatting.training import loop
+from splatting.training.observer import Announcer
+from splatting.training.observers import target
+from splatting.training.observers.progress import ProgressBar
+from splatting.training.observers.schedule import ScheduleFile
+from splatting.training.schedule.clocked import Clocked
+from splatting.training.schedule.pace import Block, Pace, Paced, Schedule, Settling
+from splatting.training.schedule.resolution import Resolution
+from splatting.training.schedule.schedule_file import read_schedule, write_schedule
 from utils.system_utils import UserError
 
 OPTIONS = ["-r", 24, "--eval", "--no_curve", "--test_iterations", -1, "--densify_grad_threshold", 1e-4,
@@ -378,7 +378,7 @@ def _timed(monkeypatch: pytest.MonkeyPatch, cost: Callable[[int], float]) -> Non
         taken.take = timed
         return taken
 
-    monkeypatch.setattr("training.run.Stopwatch", Watch)
+    monkeypatch.setattr("splatting.training.run.Stopwatch", Watch)
     monkeypatch.setattr(loop, "step_taker", taker)
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
-ROOMS = ("arguments", "gaussian_renderer", "lpipsPyTorch", "scene", "utils")
+ROOMS = ("arguments", "gaussian_renderer", "lpipsPyTorch", "scene", "splatting", "utils")
 
 # Trains two steps and renders, by the names under gaussian_splatting, by the plain ones, and by both mixed.
 SCRIPT = """
@@ -82,7 +82,7 @@ def test_utils_merges_with_a_folder_of_that_name(tmp_path):
     script = """
 import utils.pose_utils
 from utils.general_utils import PILtoTorch
-from utils.host.device import compute_device
+from splatting.host.device import compute_device
 assert utils.pose_utils.C0 > 0 and len(utils.__path__) >= 2
 print("done")
 """

@@ -11,9 +11,9 @@ from test_masks import masked_scene  # noqa: F401  (a fixture)
 
 import train
 from scene.gaussians.density_rules import actions
-from training.pacing.batched import Batched
-from training.view_order import ViewOrder
-from utils.ranks.ranks import ranks
+from splatting.distributed.ranks import ranks
+from splatting.training.schedule.batched import Batched
+from splatting.training.view_order import ViewOrder
 from utils.system_utils import UserError
 
 EVERYTHING = (

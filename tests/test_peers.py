@@ -9,12 +9,12 @@ from pathlib import Path
 import pytest
 from matplotlib.figure import Figure
 
-from evaluation import peer_curve
-from evaluation.figures import draw_curves
-from evaluation.peers import COLUMNS, peers_of, read_peer, write_peer
-from evaluation.tensorboard_scalars import read_scalars
-from records.error_curve import COLUMNS as OURS
-from records.error_curve import write_curve
+from splatting.evaluation import peer_curve
+from splatting.evaluation.error_curve import COLUMNS as OURS
+from splatting.evaluation.error_curve import write_curve
+from splatting.evaluation.figures import draw_curves
+from splatting.evaluation.peers import COLUMNS, peers_of, read_peer, write_peer
+from splatting.evaluation.tensorboard_scalars import read_scalars
 from utils.system_utils import UserError
 
 

@@ -9,20 +9,20 @@ from pathlib import Path
 import pytest
 
 from arguments import read_cfg_args, read_model_json
-from evaluation.configs import read_configs
-from evaluation.peers import read_peer
-from moving_cameras.keyframes import read_camera_path
-from moving_cameras.request import path_maker
-from records.error_curve import read_curve
-from records.training_log import read_log
 from scene.dataset_readers import read_scene
 from scene.gaussians.checkpoint import load_checkpoint
 from scene.gaussians.exposure import read_pretrained
-from scene.pictures.decode import picture_size
+from scene.images.decode import picture_size
 from scene.readers.point_cloud import read_point_cloud
-from training.pacing.schedule_file import read_schedule
-from utils.files.plain_files import MOST
-from utils.files.plane_files import read_plane
+from splatting.camera_paths.keyframes import read_camera_path
+from splatting.camera_paths.request import path_maker
+from splatting.evaluation.configs import read_configs
+from splatting.evaluation.error_curve import read_curve
+from splatting.evaluation.peers import read_peer
+from splatting.evaluation.training_log import read_log
+from splatting.files.plain_files import MOST
+from splatting.files.plane_files import read_plane
+from splatting.training.schedule.schedule_file import read_schedule
 from utils.lpips_utils import _load_state
 from utils.system_utils import UserError
 

@@ -14,16 +14,16 @@ import train
 from scene import Scene
 from scene.gaussians.adam import GaussianAdam
 from scene.gaussians.undecorated import undecorated
-from scene.pictures import store
-from training import run as training_run
-from utils.host import cuda_start
+from scene.images import store
+from splatting.host import cuda_start
+from splatting.training import run as training_run
 
 ROOT = Path(__file__).parents[1]
 UNUSED = ("torch._dynamo", "torch._inductor", "torch.onnx", "matplotlib")
 UNUSED += ("pycolmap", "scipy", "skimage", "torchvision", "lpips", "sympy", "networkx", "pandas", "triton")
 LOADED = """
 import sys
-import utils.host.openmp
+import splatting.host.openmp
 import torch, numpy, PIL.Image
 before = set(sys.modules)
 import train
@@ -189,9 +189,8 @@ def test_an_installation_for_the_cpu_leaves_the_driver_alone(monkeypatch):
 
 def test_what_was_built_with_cuda_is_known_before_torch_is_there(tmp_path):
     """In a fresh process, as the extension is found without being imported."""
-    code = (
-        "import sys\nfrom utils.host import cuda_start\nprint(cuda_start._computes_on_a_gpu(), 'torch' in sys.modules)"
-    )
+    code = "import sys\nfrom splatting.host import cuda_start\n"
+    code += "print(cuda_start._computes_on_a_gpu(), 'torch' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
     from diff_gaussian_rasterization import has_cuda_kernels
 

@@ -2,9 +2,9 @@
 
 from types import SimpleNamespace
 
-from training.loss_watch import LossWatch
-from training.observers.progress import ProgressBar
-from training.pacing.pace import Pace
+from splatting.training.loss_watch import LossWatch
+from splatting.training.observers.progress import ProgressBar
+from splatting.training.schedule.pace import Pace
 
 
 def test_the_number_of_gaussians_is_exact(capsys):

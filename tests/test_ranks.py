@@ -4,7 +4,7 @@ import pytest
 import torch
 from processes import in_ranks
 
-from utils.ranks.ranks import ALONE, Ranks, ranks
+from splatting.distributed.ranks import ALONE, Ranks, ranks
 
 
 def _talk() -> dict[str, object]:

@@ -9,9 +9,9 @@ import torch
 from processes import in_ranks
 
 import train
-from training.steps.fused import FusedStep
-from utils.ranks import several
-from utils.ranks.ranks import ranks
+from splatting.distributed import several
+from splatting.distributed.ranks import ranks
+from splatting.training.steps.fused import FusedStep
 
 COLLECTIVES = ("all_gather", several.ALL_GATHER, "all_gather_object", "all_reduce", "all_to_all_single", "barrier",
                "broadcast", "broadcast_object_list")  # fmt: skip

@@ -16,14 +16,14 @@ from gaussians import model
 from PIL import Image
 
 from arguments import ModelParams, PipelineParams
-from records import render_times
 from scene.cameras import Camera
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.attributes import attributes
 from scene.gaussians.ply import write_ply
 from scene.saved_model import load_saved
-from utils.files.numbered_pngs import to_bytes
-from utils.files.plane_files import read_plane, write_plane
+from splatting.evaluation import render_times
+from splatting.files.numbered_pngs import to_bytes
+from splatting.files.plane_files import read_plane, write_plane
 from utils.system_utils import UserError
 
 render = pytest.importorskip("render", reason="the extensions are not built: make test")

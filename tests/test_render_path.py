@@ -20,10 +20,10 @@ from waiting import LIMIT, wait_for
 
 from gaussian_renderer import render as draw
 from gaussian_renderer.free_view import free_view
-from moving_cameras import render_path, video
-from moving_cameras.keyframes import CameraPath, Keyframe
-from moving_cameras.poses import poses_of
-from moving_cameras.video import video_writer
+from splatting.camera_paths import render_path, video
+from splatting.camera_paths.keyframes import CameraPath, Keyframe
+from splatting.camera_paths.poses import poses_of
+from splatting.camera_paths.video import video_writer
 from utils.system_utils import UserError
 
 imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg", reason="no imageio-ffmpeg: pip install '.[video]'")

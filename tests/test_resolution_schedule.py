@@ -16,13 +16,13 @@ from gaussian_renderer import render
 from scene import Scene
 from scene.cameras import Camera
 from scene.gaussian_model import GaussianModel
-from scene.pictures.in_memory import InMemory
-from scene.pictures.shrink import shrink_mask, shrink_photo, shrink_values
+from scene.images.in_memory import InMemory
+from scene.images.shrink import shrink_mask, shrink_photo, shrink_values
 from scene.views.view import View
-from training import loop
-from training.pacing.pace import PYRAMID, Pace
-from training.pacing.resolution import Resolution, smaller
-from training.pacing.spectrum import FACTORS, UNTIL, levels_of
+from splatting.training import loop
+from splatting.training.schedule.pace import PYRAMID, Pace
+from splatting.training.schedule.resolution import Resolution, smaller
+from splatting.training.schedule.spectrum import FACTORS, UNTIL, levels_of
 from utils.system_utils import UserError
 
 

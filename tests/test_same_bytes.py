@@ -20,7 +20,7 @@ from test_simple_knn import cloud
 from torch import Tensor
 
 from benchmarks.workloads.splat_scenes import KINDS, frustum, ordinary
-from utils.host.machine import instruction_set
+from splatting.host.machine import instruction_set
 
 ROOT = Path(__file__).resolve().parents[1]
 Results = list[Tensor]

@@ -22,8 +22,8 @@ from arguments import ModelParams
 from scene import Scene
 from scene.dataset_readers import read_scene, sceneLoadTypeCallbacks
 from scene.gaussian_model import GaussianModel
-from training import run
-from utils.files.model_json import OFFSET
+from splatting.files.model_json import OFFSET
+from splatting.training import run
 from utils.system_utils import UserError
 
 ROOT = Path(__file__).resolve().parents[1]

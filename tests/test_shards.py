@@ -18,10 +18,10 @@ from scene.gaussian_model import GaussianModel
 from scene.gaussians.checkpoint import load_checkpoint, save_checkpoint
 from scene.gaussians.density_rules import logit
 from scene.gaussians.sh_bands import cut_bounds
-from training.strategies.adc import AdaptiveDensityControl
-from training.strategies.budget import BudgetControl
-from training.strategies.mcmc import MarkovChain
-from utils.ranks.ranks import ranks
+from splatting.distributed.ranks import ranks
+from splatting.training.strategies.adc import AdaptiveDensityControl
+from splatting.training.strategies.budget import BudgetControl
+from splatting.training.strategies.mcmc import MarkovChain
 from utils.system_utils import UserError
 
 EXTENT, THRESHOLD = 2.0, 2e-4

@@ -13,10 +13,10 @@ from processes import in_ranks
 from test_depth_maps import scene  # noqa: F401  (a fixture)
 
 import train
-from scene.pictures.handing import holders
-from scene.pictures.store import ImageStore
-from training import memory_estimate
-from utils.ranks.ranks import ranks
+from scene.images.handing import holders
+from scene.images.store import ImageStore
+from splatting.distributed.ranks import ranks
+from splatting.training import memory_estimate
 from utils.system_utils import UserError
 
 LENGTH = (

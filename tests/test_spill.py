@@ -16,8 +16,8 @@ from scene import spilled_model
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.checkpoint import load_checkpoint
 from scene.spilled_model import SpilledGaussians
-from training import memory_estimate, objective, run
-from training.memory_estimate import spilled_bytes, training_bytes
+from splatting.training import memory_estimate, objective, run
+from splatting.training.memory_estimate import spilled_bytes, training_bytes
 from utils.system_utils import UserError
 
 BETAS, EPS = (0.9, 0.999), 1e-15

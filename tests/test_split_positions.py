@@ -9,8 +9,8 @@ from diff_gaussian_rasterization.density import split_positions
 from rasterizer_tools import CPU_AND_GPU, ops
 from torch import Tensor, library
 
-from utils.exact import portable_math
-from utils.exact.counter_rng import Stream, random_bits
+from splatting.deterministic import portable_math
+from splatting.deterministic.counter_rng import Stream, random_bits
 
 WHERE = {"seed": 3, "stream": Stream.SPLIT, "iteration": 600, "draw": 1}
 

@@ -50,7 +50,7 @@ def test_what_is_imported_is_no_garbage(prepared):
     """Where a command prepares its imports; other code that uses the same function keeps its collector."""
     code = f"""
 import gc
-from utils.host import start
+from splatting.host import start
 if {prepared}:
     start.prepare()
 before = gc.isenabled()

@@ -16,14 +16,14 @@ from PIL import Image
 from rasterizer_tools import GPU_MARKS
 
 import train
-from training import run
-from training.objective import Objective
-from training.steps import ahead, recorded, run_ahead
-from training.steps.ahead import AheadStep
-from training.steps.choose import step_taker
-from training.steps.fused import FusedStep
-from training.steps.plain import PlainStep
-from training.steps.recorded import RecordedStep
+from splatting.training import run
+from splatting.training.objective import Objective
+from splatting.training.steps import ahead, recorded, run_ahead
+from splatting.training.steps.ahead import AheadStep
+from splatting.training.steps.choose import step_taker
+from splatting.training.steps.fused import FusedStep
+from splatting.training.steps.plain import PlainStep
+from splatting.training.steps.recorded import RecordedStep
 from utils.system_utils import UserError
 
 ITERATIONS = 60
@@ -130,7 +130,7 @@ def test_losses_that_are_kept_keep_no_image(scene, tmp_path, monkeypatch):
 
 def test_what_may_want_gradients_takes_the_plain_step(scene, tmp_path, monkeypatch):
     taken = []
-    monkeypatch.setattr("training.loop.step_taker", lambda run: (taken.append(step_taker(run)), taken[-1])[1])
+    monkeypatch.setattr("splatting.training.loop.step_taker", lambda run: (taken.append(step_taker(run)), taken[-1])[1])
 
     class WithFurtherTerm(Objective):
         pass
@@ -212,7 +212,7 @@ def queued(monkeypatch: pytest.MonkeyPatch) -> None:
     MADE.clear()
     monkeypatch.setattr(ahead, "RunAhead", Immediate)
     monkeypatch.setattr(recorded, "Recorder", Rerun)
-    monkeypatch.setattr("training.loop.step_taker", AheadStep)
+    monkeypatch.setattr("splatting.training.loop.step_taker", AheadStep)
 
 
 ENDS_EARLY = ("--densify_until_iter", 30)  # so that two phases have steps to record
@@ -231,7 +231,7 @@ def test_steps_that_are_recorded_give_the_same_bytes(scene, tmp_path, queued, mo
     assert MADE[0].records >= 3  # tensors that density control has replaced are recorded anew
     assert all(len({kind[-2:] for kind in known}) <= 1 for known in kinds)  # records of another phase go
     assert len(set().union(*kinds)) == (2 if options == ENDS_EARLY else 1)
-    monkeypatch.setattr("training.loop.step_taker", PlainStep)
+    monkeypatch.setattr("splatting.training.loop.step_taker", PlainStep)
     assert not differences(taken, trained(scene, tmp_path / "plain", *options))
 
 
@@ -263,7 +263,7 @@ def test_a_loss_that_was_changed_is_recorded_only_if_it_is_the_same_in_every_ste
     monkeypatch.setattr(Objective, "__call__", changed)
     taken = trained(scene, tmp_path / "queued")
     assert (MADE[0].launches > 40) == recordable and (MADE[0].launches == 0) != recordable
-    monkeypatch.setattr("training.loop.step_taker", PlainStep)
+    monkeypatch.setattr("splatting.training.loop.step_taker", PlainStep)
     assert not differences(taken, trained(scene, tmp_path / "plain"))
 
 
@@ -282,7 +282,7 @@ def test_steps_that_are_queued_give_the_same_bytes(scene, tmp_path, monkeypatch,
     monkeypatch.setattr(ahead, "RunAhead", Immediate)
     monkeypatch.setattr(recorded, "Recorder", Rerun)
     monkeypatch.setattr(RecordedStep, "take", lambda *_: None)
-    monkeypatch.setattr("training.loop.step_taker", AheadStep)
+    monkeypatch.setattr("splatting.training.loop.step_taker", AheadStep)
     taken, queue = [], AheadStep._queue
     monkeypatch.setattr(AheadStep, "_queue", lambda self, step, x: (taken.append(queue(self, step, x)), taken[-1])[1])
     assert trained(scene, tmp_path / "ahead", *OPTIONS["default"]) == plain
@@ -301,7 +301,7 @@ def test_a_term_that_appears_when_a_step_is_recorded_is_not_lost(scene, tmp_path
     monkeypatch.setattr(Objective, "__call__", with_term)
     taken = trained(scene, tmp_path / "queued")
     assert MADE[0].launches == 0
-    monkeypatch.setattr("training.loop.step_taker", PlainStep)
+    monkeypatch.setattr("splatting.training.loop.step_taker", PlainStep)
     assert not differences(taken, trained(scene, tmp_path / "plain"))
 
 
@@ -400,10 +400,10 @@ def test_a_run_that_is_killed_right_after_a_halt_resumes_to_the_same_bytes(scene
     program = """
 import os, signal, sys
 sys.path[:0] = ["tests", "."]
-import utils.host.openmp
+import splatting.host.openmp
 from pathlib import Path
 import test_steps
-from training.steps import run_ahead
+from splatting.training.steps import run_ahead
 repeat = run_ahead.RunAhead._repeat
 
 def repeat_and_die(self, report):

@@ -4,7 +4,7 @@ import os
 
 import pytest
 
-from utils.host import threads
+from splatting.host import threads
 
 
 @pytest.fixture

@@ -17,15 +17,15 @@ from plyfile import PlyData
 
 import train
 from arguments import read_stored_options
-from records.training_log import Stopwatch, TrainingLog
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.adam import GaussianAdam
 from scene.gaussians.checkpoint import load_checkpoint
 from scene.readers.point_cloud import write_point_cloud
-from training import run as training_run
-from training.observers import report
-from training.steps import fused
-from training.view_order import ViewOrder
+from splatting.evaluation.training_log import Stopwatch, TrainingLog
+from splatting.training import run as training_run
+from splatting.training.observers import report
+from splatting.training.steps import fused
+from splatting.training.view_order import ViewOrder
 from utils.system_utils import UserError
 
 ROOT = Path(__file__).parents[1]
@@ -62,7 +62,9 @@ RESUMED = [
 
 
 def test_resume_equals_uninterrupted(colmap_scene, tmp_path, monkeypatch):
-    monkeypatch.setattr("training.run.SH_INTERVAL", 130)  # so that three degrees come into play within 600 iterations
+    monkeypatch.setattr(
+        "splatting.training.run.SH_INTERVAL", 130
+    )  # so that three degrees come into play within 600 iterations
     whole = _train(colmap_scene, tmp_path / "a", *RESUMED, "--checkpoint_iterations", 300, iterations=600)
     checkpoint = tmp_path / "a" / "chkpnt300.pth"
     resumed = _train(colmap_scene, tmp_path / "b", *RESUMED, "--start_checkpoint", checkpoint, iterations=600)
@@ -181,7 +183,7 @@ def test_learning_and_what_is_said(colmap_scene, tmp_path, capfd):
 @pytest.mark.parametrize("degree", [0, 2, 3])
 def test_sh_degree_rises_every_interval_up_to_its_maximum(blender_scene, tmp_path, monkeypatch, degree):
     assert training_run.SH_INTERVAL == 1000
-    monkeypatch.setattr("training.run.SH_INTERVAL", 2)
+    monkeypatch.setattr("splatting.training.run.SH_INTERVAL", 2)
     cloud = tmp_path / "cloud.ply"
     write_point_cloud(cloud, np.random.default_rng(0).normal(size=(50, 3)) * 0.3, np.full((50, 3), 100))
     every = [str(t) for t in range(1, 9)]
@@ -314,7 +316,7 @@ def test_a_damaged_log_is_no_reason_to_stop(tmp_path, capsys, content):
 
 def test_a_stopwatch_pauses_also_when_something_fails(monkeypatch):
     now = [100.0]
-    monkeypatch.setattr("records.training_log.running_seconds", lambda: now[0])
+    monkeypatch.setattr("splatting.evaluation.training_log.running_seconds", lambda: now[0])
     clock = Stopwatch()
     now[0] += 2
     with pytest.raises(ZeroDivisionError), clock.paused("saving"):
@@ -329,7 +331,7 @@ def test_a_stopwatch_pauses_also_when_something_fails(monkeypatch):
 
 def test_a_stopwatch_stands_still_in_a_pause_and_counts_one_in_another_once(monkeypatch):
     now = [100.0]
-    monkeypatch.setattr("records.training_log.running_seconds", lambda: now[0])
+    monkeypatch.setattr("splatting.evaluation.training_log.running_seconds", lambda: now[0])
     clock = Stopwatch()
     now[0] += 2
     with clock.paused("viewing"):
@@ -433,7 +435,7 @@ def test_tensorboard_gets_the_references_tags(colmap_scene, tmp_path, monkeypatc
 
 def test_seconds_leave_evaluation_and_saving_out(colmap_scene, tmp_path, monkeypatch):
     later, clock = [0.0], time.perf_counter  # seconds that a clock of this test's own is ahead
-    monkeypatch.setattr("records.training_log.running_seconds", lambda: clock() + later[0])
+    monkeypatch.setattr("splatting.evaluation.training_log.running_seconds", lambda: clock() + later[0])
 
     def slow(*_: object) -> dict[str, float]:
         later[0] += 1000

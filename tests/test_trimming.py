@@ -19,7 +19,6 @@ from scipy.spatial.transform import Rotation, Slerp
 import render as render_script
 import train
 from arguments import ModelParams, read_cfg_args
-from diagnosis.model import check_model
 from gaussian_renderer import decisive_for, render, trimming
 from gaussian_renderer.between import FRACTIONS, NEAREST, WIDER, neighbours, views_between
 from gaussian_renderer.scored_views import ScoredViews
@@ -29,7 +28,8 @@ from scene.cameras import Camera
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.checkpoint import load_checkpoint
 from scene.readers.point_cloud import write_point_cloud
-from training.left_out import LeftOut, lines
+from splatting.diagnosis.model import check_model
+from splatting.training.left_out import LeftOut, lines
 from utils.system_utils import UserError
 
 ITERATIONS = 12
@@ -388,7 +388,7 @@ def test_the_short_line():
 def test_training_says_them(colmap_scene, tmp_path, capfd, monkeypatch):
     monkeypatch.setattr(sys, "stdout", sys.stdout)
     for short in (2000, 0):
-        monkeypatch.setattr("training.left_out.SHORT", short)
+        monkeypatch.setattr("splatting.training.left_out.SHORT", short)
         train.main(["-s", str(colmap_scene), "-m", str(tmp_path), "-r", "24", "--iterations", "2"])
         said = re.sub(r" \[\d\d/\d\d \d\d:\d\d:\d\d\]$", "", capfd.readouterr().out, flags=re.MULTILINE).splitlines()
         expected = lines(LeftOut(**json.loads((tmp_path / "model.json").read_text())["left_out"]))

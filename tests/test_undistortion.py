@@ -13,9 +13,9 @@ from synthetic import FakeGaussians, folder_state, make_colmap_scene
 from test_colmap_scene import _options, _read
 
 from scene import Scene
-from scene.pictures.lens import WIDEST, Lens, pinhole_of, shown_pixels, undistortion
-from scene.pictures.masks import TRANSPARENT, Mask
-from scene.pictures.undistortion import Photo, undistort
+from scene.images.lens import WIDEST, Lens, pinhole_of, shown_pixels, undistortion
+from scene.images.masks import TRANSPARENT, Mask
+from scene.images.undistortion import Photo, undistort
 from utils.system_utils import UserError
 
 WIDTH, HEIGHT, FOCAL = 200, 150, 150.0

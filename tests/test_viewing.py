@@ -16,16 +16,16 @@ from arguments import ModelParams
 from gaussian_renderer import render
 from gaussian_renderer.free_view import free_view
 from gaussian_renderer.view_planes import blend_depth
-from moving_cameras.keyframes import read_camera_path
 from scene import Scene
 from scene.gaussian_model import GaussianModel
+from splatting.camera_paths.keyframes import read_camera_path
+from splatting.viewer import settings as names
+from splatting.viewer.frames import LONGEST, Frames, inside, shown_part
+from splatting.viewer.scene_cameras import SceneCameras, canvas, center, fov_of_canvas
+from splatting.viewer.settings import Pose, Settings, pose_of
+from splatting.viewer.tabs import PathTab, first_box
+from splatting.viewer.watchers import MOVING, STILL, STILL_AFTER, Budget, Watchers
 from utils.system_utils import UserError
-from viewing import settings as names
-from viewing.frames import LONGEST, Frames, inside, shown_part
-from viewing.scene_cameras import SceneCameras, canvas, center, fov_of_canvas
-from viewing.settings import Pose, Settings, pose_of
-from viewing.tabs import PathTab, first_box
-from viewing.watchers import MOVING, STILL, STILL_AFTER, Budget, Watchers
 
 FRONT = Pose((0.0, 0.0, -4.0), (1.0, 0.0, 0.0, 0.0), 0.8, 96, 64)
 PLAIN = Settings()
@@ -181,7 +181,7 @@ def test_a_slider_draws_nothing_again_until_the_model_changes(gaussians, scene_c
     name, camera = next(iter(scene_cameras.by_name.items()))
     frames, asked = _frames(gaussians, scene_cameras), replace(PLAIN, camera=name, comparison=names.SLIDER)
     drawn = []
-    monkeypatch.setattr("viewing.frames.render", lambda *a, **k: (drawn.append(1), render(*a, **k))[1])
+    monkeypatch.setattr("splatting.viewer.frames.render", lambda *a, **k: (drawn.append(1), render(*a, **k))[1])
     for slider, version in ((0.1, 1), (0.2, 1), (0.9, 1), (0.9, 2)):
         frames.draw(replace(asked, slider=slider), _pose_at(camera), False, version)
     assert len(drawn) == 2

@@ -18,10 +18,10 @@ from websockets.asyncio.server import serve  # noqa: E402
 from websockets.exceptions import ConnectionClosed  # noqa: E402
 from websockets.sync.client import connect  # noqa: E402
 
-from viewing import connections  # noqa: E402
-from viewing import server as servers  # noqa: E402
-from viewing.connections import is_accepted  # noqa: E402
-from viewing.options import Address  # noqa: E402
+from splatting.viewer import connections  # noqa: E402
+from splatting.viewer import server as servers  # noqa: E402
+from splatting.viewer.connections import is_accepted  # noqa: E402
+from splatting.viewer.options import Address  # noqa: E402
 
 VALUES = {
     "text": "a", "number": 1.0, "whole": 1, "switch": False, "vector": (0.0, 0.0, 0.0), "nested": ((0, 1), (2, 3)),

@@ -23,13 +23,13 @@ from websockets.exceptions import InvalidStatus  # noqa: E402
 
 from arguments import ModelParams  # noqa: E402
 from scene import Scene  # noqa: E402
+from splatting.viewer import server as servers  # noqa: E402
+from splatting.viewer import watchers  # noqa: E402
+from splatting.viewer.auth import Auth  # noqa: E402
+from splatting.viewer.options import Address  # noqa: E402
+from splatting.viewer.page import Page, answer  # noqa: E402
+from splatting.viewer.scene_cameras import center  # noqa: E402
 from utils.system_utils import UserError  # noqa: E402
-from viewing import server as servers  # noqa: E402
-from viewing import watchers  # noqa: E402
-from viewing.auth import Auth  # noqa: E402
-from viewing.options import Address  # noqa: E402
-from viewing.page import Page, answer  # noqa: E402
-from viewing.scene_cameras import center  # noqa: E402
 
 ANY = Address("127.0.0.1", 0)
 
@@ -164,7 +164,7 @@ def test_without_viser_a_sentence_says_what_to_install(monkeypatch):
 
 def test_a_server_that_asks_no_gate_does_not_stay(monkeypatch):
     stopped = []
-    monkeypatch.setattr("viewing.auth.Auth.in_front_of_viser", lambda self: threading.Lock())
+    monkeypatch.setattr("splatting.viewer.auth.Auth.in_front_of_viser", lambda self: threading.Lock())
     monkeypatch.setattr(servers, "stop", lambda server, stop=servers.stop: (stopped.append(server), stop(server)))
     with pytest.raises(UserError, match="cannot be guarded"):
         servers.serve(ANY, "test")

@@ -19,7 +19,7 @@ from waiting import wait_for  # noqa: E402
 
 import train  # noqa: E402
 from scene.gaussians.checkpoint import load_checkpoint  # noqa: E402
-from training.observers import page as observed  # noqa: E402
+from splatting.training.observers import page as observed  # noqa: E402
 from utils.system_utils import UserError  # noqa: E402
 
 ITERATIONS = 120
@@ -66,7 +66,7 @@ class Watched:
                     client.__exit__()
                 super().ended(error)
 
-        monkeypatch.setattr("training.observers.standard.PageObserver", Observer)
+        monkeypatch.setattr("splatting.training.observers.standard.PageObserver", Observer)
 
     def connect(self) -> None:
         """Let a browser look."""
@@ -140,7 +140,7 @@ def test_watching_changes_no_byte_of_the_model(colmap_scene, tmp_path, monkeypat
 
 def test_nothing_is_drawn_while_nobody_looks(colmap_scene, tmp_path, monkeypatch):
     asked = []
-    monkeypatch.setattr("viewing.watchers.Watchers.next", lambda *_: asked.append(1))
+    monkeypatch.setattr("splatting.viewer.watchers.Watchers.next", lambda *_: asked.append(1))
     watched = Watched(monkeypatch, {})
     _train(colmap_scene, tmp_path / "out", "--no_curve")
     assert not watched.frames and not asked
@@ -189,7 +189,7 @@ def test_stop_saves_a_checkpoint_that_can_be_resumed(colmap_scene, tmp_path, mon
 def test_a_paused_training_that_ends_is_saved_and_the_pause_is_no_time_of_it(colmap_scene, tmp_path, monkeypatch, end):
     before: list[float] = []
     leap, clock = [0.0], time.perf_counter
-    monkeypatch.setattr("records.training_log.running_seconds", lambda: clock() + leap[0])
+    monkeypatch.setattr("splatting.evaluation.training_log.running_seconds", lambda: clock() + leap[0])
 
     def pause(watched: Watched) -> None:
         before.append(watched.observer._run.clock.seconds)
@@ -219,7 +219,7 @@ def test_neither_a_checkpoint_nor_a_frame_that_fails_ends_a_training(colmap_scen
         raise RuntimeError("no memory for a frame")
 
     watched = Watched(monkeypatch, {5: Watched.connect, 10: save, 20: save})
-    monkeypatch.setattr("viewing.frames.Frames.draw", broken)
+    monkeypatch.setattr("splatting.viewer.frames.Frames.draw", broken)
     (tmp_path / "out/chkpnt10.pth").mkdir(parents=True)
     expected = _train(colmap_scene, tmp_path / "alone", "--no_curve", viewer=False).read_bytes()
     assert _train(colmap_scene, tmp_path / "out", "--no_curve").read_bytes() == expected

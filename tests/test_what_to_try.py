@@ -9,10 +9,10 @@ import pytest
 
 import train
 from arguments import OptimizationParams
-from diagnosis.model import check_training
-from records.error_curve import COLUMNS, NAME, Row, write_curve
-from records.training_log import NAME as LOG
-from records.what_to_try import what_to_try
+from splatting.diagnosis.model import check_training
+from splatting.evaluation.error_curve import COLUMNS, NAME, Row, write_curve
+from splatting.evaluation.training_log import NAME as LOG
+from splatting.evaluation.what_to_try import what_to_try
 
 COUNTS = (1000, 1500, 4000, 8000)
 

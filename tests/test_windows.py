@@ -15,14 +15,14 @@ from pathlib import Path
 import pytest
 from test_house import ROOMS
 
-from evaluation import child
-from scene.pictures.find import find_pictures
+from scene.images.find import find_pictures
 from scene.readers.info import exposure_names
+from splatting.evaluation import child
+from splatting.files import lock, relative
+from splatting.host import session
+from splatting.viewer import server
 from utils import system_utils
-from utils.files import lock, relative
-from utils.host import session
 from utils.system_utils import UserError, atomic_write
-from viewing import server
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -150,7 +150,7 @@ def test_text_files_are_opened_as_utf_8():
             text = name in ("read_text", "write_text") or (
                 isinstance(node.func, ast.Name) and name == "open" and not _is_binary(node)
             )
-            if text and not {"host", "ranks"} & set(path.relative_to(ROOT).parts):
+            if text and not {"host", "distributed"} & set(path.relative_to(ROOT).parts):
                 unnamed.append(f"{path.relative_to(ROOT)}:{node.lineno}")
     assert unnamed == []
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from scene.cameras import Camera
-from scene.pictures.resolution import training_size
+from scene.images.resolution import training_size
 from scene.readers.info import CameraInfo
 from scene.views.of_info import file_size, view_of_info
 from scene.views.view import half

@@ -18,7 +18,7 @@ from types import ModuleType
 import torch
 from torch import library, nn
 
-from utils.files.tensor_files import read_tensors
+from splatting.files.tensor_files import read_tensors
 from utils.system_utils import UserError
 
 NETS = {"alex": "alexnet", "vgg": "vgg16", "squeeze": "squeezenet1_1"}  # backbones, and torchvision's names for them

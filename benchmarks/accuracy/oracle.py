@@ -29,7 +29,7 @@ from benchmarks.harness.environment import describe, print_table, require_matplo
 from benchmarks.harness.timing import cpu_milliseconds, gpu_milliseconds
 from benchmarks.workloads.splat_scenes import KINDS
 from benchmarks.workloads.stability_cases import Problem, all_stiff
-from utils.files.json_files import write_json
+from splatting.files.json_files import write_json
 from utils.system_utils import run_cli
 
 TIMED_SIZES = {

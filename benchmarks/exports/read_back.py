@@ -9,10 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
-from exports.formats import read_splats
-from exports.scene_formats import PRIM
-from exports.splats import Splats, logits
-from exports.web import PROGRAM
+from splatting.exports.formats import read_splats
+from splatting.exports.scene_formats import PRIM
+from splatting.exports.splats import Splats, logits
+from splatting.exports.web import PROGRAM
 from utils.system_utils import UserError
 
 

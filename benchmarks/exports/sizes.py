@@ -18,11 +18,11 @@ from arguments import OptionParser, PipelineParams
 from benchmarks.exports.read_back import read_back
 from benchmarks.harness.environment import describe, print_table
 from benchmarks.workloads.orbit import orbit
-from exports.formats import FORMATS, read_splats
-from exports.in_scene import model_of
-from exports.splats import Splats, drawable, selected
 from gaussian_renderer import render
 from scene.cameras import MiniCam
+from splatting.exports.formats import FORMATS, read_splats
+from splatting.exports.in_scene import model_of
+from splatting.exports.splats import Splats, drawable, selected
 from utils.system_utils import UserError, compute_device, run_cli
 
 VIEWS, SIDE = 5, 256

@@ -12,8 +12,8 @@ from typing import Any
 import torch
 
 from benchmarks.gate.judging import QUANTITIES
-from utils.files.json_files import read_json, write_json
-from utils.host.machine import instruction_set
+from splatting.files.json_files import read_json, write_json
+from splatting.host.machine import instruction_set
 from utils.system_utils import UserError, compute_device
 
 FILE = Path(__file__).resolve().parents[1] / "gate.json"

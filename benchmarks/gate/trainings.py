@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from benchmarks.scenes.training import ROOT, run, seconds_of, train
-from demo.make_scene import make_scene
+from splatting.demo.make_scene import make_scene
 from utils.system_utils import UserError
 
 WORK = ROOT / "build" / "gate"

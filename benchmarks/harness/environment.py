@@ -6,8 +6,8 @@ import platform
 
 import torch
 
-from utils.files.markdown_table import markdown_table
-from utils.host.machine import commit, cpu_name, gpu_name, instruction_set
+from splatting.files.markdown_table import markdown_table
+from splatting.host.machine import commit, cpu_name, gpu_name, instruction_set
 from utils.system_utils import UserError, compute_device
 
 

@@ -7,19 +7,19 @@ import torch
 
 import train
 from benchmarks.parallel.workload import Workload
-from records.training_log import Stopwatch
 from scene.gaussian_model import GaussianModel
 from scene.spilled_model import SpilledGaussians
-from training.loss_watch import LossWatch
-from training.objective import Objective
-from training.pacing.choose import pace_of
-from training.pacing.resolution import Resolution
-from training.run import Run
-from training.strategies.choose import density_control
-from training.view_order import ViewOrder
+from splatting.distributed.ranks import ranks
+from splatting.evaluation.training_log import Stopwatch
+from splatting.host.interrupt import DeferredInterrupt
+from splatting.training.loss_watch import LossWatch
+from splatting.training.objective import Objective
+from splatting.training.run import Run
+from splatting.training.schedule.choose import pace_of
+from splatting.training.schedule.resolution import Resolution
+from splatting.training.strategies.choose import density_control
+from splatting.training.view_order import ViewOrder
 from utils.general_utils import get_expon_lr_func
-from utils.host.interrupt import DeferredInterrupt
-from utils.ranks.ranks import ranks
 from utils.system_utils import compute_device
 
 _EXTENT = 5.0  # world units

@@ -34,12 +34,12 @@ from benchmarks.harness.environment import describe, print_table
 from benchmarks.parallel.run import WorkloadRun
 from benchmarks.parallel.workload import ALL
 from scene.gaussian_model import GaussianModel
-from training.loop import run_training
-from training.observer import Observer
-from training.observers.divergence import DivergenceWatch
-from training.step import Step
-from utils.host.process import peak_memory_mib
-from utils.ranks.ranks import ranks
+from splatting.distributed.ranks import ranks
+from splatting.host.process import peak_memory_mib
+from splatting.training.loop import run_training
+from splatting.training.observer import Observer
+from splatting.training.observers.divergence import DivergenceWatch
+from splatting.training.step import Step
 from utils.system_utils import UserError, compute_device, run_cli
 
 ROOT = Path(__file__).resolve().parents[2]

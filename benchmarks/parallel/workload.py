@@ -11,7 +11,7 @@ from benchmarks.workloads.city import city, look
 from benchmarks.workloads.splat_scenes import FOV, GPU_WORKLOADS, frustum
 from scene.cameras import Camera
 from scene.gaussians.shards import bound
-from scene.pictures.in_memory import InMemory
+from scene.images.in_memory import InMemory
 from scene.views.view import View
 from utils.graphics_utils import focal2fov, fov2focal
 

@@ -6,7 +6,7 @@ from operator import itemgetter
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
-import utils.host.extensions  # noqa: F401  isort: skip  (before the extensions)
+import splatting.host.extensions  # noqa: F401  isort: skip  (before the extensions)
 import torch
 from diff_gaussian_rasterization.optim import adam_
 from torch import Tensor

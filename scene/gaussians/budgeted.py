@@ -9,8 +9,8 @@ from scene.gaussians.moves import changes_rows
 from scene.gaussians.parameters import raw_rows
 from scene.gaussians.relocating import RelocatingGaussians
 from scene.gaussians.row_surgery import restart_rows, row_groups
-from utils.exact.portable_math import exp, log
-from utils.ranks.selection import lowest
+from splatting.deterministic.portable_math import exp, log
+from splatting.distributed.selection import lowest
 
 
 def count_after(now: int, budget: int, remaining: int, power: float) -> int:

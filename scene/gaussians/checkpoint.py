@@ -11,9 +11,9 @@ import torch
 from scene.gaussians.attributes import IN_CHECKPOINT, Attribute, Rows
 from scene.gaussians.finite import check_finite
 from scene.gaussians.statistics import Statistics
-from utils.files.tensor_files import read_tensors
-from utils.host.version import VERSION
-from utils.ranks.ranks import ranks
+from splatting.distributed.ranks import ranks
+from splatting.files.tensor_files import read_tensors
+from splatting.host.version import VERSION
 from utils.system_utils import UserError, atomic_write
 
 _LARGEST = 1e15  # extent; learning rates are multiples of it

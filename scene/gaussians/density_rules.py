@@ -7,14 +7,14 @@ import argparse
 import math
 from typing import NamedTuple
 
-import utils.host.extensions  # noqa: F401  isort: skip  (before the extensions)
+import splatting.host.extensions  # noqa: F401  isort: skip  (before the extensions)
 import torch
 from diff_gaussian_rasterization.density import split_positions
 from torch import Tensor
 
-from utils.exact.counter_rng import Stream
-from utils.ranks.ranks import ALONE, Ranks
-from utils.ranks.selection import lowest
+from splatting.deterministic.counter_rng import Stream
+from splatting.distributed.ranks import ALONE, Ranks
+from splatting.distributed.selection import lowest
 
 SHRINK = 0.8  # N children of a split have 1 / (0.8 N) of the parent's scale: 1 / 1.6 for two (paper, section 5.2)
 PRUNE_EXTENT = 0.1  # a Gaussian wider than this part of the scene's extent is removed, once sizes are limited

@@ -12,10 +12,10 @@ from torch import Tensor, nn
 
 from scene.gaussians.adam import GaussianAdam
 from scene.gaussians.trainable import trainable
-from utils.files.plain_files import plain_text
+from splatting.distributed.ranks import Ranks
+from splatting.files.plain_files import plain_text
+from splatting.host.device import compute_device
 from utils.general_utils import get_expon_lr_func
-from utils.host.device import compute_device
-from utils.ranks.ranks import Ranks
 from utils.system_utils import UserError, atomic_write
 
 NAME = "exposure.json"

@@ -1,6 +1,6 @@
 """Places in the host's memory for tensors of a GPU, whose kernels read and write them over the bus."""
 
-import utils.host.extensions  # noqa: F401  isort: skip  (before the extensions)
+import splatting.host.extensions  # noqa: F401  isort: skip  (before the extensions)
 from diff_gaussian_rasterization.backend import OPERATORS
 from torch import Tensor
 

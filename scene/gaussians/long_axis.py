@@ -22,7 +22,7 @@ import torch
 from torch import Tensor
 
 from scene.gaussians.attributes import Rows
-from utils.exact.portable_math import exp, log
+from splatting.deterministic.portable_math import exp, log
 
 SHIFT = math.sqrt(0.5)
 SHRINK = math.sqrt(1.0 - SHIFT * SHIFT)

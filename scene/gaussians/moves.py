@@ -13,7 +13,7 @@ from scene.gaussians.attributes import Rows
 from scene.gaussians.row_surgery import Group, map_rows, row_groups
 from scene.gaussians.shards import Divided, bound
 from scene.gaussians.statistics import NAMES
-from utils.ranks.ranks import Ranks
+from splatting.distributed.ranks import Ranks
 
 if TYPE_CHECKING:
     from scene.gaussians.adaptive import AdaptiveGaussians

@@ -11,9 +11,9 @@ from scene.gaussians.attributes import Attribute, Rows, attributes
 from scene.gaussians.finite import tell_of_undrawn
 from scene.gaussians.ply import column_names, read_ply, row_bytes, write_ply
 from scene.gaussians.shards import WHOLE, Divided, Shards
+from splatting.distributed.ranks import Ranks
+from splatting.host.device import compute_device
 from utils.general_utils import build_scaling_rotation, inverse_sigmoid, strip_symmetric
-from utils.host.device import compute_device
-from utils.ranks.ranks import Ranks
 from utils.system_utils import UserError
 
 

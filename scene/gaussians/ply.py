@@ -10,10 +10,10 @@ from plyfile import PlyParseError
 from torch import Tensor
 
 from scene.gaussians.attributes import Rows, attributes
-from utils.files.ply_header import read_elements
-from utils.ranks.gathering import in_order
-from utils.ranks.ranks import ALONE, Ranks
-from utils.ranks.ranks import ranks as all_ranks
+from splatting.distributed.gathering import in_order
+from splatting.distributed.ranks import ALONE, Ranks
+from splatting.distributed.ranks import ranks as all_ranks
+from splatting.files.ply_header import read_elements
 from utils.system_utils import UserError, atomic_write
 
 _NORMALS = ["nx", "ny", "nz"]  # zeros after the positions, as in the reference's files

@@ -2,7 +2,7 @@
 
 import math
 
-import utils.host.extensions  # noqa: F401  isort: skip  (before the extensions)
+import splatting.host.extensions  # noqa: F401  isort: skip  (before the extensions)
 import torch
 from diff_gaussian_rasterization.density import add_noise_, penalise_
 from torch import Tensor
@@ -15,7 +15,7 @@ from scene.gaussians.parameters import raw_rows
 from scene.gaussians.penalty import Penalty
 from scene.gaussians.relocation import divided, draw, opacity_units
 from scene.gaussians.row_surgery import overwrite_rows, row_groups
-from utils.exact.counter_rng import Stream
+from splatting.deterministic.counter_rng import Stream
 
 _RELOCATION, _GROWTH = range(2)  # draws of one iteration
 

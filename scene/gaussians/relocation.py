@@ -10,9 +10,9 @@ import math
 import torch
 from torch import Tensor
 
-from utils.exact.counter_rng import Stream, random_bits
-from utils.exact.portable_math import exp, log
-from utils.ranks.ranks import ALONE, Ranks
+from splatting.deterministic.counter_rng import Stream, random_bits
+from splatting.deterministic.portable_math import exp, log
+from splatting.distributed.ranks import ALONE, Ranks
 
 MOST_PARTS = 51  # of one Gaussian (paper): itself and 50 copies
 _UNITS = 2**24  # of opacity 1, where Gaussians are drawn in proportion to it

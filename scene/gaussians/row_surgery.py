@@ -7,7 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from scene.gaussians.host_memory import beside
-from utils.host.memory import is_out_of_memory
+from splatting.host.memory import is_out_of_memory
 
 _CHUNK = 1 << 16  # rows moved at a time when memory is too short for all of them
 

@@ -5,8 +5,8 @@ import math
 import torch
 from torch import Tensor
 
-from utils.ranks.ranks import ALONE, Ranks
-from utils.ranks.selection import largest
+from splatting.distributed.ranks import ALONE, Ranks
+from splatting.distributed.selection import largest
 
 
 def cut_bounds(f_rest: Tensor, ranks: Ranks = ALONE) -> list[float]:

@@ -5,8 +5,8 @@ from collections.abc import Iterable
 import torch
 from torch import Tensor
 
-from utils.host.device import compute_device
-from utils.ranks.ranks import ALONE, Ranks
+from splatting.distributed.ranks import ALONE, Ranks
+from splatting.host.device import compute_device
 
 _PART, _RANK = 43, 32  # bits of a key below the number of a part, and below the rank or piece in it
 

@@ -10,8 +10,8 @@ from torch import Tensor, nn
 from scene.gaussians.checkpoint import State
 from scene.gaussians.shards import Shards
 from scene.gaussians.statistics import NAMES
-from utils.ranks.gathering import whole
-from utils.ranks.ranks import Ranks
+from splatting.distributed.gathering import whole
+from splatting.distributed.ranks import Ranks
 
 
 def whole_state(state: State, ranks: Ranks) -> State:

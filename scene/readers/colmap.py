@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from scene.pictures.find import find_pictures
-from scene.pictures.masks import NO_MASKS, MaskOptions, find_masks
+from scene.images.find import find_pictures
+from scene.images.masks import NO_MASKS, MaskOptions, find_masks
 from scene.readers import colmap_model
 from scene.readers.info import SceneInfo, normalization, split_by_order
 from scene.readers.point_cloud import check_finite, read_point_cloud

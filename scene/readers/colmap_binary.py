@@ -12,7 +12,7 @@ from typing import BinaryIO, TypeVar
 import numpy as np
 
 from scene.readers.colmap_records import CAMERA_MODEL_IDS, Camera, Image, Points, PointTable
-from utils.files.file_kinds import not_the_file
+from splatting.files.file_kinds import not_the_file
 from utils.system_utils import UserError
 
 _COUNT = struct.Struct("<Q")

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from scene.pictures.lens import Lens
+from scene.images.lens import Lens
 from scene.readers.colmap_binary import (
     read_extrinsics_binary,
     read_intrinsics_binary,

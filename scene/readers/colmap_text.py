@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from scene.readers.colmap_records import CAMERA_MODEL_NAMES, Camera, Image, Points, PointTable
-from utils.files.file_kinds import not_the_file
+from splatting.files.file_kinds import not_the_file
 from utils.system_utils import UserError, first_line
 
 

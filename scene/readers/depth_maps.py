@@ -12,13 +12,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from scene.pictures.decode import picture_size
+from scene.images.decode import picture_size
 from scene.readers import colmap_model
 from scene.readers.info import CameraInfo, SceneInfo
-from utils.files.image_files import UNREADABLE, open_image
-from utils.files.listing import some
-from utils.files.plain_files import plain_text
-from utils.host.cache_folder import cache_folder
+from splatting.files.image_files import UNREADABLE, open_image
+from splatting.files.listing import some
+from splatting.files.plain_files import plain_text
+from splatting.host.cache_folder import cache_folder
 from utils.system_utils import UserError
 
 PARAMS = "depth_params.json"

@@ -10,10 +10,10 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from scene.pictures.decode import picture_size
-from scene.pictures.masks import Mask
-from scene.pictures.store import Decodable
-from utils.files.relative import relative_to
+from scene.images.decode import picture_size
+from scene.images.masks import Mask
+from scene.images.store import Decodable
+from splatting.files.relative import relative_to
 from utils.graphics_utils import BasicPointCloud, camera_center, focal2fov, fov2focal, rigid_pose
 from utils.system_utils import UserError
 

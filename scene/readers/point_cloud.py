@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 from plyfile import PlyData, PlyElement, PlyParseError
 
-from utils.files.packed import check_packed_rows
-from utils.files.ply_header import read_elements
+from splatting.files.packed import check_packed_rows
+from splatting.files.ply_header import read_elements
 from utils.graphics_utils import BasicPointCloud
 from utils.system_utils import UserError, atomic_write
 

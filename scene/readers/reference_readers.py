@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from scene.pictures.lens import Lens, pinhole_of
+from scene.images.lens import Lens, pinhole_of
 from scene.readers.colmap import read_colmap
 from scene.readers.colmap_records import Camera, Image, qvec2rotmat
 from scene.readers.depth_maps import BLENDER_UNIT, COLMAP_UNIT, named_depth_map, with_depth_maps
@@ -22,9 +22,9 @@ from scene.readers.info import HOLD, CameraInfo, SceneInfo, camera_centers, norm
 from scene.readers.point_cloud import fetchPly, write_point_cloud
 from scene.readers.source_views import SourceView, camera_of, make_cameras
 from scene.readers.transforms import read_blender, read_frames, read_nerfstudio
-from utils.files.image_files import SUFFIXES
-from utils.files.plain_files import plain_text
-from utils.host.cache_folder import cache_folder
+from splatting.files.image_files import SUFFIXES
+from splatting.files.plain_files import plain_text
+from splatting.host.cache_folder import cache_folder
 from utils.system_utils import UserError
 
 StrPath = str | os.PathLike

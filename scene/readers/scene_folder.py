@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from utils.files.listing import some
+from splatting.files.listing import some
 from utils.system_utils import UserError
 
 COLMAP, BLENDER, NERFSTUDIO = "Colmap", "Blender", "Nerfstudio"

@@ -7,10 +7,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from scene.pictures.decode import picture_size
-from scene.pictures.lens import Lens, Pinhole, pinhole_of
-from scene.pictures.masks import Mask
-from scene.pictures.undistortion import Photo, undistort
+from scene.images.decode import picture_size
+from scene.images.lens import Lens, Pinhole, pinhole_of
+from scene.images.masks import Mask
+from scene.images.undistortion import Photo, undistort
 from scene.readers.info import CameraInfo
 from utils.graphics_utils import rigid_pose
 from utils.system_utils import UserError
@@ -31,7 +31,7 @@ class SourceView(NamedTuple):
 
 
 def make_cameras(views: Sequence[SourceView], ignore_alpha: bool) -> list[CameraInfo]:
-    """The views as pinholes; photos of other lenses are undistorted first (scene/pictures/undistortion.py).
+    """The views as pinholes; photos of other lenses are undistorted first (scene/images/undistortion.py).
 
     ignore_alpha: transparent pixels of a photo do not count. UserError names the view that cannot be used.
     """

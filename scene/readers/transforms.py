@@ -8,9 +8,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from scene.pictures.decode import picture_size
-from scene.pictures.find import find_pictures
-from scene.pictures.masks import NO_MASKS, Mask, MaskOptions, find_masks
+from scene.images.decode import picture_size
+from scene.images.find import find_pictures
+from scene.images.masks import NO_MASKS, Mask, MaskOptions, find_masks
 from scene.readers.info import CameraInfo, SceneInfo, held_out, normalization, split_by_order
 from scene.readers.point_cloud import read_point_cloud
 from scene.readers.source_views import SourceView, make_cameras
@@ -23,9 +23,9 @@ from scene.readers.start_cloud import (
     random_in_frusta,
 )
 from scene.readers.transforms_lens import lens_of
-from utils.files.image_files import SUFFIXES
-from utils.files.plain_files import plain_text
-from utils.files.relative import relative_to
+from splatting.files.image_files import SUFFIXES
+from splatting.files.plain_files import plain_text
+from splatting.files.relative import relative_to
 from utils.system_utils import UserError
 
 SPLITS = ("train_filenames", "val_filenames", "test_filenames")

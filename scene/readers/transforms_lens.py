@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from scene.pictures.lens import Lens
+from scene.images.lens import Lens
 from utils.graphics_utils import fov2focal
 from utils.system_utils import UserError
 

@@ -9,8 +9,8 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from scene.pictures.decode import pixels_of
-from scene.pictures.in_memory import InMemory
+from scene.images.decode import pixels_of
+from scene.images.in_memory import InMemory
 from scene.readers.depth_maps import depth_fit, resize
 from scene.views.view import View, half
 from utils.general_utils import check_flags

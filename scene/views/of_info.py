@@ -4,10 +4,10 @@ from pathlib import Path
 
 from PIL import Image
 
-from scene.pictures.decode import picture_size, pixels_of
-from scene.pictures.in_memory import InMemory
-from scene.pictures.masks import TRANSPARENT, Cutout, Mask, add_alpha
-from scene.pictures.store import Size, Source
+from scene.images.decode import picture_size, pixels_of
+from scene.images.in_memory import InMemory
+from scene.images.masks import TRANSPARENT, Cutout, Mask, add_alpha
+from scene.images.store import Size, Source
 from scene.readers.depth_maps import BLENDER_UNIT, COLMAP_UNIT, DepthFit, DepthMap, depth_fit
 from scene.readers.info import CameraInfo
 from scene.views.view import View

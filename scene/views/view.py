@@ -5,9 +5,9 @@ from pathlib import Path
 
 import numpy as np
 
-from scene.pictures.in_memory import InMemory
-from scene.pictures.masks import Mask
-from scene.pictures.store import Size, Source
+from scene.images.in_memory import InMemory
+from scene.images.masks import Mask
+from scene.images.store import Size, Source
 from utils.graphics_utils import rigid_pose
 
 

@@ -14,12 +14,12 @@ from gaussians import pipeline
 from html_scene import SIZE, balls, cameras
 from PIL import Image
 
-from evaluation.pages import to_html
-from exports.html import write_html
-from exports.in_scene import model_of
 from gaussian_renderer import render
-from moving_cameras.generated import Ellipse
-from moving_cameras.poses import poses_of
+from splatting.camera_paths.generated import Ellipse
+from splatting.camera_paths.poses import poses_of
+from splatting.evaluation.pages import to_html
+from splatting.exports.html import write_html
+from splatting.exports.in_scene import model_of
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page

@@ -8,10 +8,10 @@ import torch
 from gaussians import model, options, take_steps
 from small_splats import empty_spz, splats
 
-from exports.formats import format_of, read_splats
 from fuzz.damage import changed, damaged, damaged_text
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.checkpoint import load_checkpoint, save_checkpoint
+from splatting.exports.formats import format_of, read_splats
 
 _TENSORS = (
     *(torch.zeros(0), torch.zeros(5), torch.zeros(5, 3, dtype=torch.float64), torch.zeros(5, 1, 3), torch.tensor(3.0)),

@@ -8,9 +8,9 @@ import numpy as np
 from PIL import Image
 
 from fuzz.damage import damaged
-from scene.pictures.decode import decode, may_be_transparent, picture_size
-from scene.pictures.masks import Mask
-from scene.pictures.resolution import training_size
+from scene.images.decode import decode, may_be_transparent, picture_size
+from scene.images.masks import Mask
+from scene.images.resolution import training_size
 from scene.readers.depth_maps import read_values
 
 _SAVED = (

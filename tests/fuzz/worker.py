@@ -13,7 +13,7 @@ import time
 import traceback
 from pathlib import Path
 
-import utils.host.openmp  # noqa: F401  isort: skip  (before torch)
+import splatting.host.openmp  # noqa: F401  isort: skip  (before torch)
 import torch
 
 import train

@@ -14,7 +14,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import utils.host.openmp  # noqa: F401  isort: skip  (before torch)
+import splatting.host.openmp  # noqa: F401  isort: skip  (before torch)
 import matplotlib.pyplot  # noqa: F401  (here: otherwise every child would start a process that imports it)
 import numpy as np
 import torch

@@ -1,0 +1,103 @@
+"""Photos from files: checked early, decoded at training size as uint8."""
+
+import os
+import warnings
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image
+from torch import Tensor
+
+from splatting.files.file_kinds import not_the_file
+from splatting.files.image_files import UNREADABLE, open_image
+from utils.system_utils import UserError
+
+_TAIL = 4096
+_EIGHT_BITS = ((np.arange(1 << 16) + 128) // 257).astype(np.uint8)  # of a 16-bit grey; 255 is 65535
+# Large photos are normal here; Pillow's own limit still refuses absurd sizes. The filter is set once, because filters
+# set for a block apply to all threads.
+warnings.filterwarnings("ignore", category=Image.DecompressionBombWarning)
+
+
+def picture_size(path: Path) -> tuple[int, int]:
+    """Size (width, height) of an image file, from its header. UserError for a file that is broken or cut short.
+
+    A file that lacks its format's end mark is decoded, to find out whether it is complete.
+    """
+    try:
+        with open_image(path) as image:
+            size = image.size
+            _refuse_float(image)
+            if not _has_end_mark(path, image.format):
+                image.load()
+    except (*UNREADABLE, MemoryError) as error:
+        raise _unreadable(path, error) from error
+    return size
+
+
+def may_be_transparent(path: Path) -> bool:
+    """Whether a readable image file has an alpha channel or a transparent colour, from its header."""
+    with open_image(path) as image:
+        return image.has_transparency_data
+
+
+def decode(path: Path, size: tuple[int, int]) -> Tensor:
+    """Do as `pixels_of` for a file; EXIF orientation is ignored, as in COLMAP. UserError if it cannot be read."""
+    try:
+        with open_image(path) as image:
+            return pixels_of(image, size)
+    except UNREADABLE as error:
+        raise _unreadable(path, error) from error
+    except MemoryError as error:
+        raise UserError(
+            f"not enough memory for {path} at {size[0]} x {size[1]} pixels; choose a smaller size with -r"
+        ) from error
+
+
+def pixels_of(image: Image.Image, size: tuple[int, int]) -> Tensor:
+    """Image (3,H,W) uint8, or (4,H,W) with straight alpha if it has any, at size (width, height).
+
+    Resized by Pillow's bicubic filter, antialiased when shrinking, with colours weighted by alpha (premultiplied).
+    Grey, palette, CMYK and 16-bit images become 8-bit RGB.
+    """
+    image = _to_rgb_or_rgba(image)
+    if image.size != size:
+        image = image.resize(size, Image.Resampling.BICUBIC)
+    pixels = np.asarray(image)
+    if pixels.shape[-1] == 4 and pixels[..., 3].min() == 255:
+        pixels = pixels[..., :3]
+    return torch.from_numpy(np.ascontiguousarray(pixels.transpose(2, 0, 1)))
+
+
+def _unreadable(path: Path, error: Exception) -> UserError:
+    if other := not_the_file(path):
+        return UserError(f"{path} is {other}; download it again or take it out of the scene")
+    return UserError(
+        f"cannot read {path} ({str(error) or type(error).__name__}); replace it or take it out of the scene"
+    )
+
+
+def _has_end_mark(path: Path, file_format: str | None) -> bool:
+    marks = {"PNG": b"IEND", "JPEG": b"\xff\xd9"}
+    if file_format not in marks:
+        return True
+    with open(path, "rb") as file:
+        file.seek(max(os.path.getsize(path) - _TAIL, 0))
+        return marks[file_format] in file.read()
+
+
+def _refuse_float(image: Image.Image) -> None:
+    if image.mode == "F":
+        raise ValueError("floating-point pixels; save it with 8 or 16 bits")
+
+
+def _to_rgb_or_rgba(image: Image.Image) -> Image.Image:
+    if image.mode.startswith("I"):
+        # Pillow's own conversion of 16-bit grey clips at 255.
+        grey = np.asarray(image)
+        grey = grey if grey.dtype == np.uint16 else np.clip(grey, 0, 65535)
+        return Image.fromarray(_EIGHT_BITS[grey]).convert("RGB")
+    _refuse_float(image)
+    has_alpha = image.has_transparency_data
+    return image.convert("RGBA" if has_alpha else "RGB")

@@ -1,0 +1,164 @@
+"""Lenses, by COLMAP's camera models, and the pinhole cameras that replace them.
+
+COLMAP chooses the pinhole so that none of its pixels lies outside the photo. A fisheye that sees half the world or more
+has border rays that no pinhole can project; then `WIDEST` decides.
+"""
+
+import functools
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from scene.images.pycolmap_import import import_pycolmap
+from utils.system_utils import UserError
+
+WIDEST = 60.0  # degrees to either side; farther out, a pinhole stretches the photo more than fourfold
+_PINHOLES = {"SIMPLE_PINHOLE": 3, "PINHOLE": 4}  # number of parameters
+# In sizes of the photo. Beyond these bounds lie damaged files and other units, not lenses: fields of view below a
+# thousandth of a degree, or so near 180 degrees that no pinhole shows anything.
+_SHORTEST, _LONGEST = 1e-4, 1e5  # focal length
+_FARTHEST = 100.0  # principal point, from the middle; parts cut out of a large photo have it outside
+_LARGEST = 1 << 20  # pixels a side
+_ROUND_TRIP = 0.5  # pixels: largest error of a usable ray, from a pixel to the ray and back
+
+
+class Lens(NamedTuple):
+    """COLMAP's camera model by name, its parameters in COLMAP's order, for photos of width x height pixels."""
+
+    model: str
+    params: tuple[float, ...]
+    width: int
+    height: int
+
+
+class Pinhole(NamedTuple):
+    """Focal lengths and principal point in pixels of an image of width x height, pixel centres at .5."""
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    width: int
+    height: int
+
+
+class Undistortion(NamedTuple):
+    """Parameters for turning photos of a lens into pinhole images.
+
+    camera, options: pycolmap's, for undistort_image. pinhole: of the result. widest: half the angle in degrees to which
+    the field of view of a wide lens is cut, else None.
+    """
+
+    camera: Any
+    options: Any
+    pinhole: Pinhole
+    widest: float | None
+
+
+def pinhole_of(lens: Lens, name: str) -> Pinhole | None:
+    """The lens as a pinhole, or None if its photos must be undistorted first.
+
+    name: of a photo, for the message. UserError for a lens that is unusable or a panorama.
+    """
+    narrow, wide = sorted((lens.width, lens.height))
+    if not (np.isfinite(lens.params).all() and narrow > 0 and wide <= _LARGEST):
+        raise _unusable(lens, name)
+    if len(lens.params) == _PINHOLES.get(lens.model):  # without pycolmap, which is slow to import
+        focal, center = lens.params[:-2], lens.params[-2:]
+    else:
+        camera = _camera(lens, name)
+        if not camera.is_perspective():
+            raise UserError(
+                f"the photo {name} has the camera model {lens.model}, a panorama that no pinhole can show; cut it "
+                "into perspective photos and reconstruct those"
+            )
+        focal = tuple(lens.params[index] for index in camera.focal_length_idxs())
+        center = tuple(lens.params[index] for index in camera.principal_point_idxs())
+        # is_undistorted alone is also true of a fisheye without further parameters.
+        straight = camera.is_perspective_pinhole() and camera.is_undistorted()
+        if not straight:
+            _check_bounds(lens, focal, center, name)
+            return None
+    _check_bounds(lens, focal, center, name)
+    return Pinhole(focal[0], focal[-1], *center, lens.width, lens.height)
+
+
+def _check_bounds(lens: Lens, focal: Sequence[float], center: Sequence[float], name: str) -> None:
+    size = max(lens.width, lens.height)
+    astray = max(abs(center[0] / lens.width - 0.5), abs(center[1] / lens.height - 0.5))
+    if not (_SHORTEST * size <= min(focal) <= max(focal) <= _LONGEST * size and astray <= _FARTHEST):
+        raise _unusable(lens, name)
+
+
+def _unusable(lens: Lens, name: str) -> UserError:
+    return UserError(
+        f"the camera of {name} has no usable size or focal length, or a principal point far outside of the photo "
+        f"({lens.model}, {lens.width} x {lens.height}, {lens.params}); fix it, or export the cameras again"
+    )
+
+
+def _camera(lens: Lens, name: str = "") -> Any:
+    pycolmap = import_pycolmap()
+    camera = pycolmap.Camera(model=lens.model, width=lens.width, height=lens.height, params=list(lens.params))
+    if not camera.verify_params():
+        raise _unusable(lens, name)
+    return camera
+
+
+@functools.cache
+def undistortion(lens: Lens, width: int, height: int) -> Undistortion:
+    """Undistortion for photos of a lens that are width x height pixels large; the lens is scaled to that size."""
+    pycolmap = import_pycolmap()
+    camera = _camera(lens)
+    if (lens.width, lens.height) != (width, height):
+        camera.rescale(width, height)
+    options = pycolmap.UndistortCameraOptions()
+    widest = None
+    if not _border_can_be_projected(camera):
+        scale = 2 * math.tan(math.radians(WIDEST)) * camera.mean_focal_length() / max(width, height)
+        options.min_scale = options.max_scale = min(max(scale, options.min_scale), options.max_scale)
+        widest = math.degrees(math.atan(options.max_scale * max(width, height) / 2 / camera.mean_focal_length()))
+    result = pycolmap.undistort_camera(options, camera)
+    pinhole = Pinhole(*(float(value) for value in result.params), int(result.width), int(result.height))
+    return Undistortion(camera, options, pinhole, widest)
+
+
+@functools.lru_cache(maxsize=4)  # few: they are large, and photos of one lens mostly follow each other
+def shown_pixels(lens: Lens, width: int, height: int) -> np.ndarray:
+    """Pixels of the undistorted image that the photo, width x height pixels large, shows: (height, width) bool."""
+    pycolmap = import_pycolmap()
+    plan = undistortion(lens, width, height)
+    white = pycolmap.Bitmap.from_array(np.full((height, width), 255, np.uint8))
+    shown, result = pycolmap.undistort_image(plan.options, white, plan.camera)
+    shown = shown.to_array() == 255
+    return shown if plan.widest is None else shown & _seen_once(plan.camera, result)
+
+
+def _border_can_be_projected(camera: Any) -> bool:
+    along = np.linspace(0, 1, 65)
+    sides = [np.column_stack([along, np.full(65, end)]) for end in (0, 1)]
+    border = np.concatenate([*sides, *(side[:, ::-1] for side in sides)]) * (camera.width, camera.height)
+    return bool(_round_trip(camera, border).max() < _ROUND_TRIP)
+
+
+def _round_trip(camera: Any, pixels: np.ndarray) -> np.ndarray:
+    """Error (N,) in pixels of points (N,2) after projection to their rays and back; infinite without a ray."""
+    with np.errstate(all="ignore"):
+        rays = np.column_stack([camera.cam_from_img(pixels), np.ones(len(pixels))])
+        distance = np.linalg.norm(camera.img_from_cam(rays) - pixels, axis=1)
+    return np.nan_to_num(distance, nan=np.inf)
+
+
+def _seen_once(camera: Any, pinhole: Any) -> np.ndarray:
+    """Pixels of the pinhole whose rays the photo really shows: (height, width) bool.
+
+    Far from the centre a distortion polynomial turns back, and would show parts of the photo a second time.
+    """
+    x, y = np.meshgrid(np.arange(pinhole.width) + 0.5, np.arange(pinhole.height) + 0.5)
+    rays = pinhole.cam_from_img(np.column_stack([x.ravel(), y.ravel()]))
+    with np.errstate(all="ignore"):
+        back = camera.cam_from_img(camera.img_from_cam(np.column_stack([rays, np.ones(len(rays))])))
+        missed = np.linalg.norm(back - rays, axis=1) * pinhole.mean_focal_length()
+    return (missed < _ROUND_TRIP).reshape(y.shape)

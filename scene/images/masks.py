@@ -1,0 +1,157 @@
+"""Masks of the photos: their files, and the meaning of their black parts.
+
+White keeps a pixel and black masks it, as in COLMAP and nerfstudio. Black has one of two meanings:
+ignore: the scene behind the pixel is unknown, so the pixel is left out of loss and scores.
+transparent: nothing is there. The mask is the photo's alpha, and a render must show the background.
+"""
+
+import os
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+import torch
+from PIL import Image, ImageFilter
+from torch import Tensor
+
+from scene.images.decode import decode, may_be_transparent, picture_size
+from scene.images.find import FileIndex
+from splatting.files.image_files import SUFFIXES
+from splatting.files.listing import some
+from utils.system_utils import UserError
+
+AUTO = "auto"
+IGNORE = "ignore"
+TRANSPARENT = "transparent"
+_REACH = ImageFilter.MinFilter(5)  # bicubic resizing mixes pixels up to 2 pixels of the coarser size apart
+
+
+@dataclass(frozen=True)
+class MaskOptions:
+    """The user's options for masks.
+
+    folder: in the scene folder, or absolute; empty: only the masks that the dataset names. invert: white is masked.
+    meaning: IGNORE or TRANSPARENT, for mask files and alpha channels; AUTO ignores under masks and keeps alpha.
+    """
+
+    folder: str = ""
+    invert: bool = False
+    meaning: str = AUTO
+
+    @property
+    def ignore_alpha(self) -> bool:
+        """Whether transparent pixels of a photo are ignored."""
+        return self.meaning == IGNORE
+
+    def mask(self, path: Path) -> "Mask":
+        """The mask in a file."""
+        return Mask(path, self.invert, TRANSPARENT if self.meaning == TRANSPARENT else IGNORE)
+
+
+NO_MASKS = MaskOptions()
+
+
+@dataclass(frozen=True)
+class Mask:
+    """A mask file, whether white is masked in it, and the meaning of masked pixels (IGNORE or TRANSPARENT)."""
+
+    path: Path
+    inverted: bool = False
+    meaning: str = IGNORE
+    pixel_bytes: ClassVar[int] = 1
+
+    def decode(self, size: tuple[int, int]) -> Tensor:
+        """(1,H,W) uint8 at size (width, height): 255 keeps, 0 masks.
+
+        The values are the file's alpha if it has any, else its brightness. In a file of values 0 and 1 (booleans saved
+        as bytes), 1 means white. For IGNORE, 128 or more keeps and the result is 0 or 255. When the size differs from
+        the file's, IGNORE keeps only pixels to which no masked pixel contributes when resized by
+        `scene.images.decode.decode`.
+        """
+        pixels = decode(self.path, picture_size(self.path)).numpy()
+        grey = pixels[3] if len(pixels) == 4 else pixels.max(axis=0)
+        if grey.max() == 1:
+            grey = grey * np.uint8(255)
+        if self.inverted:
+            grey = 255 - grey
+        if self.meaning == TRANSPARENT:
+            return _resized(grey, size, Image.Resampling.BICUBIC)
+        kept = Image.fromarray(np.where(grey >= 128, 255, 0).astype(np.uint8))
+        if size[0] > kept.width:
+            kept = kept.filter(_REACH).resize(size, Image.Resampling.BOX)
+        elif size != kept.size:
+            kept = kept.resize(size, Image.Resampling.BOX).filter(_REACH)
+        return torch.from_numpy(np.where(np.asarray(kept) == 255, np.uint8(255), np.uint8(0)))[None]
+
+
+def _resized(grey: np.ndarray, size: tuple[int, int], resampling: Image.Resampling) -> Tensor:
+    image = Image.fromarray(np.ascontiguousarray(grey))
+    image = image if image.size == size else image.resize(size, resampling)
+    return torch.from_numpy(np.array(image))[None]
+
+
+@dataclass(frozen=True)
+class Cutout:
+    """A photo whose alpha is multiplied by a TRANSPARENT mask."""
+
+    path: Path
+    mask: Mask
+    pixel_bytes: ClassVar[int] = 4
+
+    def decode(self, size: tuple[int, int]) -> Tensor:
+        """(4,H,W) uint8 as `scene.images.decode.decode` gives it, with straight alpha."""
+        full = picture_size(self.path)
+        image = Image.fromarray(add_alpha(decode(self.path, full), self.mask.decode(full)).permute(1, 2, 0).numpy())
+        # Pillow weights colours by alpha when it resizes, so masked colours do not bleed in.
+        image = image if full == size else image.resize(size, Image.Resampling.BICUBIC)
+        return torch.from_numpy(np.asarray(image).transpose(2, 0, 1).copy())
+
+
+def add_alpha(pixels: Tensor, mask: Tensor) -> Tensor:
+    """Image (4,H,W) uint8 of an image (3 or 4,H,W) uint8, with its alpha multiplied by a mask (1,H,W) uint8."""
+    if len(pixels) == 4:
+        mask = (pixels[3:].int() * mask.int() + 127).div(255, rounding_mode="floor").to(torch.uint8)
+    return torch.cat([pixels[:3], mask])
+
+
+def find_masks(scene: Path, names: Sequence[str], options: MaskOptions) -> list[Mask | None]:
+    """The mask of each photo, by name: `<name>`, `<name>.png` (as in COLMAP), or the name with another suffix.
+
+    All None without a folder in the options. UserError when the folder is missing or no photo has a mask in it. A
+    message names photos that have none.
+    """
+    if not options.folder:
+        if options.invert:
+            raise UserError("--invert_masks has no masks to invert; name their folder with --masks, or leave it out")
+        return [None] * len(names)
+    folder = scene / options.folder
+    if not folder.is_dir():
+        raise UserError(f"no folder {folder} for --masks; name a folder in the scene folder, or give an absolute path")
+    index = FileIndex(folder)
+    found = [_find(index, name) for name in names]
+    lacking = [name for name, path in zip(names, found, strict=True) if path is None]
+    if len(lacking) == len(names):
+        raise UserError(
+            f"no mask in {folder} (--masks) belongs to a photo: looked for {names[0]}, {names[0]}.png and other "
+            f"suffixes, found {some(sorted(path.name for path in folder.iterdir()))}; name masks like the photos"
+        )
+    if lacking:
+        print(f"{len(lacking)} of {len(names)} photos have no mask and count whole: {some(lacking)}", file=sys.stderr)
+    return [None if path is None else options.mask(path) for path in found]
+
+
+def refuse_nothing_to_ignore(pictures: Sequence[tuple[Path, Mask | None]], options: MaskOptions) -> None:
+    """UserError for --mask_meaning ignore if no photo has a mask or an alpha channel. pictures: photos and masks."""
+    if options.meaning == IGNORE and not any(mask or may_be_transparent(path) for path, mask in pictures):
+        raise UserError(
+            "--mask_meaning ignore has nothing to ignore: no masks are named, and no photo has an alpha channel; "
+            "name the folder of masks with --masks, or leave --mask_meaning out"
+        )
+
+
+def _find(index: FileIndex, name: str) -> Path | None:
+    stem = os.path.splitext(name)[0]
+    return index.find(name, f"{name}.png", *(stem + suffix for suffix in SUFFIXES))

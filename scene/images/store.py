@@ -1,0 +1,249 @@
+"""Decoded images of a scene: decoded ahead of their use, and kept in the memory of the CPU or the GPU."""
+
+import os
+import sys
+from collections import OrderedDict
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor, wait
+from functools import partial
+from pathlib import Path
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from scene.images.decode import decode
+from scene.images.device_copies import DeviceCopies
+from scene.images.handing import Handed, holders
+from scene.images.in_memory import InMemory
+from splatting.distributed.ranks import ALONE, Ranks
+from splatting.host.memory import free_memory
+from splatting.host.threads import threads
+
+GPU_SHARE = 0.25  # of a GPU's free memory at the start that images may take; the model needs the rest
+COPIES_AHEAD = 2  # images copied to the GPU ahead of their use; a copy takes less than an iteration
+
+Size = tuple[int, int]  # width, height
+
+
+class Decodable(Protocol):
+    """A hashable source of pixels other than a photo: a mask (masks.py) or a depth map (depth_maps.py).
+
+    pixel_bytes: bytes per pixel of the tensor (channels,H,W) that `decode` gives at a size (width, height).
+    """
+
+    pixel_bytes: int
+
+    def decode(self, size: Size) -> Tensor: ...
+
+
+Source = Path | Decodable
+Picture = tuple[Source, Size]
+Key = tuple[str | Decodable, Size]  # files by name, which is faster to hash than a Path
+
+
+class ImageStore:
+    """Images of photos and other sources, each decoded once and kept.
+
+    limit: most images kept, 0: all; beyond it the least recently used one is dropped. A mask or a depth map counts as
+    an image. keep_on: device that keeps them. device: where `get` returns them (default: keep_on). If only `device`
+    is a GPU, images lie in pinned memory and are copied without waiting. Threads exist only while there is something to
+    decode ahead. Call all methods from one thread.
+
+    sharing: ranks that have the same `plan`. Each decodes and keeps a part of it, and hands an image of it to the
+    others whenever it is read: all have to read the same images in the same order. The limit counts for each rank.
+    """
+
+    def __init__(
+        self,
+        limit: int = 0,
+        keep_on: torch.device | str = "cpu",
+        device: torch.device | str | None = None,
+        sharing: Ranks = ALONE,
+    ) -> None:
+        self.limit = limit
+        self.sharing = sharing
+        self.keep_on = torch.device(keep_on)
+        self.device = torch.device(keep_on if device is None else device)
+        self._kept: OrderedDict[Key, Tensor | Future[Tensor]] = OrderedDict()  # in order of use
+        self._planned: set[Key] = set()
+        self._awaited: set[Key] = set()  # planned for training, and not decoded yet
+        self._handed: dict[Key, Handed] = {}  # all that ranks share
+        self._workers = threads()
+        self._room_for_floats = True
+        self._threads: ThreadPoolExecutor | None = None
+        self._copies: DeviceCopies | None = None
+
+    def plan(self, training: Iterable[Picture], others: Iterable[Picture] = ()) -> None:
+        """Announce all images, before the first is asked for; ranks that share them get a part of the bytes each.
+
+        If the images kept at once exceed GPU_SHARE of a GPU's free memory, the CPU keeps them. A limit that all images
+        fit into is dropped.
+        """
+        training = dict.fromkeys(_key(source, size) for source, size in training)
+        self._planned = self._own_part([*training, *(_key(source, size) for source, size in others)])
+        self._awaited = self._planned & training.keys()
+        if self.limit >= len(self._planned):
+            self.limit = 0
+        if self.keep_on.type == "cuda":
+            free = free_memory(self.keep_on)
+            self._room_for_floats = 4 * self.planned_bytes <= GPU_SHARE * free
+            if self.planned_bytes > GPU_SHARE * free:
+                self.keep_on = torch.device("cpu")
+        if self.device.type == "cuda" and self.keep_on.type == "cpu":
+            self._copies = DeviceCopies(self.device)
+
+    def _own_part(self, keys: Iterable[Key]) -> set[Key]:
+        """Those of the images that this rank decodes; by itself, all."""
+        keys, ranks = list(dict.fromkeys(keys)), self.sharing
+        if not ranks.several:
+            return set(keys)
+        chosen = dict(zip(keys, holders((_bytes(*key) for key in keys), ranks.size), strict=True))
+        self._handed = {key: Handed(ranks, chosen[key], partial(self._own, key), self.device) for key in keys}
+        return {key for key in keys if chosen[key] == ranks.rank}
+
+    @property
+    def planned(self) -> int:
+        """Number of the images of `plan` that this rank decodes."""
+        return len(self._planned)
+
+    @property
+    def planned_bytes(self) -> int:
+        """Upper bound on the bytes of the images of `plan` that this rank keeps at once."""
+        sizes = sorted((_bytes(*key) for key in self._planned), reverse=True)
+        if self._copies:
+            sizes = [1 << (size - 1).bit_length() for size in sizes]  # torch pins memory in powers of two
+        return sum(sizes[: self.limit or None])
+
+    @property
+    def keeps_floats(self) -> bool:
+        """Whether images may also be kept as float32, four times as large, on the device of --data_device."""
+        return not self.limit and self._room_for_floats and not self.sharing.several
+
+    def get(self, source: Source, size: Size) -> Tensor:
+        """Image (3 or 4,H,W) uint8 of a photo, or the tensor that another source decodes to, on the store's device.
+
+        UserError as `decode`.
+        """
+        key = _key(source, size)
+        handed = self._handed.get(key)
+        return self._own(key) if handed is None else handed.pixels
+
+    def changed(self, source: Source, size: Size, change: Callable[[Tensor], Tensor]) -> InMemory | Handed:
+        """A picture made of an image, of which the store keeps nothing: now, or by one rank for those that share it."""
+        handed = self._handed.get(_key(source, size))
+        return InMemory(change(self.get(source, size))) if handed is None else handed.changed(change)
+
+    def _own(self, key: Key) -> Tensor:
+        picture = self._kept.get(key)
+        if picture is None or isinstance(picture, Future):
+            picture = self._finished(key)
+        self._kept.move_to_end(key)
+        return self._copies.take(key, picture) if self._copies else picture.to(self.device, non_blocking=True)
+
+    @property
+    def ahead(self) -> int:
+        """Number of images that `prefetch` can use, the current one included; 0 when it has nothing to do.
+
+        Those of other ranks count as well, though it leaves them out.
+        """
+        count = 1 + COPIES_AHEAD if self._copies else 0
+        if self.limit or self._awaited:
+            most = 1 + 2 * self._workers
+            count = min(self.limit, most) if self.limit else most
+        return count * self.sharing.size
+
+    def prefetch(self, coming: Sequence[Picture]) -> None:
+        """Start to prepare the images that `get` is asked for next, in that order and at most `limit`; never waits.
+
+        An image that cannot be decoded raises its error in `get`.
+        """
+        keys = dict.fromkeys(_key(source, size) for source, size in coming)
+        keys = [key for key in keys if key not in self._handed or key in self._planned][: self.limit or None]
+        for key in keys:
+            if key in self._kept:
+                self._kept.move_to_end(key)
+        # The other images are now in front. They are dropped first, and there are enough of them.
+        for key in keys:
+            if key not in self._kept:
+                self._make_room()
+                self._threads = self._threads or ThreadPoolExecutor(self._workers, thread_name_prefix="decode")
+                self._kept[key] = self._threads.submit(self._decode, key)
+        if self._copies:
+            self._copies.keep_only(keys)
+            for key in keys[: 1 + COPIES_AHEAD]:
+                picture = self._kept[key]
+                if not isinstance(picture, Future):
+                    self._copies.send(key, picture)
+                elif picture.done() and not picture.exception():
+                    self._copies.send(key, self._finished(key))
+
+    def __len__(self) -> int:
+        """Number of images that are kept, those being decoded included."""
+        return len(self._kept)
+
+    def _finished(self, key: Key) -> Tensor:
+        """Keep an image on `keep_on` once a thread has decoded it; if none is at it, decode it here."""
+        future = self._kept.pop(key, None)
+        if future is None:
+            self._make_room()
+        picture = future.result() if future else self._decode(key)
+        self._kept[key] = picture = picture.to(self.keep_on, non_blocking=True)
+        self._awaited.discard(key)
+        if self._threads and not self._awaited and not self.limit:
+            self._threads.shutdown(wait=False)
+            self._threads = None
+        return picture
+
+    def _decode(self, key: Key) -> Tensor:
+        source, size = key
+        picture = decode(Path(source), size) if isinstance(source, str) else source.decode(size)
+        # Only copies from pinned memory to a GPU are asynchronous.
+        return picture.pin_memory() if "cuda" in (self.keep_on.type, self.device.type) else picture
+
+    def _make_room(self) -> None:
+        while self.limit and len(self._kept) >= self.limit:
+            _, oldest = self._kept.popitem(last=False)
+            if isinstance(oldest, Future) and not oldest.cancel():
+                wait([oldest])  # a thread is decoding it, and holds as much memory as a kept image
+
+
+def _key(source: Source, size: Size) -> Key:
+    return os.fspath(source) if isinstance(source, Path) else source, size
+
+
+def _bytes(source: str | Decodable, size: Size) -> int:
+    """Most bytes of a decoded image: a JPEG has no alpha; other files may have some, which only decoding shows."""
+    if not isinstance(source, str):
+        return source.pixel_bytes * size[0] * size[1]
+    channels = 3 if source.lower().endswith((".jpg", ".jpeg")) else 4
+    return channels * size[0] * size[1]
+
+
+def picture_device(data_device: str, fallback: torch.device) -> torch.device:
+    """Device that keeps the images: that of the option --data_device if it can be used, else the one that computes.
+
+    A message says when the option is not followed, except for plain `cuda` when no GPU computes.
+    """
+    device, reason = _choice(data_device, fallback)
+    if reason:
+        print(f"warning: --data_device {data_device} {reason}; photos are kept on {fallback}", file=sys.stderr)
+    return device
+
+
+def usable_device(data_device: str, fallback: torch.device) -> torch.device:
+    """Do as `picture_device`, without a message."""
+    return _choice(data_device, fallback)[0]
+
+
+def _choice(data_device: str, fallback: torch.device) -> tuple[torch.device, str | None]:
+    """The device, and the reason why it is not the wanted one, if that needs a message."""
+    try:
+        wanted = torch.device(data_device)
+    except RuntimeError:
+        wanted = None
+    if wanted is None or wanted.type not in ("cpu", "cuda"):
+        return fallback, "is neither cpu nor cuda"
+    if wanted.type == "cpu" or (fallback.type == "cuda" and (wanted.index or 0) < torch.cuda.device_count()):
+        return wanted, None
+    return fallback, None if wanted.index is None else "is not available"

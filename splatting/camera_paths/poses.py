@@ -1,0 +1,103 @@
+"""Poses of many cameras as arrays, the point that they look at, and the pose that looks at a point."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from scene.cameras import Camera
+from splatting.camera_paths.keyframes import Keyframe
+
+SAME_PLACE = 1e-6  # of the distance from the origin, or of 1: float32 tells no smaller distances apart
+# Mean squared sine of the angles between the axes, about, below which no point is found: 1.8 degrees.
+PARALLEL = 1e-3
+
+
+@dataclass(frozen=True)
+class Poses:
+    """N poses, float64.
+
+    positions: (N,3) in the frame of training. turns: (N,3,3), from camera axes (x right, y down, z forward) to world
+    axes. fov: (N,) vertical opening angles in degrees.
+    """
+
+    positions: np.ndarray
+    turns: np.ndarray
+    fov: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.positions)
+
+    def __getitem__(self, rows: np.ndarray) -> "Poses":
+        return Poses(self.positions[rows], self.turns[rows], self.fov[rows])
+
+    @property
+    def forward(self) -> np.ndarray:
+        """The optical axes (N,3), of length 1."""
+        return self.turns[:, :, 2]
+
+    @property
+    def up(self) -> np.ndarray:
+        """The mean of the cameras' up directions (3,), not normalised."""
+        return -self.turns[:, :, 1].mean(axis=0)
+
+    @property
+    def spread(self) -> float:
+        """Mean distance of the cameras from their middle, 0 where they are all in one place."""
+        spread = np.linalg.norm(self.positions - self.positions.mean(axis=0), axis=1).mean()
+        return float(spread) if spread > SAME_PLACE * max(1.0, float(np.abs(self.positions).max())) else 0.0
+
+    @property
+    def quaternions(self) -> np.ndarray:
+        """The turns as unit quaternions (N,4) wxyz."""
+        return to_wxyz(Rotation.from_matrix(self.turns))
+
+
+def poses_of(cameras: Sequence[Camera]) -> Poses:
+    """The poses of views, by their matrices."""
+    views = np.stack([camera.world_view_transform.detach().cpu().double().numpy().T for camera in cameras])
+    positions = -np.linalg.solve(views[:, :3, :3], views[:, :3, 3:])[..., 0]
+    turns = Rotation.from_matrix(views[:, :3, :3].transpose(0, 2, 1)).as_matrix()
+    return Poses(positions, turns, np.degrees([float(camera.FoVy) for camera in cameras]))
+
+
+def to_wxyz(rotation: Rotation) -> np.ndarray:
+    """Quaternions with the real part first; SciPy has it last."""
+    return np.roll(rotation.as_quat(), 1, axis=-1)
+
+
+def unit(vector: np.ndarray) -> np.ndarray:
+    """A vector (3,) at length 1."""
+    return vector / np.linalg.norm(vector)
+
+
+def facing(forward: np.ndarray, up: np.ndarray) -> np.ndarray:
+    """The turn (3,3), from camera to world axes, of a camera that looks along `forward`, its head towards `up`.
+
+    The two directions (3,) need no length; they must not be parallel.
+    """
+    z = unit(forward)
+    x = unit(np.cross(-up, z))
+    return np.column_stack([x, np.cross(z, x), z])
+
+
+def keyframe(seconds: float, position: np.ndarray, turn: np.ndarray, fov: float) -> Keyframe:
+    """A pose with a turn (3,3) as a Keyframe."""
+    return Keyframe(seconds, tuple(position.tolist()), tuple(to_wxyz(Rotation.from_matrix(turn)).tolist()), float(fov))
+
+
+def focus_point(poses: Poses) -> np.ndarray | None:
+    """The point (3,) nearest to all optical axes, None if these are parallel or most cameras look away from it.
+
+    Least squares: the sum of (I - d d^T) (x - c) over the axes from c along d is zero (Traa, "Least-squares
+    intersection of lines", 2013).
+    """
+    axes = poses.forward
+    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
+    matrix, side = across.mean(axis=0), (across @ poses.positions[:, :, None]).mean(axis=0)[:, 0]
+    if np.linalg.eigvalsh(matrix)[0] < PARALLEL:
+        return None
+    point = np.linalg.solve(matrix, side)
+    ahead = ((point - poses.positions) * axes).sum(axis=1)
+    return point if np.median(ahead) > 0 else None

@@ -1,0 +1,150 @@
+"""Checks of a dataset, through the project's own readers: whether it can be trained, and what will harm the result."""
+
+import contextlib
+import io
+from collections import Counter
+from collections.abc import Iterator
+from itertools import chain
+from pathlib import Path
+
+import numpy as np
+
+from scene.dataset_readers import CameraInfo, SceneInfo, read_scene
+from scene.readers.info import APART, standing_apart
+from splatting.diagnosis.lines import Line, from_error
+from splatting.files.json_files import read_json
+from splatting.files.listing import some
+from utils.system_utils import UserError
+
+# Learning rates and size limits are fractions of the extent, but depths below 0.2 are culled and float32 is used.
+EXTENT = (0.1, 100.0)
+FEWEST_VIEWS = 20
+FEWEST_POINTS = 1000
+REGISTERED = 0.9  # share of the photos
+FAR_POINT = 100.0  # extents from the cameras; a sky is some tens away
+FAR_SHARE = 0.01
+OPENING = (10.0, 150.0)  # degrees; outside, the focal length is doubtful
+FEWEST_IN_VIEW = 10  # points of the cloud in a photo
+_SAMPLE = 5000  # most points tested against the views
+_WIDE = 1600
+
+
+def check_dataset(source: str, images: str) -> list[Line]:
+    """Lines about the dataset in a folder. images: as train.py's -i."""
+    said = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(said):
+            info = read_scene(source, images, hold_out=False)
+    except UserError as error:
+        return [*_warnings(said.getvalue()), from_error(error)]
+    checks = check_views(info.train_cameras), check_extent(info), check_lenses(info.train_cameras), check_cloud(info)
+    return [*_warnings(said.getvalue()), *chain(*checks, _check_registered(Path(source) / "convert_report.json"))]
+
+
+def check_views(cameras: list[CameraInfo]) -> Iterator[Line]:
+    """Number and sizes of the photos."""
+    sizes = Counter(camera.file_size for camera in cameras)
+    listed = ", ".join(f"{w} x {h} ({n})" for (w, h), n in sizes.most_common(3))
+    listed += f" and {len(sizes) - 3} more sizes" if len(sizes) > 3 else ""
+    yield Line(f"{len(cameras)} photos, none missing and all readable: {listed}")
+    if len(cameras) < FEWEST_VIEWS:
+        yield Line(f"only {len(cameras)} photos", f"take {FEWEST_VIEWS} or more; new views will look bad with fewer")
+    if wide := sum(n for (width, _), n in sizes.items() if width > _WIDE):
+        yield Line(f"{wide} photos are wider than {_WIDE} pixels and train at that width unless -r 1 is given")
+
+
+def check_extent(info: SceneInfo) -> Iterator[Line]:
+    """Scale of the scene, and cameras far away from the others."""
+    centers = _centers(info)
+    low, high = EXTENT
+    spread = np.linalg.norm(centers - centers.mean(axis=0), axis=1).max()
+    if len(centers) > 1 and spread < 1e-3 * info.extent:
+        text = "all cameras stand in one place, so depth cannot be found"
+        yield Line(text, "take photos from places some steps apart")
+    if low <= info.extent <= high:
+        yield Line(f"extent {info.extent:.3g}")
+    else:
+        remedy = f"scale cameras and points by {10.0 ** round(np.log10(5 / info.extent)):g}"
+        text = f"the extent is {info.extent:.3g}, outside {low:g} to {high:g}"
+        yield Line(text, f"{remedy}; depths below 0.2 are never drawn")
+    far = [c.image_name for c, apart in zip(info.train_cameras, standing_apart(centers), strict=True) if apart]
+    if far:
+        text = f"{len(far)} cameras are more than {APART:g} times as far out as usual ({some(far)})"
+        yield Line(text, "remove them from the model, as their poses are likely wrong; the extent leaves them out")
+
+
+def _centers(info: SceneInfo) -> np.ndarray:
+    return np.array([camera.center for camera in info.train_cameras])
+
+
+def check_lenses(cameras: list[CameraInfo]) -> Iterator[Line]:
+    """Opening angles that no usual lens has."""
+    low, high = np.radians(OPENING)
+    odd = [camera for camera in cameras if not low <= camera.FovX <= high]
+    if odd:
+        example = f"{odd[0].image_name}: {np.degrees(odd[0].FovX):.1f} degrees"
+        remedy = "check the focal length and the size of the photos, or reconstruct the scene again"
+        yield Line(f"{len(odd)} cameras have odd opening angles ({example})", remedy)
+
+
+def check_cloud(info: SceneInfo) -> Iterator[Line]:
+    """Number of points, points far away, and points that no camera sees."""
+    points = info.point_cloud.points.astype(np.float64)
+    text = f"{len(points)} points to start from"
+    if len(points) < FEWEST_POINTS:
+        more = "start from more points (--init_pcd_path), or reconstruct with more photos or features"
+        yield Line(f"only {text}; {FEWEST_POINTS} or more are good", more)
+    else:
+        yield Line(text)
+    if not len(points):
+        return
+    far = np.linalg.norm(points - _centers(info).mean(axis=0), axis=1) > FAR_POINT * info.extent
+    if far.mean() > FAR_SHARE:
+        text = f"{far.mean():.1%} of the points are more than {FAR_POINT:g} extents away"
+        yield Line(text, "remove them from the cloud (COLMAP: filter by reprojection error and angle)")
+    seen = points_in_views(info.train_cameras, points[:: max(1, len(points) // _SAMPLE)])
+    unseen = float((~seen.any(axis=0)).mean())
+    counts = seen.sum(axis=1) * len(points) / seen.shape[1]
+    away = [c.image_name for c, n in zip(info.train_cameras, counts, strict=True) if n < FEWEST_IN_VIEW]
+    if unseen > 0.5:
+        remedy = "poses and points do not belong together: check the axes (x right, y down, z forward) and the scale"
+        yield Line(f"{unseen:.0%} of the points are in no photo", remedy)
+    elif away:
+        text = f"{len(away)} cameras have hardly any point in view ({some(away)})"
+        yield Line(text, "remove them from the model: they face away from the scene, or their poses are wrong")
+
+
+def points_in_views(cameras: list[CameraInfo], points: np.ndarray) -> np.ndarray:
+    """Whether points (N,3) lie in front of each camera and inside its photo: (cameras, N) bool."""
+    seen = np.zeros((len(cameras), len(points)), dtype=bool)
+    for row, camera in zip(seen, cameras, strict=True):
+        local = points @ camera.R + camera.T
+        front = local[:, 2] > 0
+        depth = np.where(front, local[:, 2], 1.0)
+        x = camera.fx * local[:, 0] / depth + camera.cx
+        y = camera.fy * local[:, 1] / depth + camera.cy
+        row[:] = front & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
+    return seen
+
+
+def _check_registered(path: Path) -> Iterator[Line]:
+    """Line of convert.py's report, if convert.py made the scene."""
+    if not path.is_file():
+        return
+    try:
+        report = read_json(path)
+        placed, photos = int(report["registered"]), int(report["photos"])
+        advice = [str(line) for line in report["advice"]]
+    except (OSError, ValueError, KeyError, TypeError):
+        yield Line(f"{path} is damaged", "remove it, or run convert.py again")
+        return
+    text = f"{placed} of {photos} photos were placed by convert.py"
+    remedy = advice[0].rpartition("; ")[2] if advice else "take more photos that overlap"
+    few = photos and placed / photos < REGISTERED
+    yield Line(f"only {text}", remedy) if few else Line(text)
+
+
+def _warnings(said: str) -> list[Line]:
+    """Notes of the messages that the readers printed, without progress bars."""
+    texts = [text.strip() for text in said.replace("\r", "\n").splitlines() if text.strip() and "%|" not in text]
+    return [Line(text, note=True) for text in texts]

@@ -1,0 +1,257 @@
+"""Checks of a trained model: its values, and the likeliest reason for black or bad renders."""
+
+import argparse
+import contextlib
+import io
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+
+from arguments import ModelParams, PipelineParams, read_model_json, read_stored_options
+from gaussian_renderer import render
+from gaussian_renderer.scored_views import ScoredViews
+from scene import Scene
+from scene.cameras import Camera
+from scene.gaussian_model import GaussianModel
+from scene.saved_model import load_saved
+from splatting.diagnosis.dataset import check_dataset
+from splatting.diagnosis.lines import Line, from_error
+from splatting.evaluation.error_curve import NAME as CURVE
+from splatting.evaluation.error_curve import read_curve
+from splatting.evaluation.training_log import NAME as LOG
+from splatting.evaluation.training_log import read_log
+from splatting.evaluation.what_to_try import what_to_try
+from utils.image_utils import as_float, pixels_that_count, psnr
+from utils.system_utils import UserError, compute_device
+
+# Densification prunes below 0.005 and a reset leaves 0.01: a model of such a median has not recovered.
+FAINT = 0.02
+UNRECOVERED = 0.2  # median within 500 iterations of a reset
+RESET = (0.005, 0.0101)  # opacities after a reset to at most 0.01, which is below float32's 0.01; less is pruned
+RESET_SHARE = 0.95
+SIZES = (1e-6, 1.0)  # extents: medians of trained models are 1e-4 to 0.1
+SPREADS = (0.01, 100.0)  # extents: from an object amid far cameras to a landscape beyond near ones
+BINS = (0.0, 0.01, 0.05, 0.2, 0.5, 0.9, 1.0)
+HUGE = 1.0  # extents: one standard deviation of a splat as large as the whole scene
+HUGE_SHARE = 0.01
+BLACK = 0.02  # mean of an image in [0, 1]
+BAD_PSNR = 18.0  # dB on training views; models that converge reach 22 and more
+FEW_ITERATIONS = 3000
+RESET_INTERVAL = 3000  # the default of --opacity_reset_interval
+NEAREST = 0.2  # depth below which nothing is drawn
+FEW_GAUSSIANS = 2000
+_CLEARLY = 3.0  # dB
+_VIEWS = 4
+_WIDTH = 200
+
+
+def check_model(model_path: str, iteration: int, source: str | None = None, images: str | None = None) -> list[Line]:
+    """Lines about the model that train.py wrote into a folder; iteration -1: the last one saved.
+
+    source, images: scene folder and its folder of photos, None: those that the model was trained on.
+    """
+    try:
+        stored = read_stored_options(model_path)
+        stored |= {"source_path": source} if source is not None else {}
+        stored |= {"images": images} if images is not None else {}
+        options, scene = _load(model_path, stored, iteration)
+    except UserError as error:
+        return [from_error(error)]
+    gaussians, extent = scene.gaussians, scene.cameras_extent
+    name = f"iteration {scene.loaded_iter}"
+    if not len(gaussians):
+        return [Line(f"{name} has no Gaussians, so renders show the background", "train it again")]
+    lines = [Line(f"{name}, {len(gaussians)} Gaussians of SH degree {gaussians.max_sh_degree}")]
+    if wrong := [*_not_finite(gaussians)] or [*_wrong_sizes(gaussians, extent)]:
+        return [*lines, *wrong]
+    shapes = [_opacities(gaussians), _sizes(gaussians, extent)]
+    return [*lines, *shapes, _renders(scene, options, stored), *check_training(Path(model_path))]
+
+
+def check_training(model: Path) -> list[Line]:
+    """Notes on what the log and the curve of the training suggest to try; none where it has written none."""
+    try:
+        rows = read_curve(model / CURVE) if (model / CURVE).is_file() else []
+        records = read_log(model / LOG)
+    except UserError as error:
+        return [from_error(error)]
+    return [Line(sentence, note=True) for sentence in what_to_try(rows, records)]
+
+
+def _load(model_path: str, stored: dict[str, Any], iteration: int) -> tuple[argparse.Namespace, Scene]:
+    # Small images are enough to tell black renders from bad ones.
+    given = {**stored, "model_path": model_path, "resolution": _WIDTH, "images_to_load": 1}
+    given.pop("depths", None)
+    options = ModelParams(argparse.ArgumentParser()).extract(argparse.Namespace(**given))
+    with contextlib.redirect_stdout(io.StringIO()):  # from the readers
+        return options, load_saved(options, iteration)
+
+
+def _not_finite(gaussians: GaussianModel) -> Iterator[Line]:
+    """NaN and infinities among the parameters."""
+    shapes = gaussians.raw_geometry()
+    raw = {
+        "position": gaussians.get_xyz,
+        "opacity": shapes["opacities"],
+        "scale": shapes["scales"],
+        "rotation": shapes["rotations"],
+        "colour": gaussians.get_features,
+    }
+    for name, values in raw.items():
+        if bad := int((~torch.isfinite(values)).flatten(1).any(dim=1).sum()):
+            text = f"{bad} of {len(values)} Gaussians have a {name} that is not finite"
+            yield Line(text, "resume from an earlier checkpoint, or train again, with lower learning rates")
+
+
+def _wrong_sizes(gaussians: GaussianModel, extent: float) -> Iterator[Line]:
+    """Sizes that are all far too small or too large for the cameras."""
+    median = float(gaussians.get_scaling.detach().max(dim=1).values.median()) / extent
+    low, high = SIZES
+    if not low <= median <= high:
+        text = f"the Gaussians are too {'small' if median < low else 'large'} for these cameras"
+        remedy = "check what wrote or changed the PLY: scales are natural logarithms, in the units of the cameras"
+        yield Line(f"{text}: their median size is {median:.2g} extents", remedy)
+
+
+def _wrong_values(gaussians: GaussianModel, extent: float) -> Iterator[Line]:
+    """Positions in other units than the cameras', and opacities as a reset leaves them, with no training after it."""
+    points, opacity = gaussians.get_xyz.detach(), gaussians.get_opacity.detach()
+    spread = float((points - points.median(dim=0).values).norm(dim=1).median()) / extent
+    if not SPREADS[0] <= spread <= SPREADS[1]:
+        remedy = (
+            "check whether the model belongs to this dataset (-s), and what scaled the PLY: both need the same units"
+        )
+        yield Line(f"the positions of the Gaussians spread over {spread:.2g} extents of the cameras", remedy)
+    share = float(((opacity >= RESET[0]) & (opacity <= RESET[1])).float().mean())
+    if share >= RESET_SHARE:
+        text = f"{share:.0%} of the opacities are near 0.01, as a reset leaves them, and nothing was trained after it"
+        remedy = "check an earlier iteration, or train some 1000 iterations beyond the reset (--opacity_reset_interval)"
+        yield Line(text, remedy)
+
+
+def _opacities(gaussians: GaussianModel) -> Line:
+    opacity = gaussians.get_opacity.detach().flatten().cpu().numpy()
+    parts = zip(BINS, BINS[1:], np.histogram(opacity, bins=BINS)[0] / len(opacity), strict=False)
+    shares = ", ".join(f"{low:g}-{high:g} {share:.0%}" for low, high, share in parts)
+    return Line(f"opacities: {shares}; median {np.median(opacity):.2f}")
+
+
+def _sizes(gaussians: GaussianModel, extent: float) -> Line:
+    """Sizes against the extent of the cameras."""
+    largest = gaussians.get_scaling.detach().max(dim=1).values.cpu().numpy()
+    huge = float((largest > HUGE * extent).mean())
+    if huge <= HUGE_SHARE:
+        return Line(f"sizes: median {np.median(largest) / extent:.2g}, largest {largest.max() / extent:.2g} extents")
+    text = f"{huge:.1%} of the Gaussians are larger than the extent of the cameras ({extent:.3g})"
+    return Line(text, "remove far points from the start cloud, and check the poses")
+
+
+def _renders(scene: Scene, options: argparse.Namespace, stored: dict[str, Any]) -> Line:
+    """Line about a few training views, rendered small: close to their photos, or else the likeliest reason."""
+    views = _looked_at(scene)
+    means = _means(views, scene, options)
+    if means is None:
+        return Line("no pixel of the inspected training views counts", "check --masks and --invert_masks")
+    black = means.render < BLACK
+    if black and means.photo < BLACK:
+        return Line("the photos themselves are black", "inspect them; if they are transparent, train with -w")
+    if not black and means.psnr >= BAD_PSNR:
+        return Line(f"{len(views)} training views rendered {_WIDTH} pixels wide: PSNR {means.psnr:.1f} dB")
+    text = "renders of the training views are black"
+    text = text if black else f"training views have a PSNR of only {means.psnr:.1f} dB"
+    wrong = next(_wrong_values(scene.gaussians, scene.cameras_extent), None)
+    wrong = wrong or _other_background(scene, options, stored, means.psnr)
+    wrong = wrong or (_why_black(scene, views, means) if black else Line("", _why_bad(scene, stored)))
+    return wrong._replace(text=f"{text}: {wrong.text}" if wrong.text else text)
+
+
+class Means(NamedTuple):
+    """Means over views: render, photo and PSNR (dB) of scored pixels; shares of covered pixels and drawn Gaussians."""
+
+    render: float
+    photo: float
+    coverage: float
+    drawn: float
+    psnr: float
+
+
+def _looked_at(scene: Scene) -> list[Camera]:
+    cameras = [camera for camera in scene.getTrainCameras() if camera.columns is None]  # whole views
+    return cameras[:: max(1, len(cameras) // _VIEWS)][:_VIEWS]
+
+
+def _means(cameras: list[Camera], scene: Scene, options: argparse.Namespace) -> Means | None:
+    """Means over the views of which some pixel counts (masks, half images); None if there are none."""
+    measured = [values for camera in cameras if (values := _measure(camera, scene, options))]
+    return Means(*(float(np.mean(values)) for values in zip(*measured, strict=True))) if measured else None
+
+
+def _other_background(scene: Scene, options: argparse.Namespace, stored: dict[str, Any], score: float) -> Line | None:
+    """Line if photos and renders agree over the other background, black or white; None if not."""
+    white = not options.white_background
+    other_options, other = _load(scene.model_path, stored | {"white_background": white}, scene.loaded_iter)
+    means = _means(_looked_at(other), other, other_options)
+    if means is None or means.psnr < max(BAD_PSNR, score + _CLEARLY):
+        return None
+    name = "white" if white else "black"
+    remedy = f"the model was trained on {name}: set white_background={white} in {scene.model_path}/cfg_args"
+    return Line(f"over {name} it is {means.psnr:.1f} dB", remedy + ("" if white else ", and render without -w"))
+
+
+def _measure(camera: Camera, scene: Scene, options: argparse.Namespace) -> tuple[float, ...] | None:
+    """Return the `Means` of one view; None if no pixel of it counts."""
+    gaussians = scene.gaussians
+    pipe = PipelineParams(argparse.ArgumentParser()).extract(argparse.Namespace())
+    pipe.antialiasing = read_model_json(scene.model_path).get("antialiasing", False)
+    background = torch.full((3,), 1.0 if options.white_background else 0.0, device=compute_device())
+    views = ScoredViews(pipe, background, options.train_test_exp)
+    with torch.no_grad():
+        image, target, mask = views.compared(camera, gaussians)
+        if mask is not None and not mask.any():
+            return None
+        image, target = (pixels_that_count(x, mask) for x in (image, as_float(target)))
+        black, white = torch.zeros_like(gaussians.get_xyz), torch.ones_like(background)
+        silhouette = render(camera, gaussians, pipe, white, override_color=black, want_depth=False)
+    ratio = min(float(psnr(image, target).mean()), 99.0)
+    drawn = float((silhouette["radii"] > 0).float().mean())
+    return float(image.mean()), float(target.mean()), 1 - float(silhouette["render"].mean()), drawn, ratio
+
+
+def _why_black(scene: Scene, cameras: list[Camera], means: Means) -> Line:
+    gaussians = scene.gaussians
+    if means.drawn < 0.01:
+        depths = torch.cat([_depths(camera, gaussians.get_xyz) for camera in cameras])
+        if float(((depths > 0) & (depths < NEAREST)).float().mean()) > 0.5:
+            text = f"most Gaussians are nearer than {NEAREST} and never drawn"
+            return Line(text, "scale cameras and points of the scene by 10 or more and train again")
+        remedy = "check the poses (x right, y down, z forward) and whether the model belongs to this dataset"
+        return Line("no Gaussian is in view, because the cameras face away", remedy)
+    if means.coverage < 0.1 or float(gaussians.get_opacity.detach().median()) < FAINT:
+        remedy = "check the poses, and lower --opacity_lr; in a PLY of another program opacities must be logits"
+        return Line("the Gaussians are almost transparent", remedy)
+    remedy = "check whether the training photos are black (transparent ones need -w), and check --feature_lr"
+    return Line("the Gaussians themselves are black", remedy)
+
+
+def _depths(camera: Camera, points: torch.Tensor) -> torch.Tensor:
+    return points @ camera.world_view_transform[:3, 2] + camera.world_view_transform[3, 2]
+
+
+def _why_bad(scene: Scene, stored: dict[str, Any]) -> str:
+    iteration = scene.loaded_iter
+    faint = float(scene.gaussians.get_opacity.detach().median()) < UNRECOVERED
+    if faint and RESET_INTERVAL <= iteration < 15_000 and iteration % RESET_INTERVAL < 500:
+        return "this iteration is shortly after opacities were reset; check a later one"
+    if (sizes := _sizes(scene.gaussians, scene.cameras_extent)).finding:
+        return sizes.remedy
+    if iteration < FEW_ITERATIONS:
+        return f"train longer, {FEW_ITERATIONS} iterations at least"
+    dataset = check_dataset(stored.get("source_path", ""), stored.get("images", "images"))
+    if problem := next((line for line in dataset if line.finding), None):
+        return f"the dataset has problems ({problem.text}): {problem.remedy}"
+    if len(scene.gaussians) < FEW_GAUSSIANS:
+        return f"there are only {len(scene.gaussians)} Gaussians; lower --densify_grad_threshold, or give more points"
+    return "train with the default learning rates; if that does not help, the poses are wrong: reconstruct the scene"

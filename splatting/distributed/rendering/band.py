@@ -1,0 +1,117 @@
+"""A rank's band of a view: forward to the image, and back to the gradient rows of the rank's Gaussians."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import torch
+from diff_gaussian_rasterization.backend import OPERATORS
+from diff_gaussian_rasterization.schema import SCENE
+from torch import Tensor
+
+from splatting.distributed.ranks import Ranks
+from splatting.distributed.rendering.bands import Bands, find_bands, tile_rows
+from splatting.distributed.rendering.exchange import Sent, return_rows, send_splats
+
+_HEIGHT, _WIDTH = SCENE.index("height"), SCENE.index("width")
+
+
+class Band(NamedTuple):
+    """What a loss by bands has to know (`photometric_loss_by_bands` of fused_ssim)."""
+
+    rows: tuple[int, int]  # of pixels, first and end
+    add: Callable[[Tensor], Tensor]  # sums over all bands
+
+
+@dataclass(slots=True)
+class View:
+    """A rank's band of a view, and what the way back needs. Planes are of the size of the whole image."""
+
+    ranks: Ranks
+    bands: Bands
+    color: Tensor  # (3, H, W), right in the rows of the band, unless `whole_image` or `surroundings` says more
+    inverse_depth: Tensor  # (1, H, W), or no rows if it is not wanted
+    radii: Tensor  # (N,) of the rank's own Gaussians
+    splats: Tensor  # (N, 10)
+    tile_counts: Tensor  # (N,)
+    sent: Sent
+    inside: Tensor  # (n,) bool of what was received: whether it reaches no other band
+    state: tuple[Tensor, ...]  # of the band: splats, instances, ranges, splat_slots, slots, background, last, ...
+    layers: Tensor
+
+    @property
+    def last(self) -> Tensor:
+        """(H, W), where lists end in the rows of the band."""
+        return self.state[-2]
+
+    @property
+    def band(self) -> Band:
+        return Band(self.bands.pixels(self.ranks.rank), self.ranks.added)
+
+
+def draw_view(
+    ranks: Ranks,
+    scene: tuple[Any, ...],
+    background: Tensor,
+    want_depth: bool,
+    train: bool,
+    find: Callable[..., Bands] | None = None,
+) -> View:
+    """Render the rank's band of a view with the Gaussians of all ranks, with the bits of one process.
+
+    scene: the rasterizer's arguments with the rank's own Gaussians. find: takes the place of `find_bands`.
+    """
+    height, width = scene[_HEIGHT], scene[_WIDTH]
+    own, depths, rects, tile_counts, radii = OPERATORS.project(*scene)
+    bands = (find or find_bands)(ranks, rects, tile_counts, height, width)
+    (splats, depths, rects, counts), sent = send_splats(ranks, bands, (own, depths, rects, tile_counts))
+    instances, ranges, *slots = OPERATORS.bin(splats, depths, rects, counts, height, width, train)
+    begin, end = bands.borders[ranks.rank : ranks.rank + 2]
+    inside = (rects[:, 1] >= begin) & (rects[:, 3] <= end)
+    across = (len(ranges) - 1) // tile_rows(height)
+    ranges = ranges.clamp(ranges[begin * across], ranges[end * across])  # lists of other bands become empty
+    color, transmittance, inverse_depth, last, layers = OPERATORS.blend(
+        splats, instances, ranges, background, height, width, want_depth, train
+    )
+    state = (splats, instances, ranges, *slots, background, last, transmittance)
+    return View(ranks, bands, color, inverse_depth, radii, own, tile_counts, sent, inside, state, layers)
+
+
+def whole_image(view: View) -> View:
+    """Give every rank all rows of the image, and of the inverse depth if it is wanted. Returns the view."""
+    ranks, bands = view.ranks, view.bands
+    rows = [bands.pixels(rank) for rank in range(ranks.size)]
+    first, end = rows[ranks.rank]
+    own = torch.cat((view.color, view.inverse_depth))[:, first:end].transpose(0, 1)
+    planes = ranks.gather(own, [end - first for first, end in rows]).transpose(0, 1).contiguous()
+    view.color, view.inverse_depth = planes[:3], planes[3:]
+    return view
+
+
+def surroundings(view: View) -> View:
+    """Give every rank the rows of colour around its band that its loss depends on (REACH). Returns the view."""
+    given, taken = view.bands.halo
+    rows = view.color.transpose(0, 1).index_select(0, given.indices)
+    received = view.ranks.send(rows, given.sizes, taken.sizes)[0]
+    view.color.index_copy_(1, taken.indices, received.transpose(0, 1))
+    return view
+
+
+def gradient_rows(
+    view: View, gradients: tuple[Tensor, Tensor | None, Tensor | None], absolute: bool
+) -> tuple[Tensor, Tensor]:
+    """Gradient rows of the rank's own Gaussians, and how many each has, from the gradients of the image.
+
+    gradients: of colour, transmittance and inverse depth, (., H, W), of which the rows of the band count.
+    """
+    rows, counts = OPERATORS.blend_rows(*view.state, *gradients, view.layers, absolute)
+    return return_rows(view.ranks, view.sent, len(view.radii), rows, counts, view.inside)
+
+
+def decisive_in(view: View) -> Tensor:
+    """The rank's own Gaussians that the image depends on (`decisive` of diff_gaussian_rasterization): (N,) bool."""
+    splats, instances, ranges, *_, last, _ = view.state
+    mask, sent = OPERATORS.decisive(splats, instances, ranges, last), view.sent
+    by_band, _ = view.ranks.send(mask, sent.received, sent.sizes)
+    found = torch.zeros(len(view.radii), dtype=torch.int32, device=splats.device)
+    return found.index_add_(0, sent.gaussians, by_band.int()) > 0

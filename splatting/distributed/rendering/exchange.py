@@ -1,0 +1,150 @@
+"""Exchange of what ranks need of each other in a view: splats for the bands that they reach, gradient rows back.
+
+What a GPU computes is read by the host, which then waits, as rarely as can be: once to learn how many records all ranks
+send, and once how many gradient rows.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import NamedTuple
+
+import torch
+from diff_gaussian_rasterization.backend import OPERATORS
+from torch import Tensor
+
+from splatting.distributed.ranks import Ranks
+from splatting.distributed.rendering.bands import Bands
+from splatting.host.read_later import read_later
+
+_ROOM = 1.25  # records for each Gaussian, of which views see a part and few reach two bands
+
+
+@dataclass(slots=True)
+class Sent:
+    """Which of a rank's own Gaussians each rank got, as a record, and how many records this one got from each."""
+
+    gaussians: Tensor  # (n,), ascending for each rank, rank after rank
+    sizes: list[int]  # records for each rank
+    received: list[int]
+    places: Tensor | None  # (n,) int32, by Gaussian, then by rank; None: as the records lie
+
+
+def agree_on_sizes(
+    ranks: Ranks, counts: Tensor, meanwhile: Callable[[], None] = lambda: None
+) -> tuple[list[int], list[int]]:
+    """How many records this rank sends to each rank, and how many it receives.
+
+    counts: (size, n), those to each. meanwhile: queues what a GPU does until the host knows the sizes.
+    """
+    every = ranks.agree(counts.sum(1), meanwhile)
+    return every[ranks.rank], [numbers[ranks.rank] for numbers in every]
+
+
+def send_splats(ranks: Ranks, bands: Bands, splats: tuple[Tensor, ...]) -> tuple[tuple[Tensor, ...], Sent]:
+    """Send splats to the bands that their rectangles reach; receive those of this band, in the order of all Gaussians.
+
+    splats: tensors with a row for each Gaussian of the rank: splats, depths, rectangles (N, 4), tile counts (N,).
+    """
+    reach = *splats[2:], bands.limits
+    counts = OPERATORS.count_records(*reach)
+    list_records = partial(OPERATORS.list_records, *reach, counts)
+    lists: list[tuple[Tensor, Tensor]] = []
+    room = int(_ROOM * len(splats[0]))
+    sizes, received = agree_on_sizes(ranks, counts[:-1], lambda: lists.append(list_records(room)))
+    if (total := sum(sizes)) > room:
+        lists = [list_records(total)]
+    gaussians, places = (numbers[:total] for numbers in lists[0])
+    rows = ranks.send(_packed([splats], gaussians, [len(gaussians)]), sizes, received)[0]
+    return OPERATORS.unpack_splats(rows, splats[0]), Sent(gaussians, sizes, received, places)
+
+
+def send_views(ranks: Ranks, views: Sequence[tuple[Tensor, ...]]) -> tuple[tuple[Tensor, ...], Sent]:
+    """Send what has tiles in view r to rank r; receive this rank's, in the order of ranks.
+
+    views: for each, tensors as of `send_splats`.
+    """
+    reached = torch.stack([tensors[-1] for tensors in views]) > 0
+    sizes, received = agree_on_sizes(ranks, reached)
+    gaussian = torch.nonzero_static(reached, size=sum(sizes))[:, 1].contiguous()
+    rows = ranks.send(_packed(views, gaussian, sizes), sizes, received)[0]
+    return OPERATORS.unpack_splats(rows, views[0][0]), Sent(gaussian, sizes, received, None)
+
+
+def return_rows(
+    ranks: Ranks, sent: Sent, count: int, rows: Tensor, counts: Tensor, inside: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Send gradient rows back; receive those of the rank's own `count` Gaussians from all ranks.
+
+    rows: (R, V), those of a record side by side; counts (n,) int32: of each record here; inside (n,): whether the
+    record reaches no other band, so that no other rank has rows of its Gaussian. Returns the same for the rank's
+    Gaussians: the rows of each in the order of ranks, which is that of its tiles; or one row, their sum, where the
+    record of a Gaussian lies in one band.
+    """
+    arrived = _send_back(ranks, sent, rows, counts, torch.where(inside, counts.clamp_max(1), counts))
+    runs = len(sent.places)
+    ends = torch.arange(runs, runs + ranks.size, dtype=torch.int32, device=rows.device)
+    places = _with_last(sent.places.split(sent.sizes), ends)
+    moved = OPERATORS.move_runs(arrived.rows, arrived.counts, places)
+    nobody = torch.full((ranks.size,), count, device=rows.device)
+    own = _with_last(sent.gaussians.split(sent.sizes), nobody)
+    total = torch.zeros(count + 1, dtype=torch.int32, device=rows.device).index_add_(0, own, arrived.counts)
+    return moved[: sum(arrived.lengths)], total[:-1]
+
+
+def return_sums(ranks: Ranks, sent: Sent, count: int, rows: Tensor, counts: Tensor) -> list[tuple[Tensor, Tensor]]:
+    """Send back one gradient row for each record of `send_views` that has any, their sum; receive those of other ranks.
+
+    Returns for each view the rows of the rank's own `count` Gaussians, and how many each has: one or none.
+    """
+    arrived = _send_back(ranks, sent, rows, counts, counts.clamp_max(1))
+    counts = arrived.counts.split([n + 1 for n in sent.sizes])
+    views = zip(sent.gaussians.split(sent.sizes), counts, arrived.rows.split(arrived.padded), strict=True)
+    found = []
+    for (own, of_view, part), length in zip(views, arrived.lengths, strict=True):
+        total = torch.zeros(count, dtype=torch.int32, device=rows.device)
+        found.append((part[:length], total.index_add_(0, own, of_view[:-1])))
+    return found
+
+
+class _Arrived(NamedTuple):
+    """Rows from all ranks, by rank, of each an even number, so that all begin at a multiple of 16 bytes."""
+
+    rows: Tensor
+    counts: Tensor  # int32 of each record that a rank got, and behind them one more row, of zeros, or none
+    lengths: list[int]  # without these
+    padded: list[int]  # with them
+
+
+def _send_back(ranks: Ranks, sent: Sent, rows: Tensor, counts: Tensor, kept: Tensor) -> _Arrived:
+    """Send what is kept of the rows of each record (`sum_runs` of the rasterizer).
+
+    Rows that began at other places than multiples of 16 bytes took NCCL longer (docs/results/several_gpus.md).
+    """
+    odd = OPERATORS.sum_parts(kept, sent.received).remainder(2).int()
+    kept = _with_last(kept.split(sent.received), odd)
+    counts = _with_last(counts.split(sent.received), torch.zeros_like(odd))
+    received, sizes = ([n + 1 for n in of] for of in (sent.received, sent.sizes))
+    own = ranks.send(kept, received, sizes)[0]
+    more = torch.stack([part[-1] for part in own.split(sizes)])
+    sums = OPERATORS.sum_parts(own, sizes), OPERATORS.sum_parts(kept, received)
+    numbers = read_later(torch.cat((*sums, more.long())))
+    summed = OPERATORS.sum_runs(rows, counts, kept, len(rows) + ranks.size)  # before the host waits
+    found = numbers()
+    padded, to_send, rest = (found[part * ranks.size : (part + 1) * ranks.size] for part in range(3))
+    arrived = ranks.send(summed[: sum(to_send)], to_send, padded)[0]
+    return _Arrived(arrived, own, [n - one for n, one in zip(padded, rest, strict=True)], padded)
+
+
+def _with_last(parts: Sequence[Tensor], last: Tensor) -> Tensor:
+    """The parts one after the other, each with one number of `last` behind it."""
+    return torch.cat([piece for pair in zip(parts, last.split(1), strict=True) for piece in pair])
+
+
+def _packed(views: Sequence[tuple[Tensor, ...]], gaussians: Tensor, sizes: Sequence[int]) -> Tensor:
+    """A row of words of 32 bits for each Gaussian, of which the first sizes[0] are of the first view, and so on."""
+    words = sum(t.shape[1:].numel() * t.element_size() for t in views[0]) // 4
+    rows = torch.empty(len(gaussians), words, dtype=torch.int32, device=gaussians.device)
+    for part, splats, own in zip(rows.split(sizes), views, gaussians.split(sizes), strict=True):
+        OPERATORS.pack_splats_(part, *splats, own)
+    return rows

@@ -1,0 +1,144 @@
+"""A command that several ranks run together, started by torchrun: joining, and ending with one sentence."""
+
+import os
+import sys
+import threading
+import traceback
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import NoReturn
+
+import torch
+import torch.distributed as dist
+
+from splatting.distributed import quiet
+from splatting.distributed.alike import refuse_differences
+from splatting.distributed.board import Board, here
+from splatting.distributed.ending import DONE, FAULT, LOST, NO_WORD, SIGNAL, End, Ending
+from splatting.distributed.ranks import using
+from splatting.distributed.watch import Watch
+from splatting.distributed.watched import TIMEOUT, RankLost, WatchedRanks
+from splatting.host import interrupt, torchrun
+from splatting.host.device import compute_device
+from splatting.host.errors import UserError, first_line
+from splatting.host.threads import cores
+
+_SIGNALS = (130, 143)  # exit statuses
+
+
+def run_together(main: Callable[[], object], outcome: Callable[[Callable[[], object]], tuple[int, str]]) -> int:
+    """Run a command as one rank of several. Returns its exit status; one rank has printed why, if it is not 0.
+
+    outcome: runs a function, and gives its exit status and what there is to say of it. An error that it does not know
+    is raised again on the rank that tells of it.
+    """
+    rank, size = torchrun.rank(), torchrun.size()
+    quiet.hush(rank == 0)
+    try:
+        board = Board(rank, size)
+    except UserError as error:
+        quiet.speak(f"error: rank {rank}: {error}")
+        return 2
+    ending = Ending(board)
+    watch = Watch(rank, size, ending)
+    board.post("here", here())
+    watch.start()
+    end = error = None
+    try:
+        end, error = _ended(lambda: outcome(lambda: _join_and_run(main, board, watch, ending)))
+        interrupt.ignore()
+    except KeyboardInterrupt:  # torchrun ends the others when one has ended, also where that was being told
+        interrupt.ignore()
+        end = end or _end_of(143, "terminated")
+    if not ending.begin():
+        threading.Event().wait()  # the watch ends this process
+    if watch.ranks:
+        watch.ranks.leave(end.kind == DONE)
+    status, spoke = ending.finish(end)
+    at_once = not watch.leave() or status and watch.ranks and watch.ranks.by_gpu
+    if error is not None and spoke:
+        quiet.unhush()
+        if not at_once:
+            raise error
+        traceback.print_exception(error)
+    if at_once:
+        _leave_at_once(status)
+    return status
+
+
+def _leave_at_once(status: int) -> NoReturn:
+    """End without Python's own end, which would wait for kernels of NCCL that wait for a rank that is gone, and abort
+    if the watch still waits for the store."""
+    for stream in (sys.stdout, sys.stderr):
+        stream.flush()
+    os._exit(status)
+
+
+def _ended(run: Callable[[], tuple[int, str]]) -> tuple[End, BaseException | None]:
+    """How a command ends, and an error that nobody knows."""
+    try:
+        return _end_of(*run()), None
+    except RankLost:
+        return End(LOST, 1, NO_WORD), None
+    except SystemExit as exit_:  # of argparse, which has said why
+        return End(FAULT if exit_.code else DONE, exit_.code or 0), None
+    except Exception as bug:
+        return End(FAULT, 1, f"error: {type(bug).__name__}: {first_line(bug)}"), bug
+
+
+def _end_of(status: int, line: str) -> End:
+    kind = DONE if status == 0 else SIGNAL if status in _SIGNALS else FAULT
+    return End(kind, status, line)
+
+
+def _join_and_run(main: Callable[[], object], board: Board, watch: Watch, ending: Ending) -> None:
+    with _joined(board) as ranks, using(ranks):
+        watch.ranks = ranks
+        ending.stands = lambda: ranks.stands()
+        main()
+
+
+@contextmanager
+def _joined(board: Board) -> Iterator[WatchedRanks]:
+    """Make the process group: NCCL on GPUs, one a rank, and gloo on CPUs."""
+    device = _own_device()
+    refuse_differences(_everyone(board, _machine(device)), "start all ranks with the same installation")
+    options = {"device_id": device} if device.type == "cuda" else {}
+    backend = "nccl" if device.type == "cuda" else "gloo"
+    # NCCL's own watchdog would abort this process as soon as another is gone, before anybody has said which.
+    os.environ.setdefault("TORCH_NCCL_ASYNC_ERROR_HANDLING", "0")
+    dist.init_process_group(
+        backend,
+        store=dist.PrefixStore("group", board.store),
+        rank=board.rank,
+        world_size=board.size,
+        timeout=TIMEOUT,
+        **options,
+    )
+    yield WatchedRanks()
+
+
+def _everyone(board: Board, facts: dict[str, str]) -> list[dict[str, str]]:
+    board.post("machine", facts)
+    return board.everyone("machine")
+
+
+def _own_device() -> torch.device:
+    """The device of this rank, on GPUs the current one from now on. The ranks of a host share its cores."""
+    device = compute_device()
+    if os.environ.get("OMP_NUM_THREADS", "1") == "1":  # which torchrun sets where the user does not
+        torch.set_num_threads(cores())
+    if device.type == "cuda":
+        number, count = torchrun.local_rank(), torch.cuda.device_count()
+        if number >= count:
+            raise UserError(f"there is no GPU for it, as this host has {count}; lower --nproc_per_node to {count}")
+        torch.cuda.set_device(number)
+        return torch.device("cuda", number)
+    return device
+
+
+def _machine(device: torch.device) -> dict[str, str]:
+    from splatting.host.machine import device_name, instruction_set
+
+    facts = {"torch": torch.__version__, "the backend": device.type, "the instruction set": instruction_set()}
+    return facts | ({"the GPU": device_name(device)} if device.type == "cuda" else {})

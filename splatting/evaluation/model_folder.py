@@ -1,0 +1,185 @@
+"""Readers of a model folder: number of Gaussians, times, scores, rendered images."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from arguments.stored import read_model_json, read_stored_options
+from splatting.evaluation.training_log import NAME as LOG
+from splatting.evaluation.training_log import read_log
+from splatting.evaluation.what_to_try import schedules_follow_length
+from splatting.files.image_files import UNREADABLE, open_render
+from splatting.files.json_files import read_json
+from splatting.files.plain_files import plain
+from utils.system_utils import UserError, saved_iterations
+
+SCHEDULE = "schedule.json"  # of a training whose iterations followed the clock
+
+
+def json_or_none(path: Path) -> Any | None:
+    """Read a JSON file; None if it is missing or not JSON."""
+    try:
+        return read_json(path)
+    except (OSError, ValueError, RecursionError):
+        return None
+
+
+def ply_file(model: Path, iteration: int) -> Path:
+    """Return the path of a saved iteration's Gaussians."""
+    return model / "point_cloud" / f"iteration_{iteration}" / "point_cloud.ply"
+
+
+def count_gaussians(model: Path, iteration: int) -> int:
+    """Read the number of Gaussians of a saved iteration from the header of its PLY."""
+    ply = ply_file(model, iteration)
+    try:
+        with open(plain(ply), "rb") as file:
+            header = file.read(4096).split(b"end_header")[0]
+    except OSError as error:
+        raise UserError(f"cannot read {ply} ({error.strerror}); train the model again") from error
+    found = re.search(rb"element vertex (\d+)", header)
+    if not found:
+        raise UserError(f"{ply} is not a PLY of Gaussians; train the model again")
+    return int(found[1])
+
+
+def trained_gaussians(model: Path, iteration: int) -> int:
+    """Return the number of Gaussians that were trained: those of the PLY, and those left out as unseen."""
+    saved = count_gaussians(model, iteration)
+    try:
+        left_out = read_model_json(model).get("left_out") or {}
+        trained, unseen = int(left_out["gaussians"]), int(left_out["unseen"])
+    except (UserError, KeyError, TypeError, ValueError):
+        return saved  # a model of another program, which leaves nothing out
+    return trained if iteration == trained_iterations(model)[-1] and trained - unseen == saved else saved
+
+
+def shorter_ends_there(model: Path) -> bool:
+    """Whether a training with fewer --iterations ends with the model that a longer one has then; False if unknown."""
+    if (model / SCHEDULE).is_file():
+        return False
+    try:
+        options = read_stored_options(model)
+    except UserError:
+        return False
+    return not schedules_follow_length(
+        bool(options.get("depths")), bool(options.get("train_test_exp")), options.get("resolution_schedule", "none")
+    )
+
+
+def load_scores(model: Path, method: str) -> tuple[dict[str, float | None], dict[str, dict[str, float | None]]]:
+    """Read metrics.py's scores of a method: the means, and the scores by metric and view. UserError without them."""
+    try:
+        results = read_json(model / "results.json")[method]
+        per_view = read_json(model / "per_view.json")[method]
+        for numbers in ({key: results[key] for key in ("PSNR", "SSIM")}, per_view["PSNR"]):
+            if not numbers or any(type(value) not in (int, float, type(None)) for value in numbers.values()):
+                raise ValueError("no numbers")
+    except (OSError, KeyError, ValueError, TypeError, AttributeError) as error:
+        raise UserError(f"{model} has no scores of {method}; run render.py and metrics.py -m {model} first") from error
+    return results, per_view
+
+
+def training_seconds(model: Path, iteration: int) -> float | None:
+    """Read the seconds of training until an iteration, without tests and saving; None if train.py logged none."""
+    return logged(model, warn=True).get(iteration, {}).get("seconds")
+
+
+def logged(model: Path, warn: bool = False) -> dict[int, dict[str, Any]]:
+    """Read the records of train_log.json by their iterations; none without the file, or if it is damaged."""
+    try:
+        return {record["iteration"]: record for record in read_log(model / LOG)}
+    except UserError as error:
+        if warn:
+            print(f"warning: {error}", file=sys.stderr)
+        return {}
+
+
+def trained_iterations(model: Path) -> list[int]:
+    """List the saved iterations of the training that the log tells of, ascending.
+
+    Where the clock or a score ends a training, an earlier one of the same options may have left a later iteration.
+    """
+    saved, end = saved_iterations(model / "point_cloud"), max(logged(model), default=None)
+    return saved if end not in saved else [iteration for iteration in saved if iteration <= end]
+
+
+def closing_lines(model: Path) -> list[str]:
+    """Read what train.py said at its end: costs of the curve, what it left out; none if it logged nothing."""
+    lines = next(reversed(logged(model).values()), {}).get("lines")
+    return list(map(str, lines)) if isinstance(lines, list) else []
+
+
+def picture(file: Path) -> Image.Image:
+    """Read a render or a ground truth, RGB."""
+    return _opened(file, lambda image: image.convert("RGB"))
+
+
+def picture_size(file: Path) -> tuple[int, int]:
+    """Read width and height in pixels from the file's header."""
+    return _opened(file, lambda image: image.size)
+
+
+def _opened(file: Path, read: Callable[[Image.Image], Any]) -> Any:
+    try:
+        with open_render(file) as image:
+            return read(image)
+    except UNREADABLE as error:
+        raise UserError(f"{file} is missing or damaged; run render.py and metrics.py again") from error
+
+
+def view_names(folder: Path) -> list[str]:
+    """List the names of a folder's PNGs, sorted; none if there is no folder."""
+    return sorted(file.name for file in folder.glob("*.png") if not file.name.startswith("."))
+
+
+def _mask(method: Path, name: str) -> np.ndarray | None:
+    """Read which pixels of a view count for metrics.py, (H, W) bool; None: all. method: the folder `ours_N`."""
+    file = method / "masks" / name
+    return np.asarray(picture(file))[..., 0] > 0 if file.is_file() else None
+
+
+def counted_picture(method: Path, side: str, name: str) -> Image.Image:
+    """Read a view's `gt` or `renders`, RGB, white where pixels do not count. method: the folder `ours_N`."""
+    image, mask = picture(method / side / name), _mask(method, name)
+    if mask is None:
+        return image
+    return Image.fromarray(np.where(mask[..., None], np.asarray(image), np.uint8(255)))
+
+
+def picture_namer(model: Path) -> Callable[[str], str]:
+    """Return a function that names the photo of a rendered test view, by cameras.json, which has test views first."""
+    cameras = json_or_none(model / "cameras.json")
+
+    def name(file: str) -> str:
+        try:
+            return str(cameras[int(Path(file).stem)]["img_name"])
+        except (ValueError, IndexError, KeyError, TypeError):
+            return file
+
+    return name
+
+
+def ground_truth_digest(model: Path, method: str) -> str:
+    """Return the SHA-256 of the test views' ground truth, in order: sizes, pixels, masks.
+
+    Scores can be compared only if it is the same. It changes with split, resolution, resize filter, background, masks.
+    """
+    digest = hashlib.sha256()
+    folder = model / "test" / method
+    for name in view_names(folder / "gt"):
+        image = picture(folder / "gt" / name)
+        digest.update(f"{image.width}x{image.height}".encode())
+        digest.update(np.asarray(image).tobytes())
+        if (mask := _mask(folder, name)) is not None:
+            digest.update(b"mask")
+            digest.update(mask.tobytes())
+    return digest.hexdigest()

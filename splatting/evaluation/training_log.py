@@ -1,0 +1,151 @@
+"""train_log.json: error against run time, one record per tested or saved iteration and checkpoint."""
+
+import math
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from splatting.distributed.ranks import ranks
+from splatting.files.json_files import read_json, write_json
+from splatting.host.process import peak_memory_mib, wall_seconds
+from splatting.host.running import running_seconds
+from utils.system_utils import UserError, compute_device
+
+NAME = "train_log.json"
+SHORT = 2000  # iterations; after trainings up to this length, what training says at its end is short
+_FINITE = ("loss", "peak_memory_mib", "wall_seconds", "max_num_splats", "default_budget")  # if present
+
+
+class Stopwatch:
+    """Seconds since its construction, without those inside `paused()` or of a stopped process, where it stands still.
+
+    spent: the seconds inside, by their purpose. Of a pause in another one, they count for the inner purpose.
+    """
+
+    def __init__(self) -> None:
+        self._start = running_seconds()
+        self._stopped: float | None = None  # when the outermost pause began
+        self.spent: dict[str, float] = {}
+
+    @property
+    def seconds(self) -> float:
+        return (running_seconds() if self._stopped is None else self._stopped) - self._start
+
+    @contextmanager
+    def paused(self, purpose: str) -> Iterator[None]:
+        before, outer, others = running_seconds(), self._stopped, sum(self.spent.values())
+        self._stopped = before if outer is None else outer
+        try:
+            with ranks().busy():
+                yield
+        finally:
+            taken = running_seconds() - before
+            inner = sum(self.spent.values()) - others
+            self.spent[purpose] = self.spent.get(purpose, 0.0) + taken - inner
+            self._stopped = outer
+            if outer is None:
+                self._start += taken
+
+
+class TrainingLog:
+    """Records of one model folder, written whole after each addition.
+
+    A record has `iteration`; `seconds` of training, without evaluation, saving and a stopped process; `wall_seconds`
+    since the process started; `peak_memory_mib`, the most so far; `gaussians`; `loss`, a running mean; and for each set
+    tested `<set>_l1`, `<set>_psnr`. Seconds and memory include the runs that were resumed. The last record also has
+    `gaussians_left_out`, those that the last save does not have, the costs of the curve (curve_recorder.py), the
+    seconds of this process by what they were spent on (training/observers/records.py), `iterations_planned`,
+    `strategy`, and `max_num_splats` or `default_budget` (what_to_try.py), and `lines`, what training said at its end.
+
+    first_iteration, seconds_before, wall_seconds_before: done by the runs that this one resumes.
+    """
+
+    def __init__(
+        self, model_path: str | os.PathLike, first_iteration: int, before: str | os.PathLike | None = None
+    ) -> None:
+        """Keep the records of an existing log up to `first_iteration`, where a run resumes.
+
+        before: the folder of that log, unless it is model_path.
+        """
+        self._path = Path(model_path) / NAME
+        source = self._path if before is None else Path(before) / NAME
+        self.first_iteration = first_iteration
+        self.records: list[dict] = []
+        if first_iteration > 0 and source.is_file():
+            self.records = [r for r in _read(source) if r["iteration"] <= first_iteration]
+        last = self.records[-1] if self.records else {"seconds": 0.0}
+        self.seconds_before = last["seconds"]
+        self.wall_seconds_before = last.get("wall_seconds") or last["seconds"]
+        self._peak_before: float | None = last.get("peak_memory_mib")
+
+    def not_before(self, row: dict[str, float | None]) -> None:
+        """Continue counting from a row of the earlier runs' curve if it is later than their log."""
+        self.seconds_before = max(self.seconds_before, row["seconds"])
+        self.wall_seconds_before = max(self.wall_seconds_before, row["wall_seconds"] or 0.0)
+
+    @property
+    def loss(self) -> float:
+        """Running mean of the last record, 0 if there is none."""
+        return (self.records[-1].get("loss") if self.records else None) or 0.0
+
+    def peak_memory_mib(self) -> float | None:
+        """Most memory held so far, by this run or those it resumes (host/process.py); None if not known."""
+        peaks = [peak for peak in (self._peak_before, peak_memory_mib(compute_device())) if peak is not None]
+        return round(max(peaks), 1) if peaks else None
+
+    def add(self, iteration: int, seconds: float, **values: float) -> None:
+        """Append a record, or add to that of the same iteration.
+
+        A value that is not finite (PSNR of equal images) becomes null.
+        """
+        record = {name: value if math.isfinite(value) else None for name, value in values.items()}
+        record |= {
+            "iteration": iteration,
+            "peak_memory_mib": self.peak_memory_mib(),
+            "seconds": round(self.seconds_before + seconds, 3),
+            "wall_seconds": round(self.wall_seconds_before + wall_seconds(), 3),
+        }
+        if self.records and self.records[-1]["iteration"] == iteration:
+            before = self.records.pop()
+            record = before | record | {"seconds": max(before["seconds"], record["seconds"])}
+        self.records.append(record)
+        write_json(self._path, self.records)
+
+    def note(self, **values: float | None) -> None:
+        """Add values to the last record as it is."""
+        if self.records:
+            self.records[-1] |= values
+            write_json(self._path, self.records)
+
+    def tell(self, *lines: str) -> None:
+        """Print lines about the finished training, and keep them as `lines` of the last record, for reports."""
+        print(*lines, sep="\n")
+        if self.records:
+            self.records[-1].setdefault("lines", []).extend(lines)
+            write_json(self._path, self.records)
+
+
+def read_log(path: str | os.PathLike) -> list[dict]:
+    """Records of a log; none if there is no file. UserError if it is damaged."""
+    if not Path(path).is_file():
+        return []
+    try:
+        records = read_json(Path(path))
+        if not all(isinstance(r["iteration"], int) and math.isfinite(r["seconds"]) for r in records):
+            raise ValueError
+        if not all(math.isfinite(r.get(name) or 0.0) for r in records for name in _FINITE):
+            raise ValueError
+    except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
+        raise UserError(f"{path} cannot be read as a training log; train again to record one") from error
+    return records
+
+
+def _read(path: Path) -> list[dict]:
+    """Records of a log; none, with a warning, if the file is damaged: that is no reason to stop a training."""
+    try:
+        return read_log(path)
+    except UserError as error:
+        print(f"warning: {str(error).partition('; ')[0]}; a new one is started", file=sys.stderr)
+        return []

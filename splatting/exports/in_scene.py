@@ -1,0 +1,114 @@
+"""Splats, models and scenes: the splats of a model, and a file's Gaussians as a model, also in a scene's frame.
+
+A file's Gaussians are the start of a training, or other people's models in our views.
+"""
+
+import argparse
+import copy
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from scene import Scene
+from scene.gaussian_model import GaussianModel
+from scene.gaussians.attributes import attributes
+from splatting.distributed.ranks import ALONE, Ranks
+from splatting.exports.formats import is_point_cloud, read_splats
+from splatting.exports.ply import columns_of
+from splatting.exports.splats import Splats, base_colors, drawable, selected
+from utils.general_utils import inverse_sigmoid
+from utils.graphics_utils import BasicPointCloud
+from utils.system_utils import UserError
+
+
+@torch.no_grad()
+def splats_of(gaussians: GaussianModel, antialiasing: bool = False) -> Splats:
+    """The Gaussians of a model, on the CPU. Other activations than ours are undone, as files hold logits and logs."""
+    if gaussians.kernels_activate:
+        raw = gaussians.raw_geometry()
+        scales, logits = raw["scales"], raw["opacities"]
+    else:
+        scales, logits = gaussians.get_scaling.log(), inverse_sigmoid(gaussians.get_opacity)
+    values = (gaussians.get_xyz, scales, gaussians.get_rotation, logits[:, 0], gaussians.get_features)
+    means, scales, rotations, logits, sh = (x.detach().float().cpu().contiguous().numpy() for x in values)
+    return Splats(means, scales, rotations, logits, sh, antialiasing, gaussians.world_offset)
+
+
+def model_of(splats: Splats, sh_degree: int | None = None) -> GaussianModel:
+    """A model, on the device that computes, whose SH bands are all active. sh_degree: of the model, None: the splats'.
+
+    Bands that the splats lack are zero; those above sh_degree are left out.
+    """
+    degree = splats.sh_degree if sh_degree is None else sh_degree
+    gaussians = GaussianModel(degree)
+    fill_model(gaussians, splats)
+    return gaussians
+
+
+def fill_model(gaussians: GaussianModel, splats: Splats) -> None:
+    """Give a model these Gaussians, with the bands that it has. The splats' bands become active.
+
+    Attributes that splats do not have get the values of new Gaussians.
+    """
+    columns = columns_of(splats)
+    bands = (gaussians.max_sh_degree + 1) ** 2 - 1
+    rest = columns["f_rest"][:, :bands]
+    columns["f_dc"] = columns["f_dc"].contiguous()
+    columns["f_rest"] = torch.nn.functional.pad(rest, (0, 0, 0, bands - rest.shape[1])).contiguous()
+    for name, attribute in attributes(gaussians.max_sh_degree).items():
+        if name not in columns:
+            columns[name] = torch.full((len(splats), *attribute.shape), attribute.start)
+    gaussians.take_whole(columns)
+    gaussians.active_sh_degree = min(gaussians.max_sh_degree, splats.sh_degree)
+
+
+def scene_with(
+    path: str | None, options: argparse.Namespace, gaussians: GaussianModel, sharing: Ranks = ALONE
+) -> tuple[Scene, Splats | None]:
+    """A scene whose points are a file's, and the file's splats in the scene's frame; None for a point cloud.
+
+    The model stays empty. path: None or empty: the points are the dataset's own. options: the model options. Positions
+    in the file are those of the world, unless our comment world_offset tells their origin. sharing: as of Scene.
+    UserError for a file without splats that are drawn, and as from Scene.
+    """
+    options = copy.copy(options)
+    if not path or is_point_cloud(path):
+        options.init_pcd_path = path or getattr(options, "init_pcd_path", "")
+        return Scene(options, gaussians, shuffle=False, start=False, sharing=sharing), None
+    splats = read_splats(path)
+    splats = selected(splats, drawable(splats))
+    if not len(splats):
+        raise UserError(f"{path} has no Gaussians that are drawn; give another model")
+    points = splats.means.astype(np.float64) + splats.world_offset
+    colors = np.clip(base_colors(splats), 0, 1)
+    # The scene moves them into its frame, as it does any points.
+    options.init_pcd_path = BasicPointCloud(points, colors, np.zeros_like(colors))
+    scene = Scene(options, gaussians, shuffle=False, start=False, sharing=sharing)
+    means = np.ascontiguousarray(scene.info.point_cloud.points, dtype=np.float32)
+    return scene, replace(splats, means=means, world_offset=tuple(scene.info.offset.tolist()))
+
+
+def load_file(options: argparse.Namespace, path: str, pipeline: argparse.Namespace) -> Scene:
+    """Scene of the model options with a file's Gaussians, in the place of `load_saved`.
+
+    Its loaded_iter is the name of the file, without endings. `pipeline` gets antialiasing if the file says so.
+    UserError for a point cloud, and as from `scene_with`.
+    """
+    scene, splats = scene_with(path, options, GaussianModel(0))
+    if splats is None:
+        raise UserError(f"{path} is a point cloud; start a training from it with train.py --init_pcd_path {path}")
+    scene.gaussians, scene.loaded_iter = model_of(splats), Path(path).name.split(".")[0]
+    scene.gaussians.start_exposures(scene.info.train_cameras)
+    pipeline.antialiasing = pipeline.antialiasing or splats.antialiasing
+    return scene
+
+
+def start_from(splats: Splats, scene: Scene, gaussians: GaussianModel) -> None:
+    """Give a model these Gaussians as the start of a training: the SH degree is theirs, up to the model's."""
+    gaussians.spatial_lr_scale = float(scene.cameras_extent)
+    fill_model(gaussians, splats)
+    gaussians.start_exposures(scene.info.train_cameras)
+    bands = "all SH bands" if splats.sh_degree <= gaussians.max_sh_degree else f"SH bands to {gaussians.max_sh_degree}"
+    print(f"Number of Gaussians at initialisation :  {gaussians.total}, with {bands}")

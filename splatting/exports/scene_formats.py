@@ -1,0 +1,195 @@
+"""Float formats of general 3D programs: GLB (binary glTF 2.0) and USDZ. Both have linear scales, opacities and y up.
+
+The values are those of the model, in COLMAP's axes. A node, or the prim, turns them half around x.
+
+GLB has the Khronos extension KHR_gaussian_splatting: splats are points with attributes, float32, with quaternions xyzw,
+and each SH coefficient as an attribute. COLOR_0 shows programs without the extension a coloured point cloud.
+
+USDZ has the schema ParticleField3DGaussianSplat of OpenUSD 26.3 and later; SH coefficients lie splat by splat.
+"""
+
+import json
+import os
+import struct
+import zipfile
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+
+from splatting.exports.packing import rgba_bytes
+from splatting.exports.splats import Splats, opacities
+from utils.system_utils import UserError, atomic_write, temporary_folder
+
+EXTENSION = "KHR_gaussian_splatting"
+LARGEST = 2**32 - 1  # bytes of a GLB: the header has 32 bits for them
+PRIM = "/World/Splats"
+_FLOAT, _UNSIGNED_BYTE, _ARRAY_BUFFER, _POINTS = 5126, 5121, 34962, 0
+_KINDS = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
+
+
+def write_glb(path: str | os.PathLike, splats: Splats) -> None:
+    """Write a GLB, whole or not at all. UserError if it is too large.
+
+    Without splats it has a node without a mesh, as glTF has no empty one.
+    """
+    attributes = _attributes(splats) if len(splats) else {}
+    sizes = [values.nbytes for values in attributes.values()]
+    document = _document(attributes, sizes, splats.antialiasing)
+    text = json.dumps(document, separators=(",", ":"), allow_nan=False).encode()
+    text += b" " * (-len(text) % 4)
+    chunks = struct.pack("<I4s", len(text), b"JSON") + text
+    length = 12 + len(chunks) + (8 + sum(sizes) if attributes else 0)
+    if length > LARGEST:
+        raise UserError(
+            f"{path} would have {length / 1e9:.1f} GB, and a GLB has at most {LARGEST / 1e9:.1f}; leave Gaussians out "
+            "by --max_splats, or bands by --sh_degree"
+        )
+    with atomic_write(path) as temporary, open(temporary, "wb") as file:
+        file.write(struct.pack("<4sII", b"glTF", 2, length) + chunks)
+        if attributes:
+            file.write(struct.pack("<I4s", sum(sizes), b"BIN\0"))
+        for values in attributes.values():  # one by one, as all of them together take much memory
+            file.write(np.ascontiguousarray(values))
+
+
+def _attributes(splats: Splats) -> dict[str, np.ndarray]:
+    values = {
+        "POSITION": splats.means,
+        "COLOR_0": rgba_bytes(splats),
+        f"{EXTENSION}:ROTATION": np.roll(splats.rotations, -1, axis=1),
+        f"{EXTENSION}:SCALE": np.exp(splats.log_scales),
+        f"{EXTENSION}:OPACITY": opacities(splats)[:, None],
+    }
+    for degree in range(splats.sh_degree + 1):
+        for index in range(2 * degree + 1):
+            values[f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{index}"] = splats.sh[:, degree**2 + index]
+    return {name: x if x.dtype == np.uint8 else x.astype("<f4") for name, x in values.items()}
+
+
+def _document(attributes: dict[str, np.ndarray], sizes: list[int], antialiasing: bool) -> dict:
+    node = {"name": "splats", "rotation": [1, 0, 0, 0]}
+    document = {
+        "asset": {"version": "2.0", "generator": "export.py", "extras": {"antialiasing": antialiasing}},
+        "extensionsUsed": [EXTENSION],
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [node],
+    }
+    if not attributes:
+        del document["extensionsUsed"]
+        return document
+    node["mesh"] = 0
+    starts = np.cumsum([0, *sizes])
+    settings = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
+    primitive = {
+        "mode": _POINTS,
+        "attributes": {name: index for index, name in enumerate(attributes)},
+        "extensions": {EXTENSION: settings},
+    }
+    return document | {
+        "meshes": [{"primitives": [primitive]}],
+        "accessors": [_accessor(index, name, values) for index, (name, values) in enumerate(attributes.items())],
+        "bufferViews": [
+            {"buffer": 0, "byteOffset": int(start), "byteLength": size, "target": _ARRAY_BUFFER}
+            for start, size in zip(starts, sizes, strict=False)
+        ],
+        "buffers": [{"byteLength": int(starts[-1])}],
+    }
+
+
+def _accessor(index: int, name: str, values: np.ndarray) -> dict:
+    is_byte = values.dtype == np.uint8
+    accessor = {
+        "bufferView": index,
+        "componentType": _UNSIGNED_BYTE if is_byte else _FLOAT,
+        "count": len(values),
+        "type": _KINDS[values.shape[1]],
+    }
+    if is_byte:
+        accessor["normalized"] = True
+    if name == "POSITION":  # glTF asks for its bounds
+        accessor |= {"min": values.min(axis=0).tolist(), "max": values.max(axis=0).tolist()}
+    return accessor
+
+
+def write_usdz(path: str | os.PathLike, splats: Splats) -> None:
+    """Write a USDZ file, whole or not at all. UserError without a usd-core that has the schema."""
+    usd = find_pxr(path)
+    with temporary_folder() as folder, atomic_write(path) as temporary:
+        layer = folder / "splats.usdc"
+        try:
+            _write_stage(usd, str(layer), splats)
+            done = usd.UsdUtils.CreateNewUsdzPackage(usd.Sdf.AssetPath(str(layer)), str(temporary))
+        except usd.Tf.ErrorException:
+            done = False
+        if not done or not _is_whole(temporary):
+            raise UserError(
+                f"cannot write {path}; free space there and in {folder.parent}, fix the permissions, or choose "
+                "another place"
+            )
+        _forget_time(temporary)
+
+
+def _forget_time(package: Path) -> None:
+    """Give the one part of a package the first date that ZIP has, so that the same model has the same bytes."""
+    with zipfile.ZipFile(package) as archive:
+        (part,) = archive.infolist()
+        places = part.header_offset + 10, archive.start_dir + 12  # in the part's header, and in the directory
+    with open(package, "r+b") as file:
+        for place in places:
+            file.seek(place)
+            file.write(b"\0\0\x21\0")  # midnight, 1 January 1980
+
+
+def _is_whole(package: Path) -> bool:
+    """Whether a package has all of its bytes: OpenUSD does not tell of a disk that was full."""
+    try:
+        with zipfile.ZipFile(package) as archive:
+            return archive.testzip() is None
+    except zipfile.BadZipFile:
+        return False
+
+
+def find_pxr(path: str | os.PathLike) -> ModuleType:
+    """The package that a file of this name needs. UserError without it."""
+    try:
+        import pxr
+        from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdUtils, UsdVol, Vt  # noqa: F401  (so that pxr has them)
+
+        UsdVol.ParticleField3DGaussianSplat  # noqa: B018
+    except (ImportError, AttributeError) as error:
+        reason = "needs the package usd-core, 26.3 or later"
+        raise UserError(f"{path} {reason}; install it with pip install '.[export]'") from error
+    return pxr
+
+
+def _write_stage(usd: ModuleType, layer: str, splats: Splats) -> None:
+    stage = usd.Usd.Stage.CreateNew(layer)
+    usd.UsdGeom.SetStageUpAxis(stage, usd.UsdGeom.Tokens.y)
+    usd.UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+    stage.SetDefaultPrim(usd.UsdGeom.Xform.Define(stage, "/World").GetPrim())
+    field = usd.UsdVol.ParticleField3DGaussianSplat.Define(stage, PRIM)
+    usd.UsdGeom.Xformable(field).AddRotateXOp().Set(180.0)
+    field.GetPrim().SetCustomDataByKey("antialiasing", bool(splats.antialiasing))
+    vt = usd.Vt
+    xyzw = np.ascontiguousarray(np.roll(splats.rotations, -1, axis=1))  # Gf keeps the real part last
+    alpha = opacities(splats).astype(np.float32)
+    values = {
+        "positions": vt.Vec3fArray.FromNumpy(splats.means),
+        "orientations": vt.QuatfArray.FromNumpy(xyzw),
+        "scales": vt.Vec3fArray.FromNumpy(np.exp(splats.log_scales)),
+        "opacities": vt.FloatArray.FromNumpy(alpha),
+        "radiance:sphericalHarmonicsDegree": splats.sh_degree,
+        "radiance:sphericalHarmonicsCoefficients": vt.Vec3fArray.FromNumpy(splats.sh.reshape(-1, 3)),
+    }
+    for name, value in values.items():
+        field.GetPrim().GetAttribute(name).Set(value)
+    # The kernel reaches three standard deviations; bounds let programs frame and cull the splats.
+    reach = 3 * np.exp(splats.log_scales.max(axis=1, keepdims=True)) if len(splats) else splats.means
+    bounds = (
+        [(splats.means - reach).min(axis=0), (splats.means + reach).max(axis=0)] if len(splats) else np.zeros((2, 3))
+    )
+    extent = field.GetPrim().GetAttribute("extent")
+    extent.Set(vt.Vec3fArray.FromNumpy(np.asarray(bounds, np.float32)))
+    stage.GetRootLayer().Save()

@@ -1,0 +1,208 @@
+"""SPZ, the format of Niantic and Adobe: version 4 is written, versions 2 to 4 are read.
+
+Published in the README of github.com/nianticlabs/spz. Version 4 is a header of 32 bytes, a table of streams, and a zstd
+stream for each attribute: positions (24-bit fixed point), opacities, colours, logarithms of scales (steps of 1/16 from
+-10), rotations (the index of the largest component in 2 bits, the others in 10: sign and size) and SH coefficients
+(range +-1, all 8 bits used), one splat after the other. Axes are those of OpenGL: x right, y up, z back.
+"""
+
+import gzip
+import io
+import os
+import struct
+import sys
+import zlib
+from dataclasses import replace
+from types import ModuleType
+from typing import NamedTuple
+
+import numpy as np
+
+from splatting.exports.packing import morton_order, smallest_three, spread, to_bytes, whole_quaternions
+from splatting.exports.splats import Splats, half_turned, logits, opacities, selected
+from splatting.files.packed import check_packed_rows
+from utils.system_utils import UserError, atomic_write
+
+MAGIC = 0x5053474E
+_HEADER = struct.Struct("<IIIBBBB")  # magic, version, splats, SH degree, bits of a fraction, flags, streams
+_HEADER_END = struct.Struct("<I12x")  # of version 4: where the table of streams begins
+_ANTIALIASED = 1
+_COLOR = 0.15  # colours are 0.5 + 0.15 SH0, so that those beyond [0, 1] fit
+_MOST_BITS = 20  # of a position's fraction
+_LARGEST_POSITION = (1 << 23) - 1
+_FARTHEST = 1000.0  # usual distances from the middle; no move within the model shows how far it is beyond
+_LEVEL = 3  # of zstd; level 19 takes 70 times as long and saves 2 %
+
+
+class _Header(NamedTuple):
+    """The fields that all versions have, after the magic number."""
+
+    version: int
+    count: int
+    degree: int
+    bits: int
+    flags: int
+    streams: int
+
+
+def write_spz(path: str | os.PathLike, splats: Splats) -> None:
+    """Write version 4, whole or not at all. UserError without the package zstandard."""
+    zstandard = find_zstandard(path)
+    splats = _drawn_in(splats)
+    splats = half_turned(selected(splats, morton_order(splats.means)))
+    farthest = float(np.abs(splats.means).max(initial=0))
+    if farthest > _LARGEST_POSITION:
+        raise UserError(f"{path} can hold positions to {_LARGEST_POSITION:,}, not {farthest:.3g}; end --to with .ply")
+    bits = int(np.clip(np.floor(np.log2(_LARGEST_POSITION / max(farthest, 1e-30))), 0, _MOST_BITS))
+    tables = [
+        _fixed_point(splats.means, bits),
+        to_bytes(opacities(splats) * 255),
+        to_bytes((splats.sh[:, 0].astype(np.float64) * _COLOR + 0.5) * 255),
+        to_bytes((splats.log_scales.astype(np.float64) + 10) * 16),
+        _rotation_codes(splats.rotations),
+    ]
+    if splats.sh_degree:  # readers refuse an empty stream
+        tables.append(to_bytes(splats.sh[:, 1:] * 128 + 128))
+    streams = [table.tobytes() for table in tables]
+    compressor = zstandard.ZstdCompressor(level=_LEVEL)
+    packed = [compressor.compress(stream) for stream in streams]
+    table = b"".join(struct.pack("<QQ", len(p), len(s)) for p, s in zip(packed, streams, strict=True))
+    flags = _ANTIALIASED if splats.antialiasing else 0
+    header = _HEADER.pack(MAGIC, 4, len(splats), splats.sh_degree, bits, flags, len(streams))
+    header += _HEADER_END.pack(_HEADER.size + _HEADER_END.size)
+    with atomic_write(path) as temporary:
+        temporary.write_bytes(header + table + b"".join(packed))
+
+
+def _drawn_in(splats: Splats) -> Splats:
+    """The splats, of which the farthest are nearer and smaller, so that they look the same from the middle.
+
+    All positions have the same steps, which one splat far away would make coarse. It is told which splats change.
+    """
+    middle, distances, usual = spread(splats.means)
+    limit = _FARTHEST * usual
+    far = distances > limit
+    if not far.any():
+        return splats
+    print(
+        f"warning: {far.sum()} of {len(splats)} Gaussians lie more than {limit:.3g} from the middle of the model; SPZ "
+        "would round all others for them, so they are written at that distance, and smaller; --crop leaves them out",
+        file=sys.stderr,
+    )
+    means, log_scales = splats.means.copy(), splats.log_scales.copy()
+    part = (limit / distances[far])[:, None]
+    means[far] = middle + (means[far] - middle) * part
+    log_scales[far] += np.log(part)
+    return replace(splats, means=means, log_scales=log_scales)
+
+
+def find_zstandard(path: str | os.PathLike) -> ModuleType:
+    """The package that a file of this name needs. UserError without it."""
+    try:
+        import zstandard
+    except ImportError as error:
+        raise UserError(f"{path} needs the package zstandard; install it with pip install '.[export]'") from error
+    return zstandard
+
+
+def _fixed_point(means: np.ndarray, bits: int) -> np.ndarray:
+    fixed = np.clip(np.round(means.astype(np.float64) * 2**bits), -_LARGEST_POSITION, _LARGEST_POSITION)
+    return fixed.astype("<i4").view(np.uint8).reshape(-1, 3, 4)[:, :, :3]
+
+
+def _rotation_codes(wxyz: np.ndarray) -> np.ndarray:
+    largest, three = smallest_three(np.roll(wxyz, -1, axis=1))
+    size = np.floor(np.abs(three) * np.sqrt(2) * 511 + 0.5).clip(0, 511).astype(np.uint32)
+    first, second, third = (size | (three < 0).astype(np.uint32) << 9).T
+    return (largest.astype(np.uint32) << 30 | first << 20 | second << 10 | third).astype("<u4")
+
+
+def read_spz(path: str | os.PathLike) -> Splats:
+    """Read a file of this format; SH bands above degree 3 are left out, with a warning. UserError if it is damaged."""
+    with open(path, "rb") as file:
+        content = file.read()
+    try:
+        return _read_gzip(content) if content[:2] == b"\x1f\x8b" else _read_zstd(content, path)
+    except (ValueError, struct.error, EOFError, OSError, zlib.error, IndexError, MemoryError) as error:
+        raise UserError(f"{path} is not a complete SPZ file ({error}); save or download it again") from error
+
+
+def _header(content: bytes, versions: tuple[int, ...], size: int) -> _Header:
+    """The header at the start of unpacked bytes. size: bytes of the file. ValueError unless it can be what it says."""
+    magic, *fields = _HEADER.unpack_from(content)
+    header = _Header(*fields)
+    if magic != MAGIC or header.version not in versions:
+        known = f"no version that this program knows: {header.version}"
+        raise ValueError(known if magic == MAGIC else "no magic number")
+    if header.degree > 4:
+        raise ValueError(f"SH bands of degree {header.degree}, of at most 4")
+    check_packed_rows(header.count, size)
+    return header
+
+
+def _widths(header: _Header) -> list[int]:
+    """Bytes a splat of each stream: positions, opacities, colours, scales, rotations, SH bands."""
+    return [9, 1, 3, 3, 3 if header.version == 2 else 4, 3 * ((header.degree + 1) ** 2 - 1)]
+
+
+def _read_zstd(content: bytes, path: str | os.PathLike) -> Splats:
+    header = _header(content, (4,), len(content))
+    (table,) = _HEADER_END.unpack_from(content, _HEADER.size)
+    zstandard = find_zstandard(path)
+    begin, parts = table + 16 * header.streams, []
+    for index, width in enumerate(_widths(header)):
+        size = width * header.count
+        packed, whole = struct.unpack_from("<QQ", content, table + 16 * index) if index < header.streams else (0, 0)
+        if whole != size:
+            raise ValueError(f"stream {index} promises {whole} bytes instead of {size}")
+        try:
+            part = content[begin : begin + packed]
+            if size and zstandard.frame_content_size(part) not in (-1, size):  # memory is taken for what it says
+                raise ValueError(f"stream {index} does not have its {size} bytes")
+            parts.append(zstandard.ZstdDecompressor().decompress(part, max_output_size=size) if size else b"")
+        except zstandard.ZstdError as error:
+            raise ValueError(f"stream {index}: {error}") from error
+        begin += packed
+    return _splats(parts, header)
+
+
+def _read_gzip(content: bytes) -> Splats:
+    stream = gzip.GzipFile(fileobj=io.BytesIO(content))
+    header = _header(stream.read(_HEADER.size), (2, 3), len(content))
+    parts = [
+        stream.read(width * header.count) for width in _widths(header)
+    ]  # no more than that, however much is packed
+    stream.read(1)  # at the end it checks the sum
+    return _splats(parts, header)
+
+
+def _splats(parts: list[bytes], header: _Header) -> Splats:
+    count, degree = header.count, header.degree
+    tables = [
+        np.frombuffer(part, np.uint8).reshape(count, width) for part, width in zip(parts, _widths(header), strict=True)
+    ]
+    positions, alpha, color, scales, rotations, rest = tables
+    rest = rest.reshape(count, (degree + 1) ** 2 - 1, 3)[:, :15].astype(np.float32)
+    rest /= 128  # in place, as these are most of the memory
+    rest -= 1
+    if degree > 3:
+        print(f"warning: SH bands of degree {degree} are left out; models have at most degree 3", file=sys.stderr)
+    wide = np.zeros((count, 3, 4), np.uint8)
+    wide[:, :, 1:] = positions.reshape(count, 3, 3)
+    means = (wide.view("<i4")[:, :, 0] >> 8) / 2.0**header.bits
+    base = (color / 255.0 - 0.5) / _COLOR
+    sh = np.concatenate([base.astype(np.float32)[:, None], rest], axis=1)
+    values = (means, scales / 16.0 - 10, _read_rotations(rotations), logits(alpha[:, 0] / 255.0, 1 / 255), sh)
+    values = (x.astype(np.float32, copy=False) for x in values)
+    return half_turned(Splats(*values, bool(header.flags & _ANTIALIASED)))
+
+
+def _read_rotations(table: np.ndarray) -> np.ndarray:
+    """Quaternions wxyz of 4 bytes each, or of 3: x, y and z of the version before 3."""
+    if table.shape[1] == 3:
+        three = table / 127.5 - 1
+        return np.concatenate([np.sqrt(np.clip(1 - (three**2).sum(axis=1, keepdims=True), 0, 1)), three], axis=1)
+    codes = np.ascontiguousarray(table).view("<u4").reshape(-1)
+    each = np.stack([codes >> np.uint32(20), codes >> np.uint32(10), codes], axis=1) & np.uint32(1023)
+    three = np.where(each & 512, -1.0, 1.0) * (each & 511) / 511 / np.sqrt(2)
+    return np.roll(whole_quaternions((codes >> np.uint32(30)).astype(np.int64), three), 1, axis=1)

@@ -1,0 +1,86 @@
+"""Maker of exports/viewer/: the viewer that HTML exports carry, from its npm package.
+
+python -m splatting.exports.vendor
+
+Needs Node, npm and the network, and is run only when the viewer's version changes: vendored.json, in that folder, names
+package, version, integrity and minifier, and the SHA-256 of each file, unpacked. The same record gives the same code on
+any machine; other code is an error, and nothing is written.
+"""
+
+import base64
+import gzip
+import hashlib
+import json
+import shutil
+import subprocess
+import tarfile
+from argparse import ArgumentParser
+from collections.abc import Sequence
+from pathlib import Path
+
+from utils.system_utils import UserError, atomic_write, run_cli, temporary_folder
+
+ROOT = Path(__file__).resolve().parents[2]
+FOLDER = Path(__file__).resolve().parent / "viewer"
+RECORD = FOLDER / "vendored.json"
+VIEWER = "viewer.js.gz"  # packed as each page carries it, a quarter of its size
+UNPACKED = VIEWER.removesuffix(".gz")
+_SOURCES = {UNPACKED: "public/index.js", "viewer.css": "public/index.css"}  # our name: the package's, to be minified
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Make the files anew."""
+    description = f"Make {FOLDER.relative_to(ROOT)}/ from the npm package and minifier that its vendored.json names."
+    ArgumentParser(prog="python -m splatting.exports.vendor", description=description).parse_args(argv)
+    record = json.loads(RECORD.read_text(encoding="utf-8"))
+    if not shutil.which("npm"):
+        raise UserError("npm is not installed; install Node 20 or later, which brings it")
+    with temporary_folder() as folder:
+        package = _unpacked(record, folder)
+        minifier = _minifier(record, folder)
+        files = {"LICENSE": (package / "LICENSE").read_bytes()}
+        for name, source in _SOURCES.items():
+            files[name] = _output([minifier, package / source, "--minify", "--charset=utf8", *_banner(name, record)])
+    digests = {name: hashlib.sha256(content).hexdigest() for name, content in sorted(files.items())}
+    if digests != record["sha256"]:
+        raise UserError(f"the files differ from those of {RECORD}; after a look at them, enter {json.dumps(digests)}")
+    files[VIEWER] = gzip.compress(files.pop(UNPACKED), mtime=0)
+    for name, content in files.items():
+        with atomic_write(FOLDER / name) as written:
+            written.write_bytes(content)
+        print(f"{FOLDER / name}: {len(content):,} bytes")
+
+
+def _unpacked(record: dict, folder: Path) -> Path:
+    """The package's folder. UserError if its archive is not the recorded one."""
+    wanted = f"{record['package']}@{record['version']}"
+    archive = folder / _output(["npm", "pack", "--silent", wanted], folder).decode().split()[-1]
+    digest = "sha512-" + base64.b64encode(hashlib.sha512(archive.read_bytes()).digest()).decode()
+    if digest != record["integrity"]:
+        raise UserError(f"npm gave another archive of {wanted} than {RECORD} names: its integrity is {digest}")
+    with tarfile.open(archive) as tar:
+        tar.extractall(folder, filter="data")
+    return folder / "package"
+
+
+def _minifier(record: dict, folder: Path) -> Path:
+    install = ["npm", "install", "--silent", "--ignore-scripts", "--no-save", "--prefix", folder]
+    _output([*install, f"esbuild@{record['esbuild']}"])
+    return folder / "node_modules" / ".bin" / "esbuild"
+
+
+def _banner(name: str, record: dict) -> list[str]:
+    """The words that put name and licence into the file's first line."""
+    kind = name.rpartition(".")[2]
+    return [f"--banner:{kind}=/*! {record['package']} {record['version']}, {record['license']}: see LICENSE */"]
+
+
+def _output(command: list[str | Path], folder: Path | None = None) -> bytes:
+    done = subprocess.run(command, cwd=folder, capture_output=True)
+    if done.returncode:
+        raise UserError(f"{' '.join(map(str, command))} failed: {done.stderr.decode(errors='replace').strip()}")
+    return done.stdout
+
+
+if __name__ == "__main__":
+    run_cli(main)

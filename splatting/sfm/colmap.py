@@ -1,0 +1,221 @@
+"""COLMAP as convert.py uses it: the commands of its long steps, and queries of its database, also while it writes.
+
+The commands are those of pycolmap (worker.py), or those of a COLMAP program that the user names.
+"""
+
+import contextlib
+import json
+import sqlite3
+import subprocess
+import sys
+from collections import Counter
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from splatting.sfm.layout import Layout
+from utils.system_utils import UserError, atomic_write
+
+Command = list[str]
+TOLERANCE = 1e-6  # of the cost in global bundle adjustment, as in the reference: much faster, hardly worse
+# COLMAP's lens models that can be undistorted to a pinhole image.
+LENS_MODELS = (
+    *("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "FOV"),
+    *("SIMPLE_DIVISION", "DIVISION", "SIMPLE_FISHEYE", "FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"),
+    *("OPENCV_FISHEYE", "THIN_PRISM_FISHEYE", "RAD_TAN_THIN_PRISM_FISHEYE", "EUCM"),
+)
+_WORKER = Path(__file__).with_name("worker.py")
+_PAIR = 2147483647  # COLMAP: pair_id = smaller image_id * this + larger image_id
+
+
+@dataclass(frozen=True)
+class Settings:
+    """The user's choices. camera: COLMAP's name of the lens model to fit."""
+
+    camera: str
+    max_num_features: int
+    matcher: str
+    mapper: str
+    no_gpu: bool
+
+
+def _mapped(layout: Layout, settings: Settings) -> Path:
+    return layout.calibrated if settings.mapper == "global" else layout.database
+
+
+def worker_command(layout: Layout, step: str, **job: Any) -> Command:
+    """Return the command for one step of worker.py. The job is passed in a file, since there can be many photos."""
+    path = layout.work / "jobs" / f"{step}.json"
+    with atomic_write(path) as temporary:
+        temporary.write_text(json.dumps({"step": step, **job}), encoding="utf-8")
+    return [sys.executable, str(_WORKER), str(path)]
+
+
+class Pycolmap:
+    """The pycolmap package, which the project requires anyway.
+
+    identity: program and version; the results of another program are not resumed. groups: lists of photo names; the
+    photos of a list have one size and share a camera.
+    """
+
+    def __init__(self) -> None:
+        self.identity = f"pycolmap {version('pycolmap')}"
+
+    def features(self, layout: Layout, settings: Settings, groups: list[list[str]], masks: bool) -> list[Command]:
+        job = {"groups": groups, "masks": str(layout.masks) if masks else ""}
+        job |= {"camera": settings.camera, "max_num_features": settings.max_num_features}
+        return self._commands(layout, settings, "features", **job)
+
+    def matching(self, layout: Layout, settings: Settings) -> list[Command]:
+        return self._commands(layout, settings, "matching", matcher=settings.matcher)
+
+    def mapping(self, layout: Layout, settings: Settings) -> list[Command]:
+        job = {"models": str(layout.models), "mapper": settings.mapper, "tolerance": TOLERANCE}
+        return self._commands(layout, settings, "mapping", database=str(_mapped(layout, settings)), **job)
+
+    @staticmethod
+    def _commands(layout: Layout, settings: Settings, step: str, **job: Any) -> list[Command]:
+        common = {"database": str(layout.database), "photos": str(layout.photos), "no_gpu": settings.no_gpu}
+        return [worker_command(layout, step, **{**common, **job})]
+
+
+class Program:
+    """A COLMAP program, with the methods of Pycolmap.
+
+    Before any step runs, its own help gives the names of options that differ between versions.
+    UserError if it cannot be run, is not COLMAP, or lacks a command that the settings need.
+    """
+
+    def __init__(self, executable: str, settings: Settings) -> None:
+        self._executable = executable
+        named = [line for line in (self._output("help") or "").splitlines() if line.startswith("COLMAP")]
+        if not named:
+            raise UserError(
+                f"{executable} does not answer `help` as COLMAP does; pass the path of COLMAP as --colmap_executable, "
+                "or omit the option to use pycolmap"
+            )
+        self.identity = named[0]
+        self._matcher = f"{settings.matcher}_matcher"
+        switch = "0" if settings.no_gpu else "1"
+        # COLMAP 3.12 renamed these options when it got features other than SIFT.
+        names = "--FeatureExtraction.use_gpu", "--SiftExtraction.use_gpu"
+        self._gpu_for_features = [self._known("feature_extractor", *names), switch]
+        names = "--FeatureMatching.use_gpu", "--SiftMatching.use_gpu"
+        self._gpu_for_matching = [self._known(self._matcher, *names), switch]
+        commands = ("view_graph_calibrator", "global_mapper") if settings.mapper == "global" else ()
+        if any(self._output(command, "-h") is None for command in commands):
+            raise UserError(
+                f"{executable} ({self.identity}) has no global_mapper; use --mapper incremental, or omit "
+                "--colmap_executable to use pycolmap's global mapper"
+            )
+
+    def features(self, layout: Layout, settings: Settings, groups: list[list[str]], masks: bool) -> list[Command]:
+        commands = []
+        for number, names in enumerate(groups):
+            listed = layout.work / "jobs" / f"photos_{number}.txt"
+            with atomic_write(listed) as temporary:
+                temporary.write_text("".join(f"{name}\n" for name in names), encoding="utf-8")
+            command = [
+                *self._start("feature_extractor", layout.database),
+                *("--image_path", str(layout.photos)),
+                *("--image_list_path", str(listed)),
+                *("--ImageReader.camera_model", settings.camera),
+                *("--ImageReader.single_camera", "1"),
+                *("--SiftExtraction.max_num_features", str(settings.max_num_features)),
+            ]
+            command += ["--ImageReader.mask_path", str(layout.masks)] if masks else []
+            commands.append(command + self._gpu_for_features)
+        return commands
+
+    def matching(self, layout: Layout, settings: Settings) -> list[Command]:
+        return [self._start(self._matcher, layout.database) + self._gpu_for_matching]
+
+    def mapping(self, layout: Layout, settings: Settings) -> list[Command]:
+        layout.models.mkdir(parents=True)
+        paths = ["--image_path", str(layout.photos), "--output_path", str(layout.models)]
+        database = _mapped(layout, settings)
+        if settings.mapper == "global":
+            calibrate = self._start("view_graph_calibrator", database)
+            return [calibrate, [*self._start("global_mapper", database), *paths]]
+        return [[*self._start("mapper", database), *paths, "--Mapper.ba_global_function_tolerance", str(TOLERANCE)]]
+
+    def _start(self, name: str, database: Path) -> Command:
+        return [self._executable, name, "--database_path", str(database)]
+
+    def _known(self, name: str, *options: str) -> str:
+        """Return the first of the options that the help of a command lists. UserError if it lists none."""
+        text = self._output(name, "-h") or ""
+        for option in options:
+            if option in text:
+                return option
+        raise UserError(
+            f"`{self._executable} {name} -h` lists neither {' nor '.join(options)}, so this version of COLMAP is not "
+            "supported; omit --colmap_executable to use pycolmap"
+        )
+
+    def _output(self, *arguments: str) -> str | None:
+        """Return the program's output; None if it fails."""
+        command = [self._executable, *arguments]
+        try:
+            done = subprocess.run(command, capture_output=True, text=True, errors="replace", timeout=60)
+        except (OSError, subprocess.TimeoutExpired) as error:
+            raise UserError(
+                f"cannot run --colmap_executable {self._executable} ({error}); pass its full path, or omit the option "
+                "to use pycolmap"
+            ) from error
+        return done.stdout + done.stderr if done.returncode == 0 else None
+
+
+Backend = Pycolmap | Program
+
+
+def count_rows(database: Path, table: str) -> int:
+    """Count the rows of a table; 0 while it does not exist or is locked."""
+    rows = _query(database, f"SELECT COUNT(*) FROM {table}")
+    return rows[0][0] if rows else 0
+
+
+def most_features(database: Path) -> int:
+    """Return the largest number of features of a photo."""
+    rows = _query(database, "SELECT MAX(rows) FROM keypoints")
+    return (rows[0][0] or 0) if rows else 0
+
+
+def forget_matches(database: Path) -> None:
+    """Empty the tables that matching fills; keep the features."""
+    if not database.is_file():
+        return
+    # A database that was interrupted before it had tables has no matches.
+    with contextlib.suppress(sqlite3.OperationalError), contextlib.closing(sqlite3.connect(database)) as connection:
+        connection.execute("DELETE FROM matches")
+        connection.execute("DELETE FROM two_view_geometries")
+        connection.commit()
+
+
+def copy_database(database: Path, target: Path) -> None:
+    """Copy a database, including changes that are still in its log."""
+    target.unlink(missing_ok=True)
+    with contextlib.closing(sqlite3.connect(database)) as source, contextlib.closing(sqlite3.connect(target)) as copy:
+        source.backup(copy)
+
+
+def partners(database: Path) -> dict[str, int]:
+    """Count, for every photo, the other photos with which its matches passed the geometric check."""
+    names = dict(_query(database, "SELECT image_id, name FROM images"))
+    counts = Counter({name: 0 for name in names.values()})
+    for (pair,) in _query(database, "SELECT pair_id FROM two_view_geometries WHERE rows > 0"):
+        for image in divmod(pair, _PAIR):
+            if image in names:
+                counts[names[image]] += 1
+    return dict(counts)
+
+
+def _query(database: Path, statement: str) -> list[tuple]:
+    if not database.is_file():
+        return []
+    with contextlib.suppress(sqlite3.Error):
+        connection = sqlite3.connect(f"{database.absolute().as_uri()}?mode=ro", uri=True, timeout=1)
+        with contextlib.closing(connection):
+            return connection.execute(statement).fetchall()
+    return []

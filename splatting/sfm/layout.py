@@ -1,0 +1,120 @@
+"""Paths of a conversion, and checks of the folder that is given, with messages that name the fix."""
+
+from pathlib import Path
+
+from splatting.files.image_files import SUFFIXES
+from utils.system_utils import UserError
+
+# Frequent formats of photos that neither Pillow alone nor COLMAP can read.
+_FOREIGN = (".heic", ".heif", ".avif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".gif")
+_VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mts")
+FEWEST = 3
+
+
+class Layout:
+    """Paths of one conversion: `input`, the photos, which are only read; `work`, intermediate results; the scene."""
+
+    def __init__(self, scene: Path) -> None:
+        self.scene = scene
+        self.input, self.images, self.sparse = scene / "input", scene / "images", scene / "sparse"
+        self.report = scene / "convert_report.json"
+        self.work = work = scene / "distorted"
+        self.photos = work / "photos"  # for COLMAP: upright, in formats that it reads
+        self.masks, self.undistorted = work / "masks", work / "undistorted"
+        self.models = work / "sparse"  # one sub-folder per model of the mapper: 0, 1, ...
+        self.database = work / "database.db"
+        self.calibrated = work / "calibrated.db"  # a copy, into which global mapping writes its focal lengths
+        self.log, self.stages = work / "colmap.log", work / "stages.json"
+
+    def resized(self, factor: int) -> Path:
+        return self.scene / f"images_{factor}"
+
+
+def scene_folder(given: str, made: bool = False) -> Path:
+    """Return the absolute path of the folder given as -s. UserError if it is none; the message names usual mistakes.
+
+    made: the folder may be missing, since a video's frames will make it.
+    """
+    bare = given.strip("'\"")
+    if bare != given and not Path(given).exists() and Path(bare).exists():
+        raise UserError(f"the path given as -s contains quotes: {given}; pass {bare}, quoted only once for the shell")
+    folder = Path(given)
+    if folder.is_file():
+        hint = "pass its folder as -s and the video as --video" if folder.suffix.lower() in _VIDEOS else ""
+        raise UserError(
+            f"{given} is a file; {hint or 'pass the folder that contains the folder input with the photos as -s'}"
+        )
+    if not given or not (made or folder.is_dir()):
+        raise UserError(f"no folder {given}; make it, put the photos into a folder input in it, and pass it as -s")
+    return folder.absolute()
+
+
+def find_photos(layout: Layout) -> list[str]:
+    """List the photos below `input`, with its sub-folders, sorted.
+
+    UserError if there are too few, if some have a format that cannot be read, or if they are in another folder.
+    """
+    if not layout.input.is_dir():
+        raise UserError(_no_input(layout))
+    files = [path for path in sorted(layout.input.rglob("*")) if path.is_file()]
+    names = picture_names(layout.input)
+    foreign = [path for path in files if path.suffix.lower() in _FOREIGN]
+    if foreign:
+        raise UserError(
+            f"{len(foreign)} files in {layout.input} have a format that cannot be read, the first is "
+            f"{foreign[0].name}; convert them to JPEG or PNG, or remove them"
+        )
+    if len(names) < FEWEST:
+        videos = [path.name for path in files if path.suffix.lower() in _VIDEOS]
+        hint = f"; move {videos[0]} elsewhere and pass it as --video" if videos else ""
+        raise UserError(
+            f"{len(names)} photos ({', '.join(SUFFIXES)}) in {layout.input}; at least {FEWEST} are needed, and 20 to "
+            f"200 with much overlap are usual; add more{hint}"
+        )
+    return names
+
+
+def picture_names(folder: Path) -> list[str]:
+    """List the photos below a folder, without hidden files, by the names that COLMAP gives them, sorted."""
+    return sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if _is_picture(path))
+
+
+def _no_input(layout: Layout) -> str:
+    scene = layout.scene
+    if scene.name == "input":
+        return f"{scene} is the folder of the photos itself; pass its parent folder as -s: {scene.parent}"
+    beside = sum(map(_is_picture, scene.iterdir()))
+    if beside:
+        return (
+            f"no folder input in {scene}, but {beside} photos directly in it; make {layout.input}, move them there, "
+            f"and run again with -s {scene}"
+        )
+    if (scene / "images").is_dir() and not (scene / "sparse").is_dir():
+        return f"no folder input in {scene}; rename its folder images to input"
+    return f"no folder input in {scene}; make it and put the photos there, or pass a video as --video"
+
+
+def _is_picture(path: Path) -> bool:
+    return path.suffix.lower() in SUFFIXES and not path.name.startswith(".") and path.is_file()
+
+
+def refuse_foreign_results(layout: Layout, scene_made: bool, work_made: bool, skip_matching: bool) -> None:
+    """Raise UserError if writing would overwrite a scene or a COLMAP project that convert.py did not make.
+
+    scene_made, work_made: whether an earlier run here began to write the scene, or into the work folder.
+    """
+    there = [] if scene_made else [path.name for path in (layout.images, layout.sparse) if path.exists()]
+    ours = (
+        work_made
+        or skip_matching
+        or not layout.work.exists()
+        or {path.name for path in layout.work.iterdir()} <= {layout.stages.name}
+    )
+    if not ours:
+        there.append(layout.work.name)
+    if there:
+        raise UserError(
+            f"{layout.scene} already has {' and '.join(there)}, which convert.py did not make and will not overwrite; "
+            "move them away, or convert in another folder"
+            + ("; --skip_matching uses the model in distorted/sparse" if layout.models.is_dir() and not ours else "")
+        )

@@ -1,0 +1,117 @@
+"""Report of a conversion: the photos that were placed, and advice if the model is weak."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from splatting.files.json_files import read_json, write_json
+from splatting.files.listing import some
+from utils.system_utils import UserError
+
+FEWEST_POINTS = 1000  # with fewer, density control has to find the scene by itself
+SHORT_TRACKS = 3.0  # views per point; with fewer, most points depend on a single pair
+LARGE_ERROR = 1.5  # pixels; a good model of sharp photos has 0.3 to 1
+
+
+class Model(NamedTuple):
+    """One model of the mapper. registered: names of photos; track_length: mean views per point; error: mean, pixels."""
+
+    folder: str
+    registered: list[str]
+    points: int
+    track_length: float
+    error: float
+    cameras: list[dict[str, Any]]
+
+
+def read_survey(path: Path) -> list[Model]:
+    """Read the models that worker.py's survey found, sorted by photos, then points, the largest first."""
+    models = [Model(**entry) for entry in read_json(path)]
+    return sorted(models, key=lambda model: (-len(model.registered), -model.points, model.folder))
+
+
+def refuse_nothing(models: Sequence[Model], photos: Sequence[str], partners: dict[str, int], matcher: str) -> None:
+    """Raise UserError with the likeliest reason if no model has a registered photo."""
+    if models and models[0].registered:
+        return
+    matched = sum(count > 0 for count in partners.values())
+    if matched < 2:
+        reason = "no two of them show the same things sharply enough"
+    else:
+        reason = f"{matched} of them match another photo, but no pair has enough parallax or matches to start from"
+    remedy = "take sharp, evenly lit photos that overlap by 60 to 80 %, from places some steps apart"
+    if matcher == "sequential":
+        remedy += ", or use --matcher exhaustive"
+    raise UserError(f"none of {len(photos)} photos could be placed: {reason}; {remedy}")
+
+
+def advice(
+    models: Sequence[Model], photos: Sequence[str], partners: dict[str, int], matcher: str, at_limit: int = 0
+) -> list[str]:
+    """Return one line for each weakness of the chosen model, models[0], that training will show.
+
+    at_limit: --max_num_features if a photo reached it, else 0.
+    """
+    chosen = models[0]
+    out = sorted(set(photos) - set(chosen.registered))
+    lines = []
+    if out:
+        lonely = sum(partners.get(name, 0) == 0 for name in out)
+        text = f"{len(out)} of {len(photos)} photos were left out ({some(out)})"
+        if lonely:
+            text += f", and {lonely} of them match no other photo"
+        remedy = "take more photos between them and their neighbours, or remove them if they are blurred"
+        if matcher == "sequential":
+            remedy += "; --matcher exhaustive compares every pair"
+        lines.append(f"{text}; {remedy}")
+    others = [len(model.registered) for model in models[1:] if set(model.registered) - set(chosen.registered)]
+    if others:
+        sizes = ", ".join(map(str, others))
+        lines.append(
+            f"the photos form {len(others) + 1} unconnected parts ({len(chosen.registered)} photos are used, "
+            f"the other parts have {sizes}); take photos that lead from one part to the next, or try --mapper global"
+        )
+    if chosen.points < FEWEST_POINTS:
+        text = f"only {chosen.points} points; a good start needs {FEWEST_POINTS}; use larger or more photos"
+        lines.append(text + (f", or --max_num_features {2 * at_limit}" if at_limit else ""))
+    if chosen.track_length < SHORT_TRACKS:
+        lines.append(
+            f"a point is in {chosen.track_length:.1f} photos on average, so the photos overlap little; take more "
+            "photos, each with 60 to 80 % of the one before"
+        )
+    if chosen.error > LARGE_ERROR:
+        lines.append(
+            f"the mean reprojection error is {chosen.error:.1f} pixels; if objects moved, mask them (--mask_path); if "
+            "the photos come from several lenses, convert those of each lens separately; for a fisheye lens use "
+            "--camera OPENCV_FISHEYE"
+        )
+    return lines
+
+
+def summary(report: dict[str, Any]) -> str:
+    """Summarise the contents of convert_report.json in one line."""
+    return (
+        f"{report['registered']} of {report['photos']} photos placed; {report['points']} points, each in "
+        f"{report['mean_track_length']:.1f} photos, mean error {report['mean_error_px']:.2f} pixels"
+    )
+
+
+def write_report(
+    path: Path, models: Sequence[Model], photos: Sequence[str], partners: dict[str, int], lines: list[str], **made: Any
+) -> None:
+    """Write convert_report.json: photos placed and left out, models, cameras, settings (`made`), advice (`lines`)."""
+    chosen = models[0]
+    content = {
+        **made,
+        "advice": lines,
+        "cameras": chosen.cameras,
+        "left_out": {name: {"partners": partners.get(name, 0)} for name in set(photos) - set(chosen.registered)},
+        "mean_error_px": round(chosen.error, 4),
+        "mean_track_length": round(chosen.track_length, 4),
+        "model": chosen.folder,
+        "models": [{"folder": m.folder, "photos": len(m.registered), "points": m.points} for m in models],
+        "photos": len(photos),
+        "points": chosen.points,
+        "registered": len(chosen.registered),
+    }
+    write_json(path, content)

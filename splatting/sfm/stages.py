@@ -1,0 +1,260 @@
+"""Stages of a conversion, each with its inputs and the way to undo it, and the record of finished ones.
+
+A second run does only the rest.
+"""
+
+import contextlib
+import hashlib
+import json
+import re
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from splatting.files.json_files import read_json, write_json
+from splatting.sfm import colmap, photos, report
+from splatting.sfm.colmap import Backend, Settings, worker_command
+from splatting.sfm.layout import Layout, picture_names
+from splatting.sfm.programs import run_programs
+from utils.system_utils import UserError, mkdir_p
+
+FACTORS = (2, 4, 8)  # of --resize
+# Distances, in the order of names, of the pairs of COLMAP's sequential matching: 1 to 10, and 2^0 to 2^9.
+_NEIGHBOURS = sorted({*range(1, 11), *(2**k for k in range(10))})
+_REGISTERED = re.compile(rb"num_reg_frames=(\d+)|Registering image #\d+ \((\d+)\)")
+
+
+class Stage(NamedTuple):
+    """One step of a conversion.
+
+    made_from: JSON of everything that its result depends on, besides the earlier stages. reset: removes results that
+    become invalid when this or an earlier stage is done again. check: raises UserError for unusable inputs, before
+    anything is removed. resumable: `work` can resume an interrupted run with the same inputs, without a reset.
+    """
+
+    name: str
+    made_from: Any
+    reset: Callable[[], None]
+    work: Callable[[], None]
+    resumable: bool = False
+    check: Callable[[], None] = lambda: None
+
+
+class StageRecord:
+    """The file stages.json. It has, for each stage begun, a digest of its inputs and whether it was finished."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._record: dict[str, dict[str, Any]] = {}
+        if path.is_file():
+            try:
+                self._record = read_json(path)
+                _ = [(entry["done"], entry["made_from"]) for entry in self._record.values()]
+            except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+                message = f"{path} is damaged; remove the folder {path.parent} to convert from the beginning"
+                raise UserError(message) from error
+
+    def begun(self, name: str) -> bool:
+        """Whether this stage was ever begun in this folder."""
+        return name in self._record
+
+    def run(self, stages: list[Stage]) -> list[str]:
+        """Do the stages that are not done, in order; return the names of those that were done before.
+
+        The first stage whose inputs changed or that was never finished is done again, with all later ones.
+        """
+        digest, kept = "", []
+        for number, stage in enumerate(stages):
+            text = json.dumps([digest, stage.name, stage.made_from], sort_keys=True)
+            digest = hashlib.sha256(text.encode()).hexdigest()[:16]
+            before = self._record.get(stage.name, {})
+            same = before.get("made_from") == digest
+            if same and before["done"]:
+                kept.append(stage.name)
+                continue
+            stage.check()
+            for later in stages[number:]:
+                if later.name in self._record:
+                    self._record[later.name]["done"] = False  # but still begun: remaining files of it are ours
+            self._save()
+            # Reset backwards, so that the newest results go first.
+            for later in reversed(stages[number:]):
+                if later is not stage or not (same and stage.resumable):
+                    later.reset()
+            self._record[stage.name] = {"made_from": digest, "done": False}
+            self._save()
+            stage.work()
+            self._record[stage.name]["done"] = True
+            self._save()
+        return kept
+
+    def _save(self) -> None:
+        write_json(self._path, self._record)
+
+
+def video_stage(layout: Layout, video: Path, count: int) -> Stage:
+    """Make the stage that writes frames of a video into `input`."""
+
+    def reset() -> None:
+        for frame in layout.input.glob(photos.PATTERN):
+            frame.unlink()
+
+    def work() -> None:
+        mkdir_p(layout.input)
+        photos.extract_frames(video, layout.input, count)
+
+    return Stage("video", [_state(video), count], reset, work, check=photos.find_decoder)
+
+
+def photo_stage(layout: Layout, names: list[str], masks: Path | None) -> Stage:
+    """Make the stage that puts upright photos and masks into the work folder."""
+    made_from = [[name, _state(layout.input / name)] for name in names]
+    if masks:
+        made_from.append([[str(path), _state(path)] for path in sorted(masks.rglob("*")) if path.is_file()])
+
+    return Stage(
+        "photos",
+        made_from,
+        reset=lambda: _remove(layout.photos, layout.masks),
+        work=lambda: photos.prepare_photos(layout, names, masks),
+        check=lambda: photos.check_photos(layout, names, masks),
+    )
+
+
+def reconstruction_stages(layout: Layout, backend: Backend, settings: Settings, masks: bool) -> list[Stage]:
+    """Make the stages features, matching and mapping."""
+    hint = "" if settings.no_gpu else "; --no_gpu may help if the GPU or the display is the reason"
+
+    def features() -> None:
+        groups = photos.sizes(layout)
+        if len(groups) > 1:
+            listed = ", ".join(f"{w} x {h} ({len(names)})" for (w, h), names in groups.items())
+            print(f"photos have {len(groups)} sizes; each size gets its own camera: {listed}")
+        commands = backend.features(layout, settings, list(groups.values()), masks)
+        total = sum(map(len, groups.values()))
+        run_programs(
+            commands, layout.log, "Features", total, lambda: colmap.count_rows(layout.database, "keypoints"), hint
+        )
+
+    def forget_features() -> None:
+        for suffix in ("", "-wal", "-shm", "-journal"):
+            layout.database.with_name(layout.database.name + suffix).unlink(missing_ok=True)
+
+    def forget_models() -> None:
+        _remove(layout.models)
+        layout.calibrated.unlink(missing_ok=True)
+
+    def matching() -> None:
+        count = colmap.count_rows(layout.database, "images")
+        steps = range(1, count) if settings.matcher == "exhaustive" else _NEIGHBOURS
+        pairs = sum(max(count - step, 0) for step in steps)
+        done = lambda: colmap.count_rows(layout.database, "matches")  # noqa: E731
+        run_programs(backend.matching(layout, settings), layout.log, "Matching", pairs, done, hint)
+
+    def mapping() -> None:
+        total = colmap.count_rows(layout.database, "images")
+        done = _registered_since(layout.log)
+        if settings.mapper == "global":
+            colmap.copy_database(layout.database, layout.calibrated)
+        run_programs(backend.mapping(layout, settings), layout.log, "Mapping", total, done)
+
+    features_from = [backend.identity, settings.camera, settings.max_num_features, settings.no_gpu]
+    return [
+        Stage("features", features_from, forget_features, features),
+        Stage("matching", [settings.matcher], lambda: colmap.forget_matches(layout.database), matching, resumable=True),
+        Stage("mapping", [settings.mapper], forget_models, mapping),
+    ]
+
+
+def undistortion_stage(layout: Layout, settings: Settings, made_from: Any, **made: Any) -> Stage:
+    """Make the stage that undistorts the largest model to `images` and `sparse/0`, and writes the report.
+
+    made: settings to report. The scene of an earlier run stays until the new one is complete.
+    """
+
+    def work() -> None:
+        out = layout.work / "survey.json"
+        survey = worker_command(layout, "survey", models=str(layout.models), out=str(out))
+        run_programs([survey], layout.log, "Reading models", 1, out.exists)
+        models = report.read_survey(out)
+        root = layout.photos if layout.photos.is_dir() else layout.input
+        names = picture_names(root)
+        matches = colmap.partners(layout.database)
+        report.refuse_nothing(models, names, matches, settings.matcher)
+        chosen = models[0]
+        job = {"model": str(layout.models / chosen.folder), "photos": str(root), "out": str(layout.undistorted)}
+        command = worker_command(layout, "undistort", **job, jpeg_quality=photos.JPEG_QUALITY)
+        images = layout.undistorted / "images"
+        total = len(chosen.registered)
+        run_programs([command], layout.log, "Undistorting", total, lambda: sum(p.is_file() for p in images.rglob("*")))
+        missing = [name for name in chosen.registered if not (images / name).is_file()]
+        if missing:
+            raise UserError(
+                f"{len(missing)} photos of the model in {layout.models / chosen.folder} are not in {root}, the first "
+                f"is {missing[0]}; put them there under the names that they have in the model"
+            )
+        _remove(layout.images, layout.sparse, *map(layout.resized, FACTORS))
+        layout.report.unlink(missing_ok=True)
+        mkdir_p(layout.sparse)
+        (layout.undistorted / "sparse").rename(layout.sparse / "0")
+        images.rename(layout.images)
+        _remove(layout.undistorted)
+        limit = settings.max_num_features
+        at_limit = limit if colmap.most_features(layout.database) >= limit else 0
+        lines = report.advice(models, names, matches, settings.matcher, at_limit)
+        report.write_report(layout.report, models, names, matches, lines, **made)
+
+    return Stage("undistortion", made_from, lambda: _remove(layout.undistorted), work)
+
+
+def resize_stage(layout: Layout) -> Stage:
+    """Make the stage that writes smaller copies of the photos: images_2, images_4, images_8."""
+
+    def work() -> None:
+        for factor in FACTORS:
+            _remove(layout.resized(factor))
+            photos.resize_images(layout, factor)
+
+    # No reset: undistortion removes the copies when it replaces the photos that they were made from.
+    return Stage("resize", list(FACTORS), lambda: None, work)
+
+
+def model_state(layout: Layout) -> list[Any]:
+    """Describe the files of a model made elsewhere, so that changes show. UserError if there is no model."""
+    files = sorted(layout.models.rglob("*.*")) if layout.models.is_dir() else []
+    if not files:
+        raise UserError(f"--skip_matching needs a COLMAP model in {layout.models}; omit the option to make one")
+    return [[str(path.relative_to(layout.models)), *_state(path)] for path in files]
+
+
+def _registered_since(log: Path) -> Callable[[], int]:
+    """Return a function that counts the photos placed since now, according to the mapper's log."""
+    position = log.stat().st_size if log.is_file() else 0
+    most = 0
+
+    def count() -> int:
+        nonlocal position, most
+        with contextlib.suppress(OSError), open(log, "rb") as file:
+            file.seek(position)
+            text = file.read()
+            # Leave an incomplete line for the next call.
+            whole = text[: text.rfind(b"\n") + 1]
+            position += len(whole)
+            for match in _REGISTERED.finditer(whole):
+                most = max(most, int(match[1] or match[2]) + 1)
+        return most
+
+    return count
+
+
+def _state(path: Path) -> list[Any]:
+    """Describe a file, so that changes show."""
+    stat = path.stat()
+    return [path.name, stat.st_size, stat.st_mtime_ns]
+
+
+def _remove(*folders: Path) -> None:
+    for folder in folders:
+        if folder.is_dir():
+            shutil.rmtree(folder)

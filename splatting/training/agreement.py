@@ -1,0 +1,61 @@
+"""Agreement of the ranks of a training before it begins: on code, options, scene and checkpoint."""
+
+import argparse
+import hashlib
+import importlib.util
+from collections.abc import Sequence
+from pathlib import Path
+
+from scene.cameras import Camera
+from scene.scene import Scene
+from splatting.distributed.alike import refuse_differences
+from splatting.distributed.ranks import ranks
+from splatting.training.restart import what_stands
+
+_ROOT = Path(__file__).resolve().parents[2]
+_ROOMS = ("arguments", "gaussian_renderer", "splatting", "scene", "utils")
+_EXTENSIONS = ("diff_gaussian_rasterization", "simple_knn", "fused_ssim")
+
+
+def agree_on_options(args: argparse.Namespace) -> None:
+    """UserError if ranks have other code or options than rank 0."""
+    if not ranks().several:
+        return
+    refuse_differences(ranks().everyone(_code()), "give all ranks the same files", shown=False)
+    options = {f"--{name}": str(value) for name, value in vars(args).items()}
+    refuse_differences(ranks().everyone(options), "start all ranks with the same command")
+
+
+def agree_on_scene(scene: Scene, start: str | None) -> None:
+    """UserError if ranks have read another scene or checkpoint than rank 0.
+
+    From here on, a fault that cannot save the model names the checkpoint that stands (start: the one resumed).
+    """
+    if not ranks().several:
+        return
+    facts = {"the training views": _digest(scene.getTrainCameras()), "the test views": _digest(scene.getTestCameras())}
+    if start:
+        facts[start] = hashlib.sha256(Path(start).read_bytes()).hexdigest()
+    refuse_differences(ranks().everyone(facts), "give all ranks the same dataset", shown=False)
+    ranks().stands = lambda: what_stands(scene.model_path, start)
+
+
+def _code() -> dict[str, str]:
+    """Digests of the Python files that take part, by path, and of the extensions' binaries, by name."""
+    paths = [_ROOT / "train.py", *(path for room in _ROOMS for path in (_ROOT / room).rglob("*.py"))]
+    found = {str(path.relative_to(_ROOT)): path for path in sorted(paths)}
+    for name in _EXTENSIONS:
+        module = importlib.util.find_spec(name)
+        if module is not None and module.origin is not None:
+            found |= {f"{name}/{path.name}": path for path in sorted(Path(module.origin).parent.glob("*.so"))}
+    return {name: hashlib.sha256(path.read_bytes()).hexdigest() for name, path in found.items()}
+
+
+def _digest(cameras: Sequence[Camera]) -> str:
+    """Digest of names, sizes, matrices, and kinds of pictures."""
+    digest = hashlib.sha256()
+    for camera in cameras:
+        kinds = [getattr(source, "suffix", type(source).__name__) for source, _ in getattr(camera, "pictures", ())]
+        digest.update(f"{camera.image_name} {camera.image_width} {camera.image_height} {kinds}\n".encode())
+        digest.update(camera.full_proj_transform.cpu().numpy().tobytes())
+    return digest.hexdigest()

@@ -1,0 +1,62 @@
+"""The hooks by which a strategy of density control acts on a training (strategies: training/strategies)."""
+
+import math
+from typing import ClassVar
+
+from torch import Tensor
+
+from scene.gaussians.penalty import NO_PENALTY
+from splatting.training.schedule.pace import STEADY, Pace
+from splatting.training.step import Step
+
+
+class DensityControl:
+    """Decides how many Gaussians there are. A strategy overrides these hooks, in a file of its own.
+
+    fusable: whether it reads gradients only in iterations that `changes` names. All others are then taken by
+    training/steps/fused.py, which calls `observes` and `after_step` alone. It counts only where the class itself says
+    so: a subclass may want more. queues: whether `after_step` queues operators that change the model; it queues nothing
+    else, unless the iteration is one that `changes` names. most_gaussians: how many it lets there be, 0: any number.
+    penalty: a part of the loss besides the objective, of which steps add the gradients; no loss that is told has it.
+    absolute_gradients: whether the statistics take the lengths of absolute gradients (Ye et al. 2024); for the whole
+    run. clamps: whether the loss takes renders clamped to [0, 1], as the reference's does; then Gaussians brighter than
+    white cost nothing before a white background. ends: the iteration of the schedule from which it changes no rows.
+    pace: tells how far the schedule is in an iteration (training/schedule/pace.py). Rules that are windows of the
+    schedule ask it; rules that count steps take the iteration itself.
+    """
+
+    fusable: ClassVar[bool] = False
+    queues: ClassVar[bool] = False
+    most_gaussians = 0
+    penalty = NO_PENALTY
+    absolute_gradients = False
+    clamps: ClassVar[bool] = True
+    ends = math.inf
+    pace: Pace = STEADY
+
+    def started(self) -> None:
+        """Called before the first iteration of a model that was made from points, not read from a file."""
+
+    def changes(self, iteration: int) -> bool:
+        """Whether this iteration will change rows of the Gaussians besides their optimiser step.
+
+        If so, every loss so far is checked first, because a change cannot be undone.
+        """
+        return False
+
+    def observes(self, iteration: int) -> bool:
+        """Whether the view of this iteration counts in the Gaussians' statistics, where the step is fused."""
+        return False
+
+    def most_after(self, count: int, first: int, last: int) -> int:
+        """The most that `count` Gaussians can become from iteration `first` to `last`, both known to the pace.
+
+        `most_gaussians` where the strategy has no number to reach.
+        """
+        return self.most_gaussians
+
+    def after_backward(self, step: Step, package: dict[str, Tensor]) -> None:
+        """Called with the gradients computed, before the optimiser's step. package: the result of `render`."""
+
+    def after_step(self, step: Step) -> None:
+        """Called after the optimiser's step, so not in the last iteration, which takes none."""

@@ -1,0 +1,49 @@
+"""Options of train.py besides the three groups: when to score and save, where to begin, ranks, viewers."""
+
+import argparse
+from typing import Any
+
+from splatting.viewer.options import add_viewer_options
+
+
+# fmt: off
+def add_launch_options(parser: argparse.ArgumentParser) -> None:
+    """Add them to a parser. Iterations are those of the schedule (splatting/training/schedule)."""
+    add = parser.add_argument
+    flag, listed = {"action": "store_true"}, {"type": int, "nargs": "+", "metavar": "N"}
+    add("--parallel", choices=["tiles", "views"], default="tiles",
+        help="how processes that torchrun has started share the training, of which each has a part of the Gaussians; "
+             "tiles: each draws a part of every view, and the result is that of one process; views: each draws a view "
+             "of its own, so that an iteration shows several (default: tiles)")
+    add("--ip", type=str, default="127.0.0.1", help="address to listen at for the remote viewer (default: 127.0.0.1)")
+    add("--port", type=int, default=6009, help="port for the remote viewer, 0: any free one (default: 6009)")
+    add("--disable_viewer", **flag, help="open no port for the remote viewer")
+    add_viewer_options(parser)
+    add("--debug_from", type=int, default=-1, metavar="N", help="switch --debug on after iteration N (default: never)")
+    add("--detect_anomaly", **flag, help="let autograd name the operation that produced a NaN; slow")
+    add("--test_iterations", **listed, default=[7_000, 30_000],
+        help="iterations that score the test views, -1: none (default: 7000 30000, reference)")
+    add("--save_iterations", **listed, default=[7_000, 30_000],
+        help="iterations that save the model besides the last, -1: none (default: 7000 30000, reference)")
+    add("--checkpoint_iterations", **listed, default=[], help="iterations that save a checkpoint (default: none)")
+    add("--start_checkpoint", type=str, metavar="FILE", help="chkpntN.pth to resume (default: none)")
+    add("--no_curve", **flag,
+        help="write no error_vs_time.csv and .png, which cost up to 5 %% of the time, more in short runs "
+             "(default: write them with --eval)")
+    add("--plain_step", **flag,
+        help="take every step by autograd, slower and with the same result (default: the fast step)")
+    add("--quiet", **flag, help="print nothing but the progress bar and errors")
+# fmt: on
+
+
+def launch_options(**given: Any) -> argparse.Namespace:
+    """These options without a command line: those given by name, and the defaults of the others.
+
+    TypeError for other names.
+    """
+    parser = argparse.ArgumentParser()
+    add_launch_options(parser)
+    defaults = vars(parser.parse_args([]))
+    if unknown := sorted(given.keys() - defaults.keys()):
+        raise TypeError(f"train.py has no option --{unknown[0]}")
+    return argparse.Namespace(**defaults | given)

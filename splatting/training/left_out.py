@@ -1,0 +1,96 @@
+"""Lines at the end of a training: what the saved model and the memory leave out, and how much that saves."""
+
+from dataclasses import dataclass, field
+
+from gaussian_renderer.trimming import FEW, ITERATIONS_PER_VIEW, TOO_LONG, WORTH
+from splatting.evaluation.training_log import SHORT
+
+MB = 1e6
+
+
+@dataclass
+class LeftOut:
+    """Facts that `lines` reports and `model.json` keeps."""
+
+    gaussians: int  # trained
+    unseen: int  # of these, not saved, because nobody sees them
+    faint: int  # of these, of an opacity below 1/255
+    keep_unseen: bool
+    search: str  # how the search for the others ended (trimming.py)
+    views: int  # that it looked at, or would have
+    iterations: int  # of the training
+    max_sh_degree: int  # trained
+    sh_degree: int  # saved
+    cut_bounds: list[float]  # by degree: bound on a colour's change if all SH bands above the degree are cut
+    ply_bytes: int  # of all Gaussians trained, with all bands
+    ply_bytes_saved: int
+    seconds: float  # that the search took
+    picture_bytes: int  # of the training photos at training size: one byte per colour value
+    picture_bytes_in_files: int  # the same at the size of the files
+    test_change: dict[str, float] = field(default_factory=dict)  # `trimming.change_on_views`; {} without test views
+
+
+def lines(left_out: LeftOut) -> list[str]:
+    """One short line after a short training, else one each about Gaussians, SH bands and photos."""
+    if left_out.iterations <= SHORT:
+        return [_short(left_out)]
+    return [_gaussians(left_out) + _change(left_out.test_change), _bands(left_out), _pictures(left_out)]
+
+
+def _short(it: LeftOut) -> str:
+    line = f"Saved {it.gaussians - it.unseen} of {it.gaussians} Gaussians, SH degree {it.sh_degree}"
+    if it.ply_bytes_saved:
+        line += f": {(it.ply_bytes - it.ply_bytes_saved) / MB:.2f} MB instead of {it.ply_bytes / MB:.2f}"
+    return line + _change(it.test_change)
+
+
+def _gaussians(it: LeftOut) -> str:
+    if it.keep_unseen:
+        return f"Left out no Gaussians (--keep_unseen): {it.gaussians} are saved"
+    how = {
+        TOO_LONG: f"no others were looked for: that takes {it.views} views, more than the training's iterations / "
+        f"{ITERATIONS_PER_VIEW}",
+        FEW: f"fewer than {100 * WORTH:.0f} % are unseen besides, looked for in {it.seconds:.1f} s ({it.views} views)",
+    }
+    if it.search in how:
+        left = f"{it.faint} of {it.gaussians} Gaussians{_share(it, it.faint)}, of an opacity that no pixel shows"
+        return f"Left out {left if it.faint else 'no Gaussians'}; {how[it.search]}"
+    return (
+        f"Left out {it.unseen} of {it.gaussians} Gaussians{_share(it, it.unseen)} that no training view and no view "
+        f"between two of them depends on, found in {it.seconds:.1f} s ({it.views} views)"
+    )
+
+
+def _share(it: LeftOut, count: int) -> str:
+    part = count / it.gaussians
+    return f" ({100 * part:.1f} %, {it.ply_bytes * part / MB:.2f} MB of the PLY)"
+
+
+def _change(change: dict[str, float]) -> str:
+    if not change:
+        return ""
+    text = f"; test views change by at most {change['largest']:.2g} (values 0 to 1)"
+    if "psnr_before" in change:
+        text += f", PSNR {change['psnr_before']:.3f} to {change['psnr_after']:.3f} dB"
+    return text
+
+
+def _bands(it: LeftOut) -> str:
+    if it.sh_degree < it.max_sh_degree:
+        rows = it.gaussians - it.unseen
+        saved = 12 * ((it.max_sh_degree + 1) ** 2 - (it.sh_degree + 1) ** 2) * rows / MB
+        bound = it.cut_bounds[it.sh_degree]
+        moved = f"colours move by at most {bound:.2g} (values 0 to 1)" if bound else "they are zero throughout"
+        return f"Left out the SH bands above degree {it.sh_degree} ({saved:.2f} MB of the PLY): {moved}"
+    if it.max_sh_degree == 0:
+        return "Left out no SH bands: there are none above degree 0"
+    moved = ", ".join(f"{bound:.2g} above degree {degree}" for degree, bound in enumerate(it.cut_bounds[:-1]))
+    return f"Left out no SH bands; cutting them would move colours by at most {moved} (--prune_sh)"
+
+
+def _pictures(it: LeftOut) -> str:
+    saved = 4 * it.picture_bytes_in_files - it.picture_bytes
+    return (
+        f"Colours of the training photos are kept as bytes and at training size: {it.picture_bytes / MB:.1f} MB, "
+        f"{saved / MB:.1f} MB less than as float32 at the size of the files"
+    )

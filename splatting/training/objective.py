@@ -1,0 +1,51 @@
+"""The loss of a render: photometric, and inverse depth where a depth map supervises. Further terms belong here."""
+
+import argparse
+from typing import Any, NamedTuple
+
+from fused_ssim import photometric_loss_by_bands
+from torch import Tensor
+
+from splatting.training.step import Step
+from utils.loss_utils import inverse_depth_loss, photometric_loss
+
+
+class Losses(NamedTuple):
+    """Scalars of one iteration, and the mask that they were computed with."""
+
+    total: Tensor  # what is differentiated
+    l1: Tensor  # of the colours
+    depth: Tensor | None  # weighted, part of the total; None without a depth map
+    mask: Tensor | None  # (1, H, W) bool, pixels that count; None if all do
+
+
+class Objective:
+    """`(1 - lambda_dssim) L1 + lambda_dssim (1 - SSIM)` (Kerbl et al. 2023, Eq. 7), and the weighted depth loss.
+
+    clamp: compare renders clamped to [0, 1].
+    """
+
+    def __init__(self, opt: argparse.Namespace, clamp: bool = True) -> None:
+        self._lambda_dssim, self._clamp = opt.lambda_dssim, clamp
+
+    def takes_bands(self, step: Step) -> bool:
+        """Whether the loss of a step needs of the image no more than each rank's band and what surrounds it."""
+        return step.depth_weight == 0 and step.camera.counts_all and step.camera.columns is None
+
+    def __call__(self, package: dict[str, Any], step: Step) -> Losses:
+        """package: of `render`, with `depth` where step.depth_weight is above 0.
+
+        With a `band` (splatting/distributed/rendering/band.py) the gradient is right in its rows only.
+        """
+        camera = step.camera
+        target, mask = camera.ground_truth(step.background)
+        if (band := package.get("band")) is not None:
+            total, l1 = photometric_loss_by_bands(package["render"], target, self._lambda_dssim, *band, self._clamp)
+            return Losses(total, l1, depth=None, mask=None)
+        total, l1 = photometric_loss(package["render"], target, self._lambda_dssim, mask, camera.columns, self._clamp)
+        depth = None
+        if step.depth_weight > 0:
+            error = inverse_depth_loss(package["depth"], camera.inverse_depth, camera.columns, mask)
+            depth = step.depth_weight * error
+            total = total + depth
+        return Losses(total, l1, depth, mask)

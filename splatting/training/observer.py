@@ -1,0 +1,72 @@
+"""Observers of a training. Each overrides the hooks that it needs; the loop calls no others."""
+
+from collections.abc import Sequence
+from types import TracebackType
+from typing import TypeAlias
+
+from splatting.training.objective import Losses
+from splatting.training.step import Step
+
+Error: TypeAlias = BaseException | None
+
+
+class Observer:
+    """Base of all observers. A hook that a class does not override costs nothing."""
+
+    def due(self, step: Step) -> bool:
+        """Whether this iteration reads the model or a loss, or writes something. Asked once, when it begins.
+
+        If so, all steps before it are done by then, and every loss so far is checked first in `measured`. Otherwise the
+        GPU may be some steps behind in `measured` and `stepped`, so what these get must not be read, only noted.
+        """
+        raise NotImplementedError
+
+    def begins(self, step: Step) -> None:
+        """The iteration begins, with its view."""
+
+    def measured(self, step: Step, losses: Losses) -> None:
+        """The losses are computed. If the iteration is due, the model is still the one that was rendered."""
+
+    def stepped(self, step: Step) -> None:
+        """Density control and optimiser are done; the model is that of the next iteration."""
+
+    def ended(self, error: Error) -> None:
+        """Training is over: after its last iteration (None), or by an error, which may be replaced by raising."""
+
+
+class Announcer:
+    """Calls the hooks of observers, in the order of the list. Inside `with`, an error is told to `ended`."""
+
+    def __init__(self, observers: Sequence[Observer]) -> None:
+        def overridden(hook: str) -> list:
+            plain = getattr(Observer, hook)
+            return [getattr(one, hook) for one in observers if getattr(type(one), hook) is not plain]
+
+        self._due, self._begins, self._measured, self._stepped, self._ended = map(
+            overridden, ("due", "begins", "measured", "stepped", "ended")
+        )
+
+    def begins(self, step: Step) -> None:
+        # A list, so that each observer is asked in every iteration, whatever the others answer.
+        step.due = any([step.changes, *[due(step) for due in self._due]])
+        for tell in self._begins:
+            tell(step)
+
+    def measured(self, step: Step, losses: Losses) -> None:
+        for tell in self._measured:
+            tell(step, losses)
+
+    def stepped(self, step: Step) -> None:
+        for tell in self._stepped:
+            tell(step)
+
+    def ended(self, error: Error = None) -> None:
+        for tell in self._ended:
+            tell(error)
+
+    def __enter__(self) -> "Announcer":
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: Error, trace: TracebackType | None) -> None:
+        if error is not None:
+            self.ended(error)

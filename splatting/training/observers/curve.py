@@ -1,0 +1,69 @@
+"""The curve of error against run time, recorded while the model trains."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from gaussian_renderer.scored_views import ScoredViews
+from scene.cameras import Camera
+from splatting.evaluation.curve_recorder import CurveRecorder, evenly_spread
+from splatting.evaluation.what_to_try import schedules_follow_length
+from splatting.training.objective import Losses
+from splatting.training.observer import Error, Observer
+from splatting.training.run import Run
+from splatting.training.schedule.pace import Paced, Settling
+from splatting.training.step import Step
+from utils.system_utils import saved_iterations
+
+
+class Curve(Observer):
+    """Scores test views, and as many training views, in planned iterations; draws the curve at the end."""
+
+    def __init__(self, run: Run) -> None:
+        self._run = run
+        test = run.scene.getTestCameras()
+        trained = [camera for camera in run.scene.getTrainCameras() if camera.columns is None]  # in whole
+        views = ScoredViews(run.pipe, run.background, run.dataset.train_test_exp)
+        self._recorder = CurveRecorder(
+            run.scene.model_path,
+            run.rows,
+            run.log,
+            run.opt.iterations,
+            run.launch.test_iterations,
+            {"test": test, "train": evenly_spread(trained, len(test))},
+            lambda cameras: self._load(cameras, views),
+            lambda cameras: views.scores(cameras, run.gaussians),
+            run.device,
+            not isinstance(run.pace, Paced),
+        )
+        self._due = False
+        self._seconds = 0.0
+
+    def _load(self, cameras: Sequence[Camera], views: ScoredViews) -> None:
+        self._run.scene.prefetch(cameras)
+        for camera in cameras:
+            views.load(camera)
+
+    def due(self, step: Step) -> bool:
+        first = self._run.pace.nominal(self._run.first_iteration)
+        self._due = self._recorder.due(step.span, first, self._run.clock.seconds)
+        return self._due
+
+    def measured(self, step: Step, losses: Losses) -> None:
+        if self._due or step.last:
+            self._seconds = step.scored_at = self._run.clock.seconds
+            point = self._recorder.point(step.span) or step.span[-1]
+            with self._run.clock.paused("scoring"):
+                self._recorder.add(point, self._seconds, self._run.gaussians.total, step.iteration)
+
+    def ended(self, error: Error) -> None:
+        if error is not None:
+            self._recorder.abandon()
+            return
+        run = self._run
+        there = saved_iterations(Path(run.scene.model_path) / "point_cloud")
+        saved, lr_max_steps = {*run.pace.known(run.launch.save_iterations)} & {*there}, run.opt.position_lr_max_steps
+        follows_length = schedules_follow_length(
+            bool(run.dataset.depths), run.dataset.train_test_exp, run.pace.sizes, isinstance(run.pace, Settling)
+        )
+        steady = not isinstance(run.pace, Paced)
+        self._recorder.finish(self._seconds, saved, lr_max_steps if steady else None, follows_length)

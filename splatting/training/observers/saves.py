@@ -1,0 +1,79 @@
+"""Saves of the model as PLY, and checkpoints that a training can be resumed from."""
+
+import sys
+from pathlib import Path
+
+from tqdm import tqdm
+
+from scene.gaussians.checkpoint import save_checkpoint
+from splatting.training.last_save import save_last
+from splatting.training.left_out import LeftOut, lines
+from splatting.training.objective import Losses
+from splatting.training.observer import Error, Observer
+from splatting.training.observers.divergence import DivergenceWatch
+from splatting.training.observers.schedule import save_schedule
+from splatting.training.run import Run
+from splatting.training.step import Step
+
+
+class Saves(Observer):
+    """Saves the PLY when planned; the last save leaves out what the model does not need.
+
+    test_in_memory: the test photos are decoded by the last iteration, so that scoring them once more costs little.
+    """
+
+    def __init__(self, run: Run, test_in_memory: bool) -> None:
+        self._run = run
+        self._test_in_memory = test_in_memory
+        self._left_out: LeftOut | None = None
+
+    def due(self, step: Step) -> bool:
+        return step.takes(self._run.launch.save_iterations)
+
+    def measured(self, step: Step, losses: Losses) -> None:
+        if not step.takes(self._run.launch.save_iterations):
+            return
+        run = self._run
+        step.record = step.record or {}
+        with run.clock.paused("saving"):
+            run.gaussians.check_finite(step.iteration)
+            tqdm.write(f"[ITER {step.iteration}] Saving Gaussians", file=sys.stdout)
+            if step.last:
+                self._left_out = save_last(run, self._test_in_memory, step.iteration)
+                step.record["gaussians_left_out"] = self._left_out.unseen
+            else:
+                run.scene.save(step.iteration)
+
+    def ended(self, error: Error) -> None:
+        if error is None and self._left_out is not None:
+            self._run.log.tell(*lines(self._left_out))
+
+
+class Checkpoints(Observer):
+    """Writes chkpntN.pth when planned, and when a signal stops the training."""
+
+    def __init__(self, run: Run, watch: DivergenceWatch) -> None:
+        self._run = run
+        self._watch = watch
+
+    def due(self, step: Step) -> bool:
+        return step.takes(self._run.launch.checkpoint_iterations)
+
+    def stepped(self, step: Step) -> None:
+        if step.stopping or step.takes(self._run.launch.checkpoint_iterations):
+            self.save(step)
+
+    def save(self, step: Step) -> None:
+        """Write a checkpoint after an iteration that is due, and say how to resume if the training stops."""
+        run = self._run
+        self._watch.look(step.iteration, stepped=not step.last)
+        seconds = run.clock.seconds
+        with run.clock.paused("saving"):
+            run.gaussians.check_finite(step.iteration)
+            tqdm.write(f"[ITER {step.iteration}] Saving Checkpoint", file=sys.stdout)
+            path = Path(run.scene.model_path) / f"chkpnt{step.iteration}.pth"
+            save_schedule(run, step)  # first: a checkpoint never lacks its place in the schedule
+            save_checkpoint(path, run.gaussians.capture(), step.iteration)
+            run.log.add(step.iteration, seconds, gaussians=run.gaussians.total, loss=run.losses.mean)
+        if step.stopping:
+            tqdm.write(f"resume with --start_checkpoint {path}", file=sys.stderr)

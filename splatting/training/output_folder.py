@@ -1,0 +1,46 @@
+"""The output folder of a training: its default, and keeping it while the training runs."""
+
+import contextlib
+import os
+import sys
+import uuid
+from collections.abc import Iterator
+from pathlib import Path
+
+from splatting.distributed.ranks import ranks
+from splatting.files.listing import some
+from splatting.files.lock import locked
+from splatting.files.temporary_files import remove_temporary_files
+from utils.system_utils import mkdir_p
+
+_INPUTS = ("cfg_args", "model.json", "cameras.json", "input.ply")
+
+
+def new_folder() -> str:
+    """Name of a new folder under ./output, after OAR_JOB_ID or at random, as in the reference."""
+    name = os.environ.get("OAR_JOB_ID") or str(uuid.uuid4())
+    return os.path.join("./output/", ranks().shared(name)[:10])
+
+
+@contextlib.contextmanager
+def own_folder(model_path: str) -> Iterator[None]:
+    """Make the folder and keep it for this training. UserError if another train.py is at work in it.
+
+    Temporary files of killed runs are removed first. A message says if files of the run are missing at the end, as
+    when the folder was removed meanwhile. Of several ranks, the first does so for all.
+    """
+    if not ranks().first:
+        yield
+        return
+    folder = Path(model_path)
+    mkdir_p(folder)
+    with locked(folder, "train.py", "another train.py (process {process})", "-m"):
+        remove_temporary_files(folder)
+        yield
+        missing = [name for name in _INPUTS if not (folder / name).exists()]
+        if missing not in ([], ["input.ply"]):  # a run that is resumed may have begun without the latter
+            print(
+                f"warning: {some(missing)} in {folder} were removed while training; the model is saved, but other "
+                "programs may miss them",
+                file=sys.stderr,
+            )

@@ -1,0 +1,81 @@
+"""Adaptive density control, the method's own strategy (Kerbl et al. 2023, Section 5.2): clone, split, prune, reset.
+
+--absgrad judges a Gaussian by its pixels' absolute gradients (Ye et al. 2024, AbsGS) with a threshold of its own, for
+splits and for clones. --split long_axis splits along the longest axis (scene/gaussians/long_axis.py).
+"""
+
+import argparse
+import sys
+
+from torch import Tensor
+from tqdm import tqdm
+
+from scene.gaussian_model import GaussianModel
+from scene.gaussians import density_rules as rules
+from splatting.training.checks import late_reset
+from splatting.training.density import DensityControl
+from splatting.training.step import Step
+from utils.system_utils import UserError
+
+
+class AdaptiveDensityControl(DensityControl):
+    """Adaptive density control (Kerbl et al. 2023, Section 5.2), with the rules of scene/gaussians/density_rules.py.
+
+    extent: of the scene, world units; sizes are judged by it.
+    """
+
+    fusable = True
+
+    def __init__(
+        self, gaussians: GaussianModel, opt: argparse.Namespace, white_background: bool, extent: float
+    ) -> None:
+        self._gaussians = gaussians
+        self._opt = opt
+        self._white_background = white_background
+        self._extent = extent
+        self.absolute_gradients = opt.absgrad
+        self.ends = opt.densify_until_iter
+        self.most_gaussians = opt.max_num_splats
+
+    def changes(self, iteration: int) -> bool:
+        todo = self._actions(iteration)
+        return todo.densify or todo.reset_opacity
+
+    def observes(self, iteration: int) -> bool:
+        """Whether the view of this iteration counts in the statistics."""
+        return self._actions(iteration).observe
+
+    def after_backward(self, step: Step, package: dict[str, Tensor]) -> None:
+        todo = self._actions(step.iteration)
+        if todo.observe:
+            observe = self._gaussians.observe_absolute if self.absolute_gradients else self._gaussians.observe
+            observe(package["viewspace_points"], package["radii"])
+        if todo.densify:
+            self._densify(step.iteration, todo.limit_size)
+        if todo.reset_opacity:
+            if warning := late_reset(step.iteration, self.pace):
+                tqdm.write(warning, file=sys.stderr)
+            self._gaussians.reset_opacity()
+
+    def _actions(self, iteration: int) -> rules.Actions:
+        pace = self.pace
+        place = pace.span(iteration), pace.stride(iteration), pace.views
+        return rules.actions(iteration, self._opt, self._white_background, *place)
+
+    def _densify(self, iteration: int, limit_size: bool) -> None:
+        self._gaussians.densify_and_prune(
+            self._opt.absgrad_threshold if self.absolute_gradients else self._opt.densify_grad_threshold,
+            rules.MIN_OPACITY,
+            self._extent,
+            rules.MAX_SCREEN_SIZE if limit_size else None,
+            seed=self._opt.seed,
+            iteration=iteration,
+            max_splats=self._opt.max_num_splats,
+            long_axis=self._opt.split == "long_axis",
+        )
+        if self._gaussians.total == 0:
+            raise UserError(
+                f"no Gaussian was left after the densification of iteration {iteration}: the views do not agree "
+                "with the points, or show nothing but the background; check the scene, or raise "
+                "--opacity_reset_interval"
+            )

@@ -1,0 +1,126 @@
+"""Growth to a given number of Gaussians, where the training views' error is.
+
+After the growth curve of Mallick et al. 2024 (Taming 3DGS), the error-driven scores of Rota Bulo et al. 2024, and the
+long-axis split of Deng et al. 2025 (Improved-GS). Of these papers it departs as follows. The curve is even by default,
+which was no worse on small scenes and trains fewer Gaussians. Scores are sums of a pixel error times blending weight
+over several views, and nothing else counts. Gaussians are drawn by their scores without
+replacement, not the highest taken. Children keep their parent's mean and covariance. Opacities are multiplied by a
+factor, where Rota Bulo et al. subtract a constant.
+"""
+
+import math
+from typing import TYPE_CHECKING
+
+from torch import Tensor
+
+from scene.cameras import Camera
+from scene.gaussians import density_rules as rules
+from scene.gaussians.budgeted import count_after, fade, remove_useless, split_in_two
+from splatting.deterministic.counter_rng import Stream, permutation
+from splatting.deterministic.portable_math import exp, log
+from splatting.deterministic.weighted_choice import weighted_choice
+from splatting.distributed.selection import largest
+from splatting.training.density import DensityControl
+from splatting.training.error_scores import ErrorScores
+from splatting.training.schedule.pace import Paced
+from splatting.training.step import Step
+from utils.system_utils import UserError
+
+if TYPE_CHECKING:
+    from splatting.training.run import Run
+
+PIXELS = 64  # training pixels of all views for each Gaussian of the default budget
+FEWEST, MOST = 100_000, 1_000_000  # Gaussians of the default budget
+AN_ITERATION = 25  # Gaussians of the default budget for each iteration, at most, where the clock sets their number
+_SMALLEST = 1e-300
+
+
+class BudgetControl(DensityControl):
+    """Removes useless Gaussians and adds others, every densification_interval steps before densify_until_iter.
+
+    most_gaussians: their number at the end of that.
+    """
+
+    fusable = True
+    clamps = False
+
+    def __init__(self, run: "Run") -> None:
+        self._gaussians, self._opt = run.gaussians, run.opt
+        self._cameras = run.scene.getTrainCameras()
+        self.ends = run.opt.densify_until_iter
+        self._scores = ErrorScores(run.gaussians, run.pipe, run.dataset.train_test_exp, run.opt)
+        self.most_gaussians = run.opt.max_num_splats or default_budget(self._cameras)
+        self._follows_clock = not run.opt.max_num_splats and isinstance(run.pace, Paced)
+
+    def changes(self, iteration: int) -> bool:
+        in_time = self.pace.nominal(iteration) < self._opt.densify_until_iter
+        return in_time and iteration % self._interval(iteration) == 0
+
+    def after_step(self, step: Step) -> None:
+        if not self.changes(step.iteration):
+            return
+        self._gaussians.check_steps()  # before rows change, so that an error finds the rows of the step
+        grows = self._grows(step.iteration)
+        aim = now = self._gaussians.total
+        if grows:
+            aim = self._aim(now, step.iteration)
+        remove_useless(self._gaussians, self._opt.prune_opacity, max(aim, 1))
+        self._check_rest(step.iteration)
+        if grows:
+            if aim > self._gaussians.total:
+                split_in_two(self._gaussians, self._chosen(step, aim - self._gaussians.total))
+            fade(self._gaussians, self._opt.opacity_decay)
+
+    def most_after(self, count: int, first: int, last: int) -> int:
+        for iteration in filter(self.changes, range(first, last)):  # the last iteration takes no step
+            if self._grows(iteration):
+                count = min(self._aim(count, iteration), 2 * count)
+        return count
+
+    def _aim(self, now: int, iteration: int) -> int:
+        """How many Gaussians there are to be after the densification of an iteration, `now` before it."""
+        most, stride = self.most_gaussians, self.pace.stride(iteration)
+        if self._follows_clock and stride > 1:
+            most = min(most, max(int(AN_ITERATION * self.pace.length / stride), 1))
+        return count_after(now, most, self._remaining(iteration), self._opt.growth_power)
+
+    def _grows(self, iteration: int) -> bool:
+        return self.pace.nominal(iteration) > self._opt.densify_from_iter
+
+    def _remaining(self, iteration: int) -> int:
+        """How many densifications follow that of this iteration, at its pace."""
+        opt, stride = self._opt, self.pace.stride(iteration)
+        ahead = (opt.densify_until_iter - self.pace.nominal(iteration)) / (self._interval(iteration) * stride)
+        if stride != 1:
+            ahead -= 0.5  # the pace changes, so one that just comes in time may not come
+        return max(math.ceil(ahead) - 1, 0)
+
+    def _interval(self, iteration: int) -> int:
+        return rules.interval(self._opt, self._opt.densify_until_iter, self.pace.stride(iteration), self.pace.views)
+
+    def _chosen(self, step: Step, count: int) -> Tensor:
+        """Indices of this rank's Gaussians to split, ascending; those of all ranks are at most `count`."""
+        opt, shards = self._opt, self._gaussians.shards
+        scores = self._scores.of_views(self._scored_views(step.iteration), step.background)
+        # The power of a score itself may be too small a number.
+        relative = scores / largest(scores, shards.ranks).clamp_min(_SMALLEST)
+        weights = exp(opt.score_power * log(relative)) * (scores > 0)
+        numbers = {"seed": opt.seed, "stream": Stream.DENSIFY, "iteration": step.iteration}
+        return weighted_choice(weights, count, **numbers, first=shards.first, ranks=shards.ranks)
+
+    def _scored_views(self, iteration: int) -> list[Camera]:
+        order = permutation(self._opt.seed, Stream.SCORED_VIEWS, iteration, len(self._cameras))
+        return [self._cameras[index] for index in order[: self._opt.score_views]]
+
+    def _check_rest(self, iteration: int) -> None:
+        if self._gaussians.total == 0:
+            raise UserError(
+                f"no Gaussian was left after the densification of iteration {iteration}: the views do not agree "
+                "with the points, or show nothing but the background; check the scene, or lower --prune_opacity"
+            )
+
+
+def default_budget(cameras: list[Camera]) -> int:
+    """The number of Gaussians where --max_num_splats is 0: one for PIXELS pixels, from FEWEST to MOST."""
+    pixels = sum(camera.image_width * camera.image_height for camera in cameras)
+    return min(max(pixels // PIXELS, FEWEST), MOST)
