@@ -2,27 +2,21 @@
 
 import argparse
 import os
-import sys
 from collections.abc import Sequence
+from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from scene.gaussians.adam import GaussianAdam, StepGuard
-from scene.gaussians.agreement import match_optimizer
-from scene.gaussians.attributes import INITIAL_OPACITY
-from scene.gaussians.checkpoint import State, pack, unpack
-from scene.gaussians.exposed import Exposed
+from scene.gaussians import adc, checkpoint, mcmc
+from scene.gaussians.adam import GaussianAdam, SparseGaussianAdam, StepGuard
+from scene.gaussians.attributes import INITIAL_OPACITY, Rows
 from scene.gaussians.exposure import Exposures, read_exposures, read_pretrained
 from scene.gaussians.finite import check_finite
-from scene.gaussians.parameters import raw_rows
-from scene.gaussians.relocating import RelocatingGaussians
-from scene.gaussians.sparse_adam import SparseGaussianAdam
+from scene.gaussians.parameters import GaussianParameters, raw_rows
 from scene.gaussians.start import start_rows
-from scene.gaussians.trainable import trainable
-from scene.gaussians.whole import own_state, whole_state
+from scene.gaussians.table import trainable
 from scene.readers.info import exposure_names
 from splatting.host.device import compute_device
 from utils.general_utils import get_expon_lr_func, inverse_sigmoid
@@ -32,16 +26,24 @@ from utils.system_utils import UserError
 _OPTIMIZERS = {"default": GaussianAdam, "sparse_adam": SparseGaussianAdam}
 
 
-class GaussianModel(Exposed, RelocatingGaussians):
+def _of_exposures(name: str, doc: str) -> property:
+    """A part of a model's exposures, by the reference's name."""
+    return property(
+        lambda self: getattr(self.exposures, name), lambda self, value: setattr(self.exposures, name, value), doc=doc
+    )
+
+
+class GaussianModel(GaussianParameters):
     """Gaussians as they are trained, with the reference's names.
 
-    GaussianParameters has the parameters and their activated forms, AdaptiveGaussians and RelocatingGaussians have
-    density control, and Exposed the exposures. optimizer_type: "default" or "sparse_adam", whose step takes a mask of
-    the visible Gaussians. spatial_lr_scale: extent of the scene, world units.
+    GaussianParameters has the tensors and their activated forms. optimizer_type: "default" or "sparse_adam", whose step
+    takes a mask of the visible Gaussians. spatial_lr_scale: extent of the scene, world units. percent_dense: largest
+    scale, as a part of the scene's extent, of a Gaussian that is cloned; a larger one is split.
     """
 
     optimizer_type = "default"
     spatial_lr_scale = 0.0
+    percent_dense = 0.0
 
     def __init__(self, sh_degree: int, optimizer_type: str = "default") -> None:
         if optimizer_type not in _OPTIMIZERS:
@@ -80,7 +82,62 @@ class GaussianModel(Exposed, RelocatingGaussians):
         if use_train_test_exp:
             self.pretrained_exposures = read_pretrained((Path(path).absolute().parent / "../..").resolve())
 
+    # Density control: the reference's (scene/gaussians/adc.py), and that of MCMC (scene/gaussians/mcmc.py)
+
+    observe, observe_absolute = adc.observe, adc.observe_absolute
+    add_densification_stats = adc.add_densification_stats
+    densify_and_prune = adc.densify_and_prune
+    densify_and_clone, densify_and_split = adc.densify_and_clone, adc.densify_and_split
+    densification_postfix, prune_points = adc.densification_postfix, adc.prune_points
+    reset_opacity = adc.reset_opacity
+    start_as, relocate, grow = mcmc.start_as, mcmc.relocate, mcmc.grow
+    add_noise, penalise = mcmc.add_noise, mcmc.penalise
+
+    def drop_broken_statistics(self) -> None:
+        """Restart the statistics of Gaussians whose sum of gradients is not finite."""
+        self.statistics.drop_broken()
+
+    # The reference's names for changes of the optimiser's parameters; the model's own attributes stay as they are.
+
+    def replace_tensor_to_optimizer(self, tensor: Tensor, name: str) -> dict[str, nn.Parameter]:
+        """Give a parameter a new value and averages of zero (GaussianTable.replace)."""
+        return self.table.replace(name, tensor)
+
+    def cat_tensors_to_optimizer(self, tensors_dict: Rows) -> dict[str, nn.Parameter]:
+        """Append rows (n, ...) by group name, with averages of zero (GaussianTable.append)."""
+        return self.table.append(tensors_dict)
+
+    def _prune_optimizer(self, mask: Tensor) -> dict[str, nn.Parameter]:
+        """Keep the rows of a mask (N,) bool (GaussianTable.select)."""
+        return self.table.select(mask.reshape(-1).nonzero().reshape(-1), mask.numel())
+
+    def take_from_optimizer(self) -> None:
+        """Adopt the rows that densification had reached when memory ran out, so that they can be saved."""
+        self._take({group.get("name"): group["params"][0] for group in self.optimizer.param_groups})
+        if not self.statistics.fit(len(self)):
+            self._zero_statistics()
+
     # Exposures
+
+    _exposure = _of_exposures("values", "Maps of colours (n, 3, 4) of the n training photos.")
+    exposure_mapping = _of_exposures("mapping", "Index in `get_exposure` by the photo's name.")
+    pretrained_exposures = _of_exposures("pretrained", "Maps (3, 4) by name that replace the trained ones, or None.")
+    exposure_optimizer = _of_exposures("optimizer", "The optimiser of the exposures; None before training is set up.")
+    exposure_scheduler_args = _of_exposures("schedule", "Learning rate by iteration; None before training is set up.")
+
+    @cached_property
+    def exposures(self) -> Exposures:
+        """Maps of colours of the training photos, identities unless trained."""
+        return Exposures()
+
+    @property
+    def get_exposure(self) -> Tensor:
+        """Maps of colours (n, 3, 4) of the n training photos."""
+        return self._exposure
+
+    def get_exposure_from_name(self, image_name: str) -> Tensor:
+        """Map of colours (3, 4) of a training photo, by its name in exposure.json."""
+        return self.exposures[image_name]
 
     def start_exposures(self, cam_infos: Sequence) -> None:
         """Give each training camera an exposure that changes nothing."""
@@ -194,53 +251,7 @@ class GaussianModel(Exposed, RelocatingGaussians):
         if isinstance(self.optimizer, GaussianAdam):
             self.optimizer.set_active_columns("f_rest", 3 * self.active_bands)
 
-    # Checkpoints
-
-    def capture(self) -> tuple:
-        """Everything a resumed training needs, as tensors and numbers; `pack` gives the order.
-
-        Values of Gaussians are parameters: the reference trains on with the very tensors that a checkpoint holds. Of
-        several ranks, all of which must call it, the first has the whole state, on the CPU, and others have no rows.
-        """
-        raw = {name: getattr(self, a.field) for name, a in self._attributes.items()}
-        match_optimizer(self)
-        state = State(
-            self.active_sh_degree,
-            {name: x if isinstance(x, nn.Parameter) else nn.Parameter(x.detach()) for name, x in raw.items()},
-            self.statistics,
-            self.optimizer.state_dict(),
-            float(self.spatial_lr_scale),
-            self.exposures.capture() if self.exposures.trained else None,
-        )
-        return pack(whole_state(state, self.shards.ranks))
-
-    def restore(self, model_args: Sequence[Any], training_args: argparse.Namespace) -> None:
-        """Take the state of `capture()`. Learning rates and densification options come from `training_args`.
-
-        A model without exposures takes those of the state, too; one that has them must have the same photos.
-        UserError when the state was made with another maximal SH degree or does not fit together.
-        """
-        state = own_state(unpack(model_args, self._attributes, self.max_sh_degree), self.shards)
-        self.active_sh_degree = state.active_sh_degree
-        self.spatial_lr_scale = state.spatial_lr_scale
-        self.set_rows(state.rows)
-        if state.exposures is not None and not self.exposures.mapping:  # a model without a scene
-            self.exposures.start_as(state.exposures)
-        self.training_setup(training_args)
-        try:
-            if isinstance(self.optimizer, GaussianAdam):
-                lacking = self.optimizer.take_state(state.optimizer)
-            else:  # a subclass has set up another
-                self.optimizer.load_state_dict(state.optimizer)
-                lacking = []
-        except ValueError as error:
-            raise UserError(f"the optimiser state of the checkpoint does not fit ({error}); use another one") from error
-        if "xyz" in lacking:  # f_rest may lack it, as Gaussians without active bands have no steps
-            names = ", ".join(map(str, lacking))
-            print(f"warning: the checkpoint has no averages of Adam for {names}; they begin at zero", file=sys.stderr)
-        if state.exposures is not None:
-            self.exposures.restore(state.exposures)
-        self.statistics = state.statistics.to(self._xyz.device)
+    capture, restore = checkpoint.capture, checkpoint.restore
 
     def check_finite(self, iteration: int) -> None:
         """UserError for a parameter that is not finite; call it before anything of this iteration is saved."""

@@ -9,11 +9,9 @@ from diff_gaussian_rasterization.optim import catch_up_
 from torch import Tensor, nn
 
 from scene.gaussian_model import GaussianModel
-from scene.gaussians.adam import Part
-from scene.gaussians.host_memory import in_host_memory
-from scene.gaussians.row_surgery import Group, States
+from scene.gaussians.adam import Part, SparseGaussianAdam
 from scene.gaussians.side_stream import SideStream
-from scene.gaussians.sparse_adam import SparseGaussianAdam
+from scene.gaussians.table import GaussianTable, in_host_memory
 
 _MOST_MISSED = 1000  # steps, after which all rows catch up, so that the list of steps stays short
 
@@ -209,6 +207,8 @@ class SpilledGaussians(GaussianModel):
         self.catch_up()
         return super().take_marks()
 
-    def _groups(self) -> tuple[list[Group], list[Group], States]:
+    @property
+    def table(self) -> GaussianTable:
+        """The table of GaussianModel, after the steps that rows have missed."""
         self.catch_up()
-        return super()._groups()
+        return super().table

@@ -23,12 +23,12 @@ from gaussian_renderer import model_inputs, rasterizer_settings
 from gaussian_renderer.weighted_sums import weighted_sums
 from scene.cameras import MiniCam
 from scene.gaussian_model import GaussianModel
-from scene.gaussians.budgeted import count_after, fade, remove_useless, split_in_two
+from scene.gaussians.budget import count_after, fade, remove_useless, split_in_two
 from scene.gaussians.long_axis import long_axis_children
-from scene.gaussians.shards import WHOLE
 from scene.readers.point_cloud import write_point_cloud
 from splatting.deterministic.counter_rng import Stream
 from splatting.deterministic.weighted_choice import weighted_choice
+from splatting.distributed.rows import WHOLE
 from splatting.training.error_maps import error_map
 from splatting.training.error_scores import ErrorScores
 from splatting.training.objective import Objective

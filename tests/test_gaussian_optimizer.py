@@ -6,7 +6,7 @@ import pytest
 import torch
 from gaussians import GROUPS, model, moments, options, parameters, take_steps
 
-from scene.gaussians import row_surgery
+from scene.gaussians import table
 from scene.gaussians.adam import GaussianAdam
 
 
@@ -193,7 +193,7 @@ def _failing(function, call: int):
 @pytest.mark.parametrize("call", [1, 2, 3, 9, 18])
 def test_where_memory_fails_rows_are_appended_to_none_and_kept_in_all(monkeypatch, call):
     """Six groups with two moments each are 18 tensors; memory runs out at one of them."""
-    monkeypatch.setattr(row_surgery, "_CHUNK", 7)
+    monkeypatch.setattr(table, "_CHUNK", 7)
     gaussians = model(40)
     take_steps(gaussians, 2)
     before, state = parameters(gaussians), moments(gaussians)

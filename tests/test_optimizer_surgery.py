@@ -10,8 +10,7 @@ from torch import Tensor, nn
 from torch.optim.optimizer import register_optimizer_step_post_hook
 
 from scene.gaussian_model import GaussianModel
-from scene.gaussians.adam import GaussianAdam
-from scene.gaussians.sparse_adam import SparseGaussianAdam
+from scene.gaussians.adam import GaussianAdam, SparseGaussianAdam
 
 EXTENT = 20.0  # Gaussians of 0.2 and less are cloned, larger ones split, and those of more than 2 removed
 ADAM = {"lr": 0.0, "eps": 1e-15}

@@ -7,7 +7,7 @@ from gaussians import model
 from rasterizer_tools import CPU_AND_GPU, ops
 from torch import Tensor, library
 
-from scene.gaussians.penalty import NO_PENALTY, Penalty
+from scene.gaussians.mcmc import NO_PENALTY, Penalty
 
 WEIGHTS = {"opacity": 0.3, "scale": 0.7}
 

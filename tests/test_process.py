@@ -12,8 +12,7 @@ import torch
 
 import train
 from scene import Scene
-from scene.gaussians.adam import GaussianAdam
-from scene.gaussians.undecorated import undecorated
+from scene.gaussians.adam import GaussianAdam, undecorated
 from scene.images import store
 from splatting.host import cuda_start
 from splatting.training import run as training_run

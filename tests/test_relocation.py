@@ -9,7 +9,7 @@ from gaussians import GROUPS, model, take_steps
 from torch import Tensor
 
 from scene.gaussian_model import GaussianModel
-from scene.gaussians.relocation import MOST_PARTS, divided, draw, opacity_units
+from scene.gaussians.mcmc import MOST_PARTS, divided, draw, opacity_units
 
 LOGITS = torch.tensor([-5.2, -2.0, 0.0, 1.5, 4.0, 9.0, 15.0])
 WHERE = {"seed": 3, "iteration": 600}

@@ -6,7 +6,7 @@ import pytest
 import torch
 from diff_gaussian_rasterization import SparseGaussianAdam
 
-from scene.gaussians.sparse_adam import SparseGaussianAdam as OfTheModel
+from scene.gaussians.adam import SparseGaussianAdam as OfTheModel
 
 RATES = {"xyz": 0.01, "f_dc": 0.0025, "f_rest": 0.000125}
 SHAPES = {"xyz": (40, 3), "f_dc": (40, 1, 3), "f_rest": (40, 15, 3)}

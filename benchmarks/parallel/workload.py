@@ -10,9 +10,9 @@ from torch import Tensor
 from benchmarks.workloads.city import city, look
 from benchmarks.workloads.splat_scenes import FOV, GPU_WORKLOADS, frustum
 from scene.cameras import Camera
-from scene.gaussians.shards import bound
 from scene.images.in_memory import InMemory
 from scene.views.view import View
+from splatting.distributed.rows import bound
 from utils.graphics_utils import focal2fov, fov2focal
 
 VIEWS = 8

@@ -1,20 +1,19 @@
-"""Adam over the tensors of a Gaussian model."""
+"""Adam and sparse Adam over the tensors of a Gaussian model."""
 
 import math
+import sys
 from collections.abc import Callable, Mapping
 from operator import itemgetter
-from types import MappingProxyType
+from types import FunctionType, MappingProxyType
 from typing import Any, NamedTuple
 
 import splatting.host.extensions  # noqa: F401  isort: skip  (before the extensions)
 import torch
-from diff_gaussian_rasterization.optim import adam_
+from diff_gaussian_rasterization.optim import adam_, sparse_adam_
 from torch import Tensor
 from torch.optim.optimizer import _global_optimizer_post_hooks, _global_optimizer_pre_hooks
 
-from scene.gaussians.host_memory import beside
-from scene.gaussians.row_surgery import Group
-from scene.gaussians.undecorated import undecorated
+from scene.gaussians.table import Group, beside
 
 # Options of a group that the kernel takes from the optimiser's defaults, or does not know.
 _common = itemgetter("betas", "eps", "weight_decay", "amsgrad", "maximize", "capturable", "differentiable", "fused")
@@ -239,6 +238,50 @@ class GaussianAdam(torch.optim.Adam):
                     taken[index] = _fitting(state[key], param, name)
         undecorated(torch.optim.Adam.load_state_dict)(self, {"state": taken, "param_groups": own})
         return [g.get("name") for g in self.param_groups if any(param not in self.state for param in g["params"])]
+
+
+class SparseGaussianAdam(GaussianAdam):
+    """Sparse Adam (Mallick et al. 2024, Taming 3DGS): GaussianAdam for visible rows, without bias correction.
+
+    Rows that were not seen keep values and averages exactly. State and state dict keep their form. `step` counts the
+    steps of the tensor, and no formula uses it.
+    """
+
+    @torch.no_grad()
+    def step(self, visible: Tensor, N: int | None = None) -> None:
+        """Step the rows of `visible` (N,) bool in every parameter that has a gradient.
+
+        Groups that do not have a row per Gaussian are stepped by torch. N: not needed, the reference takes it.
+        """
+        groups, others = self._groups()
+        for group in groups:
+            (param,) = group["params"]
+            if param.grad is None:
+                continue
+            if len(param) != len(visible):
+                others = [*others, group]
+                continue
+            state = self.state_of(param)
+            state["step"] += 1
+            beta1, beta2 = group["betas"]
+            columns = self._active_columns.get(group.get("name"), -1) or -1  # 0, yet with a gradient: all
+            guard = self.guard.arguments if self.guard else ()
+            tensors = param, param.grad, state["exp_avg"], state["exp_avg_sq"], visible
+            if part := self.parts.get(group.get("name")):
+                tensors, columns = (*part[1:], visible[part.rows]), -1
+            sparse_adam_(*tensors, group["lr"], beta1, beta2, group["eps"], columns, *guard)
+        if others:
+            self._step_by_torch(others)
+
+
+def undecorated(method: Callable) -> Callable:
+    """A method of torch's optimisers without the decorator that hides it from torch's compiler, unless that is loaded.
+
+    torch._disable_dynamo imports torch._dynamo, in one to five seconds, to tell it to leave the method alone. While
+    nobody has loaded the compiler, there is nobody to tell.
+    """
+    hidden = isinstance(method, FunctionType) and method.__globals__.get("__name__") == "torch._compile"
+    return method.__wrapped__ if hidden and "torch._dynamo" not in sys.modules else method
 
 
 def _kind(param: Tensor) -> tuple[torch.dtype, torch.device] | None:

@@ -1,16 +1,22 @@
 """Checkpoints, files chkpntN.pth of (state of the model, N): tensors and plain values."""
 
+import argparse
 import os
-from collections.abc import Sequence
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from numbers import Real
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
+from torch import Tensor, nn
 
+from scene.gaussians.adam import GaussianAdam
 from scene.gaussians.attributes import IN_CHECKPOINT, Attribute, Rows
 from scene.gaussians.finite import check_finite
-from scene.gaussians.statistics import Statistics
+from scene.gaussians.parameters import GaussianParameters
+from scene.gaussians.statistics import NAMES, Statistics
 from splatting.distributed.ranks import ranks
 from splatting.files.tensor_files import read_tensors
 from splatting.host.version import VERSION
@@ -30,6 +36,75 @@ class State(NamedTuple):
     optimizer: dict[str, Any]  # its state dict
     spatial_lr_scale: float
     exposures: dict[str, Any] | None  # None: not trained
+
+    def mapped(self, change: Callable[[Tensor], Tensor]) -> "State":
+        """The state with other rows: those of the values, statistics and averages, each of which `change` takes."""
+        count = len(self.statistics.denom)
+
+        def changed(values: Any) -> Any:
+            if not torch.is_tensor(values) or not values.dim() or len(values) != count:
+                return values
+            new = change(values)
+            return nn.Parameter(new) if isinstance(values, nn.Parameter) and new is not values else new
+
+        optimizer = self.optimizer
+        states = optimizer.get("state") if isinstance(optimizer, dict) else None
+        if isinstance(states, dict) and all(isinstance(state, dict) for state in states.values()):
+            averages = {key: {name: changed(v) for name, v in state.items()} for key, state in states.items()}
+            optimizer = optimizer | {"state": averages}  # GaussianAdam.take_state refuses any other
+        return self._replace(
+            rows={name: changed(values) for name, values in self.rows.items()},
+            statistics=replace(self.statistics, **{n: changed(getattr(self.statistics, n)) for n in NAMES}),
+            optimizer=optimizer,
+        )
+
+
+def capture(gaussians: GaussianParameters) -> tuple:
+    """Everything a resumed training needs, as tensors and numbers; `pack` gives the order.
+
+    Values of Gaussians are parameters: the reference trains on with the very tensors that a checkpoint holds. Of
+    several ranks, all of which must call it, the first has the whole state, on the CPU, and others have no rows.
+    """
+    raw = {name: getattr(gaussians, a.field) for name, a in gaussians._attributes.items()}
+    gaussians.shards.match(gaussians.optimizer)
+    state = State(
+        gaussians.active_sh_degree,
+        {name: x if isinstance(x, nn.Parameter) else nn.Parameter(x.detach()) for name, x in raw.items()},
+        gaussians.statistics,
+        gaussians.optimizer.state_dict(),
+        float(gaussians.spatial_lr_scale),
+        gaussians.exposures.capture() if gaussians.exposures.trained else None,
+    )
+    return pack(state.mapped(gaussians.shards.whole))
+
+
+def restore(gaussians: GaussianParameters, model_args: Sequence[Any], training_args: argparse.Namespace) -> None:
+    """Take the state of `capture()`. Learning rates and densification options come from `training_args`.
+
+    A model without exposures takes those of the state, too; one that has them must have the same photos.
+    UserError when the state was made with another maximal SH degree or does not fit together.
+    """
+    state = unpack(model_args, gaussians._attributes, gaussians.max_sh_degree).mapped(gaussians.shards.own)
+    gaussians.active_sh_degree = state.active_sh_degree
+    gaussians.spatial_lr_scale = state.spatial_lr_scale
+    gaussians.set_rows(state.rows)
+    if state.exposures is not None and not gaussians.exposures.mapping:  # a model without a scene
+        gaussians.exposures.start_as(state.exposures)
+    gaussians.training_setup(training_args)
+    try:
+        if isinstance(gaussians.optimizer, GaussianAdam):
+            lacking = gaussians.optimizer.take_state(state.optimizer)
+        else:  # a subclass has set up another
+            gaussians.optimizer.load_state_dict(state.optimizer)
+            lacking = []
+    except ValueError as error:
+        raise UserError(f"the optimiser state of the checkpoint does not fit ({error}); use another one") from error
+    if "xyz" in lacking:  # f_rest may lack it, as Gaussians without active bands have no steps
+        names = ", ".join(map(str, lacking))
+        print(f"warning: the checkpoint has no averages of Adam for {names}; they begin at zero", file=sys.stderr)
+    if state.exposures is not None:
+        gaussians.exposures.restore(state.exposures)
+    gaussians.statistics = state.statistics.to(gaussians._xyz.device)
 
 
 def pack(state: State) -> tuple:

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from scene.gaussians.adam import GaussianAdam
-from scene.gaussians.trainable import trainable
+from scene.gaussians.table import trainable
 from splatting.distributed.ranks import Ranks
 from splatting.files.plain_files import plain_text
 from splatting.host.device import compute_device

@@ -1,8 +1,9 @@
-"""Parameters of N Gaussians: raw tensors, their activated forms, and the PLY they are kept in."""
+"""A set of Gaussians: raw tensors, their activated forms, statistics, and the PLY they are kept in."""
 
 import copy
 import math
 import os
+from operator import attrgetter
 
 import torch
 from torch import Tensor, nn
@@ -10,8 +11,10 @@ from torch import Tensor, nn
 from scene.gaussians.attributes import Attribute, Rows, attributes
 from scene.gaussians.finite import tell_of_undrawn
 from scene.gaussians.ply import column_names, read_ply, row_bytes, write_ply
-from scene.gaussians.shards import WHOLE, Divided, Shards
+from scene.gaussians.statistics import NAMES, Statistics
+from scene.gaussians.table import GaussianTable
 from splatting.distributed.ranks import Ranks
+from splatting.distributed.rows import WHOLE, Divided, Shards
 from splatting.host.device import compute_device
 from utils.general_utils import build_scaling_rotation, inverse_sigmoid, strip_symmetric
 from utils.system_utils import UserError
@@ -41,7 +44,10 @@ class GaussianParameters:
     `_rotation` (N,4) wxyz, any length; `_opacity` (N,1) logit. world_offset: the world's coordinates of the origin
     (scene/readers/world_offset.py), kept in the PLY. Activations are attributes, which `setup_functions` sets.
     The tensors become parameters when rows are taken; an empty model has plain ones, as in the reference. shards: where
-    these rows are among those of all ranks, if several have a part of the model each.
+    these rows are among those of all ranks, if several have a part of the model each. max_radii2D, xyz_gradient_accum,
+    denom: observations since the last densification (Statistics has shapes and units). optimizer: any of torch's, with
+    `name` in its groups; None until training is set up. tmp_radii: (N,) pixels of the present view, or None; density
+    control keeps it in step with the rows.
     """
 
     # What a subclass need not set whose __init__ sets the reference's attributes and does not call this one.
@@ -49,6 +55,8 @@ class GaussianParameters:
     max_sh_degree = 3
     world_offset = (0.0, 0.0, 0.0)
     shards: Shards = WHOLE
+    optimizer: torch.optim.Optimizer | None = None
+    tmp_radii: Tensor | None = None
 
     _xyz: Tensor
     _features_dc: Tensor
@@ -56,6 +64,9 @@ class GaussianParameters:
     _scaling: Tensor
     _rotation: Tensor
     _opacity: Tensor
+    max_radii2D: Tensor
+    xyz_gradient_accum: Tensor
+    denom: Tensor
 
     def __init__(self, sh_degree: int) -> None:
         self.active_sh_degree = 0
@@ -64,6 +75,7 @@ class GaussianParameters:
         device = compute_device()
         self._take({name: torch.empty(0, *a.shape, device=device) for name, a in self._attributes.items()})
         self.setup_functions()
+        self._zero_statistics()
 
     def setup_functions(self) -> None:
         """Set the activations and their inverses: attributes that may be replaced, or set by a subclass here."""
@@ -78,6 +90,24 @@ class GaussianParameters:
     def _attributes(self) -> dict[str, Attribute]:
         """The table of the attributes, for the maximal SH degree."""
         return attributes(self.max_sh_degree)
+
+    @property
+    def table(self) -> GaussianTable:
+        """All tensors with a row per Gaussian, to add, remove or reorder rows."""
+        return GaussianTable(self)
+
+    @property
+    def statistics(self) -> Statistics:
+        """The observations since the last densification, in one record of the model's own tensors."""
+        return Statistics(*_read_statistics(self))
+
+    @statistics.setter
+    def statistics(self, statistics: Statistics) -> None:
+        for name in NAMES:
+            setattr(self, name, getattr(statistics, name))
+
+    def _zero_statistics(self) -> None:
+        self.statistics = Statistics.zero(len(self), self._xyz.device)
 
     def __len__(self) -> int:
         """Number of Gaussians that this process has."""
@@ -178,6 +208,32 @@ class GaussianParameters:
             )
         return degree
 
+    def log_scales(self) -> Tensor:
+        """Logarithms (N, 3) of the scales, whatever their activation is."""
+        return (self._scaling if self.kernels_activate else self.get_scaling.log()).detach()
+
+    def opacity_logits(self) -> Tensor:
+        """Logits (N, 1) of the opacities, whatever their activation is."""
+        return (self._opacity if self.kernels_activate else inverse_sigmoid(self.get_opacity)).detach()
+
+    @property
+    def keeps_logits(self) -> bool:
+        """Whether raw opacities are logits, in both directions."""
+        return self.kernels_activate and self.inverse_opacity_activation is inverse_sigmoid
+
+    def raw_opacity(self, logits: Tensor) -> Tensor:
+        """Raw values of opacities (n, 1) given by their logits."""
+        return logits if self.keeps_logits else self.inverse_opacity_activation(logits.sigmoid())
+
+    def raw_scaling(self, log_scales: Tensor) -> Tensor:
+        """Raw values of scales (n, 3) given by their logarithms."""
+        keeps = self.kernels_activate and self.scaling_inverse_activation is torch.log
+        return log_scales if keeps else self.scaling_inverse_activation(log_scales.exp())
+
+    def raw_shapes(self, logits: Tensor, log_scales: Tensor) -> Rows:
+        """Raw opacities and scales by name."""
+        return {"opacity": self.raw_opacity(logits), "scaling": self.raw_scaling(log_scales)}
+
     @property
     def active_bands(self) -> int:
         """Number of SH coefficients above band 0 that the active degree uses."""
@@ -192,7 +248,7 @@ class GaussianParameters:
 
     def save_ply(self, path: str | os.PathLike) -> None:
         """Write the raw parameters as a PLY in the reference's layout."""
-        write_ply(path, raw_rows(self), self._degree_of_tensors(), self.world_offset, ranks=self.shards.ranks)
+        write_ply(path, raw_rows(self), self._degree_of_tensors(), self.world_offset, shards=self.shards)
 
     @property
     def ply_bytes(self) -> int:
@@ -200,11 +256,12 @@ class GaussianParameters:
         return self.total * row_bytes(self.max_sh_degree)
 
     def part(self, keep: Tensor | slice, sh_degree: int) -> "GaussianParameters":
-        """A copy of the Gaussians `keep`, (N,) bool or a slice, with the SH bands up to sh_degree."""
+        """A copy of the Gaussians `keep`, (N,) bool or a slice, with the SH bands up to sh_degree; no optimiser."""
         rows = {name: values[keep] for name, values in raw_rows(self).items()}
         rows["f_rest"] = rows["f_rest"][:, : (sh_degree + 1) ** 2 - 1].contiguous()
         other = copy.copy(self)
         other.max_sh_degree, other.active_sh_degree = sh_degree, min(sh_degree, self.active_sh_degree)
+        other.optimizer = None
         other.set_rows(rows)
         return other
 
@@ -212,11 +269,19 @@ class GaussianParameters:
         """Raw values by optimiser group, without gradient; they share the parameters' memory."""
         return raw_rows(self)
 
+    def rows_at(self, indices: Tensor) -> Rows:
+        """Copies of the raw values of the Gaussians (n,) int64, by optimiser group."""
+        return {name: values.index_select(0, indices) for name, values in raw_rows(self).items()}
+
     def set_rows(self, rows: Rows) -> None:
-        """Take raw values of any number of Gaussians by optimiser group; they move to the device that computes."""
+        """Take raw values of any number of Gaussians by optimiser group, with new statistics.
+
+        They move to the device that computes.
+        """
         device = compute_device()
         self._take({name: nn.Parameter(rows[name].to(device)) for name in self._attributes})
         self.shards = self.shards.of(len(self))
+        self._zero_statistics()
 
     def take_whole(self, rows: Rows) -> None:
         """Do as set_rows with the rows of a whole model, of which this rank keeps its part."""
@@ -228,6 +293,8 @@ class GaussianParameters:
             if name in params:
                 setattr(self, attribute.field, params[name])
 
+
+_read_statistics = attrgetter(*NAMES)
 
 # Read once, so that a getter is told from one that replaces it, in a subclass or in this class.
 _GEOMETRY = GaussianParameters.get_opacity, GaussianParameters.get_scaling, GaussianParameters.get_rotation

@@ -10,9 +10,8 @@ from plyfile import PlyParseError
 from torch import Tensor
 
 from scene.gaussians.attributes import Rows, attributes
-from splatting.distributed.gathering import in_order
-from splatting.distributed.ranks import ALONE, Ranks
-from splatting.distributed.ranks import ranks as all_ranks
+from splatting.distributed.ranks import ranks
+from splatting.distributed.rows import WHOLE, Shards
 from splatting.files.ply_header import read_elements
 from utils.system_utils import UserError, atomic_write
 
@@ -25,22 +24,22 @@ def write_ply(
     sh_degree: int,
     world_offset: Sequence[float] = (0.0, 0.0, 0.0),
     comments: Sequence[str] = (),
-    ranks: Ranks = ALONE,
+    shards: Shards = WHOLE,
 ) -> None:
     """Write a binary little-endian PLY, float32, SH bands channel by channel; the whole file or none.
 
     world_offset: world coordinates of the origin, written as a comment unless they are zero. comments: further ones.
-    ranks: those whose rows together make the file, of which the first writes it. Every rank must call it.
+    shards: the place of the rows among those that together make the file. Every rank must call it; the first writes.
     """
-    if not (ranks.several or all_ranks().first):
+    if shards is WHOLE and not ranks().first:
         return
     count = len(rows["xyz"])
     header = ["ply", "format binary_little_endian 1.0"]
     header += [f"comment {comment}" for comment in (*offset_comments(world_offset), *comments)]
-    header += [f"element vertex {ranks.before(count)[1]}"]
+    header += [f"element vertex {shards.total(count)}"]
     header += [f"property float {name}" for name in column_names(sh_degree)]
-    pieces = in_order(ranks, count, lambda part: _table(rows, sh_degree, part))
-    if not ranks.first:
+    pieces = shards.pieces(count, lambda part: _table(rows, sh_degree, part))
+    if not ranks().first:
         return deque(pieces, maxlen=0).clear()
     with atomic_write(path) as temporary, open(temporary, "wb") as file:
         file.write("\n".join([*header, "end_header\n"]).encode("ascii"))

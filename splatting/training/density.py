@@ -5,7 +5,7 @@ from typing import ClassVar
 
 from torch import Tensor
 
-from scene.gaussians.penalty import NO_PENALTY
+from scene.gaussians.mcmc import NO_PENALTY
 from splatting.training.schedule.pace import STEADY, Pace
 from splatting.training.step import Step
 

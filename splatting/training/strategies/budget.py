@@ -15,7 +15,7 @@ from torch import Tensor
 
 from scene.cameras import Camera
 from scene.gaussians import density_rules as rules
-from scene.gaussians.budgeted import count_after, fade, remove_useless, split_in_two
+from scene.gaussians.budget import count_after, fade, remove_useless, split_in_two
 from splatting.deterministic.counter_rng import Stream, permutation
 from splatting.deterministic.portable_math import exp, log
 from splatting.deterministic.weighted_choice import weighted_choice

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from scene.gaussian_model import GaussianModel
 from scene.gaussians import density_rules as rules
-from scene.gaussians.penalty import Penalty
+from scene.gaussians.mcmc import Penalty
 from splatting.training.density import DensityControl
 from splatting.training.step import Step
 from utils.system_utils import UserError
@@ -21,7 +21,7 @@ MOST_GAUSSIANS = 1_000_000  # where --max_num_splats is 0
 
 
 class MarkovChain(DensityControl):
-    """The strategy of the MCMC paper, with the rules of scene/gaussians/relocation.py. It resets no opacities."""
+    """The strategy of the MCMC paper, with the rules of scene/gaussians/mcmc.py. It resets no opacities."""
 
     fusable = True
     clamps = False

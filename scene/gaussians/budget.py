@@ -5,12 +5,9 @@ from torch import Tensor
 
 from scene.gaussians import density_rules as rules
 from scene.gaussians.long_axis import long_axis_children
-from scene.gaussians.moves import changes_rows
-from scene.gaussians.parameters import raw_rows
-from scene.gaussians.relocating import RelocatingGaussians
-from scene.gaussians.row_surgery import restart_rows, row_groups
+from scene.gaussians.parameters import GaussianParameters
 from splatting.deterministic.portable_math import exp, log
-from splatting.distributed.selection import lowest
+from splatting.distributed.rows import changes_rows
 
 
 def count_after(now: int, budget: int, remaining: int, power: float) -> int:
@@ -26,7 +23,7 @@ def count_after(now: int, budget: int, remaining: int, power: float) -> int:
 
 @torch.no_grad()
 @changes_rows
-def split_in_two(gaussians: RelocatingGaussians, parents: Tensor) -> None:
+def split_in_two(gaussians: GaussianParameters, parents: Tensor) -> None:
     """Split Gaussians, ascending indices (n,), along their longest axis (scene/gaussians/long_axis.py).
 
     One child takes its parent's row, the other is appended. Adam's averages of both begin at zero, so that their first
@@ -35,11 +32,11 @@ def split_in_two(gaussians: RelocatingGaussians, parents: Tensor) -> None:
     count = len(parents)
     if not gaussians.shards.ranks.anyone(count > 0):
         return
-    rows = {name: values.index_select(0, parents) for name, values in raw_rows(gaussians).items()}
-    shapes = gaussians._log_scales(), gaussians._opacity_logits()
+    rows = gaussians.rows_at(parents)
+    shapes = gaussians.log_scales(), gaussians.opacity_logits()
     log_scales, logits = (values.index_select(0, parents) for values in shapes)
     children = long_axis_children(rows["xyz"], log_scales, rows["rotation"], logits)
-    children |= gaussians._raw_shapes(children["opacity"], children["scaling"])
+    children |= gaussians.raw_shapes(children["opacity"], children["scaling"])
     second = rows | {name: values[count:] for name, values in children.items()}
     gaussians._take(gaussians.cat_tensors_to_optimizer(second))
     gaussians.shards.appended(count)
@@ -47,27 +44,26 @@ def split_in_two(gaussians: RelocatingGaussians, parents: Tensor) -> None:
     gaussians._zero_statistics()
     for name, values in children.items():
         gaussians.raw(name)[parents] = values[:count]
-    groups, _, states = gaussians._groups()
-    restart_rows(row_groups(groups, len(gaussians)), states, parents)
+    gaussians.table.restart(parents)
 
 
 @changes_rows
-def remove_useless(gaussians: RelocatingGaussians, min_opacity: float, most: int) -> None:
+def remove_useless(gaussians: GaussianParameters, min_opacity: float, most: int) -> None:
     """Remove Gaussians of an opacity below min_opacity; then those of the lowest, until there are at most `most`."""
-    opacity = gaussians._opacity_logits().reshape(-1)
+    opacity = gaussians.opacity_logits().reshape(-1)
     remove = rules.is_useless(opacity, min_opacity)
     over = gaussians.total - most
     if over > 0:
-        remove[lowest(opacity, over, gaussians.shards.ranks)] = True
+        remove[gaussians.shards.lowest(opacity, over)] = True
     gaussians.prune_points(remove)
 
 
 @torch.no_grad()
-def fade(gaussians: RelocatingGaussians, factor: float) -> None:
+def fade(gaussians: GaussianParameters, factor: float) -> None:
     """Multiply all opacities by a factor in (0, 1]. Adam's averages stay."""
     if factor < 1.0:
-        logits = faded(gaussians._opacity_logits(), factor)
-        gaussians.raw("opacity").copy_(gaussians._raw_opacity(logits))
+        logits = faded(gaussians.opacity_logits(), factor)
+        gaussians.raw("opacity").copy_(gaussians.raw_opacity(logits))
 
 
 def faded(logits: Tensor, factor: float) -> Tensor:

@@ -1,0 +1,197 @@
+"""All tensors of a model that have a row per Gaussian, changed together: parameters, Adam's averages, statistics."""
+
+from collections.abc import Callable, Iterable, MutableMapping
+from typing import Any
+
+import splatting.host.extensions  # noqa: F401  isort: skip  (before the extensions)
+import torch
+from diff_gaussian_rasterization.backend import OPERATORS
+from torch import Tensor, nn
+
+from scene.gaussians.attributes import Rows
+from scene.gaussians.statistics import NAMES
+from splatting.host.memory import is_out_of_memory
+
+_CHUNK = 1 << 16  # rows moved at a time when memory is too short for all of them
+
+Group = dict[str, Any]  # a parameter group of a torch optimiser: `params`, options, and maybe `name`
+States = MutableMapping[Tensor, dict[str, Any]]  # an optimiser's state by parameter
+Change = Callable[[Tensor], Tensor]  # of the rows (N, ...) of any tensor
+
+
+class GaussianTable:
+    """The rows of a model and of its optimiser. Nothing else adds, removes or reorders Gaussians.
+
+    model: has a tensor for each of its `_attributes`, an `optimizer` of torch or None, and statistics. Each attribute
+    is a group of the optimiser with one parameter; those that it lacks change without averages. Further groups with a
+    row per Gaussian change with the others, and the rest, such as the weights of a network, stay as they are. New
+    parameters have no gradient.
+    """
+
+    def __init__(self, model: Any) -> None:
+        optimizer = model.optimizer
+        self._model = model
+        self.optimised: list[Group] = [] if optimizer is None else list(optimizer.param_groups)
+        self.states: States = {} if optimizer is None else optimizer.state
+        names = {group.get("name") for group in self.optimised}
+        self.others: list[Group] = [
+            {"name": name, "params": [getattr(model, attribute.field)]}
+            for name, attribute in model._attributes.items()
+            if name not in names
+        ]
+
+    def select(self, indices: Tensor, count: int) -> dict[str, nn.Parameter]:
+        """Keep the rows (n,) int64, ascending, of the parameters that have `count`. Returns these by name.
+
+        When memory runs out, the rows are moved within their own memory, and the error is raised afterwards.
+        """
+        errors = []
+
+        def keep(values: Tensor, *_: object) -> Tensor:
+            try:
+                return beside(values, values.index_select(0, indices))
+            except (MemoryError, RuntimeError) as error:
+                if not is_out_of_memory(error):
+                    raise
+                errors.append(error)
+                return _move_up(values, indices)
+
+        params = self._map(self.row_groups(count), keep)
+        if errors:
+            raise errors[0]
+        return params
+
+    def append(self, rows: Rows) -> dict[str, nn.Parameter]:
+        """Append `rows[name]` (n, ...) to each parameter, with averages of zero. Returns the parameters by name.
+
+        ValueError for a parameter without rows. When memory runs out, none keeps any of the new rows.
+        """
+        bare = self._model.optimizer is None
+        groups = [*self.optimised, *(group for group in self.others if bare or group["name"] in rows)]
+        counts = [len(group["params"][0]) for group in groups if group.get("name") in rows]
+        count = counts[0] if counts else len(self._model)
+        groups = _with_rows(groups, count)
+        if lacking := [str(group.get("name")) for group in groups if group.get("name") not in rows]:
+            raise ValueError(
+                f"no rows are given for {', '.join(lacking)}, which has a row for every Gaussian; "
+                "give them to cat_tensors_to_optimizer, or to densification_postfix by name"
+            )
+
+        def grow(values: Tensor, name: str, is_state: bool) -> Tensor:
+            new = rows[name]
+            return torch.cat((values, values.new_zeros(len(new), *values.shape[1:]) if is_state else new))
+
+        try:
+            return self._map(groups, grow)
+        except (MemoryError, RuntimeError) as error:
+            if is_out_of_memory(error):
+                self._map(groups, lambda values, *_: values[:count])
+            raise
+
+    def permute(self, order: Tensor) -> None:
+        """Put the rows, with the statistics, into an order (N,) int64: row i becomes what row order[i] was."""
+        self.change(lambda values: values.index_select(0, order), self.row_groups())
+
+    def change(self, change: Change, groups: Iterable[Group]) -> None:
+        """Change the rows of groups and of the statistics, one tensor at a time."""
+        model = self._model
+        model._take(self._map(groups, lambda values, *_: change(values)))
+        for name in (*NAMES, "tmp_radii"):
+            values = getattr(model, name, None)  # users delete those that they do not need
+            if values is not None:
+                setattr(model, name, change(values))
+
+    def replace(self, name: str, value: Tensor) -> dict[str, nn.Parameter]:
+        """Give a parameter other values, and averages of zero. Returns it by name; {} for a name that is not there."""
+        params = {}
+        for group in (*self.optimised, *self.others):
+            if group.get("name") == name:
+                shape = group["params"][0].shape
+                zeros = lambda mean, shape=shape: torch.zeros_like(value if mean.shape == shape else mean)  # noqa: E731
+                params[name] = self._replace(group, value, zeros)
+        return params
+
+    @torch.no_grad()
+    def overwrite(self, indices: Tensor, rows: Rows) -> None:
+        """Write `rows[name]` (n, ...) over the rows (n,) int64, all different, of each parameter that has some.
+
+        Averages of these rows restart at zero, and gradients are dropped, as they are those of other values.
+        """
+        for group in self.row_groups():
+            (param,) = group["params"]
+            if group.get("name") in rows:
+                param.index_copy_(0, indices, rows[group["name"]])
+            param.grad = None
+        self.restart(indices)
+
+    def restart(self, indices: Tensor) -> None:
+        """Zero the averages of the rows (n,); step counters and values stay."""
+        for group in self.row_groups():
+            (param,) = group["params"]
+            for mean in self.states.get(param, {}).values():
+                if torch.is_tensor(mean) and mean.dim() == param.dim() and len(mean) == len(param):
+                    mean.index_fill_(0, indices, 0.0)
+
+    def row_groups(self, count: int | None = None) -> list[Group]:
+        """The groups that have a row for each of `count` Gaussians, by default those of the model."""
+        return _with_rows([*self.optimised, *self.others], len(self._model) if count is None else count)
+
+    def _map(self, groups: Iterable[Group], change: Callable[[Tensor, str, bool], Tensor]) -> dict[str, nn.Parameter]:
+        """Map parameters and averages; `change` takes values, the group's name, and whether they are averages."""
+        params = {}
+        for group in groups:
+            name, old = group.get("name"), group["params"][0].detach()
+            value = beside(old, change(old, name, False))
+            params[name] = self._replace(group, value, lambda mean, name=name: change(mean, name, True))
+        return params
+
+    def _replace(self, group: Group, value: Tensor, change: Change) -> nn.Parameter:
+        """Swap a group's parameter. `change` maps its averages, the state with a row per Gaussian."""
+        old, param = group["params"][0], nn.Parameter(value.detach())
+        if old in self.states:
+            state = self.states[old]
+            for key, mean in state.items():
+                # Longer than the parameter: appended just before memory ran out, and now to be cut again.
+                if torch.is_tensor(mean) and mean.dim() == old.dim() and len(mean) >= len(old):
+                    state[key] = beside(mean, change(mean))
+            self.states[param] = self.states.pop(old)
+        group["params"] = [param]
+        return param
+
+
+def _with_rows(groups: Iterable[Group], count: int) -> list[Group]:
+    return [g for g in groups if len(g["params"]) == 1 and g["params"][0].dim() and len(g["params"][0]) == count]
+
+
+def _move_up(values: Tensor, indices: Tensor) -> Tensor:
+    """values[indices] for ascending indices, in the memory of `values` itself."""
+    for start in range(0, len(indices), _CHUNK):
+        part = indices[start : start + _CHUNK]
+        values[start : start + len(part)] = values.index_select(0, part)  # later parts read rows further down
+    return values[: len(indices)]
+
+
+def trainable(values: Tensor) -> Tensor:
+    """The same parameter with contiguous values, as the fused kernels need them; a new one if none was given.
+
+    Parameters, and leaves that require a gradient, stay the same objects. Other tensors are detached.
+    """
+    if not isinstance(values, nn.Parameter) and not (values.is_leaf and values.requires_grad):
+        values = nn.Parameter(values.detach())
+    if not values.is_contiguous():
+        values.data = values.data.contiguous()
+    return values
+
+
+def in_host_memory(values: Tensor) -> Tensor:
+    """A tensor of the same device in page-locked memory of the host; the same one if it lies there, or on the CPU."""
+    if not values.numel() or OPERATORS.is_in_host_memory(values):
+        return values
+    return OPERATORS.in_host_memory(values)
+
+
+def beside(old: Tensor, new: Tensor) -> Tensor:
+    """Values that take the place of old ones: in the host's memory if those lie there, else the same tensor."""
+    if not old.is_cuda or not old.numel() or not OPERATORS.is_in_host_memory(old):
+        return new
+    return in_host_memory(new.to(old.device))

@@ -1,0 +1,254 @@
+"""Rows of Gaussians that ranks share: which rows a rank holds, and how they are divided again after a change."""
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from functools import wraps
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from splatting.distributed.gathering import in_order, whole
+from splatting.distributed.ranks import ALONE, Ranks
+from splatting.distributed.selection import largest, lowest
+from splatting.host.device import compute_device
+
+_PART, _RANK = 43, 32  # bits of a key below the number of a part, and below the rank or piece in it
+
+
+class Shards:
+    """All rows of one process; the base of rows that are divided among ranks.
+
+    ranks: those that share the rows. first: index of this rank's first row among all.
+    """
+
+    ranks: Ranks = ALONE
+    first = 0
+
+    def total(self, count: int) -> int:
+        """The number of all rows, where this rank has `count`."""
+        return count
+
+    def of(self, count: int) -> "Shards":
+        """The place of `count` rows in another model, or after a change. Every rank must call it."""
+        return self
+
+    def own(self, values: Tensor) -> Tensor:
+        """This rank's part of the values (N, ...) of all rows."""
+        return values
+
+    def whole(self, values: Tensor) -> Tensor:
+        """All rows (N, ...), on the CPU of the rank that writes files; none elsewhere. Every rank must call it."""
+        return values
+
+    def pieces(self, count: int, part: Callable[[slice], Tensor]) -> Iterator[Tensor]:
+        """All rows in order, piece by piece, on the rank that writes files; others must go through them, too.
+
+        count: of this rank's rows; part: gives some of them (n, ...).
+        """
+        return in_order(self.ranks, count, part)
+
+    def items(self, indices: Tensor) -> Tensor:
+        """Indices (n,) among all rows, of those of this rank."""
+        return indices
+
+    def together(self, found: dict[str, Tensor], names: Iterable[str]) -> dict[str, Tensor]:
+        """Indices (n,) among all rows that any rank has found, by some of the names; of those without any nothing."""
+        return found
+
+    def lowest(self, values: Tensor, count: int, *, highest: bool = False) -> Tensor:
+        """Indices of this rank's values (n,) that are among the `count` lowest, or highest, of all; ties by place."""
+        return lowest(values, count, self.ranks, highest=highest)
+
+    def largest(self, values: Tensor) -> Tensor:
+        """The largest value, a scalar, of all ranks' values (n,), of which some rank must have one."""
+        return largest(values, self.ranks)
+
+    def send_draws(self, rows: dict[str, Tensor], draws: Tensor, counts: Tensor) -> dict[str, Tensor]:
+        """Rows for the Gaussians that draws are made for, from the ranks that the draws fell on.
+
+        rows (n, ...) of this rank belong to `draws` (n,), ascending. counts (size,): draws received by each rank, in
+        rank order. Every rank must call it.
+        """
+        return rows
+
+    def changing(self, gaussians: Any) -> AbstractContextManager[None]:
+        """Context of a change of rows, at whose end they are divided again; within another one it does nothing."""
+        return nullcontext()
+
+    def match(self, optimizer: torch.optim.Optimizer | None) -> None:
+        """Give every rank the last one's step counters, for the groups that have a state there, and in that order.
+
+        A rank without Gaussians takes no steps, and the last rank has some if any has. Every rank must call it.
+        """
+
+    def kept(self, indices: Tensor) -> None:
+        """Take note of the rows (n,) that were kept."""
+
+    def appended(self, count: int) -> None:
+        """Take note of rows that were appended, of which all ranks' follow each other in the order of ranks."""
+
+    def order(self, *pieces: Tensor) -> None:
+        """Change the order of the rows that were appended last: piece by piece, over all ranks.
+
+        pieces: for each row of a piece a number (n,) int64 that orders the rows of this piece on all ranks.
+        """
+
+
+class Divided(Shards):
+    """Rows that are divided among several ranks.
+
+    While rows change, each has a key, which orders the rows of all ranks as one process would. keys: (n,) int64,
+    ascending, or None. changed: whether this rank's rows have changed.
+    """
+
+    def __init__(self, ranks: Ranks, count: int) -> None:
+        """Take the place of this rank's rows, `count` of them. Every rank must call it."""
+        self.ranks = ranks
+        self.first, self._total = ranks.before(count)
+        self.keys: Tensor | None = None
+        self.changed = False
+        self._parts = 0
+
+    def total(self, count: int) -> int:
+        return self._total
+
+    def of(self, count: int) -> "Shards":
+        return Divided(self.ranks, count)
+
+    def own(self, values: Tensor) -> Tensor:
+        first, stop = (bound(rank, len(values), self.ranks.size) for rank in (self.ranks.rank, self.ranks.rank + 1))
+        return values[first:stop].clone()  # so that the rest can be freed
+
+    def whole(self, values: Tensor) -> Tensor:
+        return whole(values, self.ranks)
+
+    def items(self, indices: Tensor) -> Tensor:
+        return indices + self.first
+
+    def together(self, found: dict[str, Tensor], names: Iterable[str]) -> dict[str, Tensor]:
+        none = torch.empty(0, dtype=torch.int64, device=compute_device())
+        every = {name: self.ranks.gather(self.items(found.get(name, none))) for name in names}
+        return {name: rows for name, rows in every.items() if len(rows)}
+
+    def send_draws(self, rows: dict[str, Tensor], draws: Tensor, counts: Tensor) -> dict[str, Tensor]:
+        moves = Redistribution(self.ranks, draws, [0, *counts.cumsum(0).tolist()])
+        return {name: moves(values) for name, values in rows.items()}
+
+    @contextmanager
+    def changing(self, gaussians: Any) -> Iterator[None]:
+        if self.keys is not None:
+            yield
+            return
+        device = gaussians.get_xyz.device
+        self.keys, self.changed, self._parts = self.first + torch.arange(len(gaussians), device=device), False, 0
+        try:
+            yield
+            self._divide_again(gaussians)
+        finally:
+            self.keys = None
+
+    @torch.no_grad()
+    def _divide_again(self, gaussians: Any) -> None:
+        """Move all that belongs to rows that have changed, one tensor at a time."""
+        ranks = self.ranks
+        if not ranks.anyone(self.changed):
+            return
+        counts = ranks.numbers(len(self.keys))[:, 0].tolist()
+        # The place of a key: how many keys of all ranks are below it.
+        places = sum(torch.searchsorted(part, self.keys) for part in ranks.gather(self.keys).split(counts))
+        bounds = [bound(rank, sum(counts), ranks.size) for rank in range(ranks.size + 1)]
+        moves = Redistribution(ranks, places, bounds)
+        self.match(gaussians.optimizer)
+        table = gaussians.table
+        groups, own = [*table.optimised, *table.others], table.row_groups()
+        here = [any(group is other for other in own) for group in groups]
+        everywhere = ranks.numbers(*map(int, here)).all(dim=0).tolist()
+        table.change(moves, [group for group, moving in zip(groups, everywhere, strict=True) if moving])
+        gaussians.shards = self.of(moves.count)
+
+    def match(self, optimizer: torch.optim.Optimizer | None) -> None:
+        if optimizer is None:
+            return
+        params, states = [group["params"][0] for group in optimizer.param_groups], optimizer.state
+        make = getattr(optimizer, "state_of", None)
+        order = {param: number for number, param in enumerate(states)}
+        mine = [number for param in params for number in (order.get(param, -1), _steps(states.get(param, {})))]
+        last = self.ranks.numbers(*mine)[-1].reshape(-1, 2).tolist()
+        for place, steps, index in sorted((*numbers, index) for index, numbers in enumerate(last)):
+            param = params[index]
+            if place < 0 or (param not in states and make is None):
+                continue
+            state = states.pop(param) if param in states else make(param)
+            states.pop(param, None)
+            states[param] = state
+            if torch.is_tensor(state.get("step")):
+                state["step"].fill_(steps)
+
+    def kept(self, indices: Tensor) -> None:
+        self.keys, self.changed = self.keys[indices], True
+
+    def appended(self, count: int) -> None:
+        self._parts, self.changed = self._parts + 1, True
+        first = (self._parts << _PART) + (self.ranks.rank << _RANK)
+        self.keys = torch.cat((self.keys, first + torch.arange(count, device=self.keys.device)))
+
+    def order(self, *pieces: Tensor) -> None:
+        new = torch.cat([(number << _RANK) + piece for number, piece in enumerate(pieces)])
+        self.keys[len(self.keys) - len(new) :] = (self._parts << _PART) + new
+
+
+WHOLE = Shards()
+
+
+def bound(rank: int, total: int, size: int) -> int:
+    """The first of all rows that a rank has, once they are divided evenly."""
+    return rank * total // size
+
+
+def changes_rows(method: Callable[..., Any]) -> Callable[..., Any]:
+    """A method of a model, or a function of one, that every rank must call, and after which rows are divided again."""
+
+    @wraps(method)
+    def changing(gaussians: Any, *args: Any, **named: Any) -> Any:
+        with gaussians.shards.changing(gaussians):
+            return method(gaussians, *args, **named)
+
+    return changing
+
+
+class Redistribution:
+    """The rows that each rank sends and receives, to be applied to one tensor after the other.
+
+    count: of this rank's rows afterwards.
+    """
+
+    def __init__(self, ranks: Ranks, places: Tensor, bounds: Sequence[int]) -> None:
+        """Move rows to their places (n,) int64, ascending, among those of all ranks. Every rank must call it.
+
+        bounds: rank r gets the places from bounds[r] to bounds[r + 1].
+        """
+        self._ranks = ranks
+        first, stop = bounds[ranks.rank : ranks.rank + 2]
+        self.count = stop - first
+        owners = torch.searchsorted(torch.tensor(bounds[1:], device=places.device), places, right=True)
+        self._stay = (owners == ranks.rank).nonzero().reshape(-1)
+        self._sent = [(owners == rank).nonzero().reshape(-1) for rank in range(ranks.size)]
+        self._sent[ranks.rank] = self._stay[:0]
+        arrived = torch.cat(ranks.exchange([places[indices] for indices in self._sent]))
+        self._here, self._there = places[self._stay] - first, arrived - first
+        self._any = ranks.anyone(len(arrived) + sum(map(len, self._sent)) > 0)
+
+    def __call__(self, values: Tensor) -> Tensor:
+        """The values of the rows (N, ...) that this rank has afterwards. Every rank must call it."""
+        if not self._any:
+            return values
+        arrived = self._ranks.exchange([values[indices] for indices in self._sent])
+        moved = values.new_empty(self.count, *values.shape[1:])
+        moved[self._here] = values[self._stay]
+        moved[self._there] = torch.cat(arrived)
+        return moved
+
+
+def _steps(state: dict[str, Any]) -> int:
+    return int(state.get("step", 0))
