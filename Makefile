@@ -86,7 +86,7 @@ cpp-test:
 	@$(call in_parallel,$(CXX_TESTS),&& TARGET)
 
 # Compiles $< of the submodule $(1); more flags follow.
-compile_test = $(CXX) $(CXX_TEST_FLAGS) -Isubmodules/$(1)/csrc -Isubmodules/common/include $<
+compile_test = $(CXX) $(CXX_TEST_FLAGS) -Isubmodules/$(1)/csrc -Isubmodules/common/include -Isubmodules/common/tests $<
 # The submodule of build/SUBMODULE/..., and its objects.
 submodule = $(firstword $(subst /, ,$(1)))
 objects = $(filter build/$(1)/%,$(CXX_TEST_OBJECTS))

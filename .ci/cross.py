@@ -116,7 +116,8 @@ def build(target: Target, isa: str, extension: str) -> Path:
     csrc = Path("submodules", extension, "csrc")
     folder = OUT / target.name / isa / extension
     folder.mkdir(parents=True, exist_ok=True)
-    compiler = [*command_of(target.compiler), *FLAGS, f"-I{csrc}", "-Isubmodules/common/include", *target.isas[isa]]
+    includes = [f"-I{folder}" for folder in (csrc, "submodules/common/include", "submodules/common/tests")]
+    compiler = [*command_of(target.compiler), *FLAGS, *includes, *target.isas[isa]]
 
     def compilations() -> Iterator[list[str]]:
         for source in sorted((ROOT / csrc / "cpu").glob("*.cpp")):

@@ -10,7 +10,8 @@ import torch
 from diff_gaussian_rasterization import GaussianRasterizationSettings, decisive, rasterize
 from diff_gaussian_rasterization.backend import OPERATORS
 from diff_gaussian_rasterization.gaussians import Gaussians
-from diff_gaussian_rasterization.ops import Rasterized, scene_arguments
+from diff_gaussian_rasterization.ops import Rasterized
+from diff_gaussian_rasterization.scene import scene_arguments
 from torch import Tensor
 
 from scene.cameras import Camera, MiniCam

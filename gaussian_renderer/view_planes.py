@@ -3,9 +3,8 @@
 import argparse
 
 import torch
-from diff_gaussian_rasterization.backend import OPERATORS
 from diff_gaussian_rasterization.gaussians import Gaussians
-from diff_gaussian_rasterization.ops import scene_arguments
+from diff_gaussian_rasterization.scene import draw, scene_arguments
 from torch import Tensor
 
 from gaussian_renderer import rasterizer_settings, render
@@ -45,5 +44,4 @@ def blend_depth(
     colors = {"sh_dc": gaussians.get_features_dc, "sh_rest": gaussians.get_features_rest}
     rows = Gaussians(gaussians.get_xyz, **gaussians.raw_geometry(), **colors)
     scene = scene_arguments(rows, rasterizer_settings(camera, gaussians, pipe, background, scaling), True)
-    *_, last, _ = OPERATORS.rasterize(rows.means, *scene, background, False, True)
-    return last
+    return draw(scene, background).last

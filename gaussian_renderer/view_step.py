@@ -8,12 +8,12 @@ statistics get the same bits as by `render`, backward, `observe` and the optimis
 import argparse
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
 
 import torch
 from diff_gaussian_rasterization.backend import OPERATORS
 from diff_gaussian_rasterization.gaussians import Gaussians
-from diff_gaussian_rasterization.ops import scene_arguments
+from diff_gaussian_rasterization.scene import Scene, scene_arguments
+from diff_gaussian_rasterization.scene import draw as rasterize
 from torch import Tensor
 
 from gaussian_renderer import rasterizer_settings
@@ -42,10 +42,9 @@ class Drawn:
     image: Tensor
     depth: Tensor | None
     radii: Tensor  # (N,) int32 pixels
-    scene: tuple[Any, ...]  # arguments of the operators
-    state: tuple[Tensor, ...] = ()
-    more: tuple[Tensor, ...] = ()  # what the backward wants after the image's gradients
-    view: View | None = None  # of several ranks, which have the state
+    scene: Scene
+    kept: tuple[Tensor, ...] = ()  # what the backward needs
+    view: View | None = None  # of several ranks, in place of what is kept
     band: Band | None = None  # if the image is right only there and around it
 
 
@@ -75,11 +74,9 @@ def draw(
         view = surroundings(view) if by_bands else whole_image(view)
         depth = view.inverse_depth if want_depth else None
         return Drawn(view.color, depth, view.radii, scene, view=view, band=view.band if by_bands else None)
-    color, transmittance, depth, radii, splats, tile_counts, *lists, last, layers = OPERATORS.rasterize(
-        rows.means, *scene, background, want_depth, True
-    )
-    state = (splats, *lists, background, last, transmittance)
-    return Drawn(color, depth if want_depth else None, radii, scene, state, (tile_counts, layers))
+    drawn = rasterize(scene, background, want_depth)
+    depth = drawn.inverse_depth if want_depth else None
+    return Drawn(drawn.color, depth, drawn.radii, scene, drawn.kept(background))
 
 
 @torch.no_grad()
@@ -98,14 +95,12 @@ def step(
     now: (NOW_WORDS,) int64 on the Gaussians' device of `FusedAdam.write_now`, for a step that is recorded.
     """
     absolute &= observe
-    further = {"now": now, "absolute": absolute, **adam.penalties()}
+    planes = image_gradient, None, depth_gradient
+    source = drawn.kept
     if (view := drawn.view) is not None:
-        rows = gradient_rows(view, (image_gradient, None, depth_gradient), absolute)
-        OPERATORS.rows_vjp_step_(
-            *drawn.scene, view.splats, view.tile_counts, *rows, drawn.radii, *adam.arguments(observe), **further
-        )
-        return
-    OPERATORS.rasterize_vjp_step_(
-        *drawn.scene, *drawn.state, image_gradient, None, depth_gradient, *drawn.more, drawn.radii,
-        *adam.arguments(observe), **further,
-    )  # fmt: skip
+        source = view.splats, view.tile_counts, *gradient_rows(view, planes, absolute)
+        planes = ()
+    # By place: names would cost the operator microseconds.
+    OPERATORS.apply_gradients_(
+        *drawn.scene.lists, source, planes, [], drawn.radii, *adam.arguments(observe), now, absolute
+    )

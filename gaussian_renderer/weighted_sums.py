@@ -4,10 +4,9 @@ import argparse
 from collections.abc import Callable
 
 import torch
-from diff_gaussian_rasterization.backend import OPERATORS
 from diff_gaussian_rasterization.gaussians import Gaussians
-from diff_gaussian_rasterization.ops import scene_arguments
-from diff_gaussian_rasterization.schema import GRADIENTS
+from diff_gaussian_rasterization.ops import gradients_of
+from diff_gaussian_rasterization.scene import draw, scene_arguments
 from torch import Tensor
 
 from gaussian_renderer import model_inputs, rasterizer_settings
@@ -16,7 +15,7 @@ from scene.gaussian_model import GaussianModel
 from splatting.distributed.rendering.band import draw_view, gradient_rows, whole_image
 from splatting.distributed.rendering.models import ranks_of
 
-_ONLY_COLORS = [name == "colors" for name in GRADIENTS]
+_ONLY_COLORS = [name == "colors" for name in ("means2d", *Gaussians._fields)]
 
 
 @torch.no_grad()
@@ -40,12 +39,9 @@ def weighted_sums(
     if (ranks := ranks_of(gaussians)).several:
         view = whole_image(draw_view(ranks, drawn, background, want_depth=False, train=True))
         rows = gradient_rows(view, (value(view.color), None, None), absolute=False)
-        gradients = OPERATORS.rows_vjp(*given, view.splats, view.tile_counts, *rows, _ONLY_COLORS)
-        return gradients[_ONLY_COLORS.index(True)]
-    image, transmittance, _, _, splats, tile_counts, *lists, last, layers = OPERATORS.rasterize(
-        xyz, *drawn, background, False, True
-    )
-    state = (splats, *lists, background, last, transmittance)
-    planes = value(image), None, None
-    gradients = OPERATORS.rasterize_vjp(*given, *state, *planes, tile_counts, layers, _ONLY_COLORS)
-    return gradients[_ONLY_COLORS.index(True)]
+        source, planes = (view.splats, view.tile_counts, *rows), ()
+    else:
+        image = draw(drawn, background)
+        source, planes = image.kept(background), (value(image.color), None, None)
+    (gradient,) = filter(torch.is_tensor, gradients_of(given, source, planes, _ONLY_COLORS))
+    return gradient

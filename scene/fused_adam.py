@@ -18,7 +18,7 @@ NOW_WORDS = 22  # int64: what changes from step to step (gs::StepNow)
 
 
 class FusedAdam:
-    """Hands a model's optimiser, and a penalty, to `rasterize_vjp_step_`. Make one only if `takes` says so."""
+    """Hands a model's optimiser, and a penalty, to `apply_gradients_`. Make one only if `takes` says so."""
 
     def __init__(self, gaussians: GaussianModel, penalty: Penalty = NO_PENALTY) -> None:
         self._gaussians = gaussians
@@ -43,21 +43,22 @@ class FusedAdam:
         )
 
     def arguments(self, observe: bool) -> tuple[Any, ...]:
-        """Arguments of the operator from `attributes` on, for the next step. observe: with the statistics."""
-        optimizer = self._gaussians.optimizer
-        stepping = list(self._stepping())
-        attributes = [one.attribute for one in stepping]
-        averages = [one.state["exp_avg"] for one in stepping], [one.state["exp_avg_sq"] for one in stepping]
-        steps = [one.state["step"] for one in stepping]
-        rates, columns = [one.rate for one in stepping], [one.columns for one in stepping]
-        statistics = self._statistics() if observe else (None, None, None)
-        guard = optimizer.guard.arguments if optimizer.guard else ()
-        return (attributes, *averages, steps, rates, *self._constants(), columns, self._sparse, *statistics, *guard)
-
-    def penalties(self) -> dict[str, float]:
-        """The operator's last arguments, which change with the number of Gaussians."""
+        """Arguments of the operator from `averages` to `iteration`, for the next step. observe: with the statistics."""
+        optimizer, stepping = self._gaussians.optimizer, list(self._stepping())
         each = self._penalty.of_each(self._gaussians.total)
-        return {"opacity_penalty": each.opacity, "scale_penalty": each.scale}
+        *guard, iteration = (optimizer.guard and optimizer.guard.arguments) or (0,)
+        return (
+            [one.state[name] for name in ("exp_avg", "exp_avg_sq") for one in stepping],
+            [one.state["step"] for one in stepping],
+            self._statistics() if observe else (),
+            guard,
+            [one.attribute for one in stepping],
+            [one.rate for one in stepping],
+            [*self._constants(), each.opacity, each.scale],
+            [one.columns for one in stepping],
+            self._sparse,
+            iteration,
+        )
 
     def write_now(self, now: Tensor, iteration: int) -> None:
         """Write what the next step stands for, (NOW_WORDS,) int64 on the CPU, and advance the step counters.

@@ -52,9 +52,12 @@ def gradient_errors(parameters: dict[str, Tensor], camera) -> tuple[float, float
 
     instances, ranges, *slots = OPS.bin(splats, depths, rects, counts, height, width, True)
     background = torch.zeros(3)
-    _, transmittance, _, last, _ = OPS.blend(splats, instances, ranges, background, height, width, False, True)
-    state = (splats, instances, ranges, *slots, background, last, transmittance)
-    quu, quv, qvv = OPS.blend_vjp(*state, weights.float(), None, None)[order, 3:6].double().unbind(1)
+    _, left, _, last, layers = OPS.blend(splats, instances, ranges, background, height, width, False, True)
+    kept = splats, counts, instances, ranges, *slots, last, layers, background, left
+    rows, of_each = OPS.blend_rows(kept, weights.float(), None, None)
+    moments = torch.zeros(len(splats), rows.shape[1], dtype=torch.float64)
+    moments.index_add_(0, torch.arange(len(splats)).repeat_interleave(of_each), rows.double())
+    quu, quv, qvv = moments[order, 3:6].unbind(1)
     uu, uv = quu * l11, quv * l11  # gradient of a symmetric matrix, 2 ln2^2 L^T W2 L; xy stands for two entries
     vu, vv = quu * l12 + quv * l22, quv * l12 + qvv * l22
     ours = 2 * math.log(2) ** 2 * torch.stack([l11 * uu, 2 * (l12 * uu + l22 * uv), l12 * vu + l22 * vv], 1)

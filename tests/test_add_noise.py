@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 from diff_gaussian_rasterization.density import add_noise_
-from rasterizer_tools import CPU_AND_GPU, ops
+from rasterizer_tools import CPU_AND_GPU
 from test_split_positions import _cross, _normal
-from torch import Tensor, library
+from torch import Tensor
 
 from splatting.deterministic import portable_math
 from splatting.deterministic.counter_rng import Stream
@@ -119,35 +119,3 @@ def test_a_mean_that_would_not_be_finite_stays(device):
     add_noise_(*gaussians, **GATE, **WHERE)
     assert torch.equal(gaussians[0][[0, 5]], wanted[0][[0, 5]])
     assert torch.equal(gaussians[0][1:5], before[1:5]) and not torch.equal(before[0], wanted[0][0])
-
-
-def test_any_number_of_threads_gives_the_same():
-    before, results = torch.get_num_threads(), []
-    try:
-        for threads in (1, 2, 3):
-            torch.set_num_threads(threads)
-            gaussians = _gaussians(20_001)
-            add_noise_(*gaussians, **GATE, **WHERE)
-            results.append(gaussians[0])
-    finally:
-        torch.set_num_threads(before)
-    assert torch.equal(results[0], results[1]) and torch.equal(results[0], results[2])
-
-
-@CPU_AND_GPU
-def test_opcheck(device):
-    library.opcheck(
-        ops.add_noise_.default, (*(t.to(device) for t in _gaussians(5)), 80.0, 100.0, 0.005, 1, 4, 600, None)
-    )
-
-
-def test_what_does_not_fit_is_named():
-    means, scales, rotations, logits = _gaussians(4)
-    with pytest.raises(TypeError, match=r"means must be torch.float32 on cpu, got torch.float64"):
-        add_noise_(means.double(), scales, rotations, logits, **GATE, **WHERE)
-    with pytest.raises(ValueError, match=r"logits must be \(4, 1\).*got \(4,\)"):
-        add_noise_(means, scales, rotations, logits[:, 0], **GATE, **WHERE)
-    with pytest.raises(ValueError, match="means must be contiguous"):
-        add_noise_(means.T.contiguous().T, scales, rotations, logits, **GATE, **WHERE)
-    with pytest.raises(ValueError, match="steepness from 0 to 10000, got 80 and 10001"):
-        add_noise_(means, scales, rotations, logits, **GATE | {"steepness": 10001.0}, **WHERE)

@@ -88,7 +88,7 @@ def test_an_iteration_makes_few_calls(colmap_scene, tmp_path):
     found = _calls(25, options, tmp_path / "long")
     found.subtract(_calls(5, options, tmp_path / "short"))
     calls = {name: count / 20 for name, count in found.items()}
-    for op in ("rasterize", "rasterize_vjp_step_"):
+    for op in ("rasterize", "apply_gradients_"):
         assert calls[f"diff_gaussian_rasterization::{op}"] == 1, op
     assert calls["fused_ssim::photometric"] == calls["fused_ssim::photometric_vjp"] == 1
     assert calls.pop("node") <= 2  # the loss, and the image that it is differentiated by

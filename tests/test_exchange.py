@@ -1,4 +1,4 @@
-"""The operators of what ranks exchange, against their plain formulation in torch: the same bits."""
+"""Exchange between ranks, against its plain formulation: the same bits."""
 
 import pytest
 import torch
@@ -7,6 +7,7 @@ from rasterizer_tools import BOTH_AND_GPU, CPU_AND_GPU, moved_by_a_word, ops
 from torch import Tensor
 
 from splatting.distributed.ranks import Ranks
+from splatting.distributed.rendering import exchange
 from splatting.distributed.rendering.exchange import Sent, return_rows
 from splatting.host.read_later import read_later
 
@@ -26,18 +27,6 @@ def some_splats(count: int, device: str, dtype: torch.dtype) -> Splats:
     return tuple(t.to(device) for t in (splats, depths, words(count, 4), words(count)))
 
 
-def packed_by_torch(splats: Splats, gaussians: Tensor) -> Tensor:
-    values, depths, rects, tile_counts = (t.index_select(0, gaussians).view(-1, t[:1].numel()) for t in splats)
-    return torch.cat([t.view(torch.int32) for t in (values, depths, tile_counts, rects)], 1)
-
-
-def pack(splats: Splats, gaussians: Tensor) -> Tensor:
-    wide = splats[0].dtype.itemsize // 4
-    packed = torch.full((len(gaussians), 11 * wide + 5), 77, dtype=torch.int32, device=gaussians.device)
-    ops.pack_splats_(packed, *splats, gaussians)
-    return packed
-
-
 def same_bits(one: Tensor, other: Tensor) -> bool:
     return one.dtype == other.dtype and torch.equal(
         one.reshape(-1).view(torch.int32), other.reshape(-1).view(torch.int32)
@@ -49,24 +38,10 @@ def same_bits(one: Tensor, other: Tensor) -> bool:
 def test_splats_are_packed_and_unpacked(chosen, device, dtype):
     splats = some_splats(LARGE // 2, device, dtype)
     gaussians = torch.randint(LARGE // 2, (chosen,), generator=torch.Generator().manual_seed(1)).to(device)
-    packed = pack(splats, gaussians)
-    assert torch.equal(packed, packed_by_torch(splats, gaussians))
-    strided = torch.stack((gaussians, gaussians), 1)[:, 0]
-    assert torch.equal(pack(splats, strided), packed)
-    unpacked = ops.unpack_splats(packed, splats[0])
-    for values, whole in zip(unpacked, splats, strict=True):
+    packed = exchange._packed([splats, splats], gaussians, [chosen // 3, chosen - chosen // 3])
+    assert packed.shape == (chosen, 11 * dtype.itemsize // 4 + 5) and packed.dtype == torch.int32
+    for values, whole in zip(exchange._unpacked(packed, splats), splats, strict=True):
         assert values.shape == (chosen, *whole.shape[1:]) and same_bits(values, whole.index_select(0, gaussians))
-
-
-@BOTH_AND_GPU
-def test_a_part_of_rows_is_packed(device, dtype):
-    splats = some_splats(50, device, dtype)
-    gaussians = torch.arange(50, device=device)
-    rows = torch.full_like(pack(splats, gaussians), -77)
-    ops.pack_splats_(rows[10:30], *splats, gaussians[10:30])
-    assert torch.equal(rows[10:30], packed_by_torch(splats, gaussians[10:30]))
-    assert (rows[:10] == -77).all() and (rows[30:] == -77).all()
-    assert ops.unpack_splats(pack(some_splats(0, device, dtype), gaussians[:0]), splats[0])[2].shape == (0, 4)
 
 
 def reach_of(kind: str, device: str) -> tuple[Tensor, Tensor, Tensor]:
@@ -98,23 +73,15 @@ def recorded_by_torch(rects: Tensor, tile_counts: Tensor, limits: Tensor) -> tup
 def test_records_are_counted_and_listed(kind, device):
     reach = reach_of(kind, device)
     numbers, gaussians, places = recorded_by_torch(*reach)
-    counts = ops.count_records(*reach)
+    counts, *found = ops.list_records(*reach, len(gaussians))
     assert torch.equal(counts[:-1].sum(1), numbers) and torch.equal(counts[-1], counts[:-1].sum(0))
-    found = ops.list_records(*reach, counts, len(gaussians))
     assert torch.equal(found[0], gaussians) and torch.equal(found[1], places)
     for room in (len(gaussians) // 2, len(gaussians) + 7):
-        part = ops.list_records(*reach, counts, room)
+        _, *part = ops.list_records(*reach, room)
         assert len(part[0]) == len(part[1]) == room
         for one, other in zip(part, found, strict=True):
             assert torch.equal(one[: len(other)], other[:room])
     assert kind != "some" or len(gaussians) > LARGE / 2
-
-
-def moved_by_torch(rows: Tensor, counts: Tensor, places: Tensor) -> Tensor:
-    ends = torch.empty_like(counts).index_copy_(0, places.long(), counts).cumsum(0).index_select(0, places.long())
-    shifts = ends - counts.cumsum(0)
-    to = torch.arange(len(rows), device=rows.device) + shifts.repeat_interleave(counts)
-    return torch.empty_like(rows).index_copy_(0, to, rows)
 
 
 def some_counts(kind: str) -> Tensor:
@@ -147,11 +114,10 @@ def test_runs_move(kind, values, device, dtype):
     # As ranks get them: in order in each of three parts, which lie in each other.
     merged = torch.cat([torch.arange(len(counts), device=device)[rank::3] for rank in range(3)])
     for places in (shuffled, merged, merged.sort().values):
-        places = places.int()
-        assert torch.equal(ops.move_runs(rows, counts, places), moved_by_torch(rows, counts, places))
-    assert torch.equal(ops.move_runs(rows, counts, places), rows)
-    wide = torch.cat((rows, rows), 1)[:, values:]
-    assert torch.equal(ops.move_runs(wide, counts, places), rows)
+        moved = exchange.move_runs(rows, counts, places.int())
+        order, runs = places.argsort(), rows.split(counts.tolist())
+        assert torch.equal(moved, torch.cat([rows[:0], *(runs[run] for run in order.tolist())]))
+    assert torch.equal(moved, rows)
 
 
 @BOTH_AND_GPU
@@ -181,10 +147,9 @@ def test_parts_are_added_up(device):
     counts = torch.randint(9, (LARGE,), generator=torch.Generator().manual_seed(4), dtype=torch.int32).to(device)
     counts[0] = 2**31 - 1
     sizes = [5, 0, 1, LARGE - 7, 1]
-    found = ops.sum_parts(counts, sizes)
+    found = exchange._sums_of_parts(counts, sizes)
     assert found.dtype == torch.int64 and found.tolist() == [int(part.sum()) for part in counts.split(sizes)]
-    assert ops.sum_parts(counts[:0], [0, 0]).tolist() == [0, 0] and len(ops.sum_parts(counts[:0], [])) == 0
-    assert torch.equal(ops.sum_parts(torch.stack((counts, counts), 1)[:, 0], sizes), found)
+    assert exchange._sums_of_parts(counts[:0], [0, 0]).tolist() == [0, 0]
 
 
 class _Both(Ranks):
@@ -233,16 +198,6 @@ def test_numbers_are_read_before_later_work_is_done():
 
 @CPU_AND_GPU
 def test_inputs_may_begin_at_any_word(device):
-    splats = some_splats(9, device, torch.float32)
-    gaussians = torch.tensor([2, 8, 3], device=device)
-    packed = pack(splats, gaussians)
-    assert torch.equal(pack(tuple(map(moved_by_a_word, splats)), gaussians), packed)
-    for one, other in zip(
-        ops.unpack_splats(packed, splats[0]), ops.unpack_splats(moved_by_a_word(packed), splats[0]), strict=True
-    ):
-        assert same_bits(one, other)
-    rows = torch.rand(5, 10, device=device)
-    counts, places = (torch.tensor(x, dtype=torch.int32, device=device) for x in ([2, 0, 3], [2, 0, 1]))
-    assert torch.equal(ops.move_runs(moved_by_a_word(rows), counts, places), ops.move_runs(rows, counts, places))
+    rows, counts = torch.rand(5, 10, device=device), torch.tensor([2, 0, 3], dtype=torch.int32, device=device)
     kept = counts.clamp_max(1)
     assert torch.equal(ops.sum_runs(moved_by_a_word(rows), counts, kept, 2), ops.sum_runs(rows, counts, kept, 2))

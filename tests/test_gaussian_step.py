@@ -5,7 +5,11 @@ from dataclasses import dataclass, field, replace
 
 import pytest
 import torch
-from diff_gaussian_rasterization import GaussianRasterizationSettings, schema
+from diff_gaussian_rasterization import GaussianRasterizationSettings
+from diff_gaussian_rasterization.density import penalise_
+from diff_gaussian_rasterization.ops import gradients_of
+from diff_gaussian_rasterization.optim import adam_, observe_, sparse_adam_
+from diff_gaussian_rasterization.scene import GRADIENTS, draw
 from rasterizer_tools import BOTH_AND_GPU, activated, ops, scene_arguments
 from torch import Tensor
 
@@ -89,91 +93,78 @@ class Case:
 
 
 def rendered(state: State, camera: GaussianRasterizationSettings, case: Case, iteration: int) -> tuple:
-    """Arguments that both backwards have in common, then the radii."""
+    """The scene, what the forward has kept, gradients of its planes, and the radii."""
     scene = scene_arguments(state.values, camera, case.raw)
-    out = ops.rasterize(None, *scene, camera.bg, True, True)
-    color, transmittance, inverse_depth, radii, splats, counts, *lists, last, layers = out
+    drawn = draw(scene, camera.bg, True)
     generator = torch.Generator().manual_seed(iteration)
-    planes = [torch.randn(t.shape, generator=generator).to(t) for t in (color, transmittance, inverse_depth)]
+    planes = [torch.randn(t.shape, generator=generator).to(t) for t in drawn[:3]]
     if iteration == 2:
-        planes[0][0, color.shape[1] // 2, color.shape[2] // 2] *= case.broken
+        planes[0][0, planes[0].shape[1] // 2, planes[0].shape[2] // 2] *= case.broken
     if not case.depth:
         planes[1:] = None, None
-    return (*scene, splats, *lists, camera.bg, last, transmittance, *planes, counts, layers), radii
+    return scene, drawn.kept(camera.bg), planes, drawn.radii
 
 
 def step_plainly(state: State, camera: GaussianRasterizationSettings, case: Case, iteration: int) -> None:
     """Take one iteration's step from gradients in memory."""
-    arguments, radii = rendered(state, camera, case, iteration)
-    wanted = [name in ("means2d", *PARAMETERS) for name in schema.GRADIENTS]
-    gradients = dict(zip(schema.GRADIENTS, ops.rasterize_vjp(*arguments, wanted, case.absolute), strict=True))
+    *arguments, radii = rendered(state, camera, case, iteration)
+    needed = [name in ("means2d", *PARAMETERS) for name in GRADIENTS]
+    gradients = dict(zip(GRADIENTS, gradients_of(*arguments, needed, case.absolute), strict=True))
     if any(case.penalties):
         penalised = "opacities", "scales"
         of = [state.values[name] for name in penalised], [gradients[name] for name in penalised]
-        ops.penalise_(*of[0], *of[1], *case.penalties)
+        penalise_(*of[0], *of[1], opacity=case.penalties[0], scale=case.penalties[1])
     if case.observed:
         screen = gradients["means2d"]
-        ops.observe_(*state.statistics, radii, screen[:, 2] if case.absolute else screen)
+        observe_(*state.statistics, radii, screen[:, 2] if case.absolute else screen)
     names = [PARAMETERS[place] for place in case.attributes]
     values, gradients = [state.values[name] for name in names], [gradients[name] for name in names]
     guard = case.guard(state, iteration)
     if not names:
         return
     if not case.sparse:
-        ops.adam_(values, gradients, *case.lists(state), *guard)
+        adam_(values, gradients, *case.lists(state), *guard)
         return
     *lists, beta1, beta2, eps, columns = case.lists(state)
     for value, gradient, mean, square, counter, rate, count in zip(values, gradients, *lists, columns, strict=True):
         counter += 1
-        ops.sparse_adam_(value, gradient, mean, square, radii > 0, rate, beta1, beta2, eps, count, *guard)
+        sparse_adam_(value, gradient, mean, square, radii > 0, rate, beta1, beta2, eps, count, *guard)
 
 
 def step_fused(state: State, camera: GaussianRasterizationSettings, case: Case, iteration: int) -> None:
     """Take the same step inside the backward."""
-    arguments, radii = rendered(state, camera, case, iteration)
-    ops.rasterize_vjp_step_(*arguments, radii, *rest_of(case, state, iteration), **named_rest_of(case))
+    scene, kept, planes, radii = rendered(state, camera, case, iteration)
+    ops.apply_gradients_(*scene.lists, kept, planes, [], radii=radii, **named(case, state, iteration))
 
 
 def step_from_rows(state: State, camera: GaussianRasterizationSettings, case: Case, iteration: int) -> None:
     """Take the same step from gradient rows."""
-    arguments, radii = rendered(state, camera, case, iteration)
-    scene, given = scene_and_rows(arguments, case)
-    ops.rows_vjp_step_(*scene, *given, radii, *rest_of(case, state, iteration), **named_rest_of(case))
+    scene, kept, planes, radii = rendered(state, camera, case, iteration)
+    source = *kept[:2], *ops.blend_rows(kept, *planes, case.absolute)
+    ops.apply_gradients_(*scene.lists, source, [], [], radii=radii, **named(case, state, iteration))
 
 
-def scene_and_rows(arguments: tuple, case: Case) -> tuple[tuple, tuple]:
-    """The arguments of the scene and of its rows, from those of a backward from lists."""
-    *backward, counts, layers = arguments[len(schema.SCENE) :]
-    return arguments[: len(schema.SCENE)], (backward[0], counts, *ops.blend_rows(*backward, layers, case.absolute))
-
-
-def rest_of(case: Case, state: State, iteration: int) -> tuple:
-    """The arguments of a step after the radii, up to the guard's."""
-    statistics = state.statistics if case.observed else (None, None, None)
-    return case.attributes, *case.lists(state), case.sparse, *statistics, *case.guard(state, iteration)
-
-
-def named_rest_of(case: Case) -> dict:
-    """The arguments of a step behind the guard's."""
-    opacity, scale = case.penalties
-    return {"absolute": case.absolute, "opacity_penalty": opacity, "scale_penalty": scale}
+def named(case: Case, state: State, iteration: int) -> dict:
+    """The arguments of a step besides the radii."""
+    means, squares, steps, rates, *constants, columns = case.lists(state)
+    *guard, number = case.guard(state, iteration) or (0,)
+    return {
+        "averages": means + squares, "steps": steps, "rates": rates, "columns": columns, "absolute": case.absolute,
+        "constants": [*constants, *case.penalties], "attributes": case.attributes, "sparse": case.sparse,
+        "statistics": state.statistics if case.observed else [], "guard": guard, "iteration": number,
+    }  # fmt: skip
 
 
 def step_recorded(state: State, camera: GaussianRasterizationSettings, case: Case, iteration: int) -> None:
     """Take the same step by numbers that the device's memory holds; those of the call are wrong."""
-    _, _, steps, rates, *constants, columns = case.lists(state)
+    _, _, steps, rates, *constants, _ = case.lists(state)
     host = torch.zeros(22, dtype=torch.int64)
-    arguments, radii = rendered(state, camera, case, iteration)
+    scene, kept, planes, radii = rendered(state, camera, case, iteration)
     ops.step_now_(host, case.attributes, steps, rates, *constants, case.sparse, iteration)
-    statistics = state.statistics if case.observed else (None, None, None)
-    guard = case.guard(state, iteration)
-    averages = case.lists(state)[:2]
-    wrong = [t + 5 for t in steps], [2.0 * rate for rate in rates], 0.5, 0.5, 1.0
-    last = (*guard[:2], 77) if guard else (None, None, 77)
-    ops.rasterize_vjp_step_(
-        *arguments, radii, case.attributes, *averages, *wrong, columns, case.sparse, *statistics, *last,
-        host.to(radii.device), case.absolute, *case.penalties,
-    )  # fmt: skip
+    wrong = {"steps": [t + 5 for t in steps], "rates": [2.0 * rate for rate in rates], "iteration": 77}
+    wrong["constants"] = [0.5, 0.5, 1.0, *case.penalties]
+    given = named(case, state, iteration) | wrong | {"now": host.to(radii.device)}
+    ops.apply_gradients_(*scene.lists, kept, planes, [], radii=radii, **given)
 
 
 def same_bytes(one: Tensor, other: Tensor) -> bool:

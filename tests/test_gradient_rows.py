@@ -5,7 +5,8 @@ from typing import NamedTuple
 
 import pytest
 import torch
-from diff_gaussian_rasterization import GaussianRasterizationSettings, schema
+from diff_gaussian_rasterization import GaussianRasterizationSettings
+from diff_gaussian_rasterization.scene import GRADIENTS, Drawing, Scene, draw
 from rasterizer_tools import BOTH_AND_GPU, CPU_AND_GPU, moved_by_a_word, ops, scene_arguments
 from torch import Tensor
 
@@ -13,7 +14,7 @@ from benchmarks.workloads.splat_scenes import PARAMETERS, frustum, on_device, se
 
 WIDTH, HEIGHT = 45, 70  # 3 x 5 tiles, some cut off
 ACROSS, DOWN = 3, 5
-WANTED = [name in (*PARAMETERS, "means2d") for name in schema.GRADIENTS]
+WANTED = [name in (*PARAMETERS, "means2d") for name in GRADIENTS]
 
 
 class Rows(NamedTuple):
@@ -27,7 +28,7 @@ class Rows(NamedTuple):
 class Forward:
     """A scene projected, binned and blended by single operators, and a gradient of its planes."""
 
-    scene: tuple  # the arguments that operators have in common
+    scene: Scene
     projected: tuple[Tensor, ...]  # splats, depths, rects, tile_counts, radii
     lists: tuple[Tensor, ...]  # instances, ranges, splat_slots, slots
     background: Tensor
@@ -36,9 +37,11 @@ class Forward:
     depth: bool
 
     @classmethod
-    def of(cls, raw: dict[str, Tensor], camera: GaussianRasterizationSettings, depth: bool) -> "Forward":
-        scene = scene_arguments(raw, camera)
-        projected, size = ops.project(*scene), (camera.image_height, camera.image_width)
+    def of(
+        cls, raw: dict[str, Tensor], camera: GaussianRasterizationSettings, depth: bool, activated: bool = False
+    ) -> "Forward":
+        scene = scene_arguments(raw, camera, not activated)
+        projected, size = ops.project(*scene), scene.size
         lists = ops.bin(*projected[:4], *size, True)
         blended = ops.blend(projected[0], *lists[:2], camera.bg, *size, depth, True)
         generator = torch.Generator().manual_seed(2)
@@ -53,36 +56,36 @@ class Forward:
         blended = ops.blend(self.projected[0], instances, ranges, self.background, *size, self.depth, True)
         return (instances, ranges, *slots), blended
 
-    def state(self, lists: tuple[Tensor, ...], blended: tuple[Tensor, ...]) -> tuple:
-        """Arguments of a backward of blending, up to the layers."""
-        _, transmittance, _, last, _ = blended
-        return (self.projected[0], *lists, self.background, last, transmittance, *self.planes)
+    def kept(self, lists: tuple[Tensor, ...], blended: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
+        """What a forward keeps for its backward."""
+        splats, _, _, tile_counts, radii = self.projected
+        *planes, last, layers = blended
+        return Drawing(*planes, radii, splats, tile_counts, *lists, last, layers).kept(self.background)
 
     def rows(self, absolute: bool) -> Rows:
-        return Rows(*ops.blend_rows(*self.state(self.lists, self.blended), self.blended[4], absolute))
+        return Rows(*ops.blend_rows(self.kept(self.lists, self.blended), *self.planes, absolute))
 
     def rows_of_bands(self, cuts: list[int], absolute: bool) -> Rows:
         """The rows of the bands between cuts, each splat's in the order of the bands."""
         bands = []
         for top, bottom in zip(cuts, cuts[1:], strict=False):
-            lists, blended = self.blend_band(top, bottom)
-            bands.append(Rows(*ops.blend_rows(*self.state(lists, blended), blended[4], absolute)))
+            bands.append(Rows(*ops.blend_rows(self.kept(*self.blend_band(top, bottom)), *self.planes, absolute)))
         splats = torch.arange(len(self.projected[0]), device=self.background.device)
         owners = torch.cat([torch.repeat_interleave(splats, band.counts) for band in bands])
         rows = torch.cat([band.rows for band in bands])[torch.argsort(owners, stable=True)]
         return Rows(rows, torch.stack([band.counts for band in bands]).sum(0, dtype=torch.int32))
 
+    def source(self, rows: Rows) -> tuple[Tensor, ...]:
+        return self.projected[0], self.projected[3], *rows
+
     def rows_vjp(self, rows: Rows, absolute: bool, wanted: list[bool] = WANTED) -> tuple[Tensor, ...]:
-        splats, _, _, tile_counts, _ = self.projected
-        return ops.rows_vjp(*self.scene, splats, tile_counts, *rows, wanted, absolute)
+        return ops.rasterize_vjp(*self.scene, wanted, self.source(rows), absolute=absolute)
 
     def add_rows_vjp(self, rows: Rows, sums: list[Tensor], absolute: bool) -> None:
-        splats, _, _, tile_counts, _ = self.projected
-        ops.rows_vjp_add_(*self.scene, splats, tile_counts, *rows, sums, absolute)
+        ops.apply_gradients_(*self.scene.lists, self.source(rows), [], sums, None, [], [], [], [], absolute=absolute)
 
     def lists_vjp(self, absolute: bool, wanted: list[bool] = WANTED) -> tuple[Tensor, ...]:
-        state = self.state(self.lists, self.blended)
-        return ops.rasterize_vjp(*self.scene, *state, self.projected[3], self.blended[4], wanted, absolute)
+        return ops.rasterize_vjp(*self.scene, wanted, self.kept(self.lists, self.blended), *self.planes, absolute)
 
 
 def same_bits(one: Tensor, other: Tensor) -> bool:
@@ -116,7 +119,7 @@ ABSOLUTE = pytest.mark.parametrize("absolute", [False, True])
 def test_single_steps_of_the_forward_are_rasterize_to_the_bit(kind, depth, device, dtype):
     raw, camera = scene_of(kind, device, dtype)
     forward = Forward.of(raw, camera, depth)
-    out = ops.rasterize(None, *forward.scene, camera.bg, depth, True)
+    out = draw(forward.scene, camera.bg, depth)
     color, transmittance, inverse_depth, radii, splats, tile_counts, *lists, last, layers = out
     seen = tile_counts > 0  # the other rows are undefined
     assert (kind in ("empty", "behind")) == (not seen.any())
@@ -142,8 +145,8 @@ def test_rows_give_the_gradients_of_the_lists(kind, depth, absolute, device, dty
         got, expected = forward.rows_vjp(rows, absolute, wanted), forward.lists_vjp(absolute, wanted)
         assert all(same_bits(a, b) for a, b in zip(got, expected, strict=True))
     if kind == "giants":
-        assert rows.counts[40] == ACROSS * DOWN and got[0].count_nonzero() > 100
-        assert (got[1][40, 2] > 0) == absolute
+        assert rows.counts[40] == ACROSS * DOWN and got[1].count_nonzero() > 100
+        assert (got[0][40, 2] > 0) == absolute
 
 
 @BOTH_AND_GPU
@@ -152,10 +155,10 @@ def test_rows_give_the_gradients_of_the_lists(kind, depth, absolute, device, dty
 def test_gradients_are_added_to_those_of_another_view(kind, absolute, device, dtype):
     forward = Forward.of(*scene_of(kind, device, dtype), True)
     rows, seen = forward.rows(absolute), forward.projected[3] > 0
-    for wanted in ([name in ("means", "sh_rest") for name in schema.GRADIENTS], WANTED):
+    for wanted in ([name in ("means", "sh_rest") for name in GRADIENTS], WANTED):
         found, expected = forward.rows_vjp(rows, absolute, wanted), []
         sums = [torch.full_like(gradient, 0.3) for gradient in found]
-        for name, before, gradient in zip(schema.GRADIENTS, sums, found, strict=True):
+        for name, before, gradient in zip(GRADIENTS, sums, found, strict=True):
             after = before.clone()
             after[: len(gradient)][seen[: len(gradient)]] += gradient[seen[: len(gradient)]]
             if name == "means2d" and absolute and len(gradient):
@@ -166,7 +169,7 @@ def test_gradients_are_added_to_those_of_another_view(kind, absolute, device, dt
         close = [
             torch.allclose(*pair, rtol=1e-5, atol=1e-6, equal_nan=True) for pair in zip(sums, expected, strict=True)
         ]
-        assert all(close), dict(zip(schema.GRADIENTS, close, strict=True))
+        assert all(close), dict(zip(GRADIENTS, close, strict=True))
         if device == "cpu":
             assert all(same_bits(*pair) for pair in zip(sums, expected, strict=True))
 
@@ -186,31 +189,20 @@ def test_gradients_without_bands_of_sh_are_added(device, dtype):
 @BOTH_AND_GPU
 def test_gradients_of_covariances_and_colors_are_added(device, dtype):
     raw, camera = scene_of("many", device, dtype)
-    forward, count = Forward.of(raw, camera, False), len(raw["means"])
+    count = len(raw["means"])
     generator = torch.Generator().manual_seed(4)
     covariances = torch.zeros(count, 6, dtype=dtype)
     covariances[:, [0, 3, 5]] = 0.01 + 0.05 * torch.rand(count, 3, generator=generator, dtype=dtype)
-    scene = list(forward.scene)
-    scene[2:8] = (
-        None,
-        None,
-        covariances.to(device),
-        torch.rand(count, 3, generator=generator).to(device, dtype),
-        None,
-        None,
-    )
-    scene[1], scene[-1] = torch.full((count, 1), 0.6, device=device, dtype=dtype), False
-    splats, depths, rects, tile_counts, _ = ops.project(*scene)
-    lists = ops.bin(splats, depths, rects, tile_counts, HEIGHT, WIDTH, True)
-    _, transmittance, _, last, layers = ops.blend(splats, *lists[:2], forward.background, HEIGHT, WIDTH, False, True)
-    state = (splats, *lists, forward.background, last, transmittance, forward.planes[0], None, None)
-    given = (*scene, splats, tile_counts, *ops.blend_rows(*state, layers))
-    found = ops.rows_vjp(*given, [name in ("means", "cov3d", "colors") for name in schema.GRADIENTS])
+    colors = torch.rand(count, 3, generator=generator).to(device, dtype)
+    given = {"opacities": torch.full((count, 1), 0.6), "cov3d": covariances, "means": raw["means"], "colors": colors}
+    forward = Forward.of({name: t.to(device, dtype) for name, t in given.items()}, camera, False, activated=True)
+    rows = forward.rows(False)
+    found = forward.rows_vjp(rows, False, [name in ("means", "cov3d", "colors") for name in GRADIENTS])
     sums = [gradient.clone() for gradient in found]
-    ops.rows_vjp_add_(*given, sums)
+    forward.add_rows_vjp(rows, sums, False)
     for twice, once in zip(sums, found, strict=True):
         torch.testing.assert_close(twice, 2 * once, rtol=1e-5, atol=1e-6)
-    assert all(found[place].count_nonzero() > 100 for place in (0, 5, 6))
+    assert all(found[place].count_nonzero() > 100 for place in (1, 5, 6))
 
 
 @BOTH_AND_GPU

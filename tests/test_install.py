@@ -224,10 +224,18 @@ def test_a_wheel_serves_every_python_and_leaves_torch_alone(tmp_path: Path) -> N
     assert requires == []
 
 
+def copy_modules(package: Path, to: Path) -> None:
+    """Copy an extension's modules, and those that all share, as its build does."""
+    shutil.copytree(package, to, ignore=shutil.ignore_patterns("*.so", "__pycache__"))
+    for shared in (COMMON / "package").glob("*.py"):
+        shutil.copy(shared, to)
+
+
 @pytest.mark.parametrize("package", ["diff_gaussian_rasterization", "fused_ssim", "simple_knn"])
 def test_an_extension_without_torch_says_what_to_do(package: str, tmp_path: Path) -> None:
     folder = ROOT / "submodules" / package.replace("_", "-")
-    env = os.environ | {"PYTHONPATH": os.pathsep.join(map(str, (tmp_path, folder)))}
+    copy_modules(folder / package, tmp_path / package)
+    env = os.environ | {"PYTHONPATH": str(tmp_path)}
 
     def last_line(torch_py: str) -> str:
         (tmp_path / "torch.py").write_text(torch_py)
@@ -253,7 +261,7 @@ def test_an_extension_without_torch_says_what_to_do(package: str, tmp_path: Path
 def test_an_older_extension_ends_in_the_remedy(statement: str, package: str, lacking: str, tmp_path: Path) -> None:
     name = package.replace("_", "-")
     older = tmp_path / package
-    shutil.copytree(ROOT / "submodules" / name / package, older, ignore=shutil.ignore_patterns("*.so", "__pycache__"))
+    copy_modules(ROOT / "submodules" / name / package, older)
     (older / lacking).unlink()
     env = os.environ | {"PYTHONPATH": os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")])}
     command = [sys.executable, "-c", statement]
@@ -301,7 +309,8 @@ def test_the_root_wheel_has_the_extensions_alone(tmp_path: Path) -> None:
     name, names, requires = wheel_of(tmp_path)
     assert name.startswith("gaussian_splatting-") and "-cp310-abi3-" in name
     packages = ("diff_gaussian_rasterization", "fused_ssim", "simple_knn")
-    parts = {f"{package}/{file}" for package in packages for file in ("__init__.py", "_backend.so")}
+    files = ["__init__.py", "_backend.so", *(path.name for path in (COMMON / "package").glob("*.py"))]
+    parts = {f"{package}/{file}" for package in packages for file in files}
     assert {name for name in names if ".dist-info/" not in name} == parts
     # The installed torch stays.
     assert "torch>=2.10" in requires and "torchvision" in requires

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from diff_gaussian_rasterization.schema import GRADIENTS
+from diff_gaussian_rasterization.scene import GRADIENTS, Drawing, draw
 from rasterizer_tools import GPU_MARKS, error, scene_arguments
 from torch import Tensor
 
@@ -62,13 +62,12 @@ class View:
         out = self.forward(True)
         self.room = [len(out[6]), len(out[9]), len(out[6])]  # of instances, slots and gradient rows, at most
 
-    def forward(self, inverse_depth: bool) -> tuple[Tensor, ...]:
-        return OPS.rasterize(self.scene[0], *self.scene, self.camera.bg, inverse_depth, True)
+    def forward(self, inverse_depth: bool) -> Drawing:
+        return draw(self.scene, self.camera.bg, inverse_depth)
 
-    def backward(self, out: tuple[Tensor, ...], inverse_depth: bool, layers: Tensor) -> tuple[Tensor, ...]:
-        state = (out[4], *out[6:10], self.camera.bg, out[10], out[1])
-        depth = self.depth if inverse_depth else None
-        return OPS.rasterize_vjp(*self.scene, *state, self.color, None, depth, out[5], layers, WANTED)
+    def backward(self, out: Drawing, inverse_depth: bool, layers: Tensor) -> tuple[Tensor, ...]:
+        kept = out._replace(layers=layers).kept(self.camera.bg)
+        return OPS.rasterize_vjp(*self.scene, WANTED, kept, self.color, None, self.depth if inverse_depth else None)
 
     def both(self) -> list[Tensor]:
         out = self.forward(True)

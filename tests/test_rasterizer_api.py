@@ -15,6 +15,7 @@ from diff_gaussian_rasterization import (
     rasterize_gaussians,
     reference,
 )
+from diff_gaussian_rasterization.scene import draw
 from rasterizer_tools import activated, few, leaves, ops, render, scene_arguments
 
 from benchmarks.workloads.splat_scenes import settings
@@ -26,7 +27,6 @@ NAMES = (
     "image_height image_width tanfovx tanfovy bg scale_modifier viewmatrix projmatrix sh_degree campos prefiltered "
     "debug antialiasing"
 )
-OUTPUTS = "color transmittance inverse_depth radii splats tile_counts instances ranges splat_slots slots last layers"
 
 
 def scene(n: int = 3, dtype: torch.dtype = torch.float32):
@@ -347,16 +347,12 @@ def test_one_gradient_alone_is_that_among_all():
 
 
 def _outputs(splats, camera, train: bool, inverse_depth: bool = True):
-    return ops.rasterize(
-        torch.zeros_like(splats["means"]), *scene_arguments(splats, camera, False), camera.bg, inverse_depth, train
-    )
+    return draw(scene_arguments(splats, camera, False), camera.bg, inverse_depth, train)
 
 
 def test_nothing_is_kept_without_gradients():
     splats, camera = scene()
-    rendering, training = (
-        dict(zip(OUTPUTS.split(), _outputs(splats, camera, train, train), strict=True)) for train in (False, True)
-    )
+    rendering, training = (_outputs(splats, camera, train, train)._asdict() for train in (False, True))
     for name in ("splat_slots", "last", "inverse_depth", "layers"):
         assert rendering[name].numel() == 0, name
     assert len(rendering["slots"]) == 0

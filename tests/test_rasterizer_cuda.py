@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+from diff_gaussian_rasterization.optim import adam_, observe_, sparse_adam_
 from rasterizer_tools import GPU_MARKS, everywhere, gradients, loss_of, scene_arguments
 
 from benchmarks.workloads.splat_scenes import KINDS, SplatScene, frustum, on_device, settings
@@ -163,8 +164,8 @@ def test_adam_is_the_cpus_to_rounding():
     for _ in range(20):
         gradients = [torch.randn(shape, generator=generator) for shape in shapes]
         rest = (rates, 0.9, 0.999, 1e-15, columns)
-        OPS.adam_(state[0], gradients, *state[1:], counters[0], *rest)
-        OPS.adam_(on_gpu[0], [g.cuda() for g in gradients], *on_gpu[1:], counters[1], *rest)
+        adam_(state[0], gradients, *state[1:], counters[0], *rest)
+        adam_(on_gpu[0], [g.cuda() for g in gradients], *on_gpu[1:], counters[1], *rest)
     # Twenty steps of 1e-2, each exact to some units in the last place.
     for got, wanted in zip(on_gpu[0], state[0], strict=True):
         torch.testing.assert_close(got.cpu(), wanted, rtol=1e-6, atol=1e-6)
@@ -180,8 +181,8 @@ def test_sparse_adam_is_the_cpus_to_rounding():
         gradient = torch.randn(500, 45, generator=generator)
         seen = torch.arange(500) < 400
         seen[:400] = torch.rand(400, generator=generator) < 0.5
-        OPS.sparse_adam_(value, gradient, mean, square, seen, 1e-2, 0.9, 0.999, 1e-15, 9)
-        OPS.sparse_adam_(on_gpu[0], gradient.cuda(), *on_gpu[1:], seen.cuda(), 1e-2, 0.9, 0.999, 1e-15, 9)
+        sparse_adam_(value, gradient, mean, square, seen, 1e-2, 0.9, 0.999, 1e-15, 9)
+        sparse_adam_(on_gpu[0], gradient.cuda(), *on_gpu[1:], seen.cuda(), 1e-2, 0.9, 0.999, 1e-15, 9)
     # Twenty steps of up to 3e-2, each exact to some units in the last place; rows never seen are equal to the bit.
     torch.testing.assert_close(on_gpu[0].cpu(), value, rtol=1e-6, atol=1e-6)
     assert torch.equal(on_gpu[0][400:].cpu(), start[400:])
@@ -203,10 +204,10 @@ def test_a_guarded_step_marks_and_stops_as_on_the_cpu(sparse):
                 gradient[::501], gradient[7, 3] = torch.nan, 1e25
             guard = (loss, stopped, iteration)
             if sparse:
-                OPS.sparse_adam_(state[0], gradient, *state[1:], seen.to(device), 1e-2, 0.9, 0.999, 1e-15, 9, *guard)
+                sparse_adam_(state[0], gradient, *state[1:], seen.to(device), 1e-2, 0.9, 0.999, 1e-15, 9, *guard)
             else:
                 lists = [[t] for t in (state[0], gradient, *state[1:], torch.tensor(float(iteration)))]
-                OPS.adam_(*lists, [1e-2], 0.9, 0.999, 1e-15, [9], *guard)
+                adam_(*lists, [1e-2], 0.9, 0.999, 1e-15, [9], *guard)
             kept.append([t.nan_to_num(nan=77.0) for t in state])
         assert stopped == 3 and all(torch.equal(a, b) for a, b in zip(kept[2], kept[4], strict=True))
         states.append([t.cpu() for t in kept[4]])
@@ -223,8 +224,8 @@ def test_density_statistics_are_the_cpus_to_the_bit():
         for _ in range(5):
             radii = torch.randint(-30, 60, (n,), generator=generator, dtype=torch.int32).clamp_min(0)
             gradient = torch.randn(n, 3, generator=generator)
-            OPS.observe_(*on_cpu, radii, gradient)
-            OPS.observe_(*on_gpu, radii.cuda(), gradient.cuda())
+            observe_(*on_cpu, radii, gradient)
+            observe_(*on_gpu, radii.cuda(), gradient.cuda())
         assert all(torch.equal(a, b.cpu()) for a, b in zip(on_cpu, on_gpu, strict=True))
 
 

@@ -2,7 +2,9 @@
 
 import pytest
 import torch
-from diff_gaussian_rasterization import GaussianRasterizationSettings, Gaussians, fakes, schema
+from diff_gaussian_rasterization import GaussianRasterizationSettings, fakes
+from diff_gaussian_rasterization.ops import gradients_of
+from diff_gaussian_rasterization.scene import GRADIENTS, Scene, draw
 from rasterizer_tools import BOTH_AND_GPU, few, leaves, ops, render, scene_arguments, together
 
 from benchmarks.workloads.splat_scenes import on_device, settings
@@ -16,39 +18,37 @@ def _few(device: str, dtype: torch.dtype = torch.float32) -> tuple[dict, Gaussia
 
 @BOTH_AND_GPU
 def test_the_steps_one_by_one_are_the_whole(device, dtype):
-    """rasterize is project, bin and blend; rasterize_vjp is blend_vjp and project_vjp."""
+    """rasterize is project, bin and blend; its backward is blend_rows, and the sums of these by projection."""
     raw, camera = _few(device, dtype)
     raw = together(raw, raw)
-    arguments = scene_arguments(raw, camera)
-    splats, depths, rects, counts, radii = ops.project(*arguments)
+    scene = scene_arguments(raw, camera)
+    splats, depths, rects, counts, radii = ops.project(*scene)
     instances, ranges, *slots = ops.bin(splats, depths, rects, counts, 7, 18, True)
-    color, transmittance, inverse_depth, last, _ = ops.blend(splats, instances, ranges, camera.bg, 7, 18, True, True)
+    color, left, inverse_depth, last, layers = ops.blend(splats, instances, ranges, camera.bg, 7, 18, True, True)
     inputs = leaves(raw)
     out = render(inputs, camera)
-    assert torch.equal(out.color, color) and torch.equal(out.transmittance, transmittance)
-    assert torch.equal(out.inverse_depth, inverse_depth) and torch.equal(out.radii, radii)
+    for got, whole in zip((color, left, inverse_depth, radii), (out[0], out[3], out[2], out[1]), strict=True):
+        assert torch.equal(got, whole)
     weights = torch.linspace(-1, 1, color.numel()).reshape(color.shape).to(color)
     (weights * out.color).sum().backward()
-    state = (splats, instances, ranges, *slots, camera.bg, last, transmittance)
-    moments = ops.blend_vjp(*state, weights, None, None)
-    wanted = [True, False, True, True, True, False, False, True, True]
-    gradients = ops.project_vjp(*arguments, counts, moments, wanted)
-    for name, g in zip(
-        ("means", "opacities", "scales", "rotations", "sh_dc", "sh_rest"),
-        [*gradients[:1], *gradients[2:5], *gradients[7:]],
-        strict=True,
-    ):
+    kept = splats, counts, instances, ranges, *slots, last, layers, camera.bg, left
+    rows = splats, counts, *ops.blend_rows(kept, weights, None, None)
+    needed = [name in raw for name in GRADIENTS]
+    found = dict(zip(GRADIENTS, gradients_of(scene, rows, (), needed), strict=True))
+    assert [name for name, gradient in found.items() if gradient is not None] == list(raw)
+    for name, values in inputs.items():
         if device == "cpu":
-            assert torch.equal(inputs[name].grad, g), name
+            assert torch.equal(values.grad, found[name]), name
         else:  # two kernels of one template, which the compiler may fuse differently
-            torch.testing.assert_close(inputs[name].grad, g, rtol=1e-5, atol=1e-6 * g.abs().max().item())
-    assert gradients[1].numel() == gradients[5].numel() == 0
+            wanted = found[name]
+            torch.testing.assert_close(values.grad, wanted, rtol=1e-5, atol=1e-6 * wanted.abs().max().item())
 
 
-def test_the_gaussians_are_the_operators_first_inputs():
-    assert schema.SCENE[: len(Gaussians._fields)] == Gaussians._fields
-    assert schema.INPUTS[: 1 + len(schema.SCENE)] == ("means2d", *schema.SCENE)
-    assert set(schema.GRADIENTS) == {"means2d", *Gaussians._fields}
+def test_the_scene_is_the_operators_first_inputs():
+    names = [argument.name for argument in ops.rasterize.default._schema.arguments]
+    assert tuple(names[: 1 + len(Scene._fields)]) == ("means2d", *Scene._fields)
+    assert tuple(result.name for result in ops.rasterize_vjp.default._schema.returns) == GRADIENTS
+    assert len(vars(ops)) <= 18 and all(len(op.default._schema.arguments) <= 20 for op in vars(ops).values())
 
 
 def test_the_fake_kernels_have_the_sizes_of_the_real_ones():
@@ -58,13 +58,12 @@ def test_the_fake_kernels_have_the_sizes_of_the_real_ones():
     assert splats.shape[1] == fakes.SPLAT_VALUES
     for size, tiles in ((fakes.TILE, 1), (fakes.TILE + 1, 4)):
         assert len(ops.bin(splats, depths, rects, 0 * counts, size, size, False)[1]) == tiles + 1
-    lists = ops.bin(splats, depths, rects, counts, 7, 18, True)
-    color, transmittance, _, last, _ = ops.blend(splats, *lists[:2], camera.bg, 7, 18, False, True)
-    moments = ops.blend_vjp(splats, *lists, camera.bg, last, transmittance, color, None, None)
-    assert moments.shape[1] == fakes.MOMENT_VALUES
+    drawn = draw(arguments, camera.bg)
+    rows = [ops.blend_rows(drawn.kept(camera.bg), drawn.color, absolute=absolute)[0] for absolute in (False, True)]
+    assert rows[0].shape[1] == fakes.MOMENT_VALUES and rows[1].shape[1] == fakes.MOMENT_VALUES + fakes.ABSOLUTE_VALUES
     rects, limits = torch.zeros(fakes.RECORD_BLOCK + 1, 4, dtype=torch.int32), torch.zeros(2, 3, dtype=torch.int32)
     for splats, blocks in ((fakes.RECORD_BLOCK, 1), (fakes.RECORD_BLOCK + 1, 2)):
-        assert ops.count_records(rects[:splats], rects[:splats, 0], limits).shape == (4, blocks)
+        assert ops.list_records(rects[:splats], rects[:splats, 0], limits, 0)[0].shape == (4, blocks)
 
 
 @pytest.mark.parametrize(

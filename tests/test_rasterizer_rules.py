@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+from diff_gaussian_rasterization.ops import mark_visible
 from rasterizer_tools import DTYPES_AND_GPU, activated, few, one_splat, ops, pick, render, scene_arguments, together
 
 from benchmarks.workloads.splat_scenes import ordinary, settings
@@ -31,7 +32,7 @@ def test_the_near_plane_is_at_0_2_and_excluded(dtype):
         out = render(one_splat(z=z, dtype=dtype), camera(dtype), raw=False)
         assert bool(out.radii[0] > 0) == visible
         assert bool(out.transmittance.min() < 1) == visible
-        assert bool(ops.mark_visible(torch.tensor([[0.0, 0.0, z]], dtype=dtype), torch.eye(4, dtype=dtype))) == visible
+        assert bool(mark_visible(torch.tensor([[0.0, 0.0, z]], dtype=dtype), torch.eye(4, dtype=dtype))) == visible
 
 
 @BOTH

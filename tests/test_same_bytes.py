@@ -9,14 +9,19 @@ from pathlib import Path
 
 import pytest
 import torch
+from diff_gaussian_rasterization.density import add_noise_, penalise_, split_positions
+from diff_gaussian_rasterization.optim import sparse_adam_
 from fused_ssim import fused_l1_ssim
 from rasterizer_tools import BOTH_AND_GPU, adam, error, gradients, ops
 from simple_knn._C import distCUDA2
-from test_exchange import pack, packed_by_torch, reach_of, recorded_by_torch, some_counts, some_splats
+from test_add_noise import GATE, WHERE
+from test_add_noise import _gaussians as noisy_gaussians
+from test_exchange import reach_of, recorded_by_torch, some_counts
 from test_fused_ssim import EPS, image_pair, with_gradient
 from test_gaussian_step import Case, start_and_camera, step_fused
 from test_gradient_rows import Forward, scene_of
 from test_simple_knn import cloud
+from test_split_positions import _parents as some_parents
 from torch import Tensor
 
 from benchmarks.workloads.splat_scenes import KINDS, frustum, ordinary
@@ -80,32 +85,42 @@ def _adam(device: str, dtype: torch.dtype) -> Callable[[], Results]:
 
 def _sparse_adam(device: str, dtype: torch.dtype) -> Callable[[], Results]:
     state, seen = _rows_of_gaussians(device, dtype, 20_000)
+    state[1][::1001] = torch.nan  # which the guard marks
+    loss = torch.ones((), device=device, dtype=dtype)
 
     def step() -> Results:
         copies = [t.clone() for t in state]
-        ops.sparse_adam_(*copies, seen, RATE, *BETAS, EPS_OF_ADAM)
-        return copies
+        stopped = torch.zeros(1, dtype=torch.int64, device=device)
+        sparse_adam_(*copies, seen, RATE, *BETAS, EPS_OF_ADAM, -1, loss, stopped, 3)
+        assert stopped == 3 and copies[2].isnan().any()
+        return [t.nan_to_num(nan=77.0) for t in (*copies, stopped)]
 
     return step
 
 
+def _density(device: str, dtype: torch.dtype) -> Callable[[], Results]:
+    """Noise and the children of a split, which are of float32 alone, and the gradients of a penalty."""
+    noisy, parents = ([t.to(device) for t in make(20_001)] for make in (noisy_gaussians, some_parents))
+    penalised = [torch.randn(5001, width).to(device, dtype) for width in (1, 3, 1, 3)]
+
+    def all_of_it() -> Results:
+        means, (logits, log_scales, *changed) = noisy[0].clone(), (t.clone() for t in penalised)
+        add_noise_(means, *noisy[1:], **GATE, **WHERE)
+        penalise_(logits, log_scales, *changed, opacity=0.3, scale=0.7)
+        return [means, split_positions(*parents, **WHERE, draw=1), *changed]
+
+    return all_of_it
+
+
 def _exchange(device: str, dtype: torch.dtype) -> Callable[[], Results]:
-    counts, reach, splats = some_counts("giants").to(device), reach_of("some", device), some_splats(9000, device, dtype)
-    gaussians = torch.randperm(len(counts)).to(device)
+    counts, reach = some_counts("giants").to(device), reach_of("some", device)
     rows = torch.randn(int(counts.sum()), 12).to(device, dtype)
     numbers, *lists = recorded_by_torch(*reach)
 
     def all_of_it() -> Results:
-        packed = pack(splats, gaussians)
-        recorded = ops.list_records(*reach, ops.count_records(*reach), int(numbers.sum()))
-        wanted = [packed_by_torch(splats, gaussians), *lists]
-        assert all(torch.equal(*pair) for pair in zip([packed, *recorded], wanted, strict=True))
-        return [
-            packed,
-            *recorded,
-            ops.move_runs(rows, counts, gaussians.int()),
-            ops.sum_runs(rows, counts, torch.ones_like(counts), len(counts)),
-        ]
+        _, *recorded = ops.list_records(*reach, int(numbers.sum()))
+        assert all(torch.equal(*pair) for pair in zip(recorded, lists, strict=True))
+        return [*recorded, ops.sum_runs(rows, counts, torch.ones_like(counts), len(counts))]
 
     return all_of_it
 
@@ -149,7 +164,7 @@ def _distances(device: str, dtype: torch.dtype) -> Callable[[], Results]:
 
 
 WORK = [_rasterize, _absolute_gradients, _adam, _sparse_adam, _exchange, _gradient_rows, _gaussian_step, _ssim]
-WORK += [_distances]
+WORK += [_distances, _density]
 
 
 @BOTH_AND_GPU

@@ -219,7 +219,7 @@ def test_numpy_double_reference_is_itself_right() -> None:
 def test_unusable_library_ends_in_the_remedy(library: bytes | None, what: str, tmp_path: Path) -> None:
     package = tmp_path / "simple_knn"
     package.mkdir()
-    for name in ("__init__.py", "backend.py", "operators.py", "ops.py", "_C.py"):
+    for name in ("__init__.py", "backend.py", "ops.py", "_C.py"):
         shutil.copy(Path(simple_knn.__file__).with_name(name), package)
     if library:
         (package / "_backend.so").write_bytes(library)

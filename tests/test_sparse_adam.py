@@ -2,8 +2,8 @@
 
 import pytest
 import torch
+from diff_gaussian_rasterization.optim import sparse_adam_
 from gaussians import GROUPS, model, moments, options, parameters, take_steps
-from rasterizer_tools import ops
 
 from scene.gaussian_model import GaussianModel
 
@@ -29,7 +29,7 @@ def test_it_is_the_formula_and_leaves_unseen_rows_alone(shape, dtype):
         gradient = torch.randn(shape, generator=generator, dtype=torch.float64).to(dtype)
         seen = (torch.rand(300, generator=generator) < 0.5) & ~never
         before = [t.clone() for t in ours]
-        ops.sparse_adam_(ours[0], gradient, *ours[1:], seen, RATE, *BETAS, EPS)
+        sparse_adam_(ours[0], gradient, *ours[1:], seen, RATE, *BETAS, EPS)
         _formula(exact[0], gradient.double(), *exact[1:], seen)
         for old, new in zip(before, ours, strict=True):
             assert torch.equal(old[~seen], new[~seen])
@@ -47,7 +47,7 @@ def test_columns_left_out_are_not_touched(columns):
     state = [torch.randn(50, 45, generator=generator), torch.zeros(50, 45), torch.zeros(50, 45)]
     before = [t.clone() for t in state]
     gradient, seen = torch.randn(50, 45, generator=generator), torch.arange(50) % 2 == 0
-    ops.sparse_adam_(state[0], gradient, *state[1:], seen, RATE, *BETAS, EPS, columns)
+    sparse_adam_(state[0], gradient, *state[1:], seen, RATE, *BETAS, EPS, columns)
     for old, new in zip(before, state, strict=True):
         assert torch.equal(old[:, columns:], new[:, columns:]) and torch.equal(old[~seen], new[~seen])
         assert columns == 0 or (old[seen, :columns] != new[seen, :columns]).all()

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 from diff_gaussian_rasterization.density import split_positions
-from rasterizer_tools import CPU_AND_GPU, ops
-from torch import Tensor, library
+from rasterizer_tools import CPU_AND_GPU
+from torch import Tensor
 
 from splatting.deterministic import portable_math
 from splatting.deterministic.counter_rng import Stream, random_bits
@@ -86,34 +86,3 @@ def test_broken_parents_harm_nobody_else(device):
     got = split_positions(*parents, **WHERE)
     assert torch.equal(got[[0, 5]], wanted[[0, 5]]) and torch.equal(got[1, :2], wanted[1, :2])
     assert got[1, 2].isnan() and got[2].isnan().any() and got[3].isnan().all() and not got[4].isnan().any()
-
-
-def test_any_number_of_threads_gives_the_same():
-    parents, before = _parents(20_001), torch.get_num_threads()
-    try:
-        results = []
-        for threads in (1, 2, 3):
-            torch.set_num_threads(threads)
-            results.append(split_positions(*parents, **WHERE))
-    finally:
-        torch.set_num_threads(before)
-    assert torch.equal(results[0], results[1]) and torch.equal(results[0], results[2])
-
-
-@CPU_AND_GPU
-def test_opcheck(device):
-    library.opcheck(ops.split_positions.default, (*(t.to(device) for t in _parents(5)), 1, 2, 600, 0))
-
-
-def test_what_does_not_fit_is_named():
-    means, scales, rotations, items = _parents(4)
-    for parents, message in (
-        ((means, scales, rotations, items.int()), "items must be torch.int64 on cpu, got torch.int32"),
-        ((means.double(), scales, rotations, items), "means must be torch.float32 on cpu, got torch.float64"),
-    ):
-        with pytest.raises(TypeError, match=message):
-            split_positions(*parents, **WHERE)
-    with pytest.raises(ValueError, match=r"rotations must be \(4, 4\).*got \(4, 3\)"):
-        split_positions(means, scales, means, items, **WHERE)
-    with pytest.raises(ValueError, match=r"items must be \(4,\).*got \(2, 2\)"):
-        split_positions(means, scales, rotations, items.reshape(2, 2), **WHERE)

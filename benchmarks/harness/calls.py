@@ -6,7 +6,7 @@ import fused_ssim  # noqa: F401  (registers its operators)
 import torch
 from diff_gaussian_rasterization import GaussianRasterizationSettings, Gaussians, rasterize
 from diff_gaussian_rasterization.ops import scene_arguments
-from diff_gaussian_rasterization.schema import GRADIENTS
+from diff_gaussian_rasterization.scene import GRADIENTS, draw
 from torch import Tensor
 
 from benchmarks.workloads.splat_scenes import PARAMETERS, SplatScene
@@ -67,22 +67,22 @@ class TrainingStep:
         values, device = self._gaussians.values(), scene.parameters["means"].device
         generator = torch.Generator().manual_seed(1)
         self._photo = torch.rand(3, scene.height, scene.width, generator=generator).to(device)
-        averages = [[torch.full_like(value, 1e-6) for value in values] for _ in range(2)]
-        self._adam = *averages, [torch.zeros(()) for _ in range(6)], [0.0] * 6, 0.9, 0.999, 1e-15, [-1] * 6
-        self._statistics = [torch.zeros(len(scene.parameters["means"]), device=device) for _ in range(3)]
+        averages = [torch.full_like(value, 1e-6) for _ in range(2) for value in values]
+        statistics = [torch.zeros(len(scene.parameters["means"]), device=device) for _ in range(3)]
+        lists = averages, [torch.zeros(()) for _ in range(6)], statistics, []
+        self._adam = *lists, list(range(6)), [0.0] * 6, [0.9, 0.999, 1e-15, 0.0, 0.0], [-1] * 6
         self._one = torch.ones((), device=device)
 
     @torch.no_grad()
     def take(self, camera: GaussianRasterizationSettings) -> Tensor:
         """Take the step of a view. Returns the tiles of each Gaussian."""
         scene = scene_arguments(Gaussians(**self._gaussians), camera, True)
-        out = OPS.rasterize(None, *scene, camera.bg, False, True)
-        color, transmittance, _, radii, splats, tiles, *lists, last, layers = out
-        _, _, kept = torch.ops.fused_ssim.photometric(color, self._photo, 0.2, True)
-        gradient = torch.ops.fused_ssim.photometric_vjp(color, self._photo, kept, 0.2, self._one)
-        state = splats, *lists, camera.bg, last, transmittance, gradient, None, None, tiles, layers, radii
-        OPS.rasterize_vjp_step_(*scene, *state, list(range(6)), *self._adam, False, *self._statistics)
-        return tiles
+        drawn = draw(scene, camera.bg)
+        _, _, kept = torch.ops.fused_ssim.photometric(drawn.color, self._photo, 0.2, True)
+        gradient = torch.ops.fused_ssim.photometric_vjp(drawn.color, self._photo, kept, 0.2, self._one)
+        source = drawn.kept(camera.bg)
+        OPS.apply_gradients_(*scene.lists, source, [gradient], [], drawn.radii, *self._adam)
+        return drawn.tile_counts
 
 
 # Of a training step: kernels that begin a stage, and those behind which another one begins.
@@ -115,10 +115,10 @@ class Stages:
         self.splats, counts = projected[0], projected[3]
         self.instances, self.ranges, *slots = OPS.bin(*projected[:4], *size, True)
         blend = (self.splats, self.instances, self.ranges, settings.bg, *size, False)
-        _, transmittance, _, self.last, _ = OPS.blend(*blend, True)
-        state = (self.splats, self.instances, self.ranges, *slots, settings.bg, self.last)
-        state += (transmittance, image_gradient(scene), None, None)
-        moments = OPS.blend_vjp(*state)
+        _, left, _, self.last, layers = OPS.blend(*blend, True)
+        kept = self.splats, counts, self.instances, self.ranges, *slots, self.last, layers, settings.bg, left
+        gradient = image_gradient(scene)
+        rows = self.splats, counts, *OPS.blend_rows(kept, gradient)
         padded = torch.nn.functional.pad(self.last, (0, -scene.width % TILE, 0, -scene.height % TILE))
         # Of each tile, the instances up to the last one that a pixel blends.
         self.processed = int(padded.unfold(0, TILE, TILE).unfold(1, TILE, TILE).amax((2, 3)).sum())
@@ -126,8 +126,8 @@ class Stages:
             "project": lambda: OPS.project(*arguments),
             "bin": lambda: OPS.bin(*projected[:4], *size, True),
             "blend": lambda: OPS.blend(*blend, False),
-            "blend_vjp": lambda: OPS.blend_vjp(*state),
-            "project_vjp": lambda: OPS.project_vjp(*arguments, counts, moments, wanted),
+            "blend_rows": lambda: OPS.blend_rows(kept, gradient),
+            "rows_vjp": lambda: OPS.rasterize_vjp(*arguments, wanted, rows),
         }
 
 

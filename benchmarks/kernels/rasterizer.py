@@ -20,7 +20,7 @@ from benchmarks.kernels import published
 from benchmarks.workloads.splat_scenes import CPU_WORKLOADS, GPU_WORKLOADS, SplatScene, frustum
 from utils.system_utils import UserError, run_cli
 
-CPU_STAGES = ("project", "bin", "blend", "blend_vjp", "project_vjp")
+CPU_STAGES = ("project", "bin", "blend", "blend_rows", "rows_vjp")
 
 
 def measure_on_cpu(scene: SplatScene, repeats: int) -> dict[str, float]:
@@ -46,7 +46,7 @@ def print_cpu(names: list[str], thread_counts: list[int], repeats: int) -> None:
             row = [f"{n // 1000} k, {width}x{height}, {sigma} px", str(threads)]
             row += [f"{found[name]:.1f}" for name in header[2:9]]
             row += [f"{found[name] / 1e3:.0f} k" for name in ("instances", "processed")]
-            rows.append([*row, *(f"{evaluations / found[name]:.2f}" for name in ("blend", "blend_vjp"))])
+            rows.append([*row, *(f"{evaluations / found[name]:.2f}" for name in ("blend", "blend_rows"))])
     print_table([*header, "G evaluations/s/core forward", "backward"], rows)
 
 

@@ -185,13 +185,13 @@ def trainable(values: Tensor) -> Tensor:
 
 def in_host_memory(values: Tensor) -> Tensor:
     """A tensor of the same device in page-locked memory of the host; the same one if it lies there, or on the CPU."""
-    if not values.numel() or OPERATORS.is_in_host_memory(values):
-        return values
-    return OPERATORS.in_host_memory(values)
+    copy = OPERATORS.in_host_memory(values) if values.numel() else None
+    return values if copy is None else copy
 
 
 def beside(old: Tensor, new: Tensor) -> Tensor:
     """Values that take the place of old ones: in the host's memory if those lie there, else the same tensor."""
-    if not old.is_cuda or not old.numel() or not OPERATORS.is_in_host_memory(old):
+    if not old.is_cuda or not old.numel() or not new.numel():
         return new
-    return in_host_memory(new.to(old.device))
+    copy = OPERATORS.in_host_memory(new.to(old.device), old)
+    return new if copy is None else copy

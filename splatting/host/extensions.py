@@ -11,13 +11,14 @@ _SOURCES = Path(__file__).resolve().parents[2] / "submodules"
 
 def _check() -> None:
     """Raise ImportError for an extension that is older than its sources here, or somebody else's of that name."""
-    for sources in sorted(_SOURCES.glob("*/*/backend.py")):
+    for sources in sorted(_SOURCES.glob("*/*/ops.py")):
         package, folder = sources.parent.name, sources.parents[1].name
         found = importlib.util.find_spec(package)
         if found is None or found.origin is None:
             continue
         installed = Path(found.origin).parent
-        lacking = [path.name for path in sources.parent.glob("*.py") if not (installed / path.name).exists()]
+        modules = *sources.parent.glob("*.py"), *_SOURCES.glob("common/package/*.py")
+        lacking = [path.name for path in modules if not (installed / path.name).exists()]
         if lacking:
             raise ImportError(
                 f"the installed {package} does not fit this checkout (it has no {min(lacking)}): "

@@ -33,6 +33,7 @@ OLDEST_TORCH = (2, 10)  # the first whose stable interface has all that csrc/tor
 OLDEST_ARCHITECTURE = 80  # reductions over a warp in one instruction
 SEEDED_CUDA = (12, 9)  # the first whose nvcc knows -frandom-seed
 COMMON_INCLUDE = Path(__file__).resolve().parent / "include"
+SHARED_MODULES = Path(__file__).resolve().parent / "package"
 # No -ffast-math: NaN, infinities and the order of sums matter. Nobody reads errno or traps.
 CXX_FLAGS = ["-O3", "-std=c++17", "-Wall", "-Wextra", "-fno-math-errno", "-fno-trapping-math"]
 CXX_FLAGS += [] if sys.platform == "win32" else ["-fPIC"]
@@ -69,13 +70,19 @@ def extension_options(roots: dict[str, Path]) -> dict[str, Any]:
 
 
 class BuildModules(build_py):
-    """Copies the packages' modules, after removing those that an earlier build of the same folder has left."""
+    """Copies the packages' modules, after removing those that an earlier build of the same folder has left.
+
+    Each extension's package gets those that all share, since each stands alone.
+    """
 
     def run(self) -> None:
         for package in self.packages or []:
             for stale in (Path(self.build_lib) / package.replace(".", "/")).glob("*.py"):
                 stale.unlink()
         super().run()
+        for package in self.packages or []:
+            for module in SHARED_MODULES.glob("*.py") if "." not in package else ():
+                shutil.copy(module, Path(self.build_lib) / package)
 
 
 class Compilation(NamedTuple):

@@ -5,6 +5,7 @@ from functools import partial
 from typing import Any
 
 import torch
+from diff_gaussian_rasterization.scene import Drawing
 from fused_ssim.backend import OPERATORS as ssim
 from rasterizer_tools import few, ops, scene_arguments
 from simple_knn.backend import OPERATORS as knn
@@ -22,55 +23,46 @@ def sound_calls(device: str = "cpu", dtype: torch.dtype = torch.float32) -> dict
     rand, single = partial(torch.rand, device=device, dtype=dtype), partial(torch.rand, device=device)
     integers = partial(torch.tensor, device=device, dtype=torch.int32)
     height, width, background = camera.image_height, camera.image_width, camera.bg.to(dtype)
-    scene = list(scene_arguments(raw, camera))
-    splats, depths, rects, counts, _ = ops.project(*scene)
+    scene = scene_arguments(raw, camera)
+    splats, depths, rects, counts, radii = ops.project(*scene)
     instances, ranges, *slots = ops.bin(splats, depths, rects, counts, height, width, True)
     *planes, last, layers = ops.blend(splats, instances, ranges, background, height, width, True, True)
-    state, planes = [splats, instances, ranges, *slots, background, last, planes[1]], [*map(torch.ones_like, planes)]
     if not len(layers):
         layers = rand(5 * 256)  # as a GPU makes them of few instances
-    rows = ops.blend_rows(*state, *planes, layers)
-    packed = integers([[0] * (11 * dtype.itemsize // 4 + 5)] * len(counts))
+    drawn = Drawing(*planes, radii, splats, counts, instances, ranges, *slots, last, layers)
+    state, planes = list(drawn.kept(background)), [*map(torch.ones_like, planes)]
+    rows = ops.blend_rows(state, *planes)
     reach = [rects, counts, integers([[0, 2], [2, 5]])]
-    recorded = ops.count_records(*reach)
     wanted = [True, True, True, True, True, False, False, True, True]
-    sums = list(ops.rows_vjp(*scene, splats, counts, *rows, wanted))
+    source = [splats, counts, *rows]
+    sums = list(ops.rasterize_vjp(*scene, wanted, source))
     lists = [[rand(3, 3), rand(2, 5)] for _ in range(4)]
     guard = [rand(()), torch.zeros(1, dtype=torch.int64, device=device), 3]
-    adam = [*lists, [torch.tensor(1.0), torch.tensor(7.0)], [0.1, 0.2], 0.9, 0.99, 1e-8, [2, -1], *guard]
+    adam = [*lists, [torch.tensor(1.0), torch.tensor(7.0)], [0.1, 0.2], 0.9, 0.99, 1e-8, [2, -1], None, *guard]
     seen = torch.tensor([True, False, True], device=device)
-    sparse = [*(rand(3, 3) for _ in range(4)), seen, 0.1, 0.9, 0.99, 1e-8, -1]
+    sparse = [*([rand(3, 3)] for _ in range(4)), [], [0.1], 0.9, 0.99, 1e-8, [-1], seen]
     statistics = [single(3), single(3, 1), single(3, 1), integers([0, 3, 5])]
     one, two, gradient = rand(3, 20, 20), rand(3, 20, 20), torch.ones((), dtype=dtype, device=device)
     kept = ssim.l1_ssim(one, two, False, True)[2]
-    step = _step(raw)
+    gaussians = [torch.empty(0) if t is None else t for t in scene.gaussians]
+    in_lists = [gaussians, *([*entries] for entries in scene.lists[1:])]
+    step = _step(raw, guard)
     return {
-        "project": (ops.project, scene),
+        "project": (ops.project, [*scene]),
         "bin": (ops.bin, [splats, depths, rects, counts, height, width, True]),
         "blend": (ops.blend, [splats, instances, ranges, background, height, width, True, True]),
-        "pack_splats_": (
-            ops.pack_splats_,
-            [packed, splats, depths, rects, counts, torch.arange(len(counts), device=device)],
-        ),
-        "unpack_splats": (ops.unpack_splats, [packed, splats]),
-        "count_records": (ops.count_records, reach),
-        "list_records": (ops.list_records, [*reach, recorded, int(recorded[-1].sum())]),
+        "list_records": (ops.list_records, [*reach, int(ops.list_records(*reach, 0)[0][-1].sum())]),
         "sum_runs": (ops.sum_runs, [*rows, rows[1].clamp_max(1), int(rows[1].count_nonzero())]),
-        "sum_parts": (ops.sum_parts, [rows[1], [1, 0, len(rows[1]) - 1]]),
-        "move_runs": (ops.move_runs, [*rows, torch.arange(len(counts), device=device).int().flip(0)]),
-        "blend_vjp": (ops.blend_vjp, [*state, *planes]),
-        "blend_rows": (ops.blend_rows, [*state, *planes, layers, True]),
-        "rows_vjp": (ops.rows_vjp, [*scene, splats, counts, *rows, wanted]),
-        "rows_vjp_add_": (ops.rows_vjp_add_, [*scene, splats, counts, *rows, sums]),
-        "rows_vjp_step_": (ops.rows_vjp_step_, [*scene, splats, counts, *rows, *step, *guard]),
-        "project_vjp": (ops.project_vjp, [*scene, counts, ops.blend_vjp(*state, *planes), wanted]),
+        "blend_rows": (ops.blend_rows, [state, *planes, True]),
         "rasterize": (ops.rasterize, [torch.zeros_like(raw["means"]), *scene, background, True, True]),
-        "rasterize_vjp": (ops.rasterize_vjp, [*scene, *state, *planes, counts, layers, wanted]),
-        "rasterize_vjp_step_": (ops.rasterize_vjp_step_, [*scene, *state, *planes, counts, layers, *step, *guard]),
-        "mark_visible": (ops.mark_visible, [raw["means"], scene[8]]),
+        "rasterize_vjp": (ops.rasterize_vjp, [*scene, wanted, state, *planes]),
+        "rasterize_vjp of rows": (ops.rasterize_vjp, [*scene, wanted, source]),
+        "apply_gradients_": (ops.apply_gradients_, [*in_lists, state, planes, [], *step]),
+        "apply_gradients_ of rows": (ops.apply_gradients_, [*in_lists, source, [], [], *step]),
+        "apply_gradients_ to sums": (ops.apply_gradients_, [*in_lists, source, [], sums, None, [], [], [], []]),
         "decisive": (ops.decisive, [splats, instances, ranges, last]),
         "adam_": (ops.adam_, adam),
-        "sparse_adam_": (ops.sparse_adam_, [*sparse, *guard]),
+        "adam_ of visible rows": (ops.adam_, [*sparse, *guard]),
         "run_ahead_": (ops.run_ahead_, [torch.zeros(5, dtype=torch.int64), [1, 1, 1], None]),  # refused: not on a GPU
         "step_now_": (ops.step_now_, _step_now()),
         "catch_up_": (
@@ -78,15 +70,14 @@ def sound_calls(device: str = "cpu", dtype: torch.dtype = torch.float32) -> dict
             [*(rand(3, 4) for _ in range(3)), integers([0, 0, 0]), [0.1], [1.0], 0.9, 0.999, 1e-8],
         ),
         "in_host_memory": (ops.in_host_memory, [rand(3, 4)]),
-        "is_in_host_memory": (ops.is_in_host_memory, [rand(3, 4)]),
         "observe_": (ops.observe_, [*statistics, single(3, 3)]),
-        "split_positions": (
-            ops.split_positions,
-            [single(3, 3), single(3, 3), single(3, 4), torch.arange(3, device=device), 1, 2, 600, 0],
+        "displace_": (
+            ops.displace_,
+            [*(single(3, width) for width in (3, 3, 4, 1)), None, [1.0, 100.0, 0.005], 1, 4, 600, 0, None],
         ),
-        "add_noise_": (
-            ops.add_noise_,
-            [*(single(3, width) for width in (3, 3, 4, 1)), 1.0, 100.0, 0.005, 1, 4, 600, None],
+        "displace_ to children": (
+            ops.displace_,
+            [single(3, 3), single(3, 3), single(3, 4), None, torch.arange(3, device=device), [], 1, 2, 600, 0],
         ),
         "penalise_": (ops.penalise_, [*(rand(3, width) for width in (1, 3, 1, 3)), 0.01, 0.02]),
         "l1_ssim": (ssim.l1_ssim, [one, two, True, True]),
@@ -95,23 +86,23 @@ def sound_calls(device: str = "cpu", dtype: torch.dtype = torch.float32) -> dict
         "photometric_vjp": (ssim.photometric_vjp, [one, two, kept, 0.2, gradient, True]),
         "photometric_band": (ssim.photometric_band, [one, two, 0, one.shape[-2], True]),
         "photometric_of_sums": (ssim.photometric_of_sums, [one, ssim.photometric_band(one, two, 0, 0, True)[0], 0.2]),
-        "photometric_band_vjp": (ssim.photometric_band_vjp, [one, two, kept, 0.2, gradient, 0, one.shape[-2]]),
         "composite": (ssim.composite, [integers([[[9] * 6] * 5] * 4).to(torch.uint8), single(3)]),
         "mean_distance2": (knn.mean_distance2, [rand(9, 3)]),
     }
 
 
-def _step(raw: dict[str, Tensor]) -> list:
-    """The arguments of `rasterize_vjp_step_` and `rows_vjp_step_` from `radii` to the statistics."""
+def _step(raw: dict[str, Tensor], guard: list) -> list:
+    """The arguments of `apply_gradients_` behind `sums`."""
     count = len(raw["means"])
-    averages = [[torch.rand_like(value) for value in raw.values()] for _ in range(2)]
+    averages = [torch.rand_like(value) for _ in range(2) for value in raw.values()]
     counters = [torch.tensor(float(place)) for place in range(6)]
     device, observed = raw["means"].device, raw["means"].dtype == torch.float32
-    statistics = [
-        torch.rand(shape, device=device) if observed else None for shape in ((count,), (count, 1), (count, 1))
-    ]
-    adam = [*averages, counters, [0.1] * 6, 0.9, 0.99, 1e-8, [-1, -1, -1, -1, -1, 9]]
-    return [torch.ones(count, dtype=torch.int32, device=device), list(range(6)), *adam, False, *statistics]
+    statistics = [torch.rand(shape, device=device) for shape in ((count,), (count, 1), (count, 1)) if observed]
+    radii, columns = torch.ones(count, dtype=torch.int32, device=device), [-1, -1, -1, -1, -1, 9]
+    constants = [0.9, 0.99, 1e-8, 0.0, 0.0]
+    *guard, iteration = guard
+    lists = radii, averages, counters, statistics, guard, list(range(6)), [0.1] * 6, constants, columns
+    return [*lists, False, iteration]
 
 
 def _step_now() -> list:
@@ -139,9 +130,10 @@ def changed_tensors(arguments: list) -> Iterator[tuple[str, list]]:
             for words, other in _others(value):
                 yield f"argument {place} {words}", [*arguments[:place], other, *arguments[place + 1 :]]
         elif isinstance(value, list) and value and torch.is_tensor(value[0]):
-            for words, other in _others(value[-1]):
-                inner = [*value[:-1], other]
-                yield f"argument {place}[-1] {words}", [*arguments[:place], inner, *arguments[place + 1 :]]
+            for inner in [k for k, one in enumerate(value) if torch.is_tensor(one) and one.shape != (0,)]:
+                for words, other in _others(value[inner]):
+                    changed = [*value[:inner], other, *value[inner + 1 :]]
+                    yield f"argument {place}[{inner}] {words}", [*arguments[:place], changed, *arguments[place + 1 :]]
             yield f"argument {place} shorter", [*arguments[:place], value[:-1], *arguments[place + 1 :]]
 
 

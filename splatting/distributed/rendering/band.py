@@ -2,18 +2,16 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from diff_gaussian_rasterization.backend import OPERATORS
-from diff_gaussian_rasterization.schema import SCENE
+from diff_gaussian_rasterization.scene import Drawing, Scene
 from torch import Tensor
 
 from splatting.distributed.ranks import Ranks
 from splatting.distributed.rendering.bands import Bands, find_bands, tile_rows
 from splatting.distributed.rendering.exchange import Sent, return_rows, send_splats
-
-_HEIGHT, _WIDTH = SCENE.index("height"), SCENE.index("width")
 
 
 class Band(NamedTuple):
@@ -36,13 +34,13 @@ class View:
     tile_counts: Tensor  # (N,)
     sent: Sent
     inside: Tensor  # (n,) bool of what was received: whether it reaches no other band
-    state: tuple[Tensor, ...]  # of the band: splats, instances, ranges, splat_slots, slots, background, last, ...
-    layers: Tensor
+    drawing: Drawing  # of the band
+    background: Tensor
 
     @property
     def last(self) -> Tensor:
         """(H, W), where lists end in the rows of the band."""
-        return self.state[-2]
+        return self.drawing.last
 
     @property
     def band(self) -> Band:
@@ -51,7 +49,7 @@ class View:
 
 def draw_view(
     ranks: Ranks,
-    scene: tuple[Any, ...],
+    scene: Scene,
     background: Tensor,
     want_depth: bool,
     train: bool,
@@ -61,7 +59,7 @@ def draw_view(
 
     scene: the rasterizer's arguments with the rank's own Gaussians. find: takes the place of `find_bands`.
     """
-    height, width = scene[_HEIGHT], scene[_WIDTH]
+    height, width = scene.size
     own, depths, rects, tile_counts, radii = OPERATORS.project(*scene)
     bands = (find or find_bands)(ranks, rects, tile_counts, height, width)
     (splats, depths, rects, counts), sent = send_splats(ranks, bands, (own, depths, rects, tile_counts))
@@ -73,8 +71,9 @@ def draw_view(
     color, transmittance, inverse_depth, last, layers = OPERATORS.blend(
         splats, instances, ranges, background, height, width, want_depth, train
     )
-    state = (splats, instances, ranges, *slots, background, last, transmittance)
-    return View(ranks, bands, color, inverse_depth, radii, own, tile_counts, sent, inside, state, layers)
+    lists = instances, ranges, *slots
+    drawing = Drawing(color, transmittance, inverse_depth, radii, splats, counts, *lists, last, layers)
+    return View(ranks, bands, color, inverse_depth, radii, own, tile_counts, sent, inside, drawing, background)
 
 
 def whole_image(view: View) -> View:
@@ -104,14 +103,14 @@ def gradient_rows(
 
     gradients: of colour, transmittance and inverse depth, (., H, W), of which the rows of the band count.
     """
-    rows, counts = OPERATORS.blend_rows(*view.state, *gradients, view.layers, absolute)
+    rows, counts = OPERATORS.blend_rows(view.drawing.kept(view.background), *gradients, absolute)
     return return_rows(view.ranks, view.sent, len(view.radii), rows, counts, view.inside)
 
 
 def decisive_in(view: View) -> Tensor:
     """The rank's own Gaussians that the image depends on (`decisive` of diff_gaussian_rasterization): (N,) bool."""
-    splats, instances, ranges, *_, last, _ = view.state
-    mask, sent = OPERATORS.decisive(splats, instances, ranges, last), view.sent
+    splats, instances, ranges, sent = view.drawing.splats, view.drawing.instances, view.drawing.ranges, view.sent
+    mask = OPERATORS.decisive(splats, instances, ranges, view.last)
     by_band, _ = view.ranks.send(mask, sent.received, sent.sizes)
     found = torch.zeros(len(view.radii), dtype=torch.int32, device=splats.device)
     return found.index_add_(0, sent.gaussians, by_band.int()) > 0

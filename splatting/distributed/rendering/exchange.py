@@ -4,12 +4,13 @@ What a GPU computes is read by the host, which then waits, as rarely as can be: 
 send, and once how many gradient rows.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
+from itertools import accumulate
 from typing import NamedTuple
 
 import torch
+import torch.nn.functional as F
 from diff_gaussian_rasterization.backend import OPERATORS
 from torch import Tensor
 
@@ -30,14 +31,9 @@ class Sent:
     places: Tensor | None  # (n,) int32, by Gaussian, then by rank; None: as the records lie
 
 
-def agree_on_sizes(
-    ranks: Ranks, counts: Tensor, meanwhile: Callable[[], None] = lambda: None
-) -> tuple[list[int], list[int]]:
-    """How many records this rank sends to each rank, and how many it receives.
-
-    counts: (size, n), those to each. meanwhile: queues what a GPU does until the host knows the sizes.
-    """
-    every = ranks.agree(counts.sum(1), meanwhile)
+def agree_on_sizes(ranks: Ranks, counts: Tensor) -> tuple[list[int], list[int]]:
+    """How many records this rank sends to each rank, and how many it receives. counts: (size, n), those to each."""
+    every = ranks.agree(counts.sum(1))
     return every[ranks.rank], [numbers[ranks.rank] for numbers in every]
 
 
@@ -47,16 +43,13 @@ def send_splats(ranks: Ranks, bands: Bands, splats: tuple[Tensor, ...]) -> tuple
     splats: tensors with a row for each Gaussian of the rank: splats, depths, rectangles (N, 4), tile counts (N,).
     """
     reach = *splats[2:], bands.limits
-    counts = OPERATORS.count_records(*reach)
-    list_records = partial(OPERATORS.list_records, *reach, counts)
-    lists: list[tuple[Tensor, Tensor]] = []
-    room = int(_ROOM * len(splats[0]))
-    sizes, received = agree_on_sizes(ranks, counts[:-1], lambda: lists.append(list_records(room)))
+    counts, *lists = OPERATORS.list_records(*reach, room := int(_ROOM * len(splats[0])))
+    sizes, received = agree_on_sizes(ranks, counts[:-1])
     if (total := sum(sizes)) > room:
-        lists = [list_records(total)]
-    gaussians, places = (numbers[:total] for numbers in lists[0])
+        _, *lists = OPERATORS.list_records(*reach, total)
+    gaussians, places = (numbers[:total] for numbers in lists)
     rows = ranks.send(_packed([splats], gaussians, [len(gaussians)]), sizes, received)[0]
-    return OPERATORS.unpack_splats(rows, splats[0]), Sent(gaussians, sizes, received, places)
+    return _unpacked(rows, splats), Sent(gaussians, sizes, received, places)
 
 
 def send_views(ranks: Ranks, views: Sequence[tuple[Tensor, ...]]) -> tuple[tuple[Tensor, ...], Sent]:
@@ -68,7 +61,7 @@ def send_views(ranks: Ranks, views: Sequence[tuple[Tensor, ...]]) -> tuple[tuple
     sizes, received = agree_on_sizes(ranks, reached)
     gaussian = torch.nonzero_static(reached, size=sum(sizes))[:, 1].contiguous()
     rows = ranks.send(_packed(views, gaussian, sizes), sizes, received)[0]
-    return OPERATORS.unpack_splats(rows, views[0][0]), Sent(gaussian, sizes, received, None)
+    return _unpacked(rows, views[0]), Sent(gaussian, sizes, received, None)
 
 
 def return_rows(
@@ -85,7 +78,7 @@ def return_rows(
     runs = len(sent.places)
     ends = torch.arange(runs, runs + ranks.size, dtype=torch.int32, device=rows.device)
     places = _with_last(sent.places.split(sent.sizes), ends)
-    moved = OPERATORS.move_runs(arrived.rows, arrived.counts, places)
+    moved = move_runs(arrived.rows, arrived.counts, places)
     nobody = torch.full((ranks.size,), count, device=rows.device)
     own = _with_last(sent.gaussians.split(sent.sizes), nobody)
     total = torch.zeros(count + 1, dtype=torch.int32, device=rows.device).index_add_(0, own, arrived.counts)
@@ -121,13 +114,13 @@ def _send_back(ranks: Ranks, sent: Sent, rows: Tensor, counts: Tensor, kept: Ten
 
     Rows that began at other places than multiples of 16 bytes took NCCL longer (docs/results/several_gpus.md).
     """
-    odd = OPERATORS.sum_parts(kept, sent.received).remainder(2).int()
+    odd = _sums_of_parts(kept, sent.received).remainder(2).int()
     kept = _with_last(kept.split(sent.received), odd)
     counts = _with_last(counts.split(sent.received), torch.zeros_like(odd))
     received, sizes = ([n + 1 for n in of] for of in (sent.received, sent.sizes))
     own = ranks.send(kept, received, sizes)[0]
     more = torch.stack([part[-1] for part in own.split(sizes)])
-    sums = OPERATORS.sum_parts(own, sizes), OPERATORS.sum_parts(kept, received)
+    sums = _sums_of_parts(own, sizes), _sums_of_parts(kept, received)
     numbers = read_later(torch.cat((*sums, more.long())))
     summed = OPERATORS.sum_runs(rows, counts, kept, len(rows) + ranks.size)  # before the host waits
     found = numbers()
@@ -146,5 +139,27 @@ def _packed(views: Sequence[tuple[Tensor, ...]], gaussians: Tensor, sizes: Seque
     words = sum(t.shape[1:].numel() * t.element_size() for t in views[0]) // 4
     rows = torch.empty(len(gaussians), words, dtype=torch.int32, device=gaussians.device)
     for part, splats, own in zip(rows.split(sizes), views, gaussians.split(sizes), strict=True):
-        OPERATORS.pack_splats_(part, *splats, own)
+        chosen = [t.index_select(0, own).view(len(own), t[:1].numel()).view(torch.int32) for t in splats]
+        torch.cat(chosen, 1, out=part)
     return rows
+
+
+def _unpacked(rows: Tensor, like: Sequence[Tensor]) -> tuple[Tensor, ...]:
+    """The tensors that `_packed` has packed."""
+    words = [t.shape[1:].numel() * t.element_size() // 4 for t in like]
+    parts = zip(rows.split(words, 1), like, strict=True)
+    return tuple(part.contiguous().view(-1).view(t.dtype).view(len(rows), *t.shape[1:]) for part, t in parts)
+
+
+def move_runs(rows: Tensor, counts: Tensor, places: Tensor) -> Tensor:
+    """Rows in another order of their runs. counts, places (n,) int32: rows of each run, its number in the new order."""
+    places = places.long()
+    ends = torch.empty_like(counts).index_copy_(0, places, counts).cumsum(0).index_select(0, places)
+    shifts = (ends - counts.cumsum(0)).repeat_interleave(counts, output_size=len(rows))
+    return torch.empty_like(rows).index_copy_(0, torch.arange(len(rows), device=rows.device) + shifts, rows)
+
+
+def _sums_of_parts(counts: Tensor, sizes: Sequence[int]) -> Tensor:
+    """Sums of so many counts each, one part after the other: (parts,) int64."""
+    upto = F.pad(counts.cumsum(0), (1, 0))
+    return torch.stack([upto[end] for end in accumulate(sizes, initial=0)]).diff()

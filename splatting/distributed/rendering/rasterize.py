@@ -5,11 +5,10 @@ from typing import Any
 
 import torch
 from diff_gaussian_rasterization import GaussianRasterizationSettings
-from diff_gaussian_rasterization.backend import OPERATORS
 from diff_gaussian_rasterization.first_order import first_order
 from diff_gaussian_rasterization.gaussians import Gaussians
-from diff_gaussian_rasterization.ops import Rasterized, scene_arguments
-from diff_gaussian_rasterization.schema import GRADIENT_PLACES, INPUTS, SCENE_TENSORS
+from diff_gaussian_rasterization.ops import Rasterized, gradients_of
+from diff_gaussian_rasterization.scene import Scene, scene_arguments
 from torch import Tensor
 
 from splatting.distributed.ranks import Ranks
@@ -36,41 +35,35 @@ def rasterize_over(
     gaussians = Gaussians(means, opacities, **others)
     scene = scene_arguments(gaussians, settings, raw)
     train = torch.is_grad_enabled() and any(x is not None and x.requires_grad for x in (*gaussians, means2d))
-    color, depth, radii = _OverRanks.apply(
-        ranks, means2d, *scene, settings.bg, want_inverse_depth, train, want_absolute_gradient
-    )
+    options = scene.camera, settings.bg, want_inverse_depth, train, want_absolute_gradient
+    color, depth, radii = _OverRanks.apply(ranks, options, means2d, *gaussians)
     return Rasterized(color, radii, depth if want_inverse_depth else None, None)
 
 
 class _OverRanks(torch.autograd.Function):
-    """Takes the ranks, then the inputs of the operator `rasterize`."""
+    """Takes the ranks, what is no Gaussian, means2d, and the Gaussians."""
 
     @staticmethod
-    def forward(ctx: Any, ranks: Ranks, *inputs: Any) -> tuple[Tensor, Tensor, Tensor]:
-        _, *scene, background, want_depth, train, absolute = inputs
-        view = whole_image(draw_view(ranks, tuple(scene), background, want_depth, train))
+    def forward(ctx: Any, ranks: Ranks, options: tuple, _: Tensor, *gaussians: Any) -> tuple[Tensor, Tensor, Tensor]:
+        camera, background, want_depth, train, absolute = options
+        view = whole_image(draw_view(ranks, Scene(*gaussians, *camera), background, want_depth, train))
         ctx.mark_non_differentiable(view.radii)
         ctx.set_materialize_grads(False)
         if train:
             # An output refers to ctx by its history. Kept here, it would be a cycle that nothing frees.
             kept = {name: getattr(view, name).detach() for name in ("color", "inverse_depth", "radii")}
-            ctx.view, ctx.want_depth, ctx.absolute = replace(view, **kept), want_depth, absolute
-            ctx.numbers = scene[SCENE_TENSORS:]
-            ctx.save_for_backward(*scene[:SCENE_TENSORS])
+            drawing = view.drawing._replace(**kept)
+            ctx.view = replace(view, drawing=drawing, **kept)
+            ctx.want_depth, ctx.absolute, ctx.camera = want_depth, absolute, camera
+            ctx.save_for_backward(*gaussians)
         return view.color, view.inverse_depth, view.radii
 
     @staticmethod
     @first_order("rasterize")
     def backward(ctx: Any, grad_color: Tensor | None, grad_depth: Tensor | None, _: None) -> tuple:
-        scene, view = (*ctx.saved_tensors, *ctx.numbers), ctx.view
+        scene, view = Scene(*ctx.saved_tensors, *ctx.camera), ctx.view
         if grad_color is None:
             grad_color = torch.zeros_like(view.color)
         gradients = grad_color, None, grad_depth if ctx.want_depth else None
-        rows, counts = gradient_rows(view, gradients, ctx.absolute)
-        wanted = [ctx.needs_input_grad[1 + place] for place in GRADIENT_PLACES]
-        found = OPERATORS.rows_vjp(*scene, view.splats, view.tile_counts, rows, counts, wanted, ctx.absolute)
-        by_input: list[Tensor | None] = [None] * len(INPUTS)
-        for place, gradient, is_wanted in zip(GRADIENT_PLACES, found, wanted, strict=True):
-            if is_wanted:
-                by_input[place] = gradient
-        return None, *by_input
+        source = view.splats, view.tile_counts, *gradient_rows(view, gradients, ctx.absolute)
+        return None, None, *gradients_of(scene, source, (), ctx.needs_input_grad[2:], ctx.absolute)

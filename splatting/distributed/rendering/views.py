@@ -8,8 +8,7 @@ from diff_gaussian_rasterization import GaussianRasterizationSettings
 from diff_gaussian_rasterization.backend import OPERATORS
 from diff_gaussian_rasterization.first_order import first_order
 from diff_gaussian_rasterization.gaussians import Gaussians
-from diff_gaussian_rasterization.ops import scene_arguments
-from diff_gaussian_rasterization.schema import GRADIENTS
+from diff_gaussian_rasterization.scene import GRADIENTS, Drawing, Scene, scene_arguments
 from torch import Tensor
 
 from splatting.distributed.ranks import Ranks
@@ -39,7 +38,7 @@ def rasterize_views(
     means2d: (views, N, 3), whose gradient is that of the screen means in each view. Backward gives each rank's own
     Gaussians the sum of the gradients of all views; every rank has to call it.
     """
-    cameras = [scene_arguments(gaussians, view, raw)[len(gaussians) :] for view in settings]
+    cameras = [scene_arguments(gaussians, view, raw).camera for view in settings]
     wants = want_inverse_depth, want_absolute_gradient
     background = settings[ranks.rank].bg
     color, depth, radii = _Views.apply(ranks, cameras, background, wants, means2d, *gaussians)
@@ -61,16 +60,19 @@ class _Views(torch.autograd.Function):
     ) -> tuple[Tensor, Tensor, Tensor]:
         projected = [OPERATORS.project(*gaussians, *camera) for camera in cameras]
         (splats, depths, rects, counts), sent = send_views(ranks, [tensors[:4] for tensors in projected])
-        height, width = cameras[ranks.rank][5:7]
+        height, width = Scene(*gaussians, *cameras[ranks.rank]).size
         lists = OPERATORS.bin(splats, depths, rects, counts, height, width, True)
         planes = OPERATORS.blend(splats, *lists[:2], background, height, width, wants[0], True)
-        color, transmittance, inverse_depth, last, ctx.layers = planes
+        color, transmittance, inverse_depth, last, layers = planes
         radii = torch.stack([radii for *_, radii in projected])
         ctx.mark_non_differentiable(radii)
         ctx.set_materialize_grads(False)
         ctx.ranks, ctx.cameras, ctx.wants, ctx.sent = ranks, cameras, wants, sent
         ctx.own = [(own, tile_counts) for own, _, _, tile_counts, _ in projected]
-        ctx.state = (splats, *lists, background, last, transmittance)
+        drawn = Drawing(
+            color.detach(), transmittance, inverse_depth.detach(), radii, splats, counts, *lists, last, layers
+        )
+        ctx.kept = drawn.kept(background)
         ctx.save_for_backward(*gaussians)
         return color, inverse_depth, radii
 
@@ -79,21 +81,25 @@ class _Views(torch.autograd.Function):
     def backward(ctx: Any, grad_color: Tensor | None, grad_depth: Tensor | None, _: None) -> tuple:
         want_depth, absolute = ctx.wants
         if grad_color is None:
-            grad_color = ctx.state[-1].new_zeros(3, *ctx.state[-1].shape[1:])
+            grad_color = ctx.kept[-1].new_zeros(3, *ctx.kept[-1].shape[1:])
         planes = grad_color, None, grad_depth if want_depth else None
-        rows, counts = OPERATORS.blend_rows(*ctx.state, *planes, ctx.layers, absolute)
+        rows, counts = OPERATORS.blend_rows(ctx.kept, *planes, absolute)
         gaussians = ctx.saved_tensors
         needed = dict(zip(Gaussians._fields, ctx.needs_input_grad[5:], strict=True), means2d=ctx.needs_input_grad[4])
         wanted = [needed[name] for name in GRADIENTS]
         count = len(gaussians[0])
         screen = gaussians[0].new_zeros(ctx.ranks.size, count if needed["means2d"] else 0, 3)
         for view, (own, own_counts) in enumerate(return_sums(ctx.ranks, ctx.sent, count, rows, counts)):
-            arguments = *gaussians, *ctx.cameras[view], *ctx.own[view], own, own_counts
+            scene, source = Scene(*gaussians, *ctx.cameras[view]), (*ctx.own[view], own, own_counts)
             if view == 0:
-                sums = dict(zip(GRADIENTS, OPERATORS.rows_vjp(*arguments, wanted, absolute), strict=True))
+                sums = dict(
+                    zip(GRADIENTS, OPERATORS.rasterize_vjp(*scene, wanted, source, absolute=absolute), strict=True)
+                )
                 screen[0] = sums["means2d"]
             else:
                 sums["means2d"] = screen[view]
-                OPERATORS.rows_vjp_add_(*arguments, list(sums.values()), absolute)
+                OPERATORS.apply_gradients_(
+                    *scene.lists, source, [], list(sums.values()), None, *[[]] * 4, absolute=absolute
+                )
         of_inputs = [sums[name] if needed[name] else None for name in Gaussians._fields]
         return None, None, None, None, screen if needed["means2d"] else None, *of_inputs

@@ -32,8 +32,6 @@ struct RowMemory {
   void project_vjp(const Where&, const Scene<T>&, const int32_t* tile_counts, const T* moments,      \
                    const SceneGradient<T>&);                                                         \
   template <class T>                                                                                 \
-  void mark_visible(const Where&, int64_t count, const T* means, const T* view, bool* visible);      \
-  template <class T>                                                                                 \
   void bin(const Where&, int64_t count, const Projected<T>&, Image, const BinMemory&);               \
   template <class T>                                                                                 \
   void blend(const Where&, const BlendInput<T>&, const Blended<T>&);                                 \
@@ -57,18 +55,10 @@ struct RowMemory {
 
 // Compiled once: see gs/rounded.h.
 void observe(const Executor&, const ObserveInput&);
-void split_positions(const Executor&, const SplitInput&);
-void add_noise(const Executor&, const NoiseInput&);
-void pack_splats(const Executor&, const PackInput&);
-void unpack_splats(const Executor&, const UnpackInput&);
-// counts: (bands + 1, record_blocks), last those of all bands.
-void count_records(const Executor&, const RecordInput&, int32_t* counts);
-void list_records(const Executor&, const RecordInput&, const int32_t* counts, const RecordLists&);
-void move_runs(const Executor&, const MoveInput&);
+void displace(const Executor&, const Displacement&);
+void list_records(const Executor&, const RecordInput&, const RecordLists&);
 template <class T>
 void sum_runs(const Executor&, const SumInput<T>&);
-// The sums of parts that lie one after the other; sizes: how many numbers each has, in the host's memory.
-void sum_parts(const int32_t* counts, const int64_t* sizes, int64_t parts, int64_t* sums);
 
 // What else the CPU offers. sum_rows: the rest of blend_vjp after blend_rows. project_vjp_step: project_vjp, and every
 // Gaussian's step as soon as its gradients are known.
@@ -89,15 +79,9 @@ GS_EACH_ISA(GS_DECLARE)
 namespace cuda {
 GS_BACKEND(Queue)
 void observe(const Queue&, const ObserveInput&);
-void split_positions(const Queue&, const SplitInput&);
-void add_noise(const Queue&, const NoiseInput&);
-void pack_splats(const Queue&, const PackInput&);
-void unpack_splats(const Queue&, const UnpackInput&);
-void count_records(const Queue&, const RecordInput&, int32_t* counts);
-void list_records(const Queue&, const RecordInput&, const int32_t* counts, const RecordLists&);
-void move_runs(const Queue&, const MoveInput&);
+void displace(const Queue&, const Displacement&);
+void list_records(const Queue&, const RecordInput&, const RecordLists&);
 void sum_runs(const Queue&, const SumInput<float>&);
-void sum_parts(const Queue&, const int32_t* counts, const int64_t* sizes, int64_t parts, int64_t* sums);
 // Allocates the gradients; called while the GPU is busy, so that the host's work costs no time.
 struct GradientMemory {
   SceneGradient<float> (*take)(void* context);

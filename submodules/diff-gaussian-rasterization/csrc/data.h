@@ -184,45 +184,18 @@ struct ObserveInput {
   const float* lengths = nullptr;            // (N) what stands for the gradients' lengths; or null
 };
 
-// Gaussians that density control splits, of each the child number `draw` (math/split.h).
-struct SplitInput {
+// Gaussians that move at random (math/displace.h): by noise, or to the children of split ones.
+struct Displacement {
   int64_t count;
-  const float *means, *log_scales, *rotations;  // (N, 3), (N, 3) and (N, 4) wxyz
-  const int64_t* items;                         // (N) indices in the model; with what follows they decide the numbers
-  uint64_t seed;
-  uint32_t draw, iteration, stream;
-  float* positions;  // (N, 3), written
-};
-
-// Noise on the centres of Gaussians (math/noise.h). Nothing happens once `stopped` (StepGuard) is not 0.
-struct NoiseInput {
-  int64_t count;
-  float* means;                                  // (N, 3), updated
-  const float *log_scales, *rotations, *logits;  // (N, 3), (N, 4) wxyz, (N)
-  double size, steepness, threshold;
-  uint64_t seed;
-  uint32_t iteration, stream;
-  const int64_t* stopped;  // or null
-  int64_t first = 0;       // index of the first one, which decides its random numbers
-};
-
-// A row of words of 32 bits for each splat, as processes send them: its values, its depth, its number of tiles and its
-// rectangle, those of Projected. `wide` words make a value: 1 of float32, 2 of float64, on the CPU alone.
-constexpr int packed_words(int wide) { return 11 * wide + 5; }
-
-struct PackInput {
-  int64_t count;
-  int wide;
-  const int64_t* gaussians;                              // (count) the rows of the next four to pack
-  const int32_t *splats, *depths, *tile_counts, *rects;  // (N, 10 wide), (N, wide), (N) and (N, 4)
-  int32_t* packed;                                       // (count, packed_words), written
-};
-
-struct UnpackInput {
-  int64_t count;
-  int wide;
-  const int32_t* packed;
-  int32_t *splats, *depths, *tile_counts, *rects;  // (count, 10 wide) and so on, written
+  float* means;                         // (N, 3), updated
+  const float *log_scales, *rotations;  // (N, 3), (N, 4) wxyz
+  const float* logits = nullptr;        // (N), of noise
+  const int64_t* items = nullptr;  // (N) indices in the model of split ones; with what follows they decide the numbers
+  double size = 0, steepness = 0, threshold = 0;
+  uint64_t seed = 0;
+  uint32_t draw = 0, iteration = 0, stream = 0;
+  const int64_t* stopped = nullptr;  // nothing happens once it (StepGuard) is not 0; or null
+  int64_t first = 0;                 // index of the first one where there are no items
 };
 
 // Which splats reach which bands of rows of tiles. A record is a splat for a band that it reaches.
@@ -236,6 +209,7 @@ struct RecordInput {
 
 struct RecordLists {
   int64_t room;        // records without room are left out
+  int32_t* counts;     // (bands + 1, record_blocks) written: of each block, last those of all bands
   int64_t* gaussians;  // (room) written: ascending for each band, band after band
   int32_t* places;     // (room) written: the record's number by splat, then by band
 };
@@ -243,16 +217,6 @@ struct RecordLists {
 // Records are counted in blocks of so many splats.
 constexpr int64_t kRecordBlock = 256;
 constexpr int64_t record_blocks(int64_t count) { return (count + kRecordBlock - 1) / kRecordBlock; }
-
-// Runs of rows that lie side by side, to come into another order.
-struct MoveInput {
-  int64_t runs, rows;     // all rows of all runs
-  int words;              // of a row: 10 or 12 on a GPU
-  const int32_t* counts;  // (runs) rows of each run
-  const int32_t* places;  // (runs) its number in the new order
-  const int32_t* from;    // (rows, words)
-  int32_t* to;            // (rows, words), written
-};
 
 // Runs of rows that lie side by side, some of which become one row each, the sum of theirs.
 template <class T>

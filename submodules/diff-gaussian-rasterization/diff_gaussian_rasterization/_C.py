@@ -8,11 +8,13 @@ import torch
 from torch import Tensor
 
 from diff_gaussian_rasterization.alternatives import chosen, given
-from diff_gaussian_rasterization.backend import OPERATORS
 from diff_gaussian_rasterization.byte_buffers import packed, unpacked
 from diff_gaussian_rasterization.fakes import SPLAT_VALUES, TILE
+from diff_gaussian_rasterization.gaussians import Gaussians
+from diff_gaussian_rasterization.ops import gradients_of
+from diff_gaussian_rasterization.ops import mark_visible as mark
 from diff_gaussian_rasterization.optim import sparse_adam_
-from diff_gaussian_rasterization.schema import GRADIENTS
+from diff_gaussian_rasterization.scene import Scene, draw
 
 __all__ = ["adamUpdate", "mark_visible", "rasterize_gaussians", "rasterize_gaussians_backward"]
 
@@ -20,7 +22,7 @@ __all__ = ["adamUpdate", "mark_visible", "rasterize_gaussians", "rasterize_gauss
 @torch.no_grad()
 def mark_visible(positions: Tensor, viewmatrix: Tensor, projmatrix: Tensor) -> Tensor:
     """Marks positions (N, 3) whose z in the view (4, 4, transposed) is above 0.2: (N,) bool. projmatrix is not read."""
-    return OPERATORS.mark_visible(positions, viewmatrix)
+    return mark(positions, viewmatrix)
 
 
 @torch.no_grad()
@@ -53,14 +55,17 @@ def rasterize_gaussians(
     is `prefiltered`, it returns no inverse depth.
     """
     of_2023 = debug is None
-    camera = viewmatrix, projmatrix, campos, tan_fovx, tan_fovy, image_height, image_width, degree, scale_modifier
     gaussians = chosen(means3D, opacity, scales, rotations, cov3D_precomp, colors, sh)
-    smooth = not of_2023 and bool(antialiasing)
-    out = OPERATORS.rasterize(None, *gaussians, *camera, smooth, False, background, True, True)
-    color, transmittance, inverse_depth, radii, splats, tile_counts, instances, ranges, splat_slots, _, last, _ = out
-    buffers = packed(splat_slots, splats, tile_counts), packed(instances), packed(ranges, transmittance, last)
-    rendered = len(instances), color, radii, *buffers
-    return rendered if of_2023 else (*rendered, inverse_depth)
+    options = image_height, image_width, degree, not of_2023 and bool(antialiasing), False
+    camera = viewmatrix, projmatrix, campos, (tan_fovx, tan_fovy, scale_modifier), options
+    out = draw(Scene(*gaussians, *camera), background, True)
+    buffers = (
+        packed(out.splat_slots, out.splats, out.tile_counts),
+        packed(out.instances),
+        packed(out.ranges, out.transmittance, out.last),
+    )
+    rendered = len(out.instances), out.color, out.radii, *buffers
+    return rendered if of_2023 else (*rendered, out.inverse_depth)
 
 
 @torch.no_grad()
@@ -106,22 +111,21 @@ def rasterize_gaussians_backward(
     ranges, transmittance, last = unpacked(imgBuffer, image)
     slots = instances.new_empty(int(splat_slots[-1, 0]), 0)
 
-    camera = viewmatrix, projmatrix, campos, tan_fovx, tan_fovy, height, width, degree, scale_modifier
-    state = splats, instances, ranges, splat_slots, slots, background, last, transmittance
-    arguments = *gaussians, *camera, bool(antialiasing), False, *state, grad_out_color, None, given(grad_out_invdepth)
+    options = height, width, degree, bool(antialiasing), False
+    scene = Scene(*gaussians, viewmatrix, projmatrix, campos, (tan_fovx, tan_fovy, scale_modifier), options)
     no_layers = splats.new_empty(0)  # the backward makes its own
-    wanted = [name == "means2d" or getattr(gaussians, name) is not None for name in GRADIENTS]
-    gradients = dict(zip(GRADIENTS, OPERATORS.rasterize_vjp(*arguments, tile_counts, no_layers, wanted), strict=True))
-    for name, is_wanted in zip(GRADIENTS, wanted, strict=True):
-        if not is_wanted:
-            gradients[name] = means3D.new_zeros(count, *gradients[name].shape[1:])
-    bands = (
-        torch.cat([gradients["sh_dc"], gradients["sh_rest"]], 1)
-        if gaussians.sh_dc is not None
-        else gradients["sh_rest"]
-    )
-    names = "means2d", "colors", "opacities", "means", "cov3d"
-    return *(gradients[name] for name in names), bands, gradients["scales"], gradients["rotations"]
+    kept = splats, tile_counts, instances, ranges, splat_slots, slots, last, no_layers, background, transmittance
+    planes = grad_out_color, None, given(grad_out_invdepth)
+    screen, *found = gradients_of(scene, kept, planes, [True, *(values is not None for values in gaussians)])
+    by_name = dict(zip(Gaussians._fields, found, strict=True))
+    shapes = {"scales": (3,), "rotations": (4,), "cov3d": (6,), "colors": (3,), "sh_rest": (0, 3)}
+    for name, shape in shapes.items():
+        if by_name[name] is None:
+            by_name[name] = means3D.new_zeros(count, *shape)
+    if gaussians.sh_dc is not None:
+        by_name["sh_rest"] = torch.cat([by_name["sh_dc"], by_name["sh_rest"]], 1)
+    names = "colors", "opacities", "means", "cov3d", "sh_rest", "scales", "rotations"
+    return screen, *(by_name[name] for name in names)
 
 
 @torch.no_grad()

@@ -3,9 +3,9 @@
 `optim` has the optimiser's kernels and `reference` the oracle.
 """
 
-from diff_gaussian_rasterization.backend import has_cuda_kernels  # first, because it says if torch is missing
+import diff_gaussian_rasterization.backend  # noqa: F401  (first, because it says whether torch is missing)
 from diff_gaussian_rasterization.gaussians import Gaussians
-from diff_gaussian_rasterization.ops import Rasterized, decisive, rasterize
+from diff_gaussian_rasterization.ops import Rasterized, decisive, has_cuda_kernels, rasterize
 from diff_gaussian_rasterization.rasterizer import GaussianRasterizer, cpu_deep_copy_tuple, rasterize_gaussians
 from diff_gaussian_rasterization.settings import GaussianRasterizationSettings
 from diff_gaussian_rasterization.sparse_adam import SparseGaussianAdam

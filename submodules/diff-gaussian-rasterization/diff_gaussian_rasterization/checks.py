@@ -15,13 +15,10 @@ def check_tensors(inputs: Mapping[str, object]) -> None:
             raise TypeError(f"{name} must be a tensor, got {found}: convert it with torch.as_tensor")
 
 
-def check_flags(flags: Mapping[str, object]) -> None:
-    """Raises TypeError that names the first value that is not True, False, 1, 0, None, or a tensor of one value."""
-    for name, value in flags.items():
-        if value is True or value is False or value is None:
-            continue
-        if value.numel() != 1 if isinstance(value, Tensor) else value not in (False, True):
-            raise TypeError(f"{name} must be True or False, got {value!r:.80}")
+def check_flag(name: str, value: object) -> None:
+    """Raises TypeError for a value that is not True, False, 1, 0, None, or a tensor of one value."""
+    if value is not None and (value.numel() != 1 if isinstance(value, Tensor) else value not in (False, True)):
+        raise TypeError(f"{name} must be True or False, got {value!r:.80}")
 
 
 def check_finite(what: str, values: Tensor) -> None:

@@ -1,11 +1,11 @@
 """Density control's computations besides its decisions. Nothing here is differentiable."""
 
+import torch
 from torch import Tensor
 
 from diff_gaussian_rasterization.backend import OPERATORS
 
-_split_positions = OPERATORS.split_positions
-_add_noise = OPERATORS.add_noise_
+_displace = OPERATORS.displace_
 _penalise = OPERATORS.penalise_
 
 
@@ -26,7 +26,9 @@ def split_positions(
     int64, their indices in the model. The random numbers are a function of seed (its lower 64 bits), stream, iteration,
     item and draw, each of the last four below 2^32. Every device and number of threads gives the same bits.
     """
-    return _split_positions(means, log_scales, rotations, items, _signed(seed), stream, iteration, draw)
+    children = means.clone(memory_format=torch.contiguous_format)
+    _displace(children, log_scales, rotations, None, items, [], _signed(seed), stream, iteration, draw)
+    return children
 
 
 def add_noise_(
@@ -53,8 +55,8 @@ def add_noise_(
     each of the last three below 2^32; first: the index of the first one. Every device and number of threads gives the
     same bits. stopped: of a guard (optim.py); once it is not 0, nothing changes.
     """
-    shapes = log_scales, rotations, logits
-    _add_noise(means, *shapes, size, steepness, threshold, _signed(seed), stream, iteration, stopped, first)
+    gate = [size, steepness, threshold]
+    _displace(means, log_scales, rotations, logits, None, gate, _signed(seed), stream, iteration, 0, stopped, first)
 
 
 def penalise_(
@@ -69,7 +71,7 @@ def penalise_(
     """Adds the gradients of opacity * sum(sigmoid(logits)) + scale * sum(exp(log_scales)) to those that are given.
 
     logits and their gradients: (N, 1); log_scales and theirs: (N, 3); all float32, or on the CPU float64. The gradients
-    are contiguous and change. `rasterize_vjp_step_` adds the same bits.
+    are contiguous and change. `apply_gradients_` adds the same bits.
     """
     _penalise(logits, log_scales, logit_gradients, log_scale_gradients, opacity, scale)
 

@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor, library
 
-from diff_gaussian_rasterization.schema import GRADIENTS, SCENE
+from diff_gaussian_rasterization.scene import GRADIENTS
 
 # A Gaussian's values in each input; a row of sh_rest depends on the number of bands.
 _ROWS = {"means": (3,), "means2d": (3,), "opacities": (1,), "scales": (3,), "rotations": (4,), "cov3d": (6,)}
@@ -18,17 +18,6 @@ RECORD_BLOCK = 256  # splats whose records are counted together
 
 def _fake(name: str):
     return library.register_fake(f"diff_gaussian_rasterization::{name}")
-
-
-def _scene(arguments: tuple) -> dict:
-    return dict(zip(SCENE, arguments[: len(SCENE)], strict=True))
-
-
-def _gradients(scene: dict, wanted: list[bool]) -> tuple[Tensor, ...]:
-    means, sh_rest = scene["means"], scene["sh_rest"]
-    rows = _ROWS | {"sh_rest": (0 if sh_rest is None else sh_rest.shape[1], 3)}
-    counts = [means.shape[0] if is_wanted else 0 for is_wanted in wanted]
-    return tuple(means.new_empty((count, *rows[name])) for name, count in zip(GRADIENTS, counts, strict=True))
 
 
 def _binned(like: Tensor, count: int, height: int, width: int, train: bool) -> tuple[Tensor, ...]:
@@ -70,31 +59,26 @@ def _(splats, instances, ranges, background, height, width, inverse_depth, train
     return _blended(splats, height, width, inverse_depth, train)
 
 
-@_fake("blend_vjp")
-def _(splats, *_):
-    return splats.new_empty((splats.shape[0], MOMENT_VALUES))
-
-
 @_fake("blend_rows")
-def _(splats, *others):
-    *_, absolute = others if isinstance(others[-1], bool) else (False,)  # the dispatcher leaves a default out
-    values = MOMENT_VALUES + (ABSOLUTE_VALUES if absolute else 0)
-    rows = splats.new_empty((library.get_ctx().new_dynamic_size(), values))
+def _(source, *arguments):
+    absolute = len(arguments) == 4 and arguments[-1]  # the dispatcher leaves a default out
+    splats = source[0]
+    rows = splats.new_empty((library.get_ctx().new_dynamic_size(), MOMENT_VALUES + absolute * ABSOLUTE_VALUES))
     return rows, splats.new_empty((splats.shape[0],), dtype=torch.int32)
 
 
-@_fake("project_vjp")
 @_fake("rasterize_vjp")
-@_fake("rows_vjp")
-def _(*arguments):
-    (wanted,) = [value for value in arguments if isinstance(value, list)]
-    return _gradients(_scene(arguments), wanted)
+def _(means, opacities, *arguments):
+    sh_rest, wanted = arguments[5], arguments[11]
+    rows = _ROWS | {"sh_rest": (0 if sh_rest is None else sh_rest.shape[1], 3)}
+    rows["opacities"] = opacities.shape[1:] if wanted[2] else (1,)
+    counts = [means.shape[0] if is_wanted else 0 for is_wanted in wanted]
+    return tuple(means.new_empty((count, *rows[name])) for name, count in zip(GRADIENTS, counts, strict=True))
 
 
 @_fake("rasterize")
-def _(means2d, *arguments):
-    scene, (inverse_depth, train) = _scene(arguments), arguments[len(SCENE) + 1 :][:2]
-    means, height, width = scene["means"], scene["height"], scene["width"]
+def _(means2d, means, *arguments):
+    (height, width, *_), _, inverse_depth, train = arguments[11:15]  # what follows is left out where it has its default
     count = means.shape[0]
     color, transmittance, depth, last, layers = _blended(means, height, width, inverse_depth, train)
     radii, tile_counts = (means.new_empty((count,), dtype=torch.int32) for _ in range(2))
@@ -103,36 +87,15 @@ def _(means2d, *arguments):
     return color, transmittance, depth, *projected, *lists, last, layers
 
 
-@_fake("mark_visible")
-def _(means, view):
-    return means.new_empty((means.shape[0],), dtype=torch.bool)
-
-
 @_fake("decisive")
 def _(splats, *_):
     return splats.new_empty((splats.shape[0],), dtype=torch.bool)
 
 
-@_fake("split_positions")
-def _(means, *_):
-    return means.new_empty((means.shape[0], 3))
-
-
-@_fake("unpack_splats")
-def _(packed, like):
-    count = packed.shape[0]
-    floats = like.new_empty((count, SPLAT_VALUES)), like.new_empty((count,))
-    return *floats, packed.new_empty((count, 4)), packed.new_empty((count,))
-
-
-@_fake("count_records")
-def _(rects, tile_counts, limits):
-    return rects.new_empty((limits.shape[1] + 1, -(-rects.shape[0] // RECORD_BLOCK)))
-
-
 @_fake("list_records")
-def _(rects, tile_counts, limits, counts, room):
-    return rects.new_empty((room,), dtype=torch.int64), rects.new_empty((room,))
+def _(rects, tile_counts, limits, room):
+    counts = rects.new_empty((limits.shape[1] + 1, -(-rects.shape[0] // RECORD_BLOCK)))
+    return counts, rects.new_empty((room,), dtype=torch.int64), rects.new_empty((room,))
 
 
 @_fake("sum_runs")
@@ -140,31 +103,12 @@ def _(rows, counts, kept, room):
     return rows.new_empty((room, rows.shape[1]))
 
 
-@_fake("sum_parts")
-def _(counts, sizes):
-    return counts.new_empty((len(sizes),), dtype=torch.int64)
-
-
-@_fake("move_runs")
-def _(rows, *_):
-    return rows.new_empty(rows.shape)
-
-
-@_fake("in_host_memory")
-def _(values):
-    return torch.empty_like(values)
-
-
 @_fake("adam_")
+@_fake("apply_gradients_")
 @_fake("catch_up_")
-@_fake("sparse_adam_")
+@_fake("displace_")
 @_fake("observe_")
-@_fake("rasterize_vjp_step_")
-@_fake("rows_vjp_step_")
-@_fake("step_now_")
-@_fake("add_noise_")
 @_fake("penalise_")
-@_fake("pack_splats_")
-@_fake("rows_vjp_add_")
+@_fake("step_now_")
 def _(*_args, **_keywords):
     return None

@@ -1,20 +1,21 @@
 """The rasterizer as Python functions: named arguments and results, autograd. The operators check their inputs."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
 from torch import Tensor, library
+from torch.utils._pytree import tree_flatten, tree_leaves, tree_unflatten
 
 import diff_gaussian_rasterization.fakes  # noqa: F401  (registers the fake kernels)
-from diff_gaussian_rasterization.backend import OPERATORS
-from diff_gaussian_rasterization.checks import check_finite, check_flags, check_tensors
+from diff_gaussian_rasterization.backend import OPERATORS, has_kernels
+from diff_gaussian_rasterization.checks import check_finite, check_tensors
 from diff_gaussian_rasterization.first_order import direct_apply, first_order, function_of, is_compiled, needs_function
 from diff_gaussian_rasterization.gaussians import Gaussians, lists_gaussians
-from diff_gaussian_rasterization.schema import GRADIENT_PLACES, INPUTS, SCENE_TENSORS
+from diff_gaussian_rasterization.scene import Drawing, draw, scene_arguments
 from diff_gaussian_rasterization.settings import GaussianRasterizationSettings
 
-_FLAGS = ("prefiltered", "debug", "antialiasing", "inverse_depth")
-_OPACITIES = INPUTS.index("opacities")
+_NEAR = 0.2  # as in csrc/math/constants.h
 
 
 class Rasterized(NamedTuple):
@@ -54,7 +55,7 @@ def rasterize(
     """
     gaussians = Gaussians(means, opacities, **others)
     try:
-        arguments = scene_arguments(gaussians, settings, raw)
+        scene = scene_arguments(gaussians, settings, raw)
         train = needs_function(*gaussians, means2d)
         if settings.debug:
             for name, values in gaussians._asdict().items():
@@ -62,7 +63,7 @@ def rasterize(
                     check_finite(name, values)
         # torch.compile knows the operator, whose autograd is registered below.
         function = _apply if train and not is_compiled() else OPERATORS.rasterize
-        out = function(means2d, *arguments, settings.bg, want_inverse_depth, train, want_absolute_gradient)
+        out = function(means2d, *scene, settings.bg, want_inverse_depth, train, want_absolute_gradient)
     except (AttributeError, TypeError, RuntimeError):
         _check_types(gaussians, settings, means2d)
         raise
@@ -94,37 +95,25 @@ def decisive(
     """
     gaussians = Gaussians(means, opacities, **others)
     try:
-        out = OPERATORS.rasterize(means, *scene_arguments(gaussians, settings, raw), settings.bg, False, True)
+        drawn = draw(scene_arguments(gaussians, settings, raw), settings.bg)
     except RuntimeError:
         _check_types(gaussians, settings)
         raise
-    _, _, _, _, splats, _, instances, ranges, _, _, last, _ = out
-    return OPERATORS.decisive(splats, instances, ranges, last)
+    return OPERATORS.decisive(drawn.splats, drawn.instances, drawn.ranges, drawn.last)
 
 
 def mark_visible(positions: Tensor, view: Tensor) -> Tensor:
     """Marks positions (N, 3) whose z is above 0.2 in the view (4, 4, transposed): (N,) bool."""
-    return OPERATORS.mark_visible(positions, view)
+    for name, values, shape in (("positions", positions, (len(positions), 3)), ("the view matrix", view, (4, 4))):
+        if values.shape != shape:
+            raise ValueError(f"{name} must be {shape}, got {tuple(values.shape)}")
+    matrix, (x, y, z) = view.to(positions), positions.unbind(1)
+    return x * matrix[0, 2] + y * matrix[1, 2] + z * matrix[2, 2] + matrix[3, 2] > _NEAR
 
 
-def scene_arguments(gaussians: Gaussians, settings: GaussianRasterizationSettings, raw: bool) -> tuple:
-    """Puts Gaussians and camera into the order of the operators' arguments (`schema.SCENE`)."""
-    check_flags({name: getattr(settings, name) for name in _FLAGS})  # the text "no" would count as True
-    center = settings.campos  # (3,); code of 2023 also gives a row (1, 3)
-    return (
-        *gaussians,
-        settings.viewmatrix,
-        settings.projmatrix,
-        center if center.dim() == 1 else center.reshape(-1),
-        settings.tanfovx,
-        settings.tanfovy,
-        settings.image_height,
-        settings.image_width,
-        settings.sh_degree,
-        settings.scale_modifier,
-        bool(settings.antialiasing),
-        raw,
-    )
+def has_cuda_kernels() -> bool:
+    """Whether this build has the CUDA backend. A GPU may be missing all the same: see torch.cuda.is_available()."""
+    return has_kernels("rasterize", "cuda")
 
 
 def _check_types(gaussians: Gaussians, settings: GaussianRasterizationSettings, means2d: object = None) -> None:
@@ -147,40 +136,55 @@ def _setup_context(ctx, inputs, output):
 
 def _keep(ctx, inputs, output):
     """Keep what the backward needs of the operator's inputs and output."""
-    *inputs, absolute = (*inputs, False)[: len(INPUTS)]  # the dispatcher leaves a default out
-    _, *scene, background, inverse_depth, train = inputs
-    _, transmittance, _, _, splats, tile_counts, instances, ranges, splat_slots, slots, last, layers = output
+    _, *tensors, lens, options, background, inverse_depth, train, absolute = inputs
     ctx.set_materialize_grads(False)
-    ctx.numbers, ctx.inverse_depth, ctx.train, ctx.absolute = scene[SCENE_TENSORS:], inverse_depth, train, absolute
-    state = (splats, instances, ranges, splat_slots, slots, background, last, transmittance)
-    ctx.save_for_backward(*scene[:SCENE_TENSORS], *state, tile_counts, layers)
+    ctx.numbers, ctx.inverse_depth, ctx.train, ctx.absolute = (lens, options), inverse_depth, train, absolute
+    ctx.save_for_backward(*tensors, *Drawing.kept(output, background))
 
 
 @first_order("rasterize")
 def _backward(ctx, grad_color, grad_transmittance, grad_inverse_depth, *_):
     if not ctx.train:
         raise RuntimeError("this image was rasterized with train=False, so it has no backward")
-    saved = ctx.saved_tensors
-    scene, state, more = (*saved[:SCENE_TENSORS], *ctx.numbers), saved[SCENE_TENSORS:-2], saved[-2:]
-    wanted = [ctx.needs_input_grad[place] for place in GRADIENT_PLACES]
+    saved, needed = ctx.saved_tensors, ctx.needs_input_grad
+    scene, kept = (*saved[:11], *ctx.numbers), saved[11:]
     if grad_color is None:
-        grad_color = state[-1].new_zeros(3, *state[-1].shape[1:])
-    if not ctx.inverse_depth:
-        grad_inverse_depth = None
-    image = grad_color, grad_transmittance, grad_inverse_depth
-    gradients = OPERATORS.rasterize_vjp(*scene, *state, *image, *more, wanted, ctx.absolute)
-    by_input = [None] * len(INPUTS)
-    for place, gradient, is_wanted in zip(GRADIENT_PLACES, gradients, wanted, strict=True):
-        if is_wanted:
-            by_input[place] = gradient
-    shape = scene[_OPACITIES - 1].shape  # `scene` lacks means2d, the first input
-    if (gradient := by_input[_OPACITIES]) is not None and gradient.shape != shape:
-        by_input[_OPACITIES] = gradient.reshape(shape)  # a caller may have given a row instead of a column
-    return tuple(by_input)
+        grad_color = kept[-1].new_zeros(3, *kept[-1].shape[1:])
+    planes = grad_color, grad_transmittance, grad_inverse_depth if ctx.inverse_depth else None
+    found = gradients_of(scene, kept, planes, needed[:9], ctx.absolute)
+    return *found, *(None,) * (len(needed) - len(found))
+
+
+def gradients_of(
+    scene: Sequence,
+    source: Sequence[Tensor],
+    planes: Sequence[Tensor | None],
+    needed: Sequence[bool],
+    absolute: bool = False,
+) -> list[Tensor | None]:
+    """Gradients of means2d and of each of the Gaussians' tensors, as far as they are needed, else None.
+
+    scene: `Scene`. source, planes: what a forward has kept (`Drawing.kept`), and the gradients of its colour,
+    transmittance and inverse depth; or splats, tile_counts, gradient rows and their counts, and nothing.
+    """
+    results = OPERATORS.rasterize_vjp(*scene, needed, source, *(planes or (None, None, None)), absolute)
+    return [gradient if is_needed else None for gradient, is_needed in zip(results, needed, strict=True)]
 
 
 # For callers of the operator itself, and for torch.compile.
 library.register_autograd("diff_gaussian_rasterization::rasterize", _backward, setup_context=_setup_context)
+
+
+@library.register_vmap("diff_gaussian_rasterization::rasterize_vjp")
+def _vjp_of_each(info, in_dims, *arguments):
+    """torch's own rule does not know lists of tensors."""
+    flat, form = tree_flatten(arguments)
+    dims = tree_leaves(in_dims)
+    found = []
+    for item in range(info.batch_size):
+        own = [value if dim is None else value.select(dim, item) for value, dim in zip(flat, dims, strict=True)]
+        found.append(OPERATORS.rasterize_vjp(*tree_unflatten(own, form)))
+    return tuple(map(torch.stack, zip(*found, strict=True))), (0,) * len(found[0])
 
 
 class _Rasterize(torch.autograd.Function):

@@ -17,7 +17,6 @@ from torch import Tensor
 from diff_gaussian_rasterization.backend import OPERATORS
 
 _adam = OPERATORS.adam_
-_sparse_adam = OPERATORS.sparse_adam_
 _catch_up = OPERATORS.catch_up_
 _observe = OPERATORS.observe_
 
@@ -47,7 +46,7 @@ def adam_(
     the step back.
     """
     lists = values, gradients, exp_avgs, exp_avg_sqs, steps
-    _adam(*lists, rates, beta1, beta2, eps, columns, loss, stopped, iteration)
+    _adam(*lists, rates, beta1, beta2, eps, columns, None, loss, stopped, iteration)
 
 
 def sparse_adam_(
@@ -70,8 +69,8 @@ def sparse_adam_(
     value, gradient and both averages: (N, ...) as for `adam_`. visible: (N,) bool. There is no bias correction.
     Changes value, exp_avg, exp_avg_sq and `stopped`; rows that are not visible keep every bit.
     """
-    tensors = value, gradient, exp_avg, exp_avg_sq, visible
-    _sparse_adam(*tensors, rate, beta1, beta2, eps, columns, loss, stopped, iteration)
+    tensors = [value], [gradient], [exp_avg], [exp_avg_sq], []
+    _adam(*tensors, [rate], beta1, beta2, eps, [columns], visible, loss, stopped, iteration)
 
 
 def catch_up_(

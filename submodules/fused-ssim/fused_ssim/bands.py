@@ -51,5 +51,5 @@ class _Banded(torch.autograd.Function):
     def backward(ctx: Any, grad_loss: Tensor | None, *_: Any) -> tuple[Tensor | None, None, None, None, None, None]:
         if grad_loss is None:
             return None, None, None, None, None, None
-        gradient = OPERATORS.photometric_band_vjp(*ctx.saved_tensors, ctx.lambda_dssim, grad_loss, *ctx.rows, ctx.clamp)
+        gradient = OPERATORS.photometric_vjp(*ctx.saved_tensors, ctx.lambda_dssim, grad_loss, ctx.clamp, ctx.rows)
         return gradient, None, None, None, None, None

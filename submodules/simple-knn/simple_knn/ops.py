@@ -3,7 +3,7 @@
 import torch
 from torch import library
 
-from simple_knn.backend import OPERATORS
+from simple_knn.backend import OPERATORS, has_kernels
 
 
 @library.register_fake("simple_knn::mean_distance2")
@@ -25,6 +25,6 @@ def distCUDA2(points: torch.Tensor) -> torch.Tensor:
     if points.dim() != 2 or points.shape[1] != 3:
         raise ValueError(f"points must be (N, 3), got {tuple(points.shape)}")
     device = points.device.type
-    if not torch._C._dispatch_has_kernel_for_dispatch_key("simple_knn::mean_distance2", device.upper()):
+    if not has_kernels("mean_distance2", device):
         raise ValueError(f"this build of simple_knn has no {device} backend: pass points.cpu()")
     return OPERATORS.mean_distance2(points.detach())

@@ -20,19 +20,12 @@ class Operators {
 
   // Defines an operator by its schema and registers its function, for the CPU and in a build with CUDA for GPUs too.
   void define(const std::string& schema, Boxed function) {
-#ifdef GS_CUDA
-    define(schema, function, function);
-#else
-    define(schema, function, nullptr);
-#endif
-  }
-
-  // The same with a function for each of the two, as GS_BOTH gives them.
-  void define(const std::string& schema, Boxed cpu, Boxed cuda) {
     schemas_.def(schema.c_str());
     const std::string name = schema.substr(0, schema.find('('));
-    cpu_.impl(name.c_str(), cpu);
-    if (cuda) cuda_.impl(name.c_str(), cuda);
+    cpu_.impl(name.c_str(), function);
+#ifdef GS_CUDA
+    cuda_.impl(name.c_str(), function);
+#endif
   }
 
   // The same with one function for all devices, for calls without a tensor too.
@@ -47,13 +40,6 @@ class Operators {
 };
 
 }  // namespace gs
-
-// An operator's function for the CPU, and in a build with CUDA the one for GPUs, whose name ends with _on_cuda.
-#ifdef GS_CUDA
-#define GS_BOTH(function) TORCH_BOX(&function), TORCH_BOX(&function##_on_cuda)
-#else
-#define GS_BOTH(function) TORCH_BOX(&function), nullptr
-#endif
 
 // GS_OPERATORS(namespace, m) { m.define(...); }, once in a file.
 #define GS_OPERATORS(name, m)                                                                     \

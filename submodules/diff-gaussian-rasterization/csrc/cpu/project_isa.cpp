@@ -124,17 +124,7 @@ void project(const Executor& executor, const Scene<T>& s, const Projected<T>& ou
   });
 }
 
-template <class T>
-void mark_visible(const Executor& executor, int64_t count, const T* means, const T* view, bool* visible) {
-  const Vec3<T> row_z = {view[2], view[6], view[10]};
-  for_dynamic(executor, count, kBlock, [&](int64_t begin, int64_t end) {
-    for (int64_t i = begin; i < end; ++i) visible[i] = in_front(dot(row_z, load3(means + 3 * i)) + view[14]);
-  });
-}
-
-#define GS_INSTANTIATE(T)                                                          \
-  template void project<T>(const Executor&, const Scene<T>&, const Projected<T>&); \
-  template void mark_visible<T>(const Executor&, int64_t, const T*, const T*, bool*);
+#define GS_INSTANTIATE(T) template void project<T>(const Executor&, const Scene<T>&, const Projected<T>&);
 GS_INSTANTIATE(float)
 GS_INSTANTIATE(double)
 

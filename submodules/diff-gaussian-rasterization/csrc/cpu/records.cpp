@@ -21,8 +21,6 @@ void for_blocks(const Executor& executor, const RecordInput& in, const Body& bod
   });
 }
 
-}  // namespace
-
 void count_records(const Executor& executor, const RecordInput& in, int32_t* counts) {
   const int64_t blocks = record_blocks(in.count);
   for_blocks(executor, in, [&](int64_t block, int64_t begin, int64_t end) {
@@ -36,13 +34,16 @@ void count_records(const Executor& executor, const RecordInput& in, int32_t* cou
   });
 }
 
-void list_records(const Executor& executor, const RecordInput& in, const int32_t* counts, const RecordLists& to) {
+}  // namespace
+
+void list_records(const Executor& executor, const RecordInput& in, const RecordLists& to) {
+  count_records(executor, in, to.counts);
   const int64_t blocks = record_blocks(in.count), by_band = in.bands * blocks;
   std::vector<int64_t> begins(by_band + blocks);
   int64_t sum = 0;
   for (int64_t k = 0; k < by_band + blocks; ++k) {
     if (k == by_band) sum = 0;
-    begins[k] = sum, sum += counts[k];
+    begins[k] = sum, sum += to.counts[k];
   }
   for_blocks(executor, in, [&](int64_t block, int64_t begin, int64_t end) {
     std::vector<int64_t> next(in.bands);

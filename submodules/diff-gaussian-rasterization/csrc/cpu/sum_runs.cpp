@@ -1,6 +1,5 @@
-// Adds up runs of gradient rows before they go to other processes, and their numbers.
+// Adds up runs of gradient rows before they go to other processes.
 #include <algorithm>
-#include <numeric>
 #include <vector>
 
 #include "../backend.h"
@@ -31,11 +30,6 @@ void sum_runs(const Executor& executor, const SumInput<T>& in) {
       std::copy_n(sums, in.values, to);
     }
   });
-}
-
-void sum_parts(const int32_t* counts, const int64_t* sizes, int64_t parts, int64_t* sums) {
-  for (int64_t part = 0; part < parts; counts += sizes[part++])
-    sums[part] = std::accumulate(counts, counts + sizes[part], int64_t(0));
 }
 
 template void sum_runs<float>(const Executor&, const SumInput<float>&);

@@ -62,11 +62,6 @@ __global__ void __launch_bounds__(kThreads)
   store_splat(out.splats, i, splat);
 }
 
-__global__ void mark_visible_kernel(int64_t count, const float* means, const float* view, bool* visible) {
-  const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
-  if (i < count) visible[i] = in_front(dot(Vec3<float>{view[2], view[6], view[10]}, load3(means + 3 * i)) + view[14]);
-}
-
 }  // namespace
 
 template <>
@@ -74,13 +69,6 @@ void project<float>(const Queue& queue, const Scene<float>& s, const Projected<f
   if (!s.count) return;
   project_kernel<<<blocks_for(s.count, kThreads), kThreads, 0, stream_of(queue)>>>(queue.halted, s, out);
   check_launch("project");
-}
-
-template <>
-void mark_visible<float>(const Queue& queue, int64_t count, const float* means, const float* view, bool* visible) {
-  if (!count) return;
-  mark_visible_kernel<<<blocks_for(count, kThreads), kThreads, 0, stream_of(queue)>>>(count, means, view, visible);
-  check_launch("mark_visible");
 }
 
 }  // namespace cuda

@@ -84,22 +84,17 @@ __global__ void __launch_bounds__(kThreads)
 
 }  // namespace
 
-void count_records(const Queue& queue, const RecordInput& in, int32_t* counts) {
-  const unsigned blocks = blocks_for(in.count, kThreads);
-  if (!blocks) return;
-  count_kernel<<<blocks, kThreads, 0, stream_of(queue)>>>(in, blocks, counts);
-  check_launch("count_records");
-}
-
-void list_records(const Queue& queue, const RecordInput& in, const int32_t* counts, const RecordLists& to) {
+void list_records(const Queue& queue, const RecordInput& in, const RecordLists& to) {
   const cudaStream_t stream = stream_of(queue);
   const unsigned blocks = blocks_for(in.count, kThreads);
   if (!blocks) return;
+  count_kernel<<<blocks, kThreads, 0, stream>>>(in, blocks, to.counts);
+  check_launch("count_records");
   const int64_t by_band = int64_t(in.bands) * blocks;
   int32_t* begins = queue.array<int32_t>(by_band + blocks);
   const auto scan = [&](int64_t first, int64_t count) {
     with_memory(queue, [&](void* memory, size_t& bytes) {
-      return cub::DeviceScan::ExclusiveSum(memory, bytes, counts + first, begins + first, count, stream);
+      return cub::DeviceScan::ExclusiveSum(memory, bytes, to.counts + first, begins + first, count, stream);
     });
   };
   scan(0, by_band), scan(by_band, blocks);

@@ -1,4 +1,4 @@
-// Adds up runs of gradient rows before they go to other processes, and their numbers.
+// Adds up runs of gradient rows before they go to other processes.
 #include <cuda_runtime.h>
 
 #include <cub/cub.cuh>
@@ -78,13 +78,6 @@ void sum_runs(const Queue& queue, const SumInput<float>& in) {
                                                 : sum_runs_kernel<kGradientValues + kAbsoluteValues>;
   sum<<<blocks_for(in.runs, kThreads), kThreads, 0, stream>>>(in, begins, new_begins);
   check_launch("sum_runs");
-}
-
-void sum_parts(const Queue& queue, const int32_t* counts, const int64_t* sizes, int64_t parts, int64_t* sums) {
-  for (int64_t part = 0; part < parts; counts += sizes[part++])
-    with_memory(queue, [&](void* memory, size_t& bytes) {
-      return cub::DeviceReduce::Sum(memory, bytes, counts, sums + part, sizes[part], stream_of(queue));
-    });
 }
 
 }  // namespace cuda

@@ -1,49 +1,11 @@
 #pragma once
-// Splats packed and unpacked, and runs of rows moved and added up, on the CPU or by the CUDA kernels.
+// Records listed, and runs of rows added up, on the CPU or by the CUDA kernels.
 #include <algorithm>
 #include <numeric>
 #include <random>
 #include <vector>
 
 #include "backend_run.h"
-
-// Any words: they are only moved.
-inline std::vector<int32_t> some_words(size_t count) {
-  std::vector<int32_t> words(count);
-  for (int32_t& word : words) word = int32_t(generator());
-  return words;
-}
-
-struct SomeSplats {
-  std::vector<int32_t> splats, depths, tile_counts, rects;
-  std::vector<int64_t> gaussians;
-
-  SomeSplats(int64_t of, int64_t chosen)
-      : splats(some_words(10 * of)), depths(some_words(of)), tile_counts(some_words(of)), rects(some_words(4 * of)) {
-    for (int64_t i = 0; i < chosen; ++i) gaussians.push_back(int64_t(generator() % of));
-  }
-};
-
-template <class Where>
-std::vector<int32_t> pack(const Where& where, const SomeSplats& s) {
-  using gs::pack_splats, gs::cuda::pack_splats;
-  std::vector<int32_t> packed(gs::packed_words(1) * s.gaussians.size(), -77);
-  pack_splats(where, gs::PackInput{int64_t(s.gaussians.size()), 1, s.gaussians.data(), s.splats.data(), s.depths.data(),
-                                   s.tile_counts.data(), s.rects.data(), packed.data()});
-  return packed;
-}
-
-// The four arrays, one after the other.
-template <class Where>
-std::vector<std::vector<int32_t>> unpack(const Where& where, const std::vector<int32_t>& packed) {
-  using gs::unpack_splats, gs::cuda::unpack_splats;
-  const size_t n = packed.size() / gs::packed_words(1);
-  std::vector<std::vector<int32_t>> to;
-  for (const size_t columns : {10, 1, 1, 4}) to.emplace_back(columns * n, -77);
-  unpack_splats(where,
-                gs::UnpackInput{int64_t(n), 1, packed.data(), to[0].data(), to[1].data(), to[2].data(), to[3].data()});
-  return to;
-}
 
 // Rectangles of splats, a quarter of them without tiles, and bands of which one is empty.
 struct SomeRects {
@@ -72,36 +34,13 @@ struct SomeRecords {
   std::vector<int64_t> gaussians;
 };
 template <class Where>
-SomeRecords records(const Where& where, const SomeRects& rects) {
-  using gs::count_records, gs::list_records, gs::cuda::count_records, gs::cuda::list_records;
+SomeRecords records(const Where& where, const SomeRects& rects, int64_t room) {
+  using gs::list_records, gs::cuda::list_records;
   const gs::RecordInput in = rects.input();
-  const int64_t blocks = gs::record_blocks(in.count);
-  SomeRecords out{std::vector<int32_t>((in.bands + 1) * blocks, -77), {}, {}};
-  count_records(where, in, out.counts.data());
-  const int64_t total = std::accumulate(out.counts.begin() + in.bands * blocks, out.counts.end(), int64_t(0));
-  out.places.assign(total, -77), out.gaussians.assign(total, -77);
-  list_records(where, in, out.counts.data(), {total, out.gaussians.data(), out.places.data()});
+  SomeRecords out{std::vector<int32_t>((in.bands + 1) * gs::record_blocks(in.count), -77),
+                  std::vector<int32_t>(room, -77), std::vector<int64_t>(room, -77)};
+  list_records(where, in, gs::RecordLists{room, out.counts.data(), out.gaussians.data(), out.places.data()});
   return out;
-}
-
-struct SomeRuns {
-  std::vector<int32_t> counts, places, rows;
-  int words;
-
-  SomeRuns(const std::vector<int32_t>& of, int words_of_row) : counts(of), places(of.size()), words(words_of_row) {
-    std::iota(places.begin(), places.end(), 0);
-    std::shuffle(places.begin(), places.end(), generator);
-    rows = some_words(size_t(words) * std::accumulate(counts.begin(), counts.end(), int64_t(0)));
-  }
-};
-
-template <class Where>
-std::vector<int32_t> move(const Where& where, const SomeRuns& r) {
-  using gs::move_runs, gs::cuda::move_runs;
-  std::vector<int32_t> to(r.rows.size(), -77);
-  move_runs(where, gs::MoveInput{int64_t(r.counts.size()), int64_t(r.rows.size()) / r.words, r.words, r.counts.data(),
-                                 r.places.data(), r.rows.data(), to.data()});
-  return to;
 }
 
 // What is kept of runs of rows: all, their sum, or nothing.

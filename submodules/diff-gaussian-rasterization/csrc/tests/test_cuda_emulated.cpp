@@ -543,22 +543,24 @@ void test_observe() {
   }
 }
 
-void test_split_positions() {
+void test_children_of_split_ones() {
   for (const int64_t n : {0, 1, 255, 700}) {
     std::vector<float> values;
     std::vector<int64_t> items;
     for (int64_t i = 0; i < 10 * n; ++i) values.push_back(float(3 * normal()));
     for (int64_t i = 0; i < n; ++i) items.push_back(i * 6700417);
-    std::vector<float> wanted(3 * n), got(3 * n);
-    const auto input = [&](std::vector<float>& positions) {
-      const float* v = values.data();
-      return gs::SplitInput{n, v, v + 3 * n, v + 6 * n, items.data(), 1ull << 40, 1, 600, 2, positions.data()};
+    const std::vector<float> means(values.begin(), values.begin() + 3 * n);
+    std::vector<float> wanted = means, got = means;
+    const auto input = [&](std::vector<float>& to) {
+      gs::Displacement in{n, to.data(), values.data() + 3 * n, values.data() + 6 * n};
+      in.items = items.data(), in.seed = 1ull << 40, in.draw = 1, in.iteration = 600, in.stream = 2;
+      return in;
     };
-    gs::split_positions(gs::serial_executor(), input(wanted));
+    gs::displace(gs::serial_executor(), input(wanted));
     gs::emulation::Memory memory;
-    gs::cuda::split_positions(memory.queue(), input(got));
+    gs::cuda::displace(memory.queue(), input(got));
     CHECK(got == wanted);
-    check_moved(got, {values.begin(), values.begin() + 3 * n}, [](int64_t) { return false; });
+    check_moved(got, means, [](int64_t) { return false; });
   }
 }
 
@@ -572,29 +574,17 @@ void in_every_order(const Check& check) {
   }
 }
 
-void test_packed_splats() {
-  for (const int64_t n : {0, 1, 63, 64, 700})
-    in_every_order([n](const gs::Queue& queue) {
-      const SomeSplats splats(200, n);
-      const std::vector<int32_t> wanted = pack(gs::serial_executor(), splats), got = pack(queue, splats);
-      CHECK(got == wanted);
-      CHECK(unpack(queue, got) == unpack(gs::serial_executor(), got));
-      if (n) CHECK(got != std::vector<int32_t>(got.size(), -77));
-    });
-}
-
 void test_records() {
   for (const int bands : {1, 2, 3, 40})
     for (const int64_t count : {0, 1, 255, 600})
       in_every_order([bands, count](const gs::Queue& queue) {
         const SomeRects rects(count, bands);
-        const SomeRecords wanted = records(gs::serial_executor(), rects), got = records(queue, rects);
-        CHECK(got.counts == wanted.counts && got.gaussians == wanted.gaussians && got.places == wanted.places);
-        CHECK(count < 255 || int64_t(got.places.size()) > count / 8);
-        // Counts that do not fit stay within memory.
-        std::vector<int32_t> many(got.counts.size(), 1 << 20), places(3, -77);
-        std::vector<int64_t> gaussians(3, -77);
-        gs::cuda::list_records(queue, rects.input(), many.data(), {3, gaussians.data(), places.data()});
+        for (const int64_t room : {int64_t(0), int64_t(3), bands * count}) {
+          const SomeRecords wanted = records(gs::serial_executor(), rects, room), got = records(queue, rects, room);
+          CHECK(got.counts == wanted.counts && got.gaussians == wanted.gaussians && got.places == wanted.places);
+          CHECK(count < 255 || room < count ||
+                std::count(got.places.begin(), got.places.end(), -77) < room - count / 8);
+        }
       });
 }
 
@@ -603,9 +593,6 @@ void test_runs() {
   for (const int values : {10, 12})
     for (const std::vector<int32_t>& counts : counts_of_runs())
       in_every_order([values, &counts](const gs::Queue& queue) {
-        const SomeRuns runs(counts, values);
-        const std::vector<int32_t> moved = move(queue, runs);
-        CHECK(moved == move(gs::serial_executor(), runs) && std::count(moved.begin(), moved.end(), -77) == 0);
         const SomeSums sums(counts, values);
         const std::vector<float> wanted = sum(gs::serial_executor(), sums), got = sum(queue, sums);
         for (size_t k = 0, run = 0, next = 0; run < counts.size(); ++run)
@@ -623,11 +610,6 @@ void test_runs_that_do_not_fit() {
     sums.counts[run] = count, sums.kept[run] = kept;
     CHECK(sum(memory.queue(), sums).size() == size_t(10 * sums.room));
   }
-  for (const auto& [run, count, place] : {std::tuple{3, 1000, 3}, {3, -1000, 3}, {3, 0, 3}, {3, 5, 5000}, {3, 5, -1}}) {
-    SomeRuns runs(std::vector<int32_t>(300, 2), 10);
-    runs.counts[run] = count, runs.places[run] = place;
-    CHECK(move(memory.queue(), runs).size() == runs.rows.size());
-  }
 }
 
 // Noise has the CPU's bits; a halted queue, and a guard that has stopped, leave the means alone.
@@ -640,18 +622,20 @@ void test_noise() {
     const int64_t stopped[2] = {0, 5};
     const auto input = [&](std::vector<float>& to, const int64_t* guard) {
       const float* v = values.data();
-      return gs::NoiseInput{n, to.data(), v, v + 3 * n, v + 7 * n, 30, 100, 0.005, 1ull << 40, 600, 4, guard, 7'000};
+      gs::Displacement in{n, to.data(), v, v + 3 * n, v + 7 * n, nullptr, 30, 100, 0.005};
+      in.seed = 1ull << 40, in.iteration = 600, in.stream = 4, in.stopped = guard, in.first = 7'000;
+      return in;
     };
-    gs::add_noise(gs::serial_executor(), input(wanted, nullptr));
+    gs::displace(gs::serial_executor(), input(wanted, nullptr));
     gs::emulation::Memory memory;
     gs::Queue queue = memory.queue();
     const int32_t halted = 1;
     queue.halted = &halted;
-    gs::cuda::add_noise(queue, input(got, nullptr));
+    gs::cuda::displace(queue, input(got, nullptr));
     queue.halted = nullptr;
-    gs::cuda::add_noise(queue, input(got, &stopped[1]));
+    gs::cuda::displace(queue, input(got, &stopped[1]));
     CHECK(got == means);
-    gs::cuda::add_noise(queue, input(got, &stopped[0]));
+    gs::cuda::displace(queue, input(got, &stopped[0]));
     CHECK(got == wanted && (n < 255 || got != means));
   }
 }
@@ -853,8 +837,7 @@ int main() {
                          test_adam,
                          test_step_guard,
                          test_observe,
-                         test_split_positions,
-                         test_packed_splats,
+                         test_children_of_split_ones,
                          test_runs,
                          test_runs_that_do_not_fit,
                          test_noise,

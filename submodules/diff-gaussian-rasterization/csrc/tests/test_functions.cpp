@@ -1,4 +1,4 @@
-// The small functions: exp2, activations, quaternions, spherical harmonics; derivatives by central differences.
+// The small functions: exp2, activations, lanes, quaternions, covariances.
 #include <limits>
 #include <random>
 #include <vector>
@@ -146,48 +146,6 @@ void test_row_lanes() {
 
 double& entry(Quat<double>& q, int k) { return k == 0 ? q.w : k == 1 ? q.x : k == 2 ? q.y : q.z; }
 
-// A fixed combination of the nine entries of R(q / |q|) or R(q).
-double rotation_objective(const Quat<double>& q, const Vec3<double> weight[3], bool unit) {
-  double norm;
-  Vec3<double> column[3];
-  rotation_columns(unit ? normalise(q, norm) : q, column);
-  return dot(column[0], weight[0]) + dot(column[1], weight[1]) + dot(column[2], weight[2]);
-}
-
-void test_rotation() {
-  for (int trial = 0; trial < 20; ++trial) {
-    Quat<double> q = {normal(), normal(), normal(), normal()};
-    Vec3<double> weight[3];
-    for (Vec3<double>& w : weight) w = {normal(), normal(), normal()};
-
-    double norm;
-    const Quat<double> n = normalise(q, norm);
-    Vec3<double> c[3];
-    rotation_columns(n, c);
-    for (int i = 0; i < 3; ++i)
-      for (int j = 0; j < 3; ++j) CHECK_NEAR(dot(c[i], c[j]), i == j, 1e-14);
-    CHECK_NEAR(dot(cross(c[0], c[1]), c[2]), 1, 1e-14);
-
-    Quat<double> as_is = rotation_columns_vjp(q, weight);
-    // The torque about column i comes from the other two: weight k's part along column j, less weight j's along column
-    // k.
-    const auto part = [&](int i, int j) { return dot(c[i], weight[j]); };
-    Quat<double> unit =
-        normalise_vjp(n, norm, Vec3<double>{part(2, 1) - part(1, 2), part(0, 2) - part(2, 0), part(1, 0) - part(0, 1)});
-    for (int k = 0; k < 4; ++k) {
-      Quat<double> high = q, low = q;
-      const double h = 1e-5;
-      entry(high, k) += h, entry(low, k) -= h;
-      for (bool raw : {false, true}) {
-        const double difference =
-            (rotation_objective(high, weight, raw) - rotation_objective(low, weight, raw)) / (2 * h);
-        // Truncation: h^2 times a third derivative of some 1 / |q|^3.
-        CHECK_NEAR(entry(raw ? unit : as_is, k), difference, 1e-8 * (1 + 1 / (norm * norm * norm)));
-      }
-    }
-  }
-}
-
 template <class T>
 void test_degenerate_quaternions() {
   T norm;
@@ -232,55 +190,8 @@ void test_covariance_axes() {
     for (const Vec3<float>& d : axes_of_covariance(c).direction) CHECK(finite(d));
 }
 
-void test_harmonics() {
-  for (int trial = 0; trial < 20; ++trial) {
-    Vec3<double> d;
-    CHECK(sh_direction(Vec3<double>{normal(), normal(), normal()}, d) > 0);
-    CHECK_NEAR(dot(d, d), 1, 1e-14);
-    double basis[16], weight[16];
-    sh_basis(3, d, basis);
-    for (double& w : weight) w = normal();
-    for (int l = 0; l <= kMaxShDegree; ++l) {  // Unsoeld: the squares of a band sum to (2 l + 1) / 4 pi
-      double sum = 0;
-      for (int k = l * l; k < sh_count(l); ++k) sum += basis[k] * basis[k];
-      CHECK_NEAR(sum, (2 * l + 1) / (4 * 3.14159265358979323846), 1e-14);
-    }
-    for (int degree = 0; degree <= kMaxShDegree; ++degree) {
-      const Vec3<double> g = sh_basis_vjp(degree, d, weight);
-      const double got[3] = {g.x, g.y, g.z};
-      for (int axis = 0; axis < 3; ++axis) {
-        const double h = 1e-5;
-        double difference = 0;
-        for (double sign : {1.0, -1.0}) {
-          Vec3<double> moved = d;
-          (axis == 0 ? moved.x : axis == 1 ? moved.y : moved.z) += sign * h;
-          sh_basis(degree, moved, basis);
-          for (int k = 0; k < sh_count(degree); ++k) difference += sign * weight[k] * basis[k] / (2 * h);
-        }
-        // The basis counts as a polynomial off the sphere too; it is cubic, so truncation is of the order of h^2.
-        CHECK_NEAR(got[axis], difference, 1e-9);
-      }
-    }
-  }
-}
-
+// The direction of no vector, of a tiny and of a huge one.
 void test_direction() {
-  const Vec3<double> v = {0.3, -1.2, 0.7}, weight = {0.5, 2, -1};
-  Vec3<double> d;
-  const double norm = sh_direction(v, d);
-  const Vec3<double> g = sh_direction_vjp(d, norm, weight);
-  const double got[3] = {g.x, g.y, g.z}, h = 1e-6;
-  for (int axis = 0; axis < 3; ++axis) {
-    double difference = 0;
-    for (double sign : {1.0, -1.0}) {
-      Vec3<double> moved = v;
-      (axis == 0 ? moved.x : axis == 1 ? moved.y : moved.z) += sign * h;
-      sh_direction(moved, d);
-      difference += sign * dot(d, weight) / (2 * h);
-    }
-    CHECK_NEAR(got[axis], difference, 1e-9);
-  }
-  // At the camera's centre there is no direction: the bands above 0 vanish, and nothing is NaN.
   Vec3<float> none;
   CHECK(sh_direction(Vec3<float>{0, 0, 0}, none) == 0);
   CHECK(none.x == 0 && none.y == 0 && none.z == 0);
@@ -299,10 +210,8 @@ int main() {
   test_exponential<float>(), test_exponential<double>();
   test_row_lanes<float>(), test_row_lanes<double>();
   test_sigmoid<float>(), test_sigmoid<double>();
-  test_rotation();
   test_degenerate_quaternions<float>(), test_degenerate_quaternions<double>();
   test_covariance_axes();
-  test_harmonics();
   test_direction();
   return gs::finish_tests("rasterizer functions");
 }

@@ -1,4 +1,4 @@
-// project_splat and its vjp: central differences in double, and the footprint of needles in float against double.
+// project_splat: the torque of its vjp, and the footprint of needles in float against double.
 #include <random>
 #include <vector>
 
@@ -33,123 +33,6 @@ Camera<double> camera(double principal_x, double principal_y) {
     full[4 * i + 3] = view[4 * i + 2];
   }
   return make_camera(view, full, center, tan_x, tan_y, kWidth, kHeight);
-}
-
-// Parameters as one array: mean, quaternion as it is, scales, opacity; or mean, covariance (6), opacity.
-using Parameters = std::vector<double>;
-
-Gaussian<double> gaussian(const Parameters& p) {
-  Gaussian<double> g;
-  g.mean = load3(p.data());
-  if (p.size() == 10) {
-    g.axes = axes_of_covariance(p.data() + 3);
-  } else {
-    rotation_columns(Quat<double>{p[3], p[4], p[5], p[6]}, g.axes.direction);
-    for (int k = 0; k < 3; ++k) g.axes.scale[k] = p[7 + k];
-  }
-  g.log2_opacity = std::log2(p.back());
-  return g;
-}
-
-struct Pixel {
-  double x, y, weight;
-};
-
-// Sum of weight * alpha over the pixels, and depth_weight / z.
-double objective(const Camera<double>& cam, const Parameters& p, bool antialiasing, const std::vector<Pixel>& pixels,
-                 double depth_weight, Moments<double>* moments = nullptr) {
-  Splat<double> s;
-  double depth;
-  int radius;
-  CHECK(project_splat(cam, gaussian(p), antialiasing, s, depth, radius));
-  double sum = depth_weight * s.inverse_depth;
-  for (const Pixel& pixel : pixels) {
-    const double u = s.l11 * (pixel.x - s.x) + s.l12 * (pixel.y - s.y), v = s.l22 * (pixel.y - s.y);
-    const double alpha = std::exp2(s.log2_opacity - u * u - v * v), q = alpha * pixel.weight;
-    sum += q;
-    if (!moments) continue;
-    moments->q += q, moments->qu += q * u, moments->qv += q * v;
-    moments->quu += q * u * u, moments->quv += q * u * v, moments->qvv += q * v * v;
-  }
-  return sum;
-}
-
-// ray_x, ray_y: where the mean is, in half images; beyond 1.3 the Jacobian's ray is clamped.
-void check_gradient(double ray_x, double ray_y, bool antialiasing, bool given_covariance) {
-  const Camera<double> cam = camera(0.1, -0.15);
-  const double z = uniform(1.5, 3);
-  const Vec3<double> view = Vec3<double>{(ray_x - 0.1) * 0.6 * z, (ray_y + 0.15) * 0.45 * z, z} - cam.translation;
-  const Vec3<double> mean = view.x * cam.row_x + view.y * cam.row_y + view.z * cam.row_z;
-  Parameters p = {mean.x, mean.y, mean.z};
-  double scale[3];
-  for (double& s : scale) s = uniform(0.02, 0.4);
-  if (given_covariance) {
-    double m[3][3], full[3][3] = {};
-    for (auto& row : m)
-      for (double& value : row) value = 0.2 * normal();
-    for (int i = 0; i < 3; ++i)
-      for (int j = 0; j < 3; ++j)
-        for (int k = 0; k < 3; ++k) full[i][j] += m[i][k] * m[j][k] + (i == j) * 1e-3;
-    for (double value : {full[0][0], full[0][1], full[0][2], full[1][1], full[1][2], full[2][2]}) p.push_back(value);
-  } else {
-    for (int k = 0; k < 4; ++k) p.push_back(normal());
-    double norm;
-    const Quat<double> q = normalise(Quat<double>{p[3], p[4], p[5], p[6]}, norm);
-    p[3] = q.w, p[4] = q.x, p[5] = q.y, p[6] = 1.05 * q.z;  // not quite a unit: taken as it is
-    for (double s : scale) p.push_back(s);
-  }
-  p.push_back(0.7);
-
-  Splat<double> s;
-  double depth;
-  int radius;
-  project_splat(cam, gaussian(p), antialiasing, s, depth, radius);
-  CHECK_NEAR(s.x, ((ray_x + 1) * kWidth - 1) / 2, 1e-10);
-  CHECK_NEAR(s.y, ((ray_y + 1) * kHeight - 1) / 2, 1e-10);
-  CHECK_NEAR(depth, z, 1e-12);
-  std::vector<Pixel> pixels;  // around the splat
-  for (int i = 0; i < 6; ++i) {
-    const double v = normal(), u = normal();
-    const double dy = v / s.l22;
-    pixels.push_back({s.x + (u - s.l12 * dy) / s.l11, s.y + dy, normal()});
-  }
-
-  const double depth_weight = 0.8;
-  Moments<double> moments = {};
-  objective(cam, p, antialiasing, pixels, depth_weight, &moments);
-  double covariance[6];
-  const GaussianGradient<double> g = project_splat_vjp(cam, gaussian(p), antialiasing, false,
-                                                       given_covariance ? covariance : nullptr, moments, depth_weight);
-  Parameters got = {g.mean.x, g.mean.y, g.mean.z};
-  if (given_covariance) {
-    got.insert(got.end(), covariance, covariance + 6);
-  } else {
-    const Quat<double> q = rotation_columns_vjp(Quat<double>{p[3], p[4], p[5], p[6]}, g.direction);
-    for (double value : {q.w, q.x, q.y, q.z}) got.push_back(value);
-    for (int k = 0; k < 3; ++k) got.push_back(g.log_scale[k] / p[7 + k]);
-  }
-  got.push_back(g.log_opacity / p.back());
-
-  for (size_t k = 0; k < p.size(); ++k) {
-    const auto central = [&](double h) {
-      Parameters high = p, low = p;
-      high[k] += h, low[k] -= h;
-      return (objective(cam, high, antialiasing, pixels, depth_weight) -
-              objective(cam, low, antialiasing, pixels, depth_weight)) /
-             (2 * h);
-    };
-    // Richardson's extrapolation leaves errors of truncation and rounding under 1e-7 of the largest gradients.
-    const double h = given_covariance && k >= 3 && k < 9 ? 1e-6 : 1e-5;
-    const double wanted = (4 * central(h) - central(2 * h)) / 3;
-    CHECK_NEAR(got[k], wanted, 1e-6 * (1 + std::abs(wanted)));
-  }
-}
-
-void test_gradients() {
-  for (bool antialiasing : {false, true})
-    for (bool given_covariance : {false, true})
-      for (double ray_x : {-1.7, -0.4, 0.9, 1.6})
-        for (double ray_y : {-1.5, 0.2, 1.8}) check_gradient(ray_x, ray_y, antialiasing, given_covariance);
 }
 
 // Turns about the axes of a unit quaternion: the torque against the gradient of the axes' directions.
@@ -286,7 +169,6 @@ void test_surely_outside() {
 }  // namespace
 
 int main() {
-  test_gradients();
   test_torque();
   test_narrow_camera();
   test_needles();

@@ -1,6 +1,4 @@
 // The op that lets the calling thread's ops run ahead of a GPU, or stops that.
-#include "ahead.h"
-
 #include <limits>
 
 #include "tensors.h"

@@ -1,20 +1,22 @@
-// The checks of a backward's tensors, and the backward of blending.
+// The checks of what a backward takes, and what a backend makes of it.
 #include "backward.h"
 
+#include <limits>
+
+#include "math/absolute.h"
 #include "math/layers.h"
 #include "math/splat.h"
 #include "math/tiles.h"
-#include "scene.h"
 
 namespace gs::ops {
 
-using gs::baseline::kGradientValues, gs::baseline::kSplatValues, gs::baseline::layer_values, gs::baseline::tiles_of;
+using gs::baseline::kAbsoluteValues, gs::baseline::kGradientValues, gs::baseline::kSplatValues;
+using gs::baseline::layer_values, gs::baseline::tiles_of;
 
 void check_splats(const Tensor& splats) {
   check_given(splats, "splats");
   const ScalarType type = splats.scalar_type();
-  GS_CHECK_TYPE(type == ScalarType::Float || type == ScalarType::Double, "splats must be float32 or float64, got ",
-                type);
+  GS_CHECK_TYPE(is_floating(type), "splats must be float32 or float64, got ", type);
   GS_CHECK_VALUE(splats.dim() == 2 && splats.size(1) == kSplatValues, "splats must be (N, ", kSplatValues, "), got ",
                  splats.sizes());
 }
@@ -37,61 +39,164 @@ void check_counts(const Tensor& tile_counts, int64_t count, Device device) {
   check_tensor(tile_counts, "tile_counts", ScalarType::Int, device, {count});
 }
 
-void check_projected(const Tensor& splats, const Tensor& depths, const Tensor& rects, const Tensor& tile_counts) {
-  check_splats(splats);
-  const Device device = splats.device();
-  const int64_t n = splats.size(0);
-  check_tensor(depths, "depths", splats.scalar_type(), device, {n});
-  check_tensor(rects, "rects", ScalarType::Int, device, {n, 4});
-  check_counts(tile_counts, n, device);
-}
-
 Tensor background_like(const Tensor& background, const Tensor& splats) {
   check_precise(background, "background", {3});
   return converted(background, splats);
 }
 
-gs::Image BlendBackward::checked(const Tensor& splats, const Tensor& instances, const Tensor& ranges,
-                                 const Tensor& splat_slots, const Tensor& slots, const Tensor& last,
-                                 const Tensor& transmittance, const Tensor& grad_color) {
-  check_splats(splats);
-  const Device device = splats.device();
-  const gs::Image image = image_of(last, splats);
-  check_lists(instances, ranges, splats, image);
-  check_tensor(splat_slots, "splat_slots", ScalarType::Long, device, {splats.size(0) + 1, 2});
-  check_tensor(slots, "slots", ScalarType::Int, device, {-1, 0});
-  if (device.is_cpu()) {
-    const int64_t end = read<int64_t>(splat_slots)[splats.size(0) * splat_slots.stride(0)];
-    GS_CHECK_VALUE(end == slots.size(0), "splat_slots end at ", end, ", but there are ", slots.size(0), " slots");
-  }
-  check_tensor(transmittance, "transmittance", splats.scalar_type(), device, {1, image.height, image.width});
-  check_given(grad_color, "grad_color");
-  return image;
+int64_t row_values(bool absolute) { return kGradientValues + (absolute ? kAbsoluteValues : 0); }
+
+BlendBackward::BlendBackward(SOURCE_PARAMETERS) {
+  GS_CHECK_VALUE(source.size() == kKept, "a backward takes ", int(kKept), " tensors that a forward has kept, got ",
+                 source.size());
+  std::copy(source.begin(), source.end(), kept_.begin());
+  check_splats(splats());
+  image_ = image_of(kept_[kLast], splats());
+  check_lists_of_forward();
+  for (Kept one : {kInstances, kRanges, kSplatSlots, kLast, kTransmittance}) kept_[one] = packed(kept_[one]);
+  kept_[kSplats] = aligned(splats(), 2), kept_[kBackground] = background_like(kept_[kBackground], splats());
+  color_ = plane(grad_color, 3), alpha_ = plane(grad_transmittance, 1), depth_ = plane(grad_inverse_depth, 1);
+  check_given(color_, "grad_color");
+  check_layers();
+  kept_[kLayers] = aligned(kept_[kLayers], 4);
 }
 
-void BlendBackward::take_layers(const Tensor& layers) {
-  check_tensor(layers, "layers", splats_.scalar_type(), splats_.device(), {-1});
-  const int64_t wanted = layer_values(image_, instances_.size(0), depth_.defined());
+void BlendBackward::check_lists_of_forward() const {
+  const Device device = splats().device();
+  check_counts(kept_[kTileCounts], splats().size(0), device);
+  check_lists(kept_[kInstances], kept_[kRanges], splats(), image_);
+  const Tensor& splat_slots = kept_[kSplatSlots];
+  const int64_t n = splats().size(0);
+  check_tensor(splat_slots, "splat_slots", ScalarType::Long, device, {n + 1, 2});
+  check_tensor(kept_[kSlots], "slots", ScalarType::Int, device, {-1, 0});
+  if (device.is_cpu()) {
+    const int64_t end = read<int64_t>(splat_slots)[n * splat_slots.stride(0)], slots = kept_[kSlots].size(0);
+    GS_CHECK_VALUE(end == slots, "splat_slots end at ", end, ", but there are ", slots, " slots");
+  }
+  check_tensor(kept_[kTransmittance], "transmittance", splats().scalar_type(), device,
+               {1, image_.height, image_.width});
+}
+
+// Without layers, the backward makes its own.
+void BlendBackward::check_layers() const {
+  const Tensor& layers = kept_[kLayers];
+  check_tensor(layers, "layers", splats().scalar_type(), splats().device(), {-1});
+  const int64_t wanted = layer_values(image_, kept_[kInstances].size(0), depth_.defined());
   GS_CHECK_VALUE(!layers.size(0) || layers.size(0) >= wanted, "layers must have ", wanted, " values, got ",
                  layers.size(0));
-  layers_ = aligned(layers, 4);
 }
 
 Tensor BlendBackward::plane(const MaybeTensor& t, int64_t channels) const {
   if (!t.has_value() || !t->defined()) return {};
   check_precise(*t, "the gradient of an image", {channels, image_.height, image_.width});
-  return converted(*t, splats_);
+  return converted(*t, splats());
 }
 
-Tensor absolute_like(const Tensor& splats, bool wanted) { return wanted ? empty({splats.size(0)}, splats) : Tensor(); }
+GradientSource::GradientSource(const SceneTensors& scene, SOURCE_PARAMETERS, bool absolute, bool lengths)
+    : image_(scene.image()) {
+  const bool rows = source.size() == 4 && !grad_color;
+  GS_CHECK_VALUE(rows || source.size() == kKept, "the source must be what a forward has kept, ", int(kKept),
+                 " tensors, or splats, tile_counts, rows and counts, got ", source.size(), " tensors");
+  check_tensor(source[kSplats], "splats", scene.dtype(), scene.device(), {scene.count(), kSplatValues});
+  if (!rows) blend_.emplace(SOURCE_ARGUMENTS);
+  check_counts(source[kTileCounts], scene.count(), scene.device());
+  tile_counts_ = packed(source[kTileCounts]);
+  if (rows) take_rows(scene, source, absolute, lengths);
+}
 
-Tensor blend_vjp(const BlendBackward& in, const Tensor& absolute) {
-  Tensor moments = empty({in.splats().size(0), kGradientValues}, in.splats());
-  with_scalar(moments.scalar_type(), [&](auto zero) {
+void GradientSource::take_rows(const SceneTensors& scene, List<Tensor> source, bool absolute, bool lengths) {
+  Tensor rows = source[2];
+  const Tensor& counts = source[3];
+  check_tensor(rows, "rows", scene.dtype(), scene.device(), {-1, row_values(absolute)});
+  check_tensor(counts, "counts", ScalarType::Int, scene.device(), {scene.count()});
+  GS_CHECK(rows.size(0) <= std::numeric_limits<int32_t>::max(), rows.size(0), " rows are more than 2^31 - 1");
+  GS_CHECK(rows.is_cpu() || scene.dtype() == ScalarType::Float, kFloatAlone);
+  splats_ = aligned(source[kSplats], 2), counts_ = packed(counts);
+  rows_ = aligned(lengths ? rows : torch::stable::narrow(rows, 1, 0, kGradientValues), 2);
+  if (rows.is_cpu()) check_sum();  // reading counts from a GPU waits for it
+}
+
+void GradientSource::check_sum() const {
+  const int32_t *counts = read<int32_t>(counts_), *tile_counts = read<int32_t>(tile_counts_);
+  int64_t sum = 0;
+  for (int64_t i = 0; i < counts_.size(0); sum += counts[i++])
+    GS_CHECK_VALUE(counts[i] == 0 || (counts[i] > 0 && tile_counts[i] != 0),
+                   "counts must be 0 or more, and 0 where tile_counts is, got ", counts[i], " of splat ", i);
+  GS_CHECK_VALUE(sum == rows_.size(0), "counts add up to ", sum, ", but there are ", rows_.size(0), " rows");
+}
+
+Tensor GradientSource::moments(const Tensor& lengths) const {
+  const Tensor& like = blend_ ? blend_->splats() : splats_;
+  Tensor moments = empty({like.size(0), kGradientValues}, like);
+  with_scalar(like.scalar_type(), [&](auto zero) {
     using T = decltype(zero);
-    GS_RUN(T, moments, blend_vjp, in.input<T>(), in.gradient<T>(write<T>(moments), absolute));
+    T* to = write<T>(moments);
+    if (blend_)
+      GS_DISPATCH(blend_vjp, gs::torch_executor(), blend_->input<T>(), blend_->gradient<T>(to, lengths));
+    else
+      GS_DISPATCH(sum_rows, gs::torch_executor(), input<T>(), sums<T>(to, lengths));
   });
   return moments;
+}
+
+#ifdef GS_CUDA
+void GradientSource::vjp(const gs::Queue& queue, const gs::Scene<float>& scene, const Tensor& lengths,
+                         const gs::cuda::GradientMemory& memory) const {
+  if (blend_)
+    gs::cuda::rasterize_vjp(queue, scene, blend_->input<float>(), blend_->gradient<float>(nullptr, lengths), memory);
+  else
+    gs::cuda::rows_vjp(queue, scene, input<float>(), sums<float>(nullptr, lengths), memory);
+}
+
+void GradientSource::step(const gs::Queue& queue, const gs::Scene<float>& scene, const Tensor& lengths,
+                          const gs::GaussianStep<float>& step) const {
+  if (blend_)
+    gs::cuda::rasterize_vjp_step(queue, scene, blend_->input<float>(), blend_->gradient<float>(nullptr, lengths), step);
+  else
+    gs::cuda::rows_vjp_step(queue, scene, input<float>(), sums<float>(nullptr, lengths), step);
+}
+#endif
+
+Tensor absolute_like(const Tensor& means, bool wanted) { return wanted ? empty({means.size(0)}, means) : Tensor(); }
+
+namespace {
+
+Gradients vjp_into(const SceneTensors& scene, const GradientSource& source, const Tensor& lengths,
+                   const std::function<SceneGradients()>& make) {
+#ifdef GS_CUDA
+  if (scene.device().is_cuda()) {
+    gs::TorchQueue queue(scene.device(), halted());
+    std::optional<SceneGradients> out;
+    auto allocate = [&] { return out.emplace(make()).template pointers<float>(); };
+    using Allocate = decltype(allocate);
+    const gs::cuda::GradientMemory memory{[](void* context) { return (*static_cast<Allocate*>(context))(); },
+                                          &allocate};
+    source.vjp(queue.queue(), scene.scene<float>(), lengths, memory);
+    if (!out) allocate();  // no Gaussians
+    return out->all();
+  }
+#endif
+  const Tensor moments = source.moments(lengths);
+  SceneGradients out = make();
+  with_scalar(scene.dtype(), [&](auto zero) {
+    using T = decltype(zero);
+    GS_DISPATCH(project_vjp, gs::torch_executor(), scene.scene<T>(), read<int32_t>(source.tile_counts()),
+                read<T>(moments), out.pointers<T>());
+  });
+  return out.all();
+}
+
+}  // namespace
+
+Gradients vjp(const SceneTensors& scene, const GradientSource& source, bool lengths,
+              const std::function<SceneGradients()>& make) {
+  const Tensor absolute = absolute_like(scene.means(), lengths);
+  Gradients all = vjp_into(scene, source, absolute, make);
+  if (lengths) {
+    Tensor column = torch::stable::select(std::get<kMeans2d>(all), 1, 2);
+    torch::stable::copy_(column, absolute);
+  }
+  return all;
 }
 
 }  // namespace gs::ops

@@ -1,31 +1,44 @@
 #pragma once
-// What a forward hands to its backward, as tensors.
-#include "tensors.h"
+// What a backward takes, as tensors: what the forward has kept, the gradients of the image, or gradient rows.
+#include <functional>
 
-#define BACKWARD_SCHEMA                                                                                   \
-  "Tensor splats, Tensor instances, Tensor ranges, Tensor splat_slots, Tensor slots, "                    \
-  "Tensor background, Tensor last, Tensor transmittance, Tensor grad_color, Tensor? grad_transmittance, " \
-  "Tensor? grad_inverse_depth"
-#define BACKWARD_PARAMETERS                                                                                            \
-  const Tensor &splats, const Tensor &instances, const Tensor &ranges, const Tensor &splat_slots, const Tensor &slots, \
-      const Tensor &background, const Tensor &last, const Tensor &transmittance, const Tensor &grad_color,             \
-      const MaybeTensor &grad_transmittance, const MaybeTensor &grad_inverse_depth
-#define BACKWARD_ARGUMENTS                                                                                        \
-  splats, instances, ranges, splat_slots, slots, background, last, transmittance, grad_color, grad_transmittance, \
-      grad_inverse_depth
+#include "scene.h"
+
+#define SOURCE_SCHEMA \
+  "Tensor[] source, Tensor? grad_color=None, Tensor? grad_transmittance=None, Tensor? grad_inverse_depth=None"
+#define SOURCE_PARAMETERS                                                                    \
+  List<Tensor> source, const MaybeTensor &grad_color, const MaybeTensor &grad_transmittance, \
+      const MaybeTensor &grad_inverse_depth
+#define SOURCE_ARGUMENTS source, grad_color, grad_transmittance, grad_inverse_depth
 
 namespace gs::ops {
+
+// What a forward keeps for its backward, in this order.
+enum Kept {
+  kSplats,
+  kTileCounts,
+  kInstances,
+  kRanges,
+  kSplatSlots,
+  kSlots,
+  kLast,
+  kLayers,
+  kBackground,
+  kTransmittance,
+  kKept
+};
 
 // The ops of single stages take these from their callers. Of values only the ends of lists are checked, and only on the
 // CPU, as reading one from a GPU waits for it. Other indices are the caller's concern.
 void check_splats(const Tensor& splats);
 void check_lists(const Tensor& instances, const Tensor& ranges, const Tensor& splats, gs::Image image);
 void check_counts(const Tensor& tile_counts, int64_t count, Device device);
-// What projection gives to binning.
-void check_projected(const Tensor& splats, const Tensor& depths, const Tensor& rects, const Tensor& tile_counts);
 // The size of the image whose `last` this is.
 gs::Image image_of(const Tensor& last, const Tensor& splats);
 Tensor background_like(const Tensor& background, const Tensor& splats);
+
+// Values of a gradient row, with those of absolute gradients or without.
+int64_t row_values(bool absolute);
 
 template <class T>
 gs::BlendInput<T> blend_input(const Tensor& splats, const Tensor& instances, const Tensor& ranges,
@@ -34,69 +47,86 @@ gs::BlendInput<T> blend_input(const Tensor& splats, const Tensor& instances, con
           image,           instances.size(0)};
 }
 
-// Owns the tensors that the gs::BlendInput and gs::BlendGradient of a backward point into.
+// Owns the tensors that the gs::BlendInput and gs::BlendGradient of a backward point into. source: Kept.
 class BlendBackward {
  public:
-  BlendBackward(const Tensor& splats, const Tensor& instances, const Tensor& ranges, const Tensor& splat_slots,
-                const Tensor& slots, const Tensor& background, const Tensor& last, const Tensor& transmittance,
-                const Tensor& grad_color, const MaybeTensor& grad_transmittance, const MaybeTensor& grad_inverse_depth)
-      : image_(checked(splats, instances, ranges, splat_slots, slots, last, transmittance, grad_color)),
-        splats_(aligned(splats, 2)),
-        instances_(packed(instances)),
-        ranges_(packed(ranges)),
-        splat_slots_(packed(splat_slots)),
-        slot_count_(slots.size(0)),
-        background_(background_like(background, splats)),
-        last_(packed(last)),
-        transmittance_(packed(transmittance)),
-        color_(plane(grad_color, 3)),
-        alpha_(plane(grad_transmittance, 1)),
-        depth_(plane(grad_inverse_depth, 1)) {}
+  BlendBackward(SOURCE_PARAMETERS);
 
-  const Tensor& splats() const { return splats_; }
-
-  // Takes the forward's layers. Without them, the backward makes its own.
-  void take_layers(const Tensor& layers);
+  const Tensor& splats() const { return kept_[kSplats]; }
 
   template <class T>
   gs::BlendInput<T> input() const {
-    return blend_input<T>(splats_, instances_, ranges_, background_, image_);
+    return blend_input<T>(kept_[kSplats], kept_[kInstances], kept_[kRanges], kept_[kBackground], image_);
   }
   // absolute: gs::BlendGradient::absolute, if it is defined.
   template <class T>
   gs::BlendGradient<T> gradient(T* moments, const Tensor& absolute) const {
-    return {splats_.size(0),
-            instances_.size(0),
-            slot_count_,
-            static_cast<const gs::SplatSlots*>(splat_slots_.const_data_ptr()),
-            read<T>(transmittance_),
-            read<int32_t>(last_),
+    const auto pointer = [](const Tensor& t) { return t.defined() ? read<T>(t) : nullptr; };
+    return {splats().size(0),
+            kept_[kInstances].size(0),
+            kept_[kSlots].size(0),
+            static_cast<const gs::SplatSlots*>(kept_[kSplatSlots].const_data_ptr()),
+            read<T>(kept_[kTransmittance]),
+            read<int32_t>(kept_[kLast]),
             read<T>(color_),
-            depth_.defined() ? read<T>(depth_) : nullptr,
-            alpha_.defined() ? read<T>(alpha_) : nullptr,
+            pointer(depth_),
+            pointer(alpha_),
             moments,
-            layers_.defined() && layers_.numel() ? read<T>(layers_) : nullptr,
+            kept_[kLayers].numel() ? read<T>(kept_[kLayers]) : nullptr,
             ahead(),
             absolute.defined() ? write<T>(absolute) : nullptr};
   }
 
  private:
-  // Checks all but the planes of gradients; returns the size of the image.
-  static gs::Image checked(const Tensor& splats, const Tensor& instances, const Tensor& ranges,
-                           const Tensor& splat_slots, const Tensor& slots, const Tensor& last,
-                           const Tensor& transmittance, const Tensor& grad_color);
+  void check_lists_of_forward() const;
+  void check_layers() const;
   Tensor plane(const MaybeTensor& t, int64_t channels) const;
 
+  std::array<Tensor, kKept> kept_;
   gs::Image image_;
-  Tensor splats_, instances_, ranges_, splat_slots_;
-  int64_t slot_count_;
-  Tensor background_, last_, transmittance_;
-  Tensor color_, alpha_, depth_, layers_;
+  Tensor color_, alpha_, depth_;
 };
 
-Tensor blend_vjp(const BlendBackward& in, const Tensor& absolute = {});
+// Where the gradients of a scene come from: what a forward has kept (BlendBackward), or gradient rows, then `source` is
+// splats, tile_counts, rows and counts, and there are no gradients of planes.
+class GradientSource {
+ public:
+  // absolute: whether rows have the values of absolute gradients. lengths: whether these are asked for.
+  GradientSource(const SceneTensors& scene, SOURCE_PARAMETERS, bool absolute, bool lengths);
+
+  const Tensor& tile_counts() const { return tile_counts_; }
+
+  // Lengths of absolute gradients are written to `lengths`, if it is defined, here and below.
+  Tensor moments(const Tensor& lengths) const;
+#ifdef GS_CUDA
+  void vjp(const gs::Queue&, const gs::Scene<float>&, const Tensor& lengths, const gs::cuda::GradientMemory&) const;
+  void step(const gs::Queue&, const gs::Scene<float>&, const Tensor& lengths, const gs::GaussianStep<float>&) const;
+#endif
+
+ private:
+  void take_rows(const SceneTensors& scene, List<Tensor> source, bool absolute, bool lengths);
+  void check_sum() const;
+
+  template <class T>
+  gs::SplatRows<T> input() const {
+    return {counts_.size(0), read<int32_t>(tile_counts_), read<int32_t>(counts_), read<T>(rows_), rows_.size(0)};
+  }
+  template <class T>
+  gs::RowSums<T> sums(T* moments, const Tensor& lengths) const {
+    return {read<T>(splats_), image_, moments, lengths.defined() ? write<T>(lengths) : nullptr};
+  }
+
+  std::optional<BlendBackward> blend_;
+  gs::Image image_;
+  Tensor splats_, tile_counts_, rows_, counts_;
+};
 
 // Memory for the lengths of absolute gradients; undefined if they are not wanted.
-Tensor absolute_like(const Tensor& splats, bool wanted);
+Tensor absolute_like(const Tensor& means, bool wanted);
+
+// The gradients of a scene in what `make` allocates. lengths: whether the third value of a row of means2d becomes the
+// length of its absolute gradient, instead of 0.
+Gradients vjp(const SceneTensors& scene, const GradientSource& source, bool lengths,
+              const std::function<SceneGradients()>& make);
 
 }  // namespace gs::ops

@@ -1,7 +1,8 @@
-// The ops that run the rasterizer's backward and take the Gaussians' steps in one.
+// The ops that run the rasterizer's backward and change what is there by its gradients, and that say what a recorded
+// step stands for.
 #include <array>
 
-#include "gradient_source.h"
+#include "backward.h"
 #include "math/step_now.h"
 #include "optim.h"
 
@@ -29,72 +30,93 @@ void advance(List<Tensor> steps) {
   for (const Tensor& step : steps) *write<float>(step) += 1;
 }
 
-// Adam's lists, with an entry for each attribute that `attributes` names by its place in gs::Stepped.
-struct StepLists {
-  Sizes attributes;
-  List<Tensor> exp_avg, exp_avg_sq, steps;
-  List<double> rates;
-  Sizes columns;
-  double beta1, beta2, eps;
+// What a step takes, in lists with an entry for each attribute that `attributes` names by its place in gs::Stepped.
+// averages: exp_avg of all these, then exp_avg_sq. statistics: max_radii, gradient_sums and views, or nothing. guard:
+// loss and stopped, or nothing. constants: beta1, beta2, eps, and the weights of the penalties on opacities and scales.
+#define STEP_SCHEMA                                                                                         \
+  "Tensor? radii, Tensor(c!)[] averages, Tensor(d!)[] steps, Tensor(e!)[] statistics, Tensor(f!)[] guard, " \
+  "int[] attributes=[], float[] rates=[], float[] constants=[], int[] columns=[], bool sparse=False, "      \
+  "int iteration=0, Tensor? now=None, bool absolute=False"
+#define STEP_PARAMETERS                                                                                             \
+  const MaybeTensor &radii, List<Tensor> averages, List<Tensor> steps, List<Tensor> statistics, List<Tensor> guard, \
+      Sizes attributes, List<double> rates, List<double> constants, Sizes columns, bool sparse, int64_t iteration,  \
+      const MaybeTensor &now, bool absolute
+#define STEP_ARGUMENTS \
+  radii, averages, steps, statistics, guard, attributes, rates, constants, columns, sparse, iteration, now, absolute
 
-  void check() const {
-    check_steps(attributes, steps, {exp_avg.size(), exp_avg_sq.size(), rates.size(), columns.size()});
+// The entry of a list that may end before it.
+template <class T>
+MaybeTensor entry(List<T> list, size_t place) {
+  return place < list.size() ? list[place] : MaybeTensor();
+}
+
+// The parameters of a step, in the order of STEP_PARAMETERS.
+struct Step {
+  const MaybeTensor& radii;
+  List<Tensor> averages, steps, statistics, guard;
+  Sizes attributes;
+  List<double> rates, constants;
+  Sizes columns;
+  bool sparse;
+  int64_t iteration;
+  const MaybeTensor& now;
+  bool absolute;
+
+  bool observes() const { return statistics.size() != 0; }
+
+  void check(const SceneTensors& scene) const {
+    GS_CHECK_VALUE(!scene.has(kCov3d) && !scene.has(kColors),
+                   "a step needs scales, rotations, sh_dc and sh_rest, not cov3d or colors");
+    GS_CHECK_TYPE(radii, "radii must be a tensor, got None");
+    check_tensor(*radii, "radii", ScalarType::Int, scene.device(), {scene.count()});
+    check_steps(attributes, steps, {rates.size(), columns.size()});
+    GS_CHECK(averages.size() == 2 * steps.size(), "averages must be two for each of the ", steps.size(),
+             " attributes, got ", averages.size());
+    GS_CHECK_VALUE(constants.size() == 5, "constants must have 5 entries, got ", constants.size());
+    GS_CHECK_VALUE((constants[3] == 0 && constants[4] == 0) || scene.raw(), "penalties are of raw Gaussians");
+    GS_CHECK(!observes() || statistics.size() == 3, "give max_radii, gradient_sums and views, or none of them");
+    GS_CHECK(!observes() || scene.dtype() == ScalarType::Float, "statistics are of float32 Gaussians, got float64");
+    if (observes()) check_statistics(statistics[0], statistics[1], statistics[2], *radii);
+    if (!now) return;
+    check_tensor(*now, "now", ScalarType::Long, scene.device(), {gs::kStepNowWords});
+    GS_CHECK_VALUE(now->is_contiguous(), "now must be contiguous");
+    GS_CHECK(scene.dtype() == ScalarType::Float, "now is of float32 Gaussians, got float64");
+  }
+
+  // What a backend takes. pixels: the radii, contiguous.
+  template <class T>
+  gs::GaussianStep<T> of(List<Tensor> gaussians, const Tensor& pixels) const {
+    constexpr int kPlaces[gs::kStepped] = {0, 1, 2, 3, 6, 7};  // of gs::Stepped, among the Gaussians' tensors
+    gs::GaussianStep<T> out{};
+    out.sparse = sparse;
+    for (size_t k = 0; k < attributes.size(); ++k) {
+      const Tensor& value = gaussians[kPlaces[attributes[k]]];
+      const Tensor &mean = averages[k], &square = averages[attributes.size() + k];
+      check_moments(value, value, mean, square);
+      gs::AdamInput<T> in = adam_input<T>(value, value, mean, square, columns[k]);
+      in.lr = rates[k], in.beta1 = constants[0], in.beta2 = constants[1], in.eps = constants[2];
+      in.step = double(*read<float>(steps[k])) + 1;
+      out.attributes[attributes[k]] = in;
+    }
+    out.guard = step_guard<T>(gaussians[0], entry(guard, 0), entry(guard, 1), iteration);
+    if (now) out.now = reinterpret_cast<const gs::StepNow*>(read<int64_t>(*now));
+    out.penalty = {T(constants[3]), T(constants[4])};
+    out.observed = {pixels.numel(), nullptr, nullptr, nullptr, read<int32_t>(pixels), nullptr};
+    if (!observes()) return out;
+    out.observed.max_radii = write<float>(statistics[0]);
+    out.observed.gradient_sums = write<float>(statistics[1]), out.observed.views = write<float>(statistics[2]);
+    return out;
   }
 };
 
-using Values = std::array<Tensor, gs::kStepped>;
-
-template <class T>
-gs::GaussianStep<T> gaussian_step(const Values& values, const StepLists& lists, bool sparse) {
-  gs::GaussianStep<T> out{};
-  out.sparse = sparse;
-  for (size_t k = 0; k < lists.attributes.size(); ++k) {
-    const Tensor& value = values[lists.attributes[k]];
-    check_moments(value, value, lists.exp_avg[k], lists.exp_avg_sq[k]);
-    gs::AdamInput<T> in = adam_input<T>(value, value, lists.exp_avg[k], lists.exp_avg_sq[k], lists.columns[k]);
-    in.lr = lists.rates[k], in.beta1 = lists.beta1, in.beta2 = lists.beta2, in.eps = lists.eps;
-    in.step = double(*read<float>(lists.steps[k])) + 1;
-    out.attributes[lists.attributes[k]] = in;
-  }
-  return out;
-}
-
-// Owns the radii, and adds the statistics to a step, if they are given.
-template <class T>
-void observe_in(gs::GaussianStep<T>& step, const Tensor& radii, const MaybeTensor& max_radii,
-                const MaybeTensor& gradient_sums, const MaybeTensor& views) {
-  step.observed = {radii.numel(), nullptr, nullptr, nullptr, read<int32_t>(radii), nullptr};
-  const bool given = max_radii.has_value();
-  GS_CHECK(gradient_sums.has_value() == given && views.has_value() == given,
-           "give max_radii, gradient_sums and views, or none of them");
-  if (!given) return;
-  check_statistics(*max_radii, *gradient_sums, *views, radii);
-  GS_CHECK((std::is_same_v<T, float>), "statistics are of float32 Gaussians, got float64");
-  step.observed.max_radii = write<float>(*max_radii);
-  step.observed.gradient_sums = write<float>(*gradient_sums);
-  step.observed.views = write<float>(*views);
-}
-
-// The numbers of a step that was recorded before; null for those of the call.
-const gs::StepNow* step_now(const MaybeTensor& now, const SceneTensors& scene) {
-  if (!now) return nullptr;
-  check_tensor(*now, "now", ScalarType::Long, scene.device(), {gs::kStepNowWords});
-  GS_CHECK_VALUE(now->is_contiguous(), "now must be contiguous");
-  GS_CHECK(scene.dtype() == ScalarType::Float, "now is of float32 Gaussians, got float64");
-  return reinterpret_cast<const gs::StepNow*>(read<int64_t>(*now));
-}
-
-// source: Lists or Rows. lengths: of absolute gradients, if it is defined; then they are what is observed.
-template <class Source>
-void run(const SceneTensors& scene, const Source& source, const Tensor& /*lengths*/,
+void run(const SceneTensors& scene, const GradientSource& source, const Tensor& /*lengths*/,
          const gs::GaussianStep<double>& step) {
   const Tensor moments = source.moments({});
   GS_DISPATCH(project_vjp_step, gs::torch_executor(), scene.scene<double>(), read<int32_t>(source.tile_counts()),
               read<double>(moments), step);
 }
 
-template <class Source>
-void run(const SceneTensors& scene, const Source& source, const Tensor& lengths, gs::GaussianStep<float> step) {
+void run(const SceneTensors& scene, const GradientSource& source, const Tensor& lengths, gs::GaussianStep<float> step) {
   gs::ObserveInput later = step.observed;
   if (lengths.defined()) later.lengths = read<float>(lengths), step.observed.max_radii = nullptr;
 #ifdef GS_CUDA
@@ -111,60 +133,40 @@ void run(const SceneTensors& scene, const Source& source, const Tensor& lengths,
   if (later.lengths) gs::observe(gs::torch_executor(), later);
 }
 
-#define STEP_SCHEMA                                                                                              \
-  "Tensor radii, int[] attributes, Tensor(g!)[] exp_avg, Tensor(h!)[] exp_avg_sq, Tensor(i!)[] steps, "          \
-  "float[] rates, float beta1, float beta2, float eps, int[] columns, bool sparse, Tensor(j!)? max_radii=None, " \
-  "Tensor(k!)? gradient_sums=None, Tensor(l!)? views=None, Tensor? loss=None, Tensor(m!)? stopped=None, "        \
-  "int iteration=0, Tensor? now=None, bool absolute=False, float opacity_penalty=0, float scale_penalty=0"
-#define STEP_PARAMETERS                                                                                              \
-  const Tensor &radii, Sizes attributes, List<Tensor> exp_avg, List<Tensor> exp_avg_sq, List<Tensor> steps,          \
-      List<double> rates, double beta1, double beta2, double eps, Sizes columns, bool sparse,                        \
-      const MaybeTensor &max_radii, const MaybeTensor &gradient_sums, const MaybeTensor &views,                      \
-      const MaybeTensor &loss, const MaybeTensor &stopped, int64_t iteration, const MaybeTensor &now, bool absolute, \
-      double opacity_penalty, double scale_penalty
-#define STEP_ARGUMENTS                                                                                                \
-  radii, attributes, exp_avg, exp_avg_sq, steps, rates, beta1, beta2, eps, columns, sparse, max_radii, gradient_sums, \
-      views, loss, stopped, iteration, now, absolute, opacity_penalty, scale_penalty
-
-// Takes the step of the Gaussians whose gradients come from what `source_of` makes of the scene.
-template <class SourceOf>
-void step_from(const SourceOf& source_of, SCENE_PARAMETERS, STEP_PARAMETERS) {
-  const SceneTensors scene(SCENE_ARGUMENTS);
-  GS_CHECK_VALUE(!cov3d && !colors, "a step needs scales, rotations, sh_dc and sh_rest, not cov3d or colors");
-  check_tensor(radii, "radii", ScalarType::Int, scene.device(), {scene.count()});
-  const auto source = source_of(scene);
-  const StepLists lists{attributes, exp_avg, exp_avg_sq, steps, rates, columns, beta1, beta2, eps};
-  lists.check();
-  const bool penalised = opacity_penalty != 0 || scale_penalty != 0;
-  GS_CHECK_VALUE(!penalised || raw, "penalties are of raw Gaussians");
-  const Tensor pixels = packed(radii), lengths = absolute_like(means, absolute && max_radii);
-  with_scalar(scene.dtype(), [&](auto zero) {
-    using T = decltype(zero);
-    auto step = gaussian_step<T>({means, opacities, *scales, *rotations, *sh_dc, *sh_rest}, lists, sparse);
-    step.guard = step_guard<T>(means, loss, stopped, iteration);
-    observe_in(step, pixels, max_radii, gradient_sums, views);
-    step.now = step_now(now, scene);
-    step.penalty = {T(opacity_penalty), T(scale_penalty)};
-    run(scene, source, lengths, step);
-  });
-  if (!now) advance(steps);
-}
-
-// rasterize_vjp, penalise_ unless both penalties are 0, then adam_ (or sparse_adam_ on the Gaussians of a radius above
-// 0) of the attributes that are named, and observe_ if statistics are given: the same bits, without gradients in
+// gaussians: those of Input, in its order, without means2d; an empty tensor of one axis stands for none.
+// planes: the gradients of colour, transmittance and inverse depth, or nothing for rows.
+// With `sums`, the results of rasterize_vjp for another view or tensors like these, which share no memory: adds a
+// view's gradients to them. Those of Gaussians that were not seen stay. With `absolute`, the third column of means2d is
+// this view's alone.
+// Without: rasterize_vjp, penalise_ unless both penalties are 0, then adam_ (with `sparse` on the Gaussians of a radius
+// above 0) of the attributes that are named, and observe_ if statistics are given: the same bits, without gradients in
 // memory. Advances the counters as adam_ does. now: what `step_now_` wrote, which stands in for steps, rates and
-// iteration, and has advanced the counters. absolute: the statistics get the lengths of absolute gradients.
-void rasterize_vjp_step_op(SCENE_PARAMETERS, LISTS_PARAMETERS, STEP_PARAMETERS) {
-  const auto lists = [&](const SceneTensors& scene) { return Lists(scene, LISTS_ARGUMENTS); };
-  step_from(lists, SCENE_ARGUMENTS, STEP_ARGUMENTS);
-}
-
-// The same from the rows of blend_rows, as rows_vjp takes them.
-void rows_vjp_step_op(SCENE_PARAMETERS, ROWS_PARAMETERS, STEP_PARAMETERS) {
-  const auto given = [&](const SceneTensors& scene) {
-    return Rows(scene, ROWS_ARGUMENTS, absolute, absolute && max_radii);
-  };
-  step_from(given, SCENE_ARGUMENTS, STEP_ARGUMENTS);
+// iteration, and has advanced the counters. absolute: the statistics get the lengths of absolute gradients. guard: loss
+// and stopped.
+void apply_gradients_op(List<Tensor> gaussians, List<Tensor> camera, List<double> lens, Sizes options,
+                        List<Tensor> source, List<MaybeTensor> planes, List<Tensor> sums, STEP_PARAMETERS) {
+  GS_CHECK_VALUE(gaussians.size() == kInputs - 1 && camera.size() == 3, "give ", kInputs - 1,
+                 " tensors of the Gaussians and 3 of the camera, got ", gaussians.size(), " and ", camera.size());
+  std::array<const Tensor*, kInputs - 1> inputs;
+  for (size_t input = 0; input < inputs.size(); ++input) {
+    const Tensor& t = gaussians[input];
+    inputs[input] = t.defined() && t.dim() == 1 && t.size(0) == 0 && input > 1 ? nullptr : &t;
+  }
+  const SceneTensors scene(inputs, {&camera[0], &camera[1], &camera[2]}, lens, options);
+  const MaybeTensor grad_color = entry(planes, 0), grad_transmittance = entry(planes, 1);
+  const MaybeTensor grad_inverse_depth = entry(planes, 2);
+  if (!sums.empty()) {
+    const SceneGradients added(scene, sums);
+    const bool lengths = absolute && sums[kMeans2d].size(0) > 0;
+    vjp(scene, GradientSource(scene, SOURCE_ARGUMENTS, absolute, lengths), lengths, [&] { return added; });
+    return;
+  }
+  const Step step{STEP_ARGUMENTS};
+  step.check(scene);
+  const Tensor pixels = packed(*radii), lengths = absolute_like(scene.means(), absolute && step.observes());
+  const GradientSource from(scene, SOURCE_ARGUMENTS, absolute, lengths.defined());
+  with_scalar(scene.dtype(), [&](auto zero) { run(scene, from, lengths, step.of<decltype(zero)>(gaussians, pixels)); });
+  if (!now) advance(steps);
 }
 
 // Writes what the next step stands for, and advances the counters.
@@ -184,16 +186,11 @@ void step_now_op(Tensor& now, Sizes attributes, List<Tensor> steps, List<double>
 }  // namespace
 
 GS_OPERATORS(diff_gaussian_rasterization, m) {
-  // The values of the Gaussians are read, and stepped in place.
-  std::string scene = SCENE_SCHEMA;
-  char alias = 'a';
-  for (const char* name : {"means", "opacities", "scales", "rotations", "sh_dc", "sh_rest"}) {
-    const size_t type = scene.rfind("Tensor", scene.find(std::string(" ") + name + ","));
-    scene.insert(type + 6, std::string("(") + alias++ + "!)");
-  }
-  m.define("rasterize_vjp_step_(" + scene + ", " LISTS_SCHEMA ", " STEP_SCHEMA ") -> ()",
-           TORCH_BOX(&rasterize_vjp_step_op));
-  m.define("rows_vjp_step_(" + scene + ", " ROWS_SCHEMA ", " STEP_SCHEMA ") -> ()", TORCH_BOX(&rows_vjp_step_op));
+  m.define(
+      "apply_gradients_(Tensor(a!)[] gaussians, "
+      "Tensor[] camera, " CAMERA_SCHEMA ", Tensor[] source, Tensor?[] planes, Tensor(b!)[] sums, " STEP_SCHEMA
+      ") -> ()",
+      TORCH_BOX(&apply_gradients_op));
   m.define(
       "step_now_(Tensor(a!) now, int[] attributes, Tensor(b!)[] steps, float[] rates, float beta1, float beta2, "
       "float eps, bool sparse, int iteration) -> ()",

@@ -1,8 +1,11 @@
-// The ops that change parameters and statistics in place: Adam, sparse Adam, and what density control observes.
+// The ops that change parameters, gradients and statistics in place: Adam, the steps that rows have missed, penalties,
+// and what density control observes.
 #include "optim.h"
 
 #include <utility>
 #include <vector>
+
+#include "math/adam.h"
 
 namespace gs::ops {
 
@@ -40,52 +43,52 @@ void check_statistics(const Tensor& max_radii, const Tensor& gradient_sums, cons
 
 namespace {
 
-// Takes one step of every parameter, in one launch on a GPU. Advances each counter first, as torch does, even if
-// the guard holds the step back.
-void adam_op(List<Tensor> values, List<Tensor> gradients, List<Tensor> exp_avg, List<Tensor> exp_avg_sq,
-             List<Tensor> steps, List<double> rates, double beta1, double beta2, double eps, Sizes columns,
-             const MaybeTensor& loss, const MaybeTensor& stopped, int64_t iteration) {
-  const size_t n = values.size();
-  for (size_t size : {gradients.size(), exp_avg.size(), exp_avg_sq.size(), steps.size(), rates.size(), columns.size()})
-    GS_CHECK(size == n, "every list must have an entry for each of the ", n, " parameters, got ", size);
-  if (n == 0) return;
-  const Tensor& first = values[0];
-  with_scalar(first.scalar_type(), [&](auto zero) {
-    using T = decltype(zero);
-    std::vector<gs::AdamInput<T>> inputs;
-    std::vector<Tensor> contiguous;  // keeps the gradients' memory until the call is over
-    for (size_t i = 0; i < n; ++i) {
-      GS_CHECK(alike(values[i], first), "all parameters must have one dtype and device");
-      check_moments(values[i], gradients[i], exp_avg[i], exp_avg_sq[i]);
-      check_counter(steps[i]);
-      contiguous.push_back(packed(gradients[i]));
-      gs::AdamInput<T> in = adam_input<T>(values[i], contiguous.back(), exp_avg[i], exp_avg_sq[i], columns[i]);
-      in.lr = rates[i], in.beta1 = beta1, in.beta2 = beta2, in.eps = eps;
-      in.step = double(*read<float>(steps[i])) + 1;
-      inputs.push_back(in);
-    }
-    GS_RUN(T, first, adam, inputs.data(), int64_t(n), step_guard<T>(first, loss, stopped, iteration));
-  });
-  for (const Tensor& step : steps) *write<float>(step) += 1;
-}
-
-void sparse_adam_op(Tensor& value, const Tensor& gradient, Tensor& exp_avg, Tensor& exp_avg_sq, const Tensor& visible,
-                    double lr, double beta1, double beta2, double eps, int64_t columns, const MaybeTensor& loss,
-                    const MaybeTensor& stopped, int64_t iteration) {
-  check_moments(value, gradient, exp_avg, exp_avg_sq);
-  check_given(visible, "visible");
+void check_visible(const Tensor& visible, const Tensor& value) {
   const int64_t rows = rows_of(value);
   GS_CHECK(visible.dim() == 1 && visible.size(0) == rows && has_dtype(visible, ScalarType::Bool) &&
                visible.device() == value.device(),
            "visible must be (", rows, ") bool on ", value.device(), ", got ", in_words(visible));
-  if (value.numel() == 0) return;
-  const Tensor g = packed(gradient), mask = packed(visible);
-  with_scalar(value.scalar_type(), [&](auto zero) {
+}
+
+// Takes one step of every parameter, in one launch on a GPU. Advances each counter first, as torch does, even if
+// the guard holds the step back. visible: takes a step of sparse Adam instead, of these rows, and has no counters.
+void adam_op(List<Tensor> values, List<Tensor> gradients, List<Tensor> exp_avg, List<Tensor> exp_avg_sq,
+             List<Tensor> steps, List<double> rates, double beta1, double beta2, double eps, Sizes columns,
+             const MaybeTensor& visible, const MaybeTensor& loss, const MaybeTensor& stopped, int64_t iteration) {
+  const size_t n = values.size();
+  for (size_t size :
+       {gradients.size(), exp_avg.size(), exp_avg_sq.size(), visible ? n : steps.size(), rates.size(), columns.size()})
+    GS_CHECK(size == n, "every list must have an entry for each of the ", n, " parameters, got ", size);
+  GS_CHECK_VALUE(!visible || steps.empty(), "sparse Adam has no counters");
+  if (n == 0) return;
+  const Tensor& first = values[0];
+  std::vector<Tensor> contiguous;  // keeps the gradients' memory until the call is over
+  for (size_t i = 0; i < n; ++i) {
+    check_moments(values[i], gradients[i], exp_avg[i], exp_avg_sq[i]);
+    GS_CHECK(alike(values[i], first), "all parameters must have one dtype and device");
+    if (visible) check_visible(*visible, values[i]);
+    contiguous.push_back(packed(gradients[i]));
+  }
+  for (const Tensor& step : steps) check_counter(step);
+  with_scalar(first.scalar_type(), [&](auto zero) {
     using T = decltype(zero);
-    gs::AdamInput<T> in = adam_input<T>(value, g, exp_avg, exp_avg_sq, columns);
-    in.lr = lr, in.beta1 = beta1, in.beta2 = beta2, in.eps = eps;
-    GS_RUN(T, value, sparse_adam, in, read<bool>(mask), step_guard<T>(value, loss, stopped, iteration));
+    std::vector<gs::AdamInput<T>> inputs;
+    for (size_t i = 0; i < n; ++i) {
+      gs::AdamInput<T> in = adam_input<T>(values[i], contiguous[i], exp_avg[i], exp_avg_sq[i], columns[i]);
+      in.lr = rates[i], in.beta1 = beta1, in.beta2 = beta2, in.eps = eps;
+      if (!visible) in.step = double(*read<float>(steps[i])) + 1;
+      inputs.push_back(in);
+    }
+    const gs::StepGuard<T> guard = step_guard<T>(first, loss, stopped, iteration);
+    if (!visible) {
+      GS_RUN(T, first, adam, inputs.data(), int64_t(n), guard);
+      return;
+    }
+    const Tensor mask = packed(*visible);
+    for (const gs::AdamInput<T>& in : inputs)
+      if (in.rows * in.row) GS_RUN(T, first, sparse_adam, in, read<bool>(mask), guard);
   });
+  for (const Tensor& step : steps) *write<float>(step) += 1;
 }
 
 void observe_op(Tensor& max_radii, Tensor& gradient_sums, Tensor& views, const Tensor& radii, const Tensor& gradient) {
@@ -114,23 +117,82 @@ void observe_op(Tensor& max_radii, Tensor& gradient_sums, Tensor& views, const T
   gs::observe(gs::torch_executor(), in);
 }
 
+// The constants (steps, 7) of past steps, on the device of the values.
+template <class T>
+Tensor constants_of(const Tensor& value, List<double> rates, List<double> steps, double beta1, double beta2,
+                    double eps) {
+  using Step = gs::baseline::AdamStep<T>;
+  static_assert(sizeof(Step) == 7 * sizeof(T), "AdamStep has seven numbers");
+  const Tensor table = torch::stable::empty({int64_t(steps.size()), 7}, value.scalar_type());
+  auto* row = reinterpret_cast<Step*>(write<T>(table));
+  for (size_t k = 0; k < steps.size(); ++k)
+    row[k] = gs::baseline::make_adam_step<T>(rates[k], beta1, beta2, eps, steps[k]);
+  return value.is_cpu() ? table : torch::stable::to(table, value.device());
+}
+
+// Row r takes the steps from number taken[r] on, without a gradient: the bits that adam_ gives it with zeros. A value
+// whose step is not finite is marked as under a guard, which has stopped nothing then.
+void catch_up_op(Tensor& value, Tensor& exp_avg, Tensor& exp_avg_sq, const Tensor& taken, List<double> rates,
+                 List<double> steps, double beta1, double beta2, double eps, int64_t columns) {
+  check_moments(value, value, exp_avg, exp_avg_sq);
+  check_tensor(taken, "taken", ScalarType::Int, value.device(), {rows_of(value)});
+  GS_CHECK_VALUE(rates.size() == steps.size(), "give a rate for each of the ", steps.size(), " steps, got ",
+                 rates.size());
+  if (value.numel() == 0 || steps.empty()) return;
+  const Tensor counts = packed(taken);
+  with_scalar(value.scalar_type(), [&](auto zero) {
+    using T = decltype(zero);
+    const gs::AdamInput<T> in = adam_input<T>(value, value, exp_avg, exp_avg_sq, columns);
+    const Tensor table = constants_of<T>(value, rates, steps, beta1, beta2, eps);
+    const gs::MissedSteps<T> missed{read<T>(table), read<int32_t>(counts), int32_t(steps.size())};
+    GS_RUN(T, value, catch_up, in, missed);
+  });
+}
+
+void penalise_op(const Tensor& logits, const Tensor& log_scales, Tensor& logit_gradients, Tensor& log_scale_gradients,
+                 double opacity, double scale) {
+  check_given(logits, "logits");
+  const int64_t n = logits.dim() > 0 ? logits.size(0) : 0;
+  check_precise(logits, "logits", {n, 1});
+  const ScalarType type = logits.scalar_type();
+  check_tensor(log_scales, "log_scales", type, logits.device(), {n, 3});
+  check_tensor(logit_gradients, "logit_gradients", type, logits.device(), {n, 1});
+  check_tensor(log_scale_gradients, "log_scale_gradients", type, logits.device(), {n, 3});
+  GS_CHECK_VALUE(logit_gradients.is_contiguous() && log_scale_gradients.is_contiguous(),
+                 "gradients must be contiguous");
+  const Tensor opacities = packed(logits), sizes = packed(log_scales);
+  with_scalar(type, [&](auto zero) {
+    using T = decltype(zero);
+    const gs::PenaltyInput<T> in{n,
+                                 {T(opacity), T(scale)},
+                                 read<T>(opacities),
+                                 read<T>(sizes),
+                                 write<T>(logit_gradients),
+                                 write<T>(log_scale_gradients)};
+    GS_RUN(T, logits, penalise, in);
+  });
+}
+
 }  // namespace
 
 GS_OPERATORS(diff_gaussian_rasterization, m) {
   m.define(
       "adam_(Tensor(a!)[] values, Tensor[] gradients, Tensor(b!)[] exp_avg, Tensor(c!)[] exp_avg_sq, "
-      "Tensor(d!)[] steps, float[] rates, float beta1, float beta2, float eps, int[] columns, Tensor? loss=None, "
-      "Tensor(e!)? stopped=None, int iteration=0) -> ()",
+      "Tensor(d!)[] steps, float[] rates, float beta1, float beta2, float eps, int[] columns, Tensor? visible=None, "
+      "Tensor? loss=None, Tensor(e!)? stopped=None, int iteration=0) -> ()",
       TORCH_BOX(&adam_op));
   m.define(
-      "sparse_adam_(Tensor(a!) value, Tensor gradient, Tensor(b!) exp_avg, Tensor(c!) exp_avg_sq, Tensor visible, "
-      "float lr, float beta1, float beta2, float eps, int columns=-1, Tensor? loss=None, Tensor(d!)? stopped=None, "
-      "int iteration=0) -> ()",
-      TORCH_BOX(&sparse_adam_op));
+      "catch_up_(Tensor(a!) value, Tensor(b!) exp_avg, Tensor(c!) exp_avg_sq, Tensor taken, float[] rates, "
+      "float[] steps, float beta1, float beta2, float eps, int columns=-1) -> ()",
+      TORCH_BOX(&catch_up_op));
   m.define(
       "observe_(Tensor(a!) max_radii, Tensor(b!) gradient_sums, Tensor(c!) views, Tensor radii, Tensor gradient) "
       "-> ()",
       TORCH_BOX(&observe_op));
+  m.define(
+      "penalise_(Tensor logits, Tensor log_scales, Tensor(a!) logit_gradients, Tensor(b!) log_scale_gradients, "
+      "float opacity, float scale) -> ()",
+      TORCH_BOX(&penalise_op));
 }
 
 }  // namespace gs::ops

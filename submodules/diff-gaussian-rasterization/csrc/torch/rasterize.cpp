@@ -8,7 +8,6 @@
 #include "math/layers.h"
 #include "math/splat.h"
 #include "math/tiles.h"
-#include "scene.h"
 
 namespace gs::ops {
 
@@ -128,7 +127,12 @@ Tensors5 project_op(SCENE_PARAMETERS) {
 
 Tensors4 bin_op(const Tensor& splats, const Tensor& depths, const Tensor& rects, const Tensor& tile_counts,
                 int64_t height, int64_t width, bool train) {
-  check_projected(splats, depths, rects, tile_counts);
+  check_splats(splats);
+  const Device device = splats.device();
+  const int64_t n = splats.size(0);
+  check_tensor(depths, "depths", splats.scalar_type(), device, {n});
+  check_tensor(rects, "rects", ScalarType::Int, device, {n, 4});
+  check_counts(tile_counts, n, device);
   ProjectedTensors p;
   p.splats = aligned(splats, 2), p.depths = packed(depths), p.rects = aligned(rects, 4);
   p.tile_counts = p.radii = packed(tile_counts);
@@ -153,25 +157,12 @@ using Rasterized =
 Rasterized rasterize_op(const Tensor& means2d, SCENE_PARAMETERS, const Tensor& background, bool inverse_depth,
                         bool train, bool /*absolute*/) {
   const SceneTensors scene(SCENE_ARGUMENTS);
-  scene.checked(kMeans2d, means2d);  // it only receives a gradient
+  scene.checked(kMeans2d, &means2d);  // it only receives a gradient
   ProjectedTensors p = project(scene, false);
   BinnedTensors b = bin(p, scene.image(), train);
   BlendedTensors o = blend(p.splats, b.instances, b.ranges, background, scene.image(), inverse_depth, train);
   return {o.color,     o.transmittance, o.inverse_depth, p.radii, p.splats, p.tile_counts,
           b.instances, b.ranges,        b.splat_slots,   b.slots, o.last,   o.layers};
-}
-
-Tensor mark_visible_op(const Tensor& means, const Tensor& view) {
-  check_given(means, "positions");
-  GS_CHECK_VALUE(means.dim() == 2 && means.size(1) == 3, "positions must be (N, 3), got ", means.sizes());
-  check_precise(view, "the view matrix", {4, 4});
-  const Tensor rows = packed(means), matrix = converted(view, means);
-  Tensor visible = empty<bool>({rows.size(0)}, rows);
-  with_scalar(rows.scalar_type(), [&](auto zero) {
-    using T = decltype(zero);
-    GS_RUN(T, rows, mark_visible, rows.size(0), read<T>(rows), read<T>(matrix), write<bool>(visible));
-  });
-  return visible;
 }
 
 Tensor decisive_op(const Tensor& splats, const Tensor& instances, const Tensor& ranges, const Tensor& last) {
@@ -210,7 +201,6 @@ GS_OPERATORS(diff_gaussian_rasterization, m) {
       "Tensor transmittance, Tensor inverse_depth, Tensor radii, Tensor splats, Tensor tile_counts, Tensor instances, "
       "Tensor ranges, Tensor splat_slots, Tensor slots, Tensor last, Tensor layers)",
       TORCH_BOX(&rasterize_op));
-  m.define("mark_visible(Tensor means, Tensor view) -> Tensor", TORCH_BOX(&mark_visible_op));
   m.define("decisive(Tensor splats, Tensor instances, Tensor ranges, Tensor last) -> Tensor", TORCH_BOX(&decisive_op));
 }
 

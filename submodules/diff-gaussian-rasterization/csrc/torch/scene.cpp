@@ -24,8 +24,8 @@ struct Row {
 };
 constexpr int64_t kNoBands = 0, kAnyBands = -1;
 constexpr Row kRows[] = {
-    {"means", 3, kNoBands},     {"means2d", 3, kNoBands}, {"opacities", 1, kNoBands}, {"scales", 3, kNoBands},
-    {"rotations", 4, kNoBands}, {"cov3d", 6, kNoBands},   {"colors", 3, kNoBands},    {"sh_dc", 3, 1},
+    {"means2d", 3, kNoBands},   {"means", 3, kNoBands}, {"opacities", 1, kNoBands}, {"scales", 3, kNoBands},
+    {"rotations", 4, kNoBands}, {"cov3d", 6, kNoBands}, {"colors", 3, kNoBands},    {"sh_dc", 3, 1},
     {"sh_rest", 3, kAnyBands}};
 static_assert(std::size(kRows) == kInputs, "every input has a row");
 
@@ -51,37 +51,36 @@ gs::Image checked_image(int64_t height, int64_t width) {
   return image;
 }
 
-SceneTensors::SceneTensors(SCENE_PARAMETERS)
-    : dtype_(ScalarType::Float),
-      device_(DeviceType::CPU),
-      tan_x_(tan_x),
-      tan_y_(tan_y),
-      scale_modifier_(scale_modifier),
-      sh_degree_(int(sh_degree)),
-      antialiasing_(antialiasing),
-      raw_(raw),
-      image_(checked_image(height, width)) {
-  check_given(means, "means");
+SceneTensors::SceneTensors(const std::array<const Tensor*, kInputs - 1>& gaussians,
+                           const std::array<const Tensor*, 3>& camera, List<double> lens, Sizes options)
+    : dtype_(ScalarType::Float), device_(DeviceType::CPU) {
+  GS_CHECK_VALUE(lens.size() == 3 && options.size() == 5, "lens must have 3 entries, and options 5, got ", lens.size(),
+                 " and ", options.size());
+  tan_x_ = lens[0], tan_y_ = lens[1], scale_modifier_ = lens[2];
+  image_ = checked_image(options[0], options[1]);
+  GS_CHECK_VALUE(options[2] >= 0 && options[2] <= kMaxShDegree, "sh_degree must be 0 to 3, got ", options[2]);
+  sh_degree_ = int(options[2]), antialiasing_ = options[3], raw_ = options[4];
+  const auto has = [&](Input input) { return gaussians[input - 1] != nullptr; };
+  GS_CHECK_TYPE(has(kMeans) && gaussians[0]->defined(), "means must be a tensor, got None");
+  const Tensor& means = *gaussians[0];
   dtype_ = means.scalar_type(), device_ = means.device();
   GS_CHECK_TYPE(is_floating(dtype_), "means must be float32 or float64, got ", dtype_);
   GS_CHECK_VALUE(means.dim() == 2 && means.size(1) == 3, "means must be (N, 3), got ", means.sizes());
-  GS_CHECK_VALUE(cov3d.has_value() != (scales.has_value() && rotations.has_value()),
-                 "give scales and rotations, or cov3d");
-  GS_CHECK_VALUE(colors.has_value() != (sh_dc.has_value() && sh_rest.has_value()), "give sh_dc and sh_rest, or colors");
-  GS_CHECK_VALUE(sh_degree >= 0 && sh_degree <= kMaxShDegree, "sh_degree must be 0 to 3, got ", sh_degree);
+  GS_CHECK_VALUE(has(kCov3d) != (has(kScales) && has(kRotations)), "give scales and rotations, or cov3d");
+  GS_CHECK_VALUE(has(kColors) != (has(kShDc) && has(kShRest)), "give sh_dc and sh_rest, or colors");
   inputs_[kMeans] = packed(means);
-  const MaybeTensor given[kInputs] = {means, {}, opacities, scales, rotations, cov3d, colors, sh_dc, sh_rest};
-  for (int input = kMeans2d; input < kInputs; ++input) inputs_[input] = checked(Input(input), given[input]);
-  check_precise(view, "view", {4, 4});
-  check_precise(projection, "projection", {4, 4});
-  check_precise(center, "center", {3});
-  view_ = converted(view, means), projection_ = converted(projection, means), center_ = converted(center, means);
+  for (int input = kOpacities; input < kInputs; ++input) inputs_[input] = checked(Input(input), gaussians[input - 1]);
+  check_precise(*camera[0], "view", {4, 4});
+  check_precise(*camera[1], "projection", {4, 4});
+  check_precise(*camera[2], "center", {3});
+  view_ = converted(*camera[0], means), projection_ = converted(*camera[1], means);
+  center_ = converted(*camera[2], means);
   check_settings();
 }
 
-Tensor SceneTensors::checked(Input input, const MaybeTensor& given) const {
+Tensor SceneTensors::checked(Input input, const Tensor* given) const {
   const Row& row = kRows[input];
-  const bool none = !given.has_value() || !given->defined();  // Python's None for an argument that must be a tensor
+  const bool none = !given || !given->defined();
   GS_CHECK_TYPE(!none || input != kOpacities, row.name, " must be a tensor, got None");
   if (none) return {};
   const Tensor& t = *given;
@@ -120,8 +119,11 @@ Wanted checked_wanted(const std::vector<bool>& wanted) {
 }
 
 SceneGradients::SceneGradients(const SceneTensors& in, const Wanted& wanted) : wanted_(wanted), adds_(false) {
-  for (int input = 0; input < kInputs; ++input)
-    tensors_[input] = empty(sizes_of(kRows[input], wanted[input] ? in.count() : 0, in.rest_bands()), in.means());
+  for (int input = 0; input < kInputs; ++input) {
+    const bool flat = input == kOpacities && wanted[input] && in.flat_opacities();
+    tensors_[input] = empty(
+        flat ? Shape{in.count()} : sizes_of(kRows[input], wanted[input] ? in.count() : 0, in.rest_bands()), in.means());
+  }
 }
 
 SceneGradients::SceneGradients(const SceneTensors& in, List<Tensor> sums) : adds_(true) {

@@ -1,28 +1,27 @@
 #pragma once
-// The Gaussians and the camera as tensors, and their gradients. A new input is added to SCENE_SCHEMA, GRADIENTS_SCHEMA,
-// SCENE_PARAMETERS and SCENE_ARGUMENTS, to Input, to the table of rows and the constructor in scene.cpp, and to the
-// structs of data.h.
+// The Gaussians and the camera as tensors, and their gradients. A new input is added to GRADIENTS_SCHEMA, to Input, to
+// the table of rows and the constructor in scene.cpp, and to the structs of data.h.
 #include <array>
-#include <cstddef>
 #include <tuple>
 #include <utility>
 
 #include "tensors.h"
 
-#define SCENE_SCHEMA                                                                                          \
-  "Tensor means, Tensor opacities, Tensor? scales, Tensor? rotations, Tensor? cov3d, Tensor? colors, "        \
-  "Tensor? sh_dc, Tensor? sh_rest, Tensor view, Tensor projection, Tensor center, float tan_x, float tan_y, " \
-  "int height, int width, int sh_degree, float scale_modifier, bool antialiasing, bool raw"
-#define SCENE_PARAMETERS                                                                                              \
-  const Tensor &means, const Tensor &opacities, const MaybeTensor &scales, const MaybeTensor &rotations,              \
-      const MaybeTensor &cov3d, const MaybeTensor &colors, const MaybeTensor &sh_dc, const MaybeTensor &sh_rest,      \
-      const Tensor &view, const Tensor &projection, const Tensor &center, double tan_x, double tan_y, int64_t height, \
-      int64_t width, int64_t sh_degree, double scale_modifier, bool antialiasing, bool raw
-#define SCENE_ARGUMENTS                                                                                               \
-  means, opacities, scales, rotations, cov3d, colors, sh_dc, sh_rest, view, projection, center, tan_x, tan_y, height, \
-      width, sh_degree, scale_modifier, antialiasing, raw
+// The Gaussians, of which some may be null; the view matrix and the full projection, both transposed, and the centre;
+// tan_x, tan_y and scale_modifier; height, width, sh_degree, antialiasing and raw.
+#define CAMERA_SCHEMA "float[] lens, int[] options"
+#define SCENE_SCHEMA                                                                                   \
+  "Tensor means, Tensor opacities, Tensor? scales, Tensor? rotations, Tensor? cov3d, Tensor? colors, " \
+  "Tensor? sh_dc, Tensor? sh_rest, Tensor view, Tensor projection, Tensor center, " CAMERA_SCHEMA
+#define SCENE_PARAMETERS                                                                                         \
+  const Tensor &means, const Tensor &opacities, const MaybeTensor &scales, const MaybeTensor &rotations,         \
+      const MaybeTensor &cov3d, const MaybeTensor &colors, const MaybeTensor &sh_dc, const MaybeTensor &sh_rest, \
+      const Tensor &view, const Tensor &projection, const Tensor &center, List<double> lens, Sizes options
+#define SCENE_ARGUMENTS                                                                                             \
+  {&means, &opacities, given(scales), given(rotations), given(cov3d), given(colors), given(sh_dc), given(sh_rest)}, \
+      {&view, &projection, &center}, lens, options
 #define GRADIENTS_SCHEMA                                                                             \
-  "(Tensor means, Tensor means2d, Tensor opacities, Tensor scales, Tensor rotations, Tensor cov3d, " \
+  "(Tensor means2d, Tensor means, Tensor opacities, Tensor scales, Tensor rotations, Tensor cov3d, " \
   "Tensor colors, Tensor sh_dc, Tensor sh_rest)"
 
 namespace gs::ops {
@@ -31,7 +30,7 @@ namespace gs::ops {
 gs::Image checked_image(int64_t height, int64_t width);
 
 // The inputs that have a gradient, in the order of GRADIENTS_SCHEMA. means2d has nothing else: its values are not read.
-enum Input { kMeans, kMeans2d, kOpacities, kScales, kRotations, kCov3d, kColors, kShDc, kShRest, kInputs };
+enum Input { kMeans2d, kMeans, kOpacities, kScales, kRotations, kCov3d, kColors, kShDc, kShRest, kInputs };
 
 using InputTensors = std::array<Tensor, kInputs>;
 using Gradients = decltype(std::tuple_cat(std::declval<InputTensors>()));
@@ -40,14 +39,24 @@ using Wanted = std::array<bool, kInputs>;
 // The same from a list that a caller gave.
 Wanted checked_wanted(const std::vector<bool>& wanted);
 
+// Null for none; Python's None for an argument that must be a tensor is an undefined one.
+inline const Tensor* given(const Tensor& t) { return t.defined() ? &t : nullptr; }
+inline const Tensor* given(const MaybeTensor& t) { return t ? given(*t) : nullptr; }
+
 // Checks the inputs, and owns the contiguous tensors that a gs::Scene points into.
 class SceneTensors {
  public:
-  explicit SceneTensors(SCENE_PARAMETERS);
+  // gaussians: those of Input, in its order, without means2d; null for none. camera: view matrix, projection and
+  // centre.
+  SceneTensors(const std::array<const Tensor*, kInputs - 1>& gaussians, const std::array<const Tensor*, 3>& camera,
+               List<double> lens, Sizes options);
 
   // Checks the shape, dtype and device of an input. Returns it contiguous; undefined where it was not given.
-  Tensor checked(Input input, const MaybeTensor& given) const;
+  Tensor checked(Input input, const Tensor* given) const;
 
+  bool has(Input input) const { return inputs_[input].defined(); }
+  bool raw() const { return raw_; }
+  bool flat_opacities() const { return inputs_[kOpacities].dim() == 1; }  // a row instead of a column
   const Tensor& means() const { return inputs_[kMeans]; }
   int64_t count() const { return inputs_[kMeans].size(0); }
   gs::Image image() const { return image_; }
@@ -104,19 +113,14 @@ class SceneGradients {
   SceneGradients(const SceneTensors& in, List<Tensor> sums);
 
   template <class T>
-  gs::SceneGradient<T> pointers() {
-    return pointers<T>(std::make_index_sequence<kInputs>());
+  gs::SceneGradient<T> pointers() const {
+    const auto of = [this](Input input) { return wanted_[input] ? write<T>(tensors_[input]) : nullptr; };
+    return {of(kMeans), of(kMeans2d), of(kOpacities), of(kScales), of(kRotations),
+            of(kCov3d), of(kColors),  of(kShDc),      of(kShRest), adds_};
   }
   Gradients all() const { return std::tuple_cat(tensors_); }
 
  private:
-  template <class T, size_t... kInput>
-  gs::SceneGradient<T> pointers(std::index_sequence<kInput...>) {
-    static_assert(offsetof(gs::SceneGradient<T>, adds) == kInputs * sizeof(T*),
-                  "SceneGradient and Input have the same fields");
-    return {(wanted_[kInput] ? write<T>(tensors_[kInput]) : nullptr)..., adds_};
-  }
-
   Wanted wanted_;
   InputTensors tensors_;
   bool adds_;

@@ -2,7 +2,6 @@
 // Helpers of all ops: checks, and calls of a backend.
 #include <type_traits>
 
-#include "ahead.h"
 #include "backend.h"
 #include "gs/isa.h"
 #include "gs/torch_executor.h"
@@ -13,6 +12,12 @@
 #endif
 
 namespace gs::ops {
+
+// How far the calling thread's ops run ahead of a GPU, as `run_ahead_` has set it; null: the host waits for lengths.
+const gs::Ahead* ahead();
+
+// The word at which kernels do nothing (gs::Queue::halted), or null.
+inline const int32_t* halted() { return ahead() ? ahead()->halted : nullptr; }
 
 constexpr const char* kFloatAlone = "the CUDA backend computes in float32, got float64: pass .float(), or use the CPU";
 

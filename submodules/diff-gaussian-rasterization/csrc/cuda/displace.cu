@@ -1,0 +1,30 @@
+// Moves Gaussians at random. A thread takes a Gaussian.
+#include <cuda_runtime.h>
+
+#include "../backend.h"
+#include "../math/displace.h"
+#include "queue.cuh"
+
+namespace gs {
+namespace cuda {
+
+namespace {
+
+constexpr int kThreads = 256;
+
+__global__ void __launch_bounds__(kThreads) displace_kernel(const int32_t* halted, Displacement in) {
+  if (is_halted(halted) || (in.stopped && *in.stopped)) return;
+  const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
+  if (i < in.count) gs::displace(in, i);
+}
+
+}  // namespace
+
+void displace(const Queue& queue, const Displacement& in) {
+  if (!in.count) return;
+  displace_kernel<<<blocks_for(in.count, kThreads), kThreads, 0, stream_of(queue)>>>(queue.halted, in);
+  check_launch("displace");
+}
+
+}  // namespace cuda
+}  // namespace gs

@@ -1,0 +1,98 @@
+"""Arguments and results of the operators: Gaussians with a camera, and what a forward makes of them."""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from diff_gaussian_rasterization.backend import OPERATORS
+from diff_gaussian_rasterization.checks import check_flag
+from diff_gaussian_rasterization.gaussians import Gaussians
+from diff_gaussian_rasterization.settings import GaussianRasterizationSettings
+
+_FLAGS = ("prefiltered", "debug", "antialiasing", "inverse_depth")
+
+_NONE = torch.empty(0)  # stands for a tensor that is not given
+
+# The inputs of `rasterize` that receive gradients, in the order of the operators' `wanted` and results.
+GRADIENTS = ("means2d", *Gaussians._fields)
+
+
+class Scene(NamedTuple):
+    """Gaussians and camera, the first arguments of most operators (csrc/torch/scene.h)."""
+
+    means: Tensor
+    opacities: Tensor
+    scales: Tensor | None
+    rotations: Tensor | None
+    cov3d: Tensor | None
+    colors: Tensor | None
+    sh_dc: Tensor | None
+    sh_rest: Tensor | None
+    view: Tensor
+    projection: Tensor
+    center: Tensor
+    lens: tuple[float, ...]  # tan_x, tan_y, scale_modifier
+    options: tuple[int, ...]  # height, width, sh_degree, antialiasing, raw
+
+    @property
+    def gaussians(self) -> tuple[Tensor | None, ...]:
+        """The fields of `Gaussians`."""
+        return self[:8]
+
+    @property
+    def camera(self) -> tuple:
+        """The other fields."""
+        return self[8:]
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Height and width of the image."""
+        return self.options[:2]
+
+    @property
+    def lists(self) -> tuple:
+        """The same for an operator that takes lists of tensors, none of them None."""
+        return [_NONE if t is None else t for t in self[:8]], self[8:11], self.lens, self.options
+
+
+class Drawing(NamedTuple):
+    """The results of the operator `rasterize`: planes of an image, and what its backward needs."""
+
+    color: Tensor  # (3, H, W)
+    transmittance: Tensor  # (1, H, W)
+    inverse_depth: Tensor  # (1, H, W), or no rows if it is not wanted
+    radii: Tensor  # (N,) int32
+    splats: Tensor  # (N, 10)
+    tile_counts: Tensor  # (N,) int32
+    instances: Tensor  # (I,) int32, the splats of all lists
+    ranges: Tensor  # (tiles + 1,) int64, of each tile's list
+    splat_slots: Tensor  # (N + 1, 2) int64
+    slots: Tensor  # (S, 0) int32, whose length counts
+    last: Tensor  # (H, W) int32, behind the last splat of a pixel in its tile's list
+    layers: Tensor  # (V,), on a GPU
+
+    def kept(self, background: Tensor) -> tuple[Tensor, ...]:
+        """What the operators of the backward take as `source` (Kept in csrc/torch/backward.h)."""
+        return *self[4:], background, self[1]
+
+
+def scene_arguments(gaussians: Gaussians, settings: GaussianRasterizationSettings, raw: bool) -> Scene:
+    """Put Gaussians and camera into the form of the operators' arguments."""
+    for name in _FLAGS:
+        if (flag := getattr(settings, name)) is not True and flag is not False and flag is not None:
+            check_flag(name, flag)  # the text "no" would count as True
+    center = settings.campos  # (3,); code of 2023 also gives a row (1, 3)
+    return Scene(
+        *gaussians,
+        settings.viewmatrix,
+        settings.projmatrix,
+        center if center.dim() == 1 else center.reshape(-1),
+        (settings.tanfovx, settings.tanfovy, settings.scale_modifier),
+        (settings.image_height, settings.image_width, settings.sh_degree, bool(settings.antialiasing), raw),
+    )
+
+
+def draw(scene: Scene, background: Tensor, want_inverse_depth: bool = False, train: bool = True) -> Drawing:
+    """Call the operator `rasterize`. train: a backward will follow."""
+    return Drawing(*OPERATORS.rasterize(None, *scene, background, want_inverse_depth, train))
